@@ -14,7 +14,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 from urllib.parse import quote
@@ -23,10 +22,10 @@ from markupsafe import Markup
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
 
 from ethbrake_marl import __version__
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, count_of, plain_text, unknown_name
+from ethbrake_marl.errors import InvalidInput, count_of, plain_text, unknown_name
 from ethbrake_marl.evaluation.results import check_target, write_output
 from ethbrake_marl.figures.style import picture_bytes
-from ethbrake_marl.files.store import check_writable, read_plain, write_file
+from ethbrake_marl.files.store import read_plain, write_file
 from ethbrake_marl.learning.training import read_object
 from ethbrake_marl.pages.frame import (
     Cell,
@@ -43,6 +42,7 @@ from ethbrake_marl.pages.frame import (
 )
 from ethbrake_marl.pages.player import player_of
 from ethbrake_marl.pages.vector import kept_drawing
+from ethbrake_marl.studies.jobs import JobFolder
 from ethbrake_marl.studies.reproduction.item import (
     MOST_EPISODES,
     TOLERANCE,
@@ -55,26 +55,9 @@ from ethbrake_marl.studies.reproduction.item import (
     Verdict,
     summarise_verdicts,
 )
-from ethbrake_marl.studies.reproduction.lists import (
-    reproduce_delays,
-    reproduce_distance,
-    reproduce_gaps,
-    reproduce_hybrid_table,
-    reproduce_illustration,
-    reproduce_random_table,
-)
-from ethbrake_marl.studies.reproduction.trainings import (
-    CURVES,
-    HIGH,
-    LOW,
-    OPEN,
-    STOPPED,
-    reproduce_curves,
-    seconds_left,
-    train_groups,
-    trained_names,
-)
-from ethbrake_marl.studies.reproduction.two_scenarios import reproduce_accelerations, reproduce_trajectories
+from ethbrake_marl.studies.reproduction.lists import LIST_ITEMS
+from ethbrake_marl.studies.reproduction.trainings import CURVE_ITEMS, seconds_left, train_groups, trained_names
+from ethbrake_marl.studies.reproduction.two_scenarios import SCENARIO_ITEMS
 
 # The episodes that an item lets one watch: kept beside its result as plain data, and read again with suspicion.
 
@@ -165,97 +148,9 @@ def _damaged(file: Path | str, where: str) -> InvalidInput:
     return InvalidInput(f"{file}: {where}: is not what a reproduction writes; make it again (--force)")
 
 
-# The table of everything that ``ethbrake reproduce`` makes: one entry per figure and table of the paper.
+# Everything that ``ethbrake reproduce`` makes, in the order of the paper.
 
-_CURVES = tuple(group for groups in CURVES.values() for group in groups)
-
-ITEMS = (
-    Item(
-        "learning-high",
-        ("fig:ppo_sac_high_latency",),
-        "Learning curves at high delay",
-        "Returns of PPO and SAC in training under large communication delays.",
-        partial(reproduce_curves, HIGH),
-        10,
-        _CURVES,
-    ),
-    Item(
-        "learning-low",
-        ("fig:ppo_sac_low_latency",),
-        "Learning curves at low delay",
-        "Returns of PPO and SAC in training under small communication delays.",
-        partial(reproduce_curves, LOW),
-        10,
-        _CURVES,
-    ),
-    Item(
-        "harm-distance",
-        ("Fig:Harm-ivds",),
-        "Harm over total distance",
-        "Harm of the non-ethical strategy, E-V2X-BM, SAC and PPO against the sum of both gaps.",
-        reproduce_distance,
-        15,
-    ),
-    Item(
-        "harm-delays",
-        ("Fig:harm-delay",),
-        "Harm at three delays",
-        "Harm of the four strategies at three communication delays, gaps of 7 m.",
-        reproduce_delays,
-        15,
-    ),
-    Item(
-        "trajectories",
-        ("Fig:pic5sim",),
-        "Trajectories of Scenarios 1 and 2",
-        "Positions of the three vehicles under PPO and SAC, against the vehicle and against time.",
-        reproduce_trajectories,
-        5,
-    ),
-    Item(
-        "accelerations",
-        ("Fig:pic5act",),
-        "Acceleration profiles of Scenarios 1 and 2",
-        "Commands of Vehicle 2 under PPO and SAC.",
-        reproduce_accelerations,
-        5,
-    ),
-    Item(
-        "hybrid-illustration",
-        ("Fig:hybrid illu",),
-        "Illustration of the hybrid",
-        "Harm of E-V2X-BM, of a policy that has not converged, and of the hybrid of both, against total distance.",
-        reproduce_illustration,
-        20,
-        (STOPPED,),
-    ),
-    Item(
-        "hybrid-table",
-        ("Table:hybrid",),
-        "E-V2X-BM, DRL and hybrid in 5,000 episodes",
-        "Collisions and harm of E-V2X-BM, of a policy that has not converged, and of the hybrid.",
-        reproduce_hybrid_table,
-        20,
-        (STOPPED,),
-    ),
-    Item(
-        "random-table",
-        ("Table:Random",),
-        "Four strategies in 10,000 random episodes",
-        "Collisions, harm and its decrease of the non-ethical strategy, E-V2X-BM and the hybrids of SAC and PPO.",
-        reproduce_random_table,
-        60,
-    ),
-    Item(
-        "gaps",
-        (),
-        "What the paper leaves open",
-        "Every quantity that the paper leaves open, our default, and how far the headline moves when it changes.",
-        reproduce_gaps,
-        40,
-        (OPEN,),
-    ),
-)
+ITEMS: tuple[Item, ...] = (*CURVE_ITEMS, *LIST_ITEMS[:2], *SCENARIO_ITEMS, *LIST_ITEMS[2:])
 
 
 def choose_items(names: Sequence[str]) -> list[Item]:
@@ -280,38 +175,25 @@ _FORMAT = {"format": "ethbrake-reproduction", "format_version": 1}
 _LIMIT_BYTES = 16 << 20  # of a figure that is read again
 
 
-def open_folder(settings: Settings, *, force: bool = False) -> None:
-    """Make the folder, or go on in it.
+def open_folder(settings: Settings, *, force: bool = False) -> JobFolder:
+    """The folder, in which the same settings go on; with ``force`` its results go and its trainings stay.
 
-    Raises ``InvalidInput`` for one that cannot be made or written to; ``AlreadyExists`` for one that holds something
-    else, or a reproduction with other settings, unless ``force``, which replaces its results and keeps its trainings.
+    Raises ``InvalidInput`` for one that cannot be made or written to, or a reproduction with other settings unless
+    ``force``; ``AlreadyExists`` for one that holds something else.
     """
-    folder, wanted = settings.folder, {"episodes": settings.episodes, "version": __version__}
-    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-        raise InvalidInput(f"{folder}: is no plain folder; give another (--output)")
-    if (folder / _SETTINGS).is_file():
-        kept = read_object(folder / _SETTINGS)
-        if kept.get("format") != _FORMAT["format"]:
-            raise AlreadyExists(f"{folder / _SETTINGS}: is not of a reproduction; give another folder (--output)")
-        other = [
-            f"{name} {kept.get(name)!s:.40}, here {value}" for name, value in wanted.items() if kept.get(name) != value
-        ]
-        if other and not force:
-            raise AlreadyExists(
-                f"{folder}: holds a reproduction with other settings ({'; '.join(other)}); give another folder"
-                " (--output), or replace it with force (--force)"
-            )
-    elif folder.is_dir() and any(each.name != "trainings" for each in folder.iterdir()):
-        raise AlreadyExists(f"{folder}: is there already and holds no reproduction; give another (--output)")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        check_writable(folder)
-    except OSError as error:
-        raise InvalidInput(f"{folder}: cannot be written to ({error.strerror}); give another (--output)") from None
-    if force:
+    path, question = settings.folder, {"episodes": settings.episodes, "version": __version__}
+    if path.is_symlink():
+        raise InvalidInput(f"{path}: is no plain folder; give another (--output)")
+    if force and (path / _SETTINGS).is_file() and read_object(path / _SETTINGS).get("format") == _FORMAT["format"]:
         for item in ITEMS:  # figures and data are replaced as they are made again
-            (folder / item.name / _RESULT).unlink(missing_ok=True)
-    write_file(folder / _SETTINGS, _text({**_FORMAT, **wanted}))
+            (path / item.name / _RESULT).unlink(missing_ok=True)
+        write_file(path / _SETTINGS, _text({**_FORMAT, **question}))
+    advice = "give another folder (--output), or replace it with force (--force)"
+    folder = JobFolder(
+        path, "reproduction", question, record=_SETTINGS, more=_FORMAT, advice=advice, beside=("trainings",)
+    )
+    folder.check()
+    return folder
 
 
 def _text(content: Mapping[str, Any]) -> bytes:
@@ -388,17 +270,17 @@ def reproduce(items: Sequence[Item], settings: Settings, *, force: bool = False)
     each item the page is written anew. Ctrl-C during a training ends all trainings, and the items are made of those
     that are finished; a second one stops at once. Raises what ``open_folder`` raises.
     """
-    open_folder(settings, force=force)
     full, finished = settings.mode == "full", True
-    for item in sorted(items, key=lambda each: len(each.trained) if full else 0):
-        if full and finished:
-            finished = train_groups(settings.folder, item.trained, settings.tell)
-        trained = trained_names(settings.folder, item.trained) if full else []
-        kept = _read_result(settings.folder, item)
-        if kept is None or list(kept.trained) != trained:
-            _make_item(item, settings, trained)
-            write_file(settings.folder / PAGE, render_page(settings.folder, read_results(settings.folder)).encode())
-    return read_results(settings.folder), finished
+    with open_folder(settings, force=force).work():
+        for item in sorted(items, key=lambda each: len(each.trained) if full else 0):
+            if full and finished:
+                finished = train_groups(settings.folder, item.trained, settings.tell)
+            trained = trained_names(settings.folder, item.trained) if full else []
+            kept = _read_result(settings.folder, item)
+            if kept is None or list(kept.trained) != trained:
+                _make_item(item, settings, trained)
+                write_file(settings.folder / PAGE, render_page(settings.folder, read_results(settings.folder)).encode())
+        return read_results(settings.folder), finished
 
 
 def _make_item(item: Item, settings: Settings, trained: Sequence[str]) -> None:

@@ -40,6 +40,7 @@ from ethbrake_marl.studies.reproduction.item import (
     SAC,
     Bound,
     Drawn,
+    Item,
     Less,
     Made,
     Parameter,
@@ -56,7 +57,14 @@ from ethbrake_marl.studies.reproduction.item import (
     scenario_parameters,
     stated,
 )
-from ethbrake_marl.studies.reproduction.trainings import OPEN, PPO_PAPER, hybrid, kept_harms, unconverged_policy
+from ethbrake_marl.studies.reproduction.trainings import (
+    OPEN,
+    PPO_PAPER,
+    STOPPED,
+    hybrid,
+    kept_harms,
+    unconverged_policy,
+)
 
 FOUR = (FULL_BRAKE, PAIRWISE, COUPLED, SAC, PPO)  # the paper's four, E-V2X-BM twice
 _BASELINES = (NAMES[PAIRWISE], NAMES[COUPLED], PREDICTED)
@@ -731,3 +739,58 @@ def _judge_gaps(base: Headline, rows: Mapping[str, Headline]) -> list[Verdict]:
     told = f"in {len(rows) - len(broken)} of {len(rows)} alternatives{'; not with ' * bool(broken)}{'; '.join(broken)}"
     verdicts.append(Verdict(f"the order stays: {' < '.join(order)}", "differs" if broken else "agrees", told))
     return verdicts
+
+
+LIST_ITEMS = (
+    Item(
+        "harm-distance",
+        ("Fig:Harm-ivds",),
+        "Harm over total distance",
+        "Harm of the non-ethical strategy, E-V2X-BM, SAC and PPO against the sum of both gaps.",
+        reproduce_distance,
+        15,
+    ),
+    Item(
+        "harm-delays",
+        ("Fig:harm-delay",),
+        "Harm at three delays",
+        "Harm of the four strategies at three communication delays, gaps of 7 m.",
+        reproduce_delays,
+        15,
+    ),
+    Item(
+        "hybrid-illustration",
+        ("Fig:hybrid illu",),
+        "Illustration of the hybrid",
+        "Harm of E-V2X-BM, of a policy that has not converged, and of the hybrid of both, against total distance.",
+        reproduce_illustration,
+        20,
+        (STOPPED,),
+    ),
+    Item(
+        "hybrid-table",
+        ("Table:hybrid",),
+        "E-V2X-BM, DRL and hybrid in 5,000 episodes",
+        "Collisions and harm of E-V2X-BM, of a policy that has not converged, and of the hybrid.",
+        reproduce_hybrid_table,
+        20,
+        (STOPPED,),
+    ),
+    Item(
+        "random-table",
+        ("Table:Random",),
+        "Four strategies in 10,000 random episodes",
+        "Collisions, harm and its decrease of the non-ethical strategy, E-V2X-BM and the hybrids of SAC and PPO.",
+        reproduce_random_table,
+        60,
+    ),
+    Item(
+        "gaps",
+        (),
+        "What the paper leaves open",
+        "Every quantity that the paper leaves open, our default, and how far the headline moves when it changes.",
+        reproduce_gaps,
+        40,
+        (OPEN,),
+    ),
+)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,6 +37,7 @@ from ethbrake_marl.studies.reproduction.item import (
     SAC,
     UNIVERSAL,
     Drawn,
+    Item,
     Less,
     Made,
     Parameter,
@@ -447,3 +449,26 @@ def _table(delay: str, courses: Courses) -> Sheet:
         " until nine tenths of the fall of the harm are behind."
     )
     return Sheet(f"Trainings at {delay} delay", head, rows, note)
+
+
+_CURVES = tuple(group for groups in CURVES.values() for group in groups)
+CURVE_ITEMS = (
+    Item(
+        "learning-high",
+        ("fig:ppo_sac_high_latency",),
+        "Learning curves at high delay",
+        "Returns of PPO and SAC in training under large communication delays.",
+        partial(reproduce_curves, HIGH),
+        10,
+        _CURVES,
+    ),
+    Item(
+        "learning-low",
+        ("fig:ppo_sac_low_latency",),
+        "Learning curves at low delay",
+        "Returns of PPO and SAC in training under small communication delays.",
+        partial(reproduce_curves, LOW),
+        10,
+        _CURVES,
+    ),
+)

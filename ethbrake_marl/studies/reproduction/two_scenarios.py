@@ -28,6 +28,7 @@ from ethbrake_marl.studies.reproduction.item import (
     READINGS,
     SAC,
     Drawn,
+    Item,
     Less,
     Made,
     Parameter,
@@ -225,3 +226,23 @@ def _csv(records: Records) -> str:
         for k, time_s in enumerate(record.time_s)
     ]
     return csv_text(head, rows)
+
+
+SCENARIO_ITEMS = (
+    Item(
+        "trajectories",
+        ("Fig:pic5sim",),
+        "Trajectories of Scenarios 1 and 2",
+        "Positions of the three vehicles under PPO and SAC, against the vehicle and against time.",
+        reproduce_trajectories,
+        5,
+    ),
+    Item(
+        "accelerations",
+        ("Fig:pic5act",),
+        "Acceleration profiles of Scenarios 1 and 2",
+        "Commands of Vehicle 2 under PPO and SAC.",
+        reproduce_accelerations,
+        5,
+    ),
+)

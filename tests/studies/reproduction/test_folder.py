@@ -37,7 +37,7 @@ def drawn(stem: str = "a-figure") -> dict[Drawn, Figure]:
 
 
 def hidden(folder: Path) -> list[Path]:
-    return [path for path in folder.rglob(".*")]
+    return [path for path in folder.rglob(".*") if path.name != ".lock"]
 
 
 def test_reproduce__writes_figures_data_results_and_one_page(settings: Settings) -> None:
@@ -107,7 +107,7 @@ def test_open_folder__refuses_what_holds_something_else(settings: Settings, tmp_
     for force in (False, True):
         with pytest.raises(AlreadyExists, match="holds no reproduction"):
             open_folder(replace(settings, folder=tmp_path / "mine"), force=force)
-    with pytest.raises(InvalidInput, match="no plain folder"):
+    with pytest.raises(InvalidInput, match="is a file"):
         open_folder(replace(settings, folder=tmp_path / "mine" / "thesis.txt"))
     (tmp_path / "link").symlink_to(tmp_path / "mine")
     with pytest.raises(InvalidInput, match="no plain folder"):
@@ -116,7 +116,7 @@ def test_open_folder__refuses_what_holds_something_else(settings: Settings, tmp_
 
 def test_open_folder__other_settings_need_force(settings: Settings) -> None:
     reproduce([planted("gaps", lambda s: made())], settings)
-    with pytest.raises(AlreadyExists, match="episodes 24, here 30"):
+    with pytest.raises(InvalidInput, match="episodes 24, here 30"):
         open_folder(replace(settings, episodes=30))
     open_folder(replace(settings, episodes=30), force=True)
     assert read_results(settings.folder) == []
@@ -233,3 +233,8 @@ def test_pages__of_results_that_do_not_say_how_many_worlds_say_nothing_of_it(set
     result = checked_result(content, "result.json")
     page = Page(render_page(settings.folder, [result]))
     assert "worlds of each list" not in page.text and "reproduce gaps --quick (" in page.text
+
+
+def test_reproduce__one_process_works_in_a_folder(settings: Settings) -> None:
+    with open_folder(settings).work(), pytest.raises(InvalidInput, match="another process works in it"):
+        reproduce([planted("gaps", lambda s: made())], settings)
