@@ -58,6 +58,7 @@ def shields(policy: eb.Policy) -> list[Any]:
         options,
         eb.HybridShield(parallel, policy, mode="step"),
         eb.shielded_aec(eb.parallel_env(), mode="step"),
+        eb.shield(eb.parallel_env()),
         eb.ShieldedEnv(eb.EthBrakeEnv()),
         eb.ShieldedVectorEnv(eb.EthBrakeVectorEnv()),
         eb.ShieldedVecEnv(batch),

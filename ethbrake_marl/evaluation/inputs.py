@@ -28,6 +28,7 @@ from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.policies.bundle import Policy
 from ethbrake_marl.scenario import Sample, Scenario, load_scenario, read_initial_states, read_yaml, worlds_from_table
 from ethbrake_marl.scenario.fields import QUANTITIES, quantity_columns
+from ethbrake_marl.shield import ShieldedDriver
 from ethbrake_marl.shield.uncertainty import Uncertainty
 
 # The identity of a result: the worlds, the scenario and the policies that it is about, and what computed it.
@@ -89,7 +90,7 @@ def scenario_sha256(scenario: Scenario) -> str:
 
 def driving_policy(agent: object) -> object:
     """What is inside everything that is around an agent: the policy that it drives by, or the agent itself."""
-    while isinstance(agent, AgentAround | LearnedAgent):
+    while isinstance(agent, AgentAround | LearnedAgent | ShieldedDriver):
         agent = agent.policy
     return agent
 

@@ -12,8 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, Rewards
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools
-from ethbrake_marl.shield.guard import Proposing
-from ethbrake_marl.shield.wrappers import Attached
+from ethbrake_marl.shield.guard import Attached, Proposing
 
 
 class ShieldedVecEnv(VecEnvWrapper):

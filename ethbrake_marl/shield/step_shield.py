@@ -312,6 +312,10 @@ class StepShield:
         """Every decision so far in which something else than the proposal was applied; None without ``logging``."""
         return self._entries[: self._logged] if self.logging else None
 
+    def clear_log(self) -> None:
+        """Forget what was logged so far: it grows until then."""
+        self._entries, self._logged = [], 0
+
     @property
     def interventions(self) -> Ints:
         """Actions that were replaced so far in each running episode, of all vehicles together, [n]."""

@@ -17,71 +17,14 @@ from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from ethbrake_marl.agents.policy import LearnedPolicy
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.gym import EthBrakeVectorEnv
 from ethbrake_marl.envs.parallel import InTurns, in_turns
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats
-from ethbrake_marl.shield.guard import Guarded, Proposing, ShieldGuard, guard_of, read_options
+from ethbrake_marl.shield.guard import Attached, Proposing
 
 Told = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # what a step of the environment returns
-
-
-class Attached:
-    """A guard in the engine of an environment, for the wrapper that put it there.
-
-    Raises ``InvalidInput`` for what is not one of this package's environments, or is shielded already.
-    """
-
-    def __init__(
-        self, env: object, interface: type, maker: str, policy: Proposing | None, where: str, options: Mapping[str, Any]
-    ) -> None:
-        self.options = read_options(where, options)
-        engine = getattr(getattr(env, "unwrapped", env), "engine", None)
-        if isinstance(engine, Engine) and isinstance(engine.guard, ShieldGuard):
-            first = engine.guard.options
-            raise InvalidInput(
-                f"{where}: a {first.where} (mode {first.mode}) shields this environment already, and its bound"
-                " holds for one shield alone; give that one other options, or close() it first"
-            )
-        if not (isinstance(env, interface) and isinstance(engine, Engine)):
-            raise InvalidInput(f"{where}: {env} is not one of this package's environments ({maker})")
-        self.engine, self._left = engine, Guarded(None, {})
-        self.guard = guard_of(engine, policy, self.options)
-        engine.protect(self.guard)
-
-    @property
-    def memory(self) -> Guarded:
-        """What the guard remembers now, or, once it was closed, remembered last."""
-        memory: Guarded | None = self.engine.guarded if self.engine.guard is self.guard else self._left
-        return Guarded(None, {}) if memory is None else memory
-
-    @property
-    def shield(self) -> Any:
-        """The ``StepShield``, ``BelievedShield`` or ``HybridAgent`` as it is now, to be read; None before a reset."""
-        return self.memory.shield
-
-    def check_open(self) -> None:
-        """Raise ``InvalidInput`` once this shield was closed: it stands nowhere any more, and bounds nothing."""
-        if self.engine.guard is not self.guard:
-            raise InvalidInput(f"{self.options.where}: this shield was closed; put a new one around the environment")
-
-    def close(self) -> None:
-        """Let go of the engine."""
-        if self.engine.guard is self.guard:
-            self._left = self.memory
-            self.engine.protect(None)
-
-    def tell(self) -> dict[str, NDArray[Any]]:
-        """What is told of the last step, or, before the first one, of the alert; each [n, L]."""
-        ruling = self.engine.ruling
-        return self.guard.tell(self.memory if ruling is None else ruling.memory, ruling)
-
-    def infos(self) -> list[dict[str, Any]]:
-        """``tell`` as plain values, for each learner of each world."""
-        told = {name: columns.reshape(-1).tolist() for name, columns in self.tell().items()}
-        return [dict(zip(told, row, strict=True)) for row in zip(*told.values(), strict=True)]
 
 
 class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped

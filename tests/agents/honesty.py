@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from ethbrake_marl.actions import command_to_action
+from ethbrake_marl.actions import action_to_command, command_to_action
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import script_agents, set_others
 from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.physics import Bools, Floats, Worlds
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.messages import CHANNEL, LINK, age_s, is_periodic, link_at, links_of, place_at, ring_at
 from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.search import state_columns
+from ethbrake_marl.shield import ShieldedDriver
+from ethbrake_marl.shield.certify import Proposer, proposed_action
 
 
 def changed_decisions(
@@ -39,6 +43,8 @@ def changed_decisions(
     scenario = scenario.with_learners([vehicle])
     rng, alert = np.random.default_rng(seed), scenario.sample(n, seed).worlds
     scripts = script_agents(scenario, except_for=vehicle)
+    if isinstance(agent, ShieldedDriver):
+        agent = Hosted(agent, scripts)
     knowing, wondering = copy.deepcopy(agent), copy.deepcopy(agent)
     engine = Engine(scenario, n, learners=[vehicle], scripts=scripts, worlds=alert)
     for driver, at_alert in ((knowing, alert), (wondering, alter_unreceived(alert, vehicle, rng))):
@@ -51,6 +57,33 @@ def changed_decisions(
         changed += int((wondering.act(alter_unreceived(now, vehicle, rng), vehicle) != command).sum())
         engine.step({vehicle: command_to_action(command, now.vehicles, vehicle)})
     return changed
+
+
+class Hosted:
+    """Who is behind a shield, asked in worlds of the caller's as an agent is."""
+
+    def __init__(self, driver: ShieldedDriver, scripts: Mapping[int, Agent]) -> None:
+        self.driver, self.scripts, self.policy = driver, scripts, copy.deepcopy(driver.policy)
+
+    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+        options, scenario = self.driver.options, self.driver.scenario
+        set_others(self.policy, vehicle, self.scripts)
+        self.policy.begin(worlds, vehicle, rows)
+        if options.believed:
+            self.shield = options.believed_shield(scenario, self.scripts)
+            self.shield.begin(worlds, vehicle, rows)
+        else:
+            self.shield = options.step_shield(scenario, vehicle, self.scripts)
+            self.shield.begin(worlds, rows, {vehicle: self.policy})
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        proposed, policies = proposed_action(self.policy, worlds, vehicle), {vehicle: self.policy}
+        if self.driver.options.believed:
+            applied = self.shield.decide(worlds, vehicle, proposed, policies)
+        else:
+            proposer = Proposer(policies, worlds)
+            applied = self.shield.decide(proposed, seen=state_columns(worlds), proposer=proposer).applied
+        return action_to_command(applied, worlds.vehicles, vehicle)
 
 
 def alter_unreceived(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> Worlds:

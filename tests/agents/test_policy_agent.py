@@ -88,9 +88,9 @@ def test_trained_model__is_shared_by_copies_and_driven_by_evaluate(model):
 @pytest.mark.parametrize("around", AROUND)
 def test_trained_model__behind_every_shield_keeps_the_bound(model, around):
     agent = shielded(eb.policy_agent(model, name="sb3"), around)
-    harm = harms(agent)
+    found = eb.evaluate(WORLDS, {"mine": agent}, scenario=SCENARIO).outcome("mine")
     if around != "+episode:pairwise":
-        assert (harm <= agent.predicted_harm + 1e-5).all()
+        assert (found.first_impact_harm <= found.predicted_harm + 1e-5).all()
 
 
 def test_policy_of_another_library__is_known_by_its_weights():
@@ -190,12 +190,13 @@ def test_memory__belongs_to_each_episode_and_goes_with_its_world():
 @pytest.mark.parametrize("around", AROUND)
 def test_memory__behind_every_shield_keeps_the_bound(around):
     agent = shielded(eb.policy_agent(ramp, initial_state=no_memory), around)
-    harm = harms(agent)
+    found = eb.evaluate(WORLDS, {"mine": agent}, scenario=SCENARIO).outcome("mine")
+    harm = found.first_impact_harm
     if around != "+episode:pairwise":
-        assert (harm <= agent.predicted_harm + 1e-9).all()
+        assert (harm <= found.predicted_harm + 1e-9).all()
     if around == "+step":  # rolled out with a memory of its own, so it drives unhindered where it is good
         alone = harms(eb.policy_agent(ramp, initial_state=no_memory))
-        assert (harm[agent.chosen_policy] == alone[agent.chosen_policy]).all() and agent.chosen_policy.any()
+        assert (harm[found.chosen_policy] == alone[found.chosen_policy]).all() and found.chosen_policy.any()
 
 
 class Recurrent:

@@ -53,8 +53,9 @@ def test_refined_again__reacts_where_another_vehicle_does_not_follow_its_script(
 
 @pytest.mark.parametrize("around", ["+episode", "+step"])
 def test_refined_again__behind_a_shield_keeps_its_bound(around):
-    agent = agent_of(f"full_brake+refined:10{around}")
-    assert (harm(agent) <= agent.predicted_harm + 1e-9).all()
+    agents = {"mine": agent_of(f"full_brake+refined:10{around}")}
+    found = eb.evaluate(WORLDS, agents, scenario=SCENARIO).outcome("mine")
+    assert (found.first_impact_harm <= found.predicted_harm + 1e-9).all()
 
 
 @pytest.mark.parametrize(

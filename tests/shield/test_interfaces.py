@@ -359,6 +359,45 @@ def test_episode_mode__tells_the_bound_of_the_episode_that_ended(make):
         told += len(ended)
 
 
+@pytest.mark.parametrize(
+    ("make", "kind"),
+    [
+        (parallel_env, HybridShield),
+        (lambda: BaseParallelWrapper(parallel_env()), HybridShield),
+        (lambda: gymnasium.wrappers.RescaleAction(EthBrakeEnv(), np.float32(-1.0), np.float32(1.0)), ShieldedEnv),
+        (lambda: EthBrakeVectorEnv(2), ShieldedVectorEnv),
+        (lambda: VecMonitor(make_sb3_vec_env("paper-random", 2)), ShieldedVecEnv),
+    ],
+)
+def test_shield__chooses_the_wrapper_of_the_interface(make, kind):
+    env = eb.shield(make(), make_agent("full_brake"), shares=True)
+    assert isinstance(env, kind) and env.attached.options.mode == "step"
+    env.reset()
+    action = np.ones((2, 1) if kind in (ShieldedVectorEnv, ShieldedVecEnv) else 1, np.float32)
+    infos = env.step({"vehicle_2": action} if kind is HybridShield else action)[-1]
+    told = infos[0] if kind is ShieldedVecEnv else infos.get("vehicle_2", infos)
+    assert "own_harm" in told["shield"]
+
+
+def test_shield__of_agents_in_turns_is_put_around_the_parallel_environment():
+    env = eb.shield(aec_env(), mode="step")
+    env.reset(seed=7)
+    for _ in range(3):
+        env.step(np.ones(1, np.float32))
+    assert env.infos["vehicle_2"]["shield"]["proposed_action"] == 1.0
+    with pytest.raises(InvalidInput, match="put the shield inside it"):
+        eb.shield(BaseWrapper(aec_env()))
+    for none in (None, gymnasium.make("CartPole-v1"), make_agent("coast")):
+        with pytest.raises(InvalidInput, match=r"has none of the interfaces|is not one of this package's environments"):
+            eb.shield(none)
+
+
+def test_shield__is_the_folder_and_the_function_whichever_is_asked_for_first():
+    import ethbrake_marl.shield.guard as guard
+
+    assert eb.shield.guard is guard and callable(eb.shield)
+
+
 @pytest.mark.parametrize("believed", [False, True])
 def test_policy_with_a_memory__is_asked_once_per_decision_whoever_proposes(believed):
     asked = []

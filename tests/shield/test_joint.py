@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pettingzoo.utils import BaseParallelWrapper
 
 from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import make_agent
@@ -11,7 +12,7 @@ from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from ethbrake_marl.errors import InvalidInput, UncertifiedStep
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.search import profile_problem
@@ -305,12 +306,19 @@ def test_parallel__what_is_not_covered_is_refused_in_one_line(make, message):
         make(parallel_env("cooperation-3-pair"))
 
 
-def test_parallel__a_changed_action_of_any_of_them_is_refused(pair_env):
-    pair_env.reset(seed=0)
-    step = pair_env._engine.step
-    pair_env._engine.step = lambda actions: step(np.where(np.arange(2) == 1, -0.123, actions))
-    with pytest.raises(UncertifiedStep, match="not the certified one"):
-        pair_env.step({"vehicle_2": [-1.0], "vehicle_3": [-1.0]})
+def test_parallel__a_changed_action_of_any_of_them_is_shielded():
+    class Driving(BaseParallelWrapper):
+        def step(self, actions):
+            return super().step({**actions, "vehicle_3": np.ones(1)})
+
+    env = HybridShield(Driving(parallel_env("cooperation-3-pair")), mode="step")
+    env.reset(seed=0)
+    bound, replaced = env.attached.shield.first_bound[0], 0
+    while env.agents:
+        *_, infos = env.step({"vehicle_2": [-1.0], "vehicle_3": [-1.0]})
+        assert infos["vehicle_3"]["shield"]["proposed_action"] == 1.0
+        replaced += infos["vehicle_3"]["shield"]["intervened"]
+    assert env.unwrapped.engine.ledger.world_harm("first")[0] <= bound and replaced > 0
 
 
 def test_aec__decides_for_all_when_the_last_has_acted():
