@@ -252,9 +252,8 @@ def check_plan(plan: Plan) -> None:
 # The joint optimum of every level: the least harm known that its learners can do together, world by world.
 #
 # It depends on the worlds, on who learns, and on the scripts of the others; not on who knows what, nor on objectives.
-# So
-# levels that differ in these only ask one question, which is searched once, and what is known of one level is known of
-# every other whose learners can do the same.
+# So levels that differ in these only ask one question, which is searched once, and what is known of one level is known
+# of every other whose learners can do the same.
 
 
 @dataclass(frozen=True, slots=True)

@@ -222,7 +222,9 @@ def read_sweep(path: str | Path) -> SweepFile:
     wording = Wording(SweepFile, "it is needed; docs/scaling.md shows an example")
     found = read_model(document, SweepFile, wording, "with a grid or a list of jobs")
     found._document = document
-    _check_size(found, document)
+    size = (0 if found.grid is None else found.grid.size()) + len(found.jobs)
+    if not 1 <= size <= MOST_JOBS:
+        raise InvalidInput(f"{document.file}: asks for {count_of(size, 'job')}; must be from 1 to {MOST_JOBS:,}")
     return found
 
 
@@ -230,12 +232,6 @@ def sweep_json_schema() -> dict[str, Any]:
     """JSON Schema of the file of a sweep, for editors that complete and check YAML."""
     schema = SweepFile.model_json_schema(schema_generator=FileSchema)
     return publish({**schema, "title": "Sweep", "anyOf": [{"required": ["grid"]}, {"required": ["jobs"]}]})
-
-
-def _check_size(found: SweepFile, document: Document) -> None:
-    size = (0 if found.grid is None else found.grid.size()) + len(found.jobs)
-    if not 1 <= size <= MOST_JOBS:
-        raise InvalidInput(f"{document.file}: asks for {count_of(size, 'job')}; must be from 1 to {MOST_JOBS:,}")
 
 
 # The jobs of a sweep, each known by the hash of its configuration, all checked before the first begins.
@@ -290,48 +286,32 @@ def plan_sweep(file: SweepFile) -> SweepPlan:
     Raises ``InvalidInput`` naming the job: an unknown scenario or recipe, a setting that neither has, what does not fit
     each other, two jobs with one hash.
     """
-    planned = _Planning(file)
+    rows: list[Row] = []
+    loaded: dict[_Kind, tuple[TrainingRecipe, Scenario]] = {}
+    firsts: dict[_Kind, tuple[Training, dict[str, dict[str, Any]]]] = {}
+    seen: dict[str, Request] = {}
     for asked in file.requests():
-        planned.add(asked)
-    return SweepPlan(planned.rows, planned.loaded)
-
-
-@dataclass
-class _Planning:
-    """The rows so far."""
-
-    file: SweepFile
-    rows: list[Row] = field(default_factory=list)
-    loaded: dict[_Kind, tuple[TrainingRecipe, Scenario]] = field(default_factory=dict)
-    _kinds: dict[_Kind, Training] = field(default_factory=dict)
-    _contents: dict[_Kind, dict[str, dict[str, object]]] = field(default_factory=dict)
-    _seen: dict[str, Request] = field(default_factory=dict)
-
-    def add(self, asked: Request) -> None:
-        """Take in one job; its seed changes nothing else than the recipe's."""
         kind = asked.kind
-        if kind not in self._kinds:
-            self._load(asked, kind)
-        first, content = self._kinds[kind], self._contents[kind]
-        content["recipe"]["seed"] = asked.seed
+        if kind not in firsts:
+            try:
+                scenario, recipe = load_parts(asked.scenario, asked.recipe, asked.settings)
+                first = resolve(recipe, scenario, seed=asked.seed)
+            except InvalidInput as error:
+                where = file.where(asked, refused_part(asked.scenario, asked.recipe, asked.settings))
+                raise type(error)(f"{where}: {_describe(asked)}: {error}") from None
+            loaded[kind] = (recipe, scenario)
+            firsts[kind] = first, training_content(first.recipe, first.scenario)
+        first, content = firsts[kind]
+        content["recipe"]["seed"] = asked.seed  # a seed changes nothing else
         identity = training_identity(content)
-        if identity in self._seen:
-            where, other = self.file.where(asked), _describe(self._seen[identity])
+        if identity in seen:
+            where, other = file.where(asked), _describe(seen[identity])
             raise InvalidInput(f"{where}: {_describe(asked)}: is the same training as {other}; leave one of them out")
-        self._seen[identity] = asked
-        recipe = first.recipe
-        name = f"{first.scenario.name}-{recipe.name}-seed{asked.seed}-{identity[:16]}"
-        self.rows.append(Row(asked, identity, name, recipe.algorithm, first.scheme, recipe.total_steps))
-
-    def _load(self, asked: Request, kind: _Kind) -> None:
-        try:
-            scenario, recipe = load_parts(asked.scenario, asked.recipe, asked.settings)
-            first = resolve(recipe, scenario, seed=asked.seed)
-        except InvalidInput as error:
-            where = self.file.where(asked, refused_part(asked.scenario, asked.recipe, asked.settings))
-            raise type(error)(f"{where}: {_describe(asked)}: {error}") from None
-        self.loaded[kind] = (recipe, scenario)
-        self._kinds[kind], self._contents[kind] = first, training_content(first.recipe, first.scenario)
+        seen[identity] = asked
+        own = first.recipe
+        name = f"{first.scenario.name}-{own.name}-seed{asked.seed}-{identity[:16]}"
+        rows.append(Row(asked, identity, name, own.algorithm, first.scheme, own.total_steps))
+    return SweepPlan(rows, loaded)
 
 
 def _describe(asked: Request) -> str:

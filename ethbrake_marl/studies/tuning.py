@@ -329,7 +329,12 @@ def plan_tuning(file: TuningFile) -> TuningPlan:
     told = {"training": content, **file.model_dump(mode="json", include={"search", "measure", "prune", "sampler"})}
     told |= {"order": [*file.search], "versions": installed_versions(), "plugins": noted_plugins()}
     plan = TuningPlan(file, changed, scenario, told)
-    _check_space(plan)
+    for key, dimension in file.search.items():
+        with file.refusing_at("search", key):
+            _check_dimension(plan, key, dimension)
+    with file.refusing_at("search"):
+        for point in _points(plan):
+            _check_point(plan, point)
     return plan
 
 
@@ -366,16 +371,6 @@ def _set_parts(file: TuningFile) -> tuple[Scenario, TrainingRecipe]:
         with file.refusing_at(*(("set", part) if part in file.settings else (part or "set",))):
             raise
     return scenario, recipe.replace(seed=file.seed)
-
-
-def _check_space(plan: TuningPlan) -> None:
-    """Raise ``InvalidInput`` for an end that the recipe does not allow, and for ends or points that do not fit."""
-    for key, dimension in plan.file.search.items():
-        with plan.file.refusing_at("search", key):
-            _check_dimension(plan, key, dimension)
-    with plan.file.refusing_at("search"):
-        for point in _points(plan):
-            _check_point(plan, point)
 
 
 def _check_dimension(plan: TuningPlan, key: str, dimension: Range | Choices) -> None:

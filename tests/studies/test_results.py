@@ -37,5 +37,5 @@ def test_results_csv__an_interval_becomes_two_columns_and_nothing_an_empty_cell(
     assert float(coast[column["first_impact_harm_low"]]) == rows[0].first_impact_harm.interval[0]
     assert float(coast[column["first_impact_harm_high"]]) == rows[0].first_impact_harm.interval[1]
     assert coast[column["predicted_harm"]] == ""
-    assert float(bm[column["predicted_harm"]]) == rows[1].predicted_harm.value
+    assert float(bm[column["predicted_harm"]]) == rows[1]["predicted_harm"].value
     assert coast[column["harm_decrease_first"]] == ""  # full braking was not evaluated
