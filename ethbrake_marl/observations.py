@@ -68,7 +68,6 @@ from ethbrake_marl.scenario.features import (
     checked_values,
     feature_named,
     listed_features,
-    register_feature,
     registered_in,
     side_of,
 )
@@ -585,25 +584,6 @@ def _fitting_deceleration(speed: float, latency_left: float, room: float) -> flo
     speed = max(speed, 0.0)
     left = max(room - speed * latency_left, 1e-3)
     return speed * speed / (2.0 * left)
-
-
-__all__ = [
-    "CONTACT_FEATURES",
-    "NEIGHBOUR_FEATURES",
-    "OBSTACLE_FEATURES",
-    "OWN_FEATURES",
-    "ROLE_FEATURES",
-    "Feature",
-    "Observation",
-    "ObservationSpec",
-    "Observations",
-    "choose_observation",
-    "observation_for",
-    "observe",
-    "observe_packed",
-    "plan_of",
-    "register_feature",
-]
 
 
 # The full state of a line as one vector, for centralised critics: all vehicles, all pairs, the time.

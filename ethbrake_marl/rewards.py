@@ -454,26 +454,3 @@ TERMS.update(
         Term("shaping", "difference of potentials: minus the least harm ahead, for learners", "m2/s2", 0.0, None),
     )
 )
-
-
-__all__ = [
-    "REWARDS",
-    "TERMS",
-    "Reward",
-    "RewardParams",
-    "StepOutcome",
-    "Term",
-    "counted_terms",
-    "further_terms",
-    "moving_terms_of",
-    "own_terms",
-    "potential",
-    "register_term",
-    "registered_terms_of",
-    "resolved_objective",
-    "reward_params",
-    "reward_terms",
-    "setting_names",
-    "shared_terms",
-    "weighted_sum",
-]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import pytest
+from rich.text import Text
 
-from ethbrake_marl.cli.terminal import result_console, say, show
+from ethbrake_marl.cli.out import Out, say
 from ethbrake_marl.errors import (
     LINE_LIMIT,
     AlreadyExists,
@@ -57,9 +58,7 @@ def test_plain_text__keeps_only_what_it_is_told_to() -> None:
 
 def test_terminal__every_way_to_it_is_clean(capsys: pytest.CaptureFixture[str]) -> None:
     say("runs/\x1b[2J\nx")
-    show("# \u202egnp\n")
-    result_console().print("[/] ppo@\x1b[31m :smile:")
-    show("6\N{NO-BREAK SPACE}m/s²")
+    Out().show("# \u202egnp\n", Text("[/] ppo@\x1b[31m :smile:"), "6\N{NO-BREAK SPACE}m/s²")
     captured = capsys.readouterr()
     assert captured.err == "runs/\\x1b[2J\\nx\n"
     assert captured.out == "# \\u202egnp\n\n[/] ppo@\\x1b[31m :smile:\n6\N{NO-BREAK SPACE}m/s²\n"

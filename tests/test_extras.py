@@ -42,7 +42,7 @@ for name in ("train", "resume", "TrainResult", "make_sb3_vec_env", "EthBrakeVecE
         sys.exit(f"{{name}} was imported")
 lineup = "ppo@shipped,ppo@shipped+episode,e_v2x_bm"
 assert run_command(["evaluate", "--agents", lineup, "--episodes", "20", "--json"]) == 0
-assert run_command(["bench", "--quick"]) == 2
+assert run_command(["doctor", "speed", "--quick"]) == 2
 sys.exit(run_command(["train", "--steps", "1"]))
 """
 
@@ -65,7 +65,7 @@ def test_command__without_its_extra_ends_with_status_2_and_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     monkeypatch.setitem(sys.modules, "onnx", None)
-    assert run_command(["export", "shipped/ppo", "--onnx", str(tmp_path / "new.onnx")]) == 2
+    assert run_command(["agent", "export", "shipped/ppo", "--onnx", str(tmp_path / "new.onnx")]) == 2
     told = capsys.readouterr()
     line = f"{sys.executable} -m pip install 'ethbrake-marl[export]'"
     assert (told.out, told.err) == ("", f"ethbrake: error: needs the package onnx, which is not installed: {line}\n")

@@ -16,12 +16,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Driver, knowledge_text
-from ethbrake_marl.cli.machine import this_machine
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.statistics import paired_difference
 from ethbrake_marl.scenario import Sample, Scenario, load_scenario
+from ethbrake_marl.studies.speed import this_machine
 
 REFINED = "ppo@shipped+refined+episode"  # the others' first-impact harm is compared with its
 SEARCHES = (  # without a policy, from a millisecond per world to what refining takes

@@ -13,10 +13,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ethbrake_marl.cli.machine import this_machine
 from ethbrake_marl.figures.style import GREY, add_caption, new_figure, series_style, style_axes, write_picture
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
-from ethbrake_marl.studies.speed import SEED, STEP_S, Effort, Work, braking, rates, stepping, until_rest
+from ethbrake_marl.studies.speed import SEED, STEP_S, Effort, Work, braking, rates, stepping, this_machine, until_rest
 
 WORLDS = (1, 4, 16, 64, 256, 1024, 4096, 16_384, 65_536)
 VEHICLES = (2, 3, 5, 8, 12, 20, 30, 50)

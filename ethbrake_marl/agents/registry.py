@@ -296,8 +296,8 @@ def make_agent(
 
     Args:
         spec: ``name[:argument][@policy]`` and what is put around it, for instance ``constant:3.5``, ``planner:20ms``,
-            ``ppo@shipped+refined+step``; ``ethbrake agents`` lists all. ``my_file.py:make_agent`` runs that file, which
-            can do whatever you can: its function gets what a factory of ``register_agent`` gets, or nothing.
+            ``ppo@shipped+refined+step``; ``ethbrake agent list`` has all. ``my_file.py:make_agent`` runs that file,
+            which can do whatever you can: its function gets what a factory of ``register_agent`` gets, or nothing.
         scenario: needed by teams, by what is put around an agent, and to find the shipped policy of this scenario.
         harm_count: which harm an optimising agent minimises, ``first`` or ``total``.
         horizon_s: until when it looks ahead, s; None: the scenario's horizon, or 8 s.
@@ -384,8 +384,8 @@ def register_agent(
         name: plain, without argument.
         factory: makes the agent, from what stands after the colon (or None) and ``AgentSettings``. The same one again
             changes nothing.
-        about: one line for ``ethbrake agents``.
-        knows: of the line while it drives, for ``ethbrake agents`` too.
+        about: one line for ``ethbrake agent list``.
+        knows: of the line while it drives, for ``ethbrake agent list`` too.
         takes_policy: whether ``name@policy`` is known, too; the factory finds it in ``AgentSettings.policy``.
 
     Raises ``AlreadyExists`` for a name that another factory has, ``InvalidInput`` for one that is not plain.

@@ -1,4 +1,7 @@
-"""Is this installation in order? Versions, folders, and the physics on worlds whose answer is known."""
+"""The commands ``doctor``: is this installation in order, and how fast is this machine?
+
+Versions, folders, and the physics on worlds whose answer is known; speed per second of processor time.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
@@ -18,24 +21,18 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.table import Table
 
 from ethbrake_marl import __version__
-from ethbrake_marl.cli.late import LATE
-from ethbrake_marl.cli.options import JsonOption
-from ethbrake_marl.cli.terminal import EVERY_S, say, show, write_json
+from ethbrake_marl.cli.command import command, new_group
+from ethbrake_marl.cli.out import EVERY_S, Out, say
 from ethbrake_marl.kernel_store import cache_folder, is_temporary
 
-if TYPE_CHECKING or LATE:
-    import numpy as np
+if TYPE_CHECKING:
     from packaging.requirements import Requirement
-    from packaging.version import Version
 
-    from ethbrake_marl.agents.e_v2x_bm_kernel import optimise_pairwise
-    from ethbrake_marl.physics import Worlds, advance, make_worlds
-    from ethbrake_marl.scenario import list_scenarios, scenario_folder
-    from ethbrake_marl.scenario.schema import SHIPPED
+    from ethbrake_marl.studies.speed import Speed
 
-DISTRIBUTION = "ethbrake-marl"
 EXTRAS = ("train", "marl", "export", "data", "render", "explore", "cluster", "tune")
 _TINY = ("--set=n_envs=16", "--set=n_steps=8", "--set=counterfactuals=16", "--set=evaluation.worlds=10")
 _LINEUP = "ladder,ppo@shipped,ppo@shipped+refined+episode,full_brake+step,full_brake+robust"
@@ -110,6 +107,8 @@ def _dependencies() -> Iterator[Check]:
 
     What only an extra brings may be missing.
     """
+    from packaging.version import Version
+
     pinned = _pinned_versions(_CHECKOUT / "constraints.txt")
     for extra, requirement in _requirements():
         name = requirement.name
@@ -128,9 +127,11 @@ def _dependencies() -> Iterator[Check]:
 
 def _requirements() -> list[tuple[str, Requirement]]:
     """(extra, or "" for what is always needed; requirement): from the checkout that it runs in, else its metadata."""
+    from packaging.requirements import Requirement
+
     project = _CHECKOUT / "pyproject.toml"
     if not project.is_file():
-        lines = [Requirement(line) for line in requires(DISTRIBUTION) or []]
+        lines = [Requirement(line) for line in requires("ethbrake-marl") or []]
         plain = [("", r) for r in lines if r.marker is None or r.marker.evaluate({"extra": ""})]
         extra = [(e, r) for e in EXTRAS for r in lines if r.marker is not None and r.marker.evaluate({"extra": e})]
         return plain + [(e, r) for e, r in extra if ("", r) not in plain]
@@ -160,13 +161,23 @@ def _kernel_cache() -> tuple[bool, str]:
 
 
 def _scenarios() -> tuple[bool, str]:
+    from ethbrake_marl.scenario import list_scenarios, scenario_folder
+    from ethbrake_marl.scenario.schema import SHIPPED
+
     found = [entry for entry in list_scenarios() if entry.origin == SHIPPED]
     return len(found) > 0, f"{len(found)} in {scenario_folder()}"
 
 
 def _golden_impact() -> tuple[bool, str]:
     """A car at 10 m/s brakes with 5 m/s2, 8 m behind a standing one: harm ``10^2 - 2 * 5 * 8 = 20``."""
-    world = _world([8.0], [0.0, 10.0], capacity_mps2=5.0, latency_s=0.0)
+    import numpy as np
+
+    from ethbrake_marl.physics import advance, make_worlds
+
+    world = make_worlds(
+        [8.0], [0.0, 10.0], braking_capacity_mps2=5.0, driving_capacity_mps2=5.0, latency_s=0.0, mass_t=5.0,
+        restitution=0.1,
+    )  # fmt: skip
     _, impacts = advance(world, np.array([[0.0, -5.0]]), 4.0)
     harm = float(impacts.total_harm[0, 0])
     return abs(harm - 20.0) < 1e-9, f"8 m behind a standing car, 10 m/s, braking 5 m/s2: harm {harm:.9g} (exact: 20)"
@@ -174,8 +185,16 @@ def _golden_impact() -> tuple[bool, str]:
 
 def _golden_baseline() -> tuple[bool, str]:
     """The paper's distance scenario at 7 m and 7 m: E-V2X-BM brakes with 5.17021 m/s2 and expects harm 4.03447."""
-    capacity, latency = np.array([6.0, 7.0, 6.0]), np.array([0.0, 0.5, 0.8])
-    world = _world([7.0, 7.0], [20.0, 18.0, 20.0], capacity_mps2=capacity, latency_s=latency)
+    import numpy as np
+
+    from ethbrake_marl.agents.e_v2x_bm_kernel import optimise_pairwise
+    from ethbrake_marl.physics import make_worlds
+
+    capacity = np.array([6.0, 7.0, 6.0])
+    world = make_worlds(
+        [7.0, 7.0], [20.0, 18.0, 20.0], braking_capacity_mps2=capacity, driving_capacity_mps2=capacity,
+        latency_s=np.array([0.0, 0.5, 0.8]), mass_t=5.0, restitution=0.1,
+    )  # fmt: skip
     best = optimise_pairwise(world, 1)
     found = f"{float(best.deceleration_mps2[0]):.6g} m/s2, harm {float(best.harm[0]):.6g}"
     wanted = "5.17021 m/s2, harm 4.03447"
@@ -213,36 +232,74 @@ def _call(arguments: tuple[str, ...], folder: str) -> str:
     return (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1] if done.returncode else ""
 
 
-def _world(
-    gaps_m: list[float], speeds_mps: list[float], *, capacity_mps2: float | np.ndarray, latency_s: float | np.ndarray
-) -> Worlds:
-    return make_worlds(
-        gaps_m,
-        speeds_mps,
-        braking_capacity_mps2=capacity_mps2,
-        driving_capacity_mps2=capacity_mps2,
-        latency_s=latency_s,
-        mass_t=5.0,
-        restitution=0.1,
-    )
+doctor = new_group(
+    "doctor", "Check this installation, or measure its speed.", "doctor --compile", "doctor speed --quick"
+)
 
 
-def doctor_command(
+@command(doctor, "check", "doctor", json=True)
+def check_command(
+    out: Out,
     compile_all: Annotated[
         bool, typer.Option("--compile", help="Compile the physics now, on all cores, so that no later command waits.")
     ] = False,
-    as_json: JsonOption = False,
 ) -> None:
     """Check this installation: versions, folders, physics.
 
     One line per check, OK or FAIL; exit status 1 when any failed.
     """
     checks = diagnose(compile_all=compile_all)
-    if as_json:
-        write_json([asdict(check) for check in checks])
-    else:
-        width = max(len(check.name) for check in checks)
-        for check in checks:
-            show(f"{'OK' if check.ok else 'FAIL':4}  {check.name:{width}}  {check.detail}")
+    width = max(len(check.name) for check in checks)
+    lines = (f"{'OK' if check.ok else 'FAIL':4}  {check.name:{width}}  {check.detail}" for check in checks)
+    out.result([asdict(check) for check in checks], *lines)
     if not all(check.ok for check in checks):
         raise typer.Exit(1)
+
+
+@command(doctor, "speed", "doctor speed --quick", needs=("stable_baselines3",), json=True)
+def speed_command(
+    out: Out,
+    quick: Annotated[bool, typer.Option("--quick", help="In about 20 s instead of a minute or two; coarser.")] = False,
+) -> None:
+    """Measure speed on this machine, per second of processor time on one core.
+
+    Medians over repetitions. Other programs that run at the same time make all figures worse.
+    """
+    from ethbrake_marl.studies.speed import BENCHMARKS, FULL, QUICK, measure, this_machine
+
+    machine = this_machine()
+    speeds: list[Speed] = []
+    for speed in measure(QUICK if quick else FULL):
+        speeds.append(speed)
+        out.progress("speed", len(speeds), len(BENCHMARKS))
+    figures = [asdict(speed) for speed in speeds]
+    out.result({"machine": asdict(machine), "figures": figures}, _speed_table(speeds), f"Machine: {machine}")
+
+
+def _speed_table(speeds: Sequence[Speed]) -> Table:
+    """One line for each figure: what, how many worlds at once, the median, its range, and the aim."""
+    from ethbrake_marl.studies.speed import WORLD_STEPS
+
+    table = Table(caption="Medians over repetitions, and their range. Aim: at least, for seconds at most.")
+    table.add_column("per CPU-second", overflow="fold")
+    for title in ("worlds", "median", "range", "x vehicles", "aim"):
+        table.add_column(title, justify="right", no_wrap=True)
+    for speed in speeds:
+        steps = speed.unit == WORLD_STEPS
+        table.add_row(
+            speed.name,
+            f"{speed.worlds:,}",
+            f"{_plain(speed.value)} {speed.unit.removesuffix('/s')}",
+            f"{_plain(speed.lowest)} - {_plain(speed.highest)}",
+            _plain(speed.value * speed.vehicles) if steps else "",
+            "" if speed.floor is None else _plain(speed.floor),
+        )
+    return table
+
+
+def _plain(value: float) -> str:
+    """Three digits, with k for thousands, M for millions and G beyond."""
+    for size, letter in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
+        if value >= size:
+            return f"{value / size:#.3g}".removesuffix(".") + letter
+    return f"{value:.3g}"

@@ -1,66 +1,63 @@
-"""The commands ``ethbrake scenario ...``: look at scenarios, check one, start a new one."""
+"""The commands about what there is: ``scenario``, ``recipe`` and ``agent``."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from ethbrake_marl.cli.late import LATE
-from ethbrake_marl.cli.options import ForceOption, JsonOption
-from ethbrake_marl.cli.terminal import say, show, write_json
+from ethbrake_marl.cli.command import command, new_group
+from ethbrake_marl.cli.out import Out, plain_table
 from ethbrake_marl.defaults import LIST_SEED
 
-if TYPE_CHECKING or LATE:
+CHECKED_DRAWS = 1000  # worlds that `scenario validate` draws
+
+NameArgument = Annotated[str, typer.Argument(metavar="NAME|PATH")]
+NewNameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Of the new file.")]
+BasedOnOption = Annotated[str, typer.Option(metavar="NAME|PATH", help="Whose values to start from.")]
+FolderOption = Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the new file.")]
+
+scenario_group = new_group(
+    "scenario",
+    "Look at scenarios, check one, start a new one, or draw its worlds.",
+    "scenario show paper-random",
+    "scenario sample paper-random --episodes 10 --output worlds.csv",
+)
+
+
+@command(scenario_group, "list", "scenario list", json=True)
+def scenario_list(out: Out) -> None:
+    """List the scenarios that have a name: that and the title, and the folder of those that a plug-in registers."""
+    from ethbrake_marl.scenario import list_scenarios
+    from ethbrake_marl.scenario.schema import SHIPPED
+
+    entries = list_scenarios()
+    width = max(len(entry.name) for entry in entries)
+    out.result(
+        [{"name": e.name, "title": e.title, "path": str(e.path), "origin": e.origin} for e in entries],
+        *(f"{e.name:{width}}  {e.title}{'' if e.origin == SHIPPED else f'  (from {e.origin})'}" for e in entries),
+    )
+
+
+@command(scenario_group, "show", "scenario show paper-random")
+def scenario_show(out: Out, scenario: NameArgument) -> None:
+    """Print the YAML of a scenario that is in order."""
+    from ethbrake_marl.scenario import load_scenario, scenario_path
+
+    load_scenario(scenario)
+    _show_file(out, scenario_path(scenario))
+
+
+@command(scenario_group, "validate", "scenario validate my-scenario.yaml", json=True)
+def scenario_validate(out: Out, path: NameArgument) -> None:
+    """Check a scenario: one line, OK or what is wrong; then what may not be meant."""
     from ethbrake_marl.agents.protocol import Team
     from ethbrake_marl.agents.registry import make_single_agent
     from ethbrake_marl.agents.rollout import drive
     from ethbrake_marl.evaluation.inputs import load_runnable
-    from ethbrake_marl.evaluation.results import write_output
-    from ethbrake_marl.files.store import read_plain
-    from ethbrake_marl.files.yaml import SIZE_LIMIT
-    from ethbrake_marl.scenario import (
-        list_scenarios,
-        load_scenario,
-        new_scenario_text,
-        scenario_json_schema,
-        scenario_path,
-    )
     from ethbrake_marl.scenario.fields import LEARNER, count_kinds, is_state_free
-    from ethbrake_marl.scenario.schema import SHIPPED
 
-CHECKED_DRAWS = 1000  # worlds that `scenario validate` draws
-
-scenario_app = typer.Typer(
-    rich_markup_mode=None,
-    help="Look at scenarios, check one, or start a new one.",
-    epilog="Example: ethbrake scenario show paper-random",
-)
-
-
-@scenario_app.command("list", epilog="Example: ethbrake scenario list")
-def scenario_list(as_json: JsonOption = False) -> None:
-    """List the scenarios that have a name: that and the title, and the folder of those that a plug-in registers."""
-    entries = list_scenarios()
-    if as_json:
-        write_json([{"name": e.name, "title": e.title, "path": str(e.path), "origin": e.origin} for e in entries])
-        return
-    width = max(len(entry.name) for entry in entries)
-    for entry in entries:
-        show(f"{entry.name:{width}}  {entry.title}{'' if entry.origin == SHIPPED else f'  (from {entry.origin})'}")
-
-
-@scenario_app.command("show", epilog="Example: ethbrake scenario show paper-random")
-def scenario_show(scenario: Annotated[str, typer.Argument(metavar="NAME|PATH")]) -> None:
-    """Print the YAML of a scenario that is in order."""
-    load_scenario(scenario)
-    show(read_plain(scenario_path(scenario), SIZE_LIMIT).decode("utf-8"), end="")
-
-
-@scenario_app.command("validate", epilog="Example: ethbrake scenario validate my-scenario.yaml")
-def scenario_validate(path: Annotated[str, typer.Argument(metavar="PATH|NAME")], as_json: JsonOption = False) -> None:
-    """Check a scenario: one line, OK or what is wrong; then what may not be meant."""
     scenario = load_runnable(path)
     sample = scenario.sample(CHECKED_DRAWS, LIST_SEED)
     names = [scenario.vehicle_names[i] for i in scenario.learners]
@@ -68,39 +65,193 @@ def scenario_validate(path: Annotated[str, typer.Argument(metavar="PATH|NAME")],
     braking = Team.copies(make_single_agent("full_brake"), deciding)
     moving = int((~drive(sample.worlds, braking, scenario).at_rest).sum())
     late = int((sample.worlds.vehicles.latency_s[:, 0] > 0.0).sum())
-    if as_json:
-        told = {"name": scenario.name, "vehicles": scenario.vehicles, "learners": names, "worlds": CHECKED_DRAWS}
-        write_json({**told, "rejected": sample.rejected, "moving_at_horizon": moving, "vehicle_1_late": late})
-        return
+    told = {"name": scenario.name, "vehicles": scenario.vehicles, "learners": names, "worlds": CHECKED_DRAWS}
     counts = f"{CHECKED_DRAWS:,} worlds drawn, {sample.rejected:,} more refused for an early impact"
     learners = ", ".join(names) or "none"
-    show(f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; {counts}{count_kinds(sample)}")
+    shown = [f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; {counts}{count_kinds(sample)}"]
     if moving:
-        show(
+        shown.append(
             f"note: at the horizon ({scenario.horizon_s:g} s) something still moves in {moving:,} of them, though"
             " whoever decides brakes fully; what comes after counts nowhere. A longer horizon_s sees more"
         )
     if late:
-        show(f"note: Vehicle 1, whose braking is the alert, has a latency above 0 in {late:,} of them")
+        shown.append(f"note: Vehicle 1, whose braking is the alert, has a latency above 0 in {late:,} of them")
+    out.result({**told, "rejected": sample.rejected, "moving_at_horizon": moving, "vehicle_1_late": late}, *shown)
 
 
-@scenario_app.command("new", epilog="Example: ethbrake scenario new my-scenario --based-on paper-distance")
+@command(scenario_group, "new", "scenario new my-scenario --based-on paper-distance", force=True)
 def scenario_new(
-    name: str,
-    based_on: Annotated[str, typer.Option(metavar="NAME|PATH", help="Whose values to start from.")] = "paper-random",
-    output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the new file.")] = Path(),
-    force: ForceOption = False,
+    out: Out, name: NewNameArgument, based_on: BasedOnOption = "paper-random", output: FolderOption = Path()
 ) -> None:
     """Write a commented NAME.yaml with every key."""
-    file = output / f"{name}.yaml"
-    write_output(file, new_scenario_text(name, based_on).encode(), force=force)
-    say(f"written: {file}; change it, then: ethbrake scenario validate {file}")
+    from ethbrake_marl.scenario import new_scenario_text
+
+    _write_new(out, "scenario", output / f"{name}.yaml", new_scenario_text(name, based_on))
 
 
-@scenario_app.command("schema", epilog="Example: ethbrake scenario schema > scenario.schema.json")
-def scenario_schema() -> None:
+@command(scenario_group, "schema", "scenario schema > scenario.schema.json")
+def scenario_schema(out: Out) -> None:
     """Print the JSON Schema of scenario files.
 
     For editors that complete and check YAML.
     """
-    write_json(scenario_json_schema())
+    from ethbrake_marl.scenario import scenario_json_schema
+
+    out.print_json(scenario_json_schema())
+
+
+@command(
+    scenario_group, "sample", "scenario sample paper-random --episodes 10 --output worlds.csv", json=True, force=True
+)
+def scenario_sample(
+    out: Out,
+    scenario: NameArgument,
+    episodes: int = 10,
+    seed: int = LIST_SEED,
+    settings: list[str] | None = None,
+    output: Annotated[
+        Path | None, typer.Option(metavar="FILE.csv", help="Write the table to this file.", show_default="stdout")
+    ] = None,
+) -> None:
+    """Draw the first worlds of a list, as the table that `ethbrake evaluate --initial-states` reads.
+
+    A column is what the scenario does not fix. The same list, seed and number are the same worlds on every machine.
+    """
+    from ethbrake_marl.evaluation.inputs import load_runnable, states_of
+    from ethbrake_marl.learning.recipe import read_settings
+
+    out.check(output, ".csv", what="a table of worlds")
+    chosen = load_runnable(scenario, read_settings(settings).scenario)
+    states = states_of(chosen.sample(episodes, seed).worlds, chosen)
+    lines = [",".join(states[0]), *(",".join(map(repr, state.values())) for state in states)]
+    if output is not None:
+        out.write(output, "\n".join([*lines, ""]), what="worlds")
+    if output is None or out.as_json:
+        out.result(states, *lines)
+
+
+recipe_group = new_group(
+    "recipe",
+    "Look at training recipes, check one, or start a new one.",
+    "recipe show ppo",
+    "recipe new my-recipe --based-on sac",
+)
+
+
+@command(recipe_group, "list", "recipe list", json=True)
+def recipe_list(out: Out) -> None:
+    """List the shipped recipes: name, algorithm and title."""
+    from ethbrake_marl.learning.recipe import load_recipe, shipped_recipes
+
+    found = {name: (load_recipe(name), path) for name, path in shipped_recipes().items()}
+    width = max(map(len, found))
+    out.result(
+        [
+            {"name": name, "algorithm": recipe.algorithm, "title": recipe.title, "path": str(path)}
+            for name, (recipe, path) in found.items()
+        ],
+        *(f"{name:{width}}  {recipe.algorithm:4}  {recipe.title}" for name, (recipe, _) in found.items()),
+    )
+
+
+@command(recipe_group, "show", "recipe show ppo")
+def recipe_show(out: Out, recipe: NameArgument) -> None:
+    """Print the YAML of a recipe that is in order."""
+    from ethbrake_marl.learning.recipe import load_recipe, recipe_path
+
+    load_recipe(recipe)
+    _show_file(out, recipe_path(recipe))
+
+
+@command(recipe_group, "validate", "recipe validate my-recipe.yaml")
+def recipe_validate(out: Out, path: NameArgument) -> None:
+    """Check a recipe: one line, OK or what is wrong."""
+    from ethbrake_marl.learning.recipe import load_recipe
+
+    recipe = load_recipe(path)
+    others = ", ".join(name for name in recipe.schemes if name not in ("single", "shared"))
+    scheme = recipe.scheme or f"single, or shared for several learners{f'; also {others}' if others else ''}"
+    out.show(
+        f"OK  {recipe.name}: {recipe.algorithm}, {recipe.total_steps:,} steps, seed {recipe.seed}, scheme {scheme}"
+    )
+
+
+@command(recipe_group, "new", "recipe new my-recipe --based-on sac", force=True)
+def recipe_new(out: Out, name: NewNameArgument, based_on: BasedOnOption = "ppo", output: FolderOption = Path()) -> None:
+    """Write a commented NAME.yaml with every key."""
+    from ethbrake_marl.learning.recipe import new_recipe_text
+
+    _write_new(out, "recipe", output / f"{name}.yaml", new_recipe_text(name, based_on))
+
+
+@command(recipe_group, "schema", "recipe schema > recipe.schema.json")
+def recipe_schema(out: Out) -> None:
+    """Print the JSON Schema of recipe files.
+
+    For editors that complete and check YAML.
+    """
+    from ethbrake_marl.learning.recipe import recipe_json_schema
+
+    out.print_json(recipe_json_schema())
+
+
+def _show_file(out: Out, path: Path) -> None:
+    from ethbrake_marl.files.store import read_plain
+    from ethbrake_marl.files.yaml import SIZE_LIMIT
+
+    out.show(read_plain(path, SIZE_LIMIT).decode("utf-8"), end="")
+
+
+def _write_new(out: Out, kind: str, file: Path, text: str) -> None:
+    out.write(file, text)
+    out.note(f"written: {file}; change it, then: ethbrake {kind} validate {file}")
+
+
+agent_group = new_group(
+    "agent", "List who can drive, or hand a policy on.", "agent list", "agent export runs/early --onnx early.onnx"
+)
+
+
+@command(agent_group, "list", "agent list", json=True)
+def agent_list(out: Out) -> None:
+    """List all agents: how each is written, what it does, what it knows.
+
+    What begins with + goes behind any agent, for instance full_brake+step: +refined first, then one shield.
+    """
+    from ethbrake_marl.agents.protocol import knowledge_text, sees_through
+    from ethbrake_marl.agents.registry import agent_entries
+
+    entries = agent_entries()
+    table = plain_table(padding=(0, 1, 0, 0))
+    table.add_column("Agent", no_wrap=True)
+    table.add_column("Drives by", overflow="fold")
+    table.add_column("Knows", overflow="fold")
+    for entry in entries:
+        added = "also " if entry.form.startswith("+") else ""
+        mark = " †" if sees_through(entry.knows) else ""
+        table.add_row(entry.form, entry.about, added + knowledge_text(entry.knows) + mark)
+    out.result(
+        [
+            {"agent": e.form, "about": e.about, "knows": list(e.knows), "omniscient": sees_through(e.knows)}
+            for e in entries
+        ],
+        table,
+        "† omniscient: reads what no channel brought. With :believed behind it, it decides on what was received.",
+        "ladder stands for coast to best_harm; a typo gets a suggestion. See docs/baselines.md and docs/shield.md.",
+    )
+
+
+@command(agent_group, "export", "agent export runs/early --onnx early.onnx", force=True)
+def agent_export(
+    out: Out,
+    policy: Annotated[str, typer.Argument(metavar="FOLDER", help="A run, a policy bundle, or shipped/NAME.")],
+    onnx: Annotated[Path, typer.Option(metavar="FILE", help="The ONNX model to write.")],
+) -> None:
+    """Write a policy as an ONNX model: observation in, acceleration out.
+
+    Needs the package onnx, which the extra `export` brings.
+    """
+    from ethbrake_marl.policies.shipped import load_named_policy, onnx_model
+
+    out.check(onnx)
+    out.write(onnx, onnx_model(load_named_policy(policy)), what="written")

@@ -192,7 +192,7 @@ class NamedWorlds(_Strict):
             raise InvalidInput(
                 f"{where}: its worlds were found in scenario {self.scenario!r}"
                 f"{''.join(f' with --set {each}' for each in self.settings)}, which {scenario.name!r} is not, or is no"
-                " longer: their contents differ; use that scenario, or search again (ethbrake falsify)"
+                " longer: their contents differ; use that scenario, or search again (ethbrake search falsify)"
             )
         columns = self.worlds[0].state.keys()
         for k, world in enumerate(self.worlds):

@@ -452,9 +452,7 @@ def _rows_of(path: Path, content: Any) -> list[dict[str, Any]]:
         if kind not in get_args(Kind):
             raise InvalidInput(f"{path}: {unknown_name('kind of results', kind, get_args(Kind))}")
         if kind not in _COMPARED:
-            raise InvalidInput(
-                f"{path}: results of ethbrake {kind} cannot be compared; those of {', '.join(_COMPARED)} can"
-            )
+            raise InvalidInput(f"{path}: results of {kind} cannot be compared; those of {', '.join(_COMPARED)} can")
     if not isinstance(content, dict):
         return several
     about = {key: value for key, value in content.items() if key != "agents"}

@@ -171,7 +171,8 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
     """Write ``folder``, completely or not at all, with every byte on the disk before it has its name; old ones go."""
     with new_folder(folder) as partial:
         write_file(partial / _NUMBERS, json.dumps(state.numbers, allow_nan=False).encode())
-        write_file(partial / _ARRAYS, safetensors.numpy.save(_contiguous(state.arrays)))
+        arrays = {name: np.ascontiguousarray(array).reshape(array.shape) for name, array in state.arrays.items()}
+        write_file(partial / _ARRAYS, safetensors.numpy.save(arrays))
         write_file(partial / _TABLE, state.table)
         save_trained(state.policy, partial / _POLICY)
         if state.best is not None:
@@ -303,10 +304,6 @@ def _read(path: Path, limit_bytes: int) -> bytes:
 
 def _is_folder(path: Path) -> bool:
     return path.is_dir() and not path.is_symlink()
-
-
-def _contiguous(arrays: Mapping[str, NDArray[Any]]) -> Arrays:
-    return {name: np.ascontiguousarray(array).reshape(array.shape) for name, array in arrays.items()}
 
 
 def _write_array(path: Path, array: NDArray[Any]) -> None:
@@ -574,22 +571,13 @@ def _check_replay(state: TrainingState, model: Model) -> None:
         if state.replay or place:
             raise ValueError("it has a replay memory, and this algorithm has none")
         return
-    rows = [ArrayRow(name, array.dtype.str, ("filled", *array.shape[1:])) for name, array in _replay_of(memory)]
+    arrays = {name: getattr(memory, name) for name in REPLAY}
+    rows = [ArrayRow(name, array.dtype.str, ("filled", *array.shape[1:])) for name, array in arrays.items()]
     filled = check_arrays(_headers(state.replay), rows)["filled"]
-    position = place.get("pos"), place.get("full")
-    if filled > memory.buffer_size or position not in ((filled, False), *_full_at(memory.buffer_size, filled, place)):
+    position, full = place.get("pos"), place.get("full")
+    somewhere = full is True and filled == memory.buffer_size and position is not None and position < filled
+    if filled > memory.buffer_size or not (somewhere or (position, full) == (filled, False)):
         raise ValueError(f"state.json: replay = {place}: does not go with a memory of {filled} entries")
-
-
-def _full_at(size: int, filled: int, place: Mapping[str, Any]) -> list[tuple[Any, bool]]:
-    """Where a full memory may go on: anywhere in it."""
-    position = place.get("pos")
-    return [(position, True)] if filled == size and position is not None and position < size else []
-
-
-def _replay_of(memory: Any) -> Iterator[tuple[str, NDArray[Any]]]:
-    for name in REPLAY:
-        yield name, getattr(memory, name)
 
 
 def _check_policy(name: str, trained: Trained, policy: Trained) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -488,9 +487,9 @@ def shipped_recipes() -> dict[str, Path]:
     return {file.stem: file for file in sorted(shipped_folder("train", "recipes").glob("*.yaml"))}
 
 
-def recipe_of(content: str) -> TrainingRecipe:
-    """The recipe that ``model_dump(mode="json")`` wrote, from its JSON text; raises ``InvalidInput``."""
-    return _checked(Document("recipe", json.loads(content), {}))
+def recipe_of(content: Any) -> TrainingRecipe:
+    """The recipe that ``model_dump(mode="json")`` wrote; raises ``InvalidInput``."""
+    return _checked(Document("recipe", content, {}))
 
 
 def _checked(source: Path | Document) -> TrainingRecipe:

@@ -153,12 +153,18 @@ def measure_on_list(training: Training) -> Evaluate:
     another objective than total, also what each one's makes of the harm, and the mean of these.
     """
     recipe, scenario = training.recipe, training.scenario
+    names = scenario.vehicle_names
     objectives = resolved_objective(recipe.reward, scenario.objective, scenario.vehicles)[1]
     worlds = scenario.sample(recipe.evaluation.worlds, recipe.evaluation.seed)
 
     def measure(trained: Trained) -> dict[str, float]:
-        agents = {"policy": driver_of(trained, scenario)}
-        outcome = evaluate(worlds, agents, scenario=scenario, aftermath=False).outcome("policy")
+        driver: Driver
+        if isinstance(trained, Policy):
+            driver = LearnedAgent(trained, "policy")
+        else:
+            members = trained.members.items()
+            driver = Team({names.index(name): LearnedAgent(each, "policy") for name, each in members}, "policy")
+        outcome = evaluate(worlds, {"policy": driver}, scenario=scenario, aftermath=False).outcome("policy")
         metrics = {
             "first_impact_harm": mean(outcome.first_impact_harm).value,
             "total_harm": mean(outcome.total_harm).value,
@@ -167,23 +173,12 @@ def measure_on_list(training: Training) -> Evaluate:
         }
         if objectives:
             harm = objective_harm(outcome.ledger, recipe.reward.harm_count, objectives)
-            each = {scenario.vehicle_names[i]: mean(harm[:, i]).value for i in scenario.learners}
+            each = {names[i]: mean(harm[:, i]).value for i in scenario.learners}
             metrics[OBJECTIVE] = sum(each.values()) / len(each)
             metrics |= {f"{OBJECTIVE}_{name}": value for name, value in each.items()}
         return metrics
 
     return measure
-
-
-def driver_of(trained: Trained, scenario: Scenario, name: str = "policy") -> Driver:
-    """What drives the scenario's learners by what was trained for them."""
-    if isinstance(trained, Policy):
-        return LearnedAgent(trained, name)
-    numbers = {each: i for i, each in enumerate(scenario.vehicle_names)}
-    return Team({numbers[each]: LearnedAgent(policy, name) for each, policy in trained.members.items()}, name)
-
-
-# Train: recipe and scenario in, a run's folder with the policies out; or go on with a training that stopped.
 
 
 def train(
@@ -329,19 +324,15 @@ def _newest(run: RunDirectory, training: str, other_versions: bool) -> tuple[Tra
                 f"{run.config}: was changed after the checkpoint {name} of this training; put it back as it was, or"
                 " train again in another folder"
             )
-        if not other_versions:
-            _check_versions(run, state.versions)
-    return state, damaged
-
-
-def _check_versions(run: RunDirectory, then: Mapping[str, str]) -> None:
-    now = installed_versions()
-    for name in sorted(now.keys() | then.keys()):
-        if now.get(name) != then.get(name):
+        now, then = installed_versions(), state.versions
+        other = sorted(name for name in now.keys() | then.keys() if now.get(name) != then.get(name))
+        if other and not other_versions:
+            name = other[0]
             raise InvalidInput(
                 f"{run.path}: was trained with {name} {then.get(name)}, here is {now.get(name)}: the numbers would"
                 " differ; install that version, or go on all the same with --other-versions"
             )
+    return state, damaged
 
 
 class Session(BaseCallback):

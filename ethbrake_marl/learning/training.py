@@ -24,7 +24,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from filelock import FileLock, Timeout
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.agents.protocol import Driver, Team
@@ -32,7 +32,7 @@ from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput
 from ethbrake_marl.files.plugins import check_plugins, noted_plugins
 from ethbrake_marl.files.store import new_folder, parse_strict_json, read_plain, write_file
-from ethbrake_marl.files.yaml import Document, FileModel, Wording, first_mistake, read_model, refuse
+from ethbrake_marl.files.yaml import Document, FileModel, Wording, read_model, refuse
 from ethbrake_marl.learning.recipe import (
     WORDS,
     Scheme,
@@ -137,8 +137,8 @@ def create_run(
         if not run.status.is_file():
             raise AlreadyExists(f"{path}: is there already, and is no run; give another name")
         raise AlreadyExists(
-            f"{path}: is there already; give another name (--name), go on with it (ethbrake resume), or replace it with"
-            " force (--force; make run ARGS=--force)"
+            f"{path}: is there already; give another name (--name), go on with it (ethbrake train resume), or replace"
+            " it with force (--force; make run ARGS=--force)"
         )
     with new_folder(path, replace=replace) as partial:
         new = RunDirectory(partial)
@@ -245,12 +245,10 @@ def training_in(folder: Path, config: Mapping[str, Any]) -> Training:
             f"{folder}: was trained by {config['library']}, which leaves nothing to go on from; train again"
         )
     try:
-        recipe = recipe_of(json.dumps(config["recipe"]))
-        scenario = Scenario.model_validate_json(json.dumps(config["scenario"]))
+        recipe = recipe_of(config["recipe"])
+        scenario = Scenario.from_document(Document("scenario", config["scenario"], {}))
     except KeyError as error:
         raise InvalidInput(f"{file}: is not the configuration of a training: {error} is missing") from None
-    except ValidationError as error:
-        raise InvalidInput(f"{file}: scenario: {first_mistake(error)}") from None
     except InvalidInput as error:
         raise InvalidInput(f"{file}: {error}") from None
     return resolve(recipe, scenario)

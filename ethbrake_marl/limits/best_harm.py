@@ -514,6 +514,22 @@ def _kept_or_searched(
     return part
 
 
+def chunks_left(scenario: Scenario, sample: Sample, *, budget: int, chunks: Path) -> tuple[int, list[Path]]:
+    """Worlds that ``search_list`` would search, with both counts, not finding them kept; and what it finds damaged."""
+    left, damaged = 0, []
+    identity = world_identity(sample.worlds, Task(scenario, scenario.learners))
+    question = {"counts": list(HARM_COUNTS), "budget": budget, "search_seed": 0}
+    for first in range(0, len(identity), CHUNK):
+        file, wanted = chunk_file(chunks, first), identity[first : first + CHUNK]
+        try:
+            kept = kept_chunk(file, wanted, question)
+        except CorruptBundle:
+            kept = None
+            damaged.append(file)
+        left += 0 if kept is not None else len(wanted)
+    return left, damaged
+
+
 def chunk_file(chunks: Path, first: int) -> Path:
     """Where the chunk that begins with world ``first`` is kept."""
     return chunks / f"{first:07d}.npz"

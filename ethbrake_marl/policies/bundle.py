@@ -20,8 +20,8 @@ from safetensors import SafetensorError
 
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.files.arrays import ArrayRow, check_arrays, safetensors_headers
-from ethbrake_marl.files.store import new_folder, parse_strict_json, read_plain, write_file
-from ethbrake_marl.files.yaml import first_mistake
+from ethbrake_marl.files.store import new_folder, read_plain, write_file
+from ethbrake_marl.files.yaml import first_mistake, read_json_model
 from ethbrake_marl.observations import ObservationSpec, choose_observation
 from ethbrake_marl.policies.actor import (
     Actor,
@@ -225,10 +225,7 @@ def _read(path: Path, limit: int) -> bytes:
 def _manifest(path: Path) -> Manifest:
     data = _read(path, MANIFEST_LIMIT_BYTES)
     try:
-        content = parse_strict_json(data)
-        manifest = Manifest.model_validate_json(data)
-    except ValidationError as error:
-        raise CorruptBundle(f"{path}: {first_mistake(error)}") from None
+        content, manifest = read_json_model(data, Manifest)
     except ValueError as error:
         raise CorruptBundle(f"{path}: {error}") from None
     found = content_sha256(content)

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,27 +14,17 @@ import numpy as np
 from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import make_single_agent
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
-from ethbrake_marl.errors import CorruptBundle, InvalidInput, OnProgress, Progress
+from ethbrake_marl.errors import InvalidInput, OnProgress, Progress
 from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY, load_runnable, policies_by_name, result_identity
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.seed_statistics import (
-    interquartile_mean,
-    mean_over_seeds,
-    paired_over_seeds,
-    rate_over_seeds,
-    share_over_seeds,
-)
-from ethbrake_marl.files.store import check_writable, write_file
 from ethbrake_marl.files.yaml import Override
 from ethbrake_marl.learning.recipe import WORDS, Scheme, TrainingRecipe
-from ethbrake_marl.learning.training import RunDirectory, check_same, load_team, read_object, resolve
+from ethbrake_marl.learning.training import load_team, resolve
 from ethbrake_marl.limits.best_harm import (
-    CHUNK,
     BestHarmTable,
     best_harm,
-    chunk_file,
-    kept_chunk,
+    chunks_left,
     realised_harm,
     search_list,
     world_identity,
@@ -47,12 +33,13 @@ from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.kernel import first_decision_s
 from ethbrake_marl.scenario import Sample, Scenario, Task
 from ethbrake_marl.shield.guard import Shielded, drive_chunks, stack
+from ethbrake_marl.studies.jobs import JobFolder
 from ethbrake_marl.studies.trainings import (
+    TIMED_DRIVES,
     TrainingJob,
     finish_trainings,
     time_training,
     told_seconds,
-    training_seconds,
     world_seconds,
 )
 
@@ -172,20 +159,6 @@ class Training:
     folder: Path
     noted: tuple[str, ...] = ()  # by which scenario and recipe differ from their files, for ``config.json``
 
-    def steps_left(self) -> int:
-        """Decisions that are still to do; raises ``InvalidInput`` for a folder that holds another training."""
-        run = RunDirectory(self.folder)
-        if not run.status.exists():
-            if self.folder.exists():
-                raise InvalidInput(f"{self.folder}: is no training; move it away, or give another --output")
-            return self.recipe.total_steps
-        status = read_kept(run.status, "delete its folder to train anew")
-        check_same(self.folder, resolve(self.recipe, self.level.scenario))
-        if status.get("status") == "finished":
-            return 0
-        steps = status.get("steps", 0)
-        return max(self.recipe.total_steps - (steps if isinstance(steps, int) else 0), 1)
-
     def job(self) -> TrainingJob:
         """What brings it to its end."""
         return TrainingJob(resolve(self.recipe, self.level.scenario), self.folder, self.noted)
@@ -237,6 +210,11 @@ class Plan:
         numbers = {name: getattr(self, name) for name in _NUMBERS}
         return {"levels": scenarios, "recipes": recipes, **numbers, "shield": self.shield}
 
+    def job_folder(self) -> JobFolder:
+        """The folder, which no ablation with other settings may have: its results would be lost."""
+        advice = f"give another folder (--output), or, to use its trainings, a copy of it without {SETTINGS}"
+        return JobFolder(self.folder, "an ablation", self.settings(), record=SETTINGS, advice=advice)
+
     def optimum_folder(self, level: Level) -> Path:
         """Where the parts of its search stand."""
         return self.folder / OPTIMUM / level.name
@@ -271,49 +249,6 @@ def check_plan(plan: Plan) -> None:
         raise InvalidInput("levels: nobody learns in any of them; give at least one with a learner")
 
 
-def check_folder(folder: Path) -> None:
-    """Raise ``InvalidInput`` for a folder that is none, or that cannot be made or written to; makes nothing."""
-    there = next(each for each in (folder, *folder.absolute().parents) if each.exists())
-    if not there.is_dir():
-        raise InvalidInput(f"{folder}: {there} is a file; give a folder of its own (--output)")
-    try:
-        check_writable(there)
-    except OSError as error:
-        raise InvalidInput(f"{folder}: cannot be written to ({error.strerror}); give another (--output)") from None
-
-
-def check_settings(plan: Plan) -> None:
-    """Raise ``InvalidInput`` where the folder holds an ablation with other settings, whose results would be lost."""
-    file = plan.folder / SETTINGS
-    if not file.exists():
-        return
-    kept, wanted = read_kept(file, "delete it to compare anew"), plan.settings()
-    other = [name for name, value in wanted.items() if kept.get(name) != value]
-    if other:
-        told = "; ".join(
-            f"{name.replace('_', '-')} {kept.get(name)!s:.40}, here {wanted[name]}" if name in _TOLD else f"{name}"
-            for name in other
-        )
-        raise InvalidInput(
-            f"{plan.folder}: holds an ablation with other settings ({told}); give another folder (--output), or, to use"
-            f" its trainings, a copy of it without {SETTINGS}"
-        )
-
-
-def keep_settings(plan: Plan) -> None:
-    """Make the folder, and write the settings into it."""
-    plan.folder.mkdir(parents=True, exist_ok=True)
-    write_file(plan.folder / SETTINGS, (json.dumps(plan.settings(), indent=2) + "\n").encode())
-
-
-def read_kept(file: Path, advice: str) -> dict[str, Any]:
-    """What a JSON file holds; raises ``InvalidInput`` (file, reason, ``advice``) if that is no object."""
-    try:
-        return read_object(file)
-    except InvalidInput as error:
-        raise InvalidInput(f"{error}; {advice}") from None
-
-
 # The joint optimum of every level: the least harm known that its learners can do together, world by world.
 #
 # It depends on the worlds, on who learns, and on the scripts of the others; not on who knows what, nor on objectives.
@@ -342,22 +277,6 @@ def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample
             identity = world_identity(part.worlds, Task(level.scenario, level.scenario.learners)).tobytes()
             found.setdefault(identity, (level, part, []))[2].append(level)
     return list(found.values())
-
-
-def parts_left(plan: Plan, level: Level, part: Sample) -> tuple[int, list[Path]]:
-    """Worlds of a question that ``search_list`` will search, not finding them kept; and what it finds damaged."""
-    left, damaged = 0, []
-    identity = world_identity(part.worlds, Task(level.scenario, level.scenario.learners))
-    question = {"counts": list(HARM_COUNTS), "budget": plan.budget, "search_seed": 0}
-    for first in range(0, part.worlds.n, CHUNK):
-        file, wanted = chunk_file(plan.optimum_folder(level), first), identity[first : first + CHUNK]
-        try:
-            kept = kept_chunk(file, wanted, question)
-        except CorruptBundle:
-            kept = None
-            damaged.append(file)
-        left += 0 if kept is not None else len(wanted)
-    return left, damaged
 
 
 def search_all(plan: Plan, samples: Sequence[Sample], jobs: int, tell: OnProgress) -> dict[str, BestHarmTable]:
@@ -423,19 +342,10 @@ def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[
         yield {harm_count: ledger.world_harm(harm_count) for harm_count in HARM_COUNTS}
 
 
-def train_all(trainings: Sequence[Training], jobs: int, tell: OnProgress | None = None) -> bool:
-    """Bring every training to its end, ``jobs`` at a time; False when Ctrl-C stopped it.
-
-    The policies do not depend on ``jobs`` or on interruptions. Raises what ``Training.steps_left`` and ``train``
-    raise.
-    """
-    return finish_trainings([training.job() for training in trainings if training.steps_left()], jobs, tell)
-
-
 def check_finished(trainings: Iterable[Training]) -> None:
     """Raise what ``load_team`` raises for a finished training that cannot drive, before anything long is begun."""
     for training in trainings:
-        if not training.steps_left():
+        if not training.job().steps_left():
             load_team(training.folder, training.level.scenario)
 
 
@@ -462,13 +372,16 @@ class Measured:
     shielded: dict[HarmCount, Shielded] | None = None  # [seeds, worlds] behind the shield that guards that count
 
 
-def load_teams(plan: Plan) -> dict[tuple[str, str], list[Team]]:
-    """What was trained, by level and algorithm, seed by seed; raises what ``load_team`` raises."""
-    teams: dict[tuple[str, str], list[Team]] = {}
-    for training in plan.trainings():
-        team = load_team(training.folder, training.level.scenario, training.folder.name)
-        teams.setdefault((training.level.name, training.algorithm), []).append(team)
-    return teams
+def run_ablation(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[Measured] | None:
+    """Bring every training to its end, ``jobs`` at a time, and measure; None when Ctrl-C stopped the trainings.
+
+    Raises what ``JobFolder.work``, ``finish_trainings`` and ``measure`` raise.
+    """
+    kept = plan.job_folder()
+    with kept.work():
+        if not finish_trainings([training.job() for training in plan.trainings()], jobs, tell, run=kept.run):
+            return None
+        return measure(plan, jobs, tell)
 
 
 def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[Measured]:
@@ -478,7 +391,10 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
     the best known of that world. Raises what loading teams and ``common_worlds`` raise, before any long work.
     """
     say = tell or (lambda progress: None)
-    teams = load_teams(plan)
+    teams: dict[tuple[str, str], list[Team]] = {}
+    for training in plan.trainings():
+        team = load_team(training.folder, training.level.scenario, training.folder.name)
+        teams.setdefault((training.level.name, training.algorithm), []).append(team)
     samples = common_worlds(plan.levels, plan.episodes, plan.list_seed)
     tables = search_all(plan, samples, jobs, say)
     answers = {}
@@ -545,186 +461,9 @@ def harms_of(outcomes: Sequence[Outcome]) -> Harms:
     )
 
 
-# The comparison of levels: harm of each, what each step is worth, who pays, the distance to the joint optimum.
-#
-# Intervals hold for other training seeds and other worlds: both are drawn anew (``evaluation.seed_statistics``).
-
-TOLERANCE = 1e-6  # m2/s2; a vehicle whose harm rose by more is worse off
-
-Json = dict[str, Any]
-
-
-def compare(measured: Sequence[Measured], searched: int) -> Json:
-    """Plain data for JSON: ``levels``, ``steps`` of the ladder, ``channels`` (lost messages); see docs/cli.md.
-
-    The joint optimum is known in the first ``searched`` worlds; what stands beside it is of these worlds too. Each
-    algorithm has a ladder of its own; levels in which nobody learns are in all of them.
-    """
-    algorithms = [m.algorithm for m in measured if m.algorithm is not None]
-    steps, channels = [], []
-    for algorithm in dict.fromkeys(algorithms):
-        own = [m for m in measured if m.algorithm in (None, algorithm)]
-        ladder = [m for m in own if m.level.clear is None]
-        steps += [_change(before, after, algorithm) for before, after in pairwise(ladder)]
-        by_name = {m.level.name: m for m in own}
-        channels += [_change(by_name[m.level.clear], m, algorithm) for m in own if m.level.clear is not None]
-    return {
-        "kind": "ablate",
-        "levels": [_level(one, searched) for one in measured],
-        "steps": steps,
-        "channels": channels,
-    }
-
-
-def _level(one: Measured, searched: int) -> Json:
-    """What one level reached under one algorithm."""
-    scenario = one.level.scenario
-    return {
-        **one.identity,
-        "policy_sha256": [dict(seed) for seed in one.reached.policies],
-        "level": one.level.name,
-        "title": scenario.title,
-        "algorithm": one.algorithm,
-        "clear": one.level.clear,
-        "learners": [scenario.vehicle_names[i] for i in scenario.learners],
-        "seeds": len(one.reached.collided),
-        "worlds": one.reached.collided.shape[1],
-        "collision_rate": rate_over_seeds(one.reached.collided).to_json(),
-        **{harm_count: _under_count(one, harm_count, searched) for harm_count in HARM_COUNTS},
-    }
-
-
-def _under_count(one: Measured, harm_count: HarmCount, searched: int) -> Json:
-    """Harm (m2/s2) under one count and what it is if all brake fully, in all worlds and in the ``searched`` ones.
-
-    There also the joint optimum, and the share of its reduction that is realised.
-    """
-    reached, braking = one.reached.world[harm_count], one.full_brake.world[harm_count]
-    each = reached.mean(axis=1)
-    return {
-        "full_brake": mean_over_seeds(braking).to_json(),
-        "harm": mean_over_seeds(reached).to_json(),
-        "each_seed": each.tolist(),
-        "interquartile_mean": interquartile_mean([each], resamples=2000).to_json(),
-        "vehicles": [mean_over_seeds(column).to_json() for column in _columns(one.reached, harm_count)],
-        "searched": _compare_searched(
-            reached[:, :searched], braking[:, :searched], None if one.best is None else one.best[harm_count]
-        ),
-        "shielded": None if one.shielded is None else _behind(one, one.shielded[harm_count], harm_count, searched),
-    }
-
-
-def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: int) -> Json:
-    """The same teams in the same worlds behind the shield that guards this count, beside what they do without it."""
-    before, after = one.reached.vehicle[harm_count], shielded.vehicle_harm
-    actions = shielded.decisions * shielded.replaced.shape[2]
-    return {
-        "harm": mean_over_seeds(shielded.harm).to_json(),
-        "each_seed": shielded.harm.mean(axis=1).tolist(),
-        "difference": mean_over_seeds(shielded.harm - one.reached.world[harm_count]).to_json(),
-        "bound": mean_over_seeds(shielded.bound).to_json(),
-        "above_bound": int((shielded.harm > shielded.bound).sum()),
-        "replaced": float(shielded.replaced.sum() / actions.sum()),
-        "replaced_vehicles": (shielded.replaced.sum(axis=(0, 1)) / shielded.decisions.sum()).tolist(),
-        "stepped_in": rate_over_seeds((shielded.replaced > 0).any(axis=2)).to_json(),
-        "vehicles": [mean_over_seeds(column).to_json() for column in np.moveaxis(after - before, 2, 0)],
-        "worse_off": rate_over_seeds((after > before + TOLERANCE).any(axis=2)).to_json(),
-        "above_baseline": rate_over_seeds((after > shielded.baseline + TOLERANCE).any(axis=2)).to_json(),
-        "moving": int(shielded.moving.sum()),
-        "searched": {"harm": mean_over_seeds(shielded.harm[:, :searched]).to_json()},
-    }
-
-
-def _compare_searched(reached: Floats, braking: Floats, best: Floats | None) -> Json:
-    """Everything in the worlds in which the joint optimum was searched."""
-    share = None if best is None else share_over_seeds(reached, braking, best)
-    return {
-        "worlds": reached.shape[1],
-        "full_brake": mean_over_seeds(braking).to_json(),
-        "harm": mean_over_seeds(reached).to_json(),
-        "each_seed": reached.mean(axis=1).tolist(),
-        "best_known": None if best is None else mean_over_seeds(best).to_json(),
-        "realised_share": None if share is None else share.to_json(),
-    }
-
-
-def _change(before: Measured, after: Measured, algorithm: str) -> Json:
-    """From one level to another on the same worlds: positive is more harm."""
-    found: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
-    for harm_count in HARM_COUNTS:
-        pairs = zip(_columns(after.reached, harm_count), _columns(before.reached, harm_count), strict=True)
-        worse = _worse_off(before.reached, after.reached, harm_count)
-        found[harm_count] = {
-            "difference": paired_over_seeds(
-                after.reached.world[harm_count], before.reached.world[harm_count]
-            ).to_json(),
-            "vehicles": [paired_over_seeds(new, old).to_json() for new, old in pairs],
-            "worse_off": rate_over_seeds(worse.any(axis=2)).to_json(),
-            "worse_off_vehicles": [float(share) for share in worse.mean(axis=(0, 1))],
-        }
-    return found
-
-
-def _worse_off(before: Harms, after: Harms, harm_count: HarmCount) -> Bools:
-    """Which vehicles bear more than before, [seeds, worlds, N]: seed k against seed k, or against the only one."""
-    old, new = before.vehicle[harm_count], after.vehicle[harm_count]
-    worse: Bools = new > old + TOLERANCE
-    return worse
-
-
-def _columns(harms: Harms, harm_count: HarmCount) -> list[Floats]:
-    """[seeds, worlds] of each vehicle."""
-    return [harms.vehicle[harm_count][:, :, i] for i in range(harms.vehicle[harm_count].shape[2])]
-
-
-# The findings of an ablation as CSV: one row per level, algorithm and seed.
-
-_SUMS = ("", "full_brake_", "searched_", "searched_full_brake_", "searched_best_known_")  # columns of each count
-_BEHIND = ("shielded_", "bound_", "actions_replaced_")  # likewise, empty without a shield
-
-
-def levels_csv(measured: Sequence[Measured], searched: int) -> str:
-    """One row per level, algorithm and seed: means over the worlds (m2/s2).
-
-    ``searched``: over the worlds in which the joint optimum was searched.
-    """
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    vehicles = measured[0].reached.vehicle["first"].shape[2]
-    harms = [f"{_column(harm_count)}_{i + 1}" for harm_count in HARM_COUNTS for i in range(vehicles)]
-    sums = [f"{name}{_column(harm_count)}" for harm_count in HARM_COUNTS for name in _SUMS]
-    behind = [f"{name}{_column(harm_count)}" for harm_count in HARM_COUNTS for name in _BEHIND]
-    writer.writerow(["level", "algorithm", "seed", "worlds", "collision_rate", *sums, *harms, *behind])
-    for one in measured:
-        for seed in range(len(one.reached.collided)):
-            row: list[object] = [one.level.name, one.algorithm or "", seed if one.algorithm else ""]
-            row += [one.reached.collided.shape[1], float(one.reached.collided[seed].mean())]
-            for harm_count in HARM_COUNTS:
-                best = "" if one.best is None else float(one.best[harm_count].mean())
-                reached, braking = one.reached.world[harm_count][seed], one.full_brake.world[harm_count]
-                row += [float(reached.mean()), float(braking.mean())]
-                row += [float(reached[:searched].mean()), float(braking[:, :searched].mean()), best]
-            for harm_count in HARM_COUNTS:
-                row += [float(harm) for harm in one.reached.vehicle[harm_count][seed].mean(axis=0)]
-            for harm_count in HARM_COUNTS:
-                row += [""] * len(_BEHIND) if one.shielded is None else _of_seed(one.shielded[harm_count], seed)
-            writer.writerow(row)
-    return text.getvalue()
-
-
-def _of_seed(shielded: Shielded, seed: int) -> list[object]:
-    """The columns ``_BEHIND`` of one training."""
-    replaced = shielded.replaced[seed].sum() / (shielded.decisions[seed].sum() * shielded.replaced.shape[2])
-    return [float(shielded.harm[seed].mean()), float(shielded.bound[seed].mean()), float(replaced)]
-
-
-def _column(harm_count: HarmCount) -> str:
-    return "first_impact_harm" if harm_count == "first" else "total_harm"
-
-
 # The cost of an ablation, measured on this machine before it starts.
 
-_TIMED_DRIVES, _TIMED_WORLDS = 50, 4  # worlds of the evaluation and of the search that are timed
+_TIMED_WORLDS = 4  # of the search, that are timed
 
 
 @dataclass(frozen=True, slots=True)
@@ -759,7 +498,7 @@ def cost_of(plan: Plan) -> Cost:
 
     Other work on the machine counts as well: seconds are of the clock. Raises as ``Training.steps_left``.
     """
-    left = [(training, training.steps_left()) for training in plan.trainings()]
+    left = [(training, training.job().steps_left()) for training in plan.trainings()]
     lists = common_worlds(plan.levels, plan.episodes, plan.list_seed)
     samples = {level.name: _first(sample) for level, sample in zip(plan.levels, lists, strict=True)}
     training_s, worlds_s = 0.0, []
@@ -768,9 +507,9 @@ def cost_of(plan: Plan) -> Cost:
         steps = sum(number for training, number in left if (training.level.name, training.algorithm) == same)
         if not steps:
             continue
-        timed = time_training(kind.recipe, kind.level.scenario, samples[kind.level.name])
+        timed = time_training(kind.job().training, samples[kind.level.name])
         worlds_s.append(timed.world_s)
-        training_s += training_seconds(kind.recipe, kind.level.scenario, timed, steps)
+        training_s += timed.seconds(kind.job().training, steps)
     if not worlds_s:
         worlds_s.append(world_seconds(left[0][0].folder, left[0][0].level.scenario, samples[left[0][0].level.name]))
     driving_s = sum(worlds_s) / len(worlds_s) * plan.episodes * (len(left) + len(plan.levels))
@@ -796,7 +535,7 @@ def _shielding_s(plan: Plan, samples: Mapping[str, Sample]) -> float:
 
 def _first(sample: Sample) -> Sample:
     """The worlds that are timed."""
-    rows = np.arange(min(_TIMED_DRIVES, sample.worlds.n))
+    rows = np.arange(min(TIMED_DRIVES, sample.worlds.n))
     return sample.take(rows)
 
 
@@ -804,7 +543,7 @@ def _search(plan: Plan, samples: Sequence[Sample]) -> tuple[float, tuple[Path, .
     """Seconds for the worlds that are still to be searched, and the kept parts that are damaged."""
     seconds, damaged = 0.0, []
     for level, part, _ in questions(plan, samples):
-        left, broken = parts_left(plan, level, part)
+        left, broken = chunks_left(level.scenario, part, budget=plan.budget, chunks=plan.optimum_folder(level))
         damaged += broken
         if left:
             worlds = part.worlds.take(np.arange(min(_TIMED_WORLDS, part.worlds.n)))

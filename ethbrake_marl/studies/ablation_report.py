@@ -6,8 +6,9 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
@@ -19,34 +20,31 @@ from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, count_of
 from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY, policy_sha256, result_identity
 from ethbrake_marl.evaluation.results import write_output
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.seed_statistics import mean_over_seeds, rate_over_seeds, share_over_seeds
-from ethbrake_marl.evaluation.statistics import Estimate, estimates_to_json
+from ethbrake_marl.evaluation.seed_statistics import (
+    interquartile_mean,
+    mean_over_seeds,
+    paired_over_seeds,
+    rate_over_seeds,
+    share_over_seeds,
+)
 from ethbrake_marl.figures.studies import change_figure, harm_curve, who_pays
 from ethbrake_marl.figures.style import Figure, write_picture
+from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text, estimates_to_json
+from ethbrake_marl.learning.progress import HARM_METRIC
 from ethbrake_marl.learning.recipe import WORDS
-from ethbrake_marl.learning.training import RunDirectory, is_team, load_team
+from ethbrake_marl.learning.training import RunDirectory, is_team, load_team, read_object
 from ethbrake_marl.limits.best_harm import best_harm
 from ethbrake_marl.pages.frame import Section, facts, page, table
 from ethbrake_marl.pages.player import Played, player
 from ethbrake_marl.pages.report import Chosen, drive_played
 from ethbrake_marl.pages.vector import drawing
-from ethbrake_marl.physics import Floats
+from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.policies.bundle import Policy, load_policy
 from ethbrake_marl.scenario import Sample, Scenario
 from ethbrake_marl.scenario.fields import DECLARED, LEARNER
-from ethbrake_marl.studies.ablation import (
-    TOLERANCE,
-    Harms,
-    Level,
-    Measured,
-    Plan,
-    Training,
-    compare,
-    harms_of,
-    levels_csv,
-    read_kept,
-)
-from ethbrake_marl.studies.jobs import pack, run_all
+from ethbrake_marl.shield.guard import Shielded
+from ethbrake_marl.studies.ablation import Harms, Level, Measured, Plan, Training, harms_of
+from ethbrake_marl.studies.jobs import Job, each, run_jobs
 
 # Episodes on the page of an ablation: the same few lines of vehicles, driven level by level.
 
@@ -201,7 +199,10 @@ def _training(path: str, policy: Policy) -> dict[str, Any]:
     found = {name: manifest[name] for name in ("algorithm", "network", "observation", "learners", "reward", "scenario")}
     config = RunDirectory(Path(path)).config
     if config.is_file():
-        recipe = dict(read_kept(config, f"give the policy instead: {Path(path) / 'policy'}").get("recipe") or {})
+        try:
+            recipe = read_object(config).get("recipe") or {}
+        except InvalidInput as error:
+            raise InvalidInput(f"{error}; give the policy instead: {Path(path) / 'policy'}") from None
         found["recipe"] = {name: value for name, value in recipe.items() if name not in (*WORDS, "seed")}
     return found
 
@@ -229,17 +230,22 @@ def drive_longer(
         raise InvalidInput(f"vehicles {', '.join(map(str, question.vehicles))}: each length once")
     lines = [lengthen(question.scenario, vehicles) for vehicles in question.vehicles]
     lists = [line.sample(question.episodes, question.list_seed) for line in lines]
-    if processes == 1 or len(lines) < 2:
-        return [_of_length(question, *line, agents, tell) for line in zip(lines, lists, strict=True)]
-    say = tell or (lambda progress: None)
+    processes = processes if len(lines) > 1 else 1
+    told = tell if processes == 1 else None
+    jobs = [
+        Job(line.name, _of_length, (question, line, sample, tuple(agents), told))
+        for line, sample in zip(lines, lists, strict=True)
+    ]
+    found: dict[str, LineResult] = {}
 
-    def call_of(number: int) -> bytes:
-        return pack(_of_length, question, lines[number], lists[number], tuple(agents), None)
+    def take(job: Job, result: LineResult) -> None:
+        found[job.name] = result
+        if tell is not None and processes > 1:
+            tell(Progress("lengths", len(found), len(jobs)))
 
-    found = run_all(call_of, len(lines), processes, "lengths", say)
-    if found is None:
+    if not run_jobs(jobs, processes, each(take)):
         raise KeyboardInterrupt
-    return found
+    return [found[job.name] for job in jobs]
 
 
 def _of_length(
@@ -288,24 +294,182 @@ def _search(
     return best[np.newaxis]
 
 
-NONE = "–"
-_ALGORITHM = "Algorithm"
-_HARM = {"first": "first-impact harm", "total": "total harm"}
+# The comparison of levels: harm of each, what each step is worth, who pays, the distance to the joint optimum.
+#
+# Intervals hold for other training seeds and other worlds: both are drawn anew (``evaluation.seed_statistics``).
+
+TOLERANCE = 1e-6  # m2/s2; a vehicle whose harm rose by more is worse off
 
 Json = dict[str, Any]
 
 
-class _Table(NamedTuple):
-    """A table whose first ``left`` columns are texts."""
+def compare(measured: Sequence[Measured], searched: int) -> Json:
+    """Plain data for JSON: ``levels``, ``steps`` of the ladder, ``channels`` (lost messages); see docs/cli.md.
 
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    left: int
+    The joint optimum is known in the first ``searched`` worlds; what stands beside it is of these worlds too. Each
+    algorithm has a ladder of its own; levels in which nobody learns are in all of them.
+    """
+    algorithms = [m.algorithm for m in measured if m.algorithm is not None]
+    steps, channels = [], []
+    for algorithm in dict.fromkeys(algorithms):
+        own = [m for m in measured if m.algorithm in (None, algorithm)]
+        ladder = [m for m in own if m.level.clear is None]
+        steps += [_change(before, after, algorithm) for before, after in pairwise(ladder)]
+        by_name = {m.level.name: m for m in own}
+        channels += [_change(by_name[m.level.clear], m, algorithm) for m in own if m.level.clear is not None]
+    return {
+        "kind": "ablate",
+        "levels": [_level(one, searched) for one in measured],
+        "steps": steps,
+        "channels": channels,
+    }
+
+
+def _level(one: Measured, searched: int) -> Json:
+    """What one level reached under one algorithm."""
+    scenario = one.level.scenario
+    return {
+        **one.identity,
+        "policy_sha256": [dict(seed) for seed in one.reached.policies],
+        "level": one.level.name,
+        "title": scenario.title,
+        "algorithm": one.algorithm,
+        "clear": one.level.clear,
+        "learners": [scenario.vehicle_names[i] for i in scenario.learners],
+        "seeds": len(one.reached.collided),
+        "worlds": one.reached.collided.shape[1],
+        "collision_rate": rate_over_seeds(one.reached.collided).to_json(),
+        **{harm_count: _under_count(one, harm_count, searched) for harm_count in HARM_COUNTS},
+    }
+
+
+def _under_count(one: Measured, harm_count: HarmCount, searched: int) -> Json:
+    """Harm (m2/s2) under one count and what it is if all brake fully, in all worlds and in the ``searched`` ones.
+
+    There also the joint optimum, and the share of its reduction that is realised.
+    """
+    reached, braking = one.reached.world[harm_count], one.full_brake.world[harm_count]
+    each = reached.mean(axis=1)
+    return {
+        "full_brake": mean_over_seeds(braking).to_json(),
+        "harm": mean_over_seeds(reached).to_json(),
+        "each_seed": each.tolist(),
+        "interquartile_mean": interquartile_mean([each], resamples=2000).to_json(),
+        "vehicles": [mean_over_seeds(column).to_json() for column in _columns(one.reached, harm_count)],
+        "searched": _compare_searched(
+            reached[:, :searched], braking[:, :searched], None if one.best is None else one.best[harm_count]
+        ),
+        "shielded": None if one.shielded is None else _behind(one, one.shielded[harm_count], harm_count, searched),
+    }
+
+
+def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: int) -> Json:
+    """The same teams in the same worlds behind the shield that guards this count, beside what they do without it."""
+    before, after = one.reached.vehicle[harm_count], shielded.vehicle_harm
+    actions = shielded.decisions * shielded.replaced.shape[2]
+    return {
+        "harm": mean_over_seeds(shielded.harm).to_json(),
+        "each_seed": shielded.harm.mean(axis=1).tolist(),
+        "difference": mean_over_seeds(shielded.harm - one.reached.world[harm_count]).to_json(),
+        "bound": mean_over_seeds(shielded.bound).to_json(),
+        "above_bound": int((shielded.harm > shielded.bound).sum()),
+        "replaced": float(shielded.replaced.sum() / actions.sum()),
+        "replaced_vehicles": (shielded.replaced.sum(axis=(0, 1)) / shielded.decisions.sum()).tolist(),
+        "stepped_in": rate_over_seeds((shielded.replaced > 0).any(axis=2)).to_json(),
+        "vehicles": [mean_over_seeds(column).to_json() for column in np.moveaxis(after - before, 2, 0)],
+        "worse_off": rate_over_seeds((after > before + TOLERANCE).any(axis=2)).to_json(),
+        "above_baseline": rate_over_seeds((after > shielded.baseline + TOLERANCE).any(axis=2)).to_json(),
+        "moving": int(shielded.moving.sum()),
+        "searched": {"harm": mean_over_seeds(shielded.harm[:, :searched]).to_json()},
+    }
+
+
+def _compare_searched(reached: Floats, braking: Floats, best: Floats | None) -> Json:
+    """Everything in the worlds in which the joint optimum was searched."""
+    share = None if best is None else share_over_seeds(reached, braking, best)
+    return {
+        "worlds": reached.shape[1],
+        "full_brake": mean_over_seeds(braking).to_json(),
+        "harm": mean_over_seeds(reached).to_json(),
+        "each_seed": reached.mean(axis=1).tolist(),
+        "best_known": None if best is None else mean_over_seeds(best).to_json(),
+        "realised_share": None if share is None else share.to_json(),
+    }
+
+
+def _change(before: Measured, after: Measured, algorithm: str) -> Json:
+    """From one level to another on the same worlds: positive is more harm."""
+    found: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
+    for harm_count in HARM_COUNTS:
+        pairs = zip(_columns(after.reached, harm_count), _columns(before.reached, harm_count), strict=True)
+        worse = _worse_off(before.reached, after.reached, harm_count)
+        found[harm_count] = {
+            "difference": paired_over_seeds(
+                after.reached.world[harm_count], before.reached.world[harm_count]
+            ).to_json(),
+            "vehicles": [paired_over_seeds(new, old).to_json() for new, old in pairs],
+            "worse_off": rate_over_seeds(worse.any(axis=2)).to_json(),
+            "worse_off_vehicles": [float(share) for share in worse.mean(axis=(0, 1))],
+        }
+    return found
+
+
+def _worse_off(before: Harms, after: Harms, harm_count: HarmCount) -> Bools:
+    """Which vehicles bear more than before, [seeds, worlds, N]: seed k against seed k, or against the only one."""
+    old, new = before.vehicle[harm_count], after.vehicle[harm_count]
+    worse: Bools = new > old + TOLERANCE
+    return worse
+
+
+def _columns(harms: Harms, harm_count: HarmCount) -> list[Floats]:
+    """[seeds, worlds] of each vehicle."""
+    return [harms.vehicle[harm_count][:, :, i] for i in range(harms.vehicle[harm_count].shape[2])]
+
+
+# The findings of an ablation as CSV: one row per level, algorithm and seed.
+
+
+def levels_csv(measured: Sequence[Measured], searched: int) -> str:
+    """One row per level, algorithm and seed: means over the worlds (m2/s2); without a shield its columns are empty.
+
+    ``searched``: over the worlds in which the joint optimum was searched.
+    """
+    rows = []
+    for one in measured:
+        for seed, collided in enumerate(one.reached.collided):
+            about: Json = {"level": one.level.name, "algorithm": one.algorithm, "seed": seed if one.algorithm else None}
+            about |= {"worlds": len(collided), "collision_rate": float(collided.mean())}
+            vehicles: Json = {}
+            behind: Json = {}
+            for harm_count in HARM_COUNTS:
+                name = HARM_METRIC[harm_count]
+                reached, braking = one.reached.world[harm_count][seed], one.full_brake.world[harm_count]
+                about |= {
+                    name: float(reached.mean()),
+                    f"full_brake_{name}": float(braking.mean()),
+                    f"searched_{name}": float(reached[:searched].mean()),
+                    f"searched_full_brake_{name}": float(braking[:, :searched].mean()),
+                    f"searched_best_known_{name}": None if one.best is None else float(one.best[harm_count].mean()),
+                }
+                each = one.reached.vehicle[harm_count][seed].mean(axis=0)
+                vehicles |= {f"{name}_{i + 1}": float(harm) for i, harm in enumerate(each)}
+                behind |= dict.fromkeys((f"shielded_{name}", f"bound_{name}", f"actions_replaced_{name}"))
+                if one.shielded is not None:
+                    found = one.shielded[harm_count]
+                    actions = found.decisions[seed].sum() * found.replaced.shape[2]
+                    shares = found.harm[seed].mean(), found.bound[seed].mean(), found.replaced[seed].sum() / actions
+                    behind |= dict(zip([*behind][-3:], map(float, shares), strict=True))
+            rows.append({**about, **vehicles, **behind})
+    return csv_text(rows)
+
+
+_ALGORITHM = "Algorithm"
+_HARM = {"first": "first-impact harm", "total": "total harm"}
 
 
 def markdown(found: Json, conditions: str) -> str:
     """All tables, with their conditions below."""
-    blocks = [each for title, tables in _blocks(found) for each in (f"## {title}", *map(_write_table, tables))]
+    blocks = [text for title, sheets in _blocks(found) for text in (f"## {title}", *(s.markdown() for s in sheets))]
     return "\n\n".join([*blocks, conditions]) + "\n"
 
 
@@ -318,32 +482,36 @@ def ablation_page(found: Json, conditions: str, figures: Mapping[str, Figure], e
     sections = [Section("Conditions", [conditions])]
     sections += [Section("Figures", drawn)] if drawn else []
     sections += episodes
-    for title, tables in _blocks(found):
-        parts = [
-            table(t.head, [[cell.replace("`", "") for cell in row] for row in t.rows]) for t in map(_alone, tables)
-        ]
+    for title, sheets in _blocks(found):
+        parts = []
+        for sheet in sheets:
+            rows = [
+                [cell.in_words.replace("`", "") for cell in row] for row in sheet.shown() if not isinstance(row, str)
+            ]
+            parts.append(table(sheet.headings, rows))
         sections.append(Section(title, parts))
     settings = {name: value for name, value in found["settings"].items() if name != "recipes"}
     sections.append(Section("Settings", [facts(settings)]))
     return page("What cooperation is worth", sections, lead="Who learns, who knows, whose harm counts: step by step.")
 
 
-def _blocks(found: Json) -> list[tuple[str, list[_Table]]]:
-    """The tables below their titles."""
-    worlds = found["levels"][0]["first"]["searched"]["worlds"]
-    blocks = [("Levels", [_levels(found["levels"], harm_count) for harm_count in HARM_COUNTS])]
-    optima = [_optima(found["levels"], harm_count) for harm_count in HARM_COUNTS]
+def _blocks(found: Json) -> list[tuple[str, list[Sheet]]]:
+    """The tables below their titles, without the algorithm's column where there is only one."""
+    levels = found["levels"]
+    worlds = levels[0]["first"]["searched"]["worlds"]
+    blocks = [("Levels", [_levels(levels, harm_count) for harm_count in HARM_COUNTS])]
+    optima = [_optima(levels, harm_count) for harm_count in HARM_COUNTS]
     blocks.append((f"How near the joint optimum, in the first {count_of(worlds, 'world')}", optima))
-    if any(level["first"]["shielded"] for level in found["levels"]):
-        behind = [_shielded(found["levels"], harm_count) for harm_count in HARM_COUNTS]
+    if any(level["first"]["shielded"] for level in levels):
+        behind = [_shielded(levels, harm_count) for harm_count in HARM_COUNTS]
         blocks.append(("Behind the step shield that guards the count of the table", behind))
     for title, key in (("What each step is worth", "steps"), ("Price of lost messages", "channels")):
         if found[key]:
             blocks.append((title, [_changes(found[key])]))
-    if found["steps"] or found["channels"]:
-        changes = found["steps"] + found["channels"]
+    changes = found["steps"] + found["channels"]
+    if changes:
         blocks.append(("Who pays", [_who_pays(changes, harm_count) for harm_count in HARM_COUNTS]))
-    return blocks
+    return [(title, list(map(_alone, sheets))) for title, sheets in blocks]
 
 
 def interval_words(seeds: int) -> str:
@@ -356,17 +524,21 @@ def interval_words(seeds: int) -> str:
 
 def lines_markdown(found: Sequence[LineResult], question: LineQuestion, runs: int) -> str:
     """One row per length of the line."""
-    head = ["Vehicles", "All brake fully", "Reached", "Decrease", "Somebody worse off"]
-    head += ["Best known", "Share of the joint optimum"] if question.search_episodes else []
-    rows = []
-    for one in found:
-        row = [str(one.vehicles), _of(one.full_brake), _of(one.reached), _of(one.decrease, 100.0, 1, " %")]
-        row.append(_of(one.worse_off, 100.0, 1, " %"))
-        rows.append(row + ([_of(one.best_known), _of(one.share, 100.0, 1, " %")] if question.search_episodes else []))
-    name = question.scenario.name
+    columns: list[Column | str] = [
+        "Vehicles",
+        _harm("All brake fully"),
+        _harm("Reached"),
+        _share("Decrease"),
+        _share("Somebody worse off"),
+    ]
+    searched = [_harm("Best known"), _share("Share of the joint optimum")] if question.search_episodes else []
+    rows = [
+        [str(one.vehicles), one.full_brake, one.reached, one.decrease, one.worse_off, one.best_known, one.share]
+        for one in found
+    ]
     conditions = (
-        f"{_HARM[question.harm_count].capitalize()} (m²/s², means per world) of the line of {name} made longer:"
-        f" {runs} {'policies' if runs > 1 else 'policy'}, {count_of(question.episodes, 'world')} of seed"
+        f"{_HARM[question.harm_count].capitalize()} (m²/s², means per world) of the line of {question.scenario.name}"
+        f" made longer: {runs} {'policies' if runs > 1 else 'policy'}, {count_of(question.episodes, 'world')} of seed"
         f" {question.list_seed} for each length; {interval_words(runs)}."
     )
     if question.search_episodes:
@@ -374,114 +546,106 @@ def lines_markdown(found: Sequence[LineResult], question: LineQuestion, runs: in
             f" Best known and share: the first {count_of(question.search_episodes, 'world')},"
             f" {question.budget:,} candidates each."
         )
-    return f"{_write_table(_Table(head, rows, left=1))}\n\n{conditions}\n"
+    return f"{Sheet('', [*columns, *searched], rows).markdown()}\n\n{conditions}\n"
 
 
-def _of(estimate: Estimate | None, scale: float = 1.0, digits: int = 2, unit: str = "") -> str:
-    return _cell(None if estimate is None else estimate.to_json(), scale, digits, unit)
+def _harm(heading: str, sign: Literal["-", "+"] = "-") -> Column:
+    return Column(heading, sign=sign)
 
 
-def _levels(levels: Sequence[Json], harm_count: HarmCount) -> _Table:
-    head = ["Level", _ALGORITHM, "Collisions", "All brake fully", f"Reached, {_HARM[harm_count]}"]
-    rows = []
-    for level in levels:
-        own = level[harm_count]
-        row = [f"`{level['level']}`", level["algorithm"] or NONE, _cell(level["collision_rate"], 100.0, 1, " %")]
-        rows.append([*row, _value(own["full_brake"]), _cell(own["harm"])])
-    return _Table(head, rows, left=2)
+def _share(heading: str) -> Column:
+    return Column(heading, digits=1, scale=100.0, unit=" %", sign="-")
 
 
-def _optima(levels: Sequence[Json], harm_count: HarmCount) -> _Table:
-    head = ["Level", _ALGORITHM, "All brake fully", f"Reached, {_HARM[harm_count]}"]
-    head += ["Joint optimum", "Share of its reduction"]
+def _estimate(told: Json | None) -> Estimate | None:
+    return None if told is None else Estimate(told["value"], told["interval"])
+
+
+def _levels(levels: Sequence[Json], harm_count: HarmCount) -> Sheet:
+    reached = _harm(f"Reached, {_HARM[harm_count]}")
+    columns: list[Column | str] = ["Level", _ALGORITHM, _share("Collisions"), _harm("All brake fully"), reached]
+    rows = [
+        [f"`{level['level']}`", level["algorithm"], _estimate(level["collision_rate"]),
+         level[harm_count]["full_brake"]["value"], _estimate(level[harm_count]["harm"])]
+        for level in levels
+    ]  # fmt: skip
+    return Sheet("", columns, rows)
+
+
+def _optima(levels: Sequence[Json], harm_count: HarmCount) -> Sheet:
+    columns: list[Column | str] = [
+        "Level",
+        _ALGORITHM,
+        _harm("All brake fully"),
+        _harm(f"Reached, {_HARM[harm_count]}"),
+    ]
+    columns += [_harm("Joint optimum"), _share("Share of its reduction")]
     rows = []
     for level in levels:
         own = level[harm_count]["searched"]
         if own["best_known"] is not None:
-            row = [f"`{level['level']}`", level["algorithm"], _value(own["full_brake"]), _cell(own["harm"])]
-            rows.append([*row, _value(own["best_known"]), _cell(own["realised_share"], 100.0, 1, " %")])
-    return _Table(head, rows, left=2)
+            row = [f"`{level['level']}`", level["algorithm"], own["full_brake"]["value"], _estimate(own["harm"])]
+            rows.append([*row, own["best_known"]["value"], _estimate(own["realised_share"])])
+    return Sheet("", columns, rows)
 
 
-def _shielded(levels: Sequence[Json], harm_count: HarmCount) -> _Table:
-    head = ["Level", _ALGORITHM, f"Without, {_HARM[harm_count]}", "With", "Change", "Bound", "Replaced", "Stepped in"]
+def _shielded(levels: Sequence[Json], harm_count: HarmCount) -> Sheet:
+    columns: list[Column | str] = [
+        "Level",
+        _ALGORITHM,
+        _harm(f"Without, {_HARM[harm_count]}"),
+        _harm("With"),
+        _harm("Change", "+"),
+    ]
+    shares = ("Replaced", "Stepped in", "Somebody worse off", "Above the baseline plan")
+    columns += [_harm("Bound"), *map(_share, shares), Column("Above the bound")]
     rows = []
     for level in levels:
         own, behind = level[harm_count], level[harm_count]["shielded"]
         if behind is not None:
-            row = [f"`{level['level']}`", level["algorithm"], _value(own["harm"]), _value(behind["harm"])]
-            row += [
-                _cell(behind["difference"], sign=True),
-                _value(behind["bound"]),
-                f"{100.0 * behind['replaced']:.1f} %",
-            ]
-            row += [_cell(behind[key], 100.0, 1, " %") for key in ("stepped_in", "worse_off", "above_baseline")]
-            rows.append([*row, str(behind["above_bound"])])
-    return _Table([*head, "Somebody worse off", "Above the baseline plan", "Above the bound"], rows, left=2)
+            row = [f"`{level['level']}`", level["algorithm"], own["harm"]["value"], behind["harm"]["value"]]
+            row += [_estimate(behind["difference"]), behind["bound"]["value"], behind["replaced"]]
+            row += [_estimate(behind[key]) for key in ("stepped_in", "worse_off", "above_baseline")]
+            rows.append([*row, behind["above_bound"]])
+    return Sheet("", columns, rows)
 
 
-def _changes(changes: Sequence[Json]) -> _Table:
-    head = ["From", "To", _ALGORITHM]
+def _changes(changes: Sequence[Json]) -> Sheet:
+    columns: list[Column | str] = ["From", "To", _ALGORITHM]
     for harm_count in HARM_COUNTS:
-        head += [f"Change of {_HARM[harm_count]}", f"Somebody worse off, {_HARM[harm_count]}"]
-    rows = []
-    for change in changes:
-        row = [f"`{change['from']}`", f"`{change['to']}`", change["algorithm"]]
-        for harm_count in HARM_COUNTS:
-            row += [
-                _cell(change[harm_count]["difference"], sign=True),
-                _cell(change[harm_count]["worse_off"], 100.0, 1, " %"),
-            ]
-        rows.append(row)
-    return _Table(head, rows, left=3)
+        columns += [_harm(f"Change of {_HARM[harm_count]}", "+"), _share(f"Somebody worse off, {_HARM[harm_count]}")]
+    rows = [
+        [f"`{change['from']}`", f"`{change['to']}`", change["algorithm"],
+         *(_estimate(change[count][key]) for count in HARM_COUNTS for key in ("difference", "worse_off"))]
+        for change in changes
+    ]  # fmt: skip
+    return Sheet("", columns, rows)
 
 
-def _who_pays(changes: Sequence[Json], harm_count: HarmCount) -> _Table:
-    vehicles = len(changes[0][harm_count]["vehicles"])
-    head = [f"Change of {_HARM[harm_count]}", _ALGORITHM, *(f"Vehicle {i + 1}" for i in range(vehicles))]
-    head += [f"Vehicle {i + 1} worse off" for i in range(vehicles)]
+def _who_pays(changes: Sequence[Json], harm_count: HarmCount) -> Sheet:
+    vehicles = [f"Vehicle {i + 1}" for i in range(len(changes[0][harm_count]["vehicles"]))]
+    columns: list[Column | str] = [
+        f"Change of {_HARM[harm_count]}",
+        _ALGORITHM,
+        *(_harm(name, "+") for name in vehicles),
+    ]
+    columns += [_share(f"{name} worse off") for name in vehicles]
     rows = []
     for change in changes:
         own = change[harm_count]
-        row = [f"`{change['from']}` to `{change['to']}`", change["algorithm"]]
-        row += [_cell(estimate, sign=True) for estimate in own["vehicles"]]
-        rows.append(row + [f"{100.0 * share:.1f} %" for share in own["worse_off_vehicles"]])
-    return _Table(head, rows, left=2)
+        row = [f"`{change['from']}` to `{change['to']}`", change["algorithm"], *map(_estimate, own["vehicles"])]
+        rows.append(row + own["worse_off_vehicles"])
+    return Sheet("", columns, rows)
 
 
-def _alone(given: _Table) -> _Table:
+def _alone(sheet: Sheet) -> Sheet:
     """The table without the algorithm's column where there is only one."""
-    head, rows, left = given
-    if _ALGORITHM not in head:
-        return given
-    column = head.index(_ALGORITHM)
-    if len({row[column] for row in rows} - {NONE}) != 1:
-        return given
-    head, *rows = ([*row[:column], *row[column + 1 :]] for row in (head, *rows))
-    return _Table(head, rows, left - 1)
-
-
-def _write_table(given: _Table) -> str:
-    """A table in Markdown."""
-    head, rows, left = _alone(given)
-    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * left + " ---: |" * (len(head) - left)]
-    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
-
-
-def _cell(estimate: Json | None, scale: float = 1.0, digits: int = 2, unit: str = "", *, sign: bool = False) -> str:
-    """``12.34 [12.00, 12.70]``."""
-    if estimate is None:
-        return NONE
-    plus = "+" if sign else ""
-    value = f"{scale * estimate['value']:{plus}.{digits}f}{unit}"
-    if estimate["interval"] is None:
-        return value
-    low, high = (f"{scale * end:{plus}.{digits}f}" for end in estimate["interval"])
-    return f"{value} [{low}, {high}]"
-
-
-def _value(estimate: Json | None) -> str:
-    return NONE if estimate is None else f"{estimate['value']:.2f}"
+    if _ALGORITHM not in sheet.columns:
+        return sheet
+    column = sheet.columns.index(_ALGORITHM)
+    if len({row[column] for row in sheet.rows} - {None}) != 1:
+        return sheet
+    return sheet.only(k for k in range(len(sheet.columns)) if k != column)
 
 
 SUMMARY, TABLE, TEXT, PAGE = "ablation.json", "ablation.csv", "ablation.md", "ablation.html"

@@ -34,7 +34,8 @@ from ethbrake_marl.evaluation.inputs import (
 from ethbrake_marl.evaluation.outcome import Evaluation
 from ethbrake_marl.evaluation.results import write_output
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.statistics import Estimate, mean, rate, relative_decrease
+from ethbrake_marl.evaluation.statistics import mean, rate, relative_decrease
+from ethbrake_marl.files.sheet import DASH, Column, Estimate, Sheet
 from ethbrake_marl.files.store import parse_strict_json, read_plain
 from ethbrake_marl.files.yaml import first_mistake
 from ethbrake_marl.limits.best_harm import load_table, world_identity
@@ -293,6 +294,11 @@ class Entry(Strict):
         """The results by list, of those that were driven."""
         return {name: each for name, each in self.lists.items() if isinstance(each, ListResult)}
 
+    @property
+    def policies(self) -> list[str]:
+        """Every policy that drove for it."""
+        return sorted({sha256 for each in self.driven.values() for sha256 in each.policies.values()})
+
     def content_sha256(self) -> str:
         """What ``entry_sha256`` must be."""
         return plain_sha256(self.model_dump(mode="json", exclude={"entry_sha256"}))
@@ -443,3 +449,176 @@ def _result(
         horizon_ends=int((~outcome.at_rest).sum()),
         outcome_sha256=content_sha256(outcome.ledger),
     )
+
+
+# Entries of one suite, sorted by their score: as a table, as Markdown and as a page.
+
+_SCORE = (
+    "Realised share of what is possible, in %: (full braking - agent) / (full braking - best known) of the mean harm"
+    " of a list; 0 is full braking, 100 the best known. 95 % intervals in brackets."
+)
+_RANK = (
+    "Only who drives every list is ranked, by the mean over all lists. A mean over some of them is shown, and is no"
+    " score: those lists may be the easy ones."
+)
+_NOT_DRIVEN = "not driven"
+
+
+def entry_sheet(entry: Entry, suite: Suite) -> Sheet:
+    """One line per list of one entry, for a terminal; means per world."""
+    columns: list[Column | str] = [
+        "List",
+        Column("Share %", digits=1, scale=100.0),
+        Column("Worst decile", digits=1),
+        Column("First", interval="hidden"),
+        Column("Total", interval="hidden"),
+        Column("Collided %", digits=1, scale=100.0, interval="hidden"),
+        Column("Moving %", digits=1, scale=100.0),
+    ]
+    found = {each.name: entry.lists[each.name] for each in suite.lists}
+    rows = [
+        [name, _NOT_DRIVEN, *[None] * 5] if isinstance(each, NotDriven) else [name, *_figures(each)]
+        for name, each in found.items()
+    ]
+    reasons = [f"{name}: {each.not_driven}" for name, each in found.items() if isinstance(each, NotDriven)]
+    return Sheet("", columns, rows, "\n".join(reasons), gap=2)
+
+
+def _figures(result: ListResult) -> list[Estimate | float]:
+    harms = (result.worst_decile_regret, result.first_impact_harm, result.total_harm)
+    return [result.realised_share, *harms, result.collision_rate, result.horizon_ends / result.worlds]
+
+
+@dataclass(frozen=True, slots=True)
+class Leaderboard:
+    """Entries of one suite: those of all lists by their score, then the others by how many lists they drove."""
+
+    suite: Suite
+    entries: tuple[tuple[Path, Entry], ...]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the figures are, who is ranked, and the suite."""
+        return _SCORE, _RANK, f"Suite {self.suite.name}, SHA-256 {self.suite.sha256}"
+
+    def sheet(self) -> Sheet:
+        """One line per entry, for a terminal; lists that were not driven show a dash."""
+        share = Column("", digits=1, scale=100.0)
+        rows = []
+        for rank, entry in self._ranks():
+            each = "  ".join(f"{name} {share.show(_share(entry, name)).value}" for name in entry.lists)
+            rows.append([rank, entry.agent, entry.mean_of_driven, self._driven(entry), each])
+        told = Column("Realised share of each list, in the suite's order", text=True)
+        overall = Column("Overall", digits=1, scale=100.0)
+        return Sheet("", [Column(""), "Agent", overall, Column("Lists"), told], rows, gap=2)
+
+    def markdown(self) -> str:
+        """One column per list."""
+        names = [each.name for each in self.suite.lists]
+        rows = []
+        for rank, entry in self._ranks():
+            overall = entry.mean_of_driven.in_words(digits=1, scale=100.0)
+            overall = overall if entry.overall is not None else f"({overall}, {self._driven(entry)} lists)"
+            agent = one_line(entry.agent).replace("`", "'").replace("|", "/")
+            rows.append([rank, f"`{agent}`", overall, *(_share(entry, name) for name in names)])
+        shares = [Column(name, digits=1, scale=100.0) for name in names]
+        return Sheet("", [Column(""), "Agent", Column("Overall"), *shares], rows).markdown() + "\n"
+
+    def page(self) -> str:
+        """The ranking, each list, and where each entry comes from, as a page."""
+        # templates take time to load, and most commands write no page
+        from ethbrake_marl.pages.frame import Block, Cell, Section, facts, page, paragraph, table
+
+        def cell(column: Column, figure: Estimate | float | None) -> Cell:
+            value, interval = column.show(figure)
+            return Cell(value, f"[{interval}]" if interval else "")
+
+        percent, harm = Column("", digits=1, scale=100.0), Column("")
+        suite, names = self.suite, [each.name for each in self.suite.lists]
+        rows = [
+            [entry.agent, rank, cell(percent, entry.mean_of_driven), self._driven(entry)]
+            + [cell(percent, each.realised_share if isinstance(each, ListResult) else None)
+               for each in map(entry.lists.__getitem__, names)]
+            for rank, entry in self._ranks()
+        ]  # fmt: skip
+        parts = [table(["Agent", "Rank", "Overall", "Lists", *names], rows, caption="Realised share, %")]
+        ranking = Section("Ranking", [*parts, paragraph(_RANK, "quiet")])
+        columns = (percent, harm, harm, harm, percent, percent)
+        lines: list[Any] = []
+        for content in (each.content for each in suite.lists):
+            lines.append(
+                Block(
+                    f"{content.name}: {content.worlds} worlds of seed {content.seed}, {content.harm_count} harm; full"
+                    f" braking {content.full_brake_harm:.2f}, best known {content.best_known_harm:.2f} m²/s²"
+                )
+            )
+            for _, entry in self.entries:
+                result = entry.lists[content.name]
+                cells = (
+                    [Cell(_NOT_DRIVEN, result.not_driven, words=True)]
+                    if isinstance(result, NotDriven)
+                    else [cell(column, figure) for column, figure in zip(columns, _figures(result), strict=True)]
+                )
+                lines.append([entry.agent, *cells, *[DASH] * (len(columns) - len(cells))])
+        head = (
+            "Agent", "Realised share, %", "Worst decile: regret", "First-impact harm", "Total harm", "Collisions, %",
+            "Moving at the horizon, %",
+        )  # fmt: skip
+        lists = Section("Lists", [table(head, lines, caption="Harm is in m²/s², mean per world")])
+        told = {
+            entry.agent: f"{entry.command}; policies: {', '.join(entry.policies) or 'none'}; "
+            + ", ".join(f"{name} {version}" for name, version in entry.versions.items())
+            + f"; entry SHA-256 {entry.entry_sha256}"
+            for _, entry in self.entries
+        }
+        lead = f"Suite {suite.name}, SHA-256 {suite.sha256}. {_SCORE}"
+        return page(f"Benchmark {suite.name}", [ranking, lists, Section("Entries", [facts(told)])], lead=lead)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        entries = [
+            {
+                "file": path.name,
+                "agent": entry.agent,
+                "overall": None if entry.overall is None else entry.overall.to_json(),
+                "mean_of_driven": entry.mean_of_driven.to_json(),
+                "lists_driven": entry.lists_driven,
+                "policies": entry.policies,
+                "lists": {name: each.model_dump(mode="json") for name, each in entry.lists.items()},
+            }
+            for path, entry in self.entries
+        ]
+        return {"suite": self.suite.name, "suite_sha256": self.suite.sha256, "entries": entries}
+
+    def _ranks(self) -> list[tuple[str, Entry]]:
+        """Every entry with its rank; a dash for who did not drive every list: its mean cannot be compared."""
+        return [(DASH if entry.overall is None else str(k), entry) for k, (_, entry) in enumerate(self.entries, 1)]
+
+    def _driven(self, entry: Entry) -> str:
+        return f"{entry.lists_driven} of {len(self.suite.lists)}"
+
+
+def _share(entry: Entry, name: str) -> float | None:
+    result = entry.lists[name]
+    return result.realised_share.value if isinstance(result, ListResult) else None
+
+
+def read_leaderboard(paths: Sequence[Path], suite: Suite | None = None) -> Leaderboard:
+    """Read and sort entries of one suite (default: the one that the first entry names).
+
+    Raises ``InvalidInput`` naming the first file that is refused: no entry, changed since it was made, or of another
+    suite.
+    """
+    if not paths:
+        raise InvalidInput("leaderboard: no entries given; ethbrake benchmark writes them")
+    entries = [(path, read_entry(path)) for path in paths]
+    suite = load_suite(entries[0][1].suite) if suite is None else suite
+    names = {each.name for each in suite.lists}
+    for path, entry in entries:
+        if entry.suite_sha256 != suite.sha256 or entry.lists.keys() != names:
+            raise InvalidInput(
+                f"{path}: is about another suite: {entry.suite} with SHA-256 {entry.suite_sha256:.12}, and"
+                f" this is {suite.name} with {suite.sha256:.12}"
+            )
+    entries.sort(key=lambda each: (-each[1].lists_driven, -each[1].mean_of_driven.value, each[1].agent))
+    return Leaderboard(suite, tuple(entries))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import re
 import time
@@ -37,6 +35,7 @@ from ethbrake_marl.evaluation.results import PER_WORLD, results_to_json, write_o
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
 from ethbrake_marl.figures.evaluation import harm_against_total_gap, learning_curve, trajectories
 from ethbrake_marl.figures.style import picture_bytes
+from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.learning.recipe import TrainingRecipe, algorithm_names
 from ethbrake_marl.learning.train import TrainResult, train
 from ethbrake_marl.learning.training import RunDirectory, RunStatus, read_object
@@ -44,7 +43,7 @@ from ethbrake_marl.pages.report import Report, ReportFigure, ReportTest, play_fo
 from ethbrake_marl.policies.actor import installed_versions
 from ethbrake_marl.policies.bundle import Policy
 from ethbrake_marl.rewards import RewardParams
-from ethbrake_marl.scenario import Sample, Scenario
+from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield import HybridAgent
 
 # The results of an experiment beside its policy: CSV and JSON, every world, three figures and one page.
@@ -57,44 +56,23 @@ HARM_AGAINST_GAP = "harm_against_gap.png"
 TRAJECTORIES = "trajectories.png"
 
 
-def write_results(folder: Path, evaluation: Evaluation, rows: Sequence[SummaryRow]) -> None:
-    """Write ``results.json`` (the rows), ``results.csv`` (the same, flat) and ``per_world.csv``."""
-    per_world = folder / PER_WORLD
-    write_per_world_csv(per_world, evaluation, force=True)
+def write_results(folder: Path, name: str, rows: Sequence[SummaryRow], per_world: Path | None = None) -> None:
+    """Write the rows as ``NAME.json`` and, flat, as ``NAME.csv``."""
     content = json.dumps(results_to_json(rows, per_world=per_world), indent=2, allow_nan=False) + "\n"
-    write_output(folder / "results.json", content.encode(), force=True)
-    write_output(folder / "results.csv", results_csv(rows).encode(), force=True)
-
-
-def write_beside(folder: Path, beside: Mapping[str, Sequence[SummaryRow]]) -> None:
-    """Write ``other_tests.json`` and ``other_tests.csv``: the rows of the other tests; nothing where there are none."""
-    rows = [row for rows in beside.values() for row in rows]
-    if rows:
-        content = json.dumps(results_to_json(rows), indent=2, allow_nan=False) + "\n"
-        write_output(folder / "other_tests.json", content.encode(), force=True)
-        write_output(folder / "other_tests.csv", results_csv(rows).encode(), force=True)
+    write_output(folder / f"{name}.json", content.encode(), force=True)
+    write_output(folder / f"{name}.csv", results_csv(rows).encode(), force=True)
 
 
 def results_csv(rows: Sequence[SummaryRow]) -> str:
     """One line per agent; the interval of column ``x`` is ``x_low`` and ``x_high``, what does not exist is empty."""
-    flat = [_flat(row.to_json()) for row in rows]
-    columns = list(dict.fromkeys(name for line in flat for name in line))
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(flat)
-    return text.getvalue()
-
-
-def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
-    line: dict[str, Any] = {name: row["parameters"][name] for name in ("scenario", "seed")}
-    for name, value in row.items():
-        if name.endswith("_interval"):
-            stem = name.removesuffix("_interval")
-            line[f"{stem}_low"], line[f"{stem}_high"] = value or (None, None)
-        elif name != "parameters":
-            line[name] = json.dumps(value, allow_nan=False) if isinstance(value, list | dict) else value
-    return line
+    lines = []
+    for told in (row.to_json() for row in rows):
+        parameters = told.pop("parameters")
+        for name, value in told.items():
+            if isinstance(value, list | dict) and not name.endswith("_interval"):
+                told[name] = json.dumps(value, allow_nan=False)
+        lines.append({"scenario": parameters["scenario"], "seed": parameters["seed"], **told})
+    return csv_text(lines)
 
 
 def write_figures(
@@ -158,40 +136,6 @@ def telling_world(evaluation: Evaluation) -> int:
     saved = before[rows] - evaluation.outcome(learned_name(evaluation)).first_impact_harm[rows]
     order = np.argsort(saved, kind="stable")
     return int(rows[order[(len(order) - 1) // 2]])
-
-
-def write_page(
-    folder: Path,
-    evaluation: Evaluation,
-    rows: Sequence[SummaryRow],
-    figures: Sequence[ReportFigure],
-    agents: Mapping[str, Agent],
-    *,
-    beside: Mapping[str, Sequence[SummaryRow]],
-    summary: str,
-    settings: Mapping[str, object],
-    versions: Mapping[str, str],
-) -> Path:
-    """Write ``report.html``, which holds the figures and some episodes inside it; gives its path."""
-    path = folder / "report.html"
-    name, learned = evaluation.scenario.name, learned_name(evaluation)
-    title = f"ethbrake run: {name}{' (the main test of three)' if beside and name == MAIN_TEST else ''}"
-    spellings = {learned: f"{learned}@{folder}", "hybrid": f"{learned}@{folder}+episode"}
-    report = Report(
-        title,
-        rows,
-        evaluation,
-        play_for_report(evaluation, agents, learned, spellings=spellings),
-        shield_evidence(agents, evaluation),
-        learned,
-        figures,
-        [ReportTest(name, TESTS[name], other) for name, other in beside.items()],
-        summary=summary,
-        settings=settings,
-        versions=versions,
-    )
-    write_report(path, report, force=True)
-    return path
 
 
 RUNS = Path("runs")
@@ -282,14 +226,31 @@ def run_experiment(
     run = RunDirectory(trained.directory)
     with _status(run, trained.status):
         agents = _agents(trained.policy, scenario)
-        evaluation = _evaluate(sample, agents, scenario, vehicle, list_seed, trained, tell)
+        total = sample.worlds.n
+        if trained.status == "interrupted":
+            note = (
+                f"interrupted after {trained.steps:,} steps: evaluating the policy so far; Ctrl-C again stops at once"
+            )
+            tell(Progress(next(iter(agents)), 0, total, note=note))
+        evaluation = evaluate(
+            sample,
+            agents,
+            scenario=scenario,
+            vehicle=vehicle,
+            seed=list_seed,
+            chunk=PROGRESS_EVERY,
+            on_progress=lambda name, done: tell(Progress(name, done, total)),
+        )
         begin = _stages(tell, 3 + len(other_tests(scenario)))
         begin("what nobody can avoid in these worlds, proven world by world")
         rows = summarise(evaluation)
         beside = _beside(trained.policy, scenario, min(episodes, BESIDE_EPISODES), list_seed, begin)
         begin("results and figures")
-        write_results(run.path, evaluation, rows)
-        write_beside(run.path, beside)
+        per_world = run.path / PER_WORLD
+        write_per_world_csv(per_world, evaluation, force=True)
+        write_results(run.path, "results", rows, per_world)
+        if beside:
+            write_results(run.path, "other_tests", [row for rows in beside.values() for row in rows])
         wall_s = time.monotonic() - started
         report = _show(run, evaluation, rows, beside, trained, agents, begin, wall_s=wall_s)
         begin("")
@@ -323,31 +284,6 @@ def _agents(policy: Policy, scenario: Scenario, baselines: Sequence[str] = BASEL
         "hybrid": HybridAgent(LearnedAgent(policy, name), scenario),
     }
     return {**make_agents(baselines, scenario), **learned}
-
-
-def _evaluate(
-    sample: Sample,
-    agents: Mapping[str, Agent],
-    scenario: Scenario,
-    vehicle: int,
-    list_seed: int,
-    trained: TrainResult,
-    tell: OnProgress,
-) -> Evaluation:
-    """Every agent on the list, with its progress told."""
-    total = sample.worlds.n
-    if trained.status == "interrupted":
-        note = f"interrupted after {trained.steps:,} steps: evaluating the policy so far; Ctrl-C again stops at once"
-        tell(Progress(next(iter(agents)), 0, total, note=note))
-    return evaluate(
-        sample,
-        agents,
-        scenario=scenario,
-        vehicle=vehicle,
-        seed=list_seed,
-        chunk=PROGRESS_EVERY,
-        on_progress=lambda name, done: tell(Progress(name, done, total)),
-    )
 
 
 def _show(
@@ -387,17 +323,24 @@ def _show(
     if trained.status == "interrupted":
         summary += " The training was interrupted; this is the policy it had by then."
     begin("the page, and the episodes to watch there")
-    return write_page(
-        run.path,
-        evaluation,
+    name, learned = evaluation.scenario.name, learned_name(evaluation)
+    spellings = {learned: f"{learned}@{run.path}", "hybrid": f"{learned}@{run.path}+episode"}
+    report = Report(
+        f"ethbrake run: {name}{' (the main test of three)' if beside and name == MAIN_TEST else ''}",
         rows,
+        evaluation,
+        play_for_report(evaluation, agents, learned, spellings=spellings),
+        shield_evidence(agents, evaluation),
+        learned,
         figures,
-        agents,
-        beside=beside,
+        [ReportTest(name, TESTS[name], other) for name, other in beside.items()],
         summary=summary,
         settings=told,
         versions=installed_versions(),
     )
+    path = run.path / "report.html"
+    write_report(path, report, force=True)
+    return path
 
 
 def _own_parts(config: Mapping[str, Any]) -> dict[str, str]:

@@ -12,7 +12,7 @@ from ethbrake_marl.agents.protocol import Driver
 from ethbrake_marl.defaults import HINDSIGHT, HarmCount, MeasureName
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.inputs import make_lineup
+from ethbrake_marl.evaluation.inputs import NamedWorld, make_lineup, states_of
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.physics import Floats, Ints
 from ethbrake_marl.scenario import Sample, Scenario
@@ -251,3 +251,21 @@ def falsify(
     sample, _ = ranges.sample(tried.points[worst])
     measured = measure(sample) if len(worst) else Measured(np.empty(0), np.empty(0), None)
     return Falsified(sample, measured, tried.scores, int(above[0]) + 1 if len(above) else None)
+
+
+def named_worlds(found: Falsified, measure: Measure) -> list[NamedWorld]:
+    """The kept worlds, worst first."""
+    if not found.sample.worlds.n:
+        return []
+    states, measured = states_of(found.sample.worlds, measure.scenario), found.measured
+    beside: Floats | list[None] = [None] * len(states) if measured.reference is None else measured.reference
+    return [
+        NamedWorld(
+            name=f"{measure.name}-{k + 1}",
+            score=float(measured.score[k]),
+            harm=float(measured.harm[k]),
+            reference=None if beside[k] is None else float(beside[k]),  # type: ignore[arg-type]
+            state=state,
+        )
+        for k, state in enumerate(states)
+    ]

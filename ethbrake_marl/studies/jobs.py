@@ -1,31 +1,50 @@
-"""Jobs in processes of this machine, with one thread each."""
+"""Jobs: a folder in which each is done once, and where they run: processes of one thread each, here or on Ray."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import pickle
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
 
-from ethbrake_marl.errors import EthBrakeError, InvalidInput, OnProgress, Progress, describe_error
-from ethbrake_marl.evaluation.inputs import load_runnable
+from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, describe_error, naming_extras, one_line
 from ethbrake_marl.files.plugins import Plugin, load_the_same, loaded_plugins
-from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe, read_settings
-from ethbrake_marl.learning.training import stop_on_signal
-from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.files.store import (
+    check_writable,
+    hold_lock,
+    open_plain,
+    parse_strict_json,
+    remove_unfinished,
+    write_file,
+)
+from ethbrake_marl.learning.training import read_object, stop_on_signal
 
 # One job as every place runs it: a function and what it is given, as bytes, and what came of it.
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")  # of a worker
+
+
+class Job(NamedTuple):
+    """A piece of work: what it is called in its folder, a function that stands in a module, and what it is given.
+
+    What the function gives is plain data; None where it was stopped before its end, and can go on.
+    """
+
+    name: str
+    function: Callable[..., Any]
+    given: tuple[Any, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +58,22 @@ class Answer:
     where: str = ""  # the process that did it
 
 
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """One attempt at a job that has ended, and whether it was the last."""
+
+    job: Job
+    attempt: int  # from 1
+    answer: Answer
+    last: bool  # finished, or failed for good
+
+    @property
+    def reason(self) -> str:
+        """Why it found nothing, in one line."""
+        error = self.answer.error
+        return one_line("was stopped from outside" if error is None else describe_error(error))
+
+
 class Workers(Protocol):
     """Where jobs run, several at a time."""
 
@@ -46,7 +81,7 @@ class Workers(Protocol):
         """How many more jobs can be begun now."""
 
     def begin(self, number: int, call: bytes) -> None:
-        """Begin a job, which is known by its number from then on."""
+        """Begin a job, which is known by its number from then on: its pickled function and what that is given."""
 
     def wait(self) -> list[tuple[int, Answer]]:
         """The jobs that have ended since; waits for one, but no longer than about a second."""
@@ -58,112 +93,285 @@ class Workers(Protocol):
         """End all workers, whatever they do."""
 
 
-def pack(function: Callable[..., Any], *given: Any) -> bytes:
-    """A call as bytes; the function stands in a module."""
-    return pickle.dumps((function, given))
-
-
-def answer(call: bytes, plugins: Sequence[Plugin], where: str) -> Answer:
+def answer(call: bytes, plugins: Sequence[Plugin]) -> Answer:
     """Do a job in a worker, after loading the plug-ins of the process that asks for it.
 
     An error of this package would come again; any other one may be of the machine.
     """
     started = time.monotonic()
+    value, told, lasting = None, None, False
     try:
         load_the_same(plugins)
         function, given = pickle.loads(call)
         value = function(*given)
     except (Exception, SystemExit) as error:
-        lasting = isinstance(error, EthBrakeError)
-        return Answer(None, _sendable(error), not lasting, time.monotonic() - started, where)
-    return Answer(value, None, value is None, time.monotonic() - started, where)
+        told, lasting = error, isinstance(error, EthBrakeError)
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:
+            told = RuntimeError(describe_error(error))
+    return Answer(value, told, value is None and not lasting, time.monotonic() - started, _process_name())
 
 
-def process_name() -> str:
-    """Computer and number of this process, for a log."""
-    return f"{os.uname().nodename}, process {os.getpid()}"
+def _process_name(number: int | None = None) -> str:
+    return f"{os.uname().nodename}, process {number or os.getpid()}"
 
-
-def _sendable(error: BaseException) -> BaseException:
-    """The error, or its text where it cannot be sent."""
-    try:
-        pickle.loads(pickle.dumps(error))
-    except Exception:
-        return RuntimeError(describe_error(error))
-    return error
-
-
-# Run jobs wherever there is room, and try again what was lost, so and so often.
 
 RETRIES = 2  # further attempts at a job whose worker was lost
 
 
-@dataclass(frozen=True, slots=True)
-class Attempt:
-    """One attempt at a job that has ended, and whether it was the last."""
-
-    number: int  # of the job
-    attempt: int  # from 1
-    answer: Answer
-    last: bool  # finished, or failed for good
-
-
 def run_jobs(
-    call_of: Callable[[int], bytes],
-    jobs: int,
-    workers: Workers,
-    on_attempt: Callable[[Attempt], None],
-    *,
-    retries: int = RETRIES,
+    jobs: Iterable[Job], workers: Workers | int, on_attempt: Callable[[Attempt], None], *, retries: int = RETRIES
 ) -> bool:
-    """Run the jobs 0 to ``jobs - 1``, in this order as far as there is room; False when Ctrl-C or SIGTERM stopped it.
+    """Run the jobs, in this order as far as there is room; False when Ctrl-C or SIGTERM stopped it.
 
     Running jobs are then asked to end and are waited for, and so they are when ``on_attempt`` raises.
 
     Args:
-        call_of: makes a job's call, when its turn has come.
-        jobs: how many there are.
-        workers: where they run; not closed here.
+        jobs: each is taken when its turn has come.
+        workers: where they run, not closed here; or how many processes of our own, 1: this one, where what a job raises
+            is raised.
         on_attempt: is told every attempt that has ended.
         retries: further attempts at a job that was lost with its worker, or that failed by no error of this package.
 
     """
-    waiting, running, attempts = deque(range(jobs)), set[int](), dict[int, int]()
+    if workers == 1:
+        return _run_here(jobs, on_attempt)
+    if isinstance(workers, int):
+        with closing(LocalWorkers(workers)) as own:
+            return run_jobs(jobs, own, on_attempt, retries=retries)
+    running: dict[int, tuple[Job, int]] = {}
     try:
         with stop_on_signal() as asked:
-            while waiting or running:
-                if asked():
-                    raise KeyboardInterrupt
-                while waiting and workers.room() > 0:
-                    number = waiting.popleft()
-                    attempts[number] = attempts.get(number, 0) + 1
-                    workers.begin(number, call_of(number))
-                    running.add(number)
-                for number, answer in workers.wait():
-                    running.discard(number)
-                    again = answer.again and attempts[number] <= retries
-                    if again:
-                        waiting.appendleft(number)
-                    on_attempt(Attempt(number, attempts[number], answer, not again))
-                    if not again:
-                        del attempts[number]
+            for ended in _attempts(jobs, workers, running, retries, asked):
+                on_attempt(ended)
     except BaseException as error:
-        _stop(running, workers, on_attempt, attempts)
+        workers.interrupt()
+        while running:
+            for number, answer in workers.wait():
+                job, attempt = running.pop(number)
+                if answer.value is not None:  # it has come to its end all the same
+                    on_attempt(Attempt(job, attempt, answer, True))
         if isinstance(error, KeyboardInterrupt):
             return False
         raise
     return True
 
 
-def _stop(running: set[int], workers: Workers, on_attempt: Callable[[Attempt], None], attempts: dict[int, int]) -> None:
-    """Ask what runs to end, and wait for it; what has come to its end all the same is told."""
-    workers.interrupt()
-    while running:
-        for number, answer in workers.wait():
-            running.discard(number)
-            if answer.value is not None:
-                on_attempt(Attempt(number, attempts[number], answer, True))
+def _run_here(jobs: Iterable[Job], on_attempt: Callable[[Attempt], None]) -> bool:
+    for job in jobs:
+        started = time.monotonic()
+        value = job.function(*job.given)
+        if value is None:
+            return False
+        on_attempt(Attempt(job, 1, Answer(value, wall_s=time.monotonic() - started, where=_process_name()), True))
+    return True
 
+
+def _attempts(
+    jobs: Iterable[Job],
+    workers: Workers,
+    running: dict[int, tuple[Job, int]],
+    retries: int,
+    asked: Callable[[], bool],
+) -> Iterator[Attempt]:
+    """Every attempt as it ends; ``running`` says at any time which jobs run, by number, with their attempts."""
+    coming = enumerate((job, 1) for job in jobs)
+    waiting, more = deque[tuple[int, tuple[Job, int]]](), True
+    while more or waiting or running:
+        if asked():
+            raise KeyboardInterrupt
+        while (more or waiting) and workers.room() > 0:
+            number, begun = waiting.popleft() if waiting else next(coming, (-1, None))
+            if begun is None:
+                more = False
+                continue
+            workers.begin(number, pickle.dumps((begun[0].function, begun[0].given)))
+            running[number] = begun
+        ended = [(number, *running.pop(number), answer) for number, answer in workers.wait()] if more or running else []
+        for number, job, attempt, answer in ended:
+            again = answer.again and attempt <= retries
+            if again:
+                waiting.appendleft((number, (job, attempt + 1)))
+            yield Attempt(job, attempt, answer, not again)
+
+
+def each(take: Callable[[Job, Any], None]) -> Callable[[Attempt], None]:
+    """Hands on what every job gives, and raises what one raises that fails for good."""
+
+    def note(attempt: Attempt) -> None:
+        if attempt.answer.value is not None:
+            take(attempt.job, attempt.answer.value)
+        elif attempt.last:
+            raise attempt.answer.error or WorkerLost(f"{attempt.job.name}: {attempt.reason}")
+
+    return note
+
+
+class JobFolder:
+    """A folder of jobs: it answers one question, one process at a time works in it, and what is finished is kept.
+
+    Args:
+        path: made when work begins.
+        kind: what it holds, for messages.
+        question: what every result in it depends on, as plain data; None: each job knows its own.
+        record: name of the file with the question, and with what ``more`` adds to it when it is written.
+        advice: what to do about a folder that answers another question.
+        beside: names of what may be in a folder without a record; None: anything.
+
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        kind: str,
+        question: Mapping[str, Any] | None = None,
+        *,
+        record: str = "question.json",
+        more: Mapping[str, Any] | None = None,
+        advice: str = "give another folder (--output)",
+        beside: Collection[str] | None = None,
+    ) -> None:
+        self.path, self._kind, self._advice, self._beside = path, kind, advice, beside
+        self._question: dict[str, Any] | None = None if question is None else json.loads(json.dumps(question))
+        self._record, self._more = path / record, dict(more or {})
+        self._journal = path / "journal.jsonl"
+
+    def check(self) -> dict[str, Any] | None:
+        """The record of this question that is there, None where there is none; makes nothing.
+
+        Raises ``InvalidInput`` for what is no folder, cannot be written to, or answers another question, with what
+        differs; ``AlreadyExists`` for a folder of something else.
+        """
+        there = next(each for each in (self.path, *self.path.absolute().parents) if each.exists())
+        if not there.is_dir():
+            raise InvalidInput(f"{self.path}: {there} is a file; give a folder of its own (--output)")
+        try:
+            check_writable(there)
+        except OSError as error:
+            raise InvalidInput(f"{self.path}: cannot be written to ({error.strerror}); {self._advice}") from None
+        if self._question is None:
+            return None
+        if not self._record.is_file():
+            if (
+                self._beside is not None
+                and there == self.path
+                and {e.name for e in there.iterdir()} - {*self._beside, _LOCK}
+            ):
+                raise AlreadyExists(f"{self.path}: is there already, and holds no {self._kind}; give another folder")
+            return None
+        try:
+            kept = read_object(self._record)
+        except InvalidInput as error:
+            raise InvalidInput(f"{error}; {self._advice}") from None
+        other = _differences({key: kept[key] for key in kept if key not in self._more}, self._question)
+        if other:
+            raise InvalidInput(
+                f"{self.path}: holds {self._kind} with other settings ({'; '.join(other)}); {self._advice}"
+            )
+        return kept
+
+    @contextmanager
+    def work(self) -> Iterator[dict[str, Any]]:
+        """Keep others out of the folder while the block runs, and give its record; what killed writers left goes.
+
+        Raises what ``check`` raises, and ``InvalidInput`` where another process works in it.
+        """
+        self.check()
+        self.path.mkdir(parents=True, exist_ok=True)
+        with hold_lock(self.path / _LOCK, "another process works in it; wait for it, or end it"):
+            record = self.check()
+            remove_unfinished(self.path)
+            if record is None:
+                record = {**self._more, **(self._question or {})}
+                if self._question is not None:
+                    write_file(self._record, (json.dumps(record, indent=2) + "\n").encode())
+            yield record
+
+    def run(
+        self,
+        jobs: Iterable[Job],
+        workers: Workers | int,
+        on_attempt: Callable[[Attempt], None],
+        *,
+        retries: int = RETRIES,
+    ) -> bool:
+        """``run_jobs``, with a line of the journal for every attempt that has ended, on its way to the disk at once.
+
+        What a finished job gave is told by ``kept`` from then on.
+        """
+        with self._journal.open("a+b", buffering=0) as journal:
+            if journal.seek(0, os.SEEK_END):
+                journal.seek(-1, os.SEEK_END)
+                if journal.read() != b"\n":  # a writer was killed in the middle of a line
+                    journal.write(b"\n")
+
+            def note(attempt: Attempt) -> None:
+                answer = attempt.answer
+                status = "finished" if answer.value is not None else "failed" if attempt.last else "again"
+                found = {"reason": attempt.reason}
+                if answer.value is not None:
+                    found = {"sha256": _sha256(answer.value), "found": answer.value}
+                entry = {
+                    "job": attempt.job.name,
+                    "status": status,
+                    "attempt": attempt.attempt,
+                    "ended_utc": datetime.now(UTC).isoformat(timespec="milliseconds"),
+                    "wall_s": round(answer.wall_s, 3),
+                    "where": answer.where,
+                    **found,
+                }
+                journal.write(json.dumps(entry).encode() + b"\n")
+                on_attempt(attempt)
+
+            return run_jobs(jobs, workers, note, retries=retries)
+
+    def kept(self) -> tuple[dict[str, Any], int]:
+        """What each finished job gave, by its name, and how many lines of the journal are damaged."""
+        found: dict[str, Any] = {}
+        damaged = 0
+        if not self._journal.exists():
+            return found, damaged
+        with open_plain(self._journal, _LIMIT_BYTES, follow_links=False) as journal:
+            for line in journal:
+                try:
+                    entry = parse_strict_json(line)
+                    if entry["status"] == "finished":
+                        if entry["sha256"] != _sha256(entry["found"]):
+                            raise ValueError("is not what was written")
+                        found[entry["job"]] = entry["found"]
+                except (ValueError, TypeError, KeyError):
+                    damaged += 1
+        return found, damaged
+
+    def log(self, name: str) -> Path:
+        """Where a job may print; absolute, for a worker may stand elsewhere."""
+        (self.path / "logs").mkdir(exist_ok=True)
+        return self.path.absolute() / "logs" / f"{name}.log"
+
+
+_LOCK, _LIMIT_BYTES = ".lock", 4 << 30  # of a journal
+
+
+def _sha256(found: Any) -> str:
+    return hashlib.sha256(json.dumps(found, allow_nan=False).encode()).hexdigest()
+
+
+def _differences(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> list[str]:
+    """What differs between two questions, in words; of lists and of what stands in one alone the name."""
+    found: list[str] = []
+    for name in dict.fromkeys([*now, *before]):
+        old, new = before.get(name), now.get(name)
+        told = f"{inside}{name.replace('_', '-')}"
+        if isinstance(old, dict) and isinstance(new, dict):
+            found += _differences(old, new, f"{told} ")
+        elif old != new:
+            plain = not isinstance(old, list | dict) and not isinstance(new, list | dict)
+            found.append(f"{told} {old!s:.40}, here {new!s:.40}" if plain else told)
+    return found
+
+
+# Processes of this machine.
 
 _WAIT_S = 1.0
 
@@ -252,33 +460,8 @@ class LocalWorkers:
         worker.pipe.close()
         ended = worker.process.exitcode or 0
         how = f"was killed by signal {-ended}" if ended < 0 else f"ended with status {ended}"
-        where = f"{os.uname().nodename}, process {worker.process.pid}"
-        return Answer(None, WorkerLost(f"the worker {how} in the middle of the job"), True, 0.0, where)
-
-
-def run_all(
-    call_of: Callable[[int], bytes], jobs: int, processes: int, name: str, tell: OnProgress
-) -> list[Any] | None:
-    """What every job gives, in their order; None when Ctrl-C stopped it. Raises what the first job raises that fails.
-
-    ``name`` is what they are called together to who is told.
-    """
-    found: list[Any] = [None] * jobs
-    done = 0
-    tell(Progress(name, done, jobs))
-
-    def note(attempt: Attempt) -> None:
-        nonlocal done
-        if not attempt.last:
-            return
-        if attempt.answer.error is not None:
-            raise attempt.answer.error
-        found[attempt.number] = attempt.answer.value
-        done += 1
-        tell(Progress(name, done, jobs))
-
-    with closing(LocalWorkers(processes)) as workers:
-        return found if run_jobs(call_of, jobs, workers, note) else None
+        told = WorkerLost(f"the worker {how} in the middle of the job")
+        return Answer(None, told, True, 0.0, _process_name(worker.process.pid))
 
 
 @contextmanager
@@ -302,13 +485,12 @@ def _serve(pipe: Connection, plugins: Sequence[Plugin]) -> None:
     parent = parent_process()
     assert parent is not None
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    where = process_name()
     while True:
         try:
             call = pipe.recv_bytes()
         except (EOFError, OSError):
             return
-        pipe.send(answer(call, plugins, where))
+        pipe.send(answer(call, plugins))
 
 
 def _end_with(parent: BaseProcess) -> None:
@@ -316,32 +498,101 @@ def _end_with(parent: BaseProcess) -> None:
     os._exit(1)
 
 
-# Scenario and recipe of a job that a file asks for, and which part of it a refusal is about.
+# A Ray cluster, or a Ray of this machine alone that nobody else can reach.
+
+LOCAL = "local"
+_LOOK_S = 10.0  # between two looks at how large the cluster is
+_AHEAD = 2  # jobs per core that Ray holds: one runs, one waits
 
 
-def load_parts(scenario: str, recipe: str, settings: Sequence[str]) -> tuple[Scenario, TrainingRecipe]:
-    """Scenario and recipe, each a name or a path, with the settings ``KEY=VALUE`` in them.
+class RayWorkers:
+    """The cores of a cluster, a job each; Ray itself never repeats one.
 
-    Raises ``InvalidInput`` for what is not known, and for a value that is not allowed.
+    Args:
+        address: of a running cluster, as Ray takes it, or ``local``: a Ray of this machine on loopback sockets, without
+            a dashboard, which ends with ``close``.
+        number: cores of the local one; of a cluster jobs at once at most, None: as many as it has cores.
+
+    Raises ``MissingExtra`` without Ray, ``InvalidInput`` where there is no cluster at the address.
+
     """
-    loaded = load_recipe(recipe)
-    given = read_settings(settings, [loaded])
-    return load_runnable(scenario, given.scenario), given.change(loaded)
 
+    def __init__(self, address: str, number: int | None = None) -> None:
+        plugins = loaded_plugins()
+        load_the_same(plugins)  # a file that was changed since is told here, in one line
+        self._plugins = tuple(_absolute(plugin) for plugin in plugins)
+        self._ray = _connect(address, number)
+        self._most = number if number is not None and address != LOCAL else None
+        self._do = self._ray.remote(num_cpus=1, max_retries=0, max_calls=0)(answer)
+        self._running: dict[Any, int] = {}
+        self._cores, self._looked = 0, float("-inf")
 
-def refused_part(scenario: str, recipe: str, settings: Sequence[str]) -> str:
-    """The part that is refused by itself where ``load_parts`` refuses: ``recipe``, ``scenario`` or a setting's key.
+    def room(self) -> int:
+        """So many that no core has to wait for us, however many join the cluster or leave it."""
+        if time.monotonic() - self._looked > _LOOK_S:
+            self._cores, self._looked = int(self._ray.cluster_resources().get("CPU", 0)), time.monotonic()
+        most = _AHEAD * self._cores if self._most is None else self._most
+        return most - len(self._running)
 
-    Empty where each by itself is in order.
-    """
-    tried: dict[str, Callable[[], object]] = {
-        "recipe": partial(load_recipe, recipe),
-        "scenario": partial(load_scenario, scenario),
-        **{text.partition("=")[0]: partial(load_parts, scenario, recipe, (text,)) for text in settings},
-    }
-    for part, load in tried.items():
+    def begin(self, number: int, call: bytes) -> None:
+        """Hand a job to Ray, which runs it when a core is free."""
+        self._running[self._do.remote(call, self._plugins)] = number
+
+    def wait(self) -> list[tuple[int, Answer]]:
+        """What came back; a job that was lost with its worker or computer may be tried again."""
+        if not self._running:
+            time.sleep(_WAIT_S)  # a cluster without a core: one may join
+            return []
+        ended, _ = self._ray.wait(list(self._running), num_returns=1, timeout=_WAIT_S)
+        return [(self._running.pop(reference), self._take(reference)) for reference in ended]
+
+    def interrupt(self) -> None:
+        """Pass Ctrl-C on: a training ends after its update, with a checkpoint; what waits is not begun."""
+        for reference in self._running:
+            self._ray.cancel(reference, force=False)
+
+    def close(self) -> None:
+        """Leave the cluster, which ends what still runs for us; a local one ends."""
+        self._ray.shutdown()
+
+    def _take(self, reference: Any) -> Answer:
+        lasting = (self._ray.exceptions.RuntimeEnvSetupError, self._ray.exceptions.AuthenticationError)
         try:
-            load()
-        except InvalidInput:
-            return part
-    return ""
+            found = self._ray.get(reference)
+        except self._ray.exceptions.RayTaskError as error:  # the package could not even be loaded there
+            return Answer(None, InvalidInput(f"a worker of the cluster cannot do the job: {error.cause!r}"))
+        except lasting as error:
+            return Answer(None, InvalidInput(f"the cluster refuses the job: {error}"))
+        except self._ray.exceptions.RayError as error:
+            return Answer(
+                None, WorkerLost(f"the worker was lost in the middle of the job ({type(error).__name__})"), True
+            )
+        assert isinstance(found, Answer)
+        return found
+
+
+def _connect(address: str, number: int | None) -> Any:
+    """Ray itself, connected."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    if address == LOCAL:
+        # What Ray reads, once, when it is loaded: no cluster can be made of this, and 127.0.0.1 is its address. An
+        # address that is given to ray.init would be changed to that of a network card.
+        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
+    with naming_extras():
+        import ray
+        import ray.exceptions
+    quiet = {"log_to_driver": False, "configure_logging": False, "runtime_env": {"env_vars": ONE_THREAD}}
+    if address == LOCAL:
+        ray.init(address=LOCAL, num_cpus=number, include_dashboard=False, **quiet)
+        return ray
+    try:
+        ray.init(address=address, **quiet)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise InvalidInput(f"ray {address!r}: no cluster can be reached there ({error})") from None
+    return ray
+
+
+def _absolute(plugin: Plugin) -> Plugin:
+    """The plug-in by a path that workers elsewhere understand."""
+    is_file = plugin.source.endswith(".py") or os.sep in plugin.source
+    return replace(plugin, source=str(Path(plugin.source).absolute())) if is_file else plugin

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,11 +15,13 @@ from ethbrake_marl.evaluation.results import write_output
 from ethbrake_marl.evaluation.seed_statistics import interquartile_mean
 from ethbrake_marl.figures.studies import SeedCurve, at_common_steps, seed_curves
 from ethbrake_marl.figures.style import Figure, write_picture
+from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.learning.progress import HARM_METRIC
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
-from ethbrake_marl.learning.training import RETURN, RunDirectory, check_same, progress_column, progress_rows, resolve
+from ethbrake_marl.learning.training import RETURN, progress_column, progress_rows, resolve
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.studies.jobs import JobFolder
 from ethbrake_marl.studies.trainings import TrainingJob, finish_trainings
 
 FIGURE, TABLE, SUMMARY = "learning_curves.png", "learning_curves.csv", "learning_curves.json"
@@ -71,18 +71,18 @@ def train_all(
     ``jobs`` of them at a time. Gives False when Ctrl-C stopped it. Raises ``InvalidInput`` for a folder that holds
     another training than this one would be (``learning.training``), before any is begun, besides what ``train`` raises.
     """
-    wanted = {
-        folder / f"{trainings.recipe.name}-seed{seed}": resolve(
-            trainings.recipe, scenario, seed=seed, total_steps=trainings.recipe.total_steps if steps is None else steps
+    trainings = [
+        TrainingJob(
+            resolve(each.recipe, scenario, seed=seed, total_steps=each.recipe.total_steps if steps is None else steps),
+            folder / f"{each.recipe.name}-seed{seed}",
+            tuple(settings),
         )
-        for trainings in plan
-        for seed in range(trainings.seeds)
-    }
-    for path, training in wanted.items():
-        if RunDirectory(path).status.is_file():
-            check_same(path, training)
-    trainings = [TrainingJob(training, path, tuple(settings)) for path, training in wanted.items()]
-    return finish_trainings(trainings, jobs, tell)
+        for each in plan
+        for seed in range(each.seeds)
+    ]
+    kept = JobFolder(folder, "learning curves")
+    with kept.work():
+        return finish_trainings(trainings, jobs, tell, run=kept.run)
 
 
 def write_curves(scenario: Scenario, plan: Sequence[Trainings], folder: Path) -> dict[str, Any]:
@@ -105,7 +105,14 @@ def write_curves(scenario: Scenario, plan: Sequence[Trainings], folder: Path) ->
             "last": last,
         }
     write_picture(folder / FIGURE, curves_figure(scenario, plan, folder), force=True)
-    write_output(folder / TABLE, _csv(curves).encode(), force=True)
+    rows = [
+        {"figure": metric, "recipe": recipe, "seed": seed, "steps": int(step), "value": float(value)}
+        for metric, lines in curves.items()
+        for recipe, curve in lines.items()
+        for seed, values in enumerate(curve.values)
+        for step, value in zip(curve.steps, values, strict=True)
+    ]
+    write_output(folder / TABLE, csv_text(rows).encode(), force=True)
     write_output(folder / SUMMARY, (json.dumps(summary, indent=2, allow_nan=False) + "\n").encode(), force=True)
     return summary
 
@@ -156,17 +163,3 @@ def _conditions(plan: Sequence[Trainings]) -> str:
     """The fixed list of each recipe, in words."""
     lists = sorted({(t.recipe.evaluation.worlds, t.recipe.evaluation.seed) for t in plan})
     return "Fixed list: " + "; ".join(f"{count_of(worlds, 'world')} of seed {seed}" for worlds, seed in lists) + "."
-
-
-def _csv(curves: Mapping[str, Mapping[str, SeedCurve]]) -> str:
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["figure", "recipe", "seed", "steps", "value"])
-    for metric, lines in curves.items():
-        for recipe, curve in lines.items():
-            for seed, values in enumerate(curve.values):
-                writer.writerows(
-                    [metric, recipe, seed, int(step), float(value)]
-                    for step, value in zip(curve.steps, values, strict=True)
-                )
-    return text.getvalue()

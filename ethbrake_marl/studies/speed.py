@@ -1,4 +1,4 @@
-"""The speed of a machine per second of processor time: the figures of ``ethbrake bench``.
+"""The speed of a machine per second of processor time: the figures of ``ethbrake doctor speed``.
 
 Every rate is the median over repetitions of work done per second of this process's own processor time, on one core and
 after a first round that does not count (it compiles and fills caches). Programs that run beside it therefore weigh
@@ -8,6 +8,8 @@ calibration, a loop so simple that hardly anything but the machine can make it s
 
 from __future__ import annotations
 
+import os
+import platform
 import resource
 import subprocess
 import sys
@@ -15,6 +17,8 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib.metadata import version
+from pathlib import Path
 
 import numpy as np
 
@@ -279,3 +283,42 @@ BENCHMARKS: tuple[Benchmark, ...] = (
     _rate_of("E-V2X-BM coupled", "one optimum per world", _coupled, 1000, unit="worlds/s"),
     _rate_of("forecast", "16 constant commands per world, to the horizon", _forecast, 1000, unit="runs/s"),
 )
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """The machine on which this runs: processor, load, versions; a figure of speed means nothing without it."""
+
+    processor: str
+    cores_usable: int
+    cores: int
+    load: float  # processes that were running, mean over the last minute
+    python: str
+    numpy: str
+    numba: str
+    ethbrake_marl: str
+
+    def __str__(self) -> str:
+        """The machine in words."""
+        return (
+            f"{self.processor}, {self.cores_usable} of {self.cores} cores usable, load {self.load:.1f};"
+            f" Python {self.python}, numpy {self.numpy}, numba {self.numba}, ethbrake_marl {self.ethbrake_marl}"
+        )
+
+
+def this_machine() -> Machine:
+    """The machine on which this runs."""
+    information = Path("/proc/cpuinfo")
+    lines = information.read_text("utf-8").splitlines() if information.is_file() else []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return Machine(
+        models[0] if models else platform.processor() or platform.machine(),
+        usable,
+        os.cpu_count() or 1,
+        os.getloadavg()[0],
+        platform.python_version(),
+        version("numpy"),
+        version("numba"),
+        eb.__version__,
+    )

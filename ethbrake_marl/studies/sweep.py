@@ -1,357 +1,358 @@
-"""Run a sweep: what is finished is kept, what is begun goes on, what fails is told at the end."""
+"""Sweeps: the YAML file of a grid or a list of jobs, checked before anything starts; what is finished is kept."""
 
 from __future__ import annotations
 
-import csv
-import io
-import json
-import os
-import sys
-import time
-import traceback
+import itertools
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from datetime import UTC, datetime
+from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal
 
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, count_of, describe_error, naming_extras, one_line
-from ethbrake_marl.files.store import (
-    hold_lock,
-    new_file,
-    parse_strict_json,
-    remove_folder,
-    remove_unfinished,
-    write_file,
+from pydantic import (
+    AfterValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    PrivateAttr,
+    Tag,
+    field_validator,
+    model_validator,
 )
-from ethbrake_marl.learning.progress import OBJECTIVE, chosen_by
-from ethbrake_marl.learning.train import StopAt
-from ethbrake_marl.learning.training import (
-    RunDirectory,
-    Training,
-    check_same,
-    is_finished,
-    progress_rows,
-    wait_for_others,
+
+from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, count_of, naming_extras
+from ethbrake_marl.files.sheet import csv_text
+from ethbrake_marl.files.store import new_file, remove_unfinished, write_file
+from ethbrake_marl.files.yaml import (
+    Document,
+    FileModel,
+    FileSchema,
+    OneOrMore,
+    Wording,
+    YamlPath,
+    flow_text,
+    publish,
+    read_model,
+    read_yaml,
 )
-from ethbrake_marl.policies.bundle import Policy, has_bundle, read_trained
-from ethbrake_marl.studies.jobs import RETRIES, Attempt, Workers, pack, run_jobs
-from ethbrake_marl.studies.sweep_file import Row, SweepPlan
+from ethbrake_marl.learning.recipe import TrainingRecipe
+from ethbrake_marl.learning.training import RunDirectory, Training, resolve, training_content, training_identity
+from ethbrake_marl.policies.bundle import has_bundle
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.studies.jobs import RETRIES, Attempt, Job, JobFolder, Workers
 from ethbrake_marl.studies.trainings import (
+    RESULTS,
     Timed,
     TrainingJob,
-    finish_training,
+    load_parts,
+    reach_results,
+    refused_part,
     time_training,
     told_seconds,
-    training_seconds,
 )
 
-# One job of a sweep, wherever it runs: train to the end, then read what the run's folder says of it.
+MOST_JOBS = 200_000
+_GRID: YamlPath = ("grid",)
+LEVEL = "cooperation-"  # how the scenario of a level of cooperation begins
 
-_MEASURED = ("first_impact_harm", "total_harm", "collision_rate")
-RESULTS = (
-    "steps",  # decisions of learners in whole updates
-    "policy_steps",  # decisions after which the kept policy was taken: the best one on the recipe's list
-    *_MEASURED,  # of the kept policy on that list
-    OBJECTIVE,  # likewise, where a learner has another objective than total
-    *(f"last_{name}" for name in _MEASURED),  # of the last one
-    "policy_sha256",  # of the kept policy's manifest, of several vehicle_i=... each
-)
-_FREE_S = 60.0  # a worker that has lost its driver may hold the folder for a moment
+_Seed = Annotated[int, Field(ge=0, lt=2**32)]
+_Names = Annotated[tuple[str, ...], Field(strict=False, min_length=1), OneOrMore]
+_Values = Annotated[tuple[Any, ...], Field(strict=False, min_length=1)]
 
 
-def do_job(job: TrainingJob, log: Path, stop_at: StopAt | None = None) -> tuple[str, ...] | None:
-    """The values of ``RESULTS``, as text; None where the training was stopped before its end, by ``stop_at`` too.
-
-    What is printed goes to ``log``, which is deleted at a good end. Raises what a training raises, ``InvalidInput``
-    where the sweep's folder cannot be seen or the run's folder holds another training, and ``BlockingIOError`` where
-    another worker has just begun it.
-    """
-    if not log.parent.is_dir():
-        raise InvalidInput(
-            f"{log.parent}: is not there on {os.uname().nodename}; every computer of a cluster must see the sweep's"
-            " folder"
-        )
-    with _printing_to(log):
-        if RunDirectory(job.folder).status.is_file():
-            wait_for_others(job.folder, _FREE_S)
-            check_same(job.folder, job.training)
-            if is_finished(job.folder) and not _keeps_policies(job):
-                remove_folder(job.folder)  # a finished run has no checkpoint: it is trained anew
-        try:
-            finished = finish_training(job, stop_at=stop_at)
-        except AlreadyExists as error:  # begun in this moment by a worker that has lost its driver
-            raise BlockingIOError(str(error)) from None
-        found = read_results(job.training, job.folder) if finished else None
-    if found is not None:
-        log.unlink(missing_ok=True)
-    return found
+def _check_keys(value: dict[str, Any]) -> dict[str, Any]:
+    for key in value:
+        if key in ("seed", "recipe.seed"):
+            raise ValueError("seed is no setting here; give it beside recipe, as seed")
+        if "=" in key:
+            raise ValueError(f"{flow_text(key, 60)}: a key has no = in it")
+    return value
 
 
-def _keeps_policies(job: TrainingJob) -> bool:
-    return all(has_bundle(job.folder / place) for place in job.training.drivers.values())
-
-
-def read_results(training: Training, folder: Path) -> tuple[str, ...]:
-    """The values of ``RESULTS`` of a finished training, in the text that its table has."""
-    table = [row for row in progress_rows(folder) if row.get(f"eval/{_MEASURED[0]}")]
-    if not table:
-        raise InvalidInput(f"{RunDirectory(folder).progress}: holds no evaluation; delete its folder to train anew")
-    harm = chosen_by(table, training.recipe.reward.harm_count, "eval/")
-    kept, last = min(table, key=lambda row: float(row[harm])), table[-1]
-    trained = read_trained(RunDirectory(folder).policy)
-    if isinstance(trained, Policy):
-        sha256 = trained.manifest.manifest_sha256
-    else:
-        sha256 = " ".join(f"{name}={policy.manifest.manifest_sha256}" for name, policy in trained.members.items())
-    measured, later = ([row[f"eval/{name}"] for name in _MEASURED] for row in (kept, last))
-    return (last["steps"], kept["steps"], *measured, kept.get(f"eval/{OBJECTIVE}", ""), *later, sha256)
-
-
-@contextmanager
-def _printing_to(log: Path) -> Iterator[None]:
-    """What this process prints inside goes to a file, from every library, and the end of an error with it."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    before = os.dup(1), os.dup(2)
-    with log.open("ab", buffering=0) as file:
-        os.dup2(file.fileno(), 1)
-        os.dup2(file.fileno(), 2)
-        try:
-            yield
-        except BaseException:
-            traceback.print_exc(file=os.fdopen(os.dup(file.fileno()), "w"))
-            raise
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            for descriptor, kept in enumerate(before, 1):
-                os.dup2(kept, descriptor)
-                os.close(kept)
-
-
-# The journal of a sweep: a line for every attempt that has ended, with what it found and when.
-#
-# What a job finds stands in its run's folder. The journal saves reading all of them when the sweep goes on, and holds
-# what must not be in the table: times, attempts and where a job ran. A line that is missing or damaged costs a look at
-# one folder, and no result.
-
-JOURNAL = "journal.jsonl"
-_LAST_LINES, _TAIL_BYTES = 10, 8192  # of what a failed job printed
-
-Results = dict[str, tuple[str, ...]]  # hash -> values of ``RESULTS``
+_Settings = Annotated[dict[str, Any], AfterValidator(_check_keys)]
+_Lists = Annotated[dict[str, _Values], AfterValidator(_check_keys)]
 
 
 @dataclass(frozen=True, slots=True)
-class Failure:
-    """A job that has failed for good."""
+class Request:
+    """One job as the file asks for it."""
 
-    row: Row
-    attempts: int
-    reason: str
-    last_lines: str
+    path: YamlPath  # in the file: of the grid, or of a listed job
+    scenario: str  # a name or a path
+    level: str  # of cooperation; empty where a scenario was named
+    recipe: str  # a name or a path
+    seed: int
+    settings: tuple[str, ...]  # KEY=VALUE each, as for ``train --set``
 
+    @property
+    def place(self) -> str:
+        """The path, as messages name it."""
+        return _place(self.path)
 
-def read_journal(folder: Path) -> tuple[Results, int]:
-    """What the finished jobs of a sweep found, and how many lines are damaged (a writer that was killed leaves one)."""
-    found: Results = {}
-    damaged = 0
-    if not (folder / JOURNAL).is_file():
-        return found, damaged
-    with (folder / JOURNAL).open("rb") as file:
-        for line in file:
-            try:
-                entry = parse_strict_json(line)
-                if entry["status"] == "finished":
-                    found[entry["hash"]] = _checked(entry["results"])
-            except (ValueError, TypeError, KeyError):
-                damaged += 1
-    return found, damaged
+    @property
+    def kind(self) -> tuple[str, str, tuple[str, ...]]:
+        """The job without its seed."""
+        return self.scenario, self.recipe, self.settings
 
 
-def _checked(results: Mapping[str, Any]) -> tuple[str, ...]:
-    values = tuple(results[name] for name in RESULTS)
-    if not all(isinstance(value, str) for value in values):
-        raise ValueError("results must be text")
-    return values
+def _place(path: YamlPath) -> str:
+    return "grid" if path == _GRID else f"jobs[{path[1]}]"
 
 
-class Journal:
-    """Writes the journal, line by line; a line is on its way to the disk when ``note`` returns."""
+class SeedRange(FileModel):
+    """``count`` seeds from ``first`` on."""
 
-    def __init__(self, folder: Path) -> None:
-        path = folder / JOURNAL
-        torn = _ends_in_a_line(path)
-        self._file = path.open("a", encoding="utf-8")
-        if torn:
-            self._write("\n")
+    first: _Seed = Field(default=0, description="the smallest seed")
+    count: int = Field(ge=1, le=MOST_JOBS, description="how many seeds")
 
-    def __enter__(self) -> Self:
+
+def _form_of_seeds(value: Any) -> str:
+    return "#range" if isinstance(value, dict | SeedRange) else "#list"
+
+
+_Seeds = Annotated[
+    Annotated[tuple[_Seed, ...], Field(strict=False, min_length=1), OneOrMore, Tag("#list")]
+    | Annotated[SeedRange, Tag("#range")],
+    Discriminator(_form_of_seeds),
+]
+
+
+class _Lines(FileModel):
+    """What a grid and a job have in common: a scenario, or the level of cooperation in its place."""
+
+    model_config = ConfigDict(json_schema_extra={"oneOf": [{"required": ["scenario"]}, {"required": ["level"]}]})
+
+    settings: _Settings = Field(default={}, alias="set", description="settings by dotted key, as train --set")
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> _Lines:
+        if (getattr(self, "scenario", None) is None) == (getattr(self, "level", None) is None):
+            raise ValueError("give one of the two: scenario, or level (4-all is the scenario cooperation-4-all)")
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._file.close()
 
-    def note(self, row: Row, attempt: Attempt) -> None:
-        """Write down one attempt."""
-        answer = attempt.answer
-        told: dict[str, Any] = {"results": dict(zip(RESULTS, answer.value or (), strict=False))}
-        if answer.value is None:
-            told = {"reason": reason_of(attempt)}
-        status = "finished" if answer.value is not None else "failed" if attempt.last else "again"
-        entry = {
-            "hash": row.identity,
-            "job": row.name,
-            "status": status,
-            "attempt": attempt.attempt,
-            "ended_utc": datetime.now(UTC).isoformat(timespec="milliseconds"),
-            "wall_s": round(answer.wall_s, 3),
-            "where": answer.where,
-            **told,
-        }
-        self._write(json.dumps(entry) + "\n")
+class Grid(_Lines):
+    """All combinations of what is listed."""
 
-    def _write(self, text: str) -> None:
-        self._file.write(text)
-        self._file.flush()
+    scenario: _Names | None = Field(default=None, description="names or paths, as train --scenario")
+    level: _Names | None = Field(default=None, description="in its place: 3-pair is the scenario cooperation-3-pair")
+    recipe: _Names = Field(description="names or paths, as train --recipe")
+    seed: _Seeds = Field(default=(0,), description="of the trainings")
+    settings: _Lists = Field(default={}, alias="set", description="a list of values for each dotted key")
 
+    @field_validator("scenario", "level", "recipe", "seed", mode="before")
+    @classmethod
+    def _one_is_a_list_of_one(cls, value: Any) -> Any:
+        return (value,) if isinstance(value, str | int) and not isinstance(value, bool) else value
 
-def _ends_in_a_line(path: Path) -> bool:
-    """Whether the last line was not written to its end."""
-    if not path.is_file() or not path.stat().st_size:
-        return False
-    with path.open("rb") as file:
-        file.seek(-1, os.SEEK_END)
-        return file.read() != b"\n"
+    def seeds(self) -> range | tuple[int, ...]:
+        """The seeds."""
+        return (
+            range(self.seed.first, self.seed.first + self.seed.count) if isinstance(self.seed, SeedRange) else self.seed
+        )
+
+    def size(self) -> int:
+        """Number of jobs."""
+        lists = (self.scenario or self.level or (), self.recipe, self.seeds(), *self.settings.values())
+        return math.prod(len(each) for each in lists)
 
 
-def reason_of(attempt: Attempt) -> str:
-    """Why an attempt found nothing, in one line."""
-    error = attempt.answer.error
-    return one_line("was stopped from outside" if error is None else describe_error(error))
+class ListedJob(_Lines):
+    """One job."""
+
+    scenario: str | None = Field(default=None, description="a name or a path, as train --scenario")
+    level: str | None = Field(default=None, description="in its place: 3-pair is the scenario cooperation-3-pair")
+    recipe: str = Field(description="a name or a path, as train --recipe")
+    seed: _Seed = Field(default=0, description="of the training")
 
 
-def last_lines(log: Path) -> str:
-    """The end of what a job printed."""
-    if not log.is_file():
-        return ""
-    with log.open("rb") as file:
-        file.seek(max(log.stat().st_size - _TAIL_BYTES, 0))
-        return "\n".join(file.read().decode("utf-8", "replace").splitlines()[-_LAST_LINES:])
+class SweepFile(FileModel):
+    """The whole file; ``settings`` hold for every job."""
+
+    title: str = Field(default="", description="one line, for you")
+    settings: _Settings = Field(default={}, alias="set", description="settings of every job, as train --set")
+    grid: Grid | None = Field(default=None, description="every combination of what it lists")
+    jobs: tuple[ListedJob, ...] = Field(default=(), strict=False, description="single jobs, after those of the grid")
+    _document: Document = PrivateAttr(Document("the sweep", {}, {}))  # where it stands, for messages
+
+    def requests(self) -> Iterator[Request]:
+        """The jobs: of the grid, seed by seed, so that first results of all are there early; then those listed."""
+        if self.grid is not None:
+            yield from self._of_grid(self.grid)
+        for k, job in enumerate(self.jobs):
+            scenario, level = (job.scenario, "") if job.level is None else (LEVEL + job.level, job.level)
+            texts = self._texts(job.settings, ("jobs", k))
+            yield Request(("jobs", k), str(scenario), level, job.recipe, job.seed, texts)
+
+    def _of_grid(self, grid: Grid) -> Iterator[Request]:
+        lines = [(name, "") for name in grid.scenario or ()] + [(LEVEL + name, name) for name in grid.level or ()]
+        changes = [
+            self._texts(dict(zip(grid.settings, values, strict=True)), _GRID)
+            for values in itertools.product(*grid.settings.values())
+        ]
+        for seed in grid.seeds():
+            for (scenario, level), recipe, texts in itertools.product(lines, grid.recipe, changes):
+                yield Request(_GRID, scenario, level, recipe, seed, texts)
+
+    def where(self, asked: Request, part: str = "") -> str:
+        """File and line of a job; of a ``part`` of it: ``recipe``, ``scenario``, or the key of a setting."""
+        path = (*asked.path, "set", part) if part else asked.path
+        if part in self.settings:
+            path = ("set", part)
+        elif part in ("recipe", "scenario"):
+            key = "level" if part == "scenario" and asked.level else part
+            listed = getattr(self.grid, key) if asked.path == _GRID else ()
+            named = {"recipe": asked.recipe, "scenario": asked.scenario, "level": asked.level}[key]
+            path = (*asked.path, key, *(k for k, each in enumerate(listed) if each == named))
+        return self._document.where(path)
+
+    def _texts(self, own: dict[str, Any], path: YamlPath) -> tuple[str, ...]:
+        twice = [key for key in own if key in self.settings]
+        if twice:
+            where = self._document.where((*path, "set", twice[0]))
+            key = f"{_place(path)}.set.{twice[0]}"
+            raise InvalidInput(f"{where}: {key}: stands in the file's own set too; leave one of them out")
+        return tuple(f"{key}={flow_text(value)}" for key, value in {**self.settings, **own}.items())
 
 
-# The tables of a sweep: one row per finished job in the order of the file, and one per failure.
+def read_sweep(path: str | Path) -> SweepFile:
+    """Read the file of a sweep; raises ``InvalidInput`` with file, line, key, value and what would be right."""
+    document = read_yaml(path)
+    wording = Wording(SweepFile, "it is needed; docs/scaling.md shows an example")
+    found = read_model(document, SweepFile, wording, "with a grid or a list of jobs")
+    found._document = document
+    _check_size(found, document)
+    return found
+
+
+def sweep_json_schema() -> dict[str, Any]:
+    """JSON Schema of the file of a sweep, for editors that complete and check YAML."""
+    schema = SweepFile.model_json_schema(schema_generator=FileSchema)
+    return publish({**schema, "title": "Sweep", "anyOf": [{"required": ["grid"]}, {"required": ["jobs"]}]})
+
+
+def _check_size(found: SweepFile, document: Document) -> None:
+    size = (0 if found.grid is None else found.grid.size()) + len(found.jobs)
+    if not 1 <= size <= MOST_JOBS:
+        raise InvalidInput(f"{document.file}: asks for {count_of(size, 'job')}; must be from 1 to {MOST_JOBS:,}")
+
+
+# The jobs of a sweep, each known by the hash of its configuration, all checked before the first begins.
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One job: what was asked for, and what is known of it without resolving it again."""
+
+    asked: Request
+    identity: str  # of its training
+    name: str  # of its folder
+    algorithm: str
+    scheme: str
+    steps: int  # decisions of learners
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """Key -> value of each setting, as text."""
+        return dict(text.split("=", 1) for text in self.asked.settings)
+
+
+_Kind = tuple[str, str, tuple[str, ...]]  # of jobs that differ in their seeds alone
+
+
+@dataclass(frozen=True)
+class SweepPlan:
+    """All jobs, in the order of the table. What they have in common is loaded once."""
+
+    rows: Sequence[Row]
+    _loaded: dict[_Kind, tuple[TrainingRecipe, Scenario]] = field(repr=False)
+
+    def training(self, row: Row) -> Training:
+        """What is to be trained."""
+        recipe, scenario = self._loaded[row.asked.kind]
+        return resolve(recipe, scenario, seed=row.asked.seed)
+
+    def job(self, row: Row, folder: Path) -> TrainingJob:
+        """The training, and its place in the folder of a sweep."""
+        return TrainingJob(self.training(row), folder.absolute() / RUNS / row.name, row.asked.settings)
+
+    @property
+    def keys(self) -> list[str]:
+        """Every key that some job sets, in the order of the file."""
+        different = dict.fromkeys(row.asked.settings for row in self.rows)
+        return list(dict.fromkeys(text.partition("=")[0] for settings in different for text in settings))
+
+
+def plan_sweep(file: SweepFile) -> SweepPlan:
+    """Resolve every job.
+
+    Raises ``InvalidInput`` naming the job: an unknown scenario or recipe, a setting that neither has, what does not fit
+    each other, two jobs with one hash.
+    """
+    planned = _Planning(file)
+    for asked in file.requests():
+        planned.add(asked)
+    return SweepPlan(planned.rows, planned.loaded)
+
+
+@dataclass
+class _Planning:
+    """The rows so far."""
+
+    file: SweepFile
+    rows: list[Row] = field(default_factory=list)
+    loaded: dict[_Kind, tuple[TrainingRecipe, Scenario]] = field(default_factory=dict)
+    _kinds: dict[_Kind, Training] = field(default_factory=dict)
+    _contents: dict[_Kind, dict[str, dict[str, object]]] = field(default_factory=dict)
+    _seen: dict[str, Request] = field(default_factory=dict)
+
+    def add(self, asked: Request) -> None:
+        """Take in one job; its seed changes nothing else than the recipe's."""
+        kind = asked.kind
+        if kind not in self._kinds:
+            self._load(asked, kind)
+        first, content = self._kinds[kind], self._contents[kind]
+        content["recipe"]["seed"] = asked.seed
+        identity = training_identity(content)
+        if identity in self._seen:
+            where, other = self.file.where(asked), _describe(self._seen[identity])
+            raise InvalidInput(f"{where}: {_describe(asked)}: is the same training as {other}; leave one of them out")
+        self._seen[identity] = asked
+        recipe = first.recipe
+        name = f"{first.scenario.name}-{recipe.name}-seed{asked.seed}-{identity[:16]}"
+        self.rows.append(Row(asked, identity, name, recipe.algorithm, first.scheme, recipe.total_steps))
+
+    def _load(self, asked: Request, kind: _Kind) -> None:
+        try:
+            scenario, recipe = load_parts(asked.scenario, asked.recipe, asked.settings)
+            first = resolve(recipe, scenario, seed=asked.seed)
+        except InvalidInput as error:
+            where = self.file.where(asked, refused_part(asked.scenario, asked.recipe, asked.settings))
+            raise type(error)(f"{where}: {_describe(asked)}: {error}") from None
+        self.loaded[kind] = (recipe, scenario)
+        self._kinds[kind], self._contents[kind] = first, training_content(first.recipe, first.scenario)
+
+
+def _describe(asked: Request) -> str:
+    settings = f", {', '.join(asked.settings)}" if asked.settings else ""
+    return f"{asked.place} ({asked.scenario}, {asked.recipe}, seed {asked.seed}{settings})"
+
+
+# What a sweep leaves: a table with one row per finished job in the order of the file, and one with each failure.
 #
 # The first is made of the plan and of what the jobs found alone, so that it is the same, byte for byte, in whatever
-# order
-# and wherever they ran, and however often they were stopped.
+# order and wherever they ran, and however often they were stopped. Times, attempts and places stand in the journal.
 
 TableFormat = Literal["csv", "parquet"]
-TABLE, FAILURES = "results", "failures.csv"  # the table's name without its ending
-
+FAILURES = "failures.csv"
+RUNS = "runs"  # inside the sweep's folder
+_LAST_LINES, _TAIL_BYTES = 10, 8192  # of what a failed job printed
 _ABOUT = ("hash", "scenario", "level", "recipe", "algorithm", "scheme", "seed", "total_steps")
 _WHOLE = {"seed", "total_steps", "steps", "policy_steps"}
 _TEXT = {"hash", "scenario", "level", "recipe", "algorithm", "scheme", "policy_sha256"}
 
-
-def table_file(folder: Path, form: TableFormat) -> Path:
-    """Where the table stands."""
-    return folder / f"{TABLE}.{form}"
-
-
-def write_tables(
-    folder: Path, plan: SweepPlan, results: Results, failures: Sequence[Failure], form: TableFormat
-) -> Path:
-    """Write the table of the finished jobs, give its path, and write that of the failures where there are any.
-
-    A setting's column is called ``set.KEY``. Parquet has numbers for results and text for settings.
-    """
-    path = table_file(folder, form)
-    {"csv": _write_csv, "parquet": _write_parquet}[form](path, plan, results)
-    if failures:
-        write_file(folder / FAILURES, _failures_csv(failures).encode())
-    else:
-        (folder / FAILURES).unlink(missing_ok=True)
-    return path
-
-
-def _columns(plan: SweepPlan) -> list[str]:
-    return [*_ABOUT, *(f"set.{key}" for key in plan.keys), *RESULTS]
-
-
-def _rows(plan: SweepPlan, results: Mapping[str, tuple[str, ...]]) -> Iterator[list[str]]:
-    """The finished jobs."""
-    keys = plan.keys
-    for row in plan.rows:
-        found = results.get(row.identity)
-        if found is not None:
-            settings = row.settings
-            yield [*_about(row), *(settings.get(key, "") for key in keys), *found]
-
-
-def _about(row: Row) -> list[str]:
-    asked = row.asked
-    return [
-        row.identity, asked.scenario, asked.level, asked.recipe, row.algorithm, row.scheme, str(asked.seed),
-        str(row.steps),
-    ]  # fmt: skip
-
-
-def _write_csv(path: Path, plan: SweepPlan, results: Results) -> None:
-    with new_file(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(_columns(plan))
-        writer.writerows(_rows(plan, results))
-
-
-def _write_parquet(path: Path, plan: SweepPlan, results: Results) -> None:
-    with naming_extras():
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-    columns = _columns(plan)
-    values = list(zip(*_rows(plan, results), strict=True)) or [()] * len(columns)
-    arrays = {}
-    for name, column in zip(columns, values, strict=True):
-        kind, read = _kind(name)
-        arrays[name] = pa.array([read(value) if value else None for value in column], getattr(pa, kind)())
-    with new_file(path) as partial:
-        pq.write_table(pa.table(arrays), partial)
-
-
-def _kind(column: str) -> tuple[str, Callable[[str], Any]]:
-    """Arrow's type of a column, and what makes a value of its text."""
-    if column in _WHOLE:
-        return "int64", int
-    return ("string", str) if column in _TEXT or column.startswith("set.") else ("float64", float)
-
-
-def _failures_csv(failures: Sequence[Failure]) -> str:
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*_ABOUT, "set", "attempts", "reason", "last_lines"])
-    for failure in failures:
-        settings = " ".join(failure.row.asked.settings)
-        writer.writerow([*_about(failure.row), settings, failure.attempts, failure.reason, failure.last_lines])
-    return text.getvalue()
-
-
-RUNS, LOGS = "runs", "logs"  # inside the sweep's folder
-_LOCK = "sweep.lock"
-
-CallOf = Callable[[SweepPlan, Row, Path], bytes]
-
-
-@dataclass(frozen=True, slots=True)
-class SweepState:
-    """How far a sweep is, for who is told."""
-
-    done: int  # jobs that have ended, finished or failed
-    total: int
-    left_s: float | None  # s until the end; None while nothing is known of it
-    note: str = ""  # to be told once
+JobOf = Callable[[SweepPlan, Row, Path, Path], Job]
 
 
 @dataclass(frozen=True, slots=True)
@@ -360,15 +361,14 @@ class SweepResult:
 
     table: Path
     finished: int
-    failures: tuple[Failure, ...]
+    failed: int
     jobs: int
     interrupted: bool
 
 
-def training_call(plan: SweepPlan, row: Row, folder: Path) -> bytes:
+def training_job(plan: SweepPlan, row: Row, folder: Path, log: Path) -> Job:
     """What trains the job of a row."""
-    job = TrainingJob(plan.training(row), folder / RUNS / row.name, row.asked.settings)
-    return pack(do_job, job, _log(folder, row))
+    return Job(row.name, reach_results, (plan.job(row, folder), log))
 
 
 def run_sweep(
@@ -378,8 +378,8 @@ def run_sweep(
     *,
     retries: int = RETRIES,
     form: TableFormat = "csv",
-    tell: Callable[[SweepState], None] | None = None,
-    call_of: CallOf = training_call,
+    tell: OnProgress | None = None,
+    job_of: JobOf = training_job,
 ) -> SweepResult:
     """Run what is left of a sweep and write its tables, after Ctrl-C too.
 
@@ -388,145 +388,157 @@ def run_sweep(
         folder: of everything; made if it is not there.
         workers: where jobs run; not closed here.
         retries: further attempts at a job that was lost.
-        form: of the table.
-        tell: is told how far it is.
-        call_of: makes the call of a row.
+        form: of the table, which is called ``results``.
+        tell: is told how many jobs have ended, and how each failed.
+        job_of: makes the job of a row.
 
-    Raises ``InvalidInput`` where another process runs a sweep in this folder.
+    Raises what ``JobFolder.work`` raises.
 
     """
-    folder = folder.absolute()  # a worker may stand elsewhere
-    for name in (RUNS, LOGS):
-        (folder / name).mkdir(parents=True, exist_ok=True)
-    with hold_lock(folder / _LOCK, "another process runs a sweep here"):
-        for place in (folder, folder / RUNS):
-            remove_unfinished(place)
-        results, left, damaged = kept_results(plan, folder)
-        failures: list[Failure] = []
-        with Journal(folder) as journal:
-            course = _Course(plan, left, tell or (lambda state: None))
-            course.start(damaged)
+    kept = JobFolder(folder, "a sweep")
+    say = tell or (lambda progress: None)
+    with kept.work():
+        (folder / RUNS).mkdir(exist_ok=True)
+        remove_unfinished(folder / RUNS)
+        results, damaged = kept_results(plan, kept)
+        left = {row.name: row for row in plan.rows if row.name not in results}
+        failures: dict[str, dict[str, Any]] = {}
 
-            def note(attempt: Attempt) -> None:
-                row = left[attempt.number]
-                journal.note(row, attempt)
-                if attempt.answer.value is not None:
-                    results[row.identity] = attempt.answer.value
-                elif attempt.last:
-                    failures.append(Failure(row, attempt.attempt, reason_of(attempt), last_lines(_log(folder, row))))
-                course.take(row, attempt)
+        def note(attempt: Attempt) -> None:
+            name, told = attempt.job.name, ""
+            if attempt.answer.value is not None:
+                results[name] = attempt.answer.value
+            elif attempt.last:
+                told = f"{name}: {attempt.reason}"
+                ended = {"attempts": attempt.attempt, "reason": attempt.reason}
+                failures[name] = {**_about(left[name]), "set": " ".join(left[name].asked.settings), **ended}
+                failures[name]["last_lines"] = _last_lines(kept.log(name))
+            else:
+                told = f"{name}: {attempt.reason}; tried again after attempt {attempt.attempt}"
+            say(Progress("sweep", len(results) + len(failures), len(plan.rows), note=told))
 
-            whole = run_jobs(
-                lambda number: call_of(plan, left[number], folder), len(left), workers, note, retries=retries
-            )
-        order = {row.identity: k for k, row in enumerate(plan.rows)}
-        failures.sort(key=lambda failure: order[failure.row.identity])
-        table = write_tables(folder, plan, results, failures, form)
-    return SweepResult(table, len(results), tuple(failures), len(plan.rows), not whole)
+        notes = [f"{len(results):,} jobs are finished already"] if results else []
+        notes += [f"{damaged} damaged lines of the journal: their jobs are looked at again"] if damaged else []
+        say(Progress("sweep", len(results), len(plan.rows), note="; ".join(notes)))
+        jobs = (job_of(plan, row, folder, kept.log(row.name)) for row in left.values())
+        whole = kept.run(jobs, workers, note, retries=retries)
+        table = _write_tables(folder, plan, results, [failures[name] for name in left if name in failures], form)
+    return SweepResult(table, len(results), len(failures), len(plan.rows), not whole)
 
 
-def kept_results(plan: SweepPlan, folder: Path) -> tuple[Results, list[Row], int]:
-    """What the finished jobs of this plan found, the others in their order, and the damaged lines of the journal.
+def kept_results(plan: SweepPlan, folder: JobFolder) -> tuple[dict[str, list[str]], int]:
+    """What the finished jobs of this plan found, by name, and the damaged lines of the journal.
 
     A job whose run's folder was taken away, or the kept policy in it, is to be done again.
     """
-    found, damaged = read_journal(folder)
-    results: Results = {}
-    left = []
+    found, damaged = folder.kept()
+    results = {}
     for row in plan.rows:
-        values = found.get(row.identity)
-        if values is not None and _is_whole(RunDirectory(folder / RUNS / row.name), values):
-            results[row.identity] = values
-        else:
-            left.append(row)
-    return results, left, damaged
+        if row.name not in found:
+            continue
+        run, values = RunDirectory(folder.path / RUNS / row.name), found[row.name]
+        hashes = values[RESULTS.index("policy_sha256")].split()
+        named = [text.rpartition("=")[0] for text in hashes]  # vehicle_i of several, of one policy nothing
+        if run.status.is_file() and all(has_bundle(run.policy / name) for name in named):
+            results[row.name] = values
+    return results, damaged
 
 
-def _is_whole(run: RunDirectory, values: tuple[str, ...]) -> bool:
-    """Whether a run still has its record and every policy whose hash the job gave."""
-    hashes = values[RESULTS.index("policy_sha256")].split()
-    named = [text.rpartition("=")[0] for text in hashes]  # vehicle_i of several, of one policy nothing
-    return run.status.is_file() and all(has_bundle(run.policy / name) for name in named)
+def _last_lines(log: Path) -> str:
+    """The end of what a job printed."""
+    if not log.is_file():
+        return ""
+    with log.open("rb") as file:
+        file.seek(max(log.stat().st_size - _TAIL_BYTES, 0))
+        return "\n".join(file.read().decode("utf-8", "replace").splitlines()[-_LAST_LINES:])
 
 
-class _Course:
-    """Tells how far a sweep is, and when it will have come to its end: by the decisions that are left."""
-
-    def __init__(self, plan: SweepPlan, left: list[Row], tell: Callable[[SweepState], None]) -> None:
-        self._total, self._tell = len(plan.rows), tell
-        self._done = self._total - len(left)
-        self._left: Counter[str] = Counter()
-        for row in left:
-            self._left[row.asked.recipe] += row.steps
-        self._steps: Counter[str] = Counter()  # of the jobs that have ended since the start
-        self._wall_s: Counter[str] = Counter()
-        self._started = time.monotonic()
-
-    def start(self, damaged: int) -> None:
-        note = f"{damaged} damaged lines of the journal: their jobs are looked at again" if damaged else ""
-        if self._done:
-            note = f"{self._done:,} jobs are finished already" + (f"; {note}" if note else "")
-        self._tell(SweepState(self._done, self._total, None, note))
-
-    def take(self, row: Row, attempt: Attempt) -> None:
-        recipe, answer = row.asked.recipe, attempt.answer
-        note = "" if answer.value is not None else f"{row.name}: {reason_of(attempt)}"
-        if attempt.last:
-            self._done += 1
-            self._left[recipe] -= row.steps
-            self._steps[recipe] += row.steps
-            self._wall_s[recipe] += answer.wall_s  # type: ignore[assignment]  # seconds are counted like anything
-        elif note:
-            note += f"; tried again after attempt {attempt.attempt}"
-        self._tell(SweepState(self._done, self._total, self._left_s(), note))
-
-    def _left_s(self) -> float | None:
-        """By each recipe's own speed, by the mean of all where it has none yet, and by how many jobs ran at once."""
-        steps, wall_s = sum(self._steps.values()), sum(self._wall_s.values())
-        if not steps or not wall_s:
-            return None
-        at_once = wall_s / (time.monotonic() - self._started)
-        work_s = sum(
-            left * (self._wall_s[recipe] / self._steps[recipe] if self._steps[recipe] else wall_s / steps)
-            for recipe, left in self._left.items()
-        )
-        return float(work_s / at_once)
+def _about(row: Row) -> dict[str, Any]:
+    asked = row.asked
+    values = (row.identity, asked.scenario, asked.level, asked.recipe, row.algorithm, row.scheme, asked.seed, row.steps)
+    return dict(zip(_ABOUT, values, strict=True))
 
 
-def _log(folder: Path, row: Row) -> Path:
-    """What the job prints."""
-    return folder / LOGS / f"{row.name}.log"
+def _write_tables(
+    folder: Path,
+    plan: SweepPlan,
+    results: Mapping[str, Sequence[str]],
+    failures: Sequence[Mapping[str, Any]],
+    form: TableFormat,
+) -> Path:
+    """Write the table of the finished jobs, give its path, and write that of the failures where there are any.
+
+    A setting's column is called ``set.KEY``. Parquet has numbers for results and text for settings.
+    """
+    path = folder / f"results.{form}"
+    columns = [*_ABOUT, *(f"set.{key}" for key in plan.keys), *RESULTS]
+    rows = (
+        {
+            **_about(row),
+            **{f"set.{key}": value for key, value in row.settings.items()},
+            **dict(zip(RESULTS, results[row.name], strict=True)),
+        }
+        for row in plan.rows
+        if row.name in results
+    )
+    if form == "csv":
+        write_file(path, csv_text(rows, columns).encode())
+    else:
+        _write_parquet(path, columns, list(rows))
+    if failures:
+        write_file(folder / FAILURES, csv_text(failures).encode())
+    else:
+        (folder / FAILURES).unlink(missing_ok=True)
+    return path
+
+
+def _write_parquet(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
+    with naming_extras():
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    arrays = {}
+    for name in columns:
+        kind: str = "float64"
+        read: Callable[[str], Any] = float
+        if name in _WHOLE:
+            kind, read = "int64", int
+        elif name in _TEXT or name.startswith("set."):
+            kind, read = "string", str
+        values = [row.get(name, "") for row in rows]
+        arrays[name] = pa.array([read(value) if value != "" else None for value in values], getattr(pa, kind)())
+    with new_file(path) as partial:
+        pq.write_table(pa.table(arrays), partial)
 
 
 # The cost of what is left of a sweep, told before anything is begun.
-
-_TIMED_DRIVES = 50  # worlds that each timed policy drives
 
 
 @dataclass(frozen=True, slots=True)
 class SweepCost:
     """Seconds of one core for what is left to do; begun jobs are reckoned whole."""
 
-    rows: Sequence[Row]  # what is left
+    states: Mapping[str, str]  # by job's name: finished, begun or new
+    jobs: int  # that are left
     decisions: int
     work_s: float
-    processes: int
     recipes: int  # one job of each was timed
 
-    def __str__(self) -> str:
-        """The cost in one line."""
-        if not self.rows:
+    def in_words(self, processes: int) -> str:
+        """The cost in one line, for so many at once."""
+        if not self.jobs:
             return "to do: nothing"
         return (
-            f"to do: {count_of(len(self.rows), 'job')}, {self.decisions:,} decisions: about {told_seconds(self.work_s)}"
-            f" of one core, {told_seconds(self.work_s / self.processes)} with {self.processes} at once"
+            f"to do: {count_of(self.jobs, 'job')}, {self.decisions:,} decisions: about {told_seconds(self.work_s)}"
+            f" of one core, {told_seconds(self.work_s / processes)} with {processes} at once"
             f" (a few updates of {count_of(self.recipes, 'recipe')} timed on this machine)"
         )
 
 
-def cost_of(plan: SweepPlan, folder: Path, processes: int) -> SweepCost:
+def cost_of(plan: SweepPlan, folder: Path) -> SweepCost:
     """Time a short training of the first job of each recipe, and reckon up what is left."""
-    left = kept_results(plan, folder)[1]
+    results, _ = kept_results(plan, JobFolder(folder, "a sweep"))
+    left = [row for row in plan.rows if row.name not in results]
+    begun = {row.name: "begun" if (folder / RUNS / row.name / "run.json").is_file() else "new" for row in left}
     steps: Counter[Row] = Counter()
     first: dict[object, Row] = {}
     for row in left:
@@ -536,16 +548,7 @@ def cost_of(plan: SweepPlan, folder: Path, processes: int) -> SweepCost:
     for row, decisions in steps.items():
         training = plan.training(row)
         if row.asked.recipe not in timed:
-            timed[row.asked.recipe] = _time(training)
-        work_s += training_seconds(training.recipe, training.scenario, timed[row.asked.recipe], decisions)
-    return SweepCost(left, sum(steps.values()), work_s, processes, len(timed))
-
-
-def _time(training: Training) -> Timed:
-    sample = training.scenario.sample(_TIMED_DRIVES, training.recipe.evaluation.seed)
-    return time_training(training.recipe, training.scenario, sample)
-
-
-def state_of(folder: Path, row: Row) -> str:
-    """How far a job is that is not finished, in a word."""
-    return "begun" if RunDirectory(folder / RUNS / row.name).status.is_file() else "new"
+            timed[row.asked.recipe] = time_training(training)
+        work_s += timed[row.asked.recipe].seconds(training, decisions)
+    states = {**{row.name: "finished" for row in plan.rows}, **begun}
+    return SweepCost(states, len(left), sum(steps.values()), work_s, len(timed))

@@ -151,7 +151,7 @@ def test_knowledge__every_agent_states_it(spec):
     knows = STATED[spec]
     assert knowledge_of(agent_of(spec)) == knows
     if "+" not in spec and spec != "e_v2x_bm:pairwise" and not spec.endswith(":believed"):
-        assert find_entry(parse_spec(spec)).knows == knows, "`ethbrake agents` says something else"
+        assert find_entry(parse_spec(spec)).knows == knows, "`ethbrake agent list` says something else"
 
 
 def test_knowledge__a_wrapper_adds_the_model_to_what_its_policy_knows():

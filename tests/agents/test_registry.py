@@ -133,7 +133,7 @@ def test_own_agent__is_evaluated_and_shielded_from_the_users_own_file(tmp_path, 
     rows = {row["agent"]: row for row in json.loads(capsys.readouterr().out)}
     assert list(rows) == specs and rows["half_brake"]["knows"] == "own sensors"
     assert rows["half_brake+step"]["first_impact_harm"] <= rows["half_brake"]["first_impact_harm"]
-    assert run_command(["agents", "--json"]) == 0
+    assert run_command(["agent", "list", "--json"]) == 0
     listed = {row["agent"]: row for row in json.loads(capsys.readouterr().out)}
     assert listed["half_brake[:ARGUMENT]"]["about"] == "half of what the brakes can"
     with pytest.raises(UnknownName, match="did you mean 'half_brake'"):
@@ -141,7 +141,7 @@ def test_own_agent__is_evaluated_and_shielded_from_the_users_own_file(tmp_path, 
 
 
 def test_agents__are_listed_with_what_they_know(capsys):
-    assert run_command(["agents"]) == 0
+    assert run_command(["agent", "list"]) == 0
     table = capsys.readouterr().out
     for name in (*registry.agent_names(), "+refined", "+episode", "+step", "+robust"):
         assert name in table

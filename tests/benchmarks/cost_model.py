@@ -68,7 +68,7 @@ def sizes(folder: Path) -> dict[str, float]:
     grid = {"scenario": SCENARIO, "recipe": "ppo", "seed": {"count": 2}}
     (folder / "sweep.yaml").write_text(yaml.safe_dump({"set": settings, "grid": grid}))
     out = folder / "sweep"
-    assert run_command(["sweep", str(folder / "sweep.yaml"), "--output", str(out), "--jobs", "1"]) == 0
+    assert run_command(["study", "sweep", str(folder / "sweep.yaml"), "--output", str(out), "--jobs", "1"]) == 0
     rows = (out / "results.csv").read_bytes().splitlines(keepends=True)
     found["job in a sweep's table (CSV)"] = len(rows[1])
     found["job in a sweep's journal"] = (out / "journal.jsonl").stat().st_size / 2

@@ -1,4 +1,4 @@
-"""How much sooner ``ethbrake falsify`` finds planted weaknesses than worlds drawn at random.
+"""How much sooner ``ethbrake search falsify`` finds planted weaknesses than worlds drawn at random.
 
 ``python -m tests.benchmarks.falsification_speed [--seeds N] [--leaks WORD,WORD]``: an agent with a hole in 0.1 % of the
 worlds, and shields with planted leaks (of ``make shield-bugs``), each in a copy of the repository.
@@ -49,7 +49,17 @@ def leak(name: str, seeds: int) -> None:
             rows = []
             for seed in range(seeds):
                 options = ["--agent", "ppo@shipped+step", "--measure", "bound", "--seed", str(seed), *how]
-                call = [sys.executable, "-c", COMMAND, "falsify", *options, "--budget", str(LEAK_BUDGET), "--json"]
+                call = [
+                    sys.executable,
+                    "-c",
+                    COMMAND,
+                    "search",
+                    "falsify",
+                    *options,
+                    "--budget",
+                    str(LEAK_BUDGET),
+                    "--json",
+                ]
                 environment = {**os.environ, "PYTHONPATH": str(folder), "NUMBA_CACHE_DIR": str(folder / KERNELS)}
                 done = subprocess.run(call, cwd=folder, env=environment, capture_output=True, text=True, check=True)
                 told = json.loads(done.stdout)

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ethbrake_marl.cli.machine import this_machine
+from ethbrake_marl.studies.speed import this_machine
 from tests.benchmarks.loops import LOOPS, OURS, REPETITIONS, SECONDS, Loop
 
 HERE = Path(__file__).resolve().parent

@@ -19,12 +19,12 @@ from pathlib import Path
 
 import yaml
 
-from ethbrake_marl.studies.jobs import Attempt, LocalWorkers, pack, run_jobs
+from ethbrake_marl.studies.jobs import Attempt, Job, LocalWorkers, run_jobs
 
-NOTHING = ("0", "0", *["0.0"] * 6, "")
+NOTHING = ["0", "0", *["0.0"] * 7, ""]
 
 
-def no_work(row: tuple[str, ...]) -> tuple[str, ...]:
+def no_work(row: list[str]) -> list[str]:
     """A job of no work."""
     return row
 
@@ -32,8 +32,7 @@ def no_work(row: tuple[str, ...]) -> tuple[str, ...]:
 def empty_jobs(folder: Path, jobs: int) -> None:
     """Plan and record so many jobs of no work."""
     # torch takes seconds to load, and the processes that load this file again need none
-    from ethbrake_marl.studies.sweep import run_sweep
-    from ethbrake_marl.studies.sweep_file import Row, SweepPlan, plan_sweep, read_sweep
+    from ethbrake_marl.studies.sweep import Row, SweepPlan, plan_sweep, read_sweep, run_sweep
 
     grid = {"scenario": ["paper-random", "paper-distance"], "recipe": ["ppo", "sac"], "seed": {"count": jobs // 4}}
     file = folder / "sweep.yaml"
@@ -42,11 +41,11 @@ def empty_jobs(folder: Path, jobs: int) -> None:
     plan = plan_sweep(read_sweep(file))
     planned = time.monotonic()
 
-    def call_of(plan: SweepPlan, row: Row, folder: Path) -> bytes:
-        return pack(no_work, NOTHING)
+    def job_of(plan: SweepPlan, row: Row, folder: Path, log: Path) -> Job:
+        return Job(row.name, no_work, (NOTHING,))
 
     with closing(LocalWorkers(2)) as workers:
-        result = run_sweep(plan, folder / "out", workers, call_of=call_of)
+        result = run_sweep(plan, folder / "out", workers, job_of=job_of)
     wall_s, cpu_s = time.monotonic() - started, time.process_time() - before
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(
@@ -68,7 +67,7 @@ def busy_processes(jobs: int, busy_s: float) -> None:
 
     started = time.monotonic()
     with closing(LocalWorkers(processes)) as workers:
-        run_jobs(lambda number: pack(_sleep, busy_s), jobs, workers, note)
+        run_jobs([Job(str(k), _sleep, (busy_s,)) for k in range(jobs)], workers, note)
     wall_s = time.monotonic() - started
     ideal_s = worked_s / processes
     print(

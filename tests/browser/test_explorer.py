@@ -43,7 +43,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     command = "from ethbrake_marl.cli.app import main; main()"
     options = ["--agents", ",".join(AGENTS), "--world", "1", "--folder", str(folder), "--no-browser"]
     with subprocess.Popen(
-        [sys.executable, "-c", command, "explore", *options],
+        [sys.executable, "-c", command, "watch", "explore", *options],
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,

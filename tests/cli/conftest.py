@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,6 @@ import yaml
 from filelock import FileLock
 
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.cli.late import import_late
 from ethbrake_marl.scenario import new_scenario_text
 from tests.fixtures.pictures import draw_nothing
 
@@ -36,13 +34,6 @@ TINY_RECIPE = {
     "evaluation": {"every_updates": 1, "worlds": 10, "seed": 7},
     "checkpoint_every_updates": 100,
 }
-
-
-@pytest.fixture(autouse=True, scope="session")
-def late_imports() -> None:
-    """Tests call functions of these modules, and replace them, without calling a command first."""
-    for name in [name for name in sys.modules if name.startswith("ethbrake_marl.cli.")]:
-        import_late(name)
 
 
 @dataclass(frozen=True)

@@ -253,7 +253,7 @@ def test_existing_folder__that_is_no_run_is_kept_even_with_force(ethbrake, tiny_
 
 
 def test_agents__one_that_cannot_drive_is_refused_before_another_works(ethbrake, monkeypatch):
-    monkeypatch.setattr("ethbrake_marl.cli.evaluate.evaluate", lambda *args, **kwargs: pytest.fail("worked"))
+    monkeypatch.setattr("ethbrake_marl.evaluation.evaluate", lambda *args, **kwargs: pytest.fail("worked"))
     refused(ethbrake("evaluate", "--agents", "e_v2x_bm,constant:99", "--episodes", "5"), "constant:99", "7 m/s2")
 
 
@@ -267,14 +267,14 @@ def test_memory__that_is_not_there_is_said_in_one_line(ethbrake, monkeypatch):
     def short(*args: object, **kwargs: object) -> None:
         raise MemoryError("Unable to allocate 9 TiB")
 
-    monkeypatch.setattr("ethbrake_marl.cli.evaluate.choose_worlds", short)
+    monkeypatch.setattr("ethbrake_marl.evaluation.inputs.choose_worlds", short)
     refused(ethbrake("evaluate"), "not enough memory (Unable to allocate 9 TiB)", "fewer worlds")
 
 
 def test_per_world__an_existing_file_is_refused_before_the_work(ethbrake, tmp_path, monkeypatch):
     path = tmp_path / "out.csv"
     path.write_text("precious")
-    monkeypatch.setattr("ethbrake_marl.cli.evaluate.evaluate", lambda *args, **kwargs: pytest.fail("worked"))
+    monkeypatch.setattr("ethbrake_marl.evaluation.evaluate", lambda *args, **kwargs: pytest.fail("worked"))
     refused(ethbrake("evaluate", "--episodes", "5", "--per-world", path), str(path), "force")
     assert path.read_text() == "precious"
 
@@ -313,6 +313,6 @@ def test_defect_of_the_program__keeps_its_traceback(ethbrake, monkeypatch):
     def broken() -> None:
         raise RuntimeError("a defect")
 
-    monkeypatch.setattr("ethbrake_marl.cli.scenario.list_scenarios", broken)
+    monkeypatch.setattr("ethbrake_marl.scenario.list_scenarios", broken)
     with pytest.raises(RuntimeError, match="a defect"):
         ethbrake("scenario", "list")

@@ -1,4 +1,4 @@
-"""``ethbrake bench``: the table and the JSON; measuring itself is tested in tests/studies/test_speed.py."""
+"""``ethbrake doctor speed``: the table and the JSON; measuring itself is tested in tests/studies/test_speed.py."""
 
 from __future__ import annotations
 
@@ -7,10 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from ethbrake_marl.cli import bench as bench_commands
-from ethbrake_marl.cli.machine import this_machine
 from ethbrake_marl.studies import speed as benchmark
-from ethbrake_marl.studies.speed import Benchmark, Effort, Speed
+from ethbrake_marl.studies.speed import Benchmark, Effort, Speed, this_machine
 
 SPEEDS = (
     Speed("engine step", "of a test", 1024, 3, "world-steps/s", 9_876_543.0, 9_000_000.0, 10_000_000.0, 8e6),
@@ -32,13 +30,12 @@ def efforts(monkeypatch: pytest.MonkeyPatch) -> list[Effort]:
         return Benchmark(speed.name, speed.workload, speed.unit, speed.worlds, speed.floor, look)
 
     made = tuple(figure(speed) for speed in SPEEDS)
-    for module in (benchmark, bench_commands):
-        monkeypatch.setattr(module, "BENCHMARKS", made)
+    monkeypatch.setattr(benchmark, "BENCHMARKS", made)
     return asked
 
 
 def test_bench__prints_a_table_and_the_machine(ethbrake, efforts):
-    answer = ethbrake("bench")
+    answer = ethbrake("doctor", "speed")
     assert answer.status == 0
     lines = answer.out.splitlines()
     (engine,) = (line for line in lines if "engine step" in line)
@@ -53,11 +50,11 @@ def test_bench__prints_a_table_and_the_machine(ethbrake, efforts):
 
 
 def test_bench_json__is_pure_and_complete(ethbrake, efforts):
-    answer = ethbrake("bench", "--quick", "--json")
+    answer = ethbrake("doctor", "speed", "--quick", "--json")
     assert answer.status == 0
     found = json.loads(answer.out)
     assert [figure["name"] for figure in found["figures"]] == [speed.name for speed in SPEEDS]
     assert found["figures"][0]["value"] == 9_876_543.0 and found["figures"][0]["relative"] == 1.0
     assert found["machine"]["cores"] >= 1 and found["machine"]["processor"]
     assert efforts == [benchmark.QUICK] * 3
-    assert "bench: 1 of 3" in answer.err
+    assert "speed: 1 of 3" in answer.err

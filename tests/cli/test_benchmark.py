@@ -57,12 +57,12 @@ def test_leaderboard__is_a_table_markdown_or_a_page(small, tmp_path):
     for agent in ("coast", "full_brake"):
         assert small("benchmark", "small", "--agent", agent, "--output", f"{agent}.json").status == 0
     files = ("coast.json", "full_brake.json")
-    found = small("leaderboard", *files, "--output", "table.html")
+    found = small("benchmark", "table", *files, "--output", "table.html")
     assert found.status == 0 and "full_brake" in found.out
     assert (tmp_path / "table.html").read_text().startswith("<!DOCTYPE html>")
-    assert small("leaderboard", *files, "--output", "table.md").status == 0
+    assert small("benchmark", "table", *files, "--output", "table.md").status == 0
     assert (tmp_path / "table.md").read_text().startswith("|  | Agent | Overall |")
-    told = json.loads(small("leaderboard", *files, "--json").out)
+    told = json.loads(small("benchmark", "table", *files, "--json").out)
     assert {entry["agent"] for entry in told["entries"]} == {"coast", "full_brake"}
 
 
@@ -71,10 +71,16 @@ def test_leaderboard__is_a_table_markdown_or_a_page(small, tmp_path):
     [
         (("benchmark", "smal", "--agent", "coast"), "unknown suite 'smal'; did you mean 'small'?"),
         (("benchmark", "small", "--agent", "coost"), "can drive no list of it: unknown agent 'coost'"),
-        (("benchmark", "small", "--agent", "coast", "--output", "x.yaml"), "an entry ends in .json"),
-        (("leaderboard", "none.json"), "none.json: no such file"),
-        (("leaderboard", "none.json", "--output", "x.pdf"), "the table ends in .html or .md"),
-        (("leaderboard",), "Missing argument"),
+        (("benchmark", "small", "--agent", "coast", "--output", "x.yaml"), "an entry must end in .json"),
+        (("benchmark", "table", "none.json"), "none.json: no such file"),
+        (("benchmark", "table", "none.json", "--output", "x.pdf"), "the table must end in .html or .htm or .md"),
+        (
+            (
+                "benchmark",
+                "table",
+            ),
+            "Missing argument",
+        ),
     ],
 )
 def test_bad_input__is_refused_in_one_line(small, line, told):

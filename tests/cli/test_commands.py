@@ -10,41 +10,81 @@ from pathlib import Path
 
 import pytest
 
-COMMANDS = [
-    "",
-    "run",
-    "train",
-    "resume",
-    "learning-curves",
-    "ablate",
-    "generalise",
-    "export",
-    "evaluate",
-    "doctor",
-    "bench",
-    "scenario",
-    "scenario list",
-    "scenario show",
-    "scenario validate",
-    "scenario new",
-    "scenario schema",
-    "recipe list",
-    "recipe show",
-    "recipe validate",
-    "recipe new",
-    "recipe schema",
-]
+from ethbrake_marl.cli.app import whole_command
+from ethbrake_marl.cli.command import DEFAULTS, MOVED
+
+IMPLIED = {f"{group} {default}": group for group, default in DEFAULTS.items()}
+COMMANDS = [""]  # every one, groups too
+for name, found in whole_command().commands.items():
+    COMMANDS += [name, *(f"{name} {each}" for each in getattr(found, "commands", ()))]
+COMMANDS += [f"watch picture {each}" for each in whole_command().commands["watch"].commands["picture"].commands]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help__has_an_example_that_parses(ethbrake, command):
+def test_help__has_examples_that_parse_and_a_short_name(ethbrake, command):
     answer = ethbrake(*command.split(), "--help")
     assert (answer.status, answer.err) == (0, "")
-    example = re.search(r"Example: ethbrake (.+)", " ".join(answer.out.split()))
-    assert example is not None
-    arguments = shlex.split(example[1].partition(" >")[0])
-    assert " ".join(arguments).startswith(command)
-    assert ethbrake(*arguments, "--help").status == 0
+    assert ethbrake(*command.split(), "-h").out == answer.out and "-h, --help" in answer.out
+    examples = [" ".join(each.split()) for each in re.findall(r"Example: ethbrake ((?:.|\n(?!\n))+)", answer.out)]
+    assert len(examples) == (2 if "\nCommands:" in answer.out else 1)
+    for example in examples:
+        arguments = shlex.split(example.partition(" >")[0])
+        assert " ".join(arguments).startswith(
+            command.removesuffix(f" {DEFAULTS.get(command.split()[0]) if command else None}")
+        )
+        assert ethbrake(*arguments, "--help").status == 0
+
+
+@pytest.mark.parametrize("old", sorted(MOVED))
+def test_old_name__is_told_its_new_place(ethbrake, old):
+    answer = ethbrake(old, "--frob")
+    assert (answer.status, answer.out) == (2, "") and MOVED[old] in COMMANDS
+    assert answer.err == f"ethbrake: error: {old} is now: {MOVED[old]} (see: ethbrake --help)\n"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "place"),
+    [
+        ("evalute", "did you mean: ethbrake evaluate?"),
+        ("falsfy", "did you mean: ethbrake search falsify?"),
+        ("learning-curve", "did you mean: ethbrake train curves?"),
+        ("train resum", "did you mean: ethbrake train resume?"),
+        ("study resume", "did you mean: ethbrake train resume?"),
+        ("watch pictures", "did you mean: ethbrake watch picture?"),
+        ("watch picture map", "known: criticality, deceleration, shield, shield-modes, robustness"),
+        ("doctor please", "known: check, speed"),
+    ],
+)
+def test_wrong_name__is_told_the_nearest_place(ethbrake, wrong, place):
+    answer = ethbrake(*wrong.split())
+    told = f"unknown command {wrong.split()[-1]!r}; {place}"
+    group = " ".join(["ethbrake", *wrong.split()[:-1]])
+    assert (answer.status, answer.err) == (2, f"ethbrake: error: {told} (see: {group} --help)\n")
+
+
+def test_default_command__has_its_options_on_the_page_of_its_group_and_behind_its_name(ethbrake):
+    for group, default in DEFAULTS.items():
+        page, own = ethbrake(group, "--help").out, ethbrake(group, default, "--help").out
+        options = own.partition("\nOptions:\n")[2].partition("\n\n")[0]
+        assert "--json" in options and options in page
+    assert ethbrake("doctor", "check", "--json").out == ethbrake("doctor", "--json").out
+    assert "Missing option '--agent'" in ethbrake("benchmark", "v2").err
+
+
+def test_scenario_sample__draws_the_worlds_that_evaluate_draws(ethbrake, tmp_path):
+    table, scenario = tmp_path / "worlds.csv", "paper-random"
+    told = ethbrake("scenario", "sample", scenario, "--episodes", "20", "--seed", "4", "--output", table, "--json")
+    assert told.status == 0 and told.err == f"worlds: {table}\n"
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    assert [{name: float(value) for name, value in row.items()} for row in rows] == json.loads(told.out)
+    assert ethbrake("scenario", "sample", scenario, "--episodes", "20", "--seed", "4").out == table.read_text()
+    agents = ("evaluate", "--agents", "full_brake", "--json")
+    (drawn,) = json.loads(ethbrake(*agents, "--episodes", "20", "--seed", "4").out)
+    (given,) = json.loads(ethbrake(*agents, "--initial-states", table).out)
+    assert drawn["first_impact_harm"] == given["first_impact_harm"] and drawn["worlds_sha256"] == given["worlds_sha256"]
+    again = ethbrake("scenario", "sample", scenario, "--output", table)
+    assert again.status == 2 and "is there already" in again.err
+    assert "must end in .csv" in ethbrake("scenario", "sample", scenario, "--output", tmp_path / "x.txt").err
 
 
 @pytest.mark.parametrize("command", ["run", "train", "evaluate"])

@@ -100,7 +100,7 @@ def test_other_worlds_or_scenarios__are_refused_in_one_line(results: Path, tmp_p
         ('[{"kind": "evaluate", "agent": "full_br', "is no JSON, or was not written to its end"),
         ('[{"kind": "evalute"}]', "unknown kind of results 'evalute'; did you mean 'evaluate'"),
         ('[{"agent": "x", "episodes": 3}]', r"\(kind is missing\)"),
-        ('{"kind": "best-harm"}', "results of ethbrake best-harm cannot be compared; those of evaluate, shield"),
+        ('{"kind": "best-harm"}', "results of best-harm cannot be compared; those of evaluate, shield"),
         ('{"kind": "evaluate-shards", "seed": 7}', "agents is missing or no list of objects"),
         (
             '[{"kind": "evaluate", "agent": "x", "episodes": 3}]',

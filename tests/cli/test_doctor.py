@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+from ethbrake_marl import physics, scenario
+from ethbrake_marl.agents import e_v2x_bm_kernel
 from ethbrake_marl.cli import doctor
 from ethbrake_marl.cli.doctor import Check, diagnose
 
@@ -71,25 +73,25 @@ def test_dependencies__each_stands_with_the_extra_that_brings_it():
 
 
 def test_physics__a_kernel_that_gives_other_harm_fails(monkeypatch):
-    exact = doctor.advance
+    exact = physics.advance
 
     def doubled(*args, **kwargs):
         worlds, impacts = exact(*args, **kwargs)
         return worlds, dataclasses.replace(impacts, total_harm=2.0 * impacts.total_harm)
 
-    monkeypatch.setattr(doctor, "advance", doubled)
+    monkeypatch.setattr(physics, "advance", doubled)
     assert not found("physics").ok
     assert "harm 40 (exact: 20)" in found("physics").detail
 
 
 def test_baseline__another_optimum_fails(monkeypatch):
-    exact = doctor.optimise_pairwise
+    exact = e_v2x_bm_kernel.optimise_pairwise
 
     def shifted(worlds, vehicle):
         best = exact(worlds, vehicle)
         return best._replace(deceleration_mps2=best.deceleration_mps2 + 1e-4)
 
-    monkeypatch.setattr(doctor, "optimise_pairwise", shifted)
+    monkeypatch.setattr(e_v2x_bm_kernel, "optimise_pairwise", shifted)
     assert not found("baseline").ok
 
 
@@ -97,7 +99,7 @@ def test_scenarios__a_damaged_folder_is_a_finding_and_no_crash(monkeypatch):
     def missing() -> None:
         raise OSError("gone")
 
-    monkeypatch.setattr(doctor, "list_scenarios", missing)
+    monkeypatch.setattr(scenario, "list_scenarios", missing)
     assert (found("scenarios").ok, found("scenarios").detail) == (False, "OSError: gone")
 
 

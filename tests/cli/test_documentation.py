@@ -7,62 +7,54 @@ import re
 from pathlib import Path
 
 import pytest
-from typer.main import get_command
 
 from ethbrake_marl.agents.registry import agent_names
-from ethbrake_marl.cli.app import app
-from ethbrake_marl.cli.recipe import recipe_app
-from ethbrake_marl.cli.scenario import scenario_app
+from ethbrake_marl.cli.app import whole_command
+from ethbrake_marl.cli.command import DEFAULTS, MOVED
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 CLI = (DOCS / "cli.md").read_text("utf-8")
 TUTORIAL = (DOCS / "tutorials" / "first-ten-minutes.md").read_text("utf-8")
 
-TABLE_OF_COMMANDS, _, GENERAL = CLI.partition("\n## run\n")[0].partition("\n## What holds for every command\n")
+TABLE_OF_COMMANDS, _, GENERAL = CLI.partition("\n## run\n")[0].partition("\n## Where commands were before\n")
 
 WORLDS = "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps\n10,8,20,18,20\n5,9,22,18,20\n7,7,20,18,20\n"
 
 
-def names(typer_app) -> set[str]:
-    found = (command.name or command.callback.__name__ for command in typer_app.registered_commands)
-    return {name.replace("_", "-") for name in found}
+def section(name: str) -> str:
+    """What the page says of a command: from its heading to the next one of its level."""
+    found = re.search(rf"^(##+) {name}\n(.*?)(?=^##? |^\1 |\Z)", CLI, re.DOTALL | re.MULTILINE)
+    assert found is not None, name
+    return found[2]
 
 
-def test_cli_page__has_every_command_and_agent():
-    training = {
-        "run",
-        "train",
-        "resume",
-        "learning-curves",
-        "sweep",
-        "tune",
-        "ablate",
-        "generalise",
-        "export",
-    }
-    measuring = {"evaluate", "compare", "falsify", "shield", "best-harm", "benchmark", "leaderboard"}
-    looking = {"agents", "record", "replay", "explore", "reproduce"}
-    assert names(app) == training | measuring | looking | {"doctor", "bench", "dataset"}
-    for command in names(app) | {"scenario", "recipe"}:
-        assert f"\n## {command}\n" in CLI and f"`{command}" in TABLE_OF_COMMANDS
-    about_scenarios = CLI.partition("\n## scenario\n")[2].partition("\n## ")[0]
-    for command in names(scenario_app):
-        assert f"ethbrake scenario {command}" in about_scenarios or f"`{command}" in about_scenarios
-    about_recipes = CLI.partition("\n## recipe\n")[2].partition("\n## ")[0]
-    for command in names(recipe_app):
-        assert f"`{command}" in about_recipes or f"ethbrake recipe {command}" in about_recipes
+def options_of(command) -> set[str]:
+    return {option for each in command.params for option in each.opts if option.startswith("--")} - {"--help"}
+
+
+def test_cli_page__has_every_command_with_every_option_and_every_agent():
+    commands = whole_command().commands
+    assert len(commands) == 14
+    for name, command in commands.items():
+        assert f"`{name}" in TABLE_OF_COMMANDS
+        for inner, each in getattr(command, "commands", {name: command}).items():
+            in_short = f"`{inner}" in section(name) or f"ethbrake {name} {inner}" in section(name)
+            alone = inner == name or inner == DEFAULTS.get(name) or (in_short and f"### {inner}\n" not in section(name))
+            about = section(name) if alone else section(inner)
+            assert inner in (name, DEFAULTS.get(name)) or in_short or f"### {inner}\n" in section(name), inner
+            wanted = set().union(*map(options_of, getattr(each, "commands", {inner: each}).values()))
+            if inner != "generalise":  # whose section shows the usual ones only
+                assert wanted <= set(re.findall(r"--[a-z-]+", GENERAL + about)), f"{name} {inner}"
     for agent in agent_names():
         assert f"`{agent}" in CLI
 
 
-@pytest.mark.parametrize("command", ["", "scenario", "recipe", "picture"])
-def test_cli_page__has_every_option(command):
-    group = get_command(app) if not command else get_command(app).commands[command]
-    for name in sorted(group.commands.keys() - {"generalise"}):  # whose section shows the usual ones only
-        section = CLI.partition(f"\n## {command or name}\n")[2].partition("\n## ")[0]
-        shown = set(re.findall(r"--[a-z-]+", GENERAL + section))
-        options = {option for each in group.commands[name].params for option in each.opts if option.startswith("--")}
-        assert options <= shown | {"--help"}, name
+def test_cli_page__tells_where_each_old_command_is_now():
+    told = CLI.partition("## Where commands were before\n")[2].partition("\n## ")[0]
+    for row in re.findall(r"^\| (`.*?) \| (`.*) \|$", told, re.MULTILINE):
+        before, now = ([name.removesuffix(" ...") for name in re.findall("`(.*?)`", cell)] for cell in row)
+        assert [MOVED[name] for name in before] == now
+    assert all(f"`{old}" in told for old in MOVED)
 
 
 @pytest.mark.parametrize("page", [CLI, TUTORIAL])

@@ -1,4 +1,4 @@
-"""`ethbrake falsify`: what it finds, writes, and drives again."""
+"""`ethbrake search falsify`: what it finds, writes, and drives again."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from ethbrake_marl.evaluation.inputs import named_worlds_text, read_named_worlds
 from tests.cli.conftest import Command
 
-FOUND = ("falsify", "--agent", "coast", "--against", "full_brake", "--budget", "300", "--keep", "4")
+FOUND = ("search", "falsify", "--agent", "coast", "--against", "full_brake", "--budget", "300", "--keep", "4")
 
 
 @pytest.fixture
@@ -32,11 +32,11 @@ def test_falsify__writes_worlds_that_evaluate_takes_and_that_read_back(ethbrake:
 
 
 def test_falsify_again__says_who_is_worse(ethbrake: Command, file: Path) -> None:
-    same = ethbrake("falsify", "--again", file)
+    same = ethbrake("search", "falsify", "--again", file)
     assert same.status == 0 and "coast is worse in 0 of 4 worlds" in same.err
-    better = ethbrake("falsify", "--again", file, "--agent", "e_v2x_bm", "--json")
+    better = ethbrake("search", "falsify", "--again", file, "--agent", "e_v2x_bm", "--json")
     assert better.status == 0 and not any(row["worse"] for row in json.loads(better.out)["worlds"])
-    worse = ethbrake("falsify", "--again", file, "--agent", "constant:-6")
+    worse = ethbrake("search", "falsify", "--again", file, "--agent", "constant:-6")
     assert worse.status == 1 and "constant:-6 is worse in 4 of 4 worlds" in worse.err
 
 
@@ -44,7 +44,7 @@ def test_falsify__tells_the_command_that_finds_the_same(ethbrake: Command, file:
     again = ethbrake(*FOUND, "--json")
     told = json.loads(again.out)
     assert told["worlds"] == [world.model_dump(exclude_none=True) for world in read_named_worlds(file).worlds]
-    assert told["found_by"].startswith("ethbrake falsify --agent coast --measure regret --against full_brake")
+    assert told["found_by"].startswith("ethbrake search falsify --agent coast --measure regret --against full_brake")
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_falsify_again__refuses_a_file_that_is_damaged(
     ethbrake: Command, file: Path, change: tuple[str, str], said: str
 ) -> None:
     file.write_text(file.read_text("utf-8").replace(*change), "utf-8")
-    answer = ethbrake("falsify", "--again", file)
+    answer = ethbrake("search", "falsify", "--again", file)
     assert answer.status == 2 and said in answer.err
 
 
@@ -80,7 +80,7 @@ def test_falsify_again__refuses_a_file_that_is_damaged(
     ],
 )
 def test_falsify__refuses(ethbrake: Command, options: tuple[str, ...], said: str) -> None:
-    answer = ethbrake("falsify", "--agent", "coast", "--budget", "10", *options)
+    answer = ethbrake("search", "falsify", "--agent", "coast", "--budget", "10", *options)
     assert answer.status == 2 and said in answer.err
 
 
@@ -90,7 +90,7 @@ def test_falsify__keeps_a_file_that_is_there(ethbrake: Command, file: Path) -> N
 
 
 def test_falsify__says_when_nothing_is_found(ethbrake: Command, tmp_path: Path) -> None:
-    same = ("falsify", "--agent", "full_brake", "--against", "constant:7", "--budget", "64")
+    same = ("search", "falsify", "--agent", "full_brake", "--against", "constant:7", "--budget", "64")
     answer = ethbrake(*same, "--output", tmp_path / "none.yaml")
     assert answer.status == 0 and "nothing was found" in answer.err and not (tmp_path / "none.yaml").exists()
     assert json.loads(ethbrake(*same, "--json").out)["worlds"] == []
@@ -104,23 +104,34 @@ def test_falsify_again__runs_no_code_that_a_file_names(ethbrake: Command, file: 
     )
     assert "evil.py" in text
     file.write_text(text, "utf-8")
-    answer = ethbrake("falsify", "--again", file)
+    answer = ethbrake("search", "falsify", "--again", file)
     assert answer.status == 2 and "is code" in answer.err and not (tmp_path / "evil.ran").exists()
 
 
 @pytest.mark.parametrize("option", [("--harm-count", "total"), ("--scenario", "stress-wide"), ("--keep", "3")])
 def test_falsify_again__refuses_what_the_file_says(ethbrake: Command, file: Path, option: tuple[str, str]) -> None:
-    answer = ethbrake("falsify", "--again", file, *option)
+    answer = ethbrake("search", "falsify", "--again", file, *option)
     assert answer.status == 2 and option[0] in answer.err
 
 
 def test_falsify__as_many_worlds_as_it_keeps_read_back(ethbrake: Command, tmp_path: Path) -> None:
     path = tmp_path / "many.yaml"
-    call = ("falsify", "--agent", "full_brake", "--measure", "harm", "--scenario", "stress-wide", "--keep", "200")
+    call = (
+        "search",
+        "falsify",
+        "--agent",
+        "full_brake",
+        "--measure",
+        "harm",
+        "--scenario",
+        "stress-wide",
+        "--keep",
+        "200",
+    )
     assert ethbrake(*call, "--budget", "512", "--at-random", "--output", path).status == 0
     assert path.stat().st_size > 64 << 10 and len(read_named_worlds(path).worlds) == 200
 
 
 def test_falsify__a_ladder_is_no_agent(ethbrake: Command) -> None:
-    answer = ethbrake("falsify", "--agent", "ladder", "--measure", "harm", "--budget", "8")
+    answer = ethbrake("search", "falsify", "--agent", "ladder", "--measure", "harm", "--budget", "8")
     assert answer.status == 2 and "stands for several agents" in answer.err

@@ -11,10 +11,9 @@ from pathlib import Path
 
 import pytest
 from numba.core import event
-from typer.main import get_command
 
 from ethbrake_marl import __version__
-from ethbrake_marl.cli import doctor, parts, terminal
+from ethbrake_marl.cli import command, doctor, out
 from ethbrake_marl.cli.app import app, run_command
 from ethbrake_marl.kernel_store import cache_folder
 from ethbrake_marl.physics.compiled import compiled
@@ -34,18 +33,8 @@ def test_version__is_told_by_the_command_and_by_python_m(ethbrake):
     assert (result.returncode, result.stdout, result.stderr) == (0, f"ethbrake {__version__}\n", "")
 
 
-def test_short_help__is_the_long_one_for_every_command(ethbrake):
-    lines = [[]]
-    for name, command in get_command(app).commands.items():
-        lines += [[name], *([name, each] for each in getattr(command, "commands", ()))]
-    for line in lines:
-        short, long = ethbrake(*line, "-h"), ethbrake(*line, "--help")
-        assert (short.status, short.out) == (0, long.out)
-        assert "-h, --help" in short.out
-
-
 def test_help__tells_the_parts_of_the_package_without_importing_them():
-    assert parts.part_names() == parts.OF_THE_PACKAGE
+    assert command.part_names() == command.PARTS
 
 
 COMPLETION = [
@@ -96,7 +85,8 @@ def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, 
     monkeypatch.setattr("ethbrake_marl.kernel_store._loaded", loaded)
     monkeypatch.setattr("ethbrake_marl.kernel_store._tellers", [])
     monkeypatch.setitem(event._registered, "numba:compile", [])  # nobody listens any more after this test
-    terminal.tell_compilation()
+    monkeypatch.setattr("warnings.showwarning", None)
+    out.prepare_streams()
 
     @compiled
     def next_number(x: int) -> int:
@@ -106,7 +96,7 @@ def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, 
     assert next_number(1.5) == 2.5
     captured = capsys.readouterr()
     assert captured.out == "" and told in captured.err and captured.err.count("\n") == 1
-    monkeypatch.setattr(terminal, "EVERY_S", 0.0)
+    monkeypatch.setattr(out, "EVERY_S", 0.0)
     assert next_number(1j) == 1 + 1j
     assert re.search(r"^compiling: \d+ kernels in \d+ s so far$", capsys.readouterr().err, re.MULTILINE)
 

@@ -14,11 +14,11 @@ import pytest
 import yaml
 
 from ethbrake_marl.cli.app import app
-from ethbrake_marl.cli.plugins import accept_plugins
+from ethbrake_marl.cli.command import whole_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files import plugins
 from ethbrake_marl.scenario import new_scenario_text
-from ethbrake_marl.studies.ablation import train_all
+from ethbrake_marl.studies.trainings import finish_trainings
 from tests.cli.conftest import TINY_RECIPE
 from tests.extending.conftest import restore, tables
 
@@ -142,7 +142,7 @@ def stopped(ethbrake, tmp_path, parts, again):
 
 def test_resume__needs_the_same_plugins_and_says_how_to_go_on(ethbrake, tmp_path, parts, stopped, again):
     def refuse(*more):
-        answer = ethbrake("resume", stopped, *more)
+        answer = ethbrake("train", "resume", stopped, *more)
         again()
         assert (answer.status, answer.err.count("\n")) == (2, 1)
         return answer.err
@@ -156,7 +156,7 @@ def test_resume__needs_the_same_plugins_and_says_how_to_go_on(ethbrake, tmp_path
     told = refuse("--plugin", parts)
     assert "the plug-in my_parts.py was another file then (SHA-256 " in told
     assert "put it back as it was, or go on all the same with --other-versions" in told
-    assert ethbrake("resume", stopped, "--plugin", parts, "--other-versions").status == 0
+    assert ethbrake("train", "resume", stopped, "--plugin", parts, "--other-versions").status == 0
     again()
     parts.write_text(PLUGIN)
     moved = parts.rename(tmp_path / "moved.py")  # the content counts, not the place
@@ -185,7 +185,14 @@ def test_bad_plugin__is_one_clear_error_on_every_command(ethbrake, tmp_path, con
     path = tmp_path / "bad.py"
     if content is not None:
         path.write_text(content)
-    for command in (("agents",), ("scenario", "list"), ("train", "--steps", "64")):
+    for command in (
+        (
+            "agent",
+            "list",
+        ),
+        ("scenario", "list"),
+        ("train", "--steps", "64"),
+    ):
         answer = ethbrake(*command, "--plugin", path)
         assert (answer.status, answer.err.count("\n")) == (2, 1)
         assert f"plug-in '{path}'" in answer.err and told in answer.err
@@ -194,19 +201,17 @@ def test_bad_plugin__is_one_clear_error_on_every_command(ethbrake, tmp_path, con
 def test_collision__of_two_plugins_names_the_second(ethbrake, tmp_path, parts):
     twin = tmp_path / "twin.py"
     twin.write_text("import ethbrake_marl as eb\neb.register_agent('gentle', print)\n")
-    assert ethbrake("agents", "--plugin", parts, "--plugin", parts).status == 0  # the same again changes nothing
-    answer = ethbrake("agents", "--plugin", twin)
+    assert ethbrake("agent", "list", "--plugin", parts, "--plugin", parts).status == 0  # the same again changes nothing
+    answer = ethbrake("agent", "list", "--plugin", twin)
     assert answer.status == 2 and f"plug-in '{twin}', line 2: agent 'gentle' is registered already" in answer.err
 
 
 def test_option__stands_on_every_command_and_before_it(ethbrake, parts):
-    from typer.main import get_command
-
-    waiting = [accept_plugins(get_command(app))]
+    waiting = [whole_command()]
     for command in waiting:
         waiting += getattr(command, "commands", {}).values()
         assert [each.name for each in command.params].count("plugin") == 1, command.name
-    answer = ethbrake("--plugin", parts, "agents")
+    answer = ethbrake("--plugin", parts, "agent", "list")
     assert answer.status == 0 and "gentle[:ARGUMENT]" in answer.out
 
 
@@ -215,18 +220,18 @@ def test_installed_plugin__is_loaded_only_when_it_is_named(ethbrake, tmp_path, m
     monkeypatch.syspath_prepend(tmp_path)
     point = EntryPoint("hills", "installed_parts", plugins.GROUP)
     monkeypatch.setattr(plugins, "entry_points", lambda group: [point] if group == plugins.GROUP else [])
-    assert "gentle[" not in ethbrake("agents").out and "installed_parts" not in sys.modules
-    assert "gentle[" in ethbrake("agents", "--plugin", "hills").out
+    assert "gentle[" not in ethbrake("agent", "list").out and "installed_parts" not in sys.modules
+    assert "gentle[" in ethbrake("agent", "list", "--plugin", "hills").out
     (noted,) = plugins.noted_plugins()
     assert noted["name"] == "hills" and noted["sha256"] == hashlib.sha256(PLUGIN.encode()).hexdigest()
-    assert "unknown plug-in 'hill'; did you mean 'hills'?" in ethbrake("agents", "--plugin", "hill").err
+    assert "unknown plug-in 'hill'; did you mean 'hills'?" in ethbrake("agent", "list", "--plugin", "hill").err
     del sys.modules["installed_parts"]
 
 
 def test_changed_file__is_refused_in_the_same_process(ethbrake, parts):
-    assert ethbrake("agents", "--plugin", parts).status == 0
+    assert ethbrake("agent", "list", "--plugin", parts).status == 0
     parts.write_text(PLUGIN + "# changed\n")
-    assert "was changed since it was loaded" in ethbrake("agents", "--plugin", parts).err
+    assert "was changed since it was loaded" in ethbrake("agent", "list", "--plugin", parts).err
     with pytest.raises(InvalidInput, match="was changed since it was loaded"):
         plugins.load_the_same(plugins.loaded_plugins())
 
@@ -242,7 +247,7 @@ def test_worker_processes__load_the_plugins_of_their_parent(tmp_path, parts, mon
     recipe = load_recipe(str(write_recipe(tmp_path, reward={"harm": 1.0, "calm": 0.01})))
     level = Level(load_scenario("paper-random"))
     wanted = [Training(level, "ppo", recipe.replace(seed=seed), tmp_path / f"seed{seed}") for seed in (0, 1)]
-    assert train_all(wanted, jobs=2)
+    assert finish_trainings([training.job() for training in wanted], 2)
     for training in wanted:
         config = json.loads((training.folder / "config.json").read_text())
         assert [each["name"] for each in config["plugins"]] == ["my_parts.py"]
@@ -251,7 +256,7 @@ def test_worker_processes__load_the_plugins_of_their_parent(tmp_path, parts, mon
 def test_plugin__that_loads_itself_is_one_line(ethbrake, tmp_path):
     file = tmp_path / "rec.py"
     file.write_text(f"import ethbrake_marl as eb\neb.load_plugin({str(file)!r})\n")
-    answer = ethbrake("agents", "--plugin", file)
+    answer = ethbrake("agent", "list", "--plugin", file)
     assert answer.status == 2
     assert len(answer.err.splitlines()) == 1 and "loads itself" in answer.err
 
@@ -268,7 +273,7 @@ def test_agent_file__that_ends_the_process_ends_in_one_line(ethbrake, tmp_path):
 def test_plugin__with_a_nul_byte_names_no_line_that_is_not_there(ethbrake, tmp_path):
     file = tmp_path / "nul.py"
     file.write_bytes(b"x = 1\n\0\n")
-    answer = ethbrake("agents", "--plugin", file)
+    answer = ethbrake("agent", "list", "--plugin", file)
     assert (answer.status, answer.err.count("\n")) == (2, 1)
     assert "null bytes" in answer.err and "None" not in answer.err
 

@@ -36,7 +36,7 @@ def test_reproduce__says_what_it_takes_makes_one_item_and_keeps_it(ethbrake, tmp
         (["../gaps"], "unknown item"),
         (["gaps", "gaps"], "given twice"),
         (["--quick", "--full"], "give one of the two"),
-        (["gaps", "--episodes", "1"], "must be from 2 to 10,000"),
+        (["gaps", "--episodes", "1"], "episodes = 1: must be a whole number in 2..10000"),
         (["gaps", "--docs", "nowhere/page.md"], "there is no folder nowhere"),
         (["gaps", "--docs", "page.html"], "must end in .md"),
     ],

@@ -51,9 +51,9 @@ def test_evaluate__what_does_not_fit_is_one_line(ethbrake, options, message):
 def test_picture__is_drawn_and_its_figures_are_told(ethbrake, tmp_path):
     out = tmp_path / "robust.png"
     options = ("--uncertainty", "gaps_m.pair_1=1", "--episodes", "4", "--output", out, "--json")
-    answer = ethbrake("picture", "robustness", *options)
+    answer = ethbrake("watch", "picture", "robustness", *options)
     assert answer.status == 0 and out.read_bytes().startswith(PNG)
     told = json.loads(answer.out)
     assert len(told) == 5 * 3 * 2 and {row["mode"] for row in told} == {"step", "robust"}
-    assert ethbrake("picture", "robustness", *options).status == 2
-    assert ethbrake("picture", "robustness", "--output", tmp_path / "robust.docx").status == 2
+    assert ethbrake("watch", "picture", "robustness", *options).status == 2
+    assert ethbrake("watch", "picture", "robustness", "--output", tmp_path / "robust.docx").status == 2

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from ethbrake_marl.agents.policy import LearnedAgent
-from ethbrake_marl.cli.terminal import Bars
+from ethbrake_marl.cli.out import Out
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.figures.evaluation import learning_curve
@@ -197,15 +197,16 @@ def ctrl_c_when(monkeypatch: pytest.MonkeyPatch, *moments: Callable[[dict[str, A
     """Press Ctrl-C when what is shown first fits the first moment, then when it first fits the second, ..."""
     waiting = list(moments)
 
-    class Pressing(Bars):
-        def show(self, *args: Any, **kwargs: Any) -> None:
-            super().show(*args, **kwargs)
-            shown = inspect.signature(Bars.show).bind(self, *args, **kwargs).arguments
-            if waiting and waiting[0](shown):
-                waiting.pop(0)
-                signal.raise_signal(signal.SIGINT)
+    progress = Out.progress
 
-    monkeypatch.setattr("ethbrake_marl.cli.terminal.Bars", Pressing)
+    def press(*args: Any, **kwargs: Any) -> None:
+        progress(*args, **kwargs)
+        shown = inspect.signature(progress).bind(*args, **kwargs).arguments
+        if waiting and waiting[0](shown):
+            waiting.pop(0)
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Out, "progress", press)
 
 
 @pytest.mark.slow

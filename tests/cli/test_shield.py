@@ -34,9 +34,9 @@ def test_shield__prints_its_rows_as_json_and_as_a_table(ethbrake):
     "command",
     [
         ("shield", "--agents", "full_brake"),
-        ("picture", "shield-modes", "--agents", "coast", "--output", "x.png"),
-        ("picture", "shield", "--agents", "coast,full_brake", "--output", "x.png"),
-        pytest.param(("picture", "robustness", "--output", "x.png"), marks=pytest.mark.slow),
+        ("watch", "picture", "shield-modes", "--agents", "coast", "--output", "x.png"),
+        ("watch", "picture", "shield", "--agents", "coast,full_brake", "--output", "x.png"),
+        pytest.param(("watch", "picture", "robustness", "--output", "x.png"), marks=pytest.mark.slow),
     ],
     ids=lambda command: " ".join(command[:2]),
 )
@@ -62,7 +62,7 @@ def test_shield__an_unknown_agent_is_refused(ethbrake):
 
 def test_picture__shows_the_modes(ethbrake, tmp_path):
     out = tmp_path / "modes.png"
-    answer = ethbrake("picture", "shield-modes", "--agents", "full_brake", "--episodes", "20", "--output", out)
+    answer = ethbrake("watch", "picture", "shield-modes", "--agents", "full_brake", "--episodes", "20", "--output", out)
     assert (answer.status, answer.out) == (0, "")
     assert out.read_bytes().startswith(b"\x89PNG")
 
@@ -90,7 +90,7 @@ def test_shield__of_several_learners_tells_bound_interventions_and_shares_and_ca
     assert compared.status == 0 and "step-cap" in compared.out
 
 
-@pytest.mark.parametrize("command", [("picture", "shield"), ("picture", "shield-modes")])
+@pytest.mark.parametrize("command", [("watch", "picture", "shield"), ("watch", "picture", "shield-modes")])
 def test_picture__draws_a_shielded_team(ethbrake, tmp_path, command):
     out = tmp_path / "team.png"
     words = ("--scenario", "cooperation-3-pair", "--agents", "full_brake", "--episodes", "6", "--output", out)
@@ -98,7 +98,7 @@ def test_picture__draws_a_shielded_team(ethbrake, tmp_path, command):
     assert (answer.status, answer.out) == (0, "") and out.read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize("words", [("shield",), ("picture", "shield", "--output", "x.png")])
+@pytest.mark.parametrize("words", [("shield",), ("watch", "picture", "shield", "--output", "x.png")])
 def test_shield__a_shielded_team_and_a_vehicle_that_is_no_learner_are_refused(ethbrake, words):
     told = ethbrake(*words, "--scenario", "cooperation-3-pair", "--agents", "coast+step", "--episodes", "3")
     assert told.status == 2 and "agent 'coast+step': has a shield already" in told.err
@@ -107,7 +107,7 @@ def test_shield__a_shielded_team_and_a_vehicle_that_is_no_learner_are_refused(et
 
 
 @pytest.mark.parametrize("spec", ["ppo@shipped+episode", "full_brake+step", "ppo@shipped+refined+step"])
-@pytest.mark.parametrize("command", ["shield", "picture shield", "picture robustness"])
+@pytest.mark.parametrize("command", ["shield", "watch picture shield", "watch picture robustness"])
 def test_shield__what_has_a_shield_already_is_refused(ethbrake, tmp_path, command, spec):
     option = "--agent" if command.endswith("robustness") else "--agents"
     output = () if command == "shield" else ("--output", tmp_path / "shield.png")

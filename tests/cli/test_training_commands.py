@@ -1,4 +1,4 @@
-"""`ethbrake resume`, `learning-curves` and `export`, with trainings of a few small updates."""
+"""`ethbrake train resume`, `learning-curves` and `export`, with trainings of a few small updates."""
 
 from __future__ import annotations
 
@@ -51,15 +51,17 @@ def test_resume__goes_on_and_ends_as_if_nothing_had_happened(ethbrake, tiny_reci
         ctrl_c_when(patch, lambda shown: shown["done"] == 128)
         answer = ethbrake("train", "--recipe", tiny_recipe, "--output", stopped)
     assert answer.status == 130
-    assert f"go on with: ethbrake resume {stopped}" in answer.err.splitlines()[-1]
-    answer = ethbrake("resume", stopped, "--json")
+    assert f"go on with: ethbrake train resume {stopped}" in answer.err.splitlines()[-1]
+    answer = ethbrake("train", "resume", stopped, "--json")
     assert answer.status == 0
     assert (json.loads(answer.out)["status"], json.loads(answer.out)["steps"]) == ("finished", 256)
     for name in ("policy", "policy-last"):
         expected = load_policy(whole / name).manifest.weights_sha256
         assert load_policy(stopped / name).manifest.weights_sha256 == expected
-    refused(ethbrake("resume", stopped), "has finished", "ethbrake evaluate --scenario paper-random --agents ppo@")
-    refused(ethbrake("resume", tmp_path), "holds no training")
+    refused(
+        ethbrake("train", "resume", stopped), "has finished", "ethbrake evaluate --scenario paper-random --agents ppo@"
+    )
+    refused(ethbrake("train", "resume", tmp_path), "holds no training")
 
 
 def test_train__by_a_scheme_leaves_a_team_that_evaluate_takes(ethbrake, tiny_recipe, tmp_path):
@@ -77,7 +79,7 @@ def test_train__by_a_scheme_leaves_a_team_that_evaluate_takes(ethbrake, tiny_rec
     refused(ethbrake("evaluate", *scenario, "--agents", f"sac@{folder}"), "was trained by PPO", f"ppo@{folder}")
     nobody = ethbrake("evaluate", "--scenario", "cooperation-0-sensors", "--agents", f"team@{folder}")
     refused(nobody, "has no learner to drive; give the scenario that the agents were trained for")
-    refused(ethbrake("resume", folder), "evaluate --scenario cooperation-3-pair --agents team@")
+    refused(ethbrake("train", "resume", folder), "evaluate --scenario cooperation-3-pair --agents team@")
 
 
 @pytest.mark.slow
@@ -87,7 +89,7 @@ def test_resume__an_interrupted_run_goes_on_as_a_training(ethbrake, tiny_recipe,
         ctrl_c_when(patch, lambda shown: shown["done"] == 128)
         assert ethbrake("run", "--recipe", tiny_recipe, "--episodes", "20", "--output", folder).status == 130
     assert run_json(folder)["stage"] == "report"
-    assert ethbrake("resume", folder).status == 0
+    assert ethbrake("train", "resume", folder).status == 0
     assert (run_json(folder)["status"], run_json(folder)["steps"]) == ("finished", 256)
 
 
@@ -104,7 +106,7 @@ def test_run__with_sac_calls_its_policy_so(ethbrake, tiny_sac, tmp_path):
 
 def test_learning_curves__one_command_trains_draws_and_goes_on(ethbrake, tiny_recipe, tiny_sac, tmp_path, monkeypatch):
     folder = tmp_path / "curves"
-    arguments = ("learning-curves", "--recipes", f"{tiny_recipe}:2,{tiny_sac}:2", "--output", folder, "--json")
+    arguments = ("train", "curves", "--recipes", f"{tiny_recipe}:2,{tiny_sac}:2", "--output", folder, "--json")
     with monkeypatch.context() as patch:
         ctrl_c_when(patch, lambda shown: shown["name"] == "tiny-seed1" and shown["done"] == 128)
         answer = ethbrake(*arguments)
@@ -132,14 +134,14 @@ def test_learning_curves__one_command_trains_draws_and_goes_on(ethbrake, tiny_re
     assert min(last) <= low <= high <= max(last)
     other = tiny_recipe.parent / "other.yaml"
     other.write_text(yaml.safe_dump({**TINY_RECIPE, "gamma": 0.9}))
-    answer = ethbrake("learning-curves", "--recipes", f"{other}:1", "--output", folder)
+    answer = ethbrake("train", "curves", "--recipes", f"{other}:1", "--output", folder)
     refused(answer, "holds another training (here other: recipe gamma); give another folder")
 
 
 def test_learning_curves__of_an_edited_scenario_are_not_those_of_the_old_one(
     ethbrake, tiny_recipe, scenario_file, tmp_path
 ):
-    command = ("learning-curves", "--recipes", f"{tiny_recipe}:1", "--output", tmp_path / "curves", "--scenario")
+    command = ("train", "curves", "--recipes", f"{tiny_recipe}:1", "--output", tmp_path / "curves", "--scenario")
     assert ethbrake(*command, scenario_file("horizon_s: 8", "horizon_s: 8")).status == 0
     drawn = (tmp_path / "curves" / "learning_curves.json").stat().st_mtime_ns
     answer = ethbrake(*command, scenario_file("horizon_s: 8", "horizon_s: 9"))
@@ -152,22 +154,24 @@ def test_learning_curves__of_an_edited_scenario_are_not_those_of_the_old_one(
 def test_learning_curves__another_training_is_told_before_any_is_begun(ethbrake, tiny_recipe, tiny_sac, tmp_path):
     folder = tmp_path / "curves"
     assert ethbrake("train", "--recipe", tiny_sac, "--seed", "0", "--output", folder / "tiny-sac-seed0").status == 0
-    both = ("learning-curves", "--recipes", f"{tiny_recipe}:1,{tiny_sac}:1", "--steps", "160", "--output", folder)
+    both = ("train", "curves", "--recipes", f"{tiny_recipe}:1,{tiny_sac}:1", "--steps", "160", "--output", folder)
     refused(ethbrake(*both), "tiny-sac-seed0: holds another training (here other: recipe total_steps)")
     assert [path.name for path in folder.iterdir()] == ["tiny-sac-seed0"]
 
 
 @pytest.mark.parametrize("recipes", ["ppo", "ppo:0", "ppo:2,ppo:3", "pppo:2", ""])
 def test_learning_curves__refuses_a_plan_that_is_none(ethbrake, recipes, tmp_path):
-    refused(ethbrake("learning-curves", "--recipes", recipes, "--output", tmp_path / "new"), "recipe")
+    refused(ethbrake("train", "curves", "--recipes", recipes, "--output", tmp_path / "new"), "recipe")
     assert not (tmp_path / "new").exists()
 
 
 def test_export__writes_onnx(ethbrake, finished_run, tmp_path, monkeypatch):
-    assert ethbrake("export", finished_run, "--onnx", tmp_path / "policy.onnx").status == 0
+    assert ethbrake("agent", "export", finished_run, "--onnx", tmp_path / "policy.onnx").status == 0
     model = onnx.load(str(tmp_path / "policy.onnx"))
     assert [output.name for output in model.graph.output] == ["action", "acceleration_mps2"]
     monkeypatch.setitem(sys.modules, "onnx", None)  # not installed: the output is looked at before that is
-    refused(ethbrake("export", finished_run, "--onnx", tmp_path / "policy.onnx"), "is there already")
-    refused(ethbrake("export", finished_run, "--onnx", tmp_path / "none" / "policy.onnx"), "there is no folder")
-    refused(ethbrake("export", finished_run, "--onnx", tmp_path / "new.onnx"), "needs the package onnx")
+    refused(ethbrake("agent", "export", finished_run, "--onnx", tmp_path / "policy.onnx"), "is there already")
+    refused(
+        ethbrake("agent", "export", finished_run, "--onnx", tmp_path / "none" / "policy.onnx"), "there is no folder"
+    )
+    refused(ethbrake("agent", "export", finished_run, "--onnx", tmp_path / "new.onnx"), "needs the package onnx")

@@ -42,24 +42,24 @@ BLOCKS: dict[str, How] = {
     "cat worlds.csv": TUTORIAL,
     "agent,world,impacts,first_impact_harm,total_harm": TUTORIAL,
     "-1.0 26.97": TUTORIAL,
-    "ethbrake replay EB1:": _by(SUITE, "tests/cli/test_replay.py"),
+    "ethbrake watch replay EB1:": _by(SUITE, "tests/cli/test_replay.py"),
     "Policy('ppo', 27 observations": _by(SUITE, "tests/docs/test_snippets.py"),
     "ethbrake evaluate --scenario paper-random --agents full_brake,e_v2x_bm,e_v2x_bm:pairwise": _by(NIGHTLY),
     "ethbrake shield --agents full_brake,ppo@shipped --episodes 30": _by(NIGHTLY),
-    "ethbrake picture criticality": _by(NIGHTLY),
-    "ethbrake record --agents full_brake,e_v2x_bm": _by(NIGHTLY),
-    "ethbrake dataset --agents full_brake,best_harm": _by(NIGHTLY),
+    "ethbrake watch picture criticality": _by(NIGHTLY),
+    "ethbrake watch record --agents full_brake,e_v2x_bm": _by(NIGHTLY),
+    "ethbrake watch dataset --agents full_brake,best_harm": _by(NIGHTLY),
     "ethbrake run": TRAINED,
     "ethbrake train --scenario paper-random-early": TRAINED,
     "ethbrake train --scenario cooperation-3-pair": TRAINED,
-    "ethbrake export runs/early": TRAINED,
+    "ethbrake agent export runs/early": TRAINED,
     "First-impact        Total Sampled": _by(TRAINING, "make run"),
     "resume, ppo: 20/20": _by(TRAINING, "make test-resume"),
-    "ethbrake best-harm --scenario paper-random --episodes 10000": _by(SEARCH),
-    "ethbrake bench": _by(SPEED),
+    "ethbrake search best-harm --scenario paper-random --episodes 10000": _by(SEARCH),
+    "ethbrake doctor speed": _by(SPEED),
     "make bench-peers": _by(SPEED),
     ".venv/bin/python -m tests.benchmarks.threads": _by(SPEED),
-    "ethbrake explore": _by(BY_HAND),
+    "ethbrake watch explore": _by(BY_HAND),
     "ethbrake doctor": _by(BY_HAND),
     "gap_1_m,gap_2_m,speed_1_mps": _by(BY_HAND),
     "paper-random full_brake        backward": EXACT,
@@ -203,20 +203,23 @@ TABLES: dict[str, How] = {
 }
 
 PICTURES: dict[str, How] = {
-    "emergency.svg": _by(NIGHTLY, "ethbrake record --agents full_brake,counterfactual@shipped --output emergency.svg"),
+    "emergency.svg": _by(
+        NIGHTLY, "ethbrake watch record --agents full_brake,counterfactual@shipped --output emergency.svg"
+    ),
     "model-": _by(SUITE, "tests/docs/test_drawings.py"),
     "criticality.png": _by(
-        NIGHTLY, "ethbrake picture criticality --scenario paper-distance --agent e_v2x_bm --output criticality.png"
+        NIGHTLY,
+        "ethbrake watch picture criticality --scenario paper-distance --agent e_v2x_bm --output criticality.png",
     ),
     "deceleration.png": _by(
-        NIGHTLY, "ethbrake picture deceleration --scenario paper-random --world 5 --output deceleration.png"
+        NIGHTLY, "ethbrake watch picture deceleration --scenario paper-random --world 5 --output deceleration.png"
     ),
     "sampled-convergence.png": _by(
         NIGHTLY,
         "python docs/studies/sampling.py sampled-convergence.png",
     ),
     "shield-robustness.png": _by(
-        SEARCH, "ethbrake picture robustness --agent ppo@shipped --episodes 300 --output shield-robustness.png"
+        SEARCH, "ethbrake watch picture robustness --agent ppo@shipped --episodes 300 --output shield-robustness.png"
     ),
     "price-of-not-knowing.png": _by(NIGHTLY, "python docs/studies/price.py price-of-not-knowing.png"),
     "shield-operating.png": _by(TRAINING),

@@ -87,7 +87,7 @@ def test_block__is_what_its_commands_print(block: Shown, told: Run) -> None:
 @pytest.mark.slow
 def test_table_of_shipped_lists__is_printed_by_its_command(told: Run) -> None:
     (table,) = (each for each in tables_of_figures() if each.begin.startswith("| list | worlds | proven"))
-    printed = told("ethbrake best-harm --shipped")[1].splitlines()
+    printed = told("ethbrake search best-harm --shipped")[1].splitlines()
     for row in table.text.splitlines():
         assert any(one.startswith(row.rstrip()) for one in printed), row
 

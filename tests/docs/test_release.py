@@ -49,7 +49,7 @@ def test_schema__that_ships_is_the_one_that_the_command_prints(
 def test_schema__of_sweeps_and_tunings_is_printed_by_the_command_and_named_by_the_examples(
     command: str, file: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run_command([command, "--schema"]) == 0
+    assert run_command(["study", command, "--schema"]) == 0
     assert (ROOT / "docs" / f"{file}.schema.json").read_text("utf-8") == capsys.readouterr().out
     for example in (ROOT / "docs").glob(f"{file}-*.yaml"):
         assert example.read_text("utf-8").startswith(f"# yaml-language-server: $schema={file}.schema.json\n")

@@ -99,7 +99,7 @@ def test_film__as_svg_moves_every_vehicle_as_its_scenes_say() -> None:
 def test_film__of_the_readme_is_that_of_its_command(tmp_path: Path) -> None:
     made = tmp_path / "made.svg"
     text = " ".join(README.read_text("utf-8").split())
-    command = re.search(r"`ethbrake (record .*?) --output docs/figures/emergency.svg`", text)
+    command = re.search(r"`ethbrake (watch record .*?) --output docs/figures/emergency.svg`", text)
     assert command is not None
     assert run_command([*command[1].split(), "--output", str(made)]) == 0
     kept = (README.parent / "docs" / "figures" / "emergency.svg").read_text("utf-8")
@@ -111,11 +111,11 @@ def test_film__of_the_readme_is_that_of_its_command(tmp_path: Path) -> None:
 
 def test_record_command__writes_the_film_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "film.gif"
-    arguments = ["record", "--agents", "full_brake", "--world", "2", "--output", str(path)]
+    arguments = ["watch", "record", "--agents", "full_brake", "--world", "2", "--output", str(path)]
     assert run_command(arguments) == 0
     assert path.read_bytes()[:6] == b"GIF89a"
     assert run_command(arguments) == 2
-    assert run_command(["record", "--output", str(tmp_path / "film.avi")]) == 2
+    assert run_command(["watch", "record", "--output", str(tmp_path / "film.avi")]) == 2
     assert "films are written as .gif, .mp4, .svg" in capsys.readouterr().err
 
 

@@ -81,10 +81,10 @@ ABOUT = {"worlds_sha256": worlds_sha256(SAMPLE.worlds, SAMPLE.index), "scenario_
     [
         ("evaluate", ("evaluate", "--agents", "full_brake")),
         ("shield", ("shield", "--agents", "full_brake")),
-        ("best-harm", ("best-harm", "--budget", "20")),
+        ("best-harm", ("search", "best-harm", "--budget", "20")),
         pytest.param(
             "robustness",
-            ("picture", "robustness", "--uncertainty", "mass_t.vehicle_3=1%", "--output", "x.png"),
+            ("watch", "picture", "robustness", "--uncertainty", "mass_t.vehicle_3=1%", "--output", "x.png"),
             marks=pytest.mark.slow,
         ),
     ],

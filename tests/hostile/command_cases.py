@@ -96,10 +96,10 @@ TARGETS = (
 )
 WRITERS: dict[str, tuple[str, ...]] = {
     "per world": ("evaluate", "--agents", "coast", *FEW, "--per-world"),
-    "table": ("best-harm", *FEW, "--budget", "1", "--output"),
+    "table": ("search", "best-harm", *FEW, "--budget", "1", "--output"),
     "run": ("train", "--steps", "1", "--output"),
     "new scenario": ("scenario", "new", "mine", "--output"),
-    "picture": ("picture", "criticality", "--output"),
+    "picture": ("watch", "picture", "criticality", "--output"),
 }
 
 
@@ -127,7 +127,7 @@ def _values() -> Iterator[Case]:
             )
         if number != "10000001":  # a budget that takes its time is the user's own wish
             wrong = number in ("", "-1", "0", "1.5", "nan")
-            yield _case("number", ("best-harm", *FEW, "--budget", number), certain=wrong)
+            yield _case("number", ("search", "best-harm", *FEW, "--budget", number), certain=wrong)
 
 
 def _words() -> Iterator[Case]:
@@ -141,18 +141,18 @@ def _words() -> Iterator[Case]:
             ("evaluate", *FEW, "--set", word),
             ("evaluate", *FEW, "--set", f"mass_t={word}"),
             ("evaluate", *FEW, "--vehicle", word),
-            ("resume", word),
+            ("train", "resume", word),
             (word,),
             ("evaluate", f"--no{word}"),
             ("train", "--name", word),
             ("train", "--recipe", word),
             ("evaluate", *FEW, "--objective", word),
             ("shield", *FEW, "--agents", word),
-            ("export", word, "--onnx", "x.onnx"),
-            ("learning-curves", "--output", "o", "--scenario", word),
-            ("ablate", "--levels", word, "--output", "o"),
-            ("generalise", "--runs", word, "--vehicles", "3"),
-            ("generalise", "--runs", "x", "--vehicles", word),
+            ("agent", "export", word, "--onnx", "x.onnx"),
+            ("train", "curves", "--output", "o", "--scenario", word),
+            ("study", "ablate", "--levels", word, "--output", "o"),
+            ("study", "generalise", "--runs", word, "--vehicles", "3"),
+            ("study", "generalise", "--runs", "x", "--vehicles", word),
         ):
             yield _case("word", command)
 

@@ -73,21 +73,24 @@ def warm_up(folder: Path) -> None:
         run_command(["nonsense"])
         for algorithm in ("ppo", "sac"):
             shutil.copytree(stopped(algorithm), folder / algorithm)
-            run_command(["resume", str(folder / algorithm)])
-        for late in (["generalise", "--runs", "x", "--vehicles", "3"], ["ablate", "--levels", "x", "--output", "x"]):
+            run_command(["train", "resume", str(folder / algorithm)])
+        for late in (
+            ["study", "generalise", "--runs", "x", "--vehicles", "3"],
+            ["study", "ablate", "--levels", "x", "--output", "x"],
+        ):
             run_command(late)
-        run_command(["learning-curves", "--scenario", "x", "--output", "x"])
-        run_command(["export", "x", "--onnx", "x"])
-        run_command(["picture", "criticality", "--output", str(folder / "mine.yaml")])
+        run_command(["train", "curves", "--scenario", "x", "--output", "x"])
+        run_command(["agent", "export", "x", "--onnx", "x"])
+        run_command(["watch", "picture", "criticality", "--output", str(folder / "mine.yaml")])
         run_command(["shield", "--agents", "x"])
         few = ["evaluate", "--agents", "coast,full_brake", "--episodes", "3"]
         run_command([*few, "--per-world", str(folder / "worlds-out.csv")])
         write(folder / "sweep.yaml", SWEEP)
-        run_command(["sweep", str(folder / "sweep.yaml"), "--output", str(folder / "mine.yaml")])
+        run_command(["study", "sweep", str(folder / "sweep.yaml"), "--output", str(folder / "mine.yaml")])
         write(folder / "tuning.yaml", TUNING)
-        run_command(["tune", str(folder / "tuning.yaml"), "--output", str(folder / "mine.yaml")])
+        run_command(["study", "tune", str(folder / "tuning.yaml"), "--output", str(folder / "mine.yaml")])
         write(folder / "worlds.yaml", worlds_text())
-        run_command(["falsify", "--again", str(folder / "worlds.yaml")])
+        run_command(["search", "falsify", "--again", str(folder / "worlds.yaml")])
         write(folder / "t.npz", good_bytes())
         write(folder / "bad" / "t.npz", b"")
         write(folder / "worlds.csv", f"{HEADER}\n{ROW}\n")

@@ -15,7 +15,7 @@ from ethbrake_marl.evaluation.inputs import (
     states_of,
 )
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies.sweep_file import plan_sweep, read_sweep
+from ethbrake_marl.studies.sweep import plan_sweep, read_sweep
 from tests.hostile.case import NASTY, Case, damaged, write
 from tests.hostile.yaml_changes import CERTAIN, encoded
 from tests.hostile.yaml_parts import NOT_FINITE, quoted, replaced
@@ -165,7 +165,7 @@ def worlds_text() -> str:
             agent="full_brake",
             measure="harm",
             harm_count="first",
-            found_by="ethbrake falsify --measure harm",
+            found_by="ethbrake search falsify --measure harm",
             worlds=[NamedWorld(name=f"world-{k}", score=1e6, harm=1e6, state=state) for k, state in enumerate(states)],
         )
     )
@@ -259,7 +259,7 @@ def _sweep(category: str, content: bytes | str, *, certain: bool = True) -> Case
         write(folder / "mine.yaml", content)
         write(folder / "taken", "precious")
 
-    command = ("sweep", "mine.yaml", "--output", "taken", "--jobs", "1")
+    command = ("study", "sweep", "mine.yaml", "--output", "taken", "--jobs", "1")
     return Case("sweep", category, command, build, certain=certain, reader=_reader(certain, _planned), content=content)
 
 
@@ -271,7 +271,7 @@ def _worlds(category: str, content: bytes | str, *, certain: bool = True) -> Cas
     return Case(
         "worlds",
         category,
-        ("falsify", "--again", "mine.yaml"),
+        ("search", "falsify", "--again", "mine.yaml"),
         lambda folder: write(folder / "mine.yaml", content),
         content=content,
         certain=certain,

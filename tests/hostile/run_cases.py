@@ -17,7 +17,7 @@ from tests.hostile.bundle_cases import changed_somewhere
 from tests.hostile.case import OUTSIDE, PRECIOUS, Case, damaged, write
 from tests.hostile.stopped_runs import RUN, listed_anew, newest, stopped
 
-RESUME = ("resume", RUN)
+RESUME = ("train", "resume", RUN)
 
 Change = Callable[[random.Random, Path], object]
 

@@ -35,7 +35,7 @@ from tests.hostile.case import NASTY, Case, damaged, write
 
 # Numbers that are read in order, and do not fit the worlds that are searched.
 ONLY_A_PROBLEM_KNOWS = ("commands that cannot be", "phases out of order", "another world")
-COMMAND = ("best-harm", "--episodes", "3", "--budget", "1", "--threads", "1", "--start", "t.npz", "--json")
+COMMAND = ("search", "best-harm", "--episodes", "3", "--budget", "1", "--threads", "1", "--start", "t.npz", "--json")
 
 CERTAIN: dict[str, Callable[[random.Random], bytes]] = {
     "wrong shape": lambda r: swapped(

@@ -82,7 +82,7 @@ def test_script__refuses_what_it_cannot_clone(script: ModuleType, tmp_path: Path
     pyarrow.parquet.write_table(pyarrow.table({"a": [1]}), tmp_path / "a.parquet")
     (tmp_path / "b.parquet").write_text("no")
     for name in ("a.parquet", "b.parquet"):
-        with pytest.raises(InvalidInput, match="is no dataset of `ethbrake dataset`"):
+        with pytest.raises(InvalidInput, match="is no dataset of `ethbrake watch dataset`"):
             script.train(tmp_path / name, 0, tmp_path / "clone")
     agents = {"full_brake": eb.make_agent("full_brake")}
     eb.write_dataset(tmp_path / "two.parquet", agents, scenario=PAIR, episodes=1)

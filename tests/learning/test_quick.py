@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.agents.policy import LearnedAgent
-from ethbrake_marl.cli.run import run_experiment_command
+from ethbrake_marl.cli.train import run_command
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.train import train
@@ -18,7 +18,7 @@ GOAL = 1.10  # harm of the policy, in the least harm known
 
 
 def test_quick__is_what_run_does_and_observes_what_ppo_does() -> None:
-    assert signature(run_experiment_command).parameters["recipe"].default == "quick"
+    assert signature(run_command).parameters["recipe"].default == "quick"
     quick = load_recipe("quick")
     assert quick.algorithm == "counterfactual" and quick.start is None
     assert quick.observation == load_recipe("ppo").observation is None

@@ -91,7 +91,7 @@ def test_sac_recipe__refuses_bad_input(change: dict[str, object], message: str) 
 def test_recipe__comes_back_from_its_json() -> None:
     for name in shipped_recipes():
         recipe = load_recipe(name)
-        assert recipe_of(recipe.model_dump_json()) == recipe
+        assert recipe_of(recipe.model_dump(mode="json")) == recipe
 
 
 def test_shipped_recipes__are_found_by_name() -> None:

@@ -89,7 +89,7 @@ def test_train__leaves_a_complete_folder(recipe: TrainingRecipe, tmp_path: Path)
     assert [p.stat().st_size > 0 for p in (tmp_path / "run" / "tensorboard").iterdir()] == [True]
 
     config = json.loads((tmp_path / "run" / "config.json").read_text())
-    assert recipe_of(json.dumps(config["recipe"])) == recipe
+    assert recipe_of(config["recipe"]) == recipe
     assert config["scenario"]["name"] == "paper-random"
     assert (
         config["versions"]["torch"] == torch.__version__.split("+")[0]

@@ -10,7 +10,7 @@ from ethbrake_marl.evaluation.inputs import LADDER
 from ethbrake_marl.limits.best_harm import TABLES, load_table, realised_harm
 from ethbrake_marl.scenario import Task, load_scenario
 
-SMALL = ["best-harm", "--scenario", "paper-random", "--episodes", "4", "--budget", "60", "--threads", "1"]
+SMALL = ["search", "best-harm", "--scenario", "paper-random", "--episodes", "4", "--budget", "60", "--threads", "1"]
 
 
 def test_best_harm_command__prints_figures_and_writes_the_table(
@@ -23,7 +23,9 @@ def test_best_harm_command__prints_figures_and_writes_the_table(
     assert figures["best_known_total_harm"] == pytest.approx(table.best["total"].harm.mean())
     assert figures["harmless_rate"] == (table.best["total"].harm == 0.0).mean()
     assert table.header["list_seed"] == 7
-    command = "ethbrake best-harm --scenario paper-random --episodes 4 --seed 7 --budget 60 --search-seed 0 --output"
+    command = (
+        "ethbrake search best-harm --scenario paper-random --episodes 4 --seed 7 --budget 60 --search-seed 0 --output"
+    )
     assert table.header["command"] == figures["command"] == f"{command} FILE.npz"
     assert 0.0 < figures["proven_harm"] <= figures["best_known_first_impact_harm"]
     assert figures["impact_proven_rate"] in (0.5, 0.75, 1.0)
@@ -43,7 +45,7 @@ def test_best_harm_command__one_count_from_an_earlier_table(tmp_path: Path, caps
 
 def test_best_harm_command__takes_what_agents_do_better(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     alone, folded = tmp_path / "t.npz", tmp_path / "u.npz"
-    small = ["best-harm", "--episodes", "30", "--budget", "60", "--threads", "1"]
+    small = ["search", "best-harm", "--episodes", "30", "--budget", "60", "--threads", "1"]
     assert run_command([*small, "--output", str(alone)]) == 0
     assert run_command([*small, "--agents", "planner:60,full_brake", "--output", str(folded)]) == 0
     before, after = load_table(alone), load_table(folded)
@@ -62,7 +64,7 @@ def test_best_harm_command__takes_what_agents_do_better(tmp_path: Path, capsys: 
 
 def test_best_harm_command__lets_the_whole_ladder_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "t.npz"
-    small = ["best-harm", "--episodes", "3", "--budget", "60", "--threads", "1", "--harm-count", "total"]
+    small = ["search", "best-harm", "--episodes", "3", "--budget", "60", "--threads", "1", "--harm-count", "total"]
     assert run_command([*small, "--agents", "ladder", "--output", str(file)]) == 0
     assert list(load_table(file).header["lowered_by"]) == list(LADDER)
 
@@ -73,7 +75,7 @@ def test_best_harm_command__lets_the_whole_ladder_drive(tmp_path: Path, capsys: 
         (["--budget", "0"], "budget = 0"),
         (["--vehicles", "vehicle_9"], "vehicle_9"),
         (["--output", "nowhere/t.npz"], "no folder"),
-        (["--output", "t.txt"], "ends in .npz"),
+        (["--output", "t.txt"], "a table must end in .npz"),
         (["--start", "missing.npz"], "no such table"),
         (["--start", str(TABLES / "paper-delay-low.npz")], "scenario paper-delay-low, list_seed 7"),
         (["--start", str(TABLES / "paper-random.npz"), "--seed", "8"], "holds none of these 4 worlds"),

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ethbrake_marl.harm import empty_ledger, injury_probability, split
+from ethbrake_marl.harm import empty_ledger, split
 from ethbrake_marl.physics import advance, make_worlds
 from tests.physics.random_worlds import driving_lines
 from tests.reference.tolerances import EPS
@@ -84,11 +84,3 @@ def test_split__the_lighter_one_bears_more_whether_in_front_or_behind():
     assert split(harm, np.array([[3.0, 1.0, 1.0]])).tolist() == [[4.0, 12.0, 0.0]]
     assert split(harm[:, ::-1], np.array([[1.0, 3.0, 1.0]])).tolist() == [[0.0, 4.0, 12.0]]
     assert split(np.array([[16.0, 8.0]]), np.array([[1.0, 3.0, 1.0]])).tolist() == [[12.0, 4.0 + 2.0, 6.0]]
-
-
-def test_injury_probability__by_hand():
-    # 1 / (1 + exp(4.457 - 0.177 dv)); the sign of the change does not matter
-    for side, offset in (("front", 4.457), ("rear", 4.888)):
-        expected = [1.0 / (1.0 + np.exp(offset - 0.177 * dv)) for dv in (0.0, 10.0, 30.0)]
-        assert injury_probability(np.array([0.0, -10.0, 30.0]), side) == pytest.approx(expected, rel=1e-12)
-    assert injury_probability(np.array([4.457 / 0.177]), "front") == pytest.approx([0.5])

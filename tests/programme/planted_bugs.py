@@ -31,7 +31,7 @@ REWARDS, V2X, ENGINE, TERMS, STEPPING, STARTS, OBJECTIVES = (
 )  # fmt: skip
 SB3 = "ethbrake_marl/envs/sb3.py"
 COMPARISON, OPTIMUM, PLAN = (
-    "ethbrake_marl/studies/ablation.py",
+    "ethbrake_marl/studies/ablation_report.py",
     "ethbrake_marl/studies/ablation.py",
     "ethbrake_marl/studies/ablation.py",
 )

@@ -11,8 +11,8 @@ from jsonschema import Draft202012Validator
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import read_yaml
-from ethbrake_marl.studies.sweep_file import read_sweep, sweep_json_schema
-from ethbrake_marl.studies.tuning_file import read_tuning, tuning_json_schema
+from ethbrake_marl.studies.sweep import read_sweep, sweep_json_schema
+from ethbrake_marl.studies.tuning import read_tuning, tuning_json_schema
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 KINDS = {"sweep": (sweep_json_schema, read_sweep), "tuning": (tuning_json_schema, read_tuning)}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import closing
 from dataclasses import replace
 from multiprocessing import active_children
@@ -16,7 +15,7 @@ from ethbrake_marl.evaluation.shards import Asked, Question, Tally, ask
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.studies import shards as studied
 from ethbrake_marl.studies.jobs import LocalWorkers
-from ethbrake_marl.studies.shards import ShardFolder, evaluate_shards
+from ethbrake_marl.studies.shards import evaluate_shards
 
 N = 4_500
 
@@ -45,19 +44,25 @@ def driven(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     return found
 
 
-def interrupted(asked: Asked, folder: ShardFolder, after: int, shards: int) -> None:
+def finished(folder: Path) -> int:
+    """How many shards the folder keeps."""
+    journal = folder / "journal.jsonl"
+    return journal.read_text().count('"status": "finished"') if journal.exists() else 0
+
+
+def interrupted(asked: Asked, folder: Path, after: int, shards: int, **more) -> None:
     """Let an evaluation be killed when so many shards are finished."""
 
     def tell(progress) -> None:
-        if len(list(folder.path.glob("shard-*.json"))) == after:
+        if finished(folder) == after:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        evaluate_shards(asked, shards=shards, folder=folder, tell=tell)
+        evaluate_shards(asked, shards=shards, folder=folder, tell=tell, **more)
 
 
 def test_killed__goes_on_with_what_is_left_in_any_number_of_shards(asked, tally, driven, tmp_path: Path) -> None:
-    folder = ShardFolder(tmp_path / "kept", asked)
+    folder = tmp_path / "kept"
     interrupted(asked, folder, 2, shards=4)
     assert driven == [(0, 1_000), (1_000, 2_000)]
     driven.clear()
@@ -72,7 +77,7 @@ def test_killed__goes_on_with_what_is_left_in_any_number_of_shards(asked, tally,
 def test_processes__give_the_same_tally_and_a_shard_whose_process_was_killed_is_driven_again(
     asked, tally, tmp_path: Path
 ) -> None:
-    folder, told = ShardFolder(tmp_path / "kept", asked), []
+    folder, told = tmp_path / "kept", []
 
     class Killing(LocalWorkers):
         def wait(self):
@@ -87,7 +92,7 @@ def test_processes__give_the_same_tally_and_a_shard_whose_process_was_killed_is_
         assert evaluate_shards(asked, shards=4, workers=workers, folder=folder) == tally
     lost = [answer for answers in told for _, answer in answers if answer.value is None]
     assert 1 <= len(lost) <= 2 and all("was killed by signal 9" in str(answer.error) for answer in lost)
-    assert len(list(folder.path.glob("shard-*.json"))) == 4
+    assert finished(folder) == 4
 
 
 @pytest.mark.slow
@@ -95,7 +100,7 @@ def test_processes__are_ended_where_a_shard_fails_or_on_ctrl_c(asked, monkeypatc
     changed = replace(asked, identity={**asked.identity, "seed": 12})
     with pytest.raises(InvalidInput, match="seed changed since the evaluation began"):
         evaluate_shards(changed, shards=4, jobs=2)
-    folder = ShardFolder(tmp_path / "kept", asked)
+    folder = tmp_path / "kept"
 
     def stop(progress) -> None:
         if progress.done:
@@ -103,67 +108,59 @@ def test_processes__are_ended_where_a_shard_fails_or_on_ctrl_c(asked, monkeypatc
 
     with pytest.raises(KeyboardInterrupt):
         evaluate_shards(asked, shards=4, jobs=2, folder=folder, tell=stop)
-    assert 1 <= len(list(folder.path.glob("shard-*.json"))) < 4 and not active_children()
+    assert 1 <= finished(folder) < 4 and not active_children()
 
 
 def test_another_question__is_refused_and_told(asked, paper_random, tmp_path: Path) -> None:
-    folder = ShardFolder(tmp_path, asked)
-    evaluate_shards(asked, shards=1, folder=folder)
+    evaluate_shards(asked, shards=1, folder=tmp_path)
     other = ask(Question(paper_random, ("full_brake",), N, 12))
-    with pytest.raises(InvalidInput, match=r"another question \(agents, knows, policy_sha256, seed differ\)"):
-        evaluate_shards(other, shards=1, folder=ShardFolder(tmp_path, other))
-    with pytest.raises(InvalidInput, match="rows differ"):
-        evaluate_shards(asked, shards=1, folder=ShardFolder(tmp_path, asked, with_rows=True))
+    with pytest.raises(
+        InvalidInput,
+        match=r"holds shards with other settings \(seed 11, here 12; agents; policy-sha256 coast; knows coast",
+    ):
+        evaluate_shards(other, shards=1, folder=tmp_path)
+    with pytest.raises(InvalidInput, match="rows False, here True"):
+        evaluate_shards(asked, shards=1, folder=tmp_path, with_rows=True)
 
 
 def test_a_folder_of_something_else__is_left_alone(asked, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(AlreadyExists, match="no folder of shards"):
-        evaluate_shards(asked, shards=1, folder=ShardFolder(tmp_path, asked))
+    with pytest.raises(AlreadyExists, match="holds no shards"):
+        evaluate_shards(asked, shards=1, folder=tmp_path)
     assert (tmp_path / "thesis.tex").read_text() == "years of work"
 
 
-def test_two_at_once__the_second_is_refused(asked, tmp_path: Path) -> None:
-    folder = ShardFolder(tmp_path, asked)
-    with folder.alone(), pytest.raises(InvalidInput, match="another evaluation works in it"):
-        evaluate_shards(asked, shards=1, folder=ShardFolder(tmp_path, asked))
+def test_a_damaged_line__is_told_and_its_worlds_are_driven_again(asked, tally, driven, tmp_path: Path) -> None:
+    evaluate_shards(asked, shards=4, folder=tmp_path)
+    journal = tmp_path / "journal.jsonl"
+    whole = journal.read_text()
+    journal.write_text(whole.replace('"worlds": 1000', '"worlds": 1001', 1))
+    driven.clear()
+    told = []
+    assert evaluate_shards(asked, shards=4, folder=tmp_path, tell=told.append) == tally
+    assert driven == [(0, 1_000)] and "1 finished shard damaged" in told[0].note
 
 
-@pytest.mark.parametrize(
-    ("damage", "reason"),
-    [
-        (lambda told: told["tally"].update(worlds=4_501), "is damaged"),
-        (lambda told: told.update(asked="0"), "another question"),
-        (lambda told: told.update(end=4_000), "another question"),
-        (lambda told: told.update(first="0"), "another question"),
-        (lambda told: told.pop("tally"), "is damaged"),
-    ],
-)
-def test_a_damaged_shard__is_refused_by_name(asked, tally, tmp_path: Path, damage, reason: str) -> None:
-    folder = ShardFolder(tmp_path, asked)
-    folder.prepare()
-    folder.keep((0, N), tally)
-    (file,) = tmp_path.glob("shard-*.json")
-    told = json.loads(file.read_text())
-    damage(told)
-    file.write_text(json.dumps(told))
-    with pytest.raises(InvalidInput, match=f"{file.name}.*{reason}"):
-        evaluate_shards(asked, shards=1, folder=folder)
-    file.write_text("{")
-    with pytest.raises(InvalidInput, match="no JSON"):
-        evaluate_shards(asked, shards=1, folder=folder)
+def test_lines_of_another_journal__are_refused_where_worlds_would_count_twice(asked, tmp_path: Path) -> None:
+    journals = [tmp_path / name / "journal.jsonl" for name in ("one", "other")]
+    for shards, journal in enumerate(journals, 1):
+        evaluate_shards(asked, shards=shards, folder=journal.parent)
+    journals[0].write_text(journals[0].read_text() + journals[1].read_text())
+    with pytest.raises(InvalidInput, match="two of its shards overlap"):
+        evaluate_shards(asked, shards=1, folder=tmp_path / "one")
 
 
 def test_rows__are_the_same_for_any_shards_and_those_of_killed_shards_go(asked, tally, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     tables = []
     for shards in (1, 4):
-        folder = ShardFolder(tmp_path / str(shards), asked, with_rows=True)
+        folder = tmp_path / str(shards)
         if shards == 4:
-            interrupted(asked, folder, 2, shards)
-            (folder.path / "worlds-0000000002000-0000000004500.parquet").write_bytes(b"half")
-        assert evaluate_shards(asked, shards=shards, folder=folder, block=1_000 * shards) == tally
-        files = sorted(folder.path.glob("worlds-*.parquet"))
+            interrupted(asked, folder, 2, shards, with_rows=True)
+            (folder / "worlds-0000000002000-0000000004500.parquet").write_bytes(b"half")
+        again = evaluate_shards(asked, shards=shards, folder=folder, with_rows=True, block=1_000 * shards)
+        assert again == tally
+        files = sorted(folder.glob("worlds-*.parquet"))
         assert len(files) == shards
         tables.append([row for file in files for row in parquet.read_table(file).to_pylist()])
     assert tables[0] == tables[1]
@@ -175,6 +172,7 @@ def test_rows__are_the_same_for_any_shards_and_those_of_killed_shards_go(asked, 
     braking = [row["total_harm"] for row in tables[0] if row["agent"] == "full_brake"]
     assert len(braking) == N
     assert np.mean(braking) == pytest.approx(tally.agents["full_brake"].moments["total_harm"].mean, rel=1e-12)
-    (tmp_path / "1" / "worlds-0000000000000-0000000004500.parquet").write_bytes(b"")
-    with pytest.raises(InvalidInput, match="is not the one that was written with"):
-        evaluate_shards(asked, shards=1, folder=ShardFolder(tmp_path / "1", asked, with_rows=True))
+    damaged = tmp_path / "1" / "worlds-0000000000000-0000000004500.parquet"
+    damaged.write_bytes(b"")
+    assert evaluate_shards(asked, shards=1, folder=tmp_path / "1", with_rows=True) == tally  # driven again
+    assert parquet.read_table(damaged).num_rows == 2 * N

@@ -1,4 +1,4 @@
-"""What ``ethbrake bench`` measures, and that no figure is far below what this code can do."""
+"""What ``ethbrake doctor speed`` measures, and that no figure is far below what this code can do."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numba
 import numpy as np
 import pytest
 
-from ethbrake_marl.cli.machine import this_machine
 from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.studies import speed as benchmark
 from ethbrake_marl.studies.speed import (
@@ -23,6 +22,7 @@ from ethbrake_marl.studies.speed import (
     braking,
     measure,
     rates,
+    this_machine,
 )
 
 SHORT = Effort(1, 1e-6)

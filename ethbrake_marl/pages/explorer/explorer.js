@@ -127,7 +127,7 @@ class Explorer {
       const content = await reply.json();
       return reply.ok ? content : { wrong: content.error, superseded: content.superseded };
     } catch {
-      return { wrong: "ethbrake explore does not answer; was it ended?" };
+      return { wrong: "ethbrake watch explore does not answer; was it ended?" };
     }
   }
 

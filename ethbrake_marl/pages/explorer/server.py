@@ -267,12 +267,12 @@ def scenario_text(name: str, world: Worlds, scenario: Scenario) -> str:
         "name": name,
         "title": f"One world, from {scenario.name}",
         "description": "A state that was saved in the explorer.",
-        "source": "ethbrake explore",
+        "source": "ethbrake watch explore",
         "early_impacts": "keep",  # this very world, whatever happens in it
         **state_of(world),
     }
     lines = [f"{key}: {flow_text(value)}" for key, value in Scenario(**fixed).declared().items()]
-    return "\n".join(["# Saved by ethbrake explore.", *lines, ""])
+    return "\n".join(["# Saved by ethbrake watch explore.", *lines, ""])
 
 
 def table_text(world: Worlds, scenario: Scenario) -> str:

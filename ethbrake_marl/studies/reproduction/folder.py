@@ -404,6 +404,15 @@ def reproduce(items: Sequence[Item], settings: Settings, *, force: bool = False)
 def _make_item(item: Item, settings: Settings, trained: Sequence[str]) -> None:
     started = time.process_time()
     made = item.make(settings)
+    tables = [
+        Table(
+            each.title,
+            each.headings,
+            [[cell.in_words for cell in row] for row in each.shown() if not isinstance(row, str)],
+            each.note,
+        )
+        for each in made.tables
+    ]
     result = Result(
         name=item.name,
         labels=item.labels,
@@ -418,7 +427,7 @@ def _make_item(item: Item, settings: Settings, trained: Sequence[str]) -> None:
         verdict=summarise_verdicts(made.verdicts),
         comparisons=made.verdicts,
         parameters=made.parameters,
-        tables=made.tables,
+        tables=tables,
         figures=list(made.figures),
         data=sorted(f"{stem}.csv" for stem in made.data),
         notes=made.notes,

@@ -19,6 +19,7 @@ from ethbrake_marl.evaluation import Evaluation, evaluate
 from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY, make_agents
 from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference, unpaired_difference
 from ethbrake_marl.figures.style import Figure
+from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.limits.limits import Unproven
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Scenario, load_scenario
@@ -48,21 +49,9 @@ class Verdict:
     because: str
 
 
-@dataclass(frozen=True, slots=True)
-class Show:
-    """The writing of a quantity: each number times ``scale``, then its unit."""
-
-    digits: int = 2
-    scale: float = 1.0
-    unit: str = ""
-
-    def estimate(self, estimate: Estimate) -> str:
-        """A value with its interval."""
-        return estimate.in_words(digits=self.digits, scale=self.scale, unit=self.unit)
-
-
-HARM = Show()
-PERCENT = Show(1, 100.0, " %")
+# How a quantity is written.
+HARM = Column("Harm")
+PERCENT = Column("Collision rate", digits=1, scale=100.0, unit=" %")
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +67,7 @@ def compare_number(
     printed: float,
     ours: Estimate,
     *,
-    show: Show = HARM,
+    show: Column = HARM,
     bound: Bound | None = None,
     others: Mapping[str, Estimate] | None = None,
 ) -> Verdict:
@@ -93,9 +82,9 @@ def compare_number(
         others: the same quantity under other readings; the nearest of them is named where ours differs.
 
     """
-    told = f"ours {show.estimate(ours)}, printed {show.scale * printed:.{show.digits + 1}f}{show.unit}"
+    told = f"ours {show.show(ours).in_words}, printed {show.scale * printed:.{show.digits + 1}f}{show.unit}"
     if bound is not None and bound.least.value - printed > _chance(bound.least):
-        least = show.estimate(bound.least)
+        least = show.show(bound.least).in_words
         return Verdict(what, "cannot agree", f"{bound.what}: at least {least}, whoever drives; {told}")
     if _is_near(printed, ours):
         return Verdict(what, "agrees", told)
@@ -125,7 +114,7 @@ def _off(printed: float, ours: Estimate) -> str:
     return f"{ours.value:+.3g} off" if printed == 0.0 else f"{100.0 * (ours.value / printed - 1.0):+.1f} %"
 
 
-def _nearest(printed: float, ours: Estimate, others: Mapping[str, Estimate], show: Show) -> str:
+def _nearest(printed: float, ours: Estimate, others: Mapping[str, Estimate], show: Column) -> str:
     """The reading that comes nearest to what is printed, if it comes nearer than ours."""
     if not others:
         return ""
@@ -133,7 +122,7 @@ def _nearest(printed: float, ours: Estimate, others: Mapping[str, Estimate], sho
     if abs(found.value - printed) >= abs(ours.value - printed):
         return "; no other reading here comes nearer"
     met = "which agrees" if _is_near(printed, found) else _off(printed, found)
-    return f"; nearest: {name}, {show.estimate(found)}, {met}"
+    return f"; nearest: {name}, {show.show(found).in_words}, {met}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +151,7 @@ class Less:
         return cls(where, paired_difference(low, high), not low.any() and not high.any(), least)
 
 
-def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False, show: Show = HARM) -> Verdict:
+def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False, show: Column = HARM) -> Verdict:
     """Whether every comparison of a statement comes out below 0, or at most 0, by its interval."""
     compared, ties = [part for part in parts if not part.neither], [part.where for part in parts if part.neither]
     places = ", ".join(ties) if len(ties) <= _MOST_NAMED else f"{len(ties)} more"
@@ -175,18 +164,18 @@ def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False,
     impossible = [part for part in failing if part.least is not None and _ends(part.least)[0] > 0.0]
     counts = f"holds in {len(compared) - len(failing)} of {len(compared)}{f' (both are 0 in {places})' if ties else ''}"
     if impossible:
-        told = ", ".join(f"{part.where} by {show.estimate(part.least)}" for part in impossible if part.least)
+        told = ", ".join(f"{part.where} by {show.show(part.least).in_words}" for part in impossible if part.least)
         return Verdict(what, "cannot agree", f"{counts}; the harm proven to be the least is above it in: {told}")
     if failing:
         ends = [_ends(part.difference) for part in failing]
         is_open = all(low < 0.0 <= high for low, high in ends)  # another list may decide either way
-        told = ", ".join(f"{part.where}, {show.estimate(part.difference)}" for part in failing)
+        told = ", ".join(f"{part.where}, {show.show(part.difference).in_words}" for part in failing)
         lead = f"{counts}; not " if len(parts) > 1 else "not "
         outcome: Judgement = "undecided" if is_open else "differs"
         return Verdict(what, outcome, f"{lead}{'shown' if is_open else 'so'}: {told}")
     worst = max(compared, key=lambda part: part.difference.value)
     lead = f"{counts}; the nearest is " if len(parts) > 1 else ""
-    return Verdict(what, "agrees", f"{lead}{worst.where}, {show.estimate(worst.difference)}")
+    return Verdict(what, "agrees", f"{lead}{worst.where}, {show.show(worst.difference).in_words}")
 
 
 def summarise_verdicts(verdicts: Sequence[Verdict]) -> Verdict:
@@ -242,7 +231,7 @@ def stated(name: str, value: str, where: str) -> Parameter:
 
 @model(frozen=True, config=_WRITTEN)
 class Table:
-    """A table of text."""
+    """A table in words, as it is written."""
 
     title: str
     head: Sequence[str]
@@ -265,7 +254,7 @@ class Made:
 
     verdicts: Sequence[Verdict]
     parameters: Sequence[Parameter]
-    tables: Sequence[Table] = ()
+    tables: Sequence[Sheet] = ()
     figures: Mapping[Drawn, Figure] = field(default_factory=dict)
     data: Mapping[str, str] = field(default_factory=dict)  # stem of a CSV file -> its text
     notes: Sequence[str] = ()  # computed sentences: what was run, what was not

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import chain, pairwise
 from typing import Any, Literal, NamedTuple
@@ -18,6 +18,7 @@ from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY
 from ethbrake_marl.evaluation.outcome import HYBRID_TEST, PAPER_ROWS, RANDOM_TEST, PaperRow
 from ethbrake_marl.evaluation.statistics import Estimate, mean, paired_difference, rate, relative_decrease
 from ethbrake_marl.figures.studies import Line, bars_figure, changes_figure, lines_figure
+from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.policies.shipped import load_shipped
@@ -44,8 +45,6 @@ from ethbrake_marl.studies.reproduction.item import (
     Parameter,
     Reading,
     Settings,
-    Show,
-    Table,
     Verdict,
     compare_number,
     csv_text,
@@ -99,11 +98,11 @@ def less_in_each(groups: Groups, smaller: str, larger: str) -> list[Less]:
     return [Less.of_harms(group, harm, smaller, larger) for group, harm in groups.items()]
 
 
-def _harm_table(title: str, groups: Groups, note: str) -> Table:
+def _harm_table(title: str, groups: Groups, note: str) -> Sheet:
     """Harm with its interval: one row per strategy, one column per group."""
     strategies = next(iter(groups.values()))
-    rows = [(name, *(HARM.estimate(mean(harm[name])) for harm in groups.values())) for name in strategies]
-    return Table(title, ("Strategy", *groups), rows, f"First-impact harm, m²/s²{note}. {_ABOUT_BASELINE}")
+    rows = [(name, *(mean(harm[name]) for harm in groups.values())) for name in strategies]
+    return Sheet(title, ("Strategy", *groups), rows, f"First-impact harm, m²/s²{note}. {_ABOUT_BASELINE}")
 
 
 def _over_distance(
@@ -256,7 +255,7 @@ def _draw_delays(worlds: str, stem: str, found: Mapping[tuple[str, str], Groups]
 
 _RATE, _MEAN_HARM, _DECREASE, _TOTAL = "collision rate", "average harm", "harm decrease", "total harm"
 _PREDICTED_HARM = "predicted harm"
-_PRINTED: Mapping[str, Show] = {_RATE: PERCENT, _MEAN_HARM: HARM, _DECREASE: PERCENT}
+_PRINTED: Mapping[str, Column] = {_RATE: PERCENT, _MEAN_HARM: HARM, _DECREASE: PERCENT}
 NOBODY = "least possible (proven)"
 
 
@@ -366,20 +365,17 @@ def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
     return Verdict(what, "agrees" if abs(follows - printed) < 0.0001 else "cannot agree", told)
 
 
-def rows_table(beside: Beside) -> Table:
+def rows_table(beside: Beside) -> Sheet:
     """Our rows of one reading, with what no strategy undercuts."""
-    columns = {
-        _RATE: "Collision rate", _MEAN_HARM: "First-impact harm", _TOTAL: "Total harm",
-        _PREDICTED_HARM: "Predicted harm", _DECREASE: "Harm decrease",
+    columns: dict[str, Column | str] = {
+        _RATE: PERCENT, _MEAN_HARM: "First-impact harm", _TOTAL: "Total harm", _PREDICTED_HARM: "Predicted harm",
+        _DECREASE: replace(PERCENT, heading="Harm decrease"),
     }  # fmt: skip
     if not any(_DECREASE in numbers for numbers in beside.numbers.values()):
         del columns[_DECREASE]
-    rows = [
-        (name, *(_PRINTED.get(q, HARM).estimate(numbers[q]) if q in numbers else "–" for q in columns))
-        for name, numbers in beside.numbers.items()
-    ]
+    rows = [(name, *map(numbers.get, columns)) for name, numbers in beside.numbers.items()]
     note = f"{beside.evaluation.worlds.n:,} worlds; 95 % intervals; harm in m²/s². {_ABOUT_BASELINE}"
-    return Table(beside.title, ("Strategy", *columns.values()), rows, note)
+    return Sheet(beside.title, ("Strategy", *columns.values()), rows, note)
 
 
 def _beside_printed(
@@ -404,7 +400,7 @@ def _beside_printed(
         if quantity in numbers
     ]
     csv = csv_text(("reading", "strategy", "quantity", "worlds", "value", "low", "high"), data)
-    tables = [Table("The paper's rows, as printed", head, rows), *map(rows_table, besides)]
+    tables = [Sheet("The paper's rows, as printed", head, rows), *map(rows_table, besides)]
     return Made([*arithmetic, *compare_rows(printed, besides)], parameters, tables, data={stem: csv}, notes=notes)
 
 
@@ -448,7 +444,7 @@ def _judge_choice(reading: str, grouped: Grouped, evaluation: Evaluation) -> lis
         worse = harm[name] > lower + 1e-9
         told = (
             f"in {int(worse.sum()):,} of {len(worse):,} worlds the {name} harms more than the lower of policy and"
-            f" {baseline}; mean excess {HARM.estimate(mean(harm[name] - lower))}"
+            f" {baseline}; mean excess {mean(harm[name] - lower).in_words()}"
         )
         what = f"the {name} takes the lower of the two ({reading})"
         verdicts.append(Verdict(what, "differs" if worse.any() else "agrees", told))
@@ -639,8 +635,8 @@ def reproduce_gaps(settings: Settings) -> Made:
     notes = []
     for name in _SHOWN:
         most = max(rows, key=lambda row: abs(changes[row][name].value))
-        harm = HARM.estimate(mean(base.harm[name]))
-        notes.append(f"What moves {name} ({harm}) most: {most}, by {HARM.estimate(changes[most][name])}.")
+        harm = mean(base.harm[name]).in_words()
+        notes.append(f"What moves {name} ({harm}) most: {most}, by {changes[most][name].in_words()}.")
     tables, trained = [_register(), _headline(base, episodes), _sensitivity(base, found)], _trained(settings)
     verdicts = _judge_gaps(base, rows)
     if not trained:
@@ -674,7 +670,7 @@ def _measure(scenario: Scenario, alternative: Alternative, episodes: int) -> Hea
     return Headline(evaluation.worlds.gaps_m, harm, collided)
 
 
-def _register() -> Table:
+def _register() -> Sheet:
     def told(gap: Gap) -> str:
         if gap.alternatives:
             return "; ".join(each.value for each in gap.alternatives)
@@ -682,36 +678,34 @@ def _register() -> Table:
 
     head = ("Quantity", "The paper", "Our default", "Alternatives, or why none is measured")
     rows = [(gap.name, gap.paper, gap.ours, told(gap)) for gap in GAPS]
-    return Table("Register of what the paper leaves open", head, rows, "Labels are those of the paper's source.")
+    return Sheet("Register of what the paper leaves open", head, rows, "Labels are those of the paper's source.")
 
 
-def _headline(base: Headline, episodes: int) -> Table:
-    rows = [
-        (name, PERCENT.estimate(collision_rate(base.collided[name])), HARM.estimate(mean(base.harm[name])))
-        for name in _SHOWN
-    ]
+def _headline(base: Headline, episodes: int) -> Sheet:
+    rows = [(name, collision_rate(base.collided[name]), mean(base.harm[name])) for name in _SHOWN]
     note = f"{episodes:,} worlds of the random test, seed {LIST_SEED}; first-impact harm, m²/s²; 95 % intervals."
-    return Table("Headline at our defaults", ("Strategy", "Collision rate", "Harm"), rows, note)
+    return Sheet("Headline at our defaults", ("Strategy", PERCENT, HARM), rows, note)
 
 
-def _sensitivity(base: Headline, found: Mapping[tuple[Gap, Alternative], Headline]) -> Table:
+def _sensitivity(base: Headline, found: Mapping[tuple[Gap, Alternative], Headline]) -> Sheet:
     rows = []
     for (gap, each), headline in found.items():
-        cells = [HARM.estimate(headline.change(base, name)) for name in _SHOWN]
+        cells = [headline.change(base, name) for name in _SHOWN]
         rates = [collision_rate(headline.collided[NAMES[spec]]).value for spec in (PAIRWISE, PPO)]
-        rows.append((gap.name, gap.ours, each.value, *cells, *(f"{100.0 * share:.1f} %" for share in rates)))
-    head = ("Quantity", "Default", "Alternative", *_SHOWN, "Collisions, E-V2X-BM", "Collisions, PPO")
+        rows.append((gap.name, gap.ours, each.value, *cells, *rates))
+    collisions = [replace(PERCENT, heading=f"Collisions, {name}") for name in ("E-V2X-BM", "PPO")]
+    head: list[Column | str] = ["Quantity", "Default", "Alternative", *_SHOWN, *collisions]
     note = (
         "Change of the mean harm (m²/s²) with its 95 % interval, paired by world where the worlds are the same; then"
         " the collision rates in the alternative. In the rows of H* inside the hybrid, PPO stands behind Algorithm 1."
     )
-    return Table("How far the headline moves", head, rows, note)
+    return Sheet("How far the headline moves", head, rows, note)
 
 
-def _trained(settings: Settings) -> list[Table]:
+def _trained(settings: Settings) -> list[Sheet]:
     """Harm of the kept policies of the trainings of what is open; none where nothing was trained."""
     rows = [
-        (name, str(len(kept)), f"{float(np.mean(kept)):.2f}", ", ".join(f"{harm:.2f}" for harm in kept))
+        (name, len(kept), float(np.mean(kept)), ", ".join(f"{harm:.2f}" for harm in kept))
         for name, kept in kept_harms(settings, OPEN).items()
     ]
     note = (
@@ -720,7 +714,7 @@ def _trained(settings: Settings) -> list[Table]:
         f" {load_recipe(PPO_PAPER.recipe).total_steps:,} decisions; two seeds say little about others."
     )
     head = ("Training", "Seeds", "Mean harm", "Each seed")
-    return [Table("What is open in training", head, rows, note)] if rows else []
+    return [Sheet("What is open in training", head, rows, note)] if rows else []
 
 
 def _judge_gaps(base: Headline, rows: Mapping[str, Headline]) -> list[Verdict]:

@@ -19,6 +19,7 @@ from ethbrake_marl.errors import OnProgress
 from ethbrake_marl.evaluation.seed_statistics import interquartile_mean
 from ethbrake_marl.evaluation.statistics import Estimate, mean
 from ethbrake_marl.figures.studies import SeedCurve, at_common_steps, seed_curves
+from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.learning.training import RETURN, RunDirectory, is_finished, progress_column, progress_rows
 from ethbrake_marl.physics import Floats
@@ -29,7 +30,6 @@ from ethbrake_marl.shield import HybridAgent
 from ethbrake_marl.shield.guard import Bound
 from ethbrake_marl.studies.reproduction.item import (
     FULL_BRAKE,
-    HARM,
     NAMES,
     PPO,
     PROVEN,
@@ -41,8 +41,6 @@ from ethbrake_marl.studies.reproduction.item import (
     Made,
     Parameter,
     Settings,
-    Show,
-    Table,
     Verdict,
     csv_text,
     drive_list,
@@ -216,7 +214,7 @@ _PAIRS = {  # stem of the figure -> recipes, and what is about them
 }  # fmt: skip
 _NEARLY = 0.05  # of the rise of the return: what "nearly identical" allows
 _DONE = 0.9  # of the fall of the harm: when a training has converged
-_NUMBER = Show(3)
+_NUMBER, _DECISIONS = Column("Final return", digits=3), Column("Decisions", digits=0)
 
 
 def _shipped_ends(settings: Settings) -> Made:
@@ -231,7 +229,7 @@ def _shipped_ends(settings: Settings) -> Made:
             found[delay] = harms(drive_list(scenario, agents, episodes, settings))
         low, high = found[LOW], found[HIGH]
         for name in low:
-            rows.append((reading.name, name, HARM.estimate(mean(low[name])), HARM.estimate(mean(high[name]))))
+            rows.append((reading.name, name, mean(low[name]), mean(high[name])))
             data += [[reading.name, name, delay, episodes, float(found[delay][name].mean())] for delay in found]
         learned = [name for name in low if name not in (NAMES[FULL_BRAKE], PROVEN)]
         parts = [Less.of_lists(name, low[name], high[name]) for name in learned]
@@ -242,7 +240,7 @@ def _shipped_ends(settings: Settings) -> Made:
         f"First-impact harm, m²/s², {episodes:,} worlds of seed 7 each. PPO and SAC were trained at 0.5 and 0.8 s,"
         " universal for all latencies; none at these delays alone."
     )
-    table = Table("What finished policies reach", ("Reading", "Strategy", "Low delay", "High delay"), rows, note)
+    table = Sheet("What finished policies reach", ("Reading", "Strategy", "Low delay", "High delay"), rows, note)
     csv = csv_text(("reading", "strategy", "delay", "worlds", "first_impact_harm"), data)
     return Made(verdicts, (), [table], data={"finished-policies": csv})
 
@@ -414,7 +412,9 @@ def _faster_and_steadier(ppo: Course, sac: Course, about: str) -> list[Verdict]:
     faster = Less.of_lists(f"{mean(fast).value:,.0f} decisions against {mean(slow).value:,.0f}", fast, slow)
     steadier = Less.of_lists(f"{mean(calm).value:.3f} of the rise against {mean(restless).value:.3f}", calm, restless)
     return [
-        judge_statement(f"SAC converges faster than PPO at low delay ({about})", [faster], show=Show(0)),
+        judge_statement(
+            f"SAC converges faster than PPO at low delay ({about})", [faster], show=Column("Decisions", digits=0)
+        ),
         judge_statement(f"PPO is the more stable one at low delay ({about})", [steadier], show=_NUMBER),
     ]
 
@@ -432,19 +432,19 @@ def _spreads_more(courses: Mapping[str, Courses]) -> Verdict:
     return judge_statement(what, parts, show=_NUMBER)
 
 
-def _table(delay: str, courses: Courses) -> Table:
+def _table(delay: str, courses: Courses) -> Sheet:
     rows = []
     for name, course in courses.items():
         harm = course.harm
         kept, last = (interquartile_mean([each]) for each in (harm.values.min(axis=1), harm.values[:, -1]))
         rows.append((
-            name, str(len(harm.values)), f"{harm.steps[-1]:,.0f}", HARM.estimate(kept), HARM.estimate(last),
-            _NUMBER.estimate(mean(course.last_returns)), f"{mean(course.decisions_to_converge).value:,.0f}",
+            name, len(harm.values), f"{harm.steps[-1]:,.0f}", kept, last, mean(course.last_returns),
+            f"{mean(course.decisions_to_converge).value:,.0f}",
         ))  # fmt: skip
-    head = ("Recipe", "Seeds", "Decisions", "Kept policy, harm", "Last policy, harm", "Final return", "90 % after")
+    head = ("Recipe", "Seeds", "Decisions", "Kept policy, harm", "Last policy, harm", _NUMBER, "90 % after")
     note = (
         "Harm: first-impact, m²/s², 1,000 worlds of seed 1007, interquartile mean over seeds with its bootstrap"
         " interval. Final return: mean over seeds of the last tenth of the updates, t interval. 90 % after: decisions"
         " until nine tenths of the fall of the harm are behind."
     )
-    return Table(f"Trainings at {delay} delay", head, rows, note)
+    return Sheet(f"Trainings at {delay} delay", head, rows, note)

@@ -13,6 +13,7 @@ from ethbrake_marl.evaluation.inputs import make_agents
 from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.figures.evaluation import trajectories
 from ethbrake_marl.figures.studies import profiles_figure, road_figure
+from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.pages.player import Played, player_content
 from ethbrake_marl.pages.report import drive_played
 from ethbrake_marl.physics import Floats
@@ -32,8 +33,6 @@ from ethbrake_marl.studies.reproduction.item import (
     Parameter,
     Reading,
     Settings,
-    Show,
-    Table,
     Verdict,
     csv_text,
     judge_statement,
@@ -45,7 +44,7 @@ from ethbrake_marl.studies.reproduction.item import (
 _AGENTS = (PPO, SAC, COUPLED, FULL_BRAKE)
 _POLICIES = (NAMES[PPO], NAMES[SAC])
 _SCENARIOS = (1, 2)
-_METRES, _COMMAND = Show(2, unit=" m"), Show(2, unit=" m/s²")
+_METRES, _COMMAND = Column("Distance", unit=" m"), Column("Command", unit=" m/s²")
 _GRID_S = 0.02
 _CELLS = [(reading, number) for reading in READINGS for number in _SCENARIOS]
 
@@ -85,10 +84,10 @@ def reproduce_accelerations(settings: Settings) -> Made:
     for (reading, number, name), record in records.items():
         driven = _Driven.of(record)
         own = (f"{driven.first:+.2f}", f"{record.command_mps2[:, 1].min():+.2f}", f"{100.0 * driven.braking:.0f} %")
-        rows.append((reading.name, str(number), name, *own, f"{driven.changes:.1f}"))
+        rows.append((reading.name, number, name, *own, f"{driven.changes:.1f}"))
     head = ("Reading", "Scenario", "Strategy", "First command", "Hardest", "Braking while it moves", "Ups and downs")
     note = "Commands of Vehicle 2 in m/s². One world each: no intervals."
-    table = Table("Commands of Vehicle 2", head, rows, note)
+    table = Sheet("Commands of Vehicle 2", head, rows, note)
     return Made(verdicts, _parameters(), [table], figures, {"accelerations": _csv(records)})
 
 
@@ -143,7 +142,7 @@ def _apart(records: Records, reading: Reading, what: str) -> list[float]:
     return [float(np.sqrt(np.mean((one - other) ** 2))) for one, other in pairs]
 
 
-def _judge(claims: Mapping[str, tuple[str, float, float]], reading: Reading, show: Show) -> list[Verdict]:
+def _judge(claims: Mapping[str, tuple[str, float, float]], reading: Reading, show: Column) -> list[Verdict]:
     """Claims, each with the numbers that it follows from, the smaller and the larger: of one world, no intervals."""
     return [
         judge_statement(f"{claim} ({reading.name})", [Less(told, Estimate(smaller - larger, None))], show=show)
@@ -205,15 +204,14 @@ def _judge_commands(reading: Reading, records: Records) -> list[Verdict]:
     return _judge(claims, reading, _COMMAND)
 
 
-def _outcomes(records: Records) -> Table:
+def _outcomes(records: Records) -> Sheet:
     """What happened in every recorded episode."""
     rows = []
     for (reading, number, name), record in records.items():
-        gaps = [f"{float(gap):.2f}" for gap in record.gaps_m[-1]]
-        harm = float(record.ledger.world_harm("first")[0])
-        rows.append((reading.name, str(number), name, str(len(record.impacts.time_s)), f"{harm:.2f}", *gaps))
+        harm, gaps = float(record.ledger.world_harm("first")[0]), map(float, record.gaps_m[-1])
+        rows.append((reading.name, number, name, len(record.impacts.time_s), harm, *gaps))
     head = ("Reading", "Scenario", "Strategy", "Impacts", "First-impact harm", "Last gap 1 (m)", "Last gap 2 (m)")
-    return Table("How the episodes end", head, rows, "One world each: no intervals. Harm in m²/s².")
+    return Sheet("How the episodes end", head, rows, "One world each: no intervals. Harm in m²/s².")
 
 
 def _csv(records: Records) -> str:

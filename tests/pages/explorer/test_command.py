@@ -19,7 +19,7 @@ import pytest
 from ethbrake_marl.cli.app import run_command
 
 ROOT = Path(__file__).resolve().parents[3]
-COMMAND = [sys.executable, "-c", "from ethbrake_marl.cli.app import main; main()", "explore", "--no-browser"]
+COMMAND = [sys.executable, "-c", "from ethbrake_marl.cli.app import main; main()", "watch", "explore", "--no-browser"]
 
 
 class Running(NamedTuple):
@@ -73,7 +73,7 @@ def test_server__does_not_wait_for_acknowledgements(monkeypatch: pytest.MonkeyPa
     """Nagle's algorithm, by which an answer waits 40 ms, is off only where a socket is TCP's by name (asyncio)."""
     named: list[int] = []
     monkeypatch.setattr("uvicorn.Server.run", lambda self, sockets: named.extend(each.proto for each in sockets))
-    assert run_command(["explore", "--no-browser", "--agents", "full_brake", "--folder", str(tmp_path)]) == 0
+    assert run_command(["watch", "explore", "--no-browser", "--agents", "full_brake", "--folder", str(tmp_path)]) == 0
     assert named == [socket.IPPROTO_TCP]
 
 
@@ -136,7 +136,7 @@ def test_server__ends_at_ctrl_c(running: Running) -> None:
 def test_command__refuses_before_it_listens(
     arguments: list[str], told: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run_command(["explore", "--no-browser", *arguments]) == 2
+    assert run_command(["watch", "explore", "--no-browser", *arguments]) == 2
     assert told in capsys.readouterr().err
 
 
@@ -146,11 +146,11 @@ def test_command__says_whose_port_it_is(capsys: pytest.CaptureFixture[str], tmp_
         taken.listen()
         port = str(taken.getsockname()[1])
         options = ["--agents", "full_brake", "--port", port, "--folder", str(tmp_path)]
-        assert run_command(["explore", "--no-browser", *options]) == 2
+        assert run_command(["watch", "explore", "--no-browser", *options]) == 2
     assert "Address already in use" in capsys.readouterr().err
 
 
 def test_command__names_its_extra(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr("ethbrake_marl.errors.find_spec", lambda name: None)
-    assert run_command(["explore", "--no-browser"]) == 2
+    assert run_command(["watch", "explore", "--no-browser"]) == 2
     assert "-m pip install 'ethbrake-marl[explore]'" in capsys.readouterr().err

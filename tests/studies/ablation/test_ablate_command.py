@@ -1,4 +1,4 @@
-"""``ethbrake ablate``: what it writes, that it goes on, and what it refuses."""
+"""``ethbrake study ablate``: what it writes, that it goes on, and what it refuses."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ def ablation(tmp_path_factory, tiny) -> Path:
     folder = tmp_path_factory.mktemp("ablation") / "whole"
     with pytest.MonkeyPatch.context() as patch:
         draw_nothing(patch)
-        assert run_command(["ablate", "--output", str(folder), "--recipes", str(tiny), *SMALL]) == 0
+        assert run_command(["study", "ablate", "--output", str(folder), "--recipes", str(tiny), *SMALL]) == 0
     return folder
 
 
 def refused(capsys, *arguments: str | Path) -> str:
     capsys.readouterr()
-    assert run_command(["ablate", *(str(argument) for argument in arguments)]) == 2
+    assert run_command(["study", "ablate", *(str(argument) for argument in arguments)]) == 2
     return capsys.readouterr().err
 
 
@@ -78,7 +78,7 @@ def test_ablate__the_shield_goes_around_what_was_trained(ablation, tmp_path, tin
     assert "other settings (shield None, here step)" in refused(capsys, *words, "step")
     (folder / "settings.json").unlink()
     assert "shield 'robust': must be step" in refused(capsys, *words, "robust")
-    assert run_command(["ablate", *map(str, words), "step"]) == 0
+    assert run_command(["study", "ablate", *map(str, words), "step"]) == 0
     assert "to do: 0 trainings" in capsys.readouterr().err
     found, alone = content(folder), content(ablation)
     assert found["settings"]["shield"] == "step" and alone["settings"]["shield"] is None
@@ -116,7 +116,7 @@ def test_ablate__goes_on_where_it_was_stopped_to_the_same_result(ablation, tmp_p
     folder, trained = tmp_path / "stopped", []
 
     def stop_in_the_second(recipe, scenario, path, **options):
-        trained.append(path.name)
+        trained.extend([path.name] if path.name != "timed" else [])
         if len(trained) == 2:
             calls = []
             monkeypatch.setattr(learning_train.Session, "_after_update", _stopping(calls, learning_train.Session))
@@ -126,13 +126,13 @@ def test_ablate__goes_on_where_it_was_stopped_to_the_same_result(ablation, tmp_p
     with monkeypatch.context() as patch:
         patch.setattr(trainings, "train", stop_in_the_second)
         patch.setattr(learning_train.Session, "_after_update", learning_train.Session._after_update)
-        assert run_command(["ablate", "--output", str(folder), "--recipes", str(tiny), *SMALL]) == 130
+        assert run_command(["study", "ablate", "--output", str(folder), "--recipes", str(tiny), *SMALL]) == 130
     monkeypatch.undo()
     half = folder / "trainings" / trained[1]
     assert json.loads((half / "run.json").read_text())["status"] != "finished"
     assert not (folder / "ablation.json").exists()
     capsys.readouterr()
-    assert run_command(["ablate", "--output", str(folder), "--recipes", str(tiny), *SMALL, "--jobs", "2"]) == 0
+    assert run_command(["study", "ablate", "--output", str(folder), "--recipes", str(tiny), *SMALL, "--jobs", "2"]) == 0
     assert "to do: 3 trainings" in capsys.readouterr().err
     assert content(folder) == content(ablation)
 
@@ -151,7 +151,7 @@ def _stopping(calls: list[int], callback):
 
 def test_ablate__states_the_cost_first(ablation, tiny, capsys):
     capsys.readouterr()
-    words = ["ablate", "--output", str(ablation), "--recipes", str(tiny), *SMALL, "--cost"]
+    words = ["study", "ablate", "--output", str(ablation), "--recipes", str(tiny), *SMALL, "--cost"]
     before = (ablation / "ablation.json").stat().st_mtime_ns
     assert run_command(words) == 0
     assert "to do: 0 trainings, 0 decisions: 0 s; joint optima 0 s;" in capsys.readouterr().err
@@ -166,7 +166,7 @@ def test_ablate__bad_input_is_refused(tmp_path, tiny, capsys):
     assert "seeds 0: must be at least 1" in refused(capsys, *start, "--seeds", "0")
     assert "at most the 10 worlds" in refused(capsys, *start, "--episodes", "10", "--search-episodes", "11")
     assert "scheme" in refused(capsys, *start, "--scheme", "shard")
-    assert "jobs 0" in refused(capsys, *start, "--jobs", "0")
+    assert "jobs = 0: must be a whole number in 1..64" in refused(capsys, *start, "--jobs", "0")
     only = "cooperation-0-sensors,paper-distance"
     assert "is a file; give a folder" in refused(capsys, "--output", tiny, "--recipes", tiny)
     assert "is a file; give a folder" in refused(capsys, "--output", tiny / "new", "--recipes", tiny)
@@ -223,7 +223,10 @@ def test_ablate__other_settings_in_the_folder_are_refused_and_nothing_is_lost(ab
 def test_ablate__the_cost_of_a_new_folder_makes_nothing(tmp_path, tiny, capsys):
     words = ["--levels", "cooperation-0-sensors,cooperation-2-paper", "--episodes", "5", "--search-episodes", "1"]
     words += ["--budget", "1", "--seeds", "1", "--steps", "64"]
-    assert run_command(["ablate", "--output", str(tmp_path / "new"), "--recipes", str(tiny), *words, "--cost"]) == 0
+    assert (
+        run_command(["study", "ablate", "--output", str(tmp_path / "new"), "--recipes", str(tiny), *words, "--cost"])
+        == 0
+    )
     assert "to do: 1 trainings, 64 decisions" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
@@ -262,6 +265,7 @@ def test_ablate__an_interruption_reaches_the_trainings_of_other_processes(tmp_pa
         sys.executable,
         "-c",
         "from ethbrake_marl.cli.app import main; main()",
+        "study",
         "ablate",
         "--output",
         str(folder),

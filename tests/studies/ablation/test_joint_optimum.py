@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +13,8 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import Progress
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.limits.best_harm import best_harm
-from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.limits.best_harm import best_harm, chunks_left
+from ethbrake_marl.scenario import Sample, load_scenario
 from ethbrake_marl.studies.ablation import (
     Cost,
     Level,
@@ -21,7 +22,6 @@ from ethbrake_marl.studies.ablation import (
     Plan,
     best_known,
     common_worlds,
-    parts_left,
     questions,
     read_levels,
     search_all,
@@ -101,6 +101,10 @@ def test_best_known__decisions_at_other_times_count_for_nothing():
         assert one.searched.best[count].harm.mean() < harm.mean()
 
 
+def left(plan: Plan, level: Level, part: Sample) -> tuple[int, list[Path]]:
+    return chunks_left(level.scenario, part, budget=plan.budget, chunks=plan.optimum_folder(level))
+
+
 def test_questions__each_is_searched_once_and_what_is_kept_is_not_searched_again(tmp_path, tiny):
     levels = tuple(read_levels(NAMES))
     recipe = with_scheme(load_recipe(str(tiny)), None)
@@ -108,15 +112,15 @@ def test_questions__each_is_searched_once_and_what_is_kept_is_not_searched_again
     samples = common_worlds(levels, 10, 7)
     asked = questions(plan, samples)
     assert [[level.name for level in alike] for *_, alike in asked] == [list(NAMES[:2]), [NAMES[2]], [NAMES[3]]]
-    assert [parts_left(plan, level, part) for level, part, _ in asked] == [(5, [])] * 3
+    assert [left(plan, level, part) for level, part, _ in asked] == [(5, [])] * 3
     told = []
     search_all(plan, samples, 1, told.append)
     assert told == [Progress(f"joint optimum of {name}", 5, 5) for name in (NAMES[0], *NAMES[2:])]
-    assert [parts_left(plan, level, part) for level, part, _ in asked] == [(0, [])] * 3
-    assert parts_left(replace(plan, budget=11), *asked[0][:2]) == (5, [])
+    assert [left(plan, level, part) for level, part, _ in asked] == [(0, [])] * 3
+    assert left(replace(plan, budget=11), *asked[0][:2]) == (5, [])
     fewer = questions(replace(plan, search_episodes=4), samples)[0]
-    assert parts_left(plan, *fewer[:2]) == (4, [])
+    assert left(plan, *fewer[:2]) == (4, [])
     damaged = tmp_path / "optimum" / NAMES[2] / "0000000.npz"
     damaged.write_bytes(b"no table")
-    assert parts_left(plan, *asked[1][:2]) == (5, [damaged])
+    assert left(plan, *asked[1][:2]) == (5, [damaged])
     assert f"{damaged}: is damaged; its worlds are searched again" in str(Cost(0, 0, 0.0, 0.0, 0.0, (damaged,)))

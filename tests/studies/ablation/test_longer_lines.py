@@ -86,7 +86,7 @@ def run(tmp_path_factory, tiny) -> Path:
 
 
 def test_generalise__prints_a_table_or_json_and_refuses_bad_input(run, tmp_path, capsys):
-    words = ["generalise", "--runs", str(run), "--scenario", "cooperation-3-pair", "--vehicles", "3,6"]
+    words = ["study", "generalise", "--runs", str(run), "--scenario", "cooperation-3-pair", "--vehicles", "3,6"]
     words += ["--episodes", "10"]
     capsys.readouterr()
     assert run_command([*words, "--search-episodes", "2", "--budget", "20", "--json"]) == 0
@@ -105,7 +105,7 @@ def test_generalise__prints_a_table_or_json_and_refuses_bad_input(run, tmp_path,
 
 def refused(capsys, runs: str, scenario: str = "cooperation-3-pair") -> str:
     capsys.readouterr()
-    words = ["generalise", "--runs", runs, "--scenario", scenario, "--vehicles", "3", "--episodes", "10"]
+    words = ["study", "generalise", "--runs", runs, "--scenario", scenario, "--vehicles", "3", "--episodes", "10"]
     assert run_command(words) == 2
     return capsys.readouterr().err
 
@@ -121,7 +121,7 @@ def test_generalise__runs_that_are_not_seeds_of_one_training_are_refused(run, tm
     other = changed(run, tmp_path / "recipe", recipe={"gamma": 0.5})
     assert "differ in recipe" in refused(capsys, f"{run},{other}")
     seed = changed(run, tmp_path / "seed", recipe={"seed": 1})
-    words = ["generalise", "--runs", f"{run},{seed}", "--scenario", "cooperation-3-pair", "--vehicles", "2,4"]
+    words = ["study", "generalise", "--runs", f"{run},{seed}", "--scenario", "cooperation-3-pair", "--vehicles", "2,4"]
     assert run_command([*words, "--episodes", "5"]) == 0
     assert "2 policies" in capsys.readouterr().out
     (seed / "config.json").write_text("[]")

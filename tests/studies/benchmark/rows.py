@@ -11,8 +11,7 @@ import sys
 from pathlib import Path
 
 from ethbrake_marl.errors import ShownProgress
-from ethbrake_marl.studies.benchmark import Suite, load_suite, make_entry, write_entry
-from ethbrake_marl.studies.leaderboard import leaderboard_markdown, read_leaderboard
+from ethbrake_marl.studies.benchmark import Suite, load_suite, make_entry, read_leaderboard, write_entry
 
 ROWS = (
     "full_brake", "e_v2x_bm", "ppo@shipped", "policy@shipped", "universal@shipped", "policy@shipped+step",
@@ -41,7 +40,7 @@ def page_tables() -> dict[str, str]:
     """Every table of docs/benchmark.md by its marker."""
     suite = load_suite("v2")
     found = read_leaderboard(sorted(ENTRIES.glob("*.json")), suite)
-    return {"lists": list_markdown(suite), "rows": leaderboard_markdown(found).rstrip("\n")}
+    return {"lists": list_markdown(suite), "rows": found.markdown().rstrip("\n")}
 
 
 def main(arguments: list[str]) -> None:

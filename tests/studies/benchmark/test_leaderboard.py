@@ -12,8 +12,7 @@ from typing import Any
 import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.studies.benchmark import plain_sha256
-from ethbrake_marl.studies.leaderboard import leaderboard_markdown, leaderboard_page, read_leaderboard
+from ethbrake_marl.studies.benchmark import plain_sha256, read_leaderboard
 
 NAMES = ("full_brake", "coast", "full_brake+episode")
 
@@ -41,22 +40,23 @@ def change(file: Path, edit: Callable[[dict[str, Any]], None], *, bind: bool = T
 
 def test_entries__are_ranked_by_their_score_and_those_of_some_lists_stand_below(tiny, entries):
     found = read_leaderboard(paths(entries), tiny)
-    ranked = [row for row in found.rows if row.ranked]
-    assert found.rows[-1].entry.agent == "full_brake+episode" and not found.rows[-1].ranked
-    assert [row.score.value for row in ranked] == sorted((row.score.value for row in ranked), reverse=True)
+    *ranked, last = [entry for _, entry in found.entries]
+    assert last.agent == "full_brake+episode" and last.overall is None and len(ranked) == 2
+    shares = [entry.overall.value for entry in ranked]
+    assert shares == sorted(shares, reverse=True)
     assert read_leaderboard(paths(entries)[::-1], tiny) == found
 
 
 def test_table__is_told_as_markdown_and_as_a_page(tiny, entries):
     found = read_leaderboard(paths(entries), tiny)
-    lines = leaderboard_markdown(found).splitlines()
+    lines = found.markdown().splitlines()
     assert lines[0] == "|  | Agent | Overall | paper-random | paper-random-obstacle | cooperation-3-pair |"
     assert (
         "| – | `full_brake+episode` | (" in lines[-1] and "2 of 3 lists) | " in lines[-1] and lines[-1].endswith("– |")
     )
-    page = leaderboard_page(found)
+    page = found.page()
     assert page.startswith("<!DOCTYPE html>") and tiny.sha256 in page and "not driven" in page
-    assert all(row.entry.entry_sha256 in page for row in found.rows)
+    assert all(entry.entry_sha256 in page for _, entry in found.entries)
 
 
 def leave_out_list(content):

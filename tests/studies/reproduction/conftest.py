@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-from ethbrake_marl.studies.reproduction.item import Drawn, Item, Made, Settings, Table, Verdict, stated
+from ethbrake_marl.files.sheet import Sheet
+from ethbrake_marl.studies.reproduction.item import Drawn, Item, Made, Settings, Verdict, stated
 
 HOSTILE = "<script>alert('x')</script>\"|*_\u202e"
 
@@ -22,7 +23,7 @@ def made(text: str = "told", figures: Mapping[Drawn, Figure] | None = None) -> M
     return Made(
         (Verdict(text, "agrees", text),),
         (stated(text, text, text),),
-        (Table(text, (text, text), ((text, text),), text),),
+        (Sheet(text, (text, text), ((text, text),), text),),
         figures or {},
         {"data": "a,b\n"},
         (text,),

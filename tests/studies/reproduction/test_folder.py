@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation.statistics import Estimate
 from ethbrake_marl.figures.studies import Line, lines_figure
+from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.studies.reproduction.folder import (
     checked_result,
     docs_page,
@@ -23,7 +24,7 @@ from ethbrake_marl.studies.reproduction.folder import (
     reproduce,
     write_docs,
 )
-from ethbrake_marl.studies.reproduction.item import Drawn, Settings, Table
+from ethbrake_marl.studies.reproduction.item import Drawn, Settings
 from tests.pages.hostile import Page
 
 from .conftest import HOSTILE, made, planted
@@ -53,7 +54,7 @@ def test_reproduce__writes_figures_data_results_and_one_page(settings: Settings)
 
 def test_page__tells_everything_that_a_result_holds(settings: Settings) -> None:
     told = replace(
-        made(), tables=(Table("A table", ("Who", "Harm"), (("PPO", "1.50 [1.25, 1.75]"),), "Of 24 worlds."),)
+        made(), tables=(Sheet("A table", ("Who", "Harm"), (("PPO", "1.50 [1.25, 1.75]"),), "Of 24 worlds."),)
     )
     (result,), _ = reproduce([planted("gaps", lambda s: told)], settings)
     page = Page((settings.folder / "index.html").read_text("utf-8"))

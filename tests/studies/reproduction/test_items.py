@@ -33,7 +33,7 @@ def test_item__has_verdicts_parameters_tables_and_data(made_of: dict[str, Made],
     stated = {parameter.name: parameter.origin.startswith("stated") for parameter in made.parameters}
     assert stated["masses"] and stated["braking capacities"]
     assert not stated["restitution e"] and not stated["time step"] and not stated["horizon"]
-    assert made.tables and all(len(row) == len(table.head) for table in made.tables for row in table.rows)
+    assert made.tables and all(len(row) == len(table.columns) for table in made.tables for row in table.rows)
     assert made.data and all(text.count("\n") > 1 for text in made.data.values())
     if name not in ("hybrid-table", "random-table", "learning-high", "learning-low"):
         assert made.figures
@@ -54,7 +54,7 @@ def test_items__speak_of_both_readings(made_of: dict[str, Made]) -> None:
 
 def test_trajectories__of_the_scenarios_have_no_impact_under_the_policies(made_of: dict[str, Made]) -> None:
     (table,) = made_of["trajectories"].tables
-    assert {row[3] for row in table.rows if row[2] in ("PPO", "SAC")} == {"0"}
+    assert {row[3] for row in table.rows if row[2] in ("PPO", "SAC")} == {0}
 
 
 def test_choose_items__in_the_order_of_the_paper() -> None:

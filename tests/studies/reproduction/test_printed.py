@@ -67,7 +67,7 @@ def test_rows_table__ends_with_what_nobody_undercuts() -> None:
     table = rows_table(own)
     assert table.rows[-1][0] == NOBODY
     assert own.bounds[RATE].least.value <= own.numbers[NAMES[FULL_BRAKE]][RATE].value
-    assert all(len(row) == len(table.head) for row in table.rows)
+    assert all(len(row) == len(table.columns) for row in table.rows)
 
 
 @pytest.mark.parametrize("row", PAPER_ROWS)

@@ -29,7 +29,7 @@ from tests.studies.sweep.disturbing import PROGRAM, holders, journal
 
 WORK = {
     "counting": ([sys.executable, "-m", "tests.studies.sweep.counting"], []),
-    "training": ([*PROGRAM, "sweep"], ["--retries", "5", "--output"]),
+    "training": ([*PROGRAM, "study", "sweep"], ["--retries", "5", "--output"]),
 }
 NODES = 2  # with one core each
 LONGEST_S = 3600.0
@@ -90,7 +90,7 @@ def run(folder: Path, work: str, jobs: int, share: float, seed: int) -> bool:
         ray.shutdown()
         cluster.shutdown()
     entries = journal(out)
-    finished = Counter(one["hash"] for one in entries if one["status"] == "finished")
+    finished = Counter(one["job"] for one in entries if one["status"] == "finished")
     same = (out / "results.csv").read_bytes() == (folder / "local" / "results.csv").read_bytes()
     lost, doubled = jobs - len(finished), sum(count > 1 for count in finished.values())
     print(

@@ -54,5 +54,8 @@ def finished_sweep(tmp_path_factory: pytest.TempPathFactory, small: dict[str, An
     (folder / "sweep.yaml").write_text(yaml.safe_dump(small))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(jobs, "LocalWorkers", Inside)
-        assert run_command(["sweep", str(folder / "sweep.yaml"), "--output", str(folder / "out"), "--jobs", "1"]) == 0
+        assert (
+            run_command(["study", "sweep", str(folder / "sweep.yaml"), "--output", str(folder / "out"), "--jobs", "1"])
+            == 0
+        )
     return folder / "out"

@@ -22,7 +22,7 @@ from filelock import FileLock
 RESULTS = 10  # values of a row
 
 
-def count(folder: Path, seed: int, steps: int, sleep_s: float) -> tuple[str, ...]:
+def count(folder: Path, seed: int, steps: int, sleep_s: float) -> list[str]:
     """The row of a job."""
     folder.mkdir(parents=True, exist_ok=True)
     with FileLock(folder / "run.lock", timeout=60.0):
@@ -37,14 +37,12 @@ def count(folder: Path, seed: int, steps: int, sleep_s: float) -> tuple[str, ...
         for name in ("manifest.json", "weights.safetensors"):
             (folder / "policy" / name).touch()
         (folder / "run.json").write_text("{}")
-    return (str(steps), str(seed), *["0.0"] * (RESULTS - 3), text)
+    return [str(steps), str(seed), *["0.0"] * (RESULTS - 3), text]
 
 
 def main() -> int:
-    from ethbrake_marl.studies.cluster import RayWorkers
-    from ethbrake_marl.studies.jobs import LocalWorkers, pack
-    from ethbrake_marl.studies.sweep import RUNS, run_sweep
-    from ethbrake_marl.studies.sweep_file import Row, SweepPlan, plan_sweep, read_sweep
+    from ethbrake_marl.studies.jobs import Job, LocalWorkers, RayWorkers
+    from ethbrake_marl.studies.sweep import RUNS, Row, SweepPlan, plan_sweep, read_sweep, run_sweep
     from tests.studies.sweep.counting import count as job  # by a name that workers know, not of __main__
 
     parser = argparse.ArgumentParser(description=__doc__)
@@ -56,14 +54,14 @@ def main() -> int:
     parser.add_argument("--sleep", type=float, default=0.01)
     options = parser.parse_args()
 
-    def call_of(plan: SweepPlan, row: Row, folder: Path) -> bytes:
-        return pack(job, folder / RUNS / row.name, row.asked.seed, options.steps, options.sleep)
+    def job_of(plan: SweepPlan, row: Row, folder: Path, log: Path) -> Job:
+        return Job(row.name, job, (folder.absolute() / RUNS / row.name, row.asked.seed, options.steps, options.sleep))
 
     plan = plan_sweep(read_sweep(options.file))
     workers = LocalWorkers(options.jobs) if options.ray is None else RayWorkers(options.ray)
     with closing(workers):
-        result = run_sweep(plan, options.folder, workers, retries=5, call_of=call_of)
-    return 130 if result.interrupted else len(result.failures)
+        result = run_sweep(plan, options.folder, workers, retries=5, job_of=job_of)
+    return 130 if result.interrupted else result.failed
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -13,8 +14,8 @@ import pytest
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.studies import cluster
-from ethbrake_marl.studies.jobs import Attempt, WorkerLost, pack, run_jobs
+from ethbrake_marl.studies import jobs
+from ethbrake_marl.studies.jobs import Attempt, Job, RayWorkers, WorkerLost, run_jobs
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -23,14 +24,13 @@ LISTENING = """
 import os
 from contextlib import closing
 from pathlib import Path
-from ethbrake_marl.studies.cluster import RayWorkers
-from ethbrake_marl.studies.jobs import run_jobs
-from ethbrake_marl.studies.jobs import pack
+from ethbrake_marl.studies.jobs import Job, RayWorkers, run_jobs
 
 before = {line.split()[9] for kind in ("tcp", "tcp6") for line in Path("/proc/net", kind).read_text().splitlines()[1:]}
 found = []
 with closing(RayWorkers("local", 2)) as workers:
-    run_jobs(lambda number: pack(os.getenv, "OMP_NUM_THREADS"), 2, workers, lambda one: found.append(one.answer.value))
+    calls = [Job(name, os.getenv, ("OMP_NUM_THREADS",)) for name in "ab"]
+    run_jobs(calls, workers, lambda one: found.append(one.answer.value))
     for kind in ("tcp", "tcp6"):
         for line in Path("/proc/net", kind).read_text().splitlines()[1:]:
             parts = line.split()
@@ -97,16 +97,16 @@ class _Reference:
 
 def test_ray__lost_jobs_are_tried_again_by_us_and_refused_ones_are_not(monkeypatch):
     ray = PretendedRay({2}, {3})
-    monkeypatch.setattr(cluster, "_connect", lambda address, number: ray)
-    workers = cluster.RayWorkers("10.0.0.1:6379")
+    monkeypatch.setattr(jobs, "_connect", lambda address, number: ray)
+    workers = RayWorkers("10.0.0.1:6379")
     attempts: list[Attempt] = []
     assert workers.room() == 2  # one runs, one waits
-    assert run_jobs(lambda number: pack(operator.neg, number), 5, workers, attempts.append)
-    last = {one.number: one for one in attempts if one.last}
+    assert run_jobs([Job(str(k), operator.neg, (k,)) for k in range(5)], workers, attempts.append)
+    last = {int(one.job.name): one for one in attempts if one.last}
     assert {number: one.answer.value for number, one in last.items()} == {0: 0, 1: -1, 2: -2, 3: None, 4: -4}
     assert last[2].attempt == 2 and type(attempts[2].answer.error) is WorkerLost
     assert isinstance(last[3].answer.error, InvalidInput) and "no module" in str(last[3].answer.error)
-    workers.begin(9, pack(operator.neg, 9))
+    workers.begin(9, pickle.dumps((operator.neg, (9,))))
     workers.interrupt()
     workers.close()
     assert (ray.cancelled, ray.ended) == (1, True)
@@ -114,7 +114,7 @@ def test_ray__lost_jobs_are_tried_again_by_us_and_refused_ones_are_not(monkeypat
 
 def test_ray__is_an_extra(monkeypatch, write_sweep, small, tmp_path, capsys):
     monkeypatch.setitem(sys.modules, "ray", None)
-    command = ["sweep", str(write_sweep(**small)), "--output", str(tmp_path / "out"), "--ray", "local"]
+    command = ["study", "sweep", str(write_sweep(**small)), "--output", str(tmp_path / "out"), "--ray", "local"]
     assert run_command(command) == 2
     assert "needs the package ray" in (told := capsys.readouterr().err) and "ethbrake-marl[cluster]" in told
     assert not (tmp_path / "out").exists()
@@ -135,8 +135,8 @@ def test_local_ray__listens_on_loopback_alone_and_has_no_dashboard():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("work", "jobs"), [("counting", 60), ("training", 8)])
-def test_cluster__of_two_nodes_whose_workers_are_killed_makes_the_same_table(work, jobs):
+@pytest.mark.parametrize(("work", "number"), [("counting", 60), ("training", 8)])
+def test_cluster__of_two_nodes_whose_workers_are_killed_makes_the_same_table(work, number):
     pytest.importorskip("ray")
-    command = [sys.executable, "-m", "tests.studies.sweep.cluster", "--jobs", str(jobs), "--work", work]
+    command = [sys.executable, "-m", "tests.studies.sweep.cluster", "--jobs", str(number), "--work", work]
     assert subprocess.run(command, cwd=ROOT, timeout=3600, check=False).returncode == 0

@@ -8,7 +8,7 @@ import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.learning.training import resolve
-from ethbrake_marl.studies.sweep_file import plan_sweep, read_sweep
+from ethbrake_marl.studies.sweep import plan_sweep, read_sweep
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 GRID = {"scenario": "paper-random", "recipe": "ppo"}

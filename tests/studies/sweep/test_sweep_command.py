@@ -1,4 +1,4 @@
-"""``ethbrake sweep``: what it writes, that nothing is done twice, and that no disturbance shows in its table."""
+"""``ethbrake study sweep``: what it writes, that nothing is done twice, and that no disturbance shows in its table."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def read(file: Path) -> list[dict[str, str]]:
 
 
 def sweep(file: Path, folder: Path, *options: str) -> int:
-    return run_command(["sweep", str(file), "--output", str(folder), "--jobs", "1", *options])
+    return run_command(["study", "sweep", str(file), "--output", str(folder), "--jobs", "1", *options])
 
 
 def test_table__has_a_row_for_every_job_in_the_order_of_the_file(finished_sweep, small):
@@ -42,7 +42,7 @@ def test_table__has_a_row_for_every_job_in_the_order_of_the_file(finished_sweep,
         ("3", "0.9"), ("3", "0.99"), ("5", "0.9"), ("5", "0.99")
     ]  # fmt: skip
     entries = journal(finished_sweep)
-    assert Counter(one["hash"] for one in entries) == Counter(row["hash"] for row in rows)
+    assert Counter(one["job"].rpartition("-")[2] for one in entries) == Counter(row["hash"][:16] for row in rows)
     assert all(one["status"] == "finished" and one["wall_s"] > 0.0 for one in entries)
     for row in rows:
         (run,) = (finished_sweep / "runs").glob(f"paper-random-tiny-seed{row['seed']}-{row['hash'][:16]}")
@@ -152,7 +152,7 @@ def test_failures__end_in_a_table_with_their_last_lines(write_sweep, tiny, tmp_p
 @pytest.mark.parametrize("options", [["--jobs", "0"], ["--retries", "-1"], ["--format", "xlsx"]])
 def test_bad_options__are_refused(write_sweep, small, tmp_path, options):
     file = write_sweep(**small)
-    assert run_command(["sweep", str(file), "--output", str(tmp_path / "new"), *options]) == 2
+    assert run_command(["study", "sweep", str(file), "--output", str(tmp_path / "new"), *options]) == 2
     assert not (tmp_path / "new").exists()
 
 
@@ -184,7 +184,7 @@ def test_disturbed_sweep__of_trainings_has_the_same_table(finished_sweep, small,
     file = tmp_path / "sweep.yaml"
     file.write_text(yaml.safe_dump(small))
     folder = tmp_path / "out"
-    disturb([*PROGRAM, "sweep", str(file), "--output", str(folder), "--jobs", "2"], folder)
+    disturb([*PROGRAM, "study", "sweep", str(file), "--output", str(folder), "--jobs", "2"], folder)
     assert (folder / TABLE).read_bytes() == (finished_sweep / TABLE).read_bytes()
     assert sorted(ends(folder).values()) == [1, 1, 1, 1]
 
@@ -221,4 +221,4 @@ def disturb(command: list[str], folder: Path) -> None:
 
 def ends(folder: Path) -> Counter[str]:
     """How often each job was finished."""
-    return Counter(one["hash"] for one in journal(folder) if one["status"] == "finished")
+    return Counter(one["job"] for one in journal(folder) if one["status"] == "finished")

@@ -52,7 +52,7 @@ def finished_tuning(tmp_path_factory: pytest.TempPathFactory, small: dict[str, A
     """The folder of that tuning, done by this process without a disturbance; not to be changed."""
     folder = tmp_path_factory.mktemp("tuning")
     (folder / "tuning.yaml").write_text(yaml.safe_dump(small))
-    command = ["tune", str(folder / "tuning.yaml"), "--output", str(folder / "out"), "--trials", str(TRIALS)]
+    command = ["study", "tune", str(folder / "tuning.yaml"), "--output", str(folder / "out"), "--trials", str(TRIALS)]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(jobs, "LocalWorkers", Inside)
         assert run_command([*command, "--export", str(folder / "best.yaml")]) == 0

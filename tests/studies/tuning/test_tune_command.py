@@ -1,4 +1,4 @@
-"""``ethbrake tune``: what it writes, that its best trial can be had again, and that no disturbance shows."""
+"""``ethbrake study tune``: what it writes, that its best trial can be had again, and that no disturbance shows."""
 
 from __future__ import annotations
 
@@ -19,8 +19,7 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.train import train
 from ethbrake_marl.studies.jobs import LocalWorkers
-from ethbrake_marl.studies.tuning import TuningStudy, place_of, run_tuning
-from ethbrake_marl.studies.tuning_file import plan_tuning, read_tuning
+from ethbrake_marl.studies.tuning import TuningStudy, place_of, plan_tuning, read_tuning, run_tuning
 from tests.studies.sweep.disturbing import PROGRAM
 from tests.studies.tuning.conftest import TRIALS
 
@@ -33,7 +32,7 @@ def read(file: Path) -> list[dict[str, str]]:
 
 
 def tune(file: Path, folder: Path, *options: str) -> int:
-    return run_command(["tune", str(file), "--output", str(folder), "--trials", str(TRIALS), *options])
+    return run_command(["study", "tune", str(file), "--output", str(folder), "--trials", str(TRIALS), *options])
 
 
 def test_table__has_every_trial_the_first_with_the_recipes_own_values(finished_tuning):
@@ -94,7 +93,18 @@ def test_trials__that_ended_are_kept_and_more_go_on_as_if_they_had_been_asked_fo
 def test_disturbed_tuning__has_the_same_table(finished_tuning, write_tuning, tmp_path):
     file, folder = write_tuning(), tmp_path / "out"
     export = tmp_path / "best.yaml"
-    command = [*PROGRAM, "tune", str(file), "--output", str(folder), "--trials", str(TRIALS), "--export", str(export)]
+    command = [
+        *PROGRAM,
+        "study",
+        "tune",
+        str(file),
+        "--output",
+        str(folder),
+        "--trials",
+        str(TRIALS),
+        "--export",
+        str(export),
+    ]
     for trial, end in ((1, signal.SIGKILL), (3, signal.SIGINT)):
         driver = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
         try:
@@ -151,7 +161,7 @@ def test_folder_of_another_tuning__is_refused(finished_tuning, write_tuning, cap
     table = (finished_tuning / TABLE).read_bytes()
     for changes in ({"seed": 1}, {"sampler": {"seed": 4}}):
         assert tune(write_tuning(**changes), finished_tuning) == 2
-        assert "holds another tuning" in capsys.readouterr().err
+        assert "holds a tuning with other settings" in capsys.readouterr().err
     assert (finished_tuning / TABLE).read_bytes() == table
 
 
@@ -163,7 +173,7 @@ def test_folder_of_other_versions__is_refused_with_their_names(finished_tuning, 
     (folder / "tuning.json").write_text(json.dumps(record))
     assert tune(write_tuning(), folder) == 2
     told = capsys.readouterr().err
-    assert "was tuned with torch 1.0, here 2." in told and "numpy" not in told
+    assert "(versions torch 1.0, here 2." in told and "numpy" not in told
 
 
 @pytest.mark.slow
@@ -180,9 +190,9 @@ def test_storage__can_be_shared_by_folders(write_tuning, tmp_path):
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        (["--trials", "0"], "trials 0: must be from 1"),
-        (["--jobs", "0"], "jobs 0: must be from 1"),
-        (["--retries", "-1"], "retries -1"),
+        (["--trials", "0"], "trials = 0: must be a whole number in 1..100000"),
+        (["--jobs", "0"], "jobs = 0: must be a whole number in 1..4096"),
+        (["--retries", "-1"], "retries = -1: must be"),
         (["--storage", "study.db"], "must be an address such as sqlite:///study.db"),
         (["--storage", "none://me:secret@here/x"], "storage none://...: cannot be used"),
         (["--export", "best.txt"], "must end in .yaml"),
@@ -240,9 +250,9 @@ def test_second_command__in_a_folder_is_refused(finished_tuning, write_tuning, t
 
     folder = tmp_path / "out"
     shutil.copytree(finished_tuning, folder)
-    with FileLock(folder / "tuning.lock"):
+    with FileLock(folder / ".lock"):
         assert tune(write_tuning(), folder) == 2
-    assert "another process tunes here" in capsys.readouterr().err
+    assert "another process works in it" in capsys.readouterr().err
 
 
 def test_same_command__exports_again_over_its_own_recipe(finished_tuning, small, tmp_path, capsys):

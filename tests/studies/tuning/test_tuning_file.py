@@ -9,7 +9,7 @@ import pytest
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning.recipe import shipped_recipes
-from ethbrake_marl.studies.tuning_file import plan_tuning, read_tuning
+from ethbrake_marl.studies.tuning import plan_tuning, read_tuning
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 RATE = {"low": 1e-4, "high": 1e-2, "log": True}
@@ -124,7 +124,7 @@ def test_bad_files__without_their_mistake_are_planned(tmp_path):
 @pytest.mark.parametrize("changes", [{"recipe": "pppo"}, searching(gama=RATE), {"prune": 1}])
 def test_bad_files__begin_no_trial_and_make_nothing(write_tuning, tmp_path, changes):
     file = write_tuning(**changes)
-    assert run_command(["tune", str(file), "--output", str(tmp_path / "new")]) == 2
+    assert run_command(["study", "tune", str(file), "--output", str(tmp_path / "new")]) == 2
     assert [*tmp_path.iterdir()] == [file]
 
 
