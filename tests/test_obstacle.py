@@ -25,7 +25,7 @@ from ethbrake_marl.physics import advance, concatenate
 from ethbrake_marl.policies.actor import observation_schema
 from ethbrake_marl.scenario import Scenario, Task, initial_state_worlds, load_scenario, worlds_from_table
 from ethbrake_marl.search import constant_profiles, follow_profiles, profile_problem
-from ethbrake_marl.shield.agents import ShieldedDriver
+from ethbrake_marl.shield.guard import ShieldedDriver
 from tests.reference.avoidability_lp import avoidable_by_lp
 
 ALL = load_scenario("cooperation-4-all")

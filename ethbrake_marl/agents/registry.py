@@ -264,20 +264,20 @@ _WRAPPERS: dict[str, Entry] = {
         "+episode[:pairwise][:believed]",
         "behind Algorithm 1: it or E-V2X-BM drives the episode, whichever harms less; believed: as far as is received",
         (Source.MODEL,),
-        "shield.agents:shield_episodes",
+        "shield.guard:shield_episodes",
     ),
     "step": Entry(
         "+step[:believed]",
         "every action certified, or replaced; of a team together; believed: certified in the world that is believed",
         (Source.MODEL,),
-        "shield.agents:shield_steps",
+        "shield.guard:shield_steps",
     ),
     "robust": Entry(
         "+robust[:interior][:believed]",
         "the same where not everything is known: in the corners of an uncertainty, interior: in all of it;"
         " believed: against all that was not received",
         (Source.MODEL,),
-        "shield.agents:shield_steps_robustly",
+        "shield.guard:shield_steps_robustly",
     ),
 }
 

@@ -20,7 +20,7 @@ from ethbrake_marl.files.sheet import Estimate, estimates_to_json
 from ethbrake_marl.physics import Floats, Ints, LeftOutRows, Worlds, measured_without_failed
 from ethbrake_marl.scenario import Sample, Task
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver
-from ethbrake_marl.shield.agents import Shielded, join, put_shield, shielded_episodes
+from ethbrake_marl.shield.guard import Shielded, join, put_shield, shielded_episodes
 from ethbrake_marl.shield.review import SAME_HARM, VERDICTS, review
 
 NONE, EPISODE, STEP = "none", "episode", "step"

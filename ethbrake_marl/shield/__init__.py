@@ -4,9 +4,8 @@ import sys
 from types import ModuleType
 from typing import Any
 
-from ethbrake_marl.shield.agents import ShieldedDriver
 from ethbrake_marl.shield.certify import Backup, Decision, Running, certify
-from ethbrake_marl.shield.guard import HybridAgent, MovingAtHorizon, ShieldOptions
+from ethbrake_marl.shield.guard import HybridAgent, MovingAtHorizon, ShieldedDriver, ShieldOptions
 from ethbrake_marl.shield.step_shield import StepShield
 from ethbrake_marl.shield.uncertainty import Interval, Uncertainty, parse_uncertainty
 from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec

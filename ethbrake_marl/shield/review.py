@@ -16,9 +16,9 @@ from ethbrake_marl.errors import InvalidInput, count_of, renumbered
 from ethbrake_marl.physics import Bools, Floats, Ints, LeftOutRows, Worlds, measured_without_failed
 from ethbrake_marl.physics.kernel import decision_at, first_decision_s
 from ethbrake_marl.scenario.schema import Task
-from ethbrake_marl.shield.agents import ShieldedDriver, put_shield, shielded_episodes
 from ethbrake_marl.shield.certify import proposed_action
 from ethbrake_marl.shield.enclosure import CORNERS, checked_robust
+from ethbrake_marl.shield.guard import ShieldedDriver, put_shield, shielded_episodes
 from ethbrake_marl.shield.step_shield import StepShield
 from ethbrake_marl.shield.uncertainty import Uncertainty
 

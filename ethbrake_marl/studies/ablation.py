@@ -32,7 +32,7 @@ from ethbrake_marl.limits.best_harm import (
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.physics.kernel import first_decision_s
 from ethbrake_marl.scenario import Sample, Scenario, Task
-from ethbrake_marl.shield.agents import Shielded, drive_chunks, stack
+from ethbrake_marl.shield.guard import Shielded, drive_chunks, stack
 from ethbrake_marl.studies.jobs import JobFolder
 from ethbrake_marl.studies.trainings import (
     TIMED_DRIVES,

@@ -42,7 +42,7 @@ from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.policies.bundle import Policy, load_policy
 from ethbrake_marl.scenario import Sample, Scenario
 from ethbrake_marl.scenario.fields import DECLARED, LEARNER
-from ethbrake_marl.shield.agents import Shielded
+from ethbrake_marl.shield.guard import Shielded
 from ethbrake_marl.studies.ablation import Harms, Level, Measured, Plan, Training, harms_of
 from ethbrake_marl.studies.jobs import Job, each, run_jobs
 

@@ -14,7 +14,7 @@ from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.evaluation.inputs import policy_sha256
 from ethbrake_marl.policies.shipped import onnx_model
-from ethbrake_marl.shield.agents import ShieldedDriver
+from ethbrake_marl.shield.guard import ShieldedDriver
 
 SCENARIO = eb.load_scenario("paper-random")
 WORLDS = SCENARIO.sample(12, 7).worlds

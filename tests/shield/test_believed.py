@@ -12,8 +12,8 @@ from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.shield import ShieldedDriver, enclosure
-from ethbrake_marl.shield.believed import BelievedShield
 from ethbrake_marl.shield.enclosure import Boxes, boxes_of
+from ethbrake_marl.shield.step_shield import BelievedShield
 from tests.shield import corners
 from tests.shield.corners import ABOVE, INSIDE, LISTS, NEVER_HEARD, WAYS, Hostile, shielded
 

@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from ethbrake_marl.figures.studies import change_figure, harm_curve, signed_ticks, who_pays
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.shield.agents import Shielded
+from ethbrake_marl.shield.guard import Shielded
 from ethbrake_marl.studies.ablation import Harms, Level, Measured
 from ethbrake_marl.studies.ablation_report import FIGURES, ablation_page, compare, interval_words, levels_csv, markdown
 from tests.pages.hostile import Page
