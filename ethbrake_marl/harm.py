@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
-from typing import Annotated, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from pydantic import GetJsonSchemaHandler
@@ -30,8 +30,11 @@ from ethbrake_marl.defaults import HarmCount as HarmCount
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, count_of, describe_error, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.physics.advance import Impacts, no_obstacle_harm
-from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.compiled import compiled, logistic
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds, unwritable
+
+_INJURY_SLOPE = 0.177  # per m/s of speed change
+_INJURY_OFFSET = {"front": -4.457, "rear": -4.888}  # side of the car that is hit
 
 
 def check_harm_count(harm_count: str) -> None:
@@ -142,6 +145,16 @@ def front_share(harm: float, front_mass: float, rear_mass: float) -> float:
     if front_mass <= rear_mass:
         return rear_mass / (front_mass + rear_mass) * harm
     return harm - front_mass / (front_mass + rear_mass) * harm
+
+
+def injury_probability(speed_change_mps: Floats, side: Literal["front", "rear"]) -> Floats:
+    """Probability of a severe injury (MAIS3+) in a rear-end collision from one occupant's change of speed.
+
+    ``P = 1 / (1 + exp(-c0 - c1 dv))`` with c1 = 0.177 per m/s and c0 = -4.457 where the car is hit in front
+    (the striking car), -4.888 at its rear (the struck car). Source: Geisslinger et al. 2023.
+    """
+    dv = np.abs(speed_change_mps)
+    return logistic(_INJURY_OFFSET[side] + _INJURY_SLOPE * dv)
 
 
 # Objectives, whose harm counts: what each vehicle's objective makes of the harm of the line, from the one ledger.

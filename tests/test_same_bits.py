@@ -42,8 +42,8 @@ REMAINS = {
     ): "quantiles for the ends of an interval; the last bit of the t quantile"
     " differs for 1 in 1,000 counts where the processor has no FMA. Means and errors are exact sums",
     ("figures/evaluation.py", "**"): SQUARES,
-    ("learning/algorithms/counterfactual_model.py", "**"): TRAINED,
-    ("learning/algorithms/networks.py", "np.exp"): TRAINED,
+    ("learning/counterfactual.py", "**"): TRAINED,
+    ("learning/counterfactual.py", "np.exp"): TRAINED,
     ("learning/recipe.py", "math.cos"): TRAINED,
     ("pages/player.py", "**"): SQUARES,
     ("studies/falsification.py", "**"): SEARCHED,

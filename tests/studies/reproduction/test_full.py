@@ -117,5 +117,14 @@ def test_course__measures_of_planted_curves() -> None:
     assert course([[-4.0, -3.0, -2.0, -1.0, 0.0]], [[1.0] * 5]).still_rising == pytest.approx(0.25)
 
 
+def test_returns__of_a_shaped_reward_say_nothing_between_delays_so_its_harm_is_compared() -> None:
+    worse = course([[-9.0] * 20, [-8.99] * 20], [[90.0] * 20, [80.0] * 20])
+    better = course([[-10.0] * 20, [-9.99] * 20], [[10.0] * 20, [8.0] * 20])  # of lower returns
+    for recipe, outcome, told in (("ppo", "agrees", "minus its harm"), ("ppo-paper", "differs", "ppo-paper")):
+        assert bool(load_recipe(recipe).reward.shaping) == (recipe == "ppo")
+        verdict = trainings._higher_when_low({"high": {recipe: worse}, "low": {recipe: better}})
+        assert (verdict.outcome, told in verdict.because) == (outcome, True)
+
+
 def test_read_courses__nothing_where_nothing_is_trained(tmp_path: Path) -> None:
     assert read_courses(tmp_path, "low") == {}
