@@ -97,8 +97,8 @@ def learn(folder: Path) -> eb.TrainResult:
 def measure(folder: Path) -> list[eb.SummaryRow]:
     scenario = eb.load_scenario(eb.list_scenarios()[0].name)
     policies = [eb.load_policy(folder), eb.load_shipped("ppo")]
-    driver = eb.make_agent("full_brake")
-    agents: dict[str, eb.Agent | eb.Team] = {"full_brake": driver, "learned": eb.LearnedAgent(policies[0])}
+    team: eb.Team = eb.Team({1: eb.LearnedAgent(policies[0])}, "learned")
+    agents = {"full_brake": eb.make_agent("full_brake"), "learned": team}
     found: eb.Evaluation = eb.evaluate(scenario.sample(10, 7), agents, scenario=scenario)
     outcome: eb.Outcome = found.outcome("learned")
     record: eb.EpisodeRecord = eb.record_episode(found.worlds.take([0]), Cautious(), scenario=scenario)
