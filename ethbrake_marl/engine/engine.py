@@ -426,7 +426,7 @@ class Engine(Running):
         new._state, new._params = (array.copy() for array in new._kept(start.packed))
         new._clock, new._wanted = start.clock.copy(), start.wanted.copy()
         new._potential = np.zeros(start.wanted.shape)
-        new._stops, new.guarded, new.ruling = [], None, None
+        new._stops, new.ruling = [], None
         new._begin(np.arange(self.n), start)
         self.__dict__.update(new.__dict__)  # in one piece: not even an interrupt comes between
 

@@ -368,7 +368,7 @@ def between_of(evaluation: Evaluation) -> Between | None:
 
 # Measures of the user's own: functions of every impact of an episode.
 
-_NAME = re.compile(r"(?!.*_[0-9]+\Z)[a-z][a-z0-9_]{0,63}")  # x_2 is that of the second vehicle
+_NAME = re.compile(r"(?!.*_([0-9]+|interval|low|high)\Z)[a-z][a-z0-9_]{0,63}")  # x_2 is that of the second vehicle
 
 
 @dataclass(frozen=True, slots=True)
@@ -399,6 +399,7 @@ class _Registered:
     unit: str
     about: str
     function: EpisodeFunction
+    form: str = ""  # what it gives: a truth or a number, per world or per vehicle
 
 
 REGISTERED: dict[str, _Registered] = {}
@@ -408,8 +409,8 @@ def register_measure(name: str, function: EpisodeFunction, *, unit: str) -> None
     """Make every evaluation from now on tell ``name`` with its interval: in tables, files, shards and pages.
 
     Args:
-        name: 1 to 64 of ``a-z``, digits and ``_``, beginning with a letter, not ending in ``_`` and a number; columns
-            are called ``metric_NAME``.
+        name: 1 to 64 of ``a-z``, digits and ``_``, beginning with a letter, not ending in ``_`` and a number,
+            ``_interval``, ``_low`` or ``_high``; columns are called ``metric_NAME``.
         function: from ``EpisodeImpacts`` to a number for each world [n], or one for each vehicle [n, N], which
             become columns of their own; of truths a rate is told. Its docstring says what it is. It must work for
             lines of any length.
@@ -423,12 +424,12 @@ def register_measure(name: str, function: EpisodeFunction, *, unit: str) -> None
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
         raise InvalidInput(
             f"measure {name!r:.80}: must be 1 to 64 of a-z, 0-9 and _, beginning with a letter, not ending in _"
-            " and a number"
+            " and a number, _interval, _low or _high"
         )
     if not callable(function) or not (function.__doc__ or "").strip():
         raise InvalidInput(f"measure {name!r}: needs a function with a docstring that says what it is")
     metric = _Registered(name, str(unit), " ".join((function.__doc__ or "").split()), function)
-    _columns(metric, _tried())
+    metric = replace(metric, form=_form(_checked(metric, _tried())))
     if REGISTERED.setdefault(name, metric) != metric:
         raise AlreadyExists(f"measure {name!r} is registered already; give another name")
 
@@ -440,7 +441,15 @@ def metric_columns(episodes: EpisodeImpacts) -> dict[str, Values]:
     """
     found: dict[str, Values] = {}
     for metric in REGISTERED.values():
-        found |= _columns(metric, episodes)
+        values = _checked(metric, episodes)
+        if _form(values) != metric.form:
+            raise InvalidInput(
+                f"measure {metric.name!r}: gave {_form(values)}; when it was registered it gave {metric.form}"
+            )
+        if values.ndim == 1:
+            found[metric.name] = values
+        else:
+            found |= {f"{metric.name}_{i + 1}": column.copy() for i, column in enumerate(values.T)}
     return found
 
 
@@ -467,11 +476,16 @@ def _registered(column: str) -> _Registered | None:
     return REGISTERED.get(column) or REGISTERED.get(column.rpartition("_")[0])
 
 
-def _columns(metric: _Registered, episodes: EpisodeImpacts) -> dict[str, Values]:
-    """What it gives, checked."""
+def _form(values: Values) -> str:
+    return f"a {'truth' if values.dtype == np.bool_ else 'number'} per {'world' if values.ndim == 1 else 'vehicle'}"
+
+
+def _checked(metric: _Registered, episodes: EpisodeImpacts) -> Values:
+    """What it gives, [n] or [n, N], checked."""
     what, (n, vehicles) = f"measure {metric.name!r}", episodes.worlds.speeds_mps.shape
     try:
-        value = np.asarray(metric.function(episodes))
+        given = metric.function(episodes)
+        value = np.asarray(None if np.ma.isMaskedArray(given) else given)
     except Exception as error:
         raise InvalidInput(f"{what}: its function fails: {describe_error(error)}") from error
     if value.shape not in ((n,), (n, vehicles)) or value.dtype.kind not in "fiub":
@@ -483,10 +497,7 @@ def _columns(metric: _Registered, episodes: EpisodeImpacts) -> dict[str, Values]
     if not finite.all():
         world = int(np.argmin(finite))
         raise InvalidInput(f"{what}: is {value[world]} in world {world}; must be finite")
-    value = value if value.dtype == np.bool_ else value.astype(np.float64)
-    if value.ndim == 1:
-        return {metric.name: value}
-    return {f"{metric.name}_{i + 1}": value[:, i].copy() for i in range(vehicles)}
+    return value if value.dtype == np.bool_ else value.astype(np.float64)
 
 
 def _tried() -> EpisodeImpacts:

@@ -393,9 +393,9 @@ def rich_table(rows: Sequence[SummaryRow]) -> Sheet:
 
 def metrics_table(rows: Sequence[SummaryRow]) -> Sheet:
     """The registered measures: one line per agent, the mean per world with its interval."""
-    headings = metric_headings(rows[0].metrics).values() if rows else ()
-    lines = [(row.agent, *row.metrics.values()) for row in rows]
-    return Sheet("Measures", ["Agent", *map(Column, headings)], lines)
+    headings = metric_headings(rows[0].metrics) if rows else {}
+    lines = [(row.agent, headings[column], value) for row in rows for column, value in row.metrics.items()]
+    return Sheet("Measures", ["Agent", Column("Measure", text=True), Column("Mean or rate")], lines)
 
 
 def markdown_table(rows: Sequence[SummaryRow]) -> str:

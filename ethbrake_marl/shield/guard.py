@@ -609,14 +609,16 @@ class Attached:
     def __init__(
         self, env: object, interface: type, maker: str, policy: Proposing | None, where: str, options: Mapping[str, Any]
     ) -> None:
-        self.options = read_options(where, options)
-        engine = getattr(getattr(env, "unwrapped", env), "engine", None)
+        self.options, self._env = read_options(where, options), env
+        engine = self._reached()
         if isinstance(engine, Engine) and isinstance(engine.guard, ShieldGuard):
             first = engine.guard.options
             raise InvalidInput(
                 f"{where}: a {first.where} (mode {first.mode}) shields this environment already, and its bound"
                 " holds for one shield alone; give that one other options, or close() it first"
             )
+        if isinstance(getattr(env, "attached", None), Attached):
+            raise InvalidInput(f"{where}: {env} is a shield that was closed; put this one around what that is around")
         if not (isinstance(env, interface) and isinstance(engine, Engine)):
             raise InvalidInput(f"{where}: {env} is not one of this package's environments ({maker})")
         self.engine, self._left = engine, Guarded(None, {})
@@ -634,8 +636,17 @@ class Attached:
         """The ``StepShield``, ``BelievedShield`` or ``HybridAgent`` as it is now, to be read; None before a reset."""
         return self.memory.shield
 
+    def _reached(self) -> Any:
+        """The engine of the environment inside, as it is now."""
+        return getattr(getattr(self._env, "unwrapped", self._env), "engine", None)
+
     def check_open(self) -> None:
-        """Raise ``InvalidInput`` once this shield was closed: it stands nowhere any more, and bounds nothing."""
+        """Raise ``InvalidInput`` where this shield bounds nothing: it was closed, or another environment is inside."""
+        if self._reached() is not self.engine:
+            raise InvalidInput(
+                f"{self.options.where}: another environment is inside than the one that is shielded; put a shield"
+                " around that one"
+            )
         if self.engine.guard is not self.guard:
             raise InvalidInput(f"{self.options.where}: this shield was closed; put a new one around the environment")
 
@@ -647,6 +658,7 @@ class Attached:
 
     def tell(self) -> dict[str, NDArray[Any]]:
         """What is told of the last step, or, before the first one, of the alert; each [n, L]."""
+        self.check_open()
         ruling = self.engine.ruling
         return self.guard.tell(self.memory if ruling is None else ruling.memory, ruling)
 

@@ -54,6 +54,7 @@ class ShieldedVecEnv(VecEnvWrapper):
 
     def step_wait(self) -> tuple[Observations, Rewards, Bools, list[dict[str, Any]]]:
         """Advance every world by one step with the actions certified or replaced."""
+        self.attached.check_open()
         observation, reward, done, infos = self.venv.step_wait()
         told = self.attached.infos()
         for info, row in zip(infos, told, strict=True):

@@ -62,14 +62,15 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         **options: Any,
     ) -> None:
         maker = "eb.parallel_env; with agents acting in turn eb.shielded_aec(that)"
+        asked = None if agents is None else _names(agents)
         self.attached = Attached(env, ParallelEnv, maker, policy, "HybridShield", {"mode": mode, **options})
         super().__init__(env)
         engine = self.attached.engine
         self.shielded = tuple(engine.scenario.vehicle_names[i] for i in engine.learners)  # front to rear
-        if agents is not None and set(_names(agents)) != set(self.shielded):
+        if asked is not None and set(asked) != set(self.shielded):
             self.attached.close()
             raise InvalidInput(
-                f"HybridShield: shields every learner, {self.shielded}, and nobody else; got {_names(agents)}. What an"
+                f"HybridShield: shields every learner, {self.shielded}, and nobody else; got {asked}. What an"
                 " unshielded one does is an assumption that nothing checks: give it a script (learners=[...] of the"
                 " environment)"
             )
@@ -199,6 +200,8 @@ class ShieldedVectorEnv(VectorWrapper):
         """Start an episode in every row; the bounds stand in ``infos["shield"]`` already."""
         self.attached.check_open()
         observations, infos = self.env.reset(seed=seed, options=options)
+        if not isinstance(infos, dict):
+            raise InvalidInput("ShieldedVectorEnv: a wrapper inside makes a list of infos; put it around the shield")
         return observations, infos | self._told(np.ones(self.num_envs, np.bool_))
 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
@@ -242,7 +245,7 @@ def shield(env: Any, policy: Proposing | None = None, mode: str = "step", **opti
     settings = {"mode": mode, **options}
     if isinstance(env, AECEnv):
         inside: Any = env
-        while isinstance(inside, InTurns | OrderEnforcingWrapper):
+        while type(inside) in (InTurns, OrderEnforcingWrapper):  # those of eb.env; another one may change actions
             inside = inside.env
         if not isinstance(inside, ParallelEnv):
             raise InvalidInput(

@@ -160,13 +160,18 @@ def test_register_measure__refuses_what_cannot_be_used() -> None:
         """Not a number."""
         return np.full(episodes.worlds.n, np.nan)
 
+    def masked(episodes: Any) -> Any:
+        """Nothing that counts."""
+        return np.ma.masked_array(np.zeros(episodes.worlds.n), True)
+
     def greedy(episodes: Any) -> Any:
         """Changes what it is given."""
         episodes.rows.closing_speed_mps[:] = 0.0
 
     for function, name, message in (
         (squared, "Squared", "must be 1 to 64 of a-z"),
-        (squared, "delta_v_2", "not ending in _ and a number"),
+        *((squared, f"delta_v_{end}", "not ending in _ and a number") for end in ("2", "interval", "low", "high")),
+        (masked, "mine", r"'mine': gave object of shape \(\)"),
         (3, "mine", "needs a function with a docstring"),
         (lambda episodes: 0, "mine", "needs a function with a docstring"),
         (flat, "mine", r"gave float64 of shape \(\); must be numbers of shape \(2,\), one per world, or \(2, 3\)"),
@@ -180,3 +185,23 @@ def test_register_measure__refuses_what_cannot_be_used() -> None:
     register()
     with pytest.raises(AlreadyExists, match="measure 'squared' is registered already"):
         register(injury)
+
+
+def test_measure__of_another_form_than_when_it_was_registered_is_refused() -> None:
+    def by_size(episodes: Any) -> Any:
+        """A truth of few worlds, a number of many."""
+        change = episodes.largest_speed_change_mps.max(axis=1)
+        return change > 3.0 if len(change) < 10 else change
+
+    def by_call(episodes: Any) -> Any:
+        """One for each vehicle, in two worlds alone."""
+        return episodes.largest_speed_change_mps[:, 0] if episodes.worlds.n > 2 else episodes.largest_speed_change_mps
+
+    for function, message in (
+        (by_size, "'mine': gave a number per world; when it was registered it gave a truth per world"),
+        (by_call, "'mine': gave a number per world; when it was registered it gave a number per vehicle"),
+    ):
+        register(function, "mine")
+        with pytest.raises(InvalidInput, match=message):
+            evaluated()
+        REGISTERED.clear()
