@@ -446,7 +446,7 @@ class Engine(Running):
         """An engine that goes on from here without changing this one (scripts that remember are shared)."""
         new = copy.copy(self)
         new.__dict__.update({name: getattr(new, name).copy() for name in RUNNING})
-        new.roster = copy.deepcopy(new.roster)
+        new.roster = new.roster.apart()
         return new
 
     def _renew(self, rows: Ints) -> None:

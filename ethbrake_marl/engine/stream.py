@@ -84,6 +84,12 @@ class Roster:
         self.given = given  # the worlds that were given, at the alert: where ``numbers`` are -1
         self.numbers = np.full(n, -1, np.int64) if first is None else first + np.arange(n)  # by row; -1: given
 
+    def apart(self) -> Roster:
+        """One that goes on from here without changing this one."""
+        new = copy.copy(self)
+        new.failed, new.numbers = dict(self.failed), self.numbers.copy()
+        return new
+
     def renew(self, rows: Ints, first: int) -> None:
         """World ``first`` of the stream and those after it now stand in these rows."""
         self.numbers[rows] = first + np.arange(len(rows))

@@ -280,13 +280,14 @@ def as_predicted(running: Running, seen: Floats) -> Bools:
     finite numbers will do.
     """
     columns, N = seen.shape[1], (running.states.shape[1] + 4) // 5
+    if running.members == 1:
+        same: Bools = (seen == running.states[:, :columns]).all(axis=1)
+        return same
     predicted = running.states.reshape(running.n, running.members, -1)
-    slack = 0.0 if running.members == 1 else SLACK
-    low, high = predicted[:, :, :columns].min(axis=1) - slack, predicted[:, :, :columns].max(axis=1) + slack
+    low, high = predicted[:, :, :columns].min(axis=1) - SLACK, predicted[:, :, :columns].max(axis=1) + SLACK
     within: Bools = ((seen >= low) & (seen <= high)).all(axis=1)
-    if running.members > 1:
-        had_impact = (predicted[:, :, 2 * N - 1 : 3 * N - 2] == 1.0).any(axis=(1, 2))
-        within |= had_impact & np.isfinite(seen).all(axis=1)
+    had_impact = (predicted[:, :, 2 * N - 1 : 3 * N - 2] == 1.0).any(axis=(1, 2))
+    within |= had_impact & np.isfinite(seen).all(axis=1)
     return within
 
 

@@ -239,23 +239,27 @@ class ShieldGuard(ABC):
         """A shield that goes on apart."""
         return copy.copy(shield)
 
-    def _asked(self, running: Running, memory: Guarded, proposed: Floats) -> tuple[Floats, dict[int, Agent], Worlds]:
-        """All proposals [n, L], those of the policies where nobody else makes one; the policies then; the worlds."""
-        policies, worlds = memory.policies, running.worlds
+    def _asked(
+        self, worlds: Worlds | None, policies: dict[int, Agent], proposed: Floats
+    ) -> tuple[Floats, dict[int, Agent]]:
+        """All proposals [n, L], those of the policies where nobody else makes one, and the policies then."""
         left_out = np.isnan(proposed).all(axis=0)
         if left_out.any() and not policies:
             raise InvalidInput("shield: no action was given, and there is no policy that could propose one")
         if left_out.any() or any(apart(policy) is not policy for policy in policies.values()):
+            assert worlds is not None
             policies = {i: apart(policy) for i, policy in policies.items()}
             own = by_vehicle(proposed_actions(policies, worlds, len(policies) == 1), self.vehicles)
             proposed = np.where(left_out, own, proposed)
-        return proposed, policies, worlds
+        return proposed, policies
 
 
 def by_row(columns: Any, n: int, learners: int) -> NDArray[Any]:
     """What is told, [], [n] of a world, or [n, L], with the axis of learners: [n, L]."""
     each = np.asarray(columns)
-    return np.broadcast_to(each[:, np.newaxis] if each.ndim == 1 else each, (n, learners))
+    if each.ndim == 1:
+        each = each[:, np.newaxis]
+    return each if each.shape == (n, learners) else np.broadcast_to(each, (n, learners))
 
 
 class StepGuard(ShieldGuard):
@@ -311,13 +315,14 @@ class StepGuard(ShieldGuard):
         """What is certified. In a world whose episode is over as far as the shield foretold it is full braking."""
         shield: StepShield = memory.shield
         goes_on, finished = ~running.ended, shield.running.finished  # type: ignore[union-attr]  # it has begun
-        proposed, policies, worlds = self._asked(running, memory, proposed)
+        worlds = running.worlds if memory.policies or self._told is not None else None  # made anew each time
+        proposed, policies = self._asked(worlds, memory.policies, proposed)
         after = copy.copy(shield)
         decision = after.decide(
             proposed if self._several else proposed[:, 0],
-            seen=seen_columns(running.packed) if self._told is None else state_columns(worlds),
+            seen=seen_columns(running.packed) if worlds is None or self._told is None else state_columns(worlds),
             only=goes_on,
-            proposer=Proposer(policies, worlds) if policies and self._later_rollouts else None,
+            proposer=None if worlds is None or not (policies and self._later_rollouts) else Proposer(policies, worlds),
         )
         applied = by_vehicle(decision.applied, self.vehicles)
         applied = np.where((goes_on & finished)[:, np.newaxis], -1.0, applied)
@@ -406,7 +411,8 @@ class BelievedGuard(ShieldGuard):
 
     def decide(self, running: Running, memory: Guarded, proposed: Floats) -> Ruling:
         """What is certified in the believed worlds."""
-        proposed, policies, worlds = self._asked(running, memory, proposed)
+        worlds = running.worlds
+        proposed, policies = self._asked(worlds, memory.policies, proposed)
         after = memory.shield.branch()
         before = after.interventions
         applied = after.decide(worlds, self.vehicles[0], proposed[:, 0], policies or None)[:, np.newaxis]

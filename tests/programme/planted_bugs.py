@@ -98,7 +98,7 @@ BUGS: dict[str, Bug] = {
         STEPPING, "1.0 if over and impacts == 0.0 else 0.0", "1.0 if at_rest and impacts == 0.0 else 0.0", OF_REWARDS
     ),
     "terminal paid after a collision of an earlier step": Bug(
-        STEPPING, "impacts += state[k, harm + 2 * P + p]", "impacts += table[COUNT, at + p]", OF_REWARDS
+        STEPPING, "impacts += state[k, harm + 2 * P + p]", "impacts += table[ROW.COUNT, at + p]", OF_REWARDS
     ),
     "risk without its safety buffer": Bug(
         REWARDS, "step.gaps_m - params.safety_buffer_m", "step.gaps_m - 0.0 * params.safety_buffer_m", OF_REWARDS

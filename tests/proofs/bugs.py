@@ -37,11 +37,11 @@ BUGS = {
         kernel, "solo_motion", "way = speed * onset", "way = 0.0", statements.stopping
     ),
     "restitution of what moves, not of what is left over": Bug(
-        kernel, "resolve_cluster", "pooled + bounce * (pooled - table[SPEED, i])",
-        "pooled + bounce * (pooled + table[SPEED, i])", statements.two,
+        kernel, "resolve_cluster", "pooled + bounce * (pooled - table[ROW.SPEED, i])",
+        "pooled + bounce * (pooled + table[ROW.SPEED, i])", statements.two,
     ),
     "blocks pooled without their masses": Bug(
-        kernel, "pool", "table[BLOCK_LOW, count] / mass", "table[BLOCK_LOW, count] / 2.0", statements.energy
+        kernel, "pool", "table[ROW.BLOCK_LOW, count] / mass", "table[ROW.BLOCK_LOW, count] / 2.0", statements.energy
     ),
     "a plastic impact is not put in order": Bug(
         kernel, "resolve_cluster", "bounce = restitution if largest >= PLASTIC_SPEED_MPS else 0.0",

@@ -163,4 +163,4 @@ def test_believed__bounds_nothing_where_its_vehicle_had_an_impact_before_the_fir
         assert 0 < np.isinf(bound).sum() < 10 and (harm <= bound + ABOVE).all()
     agents = {spec: make_agent(spec, scenario=late) for spec in ("coast+step", "coast+robust:believed")}
     known, received = summarise(evaluate(late.sample(60, 7), agents, scenario=late))
-    assert known.predicted_harm is not None and received.predicted_harm is None  # no mean of what is not finite
+    assert known["predicted_harm"] is not None and received["predicted_harm"] is None  # no mean of what is not finite
