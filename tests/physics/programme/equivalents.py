@@ -19,17 +19,16 @@ EQUIVALENT: dict[str, str] = {
     "impact.py: 12 -> 13 in `12` (1)": "one more row of the table, which nobody uses",
     "impact.py: 7 -> 8 in `7` (1)": SHARED_ROW + "STRUCK (read right after an impact) and BLOCK_MASS (while pooling)",
     "segment.py: 4 -> 5 in `4` (1)": SHARED_ROW + "ACCELERATION and FORCE_LOW, whose entries are read before",
-    "segment.py: Add -> Sub in `ROW.OF_IMPACT + 5` (1)": SHARED_ROW
-    + "FORCE_LOW and STRUCK (read right after an impact)",
+    "segment.py: Add -> Sub in `IMPACT_ROWS + 5` (1)": SHARED_ROW + "FORCE_LOW and STRUCK (read right after an impact)",
     "segment.py: 6 -> 7 in `6` (1)": SHARED_ROW + "FORCE_HIGH (used up by accelerate) and SPEED_TIME (filled after it)",
-    "segment.py: Add -> Sub in `ROW.OF_IMPACT + 6` (1)": SHARED_ROW + "FORCE_HIGH and CONTACT_SPEED (filled after it)",
-    "segment.py: Add -> Sub in `ROW.OF_IMPACT + 7` (1)": SHARED_ROW
+    "segment.py: Add -> Sub in `IMPACT_ROWS + 6` (1)": SHARED_ROW + "FORCE_HIGH and CONTACT_SPEED (filled after it)",
+    "segment.py: Add -> Sub in `IMPACT_ROWS + 7` (1)": SHARED_ROW
     + "SPEED_TIME and CLOSING (filled and read by impacts)",
     "segment.py: 9 -> 10 in `9` (1)": SHARED_ROW + "WAY (only within move_apart) and JOINED (never there)",
-    "segment.py: Add -> Sub in `ROW.OF_IMPACT + 9` (1)": SHARED_ROW
+    "segment.py: Add -> Sub in `IMPACT_ROWS + 9` (1)": SHARED_ROW
     + "WAY (within move_apart) and POOLED (within an impact)",
-    "segment.py: Add -> Sub in `ROW.OF_IMPACT + 10` (1)": SHARED_ROW + "JOINED and BEFORE (read right after an impact)",
-    "segment.py: Add -> Sub in `ROW.OF_IMPACT + 14` (1)": "row -2 of a table of 28 rows is row 26, the same one",
+    "segment.py: Add -> Sub in `IMPACT_ROWS + 10` (1)": SHARED_ROW + "JOINED and BEFORE (read right after an impact)",
+    "segment.py: Add -> Sub in `IMPACT_ROWS + 14` (1)": "row -2 of a table of 28 rows is row 26, the same one",
     "segment.py: 16 -> 17 in `16` (1)": "one more row of the table, which nobody uses",
     "segment.py: 3 -> 4 in `3` (1)": MARK,
     "segment.py: `slowest_in_front, front_steady = (math.inf, 0.0)` removed (1)": UNUSED_FIRST,
