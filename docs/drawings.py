@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.drawing.scene import vehicle_colour
-from ethbrake_marl.figures.style import COLOURS, DASHES, GREY, add_caption, new_figure, style_axes, write_picture
+from ethbrake_marl.envs.drawing import vehicle_colour
+from ethbrake_marl.figures import COLOURS, DASHES, GREY, add_caption, new_figure, style_axes, write_picture
 from ethbrake_marl.scenario import Scenario
 
 FOLDER = Path(__file__).parent / "figures"

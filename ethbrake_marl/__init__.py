@@ -9,7 +9,6 @@ read from this file, and each is made on first use.
 
 from __future__ import annotations
 
-import ast
 import sys
 from difflib import get_close_matches
 from importlib import import_module
@@ -17,115 +16,108 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ethbrake_marl.envs.registration import register_environments
+from ethbrake_marl.doors import names_behind
+from ethbrake_marl.envs import register_environments
 from ethbrake_marl.errors import naming_extras
 
 if TYPE_CHECKING:
     # Environments
-    from ethbrake_marl.engine.engine import Engine as Engine
-    from ethbrake_marl.envs.parallel import EthBrakeParallelEnv as EthBrakeParallelEnv
-    from ethbrake_marl.envs.parallel import env as env
-    from ethbrake_marl.envs.parallel import parallel_env as parallel_env
-    from ethbrake_marl.envs.parallel import raw_env as raw_env
-    from ethbrake_marl.envs.sb3 import EthBrakeVecEnv as EthBrakeVecEnv
-    from ethbrake_marl.envs.sb3 import make_sb3_vec_env as make_sb3_vec_env
-    from ethbrake_marl.envs.gym import EthBrakeEnv as EthBrakeEnv
-    from ethbrake_marl.envs.gym import EthBrakeVectorEnv as EthBrakeVectorEnv
+    from ethbrake_marl.engine import Engine as Engine
+    from ethbrake_marl.envs import (
+        EthBrakeParallelEnv as EthBrakeParallelEnv,
+        env as env,
+        parallel_env as parallel_env,
+        raw_env as raw_env,
+    )
+    from ethbrake_marl.envs import EthBrakeVecEnv as EthBrakeVecEnv, make_sb3_vec_env as make_sb3_vec_env
+    from ethbrake_marl.envs import EthBrakeEnv as EthBrakeEnv, EthBrakeVectorEnv as EthBrakeVectorEnv
 
     # Scenarios, and the worlds drawn from them
-    from ethbrake_marl.scenario import Sample as Sample
-    from ethbrake_marl.scenario import Scenario as Scenario
-    from ethbrake_marl.scenario import list_scenarios as list_scenarios
-    from ethbrake_marl.scenario import load_scenario as load_scenario
-    from ethbrake_marl.physics import Worlds as Worlds
-    from ethbrake_marl.physics import advance as advance
-    from ethbrake_marl.physics import make_worlds as make_worlds
+    from ethbrake_marl.scenario import (
+        Sample as Sample,
+        Scenario as Scenario,
+        list_scenarios as list_scenarios,
+        load_scenario as load_scenario,
+    )
+    from ethbrake_marl.physics import Worlds as Worlds, advance as advance, make_worlds as make_worlds
 
     # Observations and rewards
-    from ethbrake_marl.observations import ObservationSpec as ObservationSpec
-    from ethbrake_marl.observations import choose_observation as choose_observation
-    from ethbrake_marl.observations import observation_for as observation_for
+    from ethbrake_marl.observations import (
+        ObservationSpec as ObservationSpec,
+        choose_observation as choose_observation,
+        observation_for as observation_for,
+    )
     from ethbrake_marl.rewards import RewardParams as RewardParams
 
     # Agents, teams and policies
-    from ethbrake_marl.agents.policy import LearnedAgent as LearnedAgent
-    from ethbrake_marl.agents.policy import policy_agent as policy_agent
-    from ethbrake_marl.agents.protocol import Agent as Agent
-    from ethbrake_marl.agents.registry import AgentSettings as AgentSettings
-    from ethbrake_marl.agents.registry import agent_names as agent_names
-    from ethbrake_marl.agents.registry import make_agent as make_agent
-    from ethbrake_marl.agents.protocol import Team as Team
-    from ethbrake_marl.policies.bundle import Policy as Policy
-    from ethbrake_marl.policies.bundle import load_policy as load_policy
-    from ethbrake_marl.policies.shipped import load_shipped as load_shipped
+    from ethbrake_marl.agents import LearnedAgent as LearnedAgent, policy_agent as policy_agent
+    from ethbrake_marl.agents import Agent as Agent, Team as Team
+    from ethbrake_marl.agents import (
+        AgentSettings as AgentSettings,
+        agent_names as agent_names,
+        make_agent as make_agent,
+    )
+    from ethbrake_marl.policies import Policy as Policy, load_policy as load_policy, load_shipped as load_shipped
 
     # Shields: for any interface, and one for each
-    from ethbrake_marl.shield.wrappers import shield as shield
-    from ethbrake_marl.shield import HybridShield as HybridShield
-    from ethbrake_marl.shield import ShieldedEnv as ShieldedEnv
-    from ethbrake_marl.shield import ShieldedVectorEnv as ShieldedVectorEnv
-    from ethbrake_marl.shield import ShieldOptions as ShieldOptions
-    from ethbrake_marl.shield import shielded_aec as shielded_aec
-    from ethbrake_marl.shield.sb3 import ShieldedVecEnv as ShieldedVecEnv
+    from ethbrake_marl.shield import shield as shield
+    from ethbrake_marl.shield import (
+        HybridShield as HybridShield,
+        ShieldedEnv as ShieldedEnv,
+        ShieldedVectorEnv as ShieldedVectorEnv,
+        ShieldOptions as ShieldOptions,
+        shielded_aec as shielded_aec,
+    )
+    from ethbrake_marl.shield import ShieldedVecEnv as ShieldedVecEnv
 
     # Training
-    from ethbrake_marl.learning.recipe import TrainingRecipe as TrainingRecipe
-    from ethbrake_marl.learning.recipe import load_recipe as load_recipe
-    from ethbrake_marl.learning.train import TrainResult as TrainResult
-    from ethbrake_marl.learning.train import resume as resume
-    from ethbrake_marl.learning.train import train as train
+    from ethbrake_marl.learning import TrainingRecipe as TrainingRecipe, load_recipe as load_recipe
+    from ethbrake_marl.learning import TrainResult as TrainResult, resume as resume, train as train
     from ethbrake_marl.errors import Progress as Progress
 
     # Evaluation
-    from ethbrake_marl.evaluation import EpisodeRecord as EpisodeRecord
-    from ethbrake_marl.evaluation import Evaluation as Evaluation
-    from ethbrake_marl.evaluation import Outcome as Outcome
-    from ethbrake_marl.evaluation import SummaryRow as SummaryRow
-    from ethbrake_marl.evaluation import SummaryTable as SummaryTable
-    from ethbrake_marl.evaluation import evaluate as evaluate
-    from ethbrake_marl.evaluation import record_episode as record_episode
-    from ethbrake_marl.evaluation import summarise as summarise
-    from ethbrake_marl.evaluation.results import compare_results as compare_results
-    from ethbrake_marl.evaluation.results import read_result as read_result
-    from ethbrake_marl.evaluation.dataset import write_dataset as write_dataset
-    from ethbrake_marl.evaluation.summary import summarise_by as summarise_by
+    from ethbrake_marl.evaluation import (
+        EpisodeRecord as EpisodeRecord,
+        Evaluation as Evaluation,
+        Outcome as Outcome,
+        SummaryRow as SummaryRow,
+        SummaryTable as SummaryTable,
+        evaluate as evaluate,
+        record_episode as record_episode,
+        summarise as summarise,
+    )
+    from ethbrake_marl.evaluation import compare_results as compare_results, read_result as read_result
+    from ethbrake_marl.evaluation import write_dataset as write_dataset
+    from ethbrake_marl.evaluation import summarise_by as summarise_by
 
     # Figures: matplotlib's, which a notebook shows
-    from ethbrake_marl.evaluation.curves import criticality_map as criticality_map
-    from ethbrake_marl.evaluation.curves import deceleration_curve as deceleration_curve
-    from ethbrake_marl.figures.evaluation import criticality_figure as criticality_figure
-    from ethbrake_marl.figures.evaluation import deceleration_figure as deceleration_figure
-    from ethbrake_marl.figures.evaluation import trajectories as trajectories
-    from ethbrake_marl.figures.evaluation import harm_against_total_gap as harm_against_total_gap
-    from ethbrake_marl.figures.style import write_picture as write_picture
+    from ethbrake_marl.evaluation import criticality_map as criticality_map, deceleration_curve as deceleration_curve
+    from ethbrake_marl.figures import (
+        criticality_figure as criticality_figure,
+        deceleration_figure as deceleration_figure,
+        trajectories as trajectories,
+        harm_against_total_gap as harm_against_total_gap,
+        write_picture as write_picture,
+    )
 
     # Registration of your own parts
-    from ethbrake_marl.agents.registry import register_agent as register_agent
-    from ethbrake_marl.evaluation.measures import register_measure as register_measure
+    from ethbrake_marl.agents import register_agent as register_agent
+    from ethbrake_marl.evaluation import register_measure as register_measure
     from ethbrake_marl.files.plugins import load_plugin as load_plugin
-    from ethbrake_marl.learning.recipe import register_algorithm as register_algorithm
+    from ethbrake_marl.learning import register_algorithm as register_algorithm
     from ethbrake_marl.harm import register_objective as register_objective
-    from ethbrake_marl.scenario.features import register_feature as register_feature
+    from ethbrake_marl.scenario import register_feature as register_feature
     from ethbrake_marl.rewards import register_term as register_term
-    from ethbrake_marl.scenario.schema import register_scenarios as register_scenarios
-    from ethbrake_marl.scenario.schema import register_preset as register_preset
+    from ethbrake_marl.scenario import register_scenarios as register_scenarios
+    from ethbrake_marl.scenario import register_preset as register_preset
 
     # Errors
-    from ethbrake_marl.errors import EthBrakeError as EthBrakeError
-    from ethbrake_marl.errors import MissingExtra as MissingExtra
+    from ethbrake_marl.errors import EthBrakeError as EthBrakeError, MissingExtra as MissingExtra
 
 __version__ = "0.3.0.dev0"
 
 
-def _read_homes() -> dict[str, str]:
-    """Public name -> the module that it lives in, as the imports above say."""
-    content = ast.parse(Path(__file__).read_text("utf-8")).body
-    table = next(part for part in content if isinstance(part, ast.If)).body
-    lines = [line for line in table if isinstance(line, ast.ImportFrom)]
-    return {alias.name: str(line.module) for line in lines for alias in line.names}
-
-
-_HOMES = _read_homes()
+_HOMES = names_behind(__file__)
 _NEED_TRAIN = ("EthBrakeVecEnv", "ShieldedVecEnv", "TrainResult", "make_sb3_vec_env", "resume", "train")
 
 

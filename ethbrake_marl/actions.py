@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics import Floats, Vehicles
-from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics import Floats, Vehicles, compiled
 
 LARGEST = float(np.nextafter(np.float32(1.0), np.float32(2.0)))  # one float32 step beyond 1 is rounding, and means 1
 

@@ -188,19 +188,19 @@ class AgentFailed(InvalidInput):
         """The same of the batch from which the worlds of this one were taken, as ``PhysicsError.renumbered``."""
         return AgentFailed(self.agent, None if self.row is None else int(rows[self.row]), self.reason)
 
+    @staticmethod
+    @contextmanager
+    def naming(name: str, others: Collection[str] = ()) -> Iterator[None]:
+        """Name an agent that fails inside the block as the user does: on the command line, or in a mapping.
 
-@contextmanager
-def naming_agent(name: str, others: Collection[str] = ()) -> Iterator[None]:
-    """Name an agent that fails inside the block as the user does: on the command line, or in a mapping.
-
-    ``others``: names of who drives the other vehicles, which stay.
-    """
-    try:
-        yield
-    except AgentFailed as error:
-        if error.agent in others:
-            raise
-        raise AgentFailed(name, error.row, error.reason) from error
+        ``others``: names of who drives the other vehicles, which stay.
+        """
+        try:
+            yield
+        except AgentFailed as error:
+            if error.agent in others:
+                raise
+            raise AgentFailed(name, error.row, error.reason) from error
 
 
 class FailedWorld(UserWarning):
@@ -282,6 +282,11 @@ class Progress:
     updates: int = 0  # of a training
     wall_s: float = 0.0  # of a training
 
+    @staticmethod
+    def listener(told: Told) -> OnProgress | None:
+        """The function to tell; for ``show`` one that writes on stderr."""
+        return ShownProgress() if told == "show" else told
+
 
 OnProgress = Callable[[Progress], None]
 
@@ -308,8 +313,3 @@ class ShownProgress:
         text += f"; {progress.note}" if progress.note else ""
         sys.stderr.write(f"\r{text}\x1b[K{chr(10) if ended else ''}" if self._terminal else f"{text}\n")
         sys.stderr.flush()
-
-
-def listener(told: Told) -> OnProgress | None:
-    """The function to tell; for ``show`` one that writes on stderr."""
-    return ShownProgress() if told == "show" else told

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from fractions import Fraction
 from functools import lru_cache
 from typing import Annotated, Literal, NamedTuple
@@ -25,13 +25,10 @@ from pydantic import GetJsonSchemaHandler
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from ethbrake_marl.defaults import HARM_COUNTS as HARM_COUNTS
-from ethbrake_marl.defaults import HarmCount as HarmCount
+from ethbrake_marl.defaults import HARM_COUNTS as HARM_COUNTS, HarmCount as HarmCount
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, count_of, describe_error, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
-from ethbrake_marl.physics.advance import Impacts, no_obstacle_harm
-from ethbrake_marl.physics.compiled import compiled, logistic
-from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds, unwritable
+from ethbrake_marl.physics import Bools, Floats, Impacts, Ints, Worlds, compiled, logistic, unwritable
 
 _INJURY_SLOPE = 0.177  # per m/s of speed change
 _INJURY_OFFSET = {"front": -4.457, "rear": -4.888}  # side of the car that is hit
@@ -71,6 +68,10 @@ class Ledger:
             self.obstacle_count + impacts.obstacle_count,
             self.mass_t,
         )
+
+    def take(self, rows: Ints | Bools | Sequence[int]) -> Ledger:
+        """That of some of the worlds."""
+        return Ledger(*(getattr(self, column.name)[rows] for column in fields(self)))
 
     def pair_harm(self, harm_count: HarmCount) -> Floats:
         """Harm of each pair under a counting rule, [n, P]. Raises ``InvalidInput`` for an unknown one."""
@@ -120,7 +121,7 @@ def empty_ledger(worlds: Worlds) -> Ledger:
     """The ledger at the alert: no harm yet."""
     shape = worlds.gaps_m.shape
     pairs = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64)
-    return Ledger(*pairs, *no_obstacle_harm(worlds.n), worlds.vehicles.mass_t)
+    return Ledger(*pairs, *Impacts.no_obstacle(worlds.n), worlds.vehicles.mass_t)
 
 
 @compiled
@@ -164,9 +165,8 @@ def injury_probability(speed_change_mps: Floats, side: Literal["front", "rear"])
 # ==================  ================================================================================================
 # total               ``H``: everybody's harm alike; the same number for all vehicles
 # own                 ``H_i``
-# social:phi          ``cos(phi) H_i + sin(phi) (H - H_i)``, social value orientation: phi from 0 (own harm only) over
-# 45
-#                     (prosocial) to 90 degrees (the others' only)
+# social:phi          ``cos(phi) H_i + sin(phi) (H - H_i)``, social value orientation: phi from 0 (own harm only)
+#                     over 45 (prosocial) to 90 degrees (the others' only)
 # maximin             ``max_j H_j``: the harm of whoever bears most
 # mass-weighted       ``N sum_j m_j H_j / sum_j m_j``: harm in a heavy vehicle counts for more
 # weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``: one weight (1e-6 to 1e6) for each vehicle, as for its occupants
@@ -270,6 +270,19 @@ def standard_objectives() -> tuple[str, ...]:
     return (*STANDARD, *(name for name, kind in KINDS.items() if kind.function is not None))
 
 
+def declared_objectives(texts: Sequence[str], vehicles: int) -> list[str]:
+    """Objectives by name, ``standard`` standing for all that need no knowledge of the scenario.
+
+    Raises ``InvalidInput`` for one that is unknown, given twice, or made for another number of vehicles.
+    """
+    names = [name for text in texts for name in (standard_objectives() if text == "standard" else (text,))]
+    for k, name in enumerate(names):
+        objectives_of(name, vehicles)
+        if name in names[:k]:
+            raise InvalidInput(f"objective {name!r} is given twice")
+    return names
+
+
 def register_objective(name: str, function: ObjectiveFunction) -> None:
     """Make ``objective: name`` known to every scenario and reward, and to ``--objective``.
 
@@ -289,29 +302,25 @@ def register_objective(name: str, function: ObjectiveFunction) -> None:
 
     def amount(_: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
         try:
-            value = function(harm, vehicle)
+            given = np.asarray(function(harm, vehicle))
         except Exception as error:
             raise InvalidInput(f"objective {name!r}: of vehicle_{vehicle + 1}: {describe_error(error)}") from error
-        return _checked(name, value, vehicle, len(harm.whole))
+        worlds = len(harm.whole)
+        if given.shape != (worlds,) or given.dtype.kind not in "fiub":
+            raise InvalidInput(
+                f"objective {name!r}: gave {given.dtype} of shape {given.shape}; must be numbers of shape ({worlds},),"
+                " one per world"
+            )
+        if not np.isfinite(given).all():
+            world = int(np.argmin(np.isfinite(given)))
+            raise InvalidInput(
+                f"objective {name!r}: is {given[world]} for vehicle_{vehicle + 1} in world {world}; must be finite"
+            )
+        return given.astype(np.float64)
 
     entry = Kind(name, " ".join((function.__doc__ or "").split()), amount, function)
     if KINDS.setdefault(name, entry).function is not function:
         raise AlreadyExists(f"objective {name!r} is registered already; give another name")
-
-
-def _checked(name: str, value: object, vehicle: int, worlds: int) -> Floats:
-    amount = np.asarray(value)
-    if amount.shape != (worlds,) or amount.dtype.kind not in "fiub":
-        raise InvalidInput(
-            f"objective {name!r}: gave {amount.dtype} of shape {amount.shape}; must be numbers of shape ({worlds},),"
-            " one per world"
-        )
-    if not np.isfinite(amount).all():
-        world = int(np.argmin(np.isfinite(amount)))
-        raise InvalidInput(
-            f"objective {name!r}: is {amount[world]} for vehicle_{vehicle + 1} in world {world}; must be finite"
-        )
-    return amount.astype(np.float64)
 
 
 class _NameSchema:
@@ -349,19 +358,6 @@ def _social(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
     return own * harm.borne[:, vehicle] + others * rest
 
 
-def _maximin(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
-    worst: Floats = harm.borne.max(axis=1)
-    return worst
-
-
-def _mass_weighted(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
-    return _weighted(harm.borne, harm.mass_t)
-
-
-def _weighted_by_list(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
-    return _weighted(harm.borne, np.full(harm.borne.shape, objective.weights))
-
-
 @lru_cache
 def _social_weights(angle_deg: float) -> tuple[float, float]:
     """Weights of the own harm and of the others': cosine and sine; exactly 0 and 1 at 90 degrees too.
@@ -392,7 +388,15 @@ KINDS: dict[str, Kind] = {
     "total": Kind("total", "everybody's harm alike", lambda _, harm, vehicle: harm.whole),
     "own": Kind("own", "what the vehicle itself bears", lambda _, harm, vehicle: harm.borne[:, vehicle]),
     "social": Kind("social:ANGLE", "social value orientation: own harm at 0, the others' at 90 degrees", _social),
-    "maximin": Kind("maximin", "the harm of whoever bears most", _maximin),
-    "mass-weighted": Kind("mass-weighted", "harm in a heavy vehicle counts for more", _mass_weighted),
-    "weighted": Kind("weighted:W1,W2,...", "one weight for each vehicle", _weighted_by_list),
+    "maximin": Kind("maximin", "the harm of whoever bears most", lambda _, harm, vehicle: harm.borne.max(axis=1)),
+    "mass-weighted": Kind(
+        "mass-weighted",
+        "harm in a heavy vehicle counts for more",
+        lambda _, harm, vehicle: _weighted(harm.borne, harm.mass_t),
+    ),
+    "weighted": Kind(
+        "weighted:W1,W2,...",
+        "one weight for each vehicle",
+        lambda objective, harm, vehicle: _weighted(harm.borne, np.full(harm.borne.shape, objective.weights)),
+    ),
 }

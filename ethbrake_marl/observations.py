@@ -18,54 +18,39 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
+from itertools import product
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError, unknown_name
-from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
-from ethbrake_marl.physics.advance import (
-    RESTITUTION,
-    TIME,
-    Packed,
-    command_at,
-    gap_at,
-    has_messages,
-    has_news,
-    pack,
-    params_at,
-    speed_at,
-    state_width,
-    unpack,
-    vehicles_in,
-)
-from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.physics.kernel import (
+from ethbrake_marl.physics import (
+    BOUND,
     CONTACT,
-    FAR_AWAY_M,
     FLAG,
     ROW,
+    Bools,
+    Floats,
+    Ints,
+    Packed,
+    Vehicles,
+    Worlds,
+    columns,
+    compiled,
+    estimate_rows,
     forecast_contacts,
     place_obstacle,
     stopping_distance,
 )
-from ethbrake_marl.physics.messages import estimate_rows
-from ethbrake_marl.physics.worlds import known_at_once, read_only
-from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.scenario.features import (
+from ethbrake_marl.scenario import (
     CONTACT_COMMANDS,
-    CONTACT_FAR_FEATURES,
-    CONTACT_FEATURES,
     CONTACT_SIDES,
+    GROUPS,
     MOST_NEIGHBOURS,
-    NEIGHBOUR_FEATURES,
-    OBSTACLE_FEATURES,
-    OWN_FEATURES,
-    ROLE_FEATURES,
     Feature,
     RegisteredFeature,
-    checked_values,
+    Scenario,
     feature_named,
     listed_features,
     registered_in,
@@ -126,11 +111,11 @@ class ObservationSpec:
     @property
     def whole(self) -> tuple[Feature, ...]:
         """The same with all built-in features of every group that it looks at."""
-        groups = [("own", OWN_FEATURES), *((prefix, NEIGHBOUR_FEATURES) for prefix, _ in self.sides)]
-        groups += [("role", ROLE_FEATURES)] if self.role else []
-        groups += [("obstacle", OBSTACLE_FEATURES)] if self.obstacle else []
-        groups += [("contact", CONTACT_FEATURES)] if self.contact else []
-        groups += [("contact_far", CONTACT_FAR_FEATURES)] if self.far else []
+        groups = [("own", GROUPS.own), *((prefix, GROUPS.neighbour) for prefix, _ in self.sides)]
+        groups += [("role", GROUPS.role)] if self.role else []
+        groups += [("obstacle", GROUPS.obstacle)] if self.obstacle else []
+        groups += [("contact", GROUPS.contact)] if self.contact else []
+        groups += [("contact_far", GROUPS.contact_far)] if self.far else []
         return tuple(
             Feature(f"{prefix}.{f.name}", f.unit, f.scale, f.low, f.high, f.meaning)
             for prefix, group in groups
@@ -139,15 +124,24 @@ class ObservationSpec:
 
     @property
     def far(self) -> bool:
-        """Whether any of CONTACT_FAR_FEATURES is chosen."""
+        """Whether any of GROUPS.contact_far is chosen."""
         return any(name.startswith("contact_far.") for name in self.chosen)
 
     @property
     def size(self) -> int:
         """Length F of an observation."""
-        further = self.role * len(ROLE_FEATURES) + self.obstacle * len(OBSTACLE_FEATURES)
-        further += self.contact * len(CONTACT_FEATURES)
-        return len(self.chosen) or len(OWN_FEATURES) + (self.front + self.rear) * len(NEIGHBOUR_FEATURES) + further
+        further = self.role * len(GROUPS.role) + self.obstacle * len(GROUPS.obstacle)
+        further += self.contact * len(GROUPS.contact)
+        return len(self.chosen) or len(GROUPS.own) + (self.front + self.rear) * len(GROUPS.neighbour) + further
+
+    @property
+    def plan(self) -> Plan:
+        """Offsets of the neighbours and scaling of every feature, in order; what is picked, and what is added.
+
+        Made once for each specification, not to be changed. Raises ``InvalidInput`` for contact features without a
+        time step.
+        """
+        return _plan(self, tuple(registered_in(self.chosen).items()) if self.chosen else ())
 
     def at_steps_of(self, time_step_s: float) -> ObservationSpec:
         """The same for decisions every ``time_step_s`` (s), where it needs to know and does not say so itself."""
@@ -164,32 +158,24 @@ def choose_observation(listed: Observation, time_step_s: float | None = None) ->
     time between two decisions; an environment knows its own, so only who observes without one gives it, for contact
     features. Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for what is no such list.
     """
-    spec = _spec_of(listed)
-    return spec if time_step_s is None else spec.at_steps_of(time_step_s)
-
-
-def _spec_of(listed: Observation) -> ObservationSpec:
     if isinstance(listed, ObservationSpec):
-        return listed
-    if isinstance(listed, Mapping):
-        return _spec_of_fields(listed)
-    names = listed_features(listed)
-    front, rear, role, obstacle, contact = _reach(names)
-    usual = ObservationSpec(front, rear, role, obstacle, contact=contact)
-    if tuple(feature.name for feature in usual.features) == names:
-        return usual
-    return replace(usual, chosen=names)
-
-
-def _spec_of_fields(given: Mapping[str, Any]) -> ObservationSpec:
-    known = [field.name for field in fields(ObservationSpec)]
-    for name in given:
-        if name not in known:
-            raise unknown_name("observation", name, known)
-    chosen = given.get("chosen", ())
-    if not isinstance(chosen, list | tuple):
-        raise InvalidInput(f"observation: chosen = {chosen!r}; must be a list of features")
-    return ObservationSpec(**{**given, "chosen": listed_features(chosen) if chosen else ()})
+        spec = listed
+    elif isinstance(listed, Mapping):
+        known = [field.name for field in fields(ObservationSpec)]
+        for name in listed:
+            if name not in known:
+                raise unknown_name("observation", name, known)
+        chosen = listed.get("chosen", ())
+        if not isinstance(chosen, list | tuple):
+            raise InvalidInput(f"observation: chosen = {chosen!r}; must be a list of features")
+        spec = ObservationSpec(**{**listed, "chosen": listed_features(chosen) if chosen else ()})
+    else:
+        names = listed_features(listed)
+        front, rear, role, obstacle, contact = _reach(names)
+        spec = ObservationSpec(front, rear, role, obstacle, contact=contact)
+        if tuple(feature.name for feature in spec.features) != names:
+            spec = replace(spec, chosen=names)
+    return spec if time_step_s is None else spec.at_steps_of(time_step_s)
 
 
 def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool, bool]:
@@ -215,8 +201,8 @@ def observation_for(scenario: Scenario) -> ObservationSpec:
 #
 # The vehicle looks at the part of the line around it whose news it has, as its other features tell it. It goes on, once
 # its own latency has elapsed, with full braking, coasting or full driving. Every other vehicle of that part goes on
-# with
-# the command that is observed of it; one of which none is in force brakes fully as soon as its latency has elapsed.
+# with the command that is observed of it; one of which none is in force brakes fully as soon as its latency has
+# elapsed.
 
 FORECAST_S = 10.0  # how far the forecasts look; also the time to an impact that never comes
 _OF_PAIR, _HARMS = 4, 2  # numbers of each pair; of the line
@@ -233,49 +219,19 @@ class Contacts(NamedTuple):
     features: Floats  # [3, 30], with far [3, 42]: 1 / scale, low, high of every contact feature
 
 
-def contacts_of(names: set[str], time_step_s: float | None, *, far: bool = False) -> Contacts:
-    """What to forecast for these contact features (names in their groups); ``far``: contact_far too.
-
-    Raises ``InvalidInput`` without a time step.
-    """
-    if time_step_s is None:
-        raise InvalidInput(
-            "observation: contact features need the time between two decisions; give it as time_step_s, for instance"
-            " eb.choose_observation([...], time_step_s=scenario.time_step_s)"
-        )
-    wanted = [c for c, command in enumerate(CONTACT_COMMANDS) if any(n.startswith(f"{command}_") for n in names)]
-    features = CONTACT_FEATURES + CONTACT_FAR_FEATURES if far else CONTACT_FEATURES
-    scaling = [[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]]
-    return Contacts(time_step_s, np.array(wanted, np.int64), np.array(scaling))
-
-
-def observe_contacts(state: Floats, params: Floats, vehicles: Ints, contacts: Contacts) -> NDArray[np.float32]:
-    """All contact features of several vehicles in worlds given as rows of ``physics.rows``, scaled, [n, vehicles, C].
-
-    C is 30, and 42 with those of contact_far.
-
-    Those of commands that are not wanted are 0. Raises ``PhysicsError`` naming the worlds in which a forecast failed.
-    """
-    found = np.zeros((len(state), len(vehicles), contacts.features.shape[1]), np.float32)
-    failed = np.zeros(len(state), np.bool_)
-    _observe_contacts(state, params, vehicles, *contacts, found, failed)
-    if failed.any():
-        reason = f"a forecast of contacts could not look {FORECAST_S:g} s ahead"
-        raise PhysicsError({k: reason for k in np.flatnonzero(failed).tolist()})
-    return found
-
-
 @compiled
 def _observe_contacts(
     state: Floats, params: Floats, observers: Ints, time_step: float, commands: Ints, features: Floats,
     out: NDArray[np.float32], failed: Bools,
 ) -> None:  # fmt: skip
     """Fill ``out``, and ``failed`` [n] where a check of the kernel failed."""
-    N = vehicles_in(state)
-    at = 1 if state.shape[1] > state_width(N) else 0  # vehicle i stands in column at + i, behind an obstacle
+    of = columns(state)
+    N, at = (
+        of.vehicles,
+        1 if state.shape[1] > of.obstacle else 0,
+    )  # vehicle i stands in column at + i, behind an obstacle
     line, table = np.zeros((ROW.OF_SEGMENT, N + at)), np.zeros((ROW.OF_SEGMENT, N + at))
     found, value = np.zeros((CONTACT.WIDTH, N + at)), np.zeros(_OF_COMMAND + _FAR)
-    braking, driving = params_at(0, N), params_at(1, N)
     for k in range(out.shape[0]):
         for o in range(observers.shape[0]):
             i = observers[o]
@@ -286,10 +242,10 @@ def _observe_contacts(
                         table[row, j] = line[row, j]
                 table[ROW.COMMAND, at + i] = 0.0
                 if c == 0:
-                    table[ROW.COMMAND, at + i] = -params[k, braking + i]
+                    table[ROW.COMMAND, at + i] = -params[k, of.braking + i]
                 elif c == 2:
-                    table[ROW.COMMAND, at + i] = params[k, driving + i]
-                if forecast_contacts(table, params[k, RESTITUTION], FORECAST_S, found) != FLAG.DONE:
+                    table[ROW.COMMAND, at + i] = params[k, of.driving + i]
+                if forecast_contacts(table, params[k, of.restitution], FORECAST_S, found) != FLAG.DONE:
                     failed[k] = True
                     break
                 _tell(table, found, at + i, first, last, time_step, value)
@@ -305,13 +261,11 @@ def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, a
 
     Whoever is not known stands far away. Where an obstacle is known, it is the first column.
     """
-    N = vehicles_in(state)
-    speed, command, gap = speed_at(N), command_at(N), gap_at(N)
-    braking, latency, mass, limit, news = (
-        params_at(0, N), params_at(2, N), params_at(3, N), params_at(4, N), params_at(6, N),
-    )  # fmt: skip
-    by_link, time = has_news(params, N), state[k, TIME]
-    own_part = params_at(5, N) if by_link else latency
+    of = columns(state)
+    N, speed, command, gap, obstacle = of.vehicles, of.speed, of.command, of.gap, of.obstacle
+    braking, latency, mass, limit, news = of.braking, of.latency, of.mass, of.limit, of.news
+    by_link, time = params.shape[1] > of.own_latency, state[k, of.time]
+    own_part = of.own_latency if by_link else latency
     first, last = i, i
     while first > 0 and time >= params[k, news + i * N + first - 1 if by_link else latency + i]:
         first -= 1
@@ -329,12 +283,11 @@ def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, a
             table[ROW.ONSET, at + j] = max(params[k, own_part + j] - time, 0.0)
             table[ROW.COMMAND, at + j] = -params[k, braking + j] if known else 0.0
         if j < N - 1:
-            table[ROW.GAP, at + j] = state[k, gap + j] if first <= j < last else FAR_AWAY_M
+            table[ROW.GAP, at + j] = state[k, gap + j] if first <= j < last else BOUND.FAR_AWAY_M
             table[ROW.HIT, at + j] = state[k, gap + N - 1 + j]
     if at == 1:
-        obstacle = state_width(N)
         seen = first == 0 and state[k, obstacle] < math.inf
-        place_obstacle(table, state[k, obstacle] if seen else FAR_AWAY_M, state[k, obstacle + 1])
+        place_obstacle(table, state[k, obstacle] if seen else BOUND.FAR_AWAY_M, state[k, obstacle + 1])
         return (0 if seen else 1 + first), 1 + last
     return first, last
 
@@ -373,16 +326,16 @@ def _tell(table: Floats, found: Floats, own: int, first: int, last: int, time_st
 
 Observations = NDArray[np.float32]
 
-_OWN, _NEIGHBOUR = len(OWN_FEATURES), len(NEIGHBOUR_FEATURES)
-_ROLE, _OBSTACLE = len(ROLE_FEATURES), len(OBSTACLE_FEATURES)
+_OWN, _NEIGHBOUR = len(GROUPS.own), len(GROUPS.neighbour)
+_ROLE, _OBSTACLE = len(GROUPS.role), len(GROUPS.obstacle)
 
 
 def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations:
     """Observation of ``vehicle`` (0 = front) in every world, [n, F] float32 in its own memory."""
     if not 0 <= vehicle < worlds.N:
         raise InvalidInput(f"observe: vehicle index {vehicle}; must be in 0..{worlds.N - 1}")
-    packed = pack(worlds)
-    return observe_packed(packed.state, packed.params, np.array([vehicle]), plan_of(spec))[:, 0].copy()
+    packed = Packed.of(worlds)
+    return spec.plan.observe(packed.state, packed.params, np.array([vehicle]))[:, 0].copy()
 
 
 class Scaling(NamedTuple):
@@ -411,93 +364,87 @@ class Plan(NamedTuple):
     picked: Ints | None  # [F] columns of the whole groups; None: all of them
     extras: tuple[Extra, ...]
 
+    def observe(self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None = None) -> Observations:
+        """Observations of several vehicles in worlds given as rows of ``physics.batch``, [n, len(vehicles), F].
 
-def plan_of(spec: ObservationSpec) -> Plan:
-    """Offsets of the neighbours and scaling of every feature, in order; what is picked, and what is added.
+        ``steps`` [n] is how many steps each world has made, for error texts. Over a channel of periodic messages a
+        vehicle sees the worlds as it takes them to be (``physics.messages``). Contact features of commands that are
+        not wanted are 0. Raises ``PhysicsError`` naming the worlds in which a forecast of contacts failed.
+        """
+        if not Packed(state, params).has_messages:
+            return self._observe_present(state, params, vehicles, steps)
+        estimate, seen = np.empty(state.shape), []
+        for vehicle in vehicles.tolist():
+            estimate_rows(state, params, vehicle, estimate)
+            seen.append(self._observe_present(estimate, params, np.array([vehicle]), steps))
+        return np.concatenate(seen, axis=1)
 
-    Made once for each specification, not to be changed.
-    """
-    return _plan(spec, tuple(registered_in(spec.chosen).items()) if spec.chosen else ())
+    def _observe_present(self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None) -> Observations:
+        """The same where everything known is known as it is."""
+        shape = len(state), len(vehicles)
+        whole = np.empty((*shape, self.scaling.features.shape[1]), np.float32)
+        _observe_rows(state, params, vehicles, *self.scaling, whole)
+        if self.contacts is not None:
+            found = np.zeros((*shape, self.contacts.features.shape[1]), np.float32)
+            failed = np.zeros(len(state), np.bool_)
+            _observe_contacts(state, params, vehicles, *self.contacts, found, failed)
+            if failed.any():
+                reason = f"a forecast of contacts could not look {FORECAST_S:g} s ahead"
+                raise PhysicsError({k: reason for k in np.flatnonzero(failed).tolist()})
+            whole = np.concatenate([whole, found], axis=2)
+        if self.picked is None:
+            return whole
+        out: Observations = whole.take(self.picked, axis=2)
+        if not self.extras:
+            return out
+        worlds = Packed(state, params).worlds().read_only()
+        for extra, (o, vehicle) in product(self.extras, enumerate(vehicles.tolist())):
+            neighbour = vehicle + extra.offset if extra.offset else None
+            counts = np.ones(worlds.n, np.bool_) if neighbour is None else whole[:, o, extra.known] == 1.0
+            if counts.any():  # one of a neighbour tells where the kernel says that it is known
+                values = extra.entry.checked(worlds, vehicle, neighbour, counts, steps)
+            else:  # nobody is there, or nobody is heard
+                values = extra.entry.scaled(np.full(worlds.n, extra.entry.unknown))
+            out[:, o, extra.column] = values
+        return out
 
 
 @cache
 def _plan(spec: ObservationSpec, registered: tuple[tuple[str, RegisteredFeature], ...]) -> Plan:
     whole, entries = spec.whole, dict(registered)
-    usual = whole[: len(whole) - spec.contact * len(CONTACT_FEATURES) - spec.far * len(CONTACT_FAR_FEATURES)]
-    scaling = Scaling(
-        np.array([offset for _, offset in spec.sides], np.int64),
-        spec.role,
-        spec.obstacle,
-        np.array([[1.0 / f.scale for f in usual], [f.low for f in usual], [f.high for f in usual]]),
-    )
-    contacts = _contacts(spec) if spec.contact else None
+    usual = whole[: len(whole) - spec.contact * len(GROUPS.contact) - spec.far * len(GROUPS.contact_far)]
+    offsets = np.array([offset for _, offset in spec.sides], np.int64)
+    scaling, contacts = Scaling(offsets, spec.role, spec.obstacle, _scales(usual)), None
+    if spec.contact:
+        if spec.time_step_s is None:
+            raise InvalidInput(
+                "observation: contact features need the time between two decisions; give it as time_step_s, for"
+                " instance eb.choose_observation([...], time_step_s=scenario.time_step_s)"
+            )
+        inside = [name.partition(".") for name in spec.chosen or (feature.name for feature in spec.whole)]
+        names = [own for group, _, own in inside if group in ("contact", "contact_far")]
+        wanted = [c for c, each in enumerate(CONTACT_COMMANDS) if any(n.startswith(f"{each}_") for n in names)]
+        features = GROUPS.contact + GROUPS.contact_far if spec.far else GROUPS.contact
+        contacts = Contacts(spec.time_step_s, np.array(wanted, np.int64), _scales(features))
     if not spec.chosen:
         return Plan(scaling, contacts, None, ())
-    place, offsets = {feature.name: c for c, feature in enumerate(whole)}, dict(spec.sides)
+    place, sides = {feature.name: c for c, feature in enumerate(whole)}, dict(spec.sides)
     extras = []
     for column, name in enumerate(spec.chosen):
         if name not in place:
             side, _, own = name.rpartition(".")
-            extras.append(Extra(column, entries[own], offsets.get(side, 0), place.get(f"{side}.known", 0)))
+            extras.append(Extra(column, entries[own], sides.get(side, 0), place.get(f"{side}.known", 0)))
     picked = np.array([place.get(name, 0) for name in spec.chosen], np.int64)
     return Plan(scaling, contacts, picked, tuple(extras))
 
 
-def _contacts(spec: ObservationSpec) -> Contacts:
-    inside = (name.partition(".") for name in spec.chosen or (feature.name for feature in spec.whole))
-    names = {own for group, _, own in inside if group in ("contact", "contact_far")}
-    return contacts_of(names, spec.time_step_s, far=spec.far)
-
-
-def observe_packed(
-    state: Floats, params: Floats, vehicles: Ints, plan: Plan, steps: Floats | None = None
-) -> Observations:
-    """Observations of several vehicles in worlds given as rows of ``physics.rows``, [n, len(vehicles), F].
-
-    ``steps`` [n] is how many steps each world has made, for error texts. Over a channel of periodic messages a vehicle
-    sees the worlds as it takes them to be (``physics.estimates``).
-    """
-    if not has_messages(state, params):
-        return _observe_present(state, params, vehicles, plan, steps)
-    estimate, seen = np.empty(state.shape), []
-    for vehicle in vehicles.tolist():
-        estimate_rows(state, params, vehicle, estimate)
-        seen.append(_observe_present(estimate, params, np.array([vehicle]), plan, steps))
-    return np.concatenate(seen, axis=1)
-
-
-def _observe_present(state: Floats, params: Floats, vehicles: Ints, plan: Plan, steps: Floats | None) -> Observations:
-    """The same where everything known is known as it is."""
-    whole = np.empty((len(state), len(vehicles), plan.scaling.features.shape[1]), np.float32)
-    _observe_rows(state, params, vehicles, *plan.scaling, whole)
-    if plan.contacts is not None:
-        whole = np.concatenate([whole, observe_contacts(state, params, vehicles, plan.contacts)], axis=2)
-    if plan.picked is None:
-        return whole
-    observation: Observations = whole.take(plan.picked, axis=2)
-    if plan.extras:
-        _add_extras(observation, whole, read_only(unpack(Packed(state, params))), vehicles, plan.extras, steps)
-    return observation
-
-
-def _add_extras(
-    out: Observations, whole: Observations, worlds: Worlds, vehicles: Ints, extras: Sequence[Extra],
-    steps: Floats | None,
-) -> None:  # fmt: skip
-    """Fill the columns of registered features; one of a neighbour tells where the kernel says that it is known."""
-    for extra in extras:
-        for o, vehicle in enumerate(vehicles.tolist()):
-            neighbour = vehicle + extra.offset if extra.offset else None
-            counts = np.ones(worlds.n, np.bool_) if neighbour is None else whole[:, o, extra.known] == 1.0
-            if counts.any():
-                values = checked_values(extra.entry, worlds, vehicle, neighbour, counts, steps)
-            else:  # nobody is there, or nobody is heard
-                values = extra.entry.scaled(np.full(worlds.n, extra.entry.unknown))
-            out[:, o, extra.column] = values
+def _scales(features: Sequence[Feature]) -> Floats:
+    """1 / scale, low, high of every feature, [3, F]."""
+    return np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]])
 
 
 @compiled
-def _observe_rows(  # noqa: C901
+def _observe_rows(
     state: Floats, params: Floats, observers: Ints, offsets: Ints, role: bool, with_obstacle: bool, features: Floats,
     out: Observations,
 ) -> None:  # fmt: skip
@@ -505,16 +452,14 @@ def _observe_rows(  # noqa: C901
 
     One long loop on purpose: handing these arrays on to functions made it four times as slow.
     """
-    N = vehicles_in(state)
-    speed, command, gap_column = speed_at(N), command_at(N), gap_at(N)
-    hit = gap_column + N - 1
-    braking, driving, latency, mass = params_at(0, N), params_at(1, N), params_at(2, N), params_at(3, N)
-    news, obstacle = params_at(6, N), state_width(N)
-    by_link, some_obstacle = has_news(params, N), state.shape[1] > obstacle
-    own_part = params_at(5, N) if by_link else latency  # of vehicle j's latency: own_part + j
+    of = columns(state)
+    N, speed, command, gap_column, hit, obstacle = of.vehicles, of.speed, of.command, of.gap, of.hit, of.obstacle
+    braking, driving, latency, mass, news = of.braking, of.driving, of.latency, of.mass, of.news
+    by_link, some_obstacle = params.shape[1] > of.own_latency, state.shape[1] > obstacle
+    own_part = of.own_latency if by_link else latency  # of vehicle j's latency: own_part + j
     value = np.zeros(out.shape[2])
     for k in range(out.shape[0]):
-        time = state[k, TIME]
+        time = state[k, of.time]
         for o in range(observers.shape[0]):
             i = observers[o]
             own_speed, own_latency = state[k, speed + i], max(params[k, own_part + i] - time, 0.0)
@@ -525,7 +470,7 @@ def _observe_rows(  # noqa: C901
             value[3] = params[k, driving + i]
             value[4] = params[k, mass + i]
             value[5] = own_latency
-            value[6] = params[k, RESTITUTION]
+            value[6] = params[k, of.restitution]
             c = _OWN
             for offset in offsets:
                 j = i + offset
@@ -597,11 +542,11 @@ _OWN_ONLY = ObservationSpec(front=0, rear=0)
 _PAIR_MEANING = {"gap": "free distance between the two", "hit": "1 if the pair has had an impact"}
 _OBSTACLE_FEATURES = tuple(
     replace(f, name=f"obstacle.{f.name}", meaning=meaning)
-    for f in OBSTACLE_FEATURES
+    for f in GROUPS.obstacle
     for name, meaning in (("gap", "distance from Vehicle 1 to the obstacle"), ("hit", f.meaning))
     if f.name == name
 )
-_PAIR_FEATURES = tuple(replace(f, meaning=_PAIR_MEANING[f.name]) for f in NEIGHBOUR_FEATURES if f.name in _PAIR_MEANING)
+_PAIR_FEATURES = tuple(replace(f, meaning=_PAIR_MEANING[f.name]) for f in GROUPS.neighbour if f.name in _PAIR_MEANING)
 
 
 def state_features(scenario: Scenario) -> tuple[Feature, ...]:
@@ -609,7 +554,7 @@ def state_features(scenario: Scenario) -> tuple[Feature, ...]:
 
     Where there is an obstacle ahead of Vehicle 1, its gap and hit flag follow.
     """
-    vehicles = [replace(f, name=f"{name}.{f.name}") for name in scenario.vehicle_names for f in OWN_FEATURES]
+    vehicles = [replace(f, name=f"{name}.{f.name}") for name in scenario.vehicle_names for f in GROUPS.own]
     pairs = [replace(f, name=f"pair_{p}.{f.name}") for p in range(1, scenario.vehicles) for f in _PAIR_FEATURES]
     time = Feature("time", "s", scenario.horizon_s, 0.0, 1.0, "time since Vehicle 1 began to brake; scale: the horizon")
     obstacle = _OBSTACLE_FEATURES if scenario.has_obstacle else ()
@@ -619,7 +564,7 @@ def state_features(scenario: Scenario) -> tuple[Feature, ...]:
 def full_state(worlds: Worlds, scenario: Scenario) -> Observations:
     """State of every world, [n, S] float32 in its own memory; S = 7 N + 2 P + 1, and 2 more with an obstacle ahead."""
     latency = worlds.vehicles.latency_s  # whole, with what a channel has drawn
-    whole_latency = replace(worlds.vehicles, own_latency_s=latency, known_from_s=known_at_once(latency))
+    whole_latency = replace(worlds.vehicles, own_latency_s=latency, known_from_s=Vehicles.known_at_once(latency))
     vehicles = [observe(replace(worlds, vehicles=whole_latency), i, _OWN_ONLY) for i in range(worlds.N)]
     pair_values = {"gap": worlds.gaps_m, "hit": worlds.pair_hit.astype(np.float64)}
     columns = [pair_values[f.name][:, p] for p in range(worlds.N - 1) for f in _PAIR_FEATURES]

@@ -4,7 +4,7 @@ Terms, for vehicle i and one step (the paper's section on the reward, with its p
 
 =========  =======================================================================================================
 harm       minus the harm of the whole line in this step, each impact once (``harm_count``: first | total); or by how
-           much the step raised what the vehicle's ``objective`` makes of the harm so far (``objectives``)
+           much the step raised what the vehicle's ``objective`` makes of the harm so far
 collision  the paper's r_collision: minus ``sum_p k_energy w_p^2`` over every impact of the step
 risk       the paper's r_risk over the vehicle's own pairs: ``-sigma(-TTC / tau) - sigma(k_d (d_target - d))``; an
            opening pair has TTC = infinity (first part 0) and ``d - d_safe`` is not negative
@@ -32,8 +32,7 @@ from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, WithoutEffect, describe_error, unknown_name
 from ethbrake_marl.files.yaml import UNSHOWN, FileModel, first_mistake, refuse
 from ethbrake_marl.harm import Declared, Objective, check_declared, objectives_of
-from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, forecast
-from ethbrake_marl.physics.compiled import logistic
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, forecast, logistic
 
 # The one table of reward terms: what each is, its unit, its usual weight, and the function that computes it.
 
@@ -61,6 +60,17 @@ class StepOutcome:
     latency_s: Floats  # [n, N] from when on commands take effect
     mass_t: Floats  # [n, N]
     learners: Ints  # [L] the vehicles that learn
+
+    def built_in(self, terms: Sequence[Term], params: RewardParams) -> dict[str, Floats]:
+        """Built-in terms that need the motion, each [n, N]."""
+        return {term.name: term.function(params, self) for term in terms if term.function is not None}
+
+    def registered(self, terms: Sequence[Term], counts: Bools, steps: Ints) -> dict[str, Floats]:
+        """Registered terms, each [n, N]; see ``checked_term``. They cannot change what they are given."""
+        for name in StepOutcome.__slots__:
+            if isinstance(given := getattr(self, name), np.ndarray):
+                given.flags.writeable = False
+        return {term.name: checked_term(term, self, counts, steps) for term in terms}
 
 
 TermFunction = Callable[[StepOutcome], Floats]
@@ -113,19 +123,6 @@ def registered_terms() -> dict[str, Term]:
     return {name: term for name, term in TERMS.items() if term.registered}
 
 
-def settled_weights(given: dict[str, float]) -> dict[str, float]:
-    """The weights of registered terms, each said to be its usual one left out where that is 0.
-
-    Raises ``UnknownName`` for a term that is not registered.
-    """
-    known = registered_terms()
-    for name in given:
-        if name not in known:
-            raise unknown_name("reward term", name, known, may_be_own=True)
-    every = {name: given.get(name, term.weight) for name, term in known.items()}
-    return {name: weight for name, weight in every.items() if weight > 0.0 or known[name].weight > 0.0}
-
-
 def checked_term(term: Term, step: StepOutcome, counts: Bools, steps: Ints) -> Floats:
     """A registered term as [n, N]; 0 in rows that do not count.
 
@@ -147,10 +144,8 @@ def checked_term(term: Term, step: StepOutcome, counts: Bools, steps: Ints) -> F
     spread = np.zeros((n, vehicles))
     if value.ndim == 1:
         spread[:] = value[:, np.newaxis]
-    elif value.shape == (n, vehicles):
-        spread[:] = value
     else:
-        spread[:, step.learners] = value
+        spread[:, slice(None) if value.shape == (n, vehicles) else step.learners] = value
     spread[~counts] = 0.0
     if not np.isfinite(spread).all():
         world, vehicle = np.argwhere(~np.isfinite(spread))[0]
@@ -165,13 +160,17 @@ def checked_term(term: Term, step: StepOutcome, counts: Bools, steps: Ints) -> F
 
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Value = TypeVar("Value", float, Floats)
+
+_BRAKING_SHARES = np.linspace(0.0, 1.0, 9)
+_ROUNDS = 2  # of several learners
 
 
 class RewardParams(FileModel):
     """Weights of the terms and their constants; a weight of 0 switches a term off.
 
     Args:
-        harm, collision, risk, jerk, terminal, shaping: weights, at least 0, of the terms that the folder's head lists;
+        harm, collision, risk, jerk, terminal, shaping: weights, at least 0, of the terms that the module's head lists;
             harm must be given beside any other.
         harm_count: impacts that count, ``first`` of each pair or ``total``.
         objective: whose harm counts, one name or one for each vehicle; None: the scenario's.
@@ -222,7 +221,13 @@ class RewardParams(FileModel):
     @field_validator("terms")
     @classmethod
     def _settled(cls, value: dict[str, float]) -> dict[str, float]:
-        return settled_weights(value)
+        """Those that are registered, each said to be its usual one left out where that is 0."""
+        known = registered_terms()
+        for name in value:
+            if name not in known:
+                raise unknown_name("reward term", name, known, may_be_own=True)
+        every = {name: value.get(name, term.weight) for name, term in known.items()}
+        return {name: weight for name, weight in every.items() if weight > 0.0 or known[name].weight > 0.0}
 
     @field_validator("objective", mode="before")
     @classmethod
@@ -259,6 +264,79 @@ class RewardParams(FileModel):
         """The weight of every term."""
         return {name: self.weight(name) for name in TERMS}
 
+    @property
+    def counted(self) -> tuple[str, ...]:
+        """Names of the terms that this reward counts, in the order of the table."""
+        return tuple(name for name, weight in self.weights.items() if weight > 0.0)
+
+    @property
+    def moving(self) -> list[Term]:
+        """The built-in terms that need the motion, of those that this reward counts: collision, risk, jerk."""
+        return [TERMS[name] for name in self.counted if TERMS[name].function and not TERMS[name].registered]
+
+    @property
+    def registered(self) -> list[Term]:
+        """The registered terms that this reward counts."""
+        return [TERMS[name] for name, weight in self.terms.items() if weight > 0.0]
+
+    def shared(self, harm: Value, safe_end: Value) -> dict[str, Value]:
+        """The terms that all vehicles share and that need no more than the step's facts, of many worlds [n] or of one.
+
+        ``harm`` as counted; ``safe_end`` is 1 or 0. With an objective other than everybody's harm, harm is not shared.
+        """
+        terms = {}
+        if self.harm > 0.0 and self.objective is None:
+            terms["harm"] = -harm
+        if self.terminal > 0.0:
+            terms["terminal"] = safe_end
+        return terms
+
+    def weighted_sum(self, terms: Mapping[str, Floats], shape: tuple[int, ...]) -> Floats:
+        """Reward of every vehicle, [n, N]."""
+        total = np.zeros(shape)
+        for name, term in terms.items():
+            total += self.weight(name) * term
+        return total
+
+    def settled(self, of_scenario: Declared, vehicles: int) -> tuple[RewardParams, tuple[Objective, ...]]:
+        """The reward with its objective settled (the scenario's where it has none), and that of each vehicle.
+
+        Everybody's harm alike, the usual one, is ``None`` and no objectives: it needs no telling apart. So is any where
+        harm weighs nothing, with a warning (``WithoutEffect``).
+        Raises ``InvalidInput`` for an objective that does not fit the number of vehicles.
+        """
+        declared = of_scenario if self.objective is None else self.objective
+        try:
+            objectives = objectives_of(declared, vehicles)
+        except InvalidInput as error:  # the scenario's was found to fit when it was made
+            raise InvalidInput(f"reward: {error}") from None
+        usual = all(objective.kind == "total" for objective in objectives)
+        if not usual and self.harm == 0.0:
+            what = f"the scenario's objective, {declared if isinstance(declared, str) else ', '.join(declared)},"
+            warnings.warn(WithoutEffect(f"{what} changes nothing: this reward gives harm no weight"), stacklevel=2)
+        if usual or self.harm == 0.0:
+            return self.model_copy(update={"objective": None}), ()
+        return self.model_copy(update={"objective": declared}), objectives
+
+    def potential(self, worlds: Worlds, learners: Sequence[int], horizon_s: float) -> Floats:
+        """Minus the least harm ahead, [n], that was found with a constant deceleration of each learner from now on.
+
+        All others brake fully; harm is what ``harm_count`` counts, from now to the horizon, in the engine's physics.
+        One learner takes the best of nine shares of its capacity. Several begin with full braking and choose so one
+        after the other, front to rear, twice round, each given what the others have chosen: all have the same
+        potential.
+        """
+        braking = worlds.vehicles.braking_capacity_mps2
+        command, least = -braking, np.zeros(worlds.n)
+        for _ in range(1 if len(learners) == 1 else _ROUNDS):
+            for vehicle in learners:
+                candidates = -braking[:, vehicle, np.newaxis] * _BRAKING_SHARES
+                harm = forecast(worlds, command, vehicle, candidates, horizon_s)[0 if self.harm_count == "first" else 1]
+                choice = harm.argmin(axis=1)[:, np.newaxis]
+                command[:, vehicle] = np.take_along_axis(candidates, choice, axis=1)[:, 0]
+                least = np.take_along_axis(harm, choice, axis=1)[:, 0]
+        return -least
+
 
 SETTINGS.update(RewardParams.model_fields)
 
@@ -279,16 +357,25 @@ def reward_params(reward: Reward) -> RewardParams:
     """
     if isinstance(reward, RewardParams):
         return reward
-    if isinstance(reward, Mapping):
-        return _from_settings(reward)
-    if not isinstance(reward, str):
+    if isinstance(reward, str):
+        if reward not in REWARDS:
+            raise unknown_name("reward", reward, REWARDS)
+        return REWARDS[reward]
+    if not isinstance(reward, Mapping):
         raise InvalidInput(
             f"reward = {reward!r}: must be a name ({', '.join(REWARDS)}), a mapping such as {{'harm': 1.0}}, or"
             " RewardParams"
         )
-    if reward not in REWARDS:
-        raise unknown_name("reward", reward, REWARDS)
-    return REWARDS[reward]
+    known = setting_names()
+    for name in reward:
+        if name not in known:
+            raise unknown_name("setting of a reward", name, known)
+    try:
+        return RewardParams(**reward)
+    except ValidationError as error:
+        first = first_mistake(error)
+        given = "" if isinstance(first.given, dict) else f" = {first.given!r}"  # the whole of it is to be read there
+        raise InvalidInput(f"reward: {first.place.removeprefix('terms.')}{given}: {first.right}") from None
 
 
 def setting_names() -> list[str]:
@@ -296,132 +383,11 @@ def setting_names() -> list[str]:
     return [*RewardParams.model_fields, *registered_terms()]
 
 
-def resolved_objective(
-    params: RewardParams, of_scenario: Declared, vehicles: int
-) -> tuple[RewardParams, tuple[Objective, ...]]:
-    """The reward with its objective settled (the scenario's where it has none), and that of each vehicle.
-
-    Everybody's harm alike, the usual one, is ``None`` and no objectives: it needs no telling apart. So is any where
-    harm weighs nothing, with a warning (``WithoutEffect``).
-    Raises ``InvalidInput`` for an objective that does not fit the number of vehicles.
-    """
-    declared = of_scenario if params.objective is None else params.objective
-    try:
-        objectives = objectives_of(declared, vehicles)
-    except InvalidInput as error:  # the scenario's was found to fit when it was made
-        raise InvalidInput(f"reward: {error}") from None
-    usual = all(objective.kind == "total" for objective in objectives)
-    if not usual and params.harm == 0.0:
-        what = f"the scenario's objective, {declared if isinstance(declared, str) else ', '.join(declared)},"
-        warnings.warn(WithoutEffect(f"{what} changes nothing: this reward gives harm no weight"), stacklevel=2)
-    if usual or params.harm == 0.0:
-        return params.model_copy(update={"objective": None}), ()
-    return params.model_copy(update={"objective": declared}), objectives
-
-
-def _from_settings(settings: Mapping[str, Any]) -> RewardParams:
-    known = setting_names()
-    for name in settings:
-        if name not in known:
-            raise unknown_name("setting of a reward", name, known)
-    try:
-        return RewardParams(**settings)
-    except ValidationError as error:
-        first = first_mistake(error)
-        given = "" if isinstance(first.given, dict) else f" = {first.given!r}"  # the whole of it is to be read there
-        raise InvalidInput(f"reward: {first.place.removeprefix('terms.')}{given}: {first.right}") from None
-
-
-# The terms of a reward as functions of one step, and the potential of the shaping.
-
-Value = TypeVar("Value", float, Floats)
-
-_BRAKING_SHARES = np.linspace(0.0, 1.0, 9)
-_ROUNDS = 2  # of several learners
-
-
-def shared_terms(params: RewardParams, harm: Value, safe_end: Value) -> dict[str, Value]:
-    """The terms that all vehicles share and that need no more than the step's facts, of many worlds [n] or of one.
-
-    ``harm`` as counted; ``safe_end`` is 1 or 0. With an objective other than everybody's harm, harm is not shared.
-    """
-    terms = {}
-    if params.harm > 0.0 and params.objective is None:
-        terms["harm"] = -harm
-    if params.terminal > 0.0:
-        terms["terminal"] = safe_end
-    return terms
-
-
-def counted_terms(params: RewardParams) -> tuple[str, ...]:
-    """Names of the terms that this reward counts, in the order of the table."""
-    return tuple(name for name in TERMS if params.weight(name) > 0.0)
-
-
-def reward_terms(params: RewardParams, step: StepOutcome) -> dict[str, Floats]:
-    """Unweighted terms of one step, each [n, N]; only those with a weight above 0 (all but shaping)."""
-    harm = step.first_impact_harm if params.harm_count == "first" else step.total_harm
-    shared = shared_terms(params, harm, step.safe_end.astype(np.float64))
-    spread = {name: _shared(term, step.speeds_mps.shape) for name, term in shared.items()}
-    return spread | further_terms(moving_terms_of(params), params, step)
-
-
-def moving_terms_of(params: RewardParams) -> list[Term]:
-    """The built-in terms that need the motion, of those that this reward counts: collision, risk, jerk."""
-    return [t for t in TERMS.values() if t.function and not t.registered and params.weight(t.name) > 0.0]
-
-
-def further_terms(terms: Sequence[Term], params: RewardParams, step: StepOutcome) -> dict[str, Floats]:
-    """Built-in terms of one step that need the motion, each [n, N]."""
-    return {term.name: term.function(params, step) for term in terms if term.function is not None}
-
-
-def registered_terms_of(params: RewardParams) -> list[Term]:
-    """The registered terms that this reward counts."""
-    return [TERMS[name] for name, weight in params.terms.items() if weight > 0.0]
-
-
-def own_terms(terms: Sequence[Term], step: StepOutcome, counts: Bools, steps: Ints) -> dict[str, Floats]:
-    """Registered terms of one step, each [n, N]; see ``checked_term``. They cannot change what they are given."""
-    for name in StepOutcome.__slots__:
-        if isinstance(given := getattr(step, name), np.ndarray):
-            given.flags.writeable = False
-    return {term.name: checked_term(term, step, counts, steps) for term in terms}
-
-
-def potential(params: RewardParams, worlds: Worlds, learners: Sequence[int], horizon_s: float) -> Floats:
-    """Minus the least harm ahead, [n], that was found with a constant deceleration of each learner from now on.
-
-    All others brake fully; harm is what ``harm_count`` counts, from now to the horizon, in the engine's own physics.
-    One learner takes the best of nine shares of its capacity. Several begin with full braking and choose so one after
-    the other, front to rear, twice round, each given what the others have chosen: all have the same potential.
-    """
-    braking = worlds.vehicles.braking_capacity_mps2
-    command, least = -braking, np.zeros(worlds.n)
-    for _ in range(1 if len(learners) == 1 else _ROUNDS):
-        for vehicle in learners:
-            candidates = -braking[:, vehicle, np.newaxis] * _BRAKING_SHARES
-            harm = forecast(worlds, command, vehicle, candidates, horizon_s)[0 if params.harm_count == "first" else 1]
-            choice = harm.argmin(axis=1)[:, np.newaxis]
-            command[:, vehicle] = np.take_along_axis(candidates, choice, axis=1)[:, 0]
-            least = np.take_along_axis(harm, choice, axis=1)[:, 0]
-    return -least
-
-
-def weighted_sum(params: RewardParams, terms: Mapping[str, Floats], shape: tuple[int, ...]) -> Floats:
-    """Reward of every vehicle, [n, N]."""
-    total = np.zeros(shape)
-    for name, term in terms.items():
-        total += params.weight(name) * term
-    return total
-
-
-def _shared(world_value: Floats, shape: tuple[int, ...]) -> Floats:
-    return world_value.repeat(shape[1]).reshape(shape)
+# The terms of a reward as functions of one step.
 
 
 def _collision(params: RewardParams, step: StepOutcome) -> Floats:
-    return _shared(-params.k_energy * step.total_harm, step.speeds_mps.shape)
+    return (-params.k_energy * step.total_harm).repeat(step.speeds_mps.shape[1]).reshape(step.speeds_mps.shape)
 
 
 def _jerk(params: RewardParams, step: StepOutcome) -> Floats:

@@ -6,35 +6,37 @@ import hashlib
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.harm import check_harm_count
-from ethbrake_marl.physics import Bools, Floats, Ints, UInt64s, Worlds, advance
-from ethbrake_marl.physics.advance import TIME, command_at, gap_at, harm_at, pack, params_at, speed_at
-from ethbrake_marl.physics.compiled import compiled, compiled_apart, exp
-from ethbrake_marl.physics.kernel import (
+from ethbrake_marl.physics import (
     CLOCK,
     GOES_ON,
     ROW,
+    Bools,
+    Decisions,
     Episode,
-    ahead,
-    first_decision_s,
+    Floats,
+    Ints,
+    Packed,
+    UInt64s,
+    Worlds,
+    advance,
+    compiled,
+    exp,
     follow,
     follow_whole,
     grid_of,
     harm_so_far,
-    number_of_decisions,
-    obstacle_ahead,
     restore,
     save,
     step_again,
     value_of,
-    with_obstacle,
 )
 
 # The search for the profile of least harm in one world, compiled: one call per world, no Python inside.
@@ -42,12 +44,12 @@ from ethbrake_marl.physics.kernel import (
 # Method: given profiles (constants among them) and random ones are tried; the best of them, all different, are improved
 # by random changes of any size, each success being repeated twice as large; after each round the better half goes on.
 # The last one is divided into more phases and improved further, at the end decision by decision, as the engine runs.
-# Letters as in ``physics.episode``; Q given profiles, M of them and of the random ones improved.
+# Letters as in ``physics.kernel``; Q given profiles, M of them and of the random ones improved.
 
 # Random profiles and random changes of profiles, compiled, from one small random stream per world.
 #
 # ``bounds`` [C, 2] are the smallest and the largest command of each controlled vehicle (m/s2); the other letters are
-# those of ``profile_motion``.
+# those of ``physics.kernel``.
 
 RESOLUTION = 1048576.0  # commands are multiples of 1 / 2^20 m/s2: short to store, exact to repeat, and off any edge
 LONGEST_DRAWN = 25.0  # steps of a phase that is drawn
@@ -95,41 +97,6 @@ def draw_command(random: UInt64s, low: float, high: float) -> float:
     if u < 0.6:
         return 0.0
     return allowed(low + (high - low) * draw(random), low, high)
-
-
-@compiled
-def draw_profile(random: UInt64s, bounds: Floats, ends: Ints, commands: Floats, last: int) -> None:
-    """Fill ``ends`` [K] and ``commands`` [K, C] at random; phases are short rather than long."""
-    step = 0
-    for k in range(ends.shape[0]):
-        u = draw(random)
-        step = min(step + 1 + int(u * u * LONGEST_DRAWN), last)
-        ends[k] = step
-        for c in range(bounds.shape[0]):
-            commands[k, c] = draw_command(random, bounds[c, 0], bounds[c, 1])
-    ends[ends.shape[0] - 1] = last
-
-
-@compiled
-def draw_change(random: UInt64s, bounds: Floats, active: int, change: Floats) -> int:
-    """Fill ``change`` [CHANGE_WIDTH] at random, for one of the first ``active`` phases; returns the phase."""
-    u = draw(random)
-    phase, vehicle = draw_below(random, active), draw_below(random, bounds.shape[0])
-    sign = 1.0 if draw(random) < 0.5 else -1.0
-    size = draw(random)
-    low, high = bounds[vehicle, 0], bounds[vehicle, 1]
-    change[VEHICLE] = vehicle
-    change[PHASE] = phase
-    if u < 0.70:
-        change[KIND] = COMMAND_CHANGE if u < 0.45 else TRADE
-        change[AMOUNT] = sign * (high - low) * exp(LN_SMALLEST * size)
-    elif u < 0.78:
-        change[KIND] = SET_COMMAND
-        change[AMOUNT] = draw_command(random, low, high)
-    else:
-        change[KIND] = MOVE_END
-        change[AMOUNT] = sign * (1 + int(8.0 * size * size * size))
-    return phase
 
 
 @compiled
@@ -183,25 +150,6 @@ def compact(ends: Ints, commands: Floats, phases: int) -> int:
         kept += 1
     ends[kept - 1] = last
     return kept
-
-
-@compiled
-def split_phases(ends: Ints, commands: Floats, phases: int, wanted: int, attention: int) -> None:
-    """Halve the longest phases, in place, until there are ``wanted``; steps after ``attention`` count as nothing."""
-    while phases < wanted:
-        longest, length = 0, -1
-        for k in range(phases):
-            begin = ends[k - 1] if k > 0 else 0
-            here = min(ends[k], attention) - min(begin, attention)
-            if here > length:
-                longest, length = k, here
-        for k in range(phases, longest, -1):
-            ends[k] = ends[k - 1]
-            for c in range(commands.shape[1]):
-                commands[k, c] = commands[k - 1, c]
-        begin = ends[longest - 1] if longest > 0 else 0
-        ends[longest] = begin + max(length // 2, 0)
-        phases += 1
 
 
 MOST_PHASES = 12
@@ -294,7 +242,7 @@ def copy_rows(rows: Floats, to_rows: Floats, n: int) -> None:
             to_rows[k, c] = rows[k, c]
 
 
-@compiled_apart
+@compiled(apart=True)
 def improve(world: SearchWorld, ends: Ints, commands: Floats, states: Floats, budget: int) -> float:
     """Better and better neighbours of a profile, in place, until ``budget`` candidates have run; its value."""
     new_ends, new_commands, new_states = ends.copy(), commands.copy(), states.copy()
@@ -305,7 +253,22 @@ def improve(world: SearchWorld, ends: Ints, commands: Floats, states: Floats, bu
             break
         if spent >= 0:
             if not again:
-                phase = draw_change(world.random, world.bounds, active, change)
+                u = draw(world.random)
+                phase, vehicle = draw_below(world.random, active), draw_below(world.random, world.bounds.shape[0])
+                sign = 1.0 if draw(world.random) < 0.5 else -1.0
+                size = draw(world.random)
+                low, high = world.bounds[vehicle, 0], world.bounds[vehicle, 1]
+                change[VEHICLE] = vehicle
+                change[PHASE] = phase
+                if u < 0.70:
+                    change[KIND] = COMMAND_CHANGE if u < 0.45 else TRADE
+                    change[AMOUNT] = sign * (high - low) * exp(LN_SMALLEST * size)
+                elif u < 0.78:
+                    change[KIND] = SET_COMMAND
+                    change[AMOUNT] = draw_command(world.random, low, high)
+                else:
+                    change[KIND] = MOVE_END
+                    change[AMOUNT] = sign * (1 + int(8.0 * size * size * size))
             copy_profile(ends, commands, new_ends, new_commands)
             again = False
             if not apply_change(change, world.bounds, new_ends, new_commands):
@@ -327,7 +290,7 @@ def improve(world: SearchWorld, ends: Ints, commands: Floats, states: Floats, bu
     return value
 
 
-@compiled_apart
+@compiled(apart=True)
 def gather(
     world: SearchWorld, seed_ends: Ints, seed_commands: Floats, states: Floats, drawn: int, field: Population
 ) -> None:
@@ -344,7 +307,14 @@ def gather(
             while used < K and ends[used - 1] != last:
                 used += 1
         else:
-            draw_profile(world.random, world.bounds, ends[:used], commands[:used], last)
+            step = 0
+            for k in range(used):  # phases are short rather than long
+                u = draw(world.random)
+                step = min(step + 1 + int(u * u * LONGEST_DRAWN), last)
+                ends[k] = step
+                for c in range(world.bounds.shape[0]):
+                    commands[k, c] = draw_command(world.random, world.bounds[c, 0], world.bounds[c, 1])
+            ends[used - 1] = last
         value, reached = follow_whole(world.episode, ends[:used], commands[:used], states, field.values[worst])
         if reached < 0 or not value < field.values[worst] or is_among(value, field.values):
             continue
@@ -357,27 +327,21 @@ def gather(
     sort(field, field.values.shape[0])
 
 
-@compiled_apart
+@compiled(apart=True)
 def sort(field: Population, left: int) -> None:
     """Put the first ``left`` places of the field in order of value."""
     for here in range(1, left):
         m = here
         while m > 0 and field.values[m] < field.values[m - 1]:
-            swap(field, m)
+            field.values[m], field.values[m - 1] = field.values[m - 1], field.values[m]
+            field.phases[m], field.phases[m - 1] = field.phases[m - 1], field.phases[m]
+            for k in range(field.ends.shape[1]):
+                field.ends[m, k], field.ends[m - 1, k] = field.ends[m - 1, k], field.ends[m, k]
+                for c in range(field.commands.shape[2]):
+                    before = field.commands[m - 1, k, c]
+                    field.commands[m - 1, k, c] = field.commands[m, k, c]
+                    field.commands[m, k, c] = before
             m -= 1
-
-
-@compiled
-def swap(field: Population, m: int) -> None:
-    """Exchange place m of the field with the one before it."""
-    field.values[m], field.values[m - 1] = field.values[m - 1], field.values[m]
-    field.phases[m], field.phases[m - 1] = field.phases[m - 1], field.phases[m]
-    for k in range(field.ends.shape[1]):
-        field.ends[m, k], field.ends[m - 1, k] = field.ends[m - 1, k], field.ends[m, k]
-        for c in range(field.commands.shape[2]):
-            before = field.commands[m - 1, k, c]
-            field.commands[m - 1, k, c] = field.commands[m, k, c]
-            field.commands[m, k, c] = before
 
 
 @compiled
@@ -399,20 +363,33 @@ def largest(values: Floats) -> int:
     return place
 
 
-@compiled_apart
+@compiled(apart=True)
 def divide(world: SearchWorld, field: Population) -> None:
     """Give the best of the field as many phases as there may be."""
     used = field.phases[0]
     if used > 0 and field.values[0] > 0.0:
         K = field.ends.shape[1]
         used = compact(field.ends[0, :used], field.commands[0, :used], used)
-        split_phases(
-            field.ends[0], field.commands[0], used, K, min(ATTENTION_STEPS, int(world.episode.clock[CLOCK.LAST_STEP]))
-        )
+        phases = used
+        attention = min(ATTENTION_STEPS, int(world.episode.clock[CLOCK.LAST_STEP]))
+        while phases < K:
+            longest, length = 0, -1
+            for k in range(phases):
+                begin = field.ends[0, k - 1] if k > 0 else 0
+                here = min(field.ends[0, k], attention) - min(begin, attention)
+                if here > length:
+                    longest, length = k, here
+            for k in range(phases, longest, -1):
+                field.ends[0, k] = field.ends[0, k - 1]
+                for c in range(field.commands.shape[2]):
+                    field.commands[0, k, c] = field.commands[0, k - 1, c]
+            begin = field.ends[0, longest - 1] if longest > 0 else 0
+            field.ends[0, longest] = begin + max(length // 2, 0)
+            phases += 1
         field.phases[0] = K
 
 
-@compiled_apart
+@compiled(apart=True)
 def select_stepwise(
     world: SearchWorld, seed_ends: Ints, seed_commands: Floats, states: Floats, field: Population
 ) -> None:
@@ -450,12 +427,10 @@ def select_stepwise(
 # The problem of choosing whole profiles: whose, in which worlds, on which grid of decisions.
 
 TIME_STEP_S = 0.1  # between two decisions, where nobody says otherwise
-PER_WORLD = ("start", "clock", "bounds", "command", "latency", "mass", "limit", "identity")  # arrays of a problem
 _MIX = 0xD1342543DE82EF95  # an odd number: spreads seeds over 64 bits
 
 
-@dataclass(frozen=True, slots=True)
-class ProfileProblem:
+class ProfileProblem(NamedTuple):
     """Whose commands are chosen, in which worlds, on which grid of decisions. Build it with ``profile_problem``."""
 
     vehicles: Ints  # [C] controlled, index from 0; in lines with an obstacle from 1, it being vehicle 0 of every column
@@ -475,12 +450,143 @@ class ProfileProblem:
 
     def take(self, rows: Ints) -> ProfileProblem:
         """That of some of the worlds."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in PER_WORLD})
+        arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._fields[1:]}
+        return self._replace(**arrays)
+
+    def put(self, rows: Ints, new: ProfileProblem) -> ProfileProblem:
+        """A copy with the worlds of a ``new`` one in these rows."""
+        arrays: dict[str, Any] = {name: getattr(self, name).copy() for name in self._fields[1:]}
+        for name, array in arrays.items():
+            array[rows] = getattr(new, name)
+        return self._replace(**arrays)
 
     @property
     def last_step(self) -> Ints:
         """Number of decisions up to the horizon, [n]."""
         return self.clock[:, CLOCK.LAST_STEP].astype(np.int64)
+
+    def constant(self, commands_mps2: Floats) -> Profiles:
+        """Profiles [n * Q] that hold the given commands [n, Q, C], divided into phases for a search to change."""
+        n, Q, C = commands_mps2.shape
+        borders = np.array([2, 5, 9, 14, 20] + (MOST_PHASES - 5) * [np.iinfo(np.int64).max])
+        ends = np.minimum(borders, self.last_step[:, np.newaxis])
+        shape = (n, Q, MOST_PHASES)
+        repeated = np.broadcast_to(commands_mps2[:, :, np.newaxis], (*shape, C))
+        return Profiles(
+            np.broadcast_to(ends[:, np.newaxis], shape).reshape(n * Q, MOST_PHASES).copy(),
+            repeated.reshape(n * Q, MOST_PHASES, C).copy(),
+        )
+
+    def even_grid(self, number: int) -> Floats:
+        """``number`` commands from each vehicle's least to its greatest, evenly spaced, both included.
+
+        [n, number, C] m/s2. ``low + (high - low)`` may lie an ulp beyond ``high``, so the greatest is taken as it is.
+        """
+        low, high = self.bounds[:, np.newaxis, :, 0], self.bounds[:, np.newaxis, :, 1]
+        share = np.linspace(0.0, 1.0, number)[:, np.newaxis]
+        return np.asarray(np.minimum(low + share * (high - low), high), np.float64)
+
+    def follow(self, profiles: Profiles) -> tuple[Floats, Floats]:
+        """First-impact and total harm [n] of one profile per world, as the engine counts it, to the same bits.
+
+        Raises ``InvalidInput`` for profiles that do not fit the problem or exceed a capacity, ``PhysicsError`` naming
+        the worlds in which a check of the kernel failed.
+        """
+        self.check(profiles)
+        n = self.n
+        first, total, failed = np.zeros(n), np.zeros(n), np.zeros(n, np.bool_)
+        ends, commands = np.ascontiguousarray(profiles.ends, np.int64), np.ascontiguousarray(profiles.commands_mps2)
+        follow_worlds(self, ends, commands, first, total, failed)
+        if failed.any():
+            raise PhysicsError({k: "its profile could not be followed" for k in np.flatnonzero(failed).tolist()})
+        return first, total
+
+    def check(self, profiles: Profiles) -> None:
+        """Raise ``InvalidInput`` unless there is one profile per world, within the capacities, its phases in order."""
+        n, C = self.n, len(self.vehicles)
+        K = profiles.ends.shape[-1]
+        if profiles.ends.shape != (n, K) or profiles.commands_mps2.shape != (n, K, C):
+            raise InvalidInput(
+                f"profiles: shapes {profiles.ends.shape} and {profiles.commands_mps2.shape}; ({n}, K) and ({n}, K, {C})"
+                " are needed"
+            )
+        low, high = self.bounds[:, np.newaxis, :, 0], self.bounds[:, np.newaxis, :, 1]
+        good = (profiles.commands_mps2 >= low) & (profiles.commands_mps2 <= high)
+        if not good.all():
+            raise InvalidInput(
+                f"profiles: command {profiles.commands_mps2[~good][0]:g} m/s2 is beyond a vehicle's capacity"
+            )
+        ordered = (np.diff(profiles.ends, axis=1, prepend=0) >= 0).all() and (
+            profiles.ends[:, -1] == self.last_step
+        ).all()
+        if not ordered:
+            raise InvalidInput("profiles: phases must end in order, the last one at the last step")
+
+    def search(self, given: Profiles, *, budget: int, seed: int = 0, threads: int = 1) -> SearchResult:
+        """The best profiles of at most ``MOST_PHASES`` phases that about ``budget`` candidates per world find.
+
+        ``given`` [n * Q]: Q profiles of each world, world by world, from which to start; the result is never worse than
+        any of them. Raises ``InvalidInput`` for a budget below 1 and ``PhysicsError`` naming the worlds of which no
+        profile could be followed.
+        """
+        for name, value, least in (("budget", budget, 1), ("threads", threads, 1), ("seed", seed, 0)):
+            check_whole_number(name, value, least)
+        n, C = self.n, len(self.vehicles)
+        ends = np.ascontiguousarray(given.ends.reshape(n, -1, MOST_PHASES))
+        commands = np.ascontiguousarray(given.commands_mps2.reshape(n, -1, MOST_PHASES, C))
+        best = Profiles(np.zeros((n, MOST_PHASES), np.int64), np.zeros((n, MOST_PHASES, C)))
+        random = seeded(self.identity, seed)
+
+        def work(k: int) -> int:
+            world = make_search_world(self, k, random)
+            return search_world(world, self.start[k], ends[k], commands[k], budget, best.ends[k], best.commands_mps2[k])
+
+        if threads == 1:
+            used = [work(k) for k in range(n)]
+        else:
+            with ThreadPoolExecutor(threads) as pool:
+                used = list(pool.map(work, range(n)))
+        if 0 in used:
+            raise PhysicsError({k: "no profile could be followed" for k in range(n) if used[k] == 0})
+        return SearchResult(best, *self.follow(best))
+
+    def refine(self, commands_mps2: Floats, *, budget: int, seed: int = 0) -> Refinement:
+        """Search around ``commands_mps2`` [n, T] of the one controlled vehicle, with ``budget`` candidates per world.
+
+        Worlds are independent of each other. Raises ``InvalidInput`` for several vehicles, commands of another shape or
+        beyond a capacity, or a budget below 1, ``PhysicsError`` naming worlds in which the given commands cannot be
+        played.
+        """
+        check_whole_number("budget", budget, 1)
+        n, steps = self.n, int(self.last_step.max(initial=0))
+        low, high = self.bounds[:, :1, 0], self.bounds[:, :1, 1]
+        if len(self.vehicles) != 1 or commands_mps2.shape != (n, steps):
+            raise InvalidInput(
+                f"refine: commands of shape {commands_mps2.shape}; ({n}, {steps}) of one vehicle are needed"
+            )
+        if not ((commands_mps2 >= low) & (commands_mps2 <= high)).all():
+            raise InvalidInput("refine: a command is beyond the vehicle's capacity")
+        best, first, total = commands_mps2.copy(), np.zeros(n), np.zeros(n)
+        failed = np.zeros(n, np.bool_)
+        _refine_worlds(self, seeded(self.identity, seed), budget, best, first, total, failed)
+        if failed.any():
+            raise PhysicsError({k: "its commands could not be played" for k in np.flatnonzero(failed).tolist()})
+        return Refinement(best, first, total)
+
+    def best_templates(self, bound: Floats, *, number: int, seed: int = 0) -> tuple[Floats, Ints]:
+        """The best of ``number`` templates below ``bound`` [n] (m2/s2) in each world, of the one controlled vehicle.
+
+        Returns its commands [n, T] (m/s2), and in how many steps it was played to its end [n]: 0 where none was below.
+        Each world draws its own; worlds are independent of each other. Raises ``InvalidInput`` for several vehicles, or
+        no template.
+        """
+        check_whole_number("templates", number, 1)
+        if len(self.vehicles) != 1:
+            raise InvalidInput(f"templates: {len(self.vehicles)} vehicles; they are of one")
+        commands = np.zeros((self.n, int(self.last_step.max(initial=0))))
+        steps = np.zeros(self.n, np.int64)
+        _best_templates(self, seeded(self.identity, seed), bound, number, commands, steps)
+        return commands, steps
 
 
 def profile_problem(
@@ -497,10 +603,10 @@ def profile_problem(
 
     The first decision falls on the smallest latency of the ``deciders`` (default: ``vehicles``) or on the worlds' time,
     whichever is later; one follows every ``time_step_s``. An obstacle ahead is written out as a vehicle in front
-    (``physics.obstacle``): all columns of the problem are those of that line. The other vehicles follow ``others_mps2``
-    [n, N] (default: full braking; the columns of ``vehicles`` are ignored). Raises ``InvalidInput`` for no vehicle, one
-    given twice or not there, an unknown count, a command beyond capacity, a horizon before the first decision, or
-    worlds of which only some have an obstacle.
+    (``Worlds.with_obstacle``): all columns of the problem are those of that line. The other vehicles follow
+    ``others_mps2`` [n, N] (default: full braking; the columns of ``vehicles`` are ignored). Raises ``InvalidInput`` for
+    no vehicle, one given twice or not there, an unknown count, a command beyond capacity, a horizon before the first
+    decision, or worlds of which only some have an obstacle.
     """
     chosen = _checked_vehicles(vehicles, worlds.N)
     check_harm_count(harm_count)
@@ -511,26 +617,26 @@ def profile_problem(
     if command.shape != worlds.speeds_mps.shape:
         raise InvalidInput(f"others_mps2: shape {command.shape}; {worlds.speeds_mps.shape} is needed")
     command[:, chosen] = 0.0
-    obstacle = obstacle_ahead(worlds)
+    obstacle = worlds.obstacle_ahead
     if obstacle.any():
         if not obstacle.all():
             raise InvalidInput("profiles: only some of the worlds have an obstacle ahead (obstacle_gap_m), not all")
         return profile_problem(
-            with_obstacle(worlds),
+            worlds.with_obstacle(),
             [i + 1 for i in chosen.tolist()],
             harm_count=harm_count,
             horizon_s=horizon_s,
             time_step_s=time_step_s,
-            others_mps2=ahead(0.0, command),
+            others_mps2=np.concatenate([np.zeros((len(command), 1)), command], axis=1),
             deciders=None if deciders is None else [i + 1 for i in deciders],
         )
     decide = _checked_vehicles(vehicles if deciders is None else deciders, worlds.N)
-    first = first_decision_s(worlds, decide.tolist())
+    first = worlds.first_decision_s(decide.tolist())
     if not (first < horizon_s).all():
         raise InvalidInput(f"horizon_s {horizon_s:g}: must be after the first decision at {first.max():g} s")
     clock = np.empty((worlds.n, CLOCK.WIDTH))
     clock[:, CLOCK.START], clock[:, CLOCK.TIME_STEP], clock[:, CLOCK.HORIZON] = first, time_step_s, horizon_s
-    clock[:, CLOCK.LAST_STEP] = number_of_decisions(first, time_step_s, horizon_s)
+    clock[:, CLOCK.LAST_STEP] = Decisions(first, time_step_s).before(horizon_s)
     clock[:, CLOCK.RESTITUTION], clock[:, CLOCK.HARM_IS_TOTAL], clock[:, CLOCK.STEPWISE] = (
         v.restitution,
         harm_count == "total",
@@ -550,17 +656,17 @@ def state_columns(worlds: Worlds) -> Floats:
 
     Raises ``InvalidInput`` for worlds of which only some have an obstacle ahead.
     """
-    obstacle = obstacle_ahead(worlds)
+    obstacle = worlds.obstacle_ahead
     if obstacle.any():
         if not obstacle.all():
             raise InvalidInput("profiles: only some of the worlds have an obstacle ahead (obstacle_gap_m), not all")
-        worlds = with_obstacle(worlds)
+        worlds = worlds.with_obstacle()
     return np.concatenate([worlds.speeds_mps, worlds.gaps_m, worlds.pair_hit], axis=1)
 
 
 def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
     """These worlds in the states [n, S] of a problem with them: speeds, gaps, hit flags, and those of the obstacle."""
-    added = int(obstacle_ahead(worlds).any())  # columns in front of each group
+    added = int(worlds.obstacle_ahead.any())  # columns in front of each group
     N = worlds.N + added
     gaps, hit = states[:, N : 2 * N - 1], states[:, 2 * N - 1 : 3 * N - 2] == 1.0
     return replace(
@@ -579,15 +685,15 @@ def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -
     State and parameters of the world, the other vehicles' commands, the decisions (first, step, number), the horizon
     and the controlled vehicles; not the count.
     """
-    state, params = pack(worlds)
-    N = worlds.N
-    who = np.zeros((worlds.n, N))
+    packed = Packed.of(worlds)
+    (state, params), column = packed, packed.column
+    who = np.zeros((worlds.n, worlds.N))
     who[:, vehicles] = 1.0
     parts = [
-        state[:, [TIME]],
-        state[:, speed_at(N) : command_at(N)],
-        state[:, gap_at(N) : harm_at(N)],
-        params[:, : params_at(5, N)],  # the news of others changes no harm
+        state[:, [column.time]],
+        state[:, column.speed : column.command],
+        state[:, column.gap : column.harm],
+        params[:, : column.own_latency],  # the news of others changes no harm
         command,
         clock[:, [CLOCK.START, CLOCK.TIME_STEP, CLOCK.LAST_STEP, CLOCK.HORIZON]],
         who,
@@ -625,12 +731,26 @@ class Profiles(NamedTuple):
     def at(self, step: Ints) -> Floats:
         """The commands in force in these steps [n]: [n, C] m/s2; beyond the last step its command goes on."""
         phase = np.minimum((self.ends <= step[:, np.newaxis]).sum(axis=1), self.ends.shape[1] - 1)
-        at: Floats = self.commands_mps2[np.arange(len(phase)), phase]
-        return at
+        return np.asarray(self.commands_mps2[np.arange(len(phase)), phase], np.float64)
 
     def take(self, rows: Ints | slice) -> Profiles:
         """Those of some worlds."""
         return Profiles(self.ends[rows], self.commands_mps2[rows])
+
+    @staticmethod
+    def padded(parts: Sequence[Profiles], least: int) -> list[Profiles]:
+        """The same profiles, all with as many phases (at least ``least``): empty ones are added.
+
+        In their own memory.
+        """
+        width = max([least, *(part.ends.shape[1] for part in parts)])
+        return [
+            Profiles(
+                np.pad(part.ends, ((0, 0), (0, width - part.ends.shape[1])), mode="edge"),
+                np.pad(part.commands_mps2, ((0, 0), (0, width - part.ends.shape[1]), (0, 0)), mode="edge"),
+            )
+            for part in parts
+        ]
 
     def grown(self, n: int) -> Profiles:
         """These and as many meaningless ones as make ``n`` in all; in their own memory."""
@@ -650,142 +770,25 @@ class SearchResult(NamedTuple):
         return self.first_impact_harm if harm_count == "first" else self.total_harm
 
 
-def constant_profiles(problem: ProfileProblem, commands_mps2: Floats) -> Profiles:
-    """Profiles [n * Q] that hold the given commands [n, Q, C], divided into phases for a search to change."""
-    n, Q, C = commands_mps2.shape
-    borders = np.array([2, 5, 9, 14, 20] + (MOST_PHASES - 5) * [np.iinfo(np.int64).max])
-    ends = np.minimum(borders, problem.last_step[:, np.newaxis])
-    shape = (n, Q, MOST_PHASES)
-    repeated = np.broadcast_to(commands_mps2[:, :, np.newaxis], (*shape, C))
-    return Profiles(
-        np.broadcast_to(ends[:, np.newaxis], shape).reshape(n * Q, MOST_PHASES).copy(),
-        repeated.reshape(n * Q, MOST_PHASES, C).copy(),
-    )
-
-
-def even_grid(problem: ProfileProblem, number: int) -> Floats:
-    """``number`` commands from each vehicle's least to its greatest, evenly spaced, both included; [n, number, C] m/s2.
-
-    ``low + (high - low)`` may lie an ulp beyond ``high``, so the greatest is taken as it is.
-    """
-    low, high = problem.bounds[:, np.newaxis, :, 0], problem.bounds[:, np.newaxis, :, 1]
-    share = np.linspace(0.0, 1.0, number)[:, np.newaxis]
-    grid: Floats = np.minimum(low + share * (high - low), high)
-    return grid
-
-
-def pad_profiles(parts: Sequence[Profiles], least: int) -> list[Profiles]:
-    """The same profiles, all with as many phases (at least ``least``): empty ones are added. In their own memory."""
-    width = max([least, *(part.ends.shape[1] for part in parts)])
-    return [
-        Profiles(
-            np.pad(part.ends, ((0, 0), (0, width - part.ends.shape[1])), mode="edge"),
-            np.pad(part.commands_mps2, ((0, 0), (0, width - part.ends.shape[1]), (0, 0)), mode="edge"),
-        )
-        for part in parts
-    ]
-
-
-def search_profiles(
-    problem: ProfileProblem, given: Profiles, *, budget: int, seed: int = 0, threads: int = 1
-) -> SearchResult:
-    """The best profiles of at most ``MOST_PHASES`` phases that about ``budget`` candidates per world find.
-
-    ``given`` [n * Q]: Q profiles of each world, world by world, from which to start; the result is never worse than
-    any of them. Raises ``InvalidInput`` for a budget below 1 and ``PhysicsError`` naming the worlds of which no profile
-    could be followed.
-    """
-    for name, value, least in (("budget", budget, 1), ("threads", threads, 1), ("seed", seed, 0)):
-        check_whole_number(name, value, least)
-    n, C = problem.n, len(problem.vehicles)
-    ends = np.ascontiguousarray(given.ends.reshape(n, -1, MOST_PHASES))
-    commands = np.ascontiguousarray(given.commands_mps2.reshape(n, -1, MOST_PHASES, C))
-    best = Profiles(np.zeros((n, MOST_PHASES), np.int64), np.zeros((n, MOST_PHASES, C)))
-    random = seeded(problem.identity, seed)
-
-    def work(k: int) -> int:
-        world = make_search_world(
-            problem.clock[k], problem.bounds[k], problem.command[k], problem.latency[k], problem.mass[k],
-            problem.limit[k], problem.vehicles, random[k : k + 1],
-        )  # fmt: skip
-        return search_world(world, problem.start[k], ends[k], commands[k], budget, best.ends[k], best.commands_mps2[k])
-
-    if threads == 1:
-        used = [work(k) for k in range(n)]
-    else:
-        with ThreadPoolExecutor(threads) as pool:
-            used = list(pool.map(work, range(n)))
-    if 0 in used:
-        raise PhysicsError({k: "no profile could be followed" for k in range(n) if used[k] == 0})
-    return SearchResult(best, *follow_profiles(problem, best))
-
-
-def follow_profiles(problem: ProfileProblem, profiles: Profiles) -> tuple[Floats, Floats]:
-    """First-impact and total harm [n] of one profile per world, as the engine counts it, to the same bits.
-
-    Raises ``InvalidInput`` for profiles that do not fit the problem or exceed a capacity, ``PhysicsError`` naming the
-    worlds in which a check of the kernel failed.
-    """
-    check_profiles(problem, profiles)
-    n = problem.n
-    first, total, failed = np.zeros(n), np.zeros(n), np.zeros(n, np.bool_)
-    follow_worlds(
-        problem.start, problem.clock, problem.bounds, problem.command, problem.latency, problem.mass, problem.limit,
-        problem.vehicles, np.ascontiguousarray(profiles.ends, np.int64),
-        np.ascontiguousarray(profiles.commands_mps2, np.float64), first, total, failed,
-    )  # fmt: skip
-    if failed.any():
-        raise PhysicsError({k: "its profile could not be followed" for k in np.flatnonzero(failed).tolist()})
-    return first, total
-
-
-def check_profiles(problem: ProfileProblem, profiles: Profiles) -> None:
-    """Raise ``InvalidInput`` unless there is one profile per world, within the capacities, its phases in order."""
-    n, C = problem.n, len(problem.vehicles)
-    K = profiles.ends.shape[-1]
-    if profiles.ends.shape != (n, K) or profiles.commands_mps2.shape != (n, K, C):
-        raise InvalidInput(
-            f"profiles: shapes {profiles.ends.shape} and {profiles.commands_mps2.shape}; ({n}, K) and ({n}, K, {C})"
-            " are needed"
-        )
-    low, high = problem.bounds[:, np.newaxis, :, 0], problem.bounds[:, np.newaxis, :, 1]
-    good = (profiles.commands_mps2 >= low) & (profiles.commands_mps2 <= high)
-    if not good.all():
-        raise InvalidInput(
-            f"profiles: command {profiles.commands_mps2[~good][0]:g} m/s2 is beyond a vehicle's capacity"
-        )
-    ordered = (np.diff(profiles.ends, axis=1, prepend=0) >= 0).all() and (
-        profiles.ends[:, -1] == problem.last_step
-    ).all()
-    if not ordered:
-        raise InvalidInput("profiles: phases must end in order, the last one at the last step")
-
-
 @compiled
-def make_search_world(
-    clock: Floats, bounds: Floats, command: Floats, latency: Floats, mass: Floats, limit: Floats, vehicles: Ints,
-    random: UInt64s,
-) -> SearchWorld:  # fmt: skip
-    """One world's surroundings, with room to work in."""
-    N = mass.shape[0]
+def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> SearchWorld:
+    """The surroundings of world k, with room to work in; ``random`` [n]: the states of all worlds' random numbers."""
+    N = problem.mass.shape[1]
     table = np.zeros((ROW.OF_EPISODE, N))
     for i in range(N):
-        table[ROW.COMMAND, i], table[ROW.LATENCY, i] = command[i], latency[i]
-        table[ROW.MASS, i], table[ROW.LIMIT, i] = mass[i], limit[i]
-    return SearchWorld(Episode(table, clock.copy(), vehicles), bounds, random)
+        table[ROW.COMMAND, i], table[ROW.LATENCY, i] = problem.command[k, i], problem.latency[k, i]
+        table[ROW.MASS, i], table[ROW.LIMIT, i] = problem.mass[k, i], problem.limit[k, i]
+    return SearchWorld(Episode(table, problem.clock[k].copy(), problem.vehicles), problem.bounds[k], random[k : k + 1])
 
 
 @compiled
 def follow_worlds(
-    start: Floats, clock: Floats, bounds: Floats, command: Floats, latency: Floats, mass: Floats, limit: Floats,
-    vehicles: Ints, ends: Ints, commands: Floats, first: Floats, total: Floats, failed: Bools,
-) -> None:  # fmt: skip
+    problem: ProfileProblem, ends: Ints, commands: Floats, first: Floats, total: Floats, failed: Bools
+) -> None:
     """Fill ``first`` and ``total`` [n] with the harm of one profile per world, and ``failed`` [n] where it ended."""
-    no_random = np.zeros(1, np.uint64)
+    start, no_random = problem.start, np.zeros(problem.start.shape[0], np.uint64)
     for k in range(start.shape[0]):
-        episode = make_search_world(
-            clock[k], bounds[k], command[k], latency[k], mass[k], limit[k], vehicles, no_random
-        ).episode
+        episode = make_search_world(problem, k, no_random).episode
         states = np.zeros((ends.shape[1] + 1, start.shape[1]))
         copy_rows(start[k : k + 1], states, 1)
         episode.clock[CLOCK.STEPWISE] = 1.0
@@ -830,43 +833,17 @@ class Plan(NamedTuple):
     states: Floats  # [T + 1, S] at the start of each step
 
 
-def refine_commands(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed: int = 0) -> Refinement:
-    """Search around ``commands_mps2`` [n, T] of the one controlled vehicle, with ``budget`` candidates per world.
-
-    Worlds are independent of each other. Raises ``InvalidInput`` for several vehicles, commands of another shape or
-    beyond a capacity, or a budget below 1, ``PhysicsError`` naming worlds in which the given commands cannot be played.
-    """
-    check_whole_number("budget", budget, 1)
-    n, steps = problem.n, int(problem.last_step.max(initial=0))
-    low, high = problem.bounds[:, :1, 0], problem.bounds[:, :1, 1]
-    if len(problem.vehicles) != 1 or commands_mps2.shape != (n, steps):
-        raise InvalidInput(f"refine: commands of shape {commands_mps2.shape}; ({n}, {steps}) of one vehicle are needed")
-    if not ((commands_mps2 >= low) & (commands_mps2 <= high)).all():
-        raise InvalidInput("refine: a command is beyond the vehicle's capacity")
-    best, first, total = commands_mps2.copy(), np.zeros(n), np.zeros(n)
-    failed = np.zeros(n, np.bool_)
-    _refine_worlds(
-        problem.start, problem.clock, problem.bounds, problem.command, problem.latency, problem.mass, problem.limit,
-        problem.vehicles, seeded(problem.identity, seed), budget, best, first, total, failed,
-    )  # fmt: skip
-    if failed.any():
-        raise PhysicsError({k: "its commands could not be played" for k in np.flatnonzero(failed).tolist()})
-    return Refinement(best, first, total)
-
-
 @compiled
 def _refine_worlds(
-    start: Floats, clock: Floats, bounds: Floats, command: Floats, latency: Floats, mass: Floats, limit: Floats,
-    vehicles: Ints, random: UInt64s, budget: int, commands: Floats, first: Floats, total: Floats, failed: Bools,
+    problem: ProfileProblem, random: UInt64s, budget: int, commands: Floats, first: Floats, total: Floats,
+    failed: Bools,
 ) -> None:  # fmt: skip
     """Improve ``commands`` in place, and fill the other outputs [n]."""
-    T, S = commands.shape[1], start.shape[1]
+    start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
     mine, other = Plan(np.zeros(T), np.zeros((T + 1, S))), Plan(np.zeros(T), np.zeros((T + 1, S)))
     room = Plan(np.zeros(T), np.zeros((T + 1, S)))
     for k in range(start.shape[0]):
-        world = make_search_world(
-            clock[k], bounds[k], command[k], latency[k], mass[k], limit[k], vehicles, random[k : k + 1]
-        )
+        world = make_search_world(problem, k, random)
         for plan in (mine, other, room):
             copy_rows(start[k : k + 1], plan.states, 1)
         copy_steps(commands[k], mine.commands, 0)
@@ -878,7 +855,7 @@ def _refine_worlds(
         first[k], total[k] = harm_so_far(world.episode.table, 0.0), harm_so_far(world.episode.table, 1.0)
 
 
-@compiled_apart
+@compiled(apart=True)
 def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budget: int) -> bool:
     """Improve ``mine``; False if it cannot be played."""
     templates, theirs = int(TEMPLATE_SHARE * budget), int(THEIR_CLIMB_SHARE * budget)
@@ -896,7 +873,7 @@ def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budge
     return True
 
 
-@compiled_apart
+@compiled(apart=True)
 def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[float, int]:
     """Play a plan from the start of step ``begin`` on, and fill its states; the value, and the steps up to the end.
 
@@ -924,7 +901,7 @@ def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[
     return value, last
 
 
-@compiled_apart
+@compiled(apart=True)
 def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int, budget: int) -> tuple[float, int]:
     """Change a plan of this value for the better, in place, with ``budget`` candidates; its value and steps.
 
@@ -941,9 +918,19 @@ def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int
             first = draw_below(world.random, min(reached, steps_in(world.episode, ATTENTION_S)))
             u = draw(world.random)
             length = 1 + int(u * u * longest)
-            amount = draw_amount(world.random, high - low) if adds else draw_command(world.random, low, high)
+            if adds:  # of either sign; its logarithm is uniform over the decades below the whole range
+                sign = 1.0 if draw(world.random) < 0.5 else -1.0
+                amount = sign * (high - low) * exp(LN_SMALLEST_CHANGE * draw(world.random))
+            else:
+                amount = draw_command(world.random, low, high)
         again = False
-        if not change_steps(plan.commands, room.commands, first, length, amount, adds, low, high):
+        any_change = False
+        for t in range(first, plan.commands.shape[0]):
+            room.commands[t] = plan.commands[t]
+            if t < first + length:
+                room.commands[t] = allowed(plan.commands[t] + amount, low, high) if adds else amount
+                any_change = any_change or room.commands[t] != plan.commands[t]
+        if not any_change:
             continue
         copy_rows(plan.states[first:], room.states[first:], 1)
         new, played = follow_steps(world.episode, room, first, value)
@@ -957,7 +944,7 @@ def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int
     return value, reached
 
 
-@compiled_apart
+@compiled(apart=True)
 def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, number: int) -> tuple[float, int]:
     """Fill ``best`` with the best of some random templates; its value and steps, 0 if none is below ``bound``."""
     low, high, T = world.bounds[0, 0], world.bounds[0, 1], room.commands.shape[0]
@@ -975,27 +962,6 @@ def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, num
             copy_steps(room.commands, best.commands, 0)
             copy_rows(room.states, best.states, played + 1)
     return bound, reached
-
-
-@compiled
-def change_steps(
-    commands: Floats, changed: Floats, first: int, length: int, amount: float, adds: bool, low: float, high: float
-) -> bool:
-    """Copy the commands from step ``first`` on, the first ``length`` of them changed; False if nothing changed."""
-    any_change = False
-    for t in range(first, commands.shape[0]):
-        changed[t] = commands[t]
-        if t < first + length:
-            changed[t] = allowed(commands[t] + amount, low, high) if adds else amount
-            any_change = any_change or changed[t] != commands[t]
-    return any_change
-
-
-@compiled
-def draw_amount(random: UInt64s, whole: float) -> float:
-    """An amount to add, of either sign; its logarithm is uniform over the decades below the ``whole`` range."""
-    sign = 1.0 if draw(random) < 0.5 else -1.0
-    return float(sign * whole * exp(LN_SMALLEST_CHANGE * draw(random)))
 
 
 @compiled
@@ -1017,37 +983,15 @@ def copy_steps(commands: Floats, to: Floats, first: int) -> None:
 # ones). Nothing is improved: what does little harm as it was drawn stands on no edge, and a policy can imitate it.
 
 
-def best_templates(problem: ProfileProblem, bound: Floats, *, number: int, seed: int = 0) -> tuple[Floats, Ints]:
-    """The best of ``number`` templates below ``bound`` [n] (m2/s2) in each world, of the one controlled vehicle.
-
-    Returns its commands [n, T] (m/s2), and in how many steps it was played to its end [n]: 0 where none was below.
-    Each world draws its own; worlds are independent of each other. Raises ``InvalidInput`` for several vehicles, or no
-    template.
-    """
-    check_whole_number("templates", number, 1)
-    if len(problem.vehicles) != 1:
-        raise InvalidInput(f"templates: {len(problem.vehicles)} vehicles; they are of one")
-    commands = np.zeros((problem.n, int(problem.last_step.max(initial=0))))
-    steps = np.zeros(problem.n, np.int64)
-    _best_templates(
-        problem.start, problem.clock, problem.bounds, problem.command, problem.latency, problem.mass, problem.limit,
-        problem.vehicles, seeded(problem.identity, seed), bound, number, commands, steps,
-    )  # fmt: skip
-    return commands, steps
-
-
 @compiled
 def _best_templates(
-    start: Floats, clock: Floats, bounds: Floats, command: Floats, latency: Floats, mass: Floats, limit: Floats,
-    vehicles: Ints, random: UInt64s, bound: Floats, number: int, commands: Floats, steps: Ints,
-) -> None:  # fmt: skip
+    problem: ProfileProblem, random: UInt64s, bound: Floats, number: int, commands: Floats, steps: Ints
+) -> None:
     """Fill ``commands`` and ``steps``."""
-    T, S = commands.shape[1], start.shape[1]
+    start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
     best, room = Plan(np.zeros(T), np.zeros((T + 1, S))), Plan(np.zeros(T), np.zeros((T + 1, S)))
     for k in range(start.shape[0]):
-        world = make_search_world(
-            clock[k], bounds[k], command[k], latency[k], mass[k], limit[k], vehicles, random[k : k + 1]
-        )
+        world = make_search_world(problem, k, random)
         copy_rows(start[k : k + 1], best.states, 1)
         copy_rows(start[k : k + 1], room.states, 1)
         steps[k] = draw_templates(world, best, room, bound[k], number)[1]

@@ -15,9 +15,6 @@ class Cautious:
 
     name = "cautious"
 
-    def begin(self, worlds: eb.Worlds, vehicle: int, rows: Any) -> None:
-        """Nothing to prepare."""
-
     def act(self, worlds: eb.Worlds, vehicle: int) -> Any:
         return np.full(worlds.n, -1.0)
 

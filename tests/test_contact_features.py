@@ -14,9 +14,8 @@ from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.observations import FORECAST_S, ObservationSpec, choose_observation, observation_for, observe
 from ethbrake_marl.physics import advance, make_worlds
-from ethbrake_marl.policies.actor import NetworkSpec, installed_versions, observation_schema
-from ethbrake_marl.policies.bundle import make_policy
-from ethbrake_marl.scenario.features import CONTACT_FEATURES
+from ethbrake_marl.policies import NetworkSpec, make_policy
+from ethbrake_marl.scenario.features import GROUPS
 
 SCENARIO = eb.load_scenario("paper-random")
 STEP_S = 0.1
@@ -161,7 +160,7 @@ def test_contact__leaves_other_features_alone_in_every_interface():
     assert observation_for(declared) == ObservationSpec(contact=True, time_step_s=0.1)
     plain, more = (eb.make_sb3_vec_env(s, 6, seed=3) for s in (SCENARIO, declared))
     seen, wider = plain.reset(), more.reset()
-    assert wider.shape == (6, 27 + len(CONTACT_FEATURES))
+    assert wider.shape == (6, 27 + len(GROUPS.contact))
     assert wider[:, :27].tobytes() == seen.tobytes()
     env = eb.parallel_env(scenario=declared)
     assert env.reset(seed=3)[0]["vehicle_2"].tobytes() == wider[0].tobytes()
@@ -191,8 +190,8 @@ def contact_policy(scenario, group="contact"):
     }  # fmt: skip
     tensors = {name: draw.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
     return make_policy(
-        tensors, algorithm="counterfactual", network=network, observation=observation_schema(spec),
-        learners=("vehicle_2",), scenario=scenario, reward={}, seeds={}, steps=0, versions=installed_versions(),
+        tensors, algorithm="counterfactual", network=network, observation=spec,
+        learners=("vehicle_2",), scenario=scenario, reward={}, seeds={}, steps=0,
     )  # fmt: skip
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from rich.text import Text
 
-from ethbrake_marl.cli.out import Out, say
+from ethbrake_marl.cli.command import Out, say
 from ethbrake_marl.errors import (
     LINE_LIMIT,
     AlreadyExists,

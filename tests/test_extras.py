@@ -26,7 +26,7 @@ for name in {absent}:
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import MissingExtra
-from ethbrake_marl.figures import evaluation
+from ethbrake_marl import figures
 
 for name in eb.__all__:
     getattr(eb, name)

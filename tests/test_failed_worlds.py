@@ -10,15 +10,12 @@ import pytest
 
 from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.engine.snapshot import engine_snapshot, restore_engine
+from ethbrake_marl.engine import Engine, engine_snapshot, restore_engine
 from ethbrake_marl.errors import FailedWorld, PhysicsError
-from ethbrake_marl.physics import advance, concatenate, forecast, leaving_out_failed
-from ethbrake_marl.physics.advance import gap_at, speed_at
+from ethbrake_marl.physics import Worlds, advance, forecast, leaving_out_failed
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.search import profile_problem
-from ethbrake_marl.shield.certify import Backup, begin_running, certify
-from ethbrake_marl.shield.step_shield import StepShield
+from ethbrake_marl.shield.step_shield import Backup, StepShield, begin_running, certify
 from tests.failing_worlds import plant, planted_list, without
 
 PAPER = load_scenario("paper-random")
@@ -81,9 +78,9 @@ def engine(n=3, seed=5):
 
 def break_row(running, k):
     """Put row k into a state that the next step cannot leave."""
-    state = running.packed.state
-    state[k, gap_at(3) : gap_at(3) + 2] = [0.5, -1.0]
-    state[k, speed_at(3) : speed_at(3) + 3] = [10.0, 20.0, 16.0]
+    state, column = running.packed.state, running.packed.column
+    state[k, column.gap : column.hit] = [0.5, -1.0]
+    state[k, column.speed : column.command] = [10.0, 20.0, 16.0]
 
 
 def test_engine__cuts_the_episode_off_names_the_world_and_steps_the_others():
@@ -100,7 +97,7 @@ def test_engine__cuts_the_episode_off_names_the_world_and_steps_the_others():
     assert step.reward[1].tolist() == [0.0, 0.0, 0.0]
     assert np.array_equal(running.packed.state[[0, 2]], twin.packed.state[[0, 2]])
     assert np.array_equal(step.reward[[0, 2]], expected.reward[[0, 2]])
-    kept = [0, *range(gap_at(3), before.size)]  # time, gaps, flags, harm
+    kept = [0, *range(running.packed.column.gap, before.size)]  # time, gaps, flags, harm
     assert np.array_equal(running.packed.state[1, kept], before[kept])
     assert running.ended.tolist() == [False, True, False]
     running.renew(np.array([1]))  # the next world of the stream
@@ -146,5 +143,5 @@ def test_shield__a_proposal_that_cannot_be_advanced_is_not_certified():
 
 
 def test_concatenated_batches__are_not_told_apart(worlds):
-    both = concatenate([worlds, worlds])
+    both = Worlds.concatenate([worlds, worlds])
     assert failed_rows(lambda: advance(both, braking(both), until_s=8.0)) == [2, 6, 11, 15]

@@ -141,11 +141,11 @@ def test_matplotlib__is_imported_only_in_figures(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "source", "misplaced"),
     [
-        ("engine/engine.py", "import torch", True),
+        ("engine.py", "import torch", True),
         ("envs/sb3.py", "def step():\n    from torch.nn import Linear", True),
         ("agents/constant.py", "from safetensors import torch", True),
         ("agents/constant.py", "from safetensors.numpy import load_file", False),
-        ("engine/engine.py", "import torchlight", False),
+        ("engine.py", "import torchlight", False),
         ("learning/ppo.py", "import torch", False),
         ("agents/policy.py", "import torch.nn as nn", False),
     ],

@@ -21,8 +21,9 @@ import pytest
 
 import ethbrake_marl
 from ethbrake_marl import kernel_store
-from ethbrake_marl.kernel_store import cache_folder, digest_of_sources, keep_kernel, kernel_sources, load_kernel
-from ethbrake_marl.physics import compiled
+from ethbrake_marl.kernel_store import cache_folder
+from ethbrake_marl.physics import compiling as compiled
+from ethbrake_marl.physics.compiling import digest_of_sources, keep_kernel, kernel_sources, load_kernel
 from tests.wheel.kernels import pack
 
 needs_compiler = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="compilation is switched off")
@@ -38,7 +39,7 @@ def _own_folder(monkeypatch, tmp_path):
 
 
 def forget() -> None:
-    for remembered in (cache_folder, digest_of_sources, kernel_store._imports):
+    for remembered in (cache_folder, digest_of_sources, compiled._imports):
         remembered.cache_clear()
 
 
@@ -117,8 +118,8 @@ def test_load_kernel__of_another_users_file_is_nothing(monkeypatch, user, loaded
         found[4] = user
         return os.stat_result(found)
 
-    monkeypatch.setattr(kernel_store.os, "fstat", owned)
-    monkeypatch.setattr(kernel_store.os, "getuid", lambda: 1001)
+    monkeypatch.setattr(compiled.os, "fstat", owned)
+    monkeypatch.setattr(compiled.os, "getuid", lambda: 1001)
     assert (load_kernel("one-1") is not None) == loaded
 
 
@@ -126,7 +127,7 @@ def test_keep_kernel__on_a_full_disk_costs_a_warning(monkeypatch):
     def full(*paths):
         raise OSError("No space left on device")
 
-    monkeypatch.setattr(kernel_store.os, "replace", full)
+    monkeypatch.setattr(compiled.os, "replace", full)
     with pytest.warns(UserWarning, match="could not be kept: No space left"):
         keep_kernel("one-1", b"machine code")
     assert list(cache_folder().iterdir()) == []
@@ -139,7 +140,7 @@ def test_keep_kernel__on_a_full_disk_costs_a_warning(monkeypatch):
 def copied(monkeypatch, tmp_path) -> Path:
     package = tmp_path / "copied" / "ethbrake_marl"
     shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
-    monkeypatch.setattr(kernel_store, "_PACKAGE", package)
+    monkeypatch.setattr(compiled, "_PACKAGE", package)
     return package
 
 
@@ -151,18 +152,17 @@ def digest_in(package: Path, name: str) -> str:
 @pytest.mark.parametrize(
     ("kernel", "edited", "moves"),
     [
-        ("physics/advance.py", "physics/advance.py", True),  # its own file
-        ("physics/advance.py", "physics/kernel.py", True),  # what it calls
-        ("shield/certify_kernel.py", "physics/kernel.py", True),  # through several files
+        ("physics/batch.py", "physics/batch.py", True),  # its own file
+        ("physics/batch.py", "physics/kernel.py", True),  # what it calls
+        ("shield/step_shield.py", "physics/kernel.py", True),  # through several files
         ("observations.py", "scenario/features.py", True),  # constants, from a file without kernels
-        ("physics/advance.py", "search.py", False),  # kernels that it does not call
-        ("physics/kernel.py", "physics/advance.py", False),  # its callers
-        ("physics/advance.py", "physics/worlds.py", False),  # types
-        ("physics/compiled.py", "kernel_store.py", False),  # where kernels are kept
+        ("physics/batch.py", "search.py", False),  # kernels that it does not call
+        ("physics/kernel.py", "physics/batch.py", False),  # its callers
+        ("physics/batch.py", "physics/worlds.py", False),  # types
     ],
 )
 def test_digest_of_sources__changes_with_what_its_kernels_are_made_of(copied, monkeypatch, kernel, edited, moves):
-    monkeypatch.setattr(kernel_store, "_IMPORTED_S", float("inf"))
+    monkeypatch.setattr(compiled, "_IMPORTED_S", float("inf"))
     before = digest_in(copied, kernel)
     assert digest_in(copied, kernel) == before and len(before) == 64
     source = copied / edited
@@ -172,17 +172,17 @@ def test_digest_of_sources__changes_with_what_its_kernels_are_made_of(copied, mo
 
 def test_digest_of_sources__is_not_known_of_code_in_no_file_or_edited_since(copied):
     assert digest_of_sources(Path("<stdin>")) == ""
-    assert digest_in(copied, "physics/advance.py")
-    since = (kernel_store._IMPORTED_S + time.time()) / 2
+    assert digest_in(copied, "physics/batch.py")
+    since = (compiled._IMPORTED_S + time.time()) / 2
     os.utime(copied / "physics" / "kernel.py", (since, since))
-    assert digest_in(copied, "physics/advance.py") == ""
+    assert digest_in(copied, "physics/batch.py") == ""
 
 
 def test_digest_of_sources__is_not_known_of_files_from_the_future_which_is_told(copied):
     ahead = time.time() + 3600.0
     os.utime(copied / "physics" / "kernel.py", (ahead, ahead))
     with pytest.warns(UserWarning, match=f"{copied}: dates of files lie in the future.* touch"):
-        assert digest_in(copied, "physics/advance.py") == ""
+        assert digest_in(copied, "physics/batch.py") == ""
 
 
 @needs_compiler
@@ -203,12 +203,28 @@ def test_kernel_sources__hold_every_kernel_that_a_kernel_names():
     assert checked > 300
 
 
+def test_kernel_sources__are_found_behind_front_doors(copied):
+    """A folder offers names of several files; only the files of the names that are taken count."""
+    (copied / "physics" / "__init__.py").write_text(
+        "if TYPE_CHECKING:\n"
+        "    from ethbrake_marl.physics.kernel import pool as pool\n"
+        "    from ethbrake_marl.physics.batch import (\n        advance as advance,\n    )\n"
+        "    from ethbrake_marl.physics.worlds import Worlds as Worlds\n"
+    )
+    kernel = copied / "kernel_of_mine.py"
+    kernel.write_text("from ethbrake_marl.physics import Worlds, pool\n\n@compiled\ndef mine(): ...\n")
+    forget()
+    found = {source.relative_to(copied).as_posix() for source in kernel_sources(kernel)}
+    assert {"kernel_of_mine.py", "physics/kernel.py"} <= found
+    assert not {"physics/batch.py", "physics/worlds.py", "physics/__init__.py"} & found
+
+
 def test_kernel_sources__find_every_import(copied):
     """Kernels import from this package by ``from ethbrake_marl... import`` alone: no other way would be seen."""
     for source in copied.rglob("*.py"):
         if "@compiled" in source.read_text("utf-8"):
             tree = ast.parse(source.read_text("utf-8"))
-            found = {module.decode() for module, _ in kernel_store._IMPORT.findall(source.read_bytes())}
+            found = {module.decode() for module, _ in compiled._IMPORT.findall(source.read_bytes())}
             asked = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module}
             assert {module for module in asked if module.startswith("ethbrake_marl")} == found, source
             assert not [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.level], source
@@ -323,9 +339,9 @@ def test_kernels__without_a_folder_to_write_to_are_compiled_in_each_process(monk
 
 INNER = """
 import sys
-from ethbrake_marl.physics.compiled import compiled, compiled_apart
+from ethbrake_marl.physics.compiling import compiled
 
-@compiled_apart
+@compiled(apart=True)
 def checked(x):
     if x < 0.0:
         raise ValueError("negative", x)
@@ -336,7 +352,7 @@ def checked(x):
 def inner(x):
     return checked(x) + checked(1.0)
 
-@compiled_apart
+@compiled(apart=True)
 def other(x):
     return inner(x)
 
@@ -361,11 +377,11 @@ def test_kernels__raise_and_print_inside_of_what_they_call_also_when_they_were_l
 def test_kernels__of_a_numba_that_is_not_known_are_compiled_as_numba_does(monkeypatch):
     monkeypatch.setattr(compiled, "_KNOWN", False)
 
-    @compiled.compiled_apart
+    @compiled.compiled(apart=True)
     def twice(x: float) -> float:
         return 2.0 * x
 
-    @compiled.compiled_apart
+    @compiled.compiled(apart=True)
     def outer(x: float) -> float:
         return twice(x) + 1.0
 
@@ -374,11 +390,11 @@ def test_kernels__of_a_numba_that_is_not_known_are_compiled_as_numba_does(monkey
 
 
 def test_kernels__are_not_compiled_once_for_each_number_that_stands_in_a_source():
-    @compiled.compiled_apart
+    @compiled.compiled(apart=True)
     def twice(k: int) -> int:
         return 2 * k
 
-    @compiled.compiled_apart
+    @compiled.compiled(apart=True)
     def outer(k: int) -> int:
         return twice(1) + twice(2) + twice(k)
 

@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # File -> what it alone may use. docs/security.md says why each is none of a stranger's files.
 PLACES = {
-    "ethbrake_marl/physics/compiled.py": {"pickle"},  # machine code that this user, or root, has compiled
+    "ethbrake_marl/physics/compiling.py": {"pickle"},  # machine code that this user, or root, has compiled
     "ethbrake_marl/studies/jobs.py": {"pickle"},  # calls between processes of our own
     "ethbrake_marl/files/plugins.py": {"exec", "compile"},  # a plug-in that the user names is code
 }
@@ -163,6 +163,6 @@ def test_leave__that_is_no_longer_needed_is_told(tmp_path: Path) -> None:
     assert offences(tmp_path) == [
         "ethbrake_marl/files/plugins.py: may use compile, and does not",
         "ethbrake_marl/files/plugins.py: may use exec, and does not",
-        "ethbrake_marl/physics/compiled.py: may use pickle, and does not",
+        "ethbrake_marl/physics/compiling.py: may use pickle, and does not",
         "ethbrake_marl/studies/jobs.py: may use pickle, and does not",
     ]

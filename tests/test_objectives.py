@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import STANDARD, Ledger, objective_harm, objectives_of, parse_objective, scored
-from ethbrake_marl.physics.advance import no_obstacle_harm
+from ethbrake_marl.physics.batch import Impacts
 from ethbrake_marl.rewards import RewardParams, reward_params
 from ethbrake_marl.scenario import Scenario, load_scenario
 
@@ -23,7 +23,7 @@ EACH = [*STANDARD, "social:30", "social:90", "weighted:1,4,2"]
 def ledger() -> Ledger:
     """Pair 1 met with 12 m2/s2 (masses 1, 2), pair 2 with 9 (masses 2, 1); a second, harder impact of pair 2."""
     first, total = np.array([[12.0, 9.0]]), np.array([[12.0, 30.0]])
-    return Ledger(first, total, np.array([[1, 2]]), *no_obstacle_harm(1), np.array([[1.0, 2.0, 1.0]]))
+    return Ledger(first, total, np.array([[1, 2]]), *Impacts.no_obstacle(1), np.array([[1.0, 2.0, 1.0]]))
 
 
 # Shares by mass: pair 1 gives 12 * 2/3 = 8 and 4, pair 2 gives 9 * 1/3 = 3 and 6; so H = (8, 7, 6), 21 in all.

@@ -13,18 +13,18 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
-from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.episodes import record_episode
-from ethbrake_marl.evaluation.results import write_per_world_csv
-from ethbrake_marl.figures.evaluation import trajectories
+from ethbrake_marl.evaluation.results import write_per_world
+from ethbrake_marl.figures import trajectories
 from ethbrake_marl.harm import empty_ledger
-from ethbrake_marl.limits.best_harm import best_harm, realised_harm
+from ethbrake_marl.limits.limits import best_harm, realised_harm
 from ethbrake_marl.limits.lower_bound import avoidability, lower_bound
-from ethbrake_marl.physics import advance, concatenate
-from ethbrake_marl.policies.actor import observation_schema
+from ethbrake_marl.physics import Worlds, advance
+from ethbrake_marl.policies import ObservationSchema
 from ethbrake_marl.scenario import Scenario, Task, initial_state_worlds, load_scenario, worlds_from_table
-from ethbrake_marl.search import constant_profiles, follow_profiles, profile_problem
+from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield.guard import ShieldedDriver
 from tests.reference.avoidability_lp import avoidable_by_lp
 
@@ -80,7 +80,7 @@ def test_profiles__are_followed_with_the_obstacle_as_the_engine_drives_them():
     worlds = NEAR.sample(30, 7).worlds
     problem = profile_problem(worlds, [0, 1, 2], horizon_s=NEAR.horizon_s)
     commands = np.broadcast_to(np.array([-3.0, -2.5, -6.0]), (30, 1, 3))
-    first, total = follow_profiles(problem, constant_profiles(problem, commands))
+    first, total = problem.follow(problem.constant(commands))
     scripts = {i: make_agent(spec) for i, spec in enumerate(("constant:3", "constant:2.5", "full_brake"))}
     engine = Engine(NEAR, 30, learners=(), scripts=scripts, deciders=(0, 1, 2), worlds=worlds)
     while not engine.ended.all():
@@ -94,7 +94,7 @@ def test_profiles__are_followed_with_the_obstacle_as_the_engine_drives_them():
 
 
 def test_profiles__refuse_worlds_of_which_only_some_have_an_obstacle():
-    mixed = concatenate([NEAR.sample(1, 1).worlds, load_scenario("cooperation-3-pair").sample(1, 1).worlds])
+    mixed = Worlds.concatenate([NEAR.sample(1, 1).worlds, load_scenario("cooperation-3-pair").sample(1, 1).worlds])
     with pytest.raises(InvalidInput, match="only some of the worlds have an obstacle ahead"):
         profile_problem(mixed, [1])
 
@@ -145,7 +145,7 @@ def near_one() -> Scenario:
 def test_per_world__the_table_tells_the_obstacles_part(near_one, tmp_path: Path):
     worlds = near_one.sample(40, 7)
     result = eb.evaluate(worlds, {"coast": make_agent("coast")}, scenario=near_one)
-    write_per_world_csv(tmp_path / "worlds.csv", result)
+    write_per_world(tmp_path / "worlds.csv", result)
     with (tmp_path / "worlds.csv").open() as file:
         rows = list(csv.DictReader(file))
     ledger = result.outcome("coast").ledger
@@ -193,8 +193,8 @@ def test_shield__wrapped_around_an_environment_sees_what_it_predicted():
 @pytest.mark.parametrize("name", ["paper-random", "cooperation-4-all"])
 def test_manifest__a_policys_observation_is_known_again_by_its_features(name):
     spec = eb.observation_for(load_scenario(name))
-    schema = observation_schema(spec)
-    assert schema.spec == spec and observation_schema(schema.spec) == schema
+    schema = ObservationSchema.of(spec)
+    assert schema.spec == spec and ObservationSchema.of(schema.spec) == schema
     assert set(schema.model_dump()) == {"front", "rear", "features", "scaling_sha256"}  # as in every shipped policy
 
 

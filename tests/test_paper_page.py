@@ -11,7 +11,7 @@ import pytest
 from ethbrake_marl.agents import optimise_pairwise
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.evaluation.outcome import HYBRID_TEST, PAPER_NOTE, PAPER_ROWS
+from ethbrake_marl.evaluation.measures import PAPER_NOTE, PAPER_ROWS
 from ethbrake_marl.scenario import Scenario, load_scenario, worlds_from_table
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -91,7 +91,7 @@ def test_paper_page__links_lead_to_headings() -> None:
 
 
 def test_5000_worlds__cannot_come_from_the_speeds_of_the_figure_of_distances() -> None:
-    printed = next(row for row in PAPER_ROWS if row.table == HYBRID_TEST and row.agent == "E-V2X-BM").average_harm
+    printed = next(row for row in PAPER_ROWS if row.table == "hybrid test" and row.agent == "E-V2X-BM").average_harm
     at_figure, at_random = (
         optimise_pairwise(load_scenario(name).sample(n, 7).worlds, 1).harm.mean()
         for name, n in (("paper-distance", 5_000), ("paper-random", 10_000))

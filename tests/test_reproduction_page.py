@@ -9,23 +9,31 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.studies.reproduction.folder import FIGURES, ITEMS, PREFIX, checked_result, choose_items, docs_page
-from ethbrake_marl.studies.reproduction.item import (
+from ethbrake_marl.studies.reproduction.items import (
     FULL_BRAKE,
+    GAPS,
     NAMES,
     PERCENT,
     READINGS,
     Result,
     Settings,
+    collision_rate,
     drive_list,
     lineup,
     summarise_verdicts,
 )
-from ethbrake_marl.studies.reproduction.lists import GAPS, collision_rate
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGE = (DOCS / "reproduction.md").read_text("utf-8")
+
+
+def _cells(table: dict) -> dict:
+    """Each cell as the folder of a reproduction keeps it: a value, and an interval."""
+    return table | {"rows": [[[cell] for cell in row] for row in table["rows"]]}
+
+
 RESULTS: dict[str, Result] = {
-    each["name"]: checked_result(each, each["name"])
+    each["name"]: checked_result(each | {"tables": list(map(_cells, each["tables"]))}, "docs", each["name"])
     for each in json.loads((DOCS / "reproduction.json").read_text("utf-8"))
 }
 MOST_BYTES = 200_000  # of a figure
@@ -38,7 +46,7 @@ def test_page__is_made_of_the_committed_data() -> None:
 def test_page__has_every_item_and_every_gap() -> None:
     assert list(RESULTS) == [item.name for item in ITEMS]
     rows = RESULTS["gaps"].tables[0].rows
-    assert [row[0] for row in rows] == [gap.name for gap in GAPS]
+    assert [row[0].value for row in rows] == [gap.name for gap in GAPS]
 
 
 def test_page__every_figure_is_there_and_small_and_no_other() -> None:
@@ -60,7 +68,9 @@ def test_trajectories__are_as_committed(tmp_path: Path) -> None:
     committed = RESULTS["trajectories"]
     assert made.verdicts == committed.comparisons
     (table,), (kept,) = made.tables, committed.tables
-    assert [[cell.in_words for cell in row] for row in table.shown()] == kept.rows
+    assert [[cell.in_words for cell in row] for row in table.shown()] == [
+        [cell.value for cell in row] for row in kept.rows
+    ]
 
 
 def test_random_table__full_braking_is_as_committed(tmp_path: Path) -> None:
@@ -69,8 +79,8 @@ def test_random_table__full_braking_is_as_committed(tmp_path: Path) -> None:
         scenario = reading.scenario("paper-random")
         evaluation = drive_list(scenario, lineup((FULL_BRAKE,), scenario), 10_000, Settings("quick", tmp_path))
         outcome = evaluation.outcome(NAMES[FULL_BRAKE])
-        (row,) = (row for row in tables[reading.name].rows if row[0] == NAMES[FULL_BRAKE])
-        assert row[1] == PERCENT.show(collision_rate(outcome.collided)).in_words
+        (row,) = (row for row in tables[reading.name].rows if row[0].value == NAMES[FULL_BRAKE])
+        assert row[1].value == PERCENT.show(collision_rate(outcome.collided)).in_words
 
 
 def test_page__is_where_the_docs_speak_of_it() -> None:

@@ -10,19 +10,11 @@ from pydantic import ValidationError
 
 from ethbrake_marl import rewards as terms
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.common import make_engine
 from ethbrake_marl.errors import InvalidInput, UnknownName, WithoutEffect
 from ethbrake_marl.physics import advance, forecast, make_worlds
-from ethbrake_marl.rewards import (
-    REWARDS,
-    RewardParams,
-    StepOutcome,
-    potential,
-    reward_params,
-    reward_terms,
-    weighted_sum,
-)
+from ethbrake_marl.rewards import REWARDS, RewardParams, StepOutcome, reward_params
 from ethbrake_marl.scenario import load_scenario
 from tests.envs.lines import CRASH, REST
 
@@ -37,6 +29,14 @@ def outcome(before, after, impacts, safe_end) -> StepOutcome:
     vehicles, learners = after.vehicles, np.array([1])
     given = vehicles.braking_capacity_mps2, vehicles.driving_capacity_mps2, vehicles.latency_s, vehicles.mass_t
     return StepOutcome(*harms, np.array([safe_end]), *motion, 0.5, after.time_s, *given, learners)
+
+
+def reward_terms(params: RewardParams, step: StepOutcome):
+    """Unweighted terms of one step, each [n, N]; all but shaping."""
+    harm = step.first_impact_harm if params.harm_count == "first" else step.total_harm
+    shared = params.shared(harm, step.safe_end.astype(np.float64))
+    spread = {name: np.repeat(term[:, np.newaxis], step.speeds_mps.shape[1], axis=1) for name, term in shared.items()}
+    return spread | step.built_in(params.moving, params)
 
 
 def step(params: RewardParams, *, safe_end: bool = False):
@@ -142,7 +142,7 @@ def test_terminal__only_at_a_safe_end():
     params = RewardParams(harm=0.0, terminal=3.0)
     assert step(params)[1]["terminal"].tolist() == [[0.0] * 3]
     _, terms = step(params, safe_end=True)
-    assert weighted_sum(params, terms, (1, 3)).tolist() == [[3.0] * 3]
+    assert params.weighted_sum(terms, (1, 3)).tolist() == [[3.0] * 3]
 
 
 def test_paper__has_its_four_terms():
@@ -191,7 +191,7 @@ def test_shaping__of_an_episode_after_autoreset_begins_with_the_potential_of_its
     scripts = {0: make_agent("full_brake"), 2: make_agent("full_brake")}
     engine = Engine(scenario, 6, learners=(1,), scripts=scripts, reward=reward)
     rng = np.random.default_rng(5)
-    begun, gained, compared = potential(reward, engine.worlds, (1,), scenario.horizon_s), np.zeros(6), 0
+    begun, gained, compared = reward.potential(engine.worlds, (1,), scenario.horizon_s), np.zeros(6), 0
     while compared < 30:
         result = engine.step(rng.uniform(-1.0, 0.0, (6, 1)))
         gained += result.reward[:, 1]
@@ -199,7 +199,7 @@ def test_shaping__of_an_episode_after_autoreset_begins_with_the_potential_of_its
         assert gained[rows] == pytest.approx(-begun[rows], abs=1e-9)
         engine.renew(rows)
         compared += (begun[rows] < 0.0).sum()
-        begun[rows] = potential(reward, engine.worlds, (1,), scenario.horizon_s)[rows]
+        begun[rows] = reward.potential(engine.worlds, (1,), scenario.horizon_s)[rows]
         gained[rows] = 0.0
 
 
@@ -207,7 +207,7 @@ def test_potential__of_two_learners_lets_each_choose_given_the_other():
     worlds = load_scenario("cooperation-3-pair").sample(30, seed=3).worlds
     braking = worlds.vehicles.braking_capacity_mps2
     shares = np.linspace(0.0, 1.0, 9)
-    alone, pair = (-potential(RewardParams(), worlds, learners, 8.0) for learners in ((1,), (0, 1)))
+    alone, pair = (-RewardParams().potential(worlds, learners, 8.0) for learners in ((1,), (0, 1)))
     every = np.empty((worlds.n, 9))  # least harm by Vehicle 2, for each choice of Vehicle 1
     for c, share in enumerate(shares):
         command = -braking.copy()
@@ -244,13 +244,13 @@ def test_potential__asks_one_learner_once_and_several_twice(learners, asked, mon
         return forecast(worlds, command, vehicle, candidates, horizon_s)
 
     monkeypatch.setattr(terms, "forecast", watched)
-    potential(RewardParams(), load_scenario("paper-random").sample(2, seed=3).worlds, learners, 8.0)
+    RewardParams().potential(load_scenario("paper-random").sample(2, seed=3).worlds, learners, 8.0)
     assert told == asked
 
 
 def test_potential__of_two_learners_goes_twice_round():
     worlds = load_scenario("cooperation-3-pair").sample(300, seed=3).worlds
-    found = potential(RewardParams(), worlds, (0, 1), 8.0)
+    found = RewardParams().potential(worlds, (0, 1), 8.0)
     assert found == pytest.approx(potential_in_rounds(worlds, 2), abs=1e-12)
     assert (potential_in_rounds(worlds, 1) < found - 1.0).any()
 

@@ -30,27 +30,26 @@ TRAINED = "training: torch's own sums differ by machine, too"
 SEARCHED = "a search, whose finds are written down as numbers"
 PRINTED = "drawn or printed, with few digits"
 REMAINS = {
-    ("envs/drawing/scene.py", "math.cos"): PRINTED,
-    ("envs/drawing/scene.py", "math.sin"): PRINTED,
-    ("envs/drawing/scene.py", "**"): SQUARES,
+    ("envs/drawing.py", "math.cos"): PRINTED,
+    ("envs/drawing.py", "math.sin"): PRINTED,
+    ("envs/drawing.py", "**"): SQUARES,
     ("evaluation/statistics.py", "**"): SQUARES,
     ("evaluation/statistics.py", "scipy.stats"): "resampling and sorting: sums and products alone",
-    ("evaluation/shards.py", "**"): SQUARES,
     (
         "evaluation/statistics.py",
         "scipy.special",
     ): "quantiles for the ends of an interval; the last bit of the t quantile"
     " differs for 1 in 1,000 counts where the processor has no FMA. Means and errors are exact sums",
-    ("figures/evaluation.py", "**"): SQUARES,
-    ("learning/counterfactual.py", "**"): TRAINED,
-    ("learning/counterfactual.py", "np.exp"): TRAINED,
+    ("figures.py", "**"): SQUARES,
+    ("learning/algorithms.py", "**"): TRAINED,
+    ("learning/algorithms.py", "np.exp"): TRAINED,
     ("learning/recipe.py", "math.cos"): TRAINED,
-    ("pages/player.py", "**"): SQUARES,
+    ("pages/page.py", "**"): SQUARES,
     ("studies/falsification.py", "**"): SEARCHED,
     ("studies/falsification.py", "rng.standard_normal"): SEARCHED,
     ("studies/falsification.py", "scipy.stats"): SEARCHED,
-    ("studies/reproduction/two_scenarios.py", "**"): SQUARES,
-    ("studies/tuning.py", "**"): SEARCHED,
+    ("studies/reproduction/items.py", "**"): SQUARES,
+    ("studies/sweep.py", "**"): SEARCHED,
 }
 
 

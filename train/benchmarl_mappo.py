@@ -10,11 +10,19 @@ line) without the extra, with checkpoints and measuring on the way; this file is
 from __future__ import annotations
 
 import argparse
+import tempfile
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
 from ethbrake_marl.learning.recipe import PpoRecipe, load_recipe
+from ethbrake_marl.learning.training import RunDirectory, resolve
+from ethbrake_marl.observations import observation_for
+from ethbrake_marl.policies import NetworkSpec, Policy, make_policy
 
 
 def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> None:
@@ -23,8 +31,104 @@ def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> No
     if not isinstance(plan, PpoRecipe):
         raise InvalidInput(f"recipe {plan.name!r}: is for {plan.algorithm.upper()}; MAPPO needs one for PPO")
     with naming_extras():
-        from ethbrake_marl.learning.benchmarl import train_mappo  # only here: an extra
+        import benchmarl  # noqa: F401  # only here: an extra
     train_mappo(plan, line, output)
+
+
+def train_mappo(recipe: PpoRecipe, scenario: eb.Scenario, directory: Path) -> Policy:
+    """Train BenchMARL's MAPPO with the numbers of `recipe`, and leave the shared actor in the new `directory`.
+
+    `load_team` and `ppo@DIRECTORY` take it. The learning rate stays at its start, as BenchMARL has no schedule;
+    there are no checkpoints and nothing is measured on the way.
+    """
+    from ethbrake_marl.learning.runs import own_random_state
+
+    recipe = recipe.replace(scheme="centralised")
+    if recipe.observation is not None:
+        scenario = scenario.replace(observation=list(recipe.observation))
+    team = resolve(recipe, scenario).team()
+    content = {"recipe": recipe.model_dump(mode="json"), "scenario": scenario.model_dump(mode="json")}
+    run = RunDirectory(directory).create({**content, "library": "benchmarl"}, team=team)
+    with own_random_state(), tempfile.TemporaryDirectory() as scratch:
+        experiment = make_experiment(recipe, scenario, scratch)
+        experiment.run()
+        policy = policy_of(experiment, recipe, scenario)
+    policy.save(run.policy)
+    run.write_status("finished", steps=policy.steps)
+    return policy
+
+
+def make_experiment(recipe: PpoRecipe, scenario: eb.Scenario, scratch: str) -> Any:
+    """An experiment with the numbers of `recipe`; what BenchMARL writes of its own goes to the folder `scratch`."""
+    import torch
+    from benchmarl.algorithms import MappoConfig
+    from benchmarl.experiment import Experiment, ExperimentConfig
+    from benchmarl.models.mlp import MlpConfig
+
+    from ethbrake_marl.learning.benchmarl import LineTask
+
+    learners = len(scenario.learners)
+    config = ExperimentConfig.get_from_yaml()
+    config.gamma, config.lr = recipe.gamma, recipe.learning_rate.start
+    config.clip_grad_val = recipe.max_grad_norm
+    config.max_n_frames, config.max_n_iters = -(-recipe.total_steps // learners), None
+    config.on_policy_n_envs_per_worker = recipe.n_envs
+    config.on_policy_collected_frames_per_batch = recipe.n_envs * recipe.n_steps
+    config.on_policy_n_minibatch_iters = recipe.n_epochs
+    config.on_policy_minibatch_size = max(recipe.batch_size // learners, 1)
+    config.save_folder = scratch
+    config.evaluation, config.loggers, config.create_json = False, [], False
+    algorithm = MappoConfig.get_from_yaml()
+    algorithm.lmbda, algorithm.clip_epsilon = recipe.gae_lambda, recipe.clip_range
+    algorithm.entropy_coef, algorithm.critic_coef = recipe.ent_coef, recipe.vf_coef
+    models = [MlpConfig.get_from_yaml(), MlpConfig.get_from_yaml()]
+    activation = torch.nn.ReLU if recipe.network.activation == "relu" else torch.nn.Tanh
+    for model, cells in zip(models, (recipe.network.policy, recipe.network.value), strict=True):
+        model.num_cells, model.activation_class = list(cells), activation
+    task = LineTask(
+        scenario.name, {"scenario": scenario, "reward": recipe.reward, "horizon_is_end": recipe.horizon_is_end}
+    )
+    return Experiment(task, algorithm, models[0], recipe.seed, config, critic_model_config=models[1])
+
+
+def policy_of(experiment: Any, recipe: PpoRecipe, scenario: eb.Scenario) -> Policy:
+    """The shared actor of an experiment as a policy; its mean is squashed by the hyperbolic tangent."""
+    from torchrl.modules import MultiAgentMLP
+
+    (actor,) = (m for m in experiment.group_policies["learners"].modules() if isinstance(m, MultiAgentMLP))
+    observation = observation_for(scenario)
+    network = NetworkSpec(
+        observation_size=observation.size,
+        action_size=1,
+        policy_hidden=recipe.network.policy,
+        value_hidden=(),
+        activation=recipe.network.activation,
+        output="tanh",
+    )
+    return make_policy(
+        tensors_of(actor, len(recipe.network.policy)),
+        algorithm="ppo",
+        network=network,
+        observation=observation,
+        learners=tuple(scenario.vehicle_names[vehicle] for vehicle in scenario.learners),
+        scenario=scenario.model_dump(mode="json"),
+        reward=recipe.reward.model_dump(mode="json"),
+        seeds={"training": recipe.seed},
+        steps=int(experiment.total_frames) * len(scenario.learners),
+    )
+
+
+def tensors_of(actor: Any, hidden: int) -> dict[str, NDArray[np.float32]]:
+    """The actor's layers under the names of our table; its last one gives the mean, then the noise."""
+    found: dict[str, NDArray[np.float32]] = {}
+    for k in range(hidden + 1):
+        for part in ("weight", "bias"):
+            values = actor.params[str(2 * k), part].detach().cpu().numpy().astype(np.float32)
+            if k < hidden:
+                found[f"policy.{k}.{part}"] = values
+            else:
+                found[f"policy.output.{part}"], found[f"policy.log_std.{part}"] = values[:1], values[1:]
+    return found
 
 
 if __name__ == "__main__":

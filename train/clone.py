@@ -25,8 +25,7 @@ from torch import Tensor, nn
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.files.store import new_folder
-from ethbrake_marl.policies.actor import NetworkSpec, installed_versions, observation_schema
-from ethbrake_marl.policies.bundle import Policy, make_policy, save_policy
+from ethbrake_marl.policies import NetworkSpec, Policy, make_policy
 
 HIDDEN = (128, 128)
 EPOCHS, BATCH, LEARNING_RATE = 20, 512, 1e-3
@@ -96,13 +95,12 @@ def as_policy(network: nn.Sequential, told: dict[str, Any], seed: int) -> Policy
             activation="relu",
             output="clip",
         ),
-        observation=observation_schema(spec),
+        observation=spec,
         learners=tuple(told["learners"]),
         scenario=scenario.model_dump(mode="json"),
         reward=told["reward"],
         seeds={"training": seed, "list": told["seed"]},
         steps=0,
-        versions=installed_versions(),
     )
 
 
@@ -110,7 +108,7 @@ def train(dataset: Path, seed: int, output: Path) -> None:
     """Clone what the dataset holds into `output`/policy; refuses an `output` that is there."""
     with new_folder(output) as folder:
         seen, done, told = read_dataset(dataset)
-        save_policy(as_policy(clone(seen, done, seed), told, seed), folder / "policy")
+        as_policy(clone(seen, done, seed), told, seed).save(folder / "policy")
 
 
 # 4. Who drives by it, on every command that takes agents.

@@ -25,8 +25,7 @@ from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.files.store import new_folder
 from ethbrake_marl.learning.algorithms import tensors_of
 from ethbrake_marl.learning.training import resolve
-from ethbrake_marl.policies.actor import NetworkSpec, installed_versions, observation_schema
-from ethbrake_marl.policies.bundle import Policy, make_policy, save_policy
+from ethbrake_marl.policies import NetworkSpec, Policy, make_policy
 from ethbrake_marl.rewards import reward_params
 
 # 1. What to train: the same settings as train/ppo.yaml, in smaller networks.
@@ -132,7 +131,7 @@ def train(scenario: eb.Scenario, steps: int, seed: int, output: Path) -> None:
     """
     resolve("ppo", scenario, total_steps=steps, seed=seed)
     with new_folder(output) as folder:
-        save_policy(learn(scenario, steps, seed), folder / "policy")
+        learn(scenario, steps, seed).save(folder / "policy")
 
 
 def learn(scenario: eb.Scenario, steps: int, seed: int) -> Policy:
@@ -148,11 +147,7 @@ def learn(scenario: eb.Scenario, steps: int, seed: int) -> Policy:
         learning_rate=lambda left: 1e-3 * left + 1e-5,
         gamma=0.995,
         gae_lambda=0.8,
-        policy_kwargs={
-            "net_arch": {"pi": HIDDEN, "vf": HIDDEN},
-            "activation_fn": torch.nn.ReLU,
-            "log_std_init": -0.5,
-        },
+        policy_kwargs={"net_arch": {"pi": HIDDEN, "vf": HIDDEN}, "activation_fn": torch.nn.ReLU, "log_std_init": -0.5},
         seed=seed,
         device="cpu",
     )
@@ -170,13 +165,12 @@ def learn(scenario: eb.Scenario, steps: int, seed: int) -> Policy:
         tensors_of(model.policy, network),
         algorithm="ppo",
         network=network,
-        observation=observation_schema(observation),
+        observation=observation,
         learners=tuple(scenario.vehicle_names[i] for i in scenario.learners),
         scenario=scenario.model_dump(mode="json"),
         reward=reward_params(REWARD).model_dump(mode="json"),
         seeds={"training": seed},
         steps=model.num_timesteps,
-        versions=installed_versions(),
     )
 
 

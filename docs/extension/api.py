@@ -10,7 +10,7 @@ import ethbrake_marl
 
 TABLE = Path(ethbrake_marl.__file__)
 HEADING = re.compile(r"^    # (.*)$")
-ENTRY = re.compile(r"^    from [\w.]+ import (\w+) as \1$")
+ENTRY = re.compile(r"\b(\w+) as \1\b")
 
 
 def read_groups(text: str) -> dict[str, list[str]]:
@@ -20,8 +20,8 @@ def read_groups(text: str) -> dict[str, list[str]]:
     for line in text.splitlines():
         if heading := HEADING.match(line):
             title = heading[1]
-        elif entry := ENTRY.match(line):
-            groups.setdefault(title, []).append(entry[1])
+        elif names := ENTRY.findall(line):
+            groups.setdefault(title, []).extend(names)
     return groups
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from ethbrake_marl.agents.protocol import Driver, knowledge_text
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.evaluation.outcome import Outcome
+from ethbrake_marl.evaluation.measures import Outcome
 from ethbrake_marl.evaluation.statistics import paired_difference
 from ethbrake_marl.scenario import Sample, Scenario, load_scenario
 from ethbrake_marl.studies.speed import this_machine

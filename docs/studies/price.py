@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.evaluation import Evaluation, evaluate
 from ethbrake_marl.evaluation.statistics import mean, paired_difference, rate
-from ethbrake_marl.figures.style import GREY, add_caption, new_figure, series_style, style_axes, write_picture
+from ethbrake_marl.figures import GREY, add_caption, new_figure, series_style, style_axes, write_picture
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.scenario.v2x import CHANNELS

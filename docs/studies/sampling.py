@@ -16,8 +16,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ethbrake_marl.agents.registry import make_single_agent
-from ethbrake_marl.evaluation.inputs import identity_line
-from ethbrake_marl.figures.style import GREY, add_caption, new_figure, series_style, style_axes, write_picture
+from ethbrake_marl.engine import ask_script, begin_script
+from ethbrake_marl.evaluation.inputs import result_versions, scenario_sha256, worlds_sha256
+from ethbrake_marl.figures import GREY, add_caption, new_figure, series_style, style_axes, write_picture
 from ethbrake_marl.harm import empty_ledger
 from ethbrake_marl.physics import Bools, Floats, ImpactRows, Impacts, Worlds, advance, advance_sampled
 from ethbrake_marl.scenario import load_scenario
@@ -78,8 +79,7 @@ def convergence(worlds: Worlds, agent: str, until_s: float = 8.0, steps_s: Seque
     """Exact and sampled harm of ``worlds`` (at the alert) up to ``until_s``, for every step."""
     command = -worlds.vehicles.braking_capacity_mps2
     driver = make_single_agent(agent)
-    driver.begin(worlds, VEHICLE, np.arange(worlds.n))
-    command[:, VEHICLE] = driver.act(worlds, VEHICLE)
+    command[:, VEHICLE], _ = ask_script(driver, worlds, begin_script(driver, worlds, VEHICLE, {}), VEHICLE)
     _, exact = advance(worlds, command, until_s=until_s, record=True)
     assert exact.rows is not None
     chained = chain_impacts(worlds, exact.rows)
@@ -145,4 +145,7 @@ if __name__ == "__main__":
     sample = scenario.sample(WORLDS, SEED)
     found = [convergence(sample.worlds, agent, scenario.horizon_s) for agent in CONTROLS]
     write_picture(sys.argv[1], draw(found), force=True)
-    print("\n\n".join([*map(table, found), identity_line(scenario, sample)]))
+    versions = ", ".join(f"{name} {number}" for name, number in result_versions().items())
+    identity = f"Worlds: SHA-256 {worlds_sha256(sample.worlds, sample.index)}; "
+    identity += f"scenario: SHA-256 {scenario_sha256(scenario)}; {versions}."
+    print("\n\n".join([*map(table, found), identity]))

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ethbrake_marl.figures.style import GREY, add_caption, new_figure, series_style, style_axes, write_picture
+from ethbrake_marl.figures import GREY, add_caption, new_figure, series_style, style_axes, write_picture
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
 from ethbrake_marl.studies.speed import SEED, STEP_S, Effort, Work, braking, rates, stepping, this_machine, until_rest
 

@@ -8,8 +8,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from ethbrake_marl.policies.actor import Manifest, tensor_table
-from ethbrake_marl.policies.bundle import Policy, load_policy, make_policy, save_policy
+from ethbrake_marl.policies import Manifest, Policy, load_policy, make_policy
 
 
 def actor_only(policy: Policy) -> Policy:
@@ -17,9 +16,9 @@ def actor_only(policy: Policy) -> Policy:
     network = policy.manifest.network.model_copy(update={"value_hidden": ()})
     fields = {name: getattr(policy.manifest, name) for name in Manifest.model_fields}
     del fields["weights_sha256"], fields["manifest_sha256"]
-    tensors = {row.name: policy.tensors[row.name] for row in tensor_table(network)}
+    tensors = {row.name: policy.tensors[row.name] for row in network.tensors}
     return make_policy(tensors, **{**fields, "network": network})
 
 
 if __name__ == "__main__":
-    save_policy(actor_only(load_policy(sys.argv[1])), Path(sys.argv[2]))
+    actor_only(load_policy(sys.argv[1])).save(Path(sys.argv[2]))

@@ -16,15 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Agent, AgentAround, Knowledge, PredictingAgent, Source, fixed_commands, place
-from ethbrake_marl.engine.stream import Script
-from ethbrake_marl.errors import InvalidInput, count_of
-from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
-from ethbrake_marl.physics.messages import CHANNEL, LINK, is_periodic, links_of, move_on, place_at
-from ethbrake_marl.physics.worlds import vehicles_at_once
-from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.scenario.sampling import make_sample
-from ethbrake_marl.scenario.v2x import PER_LINK, with_news
+from ethbrake_marl.agents.protocol import Agent, AgentAround, Knowledge, Source, fixed_commands
+from ethbrake_marl.agents.rollout import script_agents
+from ethbrake_marl.engine import Memory, Script, ask_script, begin_script, renew_memory
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics import Bools, Floats, Vehicles, Worlds, is_periodic, move_on, newest_told
+from ethbrake_marl.scenario import Scenario, make_sample
 
 TOUCHING_M = 1e-9  # a gap below this is a contact: places are told with rounding
 OF_OTHERS = ("place", "speeds_mps", "braking_capacity_mps2", "mass_t", "latency_s", "news_s")  # what may be uncertain
@@ -90,22 +87,17 @@ def _places_of(worlds: Worlds, vehicle: int) -> Floats:
 
 def _told_by_messages(worlds: Worlds, vehicle: int, told: Told, periodic: Bools) -> Told:
     """The same where what is known is as old as the newest message, or the present of who is in sight."""
-    links, own = links_of(worlds)[:, vehicle], worlds.messages[:, [place_at(worlds.N) + vehicle]]
+    newest = newest_told(worlds, vehicle)
     other = periodic[:, np.newaxis] & (np.arange(worlds.N) != vehicle)
-    stale = other & (links[..., LINK.TOLD_S] < worlds.time_s[:, np.newaxis])
-    for values, column in (
-        (told.place_m, LINK.TOLD_PLACE),
-        (told.speed_mps, LINK.TOLD_SPEED),
-        (told.command_mps2, LINK.TOLD_COMMAND),
-    ):
-        since = own if column == LINK.TOLD_PLACE else 0.0
-        values[stale] = (links[..., column] - since)[stale]
-    told.at_s[stale] = links[..., LINK.TOLD_S][stale]
+    stale = other & (newest.at_s < worlds.time_s[:, np.newaxis])
+    told.place_m[stale] = (newest.place_m - newest.own_place_m[:, np.newaxis])[stale]
+    told.speed_mps[stale] = newest.speed_mps[stale]
+    told.command_mps2[stale] = newest.command_mps2[stale]
+    told.at_s[stale] = newest.at_s[stale]
     if vehicle > 0:
-        standing = worlds.messages[:, CHANNEL.OBSTACLE_PLACE] - own[:, 0]
-        told.obstacle_m[periodic] = standing[periodic]
-        told.obstacle_hit[periodic] = links[periodic, 0, LINK.TOLD_HIT] == 1.0
-    return told._replace(known=told.known & (~other | (links[..., LINK.TOLD_S] >= 0.0)))
+        told.obstacle_m[periodic] = (newest.obstacle_place_m - newest.own_place_m)[periodic]
+        told.obstacle_hit[periodic] = newest.obstacle_hit[periodic, 0] == 1.0
+    return told._replace(known=told.known & (~other | (newest.at_s >= 0.0)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,9 +158,9 @@ def ranges_of(scenario: Scenario, vehicle: int) -> Ranges:
 def _middle_news(scenario: Scenario) -> Floats:
     """When each vehicle has heard of the emergency where every number of the channel is in the middle, [N] s."""
     one, N = np.ones((1, scenario.vehicles)), scenario.vehicles
-    vehicles = vehicles_at_once(one, one, np.zeros((1, N)), one, one, np.zeros(1))
+    vehicles = Vehicles.at_once(one, one, np.zeros((1, N)), one, one, np.zeros(1))
     if scenario.v2x.by_link:
-        vehicles = with_news(scenario.v2x, vehicles, np.full((1, PER_LINK * N * N), 0.5))
+        vehicles = scenario.v2x.with_news(vehicles, np.full((1, scenario.v2x.width(N)), 0.5))
     news: Floats = vehicles.latency_s[0]
     return news
 
@@ -214,7 +206,7 @@ def believed_worlds(
     latency[:, vehicle] = np.where(
         past, v.latency_s[:, vehicle], np.maximum(v.own_latency_s[:, vehicle], worlds.time_s)
     )
-    vehicles = vehicles_at_once(
+    vehicles = Vehicles.at_once(
         of["braking_capacity_mps2"], of["driving_capacity_mps2"], latency, of["mass_t"], of["speed_limit_mps"],
         v.restitution,
     )  # fmt: skip
@@ -279,83 +271,75 @@ def split_believed(argument: str | None) -> tuple[str | None, bool]:
     return argument, False
 
 
-class Odometer:
-    """A vehicle's own way since the alert, from its own speed and command at its decisions, [n] m."""
+class Odometer(NamedTuple):
+    """A vehicle's own way since the alert, from its own speed and command at its decisions."""
 
-    def __init__(self) -> None:
-        self.way_m: Floats = np.zeros(0)
-        self.time_s: Floats = np.zeros(0)
-        self.speed_mps: Floats = np.zeros(0)
+    way_m: Floats  # [n]
+    time_s: Floats  # [n] of the last decision
+    speed_mps: Floats  # [n] then
 
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """Episodes start in these rows."""
-        self.way_m = place(self.way_m, rows, np.zeros(len(rows)))
-        self.time_s = place(self.time_s, rows, worlds.time_s)
-        self.speed_mps = place(self.speed_mps, rows, worlds.speeds_mps[:, vehicle])
+    @classmethod
+    def begun(cls, alert: Worlds, vehicle: int) -> Odometer:
+        """Where episodes start."""
+        return cls(np.zeros(alert.n), alert.time_s.copy(), alert.speeds_mps[:, vehicle].copy())
 
-    def look(self, worlds: Worlds, vehicle: int) -> Floats:
-        """The way up to now, [n]: exact under a constant command, also to a stop; the mean speed counts elsewhere."""
-        n, speed, command = worlds.n, worlds.speeds_mps[:, vehicle], worlds.command_mps2[:, vehicle]
-        before, passed = self.speed_mps[:n], worlds.time_s - self.time_s[:n]
-        way = 0.5 * (before + speed) * passed
+    def look(self, worlds: Worlds, vehicle: int) -> Odometer:
+        """The way up to now: exact under a constant command, also to a stop; the mean speed counts elsewhere."""
+        speed, command, before = worlds.speeds_mps[:, vehicle], worlds.command_mps2[:, vehicle], self.speed_mps
+        way = 0.5 * (before + speed) * (worlds.time_s - self.time_s)
         stopped = (speed == 0.0) & (before > 0.0) & (command < 0.0)
         way[stopped] = np.minimum(way, before * before / (-2.0 * np.where(stopped, command, -1.0)))[stopped]
-        self.way_m[:n] += way
-        self.time_s[:n], self.speed_mps[:n] = worlds.time_s, speed
-        return self.way_m[:n].copy()
+        return Odometer(self.way_m + way, worlds.time_s.copy(), speed.copy())
 
 
 class Believing(AgentAround):
     """Drives by ``policy``, any agent that reads the line, in the world that its vehicle believes in.
 
     The policy begins when it is first asked, from what was received by then. It begins anew in the worlds in which it
-    hears what nothing foretold: of another vehicle for the first time or, over a channel, that one reacts.
-    ``predicted_harm`` [n] is what it expected when it was first asked. ``shows``: the policy is shown the believed
-    world at every decision, not only where it begins. Raises ``InvalidInput`` for a mixture.
+    hears what nothing foretold: of another vehicle for the first time or, over a channel, that one reacts. The others
+    follow the scenario's scripts, as far as is believed. ``predicted_harm`` [n] is what the policy expected when it was
+    first asked. ``shows``: the policy is shown the believed world at every decision, not only where it begins. Raises
+    ``InvalidInput`` for a mixture.
     """
 
     def __init__(self, policy: Agent, scenario: Scenario, *, name: str | None = None, shows: bool = False) -> None:
         super().__init__(policy, f"{policy.name}:{SUFFIX}" if name is None else name)
         self.scenario = scenario
         self._shows = shows
-        self._odometer = Odometer()
-        self.predicted_harm: Floats = np.zeros(0)
-        self._signature: Floats = np.zeros((0, 0))  # NaN where the policy has not begun
-        self._ranges: tuple[int, Ranges] | None = None
-        self._ranges_of(0)  # refuses a mixture at once
+        self._of_line: dict[int, tuple[Ranges, dict[int, Agent]]] = {}  # by own vehicle
+        ranges_of(scenario, 0)  # refuses a mixture at once
 
     @property
     def knows(self) -> Knowledge:
         """What it received, and the model of the line filled in from the scenario."""
         return (Source.BELIEFS,)
 
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """Remember where these episodes start; nothing has been received yet."""
-        self._odometer.begin(worlds, vehicle, rows)
-        self._signature = place(self._signature, rows, np.full((len(rows), 2 * worlds.N), np.nan))
-        self.predicted_harm = place(self.predicted_harm, rows, np.full(len(rows), np.nan))
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        """Where these episodes start; nothing has been received yet, so the policy has not begun."""
+        return {
+            "way": Odometer.begun(alert, vehicle),
+            "heard": np.full((alert.n, 2 * alert.N), np.nan),  # that the policy began on; NaN: it has not
+            "predicted_harm": np.full(alert.n, np.nan),
+            "policy": None,
+        }
 
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """The policy's command, [n] m/s2. Raises ``InvalidInput`` if an episode never began."""
-        n = worlds.n
-        if n > len(self._signature):
-            raise InvalidInput(
-                f"agent {self.name!r}: act on {count_of(n, 'world')}, but begin was not called for each of them"
-            )
-        way = self._odometer.look(worlds, vehicle)
-        signature = self._heard(worlds, vehicle)
-        changed = (signature != self._signature[:n]).any(axis=1)
-        rows = np.flatnonzero(changed)
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        """The policy's command, [n] m/s2."""
+        way, heard = Odometer(*memory["way"]).look(worlds, vehicle), self._heard(worlds, vehicle)
+        policy, predicted = memory["policy"], memory["predicted_harm"]
+        rows = np.flatnonzero((heard != memory["heard"]).any(axis=1))
         if rows.size:
-            self._begin_policy(self._believe(worlds.take(rows), vehicle, way[rows]), vehicle, rows)
-            first, self._signature[rows] = rows[np.isnan(self._signature[rows, 0])], signature[rows]
-            if isinstance(self.policy, PredictingAgent):
-                self.predicted_harm[first] = self.policy.predicted_harm[first]
-        shown = self._believe(worlds, vehicle, way) if self._shows else worlds
-        return self.policy.act(shown, vehicle)
+            believed = self._believe(worlds.take(rows), vehicle, way.way_m[rows])
+            begun = begin_script(self.policy, self._shown_at_first(believed), vehicle, self._line(vehicle)[1])
+            policy = begun if policy is None else renew_memory(policy, rows, begun)  # first of all in every row
+            if isinstance(policy, Mapping) and "predicted_harm" in policy:
+                predicted = np.where(np.isnan(memory["heard"][:, 0]), policy["predicted_harm"], predicted)
+        shown = self._believe(worlds, vehicle, way.way_m) if self._shows else worlds
+        command, policy = ask_script(self.policy, shown, policy, vehicle)
+        return command, {"way": way, "heard": heard, "predicted_harm": predicted, "policy": policy}
 
-    def _begin_policy(self, believed: Worlds, vehicle: int, rows: Ints) -> None:
-        self.policy.begin(believed, vehicle, rows)
+    def _shown_at_first(self, believed: Worlds) -> Worlds:
+        return believed
 
     def _heard(self, worlds: Worlds, vehicle: int) -> Floats:
         """What the policy begins anew for when it changes, [n, 2 N]: who is known, and who reacts."""
@@ -364,9 +348,11 @@ class Believing(AgentAround):
         return np.concatenate([told.known, unforetold], axis=1).astype(np.float64)
 
     def _believe(self, worlds: Worlds, vehicle: int, way_m: Floats) -> Worlds:
-        return believed_worlds(worlds, vehicle, self._ranges_of(vehicle), self.others, way_m)
+        return believed_worlds(worlds, vehicle, *self._line(vehicle), way_m)
 
-    def _ranges_of(self, vehicle: int) -> Ranges:
-        if self._ranges is None or self._ranges[0] != vehicle:
-            self._ranges = vehicle, ranges_of(self.scenario, vehicle)
-        return self._ranges[1]
+    def _line(self, vehicle: int) -> tuple[Ranges, dict[int, Agent]]:
+        """What the scenario says of the line around one vehicle, and who drives the others."""
+        if vehicle not in self._of_line:
+            others = script_agents(self.scenario, except_for=vehicle)
+            self._of_line[vehicle] = ranges_of(self.scenario, vehicle), others
+        return self._of_line[vehicle]

@@ -9,28 +9,15 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from ethbrake_marl.agents.believed import Believing, split_believed
-from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
-from ethbrake_marl.agents.e_v2x_bm_kernel import optimise_pairwise
-from ethbrake_marl.agents.protocol import Agent, Source, fixed_commands, place
+from ethbrake_marl.agents.e_v2x_bm import optimise_coupled, optimise_pairwise
+from ethbrake_marl.agents.protocol import Agent, Source, fixed_commands
 from ethbrake_marl.agents.registry import AgentSettings
 from ethbrake_marl.defaults import HarmCount
-from ethbrake_marl.engine.stream import Script
-from ethbrake_marl.errors import InvalidInput, count_of, renumbered
+from ethbrake_marl.engine import Memory, Script, renew_memory, take_memory
+from ethbrake_marl.errors import InvalidInput, renumbered
 from ethbrake_marl.harm import check_harm_count
-from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
-from ethbrake_marl.physics.kernel import CLOCK, decision_at
-from ethbrake_marl.search import (
-    MOST_PHASES,
-    TIME_STEP_S,
-    ProfileProblem,
-    Profiles,
-    constant_profiles,
-    even_grid,
-    follow_profiles,
-    pad_profiles,
-    profile_problem,
-    search_profiles,
-)
+from ethbrake_marl.physics import CLOCK, Bools, Decisions, Floats, Ints, Worlds
+from ethbrake_marl.search import MOST_PHASES, TIME_STEP_S, ProfileProblem, Profiles, profile_problem
 
 CANDIDATES = 256  # per world and decision
 ROUND = 256  # candidates between two looks at the clock
@@ -40,11 +27,11 @@ _ARGUMENT = re.compile(r"(?P<number>[0-9]+(\.[0-9]+)?)(?P<unit>ms)?")
 
 
 class Planner:
-    """Receding horizon: the own profile is searched anew at each decision, the ``others`` following their scripts.
+    """Receding horizon: the own profile is searched anew at each decision, the others following their scripts.
 
     Each search starts from the plan so far, from constants and, at first, from the pairwise optimum. ``predicted_harm``
-    [n] is that of the first plan (m2/s2); no more is done if the others do as expected. Vehicles that are not in
-    ``others`` (learners) are taken to brake fully. Raises ``InvalidInput`` for an unusable argument or count and, when
+    [n] is that of the first plan (m2/s2); no more is done if the others do as expected. Vehicles without a script
+    (learners) are taken to brake fully. Raises ``InvalidInput`` for an unusable argument or count and, when
     an episode begins, for another vehicle's script whose command is not fixed at the alert.
 
     Args:
@@ -76,52 +63,32 @@ class Planner:
         time_step_s: float = TIME_STEP_S,
     ) -> None:
         check_harm_count(harm_count)
-        self.others: Mapping[int, Script] = {}
         self.name = "planner" if argument is None else f"planner:{argument}"
-        self.predicted_harm: Floats = np.empty(0)
         self._candidates, self._milliseconds = _budget(argument)
         if most_candidates is not None:
             self._candidates, self._milliseconds = min(self._candidates, most_candidates), 0.0
         self._harm_count: HarmCount = harm_count
         self._horizon_s, self._time_step_s = horizon_s, time_step_s
-        self._latency_s: Floats = np.empty(0)
-        self._others_mps2: Floats = np.empty((0, 0))  # [n, N]
-        self._plan = Profiles(np.zeros((0, MOST_PHASES), np.int64), np.zeros((0, MOST_PHASES, 1)))
-        self._planned_s: Floats = np.empty(0)  # [n] when the plan begins
 
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """Make the first plan of these rows' episodes."""
-        command = fixed_commands(self.others, worlds, f"agent {self.name!r}", vehicle=vehicle)
-        problem = self._problem(worlds, vehicle, command)
-        pairwise = -optimise_pairwise(worlds, vehicle).deceleration_mps2
-        found = self._search(problem, constant_profiles(problem, pairwise[:, np.newaxis, np.newaxis]))
-        self.predicted_harm = place(self.predicted_harm, rows, found[1])
-        self._latency_s = place(self._latency_s, rows, worlds.vehicles.latency_s[:, vehicle])
-        self._planned_s = place(self._planned_s, rows, np.maximum(self._latency_s[rows], worlds.time_s))
-        more = self._latency_s.size - len(self._plan.ends)
-        self._plan = self._plan.grown(self._latency_s.size)
-        if self._others_mps2.shape[1] != worlds.N:
-            self._others_mps2 = np.zeros((self._latency_s.size - more, worlds.N))
-        self._others_mps2 = np.pad(self._others_mps2, ((0, more), (0, 0)))
-        self._others_mps2[rows] = command
-        self._store(rows, found[0])
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        """Make the first plan of these episodes."""
+        others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
+        problem = self._problem(alert, vehicle, others)
+        pairwise = -optimise_pairwise(alert, vehicle).deceleration_mps2
+        plan, harm = self._search(problem, problem.constant(pairwise[:, np.newaxis, np.newaxis]))
+        start_s = np.maximum(alert.vehicles.latency_s[:, vehicle], alert.time_s)
+        return {"plan": plan, "planned_s": start_s, "others_mps2": others, "predicted_harm": harm}
 
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """The first command of the new plans, [n] m/s2. Raises ``InvalidInput`` if an episode never began."""
-        n = worlds.n
-        if n > self._latency_s.size or np.isnan(self._latency_s[:n]).any():
-            raise InvalidInput(
-                f"agent {self.name!r}: act on {count_of(n, 'world')}, but begin was not called for each of them"
-            )
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        """The first command of the new plans, [n] m/s2."""
         moving = (worlds.speeds_mps != 0.0).any(axis=1)
-        due = (worlds.time_s > self._planned_s[:n]) & (worlds.time_s < self._horizon_s) & moving
-        rows = np.flatnonzero(due)
+        rows = np.flatnonzero((worlds.time_s > memory["planned_s"]) & (worlds.time_s < self._horizon_s) & moving)
         if rows.size:
-            now = worlds.take(rows)
-            problem = self._problem(now, vehicle, self._others_mps2[rows])
-            self._store(rows, self._search(problem, self._rest(rows, now.time_s, problem))[0])
-            self._planned_s[rows] = now.time_s
-        return self._plan.commands_mps2[:n, 0, 0].copy()
+            now, held = worlds.take(rows), take_memory(memory, rows)
+            problem = self._problem(now, vehicle, held["others_mps2"])
+            plan, _ = self._search(problem, self._rest(held, now.time_s, problem))
+            memory = renew_memory(memory, rows, {"plan": plan, "planned_s": now.time_s})
+        return Profiles(*memory["plan"]).commands_mps2[:, 0, 0], memory
 
     def _problem(self, worlds: Worlds, vehicle: int, others: Floats) -> ProfileProblem:
         return profile_problem(
@@ -129,17 +96,13 @@ class Planner:
             others_mps2=others,
         )  # fmt: skip
 
-    def _rest(self, rows: Ints, time_s: Floats, problem: ProfileProblem) -> Profiles:
-        """What is left of the plans of ``rows`` from ``time_s`` on."""
-        passed = np.rint((time_s - self._planned_s[rows]) / self._time_step_s).astype(np.int64)[:, np.newaxis]
-        ends = np.maximum(self._plan.ends[rows] - passed, 0)
-        ends = np.minimum(ends, problem.last_step[:, np.newaxis])
+    def _rest(self, held: Memory, time_s: Floats, problem: ProfileProblem) -> Profiles:
+        """What is left of the plans from ``time_s`` on."""
+        plan = Profiles(*held["plan"])
+        passed = np.rint((time_s - held["planned_s"]) / self._time_step_s).astype(np.int64)[:, np.newaxis]
+        ends = np.minimum(np.maximum(plan.ends - passed, 0), problem.last_step[:, np.newaxis])
         ends[:, -1] = problem.last_step
-        return Profiles(ends, self._plan.commands_mps2[rows])
-
-    def _store(self, rows: Ints, plan: Profiles) -> None:
-        self._plan.ends[rows] = plan.ends
-        self._plan.commands_mps2[rows] = plan.commands_mps2
+        return Profiles(ends, plan.commands_mps2)
 
     def _search(self, problem: ProfileProblem, plan: Profiles) -> tuple[Profiles, Floats]:
         """The best plans found from these and from constants, with their harm under the own count."""
@@ -147,7 +110,7 @@ class Planner:
         seed = 0
         while True:
             given = _with_constants(problem, plan)
-            found = search_profiles(problem, given, budget=self._candidates, seed=seed)
+            found = problem.search(given, budget=self._candidates, seed=seed)
             plan, seed = found.profiles, seed + 1
             if time.perf_counter() >= stop:
                 return plan, found.harm(self._harm_count)
@@ -155,7 +118,7 @@ class Planner:
 
 def _with_constants(problem: ProfileProblem, plan: Profiles) -> Profiles:
     """Each world's plan, then constants: [n * Q]."""
-    constants = constant_profiles(problem, even_grid(problem, _CONSTANTS))
+    constants = problem.constant(problem.even_grid(_CONSTANTS))
     n, K = plan.ends.shape
     ends = np.concatenate([plan.ends[:, np.newaxis], constants.ends.reshape(n, -1, K)], axis=1)
     commands = constants.commands_mps2.reshape(n, -1, K, 1)
@@ -199,7 +162,7 @@ Recall = Callable[[ProfileProblem, HarmCount], tuple[Profiles, Bools]]
 
 
 class BestHarm:
-    """Drives the profile of least harm known, while the ``others`` follow their scripts (without one: brake fully).
+    """Drives the profile of least harm known, while the others follow their scripts (without one: brake fully).
 
     ``recall`` gives the kept profiles; a world without one is searched at the alert with ``budget`` candidates.
     Decisions fall every ``time_step_s`` from the vehicle's latency on. ``predicted_harm`` [n] is what the engine will
@@ -222,38 +185,32 @@ class BestHarm:
             raise InvalidInput(f"best_harm: budget = {budget}; at least 1 candidate is needed")
         check_harm_count(harm_count)
         self.name = "best_harm"
-        self.others: Mapping[int, Script] = {}
-        self.predicted_harm: Floats = np.empty(0)
-        self.searched: Floats = np.empty(0)  # [n] 1 where nothing was kept
         self._recall = recall
         self._harm_count: HarmCount = harm_count
         self._horizon_s, self._time_step_s = horizon_s, time_step_s
         self._budget = budget
-        self._start_s: Floats = np.empty(0)
-        self._profiles = Profiles(np.zeros((0, 1), np.int64), np.zeros((0, 1, 1)))
+        self._steps = np.arange(int(np.ceil(horizon_s / time_step_s)) + 1)
 
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """Look these rows' worlds up, and search those that are not known."""
-        others = fixed_commands(self.others, worlds, f"agent {self.name!r}", vehicle=vehicle)
-        problem = self._problem(worlds, vehicle, others)
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        """Look these worlds up, and search those that are not known."""
+        others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
+        problem = self._problem(alert, vehicle, others)
         profiles, known = self._recall(problem, self._harm_count)
         unknown = np.flatnonzero(~known)
         if unknown.size:
-            profiles = self._search(worlds, vehicle, others, profiles, unknown)
-        first, total = follow_profiles(problem, profiles)
-        self.predicted_harm = place(self.predicted_harm, rows, first if self._harm_count == "first" else total)
-        self.searched = place(self.searched, rows, (~known).astype(np.float64))
-        self._start_s = place(self._start_s, rows, problem.clock[:, CLOCK.START])
-        self._profiles = _place(self._profiles, rows, profiles, self._start_s.size)
+            profiles = self._search(alert, vehicle, others, profiles, unknown)
+        first, total = problem.follow(profiles)
+        return {
+            "predicted_harm": first if self._harm_count == "first" else total,
+            "searched": ~known,
+            "start_s": problem.clock[:, CLOCK.START].copy(),
+            "commands_mps2": np.stack([profiles.at(np.full(alert.n, step))[:, 0] for step in self._steps], axis=1),
+        }
 
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """The command of the phase in force, [n] m/s2. Raises ``InvalidInput`` if an episode never began."""
-        if worlds.n > len(self._start_s) or np.isnan(self._start_s[: worlds.n]).any():
-            raise InvalidInput(
-                f"agent {self.name!r}: act on {count_of(worlds.n, 'world')}, but begin was not called for each"
-            )
-        step = np.maximum(decision_at(worlds.time_s, self._start_s[: worlds.n], self._time_step_s), 0)
-        return self._profiles.take(slice(worlds.n)).at(step)[:, 0]
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        """The command of the phase in force, [n] m/s2."""
+        step = Decisions(memory["start_s"], self._time_step_s).latest(worlds.time_s)
+        return memory["commands_mps2"][np.arange(worlds.n), np.clip(step, 0, self._steps[-1])], memory
 
     def _problem(self, worlds: Worlds, vehicle: int, others: Floats) -> ProfileProblem:
         return profile_problem(
@@ -268,18 +225,9 @@ class BestHarm:
         horizon_s, harm_count = self._horizon_s, self._harm_count
         with renumbered(unknown):
             coupled = optimise_coupled(part, vehicle, harm_count=harm_count, horizon_s=horizon_s, others_mps2=theirs)
-            given = constant_profiles(problem, -coupled.deceleration_mps2[:, np.newaxis, np.newaxis])
-            found = search_profiles(problem, given, budget=self._budget).profiles
-        whole, found = pad_profiles([profiles, found], MOST_PHASES)
+            given = problem.constant(-coupled.deceleration_mps2[:, np.newaxis, np.newaxis])
+            found = problem.search(given, budget=self._budget).profiles
+        whole, found = Profiles.padded([profiles, found], MOST_PHASES)
         whole.ends[unknown] = found.ends
         whole.commands_mps2[unknown] = found.commands_mps2
         return whole
-
-
-def _place(stored: Profiles, rows: Ints, profiles: Profiles, n: int) -> Profiles:
-    """The stored profiles, now of ``n`` rows, with those of ``rows`` replaced."""
-    stored, profiles = pad_profiles([stored, profiles], 1)
-    grown = stored.grown(n)
-    grown.ends[rows] = profiles.ends
-    grown.commands_mps2[rows] = profiles.commands_mps2
-    return grown

@@ -1,17 +1,16 @@
 """A policy of any library as an agent: a function, a Stable-Baselines3 model, a torch module, an ONNX model.
 
-The model is shared: a copy of the agent has its own memory of the running episodes, and the same model.
+What a model remembers of its episodes is a value, which who runs them keeps; the model itself is never copied.
 """
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import os
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 import numpy as np
 from gymnasium.wrappers import NormalizeObservation, RescaleObservation
@@ -19,7 +18,8 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.actions import LARGEST, action_to_command
 from ethbrake_marl.agents.protocol import Source
-from ethbrake_marl.errors import AgentFailed, InvalidInput, count_of, describe_error, naming_extras
+from ethbrake_marl.engine import Memory, Script, checked_memory, map_memory, take_memory
+from ethbrake_marl.errors import AgentFailed, InvalidInput, describe_error, naming_extras
 from ethbrake_marl.observations import (
     Appended,
     Observation,
@@ -73,17 +73,6 @@ def _without_memory(action: Any) -> Any:
     return action
 
 
-def map_state(function: Callable[..., Any], state: State, *others: State) -> State:
-    """The function of every array of a memory, together with those in its place in the others."""
-    if state is None:
-        return None
-    if isinstance(state, Mapping):
-        return {key: map_state(function, value, *(other[key] for other in others)) for key, value in state.items()}
-    if isinstance(state, tuple | list):
-        return tuple(map_state(function, *parts) for parts in zip(state, *others, strict=True))
-    return function(state, *others)
-
-
 def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | None]:
     """A model with ``predict``; where that gives a state, too (sb3-contrib's recurrent ones), the agent keeps it.
 
@@ -105,7 +94,7 @@ def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | Non
 
     try:
         like, of_three = (predict(np.zeros((n, features), np.float32))[1] for n in (2, 3))
-        axes = map_state(world_axis, like, of_three)
+        axes = map_memory(world_axis, like, of_three)
     except Exception as error:
         raise InvalidInput(f"agent {name!r}: predict on {features} features: {describe_error(error)}") from error
     if like is None:
@@ -113,14 +102,14 @@ def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | Non
 
     def infer(seen: Observations, state: State) -> tuple[Any, State]:
         begins, memory = state
-        kept = None if begins.all() else map_state(lambda array, axis: np.moveaxis(array, 0, axis), memory, axes)
+        kept = None if begins.all() else map_memory(lambda array, axis: np.moveaxis(array, 0, axis), memory, axes)
         action, memory = predict(seen, state=kept, episode_start=begins)
-        after = map_state(lambda array, axis: np.moveaxis(to_array(array), axis, 0), memory, axes)
+        after = map_memory(lambda array, axis: np.moveaxis(to_array(array), axis, 0), memory, axes)
         return action, (np.zeros(len(seen), np.bool_), after)
 
     def begin(n: int) -> State:
-        shaped = map_state(lambda array, axis: np.moveaxis(to_array(array), axis, 0), like, axes)
-        return np.ones(n, np.bool_), map_state(lambda array: np.zeros((n, *array.shape[1:]), array.dtype), shaped)
+        shaped = map_memory(lambda array, axis: np.moveaxis(to_array(array), axis, 0), like, axes)
+        return np.ones(n, np.bool_), map_memory(lambda array: np.zeros((n, *array.shape[1:]), array.dtype), shaped)
 
     return infer, begin
 
@@ -334,154 +323,104 @@ class PolicyAgent:
         self._infer, self._initial_state, self._clip = infer, initial_state, clip
         self.remembers = initial_state is not None
         self._more = more  # what stands behind the own observation
-        self._steps: Ints = np.zeros(0, np.int64)  # [n] decisions of the running episodes
-        self._rows: Ints = np.zeros(0, np.int64)  # [n] their rows in the batch that began
-        self._state: State = None
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        """Own memory, the same model."""
-        return self.take(np.arange(len(self._steps)))
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        """No decision was made yet; the policy's own state is the initial one."""
+        state = None if self._initial_state is None else self._begun(alert.n)
+        return {"steps": np.zeros(alert.n, np.int64), "state": state}
 
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """Forget the episodes in these rows."""
-        size = max(len(self._steps), int(rows.max(initial=-1)) + 1)
-        old = np.arange(len(self._steps))
-        if self._initial_state is not None:
-            everywhere = self._begun(size)
-            if len(old):
-                everywhere = _put(everywhere, old, self._state)
-            self._state = _put(everywhere, rows, self._begun(len(rows)))
-        steps = np.zeros(size, np.int64)
-        steps[old] = self._steps
-        steps[rows] = 0
-        self._steps, self._rows = steps, np.arange(size)
-
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
         """Wanted signed acceleration [n], m/s2.
 
         Raises ``AgentFailed`` naming world and step where the policy raises, or gives another shape, no number, or one
         that is not in [-1, 1].
         """
-        if len(self._steps) < worlds.n:
-            raise InvalidInput(
-                f"agent {self.name!r}: act on {count_of(worlds.n, 'world')}, but begin was not called for each of them"
-            )
-        if len(self._steps) > worlds.n:  # a smaller batch has begun
-            self.__dict__.update(self.take(np.arange(worlds.n)).__dict__)
         seen = observe(worlds, vehicle, self.observation).astype(np.float32, copy=False)
         if self._more is not None:
             seen = np.concatenate([seen, self._more(worlds, vehicle)], axis=1, dtype=np.float32)
-        action, state = self._ask(seen, worlds)
-        values = self._checked(action, seen, worlds)
-        self._state, self._steps = state, self._steps + 1
-        return action_to_command(values, worlds.vehicles, vehicle)
-
-    def take(self, rows: Ints) -> Self:
-        """A copy that drives on in some rows of its batch only."""
-        part = copy.copy(self)
-        part._steps, part._rows = self._steps[rows], self._rows[rows]
-        part._state = _take(self._state, rows)
-        return part
+        steps = memory["steps"]
+        action, state = self._ask(seen, memory["state"], worlds, steps)
+        values = self._checked(action, seen, worlds, steps)
+        return action_to_command(values, worlds.vehicles, vehicle), {"steps": steps + 1, "state": state}
 
     def _begun(self, n: int) -> State:
         assert self._initial_state is not None
         try:
-            return _take(_checked_state(self._initial_state(n), n), np.arange(n))
+            return take_memory(checked_memory(self._initial_state(n), n), np.arange(n))
         except Exception as error:
             raise AgentFailed(self.name, None, f"initial_state({n}): {describe_error(error)}") from error
 
-    def _ask(self, seen: Observations, worlds: Worlds) -> tuple[NDArray[Any], State]:
+    def _ask(self, seen: Observations, state: State, worlds: Worlds, steps: Ints) -> tuple[NDArray[Any], State]:
         try:
-            return self._answer(seen, np.arange(worlds.n))
+            return self._answer(seen, state, np.arange(worlds.n))
         except Exception as error:
-            k = self._find_failing(seen)
-            where = self._whenever() if k is None else self._when(k, worlds)
+            k = self._find_failing(seen, state)
+            where = _steps_text(steps) if k is None else _moment_text(k, worlds, steps)
             reason = f"{where}: observations of shape {seen.shape}: {describe_error(error)}"
-            raise AgentFailed(self.name, None if k is None else int(self._rows[k]), reason) from error
+            raise AgentFailed(self.name, k, reason) from error
 
-    def _answer(self, seen: Observations, rows: Ints) -> tuple[NDArray[Any], State]:
+    def _answer(self, seen: Observations, state: State, rows: Ints) -> tuple[NDArray[Any], State]:
         """What the policy says in some rows of the batch, and its memory of them then."""
         if self._initial_state is None:
             return to_array(self._infer(seen[rows], None)[0]), None
-        action, state = self._infer(seen[rows], _take(self._state, rows))
-        return to_array(action), _checked_state(state, len(rows))
+        action, state = self._infer(seen[rows], take_memory(state, rows))
+        return to_array(action), checked_memory(state, len(rows))
 
-    def _find_failing(self, seen: Observations) -> int | None:
+    def _find_failing(self, seen: Observations, state: State) -> int | None:
         """The row for which alone the policy fails too, found by halves; None where no half fails."""
+
+        def fails(rows: Ints) -> bool:
+            try:
+                self._answer(seen, state, rows)
+            except Exception:
+                return True
+            return False
+
         rows = np.arange(len(seen))
         while len(rows) > 1:
             halves = (rows[: len(rows) // 2], rows[len(rows) // 2 :])
-            found = next((half for half in halves if self._fails(seen, half)), None)
+            found = next((half for half in halves if fails(half)), None)
             if found is None:
                 return None
             rows = found
         return int(rows[0])
 
-    def _fails(self, seen: Observations, rows: Ints) -> bool:
-        try:
-            self._answer(seen, rows)
-        except Exception:
-            return True
-        return False
-
-    def _checked(self, action: NDArray[Any], seen: Observations, worlds: Worlds) -> Floats:
+    def _checked(self, action: NDArray[Any], seen: Observations, worlds: Worlds, steps: Ints) -> Floats:
         """The actions [n] in [-1, 1]."""
         n, what = worlds.n, f"gave {action.dtype} of shape {action.shape} for observations of shape {seen.shape}"
         if action.shape != (n, 1) or action.dtype.kind not in "fiu":
             first = len(action) if action.shape[1:] in ((), (1,)) and action.ndim and len(action) < n else 0
-            raise self._refusal(first, worlds, f"{what}; one number per world is needed, shape ({n}, 1)")
+            raise self._refusal(first, worlds, steps, f"{what}; one number per world is needed, shape ({n}, 1)")
         values: Floats = action[:, 0].astype(np.float64)
         if not np.isfinite(values).all():
             k = int(np.argmin(np.isfinite(values)))
-            raise self._refusal(k, worlds, f"{what}, in which stands {values[k]}; must be in [-1, 1]")
+            raise self._refusal(k, worlds, steps, f"{what}, in which stands {values[k]}; must be in [-1, 1]")
         inside = np.abs(values) <= LARGEST
         if not (self._clip or inside.all()):
             k = int(np.argmin(inside))
             right = "must be in [-1, 1]; with clip=True the nearest is meant"
-            raise self._refusal(k, worlds, f"{what}, in which stands {values[k]:g}; {right}")
+            raise self._refusal(k, worlds, steps, f"{what}, in which stands {values[k]:g}; {right}")
         return values.clip(-1.0, 1.0)
 
-    def _refusal(self, k: int, worlds: Worlds, reason: str) -> AgentFailed:
-        return AgentFailed(self.name, int(self._rows[k]), f"{self._when(k, worlds)}: {reason}")
-
-    def _whenever(self) -> str:
-        """The step, of all running episodes, at which nobody knows whose it was."""
-        first, last = self._steps.min(initial=10**9) + 1, self._steps.max(initial=0) + 1
-        return f"step {first}" if first >= last else f"steps {first} to {last}"
-
-    def _when(self, k: int, worlds: Worlds) -> str:
-        return f"step {self._steps[k] + 1} ({worlds.time_s[k]:.2f} s)"
+    def _refusal(self, k: int, worlds: Worlds, steps: Ints, reason: str) -> AgentFailed:
+        return AgentFailed(self.name, k, f"{_moment_text(k, worlds, steps)}: {reason}")
 
 
-def _take(state: State, rows: Ints) -> State:
-    return map_state(lambda array: array[rows], state)
+def _steps_text(steps: Ints) -> str:
+    """The step, of all running episodes, at which nobody knows whose it was."""
+    first, last = steps.min(initial=10**9) + 1, steps.max(initial=0) + 1
+    return f"step {first}" if first >= last else f"steps {first} to {last}"
 
 
-def _put(state: State, rows: Ints, part: State) -> State:
-    """The memory with that of ``rows`` from another; changes and gives the first."""
-
-    def put(array: Any, new: Any) -> Any:
-        array[rows] = new
-        return array
-
-    return map_state(put, state, part)
-
-
-def _checked_state(state: State, n: int) -> State:
-    def check(array: Any) -> Any:
-        shape = tuple(getattr(array, "shape", ()))
-        if not shape or shape[0] != n:
-            raise InvalidInput(f"state: {type(array).__name__} of shape {shape}; its first axis must be the {n} worlds")
-        return array
-
-    return map_state(check, state)
+def _moment_text(k: int, worlds: Worlds, steps: Ints) -> str:
+    return f"step {steps[k] + 1} ({worlds.time_s[k]:.2f} s)"
 
 
 # A trained policy as an agent: observe, infer, ask for that acceleration. Deterministic.
 
 
 class LearnedPolicy(Protocol):
-    """What an agent needs of a policy; ``ethbrake_marl.policies.bundle.Policy`` is one."""
+    """What an agent needs of a policy; ``ethbrake_marl.policies.Policy`` is one."""
 
     @property
     def observation(self) -> ObservationSpec:
@@ -503,14 +442,10 @@ class LearnedAgent:
     """
 
     knows = Source.MESSAGES
-    remembers = False
 
     def __init__(self, policy: LearnedPolicy, name: str = "learned") -> None:
         self.policy = policy
         self.name = name
-
-    def begin(self, worlds: Worlds, vehicle: int, rows: NDArray[np.int64]) -> None:
-        """Nothing to prepare: each action follows from the present state alone."""
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """Wanted signed acceleration [n], m/s2; world k's does not depend on the other worlds of the batch."""
@@ -520,7 +455,3 @@ class LearnedAgent:
                 f"{self.name}: actions of shape {action.shape}; one per world is needed, ({worlds.n}, 1)"
             )
         return action_to_command(action[:, 0], worlds.vehicles, vehicle)
-
-    def take(self, rows: Ints) -> LearnedAgent:
-        """The same agent: it remembers nothing."""
-        return self

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Collection, Mapping
 from enum import StrEnum
-from typing import ClassVar, Protocol, Self, TypeGuard, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
-from ethbrake_marl.engine.engine import Engine, Guard
-from ethbrake_marl.engine.stream import Script, ask_script, begin_script, is_state_free
-from ethbrake_marl.errors import InvalidInput, count_of
-from ethbrake_marl.physics import Floats, Ints, Worlds
+from ethbrake_marl.engine import Engine, Guard, Memory, Script, ask_script, begin_script, is_state_free
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics import Floats, Worlds
 
 # The vocabulary in which every agent states what it knows of the line while it drives.
 #
@@ -70,52 +68,41 @@ def knowledge_text(knowledge: Knowledge) -> str:
 
 @runtime_checkable
 class Agent(Script, Protocol):
-    """A ``Script`` with a name: ``begin`` and ``act`` for one vehicle in every world of a batch of ``n``.
+    """A ``Script`` with a name: it drives one vehicle in every world of a batch of ``n``.
 
-    It says with ``knows`` what it knows of the line (``agents.knowledge``); without it tables say "not stated".
+    It says with ``knows`` what it knows of the line (``agents.protocol.Source``); without it tables say "not stated".
+    One that remembers nothing has ``act(worlds, vehicle)`` alone:
 
     >>> import ethbrake_marl as eb
     >>> class HalfBrake:
     ...     name = "half_brake"
-    ...     def begin(self, worlds, vehicle, rows):
-    ...         pass
     ...     def act(self, worlds, vehicle):
     ...         return -0.5 * worlds.vehicles.braking_capacity_mps2[:, vehicle]
     >>> isinstance(HalfBrake(), eb.Agent)
     True
+
+    What one remembers of its episodes is a value that it is given and gives back, never an attribute:
+
+    >>> class OnceHit:
+    ...     name = "once_hit"
+    ...     def begin(self, alert, vehicle, scripts):
+    ...         return alert.pair_hit.any(axis=1)
+    ...     def act(self, worlds, memory, vehicle):
+    ...         memory = memory | worlds.pair_hit.any(axis=1)
+    ...         return -1.0 * memory * worlds.vehicles.braking_capacity_mps2[:, vehicle], memory
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> eb.evaluate(scenario.sample(5, 7), {"hit": OnceHit()}, scenario=scenario).worlds.n
+    5
 
     """
 
     name: str
 
 
-@runtime_checkable
-class PredictingAgent(Protocol):
-    """An agent that also states, when an episode begins, which harm it expects."""
-
-    predicted_harm: Floats  # [n] m2/s2, filled by ``begin``
-
-
-@runtime_checkable
-class LookingAhead(Protocol):
-    """An agent whose choice depends on what the other vehicles do; whoever knows their scripts sets them."""
-
-    others: Mapping[int, Script]  # by vehicle index; vehicles without an entry brake fully
-
-
-@runtime_checkable
-class Divisible(Protocol):
-    """An agent that can go on apart, in some worlds of its batch only."""
-
-    def take(self, rows: Ints) -> Agent:
-        """An agent with this one's memory of these rows; what it does leaves this one as it is."""
-        ...
-
-
 def check_agent(agent: object, where: str) -> None:
     """Raise ``InvalidInput`` for what is not an agent."""
     if not isinstance(agent, Agent):
-        missing = [what for what in ("name", "begin", "act") if not hasattr(agent, what)]
+        missing = [what for what in ("name", "act") if not hasattr(agent, what)]
         raise InvalidInput(
             f"{where}: {type(agent).__name__!r} is no agent: it has no {' and no '.join(missing)};"
             " make_agent(name) makes one, policy_agent(policy) one of a function or a model, and"
@@ -123,29 +110,11 @@ def check_agent(agent: object, where: str) -> None:
         )
 
 
-def place(stored: Floats, rows: Ints, values: Floats) -> Floats:
-    """Per-world values [k, ...] after new episodes in ``rows``; grows to the largest row, NaN where none began yet."""
-    size = max(len(stored), int(rows.max(initial=-1)) + 1)
-    placed = np.full((size, *values.shape[1:]), np.nan)
-    if len(stored):
-        placed[: len(stored)] = stored
-    placed[rows] = values
-    return placed
-
-
-def recall(stored: Floats, n: int, name: str) -> Floats:
-    """The values of a batch of ``n`` (own memory). Raises ``InvalidInput`` if an episode in it never began."""
-    values = stored[:n].copy()
-    if len(values) < n or not np.all(np.isfinite(values)):
-        raise InvalidInput(f"agent {name!r}: act on {count_of(n, 'world')}, but begin was not called for each of them")
-    return values
-
-
 ADVICE = "; looking ahead needs full_brake, coast, constant:a, copy_leader or gentlest_front"
 
 
 def fixed_commands(
-    others: Mapping[int, Script],
+    scripts: Mapping[int, Script],
     worlds: Worlds,
     who: str,
     *,
@@ -153,13 +122,13 @@ def fixed_commands(
     is_fixed: Callable[[Script], bool] = is_state_free,
     advice: str = ADVICE,
 ) -> Floats:
-    """The command of every vehicle from the alert on, [n, N] m/s2; those without an entry in ``others`` brake fully.
+    """The command of every vehicle from the alert on, [n, N] m/s2; those without an entry in ``scripts`` brake fully.
 
     ``worlds`` are at the alert. ``who`` looks ahead and drives ``vehicle``, which is left out. Raises ``InvalidInput``
     (first ``who``, at its end ``advice``) for a script whose command is not fixed at the alert, as ``is_fixed`` says.
     """
     command = -worlds.vehicles.braking_capacity_mps2
-    for i, script in others.items():
+    for i, script in scripts.items():
         if i == vehicle:
             continue
         if not is_fixed(script):
@@ -167,21 +136,17 @@ def fixed_commands(
             raise InvalidInput(
                 f"{who}: vehicle_{i + 1} is driven by {name!r}, whose command is not fixed at the alert{advice}"
             )
-        asked = copy.deepcopy(script)  # what it remembers of running episodes is not disturbed
-        begin_script(asked, worlds, i, np.arange(worlds.n))
-        command[:, i] = asked.act(worlds, i)
+        command[:, i], _ = ask_script(script, worlds, begin_script(script, worlds, i, scripts), i)
     return command
 
 
 class AgentAround:
     """Base of agents that are put around a ``policy``, which is any agent: each says only what it does differently.
 
-    ``adds`` is what it knows beside what the policy knows. ``divides_along`` names its own arrays [n, ...], row k for
-    row k of the batch, which go with their worlds in ``take``; None where it cannot go on in some worlds only.
+    ``adds`` is what it knows beside what the policy knows. Without a memory of its own it has that of the policy.
     """
 
     adds: ClassVar[Source | None] = None
-    divides_along: ClassVar[tuple[str, ...] | None] = None
 
     def __init__(self, policy: Agent, name: str | None = None) -> None:
         self.policy = policy
@@ -192,58 +157,13 @@ class AgentAround:
         """What the policy knows, and what this adds."""
         return combine(self.policy, also=self.adds)
 
-    @property
-    def others(self) -> Mapping[int, Script]:
-        """The scripts of the other vehicles, for a policy that looks ahead."""
-        return self.policy.others if isinstance(self.policy, LookingAhead) else {}
-
-    @others.setter
-    def others(self, scripts: Mapping[int, Script]) -> None:
-        if isinstance(self.policy, LookingAhead):
-            self.policy.others = scripts
-
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         """As the policy."""
-        begin_script(self.policy, worlds, vehicle, rows)
+        return begin_script(self.policy, alert, vehicle, scripts)
 
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
         """As the policy, [n] m/s2."""
-        return ask_script(self.policy, worlds, vehicle)
-
-    def take(self, rows: Ints) -> Self:
-        """A copy that drives on in some rows of its batch only; raises ``InvalidInput`` if it or the policy cannot."""
-        if self.divides_along is None or not is_divisible(self.policy):
-            who = self.name if self.divides_along is None else self.policy.name
-            raise InvalidInput(f"{self.name}: {who} has no take(rows), so it cannot go on in some worlds")
-        part = copy.copy(self)
-        part.policy = self.policy.take(rows)
-        for name in self.divides_along:
-            setattr(part, name, getattr(self, name)[rows])
-        return part
-
-
-def is_divisible(agent: Agent) -> TypeGuard[Divisible]:
-    """Whether an agent can go on in some worlds apart; one around an agent can where both can."""
-    if isinstance(agent, AgentAround):
-        return agent.divides_along is not None and is_divisible(agent.policy)
-    return isinstance(agent, Divisible)
-
-
-def apart(agent: Agent) -> Agent:
-    """A copy that can be asked without changing this one; an agent that remembers nothing is its own copy."""
-    return agent if is_state_free(agent) or not getattr(agent, "remembers", True) else copy.deepcopy(agent)
-
-
-def begun_apart(
-    agents: Mapping[int, Agent], alert: Worlds, rows: Ints, scripts: Mapping[int, Script]
-) -> dict[int, Agent]:
-    """Copies of agents, by vehicle, once episodes start in these rows; ``scripts`` drive the other vehicles."""
-    begun = {i: copy.deepcopy(a) if getattr(a, "remembers", True) else a for i, a in agents.items()}
-    for vehicle, agent in begun.items():
-        if isinstance(agent, LookingAhead):
-            agent.others = {i: script for i, script in scripts.items() if i != vehicle}
-        begin_script(agent, alert, vehicle, rows)
-    return begun
+        return ask_script(self.policy, worlds, memory, vehicle)
 
 
 # Teams: one agent for each of several vehicles.
@@ -269,9 +189,8 @@ class Shielding(Protocol):
 class Team:
     """One agent for each driven vehicle (index, 0 = front). Each decides for its own vehicle, from what that one knows.
 
-    Behind a ``shield`` they only propose. One object cannot drive two vehicles, because it may remember its episodes:
-    ``copies`` makes a team of one agent.
-    Raises ``InvalidInput`` for what is not an agent, an index that is no whole number from 0, or one object twice.
+    Behind a ``shield`` they only propose. One agent may drive several vehicles: what it remembers of each is apart.
+    Raises ``InvalidInput`` for what is not an agent, or an index that is no whole number from 0.
 
     >>> import ethbrake_marl as eb
     >>> team = eb.Team({1: eb.make_agent("full_brake"), 2: eb.make_agent("copy_leader")}, "mixed")
@@ -286,10 +205,6 @@ class Team:
                 raise InvalidInput(f"team {name!r}: {vehicle!r}: must be the index of a vehicle, 0 or more")
             if not isinstance(agent, Agent):
                 raise InvalidInput(f"team {name!r}: vehicle_{vehicle + 1} is driven by {agent!r}, which is no agent")
-        if len({id(agent) for agent in drivers.values()}) < len(drivers):
-            raise InvalidInput(
-                f"team {name!r}: one object drives two vehicles; Team.copies gives each vehicle its own copy"
-            )
         self.drivers = {int(vehicle): drivers[vehicle] for vehicle in sorted(drivers)}
         self.name, self.shield = name, shield
 
@@ -300,15 +215,15 @@ class Team:
 
     @classmethod
     def copies(cls, agent: Agent, vehicles: Collection[int]) -> Team:
-        """A team in which each of ``vehicles`` is driven by its own copy of ``agent``."""
-        return cls({vehicle: copy.deepcopy(agent) for vehicle in vehicles}, agent.name)
+        """A team in which each of ``vehicles`` is driven by ``agent``."""
+        return cls(dict.fromkeys(vehicles, agent), agent.name)
 
 
-Driver = Team | Agent | Shielding  # an agent alone drives every learner, each by its own copy
+Driver = Team | Agent | Shielding  # an agent alone drives every learner
 
 
 def team_of(driver: Driver, learners: Collection[int]) -> Team:
-    """Fresh copies, one for each of the ``learners``. Raises ``InvalidInput`` for a team of other vehicles."""
+    """Who drives each of the ``learners``. Raises ``InvalidInput`` for a team of other vehicles."""
     if isinstance(driver, Shielding):
         return driver.on(learners)
     if not isinstance(driver, Team):
@@ -317,7 +232,7 @@ def team_of(driver: Driver, learners: Collection[int]) -> Team:
         raise InvalidInput(
             f"team {driver.name!r} drives {_names(driver.drivers)}; the vehicles to drive are {_names(learners)}"
         )
-    return copy.deepcopy(driver)
+    return driver
 
 
 def _names(vehicles: Collection[int]) -> str:

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import copy
 import re
 import time
-from typing import ClassVar
+from collections.abc import Mapping
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Agent, AgentAround, Source, check_agent, fixed_commands, place, recall
+from ethbrake_marl.agents.protocol import Agent, AgentAround, Source, check_agent, fixed_commands
 from ethbrake_marl.agents.registry import AgentSettings
-from ethbrake_marl.agents.rollout import drive, record_commands, script_agents, set_others
+from ethbrake_marl.agents.rollout import drive, record_commands
 from ethbrake_marl.defaults import HarmCount
-from ethbrake_marl.engine.stream import ask_script, begin_script
+from ethbrake_marl.engine import Memory, Script, ask_script, begin_script, take_memory
 from ethbrake_marl.errors import InvalidInput, check_whole_number, renumbered
 from ethbrake_marl.harm import check_harm_count
-from ethbrake_marl.physics import Floats, Ints, Worlds
-from ethbrake_marl.physics.kernel import CLOCK, decision_at
+from ethbrake_marl.physics import CLOCK, Decisions, Floats, Worlds
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search import ProfileProblem, Refinement, profile_problem, refine_commands
+from ethbrake_marl.search import ProfileProblem, Refinement, profile_problem
 
 # The compiled refinement of a policy: a search around its own episode at the alert, which then drives.
 
@@ -51,7 +49,6 @@ class RefinedProfile(AgentAround):
     """
 
     adds = Source.MODEL
-    divides_along: ClassVar[tuple[str, ...]] = ("_commands", "_start_s", "predicted_harm")
 
     def __init__(
         self, policy: Agent, scenario: Scenario, *, candidates: int = CANDIDATES, harm_count: HarmCount = "first"
@@ -62,25 +59,19 @@ class RefinedProfile(AgentAround):
         super().__init__(policy, f"{policy.name}+refined:profile")
         self.scenario, self.candidates = scenario, candidates
         self.harm_count: HarmCount = harm_count
-        self.predicted_harm: Floats = np.empty(0)
-        steps = int(np.ceil(scenario.horizon_s / scenario.time_step_s)) + 1
-        self._commands: Floats = np.empty((0, steps))  # [n, steps] m/s2
-        self._start_s: Floats = np.empty(0)  # of the first decision
-        self._stage = copy.deepcopy(policy)
+        self._steps = int(np.ceil(scenario.horizon_s / scenario.time_step_s)) + 1
 
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """Search for these rows; ``worlds`` holds those rows only, at the alert."""
-        scripts = script_agents(self.scenario, except_for=vehicle)
-        others = fixed_commands(scripts, worlds, f"agent {self.name!r}", vehicle=vehicle)
-        problem = self._problem(worlds, vehicle, others)
-        own = record_commands(self._stage, worlds, self.scenario, vehicle, int(problem.last_step.max()))
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        """Search in these worlds."""
+        others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
+        problem = self._problem(alert, vehicle, others)
+        own = record_commands(self.policy, alert, self.scenario, vehicle, int(problem.last_step.max()))
         found = self._search(problem, own)
-        more = self._commands.shape[1] - own.shape[1]
-        commands = np.pad(found.commands_mps2, ((0, 0), (0, more)), mode="edge")
-        self._commands = place(self._commands, rows, commands)
-        self._start_s = place(self._start_s, rows, problem.clock[:, CLOCK.START])
-        harm = found.first_impact_harm if self.harm_count == "first" else found.total_harm
-        self.predicted_harm = place(self.predicted_harm, rows, harm)
+        return {
+            "commands_mps2": np.pad(found.commands_mps2, ((0, 0), (0, self._steps - own.shape[1])), mode="edge"),
+            "start_s": problem.clock[:, CLOCK.START].copy(),  # of the first decision
+            "predicted_harm": found.first_impact_harm if self.harm_count == "first" else found.total_harm,
+        }
 
     def _problem(self, worlds: Worlds, vehicle: int, others_mps2: Floats) -> ProfileProblem:
         return profile_problem(
@@ -94,14 +85,12 @@ class RefinedProfile(AgentAround):
 
     def _search(self, problem: ProfileProblem, commands_mps2: Floats) -> Refinement:
         """The best that is found around these commands."""
-        return refine_commands(problem, commands_mps2, budget=self.candidates)
+        return problem.refine(commands_mps2, budget=self.candidates)
 
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """The command of the step, [n] m/s2. Raises ``InvalidInput`` if an episode never began."""
-        start = recall(self._start_s, worlds.n, self.name)
-        step = decision_at(worlds.time_s, start, self.scenario.time_step_s)
-        at: Floats = self._commands[np.arange(worlds.n), np.clip(step, 0, self._commands.shape[1] - 1)]
-        return at
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        """The command of the step, [n] m/s2."""
+        step = Decisions(memory["start_s"], self.scenario.time_step_s).latest(worlds.time_s)
+        return memory["commands_mps2"][np.arange(worlds.n), np.clip(step, 0, self._steps - 1)], memory
 
 
 # The compiled refinement once more at every decision, from the worlds as they are then.
@@ -134,51 +123,48 @@ class RefinedAgain(RefinedProfile):
 
     """
 
-    divides_along: ClassVar[tuple[str, ...]] = (*RefinedProfile.divides_along, "_others_mps2", "_planned_s")
-
     def __init__(self, policy: Agent, scenario: Scenario, argument: str, *, harm_count: HarmCount = "first") -> None:
         candidates, self._microseconds = _budget(argument)
         super().__init__(policy, scenario, candidates=candidates, harm_count=harm_count)
         self.name = f"{policy.name}+refined:{argument}"
-        self._others_mps2: Floats = np.empty((0, scenario.vehicles))  # [n, N]
-        self._planned_s: Floats = np.empty(0)  # [n] when the plan was made
 
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """Make the first plan of these rows' episodes."""
-        super().begin(worlds, vehicle, rows)
-        scripts = script_agents(self.scenario, except_for=vehicle)
-        others = fixed_commands(scripts, worlds, f"agent {self.name!r}", vehicle=vehicle)
-        self._others_mps2 = place(self._others_mps2, rows, others)
-        self._planned_s = place(self._planned_s, rows, self._start_s[rows])
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        """Make the first plan of these episodes."""
+        begun = super().begin(alert, vehicle, scripts)
+        others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
+        return {**begun, "others_mps2": others, "planned_s": begun["start_s"]}
 
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """The first command of the new plans, [n] m/s2. Raises ``InvalidInput`` if an episode never began."""
-        planned = recall(self._planned_s, worlds.n, self.name)
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        """The first command of the new plans, [n] m/s2."""
+        planned = memory["planned_s"]
         moving = (worlds.speeds_mps != 0.0).any(axis=1)
         rows = np.flatnonzero((worlds.time_s > planned) & (worlds.time_s < self.scenario.horizon_s) & moving)
         if rows.size:
-            self._plan_again(worlds.take(rows), vehicle, rows)
-        return super().act(worlds, vehicle)
+            plan, planned = memory["commands_mps2"].copy(), planned.copy()
+            plan[rows] = self._plan_again(worlds.take(rows), vehicle, take_memory(memory, rows))
+            planned[rows] = worlds.time_s[rows]
+            memory = {**memory, "commands_mps2": plan, "planned_s": planned}
+        return super().act(worlds, memory, vehicle)
 
-    def _plan_again(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """Search around what is left of the plans of ``rows``; ``worlds`` holds those rows only, as they are now."""
-        problem = self._problem(worlds, vehicle, self._others_mps2[rows])
-        step = decision_at(worlds.time_s, self._start_s[rows], self.scenario.time_step_s)
+    def _plan_again(self, worlds: Worlds, vehicle: int, held: Memory) -> Floats:
+        """The plans [m, steps] with what is left of them searched around, from the worlds as they are now."""
+        plan: Floats = held["commands_mps2"]
+        problem = self._problem(worlds, vehicle, held["others_mps2"])
+        step = Decisions(held["start_s"], self.scenario.time_step_s).latest(worlds.time_s)
         later = step[:, np.newaxis] + np.arange(int(problem.last_step.max()))
-        last = self._commands.shape[1] - 1
-        left = self._commands[rows[:, np.newaxis], np.minimum(later, last)]
-        found = self._search(problem, left).commands_mps2
+        rows, last = np.arange(worlds.n)[:, np.newaxis], self._steps - 1
+        found = self._search(problem, plan[rows, np.minimum(later, last)]).commands_mps2
         inside = later <= last
-        self._commands[np.broadcast_to(rows[:, np.newaxis], later.shape)[inside], later[inside]] = found[inside]
-        self._planned_s[rows] = worlds.time_s
+        plan[np.broadcast_to(rows, later.shape)[inside], later[inside]] = found[inside]
+        return plan
 
     def _search(self, problem: ProfileProblem, commands_mps2: Floats) -> Refinement:
         """The best that is found around these commands in the budget."""
         stop = time.perf_counter() + 1e-6 * self._microseconds * problem.n
-        found, seed = refine_commands(problem, commands_mps2, budget=self.candidates), 0
+        found, seed = problem.refine(commands_mps2, budget=self.candidates), 0
         while time.perf_counter() < stop:
             seed += 1
-            found = refine_commands(problem, found.commands_mps2, budget=self.candidates, seed=seed)
+            found = problem.refine(found.commands_mps2, budget=self.candidates, seed=seed)
         return found
 
 
@@ -233,7 +219,6 @@ class Refined(AgentAround):
     """
 
     adds = Source.MODEL  # in which it tries them
-    divides_along = ("_deviation", "predicted_harm")
 
     def __init__(
         self,
@@ -253,14 +238,11 @@ class Refined(AgentAround):
         self.tries = tries
         self.rounds = rounds
         self.harm_count: HarmCount = harm_count
-        self.predicted_harm: Floats = np.empty(0)
-        self._deviation: Floats = np.empty((0, _SEGMENTS))  # [n, segments] that is driven
-        self._stage = copy.deepcopy(policy)  # trying must not disturb the policy's memory of running episodes
 
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """Search for these rows; ``worlds`` holds those rows only, at the alert."""
-        best = np.zeros((worlds.n, _SEGMENTS))
-        least = self._harm(worlds, vehicle, best)
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        """Search in these worlds."""
+        best = np.zeros((alert.n, _SEGMENTS))
+        least = self._harm(alert, vehicle, best)
         for number in range(self.rounds):
             change = changes(number, self.tries)
             open_rows = np.flatnonzero(least > 0.0)
@@ -269,25 +251,23 @@ class Refined(AgentAround):
                 tried = best[some, np.newaxis] + change  # [worlds, tries, segments]
                 each = np.repeat(some, len(change))
                 with renumbered(each):
-                    harm = self._harm(worlds.take(each), vehicle, tried.reshape(-1, _SEGMENTS))
+                    harm = self._harm(alert.take(each), vehicle, tried.reshape(-1, _SEGMENTS))
                 harm = harm.reshape(len(some), len(change))
                 chosen = harm.argmin(axis=1)
                 better = harm[np.arange(len(some)), chosen] < least[some]
                 best[some[better]] = tried[better, chosen[better]]
                 least[some[better]] = harm[better, chosen[better]]
-        set_others(self.policy, vehicle, script_agents(self.scenario, except_for=vehicle))
-        begin_script(self.policy, worlds, vehicle, rows)
-        self._deviation = place(self._deviation, rows, best)
-        self.predicted_harm = place(self.predicted_harm, rows, least)
+        policy = begin_script(self.policy, alert, vehicle, scripts)
+        return {"policy": policy, "deviation": best, "predicted_harm": least}
 
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """Wanted signed acceleration, [n] m/s2. Raises ``InvalidInput`` if an episode never began."""
-        deviation = recall(self._deviation, worlds.n, self.name)
-        return deviate(ask_script(self.policy, worlds, vehicle), deviation, worlds, vehicle)
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        """Wanted signed acceleration, [n] m/s2."""
+        command, policy = ask_script(self.policy, worlds, memory["policy"], vehicle)
+        return deviate(command, memory["deviation"], worlds, vehicle), {**memory, "policy": policy}
 
     def _harm(self, worlds: Worlds, vehicle: int, deviation: Floats) -> Floats:
         """Harm under one deviation per world, [n]."""
-        return drive(worlds, _Deviating(self._stage, deviation, self.name), self.scenario, vehicle).ledger.world_harm(
+        return drive(worlds, _Deviating(self.policy, deviation, self.name), self.scenario, vehicle).ledger.world_harm(
             self.harm_count
         )
 
@@ -308,8 +288,9 @@ class _Deviating(AgentAround):
         super().__init__(policy, name)
         self.deviation = deviation  # [n, segments]
 
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        return deviate(ask_script(self.policy, worlds, vehicle), self.deviation, worlds, vehicle)
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        command, memory = ask_script(self.policy, worlds, memory, vehicle)
+        return deviate(command, self.deviation, worlds, vehicle), memory
 
 
 def changes(number: int, tries: int) -> Floats:

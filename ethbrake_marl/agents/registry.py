@@ -22,8 +22,7 @@ from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, describe_error, unknown_name
 from ethbrake_marl.files.plugins import load_function, note_file
 from ethbrake_marl.harm import check_harm_count
-from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.scenario.fields import parse_agent_spec
+from ethbrake_marl.scenario import Scenario, ScriptSpec
 
 # The grammar of agents: ``name[:argument][@policy]``, and behind it what is put around that agent.
 #
@@ -89,7 +88,7 @@ def parse_spec(spec: str) -> AgentSpec:
             )
         return AgentSpec(match["name"], match["argument"], match["policy"], around)
     head, at, path = core.partition("@")
-    name, argument = parse_agent_spec(head if at else core)
+    name, argument = ScriptSpec.parse(head if at else core)
     if at and not path:
         raise InvalidInput(f"agent {spec!r}: a path is needed after '@'")
     return AgentSpec(name, argument, path if at else None, around)
@@ -98,7 +97,7 @@ def parse_spec(spec: str) -> AgentSpec:
 def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
     core, around = spec if isinstance(spec, str) else "", list[str]()
     if not core:
-        parse_agent_spec(spec)  # says what is right
+        ScriptSpec.parse(spec)  # says what is right
     while True:
         before, plus, last = core.rpartition("+")
         if not plus or not is_around(last):
@@ -193,22 +192,13 @@ _FROM_FILE = "agents.registry:make_from_file"
 _ENTRIES: dict[str, Entry] = {
     "coast": Entry("coast", "nothing at all", (Source.SENSORS,), f"{_SCRIPTS}:make_state_free"),
     "full_brake": Entry(
-        "full_brake",
-        "full braking, the paper's non-ethical strategy",
-        (Source.SENSORS,),
-        f"{_SCRIPTS}:make_state_free",
+        "full_brake", "full braking, the paper's non-ethical strategy", (Source.SENSORS,), f"{_SCRIPTS}:make_state_free"
     ),
     "constant": Entry(
-        "constant:A",
-        "this deceleration in m/s2; negative drives",
-        (Source.SENSORS,),
-        f"{_SCRIPTS}:make_state_free",
+        "constant:A", "this deceleration in m/s2; negative drives", (Source.SENSORS,), f"{_SCRIPTS}:make_state_free"
     ),
     "copy_leader": Entry(
-        "copy_leader",
-        "brakes as hard as the vehicle in front can",
-        (Source.STATE,),
-        f"{_SCRIPTS}:make_copy_leader",
+        "copy_leader", "brakes as hard as the vehicle in front can", (Source.STATE,), f"{_SCRIPTS}:make_copy_leader"
     ),
     "gentlest_front": Entry(
         "gentlest_front",
@@ -233,7 +223,7 @@ _ENTRIES: dict[str, Entry] = {
         "best_harm[:CANDIDATES]",
         "the best profile known; a search at the alert where none is known",
         (Source.MODEL,),
-        "limits.best_harm:make_best_harm",
+        "limits.limits:make_best_harm",
     ),
     "ppo": Entry("ppo@PATH", "a policy trained by PPO: a run, a bundle, or shipped", (Source.MESSAGES,), _POLICIES),
     "sac": Entry("sac@PATH", "a policy trained by SAC: a run, a bundle, or shipped", (Source.MESSAGES,), _POLICIES),

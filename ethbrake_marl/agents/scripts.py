@@ -2,40 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
-from ethbrake_marl.agents.e_v2x_bm_kernel import optimise_pairwise
-from ethbrake_marl.agents.protocol import Agent, Source, place, recall
+from ethbrake_marl.agents.e_v2x_bm import optimise_pairwise
+from ethbrake_marl.agents.protocol import Agent, Source
 from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.engine import Script
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics import Floats, Ints, Worlds
-from ethbrake_marl.scenario.fields import constant_command, is_state_free
+from ethbrake_marl.physics import Floats, Worlds
+from ethbrake_marl.scenario import ScriptSpec
 
 
 class StateFree:
     """``full_brake``, ``coast`` or ``constant:a`` (deceleration in m/s2): the same command whatever happens.
 
     ``full_brake`` of every vehicle is the paper's non-ethical strategy. Raises ``InvalidInput`` for any other script
-    and, at ``begin``, for a constant beyond the vehicle's capacity.
+    and for a constant beyond the vehicle's capacity.
     """
 
     state_free = True
     knows = Source.SENSORS
 
     def __init__(self, spec: str) -> None:
-        if not is_state_free(spec):
+        if not ScriptSpec.parse(spec).is_state_free():
             raise InvalidInput(f"agent {spec!r}: must be full_brake, coast or constant:a")
         self.name = spec
-
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """Check the command against these worlds' capacities."""
-        self.act(worlds, vehicle)
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """The constant command, [n] m/s2."""
         vehicles = worlds.vehicles
-        command = constant_command(
-            self.name, vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
+        command = ScriptSpec.parse(self.name).command(
+            vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
         )
         assert command is not None
         return command
@@ -50,10 +49,6 @@ class CopyLeader:
     name = "copy_leader"
     state_free = True
     knows = Source.STATE
-
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """Nothing to remember."""
-        _check_has_front(self.name, vehicle)
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """``-min(a_front, a_own)``, [n] m/s2."""
@@ -73,19 +68,15 @@ class GentlestFront:
     state_free = True  # once the episode has begun
     knows = Source.STATE
 
-    def __init__(self) -> None:
-        self._deceleration_mps2: Floats = np.empty(0)
-
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """Compute the deceleration of these rows' episodes."""
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Floats:
+        """The command of these episodes."""
         _check_has_front(self.name, vehicle)
-        least = optimise_pairwise(worlds, vehicle).spares_front_mps2
-        chosen = np.minimum(least, worlds.vehicles.braking_capacity_mps2[:, vehicle])
-        self._deceleration_mps2 = place(self._deceleration_mps2, rows, chosen)
+        least = optimise_pairwise(alert, vehicle).spares_front_mps2
+        return -np.minimum(least, alert.vehicles.braking_capacity_mps2[:, vehicle])
 
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """Minus that deceleration, [n] m/s2."""
-        return -recall(self._deceleration_mps2, worlds.n, self.name)
+    def act(self, worlds: Worlds, memory: Floats, vehicle: int) -> tuple[Floats, Floats]:
+        """That command, [n] m/s2."""
+        return memory, memory
 
 
 def make_state_free(argument: str | None, settings: AgentSettings) -> Agent:

@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 import gc
+import io
 import os
 import sys
-from collections.abc import Mapping, Sequence
+import time
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import redirect_stdout
+from pathlib import Path
+from typing import Annotated, Any
 
+import typer
 from typer.exceptions import TyperException
+from typer.main import get_command
 
-from ethbrake_marl.cli import doctor, evaluate, scenario, search, study, train, watch
-from ethbrake_marl.cli.command import app, whole_command
-from ethbrake_marl.cli.out import abandon_output, prepare_streams, say
-from ethbrake_marl.errors import EthBrakeError, naming_extras
+from ethbrake_marl.cli import doctor, evaluate, scenario, search, train
+from ethbrake_marl.cli.command import EVERY_S, Out, app
+from ethbrake_marl.envs import register_environments
+from ethbrake_marl.errors import AlreadyExists, EthBrakeError, IncompleteTable, WithoutEffect, naming_extras
+from ethbrake_marl.files.plugins import load_plugin
+from ethbrake_marl.kernel_store import is_temporary, on_first_compilation
 
-__all__ = ["app", "doctor", "evaluate", "main", "run_command", "scenario", "search", "study", "train", "watch"]
+__all__ = ["app", "doctor", "evaluate", "main", "run_command", "scenario", "search", "train"]
 
 BAD_INPUT = 2
 _NO_VARIABLE = ""  # by which no shell can ask for completion
@@ -69,5 +79,111 @@ def _shell_asks(environment: Mapping[str, str]) -> bool:
 
 def _refuse(reason: str) -> int:
     """Say why, in one line; gives the exit status."""
-    say(f"ethbrake: error: {reason}")
+    Out().note(f"ethbrake: error: {reason}")
     return BAD_INPUT
+
+
+def prepare_streams() -> None:
+    """Show ``?`` for what stdout's encoding does not have (m², box lines in Latin-1) instead of failing at the end.
+
+    The package's own warnings are one line each, and one says why the first command takes longer.
+    """
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
+    shown = warnings.showwarning
+
+    def show_warning(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        if issubclass(category, IncompleteTable | WithoutEffect):
+            Out().note(f"warning: {message}")
+        else:
+            shown(message, category, *place, **more)
+
+    warnings.showwarning = show_warning
+    on_first_compilation(tell_compilation)
+
+
+def tell_compilation(folder: Path, empty: bool) -> None:
+    """Say what is compiled, when it begins, and every ten seconds how many kernels are, as long as that takes."""
+    if is_temporary(folder):
+        Out().note(
+            "compiling the physics; no folder can be written to keep it, so every command does (ethbrake doctor)"
+        )
+    elif empty:
+        Out().note("compiling the physics, once: minutes of one core, then it is kept")
+    else:
+        Out().note("compiling what was not used before, once, then it is kept")
+    from numba.core import event  # loaded by whatever compiles, and by nothing that does not
+
+    events: Any = event  # numba's own types end here
+    begun, said, count = time.monotonic(), time.monotonic(), 0
+
+    class Count(event.Listener):  # type: ignore[misc]  # numba has no types
+        def on_start(self, event_: event.Event) -> None:
+            """Nothing: it counts what is done."""
+
+        def on_end(self, event_: event.Event) -> None:
+            nonlocal said, count
+            count, now = count + 1, time.monotonic()
+            if now - said >= EVERY_S:
+                said = now
+                Out().note(f"compiling: {count} kernels in {now - begun:.0f} s so far")
+
+    events.register("numba:compile", Count())
+
+
+def abandon_output() -> None:
+    """Drop what stdout still holds and cannot hand on (a full disk), or Python fails a second time when it ends."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _load_all(sources: list[str] | None) -> None:
+    with redirect_stdout(sys.stderr):
+        for source in sources or ():
+            register_environments()
+            load_plugin(source)
+
+
+PluginOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--plugin",
+        metavar="FILE.py|NAME",
+        help="Load this file, or installed plug-in, first: it is code, and can do what you can. Repeatable.",
+        is_eager=True,  # before the values of other options are looked at
+        expose_value=False,
+        callback=_load_all,
+    ),
+]
+
+
+def whole_command() -> Any:
+    """All commands, users' own among them, with ``--plugin`` on each and on every group.
+
+    Raises ``AlreadyExists`` for a command of somebody's that would take the place of another one.
+    """
+    names = [each.name or each.callback.__name__.replace("_", "-") for each in app.registered_commands if each.callback]
+    names += [str(group.name) for group in app.registered_groups]
+    for k, name in enumerate(names):
+        if name in names[:k]:
+            raise AlreadyExists(f"command {name!r} is there already; give yours another name: app.command('my-{name}')")
+    only_option = typer.Typer(add_completion=False)
+
+    @only_option.command()
+    def takes_plugins(plugin: PluginOption = None) -> None:
+        """Nothing but the option, as Typer makes it."""
+
+    (option,) = get_command(only_option).params
+    whole = get_command(app)
+    for each in _all(whole):
+        each.params.append(option)
+    return whole
+
+
+def _all(command: Any) -> Iterator[Any]:
+    """A command, and every one inside it."""
+    yield command
+    for each in getattr(command, "commands", {}).values():
+        yield from _all(each)

@@ -1,25 +1,170 @@
-"""The frame of every command: groups, options that commands share, help, plug-ins, and where a wrong name leads."""
+"""The frame of every command: groups, shared options, help, plug-ins, where a wrong name leads, and its output."""
 
 from __future__ import annotations
 
+import json
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import redirect_stdout
 from difflib import get_close_matches
 from functools import wraps
 from inspect import Parameter, Signature, signature
-from typing import Annotated, Any, TypeVar, get_origin, get_type_hints
+from pathlib import Path
+from typing import Annotated, Any, NoReturn, TextIO, TypeVar, get_origin, get_type_hints
 
 import typer
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.segment import Segment
 from typer.core import TyperArgument, TyperCommand, TyperGroup
-from typer.main import get_command
 
 from ethbrake_marl import __version__
-from ethbrake_marl.cli.out import Out
-from ethbrake_marl.defaults import UNCERTAINTY_EXAMPLE
-from ethbrake_marl.envs.registration import register_environments
-from ethbrake_marl.errors import AlreadyExists, check_whole_number, need
-from ethbrake_marl.files.plugins import load_plugin
+from ethbrake_marl.defaults import DEFAULT
+from ethbrake_marl.envs import register_environments
+from ethbrake_marl.errors import InvalidInput, Progress as PartProgress, check_whole_number, need, one_line, plain_text
+
+_KEPT = "\n\t\N{NO-BREAK SPACE}"  # in lines of a result; the last stands between a number and its unit
+EVERY_S = 10.0  # between two signs of life where stderr is no terminal
+INTERRUPTED = 130  # 128 + SIGINT, as shells expect
+PAGES = (".html", ".htm")
+
+
+def say(text: str) -> None:
+    """One line to the person at the terminal, on stderr."""
+    typer.echo(one_line(text), err=True)
+
+
+class Out:
+    """The output of one command.
+
+    ``as_json``: results are wanted as JSON. ``force``: files are replaced. ``kept``: what Ctrl-C leaves, in words.
+    Made before stdout is turned to stderr, for what a user's agent prints: results alone go to the stdout of then.
+    """
+
+    def __init__(self, *, as_json: bool = False, force: bool = False, kept: str = "nothing was written") -> None:
+        self.as_json, self.force, self.kept = as_json, force, kept
+        self._stdout = sys.stdout
+        self._stderr: Console = _PlainConsole(sys.stderr)
+        self._bars: Progress | None = None
+        self._tasks: dict[str, TaskID] = {}
+        self._last_label, self._last_done, self._said_s = "", False, 0.0
+        self._begun: dict[str, tuple[float, int]] = {}  # when each part was first heard of, and how far it was
+
+    def result(self, content: Any, *shown: RenderableType) -> None:
+        """The result: ``content`` as JSON where that is asked for, else what is ``shown``."""
+        if self.as_json:
+            self.print_json(content)
+        else:
+            self.show(*shown)
+
+    def print_json(self, content: Any) -> None:
+        """JSON on stdout, asked for or not."""
+        self.end_progress()
+        typer.echo(json.dumps(content, indent=2, allow_nan=False), self._stdout)
+
+    def show(self, *shown: RenderableType, end: str = "\n") -> None:
+        """Texts and tables of a result; nothing in a text but line ends and tabs moves the cursor."""
+        self.end_progress()
+        for each in shown:
+            if isinstance(each, str):
+                typer.echo(plain_text(each, keep=_KEPT) + end, self._stdout, nl=False)
+            else:  # at the terminal's width, or 100 columns in a file
+                _PlainConsole(self._stdout, width=None if self._stdout.isatty() else 100).print(each)
+
+    def note(self, text: str) -> None:
+        """One line to the person at the terminal, below the progress."""
+        self.end_progress()
+        say(text)
+
+    def check(self, path: Path | None, *endings: str, what: str = "the file") -> None:
+        """Refuse, before any work, a file that cannot be written; None: none is wanted."""
+        if path is None:
+            return
+        if endings and path.suffix.lower() not in endings:
+            raise InvalidInput(f"{path}: {what} must end in {' or '.join(endings)}")
+        from ethbrake_marl.evaluation import check_target
+
+        check_target(path, force=self.force)
+
+    def write(self, path: Path, content: bytes | str, what: str | None = None) -> None:
+        """Write a file in one step, and say ``what`` it is."""
+        from ethbrake_marl.evaluation import write_output
+
+        write_output(path, content.encode() if isinstance(content, str) else content, force=self.force)
+        if what is not None:
+            self.note(f"{what}: {path}")
+
+    def interrupted(self, told: str) -> NoReturn:
+        """End the command as Ctrl-C does, with one line."""
+        self.note(told)
+        raise typer.Exit(INTERRUPTED)
+
+    def progress(
+        self,
+        name: str,
+        done: int,
+        total: int,
+        metrics: Mapping[str, float] | None = None,
+        note: str = "",
+        label: str | None = None,
+    ) -> None:
+        """The part ``name`` has come to ``done`` of ``total``; ``note`` is said once, above the bars.
+
+        On a terminal one bar per part, else a line: news, and every ten seconds. ``label`` is what stands before the
+        figures, by default the name and the harm.
+        """
+        harm = (metrics or {}).get("first_impact_harm")
+        label = one_line(label or (name if harm is None else f"{name}, first-impact harm {harm:.2f}"))
+        if not self._stderr.is_terminal:
+            if note:
+                say(note)
+            self._say_progress(name, label, done, total)
+            return
+        if note:
+            self._stderr.print(one_line(note), highlight=False)
+        if self._bars is None:
+            text = TextColumn("{task.description}", markup=False)
+            self._bars = Progress(text, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=self._stderr)
+            self._bars.start()
+        if name not in self._tasks:
+            self._tasks[name] = self._bars.add_task(label, total=total)
+        self._bars.update(self._tasks[name], completed=min(done, total), total=total, description=label)
+
+    def _say_progress(self, name: str, label: str, done: int, total: int) -> None:
+        now = time.monotonic()
+        news = label != self._last_label or (done >= total and not self._last_done)
+        begun_s, first = self._begun.setdefault(name, (now, done))
+        if news or now - self._said_s >= EVERY_S:
+            left_s = (now - begun_s) * (total - done) / (done - first) if done > first else 0.0
+            say(f"{label}: {done:,} of {total:,}{f', about {left_s:.0f} s left' if left_s >= 1.0 else ''}")
+            self._said_s = now
+        self._last_label, self._last_done = label, done >= total
+
+    def show_progress(self, progress: PartProgress) -> None:
+        """``progress`` of a ``Progress``, as the package tells it."""
+        self.progress(progress.name, progress.done, progress.total, progress.metrics, progress.note)
+
+    def end_progress(self) -> None:
+        """Leave the bars as they are; what comes next stands below them."""
+        if self._bars is not None:
+            self._bars.stop()
+            self._bars, self._tasks = None, {}
+
+
+class _PlainConsole(Console):
+    """Shows text as it is: no markup in the names of agents and paths, and nothing that commands the terminal."""
+
+    def __init__(self, file: TextIO, *, width: int | None = None) -> None:
+        super().__init__(file=file, width=width, markup=False, emoji=False, highlight=False)
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+        """The pieces of a line or table; those that rich made to style and move keep what they hold."""
+        for piece in super().render(renderable, options):
+            yield piece if piece.control else Segment(plain_text(piece.text, keep=_KEPT), piece.style)
+
+
+# The frame of every command: groups, options that commands share, help, plug-ins, and where a wrong name leads.
 
 Run = TypeVar("Run", bound=Callable[..., None])
 
@@ -45,7 +190,8 @@ OPTIONS: dict[str, Any] = {  # of parameters that bring no option of their own, 
     "world": typer.Option(help="Number of the world in the list.", min=0),
     "harm_count": typer.Option(help="Harm that agents minimise: first impacts only, or all."),
     "uncertainty": typer.Option(
-        metavar="QUANTITY=WIDTH,...", help=f"What the robust shield does not know, such as {UNCERTAINTY_EXAMPLE}."
+        metavar="QUANTITY=WIDTH,...",
+        help=f"What the robust shield does not know, such as {DEFAULT.UNCERTAINTY_EXAMPLE}.",
     ),
     "jobs": typer.Option(
         help=f"So many at once, up to {MOST_JOBS}, a process each; changes no result.", callback=_check_jobs
@@ -157,18 +303,6 @@ def new_group(name: str, about: str, *examples: str, inside: typer.Typer | None 
     return group
 
 
-def schema_option(schema: Callable[[], dict[str, Any]]) -> Any:
-    """The option ``--schema`` of a command that reads files of one kind: print their JSON Schema and exit."""
-
-    def show_schema(asked: bool) -> None:
-        if asked:
-            Out().print_json(schema())
-            raise typer.Exit
-
-    told = "Print the JSON Schema of the file, and exit."
-    return Annotated[bool, typer.Option("--schema", is_eager=True, callback=show_schema, help=told)]
-
-
 class CommandWithParts(TyperCommand):
     """A command whose help ends with the names that recipes and scenarios may have."""
 
@@ -181,12 +315,11 @@ class CommandWithParts(TyperCommand):
 
 def part_names() -> list[tuple[str, str]]:
     """Kinds of parts, each with its names; what is registered is among them."""
-    from ethbrake_marl.evaluation.measures import REGISTERED
+    from ethbrake_marl.evaluation import REGISTERED
     from ethbrake_marl.harm import KINDS
-    from ethbrake_marl.learning.recipe import algorithm_names
+    from ethbrake_marl.learning import algorithm_names
     from ethbrake_marl.rewards import TERMS
-    from ethbrake_marl.scenario.features import FEATURES
-    from ethbrake_marl.scenario.v2x import CHANNELS
+    from ethbrake_marl.scenario import CHANNELS, FEATURES
 
     own = [name if entry.of == "own" else f"front_K.{name}, rear_K.{name}" for name, entry in FEATURES.items()]
     return [
@@ -297,53 +430,3 @@ def _about(
     ] = False,
 ) -> None:
     """Options of ``ethbrake`` itself."""
-
-
-def _load_all(sources: list[str] | None) -> None:
-    with redirect_stdout(sys.stderr):
-        for source in sources or ():
-            register_environments()
-            load_plugin(source)
-
-
-PluginOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--plugin",
-        metavar="FILE.py|NAME",
-        help="Load this file, or installed plug-in, first: it is code, and can do what you can. Repeatable.",
-        is_eager=True,  # before the values of other options are looked at
-        expose_value=False,
-        callback=_load_all,
-    ),
-]
-
-
-def whole_command() -> Any:
-    """All commands, users' own among them, with ``--plugin`` on each and on every group.
-
-    Raises ``AlreadyExists`` for a command of somebody's that would take the place of another one.
-    """
-    names = [each.name or each.callback.__name__.replace("_", "-") for each in app.registered_commands if each.callback]
-    names += [str(group.name) for group in app.registered_groups]
-    for k, name in enumerate(names):
-        if name in names[:k]:
-            raise AlreadyExists(f"command {name!r} is there already; give yours another name: app.command('my-{name}')")
-    only_option = typer.Typer(add_completion=False)
-
-    @only_option.command()
-    def takes_plugins(plugin: PluginOption = None) -> None:
-        """Nothing but the option, as Typer makes it."""
-
-    (option,) = get_command(only_option).params
-    whole = get_command(app)
-    for each in _all(whole):
-        each.params.append(option)
-    return whole
-
-
-def _all(command: Any) -> Iterator[Any]:
-    """A command, and every one inside it."""
-    yield command
-    for each in getattr(command, "commands", {}).values():
-        yield from _all(each)

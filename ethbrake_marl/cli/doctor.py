@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
@@ -21,17 +21,13 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 
 from ethbrake_marl import __version__
-from ethbrake_marl.cli.command import command, new_group
-from ethbrake_marl.cli.out import EVERY_S, Out, say
+from ethbrake_marl.cli.command import EVERY_S, Out, command, new_group
 from ethbrake_marl.kernel_store import cache_folder, is_temporary
 
 if TYPE_CHECKING:
     from packaging.requirements import Requirement
-
-    from ethbrake_marl.studies.speed import Speed
 
 EXTRAS = ("train", "marl", "export", "data", "render", "explore", "cluster", "tune")
 _TINY = ("--set=n_envs=16", "--set=n_steps=8", "--set=counterfactuals=16", "--set=evaluation.worlds=10")
@@ -161,8 +157,7 @@ def _kernel_cache() -> tuple[bool, str]:
 
 
 def _scenarios() -> tuple[bool, str]:
-    from ethbrake_marl.scenario import list_scenarios, scenario_folder
-    from ethbrake_marl.scenario.schema import SHIPPED
+    from ethbrake_marl.scenario import SHIPPED, list_scenarios, scenario_folder
 
     found = [entry for entry in list_scenarios() if entry.origin == SHIPPED]
     return len(found) > 0, f"{len(found)} in {scenario_folder()}"
@@ -187,7 +182,7 @@ def _golden_baseline() -> tuple[bool, str]:
     """The paper's distance scenario at 7 m and 7 m: E-V2X-BM brakes with 5.17021 m/s2 and expects harm 4.03447."""
     import numpy as np
 
-    from ethbrake_marl.agents.e_v2x_bm_kernel import optimise_pairwise
+    from ethbrake_marl.agents import optimise_pairwise
     from ethbrake_marl.physics import make_worlds
 
     capacity = np.array([6.0, 7.0, 6.0])
@@ -219,9 +214,11 @@ def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str
             done, waiting = wait(waiting, EVERY_S, FIRST_COMPLETED)
             failed += [f"{called[future]} failed: {future.result()}" for future in done if future.result()]
             kept = sum(1 for _ in cache_folder().iterdir())
-            say(f"compile: {len(called) - len(waiting)} of {len(called)} commands done, {kept} files in the cache")
+            Out().note(
+                f"compile: {len(called) - len(waiting)} of {len(called)} commands done, {kept} files in the cache"
+            )
     for failure in failed:
-        say(f"compile: {failure}")
+        Out().note(f"compile: {failure}")
     return not failed, "; ".join(failed) or f"what these commands use is compiled, after {perf_counter() - begun:.0f} s"
 
 
@@ -265,36 +262,23 @@ def speed_command(
 
     Medians over repetitions. Other programs that run at the same time make all figures worse.
     """
-    from ethbrake_marl.studies.speed import BENCHMARKS, FULL, QUICK, measure, this_machine
+    from ethbrake_marl.files.sheet import Column, Sheet
+    from ethbrake_marl.studies.speed import BENCHMARKS, FULL, QUICK, WORLD_STEPS, measure, this_machine
 
-    machine = this_machine()
-    speeds: list[Speed] = []
+    machine, figures, rows = this_machine(), [], []
     for speed in measure(QUICK if quick else FULL):
-        speeds.append(speed)
-        out.progress("speed", len(speeds), len(BENCHMARKS))
-    figures = [asdict(speed) for speed in speeds]
-    out.result({"machine": asdict(machine), "figures": figures}, _speed_table(speeds), f"Machine: {machine}")
-
-
-def _speed_table(speeds: Sequence[Speed]) -> Table:
-    """One line for each figure: what, how many worlds at once, the median, its range, and the aim."""
-    from ethbrake_marl.studies.speed import WORLD_STEPS
-
-    table = Table(caption="Medians over repetitions, and their range. Aim: at least, for seconds at most.")
-    table.add_column("per CPU-second", overflow="fold")
-    for title in ("worlds", "median", "range", "x vehicles", "aim"):
-        table.add_column(title, justify="right", no_wrap=True)
-    for speed in speeds:
+        figures.append(asdict(speed))
         steps = speed.unit == WORLD_STEPS
-        table.add_row(
-            speed.name,
-            f"{speed.worlds:,}",
-            f"{_plain(speed.value)} {speed.unit.removesuffix('/s')}",
+        rows.append((
+            *(speed.name, f"{speed.worlds:,}", f"{_plain(speed.value)} {speed.unit.removesuffix('/s')}"),
             f"{_plain(speed.lowest)} - {_plain(speed.highest)}",
             _plain(speed.value * speed.vehicles) if steps else "",
             "" if speed.floor is None else _plain(speed.floor),
-        )
-    return table
+        ))  # fmt: skip
+        out.progress("speed", len(rows), len(BENCHMARKS))
+    columns: list[Column | str] = ["per CPU-second", *map(Column, ("worlds", "median", "range", "x vehicles", "aim"))]
+    note = "Medians over repetitions, and their range. Aim: at least, for seconds at most."
+    out.result({"machine": asdict(machine), "figures": figures}, Sheet("", columns, rows, note), f"Machine: {machine}")
 
 
 def _plain(value: float) -> str:

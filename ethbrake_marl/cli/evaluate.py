@@ -1,10 +1,10 @@
-"""The commands that measure: ``evaluate``, in one piece or in parts, ``compare`` and ``shield``."""
+"""The commands that measure and show: ``evaluate``, ``compare``, ``shield``, and ``watch ...``."""
 
 from __future__ import annotations
 
 import json
-import os
 import sys
+import webbrowser
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -13,22 +13,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
-from ethbrake_marl.cli.command import app, command
-from ethbrake_marl.cli.out import PAGES, Out, plain_table, say
-from ethbrake_marl.defaults import EPISODES, LIST_SEED, HarmCount
+from ethbrake_marl.cli.command import PAGES, Out, app, command, new_group
+from ethbrake_marl.defaults import DEFAULT, DatasetFormat, HarmCount
 from ethbrake_marl.errors import InvalidInput, check_whole_number, count_of, need
 
 if TYPE_CHECKING:
-    from ethbrake_marl.agents.protocol import Driver
-    from ethbrake_marl.evaluation import Evaluation, SummaryRow
-    from ethbrake_marl.evaluation.results import Comparison
-    from ethbrake_marl.evaluation.shards import Question
-    from ethbrake_marl.evaluation.shield_modes import ModeRow
+    from ethbrake_marl.agents import Driver
+    from ethbrake_marl.evaluation import Evaluation, Question, ShieldModes, SummaryRow, SummaryTable
     from ethbrake_marl.physics import LeftOutRows
     from ethbrake_marl.scenario import Sample, Scenario, Task
-    from ethbrake_marl.studies.jobs import Workers
 
-PROPOSERS = "ppo@shipped,full_brake,constant:3"
+_MOST_PROCESSES = 256
+_PROPOSERS = "ppo@shipped,full_brake,constant:3"
 _INTERVALS = (
     "Intervals: rates exact (Clopper-Pearson), means by Student's t; all from exact sums, the same bits in any"
     " number of shards."
@@ -37,7 +33,7 @@ _HARMS = {"first_impact_harm": "First-impact harm", "total_harm": "Total harm", 
 _POLICIES = {"same": "the same", "other": "another", "none": ""}
 
 
-def asked_task(
+def _asked_task(
     scenario: str,
     vehicle: str | None,
     settings: Sequence[str] | None,
@@ -46,21 +42,20 @@ def asked_task(
     alone: bool = False,
 ) -> Task:
     """The scenario that is named, with its settings and with who is driven; ``alone``: that is one vehicle."""
-    from ethbrake_marl.evaluation.inputs import load_driven, load_evaluated
-    from ethbrake_marl.learning.recipe import read_settings
+    from ethbrake_marl.evaluation import load_driven
+    from ethbrake_marl.learning import read_settings
     from ethbrake_marl.scenario import Task
 
-    load = load_driven if alone else load_evaluated
-    chosen = load(scenario, vehicle, read_settings(settings).scenario)
+    chosen = load_driven(scenario, vehicle, read_settings(settings).scenario, alone=alone)
     return Task(chosen, chosen.learners, harm_count)
 
 
-def make_drivers(
+def _make_drivers(
     agents: str, scenario: Scenario, harm_count: HarmCount = "first", uncertainty: str | None = None
 ) -> dict[str, Driver]:
     """Who is named on the command line, with commas between them."""
-    from ethbrake_marl.evaluation.inputs import make_lineup
-    from ethbrake_marl.shield.uncertainty import parse_uncertainty
+    from ethbrake_marl.evaluation import make_lineup
+    from ethbrake_marl.shield import parse_uncertainty
 
     intervals = None if uncertainty is None else parse_uncertainty(uncertainty)
     return make_lineup(agents.split(","), scenario, harm_count=harm_count, uncertainty=intervals)
@@ -78,8 +73,10 @@ def evaluate_command(
     out: Out,
     scenario: str = "paper-random",
     agents: str = "full_brake,e_v2x_bm,e_v2x_bm:pairwise",
-    episodes: Annotated[int | None, typer.Option(help="Worlds of the list.", show_default=str(EPISODES))] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the list.", show_default=str(LIST_SEED))] = None,
+    episodes: Annotated[
+        int | None, typer.Option(help="Worlds of the list.", show_default=str(DEFAULT.EPISODES))
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the list.", show_default=str(DEFAULT.LIST_SEED))] = None,
     harm_count: HarmCount = "first",
     uncertainty: str | None = None,
     initial_states: Annotated[
@@ -128,28 +125,40 @@ def evaluate_command(
     +refined, then one shield, +episode, +step or +robust; for instance full_brake+step or ppo@PATH+refined+episode.
     PATH is a run or a policy bundle, or shipped.
     """
-    from ethbrake_marl.evaluation import declared_objectives, evaluate, summarise
-    from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY, check_agents, choose_worlds
-    from ethbrake_marl.evaluation.shards import Question
-    from ethbrake_marl.evaluation.summary import check_group, summarise_by
-    from ethbrake_marl.scenario.fields import kind_columns
+    from ethbrake_marl.evaluation import (
+        PROGRESS_EVERY,
+        Evaluation,
+        Question,
+        Rescored,
+        check_agents,
+        choose_worlds,
+        evaluate,
+        results_to_json,
+        summarise,
+        summarise_by,
+        write_per_world,
+    )
+    from ethbrake_marl.harm import declared_objectives
 
     whole = {"--per-world": per_world, "--report": report, "--initial-states": initial_states, "--by": by}
     _check_shards(shards, jobs, ray, output, rows, whole)
     _check_outputs(out, per_world, report)
-    chosen = asked_task(scenario, vehicle, settings).scenario
+    chosen = _asked_task(scenario, vehicle, settings).scenario
     objectives = declared_objectives(objective or (), chosen.vehicles)
     if shards is not None:
-        lineup = make_drivers(agents, chosen, harm_count, uncertainty)
-        number, list_seed = EPISODES if episodes is None else episodes, LIST_SEED if seed is None else seed
+        lineup = _make_drivers(agents, chosen, harm_count, uncertainty)
+        number, list_seed = (
+            DEFAULT.EPISODES if episodes is None else episodes,
+            DEFAULT.LIST_SEED if seed is None else seed,
+        )
         question = Question(chosen, tuple(lineup), number, list_seed, harm_count, uncertainty, tuple(objectives))
         check_agents(lineup, chosen.sample(1, list_seed).worlds, chosen)
         _evaluate_in_shards(out, question, shards, jobs, ray, output, rows)
         return
     sample, drawn_by = choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
     if by is not None:
-        check_group(kind_columns(sample.types, sample.scenarios), by)
-    lineup = make_drivers(agents, chosen, harm_count, uncertainty)
+        Evaluation.check_group(sample.kinds, by)
+    lineup = _make_drivers(agents, chosen, harm_count, uncertainty)
     check_agents(lineup, sample.worlds, chosen)
     evaluation = evaluate(
         sample,
@@ -159,19 +168,30 @@ def evaluate_command(
         chunk=PROGRESS_EVERY,
         on_progress=lambda agent, done: out.progress(agent, done, sample.worlds.n),
     )
-    summary = summarise(evaluation)
+    summary, told = summarise(evaluation), evaluation.rescore(objectives)
     if report is not None:
         _write_report(out, report, evaluation, summary, lineup, harm_count)
     groups = {} if by is None else summarise_by(evaluation, by)
-    _tell_results(out, evaluation, summary, groups, objectives, per_world, harm_count, uncertainty)
+    if per_world is not None:
+        write_per_world(per_world, evaluation, objectives=objectives, force=out.force)
+    agents_told = {"harm_count": harm_count, "uncertainty": uncertainty}
+    results = results_to_json(summary, told=told, groups=groups, per_world=per_world, settings=agents_told)
+    if per_world is not None:
+        out.write(_beside(per_world), _json_text(results))
+        out.note(f"every world: {per_world}; the results: {_beside(per_world)}")
+    shown = _tables(summary)
+    for name, of_group in groups.items():
+        shown += [f"\n{name}: {count_of(of_group[0].episodes, 'world')}\n", of_group.terminal()]
+    out.result(results, *shown)
+    _tell_horizon(out, summary, sample.worlds.n, chosen)
+    if told and not out.as_json:
+        out.show(Rescored.sheet(told, harm_count))
 
 
 def _check_shards(
     shards: int | None, jobs: int, ray: str | None, output: Path | None, rows: bool, whole: Mapping[str, object]
 ) -> None:
     """Refuse options that do not go together; those of ``whole`` need every world at once."""
-    from ethbrake_marl.studies.shards import MOST_JOBS
-
     if shards is None:
         alone = {"--jobs": jobs != 1, "--ray": ray is not None, "--output": output is not None, "--rows": rows}
         if given := [name for name, is_given in alone.items() if is_given]:
@@ -181,7 +201,7 @@ def _check_shards(
         more = "; for one row per world give --output FOLDER --rows" if "--per-world" in given else ""
         raise InvalidInput(f"{given[0]}: needs every world at once, and --shards keeps none{more}")
     check_whole_number("shards", shards, 1)
-    check_whole_number("jobs", jobs, 1, MOST_JOBS)
+    check_whole_number("jobs", jobs, 1, _MOST_PROCESSES)
     if rows and output is None:
         raise InvalidInput("--rows: needs a folder for them: --output FOLDER")
     if rows:
@@ -192,7 +212,7 @@ def _check_shards(
 
 def _check_outputs(out: Out, per_world: Path | None, report: Path | None) -> None:
     """Refuse outputs that cannot be written, or that would replace one another, before any work."""
-    from ethbrake_marl.evaluation.results import check_per_world
+    from ethbrake_marl.evaluation import check_per_world
 
     out.check(report, *PAGES, what="a report")
     if per_world is None:
@@ -213,111 +233,67 @@ def _evaluate_in_shards(
     out: Out, question: Question, shards: int, jobs: int, ray: str | None, output: Path | None, rows: bool
 ) -> None:
     """Drive the list shard by shard, and print the table that is printed without shards."""
-    from ethbrake_marl.evaluation import rescored_table
-    from ethbrake_marl.evaluation.shards import ask, rescore_shards, shards_to_json, summarise_shards
+    from ethbrake_marl.evaluation import Rescored
     from ethbrake_marl.files.store import write_file
-    from ethbrake_marl.studies.shards import evaluate_shards
+    from ethbrake_marl.studies.jobs import evaluate_shards, open_workers
 
-    asked = ask(question)
+    asked = question.ask()
     if output is not None:
         out.kept = "finished shards are kept: the same command goes on"
     with ExitStack() as stack:
         # on a Ray all cores where --jobs says nothing
-        workers = None if ray is None else stack.enter_context(closing(workers_for(ray, None if jobs == 1 else jobs)))
+        workers = None if ray is None else stack.enter_context(closing(open_workers(ray, None if jobs == 1 else jobs)))
         tally = evaluate_shards(
-            asked,
-            shards=shards,
-            jobs=jobs,
-            workers=workers,
-            folder=output,
-            with_rows=rows,
-            tell=out.show_progress,
+            asked, shards=shards, jobs=jobs, workers=workers, folder=output, with_rows=rows, tell=out.show_progress
         )
-    summary = summarise_shards(asked, tally)
-    results = shards_to_json(asked, tally, summary)
+    summary = asked.summarise(tally)
+    results = asked.to_json(tally, summary)
     if output is not None:
-        write_file(output / "results.json", _json_file(results))
+        write_file(output / "results.json", _json_text(results).encode())
         out.note(f"finished shards: {output}; the results: {output / 'results.json'}")
     out.result(results, *_tables(summary), _INTERVALS)
-    _tell_horizon(summary, tally.worlds, question.scenario)
+    _tell_horizon(out, summary, tally.worlds, question.scenario)
     if question.objectives and not out.as_json:
-        out.show(rescored_table(rescore_shards(asked, tally), question.harm_count))
+        told = tally.rescore(question.objectives, question.scenario.vehicles)
+        out.show(Rescored.sheet(told, question.harm_count))
 
 
-def workers_for(ray: str | None, jobs: int | None) -> Workers:
-    """Where jobs run: processes of this machine, or a Ray; ``jobs`` at once, by default on every usable core.
+def _json_text(content: object) -> str:
+    return json.dumps(content, indent=2, allow_nan=False) + "\n"
 
-    On a cluster None leaves the number to it.
+
+def _tables(rows: SummaryTable) -> list[Any]:
+    return [rows.terminal(), *([rows.metrics_sheet()] if rows and rows[0].metrics else [])]
+
+
+def horizon_note(moving: Mapping[str, int], worlds: int, horizon_s: float) -> str:
+    """What must be said of shielded drivers: in how many worlds, by driver, something still ``moving`` was cut off.
+
+    Empty where there is nothing to say.
     """
-    number = len(os.sched_getaffinity(0)) if jobs is None else jobs
-    if ray is None:
-        from ethbrake_marl.studies.jobs import LocalWorkers
-
-        return LocalWorkers(number)
-    from ethbrake_marl.studies.jobs import LOCAL, RayWorkers
-
-    return RayWorkers(ray, number if ray == LOCAL else jobs)
-
-
-def _tell_results(
-    out: Out,
-    evaluation: Evaluation,
-    summary: Sequence[SummaryRow],
-    groups: Mapping[str, Sequence[SummaryRow]],
-    objectives: Sequence[str],
-    per_world: Path | None,
-    harm_count: HarmCount,
-    uncertainty: str | None,
-) -> None:
-    """Write what was asked for, then print the figures."""
-    from ethbrake_marl.evaluation import rescore, rescored_table, rich_table
-    from ethbrake_marl.evaluation.results import results_to_json, write_per_world
-
-    if per_world is not None:
-        write_per_world(per_world, evaluation, objectives=objectives, force=out.force)
-    told = rescore(evaluation, objectives)
-    agents_told = {"harm_count": harm_count, "uncertainty": uncertainty}
-    results = results_to_json(summary, told=told, groups=groups, per_world=per_world, settings=agents_told)
-    if per_world is not None:
-        out.write(_beside(per_world), _json_file(results))
-        out.note(f"every world: {per_world}; the results: {_beside(per_world)}")
-    shown = _tables(summary)
-    for name, rows in groups.items():
-        shown += [f"\n{name}: {count_of(rows[0].episodes, 'world')}\n", rich_table(rows)]
-    out.result(results, *shown)
-    _tell_horizon(summary, evaluation.worlds.n, evaluation.scenario)
-    if told and not out.as_json:
-        out.show(rescored_table(told, harm_count))
+    found = ", ".join(f"{name} {count}" for name, count in moving.items() if count)
+    if not found:
+        return ""
+    return (
+        f"note: bounds of the shield end at the horizon ({horizon_s:g} s) and say nothing of what comes after;"
+        f" worlds, of {worlds}, that were not at rest then: {found}"
+    )
 
 
-def _json_file(content: object) -> bytes:
-    return (json.dumps(content, indent=2, allow_nan=False) + "\n").encode()
-
-
-def _tables(rows: Sequence[SummaryRow]) -> list[Any]:
-    from ethbrake_marl.evaluation import rich_table
-    from ethbrake_marl.evaluation.summary import metrics_table
-
-    return [rich_table(rows), *([metrics_table(rows)] if rows and rows[0].metrics else [])]
-
-
-def _tell_horizon(rows: Sequence[SummaryRow], worlds: int, scenario: Scenario) -> None:
+def _tell_horizon(out: Out, rows: Sequence[SummaryRow], worlds: int, scenario: Scenario) -> None:
     """Say in how many worlds something still moves at the horizon, if in any."""
-    from ethbrake_marl.evaluation import horizon_note
-
     moving = {row.agent: row.horizon_ends for row in rows if row.policy_share is not None}
     if note := horizon_note(moving, worlds, scenario.horizon_s):
-        say(note)
+        out.note(note)
 
 
-def show_run(out: Out, rows: Sequence[SummaryRow], beside: Mapping[str, Sequence[SummaryRow]], results: Any) -> None:
+def show_run(out: Out, rows: SummaryTable, beside: Mapping[str, SummaryTable], results: Any) -> None:
     """The table of a run, and those of the other tests, each below what its test asks."""
-    from ethbrake_marl.evaluation import rich_table
-    from ethbrake_marl.evaluation.outcome import TESTS
+    from ethbrake_marl.evaluation import TESTS
 
     shown = _tables(rows)
     for test, found in beside.items():
-        shown += [Text(f"\n{TESTS[test]}\n"), rich_table(found)]
+        shown += [Text(f"\n{TESTS[test]}\n"), found.terminal()]
     out.result(results, *shown)
 
 
@@ -330,10 +306,8 @@ def _write_report(
     harm_count: HarmCount,
 ) -> None:
     """Write the page of an evaluation that has just been made."""
-    from ethbrake_marl.evaluation import parameter_line
-
     # matplotlib takes a second to load, and most evaluations draw nothing
-    from ethbrake_marl.pages.report import Report, focus_of, play_for_report, shield_evidence, write_report
+    from ethbrake_marl.pages.report import Report
 
     done: list[str] = []
 
@@ -341,30 +315,25 @@ def _write_report(
         done.append(agent)
         out.progress("report: episodes", len(done), len(agents))
 
-    focus = focus_of(rows)
-    played = play_for_report(evaluation, agents, focus, harm_count=harm_count, on_agent=tell)
     scenario, names, asked = evaluation.scenario, ", ".join(row.agent for row in rows), rows[0].parameters
     scripts = ", ".join(f"{vehicle} by {script}" for vehicle, script in asked["scripts"].items())
     report = Report(
         f"{scenario.name}: {names}" if len(names) <= 60 else f"{scenario.name}: {len(rows)} agents compared",
         rows,
         evaluation,
-        played,
-        shield_evidence(agents, evaluation, harm_count),
-        focus,
         summary=scenario.title or "Agents on the same worlds.",
         settings={
             "Command": "ethbrake " + " ".join(sys.argv[1:]),
             "Agents": names,
             "Harm that agents minimise": "first impacts only" if harm_count == "first" else "every impact",
-            "Worlds": parameter_line(asked),
+            "Worlds": asked.line,
             "Driven by the agents": asked.get("controlled_vehicle") or ", ".join(asked["controlled_vehicles"]),
             "Driven by scripts": scripts or "none",
             "Time step, horizon": f"{asked['time_step_s']:g} s, {asked['horizon_s']:g} s",
         },
         versions=rows[0].versions,
     )
-    write_report(path, report, force=out.force)
+    report.driven(agents, harm_count=harm_count, on_agent=tell).write(path, force=out.force)
     out.note(f"report: {path}")
 
 
@@ -378,36 +347,27 @@ def compare_command(out: Out, first: Annotated[Path, _FILE], second: Annotated[P
     The second minus the first, for agents of the same name. Both must be of one command, and about the same worlds of
     the same scenario. Intervals are paired by world where the files of --per-world lie beside both results.
     """
-    from ethbrake_marl.evaluation.results import compare_results, read_result
+    from ethbrake_marl.evaluation import compare_results, read_result
+    from ethbrake_marl.files.sheet import Column, Sheet
 
     found = compare_results(read_result(first), read_result(second))
-    table = plain_table("Agent", show_edge=False)
-    table.add_column("Policy")
-    for name in found.differences[0].harms:
-        table.add_column(_HARMS[name], justify="right", no_wrap=True)
-    for each in found.differences:
-        harms = (estimate.in_words() for estimate in each.harms.values())
-        table.add_row(Text(each.agent), _POLICIES[each.policy], *map(Text, harms))
-    out.result(found.to_json(), table)
-    _tell_conditions(found)
-
-
-def _tell_conditions(found: Comparison) -> None:
-    """On stderr: how the intervals were made, who stands in one result only, and which settings and versions differ."""
-    say("second minus first, mean per world in m²/s²; in brackets: 95 % intervals,")
+    names = [_HARMS[name] for name in found.differences[0].harms]
+    rows = [[each.agent, _POLICIES[each.policy], *each.harms.values()] for each in found.differences]
+    out.result(found.to_json(), Sheet("", ["Agent", Column("Policy", text=True), *map(Column, names)], rows))
+    out.note("second minus first, mean per world in m²/s²; in brackets: 95 % intervals,")
     why = found.unpaired_because
-    say("paired by world" if why is None else f"NOT paired, wider than they would be paired by world: {why}")
+    out.note("paired by world" if why is None else f"NOT paired, wider than they would be paired by world: {why}")
     for which, agents in zip(("first", "second"), found.left_over, strict=True):
         if agents:
-            say(f"in the {which} only: {', '.join(agents)}")
+            out.note(f"in the {which} only: {', '.join(agents)}")
     for name, (one, other) in {**found.other_settings, **found.other_versions}.items():
-        say(f"note: {name} {one} in the first, {other} in the second")
+        out.note(f"note: {name} {one} in the first, {other} in the second")
 
 
 @command(app, "shield", "shield --agents ppo@shipped,full_brake --episodes 500", json=True)
 def shield_command(
     out: Out,
-    agents: str = PROPOSERS,
+    agents: str = _PROPOSERS,
     scenario: str = "paper-random",
     episodes: int = 2_000,
     harm_count: HarmCount = "first",
@@ -420,32 +380,419 @@ def shield_command(
     vehicles learn: no shield, step mode, and step mode with caps, for the whole team. Each decision that step mode
     replaced is simulated again without it: needed (harm would have been higher), harmless (the same), costly (lower).
     """
-    from ethbrake_marl.evaluation import horizon_note
-    from ethbrake_marl.evaluation.shield_modes import NONE, modes_tables, modes_to_json
-
-    task = asked_task(scenario, vehicle, settings, harm_count)
-    sample = task.scenario.sample(episodes, LIST_SEED)
-    rows = measure_modes(out, agents, sample, task)
-    out.result(modes_to_json(rows, sample, task), *modes_tables(rows))
-    tell_left_out(rows[0].left_out, episodes)
-    moving = {f"{row.agent} ({row.mode})": row.horizon_ends for row in rows if row.mode != NONE}
+    task = _asked_task(scenario, vehicle, settings, harm_count)
+    sample = task.scenario.sample(episodes, DEFAULT.LIST_SEED)
+    rows = _measure_modes(out, agents, sample, task)
+    out.result(rows.to_json(sample, task), *rows.sheets())
+    _tell_left_out(out, rows[0].left_out, episodes)
+    moving = {f"{row.agent} ({row.mode})": row.horizon_ends for row in rows if row.mode != "none"}
     if note := horizon_note(moving, episodes - len(rows[0].left_out), task.scenario.horizon_s):
-        say(note)
+        out.note(note)
 
 
-def measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> list[ModeRow]:
+def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> ShieldModes:
     """The rows of these agents, with progress on stderr."""
-    from ethbrake_marl.evaluation.inputs import make_proposers
-    from ethbrake_marl.evaluation.shield_modes import compare_modes
+    from ethbrake_marl.evaluation import compare_modes, make_lineup
 
-    lineup = make_proposers(agents.split(","), task.scenario, harm_count=task.harm_count)
+    lineup = make_lineup(agents.split(","), task.scenario, harm_count=task.harm_count, bare=True)
     n = sample.worlds.n
     return compare_modes(lineup, sample.worlds, task, on_progress=lambda name, done: out.progress(name, done, n))
 
 
-def tell_left_out(left_out: LeftOutRows, whole: int) -> None:
+def _tell_left_out(out: Out, left_out: LeftOutRows, whole: int) -> None:
     """Name the worlds that count in no figure, of ``whole``, in a line on stderr; none where every world counts."""
-    from ethbrake_marl.evaluation.summary import left_out_line
+    from ethbrake_marl.evaluation import LeftOut
 
     if left_out:
-        say(left_out_line([f"world {world} of seed {LIST_SEED} ({reason})" for world, reason in left_out], whole))
+        out.note(
+            LeftOut.line([f"world {world} of seed {DEFAULT.LIST_SEED} ({reason})" for world, reason in left_out], whole)
+        )
+
+
+# The commands ``watch ...``: films, episodes played again, the explorer, pictures, and what was seen as a dataset.
+
+watch_group = new_group(
+    "watch",
+    "See and keep episodes: films, replays, pictures, data.",
+    "watch record --agents full_brake,e_v2x_bm --world 3 --output both.gif",
+    "watch explore --agents full_brake,ppo@shipped",
+)
+
+
+@command(watch_group, "record", "watch record --agents full_brake,e_v2x_bm --world 3 --output both.gif", force=True)
+def record_command(
+    out: Out,
+    output: Annotated[Path, typer.Option(metavar="FILE.gif|FILE.mp4|FILE.svg", help="The film to write.")],
+    agents: str = "e_v2x_bm",
+    scenario: str = "paper-random",
+    world: int = 0,
+    seed: int = DEFAULT.LIST_SEED,
+    vehicle: str | None = None,
+    uncertainty: str | None = None,
+) -> None:
+    """Agents in one world of the list, in real time: the road to scale, commands, impacts, harm."""
+    from ethbrake_marl.evaluation import check_film, film_bytes, film_scenes
+
+    check_film(output.suffix.lower(), len(agents.split(",")))
+    out.check(output)
+    chosen = _asked_task(scenario, vehicle, None).scenario
+    lineup = _make_drivers(agents, chosen, uncertainty=uncertainty)
+    worlds = chosen.sample(1, seed, first=world).worlds
+    films = {
+        f"{name}: world {world} of {chosen.name}": film_scenes(worlds, agent, scenario=chosen)
+        for name, agent in lineup.items()
+    }
+    out.write(output, film_bytes(films, output.suffix.lower()), what="film")
+
+
+@command(watch_group, "replay", "watch replay PASSPORT --output again.html", json=True, force=True)
+def replay_command(
+    out: Out,
+    passport: Annotated[str, typer.Argument(metavar="PASSPORT", help="As it stands under an episode of a report.")],
+    scenario: Annotated[
+        str | None, typer.Option(metavar="NAME|PATH", help="Its scenario.", show_default="the shipped one of that name")
+    ] = None,
+    agent: Annotated[
+        str | None, typer.Option(help="Who drives, where the passport cannot say it.", show_default="the passport's")
+    ] = None,
+    initial_states: Annotated[
+        Path | None, typer.Option(metavar="CSV", help="The worlds, where they came from a file.")
+    ] = None,
+    uncertainty: str | None = None,
+    settings: list[str] | None = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.html|FILE.gif|FILE.mp4|FILE.svg", help="Also write it as a page or a film."),
+    ] = None,
+) -> None:
+    """Play an episode again, bit for bit, or say what differs.
+
+    Exit status 1 where the world or the episode is another one than the passport's.
+    """
+    from ethbrake_marl.evaluation import Passport, check_film, film_bytes, film_scenes
+    from ethbrake_marl.learning import read_settings
+    from ethbrake_marl.shield import parse_uncertainty
+
+    named = Passport.parse(passport)
+    if output is not None and output.suffix.lower() not in PAGES:
+        check_film(output.suffix.lower())
+    out.check(output)
+    intervals = None if uncertainty is None else parse_uncertainty(uncertainty)
+    found = named.replay(
+        scenario=scenario, settings=read_settings(settings).scenario, agent=agent, initial_states=initial_states,
+        uncertainty=intervals,
+    )  # fmt: skip
+    first, total = found.motion.harm
+    impacts = int(found.motion.ledger.impacts[0])
+    lines = [
+        f"{found.title}: {count_of(impacts, 'impact')}, harm {first:.2f} first-impact, {total:.2f} total (m²/s²).",
+        "The same episode, bit for bit." if found.same else "Not the same episode.",
+        *(f"Differs: {each}." for each in found.differences),
+    ]
+    if output is not None and output.suffix.lower() not in PAGES:
+        scenes = film_scenes(found.worlds, found.agent, scenario=found.scenario)
+        out.write(output, film_bytes({found.title: scenes}, output.suffix.lower()))
+    elif output is not None:
+        from ethbrake_marl.pages.page import Page, Part, Played, Section
+
+        name, again = found.passport.agent, str(found.passport)
+        one = Played(found.passport.number, "Replayed", "", {name: found.motion}, {name: again})
+        section = Section("Episode", [Part.player([one], found.scenario.learners)])
+        out.write(output, Page(found.title, [section], " ".join(lines)).html)
+    told = {
+        "same": found.same,
+        "differences": list(found.differences),
+        "passport": str(found.passport),
+        "impacts": impacts,
+        "first_impact_harm": first,
+        "total_harm": total,
+    }
+    out.result(told, *lines)
+    if output is not None:
+        out.note(f"written: {output}")
+    if not found.same:
+        raise typer.Exit(1)
+
+
+@command(watch_group, "explore", "watch explore --agents full_brake,ppo@shipped", needs=("starlette", "uvicorn"))
+def explore_command(
+    out: Out,
+    scenario: str = "paper-random",
+    agents: str = "full_brake,copy_leader,e_v2x_bm,ppo@shipped,ppo@shipped+step",
+    vehicle: str | None = None,
+    settings: list[str] | None = None,
+    world: int = 0,
+    seed: int = DEFAULT.LIST_SEED,
+    harm_count: HarmCount = "first",
+    folder: Annotated[Path, typer.Option(metavar="DIR", help="Where states are saved, and nowhere else.")] = Path(),
+    port: Annotated[int, typer.Option(help="On 127.0.0.1; 0 takes a free one.", min=0, max=65535)] = 0,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address, open nothing.")] = False,
+) -> None:
+    """Open a local page: sliders for one emergency, every agent's harm and motion at once.
+
+    It listens on this machine alone, and its address holds a token that is new each time. Ctrl-C ends it.
+    """
+    from ethbrake_marl.pages.explorer import Explored, serve_explorer
+
+    chosen = _asked_task(scenario, vehicle, settings, alone=True).scenario
+    explored = Explored(chosen, _make_drivers(agents, chosen, harm_count), harm_count)
+
+    def ready(address: str) -> None:
+        out.show(address)
+        out.note(f"explore {chosen.name} there; files go to {folder.resolve()}; Ctrl-C ends it")
+        if not no_browser:
+            webbrowser.open(address)
+
+    serve_explorer(explored, folder.resolve(), port, ready, seed=seed, world=world)
+    out.note("ended")
+
+
+@command(watch_group, "dataset", "watch dataset --agents best_harm --episodes 1000 --output best.parquet", force=True)
+def dataset_command(
+    out: Out,
+    output: Annotated[Path, typer.Option(metavar="FILE.parquet|NAME-v0", help="The dataset to write.")],
+    agents: str = "best_harm",
+    scenario: str = "paper-random",
+    episodes: int = 1_000,
+    seed: int = DEFAULT.LIST_SEED,
+    format: Annotated[
+        DatasetFormat | None, typer.Option(help="Of the dataset.", show_default="as the name of --output says")
+    ] = None,
+    vehicle: str | None = None,
+    harm_count: HarmCount = "first",
+    uncertainty: str | None = None,
+    settings: list[str] | None = None,
+) -> None:
+    """Record what agents see, do and are rewarded with, decision by decision.
+
+    As one Parquet file of any agents and learners, or as a dataset of Minari of one learner. The recorded actions
+    replay to the same bits. The reward counts the harm of --harm-count, too.
+    """
+    from ethbrake_marl.evaluation import check_agents, check_dataset, write_dataset
+
+    chosen = _asked_task(scenario, vehicle, settings, harm_count).scenario
+    kind = check_dataset(output, chosen, format, force=out.force)
+    lineup = _make_drivers(agents, chosen, harm_count, uncertainty)
+    check_agents(lineup, chosen.sample(1, seed).worlds, chosen)
+    summary = write_dataset(
+        output,
+        lineup,
+        scenario=chosen,
+        episodes=episodes,
+        seed=seed,
+        format=kind,
+        reward="harm" if harm_count == "first" else "total-harm",
+        force=out.force,
+        on_progress=lambda agent, done: out.progress(agent, done, episodes),
+    )
+    for agent, number in summary.episodes.items():
+        change = f"harm differs from `ethbrake evaluate` by at most {summary.off_by[agent]:.2g} m2/s2 in a world"
+        out.note(f"{agent}: {count_of(number, 'episode')}; {change}")
+    for left in summary.left_out:
+        out.note(f"left out: world {left.world} with {left.agent}: {left.reason}")
+    out.note(f"dataset: {summary.path}, {count_of(summary.decisions, 'decision')}")
+    if summary.format == "minari":
+        folder = summary.path.resolve().parent
+        out.note(f"load it: MINARI_DATASETS_PATH={folder}, minari.load_dataset({summary.path.name!r})")
+
+
+picture_group = new_group(
+    "picture",
+    "Draw what is critical in a scenario, what one world asks for, or what the shield does.",
+    "watch picture criticality --output map.png",
+    "watch picture shield-modes --episodes 500 --output modes.png",
+    inside=watch_group,
+)
+PictureOption = Annotated[Path, typer.Option(metavar="FILE", help="The picture to write: .png, .svg or .pdf.")]
+
+
+@command(
+    picture_group, "criticality",
+    "watch picture criticality --scenario paper-distance --agent e_v2x_bm --output map.png", force=True,
+)  # fmt: skip
+def picture_criticality(
+    out: Out,
+    output: PictureOption,
+    scenario: str = "paper-distance",
+    agent: Annotated[str, typer.Option(help="Who drives; any agent of `ethbrake evaluate`.")] = "e_v2x_bm",
+    harm_count: HarmCount = "first",
+    cells: Annotated[int, typer.Option(help="Worlds along each gap.")] = 81,
+    gaps: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="LOW HIGH", help="Range of both gaps (m).", show_default="the scenario's"),
+    ] = None,
+    settings: list[str] | None = None,
+) -> None:
+    """Harm of an agent over both gaps, with the boundary of what is avoidable.
+
+    Everything else must be a fixed number in the scenario.
+    """
+    from ethbrake_marl.evaluation import criticality_map, make_agents
+
+    _check_picture(out, output)
+    chosen = _asked_task(scenario, None, settings, alone=True).scenario
+    lineup = make_agents([agent], chosen, harm_count=harm_count)
+    found = criticality_map(chosen, lineup, cells=cells, gap_range_m=gaps, on_progress=out.progress)
+    from ethbrake_marl.figures import criticality_figure  # matplotlib takes a second to load
+
+    _write_picture(out, output, criticality_figure(found))
+
+
+def _check_picture(out: Out, output: Path) -> None:
+    """Refuse a picture that cannot be written, before any work."""
+    from ethbrake_marl.figures import picture_ending
+
+    picture_ending(output)
+    out.check(output)
+
+
+def _write_picture(out: Out, output: Path, figure: Any, left_out: LeftOutRows = (), whole: int = 0) -> None:
+    """Write a picture; ``left_out`` of ``whole`` worlds count in none of its figures."""
+    from ethbrake_marl.figures import write_picture
+
+    write_picture(output, figure, force=out.force)
+    _tell_left_out(out, left_out, whole)
+    out.note(f"picture: {output}")
+
+
+def _caption(scenario: Scenario, episodes: int, rest: str, left_out: LeftOutRows) -> str:
+    """What a picture of a list is about, and how many of its worlds count in no figure."""
+    told = f"{scenario.name}, {count_of(episodes, 'world')} of the list of seed {DEFAULT.LIST_SEED}{rest}"
+    return told + (f" Left out: {len(left_out):,}, which the physics could not advance." if left_out else "")
+
+
+@command(
+    picture_group, "deceleration",
+    "watch picture deceleration --scenario paper-scenario-1 --world 0 --output curve.png", force=True,
+)  # fmt: skip
+def picture_deceleration(
+    out: Out,
+    output: PictureOption,
+    scenario: str = "paper-scenario-1",
+    world: int = 0,
+    seed: int = DEFAULT.LIST_SEED,
+    vehicle: str | None = None,
+    settings: list[str] | None = None,
+) -> None:
+    """Harm of one world against the constant deceleration of one vehicle: predicted, realised, and the best known."""
+    from ethbrake_marl.evaluation import deceleration_curve
+    from ethbrake_marl.figures import deceleration_figure
+
+    _check_picture(out, output)
+    task = _asked_task(scenario, vehicle, settings, alone=True)
+    curve = deceleration_curve(task.scenario.sample(1, seed, first=world).worlds, task)
+    title = f"{task.scenario.name}, world {world} of the list of seed {seed}"
+    _write_picture(out, output, deceleration_figure(curve, title=title))
+
+
+@command(
+    picture_group, "shield", "watch picture shield --agents ppo@shipped,full_brake --output shield.png", force=True
+)
+def picture_shield(
+    out: Out,
+    output: PictureOption,
+    agents: str = "full_brake,constant:3",
+    scenario: str = "paper-random",
+    episodes: int = 500,
+    harm_count: HarmCount = "first",
+    vehicle: str | None = None,
+    settings: list[str] | None = None,
+) -> None:
+    """How often the step shield intervenes against the harm that remains, from no allowance to any.
+
+    The agents propose, and --harm-count is the harm that is guaranteed.
+    """
+    from ethbrake_marl.evaluation import make_lineup
+    from ethbrake_marl.figures import operating_figure
+    from ethbrake_marl.shield import ALLOWANCES, operating_curves
+
+    _check_picture(out, output)
+    task = _asked_task(scenario, vehicle, settings, harm_count)
+    worlds = task.scenario.sample(episodes, DEFAULT.LIST_SEED).worlds
+    lineup = make_lineup(agents.split(","), task.scenario, harm_count=harm_count, bare=True)
+    curves = operating_curves(
+        worlds, lineup, task, ALLOWANCES,
+        on_progress=lambda name: out.progress(name, episodes, episodes),
+    )  # fmt: skip
+    left_out = next(iter(curves.values()))[0].left_out
+    rest = f"; step shield, {harm_count} harm. Beside the points: what certificates may reach above the bound (m²/s²)."
+    figure = operating_figure(list(curves.items()), caption=_caption(task.scenario, episodes, rest, left_out))
+    _write_picture(out, output, figure, left_out, episodes)
+
+
+@command(picture_group, "shield-modes", "watch picture shield-modes --episodes 500 --output modes.png", force=True)
+def picture_shield_modes(
+    out: Out,
+    output: PictureOption,
+    agents: str = _PROPOSERS,
+    scenario: str = "paper-random",
+    episodes: int = 2_000,
+    harm_count: HarmCount = "first",
+    vehicle: str | None = None,
+    settings: list[str] | None = None,
+) -> None:
+    """Harm without a shield and in step mode beside episode mode, as ``ethbrake shield`` measures it."""
+    from ethbrake_marl.figures import shield_modes_figure
+
+    _check_picture(out, output)
+    task = _asked_task(scenario, vehicle, settings, harm_count)
+    rows = _measure_modes(out, agents, task.scenario.sample(episodes, DEFAULT.LIST_SEED), task)
+    rest = f", {harm_count} harm; mean and 95 % interval of the difference, paired by world."
+    figure = shield_modes_figure(rows, caption=_caption(task.scenario, episodes, rest, rows[0].left_out))
+    _write_picture(out, output, figure, rows[0].left_out, episodes)
+
+
+@command(
+    picture_group, "robustness",
+    "watch picture robustness --agent ppo@shipped --episodes 100 --output robust.png", json=True, force=True,
+)  # fmt: skip
+def picture_robustness(
+    out: Out,
+    output: PictureOption,
+    agent: Annotated[
+        str, typer.Option(help="Who proposes; an agent of `ethbrake evaluate` without a shield.")
+    ] = "full_brake",
+    uncertainty: Annotated[
+        str, typer.Option(metavar="QUANTITY=WIDTH,...", help="The intervals; drawn at 0 to 2 times their width.")
+    ] = "braking_capacity_mps2=10%,gaps_m=0.5",
+    robust: Annotated[
+        str, typer.Option(help="What the robust shield certifies of the intervals: their corners, or their interior.")
+    ] = "corners",
+    scenario: str = "paper-random",
+    episodes: int = 200,
+    harm_count: HarmCount = "first",
+    vehicle: str | None = None,
+    settings: list[str] | None = None,
+) -> None:
+    """What it costs not to know a world: the robust shield's price, and both shields where the truth differs.
+
+    Prints the figures, too.
+    """
+    from ethbrake_marl.agents import Agent
+    from ethbrake_marl.evaluation import make_lineup, result_identity
+    from ethbrake_marl.figures import robustness_figure
+    from ethbrake_marl.files.sheet import Column, Sheet
+    from ethbrake_marl.shield import parse_uncertainty, robustness
+
+    _check_picture(out, output)
+    intervals = parse_uncertainty(uncertainty)
+    task = _asked_task(scenario, vehicle, settings, harm_count, alone=True)
+    sample = task.scenario.sample(episodes, DEFAULT.LIST_SEED)
+    (policy,) = make_lineup([agent], task.scenario, harm_count=harm_count, bare=True).values()
+    assert isinstance(policy, Agent)  # one vehicle learns
+    points = robustness(
+        sample.worlds, policy, task, intervals, robust=robust,
+        on_progress=lambda what, done: out.progress(what, done, episodes),
+    )  # fmt: skip
+    left_out = points[0].left_out
+    rest = f"; {agent} proposes; {harm_count} harm. Intervals of width 1: {intervals}." + (
+        f" Robust mode certifies their {robust}." if robust != "corners" else ""
+    )
+    caption = _caption(task.scenario, episodes, rest, left_out)
+    about = result_identity("robustness", task.scenario, sample, [world for world, _ in left_out])
+    _write_picture(out, output, robustness_figure(points, caption=caption), left_out, episodes)
+    columns: list[Column | str] = ["shield", "truth", "width", Column("mean harm"), Column("mean bound")]
+    columns += [Column("above bound", digits=1, scale=100.0, unit="%"), Column("mean excess", digits=3)]
+    columns += [Column("noticed", digits=1, scale=100.0, unit="%")]
+    rows = [(p.mode, p.truth, f"{p.width:g}", p.harm, p.bound, p.above, p.excess, p.distrusted) for p in points]
+    out.result([about | point._asdict() for point in points], Sheet("", columns, rows))

@@ -7,9 +7,8 @@ from typing import Annotated
 
 import typer
 
-from ethbrake_marl.cli.command import command, new_group
-from ethbrake_marl.cli.out import Out, plain_table
-from ethbrake_marl.defaults import LIST_SEED
+from ethbrake_marl.cli.command import Out, command, new_group
+from ethbrake_marl.defaults import DEFAULT
 
 CHECKED_DRAWS = 1000  # worlds that `scenario validate` draws
 
@@ -29,8 +28,7 @@ scenario_group = new_group(
 @command(scenario_group, "list", "scenario list", json=True)
 def scenario_list(out: Out) -> None:
     """List the scenarios that have a name: that and the title, and the folder of those that a plug-in registers."""
-    from ethbrake_marl.scenario import list_scenarios
-    from ethbrake_marl.scenario.schema import SHIPPED
+    from ethbrake_marl.scenario import SHIPPED, list_scenarios
 
     entries = list_scenarios()
     width = max(len(entry.name) for entry in entries)
@@ -52,23 +50,22 @@ def scenario_show(out: Out, scenario: NameArgument) -> None:
 @command(scenario_group, "validate", "scenario validate my-scenario.yaml", json=True)
 def scenario_validate(out: Out, path: NameArgument) -> None:
     """Check a scenario: one line, OK or what is wrong; then what may not be meant."""
-    from ethbrake_marl.agents.protocol import Team
-    from ethbrake_marl.agents.registry import make_single_agent
-    from ethbrake_marl.agents.rollout import drive
-    from ethbrake_marl.evaluation.inputs import load_runnable
-    from ethbrake_marl.scenario.fields import LEARNER, count_kinds, is_state_free
+    from ethbrake_marl.agents import Team, drive, make_single_agent
+    from ethbrake_marl.evaluation import load_runnable
+    from ethbrake_marl.scenario import ScriptSpec
 
     scenario = load_runnable(path)
-    sample = scenario.sample(CHECKED_DRAWS, LIST_SEED)
+    sample = scenario.sample(CHECKED_DRAWS, DEFAULT.LIST_SEED)
     names = [scenario.vehicle_names[i] for i in scenario.learners]
-    deciding = [i for i in range(scenario.vehicles) if not is_state_free(scenario.scripts.get(i, LEARNER))]
+    free = {i for i, script in scenario.scripts.items() if ScriptSpec.parse(script).is_state_free()}
+    deciding = [i for i in range(scenario.vehicles) if i not in free]
     braking = Team.copies(make_single_agent("full_brake"), deciding)
     moving = int((~drive(sample.worlds, braking, scenario).at_rest).sum())
     late = int((sample.worlds.vehicles.latency_s[:, 0] > 0.0).sum())
     told = {"name": scenario.name, "vehicles": scenario.vehicles, "learners": names, "worlds": CHECKED_DRAWS}
     counts = f"{CHECKED_DRAWS:,} worlds drawn, {sample.rejected:,} more refused for an early impact"
     learners = ", ".join(names) or "none"
-    shown = [f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; {counts}{count_kinds(sample)}"]
+    shown = [f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; {counts}{sample.count_kinds()}"]
     if moving:
         shown.append(
             f"note: at the horizon ({scenario.horizon_s:g} s) something still moves in {moving:,} of them, though"
@@ -107,7 +104,7 @@ def scenario_sample(
     out: Out,
     scenario: NameArgument,
     episodes: int = 10,
-    seed: int = LIST_SEED,
+    seed: int = DEFAULT.LIST_SEED,
     settings: list[str] | None = None,
     output: Annotated[
         Path | None, typer.Option(metavar="FILE.csv", help="Write the table to this file.", show_default="stdout")
@@ -117,8 +114,8 @@ def scenario_sample(
 
     A column is what the scenario does not fix. The same list, seed and number are the same worlds on every machine.
     """
-    from ethbrake_marl.evaluation.inputs import load_runnable, states_of
-    from ethbrake_marl.learning.recipe import read_settings
+    from ethbrake_marl.evaluation import load_runnable, states_of
+    from ethbrake_marl.learning import read_settings
 
     out.check(output, ".csv", what="a table of worlds")
     chosen = load_runnable(scenario, read_settings(settings).scenario)
@@ -141,7 +138,7 @@ recipe_group = new_group(
 @command(recipe_group, "list", "recipe list", json=True)
 def recipe_list(out: Out) -> None:
     """List the shipped recipes: name, algorithm and title."""
-    from ethbrake_marl.learning.recipe import load_recipe, shipped_recipes
+    from ethbrake_marl.learning import load_recipe, shipped_recipes
 
     found = {name: (load_recipe(name), path) for name, path in shipped_recipes().items()}
     width = max(map(len, found))
@@ -157,7 +154,7 @@ def recipe_list(out: Out) -> None:
 @command(recipe_group, "show", "recipe show ppo")
 def recipe_show(out: Out, recipe: NameArgument) -> None:
     """Print the YAML of a recipe that is in order."""
-    from ethbrake_marl.learning.recipe import load_recipe, recipe_path
+    from ethbrake_marl.learning import load_recipe, recipe_path
 
     load_recipe(recipe)
     _show_file(out, recipe_path(recipe))
@@ -166,7 +163,7 @@ def recipe_show(out: Out, recipe: NameArgument) -> None:
 @command(recipe_group, "validate", "recipe validate my-recipe.yaml")
 def recipe_validate(out: Out, path: NameArgument) -> None:
     """Check a recipe: one line, OK or what is wrong."""
-    from ethbrake_marl.learning.recipe import load_recipe
+    from ethbrake_marl.learning import load_recipe
 
     recipe = load_recipe(path)
     others = ", ".join(name for name in recipe.schemes if name not in ("single", "shared"))
@@ -179,7 +176,7 @@ def recipe_validate(out: Out, path: NameArgument) -> None:
 @command(recipe_group, "new", "recipe new my-recipe --based-on sac", force=True)
 def recipe_new(out: Out, name: NewNameArgument, based_on: BasedOnOption = "ppo", output: FolderOption = Path()) -> None:
     """Write a commented NAME.yaml with every key."""
-    from ethbrake_marl.learning.recipe import new_recipe_text
+    from ethbrake_marl.learning import new_recipe_text
 
     _write_new(out, "recipe", output / f"{name}.yaml", new_recipe_text(name, based_on))
 
@@ -190,7 +187,7 @@ def recipe_schema(out: Out) -> None:
 
     For editors that complete and check YAML.
     """
-    from ethbrake_marl.learning.recipe import recipe_json_schema
+    from ethbrake_marl.learning import recipe_json_schema
 
     out.print_json(recipe_json_schema())
 
@@ -218,24 +215,17 @@ def agent_list(out: Out) -> None:
 
     What begins with + goes behind any agent, for instance full_brake+step: +refined first, then one shield.
     """
-    from ethbrake_marl.agents.protocol import knowledge_text, sees_through
-    from ethbrake_marl.agents.registry import agent_entries
+    from ethbrake_marl.agents import agent_entries, knowledge_text, sees_through
+    from ethbrake_marl.files.sheet import Sheet
 
-    entries = agent_entries()
-    table = plain_table(padding=(0, 1, 0, 0))
-    table.add_column("Agent", no_wrap=True)
-    table.add_column("Drives by", overflow="fold")
-    table.add_column("Knows", overflow="fold")
-    for entry in entries:
-        added = "also " if entry.form.startswith("+") else ""
-        mark = " †" if sees_through(entry.knows) else ""
-        table.add_row(entry.form, entry.about, added + knowledge_text(entry.knows) + mark)
+    told, rows = [], []
+    for entry in agent_entries():
+        omniscient, added = sees_through(entry.knows), "also " if entry.form.startswith("+") else ""
+        told.append({"agent": entry.form, "about": entry.about, "knows": list(entry.knows), "omniscient": omniscient})
+        rows.append((entry.form, entry.about, f"{added}{knowledge_text(entry.knows)}{' †' if omniscient else ''}"))
     out.result(
-        [
-            {"agent": e.form, "about": e.about, "knows": list(e.knows), "omniscient": sees_through(e.knows)}
-            for e in entries
-        ],
-        table,
+        told,
+        Sheet("", ("Agent", "Drives by", "Knows"), rows, gap=2),
         "† omniscient: reads what no channel brought. With :believed behind it, it decides on what was received.",
         "ladder stands for coast to best_harm; a typo gets a suggestion. See docs/baselines.md and docs/shield.md.",
     )
@@ -251,7 +241,7 @@ def agent_export(
 
     Needs the package onnx, which the extra `export` brings.
     """
-    from ethbrake_marl.policies.shipped import load_named_policy, onnx_model
+    from ethbrake_marl.policies import load_named_policy, onnx_model
 
     out.check(onnx)
     out.write(onnx, onnx_model(load_named_policy(policy)), what="written")

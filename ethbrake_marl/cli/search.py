@@ -10,28 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
 
-from ethbrake_marl.cli.command import command, new_group
-from ethbrake_marl.cli.out import Out, plain_table
-from ethbrake_marl.defaults import (
-    EPISODES,
-    HARM_COUNTS,
-    HINDSIGHT,
-    LIST_SEED,
-    MEASURES,
-    MOST_NAMED_WORLDS,
-    SEARCH_BUDGET,
-    HarmCount,
-    MeasureName,
-)
+from ethbrake_marl.cli.command import Out, command, new_group
+from ethbrake_marl.defaults import DEFAULT, HARM_COUNTS, MEASURES, HarmCount, MeasureName
 from ethbrake_marl.errors import InvalidInput, count_of
 
 if TYPE_CHECKING:
-    from ethbrake_marl.evaluation.inputs import NamedWorld, NamedWorlds
-    from ethbrake_marl.limits.best_harm import BestHarmTable
-    from ethbrake_marl.scenario import Sample, Scenario, Task
-    from ethbrake_marl.studies.falsification import Falsified, Measure
+    pass
 
 ROUNDING = 1e-6  # m2/s2
 
@@ -47,16 +32,15 @@ search_group = new_group(
 def best_harm_command(
     out: Out,
     scenario: str = "paper-random",
-    episodes: int = EPISODES,
-    seed: int = LIST_SEED,
+    episodes: int = DEFAULT.EPISODES,
+    seed: int = DEFAULT.LIST_SEED,
     harm_count: Annotated[
         HarmCount | None, typer.Option(help="Harm to minimise: first impacts only, or all.", show_default="both")
     ] = None,
     vehicles: Annotated[
-        str | None,
-        typer.Option(metavar="A,B,...", help="Who is controlled, together.", show_default="the learners"),
+        str | None, typer.Option(metavar="A,B,...", help="Who is controlled, together.", show_default="the learners")
     ] = None,
-    budget: Annotated[int, typer.Option(help="Candidate profiles per world and count.")] = SEARCH_BUDGET,
+    budget: Annotated[int, typer.Option(help="Candidate profiles per world and count.")] = DEFAULT.SEARCH_BUDGET,
     search_seed: Annotated[int, typer.Option(help="Seed of the search.")] = 0,
     threads: Annotated[
         int | None, typer.Option(help="Worlds searched at once; changes no result.", show_default="every core")
@@ -81,15 +65,23 @@ def best_harm_command(
     The other vehicles follow their scripts. With --output, finished parts are kept beside the file, and the same
     command goes on where it was interrupted.
     """
-    from ethbrake_marl.evaluation.inputs import load_runnable, make_agents
-    from ethbrake_marl.evaluation.measures import shipped_bounds, shipped_lines
-    from ethbrake_marl.learning.recipe import read_settings
-    from ethbrake_marl.limits.best_harm import fold_agent, load_table, save_table, search_list
+    import numpy as np
+
+    from ethbrake_marl.evaluation import (
+        load_runnable,
+        make_agents,
+        proven_of_table,
+        result_identity,
+        shipped_bounds,
+        shipped_sheet,
+    )
+    from ethbrake_marl.learning import read_settings
+    from ethbrake_marl.limits import BestHarmTable, search_list
     from ethbrake_marl.scenario import Task
 
     if shipped:
-        found = list(shipped_bounds())
-        out.result([bounds.to_json() for bounds in found], *shipped_lines(found))
+        found = shipped_bounds()
+        out.result(found, *shipped_sheet(found).markdown().splitlines())
         return
     out.check(output, ".npz", what="a table")
     given = read_settings(settings)
@@ -98,10 +90,12 @@ def best_harm_command(
     controlled = None if names is None else chosen.with_learners(names).learners
     if controlled is None and not chosen.learners:
         raise InvalidInput(f"scenario {chosen.name!r} has no learner; say who is controlled: --vehicles vehicle_2")
-    known = None if start is None else load_table(start)
+    known = None if start is None else BestHarmTable.load(start)
     sample = chosen.sample(episodes, seed)
     counts: Sequence[HarmCount] = HARM_COUNTS if harm_count is None else (harm_count,)
-    specs = _agent_specs(agents, chosen, controlled)
+    specs = [] if agents is None else [spec.strip() for spec in agents.split(",")]
+    if specs and (len(chosen.learners) != 1 or controlled not in (None, chosen.learners)):
+        raise InvalidInput("--agents: drive the scenario's only learner; leave out --vehicles")
     lineups = {each: make_agents(specs, chosen, harm_count=each) for each in counts}
     parts = None if output is None else output.with_name(f".{output.name}.parts")
     if parts is not None:
@@ -113,7 +107,7 @@ def best_harm_command(
     drivers = list(lineups[counts[0]])
     for k, name in enumerate(drivers):
         out.progress("agents", k, len(drivers))
-        table = fold_agent(table, chosen, sample.worlds, name, {each: lineups[each][name] for each in counts})
+        table = table.folded(chosen, sample.worlds, name, {each: lineups[each][name] for each in counts})
     text = _spelled(
         "search best-harm", scenario=scenario, episodes=episodes, seed=seed, set=given.texts, harm_count=harm_count,
         vehicles=names and ",".join(names), budget=budget, search_seed=search_seed, start=start and start.name,
@@ -121,57 +115,26 @@ def best_harm_command(
     )  # fmt: skip
     table = replace(table, header={**table.header, "episodes": episodes, "list_seed": seed, "command": text})
     if output is not None and parts is not None:
-        save_table(output, table)
+        table.save(output)
         shutil.rmtree(parts)
         out.note(f"every world: {output}")
-    figures = _figures(chosen, sample, Task(chosen, controlled or chosen.learners), table, identity=out.as_json)
+    figures: dict[str, object] = {key: value for key, value in table.header.items() if key != "after"}
+    for each, best in table.best.items():
+        counted = "first_impact" if each == "first" else "total"
+        figures[f"best_known_{counted}_harm"] = float(best.harm.mean())
+        figures["harmless_rate"] = float((best.harm == 0.0).mean())
+    proven = proven_of_table(sample.worlds, Task(chosen, controlled or chosen.learners), table)
+    if proven is not None:
+        inside = {f"between_{name}": value for name, value in (proven.pop("between") or {}).items()}
+        figures |= {name: value for name, value in {**proven, **inside}.items() if value is not None}
+    if out.as_json:  # worlds that were left out are in no hash
+        left_out = np.flatnonzero(np.isin(sample.index, [int(world) for world in table.left_out]))
+        figures |= result_identity("best-harm", chosen, sample, left_out.tolist())
     lines = (
         f"{name:36} {value:.4f}" if isinstance(value, float) else f"{name:36} {value}"
         for name, value in figures.items()
     )
     out.result(figures, *lines)
-
-
-def _agent_specs(agents: str | None, scenario: Scenario, controlled: Sequence[int] | None) -> list[str]:
-    """Who drives after the search; ``InvalidInput`` if it is not the scenario's only learner that is searched."""
-    if agents is None:
-        return []
-    if len(scenario.learners) != 1 or (controlled is not None and tuple(controlled) != scenario.learners):
-        raise InvalidInput("--agents: drive the scenario's only learner; leave out --vehicles")
-    return [spec.strip() for spec in agents.split(",")]
-
-
-def _figures(
-    scenario: Scenario, sample: Sample, task: Task, table: BestHarmTable, *, identity: bool
-) -> dict[str, object]:
-    """What was asked, the mean best known harm under each count (m2/s2), and what is proven beside it.
-
-    ``identity``: of the worlds, too; those that were left out are in no hash.
-    """
-    import numpy as np
-
-    from ethbrake_marl.evaluation.inputs import result_identity
-    from ethbrake_marl.evaluation.measures import proven_of_table
-    from ethbrake_marl.limits.best_harm import LEFT_OUT
-
-    told: dict[str, object] = {key: value for key, value in table.header.items() if key != "after"}
-    for harm_count, best in table.best.items():
-        told["best_known_first_impact_harm" if harm_count == "first" else "best_known_total_harm"] = float(
-            best.harm.mean()
-        )
-        told["harmless_rate"] = float((best.harm == 0.0).mean())
-    proven = proven_of_table(sample.worlds, task, table)
-    if proven is not None:
-        told["proven_harm"] = proven.proven_harm
-        if proven.contact_proven_rate is not None:
-            told["contact_proven_rate"] = proven.contact_proven_rate
-        told["impact_proven_rate"] = proven.impact_proven_rate
-        inside = {} if proven.between is None else asdict(proven.between)
-        told |= {f"between_{name}": value for name, value in inside.items() if value is not None}
-    if identity:
-        left_out = np.flatnonzero(np.isin(sample.index, [int(world) for world in table.header.get(LEFT_OUT, ())]))
-        told |= result_identity("best-harm", scenario, sample, left_out.tolist())
-    return told
 
 
 def _spelled(name: str, **options: Any) -> str:
@@ -201,12 +164,14 @@ def falsify_command(
     ] = "regret",
     against: Annotated[
         str | None,
-        typer.Option(metavar="AGENT", help="Whom regret or difference compares with.", show_default=HINDSIGHT),
+        typer.Option(metavar="AGENT", help="Whom regret or difference compares with.", show_default=DEFAULT.HINDSIGHT),
     ] = None,
     scenario: str = "paper-random",
     budget: Annotated[int, typer.Option(help="Worlds that are tried.", min=1)] = 4000,
     seed: Annotated[int, typer.Option(help="Seed of the search.", min=0)] = 0,
-    keep: Annotated[int, typer.Option(help="Worlds that are kept, at most.", min=1, max=MOST_NAMED_WORLDS)] = 20,
+    keep: Annotated[
+        int, typer.Option(help="Worlds that are kept, at most.", min=1, max=DEFAULT.MOST_NAMED_WORLDS)
+    ] = 20,
     at_random: Annotated[
         bool, typer.Option("--at-random", help="Try worlds as a list draws them, to compare the search with.")
     ] = False,
@@ -226,91 +191,104 @@ def falsify_command(
     a shield comes to the bound it told; above zero it is broken. difference: where two agents differ most. With
     --again FILE the kept worlds are driven again, by --agent or who drove then; exit status 1: one of them is worse.
     """
-    from ethbrake_marl.evaluation.inputs import check_agents, load_evaluated, named_worlds_text, result_versions
-    from ethbrake_marl.learning.recipe import read_settings
-    from ethbrake_marl.studies.falsification import falsify, make_measure, named_worlds
+    import numpy as np
+
+    from ethbrake_marl.evaluation import NamedWorlds, check_agents, load_driven, result_versions
+    from ethbrake_marl.files.sheet import Sheet
+    from ethbrake_marl.learning import read_settings
+    from ethbrake_marl.studies.falsification import Measure, falsify
+    from ethbrake_marl.studies.speed import this_machine
 
     if again is not None:
-        _refuse_others(context)
+        for name in context.params.keys() - {"agent", "again", "as_json"}:
+            source = context.get_parameter_source(name)
+            if source is not None and source.name == "COMMANDLINE":
+                option = "set" if name == "settings" else name.replace("_", "-")
+                raise InvalidInput(
+                    f"--again: the file says what is measured; --{option} has no place beside it, --agent has"
+                )
         _drive_again(out, again, agent)
         return
     agent = agent or "policy@shipped"
     out.check(output, ".yaml", ".yml", what="a file of worlds")
     given = read_settings(settings)
-    chosen = load_evaluated(scenario, vehicle, given.scenario)
-    measured_by = make_measure(measure, agent, against, chosen, harm_count)
+    chosen = load_driven(scenario, vehicle, given.scenario, alone=False)
+    measured_by = Measure.of(measure, agent, against, chosen, harm_count)
     check_agents(measured_by.agents, chosen.replace(early_impacts="keep").sample(1, seed).worlds, chosen)
     found = falsify(
         measured_by, budget, seed, most=keep, adaptive=not at_random,
         on_round=lambda done, total: out.progress(agent, done, total),
     )  # fmt: skip
-    worlds, told = named_worlds(found, measured_by), _told(found, budget)
-    summary = _summary(told, measured_by)
-    told |= {"worlds": [world.model_dump(exclude_none=True) for world in worlds]}
+    worlds, good = found.named_worlds(measured_by), found.scores[np.isfinite(found.scores)]
+    told: dict[str, Any] = {
+        "tried": budget,
+        "counted": len(good),
+        "share_above_zero": found.share_above,
+        "first_above_zero": found.first_above,
+        "median": float(np.median(good)),
+        "worst": float(good.max()),
+        "machine": asdict(this_machine()),
+    }
+    first, shown = found.first_above, []
+    left_out = f" ({budget - len(good):,} of them are none of the scenario's)" if len(good) < budget else ""
+    summary = (
+        f"{chosen.name}: {budget:,} worlds tried{left_out}; {measure} in m2/s2, {harm_count} count: worst"
+        f" {told['worst']:.4g}, median {told['median']:.4g}; above zero in {100 * found.share_above:.1f} % of those"
+        f" tried, {f'the first after {first:,}' if first else 'none'}."
+        " The search looks for bad worlds: shares of it say nothing about a list."
+    )
+    told["worlds"] = [world.model_dump(exclude_none=True) for world in worlds]
     if worlds:
-        command = _spelled(
-            "search falsify", agent=agent, measure=measure, against=against, scenario=scenario, budget=budget,
-            seed=seed, keep=keep, at_random=at_random, vehicle=vehicle, harm_count=harm_count, set=given.texts,
+        kept = NamedWorlds.of(
+            measured_by.scenario,
+            scenario=scenario,
+            settings=[*given.texts, *([f"roles={{{vehicle}: learner}}"] if vehicle else [])],
+            agent=agent,
+            measure=measure,
+            against=against,
+            harm_count=harm_count,
+            found_by=_spelled(
+                "search falsify", agent=agent, measure=measure, against=against, scenario=scenario, budget=budget,
+                seed=seed, keep=keep, at_random=at_random, vehicle=vehicle, harm_count=harm_count, set=given.texts,
+            ),
+            worlds=worlds,
         )  # fmt: skip
-        kept = _kept(measured_by, worlds, scenario, agent, against, vehicle, given.texts, command)
         told |= kept.model_dump(exclude_none=True)
+        beside = {"harm": [], "bound": ["Bound"]}.get(measure, ["Reference's harm"])
+        columns = ("World", measure.capitalize(), "Harm", *beside, "State")
+        rows = []
+        for world in worlds:
+            reference = [] if world.reference is None else [f"{world.reference:.2f}"]
+            state = ", ".join(f"{name} {value:.4g}" for name, value in world.state.items())
+            rows.append((world.name, f"{world.score:.4g}", f"{world.harm:.2f}", *reference, state))
+        shown.append(Sheet("", columns, rows, gap=2))
         if output is not None:
-            out.write(output, named_worlds_text(kept), what="the worlds")
+            out.write(output, kept.text, what="the worlds")
     elif output is not None:
         out.note(f"nothing was found, and {output} not written")
-    out.result({**told, "versions": result_versions()}, *_table(worlds, measured_by), summary)
-
-
-def _kept(
-    measure: Measure, worlds: list[NamedWorld], scenario: str, agent: str, against: str | None, vehicle: str | None,
-    texts: tuple[str, ...], found_by: str,
-) -> NamedWorlds:  # fmt: skip
-    """The file of these worlds; the scenario, agents and vehicle as they were asked for."""
-    from ethbrake_marl.evaluation.inputs import FORMAT, VERSION, NamedWorlds, scenario_sha256
-
-    return NamedWorlds(
-        format=FORMAT,
-        version=VERSION,
-        scenario=scenario,
-        scenario_sha256=scenario_sha256(measure.scenario),
-        settings=[*texts, *([f"roles={{{vehicle}: learner}}"] if vehicle else [])],
-        agent=agent,
-        measure=measure.name,
-        against=against,
-        harm_count=measure.harm_count,
-        found_by=found_by,
-        worlds=worlds,
-    )
-
-
-def _refuse_others(context: typer.Context) -> None:
-    """Refuse options that ``--again`` would ignore: the file says the rest."""
-    for name in context.params.keys() - {"agent", "again", "as_json"}:
-        source = context.get_parameter_source(name)
-        if source is not None and source.name == "COMMANDLINE":
-            option = "--set" if name == "settings" else f"--{name.replace('_', '-')}"
-            raise InvalidInput(f"--again: the file says what is measured; {option} has no place beside it, --agent has")
+    out.result({**told, "versions": result_versions()}, *shown, summary)
 
 
 def _drive_again(out: Out, file: Path, agent: str | None) -> None:
     """Measure the worlds of a file once more, and compare; exit status 1 where one is worse, or could not be driven."""
     import numpy as np
 
-    from ethbrake_marl.agents.registry import parse_spec
-    from ethbrake_marl.evaluation.inputs import load_evaluated, read_named_worlds
-    from ethbrake_marl.learning.recipe import read_settings
+    from ethbrake_marl.agents import parse_spec
+    from ethbrake_marl.evaluation import NamedWorlds, load_driven
+    from ethbrake_marl.files.sheet import Sheet
+    from ethbrake_marl.learning import read_settings
     from ethbrake_marl.scenario import Sample
-    from ethbrake_marl.studies.falsification import make_measure
+    from ethbrake_marl.studies.falsification import Measure
 
-    kept = read_named_worlds(file)
+    kept = NamedWorlds.read(file)
     for spec in (*([kept.agent] if agent is None else []), *([kept.against] if kept.against else [])):
         if (code := parse_spec(spec).file) is not None:
             raise InvalidInput(
                 f"{file}: names an agent that is code ({code[0]}), which is not run because a file names it; --agent"
                 " names another one, and who is compared with is edited in the file"
             )
-    chosen = load_evaluated(kept.scenario, None, read_settings(kept.settings).scenario)
-    measured_by = make_measure(kept.measure, agent or kept.agent, kept.against, chosen, kept.harm_count)
+    chosen = load_driven(kept.scenario, None, read_settings(kept.settings).scenario, alone=False)
+    measured_by = Measure.of(kept.measure, agent or kept.agent, kept.against, chosen, kept.harm_count)
     worlds = kept.worlds_of(chosen, str(file))
     measured = measured_by(Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0))
     rows = [
@@ -322,54 +300,17 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
         }
         for world, now in zip(kept.worlds, measured.score, strict=True)
     ]
-    table = plain_table("World", f"{kept.measure} before", "now", "", padding=(0, 1, 0, 0))
-    for row in rows:
-        now = "could not be driven" if row["now"] is None else f"{row['now']:.4f}"
-        table.add_row(str(row["name"]), f"{row['before']:.4f}", now, "worse" if row["worse"] else "")
-    out.result({"agent": agent or kept.agent, "measure": kept.measure, "worlds": rows}, table)
+    shown = [
+        (
+            *(row["name"], f"{row['before']:.4f}"),
+            "could not be driven" if row["now"] is None else f"{row['now']:.4f}",
+            "worse" if row["worse"] else "",
+        )
+        for row in rows
+    ]
+    sheet = Sheet("", ("World", f"{kept.measure} before", "now", ""), shown, gap=2)
+    out.result({"agent": agent or kept.agent, "measure": kept.measure, "worlds": rows}, sheet)
     worse = sum(bool(row["worse"]) for row in rows)
     out.note(f"{file}: {agent or kept.agent} is worse in {worse} of {count_of(len(rows), 'world')}")
     if worse:
         raise typer.Exit(1)
-
-
-def _table(worlds: list[NamedWorld], measure: Measure) -> list[Table]:
-    """The found worlds, where there are any."""
-    beside = {"harm": None, "bound": "Bound"}.get(measure.name, "Reference's harm")
-    titles = ("World", measure.name.capitalize(), "Harm", *([beside] if beside else []), "State")
-    table = plain_table(*titles, padding=(0, 1, 0, 0))
-    for world in worlds:
-        state = ", ".join(f"{name} {value:.4g}" for name, value in world.state.items())
-        reference = [] if world.reference is None else [f"{world.reference:.2f}"]
-        table.add_row(world.name, f"{world.score:.4g}", f"{world.harm:.2f}", *reference, state)
-    return [table] if worlds else []
-
-
-def _told(found: Falsified, budget: int) -> dict[str, object]:
-    """What all the tried worlds were like, as JSON."""
-    import numpy as np
-
-    from ethbrake_marl.studies.speed import this_machine
-
-    good = found.scores[np.isfinite(found.scores)]
-    return {
-        "tried": budget,
-        "counted": len(good),
-        "share_above_zero": found.share_above,
-        "first_above_zero": found.first_above,
-        "median": float(np.median(good)),
-        "worst": float(good.max()),
-        "machine": asdict(this_machine()),
-    }
-
-
-def _summary(told: dict[str, Any], measure: Measure) -> str:
-    budget, good, first = told["tried"], told["counted"], told["first_above_zero"]
-    left_out = f" ({budget - good:,} of them are none of the scenario's)" if good < budget else ""
-    what = f"{measure.name} in m2/s2, {measure.harm_count} count"
-    above = f"above zero in {100 * told['share_above_zero']:.1f} % of those tried"
-    return (
-        f"{measure.scenario.name}: {budget:,} worlds tried{left_out}; {what}: worst {told['worst']:.4g}, median"
-        f" {told['median']:.4g}; {above}, {f'the first after {first:,}' if first else 'none'}."
-        " The search looks for bad worlds: shares of it say nothing about a list."
-    )

@@ -1,21 +1,25 @@
-"""The commands that train and that go on with a training: ``run`` and ``train``."""
+"""The commands that train, and compare trainings: ``run``, ``train``, ``study``, ``reproduce`` and ``benchmark``."""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ethbrake_marl.cli.command import app, command, new_group
+from ethbrake_marl.cli.command import Out, app, command, new_group
 from ethbrake_marl.cli.evaluate import show_run
-from ethbrake_marl.cli.out import Out
-from ethbrake_marl.defaults import EPISODES, LIST_SEED
-from ethbrake_marl.errors import Progress, check_one_learner
+from ethbrake_marl.defaults import DEFAULT, HarmCount
+from ethbrake_marl.errors import InvalidInput, Progress, check_one_learner, check_whole_number, need
 
 if TYPE_CHECKING:
-    from ethbrake_marl.learning.train import TrainResult
+    from ethbrake_marl.learning import TrainResult
+    from ethbrake_marl.studies.sweep import StudyResult, SweepPlan, TuningPlan
+
 
 KEPT = (
     "if the training had begun, the run's folder keeps the last good policy, and ethbrake train resume FOLDER goes on"
@@ -36,8 +40,8 @@ def run_command(
     scenario: str = "paper-random",
     steps: int | None = None,
     seed: SeedOption = None,
-    episodes: Annotated[int, typer.Option(help="Worlds of the evaluation list.")] = EPISODES,
-    list_seed: Annotated[int, typer.Option(help="Seed of the evaluation list.")] = LIST_SEED,
+    episodes: Annotated[int, typer.Option(help="Worlds of the evaluation list.")] = DEFAULT.EPISODES,
+    list_seed: Annotated[int, typer.Option(help="Seed of the evaluation list.")] = DEFAULT.LIST_SEED,
     recipe: str = "quick",
     settings: list[str] | None = None,
     vehicle: str | None = None,
@@ -51,9 +55,8 @@ def run_command(
     one of the three tests (paper-random, -brake-only, -obstacle) the policy also drives the other two.
     Ctrl-C ends the training early, and what it has is evaluated; a second Ctrl-C stops at once.
     """
-    from ethbrake_marl.evaluation.inputs import load_driven
-    from ethbrake_marl.evaluation.results import PER_WORLD, results_to_json
-    from ethbrake_marl.learning.recipe import load_recipe, read_settings
+    from ethbrake_marl.evaluation import PER_WORLD, load_driven, results_to_json
+    from ethbrake_marl.learning import load_recipe, read_settings
 
     # torch takes seconds to load, here and in the other commands that learn
     from ethbrake_marl.studies.experiment import run_experiment, run_folder
@@ -114,19 +117,17 @@ def start_command(
     Afterwards: `ethbrake evaluate --agents full_brake,ppo@FOLDER,ppo@FOLDER+episode`; of several: `team@FOLDER`.
     Ctrl-C ends the training after the update in progress and keeps the policy; `ethbrake train resume FOLDER` goes on.
     """
-    from ethbrake_marl.evaluation.inputs import load_runnable
-    from ethbrake_marl.learning.recipe import check_scheme, load_recipe, read_settings, who_drives_what
-    from ethbrake_marl.learning.train import train
-    from ethbrake_marl.learning.training import resolve
+    from ethbrake_marl.evaluation import load_runnable
+    from ethbrake_marl.learning import load_recipe, read_settings, resolve, train
     from ethbrake_marl.studies.experiment import run_folder
 
     plan = load_recipe(recipe)
     given = read_settings(settings, [plan])
     chosen, plan = load_runnable(scenario, given.scenario), given.change(plan, out.note)
     if scheme is not None:
-        plan = plan.replace(scheme=check_scheme(scheme))
+        plan = plan.replace(scheme=scheme)
     training = resolve(plan, chosen)
-    begun = [f"scheme {training.scheme}: {who_drives_what(training.drivers)}"]
+    begun = [training.who_drives()]
 
     def tell(progress: Progress) -> None:
         if begun:  # all input is known to be good
@@ -163,11 +164,10 @@ def resume_command(
 
     The policy is the one that the training would have come to without the stop, bit for bit.
     """
-    from ethbrake_marl.learning.train import resume
+    from ethbrake_marl.learning import resume
 
     _tell(
-        out,
-        resume(folder, stop_when_lost=stop_when_lost, on_progress=out.show_progress, other_versions=other_versions),
+        out, resume(folder, stop_when_lost=stop_when_lost, on_progress=out.show_progress, other_versions=other_versions)
     )
 
 
@@ -189,20 +189,20 @@ def curves_command(
 
     The same command goes on after an interruption: finished trainings are kept, begun ones go on.
     """
-    from ethbrake_marl.evaluation.inputs import load_runnable
-    from ethbrake_marl.learning.recipe import read_settings
-    from ethbrake_marl.studies.learning_curves import FIGURE, parse_trainings, train_all, write_curves
+    from ethbrake_marl.evaluation import load_runnable
+    from ethbrake_marl.learning import read_settings
+    from ethbrake_marl.studies.learning_curves import parse_trainings, train_all, write_curves
 
     plan = parse_trainings(recipes)
     given = read_settings(settings, [trainings.recipe for trainings in plan])
     chosen = load_runnable(scenario, given.scenario)
-    plan = [replace(trainings, recipe=given.change(trainings.recipe, out.note)) for trainings in plan]
+    plan = [trainings._replace(recipe=given.change(trainings.recipe, out.note)) for trainings in plan]
     names = [chosen.vehicle_names[i] for i in chosen.learners]
     check_one_learner(chosen.name, names, "learning curves need exactly one")
     if not train_all(chosen, plan, output, steps=steps, jobs=jobs, tell=out.show_progress, settings=given.texts):
         out.interrupted(f"interrupted; the same command goes on with what is in {output}")
     out.result(write_curves(chosen, plan, output))
-    out.note(f"figure: {output / FIGURE}")
+    out.note(f"figure: {output / 'learning_curves.png'}")
 
 
 def _tell(out: Out, result: TrainResult) -> None:
@@ -221,3 +221,424 @@ def _end(out: Out, status: str, steps: int, folder: Path) -> None:
         left = f"go on with: ethbrake train resume {folder} (its policy is there)"
         out.interrupted(f"interrupted after {steps:,} training steps; {left}")
     out.note(f"{status} after {steps:,} training steps: {folder}")
+
+
+# The commands of many trainings or evaluations: ``study``, ``reproduce`` and ``benchmark``.
+
+KEPT_IN_FOLDER = "the same command goes on with what is in the folder"
+PAPER_EPISODES = 10_000
+_MOST_WORKERS, _MOST_TRIALS, _MOST_RETRIES = 4096, 100_000, 100
+
+FolderOption = Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of everything.")]
+RetriesOption = Annotated[int, typer.Option(help="Further attempts at a job whose process was lost.")]
+DryRunOption = Annotated[
+    bool, typer.Option("--dry-run", help="Print what would be done and what it takes; do nothing.")
+]
+CostOption = Annotated[bool, typer.Option("--cost", help="Say what is left to do and what it takes; stop.")]
+
+study_group = new_group(
+    "study",
+    "Train and compare many: a grid, settings, cooperation, lines.",
+    "study sweep sweep.yaml --output runs/sweep",
+    "study ablate --quick --output runs/ablation-quick",
+)
+
+
+def _schema_option(schema: Callable[[], dict[str, Any]]) -> Any:
+    """The option ``--schema`` of a command that reads files of one kind: print their JSON Schema and exit."""
+
+    def show_schema(asked: bool) -> None:
+        if asked:
+            Out().print_json(schema())
+            raise typer.Exit
+
+    told = "Print the JSON Schema of the file, and exit."
+    return Annotated[bool, typer.Option("--schema", is_eager=True, callback=show_schema, help=told)]
+
+
+def _sweep_schema() -> dict[str, Any]:
+    from ethbrake_marl.studies.sweep import SweepPlan
+
+    return SweepPlan.json_schema()
+
+
+@command(study_group, "sweep", "study sweep sweep.yaml --output runs/sweep", kept=KEPT_IN_FOLDER, json=True)
+def sweep_command(
+    out: Out,
+    file: Annotated[Path, typer.Argument(metavar="SWEEP.yaml", help="A grid or a list of jobs.")],
+    output: FolderOption,
+    jobs: Annotated[
+        int | None, typer.Option(help="Jobs at once, a process with one thread each.", show_default="the usable cores")
+    ] = None,
+    ray: str | None = None,
+    retries: RetriesOption = 2,
+    dry_run: DryRunOption = False,
+    schema: _schema_option(_sweep_schema) = False,  # type: ignore[valid-type]  # made here, read by Typer
+) -> None:
+    """Train every job of a file, and write one table of what they reached.
+
+    The same command goes on after an interruption: finished jobs are kept, begun ones go on. Exit status 1 where jobs
+    failed: failures.csv holds the last lines of each.
+    """
+    from ethbrake_marl.studies.jobs import open_workers
+    from ethbrake_marl.studies.sweep import SweepPlan
+
+    number = len(os.sched_getaffinity(0)) if jobs is None else jobs
+    _check_workers(number, retries, ray)
+    plan = SweepPlan.read(file)
+    plan.folder(output).check()
+    if dry_run:
+        _show_sweep(out, plan, output, number)
+        return
+    with closing(open_workers(ray, jobs)) as workers:
+        result = plan.run(output, workers, retries=retries, tell=out.show_progress)
+    _tell_sweep(out, result, output)
+
+
+def _check_workers(jobs: int, retries: int, ray: str | None) -> None:
+    check_whole_number("jobs", jobs, 1, _MOST_WORKERS)
+    check_whole_number("retries", retries, 0, _MOST_RETRIES)
+    if ray is not None:
+        need("ray")
+
+
+def _show_sweep(out: Out, plan: SweepPlan, output: Path, number: int) -> None:
+    """Every job and its state, and what is left takes."""
+    cost = plan.cost(output, number)
+    states = [(row, cost.states[row.name]) for row in plan.rows]
+    jobs = [{"hash": row.identity, "job": row.name, "set": row.settings, "state": state} for row, state in states]
+    lines = ["  ".join([f"{state:8}", row.name, *row.asked.settings]) for row, state in states]
+    out.result({"jobs": jobs, "decisions_left": cost.decisions, "core_s_left": cost.work_s}, *lines)
+    if not out.as_json:
+        out.note(cost.in_words)
+
+
+def _tell_sweep(out: Out, result: StudyResult, output: Path) -> None:
+    counts = result.counts
+    out.result({**counts, "interrupted": result.interrupted, "table": str(result.table)})
+    told = f"{counts['finished']:,} of {counts['jobs']:,} jobs finished; table: {result.table}"
+    if counts["failed"]:
+        told += f"; {counts['failed']:,} failed: {output / 'failures.csv'}"
+    if result.interrupted:
+        out.interrupted(f"interrupted; {told}; {KEPT_IN_FOLDER}")
+    out.note(told)
+    if counts["failed"]:
+        raise typer.Exit(1)
+
+
+def _tuning_schema() -> dict[str, Any]:
+    from ethbrake_marl.studies.sweep import TuningPlan
+
+    return TuningPlan.json_schema()
+
+
+@command(
+    study_group, "tune", "study tune tuning.yaml --output runs/tuning --trials 30 --export best.yaml",
+    kept=KEPT_IN_FOLDER, needs=("optuna",), json=True, force=True,
+)  # fmt: skip
+def tune_command(
+    out: Out,
+    file: Annotated[Path, typer.Argument(metavar="TUNING.yaml", help="A training and the ranges of its settings.")],
+    output: FolderOption,
+    trials: Annotated[int, typer.Option(help="Trials that the folder shall have altogether.")] = 30,
+    jobs: Annotated[int, typer.Option(help="Trials at once, a process each; more than one change what is tried.")] = 1,
+    ray: str | None = None,
+    retries: RetriesOption = 2,
+    export: Annotated[
+        Path | None, typer.Option(metavar="NAME.yaml", help="Write the best trial as a recipe of this name.")
+    ] = None,
+    dry_run: DryRunOption = False,
+    schema: _schema_option(_tuning_schema) = False,  # type: ignore[valid-type]  # made here, read by Typer
+) -> None:
+    """Search the settings of a recipe that do least harm on a list of worlds of its own.
+
+    The same command goes on after an interruption: trials that ended are kept, those that were begun go on. Exit status
+    1 where no trial came to its end.
+    """
+    from ethbrake_marl.studies.jobs import open_workers
+    from ethbrake_marl.studies.sweep import TuningPlan
+
+    check_whole_number("trials", trials, 1, _MOST_TRIALS)
+    _check_workers(jobs, retries, ray)
+    plan = TuningPlan.read(file)
+    plan.folder(output).check()
+    _check_export(out, plan, export)
+    if dry_run:
+        _show_tuning(out, plan, trials, jobs)
+        return
+    with closing(open_workers(ray, jobs)) as workers:
+        result = plan.run(output, workers, trials, retries=retries, tell=out.show_progress)
+    _tell_tuning(out, plan, result, export)
+
+
+def _check_export(out: Out, plan: TuningPlan, export: Path | None) -> None:
+    """Raise before the work begins what would be raised at its end.
+
+    A file that this tuning wrote before is replaced: the same command goes on.
+    """
+    if export is None:
+        return
+    if export.is_file():
+        head = plan.export_head(export).encode()
+        with export.open("rb") as file:
+            out.force = out.force or file.read(len(head)) == head
+    if export.suffix != ".yaml":
+        raise InvalidInput(f"export {export}: must end in .yaml, as recipes do")
+    plan.best_recipe({}, export, "")
+    out.check(export)
+
+
+def _show_tuning(out: Out, plan: TuningPlan, trials: int, jobs: int) -> None:
+    """The space, and what the trials take."""
+    (per_trial, words), own = plan.cost(trials, jobs), plan.own_values()
+    space = {key: dimension.model_dump(mode="json") for key, dimension in plan.file.search.items()}
+    now = {key: "not in the space" if own is None else f"the recipe has {own[key]}" for key in space}
+    out.result(
+        {"search": space, "own_values": own, "core_s_per_trial": per_trial, "trials": trials},
+        *(f"{key}  {dimension}  ({now[key]})" for key, dimension in plan.file.search.items()),
+    )
+    if not out.as_json:
+        out.note(words)
+
+
+def _tell_tuning(out: Out, plan: TuningPlan, result: StudyResult, export: Path | None) -> None:
+    best = result.best
+    export = None if best is None or result.interrupted else export  # what goes on exports at its end
+    if best is not None and export is not None:
+        told = (
+            f"ethbrake study tune: trial {best.number}, harm {best.harm!r} on the list of seed {plan.file.measure.seed}"
+        )
+        out.write(export, plan.best_recipe(best.values, export, told))
+    shown = None if best is None else {"trial": best.number, "harm": best.harm, "values": best.values}
+    counts = {"trials": result.counts, "interrupted": result.interrupted, "table": str(result.table)}
+    lines = [] if best is None else [f"best: trial {best.number}, harm {best.harm:.4f}"]
+    lines += [] if best is None else [f"  {key} = {value}" for key, value in best.values.items()]
+    out.result({"best": shown, **counts, "exported": None if export is None else str(export)}, *lines)
+    counted = ", ".join(f"{number:,} {state}" for state, number in sorted(result.counts.items()))
+    told = f"trials: {counted or 'none'}; table: {result.table}"
+    told += f"; recipe: {export}" if export is not None else ""
+    if result.interrupted:
+        out.interrupted(f"interrupted; {told}; {KEPT_IN_FOLDER}")
+    out.note(told)
+    if best is None:
+        raise typer.Exit(1)
+
+
+@command(study_group, "ablate", "study ablate --quick --output runs/ablation-quick", kept=KEPT_IN_FOLDER, json=True)
+def ablate_command(
+    out: Out,
+    output: FolderOption,
+    levels: Annotated[
+        str | None, typer.Option(metavar="A,B,...", help="Scenarios in this order.", show_default="the shipped ladder")
+    ] = None,
+    recipes: Annotated[str, typer.Option(metavar="A,B,...", help="Training recipes.")] = "cooperation",
+    scheme: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME", help="How several learners are trained.", show_default="the recipe's; else shared"
+        ),
+    ] = None,
+    seeds: Annotated[int | None, typer.Option(help="Trainings of each, seeds 0, 1, ...", show_default="5")] = None,
+    steps: Annotated[
+        int | None, typer.Option(help="Decisions per training, for each of its learners.", show_default="400000")
+    ] = None,
+    episodes: Annotated[int | None, typer.Option(help="Common worlds to measure on.", show_default="4000")] = None,
+    list_seed: Annotated[int, typer.Option(help="Seed of the common worlds.")] = DEFAULT.LIST_SEED,
+    search_episodes: Annotated[
+        int | None, typer.Option(help="Worlds of the joint optimum, the first ones.", show_default="600")
+    ] = None,
+    budget: Annotated[
+        int | None, typer.Option(help="Candidates per world and count of that search.", show_default="20000")
+    ] = None,
+    shield: Annotated[
+        str | None,
+        typer.Option(metavar="step", help="Also drive behind this shield, one for all learners.", show_default="none"),
+    ] = None,
+    settings: list[str] | None = None,
+    quick: Annotated[bool, typer.Option("--quick", help="A first look: few seeds, worlds and decisions.")] = False,
+    jobs: int = 1,
+    cost: CostOption = False,
+) -> None:
+    """Train levels of cooperation, compare them on common worlds.
+
+    Says first what it will take. The same command goes on after an interruption: finished trainings are kept, begun
+    ones go on. Writes ablation.html, ablation.md, ablation.csv, ablation.json and three figures.
+    """
+    from ethbrake_marl.studies.ablation import plan_ablation, write_ablation
+    from ethbrake_marl.studies.speed import this_machine
+
+    plan = plan_ablation(
+        levels, recipes, scheme, settings, quick=quick, tell=out.note, seeds=seeds, steps_per_learner=steps,
+        episodes=episodes, list_seed=list_seed, search_episodes=search_episodes, budget=budget, shield=shield,
+        folder=output,
+    )  # fmt: skip
+    if not cost:
+        plan.job_folder().check()
+    out.note(plan.cost())
+    if cost:
+        return
+    measured = plan.run(jobs, out.show_progress)
+    if measured is None:
+        out.interrupted(f"interrupted; {KEPT_IN_FOLDER}")
+    found, (page, text, *figures) = write_ablation(plan, measured, str(this_machine()))
+    if out.as_json:
+        out.print_json(found)
+    else:
+        out.show(text.read_text("utf-8"), end="")
+    drawn = f"; figures: {', '.join(map(str, figures))}" if figures else ""
+    out.note(f"page: {page}; tables: {text}{drawn}")
+
+
+@command(
+    study_group, "generalise", "study generalise --runs runs/cooperation-4-all-cooperation-seed0 --vehicles 3,5,10",
+    json=True,
+)  # fmt: skip
+def generalise_command(
+    out: Out,
+    runs: Annotated[str, typer.Option(metavar="RUN,RUN,...", help="Runs or bundles, seeds of one training.")],
+    scenario: str = "cooperation-4-all",
+    vehicles: Annotated[
+        str, typer.Option(metavar="N,N,...", help="Lengths of the lines; vehicle i > 3 is like vehicle i - 2.")
+    ] = "3,4,5,6,7,8,9,10",
+    episodes: Annotated[int, typer.Option(help="Worlds of each length.")] = 1000,
+    seed: int = DEFAULT.LIST_SEED,
+    harm_count: HarmCount = "total",
+    search_episodes: Annotated[int, typer.Option(help="Worlds of the joint optimum; 0: none.")] = 0,
+    budget: Annotated[int, typer.Option(help="Candidates per world of that search.")] = 20_000,
+    settings: list[str] | None = None,
+) -> None:
+    """Let trained policies drive longer lines with the same weights.
+
+    They drive every follower, and Vehicle 1 where it learns in the scenario.
+    """
+    from ethbrake_marl.evaluation import load_runnable
+    from ethbrake_marl.learning import read_settings
+    from ethbrake_marl.studies.ablation import LineQuestion
+
+    lengths = tuple(int(each) if each.strip().isdecimal() else 0 for each in vehicles.split(","))
+    if not all(2 <= each <= 64 for each in lengths):
+        raise InvalidInput(f"vehicles {vehicles!r}: must be lengths from 2 to 64, for instance 3,4,5")
+    check_whole_number("episodes", episodes, 1)
+    check_whole_number("search-episodes", search_episodes, 0, episodes)
+    check_whole_number("budget", budget, 1)
+    line = load_runnable(scenario, read_settings(settings).scenario)
+    question = LineQuestion(line, lengths, episodes, seed, harm_count, search_episodes, budget)
+    agents = question.load_runs([each.strip() for each in runs.split(",")])
+    found = question.drive(agents, out.show_progress)
+    if out.as_json:
+        out.print_json(found)
+    else:
+        out.show(question.markdown(found, len(agents)), end="")
+
+
+@command(
+    app, "reproduce", "reproduce random-table harm-distance --quick --output runs/paper",
+    kept=KEPT_IN_FOLDER, json=True, force=True,
+)  # fmt: skip
+def reproduce_command(
+    out: Out,
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[ITEM ...]", help="What to make.", show_default="everything")
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Train nothing: shipped policies (the default).")] = False,
+    full: Annotated[bool, typer.Option("--full", help="Train learning curves and a policy stopped early.")] = False,
+    output: FolderOption = Path("runs/reproduction"),
+    episodes: Annotated[int, typer.Option(help="The most worlds of any list; the paper has 10,000.")] = PAPER_EPISODES,
+    docs: Annotated[
+        Path | None, typer.Option(metavar="FILE.md", help="Write the results as Markdown, too, figures beside it.")
+    ] = None,
+    cost: CostOption = False,
+    listed: Annotated[bool, typer.Option("--list", help="List the items; stop.")] = False,
+) -> None:
+    """Make the paper's figures and tables again, and say what agrees, what differs and what cannot agree.
+
+    Writes one page (index.html), and for each item its figures, its data and its result. Says first what it will take.
+    The same command goes on after an interruption.
+    """
+    from ethbrake_marl.files.sheet import Column, Sheet
+    from ethbrake_marl.studies.reproduction.folder import PAGE, choose_items, reproduce, tell_cost
+    from ethbrake_marl.studies.reproduction.items import Settings
+    from ethbrake_marl.studies.speed import this_machine
+
+    chosen = choose_items(names or ())
+    if listed:
+        rows = [(item.name, ", ".join(item.labels), item.title) for item in chosen]
+        columns = (Column("Item", "name"), Column("Label in the paper", "labels"), Column("What", "title"))
+        sheet = Sheet("", [replace(column, text=True) for column in columns], rows)
+        out.result(sheet.json(), sheet)
+        return
+    if quick and full:
+        raise InvalidInput("--quick and --full: give one of the two")
+    check_whole_number("episodes", episodes, 2, PAPER_EPISODES)
+    if full:
+        need("torch")
+    settings = Settings("full" if full else "quick", output, episodes, out.show_progress, str(this_machine()), docs)
+    out.note(tell_cost(chosen, settings))
+    if cost:
+        return
+    results, finished = reproduce(chosen, settings, force=out.force)
+    verdicts = [(result.name, result.verdict.outcome, result.verdict.because) for result in results]
+    out.result([result.in_words() for result in results], Sheet("", ("Item", "Verdict", "Because"), verdicts))
+    out.note(f"page: {output / PAGE}")
+    if not finished:
+        out.interrupted(f"interrupted: items are made of the trainings that were finished; {KEPT_IN_FOLDER}")
+
+
+benchmark_group = new_group(
+    "benchmark",
+    "Score an agent on a frozen suite, or show entries as a table.",
+    "benchmark v2 --agent ppo@shipped --output mine.json",
+    "benchmark table mine.json theirs.json --output table.md",
+)
+
+
+@command(benchmark_group, "drive", "benchmark v2 --agent ppo@shipped --output mine.json", json=True, force=True)
+def drive_command(
+    out: Out,
+    suite: Annotated[str, typer.Argument(metavar="SUITE", help="A suite that ships, such as v2.")],
+    agent: Annotated[str, typer.Option(metavar="SPEC", help="Who drives; any agent of `ethbrake evaluate`.")],
+    output: Annotated[
+        Path | None, typer.Option(metavar="ENTRY.json", help="Also write the entry to this file.")
+    ] = None,
+) -> None:
+    """Let an agent drive a frozen suite of lists, and score it.
+
+    The score of a list is the realised share of what is possible, 0 for full braking and 1 for the best known. A list
+    that the agent cannot drive has none, and then there is no overall score.
+    """
+    from ethbrake_marl.studies.benchmark import load_suite, make_entry
+
+    out.check(output, ".json", what="an entry")
+    chosen = load_suite(suite)
+    entry = make_entry(chosen, agent, on_progress=out.show_progress)
+    if output is not None:
+        entry.write(output, force=out.force)
+        out.note(f"entry: {output}")
+    mean = entry.mean_of_driven.in_words(digits=1, scale=100.0, unit=" %")
+    if entry.overall is not None:
+        told = f"{agent}: overall {mean} of what is possible, mean over {len(chosen.lists)} lists of suite {suite}"
+    else:
+        told = (
+            f"{agent}: no overall score, as it drives {entry.lists_driven} of {len(chosen.lists)} lists of suite"
+            f" {suite}; {mean} of what is possible there"
+        )
+    out.result(entry.model_dump(mode="json"), entry.sheet(), told)
+
+
+@command(benchmark_group, "table", "benchmark table mine.json theirs.json --output table.md", json=True, force=True)
+def table_command(
+    out: Out,
+    entries: Annotated[list[Path], typer.Argument(metavar="ENTRY.json...", help="Entries of one suite.")],
+    output: Annotated[Path | None, typer.Option(metavar="FILE.md", help="Also write the table, as Markdown.")] = None,
+) -> None:
+    """Show entries of `ethbrake benchmark` as one table, sorted by their score.
+
+    Refused by name: entries of another suite, and changed ones.
+    """
+    from ethbrake_marl.studies.benchmark import read_leaderboard
+
+    out.check(output, ".md", what="the table")
+    found = read_leaderboard(entries)
+    if output is not None:
+        out.write(output, f"{found.table().markdown()}\n", what="table")
+    out.result(found.to_json(), found.sheet(), *found.notes)

@@ -1,1 +1,46 @@
 """The four interfaces, thin over ``engine``: PettingZoo, Gymnasium, its vector API, Stable-Baselines3."""
+
+from typing import TYPE_CHECKING
+
+from ethbrake_marl.doors import front_door
+
+if TYPE_CHECKING:
+    from ethbrake_marl.envs.common import (
+        COLUMNS as COLUMNS,
+        LISTED_WORLD as LISTED_WORLD,
+        Report as Report,
+        action_box as action_box,
+        feature_box as feature_box,
+        make_engine as make_engine,
+        report as report,
+        resolve_scenario as resolve_scenario,
+    )
+    from ethbrake_marl.envs.drawing import (
+        BODY_M as BODY_M,
+        COLOURS as COLOURS,
+        Frame as Frame,
+        Scene as Scene,
+        Trace as Trace,
+        animate_films as animate_films,
+        vehicle_colour as vehicle_colour,
+    )
+    from ethbrake_marl.envs.gym import EthBrakeEnv as EthBrakeEnv, EthBrakeVectorEnv as EthBrakeVectorEnv
+    from ethbrake_marl.envs.parallel import (
+        EthBrakeParallelEnv as EthBrakeParallelEnv,
+        InTurns as InTurns,
+        env as env,
+        in_turns as in_turns,
+        parallel_env as parallel_env,
+        raw_env as raw_env,
+    )
+    from ethbrake_marl.envs.registration import (
+        GYMNASIUM_ID as GYMNASIUM_ID,
+        register_environments as register_environments,
+    )
+    from ethbrake_marl.envs.sb3 import (
+        EthBrakeVecEnv as EthBrakeVecEnv,
+        Rewards as Rewards,
+        make_sb3_vec_env as make_sb3_vec_env,
+    )
+else:
+    __getattr__ = front_door(__name__, __file__)

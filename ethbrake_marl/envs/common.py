@@ -14,30 +14,22 @@ from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import action_of, checked_action
-from ethbrake_marl.agents.rollout import script_agents
-from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.engine.step import Step
+from ethbrake_marl.agents import script_agents
+from ethbrake_marl.engine import Engine, Step
 from ethbrake_marl.errors import InvalidInput, check_one_learner, check_whole_number
 from ethbrake_marl.harm import front_share
 from ethbrake_marl.observations import Observation, ObservationSpec, choose_observation
-from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
-from ethbrake_marl.physics.advance import (
-    TIME,
-    command_at,
-    harm_at,
-    has_messages,
-    has_news,
-    messages_at,
-    own_latency_and_news,
-    params_at,
-    state_width,
-)
-from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.physics.messages import age_by_rows
+from ethbrake_marl.physics import Bools, Floats, Ints, Packed, Worlds, age_s, columns, compiled
 from ethbrake_marl.rewards import Reward, RewardParams
-from ethbrake_marl.scenario import Sample, Scenario, initial_state_worlds, load_scenario, read_scenario
-from ethbrake_marl.scenario.features import Feature
-from ethbrake_marl.scenario.fields import join_samples, kind_columns, quantity_columns
+from ethbrake_marl.scenario import (
+    QUANTITY,
+    Feature,
+    Sample,
+    Scenario,
+    initial_state_worlds,
+    load_scenario,
+    read_scenario,
+)
 
 AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping: what a file would say
 
@@ -238,12 +230,12 @@ def describe_worlds(engine: Engine) -> Columns:
     numbers, given = engine.roster.numbers, engine.roster.given
     named = {"world_seed": np.full(engine.n, engine.roster.seed), "world": numbers.copy()}
     if (numbers < 0).all() and given is not None:
-        return {**quantity_columns(given), **named}
+        return {**QUANTITY.columns(given), **named}
     if (numbers < 0).any():
         return _describe_mixed(engine, named)
     sample = _drawn_again(engine, numbers)
     _check_same(engine, sample.worlds)
-    return {**kind_columns(sample.types, sample.scenarios), **quantity_columns(sample.worlds), **named}
+    return {**sample.kinds, **QUANTITY.columns(sample.worlds), **named}
 
 
 def describe_world(engine: Engine) -> dict[str, Any]:
@@ -263,8 +255,8 @@ def _describe_mixed(engine: Engine, named: Columns) -> Columns:
     found: Columns = {}
     renewed = _drawn_again(engine, numbers[~own])
     _check_same(engine, renewed.worlds, np.flatnonzero(~own))
-    drawn = {**kind_columns(renewed.types, renewed.scenarios), **quantity_columns(renewed.worlds)}
-    started = quantity_columns(given.take(own))
+    drawn = {**renewed.kinds, **QUANTITY.columns(renewed.worlds)}
+    started = QUANTITY.columns(given.take(own))
     for name, column in drawn.items():
         found[name] = np.zeros(engine.n, column.dtype)
         found[name][~own] = column
@@ -282,7 +274,7 @@ def _drawn_again(engine: Engine, numbers: Ints) -> Sample:
         first = int(run[0])
         span = engine.scenario.sample(int(run[-1]) - first + 1, engine.roster.seed, first=first, channel="training")
         parts.append(span.take(run - first))
-    return join_samples(parts, 0).take(places)
+    return Sample.join(parts, 0).take(places)
 
 
 def _check_same(engine: Engine, drawn: Worlds, rows: Ints | None = None) -> None:
@@ -306,8 +298,7 @@ def _check_same(engine: Engine, drawn: Worlds, rows: Ints | None = None) -> None
 # of the harm so far under both counts, the same for the whole world, and whether anything has collided. Of the last
 # step: ``cost`` (the harm it added to the line, as the reward counts impacts; for safe-RL libraries) and
 # ``reward_NAME``, each term of the reward before its weight; after a reset they are 0. ``world_seed`` and ``world``
-# name
-# the world, so that it can be played again (-1: it was given). Where the scenario has a ``v2x`` channel also
+# name the world, so that it can be played again (-1: it was given). Where the scenario has a ``v2x`` channel also
 # ``known_from_s`` [N]: from when on this vehicle acts on news of each one (infinite: never; of itself: its latency);
 # and where its messages are periodic ``age_s`` [N]: how old the newest sample is that it was told of each (infinite:
 # none).
@@ -347,9 +338,11 @@ def report(engine: Engine, step: Step | None = None, rows: Ints | None = None) -
     values = np.empty((*wanted.shape, len(COLUMNS)))
     _report_rows(state, params, wanted, values)
     N = wanted.shape[1]
-    known = own_latency_and_news(params, N)[1] if has_news(params, N) else None
+    shown = Packed(state, params)
+    known = shown.known_from_s if shown.has_news else None
     cost, terms = _of_the_step(engine, step, rows)
-    age = age_by_rows(state[:, TIME], params[:, messages_at(N) :], N) if has_messages(state, params) else None
+    time_s, messages = state[:, shown.column.time], params[:, shown.column.messages :]
+    age = age_s(time_s, messages, N) if shown.has_messages else None
     return Report(values, cost, terms, engine.roster.seed, world, known, age)
 
 
@@ -369,7 +362,8 @@ def _of_the_step(engine: Engine, step: Step | None, rows: Ints | None) -> tuple[
 def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> None:
     """Fill ``out`` [n, N, ...] with the columns of AFTER_A_STEP."""
     n, N = wanted.shape
-    P, harm, mass, obstacle = N - 1, harm_at(N), params_at(3, N), state_width(N)
+    column = columns(state)
+    P, harm, mass, obstacle = N - 1, column.harm, column.mass, column.obstacle
     for k in range(n):
         first, total, impacts = 0.0, 0.0, 0.0
         for i in range(N):
@@ -390,13 +384,14 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
             out[k, 0, 2] += state[k, obstacle + 2]
             out[k, 0, 3] += state[k, obstacle + 3]
         for i in range(N):
-            out[k, i, 0] = state[k, TIME]
-            out[k, i, 1] = state[k, command_at(N) + i]
+            out[k, i, 0] = state[k, column.time]
+            out[k, i, 1] = state[k, column.command + i]
             out[k, i, 4] = first
             out[k, i, 5] = total
             out[k, i, 6] = 1.0 if impacts > 0.0 else 0.0
             out[k, i, 7] = wanted[k, i]
-            out[k, i, 8] = action_of(wanted[k, i], params[k, params_at(0, N) + i], params[k, params_at(1, N) + i])
+            braking, driving = params[k, column.braking + i], params[k, column.driving + i]
+            out[k, i, 8] = action_of(wanted[k, i], braking, driving)
 
 
 def plain_infos(told: Report, vehicles: Ints | None = None) -> list[dict[str, Any]]:

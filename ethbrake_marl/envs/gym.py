@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from ethbrake_marl.engine.step import Step
+from ethbrake_marl.engine import Step
 from ethbrake_marl.envs.common import (
     AnyScenario,
     action_box,
@@ -30,7 +30,7 @@ from ethbrake_marl.envs.common import (
     report,
     restart,
 )
-from ethbrake_marl.envs.drawing.viewer import BATCH_MODES, CLASS_METADATA, Viewer, render_metadata
+from ethbrake_marl.envs.drawing import Viewer
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observation, Observations
 from ethbrake_marl.physics import Bools, Floats
@@ -42,7 +42,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
 
     Observation: float32 [F], the features of ``ObservationSpec``. Action: [1] in [-1, 1]; -1 full braking capacity, 0
     coasts, +1 full driving capacity. Terminated: all at rest and no command that would move one. Truncated: the
-    horizon. Infos: see ``envs.infos``. ``reset(seed=s)`` starts the stream of worlds of s, ``reset()`` goes on in it;
+    horizon. Infos: see ``envs.common``. ``reset(seed=s)`` starts the stream of worlds of s, ``reset()`` goes on in it;
     ``options={"initial_state": {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}}`` starts from there. Raises
     ``InvalidInput`` for more or fewer than one learner, an action outside [-1, 1], a step without an episode.
 
@@ -65,7 +65,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
     """
 
     _spec: EnvSpec | None = None
-    metadata: dict[str, Any] = dict(CLASS_METADATA)  # noqa: RUF012  # as Gymnasium declares it
+    metadata: dict[str, Any] = dict(Viewer.METADATA)  # noqa: RUF012  # as Gymnasium declares it
 
     def __init__(
         self,
@@ -77,7 +77,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
     ) -> None:
         self.engine = make_engine(scenario, 1, learners=learners, reward=reward, observation=observation)
         self.render_mode, self.viewer = render_mode, Viewer(self.engine, render_mode)
-        self.metadata = {**self.metadata, **render_metadata(self.engine)}
+        self.metadata = {**self.metadata, **self.viewer.metadata}
         self.learner = only_learner(self.engine)
         self._column = np.array([self.learner])
         self._name = self.engine.scenario.vehicle_names[self.learner]
@@ -97,7 +97,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode; see ``envs.setup``."""
+        """Start an episode; see ``envs.common``."""
         check_seed(seed)
         if seed is None and self._np_random_seed is None:
             seed = fresh_seed()  # kept by Gymnasium: reset(seed=env.np_random_seed) repeats it
@@ -120,7 +120,7 @@ class EthBrakeEnv(gymnasium.Env[Observations, NDArray[Any]]):
         return self._observe(), reward, bool(step.terminated[0]), bool(step.truncated[0]), info
 
     def describe_world(self) -> dict[str, Any]:
-        """What the running world was drawn as: flat numbers and texts by name; see ``envs.drawn``."""
+        """What the running world was drawn as: flat numbers and texts by name; see ``envs.common``."""
         if not self._started:
             raise InvalidInput("describe_world: no episode was started; call reset first")
         return describe_world(self.engine)
@@ -183,8 +183,8 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
     ) -> None:
         self.autoreset_mode = _check_mode(autoreset_mode)
         self.engine = make_engine(scenario, num_envs, learners=learners, reward=reward, observation=observation)
-        self.render_mode, self.viewer = render_mode, Viewer(self.engine, render_mode, BATCH_MODES)
-        self.metadata = {"autoreset_mode": self.autoreset_mode, **render_metadata(self.engine, BATCH_MODES)}
+        self.render_mode, self.viewer = render_mode, Viewer(self.engine, render_mode, batch=True)
+        self.metadata = {"autoreset_mode": self.autoreset_mode, **self.viewer.metadata}
         self.learner = only_learner(self.engine)
         self.num_envs = num_envs
         self.single_observation_space = feature_box(self.engine.observation.features)
@@ -196,7 +196,7 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode in every world; see ``envs.setup``."""
+        """Start an episode in every world; see ``envs.common``."""
         check_seed(seed)
         if seed is None and self._np_random_seed is None:
             seed = fresh_seed()  # kept by Gymnasium: reset(seed=env.np_random_seed) repeats it
@@ -224,14 +224,14 @@ class EthBrakeVectorEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
         return engine.observe(self.learner), reward, step.terminated, step.truncated, infos
 
     def describe_worlds(self) -> dict[str, NDArray[Any]]:
-        """What each running world was drawn as: columns by name, each [worlds]; see ``envs.drawn``."""
+        """What each running world was drawn as: columns by name, each [worlds]; see ``envs.common``."""
         if not self._started:
             raise InvalidInput("describe_worlds: no episode was started; call reset first")
         return describe_worlds(self.engine)
 
     def render(self) -> tuple[Any, ...]:
         """A frame [H, W, 3] uint8, or a text, of every world; of a world that has just been renewed, its start."""
-        return self.viewer.render_each()
+        return tuple(self.viewer.render())
 
     def _fill_ignored(self, actions: NDArray[Any], before: Bools) -> NDArray[Any]:
         """The actions with those that the autoreset mode ignores replaced: their worlds had ended ``before``."""

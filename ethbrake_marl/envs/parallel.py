@@ -12,7 +12,7 @@ from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from ethbrake_marl.actions import checked_action
-from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.common import (
     AnyScenario,
     Report,
@@ -26,7 +26,7 @@ from ethbrake_marl.envs.common import (
     report,
     restart,
 )
-from ethbrake_marl.envs.drawing.viewer import CLASS_METADATA, Viewer, render_metadata
+from ethbrake_marl.envs.drawing import Viewer
 from ethbrake_marl.errors import InvalidInput, check_whole_number, unknown_name
 from ethbrake_marl.observations import Observation, Observations, full_state, state_features
 from ethbrake_marl.physics import Ints
@@ -53,9 +53,7 @@ class InTurns(parallel_to_aec_wrapper):  # type: ignore[misc]  # PettingZoo is u
         super().step(action)
 
 
-def in_turns(
-    env: ParallelEnv[str, Observations, NDArray[Any]],
-) -> AECEnv[str, Observations, NDArray[Any]]:
+def in_turns(env: ParallelEnv[str, Observations, NDArray[Any]]) -> AECEnv[str, Observations, NDArray[Any]]:
     """The AEC environment of a parallel one of this package, whatever wraps it; order is enforced."""
     return OrderEnforcingWrapper(InTurns(env))
 
@@ -92,7 +90,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
 
     """
 
-    metadata: dict[str, Any] = {"name": "ethbrake_v0", "is_parallelizable": True, **CLASS_METADATA}  # noqa: RUF012
+    metadata: dict[str, Any] = {"name": "ethbrake_v0", "is_parallelizable": True, **Viewer.METADATA}  # noqa: RUF012
 
     def __init__(
         self,
@@ -109,7 +107,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         self.render_mode, self.max_cycles = render_mode, max_cycles
         self.engine = make_engine(scenario, 1, learners=learners, reward=reward, observation=observation)
         self.viewer = Viewer(self.engine, render_mode)
-        self.metadata = {**self.metadata, **render_metadata(self.engine)}
+        self.metadata = {**self.metadata, **self.viewer.metadata}
         names = self.engine.scenario.vehicle_names
         self._vehicles = _agent_vehicles(self.engine, agents)
         self.possible_agents = [names[i] for i in self._vehicles.tolist()]
@@ -133,7 +131,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observations], Infos]:
-        """Start an episode; see ``envs.setup``."""
+        """Start an episode; see ``envs.common``."""
         given = fresh_seed() if seed is None and not self._seeded else seed
         restart(self.engine, given, options)
         if given is not None:
@@ -170,7 +168,7 @@ class EthBrakeParallelEnv(ParallelEnv[str, Observations, NDArray[Any]]):  # type
         )
 
     def describe_world(self) -> dict[str, Any]:
-        """What the running world was drawn as: flat numbers and texts by name; see ``envs.drawn``."""
+        """What the running world was drawn as: flat numbers and texts by name; see ``envs.common``."""
         if not self._started:
             raise InvalidInput("describe_world: no episode was started; call reset first")
         return describe_world(self.engine)

@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.engine.snapshot import Arrays, engine_snapshot, restore_engine
-from ethbrake_marl.engine.step import Step
+from ethbrake_marl.engine import Arrays, Engine, Step, engine_snapshot, restore_engine
 from ethbrake_marl.envs.common import (
     INITIAL_STATE,
     AnyScenario,
@@ -30,8 +28,7 @@ from ethbrake_marl.envs.common import (
 )
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Appended, Observation, Observations, full_state, row_features
-from ethbrake_marl.physics import Bools, Ints, Worlds, concatenate
-from ethbrake_marl.physics.advance import Packed, unpack
+from ethbrake_marl.physics import Bools, Ints, Packed, Worlds
 from ethbrake_marl.rewards import Reward
 from ethbrake_marl.scenario import initial_state_worlds
 
@@ -184,7 +181,7 @@ class EthBrakeVecEnv(VecEnv):
         return self._observe(), reward.astype(np.float32), self._by_row(over), infos
 
     def describe_worlds(self) -> dict[str, NDArray[Any]]:
-        """What each running world was drawn as: columns by name, each [worlds]; see ``envs.drawn``."""
+        """What each running world was drawn as: columns by name, each [worlds]; see ``envs.common``."""
         if not self._started:
             raise InvalidInput("describe_worlds: no episode was started; call reset first")
         return describe_worlds(self.engine)
@@ -264,7 +261,7 @@ class EthBrakeVecEnv(VecEnv):
         else:
             state, params = self.engine.packed
             some = slice(None) if worlds is None else worlds
-            more = full_state(unpack(Packed(state[some], params[some])), self.engine.scenario).repeat(width, axis=0)
+            more = full_state(Packed(state[some], params[some]).worlds(), self.engine.scenario).repeat(width, axis=0)
         return np.concatenate([rows, more], axis=1, dtype=np.float32)
 
     def _by_row(self, worlds: Bools) -> Bools:
@@ -286,7 +283,9 @@ class EthBrakeVecEnv(VecEnv):
                     f"set_options: row {k} has {row!r}; if one row has an {INITIAL_STATE}, every row needs one, and the"
                     " learners of a world the same options"
                 )
-        return concatenate([initial_state_worlds(row[INITIAL_STATE], self.engine.scenario) for row in options[::width]])
+        return Worlds.concatenate(
+            [initial_state_worlds(row[INITIAL_STATE], self.engine.scenario) for row in options[::width]]
+        )
 
     def _refuse_some_rows(self, what: str, indices: VecEnvIndices) -> None:
         if list(self._get_indices(indices)) != list(range(self.num_envs)):

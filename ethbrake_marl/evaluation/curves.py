@@ -8,19 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
-from ethbrake_marl.agents.e_v2x_bm_kernel import optimise_pairwise, pairwise_breakpoints, pairwise_harm
-from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.agents import Agent, optimise_coupled, optimise_pairwise, pairwise_breakpoints, pairwise_harm
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.outcome import Evaluation, Outcome
+from ethbrake_marl.evaluation.measures import Evaluation, Outcome
 from ethbrake_marl.evaluation.rollout import controlled_vehicle, evaluate
-from ethbrake_marl.limits.best_harm import scripted_commands
-from ethbrake_marl.limits.limits import Limits, Unproven, known_limits, undecided_because
-from ethbrake_marl.limits.lower_bound import avoidability
+from ethbrake_marl.limits import Limits, Unproven, avoidability, known_limits, scripted_commands, undecided_because
 from ethbrake_marl.physics import Bools, Floats, Worlds, advance, forecast, make_worlds
-from ethbrake_marl.scenario import Scenario, Task, worlds_from_table
-from ethbrake_marl.scenario.fields import QUANTITIES
+from ethbrake_marl.scenario import QUANTITY, Scenario, Task, worlds_from_table
 
 CELLS = 81  # along each gap
 CHUNK = 500  # worlds between two reports of progress
@@ -76,7 +71,9 @@ def criticality_map(
         raise InvalidInput(f"criticality map: scenario {scenario.name!r} has one gap; at least two are needed")
     if not cells >= 2:
         raise InvalidInput(f"criticality map: cells = {cells}; at least 2 are needed")
-    ranges = [gap_range_m or _range_of(scenario, pair) for pair in (0, 1)]
+    ranges = [gap_range_m] * 2 if gap_range_m else []
+    for low, high in scenario.bounds("gaps_m")[:2] if not ranges else ():  # drawn, or around a fixed number
+        ranges.append((low, high) if low < high else (FIXED_GAP[0] * low, FIXED_GAP[1] * high))
     for low, high in ranges:
         if not 0.0 <= low < high < np.inf:
             raise InvalidInput(f"criticality map: gaps from {low:g} to {high:g} m; must be 0 <= low < high")
@@ -129,19 +126,13 @@ def _halve(avoidable: Callable[[Floats, Floats], Bools], gap_1_m: Floats, ends: 
     return gap_1_m, np.where(inside, np.nan, at)
 
 
-def _range_of(scenario: Scenario, pair: int) -> Range:
-    """Over which a gap is drawn: what the scenario draws from, or around its fixed number."""
-    low, high = scenario.bounds("gaps_m")[pair]
-    return (low, high) if low < high else (FIXED_GAP[0] * low, FIXED_GAP[1] * high)
-
-
 def _worlds_at(scenario: Scenario, gap_1_m: Floats, gap_2_m: Floats) -> Worlds:
     """Worlds with these first two gaps; everything else as the scenario fixes it."""
     columns = {"gap_1_m": gap_1_m, "gap_2_m": gap_2_m}
-    for field, rule in QUANTITIES.items():
+    for field, rule in QUANTITY.usual.items():
         for i in range(2 if field == "gaps_m" else 0, rule.count(scenario.vehicles)):
             low, high = scenario.bounds(field)[i]
-            name = QUANTITIES[field].column_of(i)
+            name = QUANTITY.usual[field].column_of(i)
             if low != high:
                 raise InvalidInput(
                     f"scenario {scenario.name!r}: {name} is random, from {low:g} to {high:g}; a criticality map needs"
@@ -216,18 +207,15 @@ def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> De
     own = {name: p for name, p in pairs.items() if 0 <= p < world.N - 1}
     regimes = {name: regimes_of(copies, p, deceleration) for name, p in own.items()}
     predicted = contacts[:, list(own.values())].sum(axis=1)
+    coupled = {}
+    for rule in HARM_COUNTS:
+        best = optimise_coupled(world, vehicle, harm_count=rule, horizon_s=scenario.horizon_s, others_mps2=others)
+        coupled[rule] = Choice(float(best.deceleration_mps2[0]), float(best.harm[0]))
     closed_form = Choice(float(chosen[0]), float(predicted[np.searchsorted(at, chosen[0])]))
     return DecelerationCurve(
         task, world, at, predicted, first[0], total[0], regimes, closed_form,
-        {rule: _choose_coupled(world, task, rule, others) for rule in HARM_COUNTS}, known_limits(world, task),
+        coupled, known_limits(world, task),
     )  # fmt: skip
-
-
-def _choose_coupled(world: Worlds, task: Task, harm_count: HarmCount, others_mps2: Floats) -> Choice:
-    best = optimise_coupled(
-        world, task.vehicle, harm_count=harm_count, horizon_s=task.scenario.horizon_s, others_mps2=others_mps2
-    )
-    return Choice(float(best.deceleration_mps2[0]), float(best.harm[0]))
 
 
 def regimes_of(worlds: Worlds, pair: int, deceleration_mps2: Floats) -> NDArray[np.str_]:
@@ -242,7 +230,9 @@ def regimes_of(worlds: Worlds, pair: int, deceleration_mps2: Floats) -> NDArray[
         driving_capacity_mps2=0.0, latency_s=v.latency_s[:, own], mass_t=1.0, restitution=0.0,
         speed_limit_mps=v.speed_limit_mps[:, own],
     )  # fmt: skip
-    stop_s = _standstill_s(worlds.speeds_mps[:, own], deceleration_mps2[:, own], v.latency_s[:, own])
+    with np.errstate(divide="ignore", invalid="ignore"):  # when each would stand; inf without braking
+        speed = worlds.speeds_mps[:, own]
+        stop_s = np.where(speed > 0.0, v.latency_s[:, own] + speed / deceleration_mps2[:, own], 0.0)
     rows = advance(alone, -deceleration_mps2[:, own], until_s=_LONG_S, record=True)[1].rows
     assert rows is not None
     meets_s = np.full(worlds.n, np.inf)
@@ -250,9 +240,3 @@ def regimes_of(worlds: Worlds, pair: int, deceleration_mps2: Floats) -> NDArray[
     coasting, stands = meets_s <= v.latency_s[:, pair + 1], meets_s >= stop_s[:, 0]
     cases = [np.isinf(meets_s), meets_s < v.latency_s[:, pair], coasting & stands, coasting, stands]
     return np.select(cases, [NO_REGION, "early", "A'", "A", "C"], "B")
-
-
-def _standstill_s(speed_mps: Floats, deceleration_mps2: Floats, latency_s: Floats) -> Floats:
-    """When each vehicle would stand, ``latency + v / a``; inf without braking."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(speed_mps > 0.0, latency_s + speed_mps / deceleration_mps2, 0.0)

@@ -1,53 +1,94 @@
-"""Whole episodes, exact at every moment; films of them, and passports that name one so that it can be played again."""
+"""Whole episodes, exact at every moment: motions, films, passports by which one is played again, and datasets."""
 
 from __future__ import annotations
 
 import copy
 import hashlib
 import io
+import json
 import math
-import platform
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
-from functools import cache
+from functools import cache, cached_property
 from importlib.metadata import version
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import Any, get_args
 from urllib.parse import quote, unquote
 
+import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from numpy.typing import NDArray
 
-from ethbrake_marl.agents.protocol import Agent, Driver, Team, team_of
-from ethbrake_marl.agents.registry import parse_spec
-from ethbrake_marl.agents.rollout import Episodes, drive, episode_engine, play
-from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
-from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.envs.drawing.scene import Scene, Trace, animate_films, kept_motions, scenes
-from ethbrake_marl.errors import InvalidInput, PhysicsError, UnknownName, count_of, need, plain_text
+from ethbrake_marl.actions import command_to_action
+from ethbrake_marl.agents import (
+    Agent,
+    Driver,
+    Episodes,
+    Team,
+    drive,
+    episode_engine,
+    parse_spec,
+    play,
+    script_agents,
+    team_of,
+)
+from ethbrake_marl.defaults import DEFAULT, HARM_COUNTS, DatasetFormat, HarmCount
+from ethbrake_marl.engine import Engine, Step
+from ethbrake_marl.envs import (
+    COLUMNS,
+    GYMNASIUM_ID,
+    LISTED_WORLD,
+    Frame,
+    Report,
+    Scene,
+    Trace,
+    action_box,
+    animate_films,
+    feature_box,
+    report,
+)
+from ethbrake_marl.errors import (
+    AlreadyExists,
+    InvalidInput,
+    PhysicsError,
+    UnknownName,
+    check_one_learner,
+    check_whole_number,
+    count_of,
+    naming_extras,
+    need,
+    plain_text,
+    renumbered,
+    unknown_name,
+)
 from ethbrake_marl.evaluation.inputs import (
     choose_worlds,
     content_sha256,
     load_runnable,
     make_lineup,
+    policies_of,
     policy_sha256,
+    result_versions,
     scenario_sha256,
     worlds_sha256,
 )
-from ethbrake_marl.evaluation.measures import Tape
-from ethbrake_marl.evaluation.rollout import controlled_vehicle
+from ethbrake_marl.evaluation.measures import LeftOut, Tape
+from ethbrake_marl.evaluation.results import PARQUET, check_target
+from ethbrake_marl.evaluation.rollout import ShovedFront, controlled_vehicle
+from ethbrake_marl.files.sheet import parquet_file
+from ethbrake_marl.files.store import check_writable, new_folder
 from ethbrake_marl.files.yaml import Override
 from ethbrake_marl.harm import Ledger
-from ethbrake_marl.physics import Floats, ImpactRows, Worlds, advance
-from ethbrake_marl.physics.kernel import first_decision_s, segment_pieces, with_post_ahead
-from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.shield import HybridAgent
-from ethbrake_marl.shield.uncertainty import Uncertainty
-
-if TYPE_CHECKING:
-    from ethbrake_marl.envs.drawing.frame import Frame
-
+from ethbrake_marl.observations import Observation, ObservationSpec, choose_observation, observation_for
+from ethbrake_marl.physics import Bools, Floats, ImpactRows, Ints, Worlds, advance, leaving_out_failed, segment_pieces
+from ethbrake_marl.rewards import Reward, RewardParams, reward_params
+from ethbrake_marl.scenario import Sample, Scenario
+from ethbrake_marl.shield import HybridAgent, Uncertainty
 
 _SAME = 1e-9  # m, m/s: a piece that goes on like the one before it is part of it
 _SHORT_S = 1e-4  # pieces of a cascade of tiny bounces may be shorter; they are not told apart
@@ -96,8 +137,8 @@ class _Follower(Tape):
 
     def __init__(self, worlds: Worlds, team: Team, engine: Engine) -> None:
         super().__init__(worlds)
-        self._drivers = list(team.drivers.values())
-        self._first_s = first_decision_s(worlds, list(team.drivers))
+        self._hybrids = {i for i, driver in team.drivers.items() if isinstance(driver, HybridAgent)}
+        self._first_s = worlds.first_decision_s(list(team.drivers))
         self._stepped_in: list[list[float]] = [[] for _ in range(worlds.n)]
         self._engine, self._ruling = engine, engine.ruling
 
@@ -119,9 +160,10 @@ class _Follower(Tape):
         for k in range(n):
             mine = slice(*ends[k : k + 2])
             rows = ImpactRows(*(getattr(impacts, f.name)[mine] for f in fields(ImpactRows)))
-            ledger = Ledger(*(getattr(episodes.ledger, f.name)[[k]] for f in fields(Ledger)))
+            ledger = episodes.ledger.take([k])
             final, taken_over = episodes.final.take([k]), list(self._stepped_in[k])
-            if any(isinstance(d, HybridAgent) and not d.chosen_policy[k] for d in self._drivers):
+            chosen = [memory["chosen_policy"][k] for i, memory in episodes.memories.items() if i in self._hybrids]
+            if not all(chosen):
                 taken_over.append(float(self._first_s[k]))
             found.append(
                 EpisodeMotion(
@@ -243,7 +285,7 @@ def record_episode(
         raise InvalidInput(f"record_episode: sample_s = {sample_s}; must be finite and above 0")
     driven = controlled_vehicle(scenario, vehicle)
     tape = Tape(world)
-    episodes = drive(world, copy.deepcopy(agent), scenario, driven, watched_by=[tape])
+    episodes = drive(world, agent, scenario, driven, watched_by=[tape])
     samples = list(_samples(tape.steps, sample_s))
     time, gaps, speeds, positions, command = (np.concatenate(column) for column in zip(*samples, strict=True))
     return EpisodeRecord(
@@ -263,7 +305,7 @@ def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float)
         start, end = float(before.time_s[0]), float(until_s[0])
         count = max(math.ceil((end - start) / sample_s - 1e-9), 1) if end > start else 0
         times = np.linspace(start, end, count + 1)
-        post = with_post_ahead(before, np.array([end - start]))
+        post = before.with_post_ahead(np.array([end - start]))
         copies = post.take(np.zeros(count + 1, np.int64))
         moved, _ = advance(copies, command, until_s=times)
         position, gaps, speeds = front + (post.obstacle_gap_m - moved.obstacle_gap_m), moved.gaps_m, moved.speeds_mps
@@ -312,10 +354,10 @@ def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float 
     end = float(engine.worlds.time_s[0])
     times = np.append(np.arange(int(np.ceil(end * fps - 1e-9))) / fps, end)
     shown: list[Scene] = []
-    for motion in kept_motions(engine, trace):
+    for motion in trace.motions(engine):
         start, until = float(motion.start.time_s[0]), float(motion.until_s[0])
         mine = times[(times >= start if motion.fresh[0] else times > start) & (times <= until)]
-        shown += scenes(engine, motion, 0, mine) if len(mine) else []
+        shown += motion.scenes(engine, 0, mine) if len(mine) else []
     return shown
 
 
@@ -327,12 +369,11 @@ def film_bytes(films: Films, ending: str, *, fps: int = FILM_FPS) -> bytes:
     none of ``.gif``, ``.mp4`` and ``.svg``, for an ``fps`` whose frames do not last whole hundredths of a second, as a
     GIF needs, and for an MP4 where the library that writes it is missing.
     """
-    check_ending(ending)
+    check_film(ending, len(films))
     if not films or not all(films.values()):
         raise InvalidInput("film_bytes: no films given")
     if not fps > 0 or 100 % fps:
         raise InvalidInput(f"film_bytes: fps = {fps}: must divide 100, for instance 10, 20, 25 or 50")
-    check_number_of_films(len(films))
     pictures = len(films) * max(map(len, films.values()))
     if pictures > MOST_PICTURES:
         raise InvalidInput(
@@ -342,27 +383,21 @@ def film_bytes(films: Films, ending: str, *, fps: int = FILM_FPS) -> bytes:
     return _WRITERS[ending](films, fps)
 
 
-def check_number_of_films(films: int) -> None:
-    """Refuse more than ``MOST_FILMS`` with ``InvalidInput``."""
-    if films > MOST_FILMS:
-        raise InvalidInput(f"film: {films} agents, one below the other; at most {MOST_FILMS} are shown")
-
-
-def check_ending(ending: str) -> None:
-    """Refuse, before any work, a film that cannot be written; raises as ``film_bytes``."""
+def check_film(ending: str, films: int = 1) -> None:
+    """Refuse, before any work, what ``film_bytes`` cannot write: that ending, or so many films."""
     if ending not in _WRITERS:
         raise InvalidInput(f"a film that ends in {ending!r}: films are written as {', '.join(_WRITERS)}")
     if ending == ".mp4":
         need("imageio_ffmpeg")
+    if films > MOST_FILMS:
+        raise InvalidInput(f"film: {films} agents, one below the other; at most {MOST_FILMS} are shown")
 
 
 def _stacked(films: Films) -> Iterator[Frame]:
     """The frames of all films, one below the other."""
-    from ethbrake_marl.envs.drawing.frame import draw_frame
-
     for k in range(max(map(len, films.values()))):
         each = (shown[min(k, len(shown) - 1)]._replace(title=title) for title, shown in films.items())
-        yield np.concatenate([draw_frame(scene) for scene in each])
+        yield np.concatenate([scene.frame() for scene in each])
 
 
 def _write_gif(films: Films, fps: int) -> bytes:
@@ -391,11 +426,11 @@ def _write_mp4(films: Films, fps: int) -> bytes:
         return path.read_bytes()
 
 
-def _write_svg(films: Films, fps: int) -> bytes:
-    return animate_films(films, fps=fps).encode()
-
-
-_WRITERS = {".gif": _write_gif, ".mp4": _write_mp4, ".svg": _write_svg}
+_WRITERS: dict[str, Callable[[Films, int], bytes]] = {
+    ".gif": _write_gif,
+    ".mp4": _write_mp4,
+    ".svg": lambda films, fps: animate_films(films, fps=fps).encode(),
+}
 
 
 # Passports: one short string that names an episode, so that it can be played again and compared to the bit.
@@ -410,7 +445,7 @@ _MARK, _KIND = "EB", "1"
 _NAME = 30  # characters of a scenario's name
 _NONE = "-"
 _SCENARIO, _WORLD, _EPISODE, _POLICY, _CHECK = 10, 6, 10, 8, 6  # hexadecimal digits of each hash
-_PACKAGES = ("ethbrake-marl", "numba", "numpy")  # and Python, second
+_VERSIONS = ("ethbrake-marl", "Python", "numba", "numpy")
 _SHAPE = re.compile(
     r"EB1:(?P<scenario>[\w.-]+):(?P<scenario_sha>[0-9a-f]{10}):(?P<seed>\d{1,20}|-)\.(?P<number>\d{1,18})"
     r":(?P<count>[ft])(?P<vehicles>[\d.]+|-):(?P<versions>[\w.,+-]+):(?P<world_sha>[0-9a-f]{6})"
@@ -436,7 +471,13 @@ class Passport:
 
     def __str__(self) -> str:
         name = self.scenario if len(self.scenario) <= _NAME else self.scenario[:_NAME] + LEFT_OUT
-        for agent in _shorter(self.agent):
+        kind, at, _ = self.agent.partition("@")
+        try:
+            around = "".join(f"+{each}" for each in parse_spec(self.agent).around)
+        except InvalidInput:  # the name of an agent that was made in Python
+            around = ""
+        # where there is little room: as it is, without its path, not at all
+        for agent in (self.agent, *([f"{kind}@{LEFT_OUT}{around}"] if at else []), LEFT_OUT):
             text = replace(self, agent=agent)._written(name)
             if len(text) <= MOST_CHARACTERS:
                 return text
@@ -458,6 +499,85 @@ class Passport:
         text = ":".join(parts)
         return f"{text}:{_check(text)}"
 
+    @classmethod
+    def of(
+        cls,
+        motion: EpisodeMotion,
+        scenario: Scenario,
+        agent: str,
+        *,
+        seed: int | None,
+        number: int,
+        harm_count: HarmCount = "first",
+        policies: Mapping[str, str] | None = None,
+    ) -> Passport:
+        """The passport of an episode that was driven.
+
+        Args:
+            motion: the episode.
+            scenario: as it was driven, with its learners.
+            agent: as it is written.
+            seed: of the list of worlds; None: they came from a file.
+            number: of the world in its list.
+            harm_count: that agents minimise.
+            policies: SHA-256 of the policy that drives a vehicle, by vehicle, where one does.
+
+        """
+        shas = list((policies or {}).values())
+        joined = shas[0] if len(shas) == 1 else hashlib.sha256("".join(shas).encode()).hexdigest()
+        return cls(
+            scenario=scenario.name,
+            scenario_sha=scenario_sha256(scenario)[:_SCENARIO],
+            seed=seed,
+            number=number,
+            harm_count=harm_count,
+            vehicles=scenario.learners,
+            versions=_versions(),
+            world_sha=worlds_sha256(motion.world, np.array([number], np.int64))[:_WORLD],
+            episode_sha=content_sha256(motion.ledger, motion.final, motion.impacts)[:_EPISODE],
+            policy_sha=joined[:_POLICY] if shas else None,
+            agent=agent,
+        )
+
+    @classmethod
+    def parse(cls, text: str) -> Passport:
+        """The passport that a text is; raises ``InvalidInput`` that tells a typo from another kind of text."""
+        given = text.strip()
+        shown = plain_text(given[:40])
+        if not given.startswith(_MARK) or ":" not in given:
+            raise InvalidInput(
+                f"{shown!r}: is no passport; one begins with {_MARK}{_KIND}: and stands under each episode of a report"
+            )
+        if not given.startswith(f"{_MARK}{_KIND}:"):
+            raise InvalidInput(
+                f"{shown!r}: a passport of another kind; this version reads those that begin with {_MARK}{_KIND}:"
+            )
+        body, _, check = given.rpartition(":")
+        found = _SHAPE.fullmatch(body)
+        if check != _check(body) or found is None or len(given) > 2 * MOST_CHARACTERS:
+            raise InvalidInput(
+                f"{shown!r}...: a typo, or a part is missing: the check at the end does not fit; copy it whole"
+            )
+        part = found.groupdict()
+        versions, driven = tuple(part["versions"].split(",")), part["vehicles"]
+        if len(versions) != len(_VERSIONS):
+            raise InvalidInput(f"{shown!r}...: names {count_of(len(versions), 'version')}; {len(_VERSIONS)} are needed")
+        if driven != _NONE and not re.fullmatch(r"[1-9]\d?(\.[1-9]\d?)*", driven):
+            raise InvalidInput(f"{shown!r}...: vehicles {driven!r}: must be numbers from 1, with dots between them")
+        return cls(
+            scenario=part["scenario"],
+            scenario_sha=part["scenario_sha"],
+            seed=None if part["seed"] == _NONE else int(part["seed"]),
+            number=int(part["number"]),
+            harm_count="first" if part["count"] == "f" else "total",
+            vehicles=() if driven == _NONE else tuple(int(each) - 1 for each in driven.split(".")),
+            versions=versions,
+            world_sha=part["world_sha"],
+            episode_sha=part["episode_sha"],
+            policy_sha=None if part["policy_sha"] == _NONE else part["policy_sha"],
+            agent=unquote(part["agent"], errors="strict"),
+        )
+
     def differences(self, other: Passport) -> list[str]:
         """What another passport of the same world and agent says differently, in words; nothing if it is the same."""
         found = []
@@ -466,146 +586,102 @@ class Passport:
                 f"the scenario: its values have the hash {other.scenario_sha}, in the passport {self.scenario_sha}; it"
                 " was edited since, or other settings (--set) were given"
             )
-        found += [
-            f"{name}: {now} here, {then} in the passport"
-            for name, then, now in zip(
-                ("ethbrake-marl", "Python", "numba", "numpy"), self.versions, other.versions, strict=True
-            )
-            if then != now
+        told = [
+            *zip(_VERSIONS, self.versions, other.versions, strict=True),
+            ("the world at the alert", self.world_sha, other.world_sha),
+            ("the policy", self.policy_sha or "none", other.policy_sha or "none"),
+            ("the episode", self.episode_sha, other.episode_sha),
         ]
-        if self.world_sha != other.world_sha:
-            found.append(f"the world at the alert: {other.world_sha} here, {self.world_sha} in the passport")
-        if self.policy_sha != other.policy_sha:
-            found.append(f"the policy: {other.policy_sha or 'none'} here, {self.policy_sha or 'none'} in the passport")
-        if self.episode_sha != other.episode_sha:
-            found.append(f"the episode: {other.episode_sha} here, {self.episode_sha} in the passport")
-        return found
+        return [*found, *(f"{name}: {now} here, {then} in the passport" for name, then, now in told if then != now)]
 
-    def is_same_episode(self, other: Passport) -> bool:
-        """Whether world and episode are the same to the bit."""
-        return (self.world_sha, self.episode_sha) == (other.world_sha, other.episode_sha)
+    def replay(
+        self,
+        *,
+        scenario: str | None = None,
+        settings: Sequence[Override] = (),
+        agent: str | None = None,
+        initial_states: Path | None = None,
+        uncertainty: Uncertainty | None = None,
+    ) -> Replay:
+        """Play the episode again, and compare it to the bit. The arguments are what a passport does not hold.
 
+        Args:
+            scenario: a name or path; None: the shipped one of the passport's name.
+            settings: of the scenario.
+            agent: as it is written; None: as in the passport, from it alone: no passport names code to run.
+            initial_states: the file that the world came from.
+            uncertainty: that ``+robust`` was certified against.
 
-def issue_passport(
-    motion: EpisodeMotion,
-    scenario: Scenario,
-    agent: str,
-    *,
-    seed: int | None,
-    number: int,
-    harm_count: HarmCount = "first",
-    policies: Mapping[int, str] | None = None,
-) -> Passport:
-    """The passport of an episode that was driven.
+        Raises ``InvalidInput`` that says what is missing: the scenario's file, the agent or its policy, the worlds.
 
-    Args:
-        motion: the episode.
-        scenario: as it was driven, with its learners.
-        agent: as it is written.
-        seed: of the list of worlds; None: they came from a file.
-        number: of the world in its list.
-        harm_count: that agents minimise.
-        policies: SHA-256 of the policy that drives a vehicle, by vehicle, where one does.
-
-    """
-    shas = list((policies or {}).values())
-    joined = shas[0] if len(shas) == 1 else hashlib.sha256("".join(shas).encode()).hexdigest()
-    return Passport(
-        scenario=scenario.name,
-        scenario_sha=scenario_sha256(scenario)[:_SCENARIO],
-        seed=seed,
-        number=number,
-        harm_count=harm_count,
-        vehicles=scenario.learners,
-        versions=_versions(),
-        world_sha=worlds_sha256(motion.world, np.array([number], np.int64))[:_WORLD],
-        episode_sha=content_sha256(motion.ledger, motion.final, motion.impacts)[:_EPISODE],
-        policy_sha=joined[:_POLICY] if shas else None,
-        agent=agent,
-    )
-
-
-def parse_passport(text: str) -> Passport:
-    """The passport that a text is; raises ``InvalidInput`` that tells a typo from another kind of text."""
-    given = text.strip()
-    shown = plain_text(given[:40])
-    if not given.startswith(_MARK) or ":" not in given:
-        raise InvalidInput(
-            f"{shown!r}: is no passport; one begins with {_MARK}{_KIND}: and stands under each episode of a report"
+        """
+        played = self._scenario(scenario, settings)
+        if agent is None and LEFT_OUT in self.agent:
+            raise InvalidInput(
+                f"passport: the agent, {self.agent}, did not fit into it; give it whole: --agent AGENT, for instance"
+                " ppo@runs/my-run"
+            )
+        if agent is None and parse_spec(self.agent).file is not None:
+            raise InvalidInput(
+                f"passport: the agent, {self.agent!r}, is code in a file, which is run only where you name it: --agent"
+                f" {self.agent}"
+            )
+        spelling, world = self.agent if agent is None else agent, self._world(played, initial_states)
+        try:
+            lineup = make_lineup([spelling], played, harm_count=self.harm_count, uncertainty=uncertainty)
+        except InvalidInput as error:
+            hint = "" if agent else "; a policy or agent that lies elsewhere here is given by --agent"
+            raise InvalidInput(f"passport: agent {spelling!r}: {error}{hint}") from None
+        (driver,) = lineup.values()
+        (motion,) = follow_episodes(world, driver, played)
+        policies = policies_of(team_of(driver, played.learners).drivers)
+        now = Passport.of(
+            motion, played, spelling, seed=self.seed, number=self.number, harm_count=self.harm_count, policies=policies
         )
-    if not given.startswith(f"{_MARK}{_KIND}:"):
-        raise InvalidInput(
-            f"{shown!r}: a passport of another kind; this version reads those that begin with {_MARK}{_KIND}:"
-        )
-    body, _, check = given.rpartition(":")
-    found = _SHAPE.fullmatch(body)
-    if check != _check(body) or found is None or len(given) > 2 * MOST_CHARACTERS:
-        raise InvalidInput(
-            f"{shown!r}...: a typo, or a part is missing: the check at the end does not fit; copy it whole"
-        )
-    part = found.groupdict()
-    versions = tuple(part["versions"].split(","))
-    if len(versions) != len(_PACKAGES) + 1:
-        raise InvalidInput(f"{shown!r}...: names {count_of(len(versions), 'version')}; {len(_PACKAGES) + 1} are needed")
-    return Passport(
-        scenario=part["scenario"],
-        scenario_sha=part["scenario_sha"],
-        seed=None if part["seed"] == _NONE else int(part["seed"]),
-        number=int(part["number"]),
-        harm_count="first" if part["count"] == "f" else "total",
-        vehicles=_vehicles(part["vehicles"], shown),
-        versions=versions,
-        world_sha=part["world_sha"],
-        episode_sha=part["episode_sha"],
-        policy_sha=None if part["policy_sha"] == _NONE else part["policy_sha"],
-        agent=unquote(part["agent"], errors="strict"),
-    )
+        same = (self.world_sha, self.episode_sha) == (now.world_sha, now.episode_sha)
+        return Replay(now, played, world, driver, motion, tuple(self.differences(now)), same)
 
+    def _scenario(self, given: str | None, settings: Sequence[Override]) -> Scenario:
+        try:
+            scenario = load_runnable(given or self.scenario, settings)
+        except UnknownName:
+            if given is not None:
+                raise
+            raise InvalidInput(
+                f"passport: scenario {self.scenario!r} does not ship; give its file: --scenario FILE.yaml"
+            ) from None
+        if scenario.learners == self.vehicles:
+            return scenario
+        if not all(0 <= i < scenario.vehicles for i in self.vehicles):
+            most = max(self.vehicles) + 1
+            raise InvalidInput(
+                f"passport: drives Vehicle {most}, but {scenario.name!r} has {count_of(scenario.vehicles, 'vehicle')}"
+            )
+        return scenario.with_learners(self.vehicles)
 
-def _vehicles(text: str, shown: str) -> tuple[int, ...]:
-    if text == _NONE:
-        return ()
-    if not re.fullmatch(r"[1-9]\d?(\.[1-9]\d?)*", text):
-        raise InvalidInput(f"{shown!r}...: vehicles {text!r}: must be numbers from 1, with dots between them")
-    return tuple(int(each) - 1 for each in text.split("."))
-
-
-def _shorter(agent: str) -> Sequence[str]:
-    """How an agent may be written where there is little room: as it is, without its path, not at all."""
-    before, at, _ = agent.partition("@")
-    around = "" if not at else "".join(f"+{each}" for each in _around(agent))
-    return (agent, *([f"{before}@{LEFT_OUT}{around}"] if at else []), LEFT_OUT)
-
-
-def _around(agent: str) -> tuple[str, ...]:
-    try:
-        return parse_spec(agent).around
-    except InvalidInput:  # the name of an agent that was made in Python
-        return ()
+    def _world(self, scenario: Scenario, initial_states: Path | None) -> Worlds:
+        if self.seed is not None:
+            if initial_states is not None:
+                raise InvalidInput("passport: its world is of a list that is drawn; leave --initial-states out")
+            return scenario.sample(1, self.seed, first=self.number).worlds
+        if initial_states is None:
+            raise InvalidInput("passport: its world came from a file; give it: --initial-states FILE.csv")
+        worlds = choose_worlds(scenario, initial_states=initial_states)[0].worlds
+        if not self.number < worlds.n:
+            raise InvalidInput(
+                f"{initial_states}: has {count_of(worlds.n, 'world')}; the passport is of number {self.number}, from 0"
+            )
+        return worlds.take(np.array([self.number]))
 
 
 @cache
 def _versions() -> tuple[str, ...]:
-    own, *others = (version(name) for name in _PACKAGES)
-    return (own, platform.python_version(), *others)
+    found = result_versions()
+    return tuple(found[name.lower()] for name in _VERSIONS)
 
 
 def _check(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:_CHECK]
-
-
-# An episode that a passport names, played again: what must be given for it, and what differs.
-
-
-@dataclass(frozen=True, slots=True)
-class Given:
-    """What a passport does not hold."""
-
-    scenario: str | None = None  # a name or path; None: the shipped one of the passport's name
-    settings: tuple[Override, ...] = ()  # of the scenario
-    agent: str | None = None  # as it is written; None: as in the passport
-    initial_states: Path | None = None  # the file that the world came from
-    uncertainty: Uncertainty | None = None  # that ``+robust`` was certified against
 
 
 @dataclass(frozen=True, slots=True)
@@ -626,77 +702,480 @@ class Replay:
         return f"{self.passport.agent}: world {self.passport.number} of {self.scenario.name}"
 
 
-def replay(passport: Passport, given: Given) -> Replay:
-    """Play the episode of a passport again, and compare it to the bit.
+# Episodes as a learner of any interface meets them, with the actions that an agent chose.
+#
+# An agent drives as in an evaluation, where its commands (float64, m/s2) are applied as they are. A learner's action is
+# a float32 in [-1, 1], of which most commands are no exact image. So each command is rounded to an action, and those
+# actions are played from the alert on: what is recorded is that second episode, and so it replays to the same bits. On
+# the edge of an impact a last bit decides about it: of the roundings to the nearest, downwards and upwards, each world
+# gets the one whose harm is nearest to that of the commands.
 
-    Raises ``InvalidInput`` that says what is missing: the scenario's file, the agent or its policy, the worlds.
+Float32s = NDArray[np.float32]
+SLACK = 1e-6  # m2/s2; a smaller difference of harm is not worth another rounding
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What is recorded: the scenario, whose learners are driven, the list of its worlds, and what a learner is told."""
+
+    scenario: Scenario
+    seed: int  # of the list of worlds
+    reward: RewardParams
+    observation: ObservationSpec
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Episodes of n worlds; T is the longest one's number of decisions, what stands behind an episode's end is void."""
+
+    agent: str
+    task: Task
+    index: Ints  # [n] numbers of the worlds in their list
+    decisions: Ints  # [n] of each episode
+    observations: Float32s  # [T + 1, n, L, F], the last one at the end of the episode
+    actions: Float32s  # [T, n, L]
+    steps: tuple[Step, ...]  # T
+    reports: tuple[Report, ...]  # T + 1; ``reports[t + 1]`` tells what step t brought
+    positions_m: Floats  # [T + 1, n, N] front bumpers along the road; Vehicle 1 is at 0 at the alert
+    speeds_mps: Floats  # [T + 1, n, N]
+    ledger: Ledger  # [n] harm of the episodes
+    off_by: (
+        float  # largest difference (m2/s2) of a world's harm from that of the commands as they were, before rounding
+    )
+
+    @property
+    def learners(self) -> tuple[int, ...]:
+        """Indices of the driven vehicles."""
+        return self.task.scenario.learners
+
+    @cached_property
+    def running(self) -> Bools:
+        """[n, T] where a decision was made."""
+        mask: Bools = np.arange(len(self.steps)) < self.decisions[:, np.newaxis]
+        return mask
+
+    def told(self, column: str) -> Floats:
+        """A column of the infos of every vehicle, [T + 1, n, N]."""
+        at = COLUMNS.index(column)
+        return np.stack([each.values[:, :, at] for each in self.reports])
+
+    def terms(self) -> dict[str, Floats]:
+        """Each term of the reward, before its weight, after every step: [T + 1, n, L]; row 0 is 0."""
+        shape = (len(self.index), self.task.scenario.vehicles)
+        found = {}
+        for name in self.reports[0].terms:
+            each = [told.terms[name] for told in self.reports]
+            whole = [np.broadcast_to(t[:, np.newaxis] if t.ndim == 1 else t, shape) for t in each]
+            found[name] = np.stack([term[:, list(self.learners)] for term in whole])
+        return found
+
+
+def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Recording:
+    """Let ``driver`` drive the scenario's learners through these worlds, and record the episodes of its actions.
+
+    Raises ``PhysicsError`` naming worlds that could not be advanced, and what ``episode_engine`` raises.
     """
-    scenario = _scenario(passport, given)
-    spelling = _spelling(passport, given.agent)
-    world = _world(passport, scenario, given.initial_states)
-    try:
-        lineup = make_lineup([spelling], scenario, harm_count=passport.harm_count, uncertainty=given.uncertainty)
-    except InvalidInput as error:
-        hint = "" if given.agent else "; a policy or agent that lies elsewhere here is given by --agent"
-        raise InvalidInput(f"passport: agent {spelling!r}: {error}{hint}") from None
-    (agent,) = lineup.values()
-    (motion,) = follow_episodes(world, agent, scenario)
-    drivers = team_of(agent, scenario.learners).drivers
-    policies = {i: sha for i, driver in drivers.items() if (sha := policy_sha256(driver)) is not None}
-    now = issue_passport(
-        motion, scenario, spelling, seed=passport.seed, number=passport.number, harm_count=passport.harm_count,
-        policies=policies,
+    scenario, learners = task.scenario, task.scenario.learners
+    engine = episode_engine(sample.worlds, team_of(driver, learners), scenario)
+    asked = []
+    while not engine.ended.all():
+        engine.step({})
+        columns = [command_to_action(engine.wanted_mps2[:, i], sample.worlds.vehicles, i) for i in learners]
+        asked.append(np.stack(columns, axis=1))
+    _refuse_failed(engine)
+    actions, off_by = _rounded(np.stack(asked), sample.worlds, engine.ledger, task)
+    engine = _learners_engine(sample.worlds, task)
+    steps: list[Step] = []
+    front, before = ShovedFront(sample.worlds, np.zeros(sample.worlds.n)), sample.worlds  # worlds know gaps, no places
+    observations, reports, positions, speeds = [], [], [], []
+    decisions = np.zeros(engine.n, np.int64)
+    while True:
+        for part in engine.segments(before, engine.wanted_mps2):
+            front.see(*part)
+        before = engine.worlds
+        observations.append(engine.observe_all(np.array(engine.learners, np.int64)))
+        reports.append(report(engine, steps[-1] if steps else None))
+        positions.append(line_positions(front.metres, before.gaps_m))
+        speeds.append(before.speeds_mps)
+        if engine.ended.all():
+            break
+        decisions += ~engine.ended
+        steps.append(engine.step(actions[min(len(steps), len(actions) - 1)]))
+    _refuse_failed(engine)
+    played = np.stack([actions[min(t, len(actions) - 1)] for t in range(len(steps))])
+    return Recording(
+        name, task, sample.index, decisions, np.stack(observations), played, tuple(steps), tuple(reports),
+        np.stack(positions), np.stack(speeds), engine.ledger, float(off_by.max()),
     )  # fmt: skip
-    found = tuple(passport.differences(now))
-    return Replay(now, scenario, world, agent, motion, found, passport.is_same_episode(now))
 
 
-def _scenario(passport: Passport, given: Given) -> Scenario:
+def _rounded(commanded: Floats, worlds: Worlds, evaluated: Ledger, task: Task) -> tuple[Float32s, Floats]:
+    """The actions [T, n, L] to play, and by how much their harm differs from the evaluated one, [n] m2/s2."""
+    nearest = commanded.astype(np.float32)
+    best, off_by = nearest.copy(), _off_by(nearest, worlds, evaluated, task)
+    rows = np.flatnonzero(off_by > SLACK)
+    for end in (-1.0, 1.0) if len(rows) else ():
+        beyond = np.where((nearest - commanded) * end >= 0.0, nearest, np.nextafter(nearest, np.float32(end)))[:, rows]
+        part = evaluated.take(rows)
+        with renumbered(rows):
+            off = _off_by(beyond, worlds.take(rows), part, task)
+        better = off < off_by[rows]
+        best[:, rows[better]], off_by[rows[better]] = beyond[:, better], off[better]
+    return best, off_by
+
+
+def _off_by(actions: Float32s, worlds: Worlds, evaluated: Ledger, task: Task) -> Floats:
+    """By how much the harm of these actions differs from the evaluated one, the larger of both counts, [n] m2/s2."""
+    engine = _learners_engine(worlds, task)
+    step = 0
+    while not engine.ended.all():
+        engine.step(actions[min(step, len(actions) - 1)])
+        step += 1
+    _refuse_failed(engine)
+    ledger = engine.ledger
+    off: Floats = np.max([np.abs(ledger.world_harm(c) - evaluated.world_harm(c)) for c in HARM_COUNTS], axis=0)
+    return off
+
+
+def _learners_engine(worlds: Worlds, task: Task) -> Engine:
+    """An engine over worlds at the alert, as an interface has it: the learners take actions."""
+    engine = Engine(
+        task.scenario,
+        worlds.n,
+        learners=task.scenario.learners,
+        scripts=script_agents(task.scenario),
+        reward=task.reward,
+        observation=task.observation,
+        seed=task.seed,
+        worlds=worlds,
+    )
+    engine.roster.warns = False
+    return engine
+
+
+def _refuse_failed(engine: Engine) -> None:
+    if engine.roster.failed:
+        raise PhysicsError(engine.roster.failed)
+
+
+# Episodes as a Parquet file: one row per agent, world and decision, one row group per batch of worlds.
+
+KEY = "ethbrake_marl"  # of the file's metadata: what was recorded, as JSON
+
+Columns = dict[str, NDArray[Any]]
+
+
+@contextmanager
+def parquet_dataset(path: Path, told: Mapping[str, Any]) -> Iterator[Callable[[Recording], None]]:
+    """Give what adds recordings to the file, which appears at ``path`` when the block ends well.
+
+    ``told`` is read at the end, and stands in the file's metadata under ``KEY``. Raises ``MissingExtra``.
+    """
+    with naming_extras():
+        import pyarrow
+
+    with parquet_file(path, told=lambda: {KEY: json.dumps(told)}) as write:
+
+        def add(recording: Recording) -> None:
+            columns = decision_columns(recording)
+            write(columns | {"agent": pyarrow.array(columns["agent"]).dictionary_encode()}, together=True)
+
+        yield add
+
+
+def decision_columns(recording: Recording) -> Columns:
+    """One entry per decision, world by world; docs/datasets.md lists the columns."""
+    running = recording.running
+    before, after = recording.told, recording.reports[1:]
+
+    def each(values: NDArray[Any]) -> NDArray[Any]:
+        """Values [T or T + 1, n, ...], of each decision's begin, decision by decision."""
+        return values[: running.shape[1]].swapaxes(0, 1)[running]
+
+    def whole(values: NDArray[Any]) -> NDArray[Any]:
+        """A value of each episode [n] in all of its rows."""
+        return np.repeat(values, recording.decisions)
+
+    columns: Columns = {
+        "agent": np.full(int(running.sum()), recording.agent),
+        "world_seed": np.full(int(running.sum()), recording.task.seed),
+        "world": whole(recording.index),
+        "decision": np.nonzero(running)[1],
+        "time_s": each(before("time_s")[:, :, 0]),
+    }
+    in_force = before("command_in_force_mps2")
+    for i in range(recording.task.scenario.vehicles):
+        columns[f"position_{i + 1}_m"] = each(recording.positions_m[:, :, i])
+        columns[f"speed_{i + 1}_mps"] = each(recording.speeds_mps[:, :, i])
+        columns[f"command_in_force_{i + 1}_mps2"] = each(in_force[:, :, i])
+    chosen, terms = recording.told("chosen_command_mps2")[1:], recording.terms()
+    reward = np.stack([step.reward for step in recording.steps])
+    for c, i in enumerate(recording.task.scenario.learners):
+        for f, feature in enumerate(recording.task.observation.features):
+            columns[f"observation_{i + 1}.{feature.name}"] = each(recording.observations[:, :, c, f])
+        columns[f"action_{i + 1}"] = each(recording.actions[:, :, c])
+        columns[f"chosen_command_{i + 1}_mps2"] = each(chosen[:, :, i])
+        columns[f"reward_{i + 1}"] = each(reward[:, :, i])
+        columns |= {f"reward_{name}_{i + 1}": each(term[1:, :, c]) for name, term in terms.items()}
+    columns["cost"] = each(np.stack([told.cost for told in after]))
+    columns["terminated"] = each(np.stack([step.terminated for step in recording.steps]))
+    columns["truncated"] = each(np.stack([step.truncated for step in recording.steps]))
+    columns["first_impact_harm"] = whole(recording.ledger.world_harm("first"))
+    columns["total_harm"] = whole(recording.ledger.world_harm("total"))
+    return columns
+
+
+# Episodes of one learner as a dataset of Minari, which replays to the recorded bits in the environment it recovers.
+#
+# An episode's ``seed`` and ``options`` put its world back: ``env.reset(seed=seed, options=options)``.
+
+DATA = "data"  # the folder of the data inside a dataset's
+_DATASET_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]*-v\d+")
+
+
+def check_folder(path: Path, *, force: bool = False) -> None:
+    """Refuse what cannot become a dataset's folder, before any work.
+
+    Raises ``AlreadyExists`` for one that is there, ``InvalidInput`` for what ``force`` does not replace: it replaces
+    datasets of Minari alone.
+    """
+    if _DATASET_NAME.fullmatch(path.name) is None:
+        raise InvalidInput(f"{path}: a dataset of Minari is a folder called NAME-vNUMBER, for instance brakes-v0")
+    if path.is_symlink() or path.exists():
+        if not force:
+            raise AlreadyExists(f"{path}: is there already; give another name or use force (--force)")
+        if path.is_symlink() or not (path / DATA / "metadata.json").is_file():
+            raise InvalidInput(f"{path}: is no dataset of Minari, and is not replaced; give another name")
+    if not path.parent.is_dir():
+        raise InvalidInput(f"{path}: there is no folder {path.parent}; make it first")
     try:
-        scenario = load_runnable(given.scenario or passport.scenario, given.settings)
-    except UnknownName:
-        if given.scenario is not None:
-            raise
-        raise InvalidInput(
-            f"passport: scenario {passport.scenario!r} does not ship; give its file: --scenario FILE.yaml"
-        ) from None
-    if scenario.learners == passport.vehicles:
-        return scenario
-    if not all(0 <= i < scenario.vehicles for i in passport.vehicles):
-        most = max(passport.vehicles) + 1
-        raise InvalidInput(
-            f"passport: drives Vehicle {most}, but {scenario.name!r} has {count_of(scenario.vehicles, 'vehicle')}"
-        )
-    return scenario.with_learners(passport.vehicles)
+        check_writable(path.parent)
+    except OSError as error:
+        raise InvalidInput(f"{path}: cannot be written ({error.strerror})") from None
 
 
-def _spelling(passport: Passport, agent: str | None) -> str:
-    """The agent, from the passport alone where that may say it: no passport names code to run."""
-    if agent is not None:
-        return agent
-    if LEFT_OUT in passport.agent:
-        raise InvalidInput(
-            f"passport: the agent, {passport.agent}, did not fit into it; give it whole: --agent AGENT, for instance"
-            " ppo@runs/my-run"
+@contextmanager
+def minari_folder(
+    path: Path, task: Task, told: Mapping[str, Any], *, force: bool
+) -> Iterator[Callable[[Recording], None]]:
+    """Give what adds recordings to the dataset, whose folder appears at ``path`` when the block ends well.
+
+    ``told`` is read at the end, and stands in its metadata under ``KEY``, as JSON. Raises ``MissingExtra``.
+    """
+    with naming_extras():
+        import h5py  # noqa: F401  # minari's own message would name another line
+        from minari.data_collector.episode_buffer import EpisodeBuffer
+        from minari.dataset.minari_storage import MinariStorage
+
+    with new_folder(path, replace=force) as partial:
+        storage = MinariStorage.new(
+            partial.resolve() / DATA,  # of a relative path Minari 0.5.4 looks for its own files in the wrong place
+            observation_space=feature_box(task.observation.features),
+            action_space=action_box(),
+            env_spec=env_spec(task),
         )
-    if parse_spec(passport.agent).file is not None:
-        raise InvalidInput(
-            f"passport: the agent, {passport.agent!r}, is code in a file, which is run only where you name it: --agent"
-            f" {passport.agent}"
+        storage.update_metadata({"dataset_id": path.name, "minari_version": version("minari")})
+
+        def add(recording: Recording) -> None:
+            first = storage.total_episodes
+            episodes = list(_episodes(recording))
+            storage.update_episodes(EpisodeBuffer(**episode) for episode in episodes)
+            harms = zip(*(recording.ledger.world_harm(count).tolist() for count in HARM_COUNTS), strict=True)
+            beside = [{"agent": recording.agent, "first_impact_harm": one, "total_harm": whole} for one, whole in harms]
+            storage.update_episode_metadata(beside, range(first, first + len(episodes)))
+
+        yield add
+        storage.update_metadata(
+            {
+                "algorithm_name": ", ".join(told["agents"]),
+                "description": f"{task.scenario.name}: {task.scenario.title or 'emergency braking'}",
+                "requirements": [f"ethbrake-marl>={version('ethbrake-marl')}"],
+                KEY: json.dumps(told),
+            }
         )
-    return passport.agent
 
 
-def _world(passport: Passport, scenario: Scenario, initial_states: Path | None) -> Worlds:
-    if passport.seed is not None:
-        if initial_states is not None:
-            raise InvalidInput("passport: its world is of a list that is drawn; leave --initial-states out")
-        return scenario.sample(1, passport.seed, first=passport.number).worlds
-    if initial_states is None:
-        raise InvalidInput("passport: its world came from a file; give it: --initial-states FILE.csv")
-    worlds = choose_worlds(scenario, initial_states=initial_states)[0].worlds
-    if not passport.number < worlds.n:
+def env_spec(task: Task) -> EnvSpec:
+    """What ``gymnasium.make`` makes the same environment of, of plain data alone: it survives JSON.
+
+    Raises ``InvalidInput`` unless exactly one vehicle learns.
+    """
+    names = [task.scenario.vehicle_names[i] for i in task.scenario.learners]
+    check_one_learner(
+        task.scenario.name, names, "a dataset of Minari is one learner's: --vehicle NAME, or --format parquet"
+    )
+    spec = copy.deepcopy(gymnasium.spec(GYMNASIUM_ID))
+    spec.kwargs = {"scenario": task.scenario.declared(), "reward": task.reward.model_dump(mode="json")}
+    if task.observation != observation_for(task.scenario):
+        spec.kwargs["observation"] = [feature.name for feature in task.observation.features]
+    return spec
+
+
+def _episodes(recording: Recording) -> Iterator[dict[str, Any]]:
+    """The fields of an ``EpisodeBuffer``, world by world."""
+    vehicle, seed = recording.learners[0], recording.task.seed
+    infos = _infos(recording, vehicle)
+    reward = np.stack([step.reward[:, vehicle] for step in recording.steps])
+    terminated, truncated = (
+        np.stack([getattr(step, name) for step in recording.steps]) for name in ("terminated", "truncated")
+    )
+    for k, (world, end) in enumerate(zip(recording.index.tolist(), recording.decisions.tolist(), strict=True)):
+        yield {
+            "seed": seed,
+            "options": {LISTED_WORLD: {"seed": seed, "number": world}},
+            "observations": recording.observations[: end + 1, k, 0],
+            "actions": recording.actions[:end, k],
+            "rewards": reward[:end, k],
+            "terminations": terminated[:end, k],
+            "truncations": truncated[:end, k],
+            "infos": {name: values[: end + 1, k] for name, values in infos.items()},
+        }
+
+
+def _infos(recording: Recording, vehicle: int) -> dict[str, NDArray[Any]]:
+    """The infos of the environment, [T + 1, n, ...]."""
+    infos: dict[str, NDArray[Any]] = {name: recording.told(name)[:, :, vehicle] for name in COLUMNS}
+    infos["collided"] = infos["collided"] == 1.0
+    infos["chosen_action"] = infos["chosen_action"].astype(np.float32)[:, :, np.newaxis]
+    infos["cost"] = np.stack([told.cost for told in recording.reports])
+    infos["world_seed"] = np.full(infos["cost"].shape, recording.task.seed)
+    infos["world"] = np.stack([told.world for told in recording.reports])
+    infos |= {f"reward_{name}": term[:, :, 0] for name, term in recording.terms().items()}
+    news = [told.known_from_s[:, vehicle] for told in recording.reports if told.known_from_s is not None]
+    if news:
+        infos["known_from_s"] = np.stack(news)
+    return infos
+
+
+BATCH = 500  # worlds recorded together: bounds memory, changes no episode
+
+_NEEDED_PACKAGES: dict[DatasetFormat, tuple[str, ...]] = {"parquet": ("pyarrow",), "minari": ("minari", "h5py")}
+
+
+@dataclass(frozen=True, slots=True)
+class DatasetSummary:
+    """What ``write_dataset`` wrote."""
+
+    path: Path
+    format: DatasetFormat
+    episodes: Mapping[str, int]  # by agent
+    decisions: int  # of all episodes
+    off_by: Mapping[str, float]  # by agent: by how much (m2/s2) rounding to actions changed a world's harm, at most
+    left_out: tuple[LeftOut, ...]  # worlds that could not be advanced
+
+
+def write_dataset(
+    path: str | Path,
+    agents: Mapping[str, Driver],
+    *,
+    scenario: Scenario,
+    episodes: int,
+    seed: int = DEFAULT.LIST_SEED,
+    format: DatasetFormat | None = None,
+    reward: Reward = "harm",
+    observation: Observation | None = None,
+    force: bool = False,
+    on_progress: Callable[[str, int], None] | None = None,
+) -> DatasetSummary:
+    """Record agents, each in the same worlds of a list, as a Parquet file or as a dataset of Minari.
+
+    The recorded actions replay to the recorded bits; docs/datasets.md says what is in it.
+
+    Args:
+        path: the file (``.parquet``), or the folder (``NAME-v0``) to write.
+        agents: name -> agent, or team, that drives the scenario's learners; they are left as they are.
+        scenario: whose worlds are driven in.
+        episodes: worlds of the list, from its first one on.
+        seed: of the list.
+        format: ``parquet`` or ``minari``; None: as the path's ending says.
+        reward: what a learner is rewarded with.
+        observation: what a learner observes; None: ``observation_for(scenario)``.
+        force: replace a dataset that is there.
+        on_progress: is called with an agent's name and its worlds done so far.
+
+    Raises ``InvalidInput``, ``AlreadyExists`` and ``MissingExtra`` before the work, ``PhysicsError`` where no world is
+    left.
+
+    """
+    check_whole_number("write_dataset: episodes", episodes, 1)
+    check_whole_number("write_dataset: seed", seed, 0)
+    if not agents:
+        raise InvalidInput("write_dataset: no agents given; at least one is needed, for instance full_brake")
+    chosen = check_dataset(path, scenario, format, force=force)
+    spec = observation_for(scenario) if observation is None else choose_observation(observation)
+    task = Task(scenario, int(seed), reward_params(reward), spec)
+    told = tell(task, agents, episodes)
+    sink = (
+        parquet_dataset(Path(path), told) if chosen == "parquet" else minari_folder(Path(path), task, told, force=force)
+    )
+    recorded, off_by, left_out, decisions = dict.fromkeys(agents, 0), dict.fromkeys(agents, 0.0), [], 0
+    with sink as add:
+        for name, first in product(agents, range(0, int(episodes), BATCH)):
+            count = min(BATCH, int(episodes) - first)
+            sample = scenario.sample(count, task.seed, first=first)
+
+            def of(rows: Any, sample: Sample = sample, name: str = name) -> Recording:
+                return record_episodes(
+                    Sample(sample.worlds.take(rows), sample.index[rows], 0), agents[name], name, task
+                )
+
+            recording, _, failed = leaving_out_failed(of, np.arange(count))
+            left_out += [LeftOut(first + row, task.seed, name, why) for row, why in failed.items()]
+            if recording is not None:
+                add(recording)
+                recorded[name] += len(recording.index)
+                decisions += int(recording.decisions.sum())
+                off_by[name] = max(off_by[name], recording.off_by)
+            if on_progress is not None:
+                on_progress(name, first + count)
+        if not decisions:
+            raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in left_out})
+        told["left_out"] = [left._asdict() for left in left_out]
+        told["off_by"] = off_by
+    return DatasetSummary(Path(path), chosen, recorded, decisions, off_by, tuple(left_out))
+
+
+def check_dataset(
+    path: str | Path, scenario: Scenario, format: str | None = None, *, force: bool = False
+) -> DatasetFormat:
+    """The format of a dataset that can be written to ``path``; raises as ``write_dataset`` does before its work."""
+    target = Path(path)
+    is_file = target.suffix.lower() == PARQUET
+    chosen: Any = format if format is not None else "parquet" if is_file else "minari"
+    if chosen not in get_args(DatasetFormat):
+        raise unknown_name("format", chosen, get_args(DatasetFormat))
+    if is_file != (chosen == "parquet"):
+        right = f"a file ending in {PARQUET}" if chosen == "parquet" else "a folder called NAME-vNUMBER"
+        raise InvalidInput(f"{target}: the format {chosen} is written to {right}")
+    for package in _NEEDED_PACKAGES[chosen]:
+        need(package)
+    if not scenario.learners:
         raise InvalidInput(
-            f"{initial_states}: has {count_of(worlds.n, 'world')}; the passport is of number {passport.number}, from 0"
+            f"scenario {scenario.name!r} has no learner to record; say who is driven: --vehicle vehicle_2"
         )
-    return worlds.take(np.array([passport.number]))
+    if chosen == "parquet":
+        check_target(target, force=force)
+    else:
+        env_spec(Task(scenario, DEFAULT.LIST_SEED, reward_params("harm"), observation_for(scenario)))
+        check_folder(target, force=force)
+    return chosen  # type: ignore[no-any-return]  # one of them
+
+
+def tell(task: Task, agents: Mapping[str, Driver], episodes: int) -> dict[str, Any]:
+    """What is recorded, as plain data: the metadata of every dataset."""
+    scenario = task.scenario
+    teams = {name: team_of(driver, scenario.learners).drivers for name, driver in agents.items()}
+    return {
+        "scenario": scenario.declared(),
+        "scenario_sha256": scenario_sha256(scenario),
+        "seed": task.seed,
+        "episodes": int(episodes),
+        "learners": [scenario.vehicle_names[i] for i in scenario.learners],
+        "agents": {
+            name: {scenario.vehicle_names[i]: policy_sha256(agent) for i, agent in drivers.items()}
+            for name, drivers in teams.items()
+        },
+        "observation": [feature.name for feature in task.observation.features],
+        "reward": task.reward.model_dump(mode="json"),
+        "versions": result_versions(),
+    }

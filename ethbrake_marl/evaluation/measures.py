@@ -1,27 +1,594 @@
-"""Measures of an episode: each is one entry, and every table, file and page loops over the entries."""
+"""Outcomes of agents in the same worlds, the registry of measures, their tallies, and the tables made of them."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import sys
+import warnings
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import partial
-from typing import Any, Literal
+from functools import cached_property, partial
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ethbrake_marl.agents import Knowledge, Source, knowledge_text, sees_through
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, describe_error
-from ethbrake_marl.evaluation.inputs import result_identity
-from ethbrake_marl.evaluation.outcome import Evaluation, Outcome
-from ethbrake_marl.evaluation.statistics import Moments, decrease_of, difference, exact_products, mean_of, moments
-from ethbrake_marl.files.sheet import Cell, Column, Estimate, Sheet
-from ethbrake_marl.limits.best_harm import BestHarmTable, shipped_tables, world_identity
-from ethbrake_marl.limits.limits import Limits, Unproven, prove, unproven_because
-from ethbrake_marl.physics import Bools, Floats, ImpactRows, Ints, Worlds, advance, leaving_out_failed, make_worlds
-from ethbrake_marl.physics.worlds import read_only
-from ethbrake_marl.scenario import Task, load_scenario
+from ethbrake_marl.errors import (
+    AlreadyExists,
+    IncompleteTable,
+    InvalidInput,
+    PhysicsError,
+    count_of,
+    describe_error,
+    unknown_name,
+)
+from ethbrake_marl.evaluation.inputs import result_identity, result_versions, scenario_sha256, worlds_sha256
+from ethbrake_marl.evaluation.statistics import Moments, exact_sum, mean, rate
+from ethbrake_marl.files.sheet import DASH, Cell, Column, Estimate, Row, Sheet, Shown
+from ethbrake_marl.harm import Declared, Ledger, scored
+from ethbrake_marl.limits import (
+    BestHarmTable,
+    Limits,
+    Unproven,
+    known_limits,
+    prove,
+    shipped_tables,
+    unproven_because,
+    world_identity,
+)
+from ethbrake_marl.physics import (
+    Bools,
+    Floats,
+    ImpactRows,
+    Ints,
+    Worlds,
+    advance,
+    is_periodic,
+    leaving_out_failed,
+    make_worlds,
+)
+from ethbrake_marl.scenario import QUANTITY, Scenario, Task, Texts, hidden_from, load_scenario
+
+_SHOWN_AGENTS = 5  # by name, in ``repr``
+_NAMED = 10  # worlds left out that are named one by one; all stand in the JSON
+COLUMN = "metric_"  # before the name of a registered measure, in JSON and in files with every world
+Columns = dict[str, list[Any]]  # of one row per world
+
+# Columns of files with every world that hold texts, but for the types of vehicles.
+_TEXT_COLUMNS = {"agent", "scenario", "unavoidable_reason", "best_known_source", "ended", "knows"}
+_ALWAYS_TOLD = (
+    "gaps_m",
+    "speeds_mps",
+    "obstacle_gap_m",
+)  # quantities of those files that may be the same in all worlds
+_LIBRARIES = ("pandas", "polars", "columns")  # of a frame, in the order of preference
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What one agent achieved, world by world.
+
+    >>> import ethbrake_marl as eb
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> agents = {"full_brake": eb.make_agent("full_brake")}
+    >>> outcome = eb.evaluate(scenario.sample(3, seed=7), agents, scenario=scenario).outcome("full_brake")
+    >>> outcome.total_harm.round(2), outcome.collided
+    (array([33.79, 77.19,  0.  ]), array([ True,  True, False]))
+
+    """
+
+    ledger: Ledger  # of every impact
+    final: Worlds  # each world as its episode left it
+    at_rest: Bools  # [n] the line came to rest; else the horizon cut the episode off
+    predicted_harm: Floats | None  # [n] what the agent expected at the alert, if it predicts and drives alone
+    chosen_policy: Bools | None  # [n] a hybrid drove by its policy; else by its backup
+    knows: Knowledge = (Source.UNSTATED,)  # what the agent says it knows of the line
+    shoved_m: Floats | None = None  # [n] how far Vehicle 1 ends beyond where it would by itself
+    sampled_harm: Floats | None = None  # [n] the paper's sum over samples of the same commands
+    policies: Mapping[int, str] = field(default_factory=dict)  # vehicle (0 = front) -> SHA-256 of its policy's manifest
+    metrics: Mapping[str, Floats] = field(default_factory=dict)  # registered measures by column, [n]
+
+    def __repr__(self) -> str:
+        n, means = len(self.collided), "no harm"
+        if n:
+            means = f"harm {self.first_impact_harm.mean():.2f} first-impact, {self.total_harm.mean():.2f} total"
+        return f"Outcome({count_of(n, 'world')}, {int(self.collided.sum()):,} collided, {means})"
+
+    def take(self, rows: Ints | Bools) -> Outcome:
+        """That of some of the worlds."""
+        names = ("predicted_harm", "chosen_policy", "shoved_m", "sampled_harm")
+        columns: dict[str, Any] = {name: getattr(self, name) for name in names}
+        columns = {name: None if column is None else column[rows] for name, column in columns.items()}
+        metrics = {name: column[rows] for name, column in self.metrics.items()}
+        ledger, final = self.ledger.take(rows), self.final.take(rows)
+        return replace(self, ledger=ledger, final=final, at_rest=self.at_rest[rows], metrics=metrics, **columns)
+
+    @property
+    def named_policies(self) -> dict[str, str]:
+        """``policies`` by the vehicles' names."""
+        return {f"vehicle_{i + 1}": sha for i, sha in self.policies.items()}
+
+    @property
+    def collided(self) -> Bools:
+        """Whether any impact happened, [n]."""
+        return self.ledger.collided
+
+    @property
+    def impacts(self) -> Ints:
+        """Number of impacts of all pairs, and with an obstacle ahead, [n]."""
+        return self.ledger.impacts
+
+    def world_harm(self, harm_count: HarmCount) -> Floats:
+        """Harm of all vehicles under a counting rule, [n] m2/s2."""
+        return self.ledger.world_harm(harm_count)
+
+    @property
+    def first_impact_harm(self) -> Floats:
+        """Harm of all vehicles, each pair's first impact only, [n] m2/s2."""
+        return self.ledger.world_harm("first")
+
+    @property
+    def total_harm(self) -> Floats:
+        """Harm of all vehicles, every impact, [n] m2/s2."""
+        return self.ledger.world_harm("total")
+
+    def vehicle_harm(self, harm_count: HarmCount) -> Floats:
+        """Harm of each vehicle, [n, N] m2/s2."""
+        return self.ledger.vehicle_harm(harm_count)
+
+    @property
+    def ended(self) -> NDArray[np.str_]:
+        """How each episode ended, [n]: ``at_rest`` or ``horizon``."""
+        return np.where(self.at_rest, "at_rest", "horizon")
+
+    def borne(self, objectives: Sequence[Declared] = ()) -> dict[str, Floats]:
+        """What each vehicle bears under both counts, ``total_harm_2``, and what each objective makes of it [n] (m2/s2).
+
+        That is ``social:45_first_2``.
+        """
+        told = {"first_impact_harm": self.vehicle_harm("first"), "total_harm": self.vehicle_harm("total")}
+        for objective in objectives:
+            for harm_count in HARM_COUNTS:
+                (values,) = scored(self.ledger, harm_count, [objective]).values()
+                told[f"{objective}_{harm_count}"] = values
+        return {f"{name}_{i + 1}": each[:, i] for name, each in told.items() for i in range(each.shape[1])}
+
+    def columns(self) -> Columns:
+        """What happened in each world, by the names of ``--per-world``; None where the agent says nothing."""
+        final = self.final
+        found: dict[str, Any] = {
+            "collided": self.collided + 0,
+            "impacts": self.impacts,
+            **self.borne(),
+            "first_impact_harm": self.first_impact_harm,
+            "total_harm": self.total_harm,
+            "sampled_harm": self.sampled_harm,
+            "vehicle_1_shoved_m": self.shoved_m,
+        }
+        if np.isfinite(final.obstacle_gap_m).all():  # of the harm above, what Vehicle 1's impacts with the obstacle did
+            found["obstacle_first_impact_harm"] = self.ledger.obstacle_harm("first")
+            found["obstacle_total_harm"] = self.ledger.obstacle_harm("total")
+            found["final_obstacle_gap_m"] = final.obstacle_gap_m
+        found |= {f"final_gap_{p + 1}_m": final.gaps_m[:, p] for p in range(final.N - 1)}
+        found |= {f"final_speed_{i + 1}_mps": final.speeds_mps[:, i] for i in range(final.N)}
+        chosen = None if self.chosen_policy is None else self.chosen_policy + 0
+        found |= {"end_s": final.time_s, "ended": self.ended}
+        found |= {"predicted_harm": self.predicted_harm, "chosen_policy": chosen}
+        found |= {COLUMN + name: column + 0 for name, column in self.metrics.items()}  # truths as 0 and 1
+        nothing = [None] * len(self.collided)
+        return {name: nothing if column is None else column.tolist() for name, column in found.items()}
+
+
+class LeftOut(NamedTuple):
+    """A world that is in no outcome, because it could not be advanced with one of the agents."""
+
+    world: int  # number in its list
+    seed: int | None  # of the list; None for worlds that were given
+    agent: str  # the first one that met it
+    reason: str
+
+    def __str__(self) -> str:
+        of = "" if self.seed is None else f" of seed {self.seed}"
+        return f"world {self.world}{of} ({self.agent}: {self.reason})"
+
+    @staticmethod
+    def line(worlds: Sequence[str], whole: int) -> str:
+        """That these of ``whole`` worlds, each named with its reason, count in no figure."""
+        named = [*worlds[:_NAMED], *(["and so on"] if len(worlds) > _NAMED else [])]
+        return (
+            f"LEFT OUT for every agent: {len(worlds):,} of {whole:,} worlds, which the physics could not advance"
+            f" (please report them): {'; '.join(named)}."
+        )
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Outcomes of agents that drove the same vehicles in the same worlds, row k of every array being world k.
+
+    >>> import ethbrake_marl as eb
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> agents = {name: eb.make_agent(name) for name in ("full_brake", "coast")}
+    >>> evaluation = eb.evaluate(scenario.sample(3, seed=7), agents, scenario=scenario)
+    >>> list(evaluation.outcomes), evaluation.vehicle, evaluation.index
+    (['full_brake', 'coast'], 1, array([0, 1, 2]))
+
+    """
+
+    scenario: Scenario  # of the worlds
+    vehicles: tuple[int, ...]  # indices (0 = front) of the vehicles that were driven; the others followed scripts
+    worlds: Worlds  # at the alert
+    index: Ints  # [n] number of each world in its list
+    seed: int | None  # of the list; None for worlds that were given
+    outcomes: dict[str, Outcome]  # by the agent's name
+    left_out: tuple[LeftOut, ...] = ()  # worlds of the list that are in none of the arrays, the same for all agents
+    kinds: Mapping[str, Texts] = field(default_factory=dict)  # ``scenario`` of a mixture, ``vehicle_2_type``, ...: [n]
+
+    def __repr__(self) -> str:
+        drivers = [f"{agent!r:.42}" for agent in list(self.outcomes)[:_SHOWN_AGENTS]]
+        more = len(self.outcomes) - len(drivers)
+        drivers += [f"{more} more"] if more else []
+        seed = "" if self.seed is None else f" of seed {self.seed}"
+        return (
+            f"Evaluation({self.scenario.name!r}, {count_of(self.worlds.n, 'world')}{seed}, {self.task.names:.80} driven"
+            f" by {', '.join(drivers)})"
+        )
+
+    @property
+    def vehicle(self) -> int:
+        """The vehicle that was driven; raises ``InvalidInput`` if it is not exactly one."""
+        return self.task.vehicle
+
+    @property
+    def task(self) -> Task:
+        """What was asked of the agents."""
+        return Task(self.scenario, self.vehicles)
+
+    @cached_property
+    def limits(self) -> Limits | Unproven:
+        """What is known of each world whoever drives: found once, for everything that tells of this evaluation.
+
+        Warns (``IncompleteTable``) where a table of best known harm holds some of the worlds, and not the others.
+        """
+        found = known_limits(self.worlds, self.task)
+        if isinstance(found, Limits) and found.warning:
+            warnings.warn(found.warning, IncompleteTable, stacklevel=2)
+        return found
+
+    def take(self, rows: Ints | Bools) -> Evaluation:
+        """That of some of the worlds; nobody is left out of them."""
+        outcomes = {name: outcome.take(rows) for name, outcome in self.outcomes.items()}
+        kinds = {name: column[rows] for name, column in self.kinds.items()}
+        return replace(
+            self, worlds=self.worlds.take(rows), index=self.index[rows], outcomes=outcomes, left_out=(), kinds=kinds
+        )
+
+    def tally(
+        self, *, baseline: str = "full_brake", limits: bool = True, objectives: Sequence[str] | None = None
+    ) -> dict[str, AgentTally]:
+        """The tally of every agent.
+
+        Args:
+            baseline: what is compared with, but for regrets, which are compared with full braking.
+            limits: with what needs the best known harm of each world.
+            objectives: also sum up what each vehicle bears, and these of it; None: neither.
+
+        """
+        regrets, values = self.regrets if limits else None, {}
+        for agent, outcome in self.outcomes.items():
+            told = ((m.name, m.values(outcome, regrets)) for m in (*measures(outcome.metrics), *COUNTED))
+            values[agent] = {name: column for name, column in told if column is not None}
+            values[agent] |= {} if objectives is None else outcome.borne(objectives)
+        paired = {str(m.of): BASELINE if m.limits else baseline for m in measures() if m.against}
+        found = {}
+        for agent, own in values.items():
+            truths = {name: column for name, column in own.items() if column.dtype == np.bool_}
+            found[agent] = AgentTally(
+                {name: (int(column.sum()), len(column)) for name, column in truths.items()},
+                {name: Moments.of(column) for name, column in own.items() if name not in truths},
+                {
+                    name: exact_sum(own[name], values[other][name])
+                    for name, other in paired.items()
+                    if name in own and other in values
+                },
+            )
+        return found
+
+    @staticmethod
+    def check_group(kinds: Collection[str], by: str) -> None:
+        """Raise what ``summarise_by`` would for worlds with these columns of ``kinds``."""
+        if not kinds:
+            raise InvalidInput(
+                f"by {by!r}: these worlds have no groups; those of a mixture have scenario, those with vehicle_types"
+                " have vehicle_1_type and so on"
+            )
+        if by not in kinds:
+            raise unknown_name("group", by, kinds)
+
+    @property
+    def hidden(self) -> Bools:
+        """Worlds in which the channel hides something of the line from a driven vehicle, [n]; see ``v2x``."""
+        hidden = np.zeros(self.worlds.n, np.bool_)
+        for vehicle in self.vehicles:
+            hidden |= hidden_from(self.worlds.vehicles, vehicle) | is_periodic(self.worlds)
+        return hidden
+
+    @cached_property
+    def regrets(self) -> Regrets | None:
+        """Best known harm of every world, the agents of this evaluation included; None where nothing is proven."""
+        limits = self.limits
+        if isinstance(limits, Unproven):
+            return None
+        outcomes = self.outcomes.values()
+        first = np.fmin.reduce([limits.first_impact_harm, *(outcome.first_impact_harm for outcome in outcomes)])
+        total = np.fmin.reduce([limits.total_harm, *(outcome.total_harm for outcome in outcomes)])
+        regrets = Regrets(limits, first, total, np.zeros(0, np.str_))
+        below = np.logical_or.reduce([regrets.below(outcome) for outcome in outcomes])
+        avoidable = limits.proof.avoidable
+        witness = np.zeros(below.shape, np.bool_) if avoidable is None else avoidable
+        source = np.select([witness, ~limits.known, below], ["witness", "agents", "below_table"], "table")
+        return replace(regrets, source=source)
+
+    @property
+    def conditions(self) -> Conditions:
+        """Under which these are the results, with all quantities of the worlds."""
+        because = self.limits.because if isinstance(self.limits, Unproven) else None
+        return Conditions.of_test(self.task, self.seed, self.worlds.n, because, Conditions.of(self.worlds))
+
+    def per_world(self, objectives: Sequence[Declared] = (), *, limits: bool = True) -> Columns:
+        """One row per agent and world; docs/evaluation.md lists the columns. None where there is no value.
+
+        Without ``limits`` those of the best known harm are left out, every quantity is told, and no world that was left
+        out: the rows of a shard, which have the same columns as those of any other. Initial quantities are named as in
+        a table of initial states: ``gap_1_m``, ``speed_1_mps``, ``latency_2_s``, ``restitution``.
+        """
+        n, regrets = self.worlds.n, self.regrets if limits else None
+        initial: Columns = {"world": self.index.tolist()}
+        initial |= {name: column.tolist() for name, column in self.kinds.items()}
+        for key, rule in QUANTITY.of(self.worlds).items():
+            values = rule.of(self.worlds)
+            if not limits or key in _ALWAYS_TOLD or np.ptp(values, axis=0).any():
+                initial |= {rule.column_of(i): values[:, i].tolist() for i in range(values.shape[1])}
+        hidden: Columns = {"hidden": self.hidden.astype(int).tolist()}
+        found: Columns = {}
+        for agent, outcome in self.outcomes.items():
+            columns: Columns = {"agent": [agent] * n, **initial, **outcome.columns()}
+            if regrets is not None:
+                columns |= regrets.columns(outcome)
+            elif limits:
+                columns |= {name: [None] * n for name in Regrets.COLUMNS}
+            told = outcome.borne(objectives)
+            columns |= {name: column.tolist() for name, column in told.items() if name not in columns}
+            columns |= {"knows": [knowledge_text(outcome.knows)] * n, **hidden}
+            for left in self.left_out if limits else ():
+                told_of = {"agent": agent, "world": left.world, "ended": f"left out: {left.agent}: {left.reason}"}
+                columns = {name: [*values, told_of.get(name)] for name, values in columns.items()}
+            found = {name: [*found.get(name, ()), *values] for name, values in columns.items()}
+        return found
+
+    def arrays(self, objectives: Sequence[Declared] = ()) -> dict[str, NDArray[Any]]:
+        """``per_world`` as arrays: NaN for no number, the empty text for no text."""
+        found = {}
+        for name, values in self.per_world(objectives).items():
+            texts = name in _TEXT_COLUMNS or (name.startswith("vehicle_") and name.endswith("_type"))
+            found[name] = np.array([("" if texts else np.nan) if value is None else value for value in values])
+        return found
+
+    def to_frame(self, library: str | None = None) -> Any:
+        """One row per agent and world: the columns of ``--per-world`` (docs/evaluation.md), NaN for no number.
+
+        A pandas ``DataFrame`` where pandas is installed, else one of polars, else a mapping of column names to arrays.
+        ``library`` asks for one of them: ``pandas``, ``polars`` or ``columns``. Raises ``UnknownName`` for another, and
+        ``InvalidInput`` for one that is not installed.
+        """
+        if library is not None and library not in _LIBRARIES:
+            raise unknown_name("library", library, _LIBRARIES)
+        chosen = library or next((name for name in _LIBRARIES[:-1] if find_spec(name) is not None), _LIBRARIES[-1])
+        if chosen == _LIBRARIES[-1]:
+            return self.arrays()
+        if find_spec(chosen) is None:
+            raise InvalidInput(f"to_frame: {chosen} is not installed: {sys.executable} -m pip install {chosen}")
+        return import_module(chosen).DataFrame(self.arrays())
+
+    def rescore(self, declared: Sequence[Declared] | None = None) -> list[Rescored]:
+        """Every agent under every objective and both counts, in that order."""
+        return [
+            Rescored(agent, objective, harm_count, tuple(mean(column) for column in values.T))
+            for agent, outcome in self.outcomes.items()
+            for harm_count in HARM_COUNTS
+            for objective, values in scored(outcome.ledger, harm_count, declared).items()
+        ]
+
+    def _repr_html_(self) -> str:
+        """What each agent did, for a notebook."""
+        harms = {"First-impact harm": "first_impact_harm", "Total harm": "total_harm"}
+        rows = []
+        for agent, outcome in self.outcomes.items():
+            collided = rate(int(outcome.collided.sum()), self.worlds.n)
+            means = [mean(getattr(outcome, name)).in_words() for name in harms.values()]
+            rows.append((agent, collided.in_words(digits=1, scale=100.0, unit=" %"), *means))
+        note = "Means per world in m²/s², with their 95 % intervals. eb.summarise tells more."
+        return Sheet(repr(self), ("Agent", "Collisions", *harms), rows, note).html()
+
+    def complete(self) -> Evaluation:
+        """The evaluation itself, for who needs every world; raises ``PhysicsError`` if some were left out."""
+        if self.left_out:
+            raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
+        return self
+
+    def outcome(self, agent: str) -> Outcome:
+        """The outcome of one agent; raises ``InvalidInput`` naming those that were evaluated."""
+        if agent not in self.outcomes:
+            raise InvalidInput(f"agent {agent!r} was not evaluated; evaluated: {', '.join(self.outcomes)}")
+        return self.outcomes[agent]
+
+
+# The three tests that stand beside each other: the paper's own, and two that close its ways out.
+#
+# All three have the same gaps and speeds in world k. ``docs/decisions/0011`` says why the first is the main one, and
+# why none is shown alone.
+
+TESTS = {
+    "paper-random": "Main test, the paper's rules: Vehicle 2 may drive, nothing stands ahead of Vehicle 1, and pushing"
+    " it on costs nothing in either count.",
+    "paper-random-brake-only": "Brake-only test: the same worlds, but Vehicle 2 may only brake and coast; it can"
+    " neither drive on nor push with its motor.",
+    "paper-random-obstacle": "Obstacle test: the same worlds with the obstacle that Vehicle 1 brakes for, 1.7 m beyond"
+    " where it stops by itself. Vehicle 1's impact with it is harm.",
+}
+
+
+def is_as_shipped(scenario: Scenario) -> bool:
+    """Whether every value of the scenario is that of the shipped one of its name, whatever its texts say."""
+    one, other = (
+        each.model_dump(exclude={"title", "description", "source"}) for each in (scenario, load_scenario(scenario.name))
+    )
+    return one == other
+
+
+def other_tests(scenario: Scenario) -> tuple[Scenario, ...]:
+    """The two tests that belong beside results on ``scenario``; none where it is not one of the three as shipped."""
+    if scenario.name not in TESTS or not is_as_shipped(scenario):
+        return ()
+    return tuple(load_scenario(name) for name in TESTS if name != scenario.name)
+
+
+@dataclass(frozen=True, slots=True)
+class PaperRow:
+    """One row of a table of the paper, as printed; the paper reports a single harm and no intervals."""
+
+    table: Literal["random test", "hybrid test"]
+    agent: str  # the paper's name
+    episodes: int
+    collisions: int
+    collision_rate: float
+    average_harm: float  # m2/s2
+    harm_decrease: float | None  # relative to Non-E, as printed
+
+
+PAPER_ROWS = (
+    PaperRow("random test", "Non-E", 10_000, 9391, 0.9391, 33.5878, 0.0),
+    PaperRow("random test", "E-V2X-BM", 10_000, 8520, 0.852, 9.8772, 0.7059),
+    PaperRow("random test", "Hybrid SAC", 10_000, 5896, 0.5896, 5.7001, 0.8302),
+    PaperRow("random test", "Hybrid PPO", 10_000, 5974, 0.5974, 5.6202, 0.8326),
+    PaperRow("hybrid test", "E-V2X-BM", 5_000, 4263, 0.8526, 9.8514, None),
+    PaperRow("hybrid test", "Standalone DRL", 5_000, 3737, 0.7474, 12.229, None),
+    PaperRow("hybrid test", "Hybrid", 5_000, 2995, 0.599, 7.3641, None),
+)
+
+PAPER_PARAMETERS = {
+    "random test": (
+        "10,000 worlds; d = 5–10 m; v = 18–22 m/s; braking and driving capacity (6, 7, 6) m/s²; τ2 = 0.5 s, τ3 = 0.8 s;"
+        " m = (4.5, 5.5, 5.9) t; not stated: e, time step, horizon, seed"
+    ),
+    "hybrid test": (
+        "5,000 worlds; d = 5–10 m; capacities, latencies and masses as in the random test; not stated: speeds for this"
+        " test, e, time step, horizon, seed"
+    ),
+}
+
+PAPER_NOTE = (
+    "The paper's rows cannot come from the parameters that it states: in 62.3 % of the worlds of its random test no"
+    " command of Vehicle 2 whatsoever avoids an impact (in 65.1 % none avoids contact), yet its hybrids collide in"
+    " 59 %; and in its 5,000-world test the hybrid avoids 2,005 collisions, although its two parts together avoid at"
+    " most 2,000. If Vehicle 2 could act at about 0.2 s instead of the stated 0.5 s, full braking would come close to"
+    " the paper's row (the scenario paper-random-early). The paper's E-V2X-BM harm is close to what the pairwise closed"
+    " form predicts at the alert, not to what those commands cause; for the 5,000-world table that holds only at the"
+    " speeds of the random test, since at those of the paper's figure of distances it predicts 3.07. Nothing here is"
+    " tuned to these rows. docs/paper.md goes through the paper's equations, figures and tables one by one."
+)
+
+_SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the variant of which the note speaks
+
+
+# The conditions behind a result: what stands beside every table, figure and report.
+
+_SYMBOLS = {
+    "gaps_m": ("d", "m"),
+    "speeds_mps": ("v", "m/s"),
+    "braking_capacity_mps2": ("braking capacity", "m/s²"),
+    "driving_capacity_mps2": ("driving capacity", "m/s²"),
+    "latency_s": ("τ", "s"),
+    "mass_t": ("m", "t"),
+    "restitution": ("e", ""),
+    "obstacle_gap_m": ("obstacle at", "m"),
+}
+_STAY = "\u00a0"  # a blank at which no line is broken
+
+
+class Conditions(dict[str, Any]):
+    """Under which results hold, as plain data: who drove what in which test, and every quantity of its worlds."""
+
+    @classmethod
+    def of(cls, worlds: Worlds) -> Conditions:
+        """Every quantity of the worlds: a list per vehicle or pair, one entry for the whole world.
+
+        An entry is a number where all worlds agree, else its ``[least, largest]`` value.
+        """
+        return cls.of_ranges({key: rule.of(worlds).T for key, rule in QUANTITY.of(worlds).items()})
+
+    @classmethod
+    def of_ranges(cls, ranges: Mapping[str, Iterable[Any]]) -> Conditions:
+        """Those whose entries have these values, or these least and largest ones."""
+        found = {
+            key: [(float(np.min(each)), float(np.max(each))) for each in entries] for key, entries in ranges.items()
+        }
+        told = {key: [low if low == high else [low, high] for low, high in ends] for key, ends in found.items()}
+        return cls({key: ends[0] if QUANTITY.declared[key].per == "world" else ends for key, ends in told.items()})
+
+    @classmethod
+    def of_test(
+        cls, task: Task, seed: int | None, count: int, because: str | None, found: Mapping[str, Any]
+    ) -> Conditions:
+        """Those of a test.
+
+        Args:
+            task: scenario, and who was driven.
+            seed: of the list; None for worlds that were given.
+            count: number of worlds.
+            because: why nothing is proven for these worlds; None where it is.
+            found: the quantities of the worlds.
+
+        """
+        scenario = task.scenario
+        driven = [scenario.vehicle_names[i] for i in task.vehicles]
+        scripts = {scenario.vehicle_names[i]: script for i, script in scenario.scripts.items()}
+        return cls(
+            scenario=scenario.name,
+            seed=seed,
+            count=count,
+            **({"controlled_vehicle": driven[0]} if len(driven) == 1 else {"controlled_vehicles": driven}),
+            scripts={name: script for name, script in scripts.items() if name not in driven},
+            time_step_s=scenario.time_step_s,
+            horizon_s=scenario.horizon_s,
+            no_limits_because=because,
+            **found,
+        )
+
+    @property
+    def line(self) -> str:
+        """In one line, for captions: scenario, number of worlds, seed, then ``quantities``."""
+        seed = "" if self["seed"] is None else f", seed {self['seed']}"
+        return f"{self['scenario']}: {count_of(self['count'], 'world')}{seed}; {self.quantities}"
+
+    @property
+    def quantities(self) -> str:
+        """The quantities in one line, each with its symbol and unit: ``d = 7 m; v = (20, 18, 20) m/s; ...``.
+
+        Entries that read alike are written once.
+        """
+        parts = []
+        for key, (symbol, unit) in _SYMBOLS.items():
+            if key in self:
+                entries = [self[key]] if QUANTITY.declared[key].per == "world" else self[key]
+                texts = [f"{e[0]:.3g}–{e[1]:.3g}" if isinstance(e, list) else f"{e:.4g}" for e in entries]
+                told = texts[0] if len(set(texts)) == 1 else f"({f',{_STAY}'.join(texts)})"
+                parts.append(f"{symbol}{_STAY}={_STAY}{told}{f'{_STAY}{unit}' if unit else ''}")
+        return "; ".join(parts)
+
 
 # The limits of an evaluation: the least harm known of each world is that of ``limits.limits``, or what an agent of the
 # same evaluation achieved, whichever is less.
@@ -30,7 +597,7 @@ NO_HARM = 1e-3  # m2/s2: nobody is hurt by 0.03 m/s
 TOLERANCE = 1e-6  # m2/s2; less than this below the best known harm is rounding
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Regrets:
     """The limits after all agents of one evaluation drove, [n] each."""
 
@@ -52,21 +619,38 @@ class Regrets:
         first, total = self.limits.first_impact_harm, self.limits.total_harm
         return (outcome.first_impact_harm < first - TOLERANCE) | (outcome.total_harm < total - TOLERANCE)
 
+    @property
+    def avoidable(self) -> Bools | None:
+        """Where contact can be avoided, [n]; None where that is not decided."""
+        return self.limits.proof.avoidable
 
-def assess(evaluation: Evaluation) -> Regrets | None:
-    """Best known harm of every world, the agents of this evaluation included; None where nothing is proven."""
-    limits = evaluation.limits
-    if isinstance(limits, Unproven):
-        return None
-    outcomes = evaluation.outcomes.values()
-    first = np.fmin.reduce([limits.first_impact_harm, *(outcome.first_impact_harm for outcome in outcomes)])
-    total = np.fmin.reduce([limits.total_harm, *(outcome.total_harm for outcome in outcomes)])
-    regrets = Regrets(limits, first, total, np.zeros(0, np.str_))
-    below = np.logical_or.reduce([regrets.below(outcome) for outcome in outcomes])
-    avoidable = limits.proof.avoidable
-    witness = np.zeros(below.shape, np.bool_) if avoidable is None else avoidable
-    source = np.select([witness, ~limits.known, below], ["witness", "agents", "below_table"], "table")
-    return Regrets(limits, first, total, source)
+    @property
+    def between(self) -> Between | None:
+        """The worlds with proven contact and no proven impact; None where contact is not decided."""
+        if self.avoidable is None:
+            return None
+        return Between.of(~self.avoidable, self.limits.proof.impact, self.first_impact_harm, self.total_harm)
+
+    COLUMNS = (
+        "avoidable", "unavoidable_reason", "best_known_first_impact_harm", "best_known_total_harm", "best_known_source",
+        "impact_proven", "proven_harm", "regret_first_impact_harm", "regret_total_harm",
+    )  # fmt: skip
+
+    def columns(self, outcome: Outcome) -> Columns:
+        """What was avoidable and the best known in each world, by the names of ``--per-world``."""
+        n, proof = len(outcome.collided), self.limits.proof
+        columns = (
+            np.full(n, None) if proof.avoidable is None else proof.avoidable + 0,
+            np.full(n, None) if proof.reason is None else proof.reason,
+            self.first_impact_harm,
+            self.total_harm,
+            self.source,
+            proof.impact + 0,
+            proof.harm,
+            self.regret(outcome, "first"),
+            self.regret(outcome, "total"),
+        )
+        return {name: column.tolist() for name, column in zip(self.COLUMNS, columns, strict=True)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,22 +662,34 @@ class Between:
     mean_total: float | None
     harmless_rate: float | None  # share of them whose best known total harm is below 1e-3
 
+    @property
+    def text(self) -> str:
+        """What is known of them, as a sentence after another; empty without such a world."""
+        if self.rate == 0.0:
+            return ""
+        text = f" In the {100 * self.rate:.1f} % between, whether an impact can be avoided is open"
+        if self.mean_first is None or self.harmless_rate is None:
+            return f"{text}."
+        return (
+            f"{text}: the best known do {self.mean_first:.2f} there on average, and next to none in"
+            f" {100 * self.harmless_rate:.0f} % of them."
+        )
 
-def between(contact: Bools, impact: Bools, first: Floats, total: Floats) -> Between:
-    """The worlds between the two proofs; ``first`` and ``total`` [n] are the least harms known, NaN where none is."""
-    there = contact & ~impact
-    known = there & np.isfinite(first) & np.isfinite(total)
-    if not known.any():
-        return Between(float(there.mean()), None, None, None)
-    harmless = float((total[known] < NO_HARM).mean())
-    return Between(float(there.mean()), float(first[known].mean()), float(total[known].mean()), harmless)
+    @classmethod
+    def of(cls, contact: Bools, impact: Bools, first: Floats, total: Floats) -> Between:
+        """Those of worlds with these proofs; ``first`` and ``total`` [n] are the least harms known, NaN: none is."""
+        there = contact & ~impact
+        known = there & np.isfinite(first) & np.isfinite(total)
+        if not known.any():
+            return cls(float(there.mean()), None, None, None)
+        harmless = float((total[known] < NO_HARM).mean())
+        return cls(float(there.mean()), float(first[known].mean()), float(total[known].mean()), harmless)
 
 
 # The entries.
 
 BASELINE = "full_brake"
 FAR_M = 5.0  # Vehicle 1 counts as shoved far beyond this
-COLUMN = "metric_"  # before the name of a registered measure, in JSON and in files with every world
 Values = NDArray[Any]  # [n]
 
 
@@ -125,12 +721,6 @@ class Measure:
         """Its column in a table."""
         shown = {"digits": 1, "scale": 100.0, "unit": " %"} if self.percent else {}
         return Column(self.heading, self.name, short=self.short, sign="-", **shown)  # type: ignore[arg-type]
-
-
-def _avoidable(regrets: Regrets, values: Callable[[Bools], Bools]) -> Bools | None:
-    """What is counted of the worlds where contact can be avoided; None where that is not decided."""
-    avoidable = regrets.limits.proof.avoidable
-    return None if avoidable is None else values(avoidable)
 
 
 _OF_THE_EPISODE = (
@@ -184,9 +774,12 @@ _OF_THE_EPISODE = (
 )  # fmt: skip
 
 _OF_THE_LIMITS = (
-    Measure("unavoidable_rate", lambda _, r: _avoidable(r, np.logical_not), limits=True),
+    Measure("unavoidable_rate", lambda _, r: None if r.avoidable is None else ~r.avoidable, limits=True),
     Measure("impact_proven_rate", lambda _, r: r.limits.proof.impact, limits=True),
-    Measure("avoidable_collision_rate", lambda o, r: _avoidable(r, lambda a: o.collided & a), limits=True),
+    Measure(
+        "avoidable_collision_rate",
+        lambda o, r: None if r.avoidable is None else o.collided & r.avoidable, limits=True,
+    ),
     Measure("best_known_first_impact_harm", lambda _, r: r.first_impact_harm, limits=True),
     Measure("best_known_total_harm", lambda _, r: r.total_harm, limits=True),
     Measure("proven_harm", lambda _, r: r.limits.proof.harm, limits=True),
@@ -220,14 +813,14 @@ COUNTED = (  # told as numbers of worlds or shares, without an interval
 )
 
 
-def measures(columns: Iterable[str]) -> tuple[Measure, ...]:
+def _registered_values(name: str, outcome: Outcome, _: object) -> Values:
+    return outcome.metrics[name]
+
+
+def measures(columns: Iterable[str] = ()) -> tuple[Measure, ...]:
     """All that are told, in the order of JSON; ``columns`` are those of registered measures, as an outcome has them."""
-    own = [Measure(COLUMN + each, _own_values(each), _heading(each)) for each in columns]
+    own = [Measure(COLUMN + name, partial(_registered_values, name), _heading(name)) for name in columns]
     return (*_OF_THE_EPISODE, *own, *_OF_THE_LIMITS)
-
-
-def _own_values(column: str) -> Callable[[Outcome, object], Values]:
-    return lambda outcome, _: outcome.metrics[column]
 
 
 # Their sums over some worlds, exact: they merge in any order to the same bits.
@@ -242,15 +835,14 @@ class AgentTally:
     products: Mapping[str, int] = field(default_factory=dict)  # with the baseline's
 
     def __add__(self, other: AgentTally) -> AgentTally:
-        counts = {name: list(pair) for name, pair in self.counts.items()}
+        counts = dict(self.counts)
         for name, (so, of) in other.counts.items():
-            before = self.counts.get(name, (0, 0))
-            counts[name] = [before[0] + so, before[1] + of]
-        return AgentTally(
-            {name: (so, of) for name, (so, of) in counts.items()},
-            added(self.moments, other.moments, Moments()),
-            added(self.products, other.products, 0),
-        )
+            before = counts.get(name, (0, 0))
+            counts[name] = before[0] + so, before[1] + of
+        moments, products = dict(self.moments), dict(self.products)
+        moments |= {name: moments.get(name, Moments()) + each for name, each in other.moments.items()}
+        products |= {name: products.get(name, 0) + each for name, each in other.products.items()}
+        return AgentTally(counts, moments, products)
 
     def count(self, name: str) -> int:
         """Worlds in which it is so."""
@@ -274,65 +866,118 @@ class AgentTally:
             "products": {name: hex(value) for name, value in self.products.items()},
         }
 
-
-def added(one: Mapping[str, Any], other: Mapping[str, Any], zero: Any) -> dict[str, Any]:
-    """Sums by name; what one of both lacks is ``zero`` there."""
-    return {name: one.get(name, zero) + other.get(name, zero) for name in {**one, **other}}
-
-
-Extra = Callable[[Outcome], Mapping[str, Floats]]  # further numbers of each world, by name
-
-
-def tally_agents(
-    evaluation: Evaluation, *, baseline: str = BASELINE, limits: bool = True, extra: Extra | None = None
-) -> dict[str, AgentTally]:
-    """The tally of every agent.
-
-    Args:
-        evaluation: of the worlds.
-        baseline: what is compared with, but for regrets, which are compared with full braking.
-        limits: with what needs the best known harm of each world.
-        extra: gives numbers that are summed too.
-
-    """
-    regrets = assess(evaluation) if limits else None
-    values = {agent: _values(outcome, regrets, extra) for agent, outcome in evaluation.outcomes.items()}
-    paired = {m.of: BASELINE if m.limits else baseline for m in measures(()) if m.against}
-    found = {}
-    for agent, own in values.items():
-        truths = {name: column for name, column in own.items() if column.dtype == np.bool_}
-        products = {
-            str(name): exact_products(own[name], values[other][name])
-            for name, other in paired.items()
-            if name in own and other in values
+    @classmethod
+    def from_json(cls, told: Mapping[str, Any]) -> AgentTally:
+        """What ``to_json`` gave; raises ``ValueError`` and the like for anything else."""
+        counts = {name: (so, of) for name, (so, of) in told["counts"].items()}
+        for so, of in counts.values():
+            if _whole(so) > _whole(of):
+                raise ValueError(f"{so} of {of} worlds")
+        moments = {
+            name: Moments(_whole(count), int(total, 16), int(squares, 16))
+            for name, (count, total, squares) in told["moments"].items()
         }
-        found[agent] = AgentTally(
-            {name: (int(column.sum()), len(column)) for name, column in truths.items()},
-            {name: moments(column) for name, column in own.items() if name not in truths},
-            products,
-        )
-    return found
+        if not all(each.possible for each in moments.values()):
+            raise ValueError("moments that no values have")
+        return cls(counts, moments, {name: int(value, 16) for name, value in told["products"].items()})
+
+    def knowing(self, worlds: int) -> AgentTally:
+        """The tally without what needs the best known harm, unless that is known in every one of so many worlds."""
+        if self.count(KNOWN) == worlds:
+            return self
+        names = {measure.name for measure in (*measures(), *COUNTED) if measure.limits}
+        counts = {name: pair for name, pair in self.counts.items() if name not in names}
+        return AgentTally(counts, {n: each for n, each in self.moments.items() if n not in names}, self.products)
 
 
-def _values(outcome: Outcome, regrets: Regrets | None, extra: Extra | None) -> dict[str, Values]:
-    """The values of all measures of one agent."""
-    told = ((m.name, m.values(outcome, regrets)) for m in (*measures(outcome.metrics), *COUNTED))
-    found = {name: column for name, column in told if column is not None}
-    return found if extra is None else {**found, **extra(outcome)}
+def _whole(value: Any) -> int:
+    """A whole number from 0 on, of a file; raises ``ValueError`` for anything else."""
+    if type(value) is not int or not 0 <= value < 1 << 64:
+        raise ValueError(f"{value!r} is no whole number from 0 on")
+    return value
 
 
-def estimate_all(
-    tallies: Mapping[str, AgentTally],
-    agent: str,
-    worlds: int,
-    rate: Callable[[int, int], Estimate],
-    *,
-    baseline: str = BASELINE,
-) -> dict[str, Estimate | None]:
-    """What one agent did in so many worlds, by measure; None for what not all of them have.
+HASHES = 1 << 256  # sums of hashes are kept modulo this
+Range = tuple[float, float]
 
-    ``rate`` gives the share of so many worlds, of all, with its interval.
+
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """The statistics of some worlds of a list, added in any order.
+
+    ``worlds_hash`` is the sum, modulo 2^256, of the SHA-256 of the leaves: 1,000 neighbouring worlds of the list each.
     """
+
+    worlds: int = 0  # that count, driven by all agents
+    hidden: int = 0  # in which the channel hides something from a driven vehicle
+    worlds_hash: int = 0
+    ranges: Mapping[str, tuple[Range, ...]] = field(default_factory=dict)  # least and largest of every quantity
+    left_out: tuple[LeftOut, ...] = ()
+    agents: Mapping[str, AgentTally] = field(default_factory=dict)
+
+    def __add__(self, other: Tally) -> Tally:
+        ranges, agents = dict(self.ranges), dict(self.agents)
+        for name, entries in other.ranges.items():
+            both = zip(ranges.get(name, entries), entries, strict=True)
+            ranges[name] = tuple((min(a[0], b[0]), max(a[1], b[1])) for a, b in both)
+        return Tally(
+            self.worlds + other.worlds,
+            self.hidden + other.hidden,
+            (self.worlds_hash + other.worlds_hash) % HASHES,
+            ranges,
+            tuple(sorted((*self.left_out, *other.left_out))),
+            agents | {name: agents.get(name, AgentTally()) + each for name, each in other.agents.items()},
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data, as in the file of a finished shard."""
+        return {
+            "worlds": self.worlds,
+            "hidden": self.hidden,
+            "worlds_hash": hex(self.worlds_hash),
+            "ranges": {name: [list(each) for each in entries] for name, entries in self.ranges.items()},
+            "left_out": [list(left) for left in self.left_out],
+            "agents": {name: agent.to_json() for name, agent in self.agents.items()},
+        }
+
+    @classmethod
+    def from_json(cls, told: Any) -> Tally:
+        """What ``to_json`` gave; raises ``InvalidInput`` for anything else."""
+        try:
+            left_out = tuple(LeftOut(*left) for left in told["left_out"])
+            tally = cls(
+                _whole(told["worlds"]),
+                _whole(told["hidden"]),
+                int(told["worlds_hash"], 16) % HASHES,
+                {name: tuple((float(a), float(b)) for a, b in entries) for name, entries in told["ranges"].items()},
+                left_out,
+                {name: AgentTally.from_json(agent) for name, agent in told["agents"].items()},
+            )
+            for left in left_out:
+                _whole(left.world), _whole(left.seed)
+                if not (isinstance(left.agent, str) and isinstance(left.reason, str)):
+                    raise ValueError(f"{left.agent!r}, {left.reason!r}: must be texts")
+            for agent in tally.agents.values() if tally.worlds else ():
+                if any(agent.moments[name].count != tally.worlds for name in ("first_impact_harm", "total_harm")):
+                    raise ValueError("an agent that did not drive every world")
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise InvalidInput(f"is no tally of a shard: {error!r}") from None
+        return tally
+
+    def rescore(self, objectives: Sequence[str], vehicles: int) -> list[Rescored]:
+        """Every agent under these objectives and both counts, as ``Evaluation.rescore``."""
+        return [
+            Rescored(name, each, count, tuple(own.moments[f"{each}_{count}_{i + 1}"].estimate for i in range(vehicles)))
+            for name, own in self.agents.items()
+            for count in HARM_COUNTS
+            for each in objectives
+        ]
+
+
+def _estimate_all(
+    tallies: Mapping[str, AgentTally], agent: str, worlds: int, *, exact: bool, baseline: str
+) -> dict[str, Estimate | None]:
+    """What one agent did in so many worlds, by measure; None for what not all of them have."""
     own = tallies[agent]
     columns = [name.removeprefix(COLUMN) for name in (*own.counts, *own.moments) if name.startswith(COLUMN)]
     registered = list(REGISTERED.values())
@@ -341,29 +986,18 @@ def estimate_all(
     def estimate(measure: Measure) -> Estimate | None:
         name = measure.name if callable(measure.of) else measure.of
         if own.share(name, worlds) is not None:
-            return rate(own.count(name), worlds)
+            return rate(own.count(name), worlds, exact=exact)
         found = own.found(name, worlds)
         if found is None or not measure.against:
-            return None if found is None else mean_of(found)
+            return None if found is None else found.estimate
         compared = tallies.get(BASELINE if measure.limits else baseline)
         other = None if compared is None else compared.found(name, worlds)
         if other is None or (measure.limits and own.count(KNOWN) != worlds):
             return None
         product = own.products[name]
-        if measure.against == "decrease":
-            return decrease_of(found, other, product)
-        return mean_of(difference(found, other, product))
+        return found.decrease(other, product) if measure.against == "decrease" else found.minus(other, product).estimate
 
     return {measure.name: estimate(measure) for measure in measures(columns)}
-
-
-def between_of(evaluation: Evaluation) -> Between | None:
-    """The worlds with proven contact and no proven impact; None where one of both is not decided."""
-    regrets = assess(evaluation)
-    avoidable = None if regrets is None else regrets.limits.proof.avoidable
-    if regrets is None or avoidable is None:
-        return None
-    return between(~avoidable, regrets.limits.proof.impact, regrets.first_impact_harm, regrets.total_harm)
 
 
 # Measures of the user's own: functions of every impact of an episode.
@@ -377,6 +1011,13 @@ class EpisodeImpacts:
 
     worlds: Worlds  # [n] at the alert
     rows: ImpactRows  # every impact, by world and then by time, arrays [k]
+
+    @classmethod
+    def unwritable(cls, worlds: Worlds, rows: ImpactRows) -> EpisodeImpacts:
+        """Those of these episodes; the arrays of ``rows`` cannot be written to from now on."""
+        for column in fields(rows):
+            getattr(rows, column.name).flags.writeable = False
+        return cls(worlds.read_only(), rows)
 
     @property
     def largest_speed_change_mps(self) -> Floats:
@@ -434,36 +1075,6 @@ def register_measure(name: str, function: EpisodeFunction, *, unit: str) -> None
         raise AlreadyExists(f"measure {name!r} is registered already; give another name")
 
 
-def metric_columns(episodes: EpisodeImpacts) -> dict[str, Values]:
-    """Every registered measure by column, [n]: ``NAME``, or ``NAME_1``, ``NAME_2``, ... front to rear.
-
-    Raises ``InvalidInput`` that names measure and world.
-    """
-    found: dict[str, Values] = {}
-    for metric in REGISTERED.values():
-        values = _checked(metric, episodes)
-        if _form(values) != metric.form:
-            raise InvalidInput(
-                f"measure {metric.name!r}: gave {_form(values)}; when it was registered it gave {metric.form}"
-            )
-        if values.ndim == 1:
-            found[metric.name] = values
-        else:
-            found |= {f"{metric.name}_{i + 1}": column.copy() for i, column in enumerate(values.T)}
-    return found
-
-
-def metric_headings(columns: Mapping[str, object]) -> dict[str, str]:
-    """Column -> its heading with vehicle and unit: ``delta_v, vehicle 2 (m/s)``."""
-    return {column: _heading(column) for column in columns}
-
-
-def metric_meanings(columns: Mapping[str, object]) -> dict[str, str]:
-    """Name -> what each measure among the columns means."""
-    metrics = [_registered(column) for column in columns]
-    return {metric.name: metric.about for metric in metrics if metric is not None}
-
-
 def _heading(column: str) -> str:
     metric = _registered(column)
     if metric is None:  # of results that were computed before it was forgotten
@@ -512,13 +1123,7 @@ def _tried() -> EpisodeImpacts:
         restitution=[0.0, 0.3],
     )
     one = (np.array([each]) for each in (2.5, 4.0, True, 1.2, -3.1))
-    return _read_only(worlds, ImpactRows(np.array([0]), np.array([1]), *one))
-
-
-def _read_only(worlds: Worlds, rows: ImpactRows) -> EpisodeImpacts:
-    for column in fields(rows):
-        getattr(rows, column.name).flags.writeable = False
-    return EpisodeImpacts(read_only(worlds), rows)
+    return EpisodeImpacts.unwritable(worlds, ImpactRows(np.array([0]), np.array([1]), *one))
 
 
 class Tape:
@@ -550,8 +1155,23 @@ class Tape:
         return ImpactRows(**{name: column[order] for name, column in columns.items()})
 
     def measured(self) -> dict[str, Values]:
-        """The registered measures of these episodes, as ``metric_columns``."""
-        return metric_columns(_read_only(self.worlds.take(np.arange(self.worlds.n)), self.impacts()))
+        """Every registered measure of these episodes by column, [n]: ``NAME``, or ``NAME_1``, ``NAME_2``, ...
+
+        Raises ``InvalidInput`` that names measure and world.
+        """
+        episodes = EpisodeImpacts.unwritable(self.worlds.take(np.arange(self.worlds.n)), self.impacts())
+        found: dict[str, Values] = {}
+        for metric in REGISTERED.values():
+            values = _checked(metric, episodes)
+            if _form(values) != metric.form:
+                raise InvalidInput(
+                    f"measure {metric.name!r}: gave {_form(values)}; when it was registered it gave {metric.form}"
+                )
+            if values.ndim == 1:
+                found[metric.name] = values
+            else:
+                found |= {f"{metric.name}_{i + 1}": column.copy() for i, column in enumerate(values.T)}
+        return found
 
 
 # The proven bounds of a list of worlds, beside the least harm known there.
@@ -561,102 +1181,63 @@ class Tape:
 # known profiles in these very worlds tells which: next to none, or much.
 
 
-@dataclass(frozen=True, slots=True)
-class Proven:
-    """What is proven about a list of worlds."""
+def proven_of_table(worlds: Worlds, task: Task, table: BestHarmTable) -> dict[str, Any] | None:
+    """What is proven about the worlds of a list, beside the least harms of a table; None where nothing is.
 
-    proven_harm: float  # mean harm (m2/s2) that no command undercuts, under either count
-    contact_proven_rate: float | None  # None where contact is not decided
-    impact_proven_rate: float
-    between: Between | None  # None where contact is not decided
+    The mean harm (m2/s2) that no command undercuts under either count, the shares with proven contact and proven
+    impact, and ``Between``; None for what is not decided. Worlds that cannot be advanced are left out.
+    """
 
-
-def proven_of(worlds: Worlds, task: Task, first: Floats, total: Floats) -> Proven | None:
-    """What is proven about worlds at the alert, ``first`` and ``total`` [n] being the least harms known; or None."""
-    proof = prove(worlds, task)
-    if isinstance(proof, Unproven):
-        return None
-    contact, impact = proof.contact, proof.impact
-    told = (None, None) if contact is None else (float(contact.mean()), between(contact, impact, first, total))
-    return Proven(float(proof.harm.mean()), told[0], float(impact.mean()), told[1])
-
-
-def proven_of_table(worlds: Worlds, task: Task, table: BestHarmTable) -> Proven | None:
-    """``proven_of`` the worlds of a list with the least harms of a table, without those that cannot be advanced."""
-
-    def of(rows: Ints) -> Proven | None:
+    def of(rows: Ints) -> dict[str, Any] | None:
         some = worlds.take(rows)
-        identity = world_identity(some, task)
-        return proven_of(some, task, table.harm(identity, "first"), table.harm(identity, "total"))
+        proof, identity = prove(some, task), world_identity(some, task)
+        if isinstance(proof, Unproven):
+            return None
+        known = (table.harm(identity, harm_count) for harm_count in HARM_COUNTS)
+        contact, impact = proof.contact, proof.impact
+        return {
+            "proven_harm": float(proof.harm.mean()),
+            "contact_proven_rate": None if contact is None else float(contact.mean()),
+            "impact_proven_rate": float(impact.mean()),
+            "between": None if contact is None else asdict(Between.of(contact, impact, *known)),
+        }
 
     return leaving_out_failed(of, np.arange(worlds.n))[0]
 
 
-@dataclass(frozen=True, slots=True)
-class ShippedBounds:
-    """One shipped table: the least harm known, the proven one, and the gap."""
+def shipped_bounds(tables: Iterable[BestHarmTable] | None = None) -> list[dict[str, Any]]:
+    """The least harm known, the proven one, and the gap of every shipped table, as plain data, by name of its file.
 
-    scenario: str
-    vehicles: tuple[str, ...]
-    list_seed: int
-    worlds: int
-    best_known_first: float | None  # mean, m2/s2; None: the table does not hold this count
-    best_known_total: float | None
-    proven: Proven | None
-    nothing_proven_because: str | None
-    identity: dict[str, Any]  # hashes of worlds and scenario, versions
-
-    def gap(self, best_known: float | None) -> float | None:
-        """Best known minus proven harm, as a share of the best known."""
-        if self.proven is None or best_known is None:
-            return None
-        return 1.0 - self.proven.proven_harm / best_known if best_known > 0.0 else 0.0
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain data; what does not exist is null."""
-        gaps = {"gap_first": self.gap(self.best_known_first), "gap_total": self.gap(self.best_known_total)}
-        own = asdict(self)
-        return {**own.pop("identity"), **own, **gaps}
-
-
-def shipped_bounds() -> Iterator[ShippedBounds]:
-    """The bounds of every shipped table, by name of its file."""
-    for table in shipped_tables():
-        yield bounds_of(table)
-
-
-def bounds_of(table: BestHarmTable) -> ShippedBounds:
-    """The bounds of a table whose header names a shipped scenario and a list of it.
-
-    Every world is compared in the list that the header names; raises ``InvalidInput`` if the table does not hold it.
+    A header names a shipped scenario and a list of it, of which every world is compared; raises ``InvalidInput`` if
+    the table does not hold them. A gap is best known minus proven harm, as a share of the best known.
     """
-    header = table.header
-    scenario = load_scenario(header["scenario"])
-    names, seed, episodes = tuple(header["vehicles"]), int(header["list_seed"]), int(header["episodes"])
-    task = Task(scenario, tuple(scenario.vehicle_names.index(name) for name in names))
-    sample = scenario.sample(episodes, seed)
-    worlds = sample.worlds
-    table.check_holds_any(world_identity(worlds, task))
-    first, total = (
-        float(table.best[harm_count].harm.mean()) if harm_count in table.best else None for harm_count in HARM_COUNTS
-    )
-    why = unproven_because(worlds, task)
-    proven = None if why is not None else proven_of_table(worlds, task, table)
-    return ShippedBounds(
-        scenario.name,
-        names,
-        seed,
-        len(table.identity),
-        first,
-        total,
-        proven,
-        why,
-        result_identity("best-harm", scenario, sample),
-    )
+    found = []
+    for table in shipped_tables() if tables is None else tables:
+        header = table.header
+        scenario = load_scenario(header["scenario"])
+        names, seed, episodes = tuple(header["vehicles"]), int(header["list_seed"]), int(header["episodes"])
+        task = Task(scenario, tuple(scenario.vehicle_names.index(name) for name in names))
+        sample = scenario.sample(episodes, seed)
+        worlds = sample.worlds
+        table.check_holds_any(world_identity(worlds, task))
+        why = unproven_because(worlds, task)
+        proven = None if why is not None else proven_of_table(worlds, task, table)
+        known = {c: float(table.best[c].harm.mean()) if c in table.best else None for c in HARM_COUNTS}
+        told = result_identity("best-harm", scenario, sample)
+        told |= {"scenario": scenario.name, "vehicles": names, "list_seed": seed, "worlds": len(table.identity)}
+        told |= {f"best_known_{harm_count}": best for harm_count, best in known.items()}
+        told |= {"proven": proven, "nothing_proven_because": why}
+        for harm_count, best in known.items():
+            gap = None
+            if proven is not None and best is not None:
+                gap = 1.0 - proven["proven_harm"] / best if best > 0.0 else 0.0
+            told[f"gap_{harm_count}"] = gap
+        found.append(told)
+    return found
 
 
-def shipped_lines(found: Sequence[ShippedBounds]) -> list[str]:
-    """The table of all of them, in markdown; harms are means over the worlds, m2/s2."""
+def shipped_sheet(found: Sequence[Mapping[str, Any]]) -> Sheet:
+    """The table of all of them; harms are means over the worlds, m2/s2."""
     harm, share = partial(Column, digits=3, sign="-"), partial(Column, digits=1, scale=100.0, unit=" %", sign="-")
     columns = (
         "list", Column("worlds"), harm("proven"), harm("best known, first"), share("gap"), harm("best known, total"),
@@ -665,17 +1246,447 @@ def shipped_lines(found: Sequence[ShippedBounds]) -> list[str]:
     )  # fmt: skip
     rows = []
     for one in found:
-        proven, inside = one.proven, None if one.proven is None else one.proven.between
-        why = f": {one.nothing_proven_because}" if one.nothing_proven_because else ""
-        row: list[Cell] = [f"{one.scenario} (seed {one.list_seed}){why}", f"{one.worlds:,}"]
-        row += [getattr(proven, "proven_harm", None)]
-        for best in (one.best_known_first, one.best_known_total):
-            row += [best, one.gap(best)]
-        row += [getattr(proven, "contact_proven_rate", None), getattr(proven, "impact_proven_rate", None)]
-        row += [
-            getattr(inside, "rate", None),
-            getattr(inside, "mean_first", None),
-            getattr(inside, "harmless_rate", None),
+        proven = one["proven"] or {}
+        inside = proven.get("between") or {}
+        why = f": {one['nothing_proven_because']}" if one["nothing_proven_because"] else ""
+        row: list[Cell] = [f"{one['scenario']} (seed {one['list_seed']}){why}", f"{one['worlds']:,}"]
+        row += [proven.get("proven_harm")]
+        row += [one[name] for name in ("best_known_first", "gap_first", "best_known_total", "gap_total")]
+        row += [proven.get("contact_proven_rate"), proven.get("impact_proven_rate")]
+        rows.append([*row, *(inside.get(name) for name in ("rate", "mean_first", "harmless_rate"))])
+    return Sheet("", columns, rows)
+
+
+@dataclass(frozen=True, slots=True)
+class Rescored:
+    """One agent under one objective and count: the mean for each vehicle, front to rear (m2/s2); less is better."""
+
+    agent: str
+    objective: str
+    harm_count: HarmCount
+    each: tuple[Estimate, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for JSON: objective, harm count, and each vehicle's mean with its interval."""
+        each = Estimate.side_by_side({f"vehicle_{i + 1}": estimate for i, estimate in enumerate(self.each)})
+        return {"objective": self.objective, "harm_count": self.harm_count, **each}
+
+    @staticmethod
+    def sheet(rows: Sequence[Rescored], harm_count: HarmCount) -> Sheet:
+        """The means under one count: one line per agent and objective, one column per vehicle."""
+        shown = [row for row in rows if row.harm_count == harm_count]
+        vehicles = range(len(shown[0].each) if shown else 0)
+        columns = [Column(f"Vehicle {i + 1}", interval="hidden") for i in vehicles]
+        names = ["" if k and shown[k - 1].agent == row.agent else row.agent for k, row in enumerate(shown)]
+        lines = [(name, row.objective, *row.each) for name, row in zip(names, shown, strict=True)]
+        title = f"Objectives, {'first-impact' if harm_count == 'first' else 'total'} harm"
+        return Sheet(title, ["Agent", "Objective", *columns], lines)
+
+
+# The table of an evaluation: a row per agent, for a terminal and for a document, and the sentences below it.
+
+SEES_THROUGH = "† "  # before what an agent knows that no channel brought
+_HEAD = {
+    "Agent": "What drives the controlled vehicle; all other vehicles follow the scenario. full_brake is the paper's"
+    " non-ethical strategy (Non-E). e_v2x_bm is the best constant deceleration found in this simulation;"
+    " e_v2x_bm:pairwise is the paper's closed form, which treats the pairs as independent.",
+    "Knows": "What the agent has to know of the line. own sensors: its own vehicle and what its sensors see. messages:"
+    " also the messages that have reached it. true state: the others' states, capacities and latencies as they are,"
+    " received or not. true model: also masses, restitution and scripts, enough to simulate the line ahead. Of a policy"
+    " behind a shield, or a refined one, both parts are told. † marks agents that see through a channel that hides"
+    " something here.",
+}
+_ALWAYS_SHOWN = ("collision_rate", "first_impact_harm", "total_harm", "sampled_harm", "vehicle_1_shoved_m")
+_NARROW = (  # in a narrow terminal too, where there is no regret to show, and where there is
+    ("harm_decrease_first", "harm_decrease_total"),
+    ("mean_regret_first", "realised_share_first"),
+)
+_BELOW = ("collision_rate", "first_impact_harm", "total_harm")  # a terminal shows their intervals; JSON has all
+
+
+@dataclass(frozen=True, slots=True)
+class SummaryRow:
+    """What one agent achieved over the list of worlds; harms are means per world, m2/s2.
+
+    ``row["harm_decrease_total"]`` is the estimate of any measure, by its name in JSON; None where it does not exist.
+
+    >>> import ethbrake_marl as eb
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> agents = {name: eb.make_agent(name) for name in ("full_brake", "coast")}
+    >>> rows = eb.summarise(eb.evaluate(scenario.sample(3, seed=7), agents, scenario=scenario))
+    >>> rows[0].agent, rows[0].collisions, round(rows[0].total_harm.value, 2), rows[0]["predicted_harm"]
+    ('full_brake', 2, 36.99, None)
+
+    """
+
+    agent: str  # its name
+    episodes: int  # worlds
+    estimates: Mapping[str, Estimate | None]  # of every measure, by its name in JSON
+    collisions: int  # worlds with at least one impact
+    horizon_ends: int  # worlds that the horizon cut off before the line stood
+    parameters: Conditions  # of the test
+    policy_share: float | None = None  # share of worlds in which a hybrid drove by its policy
+    known_best_share: float | None = None  # worlds whose best is known without the agents of this evaluation
+    below_best_known: int | None = None  # worlds in which the agent is below it
+    between: Between | None = None  # the worlds in which contact is proven and no impact
+    warning: str = ""  # a table of best known harm holds some of the worlds, and not the others
+    left_out: tuple[LeftOut, ...] = ()  # worlds of the list that no row counts: they could not be advanced
+    beside_paper: bool = False  # these are results of the test that the paper's rows are about
+    knows: Knowledge = (Source.UNSTATED,)  # what the agent says it knows of the line
+    hidden_share: float = 0.0  # worlds in which the channel hides something from a driven vehicle, whoever drives
+    worlds_sha256: str = ""  # of the list; results on the same worlds have the same
+    scenario_sha256: str = ""  # of all that shapes an episode
+    policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle -> its policy's, where one drives
+    versions: Mapping[str, str] = field(default_factory=dict)  # of what computed it
+
+    def __getitem__(self, measure: str) -> Estimate | None:
+        return self.estimates[measure]
+
+    @property
+    def collision_rate(self) -> Estimate:
+        """Share of worlds."""
+        return self.estimates["collision_rate"]  # type: ignore[return-value]  # all have it in all worlds
+
+    @property
+    def first_impact_harm(self) -> Estimate:
+        """Each pair's first impact."""
+        return self.estimates["first_impact_harm"]  # type: ignore[return-value]  # all have it in all worlds
+
+    @property
+    def total_harm(self) -> Estimate:
+        """Every impact."""
+        return self.estimates["total_harm"]  # type: ignore[return-value]  # all have it in all worlds
+
+    @property
+    def metrics(self) -> dict[str, Estimate]:
+        """Registered measures, by column."""
+        found = {name.removeprefix(COLUMN): each for name, each in self.estimates.items() if name.startswith(COLUMN)}
+        return {name: each for name, each in found.items() if each is not None}
+
+    @property
+    def sees_through(self) -> bool:
+        """Whether the channel hides something here that this agent reads all the same."""
+        return self.hidden_share > 0.0 and sees_through(self.knows)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data for JSON; what does not exist is null, intervals are ``[low, high]``."""
+        of_limits = {measure.name for measure in measures() if measure.limits}
+        optional = {measure.name for measure in measures() if not measure.always}
+        told = {name: each for name, each in self.estimates.items() if each or name not in optional}
+        return {
+            "kind": "evaluate",
+            "agent": self.agent,
+            "knows": knowledge_text(self.knows),
+            "sees_through_channel": self.sees_through,
+            "hidden_share": self.hidden_share,
+            "episodes": self.episodes,
+            "collisions": self.collisions,
+            "horizon_ends": self.horizon_ends,
+            **Estimate.side_by_side({name: each for name, each in told.items() if name not in of_limits}),
+            **({"policy_share": self.policy_share} if self.policy_share is not None else {}),
+            **Estimate.side_by_side({name: each for name, each in told.items() if name in of_limits}),
+            "known_best_share": self.known_best_share,
+            "best_known_warning": self.warning or None,
+            "below_best_known": self.below_best_known,
+            "impact_unproven": None if self.between is None else asdict(self.between),
+            "left_out": [left._asdict() for left in self.left_out],
+            "worlds_sha256": self.worlds_sha256,
+            "scenario_sha256": self.scenario_sha256,
+            "policy_sha256": dict(self.policy_sha256),
+            "versions": dict(self.versions),
+            **({"metrics": {name: _heading(name) for name in self.metrics}} if self.metrics else {}),
+            "parameters": self.parameters,
+        }
+
+
+class SummaryTable(list[SummaryRow]):
+    """The rows of ``summarise``: a list that a notebook shows as a table.
+
+    >>> import ethbrake_marl as eb
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> agents = {"full_brake": eb.make_agent("full_brake")}
+    >>> rows = eb.summarise(eb.evaluate(scenario.sample(3, seed=7), agents, scenario=scenario))
+    >>> isinstance(rows, eb.SummaryTable), len(rows)
+    (True, 1)
+
+    """
+
+    def _repr_html_(self) -> str:
+        share = partial(Column, digits=1, scale=100.0, unit=" %")
+        columns = (
+            "Agent", "Knows", share("Collisions"), Column("First-impact harm"), Column("Total harm"),
+            Column("Regret, first"), share("Decrease, first"), share("Realised share, first"),
+        )  # fmt: skip
+        names = ("collision_rate", "first_impact_harm", "total_harm", "mean_regret_first", "harm_decrease_first")
+        rows = [
+            (row.agent, knowledge_text(row.knows), *(row[name] for name in (*names, "realised_share_first")))
+            for row in self
         ]
-        rows.append(row)
-    return Sheet("", columns, rows).markdown().splitlines()
+        note = "Harm: means per world in m²/s². In brackets: 95 % intervals. Decrease: of full braking's harm."
+        note += f" WARNING: {self[0].warning}." if self and self[0].warning else ""
+        worlds = f"{self[0].parameters['scenario']}, {count_of(self[0].episodes, 'world')}" if self else "no agent"
+        return Sheet(worlds, columns, rows, note).html()
+
+    @classmethod
+    def of_tallies(
+        cls,
+        tallies: Mapping[str, AgentTally],
+        conditions: Conditions,
+        task: Task,
+        knows: Mapping[str, Knowledge],
+        policies: Mapping[str, Mapping[str, str]],
+        *,
+        exact: bool = False,
+        baseline: str = BASELINE,
+        **shared: Any,
+    ) -> SummaryTable:
+        """One row per agent, from what was counted in the worlds of a list.
+
+        Args:
+            tallies: of every agent.
+            conditions: of the test.
+            task: who is driven where.
+            knows: by agent.
+            policies: by agent: vehicle's name -> SHA-256 of its policy.
+            exact: tell rates with their exact intervals.
+            baseline: what is compared with.
+            shared: what all rows say alike.
+
+        """
+        worlds, scenario = conditions["count"], task.scenario
+        beside = scenario.name in _SHOWN_WITH and conditions["seed"] is not None and task.vehicles == (1,)
+        return cls(
+            SummaryRow(
+                agent=agent,
+                episodes=worlds,
+                estimates=_estimate_all(tallies, agent, worlds, exact=exact, baseline=baseline),
+                collisions=tally.count("collision_rate"),
+                horizon_ends=tally.count(HORIZON),
+                policy_share=tally.share(CHOSEN, worlds),
+                known_best_share=tally.share(KNOWN, worlds),
+                below_best_known=tally.count(BELOW) if BELOW in tally.counts else None,
+                knows=knows[agent],
+                policy_sha256=policies[agent],
+                parameters=conditions,
+                beside_paper=beside and is_as_shipped(scenario),
+                **shared,
+            )
+            for agent, tally in tallies.items()
+        )
+
+    def meanings(self) -> dict[str, str]:
+        """What the columns mean, by the beginning of their headings; those of registered measures last."""
+        about = {each.heading.partition(",")[0]: each.about for each in measures() if each.about}
+        own = [_registered(column) for column in self[0].metrics] if self else []
+        return _HEAD | about | {metric.name: metric.about for metric in own if metric is not None}
+
+    def sheet(self) -> Sheet:
+        """The table: agent, what it knows, and every measure that has a heading, those of registered ones last.
+
+        A regret is marked as a lower bound where the best of some world is not known beforehand. Below it stand the
+        paper's rows, where they are about the same test.
+        """
+        columns = [each.column() for each in measures() if each.heading]
+        columns += [Column(_heading(name), COLUMN + name, sign="-") for name in (self[0].metrics if self else ())]
+        lines: list[Row] = []
+        for row in self:
+            cells: dict[str, Cell] = {column.name: row[column.name] for column in columns}
+            value, interval = Column("", sign="-").show(row["mean_regret_first"])
+            bound = row.known_best_share is not None and row.known_best_share < 1.0
+            cells["mean_regret_first"] = Shown(f"≥ {value}" if bound else value, interval)
+            lines.append((row.agent, SEES_THROUGH * row.sees_through + knowledge_text(row.knows), *cells.values()))
+        for name, paper in self._papers().items():
+            lines += [
+                f"paper, {name}",
+                *((agent, None, *(cells.get(c.name) for c in columns)) for agent, cells in paper),
+            ]
+        return Sheet("", ["Agent", "Knows", *columns], lines)
+
+    def _papers(self) -> dict[str, list[tuple[str, dict[str, str]]]]:
+        """The paper's rows that belong beside these, by table, with the digits that it prints."""
+        found: dict[str, list[tuple[str, dict[str, str]]]] = {}
+        for row in PAPER_ROWS if self and self[0].beside_paper else ():
+            cells = {
+                "collision_rate": f"{100 * row.collision_rate:.4g} %",
+                "first_impact_harm": f"{row.average_harm:.6g}",
+            }
+            if row.harm_decrease is not None:
+                cells["harm_decrease_first"] = f"{100 * row.harm_decrease:.4g} %"
+            found.setdefault(row.table, []).append((row.agent, cells))
+        return found
+
+    def paper_lines(self) -> list[str]:
+        """The conditions of the paper's rows beside these, by table; the last is what must be known of them."""
+        found = [f"{name}: {PAPER_PARAMETERS[name]}." for name in self._papers()]
+        return [*found, PAPER_NOTE] if found else []
+
+    def terminal(self) -> Sheet:
+        """The table for a terminal of 80 columns or more: ours, then the paper's rows, then the conditions of each."""
+        narrow = (*_ALWAYS_SHOWN, *_NARROW[bool(self.limit_lines())])
+        columns = [
+            replace(each, wide=each.name not in narrow, interval="below" if each.name in _BELOW else "hidden")
+            for each in (measure.column() for measure in measures() if measure.heading)
+        ]
+        lines: list[Row] = []
+        for row in self.sheet().rows:
+            if not isinstance(row, str):
+                row = (row[0] if row[1] is None else f"{row[0]}\n{row[1]}", *row[2 : 2 + len(columns)])
+            lines.append(row)
+        return Sheet("", [Column("Agent,\nwhat it knows", text=True), *columns], lines, self._conditions(), gap=1)
+
+    def metrics_sheet(self) -> Sheet:
+        """The registered measures: one line per agent, the mean per world with its interval."""
+        lines = [(row.agent, _heading(column), value) for row in self for column, value in row.metrics.items()]
+        return Sheet("Measures", ["Agent", Column("Measure", text=True), Column("Mean or rate")], lines)
+
+    def markdown(self) -> str:
+        """The table for a document, with the conditions of ours and of the paper's below it."""
+        return f"{self.sheet().markdown()}\n\n{self._conditions()}\n"
+
+    def _conditions(self) -> str:
+        if not self:
+            return ""
+        texts = [
+            f"Ours: {self[0].parameters.line}. Harms are means per world in m²/s²; in brackets or"
+            " below a value: its 95 % interval; decreases are relative to full braking."
+        ]
+        texts += self.left_out_lines() + self.warning_lines() + self.limit_lines() + self.knowledge_lines()
+        *paper, note = self.paper_lines() or [""]
+        return "\n\n".join([*texts, *(f"Paper, {line}" for line in paper), *([note] if note else [])])
+
+    def left_out_lines(self) -> list[str]:
+        """Which worlds no row counts, as a sentence; none where every world counts."""
+        left_out = self[0].left_out if self else ()
+        if not left_out:
+            return []
+        whole = self[0].episodes + len(left_out)
+        return [LeftOut.line([str(left) for left in left_out], whole)]
+
+    def warning_lines(self) -> list[str]:
+        """That a table of best known harm lacks some of these worlds, and where the horizon cut a motion off.
+
+        None where all is well.
+        """
+        lines = [f"WARNING: {self[0].warning}."] if self and self[0].warning else []
+        moving = [f"{row.agent} {row.horizon_ends:,}" for row in self if row.horizon_ends]
+        if moving:
+            lines.append(
+                f"At the horizon ({self[0].parameters['horizon_s']:g} s) something still moved, and what came after"
+                f" counts nowhere; worlds, of {self[0].episodes:,}: {', '.join(moving)}."
+            )
+        return lines
+
+    def limit_lines(self) -> list[str]:
+        """What nobody could avoid here and the best known harm, as sentences; none where nothing is proven."""
+        first, total = (
+            (self[0][f"best_known_{name}_harm"] for name in ("first_impact", "total")) if self else (None, None)
+        )
+        if first is None or total is None:
+            return []
+        row = self[0]
+        driven = row.parameters.get("controlled_vehicle")
+        command = f"command of {str(driven).replace('vehicle_', 'Vehicle ')}" if driven else "joint command"
+        share = Column("", digits=1, scale=100.0, unit=" %", sign="-")
+        contact, impact = (share.show(row[name]).in_words for name in ("unavoidable_rate", "impact_proven_rate"))
+        if row["unavoidable_rate"] is None:
+            text = f"In {impact} of these worlds no {command} avoids an impact (proven)."
+        else:
+            text = f"In {contact} of these worlds no {command} avoids contact, in {impact} none avoids an impact (both"
+            text += f" proven).{row.between.text if row.between else ''}"
+        proven = row["proven_harm"]
+        least = 0.0 if proven is None else proven.value
+        gaps = []
+        for best in (first.value, total.value):
+            part = f"{100 * (best - least) / best:.1f} %" if best > 0.0 else DASH
+            gaps.append(f"{best - least:.2f} ({part})")
+        text += (
+            f" Best known harm: {first.value:.2f} first-impact, {total.value:.2f} total; proven: no less than"
+            f" {least:.2f}; gap: {' and '.join(gaps)}."
+        )
+        known = row.known_best_share
+        if known is not None and known < 1.0:
+            text += (
+                f" Found beforehand in {100 * known:.1f} % of the worlds; in the others it is the best of"
+                " the agents above, so that regrets are lower bounds and no realised share is stated."
+            )
+        below = [
+            f"{each.agent} in {count_of(each.below_best_known, 'world')}" for each in self if each.below_best_known
+        ]
+        return [text + (f" Below what was known: {', '.join(below)}." if below else "")]
+
+    def identity_lines(self) -> list[str]:
+        """By which hashes this result is recognised, as a sentence; none without rows."""
+        if not self:
+            return []
+        policies = [f"{row.agent} ({', '.join(row.policy_sha256.values())})" for row in self if row.policy_sha256]
+        text = f"SHA-256 of the worlds {self[0].worlds_sha256}, of the scenario {self[0].scenario_sha256}"
+        return [f"{text}{', of policies: ' + '; '.join(policies) if policies else ''}."]
+
+    def knowledge_lines(self) -> list[str]:
+        """Who sees through the channel, and who does not say, as sentences; none where the channel hides nothing."""
+        hidden = self[0].hidden_share if self else 0.0
+        if not hidden:
+            return []
+        text = (
+            f"In {100 * hidden:.1f} % of these worlds the channel hides something of the line from a driven vehicle at"
+            " its first decision: news that has not arrived, or how late another vehicle will react."
+        )
+        through = ", ".join(row.agent for row in self if row.sees_through)
+        if through:
+            text += (
+                f" {SEES_THROUGH.strip()} {through}: drives by the line as it is all the same. That is a limit to"
+                " compare with, and nothing that a vehicle on this channel could do."
+            )
+        silent = ", ".join(row.agent for row in self if Source.UNSTATED in row.knows)
+        return [text + (f" Not stated what it knows: {silent}." if silent else "")]
+
+
+def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTable:
+    """One row per agent, in the order of the evaluation; compared with ``baseline`` where that was evaluated."""
+    limits, regrets = evaluation.limits, evaluation.regrets
+    return SummaryTable.of_tallies(
+        evaluation.tally(baseline=baseline),
+        evaluation.conditions,
+        evaluation.task,
+        {name: outcome.knows for name, outcome in evaluation.outcomes.items()},
+        {name: outcome.named_policies for name, outcome in evaluation.outcomes.items()},
+        baseline=baseline,
+        between=None if regrets is None else regrets.between,
+        warning=limits.warning if isinstance(limits, Limits) else "",
+        left_out=evaluation.left_out,
+        hidden_share=float(evaluation.hidden.mean()),
+        worlds_sha256=worlds_sha256(evaluation.worlds, evaluation.index),
+        scenario_sha256=scenario_sha256(evaluation.scenario),
+        versions=result_versions(),
+    )
+
+
+# An evaluation by group: the worlds of each scenario of a mixture, or those in which a vehicle is of one type.
+
+NO_TYPE = "no type"  # of a vehicle of a mixture's member without types
+
+
+def summarise_by(evaluation: Evaluation, by: str, *, baseline: str = BASELINE) -> dict[str, SummaryTable]:
+    """Rows as ``summarise`` for each group of worlds, by the group's name, sorted.
+
+    Args:
+        evaluation: of a mixture, or of a scenario with types of vehicles.
+        by: ``scenario``, or whose type: ``vehicle_2_type``.
+        baseline: as in ``summarise``.
+
+    Raises ``InvalidInput`` for worlds that were drawn without such, ``UnknownName`` for another column.
+
+    >>> import ethbrake_marl as eb
+    >>> delays = eb.load_scenario("mixture-delays")
+    >>> agents = {"full_brake": eb.make_agent("full_brake")}
+    >>> found = eb.summarise_by(eb.evaluate(delays.sample(30, seed=7), agents, scenario=delays), "scenario")
+    >>> {name: rows[0].episodes for name, rows in found.items()}
+    {'paper-delay-high': 11, 'paper-delay-low': 8, 'paper-delay-middle': 11}
+
+    """
+    Evaluation.check_group(evaluation.kinds, by)
+    column = evaluation.kinds[by]
+    return {
+        name or NO_TYPE: summarise(evaluation.take(column == name), baseline=baseline)
+        for name in np.unique(column).tolist()
+    }

@@ -1,36 +1,63 @@
-"""Results as files: what ``evaluate``, ``shield`` and ``run`` write, and how it is read again."""
+"""Results as files: what ``evaluate``, ``shield`` and ``run`` write, how they are read again; and shards."""
 
 from __future__ import annotations
 
 import csv
 import hashlib
 import io
+import json
 import math
 import os
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from importlib import import_module
-from importlib.util import find_spec
+from functools import reduce
+from itertools import pairwise
+from operator import add
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ethbrake_marl.agents.protocol import knowledge_text
-from ethbrake_marl.defaults import HARM_COUNTS
-from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, count_of, naming_extras, need, unknown_name
-from ethbrake_marl.evaluation.inputs import Kind
-from ethbrake_marl.evaluation.measures import COLUMN, Regrets, assess
-from ethbrake_marl.evaluation.outcome import Evaluation, Outcome
+from ethbrake_marl.agents import Driver, Knowledge, knowledge_of, knowledge_text, team_of
+from ethbrake_marl.defaults import HarmCount
+from ethbrake_marl.errors import (
+    AlreadyExists,
+    EthBrakeError,
+    InvalidInput,
+    PhysicsError,
+    check_whole_number,
+    count_of,
+    naming_extras,
+    need,
+    unknown_name,
+)
+from ethbrake_marl.evaluation.inputs import (
+    Kind,
+    make_lineup,
+    policies_of,
+    result_versions,
+    scenario_sha256,
+    worlds_sha256,
+)
+from ethbrake_marl.evaluation.measures import (
+    REGISTERED,
+    Conditions,
+    Evaluation,
+    Rescored,
+    SummaryRow,
+    SummaryTable,
+    Tally,
+)
+from ethbrake_marl.evaluation.rollout import evaluate_block
 from ethbrake_marl.evaluation.statistics import paired_difference, unpaired_difference
-from ethbrake_marl.evaluation.summary import Rescored, SummaryRow
-from ethbrake_marl.files.sheet import Estimate, estimates_to_json
+from ethbrake_marl.files.sheet import Estimate, parquet_file
 from ethbrake_marl.files.store import check_writable, parse_strict_json, read_plain, write_file
-from ethbrake_marl.harm import Declared, scored
+from ethbrake_marl.harm import Declared
+from ethbrake_marl.limits import Unproven, known_limits
 from ethbrake_marl.physics import Floats
-from ethbrake_marl.scenario.fields import quantity, quantity_rules
+from ethbrake_marl.scenario import QUANTITY, Scenario, Task
+from ethbrake_marl.shield import parse_uncertainty
 
 # One row per agent and world: its columns, and its file, written whole and never over another by accident.
 
@@ -43,7 +70,14 @@ def check_target(path: str | Path, *, force: bool = False) -> Path:
     """
     target = Path(path)
     try:
-        _check_place(target)
+        if target.is_symlink():
+            raise InvalidInput(f"{target}: is a symbolic link; give the file it points to")
+        if target.is_dir():
+            raise InvalidInput(f"{target}: is a folder; give the name of a file")
+        if target.exists() and not target.is_file():
+            raise InvalidInput(f"{target}: is a device or a pipe, not a plain file; give another name")
+        if not target.parent.is_dir():
+            raise InvalidInput(f"{target}: there is no folder {target.parent}; make it first")
         if os.path.lexists(target) and not force:
             raise AlreadyExists(f"{target}: is there already; give another name or use force (--force)")
         check_writable(target.parent)
@@ -55,190 +89,15 @@ def check_target(path: str | Path, *, force: bool = False) -> Path:
     return target
 
 
-def _check_place(target: Path) -> None:
-    if target.is_symlink():
-        raise InvalidInput(f"{target}: is a symbolic link; give the file it points to")
-    if target.is_dir():
-        raise InvalidInput(f"{target}: is a folder; give the name of a file")
-    if target.exists() and not target.is_file():
-        raise InvalidInput(f"{target}: is a device or a pipe, not a plain file; give another name")
-    if not target.parent.is_dir():
-        raise InvalidInput(f"{target}: there is no folder {target.parent}; make it first")
-
-
 def write_output(path: str | Path, data: bytes, *, force: bool = False) -> None:
     """Write ``data`` in one step; raises as ``check_target``."""
     write_file(check_target(path, force=force), data)
 
 
-Columns = dict[str, list[Any]]
-
-REGRET_COLUMNS = (
-    "avoidable",
-    "unavoidable_reason",
-    "best_known_first_impact_harm",
-    "best_known_total_harm",
-    "best_known_source",
-    "impact_proven",
-    "proven_harm",
-    "regret_first_impact_harm",
-    "regret_total_harm",
-)
-
 PER_WORLD = "per_world.csv"  # its name in the folder of a run
-
-_ALWAYS = ("gaps_m", "speeds_mps", "obstacle_gap_m")
-
-
-def write_per_world_csv(
-    path: str | Path, evaluation: Evaluation, *, objectives: Sequence[Declared] = (), force: bool = False
-) -> None:
-    """Write one row per agent and world; docs/evaluation.md lists the columns. ``objectives`` adds theirs.
-
-    A world that was left out has a row with nothing but its number and, in ``ended``, why.
-
-    The file appears whole or not at all. Raises ``AlreadyExists`` unless ``force``, ``InvalidInput`` without a folder.
-    """
-    check_target(path, force=force)
-    text = io.StringIO(newline="")
-    writer = csv.writer(text, lineterminator="\n")
-    columns = per_world_columns(evaluation, objectives)
-    writer.writerow(columns)
-    writer.writerows(zip(*columns.values(), strict=True))
-    write_output(path, text.getvalue().encode(), force=force)
-
-
-def per_world_columns(evaluation: Evaluation, objectives: Sequence[Declared] = (), *, limits: bool = True) -> Columns:
-    """The columns of ``write_per_world_csv``, agent by agent, then world by world; None where there is no value.
-
-    Without ``limits`` those of the best known harm are left out, every quantity is told, and no world that was left
-    out: the rows of a shard, which have the same columns as those of any other.
-    """
-    found: Columns = {}
-    initial, regrets = initial_columns(evaluation, every=not limits), assess(evaluation) if limits else None
-    hidden: Columns = {"hidden": evaluation.hidden.astype(int).tolist()}
-    for agent, outcome in evaluation.outcomes.items():
-        columns = {"agent": [agent] * evaluation.worlds.n, **initial, **outcome_columns(outcome)}
-        columns |= (regret_columns(outcome, regrets) if limits else {}) | objective_columns(outcome, objectives)
-        columns |= {"knows": [knowledge_text(outcome.knows)] * evaluation.worlds.n, **hidden}
-        for left in evaluation.left_out if limits else ():
-            told = {"agent": agent, "world": left.world, "ended": f"left out: {left.agent}: {left.reason}"}
-            columns = {name: [*values, told.get(name)] for name, values in columns.items()}
-        found = {name: [*found.get(name, ()), *values] for name, values in columns.items()}
-    return found
-
-
-def initial_columns(evaluation: Evaluation, *, every: bool = False) -> Columns:
-    """World number and its initial state: gaps, speeds, and any other quantity that differs between worlds, or every.
-
-    Where there is such, also the scenario of a mixture, and each vehicle's type. Quantities are named
-    as in a table of initial states: ``gap_1_m``, ``speed_1_mps``, ``latency_2_s``, ``restitution``.
-    """
-    columns: Columns = {"world": evaluation.index.tolist()}
-    columns |= {name: column.tolist() for name, column in evaluation.kinds.items()}
-    for field, rule in quantity_rules(evaluation.worlds).items():
-        values = quantity(evaluation.worlds, field)
-        if every or field in _ALWAYS or np.ptp(values, axis=0).any():
-            columns |= {rule.column_of(i): values[:, i].tolist() for i in range(values.shape[1])}
-    return columns
-
-
-def regret_columns(outcome: Outcome, regrets: Regrets | None) -> Columns:
-    """What was avoidable and the best known in each world; empty where nothing is proven."""
-    if regrets is None:
-        return {name: [None] * len(outcome.collided) for name in REGRET_COLUMNS}
-    n, proof = len(outcome.collided), regrets.limits.proof
-    columns = (
-        np.full(n, None) if proof.avoidable is None else proof.avoidable.astype(int),
-        np.full(n, None) if proof.reason is None else proof.reason,
-        regrets.first_impact_harm,
-        regrets.total_harm,
-        regrets.source,
-        proof.impact.astype(int),
-        proof.harm,
-        regrets.regret(outcome, "first"),
-        regrets.regret(outcome, "total"),
-    )
-    return {name: column.tolist() for name, column in zip(REGRET_COLUMNS, columns, strict=True)}
-
-
-def objective_columns(outcome: Outcome, objectives: Sequence[Declared]) -> Columns:
-    """What each objective is for each vehicle under both counts (m2/s2): ``social:45_first_2``."""
-    return {
-        f"{objective}_{harm_count}_{i + 1}": values[:, i].tolist()
-        for objective in objectives
-        for harm_count in HARM_COUNTS
-        for values in scored(outcome.ledger, harm_count, [objective]).values()
-        for i in range(values.shape[1])
-    }
-
-
-def vehicle_columns(outcome: Outcome) -> Columns:
-    """What each vehicle bears under both counts (m2/s2): ``total_harm_2``."""
-    harms = {"first_impact_harm": outcome.vehicle_harm("first"), "total_harm": outcome.vehicle_harm("total")}
-    return {f"{name}_{i + 1}": harm[:, i].tolist() for name, harm in harms.items() for i in range(harm.shape[1])}
-
-
-def outcome_columns(outcome: Outcome) -> Columns:
-    """What happened in each world; a column that the agent says nothing about is empty."""
-    n = len(outcome.collided)
-    columns: Columns = {"collided": outcome.collided.astype(int).tolist(), "impacts": outcome.impacts.tolist()}
-    columns |= vehicle_columns(outcome)
-    columns |= {"first_impact_harm": outcome.first_impact_harm.tolist(), "total_harm": outcome.total_harm.tolist()}
-    for name, column in (("sampled_harm", outcome.sampled_harm), ("vehicle_1_shoved_m", outcome.shoved_m)):
-        columns[name] = [None] * n if column is None else column.tolist()
-    final = outcome.final
-    if np.isfinite(final.obstacle_gap_m).all():  # of the harm above, what Vehicle 1's impacts with the obstacle did
-        columns |= {"obstacle_first_impact_harm": outcome.ledger.obstacle_harm("first").tolist()}
-        columns |= {"obstacle_total_harm": outcome.ledger.obstacle_harm("total").tolist()}
-        columns |= {"final_obstacle_gap_m": final.obstacle_gap_m.tolist()}
-    columns |= {f"final_gap_{p + 1}_m": final.gaps_m[:, p].tolist() for p in range(final.N - 1)}
-    columns |= {f"final_speed_{i + 1}_mps": final.speeds_mps[:, i].tolist() for i in range(final.N)}
-    columns |= {"end_s": final.time_s.tolist(), "ended": outcome.ended.tolist()}
-    predicted, chosen = outcome.predicted_harm, outcome.chosen_policy
-    columns["predicted_harm"] = [None] * n if predicted is None else predicted.tolist()
-    columns["chosen_policy"] = [None] * n if chosen is None else chosen.astype(int).tolist()
-    columns |= {COLUMN + name: (column + 0).tolist() for name, column in outcome.metrics.items()}  # truths as 0 and 1
-    return columns
-
-
-# One row per agent and world as a data frame, and as a Parquet file.
-
 CSV, PARQUET = ".csv", ".parquet"
-COLUMNS = "columns"
-LIBRARIES = ("pandas", "polars")  # in the order of preference
-_HARMS = ("agent", "world", "first_impact_harm", "total_harm")
-_TEXTS = {"agent", "scenario", "unavoidable_reason", "best_known_source", "ended", "knows"}
-
-
-def is_text(column: str) -> bool:
-    """Whether a column with every world holds texts."""
-    return column in _TEXTS or (column.startswith("vehicle_") and column.endswith("_type"))
-
-
-def typed_columns(evaluation: Evaluation, objectives: Sequence[Declared] = ()) -> dict[str, NDArray[Any]]:
-    """The columns of ``per_world_columns`` as arrays: NaN for no number, the empty text for no text."""
-    return {name: _typed(name, values) for name, values in per_world_columns(evaluation, objectives).items()}
-
-
-def _typed(name: str, values: list[Any]) -> NDArray[Any]:
-    if is_text(name):
-        return np.array([value or "" for value in values])
-    return np.array([np.nan if value is None else value for value in values])
-
-
-def make_frame(evaluation: Evaluation, library: str | None = None) -> Any:
-    """``Evaluation.to_frame``."""
-    columns = typed_columns(evaluation)
-    if library is None:
-        library = next((name for name in LIBRARIES if find_spec(name) is not None), COLUMNS)
-    if library not in (*LIBRARIES, COLUMNS):
-        raise unknown_name("library", library, (*LIBRARIES, COLUMNS))
-    if library == COLUMNS:
-        return columns
-    if find_spec(library) is None:
-        raise InvalidInput(f"to_frame: {library} is not installed: {sys.executable} -m pip install {library}")
-    return import_module(library).DataFrame(columns)
+HARMS = ("first_impact_harm", "total_harm")
+_HARMS = ("agent", "world", *HARMS)
 
 
 def write_per_world(
@@ -246,18 +105,24 @@ def write_per_world(
 ) -> None:
     """Write one row per agent and world: Parquet where the name ends in ``.parquet``, else CSV.
 
-    Raises as ``write_per_world_csv``, and as ``check_per_world``.
+    docs/evaluation.md lists the columns; ``objectives`` adds theirs. A world that was left out has a row with nothing
+    but its number and, in ``ended``, why. The file appears whole or not at all. Raises ``AlreadyExists`` unless
+    ``force``, ``InvalidInput`` without a folder, and as ``check_per_world``.
     """
     check_per_world(path)
-    if Path(path).suffix.lower() != PARQUET:
-        write_per_world_csv(path, evaluation, objectives=objectives, force=force)
+    if Path(path).suffix.lower() == PARQUET:
+        with naming_extras():
+            import pyarrow
+        columns = evaluation.arrays(objectives)
+        with parquet_file(check_target(path, force=force)) as write:
+            write({name: pyarrow.array(values, from_pandas=True) for name, values in columns.items()})
         return
-    arrow, parquet = _import_extra("pyarrow"), _import_extra("pyarrow.parquet")
-    columns = typed_columns(evaluation, objectives)
-    buffer = io.BytesIO()
-    table = arrow.table({name: arrow.array(values, from_pandas=True) for name, values in columns.items()})
-    parquet.write_table(table, buffer)
-    write_output(path, buffer.getvalue(), force=force)
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    told = evaluation.per_world(objectives)
+    writer.writerow(told)
+    writer.writerows(zip(*told.values(), strict=True))
+    write_output(path, text.getvalue().encode(), force=force)
 
 
 def check_per_world(path: str | Path) -> None:
@@ -279,7 +144,9 @@ def read_harms(path: Path, data: bytes) -> dict[str, dict[int, tuple[float, ...]
     """
     try:
         if path.suffix.lower() == PARQUET:
-            table = _import_extra("pyarrow.parquet").read_table(io.BytesIO(data), columns=list(_HARMS)).to_pydict()
+            with naming_extras():
+                from pyarrow.parquet import read_table
+            table = read_table(io.BytesIO(data), columns=list(_HARMS)).to_pydict()
             rows = list(zip(*(table[name] for name in _HARMS), strict=True))
         else:
             lines = csv.DictReader(data.decode("utf-8").splitlines())
@@ -296,13 +163,6 @@ def read_harms(path: Path, data: bytes) -> dict[str, dict[int, tuple[float, ...]
         raise InvalidInput(f"{path}: is no file of --per-world: {error}") from None
 
 
-def _import_extra(module: str) -> Any:
-    """A module of an extra; raises ``MissingExtra``."""
-    with naming_extras():
-        return import_module(module)
-
-
-HARMS = ("first_impact_harm", "total_harm")
 USUAL: Mapping[str, str | None] = {"harm_count": "first", "uncertainty": None}  # settings of agents
 _COMPARED: dict[Kind, tuple[str, ...]] = {  # harms of each
     "evaluate": HARMS,
@@ -359,11 +219,6 @@ class Result:
     rows: Mapping[str, Mapping[str, Any]]  # by agent; of ``ethbrake shield`` by agent and mode
 
     @property
-    def harm_names(self) -> tuple[str, ...]:
-        """The harms that its rows tell."""
-        return _COMPARED[self.about["kind"]]
-
-    @property
     def about(self) -> Mapping[str, Any]:
         """Any of the rows: what they say of the worlds is the same in all."""
         return next(iter(self.rows.values()))
@@ -405,10 +260,18 @@ def read_result(path: Path) -> Result:
         for key, kind in _NEEDED.items():
             if not isinstance(row.get(key), kind):
                 raise InvalidInput(f"{path}: {key} is missing or no {kind.__name__}: evaluate again")
-        _check_numbers(path, row)
+        who = f"{path}: {row['agent']}"
+        if not 1 <= row["episodes"] <= _MOST_EPISODES or isinstance(row["episodes"], bool):
+            raise InvalidInput(f"{who}: episodes = {row['episodes']!s:.40}: must be 1 to {_MOST_EPISODES:,}")
+        for harm in _COMPARED[row["kind"]]:
+            if not _is_mean(row.get(harm), row.get(f"{harm}_interval"), row["episodes"]):
+                raise InvalidInput(f"{who}: {harm} is no mean with an interval [low, high] around it")
     if len({tuple(told_of(row, key) for key in SAME) for row in rows}) > 1:
         raise InvalidInput(f"{path}: its agents drove different worlds; each test needs a file of its own")
-    named = [_name_of(row) for row in rows]
+    named = [
+        f"{row['agent']} ({row['mode']})" if row["kind"] == "shield" and "mode" in row else str(row["agent"])
+        for row in rows
+    ]
     if twice := {name for name in named if named.count(name) > 1}:
         raise InvalidInput(f"{path}: {min(twice)} stands in it twice")
     return Result(path, dict(zip(named, rows, strict=True)))
@@ -419,16 +282,6 @@ def told_of(row: Mapping[str, Any], key: str) -> str | None:
     parameters = row.get("parameters")
     told = row.get(key, parameters.get(key) if isinstance(parameters, dict) else None)
     return None if told is None else str(told)
-
-
-def _check_numbers(path: Path, row: Mapping[str, Any]) -> None:
-    """Refuse what is no number of episodes, and no mean harm with an interval around it."""
-    who = f"{path}: {row['agent']}"
-    if not 1 <= row["episodes"] <= _MOST_EPISODES or isinstance(row["episodes"], bool):
-        raise InvalidInput(f"{who}: episodes = {row['episodes']!s:.40}: must be 1 to {_MOST_EPISODES:,}")
-    for harm in _COMPARED[row["kind"]]:
-        if not _is_mean(row.get(harm), row.get(f"{harm}_interval"), row["episodes"]):
-            raise InvalidInput(f"{who}: {harm} is no mean with an interval [low, high] around it")
 
 
 def _is_mean(mean: Any, interval: Any, episodes: int) -> bool:
@@ -463,10 +316,6 @@ def _rows_of(path: Path, content: Any) -> list[dict[str, Any]]:
     return [row | about for row in agents]
 
 
-def _name_of(row: Mapping[str, Any]) -> str:
-    return f"{row['agent']} ({row['mode']})" if row["kind"] == "shield" and "mode" in row else str(row["agent"])
-
-
 # Two results compared: the same worlds of the same scenario, or no comparison.
 
 
@@ -481,7 +330,7 @@ class Difference:
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON."""
         harms = {f"{name}_difference": estimate for name, estimate in self.harms.items()}
-        return {"agent": self.agent, "policy": self.policy, **estimates_to_json(harms)}
+        return {"agent": self.agent, "policy": self.policy, **Estimate.side_by_side(harms)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -516,10 +365,11 @@ def compare_results(first: Result, second: Result) -> Comparison:
     different worlds or scenarios, or without a common agent.
     """
     for key, what in SAME.items():
-        one, other = (told_of(result.about, key) for result in (first, second))
-        if one != other:
+        told, told_second = (told_of(result.about, key) for result in (first, second))
+        if told != told_second:
             raise InvalidInput(
-                f"{second.path}: is about {what} than {first.path} ({key} {other!s:.12} and {one!s:.12}): no comparison"
+                f"{second.path}: is about {what} than {first.path} ({key} {told_second!s:.12} and {told!s:.12}):"
+                " no comparison"
             )
     common = [agent for agent in first.rows if agent in second.rows]
     left_over = [tuple(agent for agent in one.rows if agent not in common) for one in (first, second)]
@@ -527,11 +377,27 @@ def compare_results(first: Result, second: Result) -> Comparison:
         agents = " and ".join(f"{', '.join(names)}" for names in left_over)
         raise InvalidInput(f"{first.path} and {second.path} have no agent in common: {agents}")
     worlds, because = _worlds_of_both(first, second, common)
-    differences = tuple(
-        Difference(agent, _policies(first, second, agent), _differences(first, second, agent, worlds))
-        for agent in common
-    )
-    return Comparison(differences, because, (left_over[0], left_over[1]), *_others(first, second))
+    differences = []
+    for agent in common:
+        one, other = first.rows[agent], second.rows[agent]
+        if worlds is None:
+            sizes = other["episodes"], one["episodes"]
+            harms = {
+                harm: unpaired_difference(second.estimate(agent, harm), sizes[0], first.estimate(agent, harm), sizes[1])
+                for harm in _COMPARED[first.about["kind"]]
+            }
+        else:
+            before, after = worlds[agent]
+            harms = {name: paired_difference(after[:, k], before[:, k]) for k, name in enumerate(HARMS)}
+        policies = one["policy_sha256"], other["policy_sha256"]
+        same: Literal["same", "other"] = "same" if policies[0] == policies[1] else "other"
+        differences.append(Difference(agent, same if any(policies) else "none", harms))
+    changed = []
+    for key in ("agent_settings", "versions"):
+        one, other = (each if isinstance(each := of.about.get(key), dict) else {} for of in (first, second))
+        names = [name for name in dict.fromkeys([*one, *other]) if one.get(name) != other.get(name)]
+        changed.append({name: (one.get(name), other.get(name)) for name in names})
+    return Comparison(tuple(differences), because, (left_over[0], left_over[1]), *changed)
 
 
 Worlds = dict[str, tuple[Floats, Floats]]  # agent -> harms [n, 2] of the first and of the second, world by world
@@ -550,42 +416,236 @@ def _worlds_of_both(first: Result, second: Result, common: Sequence[str]) -> tup
             return None, f"the rows per world of {agent} are not those of {count_of(len(worlds), 'same world')}"
         found[agent] = tuple(np.array([side[agent][world] for world in worlds]) for side in (one, other))
         for result, harms in zip((first, second), found[agent], strict=True):
-            _check_means(result, agent, harms)
+            for name, mean in zip(HARMS, harms.mean(axis=0), strict=True):
+                told = result.rows[agent].get(name)
+                if told is not None and not math.isclose(told, mean, rel_tol=1e-9, abs_tol=1e-9):
+                    raise InvalidInput(
+                        f"{result.path}: {agent}: {name} = {told:g}, but the mean of its worlds is {mean:g}"
+                    )
     return found, None  # type: ignore[return-value]  # two of them each
 
 
-def _check_means(result: Result, agent: str, harms: Floats) -> None:
-    """Refuse means that are not those of the file with every world [n, 2]."""
-    for name, mean in zip(HARMS, harms.mean(axis=0), strict=True):
-        told = result.rows[agent].get(name)
-        if told is not None and not math.isclose(told, mean, rel_tol=1e-9, abs_tol=1e-9):
-            raise InvalidInput(f"{result.path}: {agent}: {name} = {told:g}, but the mean of its worlds is {mean:g}")
+# One row per world and agent of a shard, as a Parquet file: world by world, whatever the shards and blocks are.
+
+_WHOLE = {"world", "collided", "impacts", "chosen_policy", "hidden"}
 
 
-def _differences(first: Result, second: Result, agent: str, worlds: Worlds | None) -> dict[str, Estimate]:
-    """The second minus the first, by the name of the harm."""
-    if worlds is not None:
-        before, after = worlds[agent]
-        return {name: paired_difference(after[:, k], before[:, k]) for k, name in enumerate(HARMS)}
-    sizes = second.rows[agent]["episodes"], first.rows[agent]["episodes"]
-    return {
-        harm: unpaired_difference(second.estimate(agent, harm), sizes[0], first.estimate(agent, harm), sizes[1])
-        for harm in first.harm_names
+@contextmanager
+def rows_file(path: Path, objectives: Sequence[str]) -> Iterator[Callable[[Evaluation], None]]:
+    """Give what adds the rows of evaluations to the file, which appears at ``path`` when the block ends well.
+
+    Worlds that were left out have no row. Raises ``MissingExtra`` without pyarrow.
+    """
+    with naming_extras():
+        import pyarrow
+
+    def array(name: str, values: Sequence[Any]) -> Any:
+        whole = pyarrow.int64() if name in _WHOLE else pyarrow.float64()
+        return pyarrow.array(values, pyarrow.string() if isinstance(values[0], str) else whole)
+
+    with parquet_file(path, compression="zstd") as write:
+
+        def add(evaluation: Evaluation) -> None:
+            found = evaluation.per_world(objectives, limits=False)
+            n, agents = evaluation.worlds.n, len(evaluation.outcomes)
+            order = np.arange(n * agents).reshape(agents, n).T.ravel().tolist()  # world by world
+            write({name: array(name, [values[k] for k in order]) for name, values in found.items()})
+
+        yield add
+
+
+LEAF = 1_000  # worlds that are hashed together; shards and blocks begin at a multiple of it
+BLOCK = 4 * LEAF  # worlds advanced together: bounds memory, changes no result
+MOST_EPISODES = 10**12
+_TRIED = 100  # worlds at each end of a list that say whether best known harms may be had for all of it
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """What is asked of the worlds 0 to ``episodes - 1`` of a list; it travels to other processes.
+
+    Args:
+        scenario: of the worlds, with the learners that are driven.
+        agents: by name, as they are written.
+        episodes: worlds of the list.
+        seed: of the list.
+        harm_count: harm that agents minimise.
+        uncertainty: what agents behind ``+robust`` do not know, as on the command line.
+        objectives: under which results are told, too.
+
+    """
+
+    scenario: Scenario
+    agents: tuple[str, ...]
+    episodes: int
+    seed: int
+    harm_count: HarmCount = "first"
+    uncertainty: str | None = None
+    objectives: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_whole_number("episodes", self.episodes, 1, MOST_EPISODES)
+        check_whole_number("seed", self.seed, 0)
+
+    @property
+    def task(self) -> Task:
+        """Who is driven."""
+        return Task(self.scenario, self.scenario.learners, self.harm_count)
+
+    def lineup(self) -> Mapping[str, Driver]:
+        """The agents, made anew; raises what ``make_lineup`` raises."""
+        intervals = None if self.uncertainty is None else parse_uncertainty(self.uncertainty)
+        return make_lineup(self.agents, self.scenario, harm_count=self.harm_count, uncertainty=intervals)
+
+    def bounds(self, shards: int) -> list[tuple[int, int]]:
+        """First world and end of every shard: as equal as whole leaves allow, and no more than leaves."""
+        check_whole_number("shards", shards, 1)
+        leaves = -(-self.episodes // LEAF)
+        shards = min(shards, leaves)
+        ends = [min(leaves * k // shards * LEAF, self.episodes) for k in range(shards + 1)]
+        return list(pairwise(ends))
+
+    def ask(self) -> Asked:
+        """Look up what it is about: hashes of scenario, policies and user files, versions, and what is proven.
+
+        Raises what ``lineup`` raises.
+        """
+        lineup, scenario = self.lineup(), self.scenario
+        teams = {name: team_of(agent, scenario.learners) for name, agent in lineup.items()}
+        knows = {name: knowledge_of(team) for name, team in teams.items()}
+        policies = {name: policies_of(team.drivers) for name, team in teams.items()}
+        ends = sorted({0, max(self.episodes - _TRIED, 0)})
+        found = [
+            known_limits(scenario.sample(min(_TRIED, self.episodes), self.seed, first=k).worlds, self.task)
+            for k in ends
+        ]
+        because = next((each.because for each in found if isinstance(each, Unproven)), None)
+        identity = {
+            "format": 2,
+            "scenario": scenario.name,
+            "scenario_sha256": scenario_sha256(scenario),
+            "seed": self.seed,
+            "episodes": self.episodes,
+            "agents": list(lineup),
+            "policy_sha256": policies,
+            "knows": {name: knowledge_text(each) for name, each in knows.items()},
+            "harm_count": self.harm_count,
+            "uncertainty": self.uncertainty,
+            "objectives": list(self.objectives),
+            "metrics": sorted(REGISTERED),
+            "versions": result_versions(),
+        }
+        limits = all(not isinstance(each, Unproven) and bool(each.known.all()) for each in found)
+        return Asked(self, identity, knows, policies, limits, because)
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A question with everything that its answer depends on, looked up once and told to every process."""
+
+    question: Question
+    identity: Mapping[str, Any]  # plain data
+    knows: Mapping[str, Knowledge]  # by agent
+    policies: Mapping[str, Mapping[str, str]]  # by agent: vehicle's name -> SHA-256 of its policy
+    limits: bool  # the best known harm of its worlds is looked up
+    because: str | None  # why nothing is proven for its worlds; None where something is
+
+    @property
+    def sha256(self) -> str:
+        """Of the identity: answers belong together where it is the same."""
+        return hashlib.sha256(json.dumps(self.identity, sort_keys=True).encode()).hexdigest()
+
+    def answer(self, first: int, end: int, rows: Path | None = None, block: int = BLOCK) -> Tally:
+        """The statistics of worlds ``first`` to ``end - 1``; depends on nothing else, and ``block`` changes no bit.
+
+        Args:
+            first: a multiple of ``LEAF``.
+            end: another one, or the end of the list.
+            rows: also write one row per world and agent to this Parquet file.
+            block: worlds advanced together, a multiple of ``LEAF``.
+
+        Raises ``InvalidInput`` for a policy that is not the one that was asked about, and what driving raises.
+
+        """
+        if first % LEAF or block % LEAF or not (end % LEAF == 0 or end == self.question.episodes) or not first < end:
+            raise InvalidInput(
+                f"shard from {first} to {end} in blocks of {block}: must be whole leaves of {LEAF:,} worlds"
+            )
+        lineup, starts = self._lineup(), range(first, end, block)
+        with nullcontext(None) if rows is None else rows_file(rows, self.question.objectives) as write:
+            return reduce(add, (_answer_block(self, lineup, k, min(k + block, end), write) for k in starts), Tally())
+
+    def _lineup(self) -> Mapping[str, Driver]:
+        """The agents in this process, once."""
+        if self.sha256 not in _LINEUPS:
+            here = self.question.ask()
+            if here.sha256 != self.sha256:
+                changed = sorted(key for key in self.identity if here.identity.get(key) != self.identity[key])
+                raise InvalidInput(f"shards: {', '.join(changed)} changed since the evaluation began; begin it again")
+            _LINEUPS[self.sha256] = self.question.lineup()
+        return _LINEUPS[self.sha256]
+
+    def summarise(self, tally: Tally) -> SummaryTable:
+        """One row per agent, as ``summarise``; rates with exact intervals. ``PhysicsError`` if no world is left."""
+        if not tally.worlds:
+            raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in tally.left_out})
+        task, told = self.question.task, Conditions.of_ranges(tally.ranges)
+        return SummaryTable.of_tallies(
+            {name: tally.agents[name].knowing(tally.worlds) for name in self.identity["agents"]},
+            Conditions.of_test(task, self.question.seed, tally.worlds, self.because, told),
+            task,
+            self.knows,
+            self.policies,
+            exact=True,
+            left_out=tally.left_out,
+            hidden_share=tally.hidden / tally.worlds,
+            worlds_sha256=f"{tally.worlds_hash:064x}",
+            scenario_sha256=self.identity["scenario_sha256"],
+            versions=self.identity["versions"],
+        )
+
+    def to_json(self, tally: Tally, rows: Sequence[SummaryRow]) -> list[dict[str, Any]]:
+        """What a results file holds: one object per agent, each vehicle's harm and the kind of intervals in it."""
+        question, vehicles = self.question, self.question.scenario.vehicles
+        settings = {"harm_count": question.harm_count, "uncertainty": question.uncertainty}
+        found = results_to_json(rows, told=tally.rescore(question.objectives, vehicles), settings=settings)
+        names = [f"{name}_{i + 1}" for name in HARMS for i in range(vehicles)]
+        told = {"kind": "evaluate-shards", "intervals": INTERVALS}
+        return [
+            {
+                **row,
+                **told,
+                "vehicle_harm": Estimate.side_by_side(
+                    {name: tally.agents[row["agent"]].moments[name].estimate for name in names}
+                ),
+            }
+            for row in found
+        ]
+
+
+_LINEUPS: dict[str, Mapping[str, Driver]] = {}  # of this process; an evaluation drives copies
+
+
+def _answer_block(
+    asked: Asked, lineup: Mapping[str, Driver], first: int, end: int, write: Callable[[Evaluation], None] | None
+) -> Tally:
+    """The statistics of worlds that are advanced together."""
+    question = asked.question
+    sample = question.scenario.sample(end - first, question.seed, first=first)
+    evaluation, left_out = evaluate_block(sample, lineup, scenario=question.scenario, seed=question.seed)
+    if evaluation is None:
+        return Tally(left_out=left_out)
+    if write is not None:
+        write(evaluation)
+    worlds, index = evaluation.worlds, evaluation.index
+    ranges = {
+        name: tuple((float(c.min()), float(c.max())) for c in rule.of(worlds).T)
+        for name, rule in QUANTITY.of(worlds).items()
     }
+    leaves = [np.flatnonzero(index // LEAF == number) for number in np.unique(index // LEAF)]
+    hashes = sum(int(worlds_sha256(worlds.take(leaf), index[leaf]), 16) for leaf in leaves)
+    agents = evaluation.tally(limits=asked.limits, objectives=question.objectives)
+    return Tally(worlds.n, int(evaluation.hidden.sum()), hashes, ranges, left_out, agents)
 
 
-def _policies(first: Result, second: Result, agent: str) -> Literal["same", "other", "none"]:
-    one, other = (result.rows[agent]["policy_sha256"] for result in (first, second))
-    if not one and not other:
-        return "none"
-    return "same" if one == other else "other"
-
-
-def _others(first: Result, second: Result) -> list[dict[str, tuple[str | None, str | None]]]:
-    """Settings of the agents, and versions, that are not the same in both."""
-    found = []
-    for key in ("agent_settings", "versions"):
-        one, other = (each if isinstance(each := result.about.get(key), dict) else {} for result in (first, second))
-        names = dict.fromkeys([*one, *other])
-        found.append({name: (one.get(name), other.get(name)) for name in names if one.get(name) != other.get(name)})
-    return found
+INTERVALS = {"rates": "Clopper-Pearson", "means": "Student's t, of exact sums"}

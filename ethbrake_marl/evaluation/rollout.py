@@ -12,45 +12,43 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.protocol import Driver, Shielding, Team, check_agent, knowledge_of, team_of
-from ethbrake_marl.agents.rollout import drive, script_agents
-from ethbrake_marl.engine.stream import check_alert, is_state_free
+from ethbrake_marl.agents import Driver, Shielding, Team, check_agent, drive, knowledge_of, script_agents, team_of
+from ethbrake_marl.engine import check_alert, is_state_free
 from ethbrake_marl.errors import (
+    AgentFailed,
     InvalidInput,
     PhysicsError,
     check_one_learner,
     check_whole_number,
-    naming_agent,
     unknown_name,
 )
 from ethbrake_marl.evaluation.inputs import policy_sha256
-from ethbrake_marl.evaluation.measures import REGISTERED, Tape
-from ethbrake_marl.evaluation.outcome import Evaluation, LeftOut, Outcome
+from ethbrake_marl.evaluation.measures import REGISTERED, Evaluation, LeftOut, Outcome, Tape
 from ethbrake_marl.harm import Ledger
-from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, concatenate, leaving_out_failed
-from ethbrake_marl.physics.advance import failure
-from ethbrake_marl.physics.compiled import compiled
-from ethbrake_marl.physics.kernel import (
+from ethbrake_marl.physics import (
     FLAG,
     LISTED,
     ROW,
+    Bools,
+    Decisions,
+    Floats,
+    Ints,
+    Worlds,
     advance_table,
-    decision_s,
-    first_decision_s,
-    obstacle_ahead,
+    compiled,
+    leaving_out_failed,
     onset_s,
     place_obstacle,
+    sample_numbers,
+    sample_worlds,
     solo_motion,
-    with_post_ahead,
+    sum_rows,
 )
-from ethbrake_marl.physics.sampled import sample_numbers, sample_worlds
-from ethbrake_marl.physics.worlds import sum_rows
-from ethbrake_marl.scenario import Sample, Scenario, Task
-from ethbrake_marl.scenario.fields import constant_command, kind_columns
+from ethbrake_marl.scenario import Sample, Scenario, ScriptSpec, Task
 
 # The aftermath of a line: where Vehicle 1 ends, and how much of that others pushed it.
 #
-# Worlds know gaps and speeds, no places: a post ahead (``physics.obstacle``) makes the way of Vehicle 1 one more gap.
+# Worlds know gaps and speeds, no places: a post ahead (``with_obstacle``) makes the way of Vehicle 1 one more gap.
 
 
 class ShovedFront:
@@ -70,7 +68,7 @@ class ShovedFront:
         """What watches these worlds (at the alert); None where Vehicle 1 is driven, or its script needs the state."""
         script = None if 0 in task.vehicles else task.scenario.scripts.get(0)
         vehicles = worlds.vehicles
-        command = None if script is None else constant_command(script, vehicles.braking_capacity_mps2[:, 0])
+        command = None if script is None else ScriptSpec.parse(script).command(vehicles.braking_capacity_mps2[:, 0])
         if command is None:
             return None
         columns = (worlds.speeds_mps, vehicles.latency_s, vehicles.speed_limit_mps)
@@ -82,14 +80,14 @@ class ShovedFront:
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
         """Add the way of one step, by a post ahead: the world's own obstacle, or one out of reach."""
         v = before.vehicles
-        post_m = with_post_ahead(before, until_s - before.time_s).obstacle_gap_m
+        post_m = before.with_post_ahead(until_s - before.time_s).obstacle_gap_m
         status = np.full(before.n, FLAG.DONE)
         add_front_ways(
             post_m, before.obstacle_hit, before.gaps_m, before.speeds_mps, before.time_s, before.pair_hit, command_mps2,
             until_s, v.latency_s, v.mass_t, v.speed_limit_mps, v.restitution, self._way_m, status,
         )  # fmt: skip
         if (status != FLAG.DONE).any():
-            raise failure(status, before.time_s, until_s)
+            raise FLAG.failure(status, before.time_s, until_s)
 
     @property
     def metres(self) -> Floats:
@@ -152,7 +150,7 @@ class SampledHarm:
         self._time_s, self._pair_hit = worlds.time_s.copy(), worlds.pair_hit.copy()
         self._command = np.zeros(worlds.speeds_mps.shape)
         self._harm = np.zeros(worlds.n)
-        self._start_s = first_decision_s(worlds, [VEHICLE_2])
+        self._start_s = worlds.first_decision_s([VEHICLE_2])
         self._step_s, self._horizon_s = scenario.time_step_s, scenario.horizon_s
         self._samples = -1  # steps of the map so far; the time before its first sample is the first
 
@@ -162,7 +160,7 @@ class SampledHarm:
 
         The map knows no obstacle, and its samples are the decisions of Vehicle 2.
         """
-        if task.vehicles != (VEHICLE_2,) or obstacle_ahead(worlds).any():
+        if task.vehicles != (VEHICLE_2,) or worlds.obstacle_ahead.any():
             return None
         if not all(map(is_state_free, script_agents(task.scenario, except_for=VEHICLE_2).values())):
             return None
@@ -177,7 +175,7 @@ class SampledHarm:
     def _move(self) -> None:
         """Go on by one step: every world to its next sample, none beyond its first one at or after the horizon."""
         self._samples += 1
-        next_s = np.minimum(decision_s(self._start_s, self._step_s, self._samples), self._horizon_s)
+        next_s = np.minimum(Decisions(self._start_s, self._step_s).at(self._samples), self._horizon_s)
         until_s, v = np.maximum(next_s, self._time_s), self._vehicles
         first, last = sample_numbers(self._time_s, until_s, v.latency_s[:, VEHICLE_2], self._step_s)
         shape = self._gaps_m.shape
@@ -278,7 +276,7 @@ def _drive_all(
         chunk_of = _Chunk(sample.worlds, agent, driven, scenario, aftermath)
         for first in range(0, sample.worlds.n, chunk):
             rows = np.arange(first, min(first + chunk, sample.worlds.n))
-            with naming_agent(name, others):
+            with AgentFailed.naming(name, others):
                 outcome, kept, failed = leaving_out_failed(chunk_of.roll_out, rows)
             lost = {row: LeftOut(int(sample.index[row]), seed, name, why) for row, why in failed.items()} | lost
             if outcome is not None:
@@ -364,7 +362,7 @@ class _Whole(NamedTuple):
         if self.left_out and not good.size:
             raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
         outcomes = {name: _join([part.among(good) for part in parts]) for name, parts in self.parts.items()}
-        kinds = kind_columns(self.sample.types, self.sample.scenarios)
+        kinds = self.sample.kinds
         if self.left_out:
             worlds, index = worlds.take(good), index[good]
             kinds = {name: column[good] for name, column in kinds.items()}
@@ -392,10 +390,10 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -
     sampled = SampledHarm.of(worlds, task) if aftermath else None
     impacts = Tape(worlds, steps=False) if aftermath and REGISTERED else None
     episodes = drive(worlds, team, scenario, watched_by=[w for w in (shoved, sampled, impacts) if w is not None])
-    alone = next(iter(team.drivers.values())) if len(team.drivers) == 1 else None
+    told: Any = next(iter(episodes.memories.values()), None) if len(team.drivers) == 1 else None
     if episodes.guarded is not None:
-        alone = episodes.guarded.shield
-    predicted, chosen = (_read_column(alone, what, worlds.n) for what in ("predicted_harm", "chosen_policy"))
+        told = episodes.guarded.told
+    predicted, chosen = (_read_column(team, told, what, worlds.n) for what in ("predicted_harm", "chosen_policy"))
     return Outcome(
         episodes.ledger,
         episodes.final,
@@ -410,15 +408,15 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -
     )
 
 
-def _read_column(agent: Any, attribute: str, n: int) -> NDArray[np.generic] | None:
-    """What the agent says about each world of the batch, or None when it says nothing."""
-    value = getattr(agent, attribute, None)
-    if agent is None or value is None:
+def _read_column(team: Team, memory: Any, what: str, n: int) -> NDArray[np.generic] | None:
+    """What the memory of who drives holds about each world of the batch, or None when it holds nothing."""
+    value = memory.get(what) if isinstance(memory, Mapping) else None
+    if value is None:
         return None
     column = np.asarray(value)
-    if column.shape != (n,):
+    if column.shape != (n,) or column.dtype.kind not in "biuf":
         raise InvalidInput(
-            f"agent {getattr(agent, 'name', agent)!r}: {attribute} has shape {column.shape}; one per world, ({n},), is"
+            f"agent {team.name!r}: {what} is {column.dtype} of shape {column.shape}; one number per world, ({n},), is"
             " needed"
         )
     return column
@@ -434,7 +432,7 @@ def _join(parts: list[Outcome]) -> Outcome:
 
     return Outcome(
         ledger,
-        concatenate([part.final for part in parts]),
+        Worlds.concatenate([part.final for part in parts]),
         np.concatenate([part.at_rest for part in parts]),
         column("predicted_harm"),
         column("chosen_policy"),

@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from rich import box
-from rich.table import Table
 
-from ethbrake_marl.agents.protocol import Agent, Driver, Team, team_of
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents import Agent, Driver, Team, drive, team_of
 from ethbrake_marl.errors import renumbered
-from ethbrake_marl.evaluation.inputs import policies_by_name, policy_sha256, result_identity
+from ethbrake_marl.evaluation.inputs import policies_of, result_identity
 from ethbrake_marl.evaluation.rollout import OnWorlds
 from ethbrake_marl.evaluation.statistics import mean, paired_difference
-from ethbrake_marl.files.sheet import Estimate, estimates_to_json
+from ethbrake_marl.files.sheet import Column, Estimate, Row, Sheet
 from ethbrake_marl.physics import Floats, Ints, LeftOutRows, Worlds, measured_without_failed
 from ethbrake_marl.scenario import Sample, Task
-from ethbrake_marl.shield import HybridAgent, ShieldedDriver
-from ethbrake_marl.shield.guard import Shielded, join, put_shield, shielded_episodes
-from ethbrake_marl.shield.review import SAME_HARM, VERDICTS, review
+from ethbrake_marl.shield import (
+    SAME_HARM,
+    VERDICTS,
+    HybridAgent,
+    Shielded,
+    ShieldedDriver,
+    join,
+    put_shield,
+    review,
+    shielded_episodes,
+)
 
-NONE, EPISODE, STEP = "none", "episode", "step"
-STEP_ALERT, STEP_CAP = "step-alert", "step-cap"  # step mode: rollout at the alert only; no vehicle above its cap
+# ``step-alert``: rollout at the alert only; ``step-cap``: no vehicle above its cap.
+Mode = Literal["none", "episode", "step", "step-alert", "step-cap"]
 CHUNK = 500  # worlds advanced together: bounds memory, changes no result
 
 
@@ -43,7 +49,7 @@ class ModeRow:
     """One agent, or one team, behind one mode of the shield."""
 
     agent: str
-    mode: str
+    mode: Mode
     harm: Estimate  # mean over worlds (m2/s2)
     horizon_ends: int  # worlds that the horizon cut off before the line stood: no bound says what comes after
     against_episode: Estimate | None  # minus that of episode mode, paired by world; None: of that itself, and of teams
@@ -59,20 +65,62 @@ class ModeRow:
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON; what does not exist is null, intervals are ``[low, high]``."""
-        told: dict[str, Any] = {
+        shares = self.verdicts or (None,) * len(VERDICTS)
+        return {
             "agent": self.agent,
             "mode": self.mode,
-            **estimates_to_json({"harm": self.harm}),
+            **Estimate.side_by_side({"harm": self.harm}),
             "horizon_ends": self.horizon_ends,
-            **estimates_to_json({"against_episode": self.against_episode, "against_none": self.against_none}),
+            **Estimate.side_by_side({"against_episode": self.against_episode, "against_none": self.against_none}),
             "decisions_replaced": self.replaced,
-            **estimates_to_json({"bound": self.bound}),
+            **Estimate.side_by_side({"bound": self.bound}),
             "vehicles": [vehicle._asdict() for vehicle in self.vehicles],
+            **dict(zip(VERDICTS, shares, strict=True)),
+            "above_bound": self.above_bound,
+            "policy_sha256": dict(self.policy_sha256),
+            "left_out": [{"world": world, "reason": reason} for world, reason in self.left_out],
         }
-        shares = (None,) * len(VERDICTS) if self.verdicts is None else self.verdicts
-        told |= {**dict(zip(VERDICTS, shares, strict=True)), "above_bound": self.above_bound}
-        told["policy_sha256"] = dict(self.policy_sha256)
-        return {**told, "left_out": [{"world": world, "reason": reason} for world, reason in self.left_out]}
+
+
+class ShieldModes(list[ModeRow]):
+    """The rows of ``compare_modes``: every agent behind every mode."""
+
+    @property
+    def of_teams(self) -> bool:
+        """Whether the rows are of several learners: there is no episode mode to compare with."""
+        return all(row.against_episode is None for row in self)
+
+    def to_json(self, sample: Sample, task: Task) -> list[dict[str, Any]]:
+        """What a results file of ``ethbrake shield`` holds: one object per row, of the worlds of ``sample``."""
+        left_out = [world for world, _ in self[0].left_out]
+        about = result_identity("shield", task.scenario, sample, left_out)
+        about |= {"harm_count": task.harm_count, "episodes": sample.worlds.n - len(left_out)}
+        return [about | row.to_json() for row in self]
+
+    def sheets(self) -> list[Sheet]:
+        """The rows for a terminal, below the name of each agent; of teams also what each vehicle bears."""
+        share, teams = partial(Column, digits=1, scale=100.0, unit=" %"), self.of_teams
+        columns = [Column("agent, mode", text=True), Column("harm", interval="hidden")]
+        columns += [Column("minus no shield" if teams else "minus episode mode", sign="+")]
+        columns += [Column("bound", interval="hidden")] if teams else []
+        columns += [share("replaced"), *map(share, VERDICTS), Column("above")]
+        lines: list[Row] = []
+        for row in self:
+            lines += [(row.agent,)] if row.mode == "none" else []
+            compared = (row.against_none, row.bound) if teams else (row.against_episode,)
+            shares = row.verdicts or (None,) * len(VERDICTS)
+            lines.append((f"  {row.mode}", row.harm, *compared, row.replaced, *shares, row.above_bound))
+        title = "Mean harm per world (m²/s²), difference with 95 % interval"
+        found = [Sheet(title, columns, lines, gap=2)]
+        if teams:
+            columns = [Column("agent, mode, vehicle", text=True), share("replaced"), Column("bears")]
+            columns += [Column("under the baseline plan"), share("worlds with more")]
+            lines = []
+            for row in self:
+                lines += [(f"{row.agent}, {row.mode}",)] if row.vehicles else []
+                lines += [(f"  {each.vehicle}", *each[1:]) for each in row.vehicles]
+            found.append(Sheet("What each vehicle bears, mean per world (m²/s²)", columns, lines, gap=2))
+        return found
 
 
 def compare_modes(
@@ -80,113 +128,39 @@ def compare_modes(
     worlds: Worlds,
     task: Task,
     *,
+    behind: bool = False,
     on_progress: OnWorlds | None = None,
-) -> list[ModeRow]:
+) -> ShieldModes:
     """Let every agent drive alone, in episode mode and in step mode, through every world; see ``ModeRow``.
 
     Where several vehicles learn, a team (an agent: a copy for each) drives alone, behind one step shield, and behind
     one that caps what each vehicle bears; episode mode is for one vehicle. Each replaced decision of step mode is
     simulated again without the shield (``shield.review.review``). The given agents are left as they are. A world that
-    cannot be advanced with one of them is left out for all, and named in ``left_out``. Raises ``InvalidInput`` where a
-    shield refuses the scenario, ``PhysicsError`` where no world is left.
+    cannot be advanced with one of them is left out for all, and named in ``left_out``.
+
+    ``behind``: of what is behind a shield among these agents, and nothing where nobody has one. Agents whose shield
+    does not know the world (``+robust``) are left out then: their modes are another question.
+
+    Raises ``InvalidInput`` where a shield refuses the scenario, ``PhysicsError`` where no world is left.
     """
+    if behind:
+        shields = {name: agent.shield if isinstance(agent, Team) else agent for name, agent in agents.items()}
+        agents = {
+            shield.policy.name: shield.policy
+            for name, shield in shields.items()
+            if isinstance(shield, HybridAgent) or (isinstance(shield, ShieldedDriver) and "+robust" not in name)
+        }
+        if not agents:
+            return ShieldModes()
     rows, _, left_out = measured_without_failed(
         lambda at: _compare(agents, worlds.take(at), task, on_progress), worlds.n
     )
-    named = {name: _policies(agent, task) for name, agent in agents.items()}
-    return [replace(row, left_out=left_out, policy_sha256=named[row.agent]) for row in rows]
-
-
-def modes_to_json(rows: list[ModeRow], sample: Sample, task: Task) -> list[dict[str, Any]]:
-    """What a results file of ``ethbrake shield`` holds: one object per row, of the worlds of ``sample``."""
-    left_out = [world for world, _ in rows[0].left_out]
-    about = result_identity("shield", task.scenario, sample, left_out)
-    about |= {"harm_count": task.harm_count, "episodes": sample.worlds.n - len(left_out)}
-    return [about | row.to_json() for row in rows]
-
-
-def compare_behind_shields(agents: Mapping[str, Driver], worlds: Worlds, task: Task) -> list[ModeRow]:
-    """``compare_modes`` of what is behind a shield among these agents; nothing where nobody has one.
-
-    Agents whose shield does not know the world (``+robust``) are left out: their modes are another question.
-    """
-    behind = {name: agent.shield if isinstance(agent, Team) else agent for name, agent in agents.items()}
-    proposers = {
-        shielded.policy.name: shielded.policy
-        for name, shielded in behind.items()
-        if isinstance(shielded, HybridAgent) or (isinstance(shielded, ShieldedDriver) and "+robust" not in name)
+    drivers = {
+        name: agent.drivers if isinstance(agent, Team) else dict.fromkeys(task.vehicles, agent)
+        for name, agent in agents.items()
     }
-    return compare_modes(proposers, worlds, task) if proposers else []
-
-
-def _policies(agent: Driver, task: Task) -> Mapping[str, str]:
-    """Vehicle -> the SHA-256 of the policy that proposes for it, where one does."""
-    drivers = agent.drivers if isinstance(agent, Team) else dict.fromkeys(task.vehicles, agent)
-    found = {vehicle: policy_sha256(each) for vehicle, each in drivers.items()}
-    return policies_by_name({vehicle: sha for vehicle, sha in found.items() if sha is not None}, task.scenario)
-
-
-def _compare(agents: Mapping[str, Driver], worlds: Worlds, task: Task, on_progress: OnWorlds | None) -> list[ModeRow]:
-    """The rows of worlds that can all be advanced; ``PhysicsError`` names those that cannot."""
-    rows = []
-    for name, agent in agents.items():
-        parts = []
-        for first in range(0, worlds.n, CHUNK):
-            chunk = np.arange(first, min(first + CHUNK, worlds.n))
-            with renumbered(chunk):
-                parts.append(_measured(worlds.take(chunk), agent, task))
-            if on_progress is not None:
-                on_progress(name, min(first + CHUNK, worlds.n))
-        rows += _rows(name, parts, task)
-    return rows
-
-
-def are_teams(rows: Sequence[ModeRow]) -> bool:
-    """Whether the rows are of several learners: there is no episode mode to compare with."""
-    return all(row.against_episode is None for row in rows)
-
-
-def modes_tables(rows: list[ModeRow]) -> list[Table]:
-    """The rows for a terminal, below the name of each agent; of teams also what each vehicle bears."""
-    return [_modes_table(rows), _shares_table(rows)] if are_teams(rows) else [_modes_table(rows)]
-
-
-def _modes_table(rows: list[ModeRow]) -> Table:
-    title = "Mean harm per world (m²/s²), difference with 95 % interval"
-    table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left", padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column("agent, mode", overflow="fold")
-    several = are_teams(rows)
-    against = "minus no shield" if several else "minus episode mode"
-    for heading in ("harm", against, *(["bound"] if several else []), "replaced", *VERDICTS, "above"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for row in rows:
-        if row.mode == NONE:
-            table.add_row(row.agent)
-        shares = (None,) * len(VERDICTS) if row.verdicts is None else row.verdicts
-        table.add_row(
-            f"  {row.mode}",
-            f"{row.harm.value:.2f}",
-            _write_estimate(row.against_none if several else row.against_episode),
-            *(["–" if row.bound is None else f"{row.bound.value:.2f}"] if several else []),
-            *(_percent(share) for share in (row.replaced, *shares)),
-            "–" if row.above_bound is None else str(row.above_bound),
-        )
-    return table
-
-
-def _shares_table(rows: list[ModeRow]) -> Table:
-    title = "What each vehicle bears, mean per world (m²/s²)"
-    table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left", padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column("agent, mode, vehicle", overflow="fold")
-    for heading in ("replaced", "bears", "under the baseline plan", "worlds with more"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for row in rows:
-        if row.vehicles:
-            table.add_row(f"{row.agent}, {row.mode}")
-        for each in row.vehicles:
-            harms = (f"{each.harm:.2f}", f"{each.baseline:.2f}")
-            table.add_row(f"  {each.vehicle}", _percent(each.replaced), *harms, _percent(each.above_baseline))
-    return table
+    named = {name: policies_of(each) for name, each in drivers.items()}
+    return ShieldModes(replace(row, left_out=left_out, policy_sha256=named[row.agent]) for row in rows)
 
 
 class _Part(NamedTuple):
@@ -198,16 +172,36 @@ class _Part(NamedTuple):
     verdicts: Ints | None = None  # how many interventions got each of VERDICTS
 
 
-def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[str, _Part]:
+def _compare(agents: Mapping[str, Driver], worlds: Worlds, task: Task, on_progress: OnWorlds | None) -> list[ModeRow]:
+    """The rows of worlds that can all be advanced; ``PhysicsError`` names those that cannot."""
+    rows = []
+    for name, agent in agents.items():
+        parts: list[dict[Mode, _Part]] = []
+        for first in range(0, worlds.n, CHUNK):
+            chunk = np.arange(first, min(first + CHUNK, worlds.n))
+            with renumbered(chunk):
+                parts.append(_measured(worlds.take(chunk), agent, task))
+            if on_progress is not None:
+                on_progress(name, min(first + CHUNK, worlds.n))
+        harm = {mode: np.concatenate([part[mode].harm for part in parts]) for mode in parts[0]}
+        rows += [_row(name, mode, [part[mode] for part in parts], harm, task) for mode in harm]
+    return rows
+
+
+def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[Mode, _Part]:
     """Each mode in one chunk."""
-    several = len(task.vehicles) > 1
-    found = {NONE: _alone(worlds, team_of(agent, task.vehicles), task)}
+    several, found = len(task.vehicles) > 1, {}
+    alone: dict[Mode, Team] = {"none": team_of(agent, task.vehicles)}
     if not several:
         assert isinstance(agent, Agent)
         hybrid = HybridAgent(agent, task.scenario, harm_count=task.harm_count)
-        found[EPISODE] = _alone(worlds, Team({task.vehicle: hybrid}, hybrid.name), task)
-    modes: dict[str, dict[str, Any]] = {STEP: {}, STEP_ALERT: {"later_rollouts": False}}
-    for mode, settings in (modes | ({STEP_CAP: {"cap": "baseline"}} if several else {})).items():
+        alone["episode"] = Team({task.vehicle: hybrid}, hybrid.name)
+    for mode, team in alone.items():
+        episodes = drive(worlds, team, task.scenario)
+        found[mode] = _Part(episodes.ledger.world_harm(task.harm_count), int((~episodes.at_rest).sum()))
+    behind: dict[Mode, dict[str, Any]] = {"step": {}, "step-alert": {"later_rollouts": False}}
+    behind |= {"step-cap": {"cap": "baseline"}} if several else {}
+    for mode, settings in behind.items():
         episodes = drive(worlds, put_shield(agent, task, logging=True, **settings), task.scenario)
         shielded = shielded_episodes(episodes, task)
         verdict = review(episodes.guarded.shield, agent, worlds).verdict
@@ -216,30 +210,18 @@ def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[str, _Part]:
     return found
 
 
-def _alone(worlds: Worlds, team: Team, task: Task) -> _Part:
-    episodes = drive(worlds, team, task.scenario)
-    return _Part(episodes.ledger.world_harm(task.harm_count), int((~episodes.at_rest).sum()))
+def _row(agent: str, mode: Mode, parts: list[_Part], harm: Mapping[Mode, Floats], task: Task) -> ModeRow:
+    """One mode of an agent, from its parts and the harm under every mode; of step mode with what the shield did."""
 
-
-def _rows(name: str, parts: list[dict[str, _Part]], task: Task) -> list[ModeRow]:
-    harm = {mode: np.concatenate([part[mode].harm for part in parts]) for mode in parts[0]}
-
-    def minus(mode: str, other: str) -> Estimate | None:
+    def minus(other: Mode) -> Estimate | None:
         return None if mode == other or other not in harm else paired_difference(harm[mode], harm[other])
 
-    rows = []
-    for mode in harm:
-        moving = sum(part[mode].moving for part in parts)
-        row = ModeRow(name, mode, mean(harm[mode]), moving, minus(mode, EPISODE), minus(mode, NONE))
-        rows.append(
-            row if parts[0][mode].shielded is None else _in_step_mode(row, [part[mode] for part in parts], task)
-        )
-    return rows
-
-
-def _in_step_mode(row: ModeRow, parts: list[_Part], task: Task) -> ModeRow:
-    """The row with what the shield did."""
-    whole = join([part.shielded for part in parts if part.shielded is not None])
+    moving = sum(part.moving for part in parts)
+    row = ModeRow(agent, mode, mean(harm[mode]), moving, minus("episode"), minus("none"))
+    shielded = [part.shielded for part in parts if part.shielded is not None]
+    if not shielded:
+        return row
+    whole = join(shielded)
     counted = np.sum([part.verdicts for part in parts if part.verdicts is not None], axis=0).tolist()
     decisions, replaced = int(whole.decisions.sum()), sum(counted)
     each = dict(zip(task.vehicles, (whole.replaced.sum(axis=0) / decisions).tolist(), strict=True))
@@ -258,14 +240,3 @@ def _in_step_mode(row: ModeRow, parts: list[_Part], task: Task) -> ModeRow:
             for i, vehicle in enumerate(task.scenario.vehicle_names)
         ),
     )  # fmt: skip
-
-
-def _write_estimate(estimate: Estimate | None) -> str:
-    if estimate is None:
-        return "–"
-    interval = "" if estimate.interval is None else f" [{estimate.interval[0]:+.2f}, {estimate.interval[1]:+.2f}]"
-    return f"{estimate.value:+.2f}{interval}"
-
-
-def _percent(share: float | None) -> str:
-    return "–" if share is None else f"{100.0 * share:.1f} %"

@@ -17,17 +17,14 @@ from numpy.typing import ArrayLike
 from scipy.special import betaincinv, ndtri, stdtrit
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.sheet import Estimate as Estimate
-from ethbrake_marl.files.sheet import estimates_to_json as estimates_to_json
-from ethbrake_marl.physics import Floats, Ints
-from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.physics import Floats, Ints, compiled
 
 # Exact sums of float64: whole numbers, so that no order of the worlds, and no division into parts, changes a bit.
 #
 # A float64 is a whole multiple of 2^-1074, a product of two of them one of 2^-2148. A sum of such multiples is kept as
-# a
-# whole number: compiled as limbs of 32 bits (Kulisch's long accumulator), between calls as a Python integer. Means and
-# standard errors are then quotients and roots of whole numbers, each rounded once.
+# a whole number: compiled as limbs of 32 bits (Kulisch's long accumulator), between calls as a Python integer. Means
+# and standard errors are then quotients and roots of whole numbers, each rounded once.
 
 VALUE_BITS = 1074  # a value is a multiple of 2^-1074
 PRODUCT_BITS = 2 * VALUE_BITS
@@ -87,31 +84,28 @@ def sum_products(one: Ints, other: Ints, limbs: Ints) -> None:
     carry(limbs)
 
 
-def exact_sum(values: Floats) -> int:
-    """Sum of ``values`` [n] as a multiple of 2^-1074; raises ``InvalidInput`` for what is not finite."""
+def exact_sum(values: Floats, others: Floats | None = None) -> int:
+    """Sum of ``values`` [n] as a multiple of 2^-1074, or of their products with ``others`` [n], of 2^-2148.
+
+    Raises ``InvalidInput`` for what is not finite.
+    """
+    sides = []
+    for side in (values, *([] if others is None else [others])):
+        data = np.ascontiguousarray(side, np.float64)
+        if data.ndim != 1 or len(data) > _MOST or not np.isfinite(data).all():
+            raise InvalidInput(f"exact sum: shape {data.shape}; finite numbers, as [n], at most {_MOST:,}, are needed")
+        sides.append(data.view(np.int64))
     limbs = np.zeros(_LIMBS, np.int64)
-    sum_values(_bits(values), limbs)
-    return _whole(limbs)
-
-
-def exact_products(values: Floats, others: Floats) -> int:
-    """Sum of the products of ``values`` and ``others`` [n] as a multiple of 2^-2148; raises as ``exact_sum``."""
-    limbs = np.zeros(_LIMBS, np.int64)
-    sum_products(_bits(values), _bits(others), limbs)
-    return _whole(limbs)
-
-
-def _bits(values: Floats) -> Ints:
-    data = np.ascontiguousarray(values, np.float64)
-    if data.ndim != 1 or len(data) > _MOST or not np.isfinite(data).all():
-        raise InvalidInput(f"exact sum: shape {data.shape}; finite numbers, as [n], at most {_MOST:,}, are needed")
-    return data.view(np.int64)
-
-
-def _whole(limbs: Ints) -> int:
-    """The whole number in limbs that have been carried."""
+    if others is None:
+        sum_values(sides[0], limbs)
+    else:
+        sum_products(sides[0], sides[1], limbs)
     low = int.from_bytes(limbs[:-1].astype("<u4").tobytes(), "little")
     return low + (int(limbs[-1]) << (32 * (len(limbs) - 1)))
+
+
+CONFIDENCE = 0.95
+_UPPER = 0.5 + 0.5 * CONFIDENCE  # the quantile at the upper end of an interval
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,8 +113,8 @@ class Moments:
     """Number, sum and sum of squares of some values, exact: they are added in any order.
 
     >>> import numpy as np
-    >>> from ethbrake_marl.evaluation.statistics import moments
-    >>> moments(np.array([0.1, 0.2])) + moments(np.array([0.3])) == moments(np.array([0.3, 0.1, 0.2]))
+    >>> from ethbrake_marl.evaluation.statistics import Moments
+    >>> Moments.of(np.array([0.1, 0.2])) + Moments.of(np.array([0.3])) == Moments.of(np.array([0.3, 0.1, 0.2]))
     True
 
     """
@@ -129,8 +123,23 @@ class Moments:
     total: int = 0  # multiple of 2^-1074
     squares: int = 0  # multiple of 2^-2148
 
+    @classmethod
+    def of(cls, values: Floats) -> Moments:
+        """Those of ``values`` [n]; raises as ``exact_sum``."""
+        return cls(len(values), exact_sum(values), exact_sum(values, values))
+
     def __add__(self, other: Moments) -> Moments:
         return Moments(self.count + other.count, self.total + other.total, self.squares + other.squares)
+
+    def minus(self, other: Moments, products: int) -> Moments:
+        """The moments of the differences pair by pair; ``products``: the exact sum of the products."""
+        return Moments(self.count, self.total - other.total, self.squares - 2 * products + other.squares)
+
+    @property
+    def possible(self) -> bool:
+        """Whether some values can have them, none of them beyond 2^1000."""
+        n, far = self.count, abs(self.total) > self.count << (VALUE_BITS + 1000)
+        return not far and n * self.squares >= self.total**2 and not n == 0 < self.squares
 
     @property
     def mean(self) -> float:
@@ -143,26 +152,34 @@ class Moments:
         n = self.count
         return root(n * self.squares - self.total**2, (n * n * (n - 1)) << PRODUCT_BITS)
 
+    @property
+    def estimate(self) -> Estimate:
+        """The mean of at least one value, with the interval ``mean -+ t s / sqrt(n)``; see ``mean``."""
+        return self._around(self.mean, self.standard_error if self.count > 1 else 0.0)
 
-def moments(values: Floats) -> Moments:
-    """Those of ``values`` [n]; raises as ``exact_sum``."""
-    return Moments(len(values), exact_sum(values), exact_products(values, values))
+    def ratio_error(self, others: Moments, products: int) -> float:
+        """Standard error of the ratio ``r`` of two paired means, by the delta method.
 
+        The residuals ``values - r others`` have mean 0: ``s(residuals) / (sqrt(n) |mean(others)|)``. With sums S and
+        sums of products Q, ``n (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / (n - 1) / Sy^4`` is its square.
+        """
+        n, x, y = self.count, self.total, others.total
+        residuals = self.squares * y * y - 2 * x * y * products + x * x * others.squares
+        return root(n * residuals, (n - 1) * y**4)
 
-def difference(values: Moments, others: Moments, products: int) -> Moments:
-    """The moments of ``values - others`` pair by pair, from those of both and the exact sum of their products."""
-    return Moments(values.count, values.total - others.total, values.squares - 2 * products + others.squares)
+    def decrease(self, baseline: Moments, products: int) -> Estimate | None:
+        """``relative_decrease`` from exact moments and the exact sum of the products."""
+        if baseline.total == 0:
+            return None
+        error = self.ratio_error(baseline, products) if self.count > 1 else 0.0
+        return self._around(1.0 - self.total / baseline.total, error)
 
-
-def ratio_error(values: Moments, others: Moments, products: int) -> float:
-    """Standard error of the ratio ``r`` of two paired means, by the delta method.
-
-    The residuals ``values - r others`` have mean 0: ``s(residuals) / (sqrt(n) |mean(others)|)``. With sums S and sums
-    of products Q, ``n (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / (n - 1) / Sy^4`` is its square.
-    """
-    n, x, y = values.count, values.total, others.total
-    residuals = values.squares * y * y - 2 * x * y * products + x * x * others.squares
-    return root(n * residuals, (n - 1) * y**4)
+    def _around(self, value: float, error: float) -> Estimate:
+        """``value`` with the half-width ``t error`` of n - 1 degrees of freedom."""
+        if self.count < 2:
+            return Estimate(value, None)
+        half = float(stdtrit(self.count - 1, _UPPER)) * error
+        return Estimate(value, (value - half, value + half))
 
 
 def root(above: int, below: int) -> float:
@@ -172,41 +189,27 @@ def root(above: int, below: int) -> float:
     return math.ldexp(math.sqrt(quotient), shift)
 
 
-CONFIDENCE = 0.95
-
-
-def rate(successes: int, count: int, *, confidence: float = CONFIDENCE) -> Estimate:
+def rate(successes: int, count: int, *, exact: bool = False) -> Estimate:
     """Share ``p = successes / count`` with Wilson's score interval, which stays inside [0, 1].
 
     With z the normal quantile: centre ``(p + z^2/2n) / (1 + z^2/n)``, half-width
-    ``z / (1 + z^2/n) sqrt(p (1 - p) / n + z^2/4n^2)``. Raises ``InvalidInput`` unless 0 <= successes <= count >= 1.
+    ``z / (1 + z^2/n) sqrt(p (1 - p) / n + z^2/4n^2)``. ``exact``: with the Clopper-Pearson interval, which covers at
+    least 95 %. Its ends are the shares at which so many successes or more, or so few or fewer, have probability 2.5 %:
+    quantiles of the beta distribution. Raises ``InvalidInput`` unless 0 <= successes <= count >= 1.
     """
-    _check_rate(successes, count)
-    p = successes / count
-    return Estimate(p, wilson(p, count, confidence=confidence))
-
-
-def exact_rate(successes: int, count: int, *, confidence: float = CONFIDENCE) -> Estimate:
-    """Share ``successes / count`` with the exact (Clopper-Pearson) interval, which covers at least ``confidence``.
-
-    Its ends are the shares at which so many successes or more, or so few or fewer, have probability
-    ``(1 - confidence) / 2``: quantiles of the beta distribution. Raises ``InvalidInput`` as ``rate``.
-    """
-    _check_rate(successes, count)
-    k, n, tail = successes, count, 0.5 - 0.5 * confidence
+    if not (count >= 1 and 0 <= successes <= count):
+        raise InvalidInput(f"rate: {successes} of {count}: must be 0 <= successes <= count, and count at least 1")
+    k, n, tail = successes, count, 0.5 - 0.5 * CONFIDENCE
+    if not exact:
+        return Estimate(k / n, wilson(k / n, n))
     low = 0.0 if k == 0 else float(betaincinv(k, n - k + 1, tail))
     high = 1.0 if k == n else float(betaincinv(k + 1, n - k, 1.0 - tail))
     return Estimate(k / n, (low, high))
 
 
-def _check_rate(successes: int, count: int) -> None:
-    if not (count >= 1 and 0 <= successes <= count):
-        raise InvalidInput(f"rate: {successes} of {count}: must be 0 <= successes <= count, and count at least 1")
-
-
-def wilson(p: float, count: int, *, confidence: float = CONFIDENCE) -> tuple[float, float]:
+def wilson(p: float, count: int) -> tuple[float, float]:
     """Wilson's score interval of a share ``p`` of ``count`` draws, which need not be a whole number of them."""
-    z = _normal_quantile(confidence)
+    z = float(ndtri(_UPPER))
     shrink = 1.0 + z * z / count
     centre = (p + z * z / (2.0 * count)) / shrink
     half = z / shrink * math.sqrt(p * (1.0 - p) / count + z * z / (4.0 * count * count))
@@ -215,25 +218,19 @@ def wilson(p: float, count: int, *, confidence: float = CONFIDENCE) -> tuple[flo
     return low, high
 
 
-def mean(values: Floats, *, confidence: float = CONFIDENCE) -> Estimate:
+def mean(values: Floats) -> Estimate:
     """Mean of ``values`` [n] with the interval ``mean -+ t s / sqrt(n)``; t with n - 1 degrees of freedom.
 
     At thousands of worlds the mean is normal whatever the harm's own distribution, and the interval equals the
     bootstrap's. Raises ``InvalidInput`` when ``values`` is empty or not finite.
     """
-    return mean_of(moments(_check(values)), confidence=confidence)
+    return Moments.of(_check(values)).estimate
 
 
-def mean_of(found: Moments, *, confidence: float = CONFIDENCE) -> Estimate:
-    """``mean`` of at least one value, from exact moments."""
-    return _around(found.mean, found.standard_error if found.count > 1 else 0.0, found.count, confidence)
-
-
-def paired_difference(values: Floats, baseline: Floats, *, confidence: float = CONFIDENCE) -> Estimate:
+def paired_difference(values: Floats, baseline: Floats) -> Estimate:
     """Mean of ``values - baseline`` world by world, with the t interval of that mean."""
-    data, reference = _check_pair(values, baseline)
-    products = exact_products(data, reference)
-    return mean_of(difference(moments(data), moments(reference), products), confidence=confidence)
+    data, reference, products = _check_pair(values, baseline)
+    return data.minus(reference, products).estimate
 
 
 def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> Estimate:
@@ -246,7 +243,7 @@ def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> 
     if value.interval is None or baseline.interval is None:
         return Estimate(difference, None)
     errors = [
-        0.5 * (high - low) / float(stdtrit(size - 1, 0.5 + 0.5 * CONFIDENCE))
+        0.5 * (high - low) / float(stdtrit(size - 1, _UPPER))
         for (low, high), size in ((value.interval, n), (baseline.interval, m))
     ]
     shares = [error * error for error in errors]
@@ -254,54 +251,33 @@ def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> 
     if variance == 0.0:
         return Estimate(difference, (difference, difference))
     freedom = variance * variance / (shares[0] * shares[0] / (n - 1) + shares[1] * shares[1] / (m - 1))
-    half = float(stdtrit(freedom, 0.5 + 0.5 * CONFIDENCE)) * math.sqrt(variance)
+    half = float(stdtrit(freedom, _UPPER)) * math.sqrt(variance)
     return Estimate(difference, (difference - half, difference + half))
 
 
-def relative_decrease(values: Floats, baseline: Floats, *, confidence: float = CONFIDENCE) -> Estimate | None:
+def relative_decrease(values: Floats, baseline: Floats) -> Estimate | None:
     """``1 - mean(values) / mean(baseline)``, paired by world; None when the baseline's mean is 0.
 
     Interval by the delta method: with ``r`` the ratio of the means, the residuals ``values - r baseline`` have mean 0
     and the standard error of r is ``s_residual / (sqrt(n) mean(baseline))``.
     """
-    data, reference = _check_pair(values, baseline)
-    return decrease_of(moments(data), moments(reference), exact_products(data, reference), confidence=confidence)
+    data, reference, products = _check_pair(values, baseline)
+    return data.decrease(reference, products)
 
 
-def decrease_of(
-    values: Moments, baseline: Moments, products: int, *, confidence: float = CONFIDENCE
-) -> Estimate | None:
-    """``relative_decrease`` from exact moments and the exact sum of the products."""
-    if baseline.total == 0:
-        return None
-    error = ratio_error(values, baseline, products) if values.count > 1 else 0.0
-    return _around(1.0 - values.total / baseline.total, error, values.count, confidence)
-
-
-def _around(value: float, error: float, n: int, confidence: float) -> Estimate:
-    """``value`` with the half-width ``t error`` of n - 1 degrees of freedom."""
-    if n < 2:
-        return Estimate(value, None)
-    half = float(stdtrit(n - 1, 0.5 + 0.5 * confidence)) * error
-    return Estimate(value, (value - half, value + half))
-
-
-def _normal_quantile(confidence: float) -> float:
-    return float(ndtri(0.5 + 0.5 * confidence))
-
-
-def _check(values: Floats) -> Floats:
+def _check(values: ArrayLike, who: str = "statistics", each: str = "world") -> Floats:
     data = np.asarray(values, np.float64)
     if data.ndim != 1 or len(data) < 1 or not np.isfinite(data).all():
-        raise InvalidInput(f"statistics: shape {data.shape}; at least one finite number per world is needed, as [n]")
+        raise InvalidInput(f"{who}: shape {data.shape}; at least one finite number per {each} is needed, as [n]")
     return data
 
 
-def _check_pair(values: Floats, baseline: Floats) -> tuple[Floats, Floats]:
+def _check_pair(values: Floats, baseline: Floats) -> tuple[Moments, Moments, int]:
+    """The moments of both, and the exact sum of their products."""
     data, reference = _check(values), _check(baseline)
     if data.shape != reference.shape:
         raise InvalidInput(f"statistics: {len(data)} values cannot be paired with {len(reference)} of the baseline")
-    return data, reference
+    return Moments.of(data), Moments.of(reference), exact_sum(data, reference)
 
 
 # Statistics over trainings: a figure per seed, and what they say about the next seed.
@@ -310,14 +286,13 @@ def _check_pair(values: Floats, baseline: Floats) -> tuple[Floats, Floats]:
 # quarter; the bootstrap says how far it may be off, drawing seeds anew within each task (stratified), since tasks are
 # chosen and not drawn.
 
-RESAMPLES = 10_000
+RESAMPLES = 10_000  # of seeds
+_RESAMPLES = 2_000  # of seeds and worlds
 _CUT = 0.25
 _AT_ONCE = 1 << 20  # drawn worlds in memory: 8 MB
 
 
-def interquartile_mean(
-    tasks: Sequence[ArrayLike], *, confidence: float = CONFIDENCE, resamples: int = RESAMPLES, seed: int = 0
-) -> Estimate:
+def interquartile_mean(tasks: Sequence[ArrayLike], *, resamples: int = RESAMPLES, seed: int = 0) -> Estimate:
     """Mean of the middle half of all figures, with its stratified bootstrap interval (percentiles).
 
     ``tasks`` holds one list of figures, one per seed, for each task (scenario); floor(n / 4) of all n figures are left
@@ -326,7 +301,7 @@ def interquartile_mean(
     """
     from scipy.stats import bootstrap, trim_mean  # a second to load, and no table of an evaluation needs it
 
-    strata = [_check_figures(figures, f"task {k}") for k, figures in enumerate(tasks)]
+    strata = [_check(figures, f"interquartile_mean: task {k}", "seed") for k, figures in enumerate(tasks)]
     if not strata:
         raise InvalidInput("interquartile_mean: no tasks; at least one list of figures is needed")
 
@@ -345,37 +320,28 @@ def interquartile_mean(
         return statistic(*drawn, *(np.broadcast_to(one, (*shape, 1)) for one in fixed), axis=axis)
 
     found = bootstrap(
-        again, resample, n_resamples=resamples, confidence_level=confidence, method="percentile", rng=seed,
+        again, resample, n_resamples=resamples, confidence_level=CONFIDENCE, method="percentile", rng=seed,
         vectorized=True,
     )  # fmt: skip
     return Estimate(value, (float(found.confidence_interval.low), float(found.confidence_interval.high)))
 
 
-def paired_over_seeds(
-    values: ArrayLike, baseline: ArrayLike, *, confidence: float = CONFIDENCE, resamples: int = 2000, seed: int = 0
-) -> Estimate:
-    """Mean of ``values - baseline`` on the same worlds, [seeds, worlds] each (numbers of seeds may differ).
+def mean_over_seeds(values: ArrayLike, baseline: ArrayLike | None = None, *, seed: int = 0) -> Estimate:
+    """Mean of ``values``, or of ``values - baseline`` on the same worlds, [seeds, worlds] each.
 
-    Its bootstrap interval draws the seeds of either side and the worlds, which both sides share, anew: an interval
-    that leaves out 0 holds for other seeds *and* other worlds. None with a single world. Raises ``InvalidInput`` for
-    arrays that cannot be paired or are not finite.
+    Numbers of seeds may differ. The bootstrap interval draws the seeds of either side and the worlds, which both sides
+    share, anew: an interval of differences that leaves out 0 holds for other seeds *and* other worlds. None with a
+    single world. Raises ``InvalidInput`` for arrays that cannot be paired or are not finite.
     """
-    first, second = _pair_sides("paired_over_seeds", values, baseline)
+    given = np.atleast_2d(np.asarray(values, np.float64))
+    first, second = _pair_sides(
+        "mean_over_seeds", given, np.zeros((1, given.shape[-1])) if baseline is None else baseline
+    )
     value = float((first.mean(axis=0) - second.mean(axis=0)).mean())
     if first.shape[1] < 2:
         return Estimate(value, None)
-    means = _resample_means((first, second), resamples, seed)
-    return _with_percentiles(value, means[:, 0] - means[:, 1], confidence)
-
-
-def mean_over_seeds(
-    values: ArrayLike, *, confidence: float = CONFIDENCE, resamples: int = 2000, seed: int = 0
-) -> Estimate:
-    """Mean of ``values`` [seeds, worlds], with the interval that holds for other seeds and other worlds."""
-    given = np.atleast_2d(np.asarray(values, np.float64))
-    return paired_over_seeds(
-        given, np.zeros((1, given.shape[-1])), confidence=confidence, resamples=resamples, seed=seed
-    )
+    means = _resample_means((first, second), _RESAMPLES, seed)
+    return _with_percentiles(value, means[:, 0] - means[:, 1])
 
 
 def rate_over_seeds(happened: ArrayLike, *, seed: int = 0) -> Estimate:
@@ -392,18 +358,10 @@ def rate_over_seeds(happened: ArrayLike, *, seed: int = 0) -> Estimate:
     return Estimate(share, (max(min(low, ends[0]), 0.0), min(max(high, ends[1]), 1.0)))
 
 
-def share_over_seeds(
-    values: ArrayLike,
-    worst: ArrayLike,
-    best: ArrayLike,
-    *,
-    confidence: float = CONFIDENCE,
-    resamples: int = 2000,
-    seed: int = 0,
-) -> Estimate | None:
+def share_over_seeds(values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, seed: int = 0) -> Estimate | None:
     """``(mean(worst) - mean(values)) / (mean(worst) - mean(best))`` on the same worlds, [seeds, worlds] each.
 
-    Which part of the way from ``worst`` to ``best`` the values are; the interval is as in ``paired_over_seeds``. None
+    Which part of the way from ``worst`` to ``best`` the values are; the interval is as in ``mean_over_seeds``. None
     where ``best`` is not below ``worst``.
     """
     sides = _pair_sides("share_over_seeds", values, worst, best)
@@ -413,9 +371,9 @@ def share_over_seeds(
     share = (high - reached) / (high - low)
     if sides[0].shape[1] < 2:
         return Estimate(share, None)
-    means = _resample_means(sides, resamples, seed)
+    means = _resample_means(sides, _RESAMPLES, seed)
     means = means[means[:, 1] > means[:, 2]]
-    return _with_percentiles(share, (means[:, 1] - means[:, 0]) / (means[:, 1] - means[:, 2]), confidence)
+    return _with_percentiles(share, (means[:, 1] - means[:, 0]) / (means[:, 1] - means[:, 2]))
 
 
 def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
@@ -448,14 +406,7 @@ def _resample_means(sides: Sequence[Floats], resamples: int, seed: int) -> Float
     return np.concatenate(parts)
 
 
-def _with_percentiles(value: float, resampled: Floats, confidence: float) -> Estimate:
-    tail = 50.0 * (1.0 - confidence)
+def _with_percentiles(value: float, resampled: Floats) -> Estimate:
+    tail = 50.0 * (1.0 - CONFIDENCE)
     low, high = np.percentile(resampled, [tail, 100.0 - tail])
     return Estimate(value, (float(low), float(high)))
-
-
-def _check_figures(figures: ArrayLike, name: str) -> Floats:
-    data = np.asarray(figures, np.float64)
-    if data.ndim != 1 or len(data) < 1 or not np.isfinite(data).all():
-        raise InvalidInput(f"interquartile_mean: {name}: one finite figure per seed is needed, at least one")
-    return data

@@ -28,6 +28,11 @@ class Estimate:
     value: float
     interval: tuple[float, float] | None
 
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Its interval; the value itself where there is none."""
+        return self.interval or (self.value, self.value)
+
     def in_words(self, *, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
         """``24.19 [23.85, 24.53]``: value and interval, each times ``scale``."""
         return Column("", digits=digits, scale=scale, unit=unit).show(self).in_words
@@ -36,17 +41,17 @@ class Estimate:
         """Plain data for JSON: ``value``, and ``interval`` as ``[low, high]`` or null."""
         return {"value": self.value, "interval": None if self.interval is None else list(self.interval)}
 
+    @staticmethod
+    def side_by_side(estimates: Mapping[str, Estimate | None]) -> dict[str, Any]:
+        """Estimates by name as plain data, side by side: ``{name: value, name_interval: [low, high]}``.
 
-def estimates_to_json(estimates: Mapping[str, Estimate | None]) -> dict[str, Any]:
-    """Estimates by name as plain data, side by side: ``{name: value, name_interval: [low, high]}``.
-
-    What does not exist is null.
-    """
-    found: dict[str, Any] = {}
-    for name, estimate in estimates.items():
-        told = {"value": None, "interval": None} if estimate is None else estimate.to_json()
-        found |= {name: told["value"], f"{name}_interval": told["interval"]}
-    return found
+        What does not exist is null.
+        """
+        found: dict[str, Any] = {}
+        for name, estimate in estimates.items():
+            told = {"value": None, "interval": None} if estimate is None else estimate.to_json()
+            found |= {name: told["value"], f"{name}_interval": told["interval"]}
+        return found
 
 
 class Shown(NamedTuple):
@@ -237,7 +242,7 @@ class Sheet:
             told: dict[str, Any] = {}
             for column, cell in cells.items():
                 estimate = isinstance(cell, Estimate)
-                told |= estimates_to_json({column.name: cell}) if estimate else {column.name: cell}
+                told |= Estimate.side_by_side({column.name: cell}) if estimate else {column.name: cell}
             found += [told] if cells else []
         return found
 

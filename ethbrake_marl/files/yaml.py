@@ -34,7 +34,7 @@ _RESERVED = {"null", "true", "false"}
 
 
 def flow_text(value: Any, longest: int | None = None) -> str:
-    """Write ``value`` in YAML's flow style; reading it back with ``yaml_loading`` gives an equal value
+    """Write ``value`` in YAML's flow style; reading it back gives an equal value
     (of printable text, lists, mappings with text keys, finite or infinite numbers, true, false, null).
 
     A text longer than ``longest`` characters is cut (for messages only).
@@ -108,6 +108,24 @@ class Document:
             yield
         except InvalidInput as error:
             raise type(error)(f"{self.where(path)}: {error}") from None
+
+    def explain(self, error: ValidationError, wording: Wording) -> InvalidInput:
+        """The error where it does not fit its schema.
+
+        The first defect is shown, unknown keys before all others, and "(and k more)" counts the rest. A missing key
+        that an unknown one was probably meant to be is not counted.
+        """
+        # A default that needs another field is not made after an error elsewhere: no defect of its own.
+        details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
+        unknown = [d for d in details if d["type"] == "extra_forbidden"]
+        meant = " ".join(suggestion(str(d["loc"][-1]), wording.known(_path(d))) for d in unknown)
+        rest = [d for d in details if d not in unknown and not (d["type"] == "missing" and f" {_path(d)[-1]}" in meant)]
+        shown = (unknown + rest)[0]
+        more = len(unknown) + len(rest) - 1
+        path = _path(shown)
+        absent = shown["type"] == "missing" and len(path) == 1
+        where = self.file if absent else self.where(path)
+        return InvalidInput(f"{where}: {_describe(shown, path, wording)}{f' (and {more} more)' if more else ''}")
 
 
 @dataclass(slots=True)
@@ -276,13 +294,7 @@ class _Builder:
 # One clear message for whatever pydantic found: where, value, what would be right. No other file words its errors.
 
 # Ending of a key -> the unit in words.
-UNITS = {
-    "s": "seconds",
-    "m": "metres",
-    "mps": "metres per second",
-    "mps2": "metres per second squared",
-    "t": "tonnes",
-}
+UNITS = {"s": "seconds", "m": "metres", "mps": "metres per second", "mps2": "metres per second squared", "t": "tonnes"}
 _RIGHT = {
     "finite_number": "must be a finite number",
     "int_type": "must be a whole number, written without a decimal point",
@@ -362,7 +374,7 @@ def read_model(source: str | Path | Document, model: type[Model], wording: Wordi
     try:
         return model.model_validate(document.content)
     except ValidationError as error:
-        raise explain(error, document, wording) from None
+        raise document.explain(error, wording) from None
 
 
 def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
@@ -372,25 +384,6 @@ def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
         return content, model.model_validate_json(data)
     except ValidationError as error:
         raise ValueError(str(first_mistake(error))) from None
-
-
-def explain(error: ValidationError, document: Document, wording: Wording) -> InvalidInput:
-    """The error for a document that does not fit its schema.
-
-    The first defect is shown, unknown keys before all others, and "(and k more)" counts the rest. A missing key
-    that an unknown one was probably meant to be is not counted.
-    """
-    # A default that needs another field is not made after an error elsewhere: no defect of its own.
-    details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
-    unknown = [d for d in details if d["type"] == "extra_forbidden"]
-    meant = " ".join(suggestion(str(d["loc"][-1]), wording.known(_path(d))) for d in unknown)
-    rest = [d for d in details if d not in unknown and not (d["type"] == "missing" and f" {_path(d)[-1]}" in meant)]
-    shown = (unknown + rest)[0]
-    more = len(unknown) + len(rest) - 1
-    path = _path(shown)
-    absent = shown["type"] == "missing" and len(path) == 1
-    where = document.file if absent else document.where(path)
-    return InvalidInput(f"{where}: {_describe(shown, path, wording)}{f' (and {more} more)' if more else ''}")
 
 
 class Mistake(NamedTuple):
@@ -510,35 +503,35 @@ class Override:
         """The same without its outermost key."""
         return Override(self.text, self.path[1:], self.value)
 
+    @staticmethod
+    def parse(texts: Sequence[str]) -> list[Override]:
+        """Parse ``key.path=value``, each key once; a value is YAML on one line: ``0.2`` or ``{uniform: [1, 2]}``.
 
-def parse_overrides(texts: Sequence[str]) -> list[Override]:
-    """Parse ``key.path=value``, each key once; the value is YAML on one line, such as ``0.2`` or ``{uniform: [1, 2]}``.
+        Raises ``InvalidInput`` for a text without ``=``, an empty key, a key given twice, and a value that is no YAML.
+        """
+        found: list[Override] = []
+        for text in texts:
+            key, equals, value = text.partition("=")
+            path = tuple(part.strip() for part in key.split("."))
+            if not equals or not all(path):
+                raise InvalidInput(f"--set {text!r}: must be KEY=VALUE or KEY.KEY=VALUE, for instance gamma=0.99")
+            if any(each.path == path for each in found):
+                raise InvalidInput(f"--set {'.'.join(path)}: is given twice")
+            found.append(Override(text, path, parse_yaml(value, f"--set {'.'.join(path)}").content))
+        return found
 
-    Raises ``InvalidInput`` for a text without ``=``, an empty key, a key given twice, and a value that is no YAML.
-    """
-    found: list[Override] = []
-    for text in texts:
-        key, equals, value = text.partition("=")
-        path = tuple(part.strip() for part in key.split("."))
-        if not equals or not all(path):
-            raise InvalidInput(f"--set {text!r}: must be KEY=VALUE or KEY.KEY=VALUE, for instance gamma=0.99")
-        if any(each.path == path for each in found):
-            raise InvalidInput(f"--set {'.'.join(path)}: is given twice")
-        found.append(Override(text, path, parse_yaml(value, f"--set {'.'.join(path)}").content))
-    return found
+    @staticmethod
+    def put(content: Mapping[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
+        """Outermost key -> its new value, of ``content`` with the overrides in it; ``content`` stays as it is.
 
-
-def changed_parts(content: Mapping[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
-    """Outermost key -> its new value, of ``content`` with the overrides in it; ``content`` stays as it is.
-
-    Raises ``InvalidInput`` for a path that leads into a value that holds nothing.
-    """
-    changed: dict[str, Any] = {}
-    for override in overrides:
-        top = override.top
-        before = changed[top] if top in changed else copy.deepcopy(content.get(top))
-        changed[top] = _placed(before, override.path[1:], override)
-    return changed
+        Raises ``InvalidInput`` for a path that leads into a value that holds nothing.
+        """
+        changed: dict[str, Any] = {}
+        for override in overrides:
+            top = override.top
+            before = changed[top] if top in changed else copy.deepcopy(content.get(top))
+            changed[top] = _placed(before, override.path[1:], override)
+        return changed
 
 
 def _placed(part: Any, path: tuple[str, ...], override: Override) -> Any:
@@ -576,6 +569,11 @@ class FileSchema(GenerateJsonSchema):
         described = super().default_schema(schema)
         return {key: value for key, value in described.items() if key != "default" or value is not None}
 
+    @staticmethod
+    def publish(schema: dict[str, Any]) -> dict[str, Any]:
+        """The schema as it is printed and shipped: with the dialect that it is written in, first."""
+        return {"$schema": DIALECT, **schema}
+
 
 class OneOrMore:
     """Of a list: in a file a single entry may stand in its place (a check of the model makes it a list)."""
@@ -584,11 +582,6 @@ class OneOrMore:
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         several = handler(core)
         return {"anyOf": [several["items"], several]}
-
-
-def publish(schema: dict[str, Any]) -> dict[str, Any]:
-    """The schema as it is printed and shipped: with the dialect that it is written in, first."""
-    return {"$schema": DIALECT, **schema}
 
 
 def schema_lines(kind: str) -> str:

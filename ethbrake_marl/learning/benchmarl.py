@@ -7,29 +7,18 @@ the world, so nobody's end cuts off the others. The critic's ``state`` is the fu
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from benchmarl.algorithms import MappoConfig
 from benchmarl.environments.common import TaskClass
-from benchmarl.experiment import Experiment, ExperimentConfig
-from benchmarl.models.mlp import MlpConfig
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
-from torchrl.modules import MultiAgentMLP
 
-from ethbrake_marl.envs.common import feature_box, make_engine, resolve_scenario
-from ethbrake_marl.learning.checkpoint import own_random_state
-from ethbrake_marl.learning.recipe import PpoRecipe
-from ethbrake_marl.learning.training import create_run, resolve, team_content, write_status
+from ethbrake_marl.envs import feature_box, make_engine, resolve_scenario
 from ethbrake_marl.observations import full_state, observation_for, state_features
-from ethbrake_marl.policies.actor import Float32s, NetworkSpec, installed_versions, observation_schema
-from ethbrake_marl.policies.bundle import Policy, make_policy, save_policy
 from ethbrake_marl.rewards import Reward
 from ethbrake_marl.scenario import Scenario
 
@@ -160,92 +149,6 @@ class LineTask(TaskClass):  # type: ignore[misc]
     def env_name() -> str:
         """Name of the environment."""
         return "ethbrake"
-
-
-def train_mappo(recipe: PpoRecipe, scenario: Scenario, directory: str | Path, *, force: bool = False) -> Policy:
-    """Train BenchMARL's MAPPO with the numbers of ``recipe``, and leave the shared actor in the new ``directory``.
-
-    ``load_team`` and ``ppo@DIRECTORY`` take it. The learning rate stays at its start, as BenchMARL has no schedule;
-    there are no checkpoints and nothing is measured on the way. Raises what ``learning.train.train`` raises.
-    """
-    recipe = recipe.replace(scheme="centralised")
-    if recipe.observation is not None:
-        scenario = scenario.replace(observation=list(recipe.observation))
-    team = team_content(resolve(recipe, scenario).scheme, scenario)
-    content = {"recipe": recipe.model_dump(mode="json"), "scenario": scenario.model_dump(mode="json")}
-    run = create_run(Path(directory), {**content, "library": "benchmarl"}, team=team, force=force)
-    with own_random_state(), tempfile.TemporaryDirectory() as scratch:
-        experiment = _experiment(recipe, scenario, scratch)
-        experiment.run()
-        policy = policy_of(experiment, recipe, scenario)
-    save_policy(policy, run.policy)
-    write_status(run, "finished", {"steps": policy.manifest.steps})
-    return policy
-
-
-def _experiment(recipe: PpoRecipe, scenario: Scenario, scratch: str) -> Any:
-    """An experiment with the numbers of ``recipe``; what BenchMARL writes of its own goes to the folder ``scratch``."""
-    learners = len(scenario.learners)
-    config = ExperimentConfig.get_from_yaml()
-    config.gamma, config.lr = recipe.gamma, recipe.learning_rate.start
-    config.clip_grad_val = recipe.max_grad_norm
-    config.max_n_frames, config.max_n_iters = -(-recipe.total_steps // learners), None
-    config.on_policy_n_envs_per_worker = recipe.n_envs
-    config.on_policy_collected_frames_per_batch = recipe.n_envs * recipe.n_steps
-    config.on_policy_n_minibatch_iters = recipe.n_epochs
-    config.on_policy_minibatch_size = max(recipe.batch_size // learners, 1)
-    config.save_folder = scratch
-    config.evaluation, config.loggers, config.create_json = False, [], False
-    algorithm = MappoConfig.get_from_yaml()
-    algorithm.lmbda, algorithm.clip_epsilon = recipe.gae_lambda, recipe.clip_range
-    algorithm.entropy_coef, algorithm.critic_coef = recipe.ent_coef, recipe.vf_coef
-    models = [MlpConfig.get_from_yaml(), MlpConfig.get_from_yaml()]
-    activation = torch.nn.ReLU if recipe.network.activation == "relu" else torch.nn.Tanh
-    for model, cells in zip(models, (recipe.network.policy, recipe.network.value), strict=True):
-        model.num_cells, model.activation_class = list(cells), activation
-    task = LineTask(
-        scenario.name, {"scenario": scenario, "reward": recipe.reward, "horizon_is_end": recipe.horizon_is_end}
-    )
-    return Experiment(task, algorithm, models[0], recipe.seed, config, critic_model_config=models[1])
-
-
-def policy_of(experiment: Any, recipe: PpoRecipe, scenario: Scenario) -> Policy:
-    """The shared actor of an experiment as a policy; its mean is squashed by the hyperbolic tangent."""
-    (actor,) = (m for m in experiment.group_policies[GROUP].modules() if isinstance(m, MultiAgentMLP))
-    observation = observation_for(scenario)
-    network = NetworkSpec(
-        observation_size=observation.size,
-        action_size=1,
-        policy_hidden=recipe.network.policy,
-        value_hidden=(),
-        activation=recipe.network.activation,
-        output="tanh",
-    )
-    return make_policy(
-        _tensors(actor, len(recipe.network.policy)),
-        algorithm="ppo",
-        network=network,
-        observation=observation_schema(observation),
-        learners=tuple(scenario.vehicle_names[vehicle] for vehicle in scenario.learners),
-        scenario=scenario.model_dump(mode="json"),
-        reward=recipe.reward.model_dump(mode="json"),
-        seeds={"training": recipe.seed},
-        steps=int(experiment.total_frames) * len(scenario.learners),
-        versions=installed_versions(),
-    )
-
-
-def _tensors(actor: Any, hidden: int) -> dict[str, Float32s]:
-    """The actor's layers under the names of our table; its last one gives the mean, then the noise."""
-    found: dict[str, Float32s] = {}
-    for k in range(hidden + 1):
-        for part in ("weight", "bias"):
-            values = actor.params[str(2 * k), part].detach().cpu().numpy().astype(np.float32)
-            if k < hidden:
-                found[f"policy.{k}.{part}"] = values
-            else:
-                found[f"policy.output.{part}"], found[f"policy.log_std.{part}"] = values[:1], values[1:]
-    return found
 
 
 def _bound(box: Any, shape: tuple[int, ...]) -> Any:

@@ -21,20 +21,15 @@ from ethbrake_marl.files.yaml import (
     Override,
     Wording,
     YamlPath,
-    changed_parts,
     flow_text,
-    parse_overrides,
-    publish,
     read_model,
     read_yaml,
     refuse,
     schema_lines,
 )
-from ethbrake_marl.policies.actor import Activation, NetworkSpec, Width
+from ethbrake_marl.policies import Activation, NetworkSpec
 from ethbrake_marl.rewards import RewardParams, registered_terms, setting_names
-from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.scenario.features import ListedFeatures, listed_features
-from ethbrake_marl.scenario.schema import check_file_name, shipped_folder
+from ethbrake_marl.scenario import ListedFeatures, Scenario, check_file_name, listed_features, shipped_folder
 
 WORDS = ("title", "description", "source")  # fields that tell about a recipe and change nothing
 
@@ -43,7 +38,7 @@ Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Rate = Annotated[float, Field(gt=0.0, le=1.0)]
-Layers = Annotated[tuple[Width, ...], Field(strict=False, min_length=1, max_length=8)]
+Layers = Annotated[tuple[Annotated[int, Field(ge=1, le=4096)], ...], Field(strict=False, min_length=1, max_length=8)]
 
 
 class LearningRate(FileModel):
@@ -173,26 +168,69 @@ class TrainingRecipe(FileModel):
         return value
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """The network of the policy's bundle."""
-        raise NotImplementedError
+        """The network of the policy's bundle: that of the recipe's ``network``."""
+        shape: NetworkShape | SquashedShape | ActorShape = vars(self)["network"]
+        return shape.spec(observation_size)
 
     @property
     def rounds(self) -> int:
-        """Decisions of each learner between two updates."""
-        raise NotImplementedError
-
-    @property
-    def logged_updates(self) -> int:
-        """Updates between two rows of the progress table."""
-        return 1
-
-    @property
-    def facts(self) -> dict[str, Any]:
-        """What follows from the recipe and is worth a key of ``config.json``."""
-        return {}
+        """Decisions of each learner between two updates: the recipe's ``n_steps``."""
+        return int(vars(self)["n_steps"])
 
     def check_learners(self, learners: int) -> None:
         """Raise ``InvalidInput`` where the recipe does not fit a line with that many learners."""
+
+    def scheme_for(self, scenario: Scenario) -> Scheme:
+        """The recipe's scheme; where it names none, ``single`` for one learner and ``shared`` for several.
+
+        Raises ``InvalidInput`` where nobody learns, or where the scheme or else the recipe does not fit the learners.
+        """
+        learners, where = len(scenario.learners), f"scenario {scenario.name!r}"
+        if not learners:
+            raise InvalidInput(f"{where}: no vehicle learns; give at least one the role learner")
+        scheme = self.scheme or ("single" if learners == 1 else "shared")
+        if scheme == "single" and learners > 1:
+            raise InvalidInput(
+                f"scheme single: {where} has {learners} learners; use shared, independent or centralised, or let one"
+                " learn"
+            )
+        if scheme == "independent" and learners == 1:
+            raise InvalidInput(f"scheme independent: {where} has one learner; use single")
+        if scheme not in self.schemes:
+            raise InvalidInput(
+                f"scheme {scheme}: recipe {self.name!r} is for {self.algorithm.upper()}; it needs one for PPO"
+            )
+        self.check_learners(learners)
+        return scheme
+
+    def make_algorithm(self) -> Any:
+        """Its algorithm, new."""
+        algorithm = _ALGORITHMS[self.algorithm][1]
+        if isinstance(algorithm, str):
+            module, _, attribute = algorithm.partition(":")
+            algorithm = getattr(import_module(module), attribute)
+        return algorithm()
+
+    @staticmethod
+    def of(content: Any) -> TrainingRecipe:
+        """The recipe, of its algorithm's class, that ``model_dump(mode="json")`` wrote; raises ``InvalidInput``."""
+        return _checked(Document("recipe", content, {}))
+
+    def text(self, head: str) -> str:
+        """A commented YAML file below ``head``: all keys written out, one that the recipe leaves out in a comment."""
+        lines = [head, schema_lines("recipe")]
+        values = self.model_dump(mode="json")
+        for key in type(self).model_fields:
+            value = values.get(key)
+            lines.append(f"\n# {MEANINGS[key]}\n" if key in MEANINGS else "\n")
+            if value is None:
+                lines.append(f"# {key}:\n")
+            elif isinstance(value, Mapping):
+                inside = (f"  {name}: {flow_text(entry)}\n" for name, entry in value.items() if entry is not None)
+                lines += [f"{key}:\n", *inside]
+            else:
+                lines.append(f"{key}: {flow_text(value)}\n")
+        return "".join(lines)
 
     def replace(self, **changes: Any) -> Self:
         """The same recipe with other values in some fields, checked again; raises ``InvalidInput``."""
@@ -261,13 +299,9 @@ class PpoRecipe(TrainingRecipe):
     network: NetworkShape
 
     @model_validator(mode="after")
-    def _turns_are_for_independent_learners(self) -> PpoRecipe:
+    def _keys_fit(self) -> PpoRecipe:
         if self.turns is not None and self.scheme != "independent":
             refuse(("turns",), self.turns, "is for scheme: independent only; leave it out")
-        return self
-
-    @model_validator(mode="after")
-    def _whole_batches(self) -> PpoRecipe:
         rollout = self.n_envs * self.n_steps
         if not rollout <= ROLLOUT_LIMIT:
             right = f"n_envs x n_steps = {rollout} decisions per update; at most {ROLLOUT_LIMIT}"
@@ -275,15 +309,6 @@ class PpoRecipe(TrainingRecipe):
         if rollout % self.batch_size:
             refuse(("batch_size",), self.batch_size, f"must divide n_envs x n_steps = {rollout}")
         return self
-
-    def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Actor and critic."""
-        return self.network.spec(observation_size)
-
-    @property
-    def rounds(self) -> int:
-        """Decisions of each learner between two updates."""
-        return self.n_steps
 
     def check_learners(self, learners: int) -> None:
         """Every turn needs an update of its own."""
@@ -327,29 +352,15 @@ class SacRecipe(TrainingRecipe):
             refuse(("buffer_size",), self.buffer_size, f"must be at least n_envs = {self.n_envs}")
         return self
 
-    def network_spec(self, observation_size: int) -> NetworkSpec:
-        """The actor alone."""
-        return self.network.spec(observation_size)
-
     @property
     def rounds(self) -> int:
         """Decisions of each learner between two updates."""
         return self.steps_per_update
 
     @property
-    def logged_updates(self) -> int:
-        """Updates between two rows of the progress table."""
-        return self.log_every_updates
-
-    @property
     def update_ratio(self) -> float:
         """Gradient steps per decision of one learner in each world."""
         return self.gradient_steps / (self.n_envs * self.steps_per_update)
-
-    @property
-    def facts(self) -> dict[str, Any]:
-        """The update ratio."""
-        return {"update_ratio": self.update_ratio}
 
 
 MOMENTS_LIMIT = 2**22  # decisions held in memory between two updates
@@ -383,14 +394,10 @@ class CounterfactualRecipe(TrainingRecipe):
     modes: Annotated[ModesPlan | None, Field(exclude_if=not_)] = None  # several networks and a gate
 
     @model_validator(mode="after")
-    def _counts_to_the_end(self) -> CounterfactualRecipe:
+    def _keys_fit(self) -> CounterfactualRecipe:
         if self.reward.shaping > 0.0:
             right = "must be 0: a counterfactual is played to the end, where shaping tells nothing more"
             refuse(("reward", "shaping"), self.reward.shaping, right)
-        return self
-
-    @model_validator(mode="after")
-    def _enough_decisions(self) -> CounterfactualRecipe:
         visited = self.n_envs * self.n_steps
         if not visited <= MOMENTS_LIMIT:
             right = f"n_envs x n_steps = {visited} decisions per update; at most {MOMENTS_LIMIT}"
@@ -410,11 +417,6 @@ class CounterfactualRecipe(TrainingRecipe):
         if self.modes is not None and learners != 1:
             raise InvalidInput(f"recipe {self.name!r}: modes: are for one learner, not for {learners}; leave modes out")
 
-    @property
-    def rounds(self) -> int:
-        """Decisions of each learner between two updates."""
-        return self.n_steps
-
 
 # The names of the learning algorithms, each with the class of its recipes and the algorithm itself.
 #
@@ -424,7 +426,7 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
 _ALGORITHMS: dict[str, tuple[type[TrainingRecipe], str | type[Any]]] = {
     "ppo": (PpoRecipe, "ethbrake_marl.learning.algorithms:Ppo"),
     "sac": (SacRecipe, "ethbrake_marl.learning.algorithms:Sac"),
-    "counterfactual": (CounterfactualRecipe, "ethbrake_marl.learning.counterfactual:Counterfactual"),
+    "counterfactual": (CounterfactualRecipe, "ethbrake_marl.learning.algorithms:Counterfactual"),
 }
 
 
@@ -454,15 +456,6 @@ def algorithm_names() -> tuple[str, ...]:
     return tuple(_ALGORITHMS)
 
 
-def algorithm_named(name: str) -> Any:
-    """The algorithm of this name, new."""
-    algorithm = _ALGORITHMS[name][1]
-    if isinstance(algorithm, str):
-        module, _, attribute = algorithm.partition(":")
-        algorithm = getattr(import_module(module), attribute)
-    return algorithm()
-
-
 def load_recipe(name_or_path: str | Path) -> TrainingRecipe:
     """Read a shipped recipe by name (``ppo``) or a file by path (anything with a separator or ``.yaml``).
 
@@ -485,11 +478,6 @@ def recipe_path(name_or_path: str | Path) -> Path:
 def shipped_recipes() -> dict[str, Path]:
     """Name -> file of every recipe that comes with the package: the checkout's ``train/``, or the installed copy."""
     return {file.stem: file for file in sorted(shipped_folder("train", "recipes").glob("*.yaml"))}
-
-
-def recipe_of(content: Any) -> TrainingRecipe:
-    """The recipe that ``model_dump(mode="json")`` wrote; raises ``InvalidInput``."""
-    return _checked(Document("recipe", content, {}))
 
 
 def _checked(source: Path | Document) -> TrainingRecipe:
@@ -576,33 +564,10 @@ def new_recipe_text(name: str, based_on: str = "ppo") -> str:
         "source": f"Values of {base.name}, to be changed.",
     }
     head = f"# Recipe {name}, started from {base.name}. Train with it: ethbrake train --recipe {name}.yaml\n"
-    return recipe_text(base.replace(name=name, **words), head)
-
-
-def recipe_text(recipe: TrainingRecipe, head: str) -> str:
-    """Text of a commented YAML file of ``recipe`` below ``head``, all keys written out.
-
-    A key that it leaves out stands in a comment.
-    """
-    values = recipe.model_dump(mode="json")
-    lines = (_line_of(key, values.get(key)) for key in type(recipe).model_fields)
-    return head + schema_lines("recipe") + "".join(lines)
-
-
-def _line_of(key: str, value: Any) -> str:
-    """A key with its comment above; a mapping has each of its keys on a line of its own."""
-    comment = f"\n# {MEANINGS[key]}\n" if key in MEANINGS else "\n"
-    if value is None:
-        return f"{comment}# {key}:\n"
-    if isinstance(value, Mapping):
-        inside = "".join(f"  {name}: {flow_text(entry)}\n" for name, entry in value.items() if entry is not None)
-        return f"{comment}{key}:\n{inside}"
-    return f"{comment}{key}: {flow_text(value)}\n"
+    return base.replace(name=name, **words).text(head)
 
 
 # The JSON Schema of recipe files: for each algorithm its own keys, with their meanings.
-
-_WEIGHT = {"type": "number", "minimum": 0, "description": "weight of a registered term"}
 
 
 def recipe_json_schema() -> dict[str, Any]:
@@ -614,10 +579,12 @@ def recipe_json_schema() -> dict[str, Any]:
     places, whole = models_json_schema([(each, "validation") for each in classes.values()], schema_generator=FileSchema)
     parts = whole["$defs"]
     for name, recipe in classes.items():
-        part = parts[_part_of(places[recipe, "validation"])]
-        part["properties"] = {key: _described(key, value) for key, value in part["properties"].items()}
-        part["properties"]["algorithm"]["const"] = name
-    parts["RewardParams"]["properties"] |= {name: _WEIGHT for name in registered_terms()}
+        keys = parts[str(places[recipe, "validation"]["$ref"]).rpartition("/")[2]]["properties"]
+        for key in keys.keys() & MEANINGS.keys():
+            keys[key] = {"description": MEANINGS[key], **keys[key]}
+        keys["algorithm"]["const"] = name
+    weight = {"type": "number", "minimum": 0, "description": "weight of a registered term"}
+    parts["RewardParams"]["properties"] |= dict.fromkeys(registered_terms(), weight)
     ways = [
         {
             "if": {"properties": {"algorithm": {"const": name}}, "required": ["algorithm"]},
@@ -625,7 +592,7 @@ def recipe_json_schema() -> dict[str, Any]:
         }
         for name, recipe in classes.items()
     ]
-    return publish(
+    return FileSchema.publish(
         {
             "title": "Recipe",
             "description": "A training set-up: everything that shapes a policy.",
@@ -640,72 +607,9 @@ def recipe_json_schema() -> dict[str, Any]:
     )
 
 
-def _part_of(place: dict[str, Any]) -> str:
-    return str(place["$ref"]).rpartition("/")[2]
-
-
-def _described(key: str, value: dict[str, Any]) -> dict[str, Any]:
-    return {"description": MEANINGS[key], **value} if key in MEANINGS else value
-
-
-# Schemes of training several learners together, and the network that therefore drives each vehicle.
-
-SCHEMES: tuple[Scheme, ...] = get_args(Scheme)
-
-
-def scheme_of(recipe: TrainingRecipe, scenario: Scenario) -> Scheme:
-    """The recipe's scheme; where it names none, ``single`` for one learner and ``shared`` for several.
-
-    Raises ``InvalidInput`` where nobody learns, or for a scheme that does not fit the learners or the algorithm.
-    """
-    learners, where = len(scenario.learners), f"scenario {scenario.name!r}"
-    if not learners:
-        raise InvalidInput(f"{where}: no vehicle learns; give at least one the role learner")
-    scheme = recipe.scheme or ("single" if learners == 1 else "shared")
-    if scheme == "single" and learners > 1:
-        raise InvalidInput(
-            f"scheme single: {where} has {learners} learners; use shared, independent or centralised, or let one learn"
-        )
-    if scheme == "independent" and learners == 1:
-        raise InvalidInput(f"scheme independent: {where} has one learner; use single")
-    if scheme not in recipe.schemes:
-        raise InvalidInput(
-            f"scheme {scheme}: recipe {recipe.name!r} is for {recipe.algorithm.upper()}; it needs one for PPO"
-        )
-    return scheme
-
-
-def check_scheme(name: str) -> Scheme:
-    """``name`` if it is a scheme; raises ``UnknownName`` with a suggestion."""
-    for scheme in SCHEMES:
-        if scheme == name:
-            return scheme
-    raise unknown_name("scheme", name, SCHEMES)
-
-
-def drivers(scheme: Scheme, scenario: Scenario) -> dict[str, str]:
-    """Learner -> where in the run's folder the bundle stands that drives it, front to rear."""
-    names = [scenario.vehicle_names[vehicle] for vehicle in scenario.learners]
-    return {name: driver(scheme, name) for name in names}
-
-
-def driver(scheme: Scheme, vehicle: str) -> str:
-    """Where in the run's folder the bundle stands that drives a learner."""
-    return f"policy/{vehicle}" if scheme == "independent" else "policy"
-
-
-def who_drives_what(given: Mapping[str, str]) -> str:
-    """``drivers`` as a line to read: ``policy drives vehicle_2, vehicle_3``."""
-    bundles: dict[str, list[str]] = {}
-    for vehicle, bundle in given.items():
-        bundles.setdefault(bundle, []).append(vehicle)
-    return "; ".join(f"{bundle} drives {', '.join(vehicles)}" for bundle, vehicles in bundles.items())
-
-
 # Settings ``key=value``: which are the scenario's and which the recipe's, and what belongs together.
 
 _NO_SETTING = {"name", *WORDS}  # they tell about a file, and change nothing
-_TOGETHER = (("gamma", "reward.shaping_discount"),)  # keys of a recipe whose values must be equal
 
 
 class Settings(NamedTuple):
@@ -720,10 +624,15 @@ class Settings(NamedTuple):
         own = [override for override in self.recipe if override.top in type(recipe).model_fields]
         if not own:
             return recipe
-        changed = recipe.replace(**changed_parts(recipe.model_dump(mode="json"), own))
-        if tell is not None:
-            for note in unpaired_settings(changed, own):
-                tell(f"note: {note}")
+        changed = recipe.replace(**Override.put(recipe.model_dump(mode="json"), own))
+        together = {"gamma": changed.gamma, "reward.shaping_discount": changed.reward.shaping_discount}
+        given = [key for key in together if key in {override.key for override in own}]
+        if tell is not None and len(given) == 1 and len({*together.values()}) > 1:
+            (key,), (other,) = given, together.keys() - set(given)
+            tell(
+                f"note: {key} = {together[key]:g}, but {other} stays {together[other]:g}: shaping leaves the best"
+                f" policy as it is only where both are equal (--set {other}={together[key]:g})"
+            )
         return changed
 
 
@@ -737,7 +646,7 @@ def read_settings(texts: Sequence[str] | None, recipes: Sequence[TrainingRecipe]
         "recipe": {key for recipe in recipes for key in type(recipe).model_fields} - _NO_SETTING,
     }
     found: dict[str, list[Override]] = {"scenario": [], "recipe": []}
-    for override in parse_overrides(texts or ()):
+    for override in Override.parse(texts or ()):
         if override.top == "recipe" and len(override.path) > 1 and not recipes:
             raise InvalidInput(f"--set {override.key}: this command takes no recipe, so nothing of one can be set")
         whose = [override.top] if override.top in known and len(override.path) > 1 else [*known]
@@ -749,19 +658,3 @@ def read_settings(texts: Sequence[str] | None, recipes: Sequence[TrainingRecipe]
             raise InvalidInput(f"--set {override.key}: write scenario.{override.key} or recipe.{override.key}")
         found[owners[0]].append(inside)
     return Settings(tuple(texts or ()), tuple(found["scenario"]), tuple(found["recipe"]))
-
-
-def unpaired_settings(recipe: TrainingRecipe, overrides: Sequence[Override]) -> list[str]:
-    """What must be said of settings that belong together where only one was changed, and they differ now."""
-    keys = {override.key for override in overrides}
-    values = {"gamma": recipe.gamma, "reward.shaping_discount": recipe.reward.shaping_discount}
-    notes = []
-    for pair in _TOGETHER:
-        given = [key for key in pair if key in keys]
-        if len(given) == 1 and values[pair[0]] != values[pair[1]]:
-            (other,) = set(pair) - set(given)
-            notes.append(
-                f"{given[0]} = {values[given[0]]:g}, but {other} stays {values[other]:g}: shaping leaves the best"
-                f" policy as it is only where both are equal (--set {other}={values[given[0]]:g})"
-            )
-    return notes

@@ -26,27 +26,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 from filelock import FileLock, Timeout
 from pydantic import Field, model_validator
 
-from ethbrake_marl.agents.policy import LearnedAgent
-from ethbrake_marl.agents.protocol import Driver, Team
-from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents import AgentSettings, Driver, LearnedAgent, Team
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput
 from ethbrake_marl.files.plugins import check_plugins, noted_plugins
 from ethbrake_marl.files.store import new_folder, parse_strict_json, read_plain, write_file
 from ethbrake_marl.files.yaml import Document, FileModel, Wording, read_model, refuse
-from ethbrake_marl.learning.recipe import (
-    WORDS,
-    Scheme,
-    TrainingRecipe,
-    driver,
-    drivers,
-    load_recipe,
-    recipe_of,
-    scheme_of,
-)
+from ethbrake_marl.learning.recipe import WORDS, SacRecipe, Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.observations import ObservationSpec, choose_observation, observation_for
-from ethbrake_marl.policies.actor import installed_versions
-from ethbrake_marl.policies.bundle import Policy, load_policy
-from ethbrake_marl.policies.shipped import SHIPPED, PolicyKind, load_named_policy
+from ethbrake_marl.policies import SHIPPED, Policy, installed_versions, load_named_policy, load_policy
 from ethbrake_marl.scenario import Scenario, load_scenario
 
 if TYPE_CHECKING:  # torch takes seconds, and what is asked of a run needs none
@@ -55,7 +42,7 @@ if TYPE_CHECKING:  # torch takes seconds, and what is asked of a run needs none
     from torch import Tensor
     from torch.optim import Optimizer
 
-    from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
+    from ethbrake_marl.envs import EthBrakeVecEnv
 
 # The folder of a run: its files, its configuration, how far it came, and who may train in it.
 
@@ -65,7 +52,7 @@ RunStatus = Literal["running", "finished", "interrupted", "failed"]
 
 
 class RunDirectory:
-    """Names inside a run's folder."""
+    """A run's folder: the names inside, and what its files say."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -83,17 +70,122 @@ class RunDirectory:
         """The checkpoint after ``steps`` decisions."""
         return self.checkpoints / f"step_{steps:012d}"
 
+    def create(
+        self, config: Mapping[str, Any], *, team: Mapping[str, Any] | None = None, force: bool = False
+    ) -> RunDirectory:
+        """Make the folder with its configuration and its record, in one step: it can be resumed from then on.
+
+        ``team`` is the content of ``team.json``. Raises ``AlreadyExists`` when there is something; with ``force`` an
+        earlier run (a folder with a ``run.json``) or an empty folder is replaced, and anything else is still refused.
+        """
+        path, is_run = self.path, self.status.is_file()
+        replace = force and path.is_dir() and not path.is_symlink() and (is_run or not any(path.iterdir()))
+        if not replace and (path.exists() or path.is_symlink()):
+            if not is_run:
+                raise AlreadyExists(f"{path}: is there already, and is no run; give another name")
+            raise AlreadyExists(
+                f"{path}: is there already; give another name (--name), go on with it (ethbrake train resume), or"
+                " replace it with force (--force; make run ARGS=--force)"
+            )
+        with new_folder(path, replace=replace) as partial:
+            new = RunDirectory(partial)
+            new.write_json(new.config, config)
+            if team is not None:
+                new.write_json(new.team, team)
+            new.write_status("running")
+        return self
+
     def write_json(self, file: Path, content: Mapping[str, Any]) -> None:
         """Replace ``file`` in one step."""
         write_file(file, json.dumps(content, indent=2, allow_nan=False).encode() + b"\n")
 
+    def write_status(self, status: RunStatus, **more: Any) -> None:
+        """Replace ``run.json``: when it was started stays, and when it ended is now."""
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        before = read_object(self.status) if self.status.exists() else {}
+        times = {"started_utc": before.get("started_utc") or now}
+        if status != "running":
+            times["ended_utc"] = now
+        self.write_json(self.status, {"format": "ethbrake-run", "format_version": 1, "status": status, **times, **more})
 
-def write_status(run: RunDirectory, status: RunStatus, more: Mapping[str, Any]) -> None:
-    """Replace ``run.json``: when it was started stays, and when it ended is now."""
-    now = datetime.now(UTC).isoformat(timespec="seconds")
-    before = read_object(run.status) if run.status.exists() else {}
-    times = {"started_utc": before.get("started_utc") or now} | ({} if status == "running" else {"ended_utc": now})
-    run.write_json(run.status, {"format": "ethbrake-run", "format_version": 1, "status": status, **times, **more})
+    def read_config(self) -> dict[str, Any]:
+        """The configuration; raises ``InvalidInput`` where there is no run, or naming the file that is damaged."""
+        if not (os.path.lexists(self.status) or os.path.lexists(self.config)):
+            raise InvalidInput(f"{self.path}: holds no training; give the folder of a run, for instance runs/my-run")
+        for folder in (self.checkpoints, self.tensorboard):
+            if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+                raise InvalidInput(f"{folder}: is not a plain folder; a training deletes in it what it no longer needs")
+        status, config = read_object(self.status), read_object(self.config)
+        for key, right in (("format", ("ethbrake-run",)), ("status", get_args(RunStatus))):
+            if status.get(key) not in right:
+                raise InvalidInput(f"{self.status}: {key} = {status.get(key)!r:.60}: must be {' or '.join(right)}")
+        return config
+
+    def check_plugins(self, config: Mapping[str, Any], advice: str) -> None:
+        """Raise ``InvalidInput``, ending in ``advice``, unless the plug-ins of this process are those of this run."""
+        check_plugins(config.get("plugins", []), str(self.config), advice)
+
+    def training(self, config: Mapping[str, Any]) -> Training:
+        """The training of its configuration.
+
+        Raises ``InvalidInput`` naming what is wrong with it, and for a training of another library.
+        """
+        if "library" in config:
+            raise InvalidInput(
+                f"{self.path}: was trained by {config['library']}, which leaves nothing to go on from; train again"
+            )
+        try:
+            recipe = TrainingRecipe.of(config["recipe"])
+            scenario = Scenario.from_document(Document("scenario", config["scenario"], {}))
+        except KeyError as error:
+            raise InvalidInput(f"{self.config}: is not the configuration of a training: {error} is missing") from None
+        except InvalidInput as error:
+            raise InvalidInput(f"{self.config}: {error}") from None
+        return resolve(recipe, scenario)
+
+    def check_same(self, training: Training) -> None:
+        """Raise ``InvalidInput`` unless it holds this training, naming the keys in which they differ.
+
+        Its plug-ins must be those of this process.
+        """
+        config = read_object(self.config)
+        self.check_plugins(config, "or give another folder (--output)")
+        found = self.training(config)
+        if found.identity == training.identity:
+            return
+        kept, wanted = found.content(), training.content()
+        other = [
+            f"{part} {key}"
+            for part in wanted
+            for key in dict.fromkeys([*wanted[part], *kept[part]])
+            if key not in kept[part] or key not in wanted[part] or kept[part][key] != wanted[part][key]
+        ]
+        raise InvalidInput(
+            f"{self.path}: holds another training (here other: {', '.join(other)}); give another folder (--output)"
+        )
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether it holds a training that came to its end."""
+        return self.status.is_file() and read_object(self.status).get("status") == "finished"
+
+    @property
+    def is_team(self) -> bool:
+        """Whether its learners have a policy each, so that no policy alone drives all of them."""
+        return os.path.lexists(self.team) and len(set(_read_team(self.team).drivers.values())) > 1
+
+    def wait_for_others(self, longest_s: float) -> None:
+        """Wait until no other process trains here, so long at most: one that was left alone ends by itself."""
+        with suppress(Timeout, OSError), FileLock(self.lock, timeout=longest_s, mode=0o666):
+            pass
+
+    def rows(self) -> list[dict[str, str]]:
+        """Its table, one row per update."""
+        return list(csv.DictReader(self.progress.read_text("utf-8").splitlines()))
+
+    def column(self, name: str) -> dict[int, float]:
+        """A column of its table: step -> value, where there is one."""
+        return {int(row["steps"]): float(row[name]) for row in self.rows() if row.get(name)}
 
 
 def read_object(file: Path) -> dict[str, Any]:
@@ -113,82 +205,6 @@ def read_object(file: Path) -> dict[str, Any]:
 RETURN = "rollout/ep_rew_mean"  # column of the table: mean over the last episodes, exploration included
 
 
-def progress_rows(path: Path) -> list[dict[str, str]]:
-    """The table of the run in ``path``, one row per update."""
-    return list(csv.DictReader(RunDirectory(path).progress.read_text("utf-8").splitlines()))
-
-
-def progress_column(table: Sequence[Mapping[str, str]], name: str) -> dict[int, float]:
-    """A column of such a table: step -> value, where there is one."""
-    return {int(row["steps"]): float(row[name]) for row in table if row.get(name)}
-
-
-def create_run(
-    path: Path, config: Mapping[str, Any], *, team: Mapping[str, Any] | None = None, force: bool = False
-) -> RunDirectory:
-    """Make the folder of a run with its configuration and its record, in one step: it can be resumed from then on.
-
-    ``team`` is the content of ``team.json``. Raises ``AlreadyExists`` when there is something; with ``force`` an
-    earlier run (a folder with a ``run.json``) or an empty folder is replaced, and anything else is still refused.
-    """
-    run = RunDirectory(path)
-    replace = force and path.is_dir() and not path.is_symlink() and (run.status.is_file() or not any(path.iterdir()))
-    if not replace and (path.exists() or path.is_symlink()):
-        if not run.status.is_file():
-            raise AlreadyExists(f"{path}: is there already, and is no run; give another name")
-        raise AlreadyExists(
-            f"{path}: is there already; give another name (--name), go on with it (ethbrake train resume), or replace"
-            " it with force (--force; make run ARGS=--force)"
-        )
-    with new_folder(path, replace=replace) as partial:
-        new = RunDirectory(partial)
-        new.write_json(new.config, config)
-        if team is not None:
-            new.write_json(new.team, team)
-        write_status(new, "running", {})
-    return run
-
-
-def open_run(path: Path) -> tuple[RunDirectory, dict[str, Any]]:
-    """The run in ``path`` and its configuration.
-
-    Raises ``InvalidInput`` when there is none, or naming the file of it that is damaged.
-    """
-    run = RunDirectory(path)
-    if not (os.path.lexists(run.status) or os.path.lexists(run.config)):
-        raise InvalidInput(f"{path}: holds no training; give the folder of a run, for instance runs/my-run")
-    for folder in (run.checkpoints, run.tensorboard):
-        if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-            raise InvalidInput(f"{folder}: is not a plain folder; a training deletes in it what it no longer needs")
-    status, config = read_object(run.status), read_object(run.config)
-    for key, right in (("format", ("ethbrake-run",)), ("status", get_args(RunStatus))):
-        if status.get(key) not in right:
-            raise InvalidInput(f"{run.status}: {key} = {status.get(key)!r:.60}: must be {' or '.join(right)}")
-    return run, config
-
-
-def has_finished(run: RunDirectory) -> bool:
-    """Whether the training in an open run has come to its end, though its report may not."""
-    status = read_object(run.status)
-    resumable = any(run.checkpoints.glob("step_*"))
-    return status.get("status") == "finished" or (status.get("stage") is not None and not resumable)
-
-
-def is_finished(path: Path) -> bool:
-    """Whether ``path`` holds a training that came to its end."""
-    run = RunDirectory(path)
-    return run.status.is_file() and read_object(run.status).get("status") == "finished"
-
-
-def wait_for_others(path: Path, longest_s: float) -> None:
-    """Wait until no other process trains in the folder, so long at most: one that was left alone ends by itself."""
-    with suppress(Timeout, OSError), FileLock(RunDirectory(path).lock, timeout=longest_s, mode=0o666):
-        pass
-
-
-Content = dict[str, dict[str, Any]]
-
-
 @dataclass(frozen=True, slots=True)
 class Training:
     """All that a training is before it begins; made by ``resolve``."""
@@ -198,10 +214,24 @@ class Training:
     scheme: Scheme
     drivers: Mapping[str, str]  # learner, front to rear -> where in the run's folder its bundle will stand
     observation: ObservationSpec  # of every learner
-    identity: str  # SHA-256 of all that makes it what it is, in hexadecimal digits
 
-    def config(self) -> dict[str, Any]:
-        """What ``config.json`` says of it."""
+    def content(self) -> dict[str, dict[str, Any]]:
+        """What makes it what it is: plain data with every default in it, without words."""
+        recipe = self.recipe.model_dump(mode="json", exclude=set(WORDS))
+        return {"recipe": recipe, "scenario": self.scenario.content(without=WORDS)}
+
+    @property
+    def identity(self) -> str:
+        """SHA-256 of its content, in hexadecimal digits."""
+        return self.identity_of(self.content())
+
+    @staticmethod
+    def identity_of(content: Mapping[str, Any]) -> str:
+        """SHA-256 of such content."""
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+    def config(self, settings: Sequence[str] = ()) -> dict[str, Any]:
+        """What ``config.json`` says of it, and of the ``settings`` by which it differs from files."""
         recipe = self.recipe
         return {
             "recipe": recipe.model_dump(mode="json"),
@@ -209,89 +239,45 @@ class Training:
             "seeds": {"training": recipe.seed, "evaluation": recipe.evaluation.seed},
             "versions": installed_versions(),
             "plugins": noted_plugins(),
-            **recipe.facts,
+            **({"update_ratio": recipe.update_ratio} if isinstance(recipe, SacRecipe) else {}),
+            **({"settings": list(settings)} if settings else {}),
         }
+
+    def team(self) -> dict[str, Any]:
+        """What ``team.json`` says of it."""
+        file = _TeamFile(scheme=self.scheme, vehicles=self.scenario.vehicles, drivers=dict(self.drivers))
+        return file.model_dump(mode="json")
+
+    def who_drives(self) -> str:
+        """Its scheme and ``drivers`` to read: ``scheme shared: policy drives vehicle_2, vehicle_3``."""
+        bundles: dict[str, list[str]] = {}
+        for vehicle, bundle in self.drivers.items():
+            bundles.setdefault(bundle, []).append(vehicle)
+        told = "; ".join(f"{bundle} drives {', '.join(vehicles)}" for bundle, vehicles in bundles.items())
+        return f"scheme {self.scheme}: {told}"
 
 
 def resolve(recipe: TrainingRecipe | str | Path, scenario: Scenario | str | Path, **changes: Any) -> Training:
     """The training of a recipe on a scenario, both given or by name or path; ``changes`` override the recipe.
 
-    Raises ``InvalidInput`` where they do not fit each other: nobody learns, or the scheme is for others.
+    Learners observe what the recipe says; where it says nothing, what the scenario says. Raises ``InvalidInput`` where
+    they do not fit each other: nobody learns, or the scheme is for others.
     """
     recipe = recipe if isinstance(recipe, TrainingRecipe) else load_recipe(recipe)
     scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     recipe = recipe.replace(**changes) if changes else recipe
-    scheme = scheme_of(recipe, scenario)
-    recipe.check_learners(len(scenario.learners))
-    identity = training_identity(training_content(recipe, scenario))
-    return Training(recipe, scenario, scheme, drivers(scheme, scenario), observation_of(recipe, scenario), identity)
-
-
-def observation_of(recipe: TrainingRecipe, scenario: Scenario) -> ObservationSpec:
-    """What learners observe: what the recipe says; where it says nothing, what the scenario says."""
+    scheme = recipe.scheme_for(scenario)
+    names = [scenario.vehicle_names[vehicle] for vehicle in scenario.learners]
+    drivers = {name: _driver(scheme, name) for name in names}
     if recipe.observation is None:
-        return observation_for(scenario)
-    return choose_observation(recipe.observation, scenario.time_step_s)
+        return Training(recipe, scenario, scheme, drivers, observation_for(scenario))
+    observation = choose_observation(recipe.observation, scenario.time_step_s)
+    return Training(recipe, scenario, scheme, drivers, observation)
 
 
-def training_in(folder: Path, config: Mapping[str, Any]) -> Training:
-    """The training of the configuration of the run in ``folder``.
-
-    Raises ``InvalidInput`` naming what is wrong with it, and for a training of another library.
-    """
-    file = RunDirectory(folder).config
-    if "library" in config:
-        raise InvalidInput(
-            f"{folder}: was trained by {config['library']}, which leaves nothing to go on from; train again"
-        )
-    try:
-        recipe = recipe_of(config["recipe"])
-        scenario = Scenario.from_document(Document("scenario", config["scenario"], {}))
-    except KeyError as error:
-        raise InvalidInput(f"{file}: is not the configuration of a training: {error} is missing") from None
-    except InvalidInput as error:
-        raise InvalidInput(f"{file}: {error}") from None
-    return resolve(recipe, scenario)
-
-
-def check_run_plugins(folder: Path, config: Mapping[str, Any], advice: str) -> None:
-    """Raise ``InvalidInput``, ending in ``advice``, unless the plug-ins of this process are those of this run."""
-    check_plugins(config.get("plugins", []), str(RunDirectory(folder).config), advice)
-
-
-def check_same(folder: Path, training: Training) -> None:
-    """Raise ``InvalidInput`` unless the run in ``folder`` is this training, naming the keys in which they differ.
-
-    Its plug-ins must be those of this process.
-    """
-    config = read_object(RunDirectory(folder).config)
-    check_run_plugins(folder, config, "or give another folder (--output)")
-    found = training_in(folder, config)
-    if found.identity == training.identity:
-        return
-    kept, wanted = (training_content(each.recipe, each.scenario) for each in (found, training))
-    other = [
-        f"{part} {key}"
-        for part in wanted
-        for key in dict.fromkeys([*wanted[part], *kept[part]])
-        if key not in kept[part] or key not in wanted[part] or kept[part][key] != wanted[part][key]
-    ]
-    raise InvalidInput(
-        f"{folder}: holds another training (here other: {', '.join(other)}); give another folder (--output)"
-    )
-
-
-def training_content(recipe: TrainingRecipe, scenario: Scenario) -> Content:
-    """What makes a training what it is: plain data with every default in it, without words."""
-    return {
-        "recipe": recipe.model_dump(mode="json", exclude=set(WORDS)),
-        "scenario": scenario.content(without=WORDS),
-    }
-
-
-def training_identity(content: Content) -> str:
-    """SHA-256 of such content, in hexadecimal digits."""
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+def _driver(scheme: Scheme, vehicle: str) -> str:
+    """Where in the run's folder the bundle stands that drives a learner."""
+    return f"policy/{vehicle}" if scheme == "independent" else "policy"
 
 
 class Algorithm(ABC):
@@ -308,7 +294,7 @@ class Algorithm(ABC):
     def actors(self, model: BaseAlgorithm) -> tuple[BasePolicy, ...]:
         """What drives: one for all learners, or under ``independent`` one for each, front to rear.
 
-        Its state holds the tensors of ``policies.actor.tensor_table`` for the recipe's ``network_spec``.
+        Its state holds the ``tensors`` of the recipe's ``network_spec``.
         """
         return (model.policy,)
 
@@ -381,25 +367,13 @@ class _TeamFile(FileModel):
         for name, bundle in self.drivers.items():
             if name not in line:
                 refuse(("drivers",), name, f"must be one of {line[0]} to {line[-1]}")
-            if bundle != driver(self.scheme, name):
-                refuse(("drivers", name), bundle, f"must be {driver(self.scheme, name)} under scheme {self.scheme}")
+            if bundle != _driver(self.scheme, name):
+                refuse(("drivers", name), bundle, f"must be {_driver(self.scheme, name)} under scheme {self.scheme}")
         alone = len(self.drivers) == 1
         if (self.scheme == "single" and not alone) or (self.scheme == "independent" and alone):
             right = "two vehicles or more" if alone else "one vehicle"
             refuse(("drivers",), self.drivers, f"must be {right} under scheme {self.scheme}")
         return self
-
-
-def team_content(scheme: Scheme, scenario: Scenario) -> dict[str, Any]:
-    """What ``team.json`` says of a training."""
-    file = _TeamFile(scheme=scheme, vehicles=scenario.vehicles, drivers=drivers(scheme, scenario))
-    return file.model_dump(mode="json")
-
-
-def is_team(path: str | os.PathLike[str]) -> bool:
-    """Whether ``path`` is a run whose learners have a policy each, so that no policy alone drives all of them."""
-    file = RunDirectory(Path(path)).team
-    return os.path.lexists(file) and len(set(_read_team(file).drivers.values())) > 1
 
 
 def load_team(path: str | os.PathLike[str], scenario: str | Path | Scenario, name: str = "team") -> Team:
@@ -430,15 +404,9 @@ def load_team(path: str | os.PathLike[str], scenario: str | Path | Scenario, nam
     if missing or not wanted:
         who = ", ".join(missing) or "nobody"
         raise InvalidInput(f"{path}: drives {', '.join(team.drivers)}; scenario {scenario.name!r} has {who} to drive")
-    return Team({i: LearnedAgent(load_driver(path, each), name) for each, i in wanted.items()}, name)
-
-
-def load_driver(path: str | os.PathLike[str], vehicle: str) -> Policy:
-    """The policy that drives ``vehicle`` in the run at ``path``; raises as ``load_team``."""
-    given: Mapping[str, str] = _read_team(RunDirectory(Path(path)).team).drivers
-    if vehicle not in given:
-        raise InvalidInput(f"{path}: drives {', '.join(given)}, not {vehicle}")
-    return load_policy(Path(path) / given[vehicle])
+    return Team(
+        {i: LearnedAgent(load_policy(Path(path) / team.drivers[each]), name) for each, i in wanted.items()}, name
+    )
 
 
 def _read_team(file: Path) -> _TeamFile:
@@ -457,8 +425,6 @@ def _read_team(file: Path) -> _TeamFile:
 #
 # Needs no torch.
 
-_KINDS: dict[str, PolicyKind] = {name: name for name in get_args(PolicyKind)} | {"team": "policy"}
-
 
 def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
     """The policy of a run or a bundle, or the team of a run in which each learner has its own.
@@ -475,22 +441,19 @@ def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
             f" {name}@runs/my-run, or {name}@{SHIPPED}"
         )
     ships = path.partition("/")[0] == SHIPPED  # one policy for all learners
-    if not ships and (name == "team" or (name != "universal" and is_team(path))):
-        scenario = settings.needed_scenario()
-        team = load_team(path, scenario, spec)
-        _check_algorithm(name, path, load_driver(path, scenario.vehicle_names[min(team.drivers)]))
-        return team
+    agent: LearnedAgent | Team
     if name == "universal" and path != SHIPPED:
         raise InvalidInput(f"agent {spec!r}: must be universal@{SHIPPED}; for another policy: ppo@PATH or sac@PATH")
-    policy = load_named_policy(path, _KINDS[name], settings.scenario, settings.harm_count)
-    _check_algorithm(name, path, policy)
-    return LearnedAgent(policy, name=spec)
-
-
-def _check_algorithm(name: str, path: str, policy: Policy) -> None:
-    """``ppo@PATH``, ``sac@PATH`` and ``counterfactual@PATH`` are for policies of that algorithm."""
+    if not ships and (name == "team" or (name != "universal" and RunDirectory(Path(path)).is_team)):
+        agent = load_team(path, settings.needed_scenario(), spec)
+        first: Any = agent.drivers[min(agent.drivers)]
+        policy: Policy = first.policy
+    else:
+        policy = load_named_policy(path, "policy" if name == "team" else name, settings.scenario, settings.harm_count)
+        agent = LearnedAgent(policy, name=spec)
     trained_by = policy.manifest.algorithm
     if name in ("ppo", "sac", "counterfactual") and name != trained_by:
         raise InvalidInput(
             f"agent '{name}@{path}': that policy was trained by {trained_by.upper()}: {trained_by}@{path}"
         )
+    return agent

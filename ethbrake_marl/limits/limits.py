@@ -1,28 +1,767 @@
 """The limits of a list of worlds, found before anybody drives: avoidable, proven, and the best known harm.
 
 Three vehicles, Vehicle 2 driven, the others braking fully: for these it is proven world by world whether some command
-avoids all contact (``limits.avoidability``) and which harm no command undercuts (``limits.lower_bound``). The least
-harm known is the first proof's witness (harm 0), or the result of a search (``limits.best_harm``). Both proofs cover an
+avoids all contact, and which harm no command undercuts (``limits.lower_bound``). The least
+harm known is the first proof's witness (harm 0), or the result of a search (``best_harm``). Both proofs cover an
 obstacle that Vehicle 1 does not reach by itself: only a push brings it there.
 
-Several driven vehicles, and lines of more than three: which harm no joint command undercuts (``limits.team_bound``).
+Several driven vehicles, and lines of more than three: which harm no joint command undercuts (``team_bound``).
 Whether contact can be avoided is decided for Vehicles 2 and 3 of three, and not for other teams.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import io
+import json
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from ethbrake_marl.defaults import HARM_COUNTS
-from ethbrake_marl.limits.best_harm import best_known
-from ethbrake_marl.limits.lower_bound import avoidability, lower_bound
-from ethbrake_marl.limits.team_bound import team_bound
-from ethbrake_marl.physics import Bools, Floats, Worlds
-from ethbrake_marl.physics.kernel import stopping_distances
-from ethbrake_marl.scenario import Task
+from ethbrake_marl.agents import (
+    MOST_CANDIDATES,
+    PROFILE_BUDGET,
+    Agent,
+    AgentSettings,
+    BestHarm,
+    Driver,
+    fixed_commands,
+    optimise_coupled,
+    record_commands,
+    script_agents,
+)
+from ethbrake_marl.defaults import DEFAULT, HARM_COUNTS, HarmCount
+from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError, check_one_learner
+from ethbrake_marl.files.arrays import ArrayArchive, ArrayRow
+from ethbrake_marl.files.store import parse_strict_json, read_plain, write_file
+from ethbrake_marl.files.yaml import first_mistake, parse_numeral
+from ethbrake_marl.limits.lower_bound import (
+    FRONT_FIRST,
+    REAR_FIRST,
+    avoidability,
+    empty_plan,
+    lower_bound,
+    meet_front,
+    meet_rear,
+    onset_states,
+    team_bound,
+)
+from ethbrake_marl.physics import (
+    CLOCK,
+    Bools,
+    Floats,
+    Ints,
+    UInt64s,
+    Worlds,
+    advance,
+    compiled,
+    follow_whole,
+    leaving_out_failed,
+    stopping_distances,
+)
+from ethbrake_marl.scenario import Sample, Scenario, Task
+from ethbrake_marl.search import (
+    MOST_PHASES,
+    ProfileProblem,
+    Profiles,
+    SearchResult,
+    SearchWorld,
+    allowed,
+    copy_profile,
+    copy_rows,
+    largest,
+    make_search_world,
+    profile_problem,
+)
+
+# Tables of best known harm: small files that are looked up by what a world is, never by its place in a list.
+
+TABLE_FORMAT = 1
+SIZE_LIMIT_BYTES = 64 << 20  # of a file
+UNPACKED_LIMIT_BYTES = 256 << 20  # of its arrays
+DECODED_LIMIT = 1 << 26  # numbers of the profiles of one count, every world with as many phases as the longest
+TOLERANCE = 1e-6  # an agent must be this much (m2/s2) below the table to replace its value
+_ABOUT = ("scenario", "list_seed", "episodes", "vehicles")  # of the header, in an error
+_COUNTS: tuple[HarmCount, ...] = ("first", "total")
+
+
+class BestKnown(NamedTuple):
+    """The least harm known under one count."""
+
+    harm: Floats  # [n] m2/s2
+    profiles: Profiles  # [n] that do it; all ends 0 where only the harm is known
+
+
+@dataclass(frozen=True, slots=True)
+class BestHarmTable:
+    """The least harm known in n worlds, for one or both counts, and how it was found (``header``)."""
+
+    identity: UInt64s  # [n]
+    best: Mapping[HarmCount, BestKnown]
+    header: Mapping[str, Any]
+
+    @classmethod
+    def load(cls, path: Path) -> BestHarmTable:
+        """Read a table. Raises ``InvalidInput`` if there is no file and ``CorruptBundle`` if it is not a table.
+
+        Names, types, shapes and sizes are checked from the headers before anything is unpacked. What a table says of a
+        world is believed; that its profiles fit a problem is for ``check_fits`` to say.
+        """
+        if not os.path.exists(path):
+            raise InvalidInput(f"{path}: there is no such table of best known harm")
+        data = read_plain(path, SIZE_LIMIT_BYTES, refusal=CorruptBundle)
+        try:
+            archive = ArrayArchive(data, UNPACKED_LIMIT_BYTES)
+            counts = [harm_count for harm_count in _COUNTS if f"{harm_count}_harm" in archive.headers]
+            arrays = archive.unpack([row for harm_count in counts or _COUNTS for row in _rows(harm_count)])
+            header = parse_strict_json(arrays["header"].tobytes())
+            _Header.model_validate(header)
+            best = {harm_count: _read_best(arrays, harm_count) for harm_count in counts}
+        except ValidationError as error:
+            raise CorruptBundle(f"{path}: is not a table of best known harm: header: {first_mistake(error)}") from None
+        except ValueError as error:
+            raise CorruptBundle(f"{path}: is not a table of best known harm: {error}") from None
+        del header["format"]
+        return cls(arrays["identity"].astype(np.uint64), best, header)
+
+    def save(self, path: Path) -> None:
+        """Write the table in one step."""
+        write_file(path, table_bytes(self))
+
+    @property
+    def left_out(self) -> Mapping[str, str]:
+        """Number in the list -> why the world is in no row."""
+        return dict(self.header.get(LEFT_OUT, {}))
+
+    def rows(self, identity: UInt64s) -> NDArray[np.int64]:
+        """Row of each world, -1 where it is not in the table."""
+        order = np.argsort(self.identity, kind="stable")
+        place = np.minimum(np.searchsorted(self.identity[order], identity), len(order) - 1)
+        rows = order[place]
+        return np.where(self.identity[rows] == identity, rows, -1)
+
+    def check_holds_any(self, identity: UInt64s) -> None:
+        """Raise ``InvalidInput`` if none of these worlds is in the table: it is of another list."""
+        if not (self.rows(identity) >= 0).any():
+            made = ", ".join(f"{key} {self.header[key]}" for key in _ABOUT if key in self.header)
+            raise InvalidInput(
+                f"table of best known harm ({made}): holds none of these {len(identity)} worlds; give the scenario,"
+                " seed and vehicles that it was made for"
+            )
+
+    def check_fits(self, problem: ProfileProblem) -> None:
+        """Raise ``InvalidInput`` if a profile kept for one of these worlds cannot be driven there."""
+        for harm_count in self.best:
+            try:
+                problem.check(self.profiles(problem.identity, harm_count, problem.last_step)[0])
+            except InvalidInput as error:
+                raise InvalidInput(f"table of best known harm, {harm_count}: {error}") from None
+
+    def harm(self, identity: UInt64s, harm_count: HarmCount) -> Floats:
+        """Best known harm of each world (m2/s2), NaN where it is not in the table."""
+        rows = self.rows(identity)
+        if harm_count not in self.best:
+            return np.full(rows.shape, np.nan)
+        return np.where(rows >= 0, self.best[harm_count].harm[rows], np.nan)
+
+    def profiles(self, identity: UInt64s, harm_count: HarmCount, last_step: Ints) -> tuple[Profiles, Bools]:
+        """Kept profiles [n], and where there is one [n]; coasting elsewhere. ``last_step`` [n] ends each of them."""
+        rows = self.rows(identity)
+        if harm_count not in self.best:
+            controlled = next(iter(self.best.values())).profiles.commands_mps2.shape[2]
+            coasting = Profiles(last_step[:, np.newaxis].copy(), np.zeros((len(rows), 1, controlled)))
+            return coasting, np.zeros(len(rows), np.bool_)
+        kept = self.best[harm_count].profiles.take(rows)
+        known = (rows >= 0) & (kept.ends[:, -1] > 0)
+        ends = np.where(known[:, np.newaxis], kept.ends, last_step[:, np.newaxis])
+        return Profiles(ends, np.where(known[:, np.newaxis, np.newaxis], kept.commands_mps2, 0.0)), known
+
+    def improved(
+        self, identity: UInt64s, harm_count: HarmCount, harm: Floats, profiles: Profiles | None = None
+    ) -> tuple[BestHarmTable, Bools]:
+        """The table with every value replaced that ``harm`` [m] undercuts by more than ``TOLERANCE``; and where it did.
+
+        ``profiles`` [m] are what did it; without them only the harm is known there. Worlds that are not in the table
+        change nothing. Raises ``InvalidInput`` for a count that the table does not hold, or shapes that do not fit.
+        """
+        if harm_count not in self.best:
+            raise InvalidInput(f"table of {', '.join(self.best)}: holds no {harm_count!r} harm")
+        if harm.shape != identity.shape:
+            raise InvalidInput(f"improve: {harm.shape} harms for {identity.shape} worlds")
+        rows = self.rows(identity)
+        old = self.best[harm_count]
+        better = (rows >= 0) & (harm < old.harm[rows] - TOLERANCE)
+        at = rows[better]
+        new_harm = old.harm.copy()
+        new_harm[at] = harm[better]
+        if profiles is None:
+            profiles = Profiles(
+                np.zeros((len(harm), 1), np.int64), np.zeros((len(harm), 1, old.profiles.commands_mps2.shape[2]))
+            )
+        kept, new = Profiles.padded([old.profiles, profiles], 1)
+        kept.ends[at] = new.ends[better]
+        kept.commands_mps2[at] = new.commands_mps2[better]
+        return replace(self, best={**self.best, harm_count: BestKnown(new_harm, kept)}), better
+
+    def folded(self, scenario: Scenario, worlds: Worlds, name: str, agents: Mapping[HarmCount, Agent]) -> BestHarmTable:
+        """The table with the episodes of ``agents`` in it where they do less harm; its header says in how many worlds.
+
+        ``agents``: for each count, ``name`` made to minimise it. Each drives the scenario's learner through ``worlds``
+        (at t = 0; those that are known to end without harm are left out), and either count takes from either episode.
+        Harms are those of the profiles, driven again. Where an agent cannot drive a world to its end, the table stays
+        as it is. Raises ``InvalidInput`` if the scenario has not exactly one learner.
+        """
+        learners = [scenario.vehicle_names[i] for i in scenario.learners]
+        check_one_learner(scenario.name, learners, "agents whose episodes are kept drive exactly one")
+        task = Task(scenario, scenario.learners)
+        table, identity = self, world_identity(worlds, task)
+        known = np.max([table.harm(identity, harm_count) for harm_count in table.best], axis=0)
+        hard = np.flatnonzero(known > 0.0)
+        lowered = dict.fromkeys(table.best, 0)
+        if hard.size:
+            worlds, identity = worlds.take(hard), identity[hard]
+            problem = _problem(worlds, task)
+            for agent in agents.values():
+
+                def work(at: Ints, agent: Agent = agent) -> Profiles:
+                    return driven_profiles(agent, worlds.take(at), task, problem.last_step[at])
+
+                profiles, rows, _ = leaving_out_failed(work, np.arange(worlds.n))
+                if profiles is None:
+                    continue
+                first, total = problem.take(rows).follow(profiles)
+                for harm_count in table.best:
+                    table, better = table.improved(
+                        identity[rows], harm_count, first if harm_count == "first" else total, profiles
+                    )
+                    lowered[harm_count] += int(better.sum())
+        before = table.header.get(LOWERED, {})
+        return replace(table, header={**table.header, LOWERED: {**before, name: lowered}})
+
+
+def table_bytes(table: BestHarmTable) -> bytes:
+    """The table as a compressed .npz without pickles: only the phases in use, bytes of like weight together."""
+    arrays: dict[str, NDArray[Any]] = {
+        "header": np.frombuffer(json.dumps({"format": TABLE_FORMAT, **table.header}).encode(), np.uint8),
+        "identity": table.identity.astype("<u8"),
+    }
+    for harm_count, best in table.best.items():
+        ends, commands = best.profiles
+        used = _used(ends)
+        inside = np.arange(ends.shape[1]) < used[:, np.newaxis]
+        arrays[f"{harm_count}_harm"] = best.harm.astype("<f8")
+        arrays[f"{harm_count}_phases"] = used.astype("<u2")
+        arrays[f"{harm_count}_ends"] = ends[inside].astype("<u2")
+        flat = np.ascontiguousarray(commands[inside], "<f8")
+        arrays[f"{harm_count}_commands"] = flat.view(np.uint8).reshape(*flat.shape, 8).transpose(2, 0, 1).copy()
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **arrays)
+    return buffer.getvalue()
+
+
+def _rows(harm_count: HarmCount) -> list[ArrayRow]:
+    """What a table holds of one count: n worlds, m phases in all, C controlled vehicles."""
+    return [
+        ArrayRow("header", "|u1", ("bytes",)),
+        ArrayRow("identity", "<u8", ("n",)),
+        ArrayRow(f"{harm_count}_harm", "<f8", ("n",)),
+        ArrayRow(f"{harm_count}_phases", "<u2", ("n",)),
+        ArrayRow(f"{harm_count}_ends", "<u2", (f"m of {harm_count}",)),
+        ArrayRow(f"{harm_count}_commands", "|u1", (8, f"m of {harm_count}", "C")),
+    ]
+
+
+class _Header(BaseModel):
+    """What other code relies on in a header; it may say more."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+
+    format: Annotated[int, Field(ge=TABLE_FORMAT, le=TABLE_FORMAT)]  # neither true nor 1.0
+    scenario: str = ""
+    vehicles: list[str] = []
+    budget: int = 0
+    search_seed: int = 0
+    episodes: int = 0
+    list_seed: int = 0
+    after: dict[str, Any] = {}
+    lowered_by: dict[str, dict[str, int]] = {}
+
+
+def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> BestKnown:
+    """One count of a table whose arrays have the right shapes; raises ``ValueError`` for numbers that cannot be."""
+    harm = arrays[f"{harm_count}_harm"].astype(np.float64)
+    used = arrays[f"{harm_count}_phases"].astype(np.int64)
+    planes = arrays[f"{harm_count}_commands"]
+    flat = np.ascontiguousarray(planes.transpose(1, 2, 0)).view("<f8")[..., 0].astype(np.float64)
+    if not len(harm):
+        raise ValueError("it holds no world")
+    if not (np.isfinite(harm).all() and (harm >= 0.0).all()):
+        raise ValueError(f"{harm_count}_harm: a harm must be a finite number of at least 0 m2/s2")
+    if not np.isfinite(flat).all():
+        raise ValueError(f"{harm_count}_commands: a command must be a finite number")
+    if used.sum() != len(flat):
+        raise ValueError(f"{harm_count}_phases: {used.sum()} phases in all, but there are {len(flat)} commands")
+    width, controlled = max(int(used.max()), 1), flat.shape[1]
+    if not 1 <= controlled <= 64 or len(used) * width * (controlled + 1) > DECODED_LIMIT:
+        raise ValueError(f"{len(used)} worlds of {width} phases of {controlled} vehicles are beyond what is kept")
+    inside = np.arange(width) < used[:, np.newaxis]
+    ends, commands = np.zeros(inside.shape, np.int64), np.zeros((*inside.shape, controlled))
+    ends[inside] = arrays[f"{harm_count}_ends"]
+    commands[inside] = flat
+    last = np.maximum(used - 1, 0)
+    rows = np.arange(len(used))
+    ends = np.where(inside, ends, ends[rows, last][:, np.newaxis])
+    commands = np.where(inside[..., np.newaxis], commands, commands[rows, last][:, np.newaxis])
+    if not ((np.diff(ends, axis=1) >= 0).all() and ((ends[:, -1] > 0) == (used > 0)).all()):
+        raise ValueError(f"{harm_count}_ends: the phases of a world must end in order, the last one after step 0")
+    return BestKnown(harm, Profiles(ends, commands))
+
+
+def _used(ends: NDArray[np.int64]) -> NDArray[np.int64]:
+    """How many phases each profile uses, [n]; 0 where there is none."""
+    return np.where(ends[:, -1] > 0, np.argmax(ends == ends[:, -1:], axis=1) + 1, 0)
+
+
+# The least harm known in each world: search over whole profiles of the controlled vehicles, in the engine's physics.
+#
+# What is found is realised harm: an upper bound of the true minimum, never below it. See docs/best-harm.md.
+
+# Profiles of full drive and full braking from which a search starts: drive, brake to the leader, drive; or the mirror.
+#
+# The proof of the lower bound says what the least harm looks like: the vehicle drives as hard as it can for a while,
+# then brakes as hard as it can until it meets the leader; or it brakes, then drives until the rear one meets it. After
+# that it goes the other way (docs/avoidability.md). A random search seldom finds such a narrow optimum.
+
+KEPT = 12  # profiles of each world
+_LATEST_S = 2.0  # of the first change of command, at first
+_TIMES = 24  # of it that are tried in each round
+_ROUNDS = 3  # each closer around the best one
+_PHASES = 5  # before the first change, its step, up to the second one, its step, after it
+
+
+def extreme_profiles(problem: ProfileProblem, states: Floats, has_front: Bools, has_rear: Bools) -> Profiles:
+    """The ``KEPT`` best such profiles of each world [n * KEPT], world by world, of the one controlled vehicle.
+
+    ``states`` [n, WIDTH] is each world at the first decision (as of the bound). It tells only when the two would
+    meet, so a neighbour that does not brake fully makes the profiles less good, not wrong. A neighbour that is not
+    there [n] is not met.
+    """
+    n, last = problem.n, problem.last_step
+    ends = np.repeat(last, KEPT * MOST_PHASES).reshape(n, KEPT, MOST_PHASES)
+    commands = np.zeros((n, KEPT, MOST_PHASES, 1))
+    _fill_extremes(problem, states, has_front, has_rear, ends, commands)
+    return Profiles(ends.reshape(-1, MOST_PHASES), commands.reshape(-1, MOST_PHASES, 1))
+
+
+@compiled
+def _fill_extremes(
+    problem: ProfileProblem, states: Floats, has_front: Bools, has_rear: Bools, ends: Ints, commands: Floats
+) -> None:
+    """Fill ``ends`` [n, KEPT, K] and ``commands`` [n, KEPT, K, 1]."""
+    no_random = np.zeros(states.shape[0], np.uint64)
+    for k in range(states.shape[0]):
+        world = make_search_world(problem, k, no_random)
+        values = np.full(KEPT, math.inf)
+        for kind, there in ((FRONT_FIRST, has_front[k]), (REAR_FIRST, has_rear[k])):
+            low, high = 0.0, _LATEST_S
+            for _ in range(_ROUNDS if there else 0):
+                best = try_changes(world, kind, states[k], problem.start[k], low, high, ends[k], commands[k], values)
+                around = 1.5 * (high - low) / (_TIMES - 1)
+                low, high = max(best - around, 0.0), best + around
+
+
+@compiled(apart=True)
+def try_changes(
+    world: SearchWorld, kind: int, at: Floats, start: Floats, low: float, high: float, ends: Ints, commands: Floats,
+    values: Floats,
+) -> float:  # fmt: skip
+    """Try first changes of command from ``low`` to ``high`` (s) and keep the best profiles; the best change."""
+    plan, other = empty_plan(), empty_plan()
+    states = np.zeros((_PHASES + 1, start.shape[0]))
+    copy_rows(start.reshape(1, -1), states, 1)
+    tried_ends, tried = np.zeros(_PHASES, np.int64), np.zeros((_PHASES, 1))
+    least, best = math.inf, low
+    for k in range(_TIMES):
+        change = low + (high - low) * k / (_TIMES - 1)
+        meeting = meet_front(at, change, plan, other) if kind == FRONT_FIRST else meet_rear(at, change, plan, other)
+        for early, share in ((0, 0.0), (0, 0.5), (0, 1.0), (1, 0.5)):
+            fill_extreme(world, kind, change, meeting, early, share, tried_ends, tried)
+            value, reached = follow_whole(world.episode, tried_ends, tried, states, math.inf)
+            if reached < 0:
+                continue
+            if value < least:
+                least, best = value, change
+            worst = largest(values)
+            if value < values[worst]:
+                values[worst] = value
+                copy_profile(tried_ends, tried, ends[worst], commands[worst])
+                for phase in range(_PHASES, commands.shape[1]):
+                    commands[worst, phase, 0] = tried[_PHASES - 1, 0]
+    return best
+
+
+@compiled
+def fill_extreme(
+    world: SearchWorld, kind: int, change: float, meeting: float, early: int, share: float, ends: Ints, commands: Floats
+) -> None:
+    """One profile: from ``change`` to ``meeting`` (s) the other command; ``share`` of the first one in the step of it.
+
+    In the step of the change the command leads to the speed that the change would. ``early``: so many steps earlier.
+    """
+    low, high, step = world.bounds[0, 0], world.bounds[0, 1], world.episode.clock[CLOCK.TIME_STEP]
+    last = int(world.episode.clock[CLOCK.LAST_STEP])
+    first, second = (high, low) if kind == FRONT_FIRST else (low, high)
+    turn = min(int(change / step), last)
+    back = max(int(min(meeting / step, last)) - early, turn + 1)
+    commands[0, 0], commands[2, 0], commands[4, 0] = first, second, first
+    commands[1, 0] = second + (change / step - turn) * (first - second)
+    commands[3, 0] = second + share * (first - second)
+    ends[0], ends[1], ends[2], ends[3], ends[4] = turn, turn + 1, back, back + 1, last
+    for k in range(_PHASES):
+        ends[k] = min(ends[k], last)
+        commands[k, 0] = allowed(commands[k, 0], low, high)
+
+
+CHUNK = 200  # worlds between two reports of progress
+LEFT_OUT = "left_out"  # key of a table's header: number in the list -> why the world is in no row
+CONSTANTS = 29  # even grid of constant commands from which every search also starts
+
+Progress = Callable[[int, int], None]  # worlds done, of how many
+
+
+def best_harm(
+    scenario: Scenario,
+    worlds: Worlds,
+    *,
+    counts: Sequence[HarmCount] = HARM_COUNTS,
+    vehicles: Sequence[int] | None = None,
+    budget: int = DEFAULT.SEARCH_BUDGET,
+    seed: int = 0,
+    threads: int | None = None,
+    known: BestHarmTable | None = None,
+) -> BestHarmTable:
+    """Search every world (at t = 0) for the profiles of least harm, once per count.
+
+    ``vehicles`` are the controlled ones (default: the scenario's learners); all others follow their scripts. With both
+    counts, each may take the other's result. The result is never worse than the best constant deceleration of a
+    controlled vehicle (other controlled ones braking fully), than the same search with one of them alone, or than what
+    is ``known`` (a table with these vehicles), from which the search then starts. It does not depend on ``threads``
+    (default: every core) or on the batch. Raises ``InvalidInput`` for no vehicle, a script whose command is not fixed
+    at the alert, no count, or a budget below 1.
+    """
+    if not counts or not set(counts) <= set(HARM_COUNTS) or len(set(counts)) != len(counts):
+        raise InvalidInput(f"counts {tuple(counts)}: must be first, total, or both")
+    chosen = scenario.learners if vehicles is None else tuple(vehicles)
+    workers = (os.cpu_count() or 1) if threads is None else threads
+    search = _Search(scenario, worlds, scripted_commands(worlds, Task(scenario, chosen)), budget, seed, workers)
+    found: list[SearchResult] = []
+    identity = search.problem(chosen).identity
+    if known is not None:
+        known.check_fits(search.problem(chosen))
+    for count in counts:
+        given = [earlier.profiles for earlier in found]
+        if known is not None:
+            given.append(_startable(known.profiles(identity, count, search.problem(chosen).last_step)[0]))
+        found.append(search.best(chosen, count, given))
+    rows = np.arange(worlds.n)
+    best: dict[HarmCount, BestKnown] = {}
+    for count in counts:
+        harms = np.stack([result.harm(count) for result in found])
+        pick = np.argmin(harms, axis=0)
+        ends = np.stack([result.profiles.ends for result in found])[pick, rows]
+        commands = np.stack([result.profiles.commands_mps2 for result in found])[pick, rows]
+        best[count] = BestKnown(harms[pick, rows], Profiles(ends, commands))
+    names = [scenario.vehicle_names[i] for i in chosen]
+    header = {"scenario": scenario.name, "vehicles": names, "budget": budget, "search_seed": seed}
+    table = BestHarmTable(identity, best, header)
+    if known is None:
+        return table
+    for harm_count in [harm_count for harm_count in table.best if harm_count in known.best]:
+        nowhere = np.zeros(len(table.identity), np.int64)
+        kept, has_profile = known.profiles(table.identity, harm_count, nowhere + 1)
+        kept.ends[~has_profile] = 0
+        table, _ = table.improved(table.identity, harm_count, known.harm(table.identity, harm_count), kept)
+    return replace(table, header={**table.header, "after": dict(known.header)})
+
+
+def search_list(
+    scenario: Scenario,
+    sample: Sample,
+    *,
+    counts: Sequence[HarmCount] = HARM_COUNTS,
+    vehicles: Sequence[int] | None = None,
+    budget: int = DEFAULT.SEARCH_BUDGET,
+    seed: int = 0,
+    threads: int | None = None,
+    known: BestHarmTable | None = None,
+    chunks: Path | None = None,
+    on_progress: Progress | None = None,
+) -> BestHarmTable:
+    """``best_harm`` of a long list, ``CHUNK`` worlds at a time, resumable.
+
+    With ``chunks``, a folder, each finished chunk is kept there as a file, and a later call with the same question
+    takes it from there. A file that answers another question is computed anew and replaced. A world that cannot be
+    advanced (a defect of the physics) is left out: no table holds it, and the header names it under ``LEFT_OUT``.
+    Raises ``InvalidInput``, as ``best_harm`` does, and if ``known`` holds no world of the list; ``PhysicsError`` if no
+    world is left.
+    """
+    parts: list[BestHarmTable] = []
+    left_out: dict[int, str] = {}
+    n, task = sample.worlds.n, Task(scenario, scenario.learners if vehicles is None else tuple(vehicles))
+    if known is not None:
+        every, _, _ = leaving_out_failed(lambda at: world_identity(sample.worlds.take(at), task), np.arange(n))
+        if every is not None:
+            known.check_holds_any(every)
+    options = {"counts": counts, "budget": budget, "seed": seed, "threads": threads, "known": known}
+    for first in range(0, n, CHUNK):
+        rows = np.arange(first, min(first + CHUNK, n))
+        file = None if chunks is None else chunk_file(chunks, first)
+        work = partial(_kept_or_searched, task, sample.worlds, file, options)
+        part, _, failed = leaving_out_failed(work, rows)
+        parts += [] if part is None else [part]
+        left_out |= {int(sample.index[row]): reason for row, reason in failed.items()}
+        if on_progress is not None:
+            on_progress(int(rows[-1]) + 1, n)
+    if not parts:
+        raise PhysicsError(left_out)
+    both = [harm_count for harm_count in _COUNTS if all(harm_count in each.best for each in parts)]
+    least: dict[HarmCount, BestKnown] = {}
+    for harm_count in both:
+        padded = Profiles.padded([each.best[harm_count].profiles for each in parts], 1)
+        profiles = Profiles(*(np.concatenate(arrays) for arrays in zip(*padded, strict=True)))
+        least[harm_count] = BestKnown(np.concatenate([each.best[harm_count].harm for each in parts]), profiles)
+    table = BestHarmTable(np.concatenate([each.identity for each in parts]), least, parts[0].header)
+    named = {LEFT_OUT: {str(world): reason for world, reason in left_out.items()}} if left_out else {}
+    return replace(table, header={**table.header, **named})
+
+
+def _kept_or_searched(
+    task: Task, every: Worlds, file: Path | None, options: dict[str, Any], rows: Ints
+) -> BestHarmTable:
+    """A chunk of a list, its ``rows``: from its file where that answers the same question, else searched, and kept."""
+    worlds = every.take(rows)
+    known = options["known"]
+    question = {"counts": list(options["counts"]), "budget": options["budget"], "search_seed": options["seed"]}
+    question |= {} if known is None else {"after": dict(known.header)}
+    if file is not None:
+        with suppress(CorruptBundle):
+            part = kept_chunk(file, world_identity(worlds, task), question)
+            if part is not None:
+                return part
+    part = best_harm(task.scenario, worlds, vehicles=task.vehicles, **options)
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        part.save(file)
+    return part
+
+
+def chunks_left(scenario: Scenario, sample: Sample, *, budget: int, chunks: Path) -> tuple[int, list[Path]]:
+    """Worlds that ``search_list`` would search, with both counts, not finding them kept; and what it finds damaged."""
+    left, damaged = 0, []
+    identity = world_identity(sample.worlds, Task(scenario, scenario.learners))
+    question = {"counts": list(HARM_COUNTS), "budget": budget, "search_seed": 0}
+    for first in range(0, len(identity), CHUNK):
+        file, wanted = chunk_file(chunks, first), identity[first : first + CHUNK]
+        try:
+            kept = kept_chunk(file, wanted, question)
+        except CorruptBundle:
+            kept = None
+            damaged.append(file)
+        left += 0 if kept is not None else len(wanted)
+    return left, damaged
+
+
+def chunk_file(chunks: Path, first: int) -> Path:
+    """Where the chunk that begins with world ``first`` is kept."""
+    return chunks / f"{first:07d}.npz"
+
+
+def kept_chunk(file: Path, identity: UInt64s, question: Mapping[str, object]) -> BestHarmTable | None:
+    """A kept chunk, if it is there and answers this very question; raises ``CorruptBundle`` for a damaged one."""
+    if not file.is_file():
+        return None
+    table = BestHarmTable.load(file)
+    asked = {"counts": list(table.best), **{key: table.header[key] for key in question if key in table.header}}
+    return table if asked == question and np.array_equal(table.identity, identity) else None
+
+
+def world_identity(worlds: Worlds, task: Task) -> UInt64s:
+    """What tells the problem in one world (at t = 0) from that in any other, [n]: ``search.profiles.identities``."""
+    return _problem(worlds, task).identity
+
+
+def realised_harm(worlds: Worlds, task: Task, best: BestKnown) -> tuple[Floats, Floats]:
+    """First-impact and total harm [n] of the stored profiles, driven again in these worlds."""
+    return _problem(worlds, task).follow(best.profiles)
+
+
+def scripted_commands(worlds: Worlds, task: Task) -> Floats:
+    """The commands [n, N] of all vehicles but those of the task; full braking in the columns of these.
+
+    Raises ``InvalidInput`` for a script whose command is not fixed at the alert.
+    """
+    others = {i: script for i, script in script_agents(task.scenario).items() if i not in task.vehicles}
+    return fixed_commands(others, worlds, f"scenario {task.scenario.name!r}, search for the best profiles")
+
+
+def _problem(worlds: Worlds, task: Task) -> ProfileProblem:
+    return _Search(task.scenario, worlds, scripted_commands(worlds, task), 1, 0, 1).problem(task.vehicles)
+
+
+@dataclass(frozen=True, slots=True)
+class _Search:
+    """Searches in given worlds."""
+
+    scenario: Scenario
+    worlds: Worlds
+    others: Floats  # [n, N]
+    budget: int
+    seed: int
+    threads: int
+
+    def problem(
+        self, vehicles: Sequence[int], harm_count: HarmCount = "first", deciders: Sequence[int] | None = None
+    ) -> ProfileProblem:
+        return profile_problem(
+            self.worlds,
+            vehicles,
+            harm_count=harm_count,
+            horizon_s=self.scenario.horizon_s,
+            time_step_s=self.scenario.time_step_s,
+            others_mps2=self.others,
+            deciders=deciders,
+        )
+
+    def best(
+        self,
+        vehicles: Sequence[int],
+        harm_count: HarmCount,
+        given: Sequence[Profiles] = (),
+        deciders: Sequence[int] | None = None,
+    ) -> SearchResult:
+        """The best profiles that start from constants, from ``given``, and from each vehicle's own best profile."""
+        problem = self.problem(vehicles, harm_count, deciders)
+        starts = [problem.constant(problem.even_grid(CONSTANTS)), *given]
+        if len(vehicles) == 1:
+            coupled = optimise_coupled(
+                self.worlds,
+                vehicles[0],
+                harm_count=harm_count,
+                horizon_s=self.scenario.horizon_s,
+                others_mps2=self.others,
+            )
+            starts.insert(0, problem.constant(-coupled.deceleration_mps2[:, np.newaxis, np.newaxis]))
+            at, _ = advance(self.worlds, self.others, until_s=problem.clock[:, CLOCK.START])
+            forward = np.all(at.speeds_mps >= 0.0, axis=1)
+            neighbours = (forward & there for there in (vehicles[0] > 0, vehicles[0] < at.N - 1))
+            starts.append(extreme_profiles(problem, onset_states(at, vehicles[0], None), *neighbours))
+        else:
+            for c, vehicle in enumerate(vehicles):
+                alone = self.best([vehicle], harm_count, (), vehicles if deciders is None else deciders).profiles
+                least = problem.bounds[:, np.newaxis, :, 0]
+                commands = np.broadcast_to(least, (*alone.ends.shape, len(vehicles))).copy()
+                commands[..., c] = alone.commands_mps2[..., 0]
+                starts.append(Profiles(alone.ends, commands))
+        return problem.search(_joined(starts, problem.n), budget=self.budget, seed=self.seed, threads=self.threads)
+
+
+def _startable(profiles: Profiles) -> Profiles:
+    """Those with as few phases as a search can start from; the others hold their first command."""
+    ends, commands = Profiles.padded([profiles], MOST_PHASES)[0]
+    last = ends[:, -1:]
+    short = ends[:, MOST_PHASES - 1 : MOST_PHASES] == last
+    return Profiles(
+        np.where(short, ends[:, :MOST_PHASES], last),
+        np.where(short[..., np.newaxis], commands[:, :MOST_PHASES], commands[:, :1]),
+    )
+
+
+def _joined(parts: list[Profiles], n: int) -> Profiles:
+    """Several given profiles of each world, [n * Q_j] each, as one list [n * Q] world by world."""
+    parts = Profiles.padded(parts, MOST_PHASES)
+    ends = np.concatenate([part.ends.reshape(n, -1, MOST_PHASES) for part in parts], axis=1)
+    shape = (n, -1, MOST_PHASES, parts[0].commands_mps2.shape[2])
+    commands = np.concatenate([part.commands_mps2.reshape(shape) for part in parts], axis=1)
+    return Profiles(ends.reshape(-1, MOST_PHASES), commands.reshape(-1, *shape[2:]))
+
+
+# Episodes that agents drive, as profiles: what one does better than the best known becomes the best known.
+
+LOWERED = "lowered_by"  # key of a table's header: agent -> count -> in how many worlds it did less harm
+
+
+def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) -> Profiles:
+    """What ``agent`` commands the vehicle in every step of its episodes, as profiles; equal neighbours are joined."""
+    commands = record_commands(agent, worlds, task.scenario, task.vehicle, int(last_step.max()))
+    # one phase per change
+    steps = commands.shape[1]
+    ends = [np.append(np.flatnonzero(row[1:] != row[:-1]) + 1, steps) for row in commands]
+    width = max(len(each) for each in ends)
+    padded = np.array([np.append(each, np.full(width - len(each), steps)) for each in ends])
+    chosen = np.take_along_axis(commands, padded - 1, axis=1)
+    return Profiles(np.minimum(padded, last_step[:, np.newaxis]), chosen[:, :, np.newaxis])
+
+
+# The tables of best known harm that travel with the package, and the agent that drives their profiles.
+
+TABLES = Path(__file__).resolve().parents[1] / "_tables" / "best_harm"
+
+
+@cache
+def shipped_tables() -> tuple[BestHarmTable, ...]:
+    """Every shipped table, by name of its file."""
+    return tuple(BestHarmTable.load(path) for path in sorted(TABLES.glob("*.npz")))
+
+
+def best_known(worlds: Worlds, task: Task) -> dict[HarmCount, Floats]:
+    """The least harm known in each world (at t = 0) under each count, [n] m2/s2; NaN where no shipped table holds it.
+
+    Worlds are recognised by everything their harm depends on: state, parameters, the others' scripts, time step,
+    horizon and the driven vehicles. Raises ``InvalidInput`` for a script whose command is not fixed at the alert, as no
+    search knows it.
+    """
+    identity = world_identity(worlds, task)
+    known = {harm_count: np.full(worlds.n, np.nan) for harm_count in HARM_COUNTS}
+    for table in shipped_tables():
+        known = {harm_count: np.fmin(harm, table.harm(identity, harm_count)) for harm_count, harm in known.items()}
+    return known
+
+
+def shipped_profiles(problem: ProfileProblem, harm_count: HarmCount) -> tuple[Profiles, Bools]:
+    """Kept profiles of a problem with one controlled vehicle, [n], and where there is one, [n]."""
+    last_step = problem.last_step
+    profiles, known = Profiles(last_step[:, np.newaxis].copy(), np.zeros((problem.n, 1, 1))), np.zeros(problem.n, bool)
+    for table in shipped_tables():
+        kept, here = table.profiles(problem.identity, harm_count, last_step)
+        profiles, kept = Profiles.padded([profiles, kept], 1)
+        profiles.ends[here] = kept.ends[here]
+        profiles.commands_mps2[here] = kept.commands_mps2[here]
+        known |= here
+    return profiles, known
+
+
+def make_best_harm(argument: str | None, settings: AgentSettings) -> Agent:
+    """``best_harm[:candidates]``: the shipped profile, or a search with so many candidates where there is none."""
+    number = PROFILE_BUDGET if argument is None else parse_numeral(argument)
+    if number is None or (argument is not None and not argument.isdecimal()) or not 1 <= number <= MOST_CANDIDATES:
+        raise InvalidInput(
+            f"agent 'best_harm:{argument}': the argument must be a number of candidates, for instance {PROFILE_BUDGET},"
+            f" at most {MOST_CANDIDATES:,}"
+        )
+    budget = int(number) if settings.most_candidates is None else min(int(number), settings.most_candidates)
+    return BestHarm(
+        shipped_profiles, harm_count=settings.harm_count, horizon_s=settings.horizon_s, budget=budget,
+        time_step_s=settings.time_step_s,
+    )  # fmt: skip
+
 
 _VEHICLES, _DRIVEN = 3, 1
 _DECIDED = ({1}, {1, 2})  # of three vehicles: who is driven where avoidability is proven
@@ -46,8 +785,7 @@ class Proof:
     @property
     def impact(self) -> Bools:
         """Worlds in which every command leads to an impact, not only to contact."""
-        certain: Bools = self.harm > 0.0
-        return certain
+        return np.asarray(self.harm > 0.0, np.bool_)
 
     @property
     def contact(self) -> Bools | None:

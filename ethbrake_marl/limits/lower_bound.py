@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -22,9 +22,20 @@ from numpy.typing import NDArray
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.harm import check_harm_count, empty_ledger
-from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, advance
-from ethbrake_marl.physics.compiled import by_parts, compiled, compiled_apart
-from ethbrake_marl.physics.kernel import TOUCH_SPEED_MPS, contact, solo_motion, stopping_distances
+from ethbrake_marl.physics import (
+    BOUND,
+    Bools,
+    Floats,
+    Ints,
+    Vehicles,
+    Worlds,
+    advance,
+    by_parts,
+    compiled,
+    contact,
+    solo_motion,
+    stopping_distances,
+)
 
 # Two vehicles on plans of piecewise constant acceleration: how close they come, and where they first meet.
 #
@@ -136,10 +147,8 @@ def walk(
 # Compiled decision of one world: the largest trajectory behind the front vehicle, and whether the rear one meets it.
 #
 # Symbols: l the front vehicle (leader), f the controlled one (follower), r the rear one; gap [m], speed v [m/s],
-# braking
-# capacity a > 0, driving capacity u >= 0 [m/s2]. Times count from the moment at which the controlled vehicle may act;
-# by
-# then the leader brakes. docs/avoidability.md derives every formula. Only + - * / and sqrt.
+# braking capacity a > 0, driving capacity u >= 0 [m/s2]. Times count from the moment at which the controlled vehicle
+# may act; by then the leader brakes. docs/avoidability.md derives every formula. Only + - * / and sqrt.
 
 ROUNDING_M = 1e-12  # an overlap up to this is the rounding of a touch, not an impact
 SQUEEZE_M = 1e-9  # with less room than this between both neighbours, contact counts as unavoidable
@@ -221,7 +230,7 @@ def lowest_while_coasting(gap: float, v_f: float, v_r: float, a_r: float, onset_
 @compiled
 def met(gap: float, closing: float) -> bool:
     """Whether a pair with this gap and closing speed has met, or meets at this very moment, with an impact."""
-    return gap < -ROUNDING_M or (gap <= 0.0 and closing > TOUCH_SPEED_MPS)
+    return gap < -ROUNDING_M or (gap <= 0.0 and closing > BOUND.TOUCH_SPEED_MPS)
 
 
 @compiled
@@ -282,29 +291,6 @@ def meets_rear_early(gap: Floats, speed: Floats, onset: Floats, braking: Floats,
 
 
 @compiled
-def decide_rear(
-    gap: Floats, speed: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, plan: Floats,
-    rear: Floats, out: Floats,
-) -> None:  # fmt: skip
-    """Whether the rear vehicle stays behind the largest trajectory of vehicle ``i``; plan and rear are scratch."""
-    v_f, a_r, start = speed[i], braking[i + 1], onset[i]
-    v_r, way, _ = solo_motion(speed[i + 1], -a_r, onset[i + 1], math.inf, start)
-    behind = max(gap[i] + (v_f * start - way), 0.0)
-    onset_r = max(onset[i + 1] - start, 0.0)
-    fill_braking(rear, onset_r, a_r)
-    plan_behind(gap, speed, onset, braking, driving, limit, i, 0.0, plan, out)
-    margin = walk(behind, v_f, plan, v_r, rear, onset_r + v_r / a_r)[0]
-    out[MARGIN] = margin
-    if margin < -ROUNDING_M:
-        out[REASON] = REAR
-    elif i > 0:
-        if behind > SQUEEZE_M and margin < (SQUEEZE_M if out[SPARE] >= SQUEEZE_M else TOUCHING_M):
-            out[REASON] = REAR
-        keep = 0.5 * min(SQUEEZE_M, out[SPARE], max(margin, 0.0))
-        plan_behind(gap, speed, onset, braking, driving, limit, i, keep, plan, out)
-
-
-@compiled
 def decide_world(
     gap: Floats, speed: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, plan: Floats,
     rear: Floats, out: Floats,
@@ -318,7 +304,22 @@ def decide_world(
     if has_rear and meets_rear_early(gap, speed, onset, braking, i, out):
         return
     if has_rear and out[REASON] == AVOIDABLE:
-        decide_rear(gap, speed, onset, braking, driving, limit, i, plan, rear, out)
+        # whether the rear vehicle stays behind the largest trajectory of vehicle i
+        v_f, a_r, start = speed[i], braking[i + 1], onset[i]
+        v_r, way, _ = solo_motion(speed[i + 1], -a_r, onset[i + 1], math.inf, start)
+        behind = max(gap[i] + (v_f * start - way), 0.0)
+        onset_r = max(onset[i + 1] - start, 0.0)
+        fill_braking(rear, onset_r, a_r)
+        plan_behind(gap, speed, onset, braking, driving, limit, i, 0.0, plan, out)
+        margin = walk(behind, v_f, plan, v_r, rear, onset_r + v_r / a_r)[0]
+        out[MARGIN] = margin
+        if margin < -ROUNDING_M:
+            out[REASON] = REAR
+        elif i > 0:
+            if behind > SQUEEZE_M and margin < (SQUEEZE_M if out[SPARE] >= SQUEEZE_M else TOUCHING_M):
+                out[REASON] = REAR
+            keep = 0.5 * min(SQUEEZE_M, out[SPARE], max(margin, 0.0))
+            plan_behind(gap, speed, onset, braking, driving, limit, i, keep, plan, out)
 
 
 @compiled
@@ -357,8 +358,7 @@ class Avoidability:
     @property
     def avoidable(self) -> Bools:
         """Whether some profile avoids all contact, hence every impact, [n]."""
-        yes: Bools = self.reason == 0
-        return yes
+        return np.asarray(self.reason == 0, np.bool_)
 
     @property
     def reason_name(self) -> NDArray[np.str_]:
@@ -371,37 +371,15 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
 
     Elsewhere every profile leads to contact, but not always to an impact: see ``LowerBound.impact_proven``.
     Three vehicles with the middle one controlled, or two with either. The others brake with their whole capacity from
-    their latencies on. ``scripts`` (index -> name, as ``scenario.roles``) is only checked to say the same. An overlap
+    their latencies on. ``scripts`` (index -> name, as ``Scenario.roles``) is only checked to say the same. An overlap
     of the deciding trajectories of up to 1e-12 m counts as a touch, hence as avoided.
 
     Raises ``InvalidInput`` for another line, another script than full_brake, a front vehicle that may brake only after
     the controlled one acts, a vehicle that moves backward, or an obstacle (``obstacle_gap_m``) that vehicle_1 could
     reach before any contact.
     """
-    _check(worlds, vehicle, scripts or {})
-    v = worlds.vehicles
-    onset = np.maximum(v.latency_s - worlds.time_s[:, None], 0.0)
-    out = np.empty((worlds.n, RESULT_WIDTH))
-    decide_worlds(
-        worlds.gaps_m, worlds.speeds_mps, onset, v.braking_capacity_mps2, v.driving_capacity_mps2, v.speed_limit_mps,
-        vehicle, out,
-    )  # fmt: skip
-    reason = out[:, REASON].astype(np.int64)
-    start = worlds.time_s + onset[:, vehicle]
-    switch = np.column_stack([worlds.time_s, start + out[:, DRIVE], start + out[:, TOUCH]])
-    braking = -v.braking_capacity_mps2[:, vehicle]
-    command = np.column_stack([v.driving_capacity_mps2[:, vehicle], braking, out[:, FOLLOW]])
-    switch[reason > 0] = np.nan
-    command[reason > 0] = np.nan
-    return Avoidability(reason, out[:, MARGIN].copy(), switch, command)
-
-
-def _check(worlds: Worlds, vehicle: int, scripts: Mapping[int, str]) -> None:
-    """Refuse what the theorem does not cover.
-
-    An obstacle that Vehicle 1 cannot reach by braking fully changes nothing: only a push could bring it there, and that
-    is an impact already.
-    """
+    # An obstacle that Vehicle 1 cannot reach by braking fully changes nothing: only a push could bring it there, and
+    # that is an impact already.
     check_whole_number("avoidability: vehicle", vehicle, 0, worlds.N - 1)
     own = np.maximum(worlds.vehicles.latency_s[:, 0] - worlds.time_s, 0.0)
     way = stopping_distances(worlds.speeds_mps[:, 0], own, worlds.vehicles.braking_capacity_mps2[:, 0])
@@ -419,7 +397,7 @@ def _check(worlds: Worlds, vehicle: int, scripts: Mapping[int, str]) -> None:
             f"avoidability: vehicle_{vehicle + 1} of {worlds.N} vehicles; it is decided exactly for vehicle_2 of 3 and"
             " for either vehicle of 2, otherwise use avoidable_by_lp"
         )
-    for index, script in scripts.items():
+    for index, script in (scripts or {}).items():
         if index != vehicle and script != "full_brake":
             raise InvalidInput(f"avoidability: vehicle_{index + 1} follows {script!r}; must be 'full_brake'")
     if vehicle == 1:
@@ -427,6 +405,21 @@ def _check(worlds: Worlds, vehicle: int, scripts: Mapping[int, str]) -> None:
         _refuse(latency[:, 0] > latency[:, 1], worlds.vehicles.latency_s[:, 0], "latency_s", 0, "not above vehicle_2's")
     for i in range(worlds.N):
         _refuse(~(worlds.speeds_mps[:, i] >= 0.0), worlds.speeds_mps[:, i], "speeds_mps", i, ">= 0")
+    v = worlds.vehicles
+    onset = np.maximum(v.latency_s - worlds.time_s[:, None], 0.0)
+    out = np.empty((worlds.n, RESULT_WIDTH))
+    decide_worlds(
+        worlds.gaps_m, worlds.speeds_mps, onset, v.braking_capacity_mps2, v.driving_capacity_mps2, v.speed_limit_mps,
+        vehicle, out,
+    )  # fmt: skip
+    reason = out[:, REASON].astype(np.int64)
+    start = worlds.time_s + onset[:, vehicle]
+    switch = np.column_stack([worlds.time_s, start + out[:, DRIVE], start + out[:, TOUCH]])
+    braking = -v.braking_capacity_mps2[:, vehicle]
+    command = np.column_stack([v.driving_capacity_mps2[:, vehicle], braking, out[:, FOLLOW]])
+    switch[reason > 0] = np.nan
+    command[reason > 0] = np.nan
+    return Avoidability(reason, out[:, MARGIN].copy(), switch, command)
 
 
 def _refuse(bad: Bools, values: Floats, name: str, i: int | None, right: str) -> None:
@@ -439,8 +432,7 @@ def _refuse(bad: Bools, values: Floats, name: str, i: int | None, right: str) ->
 # Compiled: the gentlest first meeting of the controlled vehicle with a neighbour at a given time.
 #
 # Times count from the moment at which the controlled vehicle may act; the front vehicle (leader, l) brakes by then, f
-# is
-# the controlled one, the rear vehicle (r) coasts to its onset and then brakes. All speeds and gaps are >= 0.
+# is the controlled one, the rear vehicle (r) coasts to its onset and then brakes. All speeds and gaps are >= 0.
 # docs/avoidability.md has the proofs.
 
 
@@ -491,7 +483,7 @@ def follower(at: Floats, time: float) -> tuple[float, float]:
     return speed, way
 
 
-@compiled_apart
+@compiled(apart=True)
 def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
     """Least closing speed of a meeting with the leader at ``time``, and how long it must be driven before braking.
 
@@ -528,10 +520,13 @@ def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, fl
     return way, slow + drive * (left - beyond)
 
 
-@compiled_apart
-def braking_to_rear(at: Floats, time: float) -> float:
-    """How long it must be braked to be met by the rear vehicle at ``time``, if it is driven from then on."""
-    place = follower(at, time)[1] - at[LINE.GAP_R]
+@compiled(apart=True)
+def braking_to_rear(at: Floats, time: float, further: float) -> float:
+    """How long it must be braked to be met by the rear vehicle at ``time``, if it is driven from then on.
+
+    Or by one that has come ``further`` than the rear vehicle by full braking (m).
+    """
+    place = follower(at, time)[1] - at[LINE.GAP_R] + further
     low, high = 0.0, time
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
@@ -542,24 +537,24 @@ def braking_to_rear(at: Floats, time: float) -> float:
     return low
 
 
-@compiled_apart
+@compiled(apart=True)
 def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
     """Least closing speed of a meeting with the rear vehicle at ``time``, and how long it must be braked before.
 
     The fastest way to be there then: brake, then drive. The braking is infinite where that is at its speed limit.
     """
-    brake = braking_to_rear(at, time)
+    brake = braking_to_rear(at, time, 0.0)
     speed = braked_then_driven(at, brake, time)[1]
     return max(follower(at, time)[0] - speed, 0.0), brake if speed < at[LINE.LIMIT_F] else math.inf
 
 
-@compiled_apart
+@compiled(apart=True)
 def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
     """``gentlest_front`` or ``gentlest_rear``."""
     return gentlest_front(at, time) if kind == FRONT_FIRST else gentlest_rear(at, time)
 
 
-@compiled_apart
+@compiled(apart=True)
 def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
     """When one that drives for ``drive``, then brakes, meets the leader."""
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
@@ -567,7 +562,7 @@ def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
     return walk(at[LINE.GAP_L], at[LINE.V_L], other, at[LINE.V_F], plan, math.inf)[1]
 
 
-@compiled_apart
+@compiled(apart=True)
 def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
     """When the rear vehicle meets one that brakes for ``brake``, then drives."""
     fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])
@@ -577,7 +572,7 @@ def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
     )[1]
 
 
-@compiled_apart
+@compiled(apart=True)
 def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Floats) -> bool:
     """Whether one that drives for ``drive``, then brakes, is not met from behind until then."""
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
@@ -585,7 +580,7 @@ def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Flo
     return walk(at[LINE.GAP_R], at[LINE.V_F], plan, at[LINE.V_R], other, until)[0] >= -AHEAD_M
 
 
-@compiled_apart
+@compiled(apart=True)
 def stays_behind(at: Floats, brake: float, until: float, plan: Floats, other: Floats) -> bool:
     """Whether one that brakes for ``brake``, then drives, does not meet the leader until then."""
     fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])
@@ -596,8 +591,7 @@ def stays_behind(at: Floats, brake: float, until: float, plan: Floats, other: Fl
 # Compiled: how much faster than the common speed of two touching vehicles one of them can be, and what that costs.
 #
 # ``share`` is the partner's share of both masses; ``press`` the acceleration with which they close under the best
-# command
-# (m/s2), ``reach`` how much of it a command can hold back. docs/avoidability.md has the proofs.
+# command (m/s2), ``reach`` how much of it a command can hold back. docs/avoidability.md has the proofs.
 
 
 @compiled
@@ -635,7 +629,7 @@ def best_flight(share: float, press: float, reach: float, opening: float) -> flo
     return max(reach * opening / (root * (slope + root)), 2.0 * opening / press)
 
 
-@compiled_apart
+@compiled(apart=True)
 def lead(
     share: float, press: float, reach: float, opening: float, shortest: float, longest: float, lost: float
 ) -> float:
@@ -668,7 +662,7 @@ def decays(share: float, press: float, reach: float, bounce: float) -> bool:
     return bounce * flight_lead(share, press, reach, 1.0, best_flight(share, press, reach, 1.0)) <= 1.0 - share
 
 
-@compiled_apart
+@compiled(apart=True)
 def largest_lead(
     share: float, press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float,
     since: float, until: float,
@@ -717,10 +711,8 @@ def widest_flight(
 # Compiled: the harm at the other pair that must follow a first meeting, whatever the controlled vehicle does then.
 #
 # A first meeting at ``time`` with ``closing`` leaves a state that is known exactly. From it on, the centre of mass of
-# the
-# two moves on a path that no command improves but the extreme one, and the controlled vehicle is faster (slower) than
-# the
-# centre only while it comes back to its partner. ``lead`` bounds that. docs/avoidability.md has the proofs.
+# the two moves on a path that no command improves but the extreme one, and the controlled vehicle is faster (slower)
+# than the centre only while it comes back to its partner. ``lead`` bounds that. docs/avoidability.md has the proofs.
 #
 # A cell of meetings lies between ``early`` and ``late``; its state is taken at ``early``. From ``late`` to ``end`` the
 # command of the decision before is still in force, which lacks at least ``lack`` of the extreme one (m/s2).
@@ -743,7 +735,7 @@ def least_of_line(
     return least
 
 
-@compiled_apart
+@compiled(apart=True)
 def least_closing(
     start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, share: float,
     press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float, until: float,
@@ -766,7 +758,7 @@ def least_closing(
     return max(best, 0.0)
 
 
-@compiled_apart
+@compiled(apart=True)
 def pushed_by_leader(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
@@ -803,7 +795,7 @@ def pushed_by_leader(
     )  # fmt: skip
 
 
-@compiled_apart
+@compiled(apart=True)
 def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: Floats, other: Floats) -> float:
     """Least closing speed at the rear of one that cannot fall far behind a leader of harder brakes; 0: not proven."""
     share, rest, bounce = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.RESTITUTION]
@@ -840,7 +832,7 @@ def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: 
     return float(max(min(fast, slowest - final) - share * most, 0.0))
 
 
-@compiled_apart
+@compiled(apart=True)
 def after_front(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
@@ -879,11 +871,10 @@ def obstacle_harm(at: Floats, early: float, late: float, closing: float) -> floa
         return 0.0
     free = at[LINE.OBSTACLE] - leader(at, early)[1]
     speed = leader(at, late)[0] + (1.0 - at[LINE.FRONT_SHARE]) * (1.0 + at[LINE.RESTITUTION]) * closing
-    harm: float = max(speed * speed - 2.0 * at[LINE.A_L] * free, 0.0)
-    return harm
+    return float(max(speed * speed - 2.0 * at[LINE.A_L] * free, 0.0))
 
 
-@compiled_apart
+@compiled(apart=True)
 def braking_after(
     gap: float, least_gap: float, v_l: float, a_l: float, v_f: float, a_f: float, plan: Floats, other: Floats
 ) -> float:
@@ -900,7 +891,7 @@ def braking_after(
     return squared
 
 
-@compiled_apart
+@compiled(apart=True)
 def pushed_by_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, gap: float, plan: Floats,
     other: Floats,
@@ -926,7 +917,7 @@ def pushed_by_rear(
     )  # fmt: skip
 
 
-@compiled_apart
+@compiled(apart=True)
 def slowed_by_rear(at: Floats, early: float, closing: float, gap: float, plan: Floats, other: Floats) -> float:
     """Least closing speed at the front of one that stays ahead of both; for ``a_f >= a_r``. 0 where it may rise."""
     share, v_l = at[LINE.REAR_SHARE], leader(at, early)[0]
@@ -941,7 +932,7 @@ def slowed_by_rear(at: Floats, early: float, closing: float, gap: float, plan: F
     return max(speed - mean * until - max(v_l - at[LINE.A_L] * until, 0.0), 0.0) if until < math.inf else 0.0
 
 
-@compiled_apart
+@compiled(apart=True)
 def after_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
@@ -963,7 +954,7 @@ def after_rear(
     return max(squared, pushed * pushed)
 
 
-@compiled_apart
+@compiled(apart=True)
 def after(
     kind: int, at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats,
     other: Floats,
@@ -984,23 +975,14 @@ CELL = 1e-3  # a minimum over meetings is bounded this closely, relative to 1 m2
 CELLS = 600  # room on the heap: after that many divisions a minimum stays as loose as it is
 
 
-class _Cell(NamedTuple):
-    """Columns of the heap, of a cell of meetings: bound, times (s), closing speeds (m/s)."""
-
-    HARM: int = 0
-    EARLY: int = 1
-    LATE: int = 2
-    SOFT: int = 3
-    HARD: int = 4
-    WIDTH: int = 5
-
-
-CELL_OF = _Cell()
+# columns of a heap, of a cell of meetings: bound; times (s); closing speeds (m/s); of meetings behind also how much
+# further the rear vehicle has come (m)
+_HARM, _EARLY, _LATE, _SOFT, _HARD, _NEAR, _FAR, HEAP_WIDTH = range(8)
 _SPLITS = 64  # parts at most into which decisions divide the times
 _TRIED = 8  # meetings tried before the search, to have something to compare with
 
 
-@compiled_apart
+@compiled(apart=True)
 def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
     """Least closing speed of the meetings between two times.
 
@@ -1025,7 +1007,7 @@ def decision_around(at: Floats, early: float, late: float) -> tuple[float, float
     return begin, begin + step
 
 
-@compiled_apart
+@compiled(apart=True)
 def lacking(kind: int, at: Floats, early: float, late: float, softest: float, hard: float, begin: float) -> float:
     """How much the command in force at the meetings of a cell lacks, at least, of the extreme one that follows best.
 
@@ -1044,14 +1026,12 @@ def lacking(kind: int, at: Floats, early: float, late: float, softest: float, ha
     softer = max(hard - softest, 0.0) / (early - begin)
     if turn >= begin:
         share = (turn - begin) / (early - begin)
-        lack: float = max(whole - 2.0 * softer - whole * share * share, 0.0)
-        return lack
+        return float(max(whole - 2.0 * softer - whole * share * share, 0.0))
     steep = (late - begin) / (begin - turn)
-    lack = max(whole - softer * (1.0 + steep) / (1.0 + 0.5 * steep), 0.0)
-    return lack
+    return float(max(whole - softer * (1.0 + steep) / (1.0 + 0.5 * steep), 0.0))
 
 
-@compiled_apart
+@compiled(apart=True)
 def harm_of(
     kind: int, at: Floats, early: float, late: float, soft: float, hard: float, floor: float, plan: Floats,
     other: Floats,
@@ -1066,39 +1046,35 @@ def harm_of(
     return harm + obstacle_harm(at, early, late, soft) if kind == FRONT_FIRST else harm
 
 
-@compiled_apart
-def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: float, hard: float) -> int:
-    """Put a cell on the heap, whose first cell is the one of least harm; the new number of cells."""
+@compiled
+def room_for(heap: Floats, count: int, harm: float) -> int:
+    """Make room on the heap, whose first cell is the one of least harm, for a cell of this one; its place."""
     at = count
-    while at > 0 and heap[(at - 1) // 2, CELL_OF.HARM] > harm:
+    while at > 0 and heap[(at - 1) // 2, _HARM] > harm:
         for c in range(heap.shape[1]):  # numba compiles the copy of a row with the text of an error, for 3 CPU-s
             heap[at, c] = heap[(at - 1) // 2, c]
         at = (at - 1) // 2
-    (
-        heap[at, CELL_OF.HARM],
-        heap[at, CELL_OF.EARLY],
-        heap[at, CELL_OF.LATE],
-        heap[at, CELL_OF.SOFT],
-        heap[at, CELL_OF.HARD],
-    ) = (
-        harm,
-        early,
-        late,
-        soft,
-        hard,
-    )
+    heap[at, _HARM] = harm
+    return at
+
+
+@compiled(apart=True)
+def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: float, hard: float) -> int:
+    """Put a cell on the heap; the new number of cells."""
+    at = room_for(heap, count, harm)
+    heap[at, _EARLY], heap[at, _LATE], heap[at, _SOFT], heap[at, _HARD] = early, late, soft, hard
     return count + 1
 
 
-@compiled_apart
+@compiled(apart=True)
 def drop_first(heap: Floats, count: int) -> int:
     """Take the first cell off the heap; the new number of cells."""
     count -= 1
     at, below = 0, 1
     while below < count:
-        if below + 1 < count and heap[below + 1, CELL_OF.HARM] < heap[below, CELL_OF.HARM]:
+        if below + 1 < count and heap[below + 1, _HARM] < heap[below, _HARM]:
             below += 1
-        if heap[below, CELL_OF.HARM] >= heap[count, CELL_OF.HARM]:
+        if heap[below, _HARM] >= heap[count, _HARM]:
             break
         for c in range(heap.shape[1]):
             heap[at, c] = heap[below, c]
@@ -1108,35 +1084,12 @@ def drop_first(heap: Floats, count: int) -> int:
     return count
 
 
-@compiled_apart
-def first_cells(
-    kind: int, at: Floats, first: float, last: float, hard: float, floor: float, plan: Floats, other: Floats,
-    heap: Floats,
-) -> int:  # fmt: skip
-    """Put the meetings between two times, at most ``hard``, on the heap: one cell for each step; their number."""
-    count, time = 0, first
-    while time < last:
-        until = next_split(kind, at, time, last) if count < _SPLITS else last
-        soft = gentlest_between(kind, at, time, until)
-        if soft < hard:
-            harm = harm_of(kind, at, time, until, soft, hard, floor, plan, other)
-            count = put(heap, count, harm, time, until, soft, hard)
-        time = until
-    return count
-
-
-@compiled_apart
+@compiled(apart=True)
 def divide(
     kind: int, at: Floats, floor: float, count: int, plan: Floats, other: Floats, heap: Floats
 ) -> tuple[int, float]:
     """Replace the first cell of the heap by its halves; their number, and the harm of a meeting within."""
-    harm, early, late, soft, hard = (
-        heap[0, CELL_OF.HARM],
-        heap[0, CELL_OF.EARLY],
-        heap[0, CELL_OF.LATE],
-        heap[0, CELL_OF.SOFT],
-        heap[0, CELL_OF.HARD],
-    )
+    harm, early, late, soft, hard = (heap[0, _HARM], heap[0, _EARLY], heap[0, _LATE], heap[0, _SOFT], heap[0, _HARD])
     count = drop_first(heap, count)
     middle = 0.5 * (early + late)
     if (late - early) * (at[LINE.U_F] + at[LINE.A_F] + at[LINE.A_L]) > hard - soft and early < middle < late:
@@ -1157,7 +1110,7 @@ def divide(
     return count, met
 
 
-@compiled_apart
+@compiled(apart=True)
 def least_harm(
     kind: int, at: Floats, first: float, last: float, floor: float, best: float, enough: float, plan: Floats,
     other: Floats, heap: Floats,
@@ -1170,15 +1123,24 @@ def least_harm(
         time = first + (last - first) * k / (_TRIED - 1)
         closing = gentlest(kind, at, time)[0]
         best = min(best, harm_of(kind, at, time, time, closing, closing, floor, plan, other))
-    count = first_cells(kind, at, first, last, math.sqrt(best), floor, plan, other, heap)
+    # the meetings between both times, at most ``hard``, on the heap: one cell for each step
+    hard = math.sqrt(best)
+    count, begin = 0, first
+    while begin < last:
+        until = next_split(kind, at, begin, last) if count < _SPLITS else last
+        soft = gentlest_between(kind, at, begin, until)
+        if soft < hard:
+            harm = harm_of(kind, at, begin, until, soft, hard, floor, plan, other)
+            count = put(heap, count, harm, begin, until, soft, hard)
+        begin = until
     for _ in range(heap.shape[0] - _SPLITS - 2):
-        if best <= enough or count == 0 or heap[0, CELL_OF.HARM] >= best - CELL * (1.0 + best):
+        if best <= enough or count == 0 or heap[0, _HARM] >= best - CELL * (1.0 + best):
             break
         count, met = divide(kind, at, floor, count, plan, other, heap)
         best = min(best, met)
     if best <= enough:
         return 0.0
-    return min(best, heap[0, CELL_OF.HARM]) if count > 0 else best
+    return min(best, heap[0, _HARM]) if count > 0 else best
 
 
 @compiled
@@ -1212,21 +1174,10 @@ def next_split(kind: int, at: Floats, time: float, last: float) -> float:
 
 FRONT_BOUND, REAR_BOUND, COMBINED_BOUND, BOUNDS = range(4)
 LARGE = 1e6  # m2/s2: more harm than any impact of vehicles does
-_TOUCH_HARM = 2.0 * TOUCH_SPEED_MPS * TOUCH_SPEED_MPS  # what two touches may hide
+_TOUCH_HARM = 2.0 * BOUND.TOUCH_SPEED_MPS * BOUND.TOUCH_SPEED_MPS  # what two touches may hide
 _TOUCHING_M = 1e-9  # more than rounding leaves between two that touch
 _GRAZE_S = 1e-3  # more than rounding can move a graze
 _PARTS = 8  # into which the times of soft meetings are divided
-
-
-@compiled
-def front_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
-    """Least squared closing speed at the front pair's first contact, whoever pushes; and its latest time."""
-    fill_braking(plan, 0.0, at[LINE.A_L])
-    fill_braking(other, 0.0, at[LINE.A_F])
-    _, time, squared = walk(at[LINE.GAP_L], at[LINE.V_L], plan, at[LINE.V_F], other, at[LINE.V_F] / at[LINE.A_F])
-    if at[LINE.A_F] < at[LINE.A_L] and at[LINE.V_F] < at[LINE.V_L]:
-        squared = min(squared, 2.0 * (at[LINE.A_L] - at[LINE.A_F]) * at[LINE.GAP_L])
-    return squared, time
 
 
 @compiled
@@ -1240,41 +1191,49 @@ def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
     return squared, time
 
 
-@compiled_apart
-def last_ahead(at: Floats, first: float, last: float, plan: Floats, other: Floats) -> float:
-    """The latest time, at most ``last``, of a meeting with the leader before which the rear vehicle has not come.
+@compiled(apart=True)
+def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
+    """Whether the other neighbour has not come before the gentlest meeting at ``time``."""
+    if kind == FRONT_FIRST:
+        return stays_ahead(at, gentlest_front(at, time)[1], time, plan, other)
+    return stays_behind(at, braking_to_rear(at, time, 0.0), time, plan, other)
 
-    At ``first`` there is room. The later the meeting, the shorter the drive before it and the less room behind.
+
+@compiled(apart=True)
+def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, other: Floats) -> float:
+    """The latest time, at most ``last``, of a meeting with one neighbour before which the other one has not come.
+
+    At ``first`` there is room. The later the meeting, the shorter the drive (the braking) before it, and the less room
+    behind (ahead).
     """
-    if stays_ahead(at, gentlest_front(at, last)[1], last, plan, other):
+    if is_first(kind, at, last, plan, other):
         return last
     for _ in range(_HALVINGS):
         middle = 0.5 * (first + last)
-        if stays_ahead(at, gentlest_front(at, middle)[1], middle, plan, other):
+        if is_first(kind, at, middle, plan, other):
             first = middle
         else:
             last = middle
     return last
 
 
-@compiled_apart
-def last_behind(at: Floats, first: float, last: float, plan: Floats, other: Floats) -> float:
-    """The latest time, at most ``last``, of a meeting with the rear vehicle before which the leader is not met.
+@compiled(apart=True)
+def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple[float, float, bool]:
+    """When the leader, met at ``first`` at the earliest, is met at the latest; when it is met first at the latest.
 
-    At ``first`` there is room. The later the meeting, the shorter the braking before it and the less room ahead.
+    And whether it may be met first however late and softly.
     """
-    if stays_behind(at, braking_to_rear(at, last), last, plan, other):
-        return last
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (first + last)
-        if stays_behind(at, braking_to_rear(at, middle), middle, plan, other):
-            first = middle
-        else:
-            last = middle
-    return last
+    touches = spare_gap(at[LINE.GAP_L], at[LINE.V_L], at[LINE.A_L], at[LINE.V_F], at[LINE.A_F]) >= 0.0
+    last = meet_front(at, 0.0, plan, other)
+    if touches:
+        last = largest_behind(
+            at[LINE.GAP_L], at[LINE.V_L], at[LINE.A_L], at[LINE.V_F], at[LINE.A_F], at[LINE.U_F], at[LINE.LIMIT_F]
+        )[1]
+    end = last_first(FRONT_FIRST, at, first, last, plan, other)
+    return last, end, touches and end == last
 
 
-@compiled_apart
+@compiled(apart=True)
 def front_first(
     at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
@@ -1290,20 +1249,13 @@ def front_first(
         return min(best, rear_bound(at, plan, other)[0])
     if first == math.inf or not stays_ahead(at, first, first, plan, other):
         return best
-    touches = spare_gap(at[LINE.GAP_L], at[LINE.V_L], at[LINE.A_L], at[LINE.V_F], at[LINE.A_F]) >= 0.0
-    last = meet_front(at, 0.0, plan, other)
-    if touches:
-        last = largest_behind(
-            at[LINE.GAP_L], at[LINE.V_L], at[LINE.A_L], at[LINE.V_F], at[LINE.A_F], at[LINE.U_F], at[LINE.LIMIT_F]
-        )[1]
-    end = last_ahead(at, first, last, plan, other)
+    last, end, leans = last_meeting(at, first, plan, other)
     best = least_harm(FRONT_FIRST, at, first, end, floor, best, enough, plan, other, heap)
-    leans = touches and end == last
     if leans:
-        best = leaning_harm(at, last, floor, best, plan, other)
+        best = soft_harm(FRONT_FIRST, at, last, last, floor, best, plan, other)
         stand = at[LINE.V_L] / at[LINE.A_L]
         if last < stand:
-            best = leaning_harm(at, stand, floor, best, plan, other)
+            best = soft_harm(FRONT_FIRST, at, stand, stand, floor, best, plan, other)
     fill_braking(plan, 0.0, at[LINE.A_L])
     fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
     _, time, squared = walk(at[LINE.GAP_L] + at[LINE.GAP_R], at[LINE.V_L], plan, at[LINE.V_R], other, math.inf)
@@ -1315,19 +1267,21 @@ def front_first(
     return min(best, front * front + rear * rear)
 
 
-@compiled_apart
-def leaning_harm(at: Floats, time: float, floor: float, best: float, plan: Floats, other: Floats) -> float:
-    """Least harm, if below ``best``, of the meetings with the leader from ``time`` on, however soft."""
+@compiled(apart=True)
+def soft_harm(
+    kind: int, at: Floats, early: float, late: float, floor: float, best: float, plan: Floats, other: Floats
+) -> float:
+    """Least harm, if below ``best``, of the meetings with one neighbour from ``early`` to ``late``, however soft."""
     soft = 0.0
     while soft * soft < best:
         hard = soft + 0.02 * (1.0 + soft)
-        follows = after_front(at, time, time, hard, time, 0.0, plan, other)
+        follows = after(kind, at, early, late, hard, late, 0.0, plan, other)
         best = min(best, soft * soft + max(follows, floor))
         soft = hard
     return best
 
 
-@compiled_apart
+@compiled(apart=True)
 def rear_first(
     at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
@@ -1338,7 +1292,7 @@ def rear_first(
         return best
     last = meet_rear(at, 0.0, plan, other)
     if last < math.inf:
-        end = last_behind(at, first, last, plan, other)
+        end = last_first(REAR_FIRST, at, first, last, plan, other)
         return least_harm(REAR_FIRST, at, first, end, floor, best, enough, plan, other, heap)
     low, top = 0.0, high
     for _ in range(_HALVINGS):
@@ -1348,18 +1302,18 @@ def rear_first(
         else:
             low = middle
     last = meet_rear(at, top, plan, other)
-    end = last_behind(at, first, last, plan, other)
+    end = last_first(REAR_FIRST, at, first, last, plan, other)
     best = least_harm(REAR_FIRST, at, first, end, floor, best, enough, plan, other, heap)
     if end < last:
         return best
     late = max(last_soft(at, high, plan, other), last) + _GRAZE_S
     part = (late - last) / _PARTS
     for k in range(_PARTS):
-        best = leaned_on_harm(at, last + k * part, last + (k + 1) * part, floor, best, plan, other)
+        best = soft_harm(REAR_FIRST, at, last + k * part, last + (k + 1) * part, floor, best, plan, other)
     return best
 
 
-@compiled_apart
+@compiled(apart=True)
 def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
     """A time after which no first meeting with the rear vehicle comes, however soft; all stand at ``rest``.
 
@@ -1380,21 +1334,17 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
     return float(min(last, onset + min(ahead / harder, math.sqrt(2.0 * gap / harder))))
 
 
-@compiled_apart
-def leaned_on_harm(
-    at: Floats, early: float, late: float, floor: float, best: float, plan: Floats, other: Floats
-) -> float:
-    """Least harm, if below ``best``, of the meetings with the rear vehicle from ``early`` to ``late``, however soft."""
-    soft = 0.0
-    while soft * soft < best:
-        hard = soft + 0.02 * (1.0 + soft)
-        follows = after_rear(at, early, late, hard, late, 0.0, plan, other)
-        best = min(best, soft * soft + max(follows, floor))
-        soft = hard
-    return best
+@compiled(apart=True)
+def last_rest(at: Floats) -> tuple[float, float]:
+    """By when what follows from braking is over, whoever is met; and when the rear vehicle stands by full braking."""
+    stand = at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R]
+    way = solo_motion(at[LINE.V_R], -at[LINE.A_R], at[LINE.ONSET_R], math.inf, stand)[1]
+    room = at[LINE.GAP_L] + at[LINE.V_L] * at[LINE.V_L] / (2.0 * at[LINE.A_L]) + at[LINE.GAP_R] - way
+    rest = at[LINE.ONSET_R] + at[LINE.V_R] / min(at[LINE.A_R], at[LINE.A_F])
+    return max(rest, stand + math.sqrt(2.0 * max(room, 0.0) / at[LINE.A_F])), stand
 
 
-@compiled_apart
+@compiled(apart=True)
 def combined_bound(
     at: Floats, until: float, front: float, rear: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
@@ -1402,11 +1352,7 @@ def combined_bound(
 
     ``front`` and ``rear`` are the pairs' own bounds.
     """
-    stand = at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R]
-    way = solo_motion(at[LINE.V_R], -at[LINE.A_R], at[LINE.ONSET_R], math.inf, stand)[1]
-    room = at[LINE.GAP_L] + at[LINE.V_L] * at[LINE.V_L] / (2.0 * at[LINE.A_L]) + at[LINE.GAP_R] - way
-    rest = at[LINE.ONSET_R] + at[LINE.V_R] / min(at[LINE.A_R], at[LINE.A_F])
-    if not max(rest, stand + math.sqrt(2.0 * max(room, 0.0) / at[LINE.A_F])) < until:
+    if not last_rest(at)[0] < until:
         return 0.0
     step, least = at[LINE.TIME_STEP], 0.0
     for time_step in (0.0, step):  # what holds for any command holds for one that changes at decisions only
@@ -1427,11 +1373,19 @@ def bound_worlds(
 
     Each pair's where it exists, both together where contact is unavoidable.
     """
-    plan, other, heap = empty_plan(), empty_plan(), np.empty((CELLS, CELL_OF.WIDTH))
+    plan, other, heap = empty_plan(), empty_plan(), np.empty((CELLS, _NEAR))
     for k in range(states.shape[0]):
         front, rear = 0.0, 0.0
         if has_front[k]:
-            squared, time = front_bound(states[k], plan, other)
+            # least squared closing speed at the front pair's first contact, whoever pushes; and its latest time
+            at = states[k]
+            fill_braking(plan, 0.0, at[LINE.A_L])
+            fill_braking(other, 0.0, at[LINE.A_F])
+            _, time, squared = walk(
+                at[LINE.GAP_L], at[LINE.V_L], plan, at[LINE.V_F], other, at[LINE.V_F] / at[LINE.A_F]
+            )
+            if at[LINE.A_F] < at[LINE.A_L] and at[LINE.V_F] < at[LINE.V_L]:
+                squared = min(squared, 2.0 * (at[LINE.A_L] - at[LINE.A_F]) * at[LINE.GAP_L])
             front = squared if time < until[k] and squared > _TOUCH_HARM else 0.0
         if has_rear[k]:
             squared, time = rear_bound(states[k], plan, other)
@@ -1464,8 +1418,7 @@ class LowerBound:
     @property
     def impact_proven(self) -> Bools:
         """Whether every profile has an impact, [n]; elsewhere none is proven, which need not mean that one can."""
-        yes: Bools = self.harm > 0.0
-        return yes
+        return np.asarray(self.harm > 0.0, np.bool_)
 
 
 def lower_bound(
@@ -1491,17 +1444,10 @@ def lower_bound(
     """
     check_asked("lower_bound", harm_count, horizon_s, time_step_s)
     verdict = avoidability(worlds, vehicle, scripts=scripts)
-    start = np.maximum(worlds.vehicles.latency_s[:, vehicle], worlds.time_s)
-    if not (np.all(start <= horizon_s) and horizon_s < np.inf):
-        raise InvalidInput(f"lower_bound: horizon_s {horizon_s!r}: must be finite and at least {start.max():g} s")
-    at_onset, impacts = advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=start)
-    early = empty_ledger(worlds).add(impacts).world_harm(harm_count)
-    counts = ~at_onset.pair_hit if harm_count == "first" else np.ones_like(at_onset.pair_hit)
-    forward = at_onset.speeds_mps >= 0.0
-    open_pair = counts & forward[:, 1:] & forward[:, :-1]
+    at_onset, start, early, counts = _at_onset("lower_bound", worlds, np.array([vehicle]), harm_count, horizon_s)
     none = np.zeros(worlds.n, dtype=np.bool_)
-    has_front = open_pair[:, vehicle - 1] if vehicle > 0 else none
-    has_rear = open_pair[:, vehicle] if vehicle < worlds.N - 1 else none
+    has_front = counts[:, vehicle - 1] if vehicle > 0 else none
+    has_rear = counts[:, vehicle] if vehicle < worlds.N - 1 else none
     struck = at_onset.obstacle_hit & (harm_count == "first")  # whoever is pushed there is not charged for it again
     unavoidable = has_front & has_rear & (verdict.reason >= 2) & ~struck
     out = np.empty((worlds.n, BOUNDS))
@@ -1520,6 +1466,23 @@ def lower_bound(
     return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined, verdict)
 
 
+def _at_onset(
+    where: str, worlds: Worlds, vehicles: Ints, harm_count: HarmCount, horizon_s: float
+) -> tuple[Worlds, Floats, Floats, Bools]:
+    """The worlds when the first of these vehicles may act, when that is (s), and the harm that was done before, [n].
+
+    And the pairs whose next impact counts, and which move forward, [n, P].
+    """
+    start = np.maximum(worlds.vehicles.latency_s[:, vehicles].min(axis=1), worlds.time_s)
+    if not (np.all(start <= horizon_s) and horizon_s < np.inf):
+        raise InvalidInput(f"{where}: horizon_s {horizon_s!r}: must be finite and at least {start.max():g} s")
+    now, impacts = advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=start)
+    early = empty_ledger(worlds).add(impacts).world_harm(harm_count)
+    forward = now.speeds_mps >= 0.0
+    counts = (~now.pair_hit if harm_count == "first" else True) & forward[:, 1:] & forward[:, :-1]
+    return now, start, early, counts
+
+
 def check_asked(where: str, harm_count: str, horizon_s: object, time_step_s: object) -> None:
     """Raise ``InvalidInput`` for an unknown count, a horizon that is no number, or a time step that cannot be."""
     check_harm_count(harm_count)
@@ -1535,29 +1498,30 @@ def _is_number(value: object) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
-def rounding(worlds: Worlds, vehicle: int) -> Floats:
+def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -> Floats:
     """How far arithmetic can move a bound and a realised harm apart, at most; [n] m2/s2.
 
-    A squared closing speed is ``D = w^2 + 2 b g``. With ``V`` the largest speed in the line, ``G`` its gaps, ``A`` the
-    largest closing acceleration and ``a`` the weakest brakes, every ``w^2`` is at most ``V^2`` and no gap grows beyond
-    ``G + V^2 / 2a``, so all terms of D stay below ``S = V^2 (1 + A / a) + 2 A G``. A segment of motion rounds each
-    speed twice and each gap five times, a round of impacts each speed by ``CLUSTER_EPS``: either moves D by at most
-    8 eps S. These add up and are not multiplied, for the proofs compare a run with itself, not with another one.
-    ``BOUND_EPS`` grants 500 of them; the steps of an episode of 8 s are 80, and the bound's own arithmetic, a few
-    hundred roundings, is among them too.
+    A squared closing speed is ``D = w^2 + 2 b g``. With ``V`` the largest speed in the line, ``G`` its gaps (and
+    ``way_m`` [n] beyond them), ``A`` the largest closing acceleration and ``a`` the weakest brakes, every ``w^2`` is at
+    most ``V^2`` and no gap grows beyond ``G + V^2 / 2a``, so all terms of D stay below ``S = V^2 (1 + A / a) + 2 A G``.
+    A segment of motion rounds each speed twice and each gap five times, a round of impacts each speed by
+    ``CLUSTER_EPS``: either moves D by at most 8 eps S. These add up and are not multiplied, for the proofs compare a
+    run with itself, not with another one. ``BOUND_EPS`` grants 500 of them; the steps of an episode of 8 s are 80, and
+    the bound's own arithmetic, a few hundred roundings, is among them too. Of several vehicles (a team) the largest
+    speed is a speed limit where any of them may drive, the largest closing acceleration that of the strongest drive.
     """
-    v = worlds.vehicles
-    drives = v.driving_capacity_mps2[:, vehicle] > 0.0
-    fastest = np.maximum(worlds.speeds_mps.max(axis=1), np.where(drives, v.speed_limit_mps[:, vehicle], 0.0))
-    closing = v.braking_capacity_mps2.max(axis=1) + v.driving_capacity_mps2[:, vehicle]
+    v, chosen = worlds.vehicles, np.atleast_1d(vehicle)
+    driving = v.driving_capacity_mps2[:, chosen]
+    limits = np.where(driving > 0.0, v.speed_limit_mps[:, chosen], 0.0)
+    fastest = np.maximum(worlds.speeds_mps.max(axis=1), limits.max(axis=1))
+    closing = v.braking_capacity_mps2.max(axis=1) + driving.max(axis=1)
     weakest = v.braking_capacity_mps2.min(axis=1)
-    scale = fastest * fastest * (1.0 + closing / weakest) + 2.0 * closing * worlds.gaps_m.sum(axis=1)
-    outward: Floats = BOUND_EPS * EPS * scale
-    return outward
+    scale = fastest * fastest * (1.0 + closing / weakest) + 2.0 * closing * (worlds.gaps_m.sum(axis=1) + way_m)
+    return np.asarray(BOUND_EPS * EPS * scale, np.float64)
 
 
 def onset_states(worlds: Worlds, i: int, time_step_s: float | Floats | None) -> Floats:
-    """The worlds, in which vehicle ``i`` may act, as the compiled bounds take them [n, WIDTH] (``limits.meetings``).
+    """The worlds, in which vehicle ``i`` may act, as the compiled bounds take them [n, WIDTH] (``limits.lower_bound``).
 
     Columns of a neighbour that is not there stay 0, as does the time step where there is none.
     """
@@ -1586,3 +1550,522 @@ def onset_states(worlds: Worlds, i: int, time_step_s: float | Floats | None) -> 
     for column, values in columns.items():
         at[:, column] = values
     return at
+
+
+# A proven lower bound on the harm of every world, whatever several controlled vehicles do together.
+#
+# docs/avoidability.md, "Teams", has the proofs, under both counting rules:
+#
+# * each pair alone: its front vehicle as far ahead as it can be (full drive where it is controlled, else full braking),
+#   its rear vehicle as far behind (full braking); pushes from outside the pair only make it worse;
+# * the front three together, where Vehicle 1 brakes fully, Vehicle 2 is controlled, and contact is unavoidable; where
+#   Vehicle 1 is controlled, the obstacle ahead is the first of the three.
+#
+# Bounds of different pairs add up, as each holds for every joint command. All parts are rounded outward.
+
+# Compiled: the least closing speed of a pair's first contact, whatever its vehicles and those around it do.
+#
+# The leader goes as far ahead as it can (full drive where it is controlled, else full braking), the follower stays as
+# far behind as it can (full braking). Where these extremes meet, every run of the pair meets no later.
+# docs/avoidability.md, "Teams", has the proof.
+
+# one pair: its gap; speed, onset and brakes of both; the leader's drive and speed limit where it is controlled
+PAIR_GAP, LEADER_V, LEADER_ONSET, LEADER_A, LEADER_FREE, LEADER_U, LEADER_LIMIT = range(7)
+FOLLOWER_V, FOLLOWER_ONSET, FOLLOWER_A, PAIR_WIDTH = range(7, 11)
+
+
+@compiled(apart=True)
+def least_on_piece(constant: float, pressing: float, since: float, until: float) -> float:
+    """Least value of ``constant / t + pressing t / 2`` from ``since`` to ``until``."""
+    least = constant / until + 0.5 * pressing * until
+    if since > 0.0:
+        least = min(least, constant / since + 0.5 * pressing * since)
+    elif constant <= 0.0:
+        least = min(least, 0.0) if constant == 0.0 else -math.inf
+    if constant > 0.0 and pressing > 0.0:
+        turn = math.sqrt(2.0 * constant / pressing)
+        if since < turn < until:
+            least = min(least, math.sqrt(2.0 * constant * pressing))
+    return least
+
+
+@compiled(apart=True)
+def least_before(at: Floats, met: float, squared: float) -> float:
+    """Least closing speed of a pair's first contact up to ``met``, where both extremes meet; a scripted leader.
+
+    ``c(t) + g(t) / t``: the extremes' closing speed, and what must be added to it to be through their gap by then.
+    """
+    if met <= 0.0:
+        return math.sqrt(squared)
+    least, now = math.sqrt(squared), 0.0
+    gap, v_l, v_f = at[PAIR_GAP], at[LEADER_V], at[FOLLOWER_V]
+    rest = at[LEADER_ONSET] + at[LEADER_V] / at[LEADER_A]
+    for _ in range(4):
+        end = met
+        for turn in (at[LEADER_ONSET], at[FOLLOWER_ONSET], rest):
+            if now < turn < end:
+                end = turn
+        u_l = -at[LEADER_A] if at[LEADER_ONSET] <= now < rest else 0.0
+        u_f = -at[FOLLOWER_A] if now >= at[FOLLOWER_ONSET] else 0.0
+        w, b, step = v_f - v_l, u_f - u_l, end - now
+        least = min(least, least_on_piece(gap + (w - 0.5 * b * now) * now, b, now, end))
+        gap -= (w + 0.5 * b * step) * step
+        v_l = 0.0 if end >= rest else v_l + u_l * step
+        v_f += u_f * step
+        now = end
+        if now >= met:
+            break
+    return max(least, 0.0)
+
+
+@compiled(apart=True)
+def least_closing_of_pair(at: Floats, until: float, plan: Floats, other: Floats) -> tuple[float, float]:
+    """Least closing speed at a pair's first contact, and its latest time; 0, inf where none is forced by ``until``."""
+    onset = at[LEADER_ONSET]
+    if at[LEADER_FREE] > 0.0:
+        full = onset + time_to_limit(at[LEADER_V], at[LEADER_U], at[LEADER_LIMIT])
+        fill_plan(plan, onset, 0.0, full, at[LEADER_U], full, 0.0, 0.0)
+    else:
+        fill_braking(plan, onset, at[LEADER_A])
+    fill_braking(other, at[FOLLOWER_ONSET], at[FOLLOWER_A])
+    _, met, squared = walk(at[PAIR_GAP], at[LEADER_V], plan, at[FOLLOWER_V], other, until)
+    if not met < until:
+        return 0.0, math.inf
+    return math.sqrt(squared) if at[LEADER_FREE] > 0.0 else least_before(at, met, squared), met
+
+
+@compiled
+def bound_pairs(pairs: Floats, until: Floats, out: Floats) -> None:
+    """Bounds of pairs ``pairs`` [n, PAIR_WIDTH] into ``out`` [n]; a touch counts as 0."""
+    plan, other = empty_plan(), empty_plan()
+    for k in range(pairs.shape[0]):
+        closing = least_closing_of_pair(pairs[k], until[k], plan, other)[0]
+        out[k] = closing * closing if closing * closing > _TOUCH_HARM else 0.0
+
+
+# Compiled: the least harm over all first meetings with a rear vehicle that may do as it likes.
+#
+# It is never behind, nor slower than, its full braking, but it may come earlier. So a meeting is a time, how much
+# *further* it has come than by full braking, and a closing speed. Cells of these are halved until their bounds come
+# close to the least meeting tried. docs/avoidability.md, "Teams", has the proof.
+
+SINCE, POWER, FLOOR, BEST, SEARCH = range(5)  # of a search: see gained; the front pair's own bound; the least meeting
+SEARCHED = 400  # divisions after which the least meeting stays as loosely bounded as it is
+_SHORT_S = 1e-3
+
+
+@compiled
+def gained(near: float, time: float, since: float, power: float) -> float:
+    """How much faster than by full braking the rear vehicle is, at least, if it has come ``near`` further by ``time``.
+
+    It holds back from ``since`` on, at most ``power`` a second (infinite where others push it).
+    """
+    if near <= 0.0 or time <= since:
+        return 0.0
+    span = time - since
+    if power == math.inf:
+        return near / span
+    return float(power * (span - math.sqrt(max(span * span - 2.0 * near / power, 0.0))))
+
+
+@compiled
+def behind_full_braking(at: Floats, early: float, late: float) -> float:
+    """Gap behind, at least, where both brake fully: the controlled one until ``early``, the rear one until ``late``."""
+    return float(
+        at[LINE.GAP_R] + solo_motion(at[LINE.V_F], -at[LINE.A_F], 0.0, math.inf, early)[1] - follower(at, late)[1]
+    )
+
+
+@compiled
+def soft_behind(at: Floats, early: float, late: float, near: float, far: float, since: float, power: float) -> float:
+    """Least closing speed of the meetings behind in a cell."""
+    faster = gained(near, late, since, power)
+    # of one that comes as much further, by the fastest way to be there: brake, then drive; negative where it is faster
+    brake = braking_to_rear(at, late, far + faster * (late - early))
+    closing = follower(at, late)[0] - braked_then_driven(at, brake, late)[1]
+    return max(closing + faster, 0.0)
+
+
+@compiled(apart=True)
+def after_behind(
+    at: Floats, early: float, late: float, near: float, far: float, hard: float, faster: float, moved: Floats,
+    plan: Floats, other: Floats,
+) -> float:  # fmt: skip
+    """Least squared closing speed at the front after the meetings behind of a cell, of at most ``hard``.
+
+    The state is one at ``early`` that is, at every later time of the cell, no further and no faster than that of any
+    meeting there: ``near`` to ``far`` further than by full braking, and ``faster``.
+    """
+    further = near - faster * (late - early)
+    v_l, way_l = leader(at, early)
+    v_r, way_r = follower(at, early)
+    gap = max(at[LINE.GAP_L] + at[LINE.GAP_R] + way_l - way_r - further, 0.0)
+    passed = max(follower(at, late)[1] - way_r - (leader(at, late)[1] - way_l), 0.0)
+    for column in range(LINE.WIDTH):
+        moved[column] = at[column]
+    moved[LINE.V_L], moved[LINE.GAP_L], moved[LINE.GAP_R] = v_l, gap, 0.0
+    moved[LINE.V_R], moved[LINE.ONSET_R] = v_r + faster, max(at[LINE.ONSET_R] - early, 0.0)
+    share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
+    speed = moved[LINE.V_R] - rest * hard
+    if share * (1.0 + at[LINE.RESTITUTION]) <= 1.0:
+        speed += share * at[LINE.RESTITUTION] * hard
+    speed = max(speed - max(at[LINE.A_R] - at[LINE.A_F], 0.0) * (late - early), 0.0)
+    least = gap - passed - (far - further)
+    squared = braking_after(gap, least, v_l, at[LINE.A_L], speed, at[LINE.A_F], plan, other)
+    if at[LINE.A_F] < at[LINE.A_R]:
+        return squared
+    pushed = pushed_by_rear(moved, 0.0, late - early, hard, late - early, 0.0, gap, plan, other)
+    return max(squared, pushed * pushed)
+
+
+@compiled(apart=True)
+def put_behind(
+    at: Floats, early: float, late: float, near: float, far: float, soft: float, hard: float, search: Floats,
+    count: int, moved: Floats, plan: Floats, other: Floats, heap: Floats,
+) -> int:  # fmt: skip
+    """Put a cell of meetings behind on the heap if it may hold less harm than the best; the new number of cells."""
+    since, power, floor = search[SINCE], search[POWER], search[FLOOR]
+    room = at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, late)[1] - follower(at, early)[1]
+    span = max(late - since, 0.0)
+    if near > room or behind_full_braking(at, early, late) > far or 2.0 * near > power * span * span:
+        return count
+    soft = max(soft, soft_behind(at, early, late, near, far, since, power))
+    if soft >= hard:
+        return count
+    follows = after_behind(at, early, late, near, far, hard, gained(near, late, since, power), moved, plan, other)
+    harm = soft * soft + max(follows, floor)
+    if harm >= search[BEST]:
+        return count
+    k = room_for(heap, count, harm)
+    heap[k, _EARLY], heap[k, _LATE], heap[k, _SOFT], heap[k, _HARD] = early, late, soft, hard
+    heap[k, _NEAR], heap[k, _FAR] = near, far
+    return count + 1
+
+
+@compiled(apart=True)
+def try_behind(
+    at: Floats, time: float, near: float, far: float, search: Floats, moved: Floats, plan: Floats, other: Floats
+) -> None:
+    """Lower the best to the bound of the gentlest meeting behind at ``time`` that is about ``near`` further."""
+    near = max(near, behind_full_braking(at, time, time))
+    if near > far or near > at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, time)[1] - follower(at, time)[1]:
+        return
+    since, power = search[SINCE], search[POWER]
+    soft = soft_behind(at, time, time, near, near, since, power)
+    follows = after_behind(at, time, time, near, near, soft, gained(near, time, since, power), moved, plan, other)
+    search[BEST] = min(search[BEST], soft * soft + max(follows, search[FLOOR]))
+
+
+@compiled(apart=True)
+def divide_behind(
+    at: Floats, search: Floats, count: int, moved: Floats, plan: Floats, other: Floats, heap: Floats
+) -> int:
+    """Replace the first cell of the heap by its halves; the new number of cells."""
+    early, late, near, far = heap[0, _EARLY], heap[0, _LATE], heap[0, _NEAR], heap[0, _FAR]
+    soft, hard = heap[0, _SOFT], min(heap[0, _HARD], math.sqrt(search[BEST]))
+    count = drop_first(heap, count)
+    try_behind(at, early, near, far, search, moved, plan, other)
+    by_time = (late - early) * (at[LINE.U_F] + at[LINE.A_F] + at[LINE.A_R])
+    by_place = (far - near) / max(late - search[SINCE], _SHORT_S)
+    for half in range(2):
+        times, places, speeds = (early, late), (near, far), (soft, hard)
+        if by_time >= max(by_place, hard - soft):
+            middle = 0.5 * (early + late)
+            times = (early, middle) if half == 0 else (middle, late)
+        elif by_place >= hard - soft:
+            middle = 0.5 * (near + far)
+            places = (near, middle) if half == 0 else (middle, far)
+        else:
+            middle = 0.5 * (soft + hard)
+            speeds = (soft, middle) if half == 0 else (middle, hard)
+        count = put_behind(
+            at, times[0], times[1], places[0], places[1], speeds[0], speeds[1], search, count, moved, plan, other, heap
+        )
+    return count
+
+
+@compiled(apart=True)
+def meetings_behind(
+    at: Floats, last: float, search: Floats, moved: Floats, plan: Floats, other: Floats, heap: Floats
+) -> float:
+    """Lower bound of the harm, if below the best, of all meetings behind that come first, until ``last``."""
+    since, hard, count = min(search[SINCE], last), math.sqrt(search[BEST]), 0
+    if since > 0.0:
+        count = put_behind(at, 0.0, since, 0.0, 0.0, 0.0, hard, search, count, moved, plan, other, heap)
+    if last > since:
+        far = at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, last)[1] if search[POWER] > 0.0 else 0.0
+        count = put_behind(at, since, last, 0.0, far, 0.0, hard, search, count, moved, plan, other, heap)
+    for _ in range(SEARCHED):
+        if count == 0 or heap[0, _HARM] >= search[BEST] - CELL * (1.0 + search[BEST]):
+            break
+        count = divide_behind(at, search, count, moved, plan, other, heap)
+    return float(min(search[BEST], heap[0, _HARM]) if count > 0 else search[BEST])
+
+
+# Compiled: the least harm of the front three, Vehicle 1 scripted, Vehicle 2 controlled, the one behind it anything.
+#
+# The meetings with the leader are those of one controlled vehicle (``lower_bound_kernel``): a rear vehicle that comes
+# earlier only makes what follows worse. Those behind have a search of their own (``meetings_behind``).
+# docs/avoidability.md, "Teams", has the proofs.
+
+
+@compiled(apart=True)
+def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Floats, other: Floats) -> float:
+    """Least harm where leader and rear vehicle meet, with the controlled one between them; inf where they do not.
+
+    The front pair has at least the least closing speed of its meetings, the other one what is left.
+    """
+    pair[PAIR_GAP], pair[LEADER_ONSET], pair[LEADER_FREE] = at[LINE.GAP_L] + at[LINE.GAP_R], 0.0, 0.0
+    pair[LEADER_V], pair[LEADER_A] = at[LINE.V_L], at[LINE.A_L]
+    pair[FOLLOWER_V], pair[FOLLOWER_ONSET], pair[FOLLOWER_A] = at[LINE.V_R], at[LINE.ONSET_R], at[LINE.A_R]
+    both, met = least_closing_of_pair(pair, math.inf, plan, other)
+    if met == math.inf:
+        return math.inf
+    until = min(met, last)
+    least = gentlest_between(FRONT_FIRST, at, first, until) if until > first else 0.0
+    front = max(least, 0.5 * both)
+    rear = max(both - front, 0.0)
+    return float(front * front + rear * rear)
+
+
+@compiled(apart=True)
+def late_meetings(at: Floats, first: float, stand: float, plan: Floats, other: Floats) -> int:
+    """Whether the rear vehicle may first meet the controlled one only after it would stand by full braking.
+
+    0: no. 1: yes, and then no harm is less than where the leader is met first. 2: yes, and nothing is proven.
+    """
+    if first == math.inf or not stays_ahead(at, first, first, plan, other):
+        return 0
+    _, end, leans = last_meeting(at, first, plan, other)  # first of the leader, the rear one braking fully
+    if end <= stand and not leans:
+        return 0
+    leader_moves = at[LINE.A_F] < at[LINE.A_L] and at[LINE.V_L] > at[LINE.A_L] * stand
+    thrown_back = (
+        1.0 - at[LINE.FRONT_SHARE] < at[LINE.RESTITUTION] * at[LINE.FRONT_SHARE] or at[LINE.OBSTACLE] < math.inf
+    )
+    return 2 if leader_moves or thrown_back else 1
+
+
+@compiled(apart=True)
+def combined_bound_of_team(
+    at: Floats, until: float, front: float, rear: float, since: float, power: float, pair: Floats, moved: Floats,
+    plan: Floats, other: Floats, heap: Floats, heap_behind: Floats,
+) -> float:  # fmt: skip
+    """Least harm of the front three where contact is unavoidable, whoever is met first; 0 if that may be after until.
+
+    ``front`` and ``rear`` are the pairs' own bounds. The rear vehicle may hold back from ``since`` on, by ``power``.
+    """
+    rest, stand = last_rest(at)
+    if not rest < until:
+        return 0.0
+    first = meet_front(at, math.inf, plan, other)
+    late = late_meetings(at, first, stand, plan, other)
+    if late == 2:
+        return 0.0
+    step, least, any_time = at[LINE.TIME_STEP], 0.0, 0.0
+    once = all_at_once(at, first, meet_front(at, 0.0, plan, other), pair, plan, other)
+    search = np.empty(SEARCH)
+    search[SINCE], search[POWER], search[FLOOR] = since, power, front
+    for time_step in (0.0, step):  # what holds for any command holds for one that changes at decisions only
+        at[LINE.TIME_STEP] = time_step
+        best = min(front_first(at, rear, LARGE, front + rear, plan, other, heap), once)
+        if time_step <= 0.0:
+            any_time = best
+        elif late == 1:
+            best = min(best, any_time)
+        search[BEST] = best
+        if best > front + rear:
+            best = meetings_behind(at, stand, search, moved, plan, other, heap_behind)
+        least = max(least, best - _TOUCH_HARM if best < LARGE else 0.0)
+        if step <= 0.0:
+            break
+    return least
+
+
+@compiled
+def bound_threes(states: Floats, until: Floats, pairs: Floats, since: Floats, power: Floats, out: Floats) -> None:
+    """Combined bounds of the front three of worlds ``states`` [n, WIDTH] into ``out`` [n]; contact is unavoidable.
+
+    ``pairs`` [n, 2] are the bounds of their two pairs.
+    """
+    plan, other, pair, moved = empty_plan(), empty_plan(), np.empty(PAIR_WIDTH), np.empty(LINE.WIDTH)
+    heap, heap_behind = np.empty((CELLS, _NEAR)), np.empty((SEARCHED + 4, HEAP_WIDTH))
+    for k in range(states.shape[0]):
+        out[k] = combined_bound_of_team(
+            states[k], until[k], pairs[k, 0], pairs[k, 1], since[k], power[k], pair, moved, plan, other, heap,
+            heap_behind,
+        )  # fmt: skip
+
+
+# The front three vehicles of a line whose second one is controlled, bounded together: rows of the compiled bound.
+#
+# An obstacle ahead of a controlled Vehicle 1 is a first vehicle that nothing moves. docs/avoidability.md, "Teams".
+
+_MIDDLE, _REAR = 1, 2
+_UNMOVED_T = 1e30  # an obstacle: its share of any two masses is 1
+
+
+def _combined_bound_of_line(
+    now: Worlds, onset: Floats, counts: Bools, chosen: Ints, until: Floats, pairs: Floats, time_step_s: float | None
+) -> Floats:
+    """The bound of the front two pairs together, [n] m2/s2, ``until`` [n] s from now; 0 where nothing is proven.
+
+    ``onset`` [n, N] is counted from now; ``counts`` [n, P] says of which pairs the next impact counts, and which move
+    forward. It asks that the first vehicle brakes by now; the second one, which is among the ``chosen``, is taken to
+    act from now on. ``pairs`` [n, 2] are the bounds of both pairs alone.
+    """
+    v = now.vehicles
+    stops = stopping_distances(now.speeds_mps[:, 0], onset[:, 0], v.braking_capacity_mps2[:, 0]) < now.obstacle_gap_m
+    rows = np.flatnonzero((onset[:, 0] <= 0.0) & counts[:, 0] & counts[:, 1] & stops & ~now.obstacle_hit)
+    # The first three vehicles of these worlds, Vehicle 2 free to act at once.
+    some = now.take(rows)
+    given = some.vehicles
+    braking, driving, latency, mass, limit = (
+        np.ascontiguousarray(each[:, :3])
+        for each in (
+            given.braking_capacity_mps2,
+            given.driving_capacity_mps2,
+            given.latency_s,
+            given.mass_t,
+            given.speed_limit_mps,
+        )
+    )
+    latency[:, _MIDDLE] = np.minimum(latency[:, _MIDDLE], some.time_s)
+    three = replace(
+        some,
+        vehicles=Vehicles.at_once(braking, driving, latency, mass, limit, given.restitution),
+        gaps_m=some.gaps_m[:, :2].copy(),
+        speeds_mps=some.speeds_mps[:, :3].copy(),
+        pair_hit=some.pair_hit[:, :2].copy(),
+        command_mps2=some.command_mps2[:, :3].copy(),
+        messages=np.zeros((some.n, 0)),
+    )
+    if not len(rows):
+        return np.zeros(now.n)
+    unavoidable = avoidability(three, _MIDDLE).reason >= 2
+    rows, three = rows[unavoidable], three.take(np.flatnonzero(unavoidable))
+    steps = np.where(onset[rows, _MIDDLE] <= 0.0, 0.0 if time_step_s is None else time_step_s, 0.0)
+    since, power = np.zeros(len(rows)), np.full(len(rows), np.inf)
+    if now.N == 3:  # nobody pushes the last one
+        full = v.braking_capacity_mps2[rows, _REAR] + v.driving_capacity_mps2[rows, _REAR]
+        since, power = onset[rows, _REAR], full if _REAR in chosen else np.zeros(len(rows))
+    found, out = np.zeros(now.n), np.empty(len(rows))
+    bound_threes(onset_states(three, _MIDDLE, steps), until[rows], pairs[rows], since, power, out)
+    found[rows] = out
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class TeamBound:
+    """What is proven about each world [n], in m2/s2."""
+
+    harm: Floats  # no joint command does less harm than this
+    early: Floats  # done before any controlled vehicle may act
+    obstacle: Floats  # Vehicle 1 and the obstacle ahead
+    pairs: Floats  # [n, P] of each pair alone, from then on
+    combined: Floats  # of the front two pairs together (see ``team_bound``); 0 where nothing is proven
+
+    @property
+    def impact_proven(self) -> Bools:
+        """Whether every joint command has an impact, [n]; elsewhere none is proven."""
+        return np.asarray(self.harm > 0.0, np.bool_)
+
+
+def team_bound(
+    worlds: Worlds,
+    vehicles: Iterable[int],
+    *,
+    harm_count: HarmCount = "first",
+    horizon_s: float = 8.0,
+    scripts: Mapping[int, str] | None = None,
+    time_step_s: float | None = None,
+) -> TeamBound:
+    """Proven lower bound on the harm from now to ``horizon_s`` (absolute), over all joint commands of ``vehicles``.
+
+    ``harm = early + obstacle + max(pairs[:, 0] + pairs[:, 1], combined) + pairs[:, 2:]``, each part rounded outward;
+    where Vehicle 1 is controlled, ``combined`` is that of the obstacle and Vehicles 1 and 2: ``early + max(obstacle +
+    pairs[:, 0], combined) + pairs[:, 1:]``.
+    All other vehicles brake with their whole capacity from their latencies on; ``scripts`` (index -> name) is only
+    checked to say the same. What may come only after the horizon counts as 0, and so does the next impact of a pair
+    that was hit before where ``harm_count`` is "first". One controlled vehicle is allowed; ``lower_bound`` is sharper
+    where it covers the line.
+
+    With ``time_step_s`` it is proven only for commands that change at decisions, the first one when the first of the
+    vehicles may act, one every ``time_step_s`` after it. That is sharper where Vehicle 2 is the first.
+
+    Raises ``InvalidInput`` for vehicles that are none, not there or given twice, another script, an unknown count, a
+    time step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before any of them may act.
+    """
+    check_asked("team_bound", harm_count, horizon_s, time_step_s)
+    # The controlled vehicles in order; refuse what the bound does not cover.
+    if not isinstance(vehicles, Iterable):
+        raise InvalidInput(f"team_bound: vehicles {vehicles!r}: must be a list of vehicles, for instance (1, 2)")
+    given = tuple(vehicles)
+    for vehicle in given:
+        check_whole_number("team_bound: a vehicle", vehicle, 0, worlds.N - 1)
+    if not given or len(set(given)) != len(given):
+        raise InvalidInput(f"team_bound: vehicles {given}: at least one is needed, each once")
+    for index, script in (scripts or {}).items():
+        check_whole_number("team_bound: a vehicle of scripts", index, 0, worlds.N - 1)
+        if index not in given and script != "full_brake":
+            raise InvalidInput(f"team_bound: vehicle_{index + 1} follows {script!r}; must be 'full_brake'")
+    chosen = np.array(sorted(given), np.int64)
+    now, start, early, counts = _at_onset("team_bound", worlds, chosen, harm_count, horizon_s)
+    onset = np.maximum(worlds.vehicles.latency_s - start[:, np.newaxis], 0.0)
+    until, v = horizon_s - start, now.vehicles
+    each: list[dict[int, Floats | float]] = [
+        {
+            PAIR_GAP: now.gaps_m[:, p],
+            LEADER_V: now.speeds_mps[:, p],
+            LEADER_ONSET: onset[:, p],
+            LEADER_A: v.braking_capacity_mps2[:, p],
+            LEADER_FREE: float(p in chosen),
+            LEADER_U: v.driving_capacity_mps2[:, p],
+            LEADER_LIMIT: v.speed_limit_mps[:, p],
+            FOLLOWER_V: now.speeds_mps[:, p + 1],
+            FOLLOWER_ONSET: onset[:, p + 1],
+            FOLLOWER_A: v.braking_capacity_mps2[:, p + 1],
+        }
+        for p in range(worlds.N - 1)
+    ]
+    pairs = np.stack([_pair_bound(columns, until, counts[:, p]) for p, columns in enumerate(each)], axis=1)
+    ahead = np.isfinite(now.obstacle_gap_m) & ~(now.obstacle_hit & (harm_count == "first"))
+    ahead &= now.speeds_mps[:, 0] >= 0.0
+    standing: dict[int, Floats | float] = {  # the obstacle, as the front vehicle of a pair
+        PAIR_GAP: np.where(ahead, now.obstacle_gap_m, 0.0),
+        LEADER_A: 1.0,
+        FOLLOWER_V: now.speeds_mps[:, 0],
+        FOLLOWER_ONSET: onset[:, 0],
+        FOLLOWER_A: v.braking_capacity_mps2[:, 0],
+    }
+    obstacle = _pair_bound(standing, until, ahead)
+    combined, walled = np.zeros(worlds.n), bool(chosen[0] == 0)
+    if walled and ahead.any():
+        # the line with its obstacle as a first vehicle that stands and that nothing moves
+        line = now.with_obstacle()
+        braking, mass = line.vehicles.braking_capacity_mps2.copy(), line.vehicles.mass_t.copy()
+        braking[:, 0], mass[:, 0] = 1.0, _UNMOVED_T
+        behind = replace(line.vehicles, braking_capacity_mps2=braking, mass_t=mass)
+        line = replace(line, vehicles=behind, obstacle_gap_m=np.ones(line.n))  # thrown back: no centre of mass
+        onsets, counted = np.column_stack([np.zeros(line.n), onset]), np.column_stack([ahead, counts])
+        both = np.stack([obstacle, pairs[:, 0]], axis=1)
+        combined = _combined_bound_of_line(line, onsets, counted, chosen + 1, until, both, time_step_s)
+    elif worlds.N >= 3 and chosen[0] == 1:
+        combined = _combined_bound_of_line(now, onset, counts, chosen, until, pairs[:, :2], time_step_s)
+    outward = rounding(worlds, chosen, np.where(np.isfinite(worlds.obstacle_gap_m), worlds.obstacle_gap_m, 0.0))
+    early, obstacle, combined = (np.maximum(part - outward, 0.0) for part in (early, obstacle, combined))
+    pairs = np.maximum(pairs - outward[:, np.newaxis], 0.0)
+    alone = np.column_stack([obstacle, pairs])
+    together = alone[:, :2] if walled else alone[:, 1:3]
+    harm = early + alone.sum(axis=1) + np.maximum(combined - together.sum(axis=1), 0.0)
+    return TeamBound(harm, early, obstacle, pairs, combined)
+
+
+def _pair_bound(columns: Mapping[int, Floats | float], until: Floats, counts: Bools) -> Floats:
+    """The bound of one pair alone, [n], of which these columns are not 0; 0 where its next impact does not count."""
+    at, found, out = np.zeros((len(until), PAIR_WIDTH)), np.zeros(len(until)), np.empty(int(counts.sum()))
+    for column, values in columns.items():
+        at[:, column] = values
+    bound_pairs(at[counts], until[counts], out)
+    found[counts] = out
+    return found

@@ -8,24 +8,31 @@ table of one world whose first rows ``impact`` names.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError, renumbered
-from ethbrake_marl.physics.compiled import compiled, compiled_apart, compiled_bare, compiled_within
-from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds, sum_rows, vehicles_at_once
+from ethbrake_marl.physics.compiling import compiled
+from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds
 
 # Closed-form times of the events that end a segment of constant acceleration.
 #
 # Between events every quantity is a quadratic in time, so the first event is found exactly and none is missed.
 # Only + - * / and sqrt are used: the same world gives the same bits in any batch.
 
-TOUCH_SPEED_MPS = 1e-5  # a contact at or below this closing speed is a touch: no impact, no harm
-PLASTIC_SPEED_MPS = 0.05  # a cluster whose largest closing speed is below this does not bounce
+
+class _Bounds(NamedTuple):
+    """Where one rule of the physics ends and another begins."""
+
+    TOUCH_SPEED_MPS: float = 1e-5  # a contact at or below this closing speed is a touch: no impact, no harm
+    PLASTIC_SPEED_MPS: float = 0.05  # a cluster whose largest closing speed is below this does not bounce
+    PENETRATION_M: float = 1e-9  # a gap below minus this means that a contact was missed
+    MOST_EVENTS: int = 1_000_000  # per world and segment; reached by a defect of the kernel (160,000 were seen)
+    FAR_AWAY_M: float = 1e300  # of no obstacle where others of a batch have one: nothing comes near, no bit changes
+
+
+BOUND = _Bounds()
 
 
 @compiled
@@ -217,7 +224,7 @@ class _Rows(NamedTuple):
 ROW = _Rows()
 
 
-@compiled_bare
+@compiled(bare=True)
 def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) -> int:
     """Mass-weighted isotonic regression of vehicles ``first..last`` (inclusive) into row ``out``; the number of blocks.
 
@@ -252,7 +259,7 @@ def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) ->
     return count
 
 
-@compiled_bare
+@compiled(bare=True)
 def resolve_cluster(table: Floats, restitution: float, first: int, last: int) -> None:
     """Replace the speeds of touching vehicles ``first..last`` by their speeds after the impact.
 
@@ -267,7 +274,7 @@ def resolve_cluster(table: Floats, restitution: float, first: int, last: int) ->
     largest = 0.0
     for p in range(first, last):
         largest = max(largest, table[ROW.CLOSING, p])
-    bounce = restitution if largest >= PLASTIC_SPEED_MPS else 0.0
+    bounce = restitution if largest >= BOUND.PLASTIC_SPEED_MPS else 0.0
     end = last + 1
     for block in range(pool(table, ROW.SPEED, ROW.SPEED, first, last, ROW.POOLED) - 1, -1, -1):
         head = int(table[ROW.BLOCK_FIRST, block])
@@ -285,7 +292,7 @@ def resolve_cluster(table: Floats, restitution: float, first: int, last: int) ->
             table[ROW.SPEED, i] = min(table[ROW.SPEED, i], table[ROW.SPEED, i - 1])
 
 
-@compiled_bare
+@compiled(bare=True)
 def resolve_impacts(table: Floats, restitution: float) -> bool:
     """One round of impacts of one world: every cluster that holds an approaching pair, once. False if there is none.
 
@@ -317,12 +324,8 @@ def resolve_impacts(table: Floats, restitution: float) -> bool:
         first = last + 1
     for p in range(pairs):
         table[ROW.CONTACT_SPEED, p] = 0.0
-        table[ROW.STRUCK, p] = 1.0 if table[ROW.CLOSING, p] > TOUCH_SPEED_MPS else 0.0
+        table[ROW.STRUCK, p] = 1.0 if table[ROW.CLOSING, p] > BOUND.TOUCH_SPEED_MPS else 0.0
     return True
-
-
-PENETRATION_TOLERANCE_M = 1e-9  # a gap below minus this means that a contact was missed
-MOST_EVENTS = 1_000_000  # per world and segment; reached by a defect of the kernel. (Cascades of 160,000 were seen.)
 
 
 class _Flags(NamedTuple):
@@ -332,6 +335,16 @@ class _Flags(NamedTuple):
     DONE: int = 1
     PENETRATED: int = 2
     STUCK: int = 3
+
+    def failure(self, status: Ints, from_s: Floats, until_s: Floats) -> PhysicsError:
+        """The error for all worlds that the kernel marked with a ``status`` [n] other than DONE."""
+        reasons = {self.PENETRATED: "a contact was missed", self.STUCK: f"more than {BOUND.MOST_EVENTS} events"}
+        return PhysicsError(
+            {
+                k: f"{reasons[int(status[k])]} between {from_s[k]:g} s and {until_s[k]:g} s"
+                for k in np.flatnonzero(status != self.DONE).tolist()
+            }
+        )
 
 
 FLAG = _Flags()
@@ -353,7 +366,7 @@ class _Listed(NamedTuple):
 LISTED = _Listed()
 
 
-@compiled_bare
+@compiled(bare=True)
 def advance_table(
     table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int
 ) -> tuple[int, int]:
@@ -370,7 +383,7 @@ def advance_table(
         return recorded, FLAG.DONE
     start_events(table)
     now = 0.0
-    for _ in range(MOST_EVENTS):
+    for _ in range(BOUND.MOST_EVENTS):
         status, now = to_next_impact(table, restitution, now, duration)
         if status != FLAG.IMPACT:
             return recorded, status
@@ -378,7 +391,7 @@ def advance_table(
     return recorded, FLAG.STUCK
 
 
-@compiled_bare
+@compiled(bare=True)
 def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recorded: int) -> int:
     """Add the last round of impacts to the harm, and to the list of impacts."""
     for p in range(table.shape[1] - 1):
@@ -403,7 +416,7 @@ def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recor
     return recorded
 
 
-@compiled_bare
+@compiled(bare=True)
 def move_apart(table: Floats, duration: float) -> bool:
     """Move a world whose vehicles surely stay apart; leave it and return False when that is not sure.
 
@@ -437,7 +450,7 @@ def move_apart(table: Floats, duration: float) -> bool:
     return True
 
 
-@compiled_bare
+@compiled(bare=True)
 def start_events(table: Floats) -> None:
     """Make the table ready for ``to_next_impact`` from the start of a segment."""
     for i in range(table.shape[1]):
@@ -445,13 +458,13 @@ def start_events(table: Floats) -> None:
         table[ROW.CONTACT_SPEED, i] = 0.0
 
 
-@compiled_bare
+@compiled(bare=True)
 def to_next_impact(table: Floats, restitution: float, now: float, duration: float) -> tuple[int, float]:
     """Move from ``now`` event by event up to and through the next round of impacts, or to the end of the segment.
 
     Returns IMPACT (call again), DONE, or what went wrong; and the time reached.
     """
-    for _ in range(MOST_EVENTS):
+    for _ in range(BOUND.MOST_EVENTS):
         if resolve_impacts(table, restitution):
             return FLAG.IMPACT, now
         if now >= duration:
@@ -462,7 +475,7 @@ def to_next_impact(table: Floats, restitution: float, now: float, duration: floa
     return FLAG.STUCK, now
 
 
-@compiled_bare
+@compiled(bare=True)
 def to_next_event(table: Floats, now: float, duration: float) -> tuple[bool, float]:
     """Move from ``now`` to the next event or to the end of the segment; False where a gap became impossible."""
     accelerate(table)
@@ -475,7 +488,7 @@ def to_next_event(table: Floats, now: float, duration: float) -> tuple[bool, flo
     return True, duration if passed >= duration - now else now + passed
 
 
-@compiled_bare
+@compiled(bare=True)
 def accelerate(table: Floats) -> None:
     """Accelerations in force, touching vehicles coupled; marks the pairs that move as one body."""
     vehicles = table.shape[1]
@@ -501,7 +514,7 @@ def accelerate(table: Floats) -> None:
         first = last + 1
 
 
-@compiled_bare
+@compiled(bare=True)
 def next_event(table: Floats, now: float, end: float) -> float:
     """Time from ``now`` to the next event, at most ``end - now``; fills the candidates of each vehicle and pair."""
     vehicles = table.shape[1]
@@ -526,7 +539,7 @@ def next_event(table: Floats, now: float, end: float) -> float:
     return soonest
 
 
-@compiled_bare
+@compiled(bare=True)
 def move(table: Floats, duration: float) -> bool:
     """Move to the next event, putting event values exactly; False when a gap became impossible."""
     sound = True
@@ -539,13 +552,13 @@ def move(table: Floats, duration: float) -> bool:
             closing = table[ROW.SPEED, p + 1] - table[ROW.SPEED, p]
             pressing = table[ROW.ACCELERATION, p + 1] - table[ROW.ACCELERATION, p]
             after = drift(table[ROW.GAP, p], closing, pressing, duration)
-            sound = sound and after >= -PENETRATION_TOLERANCE_M
+            sound = sound and after >= -BOUND.PENETRATION_M
             table[ROW.GAP, p] = max(after, 0.0)
     move_speeds(table, duration)
     return sound
 
 
-@compiled_bare
+@compiled(bare=True)
 def move_speeds(table: Floats, duration: float) -> None:
     """Speeds after ``duration``: one value for each joined body, and a pair in contact differs by its closing speed."""
     vehicles = table.shape[1]
@@ -569,91 +582,15 @@ def move_speeds(table: Floats, duration: float) -> None:
 # The obstacle ahead of Vehicle 1, for the kernels: one more vehicle in front, which stands and which nothing moves.
 #
 # Its mass is infinite. In the regression P of a cluster that touches it, and of touching vehicles that press against
-# it,
-# it therefore stays at 0, and P is the regression of the vehicles alone bounded above by 0: ``min(P, 0)``. Contact,
+# it, it therefore stays at 0, and P is the regression of the vehicles alone bounded above by 0: ``min(P, 0)``. Contact,
 # touch, plastic impacts and first impacts follow the rules of any pair, to the same bits. The added vehicle exists
-# inside
-# the physics only; everybody else keeps the numbers of the vehicles, and the obstacle has columns of its own.
-
-UNMOVABLE_T = math.inf
-FAR_AWAY_M = 1e300  # stands for no obstacle where others of a batch have one: nothing comes near, no bit changes
-
-
-def obstacle_ahead(worlds: Worlds) -> Bools:
-    """Which worlds have an obstacle ahead of Vehicle 1, [n]."""
-    return np.isfinite(worlds.obstacle_gap_m)
-
-
-def with_obstacle(worlds: Worlds) -> Worlds:
-    """These worlds, all with an obstacle ahead, with that obstacle as vehicle 0 and every other vehicle one later."""
-    vehicles = worlds.vehicles
-    written_out = vehicles_at_once(  # inside the physics nobody observes
-        ahead(0.0, vehicles.braking_capacity_mps2),
-        ahead(0.0, vehicles.driving_capacity_mps2),
-        ahead(0.0, vehicles.latency_s),
-        ahead(UNMOVABLE_T, vehicles.mass_t),
-        ahead(0.0, vehicles.speed_limit_mps),
-        vehicles.restitution,
-    )
-    return Worlds(
-        written_out,
-        np.concatenate([worlds.obstacle_gap_m[:, np.newaxis], worlds.gaps_m], axis=1),
-        ahead(0.0, worlds.speeds_mps),
-        worlds.time_s,
-        np.concatenate([worlds.obstacle_hit[:, np.newaxis], worlds.pair_hit], axis=1),
-        ahead(0.0, worlds.command_mps2),
-        np.full(worlds.n, np.inf),
-        np.zeros(worlds.n, np.bool_),
-        worlds.messages,
-    )
-
-
-def without_obstacle(written_out: Worlds, vehicles: Vehicles) -> Worlds:
-    """Back from ``with_obstacle``: the obstacle's columns beside those of the pairs; ``vehicles`` are the real ones."""
-    return replace(
-        written_out,
-        vehicles=vehicles,
-        gaps_m=written_out.gaps_m[:, 1:].copy(),
-        speeds_mps=written_out.speeds_mps[:, 1:].copy(),
-        pair_hit=written_out.pair_hit[:, 1:].copy(),
-        command_mps2=written_out.command_mps2[:, 1:].copy(),
-        obstacle_gap_m=written_out.gaps_m[:, 0].copy(),
-        obstacle_hit=written_out.pair_hit[:, 0].copy(),
-    )
-
-
-def with_post_ahead(worlds: Worlds, duration_s: Floats) -> Worlds:
-    """These worlds, each with an obstacle ahead: its own, or one that Vehicle 1 cannot reach in ``duration_s`` [n].
-
-    Worlds know gaps and speeds, no places. Such a post makes the way of Vehicle 1 the change of one more gap, and
-    changes no motion.
-    """
-    out_of_reach = _farthest(worlds, duration_s) + 1.0
-    return replace(worlds, obstacle_gap_m=np.where(obstacle_ahead(worlds), worlds.obstacle_gap_m, out_of_reach))
-
-
-def _farthest(worlds: Worlds, duration_s: Floats) -> Floats:
-    """More than Vehicle 1 can travel, [n] m: ``T sqrt(2 E / m_1)``, had it all the energy E the line can ever have.
-
-    Impacts and brakes only take energy; driving adds at most ``m a v`` per second, and never above the speed limit.
-    """
-    vehicles = worlds.vehicles
-    driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]
-    energy = sum_rows(vehicles.mass_t * (worlds.speeds_mps * worlds.speeds_mps / 2.0 + driving))
-    farthest: Floats = 1.01 * duration_s * np.sqrt(2.0 * energy / vehicles.mass_t[:, 0])
-    return farthest
-
-
-def ahead(value: float, columns: Floats) -> Floats:
-    """The columns of the vehicles [n, N] with one more in front, [n, N + 1]."""
-    added: NDArray[np.float64] = np.concatenate([np.full((len(columns), 1), value), columns], axis=1)
-    return added
+# inside the physics only; everybody else keeps the numbers of the vehicles, and the obstacle has columns of its own.
 
 
 @compiled
 def place_obstacle(table: Floats, gap: float, hit: float) -> None:
     """Write the obstacle into column 0 of a world's table; its speed and command are the zeros of a new table."""
-    table[ROW.MASS, 0] = UNMOVABLE_T
+    table[ROW.MASS, 0] = math.inf
     table[ROW.GAP, 0] = gap
     table[ROW.HIT, 0] = hit
 
@@ -662,9 +599,8 @@ def place_obstacle(table: Floats, gap: float, hit: float) -> None:
 #
 # Search and shield advance an episode by ``step_episode``. The engine, whose loop keeps its worlds in rows, is made of
 # the same rules (``step_end_s``, ``onset_s``, ``command_in_force``, ``stands``) around the same ``advance_table``, so
-# all
-# three agree to the bit (decision 0025). Search and shield copy one world at a time into the table of
-# ``physics.segment``, which is longer here by the rows below.
+# all three agree to the bit (decision 0025). Search and shield copy one world at a time into the table of
+# ``physics.kernel``, which is longer here by the rows below.
 #
 # A *profile* holds the commands of the controlled vehicles in each of its phases. Phases begin and end on the grid of
 # decisions, so an agent can drive it. Letters beside those of ``physics.worlds``:
@@ -701,8 +637,6 @@ OTHER_WEIGHT = 1e-8  # of the other count in the value that is minimised: it dec
 _ROUNDING = 1e-9  # of a step: by less than this the horizon may lie beyond the last whole step
 _ON_GRID = 1e-6  # of a step: a time this close before a decision is that decision
 
-Number = TypeVar("Number", float, Floats)
-
 
 class Grid(NamedTuple):
     """The decisions of one episode: one every ``time_step_s`` from ``first_s`` on, ``last_step`` of them."""
@@ -721,34 +655,24 @@ class Episode(NamedTuple):
     controlled: Ints  # [C] vehicles
 
 
-def first_decision_s(worlds: Worlds, deciders: Sequence[int]) -> Floats:
-    """Time of the first decision, [n] s: the least latency of the ``deciders``, or the worlds' time where it is later.
+class Decisions(NamedTuple):
+    """Moments at which somebody decides, of one world or of many: at ``first_s``, and each time step from then on."""
 
-    With nobody to decide it is the worlds' time.
-    """
-    if len(deciders) == 0:
-        return worlds.time_s.copy()
-    first: Floats = np.maximum(worlds.vehicles.latency_s[:, list(deciders)].min(axis=1), worlds.time_s)
-    return first
+    first_s: Floats  # s
+    time_step_s: Floats | float  # s
 
+    def before(self, time_s: Floats | float) -> Floats:
+        """How many fall before the horizon, or another time."""
+        return np.ceil((time_s - self.first_s) / self.time_step_s - _ROUNDING)
 
-def number_of_decisions(first_s: Floats, time_step_s: float, horizon_s: Floats | float) -> Floats:
-    """How many decisions fall before the horizon, or another time, the first one at ``first_s``, whose shape it has."""
-    return np.ceil((horizon_s - first_s) / time_step_s - _ROUNDING)
+    def latest(self, time_s: Floats) -> Ints:
+        """Number of the latest one at these times; below 0 before the first one."""
+        number: Floats = np.floor((time_s - self.first_s) / self.time_step_s + _ON_GRID)
+        return number.astype(np.int64)
 
-
-def decision_at(time_s: Floats, first_s: Floats, time_step_s: Floats | float) -> Ints:
-    """Number of the latest decision at these times, [n]; below 0 before the first one."""
-    return np.floor((time_s - first_s) / time_step_s + _ON_GRID).astype(np.int64)
-
-
-def decision_s(first_s: Number, time_step_s: Any, step: Any) -> Number:
-    """Time at which a step before the last one begins: of one world or of many, s."""
-    time: Number = first_s + step * time_step_s
-    return time
-
-
-_decision_s = compiled(decision_s)
+    def at(self, step: Floats | Ints | float) -> Floats:
+        """Time of a decision by its number: when that step, unless it is the last one, begins (s)."""
+        return self.first_s + step * self.time_step_s
 
 
 @compiled
@@ -760,7 +684,7 @@ def grid_of(clock: Floats) -> Grid:
 @compiled
 def step_end_s(step: float, last_step: float, first_s: float, time_step_s: float, horizon_s: float) -> float:
     """Time (s) at which the step with this number, from 1, ends; the last one ends at the horizon."""
-    return horizon_s if step >= last_step else _decision_s(first_s, time_step_s, step)
+    return horizon_s if step >= last_step else first_s + step * time_step_s
 
 
 @compiled
@@ -787,7 +711,7 @@ def command_in_force(command: float, latency_s: float, time_s: float) -> float:
     return command if latency_s <= time_s else 0.0
 
 
-@compiled_within
+@compiled(within=True)
 def at_rest(table: Floats) -> bool:
     """Whether the episode has ended: everything stands and no command would move it."""
     for i in range(table.shape[1]):  # noqa: SIM110  # all() is not compiled
@@ -796,7 +720,7 @@ def at_rest(table: Floats) -> bool:
     return True
 
 
-@compiled_within
+@compiled(within=True)
 def step_episode(
     table: Floats, restitution: float, time: float, until: float, horizon_s: float, no_rows: Floats
 ) -> int:
@@ -817,7 +741,7 @@ def step_episode(
     return AT_HORIZON if until >= horizon_s else GOES_ON
 
 
-@compiled_within
+@compiled(within=True)
 def step_again(table: Floats, restitution: float, grid: Grid, step: int, end: int, no_rows: Floats) -> int:
     """``step_episode`` from decision ``step`` to decision ``end`` of a table that stays loaded from step to step."""
     time = time_of(grid, step)
@@ -869,7 +793,7 @@ def restore(table: Floats, state: Floats) -> None:
         table[ROW.SUM_TOTAL_HARM, p] = state[vehicles + 3 * pairs + p]
 
 
-@compiled_apart
+@compiled(apart=True)
 def follow_whole(world: Episode, ends: Ints, commands: Floats, states: Floats, bound: float) -> tuple[float, int]:
     """``follow`` a profile from its first phase on."""
     phase = min(0, ends.shape[0])  # 0, but no literal, for which everything would be compiled a second time
@@ -925,7 +849,7 @@ def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) ->
     vehicles = table.shape[1]
     start_events(table)
     now, count = 0.0, 0
-    for _ in range(MOST_EVENTS):
+    for _ in range(BOUND.MOST_EVENTS):
         if resolve_impacts(table, restitution):
             continue
         if now >= duration:
@@ -962,7 +886,7 @@ def segment_pieces(worlds: Worlds, command_mps2: Floats, until_s: Floats) -> lis
 
     """
     v, N, durations = worlds.vehicles, worlds.N, until_s - worlds.time_s
-    front_gaps = with_post_ahead(worlds, durations).obstacle_gap_m  # says where Vehicle 1 is
+    front_gaps = worlds.with_post_ahead(durations).obstacle_gap_m  # says where Vehicle 1 is
     latencies, restitutions = v.latency_s, v.restitution
     wanted = [*range(N + 1), *range(N + 2, 2 * N + 2), *range(2 * N + 3, 3 * N + 3)]  # all but the post's own
     found = []
@@ -1019,12 +943,13 @@ def forecast(
         raise InvalidInput(
             f"forecast: candidate {candidates_mps2[~good][0]:g} m/s2 is beyond vehicle_{vehicle + 1}'s capacity"
         )
-    obstacle = obstacle_ahead(worlds)
+    obstacle = worlds.obstacle_ahead
     if not obstacle.any():
         return _forecast(worlds, command_mps2, vehicle, candidates_mps2, until_s)
     first, total = np.empty(candidates_mps2.shape), np.empty(candidates_mps2.shape)
     with_one, without = np.flatnonzero(obstacle), np.flatnonzero(~obstacle)
-    lines, command = with_obstacle(worlds.take(with_one)), ahead(0.0, command_mps2[with_one])
+    lines = worlds.take(with_one).with_obstacle()
+    command = np.concatenate([np.zeros((len(with_one), 1)), command_mps2[with_one]], axis=1)
     with renumbered(with_one):
         first[with_one], total[with_one] = _forecast(lines, command, vehicle + 1, candidates_mps2[with_one], until_s)
     with renumbered(without):
@@ -1099,7 +1024,7 @@ class _Contact(NamedTuple):
 CONTACT = _Contact()
 
 
-@compiled_apart
+@compiled(apart=True)
 def forecast_contacts(table: Floats, restitution: float, duration: float, found: Floats) -> int:
     """Take one world ``duration`` (s) on; its status. Fills ``found`` [CONTACT_ROWS, N], and the harm of the table.
 
@@ -1114,7 +1039,7 @@ def forecast_contacts(table: Floats, restitution: float, duration: float, found:
         return FLAG.DONE
     start_events(table)
     no_rows, now = table[:0], 0.0
-    for _ in range(MOST_EVENTS):
+    for _ in range(BOUND.MOST_EVENTS):
         status, now = to_next_impact(table, restitution, now, duration)
         if status != FLAG.IMPACT:
             return status

@@ -6,8 +6,8 @@ message that arrived it turns bad with probability p and good again with r, per 
 bad is lost. Chance is a pure function of the world's key, the link and the number of the message, whatever the batch
 and the step. A neighbour in sight is measured: what is known of it is the present.
 
-Columns, for N vehicles, behind the news in the parameters of ``physics.rows``; they are the memory of the channel and
-change as it speaks. The period is 0 in a world without periodic messages: there the present is known.
+Columns, for N vehicles, behind the news in the parameters (``physics.batch.Columns``); they are the memory of the
+channel and change as it speaks. The period is 0 in a world without periodic messages: there the present is known.
 
 head    period (s), delay from sending to use (s), p, r, key (a whole number below 2^53), samples taken, place of the
         obstacle ahead (m; infinite: there is none)
@@ -24,18 +24,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.physics.advance import (
-    RESTITUTION,
-    TIME,
-    command_at,
-    gap_at,
-    messages_at,
-    params_at,
-    speed_at,
-    state_width,
-    vehicles_in,
-)
-from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.batch import Columns, columns
+from ethbrake_marl.physics.compiling import compiled
 from ethbrake_marl.physics.kernel import (
     FLAG,
     LISTED,
@@ -86,7 +76,6 @@ LINK = _Link()
 RING_HEAD = 2
 
 POST_M = 1e6  # so far ahead of Vehicle 1 an obstacle is out of reach; it makes the way of Vehicle 1 the change of a gap
-MOST_SAMPLES = 1_000  # in the ring
 _ON_GRID = 1e-9
 
 
@@ -108,14 +97,62 @@ def ring_at(vehicles: int) -> int:
     return CHANNEL.WIDTH + vehicles + LINK.WIDTH * vehicles * vehicles
 
 
-def message_columns(vehicles: int, samples: int) -> int:
-    """How many columns M the messages of a line take, with so many samples in the ring."""
-    return ring_at(vehicles) + samples * (RING_HEAD + 3 * vehicles)
-
-
 def ring_length(delay_s: float, time_step_s: float) -> int:
     """Samples that a message may still carry when it arrives: those of its delay, and one at each end."""
     return math.ceil(delay_s / time_step_s - _ON_GRID) + 3
+
+
+class Told(NamedTuple):
+    """The newest state that a vehicle was told of each other one, [n, N] each; views of the columns."""
+
+    at_s: Floats  # when it was sampled; below 0: never
+    place_m: Floats
+    speed_mps: Floats
+    command_mps2: Floats
+    obstacle_hit: Floats  # 1 where Vehicle 1 had hit the obstacle by then
+    own_place_m: Floats  # [n] where the vehicle is
+    obstacle_place_m: Floats  # [n] where the obstacle ahead is
+
+
+def newest_told(worlds: Worlds, vehicle: int) -> Told:
+    """What ``vehicle`` was last told, in worlds with columns of messages."""
+    links = _links(worlds.messages, worlds.N)[:, vehicle]
+    own, obstacle = worlds.messages[:, place_at(worlds.N) + vehicle], worlds.messages[:, CHANNEL.OBSTACLE_PLACE]
+    at_s, place, speed, command, hit = (links[..., entry] for entry in range(LINK.TOLD_S, LINK.WIDTH))
+    return Told(at_s, place, speed, command, hit, own, obstacle)
+
+
+def silent_messages(
+    heard_s: Floats, seen_s: Floats, key: Floats, samples: int, *, period_s: float, delay_s: float,
+    loss_begins: float, loss_ends: float,
+) -> Floats:  # fmt: skip
+    """The columns [n, M] before any message is sent.
+
+    Args:
+        heard_s: when the first message of vehicle j is of use to vehicle i, [n, N, N]; infinite: never.
+        seen_s: from when on i measures j, [n, N, N]; infinite: never.
+        key: [n], a whole number below 2^53, by which later messages are lost or not.
+        samples: in the ring, see ``ring_length``.
+        period_s: between two messages of a link.
+        delay_s: from sending a message to its use.
+        loss_begins: probability that a good channel turns bad, per message.
+        loss_ends: probability that a bad one turns good again.
+
+    """
+    n, N = heard_s.shape[:2]
+    columns = np.zeros((n, ring_at(N) + samples * (RING_HEAD + 3 * N)))
+    columns[:, : CHANNEL.KEY] = period_s, delay_s, loss_begins, loss_ends
+    columns[:, CHANNEL.KEY] = key
+    links, itself = _links(columns, N), np.eye(N, dtype=np.bool_)
+    links[..., LINK.NEXT_SENT] = np.where(itself, np.inf, heard_s - delay_s)
+    links[..., LINK.SEEN_FROM] = np.where(itself, np.inf, seen_s)
+    links[..., LINK.TOLD_S] = -1.0
+    return columns
+
+
+def _links(messages: Floats, N: int) -> Floats:
+    """The columns of every link, [n, N, N, LINK]: a view of the columns of ``messages`` [n, M]."""
+    return messages[:, link_at(0, 0, N) : ring_at(N)].reshape(-1, N, N, LINK.WIDTH)
 
 
 @compiled
@@ -140,8 +177,8 @@ def hear_rows(
     Samples are taken every ``time_step_s``, counted back from the next decision at ``decision_s`` [n]; who stops before
     it measures the present, and that sample is not kept. A world that cannot be advanced hears nothing.
     """
-    N = vehicles_in(moving)
-    head = messages_at(N)
+    column = columns(moving)
+    N, head = column.vehicles, column.messages
     table = np.zeros((ROW.OF_SEGMENT, N + 1))
     no_rows = np.empty((0, LISTED.WIDTH))
     for k in range(moving.shape[0]):
@@ -149,58 +186,61 @@ def hear_rows(
             continue
         told = params[k, head:]
         if told[CHANNEL.TAKEN] == 0.0:
-            _start(moving[k], told, N, wanted[k], params[k, params_at(2, N) :])
-        while moving[k, TIME] < until_s[k]:
-            left = math.ceil((decision_s[k] - moving[k, TIME]) / time_step_s - 1e-6) - 1.0
+            _start(moving[k], told, column, wanted[k], params[k, column.latency :])
+        while moving[k, column.time] < until_s[k]:
+            left = math.ceil((decision_s[k] - moving[k, column.time]) / time_step_s - 1e-6) - 1.0
             end = decision_s[k] - max(left, 0.0) * time_step_s
             stops = end > until_s[k]
             if stops:
                 end = until_s[k]
-            if not _move(moving[k], params[k], wanted[k], end, table, no_rows):
+            if not _move(moving[k], params[k], column, wanted[k], end, table, no_rows):
                 break
-            _sample(moving[k], told, N)
-            _receive(moving[k], told, N)
+            _sample(moving[k], told, column)
+            _receive(moving[k, column.time], told, N)
             if stops:
                 told[CHANNEL.TAKEN] -= 1.0
 
 
 @compiled
-def _start(state: Floats, told: Floats, N: int, wanted: Floats, latency: Floats) -> None:
+def _start(state: Floats, told: Floats, column: Columns, wanted: Floats, latency: Floats) -> None:
     """Places and the first sample, at the alert."""
-    place, gap = place_at(N), gap_at(N)
+    N, obstacle, gap = column.vehicles, column.obstacle, column.gap
+    place = place_at(N)
     told[place] = 0.0
-    told[CHANNEL.OBSTACLE_PLACE] = state[state_width(N)] if state.shape[0] > state_width(N) else math.inf
+    told[CHANNEL.OBSTACLE_PLACE] = state[obstacle] if state.shape[0] > obstacle else math.inf
     for p in range(N - 1):
         told[place + p + 1] = told[place + p] - state[gap + p]
     for i in range(N):
-        state[command_at(N) + i] = command_in_force(wanted[i], latency[i], state[TIME])
-    _sample(state, told, N)
-    _receive(state, told, N)
+        state[column.command + i] = command_in_force(wanted[i], latency[i], state[column.time])
+    _sample(state, told, column)
+    _receive(state[column.time], told, N)
 
 
 @compiled
-def _move(state: Floats, params: Floats, wanted: Floats, end: float, table: Floats, no_rows: Floats) -> bool:
+def _move(
+    state: Floats, params: Floats, column: Columns, wanted: Floats, end: float, table: Floats, no_rows: Floats
+) -> bool:
     """One world moved to ``end``, its places included; False, and nothing moved, where the kernel cannot."""
-    N, time = wanted.shape[0], state[TIME]
-    speed, command, gap, obstacle = speed_at(N), command_at(N), gap_at(N), state_width(N)
+    N, time = column.vehicles, state[column.time]
+    speed, command, gap, obstacle = column.speed, column.command, column.gap, column.obstacle
     with_obstacle = state.shape[0] > obstacle and state[obstacle] < math.inf
     ahead = state[obstacle] if with_obstacle else POST_M
     place_obstacle(table, ahead, state[obstacle + 1] if with_obstacle else 0.0)
-    latency = params_at(2, N)
+    latency = column.latency
     for i in range(N):
         table[ROW.SPEED, i + 1] = state[speed + i]
         table[ROW.COMMAND, i + 1] = wanted[i]
-        table[ROW.MASS, i + 1] = params[params_at(3, N) + i]
-        table[ROW.LIMIT, i + 1] = params[params_at(4, N) + i]
+        table[ROW.MASS, i + 1] = params[column.mass + i]
+        table[ROW.LIMIT, i + 1] = params[column.limit + i]
         table[ROW.ONSET, i + 1] = onset_s(params[latency + i], time)
     for p in range(N - 1):
         table[ROW.GAP, p + 1] = state[gap + p]
         table[ROW.HIT, p + 1] = state[gap + N - 1 + p]
-    if advance_table(table, params[RESTITUTION], end - time, time, 0, no_rows, 0)[1] != FLAG.DONE:
+    if advance_table(table, params[column.restitution], end - time, time, 0, no_rows, 0)[1] != FLAG.DONE:
         return False
-    place = messages_at(N) + place_at(N)
+    place = column.messages + place_at(N)
     params[place] += ahead - table[ROW.GAP, 0]
-    state[TIME] = end
+    state[column.time] = end
     for i in range(N):
         state[speed + i] = table[ROW.SPEED, i + 1]
         state[command + i] = command_in_force(wanted[i], params[latency + i], end)
@@ -215,23 +255,23 @@ def _move(state: Floats, params: Floats, wanted: Floats, end: float, table: Floa
 
 
 @compiled
-def _sample(state: Floats, told: Floats, N: int) -> None:
+def _sample(state: Floats, told: Floats, column: Columns) -> None:
     """Every vehicle takes a sample of its state, over the oldest one."""
+    N, obstacle = column.vehicles, column.obstacle
     width, first = RING_HEAD + 3 * N, ring_at(N)
     at = first + width * (int(told[CHANNEL.TAKEN]) % ((told.shape[0] - first) // width))
-    told[at] = state[TIME]
-    told[at + 1] = state[state_width(N) + 1] if state.shape[0] > state_width(N) else 0.0
+    told[at] = state[column.time]
+    told[at + 1] = state[obstacle + 1] if state.shape[0] > obstacle else 0.0
     for i in range(N):
         told[at + RING_HEAD + i] = told[place_at(N) + i]
-        told[at + RING_HEAD + N + i] = state[speed_at(N) + i]
-        told[at + RING_HEAD + 2 * N + i] = state[command_at(N) + i]
+        told[at + RING_HEAD + N + i] = state[column.speed + i]
+        told[at + RING_HEAD + 2 * N + i] = state[column.command + i]
     told[CHANNEL.TAKEN] += 1.0
 
 
 @compiled
-def _receive(state: Floats, told: Floats, N: int) -> None:
+def _receive(time: float, told: Floats, N: int) -> None:
     """Deal with every message that is of use by now, and measure who is in sight."""
-    time = state[TIME]
     for i in range(N):
         for j in range(N):
             link = link_at(i, j, N)
@@ -277,25 +317,26 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
     vehicles it sees now has its true gap; the own pairs' hit flags are its own. Who is not known stands in the place of
     the next one towards the observer, at rest: nothing of it is left.
     """
-    N = vehicles_in(state)
-    head, gap, speed, command = messages_at(N), gap_at(N), speed_at(N), command_at(N)
+    column = columns(state)
+    N, gap, speed, command, obstacle = column.vehicles, column.gap, column.speed, column.command, column.obstacle
+    head = column.messages
     place, fresh = np.empty(N), np.empty(N, np.bool_)
     out[:] = state
     for k in range(state.shape[0]):
         if params[k, head + CHANNEL.PERIOD] == 0.0:
             continue
-        told, time = params[k, head:], state[k, TIME]
+        told, time = params[k, head:], state[k, column.time]
         place[observer], fresh[observer] = told[place_at(N) + observer], True
         for way in (-1, 1):
             last = place[observer]
             j = observer + way
             while 0 <= j < N:
                 link = link_at(observer, j, N)
-                known = time >= params[k, params_at(6, N) + observer * N + j] and told[link + LINK.TOLD_S] >= 0.0
+                known = time >= params[k, column.news + observer * N + j] and told[link + LINK.TOLD_S] >= 0.0
                 fresh[j] = known and told[link + LINK.TOLD_S] >= time
                 out[k, speed + j], out[k, command + j], place[j] = 0.0, 0.0, last
                 if known:
-                    limit, age = params[k, params_at(4, N) + j], time - told[link + LINK.TOLD_S]
+                    limit, age = params[k, column.limit + j], time - told[link + LINK.TOLD_S]
                     after, passed = moved_on(told[link + LINK.TOLD_SPEED], told[link + LINK.TOLD_COMMAND], limit, age)
                     out[k, speed + j], out[k, command + j] = after, told[link + LINK.TOLD_COMMAND]
                     place[j] = told[link + LINK.TOLD_PLACE] + passed
@@ -306,9 +347,9 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
                 out[k, gap + p] = max(place[p] - place[p + 1], 0.0)
             if p != observer and p + 1 != observer:
                 out[k, gap + N - 1 + p] = 0.0
-        if observer > 0 and state.shape[1] > state_width(N):
-            out[k, state_width(N)] = max(told[CHANNEL.OBSTACLE_PLACE] - place[0], 0.0)
-            out[k, state_width(N) + 1] = told[link_at(observer, 0, N) + LINK.TOLD_HIT]
+        if observer > 0 and state.shape[1] > obstacle:
+            out[k, obstacle] = max(told[CHANNEL.OBSTACLE_PLACE] - place[0], 0.0)
+            out[k, obstacle + 1] = told[link_at(observer, 0, N) + LINK.TOLD_HIT]
 
 
 @compiled
@@ -330,28 +371,17 @@ def is_periodic(worlds: Worlds) -> Bools:
     return periodic
 
 
-def links_of(worlds: Worlds) -> Floats:
-    """The columns of every link, [n, N, N, LINK], of worlds with columns of messages."""
-    n, N = worlds.speeds_mps.shape
-    return worlds.messages[:, link_at(0, 0, N) : ring_at(N)].reshape(n, N, N, LINK.WIDTH)
-
-
-def age_s(worlds: Worlds) -> Floats:
+def age_s(time_s: Floats, messages: Floats, vehicles: int) -> Floats:
     """How old what vehicle i was last told of vehicle j is, [n, N, N] s: since the state was sampled.
 
-    0 without periodic messages, where the present is known; infinite where nothing has been told yet. Whether i may act
-    on it is another question (``Vehicles.known_from_s``).
+    Of worlds at ``time_s`` [n] with columns of ``messages`` [n, M]. 0 without periodic messages, where the present is
+    known; infinite where nothing has been told yet. Whether i may act on it is another question
+    (``Vehicles.known_from_s``).
     """
-    return age_by_rows(worlds.time_s, worlds.messages, worlds.N)
-
-
-def age_by_rows(time_s: Floats, messages: Floats, vehicles: int) -> Floats:
-    """``age_s`` of worlds at ``time_s`` [n] by their columns of ``messages`` [n, M]."""
     age = np.zeros((len(time_s), vehicles, vehicles))
     if messages.shape[1] == 0:
         return age
-    links = messages[:, link_at(0, 0, vehicles) : ring_at(vehicles)].reshape(-1, vehicles, vehicles, LINK.WIDTH)
-    periodic, told_s = messages[:, CHANNEL.PERIOD] > 0.0, links[..., LINK.TOLD_S]
+    periodic, told_s = messages[:, CHANNEL.PERIOD] > 0.0, _links(messages, vehicles)[..., LINK.TOLD_S]
     age[periodic] = np.where(told_s >= 0.0, time_s[:, np.newaxis, np.newaxis] - told_s, np.inf)[periodic]
     age[:, np.arange(vehicles), np.arange(vehicles)] = 0.0
     return age

@@ -15,8 +15,9 @@ Only gaps and speeds are stored: absolute positions would lose digits as the lin
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,46 @@ class Vehicles:
         """Select worlds by index or mask (always a copy)."""
         index = np.asarray(rows)
         return _combined(lambda column: np.ascontiguousarray(column[index]), self)
+
+    @classmethod
+    def at_once(
+        cls,
+        braking_mps2: Floats,
+        driving_mps2: Floats,
+        latency_s: Floats,
+        mass_t: Floats,
+        limit_mps: Floats,
+        restitution: Floats,
+    ) -> Vehicles:
+        """Vehicles without a channel: latencies are all own, and all news is known from them on."""
+        known = cls.known_at_once(latency_s)
+        return cls(braking_mps2, driving_mps2, latency_s, mass_t, limit_mps, restitution, latency_s, known)
+
+    @staticmethod
+    def known_at_once(latency_s: Floats) -> Floats:
+        """``known_from_s`` [n, N, N] without a channel: all news, from the own latency [n, N] on.
+
+        A view of ``latency_s`` that takes no memory (its last axis has stride 0) and cannot be written.
+        """
+        latency = np.ascontiguousarray(latency_s, np.float64)
+        (n, N), size = latency.shape, latency.itemsize
+        view: Floats = np.ndarray((n, N, N), np.float64, latency, strides=(N * size, size, 0))
+        view.flags.writeable = False
+        return view
+
+    @property
+    def is_known_at_once(self) -> bool:
+        """Whether nothing comes link by link, whatever memory says so: no channel, or one that changes nothing."""
+        if self._is_view:
+            return True
+        own, latency = self.own_latency_s, self.latency_s
+        return bool((own == latency).all() and (self.known_from_s == latency[:, :, np.newaxis]).all())
+
+    @property
+    def _is_view(self) -> bool:
+        """Whether own latency and news are the latency's memory, as ``at_once`` makes them."""
+        latency, news = self.latency_s, self.known_from_s
+        return self.own_latency_s is latency and news.base is latency and news.strides[1:] == (latency.itemsize, 0)
 
 
 _OF_VEHICLES = tuple(f.name for f in fields(Vehicles))
@@ -101,9 +142,96 @@ class Worlds:
         """Select worlds by index or mask (always a copy)."""
         index = np.asarray(rows)
         return Worlds(
-            self.vehicles.take(index),
-            *(np.ascontiguousarray(getattr(self, f.name)[index]) for f in fields(self)[1:]),
+            self.vehicles.take(index), *(np.ascontiguousarray(getattr(self, f.name)[index]) for f in fields(self)[1:])
         )
+
+    @staticmethod
+    def concatenate(parts: Sequence[Worlds]) -> Worlds:
+        """Join worlds with the same number of vehicles into one batch."""
+        vehicles = _combined(lambda *columns: np.concatenate(columns), *(w.vehicles for w in parts))
+        return Worlds(vehicles, *(np.concatenate([getattr(w, name) for w in parts]) for name in _OF_WORLDS))
+
+    def assign(self, rows: Ints, fresh: Worlds) -> Worlds:
+        """The batch with ``rows`` replaced by the len(rows) worlds of ``fresh``; nothing is changed in place."""
+        vehicles = _combined(lambda whole, part: _assigned(whole, rows, part), self.vehicles, fresh.vehicles)
+        return Worlds(vehicles, *(_assigned(getattr(self, name), rows, getattr(fresh, name)) for name in _OF_WORLDS))
+
+    def read_only(self) -> Worlds:
+        """The same worlds as arrays that cannot be written to; these stay as they are."""
+        vehicles = _combined(unwritable, self.vehicles)
+        return Worlds(vehicles, *(unwritable(getattr(self, name)) for name in _OF_WORLDS))
+
+    def first_decision_s(self, deciders: Sequence[int]) -> Floats:
+        """Time of the first decision, [n] s: the least latency of the ``deciders``, or the worlds' time if it is later.
+
+        With nobody to decide it is the worlds' time.
+        """
+        if len(deciders) == 0:
+            return self.time_s.copy()
+        first: Floats = np.maximum(self.vehicles.latency_s[:, list(deciders)].min(axis=1), self.time_s)
+        return first
+
+    # The obstacle ahead of Vehicle 1 is for the kernels one more vehicle in front, which nothing moves. Everybody else
+    # keeps the numbers of the vehicles, and the obstacle has columns of its own.
+
+    @property
+    def obstacle_ahead(self) -> Bools:
+        """Which worlds have an obstacle ahead of Vehicle 1, [n]."""
+        return np.isfinite(self.obstacle_gap_m)
+
+    def with_obstacle(self) -> Worlds:
+        """These worlds, all with an obstacle ahead, with that obstacle as vehicle 0 and the vehicles one later."""
+
+        def ahead(value: float, columns: Floats) -> Floats:
+            return np.concatenate([np.full((len(columns), 1), value), columns], axis=1)
+
+        vehicles = self.vehicles
+        written_out = Vehicles.at_once(  # inside the physics nobody observes
+            ahead(0.0, vehicles.braking_capacity_mps2),
+            ahead(0.0, vehicles.driving_capacity_mps2),
+            ahead(0.0, vehicles.latency_s),
+            ahead(math.inf, vehicles.mass_t),
+            ahead(0.0, vehicles.speed_limit_mps),
+            vehicles.restitution,
+        )
+        return Worlds(
+            written_out,
+            np.concatenate([self.obstacle_gap_m[:, np.newaxis], self.gaps_m], axis=1),
+            ahead(0.0, self.speeds_mps),
+            self.time_s,
+            np.concatenate([self.obstacle_hit[:, np.newaxis], self.pair_hit], axis=1),
+            ahead(0.0, self.command_mps2),
+            np.full(self.n, np.inf),
+            np.zeros(self.n, np.bool_),
+            self.messages,
+        )
+
+    def without_obstacle(self, vehicles: Vehicles) -> Worlds:
+        """Back from ``with_obstacle``: its columns beside those of the pairs; ``vehicles`` are the real ones."""
+        return replace(
+            self,
+            vehicles=vehicles,
+            gaps_m=self.gaps_m[:, 1:].copy(),
+            speeds_mps=self.speeds_mps[:, 1:].copy(),
+            pair_hit=self.pair_hit[:, 1:].copy(),
+            command_mps2=self.command_mps2[:, 1:].copy(),
+            obstacle_gap_m=self.gaps_m[:, 0].copy(),
+            obstacle_hit=self.pair_hit[:, 0].copy(),
+        )
+
+    def with_post_ahead(self, duration_s: Floats) -> Worlds:
+        """These worlds, each with an obstacle ahead: its own, or one that Vehicle 1 cannot reach in ``duration_s`` [n].
+
+        Worlds know gaps and speeds, no places. Such a post makes the way of Vehicle 1 the change of one more gap, and
+        changes no motion. It is farther than Vehicle 1 can travel, ``T sqrt(2 E / m_1)``, had it all the energy E the
+        line can ever have: impacts and brakes only take energy; driving adds at most ``m a v`` per second, and never
+        above the speed limit.
+        """
+        vehicles = self.vehicles
+        driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]
+        energy = sum_rows(vehicles.mass_t * (self.speeds_mps * self.speeds_mps / 2.0 + driving))
+        farthest = 1.01 * duration_s * np.sqrt(2.0 * energy / vehicles.mass_t[:, 0])
+        return replace(self, obstacle_gap_m=np.where(self.obstacle_ahead, self.obstacle_gap_m, farthest + 1.0))
 
 
 _OF_WORLDS = tuple(f.name for f in fields(Worlds))[1:]
@@ -117,64 +245,13 @@ def _span(values: Floats) -> str:
     return f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
 
 
-def vehicles_at_once(
-    braking_mps2: Floats,
-    driving_mps2: Floats,
-    latency_s: Floats,
-    mass_t: Floats,
-    limit_mps: Floats,
-    restitution: Floats,
-) -> Vehicles:
-    """Vehicles without a channel: latencies are all own, and all news is known from them on."""
-    known = known_at_once(latency_s)
-    return Vehicles(braking_mps2, driving_mps2, latency_s, mass_t, limit_mps, restitution, latency_s, known)
-
-
-def known_at_once(latency_s: Floats) -> Floats:
-    """``Vehicles.known_from_s`` [n, N, N] without a channel: all news, from the own latency [n, N] on.
-
-    A view of ``latency_s`` that takes no memory (its last axis has stride 0) and cannot be written.
-    """
-    latency = np.ascontiguousarray(latency_s, np.float64)
-    (n, N), size = latency.shape, latency.itemsize
-    view: Floats = np.ndarray((n, N, N), np.float64, latency, strides=(N * size, size, 0))
-    view.flags.writeable = False
-    return view
-
-
-def is_known_at_once(vehicles: Vehicles) -> bool:
-    """Whether nothing comes link by link, whatever memory says so: no channel, or one that changes nothing."""
-    if _is_view(vehicles):
-        return True
-    own, latency = vehicles.own_latency_s, vehicles.latency_s
-    return bool((own == latency).all() and (vehicles.known_from_s == latency[:, :, np.newaxis]).all())
-
-
-def _is_view(vehicles: Vehicles) -> bool:
-    """Whether own latency and news are the latency's memory, as ``vehicles_at_once`` makes them."""
-    latency, news = vehicles.latency_s, vehicles.known_from_s
-    return vehicles.own_latency_s is latency and news.base is latency and news.strides[1:] == (latency.itemsize, 0)
-
-
-def concatenate(parts: Sequence[Worlds]) -> Worlds:
-    """Join worlds with the same number of vehicles into one batch."""
-    vehicles = _combined(lambda *columns: np.concatenate(columns), *(w.vehicles for w in parts))
-    return Worlds(vehicles, *(np.concatenate([getattr(w, name) for w in parts]) for name in _OF_WORLDS))
-
-
 def _combined(change: Callable[..., NDArray[Any]], *parts: Vehicles) -> Vehicles:
     """``change`` of each column of these vehicles, which picks or joins rows; without a channel it stays one memory."""
-    at_once = all(_is_view(part) for part in parts)
+    at_once = all(part._is_view for part in parts)
     columns = [
         change(*(getattr(part, name) for part in parts)) for name in (_WITHOUT_NEWS if at_once else _OF_VEHICLES)
     ]
-    return vehicles_at_once(*columns) if at_once else Vehicles(*columns)
-
-
-def read_only(worlds: Worlds) -> Worlds:
-    """The same worlds as arrays that cannot be written to; those given stay as they are."""
-    vehicles = _combined(unwritable, worlds.vehicles)
-    return Worlds(vehicles, *(unwritable(getattr(worlds, name)) for name in _OF_WORLDS))
+    return Vehicles.at_once(*columns) if at_once else Vehicles(*columns)
 
 
 def unwritable(array: NDArray[Any]) -> NDArray[Any]:
@@ -182,13 +259,6 @@ def unwritable(array: NDArray[Any]) -> NDArray[Any]:
     view = array.view()
     view.flags.writeable = False
     return view
-
-
-def assign(worlds: Worlds, rows: Ints, fresh: Worlds) -> Worlds:
-    """The batch with ``rows`` replaced by the worlds of ``fresh`` (len(rows) of them); nothing is changed in place."""
-    vehicles = _combined(lambda whole, part: _assigned(whole, rows, part), worlds.vehicles, fresh.vehicles)
-    state = (_assigned(getattr(worlds, name), rows, getattr(fresh, name)) for name in _OF_WORLDS)
-    return Worlds(vehicles, *state)
 
 
 def _assigned(whole: NDArray[Any], rows: Ints, part: NDArray[Any]) -> NDArray[Any]:
@@ -243,7 +313,7 @@ def make_worlds(
     n = speeds.shape[0] if gaps.ndim < 2 else max(speeds.shape[0], gaps.shape[0])
     N = speeds.shape[1]
     restitution_ = _full("restitution", restitution, (n,), 0.0, 1.0)
-    vehicles = vehicles_at_once(
+    vehicles = Vehicles.at_once(
         _full("braking_capacity_mps2", braking_capacity_mps2, (n, N), 0.0, np.inf, open_low=True),
         _full("driving_capacity_mps2", driving_capacity_mps2, (n, N), 0.0, np.inf),
         _full("latency_s", latency_s, (n, N), 0.0, np.inf),

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from pydantic import Field, GetJsonSchemaHandler
@@ -15,9 +15,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
-from ethbrake_marl.physics import Floats, Worlds, make_worlds
-from ethbrake_marl.physics.messages import age_s
-from ethbrake_marl.physics.worlds import read_only
+from ethbrake_marl.physics import Floats, Worlds, age_s, make_worlds
 
 MOST_NEIGHBOURS = 64  # on each side
 
@@ -36,7 +34,7 @@ class Feature:
     meaning: str
 
 
-OWN_FEATURES = (
+_OWN = (
     Feature("speed", "m/s", 20.0, -2.0, 4.0, "own speed"),
     Feature("acceleration", "m/s2", 10.0, -2.0, 2.0, "own command in force"),
     Feature("braking_capacity", "m/s2", 10.0, 0.0, 2.0, "own largest deceleration"),
@@ -45,7 +43,7 @@ OWN_FEATURES = (
     Feature("latency_left", "s", 1.0, 0.0, 4.0, "time until own commands take effect"),
     Feature("restitution", "1", 1.0, 0.0, 1.0, "coefficient of restitution"),
 )
-NEIGHBOUR_FEATURES = (
+_NEIGHBOUR = (
     Feature("known", "1", 1.0, 0.0, 1.0, "1 if this neighbour exists and its message has arrived"),
     Feature("gap", "m", 10.0, 0.0, 10.0, "free distance to it, other vehicles between not counted as length"),
     Feature("closing_speed", "m/s", 10.0, -4.0, 4.0, "positive when the two approach"),
@@ -65,11 +63,11 @@ NEIGHBOUR_FEATURES = (
     ),
 )
 
-ROLE_FEATURES = (
+_ROLE = (
     Feature("vehicles_ahead", "1", 1.0, 0.0, 2.0, "how many vehicles are ahead in the line; 2 stands for 2 or more"),
     Feature("vehicles_behind", "1", 1.0, 0.0, 2.0, "how many are behind"),
 )
-OBSTACLE_FEATURES = (
+_OBSTACLE = (
     Feature("known", "1", 1.0, 0.0, 1.0, "1 if there is an obstacle ahead of the line and this vehicle knows of it"),
     Feature("gap", "m", 10.0, 0.0, 10.0, "free distance to it, vehicles between not counted as length"),
     Feature("hit", "1", 1.0, 0.0, 1.0, "1 if Vehicle 1 has had an impact with it"),
@@ -81,47 +79,38 @@ CONTACT_COMMANDS = ("brake", "coast", "drive")  # own commands that are forecast
 CONTACT_SIDES = ("front", "rear")  # own pairs; in front of Vehicle 1 an obstacle
 
 
-def _contact_features(command: str) -> tuple[Feature, ...]:
-    """What one forecast tells: four numbers of each own pair, then the harm of the line."""
-    held = {"brake": "braking fully", "coast": "coasting", "drive": "driving fully"}[command]
-    pairs = [
-        feature
-        for side, where in zip(CONTACT_SIDES, ("in front", "behind"), strict=True)
-        for feature in (
-            Feature(f"{command}_{side}_time", "s", 2.0, 0.0, 2.0, f"{held}: time to the first impact {where}"),
-            Feature(f"{command}_{side}_closing_speed", "m/s", 10.0, 0.0, 4.0, "its closing speed; 0 without one"),
-            Feature(f"{command}_{side}_fraction", "1", 1.0, 0.0, 1.0, "where in its decision step it falls"),
-            Feature(f"{command}_{side}_steps", "1", 10.0, 0.0, 2.0, "whole decision steps before that one"),
-        )
+class Groups(NamedTuple):
+    """The built-in features by group; those of contacts are told of each of ``CONTACT_COMMANDS`` in turn."""
+
+    own: tuple[Feature, ...]
+    role: tuple[Feature, ...]
+    obstacle: tuple[Feature, ...]
+    contact: tuple[Feature, ...]
+    contact_far: tuple[Feature, ...]
+    neighbour: tuple[Feature, ...]  # of each that is listed, ``front_1`` and so on
+
+
+_contact: list[Feature] = []
+_far: list[Feature] = []
+for _command, _held in zip(CONTACT_COMMANDS, ("braking fully", "coasting", "driving fully"), strict=True):
+    for _side, _where in zip(CONTACT_SIDES, ("in front", "behind"), strict=True):  # four numbers of each own pair
+        _pair, _told = f"{_command}_{_side}", f"{_held}: time to the first impact {_where}"
+        _contact += [
+            Feature(f"{_pair}_time", "s", 2.0, 0.0, 2.0, _told),
+            Feature(f"{_pair}_closing_speed", "m/s", 10.0, 0.0, 4.0, "its closing speed; 0 without one"),
+            Feature(f"{_pair}_fraction", "1", 1.0, 0.0, 1.0, "where in its decision step it falls"),
+            Feature(f"{_pair}_steps", "1", 10.0, 0.0, 2.0, "whole decision steps before that one"),
+        ]
+        _far += [Feature(f"{_pair}_time", "s", 5.0, 0.0, 2.0, _told)]
+    _contact += [  # then the harm of the line
+        Feature(f"{_command}_first_impact_harm", "m2/s2", 50.0, 0.0, 4.0, f"{_held}: first-impact harm of the line"),
+        Feature(f"{_command}_total_harm", "m2/s2", 50.0, 0.0, 4.0, f"{_held}: total harm of the line"),
     ]
-    return (
-        *pairs,
-        Feature(f"{command}_first_impact_harm", "m2/s2", 50.0, 0.0, 4.0, f"{held}: first-impact harm of the line"),
-        Feature(f"{command}_total_harm", "m2/s2", 50.0, 0.0, 4.0, f"{held}: total harm of the line"),
-    )
-
-
-def _far_features(command: str) -> tuple[Feature, ...]:
-    """What the same forecast tells of what is late or hard: beyond the bounds of the features above."""
-    held = {"brake": "braking fully", "coast": "coasting", "drive": "driving fully"}[command]
-    return (
-        Feature(f"{command}_front_time", "s", 5.0, 0.0, 2.0, f"{held}: time to the first impact in front"),
-        Feature(f"{command}_rear_time", "s", 5.0, 0.0, 2.0, f"{held}: time to the first impact behind"),
-        Feature(f"{command}_first_impact_speed", "m/s", 10.0, 0.0, 6.0, "square root of the first-impact harm"),
-        Feature(f"{command}_total_speed", "m/s", 10.0, 0.0, 6.0, "square root of the total harm"),
-    )
-
-
-CONTACT_FEATURES = tuple(feature for command in CONTACT_COMMANDS for feature in _contact_features(command))
-CONTACT_FAR_FEATURES = tuple(feature for command in CONTACT_COMMANDS for feature in _far_features(command))
-
-_BUILT_IN = {
-    "own": OWN_FEATURES,
-    "role": ROLE_FEATURES,
-    "obstacle": OBSTACLE_FEATURES,
-    "contact": CONTACT_FEATURES,
-    "contact_far": CONTACT_FAR_FEATURES,
-}
+    _far += [  # what is late or hard: beyond the bounds of those above
+        Feature(f"{_command}_first_impact_speed", "m/s", 10.0, 0.0, 6.0, "square root of the first-impact harm"),
+        Feature(f"{_command}_total_speed", "m/s", 10.0, 0.0, 6.0, "square root of the total harm"),
+    ]
+GROUPS = Groups(_OWN, _ROLE, _OBSTACLE, tuple(_contact), tuple(_far), _NEIGHBOUR)
 _SIDE = re.compile(r"(front|rear)_([1-9][0-9]?)")
 
 
@@ -140,10 +129,33 @@ class RegisteredFeature:
         feature = self.feature
         return np.clip(value * (1.0 / feature.scale), feature.low, feature.high)
 
+    def checked(self, worlds: Worlds, vehicle: int, neighbour: int | None, counts: Any, steps: Floats | None) -> Floats:
+        """What it gives, scaled, [n]; ``unknown`` where it does not count.
+
+        ``steps`` [n], if known, is told in the message. Raises ``InvalidInput`` that names feature, vehicle and world.
+        """
+        name = self.feature.name
+        given = (worlds, vehicle) if neighbour is None else (worlds, vehicle, neighbour)
+        value = np.asarray(self.function(*given))
+        if value.shape != (worlds.n,) or value.dtype.kind not in "fiub":
+            raise InvalidInput(
+                f"feature {name!r}: gave {value.dtype} of shape {value.shape}; must be numbers of shape ({worlds.n},),"
+                " one per world"
+            )
+        told = np.where(counts, value, self.unknown)
+        if not np.isfinite(told).all():
+            world = int(np.argmin(np.isfinite(told)))
+            step = "" if steps is None else f" after step {int(steps[world])}"
+            raise InvalidInput(
+                f"feature {name!r}: is {told[world]} for vehicle_{vehicle + 1} in world {world} at"
+                f" {worlds.time_s[world]:g} s{step}; must be finite"
+            )
+        return self.scaled(told)
+
 
 def age(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
     """Time since the sample that was last told of it, [n] s; 0 where the present is known."""
-    told = age_s(worlds)[:, vehicle, neighbour]
+    told = age_s(worlds.time_s, worlds.messages, worlds.N)[:, vehicle, neighbour]
     return np.where(np.isfinite(told), told, 0.0)
 
 
@@ -207,7 +219,7 @@ def registered_in(names: Iterable[str]) -> dict[str, RegisteredFeature]:
 
 def built_in_names() -> set[str]:
     """Names of groups and of the features in them."""
-    return {*_BUILT_IN, *(feature.name for group in (*_BUILT_IN.values(), NEIGHBOUR_FEATURES) for feature in group)}
+    return {*GROUPS._fields[:-1], *(feature.name for group in GROUPS for feature in group)}
 
 
 def choices(sides: Iterable[str] = ("front_1", "rear_1")) -> list[str]:
@@ -228,7 +240,9 @@ def _expanded(each: object) -> tuple[str, ...]:
 
 
 def _group(name: str) -> tuple[Feature, ...]:
-    return NEIGHBOUR_FEATURES if _is_side(name) else _BUILT_IN.get(name, ())
+    if _is_side(name):
+        return GROUPS.neighbour
+    return getattr(GROUPS, name) if name in GROUPS._fields[:-1] else ()
 
 
 def _is_side(name: str) -> bool:
@@ -297,32 +311,6 @@ def register_feature(
         raise AlreadyExists(f"feature {name!r} is registered already; give another name")
 
 
-def checked_values(
-    entry: RegisteredFeature, worlds: Worlds, vehicle: int, neighbour: int | None, counts: Any, steps: Floats | None
-) -> Floats:
-    """What a registered feature gives, scaled, [n]; ``unknown`` where it does not count.
-
-    ``steps`` [n], if known, is told in the message. Raises ``InvalidInput`` that names feature, vehicle and world.
-    """
-    name = entry.feature.name
-    given = (worlds, vehicle) if neighbour is None else (worlds, vehicle, neighbour)
-    value = np.asarray(entry.function(*given))
-    if value.shape != (worlds.n,) or value.dtype.kind not in "fiub":
-        raise InvalidInput(
-            f"feature {name!r}: gave {value.dtype} of shape {value.shape}; must be numbers of shape ({worlds.n},), one"
-            " per world"
-        )
-    told = np.where(counts, value, entry.unknown)
-    if not np.isfinite(told).all():
-        world = int(np.argmin(np.isfinite(told)))
-        step = "" if steps is None else f" after step {int(steps[world])}"
-        raise InvalidInput(
-            f"feature {name!r}: is {told[world]} for vehicle_{vehicle + 1} in world {world} at"
-            f" {worlds.time_s[world]:g} s{step}; must be finite"
-        )
-    return entry.scaled(told)
-
-
 def _taken() -> set[str]:
     return {*built_in_names(), *(f"{side}_{k}" for side in ("front", "rear") for k in range(MOST_NEIGHBOURS + 1))}
 
@@ -338,20 +326,18 @@ def _check_numbers(name: str, **numbers: float) -> None:
 
 
 def _tried(entry: RegisteredFeature) -> tuple[float, ...]:
-    worlds = read_only(
-        make_worlds(
-            [[8.0, 6.0], [3.0, 21.0], [0.5, 40.0]],
-            [[20.0, 18.0, 22.0], [9.0, 13.0, 11.0], [31.0, 30.0, 33.0]],
-            braking_capacity_mps2=[6.0, 7.0, 5.0],
-            driving_capacity_mps2=[1.0, 2.0, 3.0],
-            latency_s=[0.0, 0.5, 0.25],
-            mass_t=[4.5, 15.5, 5.9],
-            restitution=[0.0, 0.1, 0.3],
-        )
-    )
+    worlds = make_worlds(
+        [[8.0, 6.0], [3.0, 21.0], [0.5, 40.0]],
+        [[20.0, 18.0, 22.0], [9.0, 13.0, 11.0], [31.0, 30.0, 33.0]],
+        braking_capacity_mps2=[6.0, 7.0, 5.0],
+        driving_capacity_mps2=[1.0, 2.0, 3.0],
+        latency_s=[0.0, 0.5, 0.25],
+        mass_t=[4.5, 15.5, 5.9],
+        restitution=[0.0, 0.1, 0.3],
+    ).read_only()
     seen = [(0, None), (1, None), (2, None)] if entry.of == "own" else [(1, 0), (1, 2), (2, 0)]
     try:
-        values = [checked_values(entry, worlds, vehicle, neighbour, True, None) for vehicle, neighbour in seen]
+        values = [entry.checked(worlds, vehicle, neighbour, True, None) for vehicle, neighbour in seen]
     except InvalidInput:
         raise
     except Exception as error:

@@ -5,130 +5,63 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
-from pydantic_core.core_schema import ValidationInfo
 
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.files.yaml import (
-    UNSHOWN,
     Document,
     FileSchema,
     Wording,
     YamlPath,
-    explain,
     flow_text,
-    publish,
     read_yaml,
     refuse,
     schema_lines,
     suggestion,
 )
-from ethbrake_marl.harm import check_harm_count, objectives_of
-from ethbrake_marl.physics.messages import MOST_SAMPLES
-from ethbrake_marl.scenario.features import listed_features
-from ethbrake_marl.scenario.fields import (
-    ALTERNATIVES,
-    DECLARED,
+from ethbrake_marl.harm import check_harm_count
+from ethbrake_marl.scenario.sampling import (
     DISTRIBUTIONS,
     LEARNER,
-    LEFT_OUT,
     NAME_PATTERN,
-    OF_EVERY_VEHICLE,
-    OPTIONAL,
-    QUANTITIES,
+    QUANTITY,
     STATE_FREE,
-    TYPE_KEYS,
+    Channel,
     Member,
-    QuantityRule,
     Sample,
     ScenarioFields,
-    check_types,
-    complete_roles,
-    constant_deceleration,
-    is_state_free,
-    join_samples,
-    missing_quantity,
-    parse_agent_spec,
+    ScriptSpec,
+    draw,
     support,
 )
-from ethbrake_marl.scenario.sampling import (
-    Channel,
-    check_request,
-    draw_list,
-    draw_numbers,
-    farthest_obstacle_m,
-    quantity_bounds,
-    uniform_numbers,
-)
-from ethbrake_marl.scenario.v2x import CHANNELS, V2X
+
+MOST_SAMPLES = 1_000  # that a message may be older than the newest one
 
 # Checks of a scenario that concern a whole field or several fields at once.
 #
 # Each raises pydantic's error for the first defect, with the path inside the field or file and the value.
 
 
-def check_entries(rule: QuantityRule, value: Any, vehicles: int | None) -> None:
-    """Every entry of a quantity is in range over its whole support, and a list has the right length."""
-    listed = isinstance(value, tuple)
-    if listed and vehicles is not None and len(value) != rule.count(vehicles):
-        per = "one per pair" if rule.per == "pair" else "one per vehicle"
-        right = f"has {len(value)} entries; {vehicles} vehicles need {rule.count(vehicles)} ({per}), or one for all"
-        refuse((), UNSHOWN, right)
-    for index, entry in enumerate(value if listed else (value,)):
-        low, high = support(entry)
-        if not rule.allows(low, high):
-            overlap = "; a negative gap means overlapping vehicles" if rule.per == "pair" and low < 0.0 else ""
-            refuse((index,) if listed else (), entry, f"must be {rule.interval}{overlap}")
-
-
-def check_given(key: str, value: Any, data: Mapping[str, Any]) -> Any:
-    """The value of a quantity that every vehicle needs; None where every type declares it, and nobody else has to.
-
-    ``data`` are the fields before it. Raises pydantic's error where it is missing, and where nobody would read it.
-    """
-    kinds = data.get("vehicle_types")
-    without = None if kinds is None else missing_quantity(kinds, key)
-    if value is LEFT_OUT:
-        if data.get("mixture") is not None or not {"vehicle_types", "mixture"} <= data.keys():
-            return None
-        if kinds is None:
-            raise PydanticCustomError("missing", "missing", {"at": ()})
-        if without is not None:
-            right = f"type {without} does not declare it: give it there, or here for every type that does not"
-            refuse((), UNSHOWN, right)
-        return None
-    if value is None:
-        refuse((), value, "must be a number or a distribution; a key that is not used is left out")
-    if kinds is not None and without is None:
-        refuse((), value, "every type declares it; leave it out")
-    return value
-
-
-def _check_alternatives(scenario: ScenarioFields) -> None:
-    """Gaps and speeds are declared in one of two ways, an obstacle in one at most; deviations need a line speed."""
+def check_whole(scenario: ScenarioFields) -> None:
+    """Fields that limit each other: quantities declared twice, time step, horizon, latency, speeds, gaps, scripts."""
     if "speed_deviations_mps" in scenario.model_fields_set and scenario.line_speed_mps is None:
         right = "needs line_speed_mps, the speed that it is added to"
         refuse(("speed_deviations_mps",), scenario.speed_deviations_mps, right)
-    for usual, other in ALTERNATIVES.items():
+    for usual, other in QUANTITY.alternatives.items():
         given = [key for key in (usual, other) if getattr(scenario, key) is not None]
-        if not given and usual not in OPTIONAL:
+        if not given and usual not in QUANTITY.optional:
             raise PydanticCustomError("missing", "missing", {"at": (usual,)})
         if len(given) == 2:
             refuse((other,), getattr(scenario, other), f"give either {usual} or {other}, not both")
-
-
-def check_whole(scenario: ScenarioFields) -> None:
-    """Fields that limit each other: quantities declared twice, time step, horizon, latency, speeds, gaps, scripts."""
-    _check_alternatives(scenario)
     if not scenario.time_step_s <= scenario.horizon_s:
         refuse(("time_step_s",), scenario.time_step_s, f"must not be above horizon_s ({scenario.horizon_s:g} s)")
     for i, latencies in enumerate(scenario.possible_quantities("latency_s")):
@@ -138,18 +71,8 @@ def check_whole(scenario: ScenarioFields) -> None:
                 refuse(_path(scenario, "latency_s", i, kind), latency, right)
     _check_reactions(scenario)
     _check_speeds(scenario)
-    if scenario.time_gaps_s is not None:
-        _check_time_gaps(scenario)
-    if scenario.obstacle_margin_m is not None:
-        _check_obstacle_margin(scenario)
-    _check_constant_scripts(scenario)
-    if 0 in scenario.learners and not scenario.has_obstacle:
-        right = (
-            "has nothing to lose without an obstacle ahead; give obstacle_gap_m too, for instance obstacle_gap_m: 42"
-        )
-        refuse(("roles", "vehicle_1"), LEARNER, right)
-    if scenario.early_impacts == "reject" and scenario.learners:
-        _check_rejection(scenario)
+    _check_derived(scenario)
+    _check_scripts(scenario)
 
 
 def _check_reactions(scenario: ScenarioFields) -> None:
@@ -170,7 +93,7 @@ def _check_reactions(scenario: ScenarioFields) -> None:
 
 def _check_speeds(scenario: ScenarioFields) -> None:
     limits = scenario.possible_quantities("speed_limit_mps")
-    for i, (low, high) in enumerate(quantity_bounds(scenario, "speeds_mps")):
+    for i, (low, high) in enumerate(scenario.bounds("speeds_mps")):
         lowest = min(limits[i].values(), key=lambda quantity: support(quantity)[0])
         if low >= 0.0 and high <= support(lowest)[0]:
             continue
@@ -184,37 +107,37 @@ def _check_speeds(scenario: ScenarioFields) -> None:
         refuse(("line_speed_mps",), scenario.line_speed_mps, right)
 
 
-def _check_time_gaps(scenario: ScenarioFields) -> None:
-    largest = QUANTITIES["gaps_m"].high
-    for pair, (_, high) in enumerate(quantity_bounds(scenario, "gaps_m")):
+def _check_derived(scenario: ScenarioFields) -> None:
+    """Gaps that follow from time gaps, and an obstacle's distance that follows from its margin, are in range."""
+    largest = QUANTITY.usual["gaps_m"].high
+    for pair, (_, high) in enumerate(scenario.bounds("gaps_m") if scenario.time_gaps_s is not None else ()):
         if not high <= largest:
             right = f"is up to {high:g} m at the speed of vehicle_{pair + 2}; a gap must not be above {largest:g} m"
             refuse(_path(scenario, "time_gaps_s", pair), scenario.quantities("time_gaps_s")[pair], right)
-
-
-def _check_obstacle_margin(scenario: ScenarioFields) -> None:
-    farthest = farthest_obstacle_m(scenario)
-    if not farthest <= OPTIONAL["obstacle_gap_m"].high:
-        right = (
-            f"puts the obstacle up to {farthest:g} m ahead of vehicle_1; that distance must not be above"
-            f" {OPTIONAL['obstacle_gap_m'].high:g} m"
-        )
+    largest = QUANTITY.optional["obstacle_gap_m"].high
+    if scenario.obstacle_margin_m is not None and not scenario.farthest_obstacle_m <= largest:
+        farthest = f"puts the obstacle up to {scenario.farthest_obstacle_m:g} m ahead of vehicle_1"
+        right = f"{farthest}; that distance must not be above {largest:g} m"
         refuse(("obstacle_margin_m",), scenario.obstacle_margin_m, right)
 
 
-def _check_constant_scripts(scenario: ScenarioFields) -> None:
+def _check_scripts(scenario: ScenarioFields) -> None:
+    """A constant command is within the vehicle's capacity; where impacts are early, no script depends on the state."""
     for i, script in scenario.scripts.items():
-        deceleration = constant_deceleration(script) or 0.0
+        deceleration = ScriptSpec.parse(script).deceleration_mps2 or 0.0
         field = "braking_capacity_mps2" if deceleration > 0.0 else "driving_capacity_mps2"
         capacity = scenario.supports(field)[i][0]
         if not abs(deceleration) <= capacity:
             refuse(("roles", f"vehicle_{i + 1}"), script, f"is above this vehicle's {field}, {capacity:g} m/s2")
-
-
-def _check_rejection(scenario: ScenarioFields) -> None:
-    for i, script in scenario.scripts.items():
-        if not is_state_free(script):
-            close = get_close_matches(parse_agent_spec(script)[0], STATE_FREE, n=1)
+    if 0 in scenario.learners and not scenario.has_obstacle:
+        right = (
+            "has nothing to lose without an obstacle ahead; give obstacle_gap_m too, for instance obstacle_gap_m: 42"
+        )
+        refuse(("roles", "vehicle_1"), LEARNER, right)
+    for i, script in scenario.scripts.items() if scenario.early_impacts == "reject" and scenario.learners else ():
+        spec = ScriptSpec.parse(script)
+        if not spec.is_state_free():
+            close = get_close_matches(spec.name, STATE_FREE, n=1)
             hint = f"; did you mean {close[0]}?" if close else ""
             right = f"with early_impacts: reject a script must be full_brake, coast or constant:a{hint}"
             refuse(("roles", f"vehicle_{i + 1}"), script, right)
@@ -222,19 +145,12 @@ def _check_rejection(scenario: ScenarioFields) -> None:
 
 def _path(scenario: ScenarioFields, field: str, index: int, kind: int = 0) -> YamlPath:
     line = scenario.types_of_line
-    if line is not None and field in TYPE_KEYS and getattr(line.kinds[kind], field) is not None:
+    if line is not None and field in QUANTITY.of_a_type and getattr(line.kinds[kind], field) is not None:
         return ("vehicle_types", line.names[kind], field)
     return (field, index) if isinstance(getattr(scenario, field), tuple) else (field,)
 
 
 # Mixtures of scenarios: each world is drawn from one member, by weight, and is then that member's own world.
-#
-# World k of a mixture is world k of its member under the same seed, bit for bit. So results on a mixture can be
-# compared
-# with results on its members, world by world.
-
-MIXTURE = (4,)  # the stream of what each world is drawn from
-MIXTURE_WIDTH = 4  # its numbers per world, of which the first is used
 
 WORDS = ("title", "description", "source")
 _OWN = {"name", *WORDS, "mixture"}  # of the mixture itself; every other key beside it holds for all members
@@ -246,7 +162,7 @@ AnyScenario = TypeVar("AnyScenario", bound=ScenarioFields)
 
 def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """What a scenario says, with other values under some keys; a new way to declare gaps takes the old one's place."""
-    old = {key for pair in ALTERNATIVES.items() for key in pair if changes.keys() & set(pair)}
+    old = {key for pair in QUANTITY.alternatives.items() for key in pair if changes.keys() & set(pair)}
     if "speeds_mps" in changes:
         old.add("speed_deviations_mps")
     return {**{key: value for key, value in content.items() if key not in old}, **changes}
@@ -269,7 +185,9 @@ def build_members(
     _check_members(document, members)
     mixture = [{**entry, "scenario": member_content(member)} for entry, member in zip(listed, members, strict=True)]
     own = {key: value for key, value in content.items() if key not in beside}
-    return Document(document.file, {**own, **_shared(members), "mixture": mixture}, document.lines), members
+    told = [member.model_dump(mode="json", include=set(_SHARED), exclude_none=True) for member in members]
+    shared = {key: value for key, value in told[0].items() if all(each.get(key) == value for each in told)}
+    return Document(document.file, {**own, **shared, "mixture": mixture}, document.lines), members
 
 
 def _is_whole(entry: Any) -> bool:
@@ -332,30 +250,6 @@ def _told(scenario: ScenarioFields, key: str) -> str:
     return "nothing" if value is None else flow_text(dict(value) if key == "roles" else value, 120)
 
 
-def _shared(members: Sequence[ScenarioFields]) -> dict[str, Any]:
-    """Plain values of the keys in which all members agree."""
-    told = [member.model_dump(mode="json", include=set(_SHARED), exclude_none=True) for member in members]
-    return {key: value for key, value in told[0].items() if all(each.get(key) == value for each in told)}
-
-
-def draw_mixture(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
-    """Worlds ``first`` to ``first + n - 1`` of a mixture's list, each drawn from one member; as ``draw_list``."""
-    check_request(n, seed, first, channel)
-    assert scenario.mixture is not None
-    cumulative = np.cumsum([member.weight for member in scenario.mixture])
-    u = uniform_numbers(int(seed), channel, 0, first, n, MIXTURE_WIDTH, of=MIXTURE)[:, 0]
-    chosen = np.searchsorted(cumulative / cumulative[-1], u, side="right")
-    typed = any(member.vehicle_types is not None for member in scenario.members)
-    parts = []
-    for k, member in enumerate(scenario.members):
-        index = first + np.flatnonzero(chosen == k)
-        if len(index):
-            drawn = draw_numbers(member, index, int(seed), channel)
-            no_type = np.full((len(index), scenario.vehicles), "") if typed and drawn.types is None else drawn.types
-            parts.append(replace(drawn, types=no_type, scenarios=np.full(len(index), member.name)))
-    return join_samples(parts, sum(part.rejected for part in parts))
-
-
 # The wording of messages about a scenario file: its keys, their places and their meanings.
 
 _DISTRIBUTION = (
@@ -379,17 +273,21 @@ class ScenarioWording(Wording):
             return "it is needed, for instance {scenario: paper-random, weight: 2}"
         if isinstance(key, int):
             return "two numbers [low, high] are needed"
-        rule = DECLARED.get(key)
+        rule = QUANTITY.declared.get(key)
         if rule is None and len(path) > 1:
             return "a number is needed, as in {normal: {mean: 20, sd: 1, low: 18, high: 22}}"
         if rule is None:
             return f"it is needed, for instance {key}: my-scenario"
-        other = f", or {ALTERNATIVES[key]}: {DECLARED[ALTERNATIVES[key]].example}" if key in ALTERNATIVES else ""
+        other = (
+            f", or {QUANTITY.alternatives[key]}: {QUANTITY.declared[QUANTITY.alternatives[key]].example}"
+            if key in QUANTITY.alternatives
+            else ""
+        )
         return f"the {rule.meaning} is needed, for instance {key}: {rule.example}{other}"
 
     def owner(self, path: YamlPath) -> str:
         """Whose value stands at ``path``: a vehicle or a pair; empty for anything else."""
-        rule = DECLARED.get(str(path[0])) if len(path) > 1 else None
+        rule = QUANTITY.declared.get(str(path[0])) if len(path) > 1 else None
         return rule.owner(path[1]) if rule is not None and isinstance(path[1], int) else ""
 
     def right(self, detail: ErrorDetails) -> str:
@@ -437,79 +335,6 @@ class Scenario(ScenarioFields):
         _build(scenario, document)
         return scenario
 
-    @field_validator(*ALTERNATIVES, *ALTERNATIVES.values(), mode="before")
-    @classmethod
-    def _given(cls, value: Any) -> Any:
-        """``null`` is no value: a key that is not used is left out."""
-        if value is None:
-            refuse((), value, "must be a number or a distribution; a key that is not used is left out")
-        return value
-
-    @field_validator(*OF_EVERY_VEHICLE, mode="before")
-    @classmethod
-    def _needed(cls, value: Any, info: ValidationInfo) -> Any:
-        return check_given(str(info.field_name), value, info.data)
-
-    @field_validator("vehicle_types", "types", "mixture", mode="before")
-    @classmethod
-    def _not_empty(cls, value: Any) -> Any:
-        if value is None or (isinstance(value, dict | list | tuple) and not value):
-            refuse((), value, "must not be empty; a key that is not used is left out")
-        return value
-
-    @field_validator("types")
-    @classmethod
-    def _types(cls, value: Any, info: ValidationInfo) -> Any:
-        if "vehicles" in info.data and "vehicle_types" in info.data:
-            check_types(value, info.data["vehicle_types"], info.data["vehicles"])
-        return value
-
-    @field_validator(*DECLARED)
-    @classmethod
-    def _entries(cls, value: Any, info: ValidationInfo) -> Any:
-        if value is not None:
-            check_entries(DECLARED[str(info.field_name)], value, info.data.get("vehicles"))
-        return value
-
-    @field_validator("roles")
-    @classmethod
-    def _roles(cls, value: dict[str, str], info: ValidationInfo) -> dict[str, str]:
-        vehicles = info.data.get("vehicles")
-        if vehicles is None:
-            return value
-        names = [f"vehicle_{i + 1}" for i in range(vehicles)]
-        for name, role in value.items():
-            if name not in names:
-                close = [] if name.startswith("vehicle_") else get_close_matches(name, names, n=1)
-                hint = f"did you mean {close[0]}?" if close else f"this scenario has vehicle_1 ... vehicle_{vehicles}"
-                refuse((name,), role, f"unknown vehicle; {hint}")
-            try:
-                is_state_free(role)
-            except InvalidInput as error:
-                refuse((name,), role, str(error))
-            if role.startswith(f"{LEARNER}:"):
-                refuse((name,), role, f"{LEARNER} takes no argument")
-        return complete_roles(value, vehicles)
-
-    @field_validator("objective", mode="before")
-    @classmethod
-    def _objective(cls, value: Any, info: ValidationInfo) -> Any:
-        if "vehicles" in info.data:
-            try:
-                objectives_of(value, info.data["vehicles"])
-            except InvalidInput as error:
-                refuse((), value, str(error).removeprefix("objective: "))
-        return value
-
-    @field_validator("observation", mode="before")
-    @classmethod
-    def _observation(cls, value: Any) -> Any:
-        try:
-            listed_features(value)
-        except InvalidInput as error:
-            refuse((), value, str(error).removeprefix("observation: "))
-        return value
-
     @model_validator(mode="after")
     def _whole(self) -> Scenario:
         if self.mixture is not None:  # its members have been checked
@@ -530,13 +355,6 @@ class Scenario(ScenarioFields):
             told["mixture"] = ", ".join(f"{e.weight:g} x {e.scenario['name']}" for e in self.mixture)
         rows = [(key, value if isinstance(value, str) else flow_text(value)) for key, value in told.items()]
         return Sheet(f"Scenario {self.name}: {self.title or 'no title'}", ("Key", "Value"), rows).html()
-
-    def bounds(self, field: str) -> tuple[tuple[float, float], ...]:
-        """Smallest and largest value of each entry of ``gaps_m``, ``speeds_mps``, ..., however it is declared."""
-        each = [quantity_bounds(member, field) for member in self.members or (self,)]
-        return tuple(
-            (min(low for low, _ in entry), max(high for _, high in entry)) for entry in zip(*each, strict=True)
-        )
 
     def declared(self) -> dict[str, Any]:
         """What was given, as plain data: ``Scenario(**scenario.declared())`` is the same scenario."""
@@ -559,7 +377,6 @@ class Scenario(ScenarioFields):
         ``"training"`` are independent of each other. Raises ``InvalidInput`` for a negative seed or ``first``,
         ``n < 1``, or when early impacts are rejected and (almost) every draw has one.
         """
-        draw = draw_mixture if self.members else draw_list
         return draw(self, n, seed, first=first, channel=channel)
 
     def replace(self, **changes: Any) -> Scenario:
@@ -600,14 +417,16 @@ class Scenario(ScenarioFields):
 def scenario_json_schema() -> dict[str, Any]:
     """JSON Schema of a scenario file, for editors that complete and check YAML."""
     one_of_two: list[dict[str, Any]] = [
-        {"not": {"required": [*pair]}} if pair[0] in OPTIONAL else {"oneOf": [{"required": [key]} for key in pair]}
-        for pair in ALTERNATIVES.items()
+        {"not": {"required": [*pair]}}
+        if pair[0] in QUANTITY.optional
+        else {"oneOf": [{"required": [key]} for key in pair]}
+        for pair in QUANTITY.alternatives.items()
     ]
-    by_types = {"anyOf": [{"required": ["vehicle_types"]}, {"required": [*OF_EVERY_VEHICLE]}]}
+    by_types = {"anyOf": [{"required": ["vehicle_types"]}, {"required": [*QUANTITY.needed]}]}
     whole = {"if": {"not": {"required": ["mixture"]}}, "then": {"allOf": [*one_of_two, by_types]}}
     needed = {"speed_deviations_mps": ["line_speed_mps"]}
     schema = Scenario.model_json_schema(schema_generator=FileSchema)
-    return publish({**schema, **whole, "dependentRequired": needed})
+    return FileSchema.publish({**schema, **whole, "dependentRequired": needed})
 
 
 def _build(scenario: Scenario, document: Document) -> None:
@@ -620,7 +439,7 @@ def _build(scenario: Scenario, document: Document) -> None:
     try:
         BaseModel.__init__(scenario, **document.content)
     except ValidationError as error:
-        raise explain(error, document, ScenarioWording(Scenario)) from None
+        raise document.explain(error, ScenarioWording(Scenario)) from None
     scenario._members = members
 
 
@@ -826,7 +645,7 @@ def _with_members(document: Document, folder: Path) -> Document:
     if not isinstance(listed, list | tuple):
         return document
     found = [
-        {**entry, "scenario": _member(entry["scenario"], _place(document, i), folder)}
+        {**entry, "scenario": _member(entry["scenario"], document.where(("mixture", i, "scenario")), i, folder)}
         if isinstance(entry, dict) and isinstance(entry.get("scenario"), str)
         else entry
         for i, entry in enumerate(listed)
@@ -834,11 +653,7 @@ def _with_members(document: Document, folder: Path) -> Document:
     return Document(document.file, {**content, "mixture": found}, document.lines)
 
 
-def _place(document: Document, i: int) -> str:
-    return f"{document.where(('mixture', i, 'scenario'))}: mixture[{i}].scenario"
-
-
-def _member(name: str, where: str, folder: Path) -> dict[str, Any]:
+def _member(name: str, where: str, i: int, folder: Path) -> dict[str, Any]:
     try:
         path = Path(scenario_path(name))
         if path not in _shipped_paths().values():
@@ -848,7 +663,7 @@ def _member(name: str, where: str, folder: Path) -> dict[str, Any]:
             raise InvalidInput(f"{name} is a mixture itself; list its scenarios here")
         return _load(path).declared()
     except InvalidInput as error:
-        raise InvalidInput(f"{where} = {name}: {error}") from None
+        raise InvalidInput(f"{where}: mixture[{i}].scenario = {name}: {error}") from None
 
 
 _HEAD = """\
@@ -908,8 +723,8 @@ def _line(key: str, values: Mapping[str, object]) -> str:
     """``key: value``; a key that goes only with the other way to declare the same stands in a comment."""
     if key in values:
         return f"{key}:{_value(values[key])}"
-    if key in DECLARED:
-        return f"# {key}: {DECLARED[key].example}"
+    if key in QUANTITY.declared:
+        return f"# {key}: {QUANTITY.declared[key].example}"
     default = Scenario.model_fields[key].default
     return f"# {key}: {_EXAMPLES[key] if key in _EXAMPLES else flow_text(default)}"
 
@@ -922,10 +737,10 @@ def _short_member(entry: dict[str, Any]) -> dict[str, Any]:
 
 
 def _comment(key: str) -> str:
-    rule = DECLARED.get(key)
+    rule = QUANTITY.declared.get(key)
     if rule is None:
         return str(Scenario.model_fields[key].description)
-    other = {**ALTERNATIVES, **{new: usual for usual, new in ALTERNATIVES.items()}}.get(key)
+    other = {**QUANTITY.alternatives, **{new: usual for usual, new in QUANTITY.alternatives.items()}}.get(key)
     besides = f"; either this or {other}" if other else ""
     besides = "; only beside line_speed_mps" if key == "speed_deviations_mps" else besides
     return f"{rule.meaning}; {rule.interval}{', below horizon_s' if key == 'latency_s' else ''}{besides}"
@@ -936,31 +751,3 @@ def _value(value: object) -> str:
     if isinstance(value, dict) and all(isinstance(entry, str) for entry in value.values()):
         return "".join(f"\n  {key}: {flow_text(entry)}" for key, entry in value.items())
     return f" {flow_text(value)}"
-
-
-# Presets of the V2X channel that somebody registers.
-
-_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
-
-
-def register_preset(name: str, settings: Mapping[str, Any]) -> None:
-    """Make ``v2x: name`` known to every scenario.
-
-    Args:
-        name: 1 to 64 of ``a-z``, digits, ``-`` and ``_``.
-        settings: what a scenario would say, a preset and what differs from it: ``{"preset": "nominal", "lost": 0.1}``.
-
-    Registering the same again changes nothing. Raises ``AlreadyExists`` for another channel under a name that is taken,
-    ``InvalidInput`` for a name that is none and for settings that are no channel.
-
-    """
-    if not isinstance(name, str) or _NAME.fullmatch(name) is None:
-        raise InvalidInput(f"preset {name!r:.80}: must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _")
-    if not isinstance(settings, Mapping):
-        raise InvalidInput(f"preset {name!r}: settings = {settings!r:.80}: must be a mapping such as {{'lost': 0.1}}")
-    try:
-        channel = V2X.model_validate(dict(settings)).channel
-    except ValidationError as error:
-        raise explain(error, Document(f"preset {name!r}", dict(settings), {}), ScenarioWording(V2X)) from None
-    if CHANNELS.setdefault(name, channel) != channel:
-        raise AlreadyExists(f"preset {name!r} is registered already; give another name")

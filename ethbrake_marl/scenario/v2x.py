@@ -23,19 +23,20 @@ arrived (``physics.messages``).
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Mapping
 from dataclasses import replace
 from operator import not_
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import AfterValidator, Field, GetJsonSchemaHandler, model_validator
+from pydantic import AfterValidator, Field, GetJsonSchemaHandler, ValidationError, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.yaml import FileModel, refuse
-from ethbrake_marl.physics.messages import CHANNEL, LINK, link_at, message_columns, ring_at, ring_length
-from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.files.yaml import Document, FileModel, Wording, refuse
+from ethbrake_marl.physics import Bools, Floats, Ints, Vehicles, Worlds, ring_length, silent_messages
 
 PER_LINK = 4  # uniform numbers of one link: wait, burst, loss, hop; one Philox counter
 
@@ -202,6 +203,76 @@ class V2X(FileModel):
             latest[i] = max(latest[i], min(seen, heard))
         return latest
 
+    @staticmethod
+    def width(vehicles: int) -> int:
+        """How many uniform numbers the news of a line takes."""
+        return PER_LINK * vehicles * vehicles
+
+    def with_news(self, vehicles: Vehicles, u: Floats) -> Vehicles:
+        """These vehicles with the latencies and the news of the channel drawn by ``u`` [n, N * N * PER_LINK] in [0, 1).
+
+        Their latencies, so far all own, stay as ``own_latency_s``.
+        """
+        (N, channel), (heard, seen) = (vehicles.latency_s.shape[1], self.channel), self.heard_and_seen(vehicles, u)
+        latency = vehicles.latency_s.copy()
+        if channel.timing != "latency":
+            for i in range(1, N):
+                told = np.minimum(heard[:, i, 0], latency[:, i - 1] + seen[:, i, i - 1])
+                latency[:, i] = np.maximum(latency[:, i], told)
+        known = np.maximum(latency[:, :, np.newaxis], np.minimum(heard, seen))
+        known[:, np.arange(N), np.arange(N)] = latency  # no vehicle waits for a message from itself
+        return replace(vehicles, latency_s=latency, known_from_s=known)
+
+    def heard_and_seen(self, vehicles: Vehicles, u: Floats) -> tuple[Floats, Floats]:
+        """When a first message of vehicle j reaches vehicle i, and when i sees j, [n, N, N] s each; infinite: never."""
+        n, N = vehicles.latency_s.shape
+        channel, links = self.channel, u.reshape(n, N, N, PER_LINK)
+        low, high = channel.sensing_s
+        hop = low + (high - low) * links[..., 3]
+        heard = np.full((n, N, N), -np.inf) if channel.timing == "latency" else link_delays(channel, links)
+        if channel.timing == "latency":
+            heard[links[..., 2] < channel.lost] = np.inf
+        receiver, sender = np.indices((N, N))
+        heard[:, (sender >= receiver) if channel.hears == "front" else np.full((N, N), channel.hears == "none")] = (
+            np.inf
+        )
+        ahead = sender == receiver - 1
+        in_sight = {"both": ahead | (sender == receiver + 1), "front": ahead, "none": np.zeros((N, N), np.bool_)}
+        return heard, np.where(in_sight[channel.senses], hop, np.inf)
+
+    def with_channel(self, worlds: Worlds, u: Floats, key: Floats, time_step_s: float) -> Worlds:
+        """These worlds at the alert with their news and, where messages are periodic, their columns, none sent yet.
+
+        Args:
+            worlds: whose latencies are all own.
+            u: what the news is drawn by, [n, N * N * PER_LINK] in [0, 1).
+            key: [n] in [0, 1), one for all later losses of a world.
+            time_step_s: between two decisions, at which vehicles sample their states.
+
+        """
+        channel = self.channel
+        worlds = replace(worlds, vehicles=self.with_news(worlds.vehicles, u))
+        if channel.persistence == "first":
+            return worlds
+        heard, seen = self.heard_and_seen(worlds.vehicles, u)
+        messages = silent_messages(
+            heard, seen, key * 2.0**53, channel.samples(time_step_s), period_s=channel.message_period_s,
+            delay_s=channel.delay_s, loss_begins=channel.loss_begins, loss_ends=channel.loss_ends,
+        )  # fmt: skip
+        return replace(worlds, messages=messages)
+
+    def with_fixed_news(self, worlds: Worlds, time_step_s: float, where: str) -> Worlds:
+        """Worlds that somebody gives with this channel; ``InvalidInput`` where it leaves something to chance."""
+        if not self.by_link:
+            return worlds
+        if self.drawn:
+            raise InvalidInput(
+                f"{where}: the scenario draws what each vehicle knows when (v2x: {self.preset}); take one whose channel"
+                " is fixed, for instance scenario.replace(v2x='paper')"
+            )
+        n, N = worlds.speeds_mps.shape
+        return self.with_channel(worlds, np.zeros((n, self.width(N))), np.zeros(n), time_step_s)
+
 
 def _require(holds: bool, name: str, v2x: V2X, right: str) -> None:
     """Refuse the value of ``name`` unless ``holds``; ``right`` says what would do."""
@@ -237,38 +308,6 @@ def link_delays(channel: Channel, u: Floats) -> Floats:
     return delay
 
 
-def with_news(v2x: V2X, vehicles: Vehicles, u: Floats) -> Vehicles:
-    """These vehicles with the latencies and the news of the channel drawn by ``u`` [n, N * N * PER_LINK] in [0, 1).
-
-    Their latencies, so far all own, stay as ``own_latency_s``.
-    """
-    (N, channel), (heard, seen) = (vehicles.latency_s.shape[1], v2x.channel), heard_and_seen(v2x, vehicles, u)
-    latency = vehicles.latency_s.copy()
-    if channel.timing != "latency":
-        for i in range(1, N):
-            told = np.minimum(heard[:, i, 0], latency[:, i - 1] + seen[:, i, i - 1])
-            latency[:, i] = np.maximum(latency[:, i], told)
-    known = np.maximum(latency[:, :, np.newaxis], np.minimum(heard, seen))
-    known[:, np.arange(N), np.arange(N)] = latency  # no vehicle waits for a message from itself
-    return replace(vehicles, latency_s=latency, known_from_s=known)
-
-
-def heard_and_seen(v2x: V2X, vehicles: Vehicles, u: Floats) -> tuple[Floats, Floats]:
-    """When the first message of vehicle j reaches vehicle i, and when i sees j, each [n, N, N] s; infinite: never."""
-    n, N = vehicles.latency_s.shape
-    channel, links = v2x.channel, u.reshape(n, N, N, PER_LINK)
-    low, high = channel.sensing_s
-    hop = low + (high - low) * links[..., 3]
-    heard = np.full((n, N, N), -np.inf) if channel.timing == "latency" else link_delays(channel, links)
-    if channel.timing == "latency":
-        heard[links[..., 2] < channel.lost] = np.inf
-    receiver, sender = np.indices((N, N))
-    heard[:, (sender >= receiver) if channel.hears == "front" else np.full((N, N), channel.hears == "none")] = np.inf
-    ahead = sender == receiver - 1
-    in_sight = {"both": ahead | (sender == receiver + 1), "front": ahead, "none": np.zeros((N, N), np.bool_)}
-    return heard, np.where(in_sight[channel.senses], hop, np.inf)
-
-
 def hidden_from(vehicles: Vehicles, vehicle: int) -> Bools:
     """Worlds in which the channel hides something of the line from ``vehicle`` at its first decision, [n].
 
@@ -282,45 +321,29 @@ def hidden_from(vehicles: Vehicles, vehicle: int) -> Bools:
     return some
 
 
-# The channel in the worlds of a scenario: their news, and the memory of periodic messages before the first is sent.
+# Presets of the V2X channel that somebody registers.
+
+_NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
 
 
-def with_channel(v2x: V2X, worlds: Worlds, u: Floats, key: Floats, time_step_s: float) -> Worlds:
-    """These worlds at the alert with their news and, where messages are periodic, the columns of these, none sent yet.
+def register_preset(name: str, settings: Mapping[str, Any]) -> None:
+    """Make ``v2x: name`` known to every scenario.
 
     Args:
-        v2x: the channel.
-        worlds: whose latencies are all own.
-        u: what the news is drawn by, [n, N * N * PER_LINK] in [0, 1).
-        key: [n] in [0, 1), one for all later losses of a world.
-        time_step_s: between two decisions, at which vehicles sample their states.
+        name: 1 to 64 of ``a-z``, digits, ``-`` and ``_``.
+        settings: what a scenario would say, a preset and what differs from it: ``{"preset": "nominal", "lost": 0.1}``.
+
+    Registering the same again changes nothing. Raises ``AlreadyExists`` for another channel under a name that is taken,
+    ``InvalidInput`` for a name that is none and for settings that are no channel.
 
     """
-    channel, (n, N) = v2x.channel, worlds.speeds_mps.shape
-    worlds = replace(worlds, vehicles=with_news(v2x, worlds.vehicles, u))
-    if channel.persistence == "first":
-        return worlds
-    heard, seen = heard_and_seen(v2x, worlds.vehicles, u)
-    itself = np.eye(N, dtype=np.bool_)
-    columns = np.zeros((n, message_columns(N, channel.samples(time_step_s))))
-    columns[:, CHANNEL.PERIOD], columns[:, CHANNEL.DELAY] = channel.message_period_s, channel.delay_s
-    columns[:, CHANNEL.LOSS_BEGINS], columns[:, CHANNEL.LOSS_ENDS] = channel.loss_begins, channel.loss_ends
-    columns[:, CHANNEL.KEY] = key * 2.0**53
-    links = columns[:, link_at(0, 0, N) : ring_at(N)].reshape(n, N, N, LINK.WIDTH)
-    links[..., LINK.NEXT_SENT] = np.where(itself, np.inf, heard - channel.delay_s)
-    links[..., LINK.SEEN_FROM] = np.where(itself, np.inf, seen)
-    links[..., LINK.TOLD_S] = -1.0
-    return replace(worlds, messages=columns)
-
-
-def with_fixed_news(v2x: V2X, worlds: Worlds, time_step_s: float, where: str) -> Worlds:
-    """Worlds that somebody gives with their channel, which leaves nothing to chance; ``InvalidInput`` where it does."""
-    if not v2x.by_link:
-        return worlds
-    if v2x.drawn:
-        raise InvalidInput(
-            f"{where}: the scenario draws what each vehicle knows when (v2x: {v2x.preset}); take one whose channel is"
-            " fixed, for instance scenario.replace(v2x='paper')"
-        )
-    n, N = worlds.speeds_mps.shape
-    return with_channel(v2x, worlds, np.zeros((n, N * N * PER_LINK)), np.zeros(n), time_step_s)
+    if not isinstance(name, str) or _NAME.fullmatch(name) is None:
+        raise InvalidInput(f"preset {name!r:.80}: must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _")
+    if not isinstance(settings, Mapping):
+        raise InvalidInput(f"preset {name!r}: settings = {settings!r:.80}: must be a mapping such as {{'lost': 0.1}}")
+    try:
+        channel = V2X.model_validate(dict(settings)).channel
+    except ValidationError as error:
+        raise Document(f"preset {name!r}", dict(settings), {}).explain(error, Wording(V2X)) from None
+    if CHANNELS.setdefault(name, channel) != channel:
+        raise AlreadyExists(f"preset {name!r} is registered already; give another name")

@@ -2,40 +2,55 @@
 
 import sys
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ethbrake_marl.shield.certify import Backup, Decision, Running, certify
-from ethbrake_marl.shield.guard import HybridAgent, MovingAtHorizon, ShieldedDriver, ShieldOptions
-from ethbrake_marl.shield.step_shield import StepShield
-from ethbrake_marl.shield.uncertainty import Interval, Uncertainty, parse_uncertainty
-from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
-from ethbrake_marl.shield.wrappers import shield as _shield
+from ethbrake_marl.doors import front_door
 
-__all__ = [
-    "Backup",
-    "Decision",
-    "HybridAgent",
-    "HybridShield",
-    "Interval",
-    "MovingAtHorizon",
-    "Running",
-    "ShieldOptions",
-    "ShieldedDriver",
-    "ShieldedEnv",
-    "ShieldedVectorEnv",
-    "StepShield",
-    "Uncertainty",
-    "certify",
-    "parse_uncertainty",
-    "shielded_aec",
-]
+if TYPE_CHECKING:
+    from ethbrake_marl.shield.evidence import (
+        ALLOWANCES as ALLOWANCES,
+        SAME_HARM as SAME_HARM,
+        VERDICTS as VERDICTS,
+        OperatingPoint as OperatingPoint,
+        RobustnessPoint as RobustnessPoint,
+        operating_curves as operating_curves,
+        review as review,
+        robustness as robustness,
+    )
+    from ethbrake_marl.shield.guard import (
+        Bound as Bound,
+        HybridAgent as HybridAgent,
+        MovingAtHorizon as MovingAtHorizon,
+        Shielded as Shielded,
+        ShieldedDriver as ShieldedDriver,
+        ShieldOptions as ShieldOptions,
+        drive_chunks as drive_chunks,
+        join as join,
+        put_shield as put_shield,
+        shielded_episodes as shielded_episodes,
+        stack as stack,
+    )
+    from ethbrake_marl.shield.sb3 import ShieldedVecEnv as ShieldedVecEnv
+    from ethbrake_marl.shield.step_shield import StepShield as StepShield
+    from ethbrake_marl.shield.uncertainty import Uncertainty as Uncertainty, parse_uncertainty as parse_uncertainty
+    from ethbrake_marl.shield.wrappers import (
+        HybridShield as HybridShield,
+        ShieldedEnv as ShieldedEnv,
+        ShieldedVectorEnv as ShieldedVectorEnv,
+        shield as shield,
+        shielded_aec as shielded_aec,
+    )
+else:
+    __getattr__ = front_door(__name__, __file__)
 
 
 class _Shielding(ModuleType):
     """``eb.shield`` is this folder and the function of its name: whoever imports one has the other."""
 
     def __call__(self, *arguments: Any, **settings: Any) -> Any:
-        return _shield(*arguments, **settings)
+        from ethbrake_marl.shield.wrappers import shield
+
+        return shield(*arguments, **settings)
 
 
 sys.modules[__name__].__class__ = _Shielding

@@ -1,6 +1,6 @@
 """Motion of a whole box of worlds through one piece of time: each vehicle on its own, and pairs that stay in contact.
 
-A *cell* is a box of worlds whose uncertain numbers are affine forms (``shield.forms``). A *path* is one way in which
+A *cell* is a box of worlds whose uncertain numbers are affine forms. A *path* is one way in which
 impacts may follow each other in it: speeds and gaps of all worlds of the cell that go this way, as forms. Time runs in
 *pieces*, between two neighbouring decisions or onsets, in which every command is constant.
 """
@@ -14,29 +14,24 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.defaults import HarmCount
-from ethbrake_marl.engine.stream import Script
-from ethbrake_marl.errors import InvalidInput, renumbered, unknown_name
-from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
-from ethbrake_marl.physics.compiled import compiled_apart
-from ethbrake_marl.physics.kernel import PLASTIC_SPEED_MPS, TOUCH_SPEED_MPS, obstacle_ahead
+from ethbrake_marl.engine import Script
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.physics import BOUND, Floats, Ints, Worlds, compiled
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.shield.certify import Backup, Decision, Running, as_predicted, certify, put
-from ethbrake_marl.shield.certify_kernel import NO_CERTIFICATE
+from ethbrake_marl.search import ProfileProblem
 
 # Affine forms: numbers that depend on where in a box a world lies, with a bound on what is not linear in it.
 #
 # A form [W] of a box with K uncertain numbers, W = K + 2, stands for ``c + g_1 e_1 + ... + g_K e_K + r e``: the centre,
 # one slope for each uncertain number, and a remainder. ``e_k`` in [-1, 1] says where in the box the world lies, the
-# same
-# in every form; ``e`` in [-1, 1] is any, another one in every form. What two forms share in ``e_k`` cancels when they
-# are
-# subtracted, which plain intervals cannot do.
+# same in every form; ``e`` in [-1, 1] is any, another one in every form. What two forms share in ``e_k`` cancels when
+# they are subtracted, which plain intervals cannot do.
 #
 # Each operation encloses: for every world of the box there are values of ``e`` for which the result stands for what the
 # operation makes of the operands. Rounding is not part of an operation; ``shield.enclosure`` adds it (``ROUNDING``).
 
 
-@compiled_apart
+@compiled(apart=True)
 def radius(x: Floats) -> float:
     """Largest distance from the centre."""
     whole: float = x[-1]
@@ -45,21 +40,19 @@ def radius(x: Floats) -> float:
     return whole
 
 
-@compiled_apart
+@compiled(apart=True)
 def low(x: Floats) -> float:
     """Least value."""
-    least: float = x[0] - radius(x)
-    return least
+    return float(x[0] - radius(x))
 
 
-@compiled_apart
+@compiled(apart=True)
 def high(x: Floats) -> float:
     """Largest value."""
-    most: float = x[0] + radius(x)
-    return most
+    return float(x[0] + radius(x))
 
 
-@compiled_apart
+@compiled(apart=True)
 def add(out: Floats, share: float, x: Floats) -> None:
     """``out += share * x``; exact but for rounding."""
     for k in range(x.shape[0] - 1):
@@ -67,7 +60,7 @@ def add(out: Floats, share: float, x: Floats) -> None:
     out[-1] += abs(share) * x[-1]
 
 
-@compiled_apart
+@compiled(apart=True)
 def difference(x: Floats, y: Floats) -> Floats:
     """``x - y``."""
     out = x.copy()
@@ -75,13 +68,13 @@ def difference(x: Floats, y: Floats) -> Floats:
     return out
 
 
-@compiled_apart
+@compiled(apart=True)
 def negative(x: Floats) -> Floats:
     """``-x``."""
     return linear(x, -1.0, 0.0, 0.0)
 
 
-@compiled_apart
+@compiled(apart=True)
 def between(least: float, most: float, width: int) -> Floats:
     """The form [width] of any number in an interval."""
     out = np.zeros(width)
@@ -89,7 +82,7 @@ def between(least: float, most: float, width: int) -> Floats:
     return out
 
 
-@compiled_apart
+@compiled(apart=True)
 def product(x: Floats, y: Floats) -> Floats:
     """``x * y``: what is of second order goes to the remainder."""
     out = np.empty_like(x)
@@ -100,7 +93,7 @@ def product(x: Floats, y: Floats) -> Floats:
     return out
 
 
-@compiled_apart
+@compiled(apart=True)
 def square(x: Floats) -> Floats:
     """``x * x``: its part of second order is at least 0, which halves the remainder."""
     out = np.empty_like(x)
@@ -112,7 +105,7 @@ def square(x: Floats) -> Floats:
     return out
 
 
-@compiled_apart
+@compiled(apart=True)
 def linear(x: Floats, slope: float, start: float, error: float) -> Floats:
     """``start + slope * x``, and an error of at most ``error`` on either side."""
     out = np.empty_like(x)
@@ -123,7 +116,7 @@ def linear(x: Floats, slope: float, start: float, error: float) -> Floats:
     return out
 
 
-@compiled_apart
+@compiled(apart=True)
 def square_root(x: Floats) -> Floats:
     """Square root wherever ``x >= 0``; nothing is said where it is below. ``high(x) >= 0``.
 
@@ -138,7 +131,7 @@ def square_root(x: Floats) -> Floats:
     return linear(x, slope, start + error, error)
 
 
-@compiled_apart
+@compiled(apart=True)
 def reciprocal(x: Floats) -> Floats:
     """``1 / x`` for ``low(x) > 0``: between the chord, of slope -1 / (a b), and the parallel tangent."""
     least, most = low(x), high(x)
@@ -148,7 +141,7 @@ def reciprocal(x: Floats) -> Floats:
     return linear(x, slope, chord - error, error)
 
 
-@compiled_apart
+@compiled(apart=True)
 def positive_part(x: Floats) -> Floats:
     """``max(x, 0)``: between its chord and the parallel line through 0."""
     least, most = low(x), high(x)
@@ -161,7 +154,7 @@ def positive_part(x: Floats) -> Floats:
     return linear(x, slope, error, error)
 
 
-@compiled_apart
+@compiled(apart=True)
 def cut(x: Floats, least: float, most: float) -> Floats:
     """A form of the same number, known to lie in an interval: that interval where it says more than the form."""
     inside_low, inside_high = max(low(x), least), min(high(x), most)
@@ -219,7 +212,7 @@ class Motion(NamedTuple):
     vague: Floats  # [N] by how much its acceleration may differ from ``pull`` within the piece
 
 
-@compiled_apart
+@compiled(apart=True)
 def new_motion(N: int, width: int) -> Motion:
     """Room for ``move_alone``."""
     return Motion(
@@ -228,52 +221,49 @@ def new_motion(N: int, width: int) -> Motion:
     )  # fmt: skip
 
 
-@compiled_apart
+@compiled(apart=True)
 def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
     """Every vehicle through one piece of time under its command, as if it were alone."""
     for i in range(cell.speed.shape[0]):
         command(cell, i, piece, motion)
     for i in range(cell.speed.shape[0]):
         speed, length = path.forms[i], cell.times[piece + 1] - cell.times[piece]
-        drift(cell, speed, i, piece, motion)
+        onward, reach, pull = motion.onward[i], motion.reach[i], motion.pull[i]
+        onward[:], reach[:] = speed, 0.0
+        add(reach, length, speed)
+        if i != cell.vehicle and high(cell.onset[i]) > cell.times[piece]:
+            begin_later(cell, i, piece, motion)
+        else:
+            add(onward, length, pull)
+            add(reach, 0.5 * length * length, pull)
         if high(motion.pull[i]) + motion.vague[i] > 0.0:
-            fastest = high(speed) + length * high(motion.pull[i]) + beside(cell, path, motion, i, length)
+            # by how much a vehicle in contact with another one may be faster than its form within the piece
+            P, most = cell.gap.shape[0], 0.0
+            for p in range(max(i - 1, 0), min(i + 1, P)):
+                if path.marks[P + p] == TOUCHES:
+                    touch = path.touch[p]
+                    most += max(touch[OPENING], touch[CLOSING], 0.0) + 5.0 * touch[CREEP]
+                    for k in range(p, p + 2):
+                        most += length * (abs(motion.pull[k, 0]) + radius(motion.pull[k]) + motion.vague[k])
+            fastest = high(speed) + length * high(motion.pull[i]) + most
             if fastest > cell.limit[i]:
-                stop_driving(i, length, motion)
+                # the speed limit may end its drive anywhere within the piece: it gives any part of it then
+                drive = high(motion.pull[i]) + motion.vague[i]
+                motion.onward[i] = between_shifted(motion.onward[i], -length * drive)
+                motion.reach[i] = between_shifted(motion.reach[i], -0.5 * length * length * drive)
+                motion.vague[i] = 0.5 * drive
+                motion.pull[i] = between(0.5 * drive, 0.5 * drive, motion.pull.shape[1])
         motion.onward[i, -1] += ROUNDING * (1.0 + abs(motion.onward[i, 0]))
         motion.reach[i, -1] += ROUNDING * (1.0 + abs(motion.reach[i, 0]))
         motion.speed[i], motion.way[i] = motion.onward[i], motion.reach[i]
-        if _stands(speed) and high(motion.pull[i]) + motion.vague[i] <= 0.0:
+        if speed[0] == 0.0 and radius(speed) == 0.0 and high(motion.pull[i]) + motion.vague[i] <= 0.0:
             motion.rest[i] = STANDS
             motion.speed[i], motion.way[i] = 0.0, 0.0
         elif low(motion.onward[i]) < 0.0 and low(motion.pull[i]) - motion.vague[i] < 0.0:
             stop(speed, i, length, motion)
 
 
-@compiled_apart
-def beside(cell: Cell, path: Path, motion: Motion, i: int, length: float) -> float:
-    """By how much a vehicle in contact with another one may be faster than its form within the piece."""
-    P, most = cell.gap.shape[0], 0.0
-    for p in range(max(i - 1, 0), min(i + 1, P)):
-        if path.marks[P + p] == TOUCHES:
-            touch = path.touch[p]
-            most += max(touch[OPENING], touch[CLOSING], 0.0) + 5.0 * touch[CREEP]
-            for k in range(p, p + 2):
-                most += length * (abs(motion.pull[k, 0]) + radius(motion.pull[k]) + motion.vague[k])
-    return most
-
-
-@compiled_apart
-def stop_driving(i: int, length: float, motion: Motion) -> None:
-    """The speed limit may end a vehicle's drive anywhere within the piece: it gives any part of it then."""
-    drive = high(motion.pull[i]) + motion.vague[i]
-    motion.onward[i] = between_shifted(motion.onward[i], -length * drive)
-    motion.reach[i] = between_shifted(motion.reach[i], -0.5 * length * length * drive)
-    motion.vague[i] = 0.5 * drive
-    motion.pull[i] = between(0.5 * drive, 0.5 * drive, motion.pull.shape[1])
-
-
-@compiled_apart
+@compiled(apart=True)
 def between_shifted(x: Floats, shift: float) -> Floats:
     """A number between what ``x`` stands for and that plus ``shift``."""
     out = x.copy()
@@ -281,12 +271,7 @@ def between_shifted(x: Floats, shift: float) -> Floats:
     return out
 
 
-@compiled_apart
-def _stands(speed: Floats) -> bool:
-    return speed[0] == 0.0 and radius(speed) == 0.0
-
-
-@compiled_apart
+@compiled(apart=True)
 def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
     """``pull`` of vehicle ``i``, 0 before its latency has elapsed."""
     pull = motion.pull[i]
@@ -305,21 +290,7 @@ def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
             pull[0] = cell.constant[i]
 
 
-@compiled_apart
-def drift(cell: Cell, speed: Floats, i: int, piece: int, motion: Motion) -> None:
-    """``onward`` and ``reach`` of vehicle ``i``."""
-    onward, reach, pull = motion.onward[i], motion.reach[i], motion.pull[i]
-    length = cell.times[piece + 1] - cell.times[piece]
-    onward[:], reach[:] = speed, 0.0
-    add(reach, length, speed)
-    if i != cell.vehicle and high(cell.onset[i]) > cell.times[piece]:
-        begin_later(cell, i, piece, motion)
-    else:
-        add(onward, length, pull)
-        add(reach, 0.5 * length * length, pull)
-
-
-@compiled_apart
+@compiled(apart=True)
 def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
     """``onward`` and ``reach`` of a vehicle whose command begins somewhere within this piece, or after it."""
     pull = motion.pull[i]
@@ -337,7 +308,7 @@ def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
     pull[:] = between(0.5 * (least + most), 0.5 * (least + most), pull.shape[0])
 
 
-@compiled_apart
+@compiled(apart=True)
 def _since(cell: Cell, i: int, time: float) -> Floats:
     """How long a command has acted at a time, s."""
     since = negative(cell.onset[i])
@@ -345,7 +316,7 @@ def _since(cell: Cell, i: int, time: float) -> Floats:
     return positive_part(since)
 
 
-@compiled_apart
+@compiled(apart=True)
 def stop(speed: Floats, i: int, length: float, motion: Motion) -> None:
     """A braking vehicle that stops in this piece, or may: it stands from then on."""
     pull, vague, width = motion.pull[i], motion.vague[i], speed.shape[0]
@@ -372,7 +343,7 @@ def stop(speed: Floats, i: int, length: float, motion: Motion) -> None:
 SHARP = 0.1  # m/s: a pair that opens moves alone once its speeds are known to this
 
 
-@compiled_apart
+@compiled(apart=True)
 def common(cell: Cell, p: int, front: Floats, rear: Floats) -> Floats:
     """Of two quantities of a pair, that of its centre of mass."""
     out = product(cell.share[p, 1], front)
@@ -380,7 +351,7 @@ def common(cell: Cell, p: int, front: Floats, rear: Floats) -> Floats:
     return out
 
 
-@compiled_apart
+@compiled(apart=True)
 def pressing_together(motion: Motion, p: int) -> tuple[float, float]:
     """Least and largest closing acceleration of a pair whose commands act on both."""
     vague = motion.vague[p] + motion.vague[p + 1]
@@ -388,53 +359,41 @@ def pressing_together(motion: Motion, p: int) -> tuple[float, float]:
     return least, high(motion.pull[p + 1]) - low(motion.pull[p]) + vague
 
 
-@compiled_apart
+@compiled(apart=True)
 def apart(touch: Floats) -> float:
     """Largest difference of speeds of a pair in contact."""
-    most: float = max(touch[OPENING], touch[CLOSING], 0.0)
-    return most
+    return float(max(touch[OPENING], touch[CLOSING], 0.0))
 
 
-@compiled_apart
-def largest_share(cell: Cell, p: int) -> float:
-    """Of a difference of speeds, the most that one of a pair has against their centre of mass."""
-    share: float = max(high(cell.share[p, 0]), high(cell.share[p, 1]))
-    return share
-
-
-@compiled_apart
+@compiled(apart=True)
 def faster(cell: Cell, p: int) -> float:
     """How many times the rear one's speed its impacts may give the front one, at least 1."""
-    times: float = max(1.0, (1.0 + cell.restitution) * high(cell.share[p, 0]))
-    return times
+    return float(max(1.0, (1.0 + cell.restitution) * high(cell.share[p, 0])))
 
 
-@compiled_apart
+@compiled(apart=True)
 def backwards(cell: Cell, p: int) -> float:
     """How many times its speed the rear one may have backwards after an impact, at least 0."""
-    times: float = max(0.0, (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0)
-    return times
+    return float(max(0.0, (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0))
 
 
-@compiled_apart
+@compiled(apart=True)
 def stray(cell: Cell, touch: Floats, p: int) -> float:
     """Largest difference between the speed of a pair's centre of mass and its form.
 
     In a world that creeps the form's speed is between 0 and ``CREEP``, the rear one's between minus ``backwards`` and 1
     times that, the front one's between 0 and ``faster`` times that: no impact makes a rear one faster.
     """
-    most: float = max(faster(cell, p), 1.0 + backwards(cell, p)) * touch[CREEP]
-    return most
+    return float(max(faster(cell, p), 1.0 + backwards(cell, p)) * touch[CREEP])
 
 
-@compiled_apart
+@compiled(apart=True)
 def blur(cell: Cell, path: Path, p: int, side: int) -> float:
     """By how much the speed of one of a pair may differ from the form at any time in the present piece."""
-    most: float = high(cell.share[p, side]) * path.touch[p, SPREAD] + stray(cell, path.touch[p], p)
-    return most
+    return float(high(cell.share[p, side]) * path.touch[p, SPREAD] + stray(cell, path.touch[p], p))
 
 
-@compiled_apart
+@compiled(apart=True)
 def begin_touch(touch: Floats) -> None:
     """Forget what a pair did when it was in contact before."""
     spread, reach = touch[SPREAD], touch[REACH]  # of the present piece
@@ -442,7 +401,7 @@ def begin_touch(touch: Floats) -> None:
     touch[SPREAD], touch[REACH], touch[SOFTEST] = spread, reach, math.inf
 
 
-@compiled_apart
+@compiled(apart=True)
 def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
     """A pair in contact through one piece of time; ``motion`` holds both as if alone, and then as one."""
     touch, front, rear = path.touch[p], p, p + 1
@@ -473,17 +432,18 @@ def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float)
     motion.rest[rear], motion.vague[rear] = motion.rest[front], vague
 
 
-@compiled_apart
+@compiled(apart=True)
 def own_pulls(motion: Motion, p: int) -> tuple[float, float]:
     """Least and largest acceleration that a command of a pair gives."""
     weakest = min(low(motion.pull[p]) - motion.vague[p], low(motion.pull[p + 1]) - motion.vague[p + 1])
     return weakest, max(high(motion.pull[p]) + motion.vague[p], high(motion.pull[p + 1]) + motion.vague[p + 1])
 
 
-@compiled_apart
+@compiled(apart=True)
 def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, hardest: float, length: float) -> None:
     """Note that worlds may creep by now, the pair's centre of mass being as slow as ``slowest`` in this piece."""
-    if weakest < 0.0 and touch[SPREAD] > 0.0 and slowest <= largest_share(cell, p) * touch[SPREAD]:
+    largest = max(high(cell.share[p, 0]), high(cell.share[p, 1]))  # share of one against their centre of mass
+    if weakest < 0.0 and touch[SPREAD] > 0.0 and slowest <= largest * touch[SPREAD]:
         touch[CREEP] = max(touch[CREEP], touch[SPREAD])
     if touch[CREEP] > 0.0:
         touch[CREEP] += max(hardest, 0.0) * length
@@ -497,7 +457,7 @@ def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, har
     touch[REACH] = max(touch[REACH], touch[WIDE])
 
 
-@compiled_apart
+@compiled(apart=True)
 def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
     """A pair whose form stands: each of its worlds stands, or creeps and is braked.
 
@@ -515,7 +475,7 @@ def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) 
     touch[CLOSING] = min(max(touch[CLOSING], 0.0), touch[CREEP])
 
 
-@compiled_apart
+@compiled(apart=True)
 def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
     """A pair that was in contact opens in this piece: from now on each moves alone."""
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -536,7 +496,7 @@ def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
             add(path.forms[N + neighbour], 1.0, between(-abs(share) * wide, 0.0, width))
 
 
-@compiled_apart
+@compiled(apart=True)
 def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length: float, vague: float) -> None:
     """What becomes of the difference of speeds and of the gap of a pair in contact within one piece.
 
@@ -569,7 +529,7 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
     touch[WIDE] += max(opening, 0.0) * length
 
 
-@compiled_apart
+@compiled(apart=True)
 def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: float, most: float) -> None:
     """A pair is pressed together in another way than before: between both ways, or if need be in the new one alone."""
     if not e * math.sqrt(hardest / softest) < 1.0:
@@ -584,7 +544,7 @@ def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: fl
     touch[CLOSING] = touch[OPENING]
 
 
-@compiled_apart
+@compiled(apart=True)
 def settle(touch: Floats, e: float, length: float) -> None:
     """Whether a pair moves as one by the end of the piece.
 
@@ -595,12 +555,12 @@ def settle(touch: Floats, e: float, length: float) -> None:
         touch[SINCE] = 0.0
         return
     fastest = touch[OPENING]
-    ratio = 0.0 if fastest < PLASTIC_SPEED_MPS else e * math.sqrt(touch[HARDEST] / touch[SOFTEST])
+    ratio = 0.0 if fastest < BOUND.PLASTIC_SPEED_MPS else e * math.sqrt(touch[HARDEST] / touch[SOFTEST])
     if touch[SINCE] * touch[SOFTEST] * (1.0 - ratio) > 2.0 * fastest * (1.0 + 1e-9) + 1e-9:
         begin_touch(touch)
 
 
-@compiled_apart
+@compiled(apart=True)
 def is_blurred(path: Path, motion: Motion, N: int, p: int, length: float) -> bool:
     """Whether a moving pair may meet again at so many different times that they are better taken together."""
     if motion.rest[p] != MOVES or motion.rest[p + 1] != MOVES:
@@ -609,41 +569,19 @@ def is_blurred(path: Path, motion: Motion, N: int, p: int, length: float) -> boo
     return radius(path.forms[N + p]) > max(high(closing), 0.0) * length
 
 
-@compiled_apart
-def embrace(cell: Cell, path: Path, p: int) -> None:
-    """Take a pair that may or may not be in contact as one that is."""
-    N, P = cell.speed.shape[0], cell.gap.shape[0]
-    front, rear, gap = path.forms[p].copy(), path.forms[p + 1].copy(), path.forms[N + p]
-    closing = difference(rear, front)
-    touch = path.touch[p]
-    begin_touch(touch)
-    touch[OPENING], touch[CLOSING], touch[WIDE] = max(-low(closing), 0.0), high(closing), max(high(gap), 0.0)
-    path.forms[p] = common(cell, p, front, rear)
-    path.forms[p + 1] = path.forms[p]
-    inside = cut(gap, 0.0, math.inf)
-    if p > 0:
-        add(path.forms[N + p - 1], 1.0, product(cell.share[p, 0], inside))
-    if p < P - 1:
-        add(path.forms[N + p + 1], 1.0, product(cell.share[p, 1], inside))
-    path.marks[P + p] = TOUCHES
-
-
 # A bound on harm that needs no path: by the speeds that the vehicles of a line may still have.
 #
 # Where a path cannot be followed, this is what is said of the worlds that go it, so that no bound is ever infinite.
 #
 # A vehicle on its own is at most as fast as it is, or as it drives up to its limit. In an impact of a pair whose
-# closing
-# speed is w each one's speed changes by its share of (1 + e) w. Let u be the largest of all own speeds, e restitution,
-# and nobody move backwards yet. A rear vehicle is slowed by an impact, and left with at least -e times its speed; a
-# front
-# one that was at rest has at most (1 + e) times the rear one's. So the middle one of three is between -e u and (1 + e)
-# u
-# until its second pair meets. (Three that touch are one cluster, in which each ends with P + e (P - v) for a mean P of
-# their speeds v: between the same bounds.)
+# closing speed is w each one's speed changes by its share of (1 + e) w. Let u be the largest of all own speeds, e
+# restitution, and nobody move backwards yet. A rear vehicle is slowed by an impact, and left with at least -e times its
+# speed; a front one that was at rest has at most (1 + e) times the rear one's. So the middle one of three is between -e
+# u and (1 + e) u until its second pair meets. (Three that touch are one cluster, in which each ends with P + e (P - v)
+# for a mean P of their speeds v: between the same bounds.)
 
 
-@compiled_apart
+@compiled(apart=True)
 def driven(cell: Cell, i: int, speed: float, since: float) -> float:
     """Largest speed of a vehicle that is at most as fast as this at a time, by its own drive from then on."""
     drive, rest = 0.0, cell.times[-1] - since
@@ -653,11 +591,10 @@ def driven(cell: Cell, i: int, speed: float, since: float) -> float:
                 drive = max(drive, cell.action[j] * high(cell.drive))
     elif cell.constant[i] > 0.0:
         drive = cell.constant[i]
-    most: float = max(speed, min(cell.limit[i], speed + drive * rest)) if drive > 0.0 else speed
-    return most
+    return float(max(speed, min(cell.limit[i], speed + drive * rest)) if drive > 0.0 else speed)
 
 
-@compiled_apart
+@compiled(apart=True)
 def rough_harm(cell: Cell, path: Path, hit: int) -> float:
     """Upper bound on the harm of all worlds of a path, from the present piece on, if pair ``hit`` was hit by now.
 
@@ -676,26 +613,13 @@ def rough_harm(cell: Cell, path: Path, hit: int) -> float:
     return high(path.forms[-1]) + rough_rest(cell, own, backwards, since, path, hit)
 
 
-@compiled_apart
-def rough_at_alert(cell: Cell, late: Floats) -> float:
-    """Upper bound on the harm of all worlds of a cell whose first piece of time begins ``late`` after the alert."""
-    N, P, width = cell.speed.shape[0], cell.gap.shape[0], cell.speed.shape[1]
-    path = Path(np.zeros((N + P + 1, width)), np.zeros((P, TOUCH_WIDTH)), np.zeros(2 * P + 1, np.int64))
-    for i in range(N):
-        path.forms[i] = cell.speed[i]
-        if i != cell.vehicle and cell.constant[i] > 0.0:
-            path.forms[i, -1] += cell.constant[i] * high(late)
-    return rough_harm(cell, path, -1)
-
-
-@compiled_apart
+@compiled(apart=True)
 def rough_rest(cell: Cell, own: Floats, backwards: float, since: float, path: Path, hit: int) -> float:
     """Largest sum of the squared closing speeds of first impacts that are still to come."""
     P, e = cell.gap.shape[0], cell.restitution
     first = path.marks[0] == 1 or hit == 0
     if P == 1:
-        alone: float = 0.0 if first else own[1] * own[1]
-        return alone
+        return float(0.0 if first else own[1] * own[1])
     second = path.marks[1] == 1 or hit == 1
     fastest = max(own[1], own[2])
     ahead = driven(cell, 1, (1.0 + e) * fastest, since)  # closing speed of the front pair, its rear one pushed
@@ -708,16 +632,14 @@ def rough_rest(cell: Cell, own: Floats, backwards: float, since: float, path: Pa
         return back * back
     if second:
         return ahead * ahead
-    most: float = max(fastest * fastest + back * back, own[2] * own[2] + ahead * ahead)
-    return most
+    return float(max(fastest * fastest + back * back, own[2] * own[2] + ahead * ahead))
 
 
 # An upper bound on the first-impact harm of a plan over a whole box of worlds.
 #
 # Every way in which impacts may follow each other in the box is a path. In each piece of time a path goes on without an
 # impact, and another one branches off for each pair that may have one then. The harm of a path that has ended is a
-# form;
-# the bound is the largest value of any. Lines of at most three vehicles: once two pairs were hit, harm is final.
+# form; the bound is the largest value of any. Lines of at most three vehicles: once two pairs were hit, harm is final.
 
 # Impacts of a box of worlds within one piece of time, and pairs that stay in contact.
 #
@@ -736,7 +658,7 @@ class Approach(NamedTuple):
     front_stands: bool  # at contact
 
 
-@compiled_apart
+@compiled(apart=True)
 def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
     """By how much speeds (or gap) of a pair may differ in this piece because a neighbouring pair is in contact."""
     P, most = cell.gap.shape[0], 0.0
@@ -747,7 +669,7 @@ def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
     return most
 
 
-@compiled_apart
+@compiled(apart=True)
 def pressing(motion: Motion, p: int) -> tuple[float, float]:
     """Least and largest closing acceleration of a pair within the piece, whether or not one of them stops."""
     front_low, front_high = low(motion.pull[p]) - motion.vague[p], high(motion.pull[p]) + motion.vague[p]
@@ -759,7 +681,7 @@ def pressing(motion: Motion, p: int) -> tuple[float, float]:
     return rear_low - front_high, rear_high - front_low
 
 
-@compiled_apart
+@compiled(apart=True)
 def may_meet(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> bool:
     """Whether a pair may have a contact in this piece in which it closes."""
     N = cell.speed.shape[0]
@@ -779,7 +701,7 @@ def may_meet(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> b
     return min(low(gap), low(after)) - dip <= NEVER
 
 
-@compiled_apart
+@compiled(apart=True)
 def approach(
     cell: Cell, path: Path, motion: Motion, p: int, length: float, front_stands: bool
 ) -> tuple[Approach, bool]:
@@ -807,7 +729,7 @@ def approach(
         opening = max(-low(closing), 0.0) + length * (vague + radius(press) + abs(press[0]))
         squared[-1] += 2.0 * vague * (max(high(gap), 0.0) + 2.0 * length * opening)
     squared[-1] += NEVER
-    there = high(squared) > TOUCH_SPEED_MPS * TOUCH_SPEED_MPS
+    there = high(squared) > BOUND.TOUCH_SPEED_MPS * BOUND.TOUCH_SPEED_MPS
     if slack > 0.0:  # at contact
         least = math.sqrt(max(low(squared), 0.0)) - slack
         rough = square_root(cut(squared, 0.0, math.inf))
@@ -816,7 +738,7 @@ def approach(
         closing[-1] += slack
     fastest = max(high(closing), 0.0) + (max(high(press), 0.0) + vague) * length
     squared = cut(squared, 0.0, fastest * fastest + NEVER)
-    if not there or fastest <= TOUCH_SPEED_MPS:
+    if not there or fastest <= BOUND.TOUCH_SPEED_MPS:
         return Approach(closing, squared, gap, front_stands), False
     speed = square_root(squared)
     time, whole = between(0.0, length, width), closing.copy()
@@ -830,7 +752,7 @@ def approach(
     return Approach(closing, squared, time, front_stands), True
 
 
-@compiled_apart
+@compiled(apart=True)
 def _stopping_way(speed: Floats, pull: Floats, vague: float, length: float) -> Floats:
     """Way of a braking vehicle until it stands, which it does within the piece."""
     if vague > 0.0 or not high(pull) < 0.0:
@@ -844,15 +766,7 @@ def _stopping_way(speed: Floats, pull: Floats, vague: float, length: float) -> F
 # Impacts of a box of worlds: how the two vehicles of an impact move on until the piece of time ends.
 
 
-@compiled_apart
-def ceasing_drive(cell: Cell, motion: Motion, p: int, speed: Floats, length: float) -> float:
-    """Drive of a front vehicle that ceases because an impact pushes it beyond its speed limit; 0: it does not."""
-    drive = high(motion.pull[p]) + motion.vague[p]
-    pushed = (1.0 + cell.restitution) * high(speed) + 2.0 * max(pressing(motion, p)[1], 0.0) * length
-    return drive if drive > 0.0 and high(motion.onward[p]) + pushed > cell.limit[p] else 0.0
-
-
-@compiled_apart
+@compiled(apart=True)
 def spring_apart(
     cell: Cell, path: Path, motion: Motion, p: int, how: Approach, jump: Floats, left: Floats, after: Path, way: Floats
 ) -> None:
@@ -861,7 +775,13 @@ def spring_apart(
     after.forms[p + 1] = difference(motion.onward[p + 1], rear)
     way[p + 1] = difference(motion.reach[p + 1], product(rear, left))
     if how.front_stands:
-        from_standstill(path, motion, p, front, left, after.forms[p], way[p])
+        after.forms[p] = front  # it stood when it was given that speed; then it brakes
+        add(after.forms[p], 1.0, product(motion.pull[p], left))
+        add(way[p], 1.0, product(front, left))
+        add(way[p], 0.5, product(motion.pull[p], square(left)))
+        vague, most = motion.vague[p], high(left)
+        after.forms[p, -1] += vague * most
+        way[p, -1] += 0.5 * vague * most * most
     else:
         after.forms[p], way[p] = motion.onward[p], motion.reach[p]
         add(after.forms[p], 1.0, front)
@@ -870,21 +790,7 @@ def spring_apart(
         stand_still(motion.pull[i], motion.vague[i], high(left), after.forms[i], way[i])
 
 
-@compiled_apart
-def from_standstill(
-    path: Path, motion: Motion, i: int, start: Floats, left: Floats, speed: Floats, way: Floats
-) -> None:
-    """``speed`` at the end and ``way`` of a vehicle that stood when it was given ``start`` (m/s); then it brakes."""
-    speed[:] = start
-    add(speed, 1.0, product(motion.pull[i], left))
-    add(way, 1.0, product(start, left))
-    add(way, 0.5, product(motion.pull[i], square(left)))
-    vague, most = motion.vague[i], high(left)
-    speed[-1] += vague * most
-    way[-1] += 0.5 * vague * most * most
-
-
-@compiled_apart
+@compiled(apart=True)
 def stand_still(pull: Floats, vague: float, left: float, speed: Floats, way: Floats) -> None:
     """Where a braking vehicle's speed would have become negative, it stood before."""
     least = low(speed)
@@ -896,7 +802,7 @@ def stand_still(pull: Floats, vague: float, left: float, speed: Floats, way: Flo
         speed[:] = positive_part(speed)
 
 
-@compiled_apart
+@compiled(apart=True)
 def stay(
     cell: Cell, path: Path, motion: Motion, p: int, how: Approach, speed: Floats, left: Floats, after: Path, way: Floats
 ) -> None:
@@ -925,24 +831,6 @@ def stay(
     add(way[p + 1], 1.0, gap)
 
 
-@compiled_apart
-def settle_down(cell: Cell, motion: Motion, p: int, most_apart: float, length: float, touch: Floats) -> None:
-    """Largest difference of speeds and gap of a pair in contact; its impact opens it by ``most_apart`` at most."""
-    least, most = pressing_together(motion, p)
-    begin_touch(touch)
-    touch[CLOSING] = max(most, 0.0) * length
-    touch[OPENING] = max(most_apart, cell.restitution * touch[CLOSING]) - min(least, 0.0) * length
-    touch[WIDE] = touch[OPENING] * length
-    if least > 0.0 and motion.vague[p] + motion.vague[p + 1] == 0.0:
-        ratio = math.sqrt(most / least)
-        touch[OPENING], touch[CLOSING] = most_apart, most_apart
-        touch[WIDE] = min(0.5 * most_apart * most_apart / least, most_apart * length)
-        if cell.restitution * ratio < 1.0:
-            touch[OPENING], touch[CLOSING] = most_apart * ratio, most_apart * ratio
-            touch[SOFTEST], touch[HARDEST], touch[SINCE] = least, most, 0.0
-    touch[SPREAD], touch[REACH] = apart(touch), 0.0
-
-
 # Impacts of a box of worlds: a path branches off, in which a pair has its impact in this piece of time.
 
 STACK = 256  # most paths that wait to be followed
@@ -957,7 +845,7 @@ class Stack(NamedTuple):
     size: Ints  # [1]
 
 
-@compiled_apart
+@compiled(apart=True)
 def new_stack(N: int, width: int) -> Stack:
     """An empty one."""
     P = N - 1
@@ -969,7 +857,7 @@ def new_stack(N: int, width: int) -> Stack:
     )
 
 
-@compiled_apart
+@compiled(apart=True)
 def keep_worst(harm: Floats, worst: float, out: Floats) -> float:
     """The larger harm; its form goes to ``out``."""
     if not high(harm) <= worst:
@@ -978,15 +866,13 @@ def keep_worst(harm: Floats, worst: float, out: Floats) -> float:
     return worst
 
 
-@compiled_apart
-def keep_rough(cell: Cell, path: Path, hit: int, worst: float, out: Floats) -> float:
+@compiled(apart=True)
+def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
     """``keep_worst`` of a path that is not followed any further."""
-    harm = np.zeros(cell.speed.shape[1])
-    harm[0] = rough_harm(cell, path, hit)
-    return keep_worst(harm, worst, out)
+    return keep_with(np.zeros(cell.speed.shape[1]), rough_harm(cell, path, -1), worst, out)
 
 
-@compiled_apart
+@compiled(apart=True)
 def branch(
     cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, how: Approach, worst: float, out: Floats
 ) -> float:
@@ -1015,7 +901,7 @@ def branch(
     return worst
 
 
-@compiled_apart
+@compiled(apart=True)
 def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
     """``keep_worst`` of a harm to which at most ``rest`` is added."""
     whole = harm.copy()
@@ -1023,7 +909,7 @@ def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
     return keep_worst(whole, worst, out)
 
 
-@compiled_apart
+@compiled(apart=True)
 def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats, time: Floats, length: float) -> Floats:
     """Closing speed of the other one of two pairs that meets in the same piece, after pair ``p``; 0: it does not."""
     N, other = cell.speed.shape[0], 1 - p
@@ -1044,7 +930,7 @@ def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats,
     return closing
 
 
-@compiled_apart
+@compiled(apart=True)
 def strike(
     cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, how: Approach, speed: Floats, harm: Floats
 ) -> bool:
@@ -1064,16 +950,32 @@ def strike(
     way = np.empty((N, width))
     for i in range(N):
         after.forms[i], way[i] = motion.speed[i], motion.way[i]
-    bounces = cell.restitution if high(speed) >= PLASTIC_SPEED_MPS else 0.0
-    returns = cell.restitution if low(speed) >= PLASTIC_SPEED_MPS else 0.0
+    bounces = cell.restitution if high(speed) >= BOUND.PLASTIC_SPEED_MPS else 0.0
+    returns = cell.restitution if low(speed) >= BOUND.PLASTIC_SPEED_MPS else 0.0
     _, most = pressing(motion, p)
-    unlimited = ceasing_drive(cell, motion, p, speed, length)
+    # drive of a front vehicle that ceases because an impact pushes it beyond its speed limit; 0: it does not
+    drive = high(motion.pull[p]) + motion.vague[p]
+    pushed = (1.0 + cell.restitution) * high(speed) + 2.0 * max(pressing(motion, p)[1], 0.0) * length
+    unlimited = drive if drive > 0.0 and high(motion.onward[p]) + pushed > cell.limit[p] else 0.0
     if most < 0.0 or -returns * low(speed) + max(most, 0.0) * high(left) < 0.0:
         jump = speed * (1.0 + bounces)
-        jump[-1] = abs(jump[-1]) + (bounces - returns) * PLASTIC_SPEED_MPS
+        jump[-1] = abs(jump[-1]) + (bounces - returns) * BOUND.PLASTIC_SPEED_MPS
         spring_apart(cell, path, motion, p, how, jump, left, after, way)
     else:
-        settle_down(cell, motion, p, bounces * high(speed), length, after.touch[p])
+        most_apart, touch = bounces * high(speed), after.touch[p]  # by so much its impact opens the pair at most
+        least, hardest = pressing_together(motion, p)
+        begin_touch(touch)
+        touch[CLOSING] = max(hardest, 0.0) * length
+        touch[OPENING] = max(most_apart, cell.restitution * touch[CLOSING]) - min(least, 0.0) * length
+        touch[WIDE] = touch[OPENING] * length
+        if least > 0.0 and motion.vague[p] + motion.vague[p + 1] == 0.0:
+            ratio = math.sqrt(hardest / least)
+            touch[OPENING], touch[CLOSING] = most_apart, most_apart
+            touch[WIDE] = min(0.5 * most_apart * most_apart / least, most_apart * length)
+            if cell.restitution * ratio < 1.0:
+                touch[OPENING], touch[CLOSING] = most_apart * ratio, most_apart * ratio
+                touch[SOFTEST], touch[HARDEST], touch[SINCE] = least, hardest, 0.0
+        touch[SPREAD], touch[REACH] = apart(touch), 0.0
         stay(cell, path, motion, p, how, speed, left, after, way)
         after.marks[P + p] = TOUCHES
     for i in range(p, p + 2):
@@ -1091,7 +993,7 @@ def strike(
     return True
 
 
-@compiled_apart
+@compiled(apart=True)
 def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int) -> bool:
     """Whether a pair may have come to gap 0 at closing speed 0 just when it begins to be pressed together.
 
@@ -1109,7 +1011,7 @@ def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int) -> bool:
     return changed and low(closing) <= 1e-4 and high(closing) >= -1e-4 and low(path.forms[N + p]) <= 1e-6
 
 
-@compiled_apart
+@compiled(apart=True)
 def touch_only(path: Path, stack: Stack, p: int) -> bool:
     """Beside the path on top that of the worlds in which pair ``p`` met, stayed in contact, and had no impact."""
     size = stack.size[0]
@@ -1125,7 +1027,7 @@ def touch_only(path: Path, stack: Stack, p: int) -> bool:
     return True
 
 
-@compiled_apart
+@compiled(apart=True)
 def thrown_back(cell: Cell, path: Path, motion: Motion, p: int, how: Approach, speed: Floats) -> bool:
     """Whether the striking vehicle may move backwards after the impact, and be met again.
 
@@ -1140,7 +1042,7 @@ def thrown_back(cell: Cell, path: Path, motion: Motion, p: int, how: Approach, s
 MOST_PATHS = 4000  # of one cell
 
 
-@compiled_apart
+@compiled(apart=True)
 def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float) -> float:
     """Upper bound on the harm of every world of the cell (m2/s2), unless it is above ``most``.
 
@@ -1162,28 +1064,28 @@ def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float
         if worst > most:
             return worst
         if paths > MOST_PATHS:
-            return give_up(cell, stack, worst, out)
+            for k in range(stack.size[0]):
+                worst = keep_rough(cell, Path(stack.forms[k], stack.touch[k], stack.marks[k]), worst, out)
+            return worst
     return worst if worst >= 0.0 else math.inf  # each world goes some way
 
 
-@compiled_apart
-def give_up(cell: Cell, stack: Stack, worst: float, out: Floats) -> float:
-    """The larger one of ``worst`` and of what is certain of all paths that wait."""
-    for k in range(stack.size[0]):
-        worst = keep_rough(cell, Path(stack.forms[k], stack.touch[k], stack.marks[k]), -1, worst, out)
-    return worst
-
-
-@compiled_apart
+@compiled(apart=True)
 def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
     """Follow a path to its end; the larger one of ``worst`` and its harm and that of the paths that end with it."""
     N, P = cell.speed.shape[0], cell.gap.shape[0]
-    quiet = quiet_from(cell)
+    quiet = 0  # the piece of time from which on nobody drives
+    for j in range(cell.action.shape[0]):
+        if cell.action[j] > 0.0:
+            quiet = j + 1
+    for i in range(cell.constant.shape[0]):
+        if i != cell.vehicle and cell.constant[i] > 0.0:
+            quiet = cell.action.shape[0]
     while path.marks[2 * P] < cell.action.shape[0]:
         piece = path.marks[2 * P]
         move_alone(cell, path, piece, motion)
         if may_meet_unseen(cell, path, motion):
-            return keep_rough(cell, path, -1, worst, out)
+            return keep_rough(cell, path, worst, out)
         worst = meet(cell, path, stack, motion, worst, out)
         if not go_on(cell, path, motion):
             return worst
@@ -1193,20 +1095,7 @@ def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, o
     return keep_worst(path.forms[N + P], worst, out)
 
 
-@compiled_apart
-def quiet_from(cell: Cell) -> int:
-    """The piece of time from which on nobody drives."""
-    quiet = 0
-    for j in range(cell.action.shape[0]):
-        if cell.action[j] > 0.0:
-            quiet = j + 1
-    for i in range(cell.constant.shape[0]):
-        if i != cell.vehicle and cell.constant[i] > 0.0:
-            quiet = cell.action.shape[0]
-    return quiet
-
-
-@compiled_apart
+@compiled(apart=True)
 def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
     """Whether a pair that touched without an impact may open in this piece and meet again, which would be its first."""
     P = cell.gap.shape[0]
@@ -1218,7 +1107,7 @@ def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
     return False
 
 
-@compiled_apart
+@compiled(apart=True)
 def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
     """Pairs in contact, and those that may come into contact, in one piece of time; ``worst`` as ``follow``."""
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -1226,33 +1115,42 @@ def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out
     for p in range(P):
         again = path.marks[P + p] == FREE and path.marks[p] == 1 and (P == 1 or path.marks[2 * P - 1 - p] == FREE)
         if again and may_meet(cell, path, motion, p, length) and is_blurred(path, motion, N, p, length):
-            embrace(cell, path, p)
+            # what may or may not be in contact is taken as a pair that is
+            front, rear, gap = path.forms[p].copy(), path.forms[p + 1].copy(), path.forms[N + p]
+            closing = difference(rear, front)
+            touch = path.touch[p]
+            begin_touch(touch)
+            touch[OPENING], touch[CLOSING], touch[WIDE] = max(-low(closing), 0.0), high(closing), max(high(gap), 0.0)
+            path.forms[p] = common(cell, p, front, rear)
+            path.forms[p + 1] = path.forms[p]
+            inside = cut(gap, 0.0, math.inf)
+            if p > 0:
+                add(path.forms[N + p - 1], 1.0, product(cell.share[p, 0], inside))
+            if p < P - 1:
+                add(path.forms[N + p + 1], 1.0, product(cell.share[p, 1], inside))
+            path.marks[P + p] = TOUCHES
         if path.marks[P + p] == TOUCHES:
             move_together(cell, path, motion, p, length)
     for p in range(P):
         if path.marks[P + p] == FREE and may_meet(cell, path, motion, p, length):
-            worst = impacts(cell, path, stack, motion, p, worst, out)
+            # its impacts in this piece of time, its front moving then or standing
+            for i in range(p, p + 2):
+                motion.way[i, -1] += BOUND.TOUCH_SPEED_MPS * length  # by a touch, which is no impact
+                if (
+                    motion.rest[i] == MOVES
+                    or high(motion.speed[i]) > 0.0
+                    or high(motion.pull[i]) + motion.vague[i] >= 0.0
+                ):
+                    motion.speed[i, -1] += BOUND.TOUCH_SPEED_MPS
+            for stands in range(2):
+                if (motion.rest[p] == STANDS) == (stands == 1) or motion.rest[p] == MAY_STOP:
+                    how, there = approach(cell, path, motion, p, length, stands == 1)
+                    if there:
+                        worst = branch(cell, path, stack, motion, p, how, worst, out)
     return worst
 
 
-@compiled_apart
-def impacts(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, worst: float, out: Floats) -> float:
-    """The impacts that a pair may have in one piece of time, its front moving then or standing."""
-    P = cell.gap.shape[0]
-    length = cell.times[path.marks[2 * P] + 1] - cell.times[path.marks[2 * P]]
-    for i in range(p, p + 2):
-        motion.way[i, -1] += TOUCH_SPEED_MPS * length  # by a touch, which is no impact
-        if motion.rest[i] == MOVES or high(motion.speed[i]) > 0.0 or high(motion.pull[i]) + motion.vague[i] >= 0.0:
-            motion.speed[i, -1] += TOUCH_SPEED_MPS
-    for stands in range(2):
-        if (motion.rest[p] == STANDS) == (stands == 1) or motion.rest[p] == MAY_STOP:
-            how, there = approach(cell, path, motion, p, length, stands == 1)
-            if there:
-                worst = branch(cell, path, stack, motion, p, how, worst, out)
-    return worst
-
-
-@compiled_apart
+@compiled(apart=True)
 def go_on(cell: Cell, path: Path, motion: Motion) -> bool:
     """Move on without an impact in this piece; False if no world can."""
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -1275,8 +1173,7 @@ def go_on(cell: Cell, path: Path, motion: Motion) -> bool:
 #
 # What is certified is a whole plan, from the alert on: nothing that is seen later narrows a box. So the proof is short.
 # The plan that is held has a bound over all worlds of the box; it is replaced by another one, with the same past, only
-# if
-# that one's bound is at most the budget. What was applied at the end is the plan that is held then.
+# if that one's bound is at most the budget. What was applied at the end is the plan that is held then.
 
 # Branch and bound: an upper bound on the harm of a plan over a box, refined where it is largest.
 
@@ -1297,7 +1194,7 @@ class Known(NamedTuple):
     horizon_s: float
 
 
-@compiled_apart
+@compiled(apart=True)
 def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
     """The form of number ``which`` of a box whose uncertain ones are ``free`` [K]."""
     out = np.zeros(free.shape[0] + 2)
@@ -1311,7 +1208,7 @@ def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
     return out
 
 
-@compiled_apart
+@compiled(apart=True)
 def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats) -> tuple[Cell, Floats]:
     """The cell of a box [Q], its worlds at the alert, and how long after it the first piece of time begins (s).
 
@@ -1349,7 +1246,7 @@ def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats)
     return cell, first
 
 
-@compiled_apart
+@compiled(apart=True)
 def wait(cell: Cell, late: Floats) -> bool:
     """Move a cell's worlds on by ``late`` (s), each by its own; False where that may not be all that happens."""
     if high(late) <= 1e-12:
@@ -1376,7 +1273,7 @@ def wait(cell: Cell, late: Floats) -> bool:
     return True
 
 
-@compiled_apart
+@compiled(apart=True)
 def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
     """Acceleration of a vehicle until ``late`` after the alert; False where it may begin within that time."""
     pull = np.zeros_like(late)
@@ -1393,7 +1290,7 @@ def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
     return pull, True
 
 
-@compiled_apart
+@compiled(apart=True)
 def pieces(known: Known, onset: Floats, earliest: float, plan: Floats) -> tuple[Floats, Floats]:
     """Where commands may change, s after the first decision, and the shielded vehicle's action between."""
     N = onset.shape[0]
@@ -1423,14 +1320,21 @@ def pieces(known: Known, onset: Floats, earliest: float, plan: Floats) -> tuple[
     return times, action
 
 
-@compiled_apart
+@compiled(apart=True)
 def bound_of(
     low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, stack: Stack, motion: Motion, out: Floats,
     most: float,
 ) -> float:  # fmt: skip
     """Upper bound on the harm of a plan over one box, unless it is above ``most``."""
     cell, late = cell_of(low_, high_, free, known, plan)
-    rough = rough_at_alert(cell, late)
+    # of all worlds whose first piece of time begins ``late`` after the alert
+    N, P, width = cell.speed.shape[0], cell.gap.shape[0], cell.speed.shape[1]
+    path = Path(np.zeros((N + P + 1, width)), np.zeros((P, TOUCH_WIDTH)), np.zeros(2 * P + 1, np.int64))
+    for i in range(N):
+        path.forms[i] = cell.speed[i]
+        if i != cell.vehicle and cell.constant[i] > 0.0:
+            path.forms[i, -1] += cell.constant[i] * high(late)
+    rough = rough_harm(cell, path, -1)
     if wait(cell, late):
         harm = most_harm(cell, stack, motion, out, most)
         if harm <= rough:
@@ -1440,7 +1344,7 @@ def bound_of(
     return rough
 
 
-@compiled_apart
+@compiled(apart=True)
 def bound_box(
     low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, enough: float, cells: int, only_enough: bool
 ) -> tuple[float, int]:
@@ -1479,7 +1383,6 @@ NEAR = 1.02  # times the largest harm in a corner: a bound this good is not refi
 NEARLY_NOTHING = 0.1  # m2/s2, likewise
 CORNERS, INTERIOR = "corners", "interior"  # which worlds of a box robust mode certifies
 CERTAINTIES = (CORNERS, INTERIOR)
-PER_BOX = ("low", "high", "limit", "restitution", "begin_s", "constant")  # arrays of Boxes
 SCRIPTS = ("full_brake", "coast", "constant")
 
 
@@ -1496,20 +1399,42 @@ class Boxes(NamedTuple):
     time_step_s: float
     horizon_s: float
 
-    def put(self, rows: Ints, new: Boxes) -> Boxes:
-        """A copy with the boxes of ``new`` in these rows."""
-        columns: dict[str, Any] = {name: put(getattr(self, name), rows, getattr(new, name)) for name in PER_BOX}
-        return self._replace(**columns)
-
     def take(self, rows: Ints) -> Boxes:
-        """Those of some worlds."""
-        columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in PER_BOX}
-        return self._replace(**columns)
+        """The boxes of some worlds."""
+        arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._fields[:6]}
+        return self._replace(**arrays)
 
+    def placed(self, old: Boxes | None, rows: Ints) -> Boxes:
+        """The boxes of a batch in which these ones begin in these rows: all of them, or some of the ``old`` ones."""
+        if old is None or len(rows) >= len(old.low):
+            return self.take(np.argsort(rows))
+        arrays: dict[str, Any] = {name: getattr(old, name).copy() for name in self._fields[:6]}
+        for name, array in arrays.items():
+            array[rows] = getattr(self, name)
+        return self._replace(**arrays)
 
-def placed(old: Boxes | None, new: Boxes, rows: Ints) -> Boxes:
-    """The boxes of a batch in which episodes begin in these rows: all of them, or some of the ``old`` ones."""
-    return new.take(np.argsort(rows)) if old is None or len(rows) >= len(old.low) else old.put(rows, new)
+    def at_alert(self, plans: Floats, harm: Floats) -> Floats:
+        """Upper bound on the harm of each plan [n, L], ``harm`` being its largest in a corner, [n] m2/s2."""
+        return self.bound(np.arange(len(plans)), plans, NEAR * harm + NEARLY_NOTHING, CELLS_AT_ALERT)
+
+    def bound(
+        self, rows: Ints, plans: Floats, enough: Floats, cells: int = CELLS, *, only_enough: bool = False
+    ) -> Floats:
+        """Upper bound on the harm of each plan [m, L], from the alert on, over all worlds of a box [m], m2/s2.
+
+        A bound at most ``enough`` [m] is not refined any further, and no more than ``cells`` parts of a box are looked
+        at. With ``only_enough`` what is above ``enough`` is no bound: it says that none at most that was found.
+        """
+        bounds = np.empty(len(rows))
+        for j, k in enumerate(rows.tolist()):
+            low, high = self.low[k], self.high[k]
+            known = Known(
+                self.vehicle, self.constant[k], self.limit[k], float(self.restitution[k]), float(self.begin_s[k]),
+                self.time_step_s, self.horizon_s,
+            )  # fmt: skip
+            free, plan = np.flatnonzero(high > low), np.ascontiguousarray(plans[j], np.float64)
+            bounds[j], _ = bound_box(low, high, free, known, plan, float(enough[j]), cells, only_enough)
+        return bounds
 
 
 def check_possible(robust: str, scenario: Scenario, harm_count: HarmCount, others: Mapping[int, Script]) -> None:
@@ -1520,12 +1445,13 @@ def check_possible(robust: str, scenario: Scenario, harm_count: HarmCount, other
     """
     if robust != INTERIOR:
         return
-    if harm_count == "total":
-        raise _refusal("total harm")
-    if scenario.vehicles > MOST_VEHICLES:
-        raise _refusal(f"{scenario.vehicles} vehicles")
-    if scenario.has_obstacle:
-        raise _refusal("an obstacle ahead")
+    for what, there in (
+        ("total harm", harm_count == "total"),
+        (f"{scenario.vehicles} vehicles", scenario.vehicles > MOST_VEHICLES),
+        ("an obstacle ahead", scenario.has_obstacle),
+    ):
+        if there:
+            raise _refusal(what)
     for i, script in sorted(others.items()):
         name = getattr(script, "name", type(script).__name__)
         if name.split(":")[0] not in SCRIPTS:
@@ -1542,36 +1468,21 @@ def _refusal(what: str) -> InvalidInput:
     )
 
 
-def boxes_of(possible: Worlds, running: Running, scenario: Scenario, others: Mapping[int, Script]) -> Boxes:
-    """The boxes of the n worlds of ``running`` at the alert, their members being ``possible`` [n * M].
+def boxes_of(
+    possible: Worlds, problem: ProfileProblem, n: int, scenario: Scenario, others: Mapping[int, Script]
+) -> Boxes:
+    """The boxes of n worlds at the alert, their members being ``possible`` [n * M], as in the ``problem``.
 
     Raises ``InvalidInput`` for worlds that interior mode cannot certify: with an obstacle ahead, or in which another
     vehicle's command is not the same in the whole box. ``check_possible`` says what no world of a scenario changes.
     """
-    n, vehicle = running.n, int(running.problem.vehicles[0])
-    v, N = possible.vehicles, possible.N
-    command = running.problem.command[:, running.problem.command.shape[1] - N :]
-    if obstacle_ahead(possible).any():
+    v, N, vehicle, members = possible.vehicles, possible.N, int(problem.vehicles[0]), possible.n // n
+    if possible.obstacle_ahead.any():
         raise _refusal("an obstacle ahead")
-    numbers = np.concatenate(
-        [v.braking_capacity_mps2, v.driving_capacity_mps2, v.latency_s, v.mass_t, possible.speeds_mps, possible.gaps_m],
-        axis=1,
-    ).reshape(n, -1, 6 * N - 1)
-    members = len(v.mass_t) // n
-    return Boxes(
-        numbers.min(axis=1), numbers.max(axis=1), v.speed_limit_mps[::members], v.restitution[::members],
-        possible.time_s[::members], _constants(others, vehicle, command.reshape(n, members, N)), vehicle,
-        scenario.time_step_s, scenario.horizon_s,
-    )  # fmt: skip
-
-
-def _constants(others: Mapping[int, Script], vehicle: int, command: Floats) -> Floats:
-    """Command of each other vehicle [n, N], NaN where it brakes fully; [n, M, N] in the members."""
-    constant = np.full((command.shape[0], command.shape[2]), np.nan)
+    command, constant = problem.command.reshape(n, members, N), np.full((n, N), np.nan)
     for i, script in others.items():
         name = getattr(script, "name", type(script).__name__)
-        kind = name.split(":")[0]
-        if i == vehicle or kind == "full_brake":
+        if i == vehicle or name.split(":")[0] == "full_brake":
             continue
         if not (command[:, :, i] == command[:, :1, i]).all():
             raise InvalidInput(
@@ -1580,45 +1491,14 @@ def _constants(others: Mapping[int, Script], vehicle: int, command: Floats) -> F
                 " the box"
             )
         constant[:, i] = command[:, 0, i]
-    return constant
-
-
-def expects(boxes: Boxes | None, running: Running, seen: Floats) -> Bools:
-    """Where what is seen now [n, columns] may be, as far as is known, [n].
-
-    Where the own latency of a box is uncertain a decision falls at another time in each of its worlds. No range of the
-    corners holds them then: any finite numbers may be.
-    """
-    expected = as_predicted(running, seen)
-    if boxes is not None:
-        own = 2 * boxes.limit.shape[1] + boxes.vehicle
-        expected |= (boxes.high[:, own] > boxes.low[:, own]) & np.isfinite(seen).all(axis=1)
-    return expected
-
-
-def bounds_at_alert(boxes: Boxes, plans: Floats, harm: Floats) -> Floats:
-    """Upper bound on the harm of each plan [n, L] over its box, ``harm`` being its largest in a corner, [n] m2/s2."""
-    return bound_plans(boxes, plans, NEAR * harm + NEARLY_NOTHING, CELLS_AT_ALERT)
-
-
-def bound_plans(boxes: Boxes, plans: Floats, enough: Floats, cells: int, *, only_enough: bool = False) -> Floats:
-    """Upper bound on the harm of each plan [n, L], from the alert on, over all worlds of its box, [n] m2/s2.
-
-    A bound at most ``enough`` [n] is not refined any further, and no more than ``cells`` parts of a box are looked at.
-    With ``only_enough`` what is above ``enough`` is no bound: it says that none at most that was found.
-    """
-    bounds = np.empty(len(plans))
-    for k in range(len(plans)):
-        low, high = boxes.low[k], boxes.high[k]
-        known = Known(
-            boxes.vehicle, boxes.constant[k], boxes.limit[k], float(boxes.restitution[k]), float(boxes.begin_s[k]),
-            boxes.time_step_s, boxes.horizon_s,
-        )  # fmt: skip
-        plan = np.ascontiguousarray(plans[k], np.float64)
-        bounds[k] = bound_box(low, high, np.flatnonzero(high > low), known, plan, float(enough[k]), cells, only_enough)[
-            0
-        ]
-    return bounds
+    numbers = np.concatenate(
+        [v.braking_capacity_mps2, v.driving_capacity_mps2, v.latency_s, v.mass_t, possible.speeds_mps, possible.gaps_m],
+        axis=1,
+    ).reshape(n, members, 6 * N - 1)
+    return Boxes(
+        numbers.min(axis=1), numbers.max(axis=1), v.speed_limit_mps[::members], v.restitution[::members],
+        possible.time_s[::members], constant, vehicle, scenario.time_step_s, scenario.horizon_s,
+    )  # fmt: skip
 
 
 def checked_robust(robust: object, where: str) -> str:
@@ -1626,49 +1506,3 @@ def checked_robust(robust: object, where: str) -> str:
     if robust not in CERTAINTIES:
         raise unknown_name(f"{where}: robust", robust, CERTAINTIES)
     return str(robust)
-
-
-def certify_inside(
-    boxes: Boxes | None, running: Running, held: Backup, budget: Floats, decision: Decision, asked: Bools
-) -> Decision:
-    """A decision that the corners allow, refused where its plan is not certified for every world of the box, if any.
-
-    ``held`` is the backup before it. A plan without a certificate never replaces the held one. Episodes end at the
-    horizon: that all corners rest does not mean that every world does.
-    """
-    if boxes is None:
-        return decision
-    plan, other = decision.backup.plan.copy(), (decision.backup.plan != held.plan).any(axis=1)
-    bound = np.where(asked & ~other, held.harm, decision.bound)  # of the corners alone, where the plan is the same
-    changed = np.flatnonzero(asked & other)
-    found = bound_plans(boxes.take(changed), plan[changed], budget[changed], CELLS, only_enough=True)
-    least = np.where(decision.intervened, held.harm, budget)[changed]
-    good = found <= least
-    bound[changed[good]] = found[good]
-    known = np.isfinite(found)
-    decision.margin[changed[known]] = (budget[changed] - found)[known]
-    bad = changed[~good]
-    plan[bad], bound[bad] = held.plan[bad], held.harm[bad]
-    decision = decision._replace(bound=bound, backup=decision.backup._replace(plan=plan, harm=bound))
-    refused = bad[~decision.intervened[bad]]
-    if refused.size:
-        decision = _refuse(running, held, decision, refused)
-    after = decision.after
-    over = np.repeat(after.steps, after.members) >= after.problem.last_step
-    each = np.repeat(asked, after.members)
-    return decision._replace(after=after._replace(ended=np.where(each, over, after.ended)))
-
-
-def _refuse(running: Running, held: Backup, decision: Decision, rows: Ints) -> Decision:
-    """The decision with the held plan's action in these rows."""
-    part = running.take(rows)
-    action = held.plan[rows, part.steps]
-    kept = Backup(held.plan[rows], held.harm[rows], held.constants)
-    with renumbered(rows):
-        instead = certify(part, action, kept, held.harm[rows])
-    at, after = running.rows_of(rows), decision.after
-    states, ended = after.states.copy(), after.ended.copy()
-    states[at], ended[at] = instead.after.states, instead.after.ended
-    decision.applied[rows], decision.intervened[rows] = instead.applied, True
-    decision.reason[rows] = NO_CERTIFICATE
-    return decision._replace(after=after._replace(states=states, ended=ended))

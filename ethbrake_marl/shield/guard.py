@@ -25,38 +25,55 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import command_to_action
-from ethbrake_marl.agents.believed import Believing, split_believed
-from ethbrake_marl.agents.e_v2x_bm import EV2XBM
-from ethbrake_marl.agents.policy import LearnedPolicy
-from ethbrake_marl.agents.protocol import (
+from ethbrake_marl.agents import (
+    EV2XBM,
     Agent,
     AgentAround,
+    AgentSettings,
+    Believing,
     Driver,
+    Episodes,
     Knowledge,
+    LearnedPolicy,
+    Refined,
     Source,
     Team,
-    apart,
-    begun_apart,
     check_agent,
     combine,
-    place,
-    recall,
+    drive,
+    split_believed,
     team_of,
 )
-from ethbrake_marl.agents.refined import Refined
-from ethbrake_marl.agents.registry import AgentSettings
-from ethbrake_marl.agents.rollout import Episodes, drive, script_agents, set_others
 from ethbrake_marl.defaults import HarmCount
-from ethbrake_marl.engine.engine import Engine, Guard, Ruling, Running
-from ethbrake_marl.engine.stream import Script, ask_script, begin_script
+from ethbrake_marl.engine import (
+    Engine,
+    Guard,
+    Memory,
+    Ruling,
+    Running,
+    Script,
+    ask_script,
+    begin_script,
+    renew_memory,
+    take_memory,
+)
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep, check_one_learner, count_of, renumbered, unknown_name
-from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
-from ethbrake_marl.physics.worlds import vehicles_at_once
+from ethbrake_marl.physics import Bools, Floats, Ints, Vehicles, Worlds
 from ethbrake_marl.scenario import Scenario, Task
 from ethbrake_marl.search import state_columns
-from ethbrake_marl.shield.certify import REASONS, Decision, Proposer, difference, proposed_actions, seen_columns
-from ethbrake_marl.shield.enclosure import CORNERS, INTERIOR, checked_robust, expects
-from ethbrake_marl.shield.step_shield import CAPS, BelievedShield, Cap, StepShield, by_vehicle
+from ethbrake_marl.shield.enclosure import CORNERS, INTERIOR, checked_robust
+from ethbrake_marl.shield.step_shield import (
+    CAPS,
+    REASONS,
+    BelievedShield,
+    Cap,
+    Decision,
+    Proposer,
+    StepShield,
+    difference,
+    proposed_actions,
+    seen_columns,
+)
 from ethbrake_marl.shield.uncertainty import (
     Uncertainty,
     check_amount,
@@ -188,10 +205,21 @@ class MovingAtHorizon(UserWarning):
 
 
 class Guarded(NamedTuple):
-    """What a guard remembers: its shield, and who proposes with what they remember; neither is changed in place."""
+    """What a guard remembers: its shield, and what those do who propose; neither is changed in place."""
 
-    shield: Any  # StepShield, BelievedShield or HybridAgent
-    policies: dict[int, Agent]  # by shielded vehicle, front to rear; none where nobody is known to propose
+    shield: Any  # StepShield, BelievedShield, or in mode ``episode`` the memory of the HybridAgent
+    policies: dict[int, Memory]  # by shielded vehicle, front to rear; none where nobody is known to propose
+
+    def take(self, rows: Ints) -> Guarded:
+        """Of some rows of the engine, or of one several times."""
+        is_tree = isinstance(self.shield, Mapping)
+        shield = take_memory(self.shield, rows) if is_tree else self.shield.take(rows)
+        return Guarded(shield, take_memory(self.policies, rows))
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """What it says of each world, as the memory of an agent would."""
+        return {what: getattr(self.shield, what, None) for what in ("predicted_harm", "chosen_policy")}
 
 
 class ShieldGuard(ABC):
@@ -211,8 +239,8 @@ class ShieldGuard(ABC):
         """The shield before any episode."""
 
     @abstractmethod
-    def _started(self, shield: Any, alert: Worlds, rows: Ints, policies: dict[int, Agent]) -> None:
-        """Start episodes in these rows of a shield of its own."""
+    def _started(self, shield: Any, alert: Worlds, rows: Ints) -> Any:
+        """The shield once episodes start in these rows; the one that is given may be changed."""
 
     @abstractmethod
     def decide(self, running: Running, memory: Guarded, proposed: Floats) -> Ruling:
@@ -224,11 +252,10 @@ class ShieldGuard(ABC):
 
     def begin(self, memory: Guarded | None, alert: Worlds, rows: Ints) -> Guarded:
         """The shield and the policies once episodes start in these rows."""
-        shield, policies = memory or Guarded(self._fresh, self._policies)
-        policies = begun_apart(policies, alert, rows, self.scripts)
-        shield = self._apart(shield)
-        self._started(shield, alert, rows, policies)
-        return Guarded(shield, policies)
+        shield, policies = memory or Guarded(self._fresh, {})
+        begun = {i: begin_script(policy, alert, i, self.scripts) for i, policy in self._policies.items()}
+        policies = renew_memory(policies, rows, begun) if policies else begun
+        return Guarded(self._started(self._apart(shield), alert, rows), policies)
 
     def check(self, ruling: Ruling, after: Running) -> Guarded:
         """The memory as the ruling says: only step mode compares what a step led to."""
@@ -240,18 +267,22 @@ class ShieldGuard(ABC):
         return copy.copy(shield)
 
     def _asked(
-        self, worlds: Worlds | None, policies: dict[int, Agent], proposed: Floats
-    ) -> tuple[Floats, dict[int, Agent]]:
-        """All proposals [n, L], those of the policies where nobody else makes one, and the policies then."""
+        self, worlds: Worlds | None, memories: dict[int, Memory], proposed: Floats
+    ) -> tuple[Floats, dict[int, Memory]]:
+        """All proposals [n, L], those of the policies where nobody else makes one, and what they remember then."""
         left_out = np.isnan(proposed).all(axis=0)
-        if left_out.any() and not policies:
+        if left_out.any() and not self._policies:
             raise InvalidInput("shield: no action was given, and there is no policy that could propose one")
-        if left_out.any() or any(apart(policy) is not policy for policy in policies.values()):
+        remember = (i for i, agent in self._policies.items() if getattr(agent, "remembers", memories[i] is not None))
+        if left_out.any() or any(True for _ in remember):
             assert worlds is not None
-            policies = {i: apart(policy) for i, policy in policies.items()}
-            own = by_vehicle(proposed_actions(policies, worlds, len(policies) == 1), self.vehicles)
+            own, memories = proposed_actions(self._policies, memories, worlds)
             proposed = np.where(left_out, own, proposed)
-        return proposed, policies
+        return proposed, memories
+
+    def _proposer(self, memories: dict[int, Memory], worlds: Worlds | None) -> Proposer | None:
+        """Who may be rolled out; None where nobody proposes."""
+        return Proposer(self._policies, memories, worlds) if self._policies and worlds is not None else None
 
 
 def by_row(columns: Any, n: int, learners: int) -> NDArray[Any]:
@@ -296,10 +327,10 @@ class StepGuard(ShieldGuard):
             self.scenario, self.vehicles if self._several else self.vehicles[0], self.scripts
         )
 
-    def _started(self, shield: StepShield, alert: Worlds, rows: Ints, policies: dict[int, Agent]) -> None:
+    def _started(self, shield: StepShield, alert: Worlds, rows: Ints) -> StepShield:
         if self._told is not None and not (rows < self._told.n).all():
             raise InvalidInput(f"shield: told of {count_of(self._told.n, 'world')}, but row {rows.max()} begins")
-        shield.begin(alert if self._told is None else self._told.take(rows), rows, policies or None)
+        shield.begin(alert if self._told is None else self._told.take(rows), rows, self._policies or None)
         moving = int((~shield.settles[rows]).sum())
         if moving and self._to_warn:
             self._to_warn = False
@@ -310,24 +341,24 @@ class StepGuard(ShieldGuard):
                 MovingAtHorizon,
                 stacklevel=2,
             )
+        return shield
 
     def decide(self, running: Running, memory: Guarded, proposed: Floats) -> Ruling:
         """What is certified. In a world whose episode is over as far as the shield foretold it is full braking."""
         shield: StepShield = memory.shield
         goes_on, finished = ~running.ended, shield.running.finished  # type: ignore[union-attr]  # it has begun
-        worlds = running.worlds if memory.policies or self._told is not None else None  # made anew each time
-        proposed, policies = self._asked(worlds, memory.policies, proposed)
+        worlds = running.worlds if self._policies or self._told is not None else None  # made anew each time
+        proposed, memories = self._asked(worlds, memory.policies, proposed)
         after = copy.copy(shield)
         decision = after.decide(
             proposed if self._several else proposed[:, 0],
             seen=seen_columns(running.packed) if worlds is None or self._told is None else state_columns(worlds),
             only=goes_on,
-            proposer=None if worlds is None or not (policies and self._later_rollouts) else Proposer(policies, worlds),
+            proposer=self._proposer(memories, worlds) if self._later_rollouts else None,
         )
-        applied = by_vehicle(decision.applied, self.vehicles)
-        applied = np.where((goes_on & finished)[:, np.newaxis], -1.0, applied)
-        stepped_in: Bools = np.any(by_vehicle(decision.intervened, self.vehicles), axis=1)
-        return Ruling(proposed, applied, stepped_in, goes_on & ~finished, decision, Guarded(after, policies))
+        applied = np.where((goes_on & finished)[:, np.newaxis], -1.0, decision.applied.reshape(proposed.shape))
+        stepped_in: Bools = np.any(decision.intervened.reshape(proposed.shape), axis=1)
+        return Ruling(proposed, applied, stepped_in, goes_on & ~finished, decision, Guarded(after, memories))
 
     def check(self, ruling: Ruling, after: Running) -> Guarded:
         """Compare what the step led to with what was certified, the last step included.
@@ -346,7 +377,7 @@ class StepGuard(ShieldGuard):
                 f"shield: world {k} is at step {after.steps[k]} of its episode, certified was step {running.steps[k]}"
             )
         seen = seen_columns(after.packed)
-        surprising = wanted & ~expects(shield.boxes, running, seen)
+        surprising = wanted & ~shield.expects(seen)
         if not surprising.any():
             return memory
         if self._told is None:
@@ -406,18 +437,19 @@ class BelievedGuard(ShieldGuard):
     def _apart(self, shield: BelievedShield) -> BelievedShield:
         return shield.branch()
 
-    def _started(self, shield: BelievedShield, alert: Worlds, rows: Ints, policies: dict[int, Agent]) -> None:
+    def _started(self, shield: BelievedShield, alert: Worlds, rows: Ints) -> BelievedShield:
         shield.begin(alert, self.vehicles[0], rows)
+        return shield
 
     def decide(self, running: Running, memory: Guarded, proposed: Floats) -> Ruling:
         """What is certified in the believed worlds."""
         worlds = running.worlds
-        proposed, policies = self._asked(worlds, memory.policies, proposed)
+        proposed, memories = self._asked(worlds, memory.policies, proposed)
         after = memory.shield.branch()
-        before = after.interventions
-        applied = after.decide(worlds, self.vehicles[0], proposed[:, 0], policies or None)[:, np.newaxis]
+        before, proposer = after.interventions, self._proposer(memories, worlds)
+        applied = after.decide(worlds, self.vehicles[0], proposed[:, 0], proposer)[:, np.newaxis]
         stepped_in = after.interventions > before
-        return Ruling(proposed, applied, stepped_in, ~running.ended, after.decision, Guarded(after, policies))
+        return Ruling(proposed, applied, stepped_in, ~running.ended, after.decision, Guarded(after, memories))
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, NDArray[Any]]:
         """The keys of ``infos[agent]["shield"]``; ``trusted``: the mode promises something of the world as it is."""
@@ -447,8 +479,8 @@ Bound = Literal["coupled", "pairwise"]
 class HybridAgent(AgentAround):
     """Drives by ``policy`` in the worlds where its rolled-out harm is at most ``H*``, else by E-V2X-BM.
 
-    ``bound`` says which ``H*`` and ``a*``; ``harm_count`` which harm counts. After ``begin``, ``chosen_policy`` [n]
-    says who drives; ``policy_harm`` [n] and ``bound_harm`` [n] were compared, ``predicted_harm`` [n] is the lower one.
+    ``bound`` says which ``H*`` and ``a*``; ``harm_count`` which harm counts. Its memory holds ``chosen_policy`` [n],
+    who drives; ``policy_harm`` [n] and ``bound_harm`` [n] were compared, ``predicted_harm`` [n] is the lower one.
     Raises ``InvalidInput`` for an unknown ``bound`` or ``harm_count``, and for what is not an agent.
     """
 
@@ -464,42 +496,28 @@ class HybridAgent(AgentAround):
         self.scenario = scenario
         self.bound: Bound = bound
         self.harm_count: HarmCount = harm_count
-        self.policy_harm: Floats = np.zeros(0)
-        self.bound_harm: Floats = np.zeros(0)
-        self._stage = copy.deepcopy(policy)  # predicting must not disturb the policy's memory of running episodes
 
-    @property
-    def chosen_policy(self) -> Bools:
-        """Where the policy drives, [n]."""
-        chosen: Bools = self.policy_harm <= self.bound_harm
-        return chosen
-
-    @property
-    def predicted_harm(self) -> Floats:
-        """Harm expected at the alert, [n] m2/s2."""
-        return np.minimum(self.policy_harm, self.bound_harm)
-
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """Choose for these rows; ``worlds`` holds those rows only, at the alert."""
-        scripts = script_agents(self.scenario, except_for=vehicle)
-        for agent in (self.policy, self.backup):
-            set_others(agent, vehicle, scripts)
-            begin_script(agent, worlds, vehicle, rows)
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        """Choose in these worlds."""
+        policy = begin_script(self.policy, alert, vehicle, scripts)
+        backup = begin_script(self.backup, alert, vehicle, scripts)
         if isinstance(self.policy, Refined):  # was rolled out just now
-            policy_harm = self.policy.predicted_harm[rows]
+            policy_harm = policy["predicted_harm"]
         else:
-            policy_harm = self._harm(worlds, self._stage, vehicle)
-        bound = self.backup.predicted_harm[rows]
+            policy_harm = self._harm(alert, self.policy, vehicle)
+        bound = backup["predicted_harm"]
         if self.bound == "coupled":
-            bound = self._harm(worlds, FixedCommand(-self.backup.deceleration_mps2[rows]), vehicle)
-        self.bound_harm = place(self.bound_harm, rows, bound)
-        self.policy_harm = place(self.policy_harm, rows, policy_harm)
+            bound = self._harm(alert, FixedCommand(-backup["deceleration_mps2"]), vehicle)
+        return {
+            "policy": policy, "backup": backup, "policy_harm": policy_harm, "bound_harm": bound,
+            "predicted_harm": np.minimum(policy_harm, bound), "chosen_policy": policy_harm <= bound,
+        }  # fmt: skip
 
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
         """Wanted signed acceleration of the chosen strategy, [n] m/s2."""
-        self.policy_harm = recall(self.policy_harm, worlds.n, self.name)  # of this batch; an earlier one may be larger
-        self.bound_harm = recall(self.bound_harm, worlds.n, self.name)
-        return np.where(self.chosen_policy, ask_script(self.policy, worlds, vehicle), self.backup.act(worlds, vehicle))
+        command, policy = ask_script(self.policy, worlds, memory["policy"], vehicle)
+        constant, _ = self.backup.act(worlds, memory["backup"], vehicle)
+        return np.where(memory["chosen_policy"], command, constant), {**memory, "policy": policy}
 
     def _harm(self, worlds: Worlds, agent: Agent, vehicle: int) -> Floats:
         return drive(worlds, agent, self.scenario, vehicle).ledger.world_harm(self.harm_count)
@@ -512,9 +530,6 @@ class FixedCommand:
 
     def __init__(self, command_mps2: Floats) -> None:
         self.command_mps2 = command_mps2
-
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """Nothing to prepare."""
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """The command of each world, [n] m/s2."""
@@ -530,29 +545,27 @@ class EpisodeGuard(ShieldGuard):
     A proposal counts as replaced where it differs by more than the rounding of its 32 bits.
     """
 
-    def _make(self) -> HybridAgent:
+    def _make(self) -> None:
         (policy,) = self._policies.values()
-        self._policies = {}
-        return HybridAgent(policy, self.scenario, bound=self.options.bound, harm_count=self.options.harm_count)
+        self._hybrid = HybridAgent(policy, self.scenario, bound=self.options.bound, harm_count=self.options.harm_count)
+        self._policies = {}  # the hybrid asks
 
-    def _apart(self, shield: HybridAgent) -> HybridAgent:
-        return copy.deepcopy(shield)
-
-    def _started(self, shield: HybridAgent, alert: Worlds, rows: Ints, policies: dict[int, Agent]) -> None:
-        shield.begin(alert, self.vehicles[0], rows)
+    def _started(self, shield: Memory, alert: Worlds, rows: Ints) -> Memory:
+        begun = begin_script(self._hybrid, alert, self.vehicles[0], self.scripts)
+        return begun if shield is None else renew_memory(shield, rows, begun)
 
     def decide(self, running: Running, memory: Guarded, proposed: Floats) -> Ruling:
         """What the chosen agent does."""
-        hybrid, worlds = copy.copy(memory.shield), running.worlds
-        hybrid.policy = apart(hybrid.policy)
-        applied = command_to_action(hybrid.act(worlds, self.vehicles[0]), worlds.vehicles, self.vehicles[0])
+        worlds = running.worlds
+        command, hybrid = ask_script(self._hybrid, worlds, memory.shield, self.vehicles[0])
+        applied = command_to_action(command, worlds.vehicles, self.vehicles[0])[:, np.newaxis]
         memory = memory._replace(shield=hybrid)
-        return Ruling(proposed, applied[:, np.newaxis], ~hybrid.chosen_policy, ~running.ended, None, memory)
+        return Ruling(proposed, applied, ~hybrid["chosen_policy"], ~running.ended, None, memory)
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, NDArray[Any]]:
         """The keys of ``infos[agent]["shield"]``; ``proposed_action`` is NaN where nothing was proposed."""
-        hybrid: HybridAgent = memory.shield
-        proposed = applied = np.zeros((len(hybrid.policy_harm), 1))
+        hybrid = memory.shield
+        proposed = applied = np.zeros((len(hybrid["policy_harm"]), 1))
         if ruling is not None:
             proposed, applied = ruling.proposed, ruling.applied
         told = {
@@ -560,9 +573,9 @@ class EpisodeGuard(ShieldGuard):
             "proposed_action": proposed,
             "chosen_action": applied,
             "intervened": abs(applied - proposed) > ROUNDING,
-            "chosen_policy": hybrid.chosen_policy,
-            "policy_harm": hybrid.policy_harm,
-            "bound_harm": hybrid.bound_harm,
+            "chosen_policy": hybrid["chosen_policy"],
+            "policy_harm": hybrid["policy_harm"],
+            "bound_harm": hybrid["bound_harm"],
         }
         return {name: by_row(columns, len(proposed), 1) for name, columns in told.items()}
 
@@ -639,7 +652,10 @@ class Attached:
 
     @property
     def shield(self) -> Any:
-        """The ``StepShield``, ``BelievedShield`` or ``HybridAgent`` as it is now, to be read; None before a reset."""
+        """As it is now, to be read; None before a reset.
+
+        A ``StepShield`` or ``BelievedShield``; in mode ``episode`` what the ``HybridAgent`` remembers.
+        """
         return self.memory.shield
 
     def _reached(self) -> Any:
@@ -826,18 +842,17 @@ class BelievingHybrid(Believing):
         """What the policy knows, which drives by what it observes, and what the comparison adds."""
         return combine(self.policy.policy, also=Source.BELIEFS)
 
-    def _begin_policy(self, believed: Worlds, vehicle: int, rows: Ints) -> None:
+    def _shown_at_first(self, believed: Worlds) -> Worlds:
         """The comparison is a rollout, which begins at t = 0 without impacts: the same line, its clock put back."""
         v, n = believed.vehicles, believed.n
         latency = np.maximum(v.latency_s - believed.time_s[:, np.newaxis], 0.0)
-        vehicles = vehicles_at_once(
+        vehicles = Vehicles.at_once(
             v.braking_capacity_mps2, v.driving_capacity_mps2, latency, v.mass_t, v.speed_limit_mps, v.restitution
         )
-        line = replace(
+        return replace(
             believed, vehicles=vehicles, time_s=np.zeros(n), pair_hit=np.zeros_like(believed.pair_hit),
             obstacle_hit=np.zeros(n, np.bool_),
         )  # fmt: skip
-        super()._begin_policy(line, vehicle, rows)
 
 
 def shield_episodes(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, Rewards
+from ethbrake_marl.envs import EthBrakeVecEnv, Rewards
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools
 from ethbrake_marl.shield.guard import Attached, Proposing
@@ -32,12 +32,7 @@ class ShieldedVecEnv(VecEnvWrapper):
 
     """
 
-    def __init__(
-        self,
-        venv: EthBrakeVecEnv,
-        policy: Proposing | None = None,
-        **options: Any,
-    ) -> None:
+    def __init__(self, venv: EthBrakeVecEnv, policy: Proposing | None = None, **options: Any) -> None:
         self.attached = Attached(venv, VecEnv, "make_sb3_vec_env", policy, "ShieldedVecEnv", options)
         super().__init__(venv)
 

@@ -8,7 +8,6 @@ numbers. What robust mode proves, it proves for the members (``docs/shield.md``)
 
 from __future__ import annotations
 
-import copy
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,15 +16,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.policy import LearnedAgent, LearnedPolicy
-from ethbrake_marl.agents.protocol import Agent, Team
-from ethbrake_marl.defaults import UNCERTAINTY_EXAMPLE
+from ethbrake_marl.agents import Agent, LearnedAgent, LearnedPolicy, Team
+from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.observations import ObservationSpec
-from ethbrake_marl.physics import Floats, Worlds, concatenate
-from ethbrake_marl.physics.worlds import is_known_at_once, known_at_once
-from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.scenario.fields import DECLARED
+from ethbrake_marl.physics import Floats, Vehicles, Worlds
+from ethbrake_marl.scenario import QUANTITY, Scenario
 
 # Checks of what a shield is built with: amounts, scenario, policy, environment.
 
@@ -87,10 +83,9 @@ def policies_of(
 def proposing_agents(
     policy: Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy], vehicles: Sequence[int], where: str
 ) -> dict[int, Agent]:
-    """Who proposes for each shielded vehicle: a team, policies by name of vehicle, or copies of one for all.
+    """Who proposes for each shielded vehicle: a team, policies by name of vehicle, or one for all.
 
-    Raises ``InvalidInput`` for what is none of these, a team of other vehicles, and one agent given for two of them,
-    which may remember its episodes.
+    Raises ``InvalidInput`` for what is none of these, and a team of other vehicles.
     """
     if isinstance(policy, Team):
         given: dict[int, Agent] = policy.drivers
@@ -99,12 +94,10 @@ def proposing_agents(
         given = {by_name.get(name, -1): proposing_agent(each, where) for name, each in policy.items()}
     else:
         agent = proposing_agent(policy, where)
-        return {i: agent if k == 0 else copy.deepcopy(agent) for k, i in enumerate(vehicles)}
+        return dict.fromkeys(vehicles, agent)
     if set(given) != set(vehicles):
         names = ", ".join(f"vehicle_{i + 1}" for i in vehicles)
         raise InvalidInput(f"{where}: policy: one for each of {names} is needed, and for nobody else")
-    if len({id(agent) for agent in given.values()}) < len(given):
-        raise InvalidInput(f"{where}: policy: one object drives two vehicles; alone it is copied for each of them")
     return {i: given[i] for i in vehicles}
 
 
@@ -112,11 +105,10 @@ OF_VEHICLES = ("braking_capacity_mps2", "driving_capacity_mps2", "latency_s", "m
 QUANTITIES = (*OF_VEHICLES, "speeds_mps", "gaps_m")
 POSITIVE = ("braking_capacity_mps2", "mass_t")  # must stay above 0
 MOST_CORNERS = 1024  # of one world: each costs as much as the world itself
-_FORM = f"must be quantity=half-width, for instance {UNCERTAINTY_EXAMPLE}"
+_FORM = f"must be quantity=half-width, for instance {DEFAULT.UNCERTAINTY_EXAMPLE}"
 
 _ENTRY = re.compile(
-    r"(?P<name>\w+)(?:\.(?P<what>vehicle|pair)_(?P<number>[1-9]\d*))?\s*=\s*(?P<width>[^=%\s]+)(?P<share>%?)",
-    re.ASCII,
+    r"(?P<name>\w+)(?:\.(?P<what>vehicle|pair)_(?P<number>[1-9]\d*))?\s*=\s*(?P<width>[^=%\s]+)(?P<share>%?)", re.ASCII
 )
 _NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
@@ -170,7 +162,7 @@ class Uncertainty:
                 f"uncertainty: intervals = {self.intervals!r}: must be a tuple of Interval; parse_uncertainty reads it"
             )
         if not self.intervals:
-            raise InvalidInput(f"uncertainty: no interval; one is needed, for instance {UNCERTAINTY_EXAMPLE}")
+            raise InvalidInput(f"uncertainty: no interval; one is needed, for instance {DEFAULT.UNCERTAINTY_EXAMPLE}")
         for k, one in enumerate(self.intervals):
             for other in self.intervals[:k]:
                 same = None in (one.place, other.place) or one.place == other.place
@@ -196,11 +188,11 @@ class Uncertainty:
         if corners > MOST_CORNERS:
             raise InvalidInput(
                 f"uncertainty: {len(sides)} uncertain numbers in each world make {corners} corners; at most"
-                f" {MOST_CORNERS} can be certified: name vehicles or pairs, for instance {UNCERTAINTY_EXAMPLE}"
+                f" {MOST_CORNERS} can be certified: name vehicles or pairs, for instance {DEFAULT.UNCERTAINTY_EXAMPLE}"
             )
         parts = [worlds] + [_placed(worlds, sides, lambda k, c=c: c >> k & 1) for c in range(corners)]  # type: ignore[misc]
         order = np.arange(worlds.n * len(parts)).reshape(len(parts), worlds.n).T.ravel()
-        return concatenate(parts).take(order)
+        return Worlds.concatenate(parts).take(order)
 
     def draw(self, worlds: Worlds, rng: np.random.Generator, *, corners: bool = False) -> Worlds:
         """One world [n] out of each box: evenly from its inside, or one of its ``corners``."""
@@ -234,7 +226,19 @@ def parse_uncertainty(text: str) -> Uncertainty:
     entries = [entry.strip() for entry in text.split(",")]
     if "" in entries:
         raise InvalidInput(f"uncertainty: {text!r}: entry {entries.index('') + 1} is empty; it {_FORM}")
-    return Uncertainty(tuple(_interval(entry) for entry in entries))
+    intervals = []
+    for entry in entries:
+        found = _ENTRY.fullmatch(entry)
+        if found is None or _NUMBER.fullmatch(found["width"]) is None:
+            raise InvalidInput(f"uncertainty: {entry!r}: {_FORM}")
+        name, width = found["name"], float(found["width"])
+        if name in QUANTITIES and found["what"] not in (None, "pair" if name == "gaps_m" else "vehicle"):
+            raise InvalidInput(
+                f"uncertainty: {entry!r}: gaps_m is of pairs (.pair_1), all else of vehicles (.vehicle_1)"
+            )
+        place = None if found["number"] is None else int(found["number"]) - 1
+        intervals.append(Interval(name, width / 100.0 if found["share"] else width, bool(found["share"]), place))
+    return Uncertainty(tuple(intervals))
 
 
 def checked_uncertainty(given: object) -> Uncertainty | None:
@@ -243,7 +247,9 @@ def checked_uncertainty(given: object) -> Uncertainty | None:
         return given
     if isinstance(given, str):
         return parse_uncertainty(given)
-    raise InvalidInput(f"uncertainty = {given!r}: must be an Uncertainty or text, for instance {UNCERTAINTY_EXAMPLE!r}")
+    raise InvalidInput(
+        f"uncertainty = {given!r}: must be an Uncertainty or text, for instance {DEFAULT.UNCERTAINTY_EXAMPLE!r}"
+    )
 
 
 def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None:
@@ -251,25 +257,13 @@ def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None
     uncertainty = checked_uncertainty(given)
     if (mode == "robust") != (uncertainty is not None):
         what = "needs an uncertainty" if uncertainty is None else "takes no uncertainty; robust does"
-        raise InvalidInput(f"{where}: mode {mode} {what}, for instance {UNCERTAINTY_EXAMPLE}")
+        raise InvalidInput(f"{where}: mode {mode} {what}, for instance {DEFAULT.UNCERTAINTY_EXAMPLE}")
     return uncertainty
-
-
-def _interval(entry: str) -> Interval:
-    found = _ENTRY.fullmatch(entry)
-    if found is None or _NUMBER.fullmatch(found["width"]) is None:
-        raise InvalidInput(f"uncertainty: {entry!r}: {_FORM}")
-    name, width = found["name"], float(found["width"])
-    if name in QUANTITIES and found["what"] not in (None, "pair" if name == "gaps_m" else "vehicle"):
-        raise InvalidInput(f"uncertainty: {entry!r}: gaps_m is of pairs (.pair_1), all else of vehicles (.vehicle_1)")
-    place = None if found["number"] is None else int(found["number"]) - 1
-    return Interval(name, width / 100.0 if found["share"] else width, bool(found["share"]), place)
 
 
 def _values(worlds: Worlds, quantity: str) -> Floats:
     """What was told, [n, N] or [n, P]."""
-    values: Floats = getattr(worlds.vehicles if quantity in OF_VEHICLES else worlds, quantity)
-    return values
+    return np.asarray(getattr(worlds.vehicles if quantity in OF_VEHICLES else worlds, quantity), np.float64)
 
 
 def _side(worlds: Worlds, interval: Interval, place: int) -> Side:
@@ -284,7 +278,7 @@ def _side(worlds: Worlds, interval: Interval, place: int) -> Side:
             " must stay above 0"
         )
     most = worlds.vehicles.speed_limit_mps[:, place] if interval.quantity == "speeds_mps" else np.inf
-    high, rule = np.minimum(high, most), DECLARED[interval.quantity]
+    high, rule = np.minimum(high, most), QUANTITY.declared[interval.quantity]
     if not (high <= rule.high).all():
         k = int(np.argmax(high))
         raise InvalidInput(
@@ -306,8 +300,8 @@ def _placed(worlds: Worlds, sides: list[Side], share: Callable[[int], Floats | i
         at = np.broadcast_to(np.asarray(share(k), np.float64), side.low.shape)
         inside = side.low + at * (side.high - side.low)
         values[:, side.place] = np.where(at == 0.0, side.low, np.where(at == 1.0, side.high, inside))
-    if "latency_s" in changed and is_known_at_once(worlds.vehicles):
+    if "latency_s" in changed and worlds.vehicles.is_known_at_once:
         latency = changed["latency_s"]
-        changed |= {"own_latency_s": latency, "known_from_s": known_at_once(latency)}
+        changed |= {"own_latency_s": latency, "known_from_s": Vehicles.known_at_once(latency)}
     vehicles = replace(worlds.vehicles, **{name: v for name, v in changed.items() if hasattr(worlds.vehicles, name)})
     return replace(worlds, vehicles=vehicles, **{name: v for name, v in changed.items() if hasattr(worlds, name)})

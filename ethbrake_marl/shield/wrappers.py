@@ -15,10 +15,8 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
-from ethbrake_marl.agents.policy import LearnedPolicy
-from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.envs.gym import EthBrakeVectorEnv
-from ethbrake_marl.envs.parallel import InTurns, in_turns
+from ethbrake_marl.agents import Agent, LearnedPolicy
+from ethbrake_marl.envs import EthBrakeVectorEnv, InTurns, in_turns
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats
@@ -184,12 +182,7 @@ class ShieldedVectorEnv(VectorWrapper):
 
     """
 
-    def __init__(
-        self,
-        env: EthBrakeVectorEnv,
-        policy: Agent | LearnedPolicy | None = None,
-        **options: Any,
-    ) -> None:
+    def __init__(self, env: EthBrakeVectorEnv, policy: Agent | LearnedPolicy | None = None, **options: Any) -> None:
         maker = "gymnasium.make_vec('EthBrake-v0')"
         self.attached = Attached(env, gymnasium.vector.VectorEnv, maker, policy, "ShieldedVectorEnv", options)
         super().__init__(env)

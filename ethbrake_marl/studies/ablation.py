@@ -1,38 +1,54 @@
-"""Training everything that an ablation needs, and letting it drive the common worlds."""
+"""Ablations: levels of cooperation, trained and compared on the same worlds; and trained policies on longer lines."""
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import make_single_agent
+from ethbrake_marl.agents import Agent, Driver, LearnedAgent, Team, make_single_agent
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
-from ethbrake_marl.errors import InvalidInput, OnProgress, Progress
-from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY, load_runnable, policies_by_name, result_identity
-from ethbrake_marl.evaluation.outcome import Outcome
-from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.files.yaml import Override
-from ethbrake_marl.learning.recipe import WORDS, Scheme, TrainingRecipe
-from ethbrake_marl.learning.training import load_team, resolve
-from ethbrake_marl.limits.best_harm import (
-    BestHarmTable,
-    best_harm,
-    chunks_left,
-    realised_harm,
-    search_list,
-    world_identity,
+from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, count_of
+from ethbrake_marl.evaluation import (
+    PROGRESS_EVERY,
+    evaluate,
+    interquartile_mean,
+    load_runnable,
+    mean_over_seeds,
+    policy_sha256,
+    rate_over_seeds,
+    result_identity,
+    share_over_seeds,
+    write_output,
 )
+from ethbrake_marl.figures import Figure, ablation_figures, write_picture
+from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
+from ethbrake_marl.files.yaml import Override
+from ethbrake_marl.learning import (
+    HARM_METRIC,
+    WORDS,
+    RunDirectory,
+    TrainingRecipe,
+    load_recipe,
+    load_team,
+    read_object,
+    read_settings,
+    resolve,
+)
+from ethbrake_marl.limits import BestHarmTable, best_harm, chunks_left, realised_harm, search_list, world_identity
+from ethbrake_marl.pages.page import Page, Part, Played, Section
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
-from ethbrake_marl.physics.kernel import first_decision_s
-from ethbrake_marl.scenario import Sample, Scenario, Task
-from ethbrake_marl.shield.guard import Shielded, drive_chunks, stack
+from ethbrake_marl.policies import Policy, load_policy
+from ethbrake_marl.scenario import LEARNER, QUANTITY, Sample, Scenario, Task
+from ethbrake_marl.shield import Shielded, drive_chunks, stack
 from ethbrake_marl.studies.jobs import JobFolder
 from ethbrake_marl.studies.trainings import (
     TIMED_DRIVES,
@@ -54,11 +70,13 @@ LADDER = (
 )
 STANDARD = (*LADDER, "cooperation-2-blocked")
 
+Json = dict[str, Any]
+
 _LINE = ("vehicles", "time_step_s", "horizon_s")
 _WORLD = ("gaps_m", "speeds_mps")
 _VEHICLE = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "speed_limit_mps", "restitution")
 _MAY_DIFFER = "roles, objective, obstacle_gap_m, v2x and, where v2x differs, latency_s"
-_ABOUT = {"name", "title", "description", "source"}
+_BUT_CHANNEL = {"name", "title", "description", "source", "v2x"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +109,14 @@ def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list
         scenario = load_runnable(name, settings)
         if any(level.name == scenario.name for level in levels):
             raise InvalidInput(f"levels: {scenario.name!r} is given twice")
-        same = [level.name for level in levels if level.clear is None and _but_channel(level.scenario, scenario)]
+        told = scenario.model_dump(mode="json", exclude=_BUT_CHANNEL)
+        same = [
+            level.name
+            for level in levels
+            if level.clear is None
+            and level.scenario.v2x != scenario.v2x
+            and level.scenario.model_dump(mode="json", exclude=_BUT_CHANNEL) == told
+        ]
         levels.append(Level(scenario, same[0] if same else None))
     if len(levels) < 2:
         raise InvalidInput(f"levels: {len(levels)} given; at least two are needed to compare")
@@ -137,16 +162,10 @@ def _values(name: str, level: Level, sample: Sample) -> Floats:
     return values
 
 
-def _but_channel(one: Scenario, other: Scenario) -> bool:
-    """Whether two scenarios differ in their channel, and in nothing else that matters."""
-    first, second = (scenario.model_dump(mode="json", exclude=_ABOUT | {"v2x"}) for scenario in (one, other))
-    return first == second and one.v2x != other.v2x
-
-
-TRAININGS, OPTIMUM, SETTINGS = "trainings", "optimum", "settings.json"  # inside the ablation's folder
-SHIELDS = ("step",)  # that may be put around every level's learners
+SETTINGS = "settings.json"  # inside the ablation's folder
+_QUICK = {"seeds": 2, "steps_per_learner": 200_000, "episodes": 500, "search_episodes": 40, "budget": 2_000}
+_FULL = {"seeds": 5, "steps_per_learner": 400_000, "episodes": 4_000, "search_episodes": 600, "budget": 20_000}
 _NUMBERS = ("seeds", "steps_per_learner", "episodes", "list_seed", "search_episodes", "budget")
-_TOLD = (*_NUMBERS, "shield")  # settings whose values are told where they differ
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +197,7 @@ class Plan:
     budget: int  # candidates per world and count of that search
     folder: Path
     noted: tuple[str, ...] = ()  # see ``Training``
-    shield: str | None = None  # one of ``SHIELDS``: everything drives a second time, behind it
+    shield: str | None = None  # "step": everything drives a second time, behind it
 
     @property
     def algorithms(self) -> tuple[str, ...]:
@@ -200,7 +219,7 @@ class Plan:
         if learners == 1:  # the same training whatever the scheme of several learners
             changes |= dict.fromkeys({"scheme", "turns"} & type(recipe).model_fields.keys())
         name = recipe.name if learners == 1 else _algorithm(recipe)
-        folder = self.folder / TRAININGS / f"{level.name}-{name}-seed{seed}"
+        folder = self.folder / "trainings" / f"{level.name}-{name}-seed{seed}"
         return Training(level, _algorithm(recipe), recipe.replace(**changes), folder, self.noted)
 
     def settings(self) -> dict[str, Any]:
@@ -217,10 +236,78 @@ class Plan:
 
     def optimum_folder(self, level: Level) -> Path:
         """Where the parts of its search stand."""
-        return self.folder / OPTIMUM / level.name
+        return self.folder / "optimum" / level.name
+
+    def run(self, jobs: int = 1, tell: OnProgress | None = None) -> list[Measured] | None:
+        """Bring every training to its end, ``jobs`` at a time, and measure; None when Ctrl-C stopped the trainings.
+
+        Raises what ``JobFolder.work``, ``finish_trainings`` and ``measure`` raise.
+        """
+        kept = self.job_folder()
+        with kept.work():
+            if not finish_trainings([training.job() for training in self.trainings()], jobs, tell, kept=kept):
+                return None
+            return measure(self, jobs, tell)
+
+    def cost(self) -> str:
+        """What is left to do, in seconds of one core, and a line for each damaged part of a search.
+
+        A short training of each level and recipe, an evaluation and a search are timed; other work on the machine
+        counts as well, for seconds are of the clock. Raises as ``TrainingJob.steps_left``, and what ``load_team``
+        raises for a finished training that cannot drive.
+        """
+        left = [(training, training.job().steps_left()) for training in self.trainings()]
+        for training, steps in left:
+            if not steps:
+                load_team(training.folder, training.level.scenario)
+        lists = common_worlds(self.levels, self.episodes, self.list_seed)
+        timed = np.arange(min(TIMED_DRIVES, self.episodes))
+        samples = {level.name: sample.take(timed) for level, sample in zip(self.levels, lists, strict=True)}
+        training_s, worlds_s = 0.0, []
+        for kind in {training.folder.name.rpartition("-seed")[0]: training for training, _ in left}.values():
+            same = (kind.level.name, kind.algorithm)
+            steps = sum(number for training, number in left if (training.level.name, training.algorithm) == same)
+            if steps:
+                measured = time_training(kind.job().training, samples[kind.level.name])
+                worlds_s.append(measured.world_s)
+                training_s += measured.seconds(kind.job().training, steps)
+        if not worlds_s:
+            first = left[0][0]
+            worlds_s.append(world_seconds(first.folder, first.level.scenario, samples[first.level.name]))
+        driving_s = sum(worlds_s) / len(worlds_s) * self.episodes * (len(left) + len(self.levels))
+        for level in self.levels if self.shield else ():  # learners that brake fully are replaced most often
+            if level.trained:
+                worlds, task = samples[level.name].worlds, Task(level.scenario, level.scenario.learners)
+                braking = make_single_agent("full_brake")
+                drive_chunks(braking, worlds.take([0]), task)  # compiles
+                started = time.monotonic()
+                drive_chunks(braking, worlds, task)
+                often = self.episodes * self.seeds * len(self.recipes) * len(HARM_COUNTS)
+                driving_s += (time.monotonic() - started) / worlds.n * often
+        search_s, damaged = 0.0, []
+        for level, part, _ in questions(self, lists):
+            number, broken = chunks_left(level.scenario, part, budget=self.budget, chunks=self.optimum_folder(level))
+            damaged += broken
+            if number:
+                worlds = part.worlds.take(np.arange(min(_TIMED_WORLDS, part.worlds.n)))
+                best_harm(level.scenario, worlds.take([0]), budget=100, threads=1)
+                started = time.monotonic()
+                best_harm(level.scenario, worlds, budget=self.budget, threads=1)
+                search_s += (time.monotonic() - started) / worlds.n * number
+        trainings, decisions = sum(1 for _, steps in left if steps), sum(steps for _, steps in left)
+        speed = f" at {decisions / training_s:,.0f}/s" if training_s > 0.0 else ""
+        line = (
+            f"to do: {trainings} trainings, {decisions:,} decisions{speed}: {told_seconds(training_s)};"
+            f" joint optima {told_seconds(search_s)}; driving the common worlds {told_seconds(driving_s)};"
+            f" together about {told_seconds(training_s + driving_s + search_s)} of one core"
+        )
+        return "\n".join([line, *(f"{file}: is damaged; its worlds are searched again" for file in damaged)])
 
 
-def with_scheme(recipe: TrainingRecipe, scheme: Scheme | None) -> TrainingRecipe:
+_TIMED_WORLDS = 4  # of the search
+
+
+def with_scheme(recipe: TrainingRecipe, scheme: str | None) -> TrainingRecipe:
     """The recipe with this scheme for several learners; None: its own, else shared."""
     return recipe.replace(scheme=scheme or recipe.scheme or "shared")
 
@@ -229,24 +316,49 @@ def _algorithm(recipe: TrainingRecipe) -> str:
     return f"{recipe.name}-{recipe.scheme}"
 
 
-def check_plan(plan: Plan) -> None:
-    """Raise ``InvalidInput`` for recipes of one name, numbers below 1, an unknown shield, or nothing to train."""
-    names = [recipe.name for recipe in plan.recipes]
-    if not names or len(set(names)) < len(names):
-        raise InvalidInput(f"recipes {', '.join(names) or 'none'}: give at least one, each with a name of its own")
+def plan_ablation(
+    levels: str | None,
+    recipes: str,
+    scheme: str | None,
+    settings: Sequence[str] | None,
+    *,
+    quick: bool = False,
+    tell: Callable[[str], None] | None = None,
+    **given: Any,
+) -> Plan:
+    """The ablation that is asked for; ``given`` are fields of ``Plan``, None: as ``quick`` has them, or as usual.
+
+    Raises ``InvalidInput`` for recipes of one name, numbers below 1, an unknown shield, nothing to train, and whatever
+    cannot be trained or compared.
+    """
+    names = [*(LADDER if quick else STANDARD)] if levels is None else levels.split(",")
+    loaded = [load_recipe(each.strip()) for each in recipes.split(",")]
+    changed = read_settings(settings, loaded)
+    plan = Plan(
+        levels=tuple(read_levels([each.strip() for each in names], changed.scenario)),
+        recipes=tuple(with_scheme(changed.change(recipe, tell), scheme) for recipe in loaded),
+        noted=changed.texts,
+        **{**(_QUICK if quick else _FULL), **{name: value for name, value in given.items() if value is not None}},
+    )
+    called = [recipe.name for recipe in loaded]
+    if len(set(called)) < len(called):
+        raise InvalidInput(f"recipes {', '.join(called)}: give at least one, each with a name of its own")
     for name in _NUMBERS:
         if name != "list_seed" and not getattr(plan, name) >= 1:
             raise InvalidInput(f"{name.replace('_', '-')} {getattr(plan, name)}: must be at least 1")
-    if plan.shield not in (None, *SHIELDS):
-        raise InvalidInput(
-            f"shield {plan.shield!r}: must be {', '.join(SHIELDS)}; episode and robust shield one vehicle"
-        )
+    if plan.shield not in (None, "step"):
+        raise InvalidInput(f"shield {plan.shield!r}: must be step; episode and robust shield one vehicle")
     if plan.search_episodes > plan.episodes:
         raise InvalidInput(
             f"search-episodes {plan.search_episodes}: must be at most the {plan.episodes} worlds of --episodes"
         )
     if not any(level.trained for level in plan.levels):
         raise InvalidInput("levels: nobody learns in any of them; give at least one with a learner")
+    JobFolder(plan.folder, "an ablation").check()
+    common_worlds(plan.levels, 5, plan.list_seed)
+    for training in plan.trainings():
+        training.recipe.scheme_for(training.level.scenario)
+    return plan
 
 
 # The joint optimum of every level: the least harm known that its learners can do together, world by world.
@@ -321,7 +433,7 @@ def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
     if not (set(theirs.learners) <= set(mine.learners) and same_scripts):
         return np.zeros(own.worlds.n, np.bool_)
     latency_s, obstacle_m = own.worlds.vehicles.latency_s, other.worlds.obstacle_gap_m
-    later_s = first_decision_s(own.worlds, theirs.learners) - first_decision_s(own.worlds, mine.learners)
+    later_s = own.worlds.first_decision_s(theirs.learners) - own.worlds.first_decision_s(mine.learners)
     steps = later_s / mine.time_step_s
     same = (latency_s == other.worlds.vehicles.latency_s).all(axis=1)
     on_grid = np.abs(steps - np.rint(steps)) < 1e-9
@@ -339,13 +451,6 @@ def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[
         driven = evaluate(worlds, {team.name: team}, scenario=scenario, aftermath=False).complete()
         ledger = driven.outcome(team.name).ledger
         yield {harm_count: ledger.world_harm(harm_count) for harm_count in HARM_COUNTS}
-
-
-def check_finished(trainings: Iterable[Training]) -> None:
-    """Raise what ``load_team`` raises for a finished training that cannot drive, before anything long is begun."""
-    for training in trainings:
-        if not training.job().steps_left():
-            load_team(training.folder, training.level.scenario)
 
 
 @dataclass(frozen=True, slots=True)
@@ -371,18 +476,6 @@ class Measured:
     shielded: dict[HarmCount, Shielded] | None = None  # [seeds, worlds] behind the shield that guards that count
 
 
-def run_ablation(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[Measured] | None:
-    """Bring every training to its end, ``jobs`` at a time, and measure; None when Ctrl-C stopped the trainings.
-
-    Raises what ``JobFolder.work``, ``finish_trainings`` and ``measure`` raise.
-    """
-    kept = plan.job_folder()
-    with kept.work():
-        if not finish_trainings([training.job() for training in plan.trainings()], jobs, tell, run=kept.run):
-            return None
-        return measure(plan, jobs, tell)
-
-
 def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[Measured]:
     """Let everything that was trained drive the common worlds, and search the joint optima (parts found are kept).
 
@@ -404,7 +497,8 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
             answers[level.name] = LevelOptimum(level, part, tables[level.name], tuple(own))
     found: list[Measured] = []
     for level, sample in zip(plan.levels, samples, strict=True):
-        braking = _drive(_all_brake(level.scenario), sample, [Team({}, f"full braking in {level.name}")], say)
+        alike = level.scenario.replace(roles=dict.fromkeys(level.scenario.vehicle_names, "full_brake"))
+        braking = _drive(alike, sample, [Team({}, f"full braking in {level.name}")], say)
         about = result_identity("ablate", level.scenario, sample)
         if not level.trained:
             scripts = _drive(level.scenario, sample, [Team({}, f"scripts of {level.name}")], say)
@@ -415,139 +509,564 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
         for algorithm in plan.algorithms:
             own = teams[level.name, algorithm]
             reached = _drive(level.scenario, sample, own, say)
-            behind = None if plan.shield is None else _drive_behind(level.scenario, sample, own, say)
-            found.append(Measured(level, algorithm, reached, braking, best, about, behind))
+            behind: dict[HarmCount, Shielded] = {}
+            for harm_count in HARM_COUNTS if plan.shield else ():
+                task, parts = Task(level.scenario, level.scenario.learners, harm_count), []
+                for team in own:
+                    parts.append(drive_chunks(team, sample.worlds, task))
+                    name = f"driving {team.name} behind the shield, {harm_count}"
+                    say(Progress(name, sample.worlds.n, sample.worlds.n))
+                behind[harm_count] = stack(parts)
+            found.append(Measured(level, algorithm, reached, braking, best, about, behind or None))
     return found
 
 
-def _all_brake(scenario: Scenario) -> Scenario:
-    """The scenario with every vehicle braking fully."""
-    return scenario.replace(roles=dict.fromkeys(scenario.vehicle_names, "full_brake"))
-
-
-def _drive(scenario: Scenario, sample: Sample, teams: Sequence[Team], tell: OnProgress) -> Harms:
-    """Harms of several teams of one level."""
+def _drive(scenario: Scenario, sample: Sample, drivers: Sequence[Driver], tell: OnProgress) -> Harms:
+    """Harms of several drivers of one level on the same worlds."""
     outcomes = []
-    for team in teams:
-        result = evaluate(sample, {team.name: team}, scenario=scenario, chunk=PROGRESS_EVERY).complete()
-        outcomes.append(result.outcome(team.name))
-        tell(Progress(f"driving {team.name}", sample.worlds.n, sample.worlds.n))
-    policies = tuple(policies_by_name(outcome.policies, scenario) for outcome in outcomes)
-    return replace(harms_of(outcomes), policies=policies)
-
-
-def _drive_behind(
-    scenario: Scenario, sample: Sample, teams: Sequence[Team], tell: OnProgress
-) -> dict[HarmCount, Shielded]:
-    """Several teams of one level behind one step shield, once for each count, which that shield guards."""
-    found: dict[HarmCount, Shielded] = {}
-    for harm_count in HARM_COUNTS:
-        task = Task(scenario, scenario.learners, harm_count)
-        parts = []
-        for team in teams:
-            parts.append(drive_chunks(team, sample.worlds, task))
-            tell(Progress(f"driving {team.name} behind the shield, {harm_count}", sample.worlds.n, sample.worlds.n))
-        found[harm_count] = stack(parts)
-    return found
-
-
-def harms_of(outcomes: Sequence[Outcome]) -> Harms:
-    """The outcomes of several seeds on the same worlds, stacked."""
+    for driver in drivers:
+        result = evaluate(sample, {driver.name: driver}, scenario=scenario, chunk=PROGRESS_EVERY).complete()
+        outcomes.append(result.outcome(driver.name))
+        tell(Progress(f"driving {driver.name}", sample.worlds.n, sample.worlds.n))
+    ledgers = [outcome.ledger for outcome in outcomes]
     return Harms(
-        {harm_count: np.stack([o.ledger.world_harm(harm_count) for o in outcomes]) for harm_count in HARM_COUNTS},
-        {harm_count: np.stack([o.ledger.vehicle_harm(harm_count) for o in outcomes]) for harm_count in HARM_COUNTS},
-        np.stack([o.collided for o in outcomes]),
+        {harm_count: np.stack([each.world_harm(harm_count) for each in ledgers]) for harm_count in HARM_COUNTS},
+        {harm_count: np.stack([each.vehicle_harm(harm_count) for each in ledgers]) for harm_count in HARM_COUNTS},
+        np.stack([outcome.collided for outcome in outcomes]),
+        tuple(outcome.named_policies for outcome in outcomes),
     )
 
 
-# The cost of an ablation, measured on this machine before it starts.
+# The findings of an ablation: Markdown tables, and a page.
 
-_TIMED_WORLDS = 4  # of the search, that are timed
+# Episodes on the page of an ablation: the same few lines of vehicles, driven level by level.
+
+_MOST, _USUAL, _LEAST = 3, 2, 2  # worlds in which most, as usual and least is saved
+
+
+def choose_worlds(measured: Sequence[Measured]) -> list[Played]:
+    """A few worlds by what the last level of the ladder saves against the first, in total harm, of the first seed."""
+    ladder = [one for one in measured if one.level.clear is None]
+    first, last = ladder[0], ladder[-1]
+    before, after = (one.reached.world["total"][0] for one in (first, last))
+    order = np.argsort(after - before, kind="stable")
+    middle = max((len(order) - _USUAL) // 2, 0)
+    kinds = (
+        (f"Where {last.level.name} saves most against {first.level.name}", order[:_MOST]),
+        ("As usual", order[middle : middle + _USUAL]),
+        ("Where it saves least, or harms", order[::-1][:_LEAST]),
+    )
+    found: dict[int, Played] = {}
+    for kind, rows in kinds:
+        for row in map(int, rows):
+            why = f"total harm {before[row]:.2f} to {after[row]:.2f}"
+            found.setdefault(row, Played(row, kind, why))
+    return list(found.values())
+
+
+def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
+    """A few worlds of the ablation to watch, level beside level; each trained level by its first seed."""
+    played = choose_worlds(measured)
+    rows = np.array([each.number for each in played], np.int64)
+    driven: dict[str, tuple[int, ...]] = {}
+    for name, level, driver, spelling in _drivers(plan):
+        worlds = level.scenario.sample(plan.episodes, plan.list_seed).worlds.take(rows)
+        Played.drive(played, worlds, name, driver, level.scenario, spelling, seed=plan.list_seed)
+        driven[name] = level.scenario.learners
+    told = (
+        f"{count_of(len(played), 'world')}, the same line at every level; of several seeds the first drives."
+        f" The conditions are those of {plan.levels[0].name}: delays of messages and an obstacle ahead are each"
+        " level's own."
+    )
+    return Section("Episodes", [told, Part.player(played, driven)])
+
+
+def _drivers(plan: Plan) -> Iterator[tuple[str, Level, Driver, str]]:
+    """Name, level, who drives and how that is written on a command line, level by level."""
+    trained: dict[tuple[str, str], Training] = {}
+    for training in plan.trainings():
+        trained.setdefault((training.level.name, training.algorithm), training)
+    for level in plan.levels:
+        if not level.trained:  # who drives nobody changes nothing
+            yield level.name, level, Team({}, level.name), "full_brake"
+            continue
+        for algorithm in plan.algorithms:
+            training = trained[level.name, algorithm]
+            name = level.name if len(plan.algorithms) == 1 else f"{level.name}, {algorithm}"
+            team = load_team(training.folder, level.scenario, name)
+            yield name, level, team, f"{training.recipe.algorithm}@{training.folder}"
+
+
+# The same weights on longer lines: policies of one line length drive every learner of lines of other lengths.
 
 
 @dataclass(frozen=True, slots=True)
-class Cost:
-    """Seconds of one core for what is left to do."""
+class LineQuestion:
+    """On which lines the policies are measured."""
 
-    trainings: int
-    decisions: int
-    training_s: float
-    driving_s: float
-    search_s: float
-    damaged: tuple[Path, ...]  # kept parts of a search that will be searched again
+    scenario: Scenario  # of any length; see ``lengthen``
+    vehicles: tuple[int, ...]  # lengths of the lines
+    episodes: int
+    list_seed: int
+    harm_count: HarmCount
+    search_episodes: int  # worlds in which the joint optimum is searched; 0: none
+    budget: int
 
-    @property
-    def whole_s(self) -> float:
-        """Everything."""
-        return self.training_s + self.driving_s + self.search_s
+    def load_runs(self, paths: Sequence[str]) -> list[Agent]:
+        """One agent for each run or bundle, the seeds of one training, to drive these lines.
 
-    def __str__(self) -> str:
-        """The cost in one line, and a line for each damaged part."""
-        speed = f" at {self.decisions / self.training_s:,.0f}/s" if self.training_s > 0.0 else ""
-        line = (
-            f"to do: {self.trainings} trainings, {self.decisions:,} decisions{speed}: {told_seconds(self.training_s)};"
-            f" joint optima {told_seconds(self.search_s)}; driving the common worlds {told_seconds(self.driving_s)};"
-            f" together about {told_seconds(self.whole_s)} of one core"
+        Raises ``InvalidInput`` for no path, a run whose learners have a policy each, one policy twice, policies of
+        different trainings, or policies that never drove Vehicle 1 where it learns.
+        """
+        if not paths or not all(paths):
+            raise InvalidInput(f"runs {','.join(paths)!r}: must be runs or bundles, for instance runs/my-run")
+        for path in paths:
+            if RunDirectory(Path(path)).is_team:
+                raise InvalidInput(
+                    f"{path}: its learners have a policy each; only one that all share drives other lines"
+                )
+        policies = [load_policy(Path(path)) for path in paths]
+        trained = [_training(path, policy) for path, policy in zip(paths, policies, strict=True)]
+        for k, policy in enumerate(policies):
+            manifest = policy.manifest
+            if 0 in self.scenario.learners and "vehicle_1" not in manifest.learners:
+                raise InvalidInput(
+                    f"scenario {self.scenario.name!r}: vehicle_1 learns there, and {paths[k]} was trained for"
+                    f" {', '.join(manifest.learners)}; give one whose Vehicle 1 follows a script, for instance"
+                    f" --scenario {manifest.scenario['name']}"
+                )
+            same = [paths[j] for j in range(k) if policies[j].manifest.weights_sha256 == manifest.weights_sha256]
+            if same:
+                raise InvalidInput(f"runs {same[0]} and {paths[k]}: are one policy; give each once")
+            other = [name for name, value in trained[k].items() if trained[0].get(name, value) != value]
+            if other:
+                raise InvalidInput(
+                    f"runs {paths[0]} and {paths[k]}: differ in {', '.join(other)}; give seeds of one training"
+                )
+        return [LearnedAgent(policy, path) for path, policy in zip(paths, policies, strict=True)]
+
+    def drive(self, agents: Sequence[Agent], tell: OnProgress | None = None) -> list[Json]:
+        """Let every agent drive all learners of lines of each length, on the same worlds as full braking.
+
+        Plain data for JSON, one for each length: means over the worlds, and over several agents (m2/s2). All lines are
+        made before the first is driven. Raises ``InvalidInput`` for a length that is given twice or that the scenario
+        cannot have.
+        """
+        if len(set(self.vehicles)) < len(self.vehicles):
+            raise InvalidInput(f"vehicles {', '.join(map(str, self.vehicles))}: each length once")
+        lines = [lengthen(self.scenario, vehicles) for vehicles in self.vehicles]
+        lists = [line.sample(self.episodes, self.list_seed) for line in lines]
+        return [self._drive_line(*each, agents, tell) for each in zip(lines, lists, strict=True)]
+
+    def _drive_line(self, scenario: Scenario, sample: Sample, agents: Sequence[Agent], tell: OnProgress | None) -> Json:
+        count, say = self.harm_count, tell or (lambda progress: None)
+        braking = _drive(scenario, sample, [make_single_agent("full_brake")], say)
+        reached = _drive(scenario, sample, agents, say)
+        worst, own = braking.world[count], reached.world[count]
+        best_known, share = None, None
+        if self.search_episodes:
+            part = sample.worlds.take(np.arange(self.search_episodes))
+            searched = best_harm(scenario, part, counts=[count], budget=self.budget).best[count].harm
+            say(Progress(f"joint optimum of {scenario.name}", part.n, part.n))
+            best: Floats = np.minimum(searched, own[:, : part.n].min(axis=0))[np.newaxis]
+            best_known, share = mean_over_seeds(best), share_over_seeds(own[:, : part.n], worst[:, : part.n], best)
+        told = {
+            "full_brake": mean_over_seeds(worst),
+            "reached": mean_over_seeds(own),
+            "decrease": share_over_seeds(own, worst, np.zeros_like(worst)),
+            "best_known": best_known,  # in the worlds that were searched
+            "share": share,  # of the joint optimum's reduction, there
+            "worse_off": rate_over_seeds((reached.vehicle[count] > braking.vehicle[count] + TOLERANCE).any(axis=2)),
+        }
+        return {
+            **result_identity("generalise", scenario, sample),
+            "vehicles": scenario.vehicles,
+            **Estimate.side_by_side(told),
+            "policy_sha256": [policy_sha256(agent) for agent in agents],
+        }
+
+    def markdown(self, found: Sequence[Json], runs: int) -> str:
+        """One row per length of the line."""
+        columns: dict[str, Column] = {
+            "full_brake": _harm("All brake fully"),
+            "reached": _harm("Reached"),
+            "decrease": _share("Decrease"),
+            "worse_off": _share("Somebody worse off"),
+        }
+        if self.search_episodes:
+            columns |= {"best_known": _harm("Best known"), "share": _share("Share of the joint optimum")}
+        rows = [
+            [
+                str(one["vehicles"]),
+                *(None if one[key] is None else Estimate(one[key], one[f"{key}_interval"]) for key in columns),
+            ]
+            for one in found
+        ]
+        conditions = (
+            f"{_HARM[self.harm_count].capitalize()} (m²/s², means per world) of the line of {self.scenario.name}"
+            f" made longer: {runs} {'policies' if runs > 1 else 'policy'}, {count_of(self.episodes, 'world')} of seed"
+            f" {self.list_seed} for each length; {interval_words(runs)}."
         )
-        return "\n".join([line, *(f"{file}: is damaged; its worlds are searched again" for file in self.damaged)])
+        if self.search_episodes:
+            conditions += (
+                f" Best known and share: the first {count_of(self.search_episodes, 'world')},"
+                f" {self.budget:,} candidates each."
+            )
+        return f"{Sheet('', ['Vehicles', *columns.values()], rows).markdown()}\n\n{conditions}\n"
 
 
-def cost_of(plan: Plan) -> Cost:
-    """Time a short training of each level and recipe, an evaluation and a search, and reckon up what is left.
+def lengthen(scenario: Scenario, vehicles: int) -> Scenario:
+    """The scenario with a line of ``vehicles``: shorter ones lose the rear, vehicle i > N is like vehicle i - 2.
 
-    Other work on the machine counts as well: seconds are of the clock. Raises as ``Training.steps_left``.
+    All followers learn; Vehicle 1 keeps its role. Raises ``InvalidInput`` for fewer than 2 vehicles.
     """
-    left = [(training, training.job().steps_left()) for training in plan.trainings()]
-    lists = common_worlds(plan.levels, plan.episodes, plan.list_seed)
-    samples = {level.name: _first(sample) for level, sample in zip(plan.levels, lists, strict=True)}
-    training_s, worlds_s = 0.0, []
-    for kind in {training.folder.name.rpartition("-seed")[0]: training for training, _ in left}.values():
-        same = (kind.level.name, kind.algorithm)
-        steps = sum(number for training, number in left if (training.level.name, training.algorithm) == same)
-        if not steps:
-            continue
-        timed = time_training(kind.job().training, samples[kind.level.name])
-        worlds_s.append(timed.world_s)
-        training_s += timed.seconds(kind.job().training, steps)
-    if not worlds_s:
-        worlds_s.append(world_seconds(left[0][0].folder, left[0][0].level.scenario, samples[left[0][0].level.name]))
-    driving_s = sum(worlds_s) / len(worlds_s) * plan.episodes * (len(left) + len(plan.levels))
-    driving_s += 0.0 if plan.shield is None else _shielding_s(plan, samples)
-    trainings, decisions = sum(1 for _, steps in left if steps), sum(steps for _, steps in left)
-    return Cost(trainings, decisions, training_s, driving_s, *_search(plan, lists))
+    if not vehicles >= 2:
+        raise InvalidInput(f"line of {vehicles} vehicles: at least 2 are needed")
+    given = scenario.model_dump(mode="json", exclude_unset=True)
+    changes: dict[str, Any] = {"vehicles": vehicles, "name": f"{scenario.name}-n{vehicles}"}
+    for key in (*QUANTITY.declared, "objective", "types"):
+        values = given.get(key)
+        if isinstance(values, list):
+            wanted = vehicles - (scenario.vehicles - len(values))
+            while len(values) < wanted:
+                values = [*values, values[-2] if len(values) > 1 else values[-1]]
+            changes[key] = values[:wanted]
+    first = scenario.roles.get("vehicle_1", "full_brake")
+    roles = {"vehicle_1": first} | {f"vehicle_{i + 1}": LEARNER for i in range(1, vehicles)}
+    return scenario.replace(**changes, roles=roles)
 
 
-def _shielding_s(plan: Plan, samples: Mapping[str, Sample]) -> float:
-    """Seconds behind the shield, of both counts; timed with learners that brake fully, which it replaces most often."""
-    seconds = 0.0
-    for level in plan.levels:
-        if level.trained:
-            worlds, task = samples[level.name].worlds, Task(level.scenario, level.scenario.learners)
-            braking = make_single_agent("full_brake")
-            drive_chunks(braking, worlds.take(np.arange(1)), task)  # compiles
-            started = time.monotonic()
-            drive_chunks(braking, worlds, task)
-            each = (time.monotonic() - started) / worlds.n
-            seconds += each * plan.episodes * plan.seeds * len(plan.recipes) * len(HARM_COUNTS)
-    return seconds
+def _training(path: str, policy: Policy) -> dict[str, Any]:
+    """What seeds of one training have in common; the recipe too where ``path`` is a run."""
+    manifest = policy.manifest.model_dump(mode="json")
+    found = {name: manifest[name] for name in ("algorithm", "network", "observation", "learners", "reward", "scenario")}
+    config = RunDirectory(Path(path)).config
+    if config.is_file():
+        try:
+            recipe = read_object(config).get("recipe") or {}
+        except InvalidInput as error:
+            raise InvalidInput(f"{error}; give the policy instead: {Path(path) / 'policy'}") from None
+        found["recipe"] = {name: value for name, value in recipe.items() if name not in (*WORDS, "seed")}
+    return found
 
 
-def _first(sample: Sample) -> Sample:
-    """The worlds that are timed."""
-    rows = np.arange(min(TIMED_DRIVES, sample.worlds.n))
-    return sample.take(rows)
+# The comparison of levels: harm of each, what each step is worth, who pays, the distance to the joint optimum.
+#
+# Intervals hold for other training seeds and other worlds: both are drawn anew (``evaluation.statistics``).
+
+TOLERANCE = 1e-6  # m2/s2; a vehicle whose harm rose by more is worse off
 
 
-def _search(plan: Plan, samples: Sequence[Sample]) -> tuple[float, tuple[Path, ...]]:
-    """Seconds for the worlds that are still to be searched, and the kept parts that are damaged."""
-    seconds, damaged = 0.0, []
-    for level, part, _ in questions(plan, samples):
-        left, broken = chunks_left(level.scenario, part, budget=plan.budget, chunks=plan.optimum_folder(level))
-        damaged += broken
-        if left:
-            worlds = part.worlds.take(np.arange(min(_TIMED_WORLDS, part.worlds.n)))
-            best_harm(level.scenario, worlds.take(np.arange(1)), budget=100, threads=1)
-            started = time.monotonic()
-            best_harm(level.scenario, worlds, budget=plan.budget, threads=1)
-            seconds += (time.monotonic() - started) / worlds.n * left
-    return seconds, tuple(damaged)
+def compare(measured: Sequence[Measured], searched: int) -> Json:
+    """Plain data for JSON: ``levels``, ``steps`` of the ladder, ``channels`` (lost messages); see docs/cli.md.
+
+    The joint optimum is known in the first ``searched`` worlds; what stands beside it is of these worlds too. Each
+    algorithm has a ladder of its own; levels in which nobody learns are in all of them.
+    """
+    algorithms = [m.algorithm for m in measured if m.algorithm is not None]
+    steps, channels = [], []
+    for algorithm in dict.fromkeys(algorithms):
+        own = [m for m in measured if m.algorithm in (None, algorithm)]
+        ladder = [m for m in own if m.level.clear is None]
+        steps += [_change(before, after, algorithm) for before, after in pairwise(ladder)]
+        by_name = {m.level.name: m for m in own}
+        channels += [_change(by_name[m.level.clear], m, algorithm) for m in own if m.level.clear is not None]
+    return {
+        "kind": "ablate",
+        "levels": [_level(one, searched) for one in measured],
+        "steps": steps,
+        "channels": channels,
+    }
+
+
+def _level(one: Measured, searched: int) -> Json:
+    """What one level reached under one algorithm; harm (m2/s2) in all worlds, and in the ``searched`` ones.
+
+    There also the joint optimum, and the share of its reduction that is realised.
+    """
+    scenario = one.level.scenario
+    found: Json = {
+        **one.identity,
+        "policy_sha256": [dict(seed) for seed in one.reached.policies],
+        "level": one.level.name,
+        "title": scenario.title,
+        "algorithm": one.algorithm,
+        "clear": one.level.clear,
+        "learners": [scenario.vehicle_names[i] for i in scenario.learners],
+        "seeds": len(one.reached.collided),
+        "worlds": one.reached.collided.shape[1],
+        "collision_rate": rate_over_seeds(one.reached.collided).to_json(),
+    }
+    for harm_count in HARM_COUNTS:
+        reached, braking = one.reached.world[harm_count], one.full_brake.world[harm_count]
+        best = None if one.best is None else one.best[harm_count]
+        share = None if best is None else share_over_seeds(reached[:, :searched], braking[:, :searched], best)
+        found[harm_count] = {
+            "full_brake": mean_over_seeds(braking).to_json(),
+            "harm": mean_over_seeds(reached).to_json(),
+            "each_seed": reached.mean(axis=1).tolist(),
+            "interquartile_mean": interquartile_mean([reached.mean(axis=1)], resamples=2000).to_json(),
+            "vehicles": [mean_over_seeds(column).to_json() for column in _columns(one.reached, harm_count)],
+            "searched": {
+                "worlds": min(searched, reached.shape[1]),
+                "full_brake": mean_over_seeds(braking[:, :searched]).to_json(),
+                "harm": mean_over_seeds(reached[:, :searched]).to_json(),
+                "each_seed": reached[:, :searched].mean(axis=1).tolist(),
+                "best_known": None if best is None else mean_over_seeds(best).to_json(),
+                "realised_share": None if share is None else share.to_json(),
+            },
+            "shielded": None if one.shielded is None else _behind(one, one.shielded[harm_count], harm_count, searched),
+        }
+    return found
+
+
+def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: int) -> Json:
+    """The same teams in the same worlds behind the shield that guards this count, beside what they do without it."""
+    before, after = one.reached.vehicle[harm_count], shielded.vehicle_harm
+    actions = shielded.decisions * shielded.replaced.shape[2]
+    return {
+        "harm": mean_over_seeds(shielded.harm).to_json(),
+        "each_seed": shielded.harm.mean(axis=1).tolist(),
+        "difference": mean_over_seeds(shielded.harm - one.reached.world[harm_count]).to_json(),
+        "bound": mean_over_seeds(shielded.bound).to_json(),
+        "above_bound": int((shielded.harm > shielded.bound).sum()),
+        "replaced": float(shielded.replaced.sum() / actions.sum()),
+        "replaced_vehicles": (shielded.replaced.sum(axis=(0, 1)) / shielded.decisions.sum()).tolist(),
+        "stepped_in": rate_over_seeds((shielded.replaced > 0).any(axis=2)).to_json(),
+        "vehicles": [mean_over_seeds(column).to_json() for column in np.moveaxis(after - before, 2, 0)],
+        "worse_off": rate_over_seeds((after > before + TOLERANCE).any(axis=2)).to_json(),
+        "above_baseline": rate_over_seeds((after > shielded.baseline + TOLERANCE).any(axis=2)).to_json(),
+        "moving": int(shielded.moving.sum()),
+        "searched": {"harm": mean_over_seeds(shielded.harm[:, :searched]).to_json()},
+    }
+
+
+def _change(before: Measured, after: Measured, algorithm: str) -> Json:
+    """From one level to another on the same worlds: positive is more harm."""
+    found: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
+    for harm_count in HARM_COUNTS:
+        pairs = zip(_columns(after.reached, harm_count), _columns(before.reached, harm_count), strict=True)
+        # seed k against seed k, or against the only one
+        old, new = before.reached.vehicle[harm_count], after.reached.vehicle[harm_count]
+        worse = new > old + TOLERANCE
+        found[harm_count] = {
+            "difference": mean_over_seeds(after.reached.world[harm_count], before.reached.world[harm_count]).to_json(),
+            "vehicles": [mean_over_seeds(new, old).to_json() for new, old in pairs],
+            "worse_off": rate_over_seeds(worse.any(axis=2)).to_json(),
+            "worse_off_vehicles": [float(share) for share in worse.mean(axis=(0, 1))],
+        }
+    return found
+
+
+def _columns(harms: Harms, harm_count: HarmCount) -> list[Floats]:
+    """[seeds, worlds] of each vehicle."""
+    return [harms.vehicle[harm_count][:, :, i] for i in range(harms.vehicle[harm_count].shape[2])]
+
+
+# The findings of an ablation as CSV: one row per level, algorithm and seed.
+
+
+def levels_csv(measured: Sequence[Measured], searched: int) -> str:
+    """One row per level, algorithm and seed: means over the worlds (m2/s2); without a shield its columns are empty.
+
+    ``searched``: over the worlds in which the joint optimum was searched.
+    """
+    rows = []
+    for one in measured:
+        for seed, collided in enumerate(one.reached.collided):
+            about: Json = {"level": one.level.name, "algorithm": one.algorithm, "seed": seed if one.algorithm else None}
+            about |= {"worlds": len(collided), "collision_rate": float(collided.mean())}
+            vehicles: Json = {}
+            behind: Json = {}
+            for harm_count in HARM_COUNTS:
+                name = HARM_METRIC[harm_count]
+                reached, braking = one.reached.world[harm_count][seed], one.full_brake.world[harm_count]
+                about |= {
+                    name: float(reached.mean()),
+                    f"full_brake_{name}": float(braking.mean()),
+                    f"searched_{name}": float(reached[:searched].mean()),
+                    f"searched_full_brake_{name}": float(braking[:, :searched].mean()),
+                    f"searched_best_known_{name}": None if one.best is None else float(one.best[harm_count].mean()),
+                }
+                each = one.reached.vehicle[harm_count][seed].mean(axis=0)
+                vehicles |= {f"{name}_{i + 1}": float(harm) for i, harm in enumerate(each)}
+                behind |= dict.fromkeys((f"shielded_{name}", f"bound_{name}", f"actions_replaced_{name}"))
+                if one.shielded is not None:
+                    found = one.shielded[harm_count]
+                    actions = found.decisions[seed].sum() * found.replaced.shape[2]
+                    shares = found.harm[seed].mean(), found.bound[seed].mean(), found.replaced[seed].sum() / actions
+                    behind |= dict(zip([*behind][-3:], map(float, shares), strict=True))
+            rows.append({**about, **vehicles, **behind})
+    return csv_text(rows)
+
+
+_ALGORITHM = "Algorithm"
+_HARM = {"first": "first-impact harm", "total": "total harm"}
+
+
+def markdown(found: Json, conditions: str) -> str:
+    """All tables, with their conditions below."""
+    blocks = [text for title, sheets in _blocks(found) for text in (f"## {title}", *(s.markdown() for s in sheets))]
+    return "\n\n".join([*blocks, conditions]) + "\n"
+
+
+def ablation_page(found: Json, conditions: str, figures: Mapping[str, Figure], episodes: Sequence[Section] = ()) -> str:
+    """The figures by name, sections of episodes to watch and all tables as one HTML page, with their conditions."""
+    drawn = [
+        Part.drawing(figure, *FIGURES[name], alone=name == "ablation-who-pays.png", known=conditions)
+        for name, figure in figures.items()
+    ]
+    sections = [Section("Conditions", [conditions])]
+    sections += [Section("Figures", drawn)] if drawn else []
+    sections += episodes
+    for title, sheets in _blocks(found):
+        parts = []
+        for sheet in sheets:
+            rows = [
+                [cell.in_words.replace("`", "") for cell in row] for row in sheet.shown() if not isinstance(row, str)
+            ]
+            parts.append(Part.table(Sheet("", [Column(heading) for heading in sheet.headings], rows)))
+        sections.append(Section(title, parts))
+    settings = {name: value for name, value in found["settings"].items() if name != "recipes"}
+    sections.append(Section("Settings", [Part.facts(settings)]))
+    lead = "Who learns, who knows, whose harm counts: step by step."
+    return Page("What cooperation is worth", sections, lead).html
+
+
+def _blocks(found: Json) -> list[tuple[str, list[Sheet]]]:
+    """The tables below their titles; a cell stands where its path says: keys with blanks between."""
+    levels = [{**level, "level": f"`{level['level']}`"} for level in found["levels"]]
+    steps, channels = (
+        [{**change, "from": f"`{change['from']}`", "to": f"`{change['to']}`"} for change in found[key]]
+        for key in ("steps", "channels")
+    )
+    both = [{**change, "change": f"{change['from']} to {change['to']}"} for change in steps + channels]
+    vehicles = range(len(both[0]["first"]["vehicles"]) if both else 0)
+    about: _Columns = [("Level", "level"), (_ALGORITHM, "algorithm")]
+    changed: _Columns = [("From", "from"), ("To", "to"), (_ALGORITHM, "algorithm")]
+    sheets: dict[str, list[Sheet]] = {"levels": [], "optima": [], "shielded": [], "pays": []}
+    for count in HARM_COUNTS:
+        reached, braking = _harm(f"Reached, {_HARM[count]}"), _harm("All brake fully")
+        drive: _Columns = [(_share("Collisions"), "collision_rate"), (braking, f"{count} full_brake value")]
+        sheets["levels"].append(_sheet(levels, [*about, *drive, (reached, f"{count} harm")]))
+        known = [level for level in levels if level[count]["searched"]["best_known"] is not None]
+        optima: _Columns = [
+            (braking, f"{count} searched full_brake value"),
+            (reached, f"{count} searched harm"),
+            (_harm("Joint optimum"), f"{count} searched best_known value"),
+            (_share("Share of its reduction"), f"{count} searched realised_share"),
+        ]
+        sheets["optima"].append(_sheet(known, [*about, *optima]))
+        behind: _Columns = [
+            (_harm(f"Without, {_HARM[count]}"), f"{count} harm value"),
+            (_harm("With"), f"{count} shielded harm value"),
+            (_harm("Change", "+"), f"{count} shielded difference"),
+            (_harm("Bound"), f"{count} shielded bound value"),
+            (_share("Replaced"), f"{count} shielded replaced"),
+            (_share("Stepped in"), f"{count} shielded stepped_in"),
+            (_share("Somebody worse off"), f"{count} shielded worse_off"),
+            (_share("Above the baseline plan"), f"{count} shielded above_baseline"),
+            (Column("Above the bound"), f"{count} shielded above_bound"),
+        ]
+        sheets["shielded"].append(_sheet([level for level in levels if level[count]["shielded"]], [*about, *behind]))
+        changed += [
+            (_harm(f"Change of {_HARM[count]}", "+"), f"{count} difference"),
+            (_share(f"Somebody worse off, {_HARM[count]}"), f"{count} worse_off"),
+        ]
+        pays: _Columns = [(f"Change of {_HARM[count]}", "change"), (_ALGORITHM, "algorithm")]
+        pays += [(_harm(f"Vehicle {i + 1}", "+"), f"{count} vehicles {i}") for i in vehicles]
+        pays += [(_share(f"Vehicle {i + 1} worse off"), f"{count} worse_off_vehicles {i}") for i in vehicles]
+        sheets["pays"].append(_sheet(both, pays))
+    worlds = found["levels"][0]["first"]["searched"]["worlds"]
+    blocks = [
+        ("Levels", sheets["levels"]),
+        (f"How near the joint optimum, in the first {count_of(worlds, 'world')}", sheets["optima"]),
+    ]
+    if any(level["first"]["shielded"] for level in levels):
+        blocks.append(("Behind the step shield that guards the count of the table", sheets["shielded"]))
+    for title, changes in (("What each step is worth", steps), ("Price of lost messages", channels)):
+        if changes:
+            blocks.append((title, [_sheet(changes, changed)]))
+    if both:
+        blocks.append(("Who pays", sheets["pays"]))
+    return blocks
+
+
+_Columns = list[tuple[Column | str, str]]
+
+
+def _sheet(rows: Sequence[Json], columns: _Columns) -> Sheet:
+    """The table without the algorithm's column where there is only one."""
+    if len({row["algorithm"] for row in rows} - {None}) == 1:
+        columns = [(column, path) for column, path in columns if column != _ALGORITHM]
+    cells: list[list[Any]] = []
+    for row in rows:
+        cells.append([])
+        for _, path in columns:
+            found: Any = row
+            for key in path.split():
+                found = found[int(key) if isinstance(found, list) else key]
+            cells[-1].append(Estimate(**found) if isinstance(found, dict) else found)
+    return Sheet("", [column for column, _ in columns], cells)
+
+
+def interval_words(seeds: int) -> str:
+    """What the intervals of figures over so many seeds hold for."""
+    if seeds == 1:
+        return "95 % intervals for other worlds only: one seed says nothing about others"
+    rough = f" (rough: {seeds} seeds)" if seeds < 3 else ""
+    return f"95 % intervals for other seeds and other worlds{rough}"
+
+
+def _harm(heading: str, sign: Literal["-", "+"] = "-") -> Column:
+    return Column(heading, sign=sign)
+
+
+def _share(heading: str) -> Column:
+    return Column(heading, digits=1, scale=100.0, unit=" %", sign="-")
+
+
+FIGURES = {  # those of ``ablation_figures``, each with its title and what it shows
+    "ablation.png": (
+        "Harm against cooperation",
+        "Both harms at each level, between full braking and the joint optimum.",
+    ),
+    "ablation-changes.png": ("What each step is worth", "Change of both harms from one level to the next."),
+    "ablation-who-pays.png": ("Who pays", "Change of the harm of each vehicle, under both counts."),
+}
+
+
+def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> tuple[Json, list[Path]]:
+    """Write all files, replacing earlier ones: what ``ablation.json`` holds; page, Markdown and figures."""
+    settings = {
+        **plan.settings(),
+        "levels": [level.name for level in plan.levels],
+        "recipes": {name: r.model_dump(mode="json") for name, r in zip(plan.algorithms, plan.recipes, strict=True)},
+        "machine": machine,
+        "date": datetime.now(UTC).date().isoformat(),
+    }
+    found = {"settings": settings, **compare(measured, plan.search_episodes)}
+    recipes = ", ".join(
+        f"{name} (rewarded for {'first-impact' if recipe.reward.harm_count == 'first' else 'total'} harm)"
+        for name, recipe in zip(plan.algorithms, plan.recipes, strict=True)
+    )
+    conditions = (
+        f"{recipes}; {plan.seeds} {'seeds' if plan.seeds > 1 else 'seed'}, {plan.steps_per_learner:,} decisions of each"
+        f" learner. Harms are means per world in m²/s² on the same {count_of(plan.episodes, 'world')} of seed"
+        f" {plan.list_seed} at every level; {interval_words(plan.seeds)}. Joint optimum: the least harm known that"
+        f" the level's learners can do, and everything beside it, in the first {plan.search_episodes:,} of these"
+        f" worlds, {plan.budget:,} candidates per world and count. {machine}."
+    )
+    drawn = found["steps"] or found["channels"]
+    figures = dict(zip(FIGURES, ablation_figures(found, conditions), strict=True)) if drawn else {}
+    for name, figure in figures.items():
+        write_picture(plan.folder / name, figure, force=True)
+    texts = {
+        "ablation.html": ablation_page(found, conditions, figures, [episodes_section(plan, measured)]),
+        "ablation.md": markdown(found, conditions),
+        "ablation.csv": levels_csv(measured, plan.search_episodes),
+        "ablation.json": json.dumps(found, indent=2, allow_nan=False) + "\n",
+    }
+    for name, text in texts.items():
+        write_output(plan.folder / name, text.encode(), force=True)
+    return found, [plan.folder / name for name in ("ablation.html", "ablation.md", *figures)]

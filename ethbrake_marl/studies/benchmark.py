@@ -11,36 +11,36 @@ import json
 import math
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
 
-from ethbrake_marl.agents.protocol import Driver, knowledge_text, team_of
+from ethbrake_marl.agents import Driver, knowledge_text, team_of
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, OnProgress, PhysicsError, Progress, one_line, unknown_name
-from ethbrake_marl.evaluation.inputs import (
+from ethbrake_marl.evaluation import (
     PROGRESS_EVERY,
     check_agents,
     content_sha256,
     driving_policy,
+    evaluate,
     make_lineup,
-    policies_by_name,
+    mean,
+    rate,
+    relative_decrease,
     result_versions,
     worlds_sha256,
+    write_output,
 )
-from ethbrake_marl.evaluation.outcome import Evaluation
-from ethbrake_marl.evaluation.results import write_output
-from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.statistics import mean, rate, relative_decrease
 from ethbrake_marl.files.sheet import DASH, Column, Estimate, Sheet
 from ethbrake_marl.files.store import parse_strict_json, read_plain
 from ethbrake_marl.files.yaml import first_mistake
-from ethbrake_marl.limits.best_harm import load_table, world_identity
+from ethbrake_marl.limits import BestHarmTable, world_identity
 from ethbrake_marl.physics import Floats
-from ethbrake_marl.policies.bundle import Policy
+from ethbrake_marl.policies import Policy
 from ethbrake_marl.scenario import Sample, Scenario, Task
 
 # Frozen suites: lists of worlds that never change, each with the least harm known in it.
@@ -103,11 +103,6 @@ class SuiteList:
         """Of the list, in the suite."""
         return self.content.name
 
-    @property
-    def task(self) -> Task:
-        """What is asked: the scenario's learners drive, and the list's harm counts."""
-        return Task(self.scenario, self.scenario.learners, self.content.harm_count)
-
     def sample(self) -> Sample:
         """Its worlds; raises ``InvalidInput`` if this version draws others than the suite was frozen with."""
         sample = self.scenario.sample(self.content.worlds, self.content.seed)
@@ -127,7 +122,8 @@ class SuiteList:
         file = self.folder / f"{self.name}.npz"
         if hashlib.sha256(read_plain(file, _TABLE_BYTES)).hexdigest() != self.content.table_sha256:
             raise InvalidInput(f"{file}: is not the table that belongs to the suite")
-        harm = load_table(file).harm(world_identity(sample.worlds, self.task), self.content.harm_count)
+        task = Task(self.scenario, self.scenario.learners, self.content.harm_count)
+        harm = BestHarmTable.load(file).harm(world_identity(sample.worlds, task), self.content.harm_count)
         if not np.isfinite(harm).all():
             raise InvalidInput(f"{file}: holds {int(np.isfinite(harm).sum())} of the {len(harm)} worlds of its list")
         return harm
@@ -164,21 +160,16 @@ def load_suite(name: str, folder: Path | None = None) -> Suite:
     content = read_content(file, SuiteContent)
     if content.name != name:
         raise InvalidInput(f"{file}: is suite {content.name}")
-    lists = tuple(SuiteList(each, _scenario_of(file, each), file.parent) for each in content.lists)
+    lists = []
+    for each in content.lists:
+        try:
+            lists.append(SuiteList(each, Scenario(**each.scenario), file.parent))
+        except InvalidInput as error:
+            raise InvalidInput(f"{file}, list {each.name}: {error}") from None
     named = [each.name for each in lists]
     if twice := {name for name in named if named.count(name) > 1}:
         raise InvalidInput(f"{file}: list {min(twice)} stands in it twice")
-    return Suite(name, plain_sha256(content.model_dump(mode="json")), lists)
-
-
-def _scenario_of(file: Path, content: ListContent) -> Scenario:
-    try:
-        scenario = Scenario(**content.scenario)
-    except InvalidInput as error:
-        raise InvalidInput(f"{file}, list {content.name}: {error}") from None
-    if not scenario.learners:
-        raise InvalidInput(f"{file}, list {content.name}: nobody learns, so nobody can be scored")
-    return scenario
+    return Suite(name, plain_sha256(content.model_dump(mode="json")), tuple(lists))
 
 
 def read_content(file: Path, kind: type[Content]) -> Content:
@@ -303,6 +294,32 @@ class Entry(Strict):
         """What ``entry_sha256`` must be."""
         return plain_sha256(self.model_dump(mode="json", exclude={"entry_sha256"}))
 
+    def write(self, path: Path, *, force: bool = False) -> None:
+        """Write it; raises as ``check_target``."""
+        content = json.dumps(self.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
+        write_output(path, content.encode(), force=force)
+
+    def sheet(self) -> Sheet:
+        """One line per list, for a terminal; means per world."""
+        columns: list[Column | str] = [
+            "List",
+            Column("Share %", digits=1, scale=100.0),
+            Column("Worst decile", digits=1),
+            Column("First", interval="hidden"),
+            Column("Total", interval="hidden"),
+            Column("Collided %", digits=1, scale=100.0, interval="hidden"),
+            Column("Moving %", digits=1, scale=100.0),
+        ]
+        rows: list[list[Any]] = []
+        for name, each in self.lists.items():
+            if isinstance(each, NotDriven):
+                rows.append([name, "not driven", *[None] * 5])
+            else:
+                harms = (each.worst_decile_regret, each.first_impact_harm, each.total_harm)
+                rows.append([name, each.realised_share, *harms, each.collision_rate, each.horizon_ends / each.worlds])
+        reasons = [f"{name}: {each.not_driven}" for name, each in self.lists.items() if isinstance(each, NotDriven)]
+        return Sheet("", columns, rows, "\n".join(reasons), gap=2)
+
 
 def make_entry(suite: Suite, spec: str, *, on_progress: OnProgress | None = None) -> Entry:
     """Let an agent drive every list of the suite.
@@ -319,13 +336,25 @@ def make_entry(suite: Suite, spec: str, *, on_progress: OnProgress | None = None
     lists: dict[str, ListResult | NotDriven] = {}
     for each in suite.lists:
         sample = each.sample()  # an error here is the suite's, not the agent's
+        count = each.content.harm_count
         try:
-            driver = _make_driver(each, sample, spec)
+            lineup = make_lineup([spec], each.scenario, harm_count=count)
+            if len(lineup) != 1:
+                raise InvalidInput(f"agent {spec!r}: stands for {len(lineup)} agents; an entry is of one")
+            check_agents(lineup, sample.worlds, each.scenario)
         except (InvalidInput, PhysicsError) as error:
             lists[each.name] = NotDriven(not_driven=one_line(str(error))[:1000])
             continue
-        _check_seeds(spec, policy_seeds(driver, each), suite)
-        lists[each.name] = _drive_list(each, sample, spec, driver, on_progress)
+        (driver,) = lineup.values()
+        seeds = policy_seeds(driver, each)
+        for vehicle, purposes in seeds.items():
+            for purpose, seed in purposes.items():
+                if seed in suite.seeds:
+                    raise InvalidInput(
+                        f"agent {spec!r}: its policy of {vehicle} was made with {purpose} seed {seed}, which is suite"
+                        f" {suite.name}'s own: the suite would not measure it, but what it was made with"
+                    )
+        lists[each.name] = _drive_list(each, sample, lineup, seeds, on_progress)
     driven = [each for each in lists.values() if isinstance(each, ListResult)]
     if not driven:
         reasons = [each.not_driven for each in lists.values() if isinstance(each, NotDriven)]
@@ -348,12 +377,6 @@ def make_entry(suite: Suite, spec: str, *, on_progress: OnProgress | None = None
     return entry.model_copy(update={"entry_sha256": entry.content_sha256()})
 
 
-def write_entry(path: Path, entry: Entry, *, force: bool = False) -> None:
-    """Write an entry; raises as ``check_target``."""
-    content = json.dumps(entry.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
-    write_output(path, content.encode(), force=force)
-
-
 def read_entry(path: Path) -> Entry:
     """Read an entry; raises ``InvalidInput`` for what is none, or was changed after it was made."""
     entry = read_content(path, Entry)
@@ -372,32 +395,18 @@ def policy_seeds(driver: Driver, each: SuiteList) -> dict[str, dict[str, int]]:
     return found
 
 
-def _check_seeds(spec: str, seeds: Mapping[str, Mapping[str, int]], suite: Suite) -> None:
-    """Refuse a policy that was trained or chosen with a seed of the suite."""
-    for vehicle, each in seeds.items():
-        for purpose, seed in each.items():
-            if seed in suite.seeds:
-                raise InvalidInput(
-                    f"agent {spec!r}: its policy of {vehicle} was made with {purpose} seed {seed}, which is suite"
-                    f" {suite.name}'s own: the suite would not measure it, but what it was made with"
-                )
-
-
-def _make_driver(each: SuiteList, sample: Sample, spec: str) -> Driver:
-    """The agent for a list, tried out there."""
-    lineup = make_lineup([spec], each.scenario, harm_count=each.content.harm_count)
-    if len(lineup) != 1:
-        raise InvalidInput(f"agent {spec!r}: stands for {len(lineup)} agents; an entry is of one")
-    check_agents(lineup, sample.worlds, each.scenario)
-    (driver,) = lineup.values()
-    return driver
-
-
 def _drive_list(
-    each: SuiteList, sample: Sample, spec: str, driver: Driver, on_progress: OnProgress | None
+    each: SuiteList,
+    sample: Sample,
+    lineup: Mapping[str, Driver],
+    seeds: dict[str, dict[str, int]],
+    on_progress: OnProgress | None,
 ) -> ListResult | NotDriven:
-    """What the agent does on a list; ``NotDriven`` where it, or the physics under it, fails."""
-    reference = make_lineup([REFERENCE], each.scenario)[REFERENCE]
+    """What the agent does on a list; ``NotDriven`` where it, or the physics under it, fails.
+
+    Raises ``InvalidInput`` where full braking or the best known is not the suite's.
+    """
+    content, (spec,) = each.content, lineup
 
     def tell(agent: str, done: int) -> None:
         if on_progress is not None and agent == spec:
@@ -406,24 +415,16 @@ def _drive_list(
     try:
         evaluation = evaluate(
             sample,
-            {REFERENCE: reference} | {spec: driver},
+            {**make_lineup([REFERENCE], each.scenario), **lineup},
             scenario=each.scenario,
-            seed=each.content.seed,
+            seed=content.seed,
             chunk=PROGRESS_EVERY,
             on_progress=tell,
             aftermath=False,
         ).complete()
     except (InvalidInput, PhysicsError) as error:
         return NotDriven(not_driven=one_line(str(error))[:1000])
-    return _result(each, sample, evaluation, spec, policy_seeds(driver, each))
-
-
-def _result(
-    each: SuiteList, sample: Sample, evaluation: Evaluation, spec: str, seeds: dict[str, dict[str, int]]
-) -> ListResult:
-    """The figures of a list; raises ``InvalidInput`` where full braking or the best known is not the suite's."""
-    content, outcome = each.content, evaluation.outcome(spec)
-    best = each.best_known(sample)
+    outcome, best = evaluation.outcome(spec), each.best_known(sample)
     full, harm = (evaluation.outcome(name).world_harm(content.harm_count) for name in (REFERENCE, spec))
     for what, found, frozen in (
         ("full braking", float(full.mean()), content.full_brake_harm),
@@ -437,7 +438,7 @@ def _result(
     return ListResult(
         worlds=content.worlds,
         worlds_sha256=content.worlds_sha256,
-        policies=policies_by_name(outcome.policies, each.scenario),
+        policies=outcome.named_policies,
         policy_seeds=seeds,
         knows=knowledge_text(outcome.knows),
         realised_share=realised_share(harm, full, best),
@@ -461,32 +462,6 @@ _RANK = (
     "Only who drives every list is ranked, by the mean over all lists. A mean over some of them is shown, and is no"
     " score: those lists may be the easy ones."
 )
-_NOT_DRIVEN = "not driven"
-
-
-def entry_sheet(entry: Entry, suite: Suite) -> Sheet:
-    """One line per list of one entry, for a terminal; means per world."""
-    columns: list[Column | str] = [
-        "List",
-        Column("Share %", digits=1, scale=100.0),
-        Column("Worst decile", digits=1),
-        Column("First", interval="hidden"),
-        Column("Total", interval="hidden"),
-        Column("Collided %", digits=1, scale=100.0, interval="hidden"),
-        Column("Moving %", digits=1, scale=100.0),
-    ]
-    found = {each.name: entry.lists[each.name] for each in suite.lists}
-    rows = [
-        [name, _NOT_DRIVEN, *[None] * 5] if isinstance(each, NotDriven) else [name, *_figures(each)]
-        for name, each in found.items()
-    ]
-    reasons = [f"{name}: {each.not_driven}" for name, each in found.items() if isinstance(each, NotDriven)]
-    return Sheet("", columns, rows, "\n".join(reasons), gap=2)
-
-
-def _figures(result: ListResult) -> list[Estimate | float]:
-    harms = (result.worst_decile_regret, result.first_impact_harm, result.total_harm)
-    return [result.realised_share, *harms, result.collision_rate, result.horizon_ends / result.worlds]
 
 
 @dataclass(frozen=True, slots=True)
@@ -503,76 +478,25 @@ class Leaderboard:
 
     def sheet(self) -> Sheet:
         """One line per entry, for a terminal; lists that were not driven show a dash."""
-        share = Column("", digits=1, scale=100.0)
         rows = []
         for rank, entry in self._ranks():
-            each = "  ".join(f"{name} {share.show(_share(entry, name)).value}" for name in entry.lists)
+            each = "  ".join(f"{name} {_SHARE.show(_share(entry, name)).value}" for name in entry.lists)
             rows.append([rank, entry.agent, entry.mean_of_driven, self._driven(entry), each])
         told = Column("Realised share of each list, in the suite's order", text=True)
-        overall = Column("Overall", digits=1, scale=100.0)
+        overall = replace(_SHARE, heading="Overall")
         return Sheet("", [Column(""), "Agent", overall, Column("Lists"), told], rows, gap=2)
 
-    def markdown(self) -> str:
-        """One column per list."""
+    def table(self) -> Sheet:
+        """One column per list, for a document."""
         names = [each.name for each in self.suite.lists]
         rows = []
         for rank, entry in self._ranks():
-            overall = entry.mean_of_driven.in_words(digits=1, scale=100.0)
+            overall = _SHARE.show(entry.mean_of_driven).in_words
             overall = overall if entry.overall is not None else f"({overall}, {self._driven(entry)} lists)"
             agent = one_line(entry.agent).replace("`", "'").replace("|", "/")
             rows.append([rank, f"`{agent}`", overall, *(_share(entry, name) for name in names)])
-        shares = [Column(name, digits=1, scale=100.0) for name in names]
-        return Sheet("", [Column(""), "Agent", Column("Overall"), *shares], rows).markdown() + "\n"
-
-    def page(self) -> str:
-        """The ranking, each list, and where each entry comes from, as a page."""
-        # templates take time to load, and most commands write no page
-        from ethbrake_marl.pages.frame import Block, Cell, Section, facts, page, paragraph, table
-
-        def cell(column: Column, figure: Estimate | float | None) -> Cell:
-            value, interval = column.show(figure)
-            return Cell(value, f"[{interval}]" if interval else "")
-
-        percent, harm = Column("", digits=1, scale=100.0), Column("")
-        suite, names = self.suite, [each.name for each in self.suite.lists]
-        rows = [
-            [entry.agent, rank, cell(percent, entry.mean_of_driven), self._driven(entry)]
-            + [cell(percent, each.realised_share if isinstance(each, ListResult) else None)
-               for each in map(entry.lists.__getitem__, names)]
-            for rank, entry in self._ranks()
-        ]  # fmt: skip
-        parts = [table(["Agent", "Rank", "Overall", "Lists", *names], rows, caption="Realised share, %")]
-        ranking = Section("Ranking", [*parts, paragraph(_RANK, "quiet")])
-        columns = (percent, harm, harm, harm, percent, percent)
-        lines: list[Any] = []
-        for content in (each.content for each in suite.lists):
-            lines.append(
-                Block(
-                    f"{content.name}: {content.worlds} worlds of seed {content.seed}, {content.harm_count} harm; full"
-                    f" braking {content.full_brake_harm:.2f}, best known {content.best_known_harm:.2f} m²/s²"
-                )
-            )
-            for _, entry in self.entries:
-                result = entry.lists[content.name]
-                cells = (
-                    [Cell(_NOT_DRIVEN, result.not_driven, words=True)]
-                    if isinstance(result, NotDriven)
-                    else [cell(column, figure) for column, figure in zip(columns, _figures(result), strict=True)]
-                )
-                lines.append([entry.agent, *cells, *[DASH] * (len(columns) - len(cells))])
-        head = (
-            "Agent", "Realised share, %", "Worst decile: regret", "First-impact harm", "Total harm", "Collisions, %",
-            "Moving at the horizon, %",
-        )  # fmt: skip
-        lists = Section("Lists", [table(head, lines, caption="Harm is in m²/s², mean per world")])
-        told = {
-            entry.agent: f"{entry.command}; policies: {', '.join(entry.policies) or 'none'}; "
-            + ", ".join(f"{name} {version}" for name, version in entry.versions.items())
-            + f"; entry SHA-256 {entry.entry_sha256}"
-            for _, entry in self.entries
-        }
-        lead = f"Suite {suite.name}, SHA-256 {suite.sha256}. {_SCORE}"
-        return page(f"Benchmark {suite.name}", [ranking, lists, Section("Entries", [facts(told)])], lead=lead)
+        shares = [replace(_SHARE, heading=name) for name in names]
+        return Sheet("", [Column(""), "Agent", Column("Overall"), *shares], rows)
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON."""
@@ -596,6 +520,9 @@ class Leaderboard:
 
     def _driven(self, entry: Entry) -> str:
         return f"{entry.lists_driven} of {len(self.suite.lists)}"
+
+
+_SHARE = Column("", digits=1, scale=100.0)
 
 
 def _share(entry: Entry, name: str) -> float | None:

@@ -11,49 +11,55 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
-from ethbrake_marl.agents.policy import LearnedAgent
-from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.defaults import EPISODES, LIST_SEED
+from ethbrake_marl.agents import Agent, LearnedAgent
+from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, count_of
 from ethbrake_marl.evaluation import (
+    BASELINE,
+    PER_WORLD,
+    PROGRESS_EVERY,
+    TESTS,
     Evaluation,
     SummaryRow,
+    SummaryTable,
+    controlled_vehicle,
     evaluate,
-    parameter_line,
+    make_agents,
+    other_tests,
     record_episode,
+    results_to_json,
     summarise,
-    write_per_world_csv,
+    write_output,
+    write_per_world,
 )
-from ethbrake_marl.evaluation.inputs import PROGRESS_EVERY, make_agents
-from ethbrake_marl.evaluation.measures import BASELINE
-from ethbrake_marl.evaluation.outcome import MAIN_TEST, TESTS, other_tests
-from ethbrake_marl.evaluation.results import PER_WORLD, results_to_json, write_output
-from ethbrake_marl.evaluation.rollout import controlled_vehicle
-from ethbrake_marl.figures.evaluation import harm_against_total_gap, learning_curve, trajectories
-from ethbrake_marl.figures.style import picture_bytes
+from ethbrake_marl.figures import harm_against_total_gap, learning_curve, trajectories, write_picture
 from ethbrake_marl.files.sheet import csv_text
-from ethbrake_marl.learning.recipe import TrainingRecipe, algorithm_names
-from ethbrake_marl.learning.train import TrainResult, train
-from ethbrake_marl.learning.training import RunDirectory, RunStatus, read_object
-from ethbrake_marl.pages.report import Report, ReportFigure, ReportTest, play_for_report, shield_evidence, write_report
-from ethbrake_marl.policies.actor import installed_versions
-from ethbrake_marl.policies.bundle import Policy
+from ethbrake_marl.learning import (
+    RunDirectory,
+    RunStatus,
+    TrainingRecipe,
+    TrainResult,
+    algorithm_names,
+    read_object,
+    train,
+)
+from ethbrake_marl.pages.page import Part
+from ethbrake_marl.pages.report import Report
+from ethbrake_marl.policies import Policy, installed_versions
 from ethbrake_marl.rewards import RewardParams
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield import HybridAgent
 
 # The results of an experiment beside its policy: CSV and JSON, every world, three figures and one page.
 
-REFERENCES = ("full_brake", "e_v2x_bm")  # level lines beside the learning curve
-SHOWN = ("full_brake", "e_v2x_bm")  # columns of the figure of one episode, and the policy
-
-LEARNING_CURVE = "learning_curve.png"
-HARM_AGAINST_GAP = "harm_against_gap.png"
-TRAJECTORIES = "trajectories.png"
+BESIDE = ("full_brake", "e_v2x_bm")  # beside the policy: in its figures, and on the other two of the three tests
+BESIDE_EPISODES = 2_000  # at most so many worlds of each of these tests
+BASELINES = (*BESIDE, "e_v2x_bm:pairwise")
+RUNS = Path("runs")
 
 
 def write_results(folder: Path, name: str, rows: Sequence[SummaryRow], per_world: Path | None = None) -> None:
@@ -83,43 +89,36 @@ def write_figures(
     course: Sequence[Mapping[str, float]],
     course_caption: str,
     agents: Mapping[str, Agent],
-) -> list[ReportFigure]:
+) -> list[Part]:
     """Draw the three figures, write them as PNG, and give them for the report."""
-    references = [row for row in rows if row.agent in REFERENCES]
+    references = [row for row in rows if row.agent in BESIDE]
     shown = telling_world(evaluation)
-    world = evaluation.worlds.take([shown])
+    world, row = int(evaluation.index[shown]), evaluation.worlds.take([shown])
     records = {
-        name: record_episode(world, agents[name], scenario=evaluation.scenario, vehicle=evaluation.vehicle)
-        for name in (*SHOWN, learned_name(evaluation))
+        name: record_episode(row, agents[name], scenario=evaluation.scenario, vehicle=evaluation.vehicle)
+        for name in (*BESIDE, learned_name(evaluation))
     }
     drawn = {
-        LEARNING_CURVE: learning_curve(course, references=references, caption=course_caption),
-        HARM_AGAINST_GAP: harm_against_total_gap(evaluation),
-        TRAJECTORIES: trajectories(records),
+        "learning_curve.png": (
+            "Learning curve",
+            "Harm and collisions of the policy on a fixed list of worlds while it learns; level lines: baselines.",
+            learning_curve(course, references=references, caption=course_caption),
+        ),
+        "harm_against_gap.png": (
+            "Harm against the total initial gap",
+            "Mean harm of each agent in worlds grouped by the sum of their gaps at the alert.",
+            harm_against_total_gap(evaluation),
+        ),
+        "trajectories.png": (
+            "One episode",
+            f"World {world} of the list, driven by three agents: the world whose saving of harm, policy against full"
+            " braking, is the median of all worlds in which full braking collides.",
+            trajectories(records),
+        ),
     }
-    figures = []
-    for name, figure in drawn.items():
-        title, description = FIGURE_TEXTS[name]
-        write_output(folder / name, picture_bytes(figure, name), force=True)
-        figures.append(ReportFigure(title, description.format(world=int(evaluation.index[shown])), figure))
-    return figures
-
-
-FIGURE_TEXTS = {
-    LEARNING_CURVE: (
-        "Learning curve",
-        "Harm and collisions of the policy on a fixed list of worlds while it learns; level lines: baselines.",
-    ),
-    HARM_AGAINST_GAP: (
-        "Harm against the total initial gap",
-        "Mean harm of each agent in worlds grouped by the sum of their gaps at the alert.",
-    ),
-    TRAJECTORIES: (
-        "One episode",
-        "World {world} of the list, driven by three agents: the world whose saving of harm, policy against full"
-        " braking, is the median of all worlds in which full braking collides.",
-    ),
-}
+    for name, (_, _, figure) in drawn.items():
+        write_picture(folder / name, figure, force=True)
+    return [Part.drawing(figure, title, description) for title, description, figure in drawn.values()]
 
 
 def learned_name(evaluation: Evaluation) -> str:
@@ -138,11 +137,6 @@ def telling_world(evaluation: Evaluation) -> int:
     return int(rows[order[(len(order) - 1) // 2]])
 
 
-RUNS = Path("runs")
-BASELINES = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise")
-BESIDE = ("full_brake", "e_v2x_bm")  # baselines on the other two of the three tests
-BESIDE_EPISODES = 2_000  # at most so many worlds of each
-
 Ended = Literal["finished", "interrupted"]
 
 
@@ -153,9 +147,9 @@ class ExperimentResult:
     directory: Path
     status: Ended  # interrupted: the policy was not trained to the end, everything else is there
     steps: int
-    rows: list[SummaryRow]
+    rows: SummaryTable
     report: Path
-    beside: Mapping[str, list[SummaryRow]] = field(default_factory=dict)  # by test: the other two of the three tests
+    beside: Mapping[str, SummaryTable] = field(default_factory=dict)  # by test: the other two of the three tests
 
 
 def run_folder(
@@ -190,8 +184,8 @@ def run_experiment(
     recipe: TrainingRecipe,
     steps: int | None = None,
     seed: int | None = None,
-    episodes: int = EPISODES,
-    list_seed: int = LIST_SEED,
+    episodes: int = DEFAULT.EPISODES,
+    list_seed: int = DEFAULT.LIST_SEED,
     stop_when_lost: bool = False,
     force: bool = False,
     settings: Sequence[str] = (),
@@ -241,13 +235,23 @@ def run_experiment(
             chunk=PROGRESS_EVERY,
             on_progress=lambda name, done: tell(Progress(name, done, total)),
         )
-        begin = _stages(tell, 3 + len(other_tests(scenario)))
+        others, done = other_tests(scenario), count()
+
+        def begin(note: str) -> None:
+            """Tell that a part of the report begins, or that all have ended."""
+            tell(Progress("report", next(done), 3 + len(others), note=note))
+
         begin("what nobody can avoid in these worlds, proven world by world")
         rows = summarise(evaluation)
-        beside = _beside(trained.policy, scenario, min(episodes, BESIDE_EPISODES), list_seed, begin)
+        beside: dict[str, SummaryTable] = {}
+        for other in others:  # the policy was trained on ``scenario`` alone
+            part = other.sample(min(episodes, BESIDE_EPISODES), list_seed)
+            begin(f"the same policy on {other.name}: {count_of(part.worlds.n, 'world')}")
+            driven = evaluate(part, _agents(trained.policy, other, BESIDE), scenario=other, seed=list_seed)
+            beside[other.name] = summarise(driven)
         begin("results and figures")
         per_world = run.path / PER_WORLD
-        write_per_world_csv(per_world, evaluation, force=True)
+        write_per_world(per_world, evaluation, force=True)
         write_results(run.path, "results", rows, per_world)
         if beside:
             write_results(run.path, "other_tests", [row for rows in beside.values() for row in rows])
@@ -255,25 +259,6 @@ def run_experiment(
         report = _show(run, evaluation, rows, beside, trained, agents, begin, wall_s=wall_s)
         begin("")
     return ExperimentResult(run.path, trained.status, trained.steps, rows, report, beside)
-
-
-def _stages(tell: OnProgress, total: int) -> Callable[[str], None]:
-    """What is to be called when each of so many parts of the report begins, with a line about it, and at the end."""
-    done = count()
-    return lambda note: tell(Progress("report", next(done), total, note=note))
-
-
-def _beside(
-    policy: Policy, scenario: Scenario, episodes: int, list_seed: int, begin: Callable[[str], None]
-) -> dict[str, list[SummaryRow]]:
-    """The same policy, trained on ``scenario`` alone, on the other two of the three tests, beside two baselines."""
-    found: dict[str, list[SummaryRow]] = {}
-    for other in other_tests(scenario):
-        begin(f"the same policy on {other.name}: {count_of(episodes, 'world')}")
-        agents = _agents(policy, other, BESIDE)
-        evaluation = evaluate(other.sample(episodes, list_seed), agents, scenario=other, seed=list_seed)
-        found[other.name] = summarise(evaluation)
-    return found
 
 
 def _agents(policy: Policy, scenario: Scenario, baselines: Sequence[str] = BASELINES) -> dict[str, Agent]:
@@ -289,8 +274,8 @@ def _agents(policy: Policy, scenario: Scenario, baselines: Sequence[str] = BASEL
 def _show(
     run: RunDirectory,
     evaluation: Evaluation,
-    rows: list[SummaryRow],
-    beside: Mapping[str, list[SummaryRow]],
+    rows: SummaryTable,
+    beside: Mapping[str, SummaryTable],
     trained: TrainResult,
     agents: Mapping[str, Agent],
     begin: Callable[[str], None],
@@ -302,18 +287,20 @@ def _show(
     plan = config["recipe"]["evaluation"]
     caption = (
         f"{evaluation.scenario.name}: worlds 0 to {plan['worlds'] - 1} of the list of seed {plan['seed']} at every"
-        f" point; training seed {config['seeds']['training']}. Level lines: {parameter_line(rows[0].parameters)}."
+        f" point; training seed {config['seeds']['training']}. Level lines: {rows[0].parameters.line}."
     )
     figures = write_figures(
         run.path, evaluation, rows, course=trained.evaluations, course_caption=caption, agents=agents
     )
+    reward = RewardParams(**config["recipe"]["reward"]).model_dump(exclude_defaults=True)
     told = {
         "Training": f"{config['recipe']['title'] or config['recipe']['name']}: {trained.steps:,} steps"
         f" of {config['recipe']['total_steps']:,} ({trained.status}), {trained.wall_s:.0f} s",
         "Seeds": f"training {config['seeds']['training']}, evaluation list {evaluation.seed}",
-        "Reward": _reward(config["recipe"]["reward"]),
+        "Reward": ", ".join(f"{name} {value}" for name, value in reward.items()) or "minus the first-impact harm",
         "Whole run": f"{wall_s:.0f} s",
-        **_own_parts(config),
+        "Settings": ", ".join(config.get("settings", ())),
+        "Plug-ins": ", ".join(f"{each['name']} (SHA-256 {each['sha256']})" for each in config["plugins"]),
     }
     manifest = trained.policy.manifest
     which = f"Policy by {manifest.algorithm}, after {manifest.steps:,} steps (least harm on its own list)"
@@ -326,36 +313,19 @@ def _show(
     name, learned = evaluation.scenario.name, learned_name(evaluation)
     spellings = {learned: f"{learned}@{run.path}", "hybrid": f"{learned}@{run.path}+episode"}
     report = Report(
-        f"ethbrake run: {name}{' (the main test of three)' if beside and name == MAIN_TEST else ''}",
+        f"ethbrake run: {name}{' (the main test of three)' if beside and name == next(iter(TESTS)) else ''}",
         rows,
         evaluation,
-        play_for_report(evaluation, agents, learned, spellings=spellings),
-        shield_evidence(agents, evaluation),
-        learned,
-        figures,
-        [ReportTest(name, TESTS[name], other) for name, other in beside.items()],
+        focus=learned,
+        figures=figures,
+        tests=[(name, TESTS[name], other) for name, other in beside.items()],
         summary=summary,
-        settings=told,
+        settings={name: value for name, value in told.items() if value},
         versions=installed_versions(),
     )
     path = run.path / "report.html"
-    write_report(path, report, force=True)
+    report.driven(agents, spellings=spellings).write(path, force=True)
     return path
-
-
-def _own_parts(config: Mapping[str, Any]) -> dict[str, str]:
-    """What the command line changed or added: settings and plug-ins; nothing where there are none."""
-    told = {
-        "Settings": config.get("settings", ()),
-        "Plug-ins": [f"{each['name']} (SHA-256 {each['sha256']})" for each in config["plugins"]],
-    }
-    return {what: ", ".join(each) for what, each in told.items() if each}
-
-
-def _reward(given: dict[str, Any]) -> str:
-    """The settings of a reward that are not its defaults."""
-    own = RewardParams(**given).model_dump(exclude_defaults=True)
-    return ", ".join(f"{name} {value}" for name, value in own.items()) or "minus the first-impact harm"
 
 
 @contextmanager

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Driver
-from ethbrake_marl.defaults import HINDSIGHT, HarmCount, MeasureName
+from ethbrake_marl.agents import Driver
+from ethbrake_marl.defaults import DEFAULT, HarmCount, MeasureName
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
-from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.inputs import NamedWorld, make_lineup, states_of
-from ethbrake_marl.evaluation.outcome import Outcome
+from ethbrake_marl.evaluation import NamedWorld, evaluate, make_lineup, states_of
 from ethbrake_marl.physics import Floats, Ints
-from ethbrake_marl.scenario import Sample, Scenario
-from ethbrake_marl.scenario.sampling import ranges_of
+from ethbrake_marl.scenario import Sample, Scenario, ranges_of
 
 # Measures of an agent's weakness, world by world.
 
@@ -55,41 +53,34 @@ class Measure:
         rows = np.searchsorted(sample.index, found.index)
         agent, *other = (found.outcome(name) for name in self.agents)
         harm[rows] = agent.ledger.world_harm(self.harm_count)
-        beside = self._reference(agent, other)
-        if beside is None:
+        if self.name == "harm":
             score[rows] = harm[rows]
             return Measured(score, harm, None)
+        beside = other[0].ledger.world_harm(self.harm_count) if other else agent.predicted_harm
+        if beside is None:
+            raise InvalidInput(
+                f"agent {next(iter(self.agents))!r}: tells no bound; --measure bound is for an agent behind a shield,"
+                " for instance ppo@shipped+step"
+            )
         reference[rows] = beside
         more = harm[rows] - beside
         score[rows] = np.abs(more) if self.name == "difference" else more
         return Measured(score, harm, reference)
 
-    def _reference(self, agent: Outcome, other: list[Outcome]) -> Floats | None:
-        if self.name == "harm":
-            return None
-        if self.name != "bound":
-            return other[0].ledger.world_harm(self.harm_count)
-        if agent.predicted_harm is None:
-            raise InvalidInput(
-                f"agent {next(iter(self.agents))!r}: tells no bound; --measure bound is for an agent behind a shield,"
-                " for instance ppo@shipped+step"
-            )
-        return agent.predicted_harm
-
-
-def make_measure(
-    name: MeasureName, agent: str, against: str | None, scenario: Scenario, harm_count: HarmCount
-) -> Measure:
-    """The measure of that name; raises ``InvalidInput`` for a reference that is missing or that nobody asks."""
-    if name in ("harm", "bound") and against is not None:
-        raise InvalidInput(f"--against {against}: --measure {name} compares with nobody; use regret or difference")
-    if name == "difference" and against is None:
-        raise InvalidInput("--measure difference: compares two agents; say which is the other one, --against AGENT")
-    specs = [agent] if name in ("harm", "bound") else [agent, against or HINDSIGHT]
-    lineup = make_lineup(specs, scenario, harm_count=harm_count)
-    if len(lineup) != len(specs):
-        raise InvalidInput(f"agent {' or '.join(specs)}: stands for several agents; one is needed here")
-    return Measure(name, lineup, scenario, harm_count)
+    @classmethod
+    def of(
+        cls, name: MeasureName, agent: str, against: str | None, scenario: Scenario, harm_count: HarmCount
+    ) -> Measure:
+        """The measure of that name; raises ``InvalidInput`` for a reference that is missing or that nobody asks."""
+        if name in ("harm", "bound") and against is not None:
+            raise InvalidInput(f"--against {against}: --measure {name} compares with nobody; use regret or difference")
+        if name == "difference" and against is None:
+            raise InvalidInput("--measure difference: compares two agents; say which is the other one, --against AGENT")
+        specs = [agent] if name in ("harm", "bound") else [agent, against or DEFAULT.HINDSIGHT]
+        lineup = make_lineup(specs, scenario, harm_count=harm_count)
+        if len(lineup) != len(specs):
+            raise InvalidInput(f"agent {' or '.join(specs)}: stands for several agents; one is needed here")
+        return cls(name, lineup, scenario, harm_count)
 
 
 # An adaptive search of the unit cube for the points of highest score, of which several far apart are wanted.
@@ -124,7 +115,7 @@ def search(
     check_whole_number("search: budget", budget, 1)
     check_whole_number("search: seed", seed, 0)
     rng = np.random.default_rng([seed, dimensions])
-    spread = _Spread(dimensions, seed)
+    spread = _spread(dimensions, seed)
     points, scores = np.empty((0, dimensions)), np.empty(0)
     while len(points) < budget:
         count = min(ROUND, budget - len(points))
@@ -133,28 +124,20 @@ def search(
         else:
             parents = points[far_apart(_above_median(Scored(points, scores)), _PARENTS)]
             steps = int(count * (1.0 - _EXPLORING)) if len(parents) else 0
-            new = np.vstack([_children(parents, steps, rng), spread.take(count - steps)])
+            new = np.vstack([_children(parents, steps, rng), *islice(spread, count - steps)])
         points, scores = np.vstack([points, new]), np.concatenate([scores, score(new)])
         if on_round is not None:
             on_round(len(points), budget)
     return Scored(points, scores)
 
 
-class _Spread:
+def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
     """Scrambled Sobol points, drawn a whole round at a time: their balance needs powers of two."""
+    from scipy.stats import qmc  # takes a second to load, and most commands search nothing
 
-    def __init__(self, dimensions: int, seed: int) -> None:
-        from scipy.stats import qmc  # takes a second to load, and most commands search nothing
-
-        self._sobol = qmc.Sobol(dimensions, rng=np.random.default_rng([seed, dimensions, 1]))
-        self._left = np.empty((0, dimensions))
-
-    def take(self, count: int) -> Floats:
-        """The next points, [count, d]."""
-        while len(self._left) < count:
-            self._left = np.vstack([self._left, np.minimum(self._sobol.random(ROUND), _LAST)])
-        taken, self._left = self._left[:count], self._left[count:]
-        return taken
+    sobol = qmc.Sobol(dimensions, rng=np.random.default_rng([seed, dimensions, 1]))
+    while True:
+        yield from np.minimum(sobol.random(ROUND), _LAST)
 
 
 def far_apart(found: Scored, count: int) -> Ints:
@@ -188,12 +171,8 @@ def _children(parents: Floats, count: int, rng: np.random.Generator) -> Floats:
     step = np.where(moved, size * rng.standard_normal(parent.shape), 0.0)
     one, other = (parents[rng.integers(len(parents), size=count)] for _ in range(2))
     crossing = rng.random((count, 1)) < 1.0 / 3.0
-    return _reflected(parent + np.where(crossing, 0.5 * (one - other) + 0.1 * step, step))
-
-
-def _reflected(points: Floats) -> Floats:
-    """Points that left the cube, thrown back at its faces."""
-    inside: Floats = 1.0 - np.abs(np.mod(points, 2.0) - 1.0)
+    moved_to = parent + np.where(crossing, 0.5 * (one - other) + 0.1 * step, step)
+    inside: Floats = 1.0 - np.abs(np.mod(moved_to, 2.0) - 1.0)  # what left the cube is thrown back at its faces
     return np.clip(inside, 0.0, _LAST)
 
 
@@ -212,15 +191,25 @@ class Falsified:
         good = self.scores[np.isfinite(self.scores)]
         return float((good > 0.0).mean()) if len(good) else 0.0
 
+    def named_worlds(self, measure: Measure) -> list[NamedWorld]:
+        """The kept worlds, worst first."""
+        if not self.sample.worlds.n:
+            return []
+        states, measured = states_of(self.sample.worlds, measure.scenario), self.measured
+        return [
+            NamedWorld(
+                name=f"{measure.name}-{k + 1}",
+                score=float(measured.score[k]),
+                harm=float(measured.harm[k]),
+                reference=None if measured.reference is None else float(measured.reference[k]),
+                state=state,
+            )
+            for k, state in enumerate(states)
+        ]
+
 
 def falsify(
-    measure: Measure,
-    budget: int,
-    seed: int,
-    *,
-    most: int = 20,
-    adaptive: bool = True,
-    on_round: Watcher | None = None,
+    measure: Measure, budget: int, seed: int, *, most: int = 20, adaptive: bool = True, on_round: Watcher | None = None
 ) -> Falsified:
     """Try ``budget`` worlds of the measure's scenario, and keep the worst, at most ``most``, that are far apart.
 
@@ -251,21 +240,3 @@ def falsify(
     sample, _ = ranges.sample(tried.points[worst])
     measured = measure(sample) if len(worst) else Measured(np.empty(0), np.empty(0), None)
     return Falsified(sample, measured, tried.scores, int(above[0]) + 1 if len(above) else None)
-
-
-def named_worlds(found: Falsified, measure: Measure) -> list[NamedWorld]:
-    """The kept worlds, worst first."""
-    if not found.sample.worlds.n:
-        return []
-    states, measured = states_of(found.sample.worlds, measure.scenario), found.measured
-    beside: Floats | list[None] = [None] * len(states) if measured.reference is None else measured.reference
-    return [
-        NamedWorld(
-            name=f"{measure.name}-{k + 1}",
-            score=float(measured.score[k]),
-            harm=float(measured.harm[k]),
-            reference=None if beside[k] is None else float(beside[k]),  # type: ignore[arg-type]
-            state=state,
-        )
-        for k, state in enumerate(states)
-    ]

@@ -10,16 +10,29 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from functools import reduce
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from operator import add
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
-from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, describe_error, naming_extras, one_line
+from ethbrake_marl.errors import (
+    AlreadyExists,
+    EthBrakeError,
+    InvalidInput,
+    OnProgress,
+    Progress,
+    count_of,
+    describe_error,
+    naming_extras,
+    one_line,
+)
+from ethbrake_marl.evaluation import BLOCK, Asked, Tally
 from ethbrake_marl.files.plugins import Plugin, load_the_same, loaded_plugins
 from ethbrake_marl.files.store import (
     check_writable,
@@ -29,7 +42,7 @@ from ethbrake_marl.files.store import (
     remove_unfinished,
     write_file,
 )
-from ethbrake_marl.learning.training import read_object, stop_on_signal
+from ethbrake_marl.learning import read_object, stop_on_signal
 
 # One job as every place runs it: a function and what it is given, as bytes, and what came of it.
 
@@ -74,25 +87,6 @@ class Attempt:
         return one_line("was stopped from outside" if error is None else describe_error(error))
 
 
-class Workers(Protocol):
-    """Where jobs run, several at a time."""
-
-    def room(self) -> int:
-        """How many more jobs can be begun now."""
-
-    def begin(self, number: int, call: bytes) -> None:
-        """Begin a job, which is known by its number from then on: its pickled function and what that is given."""
-
-    def wait(self) -> list[tuple[int, Answer]]:
-        """The jobs that have ended since; waits for one, but no longer than about a second."""
-
-    def interrupt(self) -> None:
-        """Ask every running job to end soon and to keep what it has; none waits for its turn any more."""
-
-    def close(self) -> None:
-        """End all workers, whatever they do."""
-
-
 def answer(call: bytes, plugins: Sequence[Plugin]) -> Answer:
     """Do a job in a worker, after loading the plug-ins of the process that asks for it.
 
@@ -117,11 +111,8 @@ def _process_name(number: int | None = None) -> str:
     return f"{os.uname().nodename}, process {number or os.getpid()}"
 
 
-RETRIES = 2  # further attempts at a job whose worker was lost
-
-
 def run_jobs(
-    jobs: Iterable[Job], workers: Workers | int, on_attempt: Callable[[Attempt], None], *, retries: int = RETRIES
+    jobs: Iterable[Job], workers: Workers | int, on_attempt: Callable[[Attempt], None], *, retries: int = 2
 ) -> bool:
     """Run the jobs, in this order as far as there is room; False when Ctrl-C or SIGTERM stopped it.
 
@@ -169,11 +160,7 @@ def _run_here(jobs: Iterable[Job], on_attempt: Callable[[Attempt], None]) -> boo
 
 
 def _attempts(
-    jobs: Iterable[Job],
-    workers: Workers,
-    running: dict[int, tuple[Job, int]],
-    retries: int,
-    asked: Callable[[], bool],
+    jobs: Iterable[Job], workers: Workers, running: dict[int, tuple[Job, int]], retries: int, asked: Callable[[], bool]
 ) -> Iterator[Attempt]:
     """Every attempt as it ends; ``running`` says at any time which jobs run, by number, with their attempts."""
     coming = enumerate((job, 1) for job in jobs)
@@ -237,8 +224,8 @@ class JobFolder:
         self._record, self._more = path / record, dict(more or {})
         self._journal = path / "journal.jsonl"
 
-    def check(self) -> dict[str, Any] | None:
-        """The record of this question that is there, None where there is none; makes nothing.
+    def check(self) -> bool:
+        """Whether no record of the question is there yet; makes nothing.
 
         Raises ``InvalidInput`` for what is no folder, cannot be written to, or answers another question, with what
         differs; ``AlreadyExists`` for a folder of something else.
@@ -251,7 +238,12 @@ class JobFolder:
         except OSError as error:
             raise InvalidInput(f"{self.path}: cannot be written to ({error.strerror}); {self._advice}") from None
         if self._question is None:
-            return None
+            if self._record.is_file():
+                raise AlreadyExists(
+                    f"{self.path}: is no folder of {self._kind}: {self._record.name} of another command is there;"
+                    f" {self._advice}"
+                )
+            return True
         if not self._record.is_file():
             if (
                 self._beside is not None
@@ -259,7 +251,7 @@ class JobFolder:
                 and {e.name for e in there.iterdir()} - {*self._beside, _LOCK}
             ):
                 raise AlreadyExists(f"{self.path}: is there already, and holds no {self._kind}; give another folder")
-            return None
+            return True
         try:
             kept = read_object(self._record)
         except InvalidInput as error:
@@ -269,32 +261,26 @@ class JobFolder:
             raise InvalidInput(
                 f"{self.path}: holds {self._kind} with other settings ({'; '.join(other)}); {self._advice}"
             )
-        return kept
+        return False
 
     @contextmanager
-    def work(self) -> Iterator[dict[str, Any]]:
-        """Keep others out of the folder while the block runs, and give its record; what killed writers left goes.
+    def work(self) -> Iterator[None]:
+        """Keep others out of the folder while the block runs; what killed writers left goes.
 
         Raises what ``check`` raises, and ``InvalidInput`` where another process works in it.
         """
         self.check()
         self.path.mkdir(parents=True, exist_ok=True)
         with hold_lock(self.path / _LOCK, "another process works in it; wait for it, or end it"):
-            record = self.check()
+            is_new = self.check()
             remove_unfinished(self.path)
-            if record is None:
-                record = {**self._more, **(self._question or {})}
-                if self._question is not None:
-                    write_file(self._record, (json.dumps(record, indent=2) + "\n").encode())
-            yield record
+            if is_new and self._question is not None:
+                record = {**self._more, **self._question}
+                write_file(self._record, (json.dumps(record, indent=2) + "\n").encode())
+            yield
 
     def run(
-        self,
-        jobs: Iterable[Job],
-        workers: Workers | int,
-        on_attempt: Callable[[Attempt], None],
-        *,
-        retries: int = RETRIES,
+        self, jobs: Iterable[Job], workers: Workers | int, on_attempt: Callable[[Attempt], None], *, retries: int = 2
     ) -> bool:
         """``run_jobs``, with a line of the journal for every attempt that has ended, on its way to the disk at once.
 
@@ -309,9 +295,6 @@ class JobFolder:
             def note(attempt: Attempt) -> None:
                 answer = attempt.answer
                 status = "finished" if answer.value is not None else "failed" if attempt.last else "again"
-                found = {"reason": attempt.reason}
-                if answer.value is not None:
-                    found = {"sha256": _sha256(answer.value), "found": answer.value}
                 entry = {
                     "job": attempt.job.name,
                     "status": status,
@@ -319,8 +302,11 @@ class JobFolder:
                     "ended_utc": datetime.now(UTC).isoformat(timespec="milliseconds"),
                     "wall_s": round(answer.wall_s, 3),
                     "where": answer.where,
-                    **found,
                 }
+                if answer.value is None:
+                    entry["reason"] = attempt.reason
+                else:
+                    entry |= {"sha256": _sha256(answer.value), "found": answer.value}
                 journal.write(json.dumps(entry).encode() + b"\n")
                 on_attempt(attempt)
 
@@ -399,11 +385,14 @@ class LocalWorkers:
         load_the_same(self._plugins)  # a file that was changed since is told here, in one line
 
     def room(self) -> int:
-        """Processes without a job, those that are not begun yet among them."""
+        """How many more jobs can be begun now: processes without one, those that are not begun yet among them."""
         return self._number - sum(worker.job is not None for worker in self._workers)
 
     def begin(self, number: int, call: bytes) -> None:
-        """Give the job to a process; one that has ended in the meantime is told by ``wait``."""
+        """Begin a job, known by its number from then on: its pickled function and what that is given.
+
+        A process that has ended in the meantime is told by ``wait``.
+        """
         worker = next((one for one in self._workers if one.job is None), None) or self._add_worker()
         worker.job = number
         try:
@@ -412,7 +401,10 @@ class LocalWorkers:
             worker.process.join(_WAIT_S)
 
     def wait(self) -> list[tuple[int, Answer]]:
-        """What the processes answer; of one that was lost an answer that says how."""
+        """The jobs that have ended since; waits for one, but no longer than about a second.
+
+        Of a process that was lost there is an answer that says how.
+        """
         by_pipe = {worker.pipe: worker for worker in self._workers}
         found = []
         for pipe in wait(list(by_pipe), _WAIT_S):
@@ -427,7 +419,7 @@ class LocalWorkers:
         return found
 
     def interrupt(self) -> None:
-        """Pass Ctrl-C on, once: a training ends after its update, with a checkpoint."""
+        """Ask every running job to end soon and to keep what it has, once: a training ends after its update."""
         if not self._interrupted:
             self._interrupted = True
             for worker in self._workers:
@@ -500,7 +492,7 @@ def _end_with(parent: BaseProcess) -> None:
 
 # A Ray cluster, or a Ray of this machine alone that nobody else can reach.
 
-LOCAL = "local"
+_LOCAL = "local"
 _LOOK_S = 10.0  # between two looks at how large the cluster is
 _AHEAD = 2  # jobs per core that Ray holds: one runs, one waits
 
@@ -520,9 +512,14 @@ class RayWorkers:
     def __init__(self, address: str, number: int | None = None) -> None:
         plugins = loaded_plugins()
         load_the_same(plugins)  # a file that was changed since is told here, in one line
-        self._plugins = tuple(_absolute(plugin) for plugin in plugins)
+        self._plugins = tuple(  # files by paths that workers elsewhere understand
+            replace(each, source=str(Path(each.source).absolute()))
+            if each.source.endswith(".py") or os.sep in each.source
+            else each
+            for each in plugins
+        )
         self._ray = _connect(address, number)
-        self._most = number if number is not None and address != LOCAL else None
+        self._most = number if number is not None and address != _LOCAL else None
         self._do = self._ray.remote(num_cpus=1, max_retries=0, max_calls=0)(answer)
         self._running: dict[Any, int] = {}
         self._cores, self._looked = 0, float("-inf")
@@ -574,7 +571,7 @@ class RayWorkers:
 def _connect(address: str, number: int | None) -> Any:
     """Ray itself, connected."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    if address == LOCAL:
+    if address == _LOCAL:
         # What Ray reads, once, when it is loaded: no cluster can be made of this, and 127.0.0.1 is its address. An
         # address that is given to ray.init would be changed to that of a network card.
         os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
@@ -582,8 +579,8 @@ def _connect(address: str, number: int | None) -> Any:
         import ray
         import ray.exceptions
     quiet = {"log_to_driver": False, "configure_logging": False, "runtime_env": {"env_vars": ONE_THREAD}}
-    if address == LOCAL:
-        ray.init(address=LOCAL, num_cpus=number, include_dashboard=False, **quiet)
+    if address == _LOCAL:
+        ray.init(address=_LOCAL, num_cpus=number, include_dashboard=False, **quiet)
         return ray
     try:
         ray.init(address=address, **quiet)
@@ -592,7 +589,95 @@ def _connect(address: str, number: int | None) -> Any:
     return ray
 
 
-def _absolute(plugin: Plugin) -> Plugin:
-    """The plug-in by a path that workers elsewhere understand."""
-    is_file = plugin.source.endswith(".py") or os.sep in plugin.source
-    return replace(plugin, source=str(Path(plugin.source).absolute())) if is_file else plugin
+Workers = LocalWorkers | RayWorkers  # where jobs run, several at a time
+
+
+def open_workers(ray: str | None, jobs: int | None) -> Workers:
+    """Where jobs run: processes of this machine, or a Ray; ``jobs`` at once, by default on every usable core.
+
+    On a cluster None leaves the number to it.
+    """
+    number = len(os.sched_getaffinity(0)) if jobs is None else jobs
+    if ray is None:
+        return LocalWorkers(number)
+    return RayWorkers(ray, number if ray == _LOCAL else jobs)
+
+
+# Sharded evaluations: shards in processes, what is finished in a folder, and the merged tally.
+
+
+def evaluate_shards(
+    asked: Asked,
+    *,
+    shards: int,
+    jobs: int = 1,
+    workers: Workers | None = None,
+    folder: Path | None = None,
+    with_rows: bool = False,
+    block: int = BLOCK,
+    tell: OnProgress | None = None,
+) -> Tally:
+    """The merged tally of all worlds of a list; the same bits whatever ``shards``, ``jobs`` and ``block`` are.
+
+    Args:
+        asked: the question.
+        shards: parts of the list; finished ones are kept.
+        jobs: processes; 1: this one.
+        workers: where shards are answered, of a cluster for instance, in place of ``jobs``; not closed here.
+        folder: keeps finished shards of this many, and those that it has are not driven again.
+        with_rows: a file with one row per world and agent is kept in the folder for each shard.
+        block: worlds advanced together, a multiple of 1,000.
+        tell: is told the worlds done so far.
+
+    Raises what ``Asked.answer`` and ``JobFolder.work`` raise, ``WorkerLost`` where a shard was lost again and again.
+
+    """
+    run, note = run_jobs, ""
+    bounds = {f"{first:013d}-{end:013d}": (first, end) for first, end in asked.question.bounds(shards)}
+    files = {} if folder is None else {name: folder.absolute() / f"worlds-{name}.parquet" for name in bounds}
+    done: dict[str, Any] = {}
+    with ExitStack() as stack:
+        if folder is not None:
+            question = {**asked.identity, "rows": with_rows, "shards": len(bounds)}
+            kept = JobFolder(folder, "shards", question, beside=())
+            stack.enter_context(kept.work())
+            found, damaged = kept.kept()
+            for name in bounds.keys() & found.keys():
+                is_there = files[name].is_file() and files[name].stat().st_size == found[name]["rows_bytes"]
+                if with_rows and not is_there:
+                    damaged += 1
+                else:
+                    done[name] = found[name]
+            for file in folder.glob("worlds-*.parquet"):
+                if file.stem.removeprefix("worlds-") not in done:
+                    file.unlink()
+            note = f"{count_of(damaged, 'finished shard')} damaged: driven again" if damaged else ""
+            run = kept.run
+        whole = reduce(add, (Tally.from_json(told["tally"]) for told in done.values()), Tally())
+        worlds = sum(told["end"] - told["first"] for told in done.values())
+
+        def say(note: str = "") -> None:
+            if tell is not None:
+                tell(Progress("worlds", worlds, asked.question.episodes, note=note))
+
+        def take(job: Job, found: dict[str, Any]) -> None:
+            nonlocal whole, worlds
+            whole += Tally.from_json(found["tally"])
+            worlds += found["end"] - found["first"]
+            say()
+
+        say(note)
+        left = [
+            Job(name, _answer, (asked, *ends, files[name] if with_rows and files else None, block))
+            for name, ends in bounds.items()
+            if name not in done
+        ]
+        if not run(left, workers or (jobs if len(left) > 1 else 1), each(take)):
+            raise KeyboardInterrupt
+        return whole
+
+
+def _answer(asked: Asked, first: int, end: int, rows: Path | None, block: int) -> dict[str, Any]:
+    tally = asked.answer(first, end, rows, block)
+    size = None if rows is None else rows.stat().st_size
+    return {"first": first, "end": end, "rows_bytes": size, "tally": tally.to_json()}

@@ -19,17 +19,15 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
-from ethbrake_marl.agents.e_v2x_bm_kernel import optimise_pairwise
-from ethbrake_marl.envs.common import make_engine
-from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.agents import optimise_coupled, optimise_pairwise
+from ethbrake_marl.envs import make_engine, parallel_env
 from ethbrake_marl.harm import empty_ledger
-from ethbrake_marl.physics import Floats, Worlds, advance, forecast
-from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics import Floats, Worlds, advance, compiled, forecast
 from ethbrake_marl.scenario import load_scenario
 
 SCENARIO = "paper-random"
@@ -43,8 +41,7 @@ MOST_STEPS = 1000  # by then every world is at rest, or none will be
 Work = Callable[[], int]  # does some work and says how much it was
 
 
-@dataclass(frozen=True, slots=True)
-class Effort:
+class Effort(NamedTuple):
     """How long to look: repetitions of each measurement, and processor seconds of each at least."""
 
     repetitions: int
@@ -193,14 +190,9 @@ def _sampling(n: int) -> Work:
     return lambda: scenario.sample(n, SEED).worlds.n
 
 
-def _pairwise(n: int) -> Work:
+def _optimise(optimise: Callable[[Worlds, int], Any], n: int) -> Work:
     worlds = load_scenario(SCENARIO).sample(n, SEED).worlds
-    return lambda: len(optimise_pairwise(worlds, 1).harm)
-
-
-def _coupled(n: int) -> Work:
-    worlds = load_scenario(SCENARIO).sample(n, SEED).worlds
-    return lambda: len(optimise_coupled(worlds, 1).harm)
+    return lambda: len(optimise(worlds, 1).harm)
 
 
 def _forecast(n: int, candidates: int = 16) -> Work:
@@ -237,19 +229,17 @@ environment.step({"vehicle_2": [-1.0]})
 
 
 def _start_seconds(effort: Effort) -> Floats:
-    """Seconds of a fresh interpreter that makes one world and steps it once; the kernels' cache is warm."""
-    _child_seconds()
-    return np.sort([_child_seconds() for _ in range(effort.repetitions)])
+    """Processor seconds of a fresh interpreter that makes one world and steps it once; the kernels' cache is warm."""
+    found = []
+    for _ in range(effort.repetitions + 1):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run([sys.executable, "-c", _START], check=True, capture_output=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        found.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    return np.sort(found[1:])
 
 
-def _child_seconds() -> float:
-    """Processor seconds of that interpreter, from its start to its end."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run([sys.executable, "-c", _START], check=True, capture_output=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-
-
+_OPTIMUM = "one optimum per world"
 _BRAKING = "first decision to rest in steps of 0.1 s; Vehicle 2 brakes with {:.0%} of its capacity, all others fully"
 _DRIVING = "Vehicle 2 brakes with 75% of its capacity; new episodes as old ones end"
 _FRESH = "a fresh interpreter: import, parallel_env, reset, step; kernels compiled before"
@@ -261,26 +251,24 @@ def _rate_of(
     return Benchmark(name, workload, unit, n, floor, lambda effort: rates(make(n), effort))
 
 
-def _advance_of(n: int, share: float) -> Benchmark:
-    name = f"advance and ledger, {share:.0%}"
-    return _rate_of(name, _BRAKING.format(share), partial(braking, share=share), n, 15e6)
-
-
 # The calibration comes first: the others are set against it.
 BENCHMARKS: tuple[Benchmark, ...] = (
     _rate_of("calibration", "constant deceleration, no event", _calibration, 1024),
-    _advance_of(1024, SHARE),
-    _advance_of(1024, 1.0),
-    _advance_of(4096, SHARE),
-    _advance_of(4096, 1.0),
+    *(
+        _rate_of(f"advance and ledger, {share:.0%}", _BRAKING.format(share), partial(braking, share=share), n, 15e6)
+        for n in (1024, 4096)
+        for share in (SHARE, 1.0)
+    ),
     _rate_of("engine step", _DRIVING, stepping, 1024, 8e6),
     _rate_of("engine step", _DRIVING, stepping, 4096, 8e6),
     _rate_of("Stable-Baselines3 VecEnv", _DRIVING, vec_env, 512, 4e6),
     _rate_of("PettingZoo parallel", "whole episodes, resets included", parallel, 1, 80e3),
     Benchmark("import and first step", _FRESH, "s", 1, 2.0, _start_seconds),
     _rate_of("sampling", "a list of worlds, refused draws included", _sampling, 10_000, unit="worlds/s"),
-    _rate_of("E-V2X-BM pairwise", "one optimum per world", _pairwise, 10_000, unit="worlds/s"),
-    _rate_of("E-V2X-BM coupled", "one optimum per world", _coupled, 1000, unit="worlds/s"),
+    _rate_of(
+        "E-V2X-BM pairwise", "one optimum per world", partial(_optimise, optimise_pairwise), 10_000, unit="worlds/s"
+    ),
+    _rate_of("E-V2X-BM coupled", _OPTIMUM, partial(_optimise, optimise_coupled), 1000, unit="worlds/s"),
     _rate_of("forecast", "16 constant commands per world, to the horizon", _forecast, 1000, unit="runs/s"),
 )
 

@@ -2,70 +2,21 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import tempfile
 import time
-import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, OnProgress, Progress
-from ethbrake_marl.evaluation.inputs import load_runnable
-from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.files.store import remove_folder
-from ethbrake_marl.learning.progress import OBJECTIVE, chosen_by
-from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe, read_settings
-from ethbrake_marl.learning.train import StopAt, resume, train
-from ethbrake_marl.learning.training import (
-    RunDirectory,
-    Training,
-    check_same,
-    is_finished,
-    load_team,
-    progress_rows,
-    read_object,
-    wait_for_others,
-)
-from ethbrake_marl.policies.bundle import Policy, has_bundle, read_trained
-from ethbrake_marl.scenario import Sample, Scenario, load_scenario
-from ethbrake_marl.studies.jobs import Attempt, Job, each, run_jobs
-
-# Scenario and recipe of a training that a file asks for, and which part of it a refusal is about.
-
-
-def load_parts(scenario: str, recipe: str, settings: Sequence[str]) -> tuple[Scenario, TrainingRecipe]:
-    """Scenario and recipe, each a name or a path, with the settings ``KEY=VALUE`` in them.
-
-    Raises ``InvalidInput`` for what is not known, and for a value that is not allowed.
-    """
-    loaded = load_recipe(recipe)
-    given = read_settings(settings, [loaded])
-    return load_runnable(scenario, given.scenario), given.change(loaded)
-
-
-def refused_part(scenario: str, recipe: str, settings: Sequence[str]) -> str:
-    """The part that is refused by itself where ``load_parts`` refuses: ``recipe``, ``scenario`` or a setting's key.
-
-    Empty where each by itself is in order.
-    """
-    tried: dict[str, Callable[[], object]] = {
-        "recipe": partial(load_recipe, recipe),
-        "scenario": partial(load_scenario, scenario),
-        **{text.partition("=")[0]: partial(load_parts, scenario, recipe, (text,)) for text in settings},
-    }
-    for part, load in tried.items():
-        try:
-            load()
-        except InvalidInput:
-            return part
-    return ""
+from ethbrake_marl.errors import InvalidInput, OnProgress, Progress
+from ethbrake_marl.evaluation import evaluate
+from ethbrake_marl.learning import RunDirectory, StopAt, Training, load_team, read_object, resume, train
+from ethbrake_marl.scenario import Sample, Scenario
+from ethbrake_marl.studies.jobs import Job, JobFolder, each, run_jobs
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +38,7 @@ class TrainingJob:
             status = read_object(run.status)
         except InvalidInput as error:
             raise InvalidInput(f"{error}; delete its folder to train anew") from None
-        check_same(self.folder, self.training)
+        run.check_same(self.training)
         if status.get("status") == "finished":
             return 0
         steps = status.get("steps", 0)
@@ -98,9 +49,10 @@ class TrainingJob:
 
         Raises what ``train`` and ``resume`` raise.
         """
-        if is_finished(self.folder):
+        run = RunDirectory(self.folder)
+        if run.is_finished:
             return True
-        if RunDirectory(self.folder).status.is_file():
+        if run.status.is_file():
             ended = resume(self.folder, stop_at=stop_at, on_progress=tell)
         else:
             self.folder.parent.mkdir(parents=True, exist_ok=True)
@@ -116,115 +68,29 @@ def finish_trainings(
     processes: int = 1,
     tell: OnProgress | None = None,
     *,
-    run: Callable[[Iterable[Job], int, Callable[[Attempt], None]], bool] = run_jobs,
+    kept: JobFolder | None = None,
 ) -> bool:
     """Bring every training to its end, ``processes`` at a time; False when Ctrl-C stopped it.
 
-    The policies do not depend on ``processes`` or on interruptions. ``run`` runs the jobs, that of a ``JobFolder`` for
-    instance. Raises, before any is begun, what ``steps_left`` raises, and what the first training raises that fails.
+    The policies do not depend on ``processes`` or on interruptions. ``kept`` keeps a journal of them. Raises, before
+    any is begun, what ``steps_left`` raises, and what the first training raises that fails.
     """
-    say = tell or (lambda progress: None)
+    run, say = run_jobs if kept is None else kept.run, tell or (lambda progress: None)
     left = [training for training in trainings if training.steps_left()]
     if processes == 1 or len(left) < 2:
-        told = [partial(_tell_named, say, each.folder.name) for each in left]
-        jobs = [Job(one.folder.name, one.finish, (who,)) for one, who in zip(left, told, strict=True)]
+        jobs = []
+        for one in left:
+            named = partial(_tell_named, say, one.folder.name)
+            jobs.append(Job(one.folder.name, one.finish, (named,)))
         return run(jobs, 1, lambda attempt: None)
-    done = 0
-
-    def count(job: Job, found: Any) -> None:
-        nonlocal done
-        done += 1
-        say(Progress("trainings", done, len(left)))
-
+    done = count(1)
     say(Progress("trainings", 0, len(left)))
-    return run([Job(one.folder.name, one.finish, ()) for one in left], processes, each(count))
+    jobs = [Job(one.folder.name, one.finish, ()) for one in left]
+    return run(jobs, processes, each(lambda job, found: say(Progress("trainings", next(done), len(left)))))
 
 
 def _tell_named(tell: OnProgress, name: str, progress: Progress) -> None:
     tell(replace(progress, name=name))
-
-
-# A training whose figures go into a table: train to the end, then read what the run's folder says of it.
-
-_MEASURED = ("first_impact_harm", "total_harm", "collision_rate")
-RESULTS = (
-    "steps",  # decisions of learners in whole updates
-    "policy_steps",  # decisions after which the kept policy was taken: the best one on the recipe's list
-    *_MEASURED,  # of the kept policy on that list
-    OBJECTIVE,  # likewise, where a learner has another objective than total
-    *(f"last_{name}" for name in _MEASURED),  # of the last one
-    "policy_sha256",  # of the kept policy's manifest, of several vehicle_i=... each
-)
-_FREE_S = 60.0  # a worker that has lost its driver may hold the folder for a moment
-
-
-def reach_results(job: TrainingJob, log: Path, stop_at: StopAt | None = None) -> list[str] | None:
-    """The values of ``RESULTS``, as text; None where the training was stopped before its end, by ``stop_at`` too.
-
-    What is printed goes to ``log``, which is deleted at a good end. Raises what a training raises, ``InvalidInput``
-    where the folder of all cannot be seen or the run's folder holds another training, and ``BlockingIOError`` where
-    another worker has just begun it.
-    """
-    if not log.parent.is_dir():
-        raise InvalidInput(
-            f"{log.parent}: is not there on {os.uname().nodename}; every computer of a cluster must see the sweep's"
-            " folder"
-        )
-    with _printing_to(log):
-        if RunDirectory(job.folder).status.is_file():
-            wait_for_others(job.folder, _FREE_S)
-            check_same(job.folder, job.training)
-            if is_finished(job.folder) and not all(
-                has_bundle(job.folder / place) for place in job.training.drivers.values()
-            ):
-                remove_folder(job.folder)  # a finished run has no checkpoint: it is trained anew
-        try:
-            finished = job.finish(stop_at=stop_at)
-        except AlreadyExists as error:  # begun in this moment by a worker that has lost its driver
-            raise BlockingIOError(str(error)) from None
-        found = read_results(job) if finished else None
-    if found is not None:
-        log.unlink(missing_ok=True)
-    return found
-
-
-def read_results(job: TrainingJob) -> list[str]:
-    """The values of ``RESULTS`` of a finished training, in the text that its table has."""
-    run = RunDirectory(job.folder)
-    table = [row for row in progress_rows(job.folder) if row.get(f"eval/{_MEASURED[0]}")]
-    if not table:
-        raise InvalidInput(f"{run.progress}: holds no evaluation; delete its folder to train anew")
-    harm = chosen_by(table, job.training.recipe.reward.harm_count, "eval/")
-    kept, last = min(table, key=lambda row: float(row[harm])), table[-1]
-    trained = read_trained(run.policy)
-    if isinstance(trained, Policy):
-        sha256 = trained.manifest.manifest_sha256
-    else:
-        sha256 = " ".join(f"{name}={policy.manifest.manifest_sha256}" for name, policy in trained.members.items())
-    measured, later = ([row[f"eval/{name}"] for name in _MEASURED] for row in (kept, last))
-    return [last["steps"], kept["steps"], *measured, kept.get(f"eval/{OBJECTIVE}", ""), *later, sha256]
-
-
-@contextmanager
-def _printing_to(log: Path) -> Iterator[None]:
-    """What this process prints inside goes to a file, from every library, and the end of an error with it."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    before = os.dup(1), os.dup(2)
-    with log.open("ab", buffering=0) as file:
-        os.dup2(file.fileno(), 1)
-        os.dup2(file.fileno(), 2)
-        try:
-            yield
-        except BaseException:
-            traceback.print_exc(file=os.fdopen(os.dup(file.fileno()), "w"))
-            raise
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            for descriptor, kept in enumerate(before, 1):
-                os.dup2(kept, descriptor)
-                os.close(kept)
 
 
 # The cost of a training on this machine, measured by a short one.

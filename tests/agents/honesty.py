@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -10,14 +9,14 @@ import numpy as np
 
 from ethbrake_marl.actions import action_to_command, command_to_action
 from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.agents.rollout import script_agents, set_others
-from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
-from ethbrake_marl.physics.messages import CHANNEL, LINK, age_s, is_periodic, link_at, links_of, place_at, ring_at
+from ethbrake_marl.agents.rollout import script_agents
+from ethbrake_marl.engine import Engine, Memory, Script, ask_script, begin_script
+from ethbrake_marl.physics import Bools, Floats, Worlds
+from ethbrake_marl.physics.messages import CHANNEL, LINK, _links, age_s, is_periodic, link_at, place_at, ring_at
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search import state_columns
 from ethbrake_marl.shield import ShieldedDriver
-from ethbrake_marl.shield.certify import Proposer, proposed_action
+from ethbrake_marl.shield.step_shield import Proposer, proposed_action
 
 
 def changed_decisions(
@@ -25,8 +24,8 @@ def changed_decisions(
 ) -> int:
     """How many decisions change when all is altered that has not reached the vehicle by then: 0 for an honest agent.
 
-    Two copies of the agent drive the first ``n`` worlds of a list, or are asked what they would do in them: one sees
-    the worlds as they are, the other one with random numbers for what was not received, at the alert and anew at each
+    The agent drives twice the first ``n`` worlds of a list, or are asked what it would do in them: once it sees
+    the worlds as they are, once with random numbers for what was not received, at the alert and anew at each
     of the first ``decisions``. Take a scenario with a channel that hides something, or nothing is altered.
 
     Args:
@@ -44,17 +43,16 @@ def changed_decisions(
     rng, alert = np.random.default_rng(seed), scenario.sample(n, seed).worlds
     scripts = script_agents(scenario, except_for=vehicle)
     if isinstance(agent, ShieldedDriver):
-        agent = Hosted(agent, scripts)
-    knowing, wondering = copy.deepcopy(agent), copy.deepcopy(agent)
+        agent = Hosted(agent)
     engine = Engine(scenario, n, learners=[vehicle], scripts=scripts, worlds=alert)
-    for driver, at_alert in ((knowing, alert), (wondering, alter_unreceived(alert, vehicle, rng))):
-        set_others(driver, vehicle, scripts)
-        driver.begin(at_alert, vehicle, np.arange(n))
+    seen = (alert, alter_unreceived(alert, vehicle, rng))
+    knowing, wondering = (begin_script(agent, at_alert, vehicle, scripts) for at_alert in seen)
     changed = 0
     for _ in range(decisions):
         now = engine.worlds
-        command = knowing.act(now, vehicle)
-        changed += int((wondering.act(alter_unreceived(now, vehicle, rng), vehicle) != command).sum())
+        command, knowing = ask_script(agent, now, knowing, vehicle)
+        other, wondering = ask_script(agent, alter_unreceived(now, vehicle, rng), wondering, vehicle)
+        changed += int((other != command).sum())
         engine.step({vehicle: command_to_action(command, now.vehicles, vehicle)})
     return changed
 
@@ -62,28 +60,31 @@ def changed_decisions(
 class Hosted:
     """Who is behind a shield, asked in worlds of the caller's as an agent is."""
 
-    def __init__(self, driver: ShieldedDriver, scripts: Mapping[int, Agent]) -> None:
-        self.driver, self.scripts, self.policy = driver, scripts, copy.deepcopy(driver.policy)
+    name = "hosted"
+    __module__ = "ethbrake_marl.hosted"  # its memory holds a shield, which that of no agent from outside may
 
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+    def __init__(self, driver: ShieldedDriver) -> None:
+        self.driver, self.policy = driver, driver.policy
+
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         options, scenario = self.driver.options, self.driver.scenario
-        set_others(self.policy, vehicle, self.scripts)
-        self.policy.begin(worlds, vehicle, rows)
         if options.believed:
-            self.shield = options.believed_shield(scenario, self.scripts)
-            self.shield.begin(worlds, vehicle, rows)
+            shield = options.believed_shield(scenario, scripts)
+            shield.begin(alert, vehicle, np.arange(alert.n))
         else:
-            self.shield = options.step_shield(scenario, vehicle, self.scripts)
-            self.shield.begin(worlds, rows, {vehicle: self.policy})
+            shield = options.step_shield(scenario, vehicle, scripts)
+            shield.begin(alert, np.arange(alert.n), {vehicle: self.policy})
+        return np.array([shield] * alert.n), begin_script(self.policy, alert, vehicle, scripts)
 
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        proposed, policies = proposed_action(self.policy, worlds, vehicle), {vehicle: self.policy}
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        (shield, *_), policy = memory
+        proposed, policy = proposed_action(self.policy, worlds, policy, vehicle)
+        proposer = Proposer({vehicle: self.policy}, {vehicle: policy}, worlds)
         if self.driver.options.believed:
-            applied = self.shield.decide(worlds, vehicle, proposed, policies)
+            applied = shield.decide(worlds, vehicle, proposed, proposer)
         else:
-            proposer = Proposer(policies, worlds)
-            applied = self.shield.decide(proposed, seen=state_columns(worlds), proposer=proposer).applied
-        return action_to_command(applied, worlds.vehicles, vehicle)
+            applied = shield.decide(proposed, seen=state_columns(worlds), proposer=proposer).applied
+        return action_to_command(applied, worlds.vehicles, vehicle), (memory[0], policy)
 
 
 def alter_unreceived(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> Worlds:
@@ -94,7 +95,7 @@ def alter_unreceived(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> 
     unknown[:, vehicle] = False  # of itself it knows
     stale = unknown.copy()  # whose present it does not know
     if is_periodic(worlds).all():
-        stale |= age_s(worlds)[:, vehicle] > 0.0
+        stale |= age_s(worlds.time_s, worlds.messages, worlds.N)[:, vehicle] > 0.0
     far = np.array([pair if pair < vehicle else pair + 1 for pair in range(N - 1)])  # of each pair, seen from here
 
     def other(values: Floats, low: float, high: float, where: Bools) -> Floats:
@@ -147,7 +148,7 @@ def _alter_messages(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> F
     columns, N = worlds.messages.copy(), worlds.N
     if not columns.shape[1]:
         return columns
-    kept = links_of(worlds)[:, vehicle].copy()
+    kept = _links(worlds.messages, N)[:, vehicle].copy()
     own = columns[:, place_at(N) + vehicle].copy()
     columns[:, [CHANNEL.KEY, CHANNEL.TAKEN]] += 5.0
     columns[:, place_at(N) :] += rng.uniform(0.5, 3.0, columns[:, place_at(N) :].shape)

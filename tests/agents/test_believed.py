@@ -8,7 +8,7 @@ import pytest
 from ethbrake_marl.agents.believed import Odometer, believed_worlds, ranges_of, told_to
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive, script_agents
-from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario, load_scenario
@@ -25,7 +25,7 @@ def engine_of(scenario: Scenario, n: int = 40, vehicle: int = 1, seed: int = 7) 
 
 def believed(engine: Engine, vehicle: int = 1, odometer: Odometer | None = None) -> Worlds:
     worlds, scenario = engine.worlds, engine.scenario
-    way = worlds.speeds_mps[:, vehicle] * worlds.time_s if odometer is None else odometer.look(worlds, vehicle)
+    way = worlds.speeds_mps[:, vehicle] * worlds.time_s if odometer is None else odometer.way_m
     scripts = script_agents(scenario, except_for=vehicle)
     return believed_worlds(worlds, vehicle, ranges_of(scenario, vehicle), scripts, way)
 
@@ -70,11 +70,11 @@ def test_believed__an_old_message_is_moved_on_by_the_script_to_the_truth() -> No
         "sensing_s": [5, 5],
     }
     engine = engine_of(BASE.replace(v2x=channel))
-    odometer = Odometer()
-    odometer.begin(engine.scenario.sample(40, 7).worlds, 1, np.arange(40))
+    odometer = Odometer.begun(engine.scenario.sample(40, 7).worlds, 1)
     for _ in range(12):
         now, told = engine.worlds, told_to(engine.worlds, 1)
         assert told.known.all() and (told.at_s[:, [0, 2]] < now.time_s[:, np.newaxis] - 0.19).all()
+        odometer = odometer.look(now, 1)
         taken = believed(engine, odometer=odometer)
         free = ~now.pair_hit.any(axis=1)
         np.testing.assert_allclose(taken.gaps_m[free], now.gaps_m[free], atol=1e-9)
@@ -85,14 +85,13 @@ def test_believed__an_old_message_is_moved_on_by_the_script_to_the_truth() -> No
 
 def test_odometer__is_exact_without_impacts() -> None:
     scenario = BASE.replace(gaps_m=[500.0, 500.0])
-    engine, odometer = engine_of(scenario, n=5), Odometer()
-    alert = scenario.sample(5, 7).worlds
-    odometer.begin(alert, 1, np.arange(5))
+    engine, alert = engine_of(scenario, n=5), scenario.sample(5, 7).worlds
+    odometer = Odometer.begun(alert, 1)
     v = alert.speeds_mps[:, 1]
     while not engine.ended.all():
-        way = odometer.look(engine.worlds, 1)
+        odometer = odometer.look(engine.worlds, 1)
         t = np.minimum(engine.worlds.time_s - 0.5, v / 7.0)
-        np.testing.assert_allclose(way, 0.5 * v + v * t - 3.5 * t * t, atol=1e-9)
+        np.testing.assert_allclose(odometer.way_m, 0.5 * v + v * t - 3.5 * t * t, atol=1e-9)
         engine.step(np.full((5, 1), -1.0))
 
 
@@ -164,8 +163,3 @@ def test_believing__a_mixture_says_too_little() -> None:
     mixture = Scenario(name="mixed", mixture=members)
     with pytest.raises(InvalidInput, match="is a mixture, and a vehicle that is not known could be of any of"):
         make_agent("e_v2x_bm:believed", scenario=mixture)
-
-
-def test_believing__act_without_begin_is_an_error() -> None:
-    with pytest.raises(InvalidInput, match="begin was not called"):
-        make_agent("e_v2x_bm:believed", scenario=BASE).act(BASE.sample(3, 7).worlds, 1)

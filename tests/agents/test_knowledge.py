@@ -16,7 +16,6 @@ from ethbrake_marl.agents.registry import agent_entries, find_entry, parse_spec
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.physics.messages import is_periodic
-from ethbrake_marl.policies.bundle import save_policy
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.scenario.v2x import PRESETS, hidden_from
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
@@ -88,9 +87,6 @@ class Silent:
     """An agent of the user's own that says nothing."""
 
     name = "silent"
-
-    def begin(self, worlds, vehicle, rows):
-        pass
 
     def act(self, worlds, vehicle):
         return np.zeros(worlds.n)
@@ -218,7 +214,7 @@ def test_channels__hide_something_to_be_altered(channel):
 @pytest.mark.parametrize("channel", ["blocked", {"preset": "blocked", "persistence": "periodic"}], ids=str)
 def test_messages__contact_features_tell_nothing_that_was_not_received(channel, tmp_path):
     scenario = BLOCKED.replace(v2x=channel)
-    save_policy(contact_policy(scenario.model_dump(mode="json")), tmp_path / "policy")
+    contact_policy(scenario.model_dump(mode="json")).save(tmp_path / "policy")
     agent = agent_of(f"counterfactual@{tmp_path}", scenario)
     assert knowledge_of(agent) == (MESSAGES,)
     assert changed_decisions(agent, scenario) == 0

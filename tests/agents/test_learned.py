@@ -8,7 +8,7 @@ from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations, ObservationSpec, observe
 from ethbrake_marl.physics import make_worlds
-from ethbrake_marl.policies.bundle import Policy
+from ethbrake_marl.policies import Policy
 from ethbrake_marl.scenario import load_scenario
 
 

@@ -10,6 +10,7 @@ from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario, load_scenario
+from tests.fixtures.asked import Asked
 
 
 @pytest.fixture(scope="module")
@@ -27,9 +28,9 @@ def test_planner__does_no_more_harm_than_its_first_plan_and_improves_on_constant
     scenario: Scenario, worlds: Worlds, harm_count: HarmCount
 ) -> None:
     agent = make_agent("planner:150", harm_count=harm_count)
-    harm = drive(worlds, agent, scenario, 1).ledger.world_harm(harm_count)
-    assert isinstance(agent, Planner)
-    assert (harm <= agent.predicted_harm + 1e-4).all()
+    episodes = drive(worlds, agent, scenario, 1)
+    harm = episodes.ledger.world_harm(harm_count)
+    assert (harm <= episodes.memories[1]["predicted_harm"] + 1e-4).all()
     assert harm.mean() < 0.7 * optimise_coupled(worlds, 1, harm_count=harm_count).harm.mean()
 
 
@@ -49,19 +50,16 @@ def test_planner__with_a_time_per_decision_plans_at_least_one_round(scenario: Sc
 def test_planner__knows_what_the_others_do(scenario: Scenario, worlds: Worlds) -> None:
     gentle = scenario.replace(roles={**scenario.roles, "vehicle_3": "constant:3"})
     agent = Planner("60")
-    harm = drive(worlds, agent, gentle, 1).ledger.world_harm("first")
-    assert (harm <= agent.predicted_harm + 1e-4).all()
+    episodes = drive(worlds, agent, gentle, 1)
+    assert (episodes.ledger.world_harm("first") <= episodes.memories[1]["predicted_harm"] + 1e-4).all()
 
 
 def test_planner__starts_new_episodes_in_some_rows(worlds: Worlds) -> None:
-    agent = Planner("20")
-    agent.begin(worlds, 1, np.arange(worlds.n))
+    agent = Asked(Planner("20")).begin(worlds, 1)
     before = agent.act(worlds, 1)
     rows = np.array([8, 2])
     agent.begin(worlds.take(rows), 1, rows)
     assert np.array_equal(agent.act(worlds, 1), before)
-    with pytest.raises(InvalidInput, match="begin was not called"):
-        Planner("20").act(worlds, 1)
 
 
 @pytest.mark.parametrize("argument", ["0", "-5", "fast", "0ms", "1.5", "5s", ""])
@@ -75,7 +73,7 @@ def test_planner__refuses_a_budget_that_is_none(argument: str) -> None:
 def test_search__decides_when_its_scenario_does(spec, time_step_s):
     scenario = load_scenario("paper-random").replace(time_step_s=time_step_s)
     agent = make_agent(spec, scenario=scenario)
-    harm = drive(scenario.sample(20, 7).worlds, agent, scenario, 1).ledger.world_harm("first")
-    assert (harm <= agent.predicted_harm + 1e-9).all()
+    episodes = drive(scenario.sample(20, 7).worlds, agent, scenario, 1)
+    assert (episodes.ledger.world_harm("first") <= episodes.memories[1]["predicted_harm"] + 1e-9).all()
     role = scenario.replace(early_impacts="keep", roles={"vehicle_2": spec, "vehicle_3": "learner"})
     assert script_agents(role)[1]._time_step_s == time_step_s

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +12,9 @@ from ethbrake_marl.agents import registry
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.evaluation.inputs import policy_sha256
-from ethbrake_marl.policies.shipped import onnx_model
+from ethbrake_marl.policies import onnx_model
 from ethbrake_marl.shield.guard import ShieldedDriver
+from tests.fixtures.asked import Asked
 
 SCENARIO = eb.load_scenario("paper-random")
 WORLDS = SCENARIO.sample(12, 7).worlds
@@ -57,8 +57,10 @@ def model():
 def test_function__drives_as_it_says_and_is_named_after_itself():
     agent = eb.policy_agent(brake)
     assert agent.name == "brake" and isinstance(agent, eb.Agent)
-    agent.begin(WORLDS, 1, np.arange(12))
-    assert agent.act(WORLDS, 1).tolist() == (-0.5 * WORLDS.vehicles.braking_capacity_mps2[:, 1]).tolist()
+    assert (
+        Asked(agent).begin(WORLDS, 1).act(WORLDS, 1).tolist()
+        == (-0.5 * WORLDS.vehicles.braking_capacity_mps2[:, 1]).tolist()
+    )
 
 
 def test_trained_model__drives_as_in_its_own_librarys_rollout(model):
@@ -75,11 +77,8 @@ def test_trained_model__drives_as_in_its_own_librarys_rollout(model):
         assert harms(agent, worlds)[0] == pytest.approx(-reward, rel=1e-5, abs=1e-5)
 
 
-def test_trained_model__is_shared_by_copies_and_driven_by_evaluate(model):
+def test_trained_model__is_driven_by_evaluate(model):
     agent = eb.policy_agent(model, name="sb3")
-    copied = copy.deepcopy(agent)
-    copied.begin(WORLDS, 1, np.arange(12))
-    assert len(copied._steps) == 12 and len(agent._steps) == 0
     found = eb.evaluate(SCENARIO.sample(12, 7), {"sb3": agent}, scenario=SCENARIO, chunk=5)
     # Torch rounds products by the size of the batch, so a chunk changes the last digits.
     assert found.outcome("sb3").first_impact_harm == pytest.approx(harms(agent), rel=1e-5)
@@ -148,7 +147,7 @@ def test_torch_module__drives_without_gradients_and_is_shared():
     def by_hand(observation):
         return module(torch.from_numpy(observation)).detach().numpy()
 
-    assert harms(copy.deepcopy(agent)).tolist() == harms(eb.policy_agent(by_hand)).tolist()
+    assert harms(agent).tolist() == harms(eb.policy_agent(by_hand)).tolist()
 
 
 def test_onnx__path_and_session_drive_as_the_policy_does(tmp_path: Path):
@@ -175,7 +174,7 @@ def no_memory(n):
 
 
 def test_memory__belongs_to_each_episode_and_goes_with_its_world():
-    agent = eb.policy_agent(ramp, initial_state=no_memory)
+    agent = Asked(eb.policy_agent(ramp, initial_state=no_memory))
     capacity = WORLDS.vehicles.braking_capacity_mps2[:, 1]
     agent.begin(WORLDS, 1, np.arange(12))
     for _ in range(3):
@@ -211,7 +210,7 @@ class Recurrent:
 
 
 def test_recurrent_model__keeps_its_state_world_by_world():
-    agent, same = eb.policy_agent(Recurrent()), eb.policy_agent(ramp, initial_state=no_memory)
+    agent, same = Asked(eb.policy_agent(Recurrent())), Asked(eb.policy_agent(ramp, initial_state=no_memory))
     for each in (agent, same):
         each.begin(WORLDS, 1, np.arange(12))
     for step in range(5):
@@ -221,7 +220,7 @@ def test_recurrent_model__keeps_its_state_world_by_world():
                 each.begin(WORLDS.take([4, 7]), 1, np.array([4, 7]))
     rows = np.array([7, 3])
     assert agent.take(rows).act(WORLDS.take(rows), 1).tolist() == same.take(rows).act(WORLDS.take(rows), 1).tolist()
-    assert harms(agent).tolist() == harms(same).tolist()
+    assert harms(agent.agent).tolist() == harms(same.agent).tolist()
 
 
 def test_recurrent_model__whose_state_has_no_axis_of_worlds_is_refused():
@@ -342,10 +341,7 @@ def test_exception__names_the_same_world_behind_every_shield(around):
 @pytest.mark.parametrize(
     ("answer", "told"),
     [
-        (
-            lambda seen: brake(seen)[:, 0],
-            r"world 0, step 1 \(0\.00 s\): gave float32 of shape \(12,\) for",
-        ),
+        (lambda seen: brake(seen)[:, 0], r"world 0, step 1 \(0\.00 s\): gave float32 of shape \(12,\) for"),
         (lambda seen: brake(seen)[:5], r"world 5, .*gave float32 of shape \(5, 1\)"),
         (lambda seen: np.where(np.arange(12) == 3, np.nan, -1.0)[:, None], r"world 3, .*in which stands nan; must be"),
         (lambda seen: 1.5 * np.eye(12)[:, 2:3], r"world 2, .*stands 1.5; must be in \[-1, 1\]; with clip=True"),
@@ -353,8 +349,7 @@ def test_exception__names_the_same_world_behind_every_shield(around):
     ],
 )
 def test_answer__that_is_no_action_names_agent_world_and_shape(answer, told):
-    agent = eb.policy_agent(answer, name="mine")
-    agent.begin(WORLDS, 1, np.arange(12))
+    agent = Asked(eb.policy_agent(answer, name="mine")).begin(WORLDS, 1)
     with pytest.raises(InvalidInput, match="agent 'mine', " + told):
         agent.act(WORLDS, 1)
 
@@ -362,8 +357,10 @@ def test_answer__that_is_no_action_names_agent_world_and_shape(answer, told):
 def test_clip__means_the_nearest_and_one_float32_step_beyond_is_always_1():
     for beyond, clip in ((1.5, True), (float(np.nextafter(np.float32(1), np.float32(2))), False)):
         agent = eb.policy_agent(lambda seen, beyond=beyond: np.full((len(seen), 1), -beyond), clip=clip)
-        agent.begin(WORLDS, 1, np.arange(12))
-        assert agent.act(WORLDS, 1).tolist() == (-WORLDS.vehicles.braking_capacity_mps2[:, 1]).tolist()
+        assert (
+            Asked(agent).begin(WORLDS, 1).act(WORLDS, 1).tolist()
+            == (-WORLDS.vehicles.braking_capacity_mps2[:, 1]).tolist()
+        )
 
 
 def test_bad_policies__are_refused_at_once(tmp_path: Path, model):
@@ -377,9 +374,7 @@ def test_bad_policies__are_refused_at_once(tmp_path: Path, model):
         eb.policy_agent(model, initial_state=no_memory)
     agent = eb.policy_agent(ramp, initial_state=lambda n: {"steps": np.zeros(3)})
     with pytest.raises(AgentFailed, match=r"initial_state\(12\): state: ndarray of shape \(3,\); its first"):
-        agent.begin(WORLDS, 1, np.arange(12))
-    with pytest.raises(InvalidInput, match="begin was not called for each"):
-        eb.policy_agent(brake).act(WORLDS, 1)
+        agent.begin(WORLDS, 1, {})
 
 
 class OwnAgent:
@@ -387,9 +382,6 @@ class OwnAgent:
 
     def __init__(self, answer):
         self.name, self.answer = "own", answer
-
-    def begin(self, worlds, vehicle, rows):
-        pass
 
     def act(self, worlds, vehicle):
         return self.answer(worlds)
@@ -443,7 +435,7 @@ def test_own_agent__without_a_name_or_with_other_parameters_is_told_what_is_wron
         eb.evaluate(SCENARIO.sample(3, 7), {"own": Nameless()}, scenario=SCENARIO)
     agent = Nameless()
     agent.name = "own"
-    told = r"'own' of vehicle_2: begin on \d+ worlds? at 0.00 s: TypeError: Nameless.begin\(\) takes 2 .* were given$"
+    told = r"'own' of vehicle_2: has begin, and act without a memory; one that remembers has begin\(alert, vehicle, scr"
     with pytest.raises(InvalidInput, match=told):
         eb.evaluate(SCENARIO.sample(3, 7), {"own": shielded(agent, around)}, scenario=SCENARIO)
 

@@ -12,6 +12,7 @@ from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.scenario import load_scenario
+from tests.fixtures.asked import Asked
 
 SCENARIO = load_scenario("paper-random")
 WORLDS = SCENARIO.sample(120, 3).worlds
@@ -27,7 +28,7 @@ def test_refined__is_never_worse_and_as_predicted(harm_count):
     agent = Refined(make_agent("constant:5"), SCENARIO, tries=8, harm_count=harm_count)
     realised = harm(agent, harm_count)
     assert (realised <= plain).all() and (realised < plain - 1.0).any()
-    assert realised.tolist() == agent.predicted_harm.tolist()
+    assert realised.tolist() == Asked(agent).begin(WORLDS, 1).predicted_harm.tolist()
 
 
 def test_refined__of_more_is_never_worse():
@@ -49,8 +50,7 @@ def test_refined__does_not_depend_on_how_the_trials_are_cut(monkeypatch):
 
 def test_refined__where_nothing_is_better_drives_as_the_policy_does():
     apart = WORLDS.take(np.flatnonzero(harm(make_agent("full_brake")) == 0.0))
-    agent = Refined(make_agent("full_brake"), SCENARIO, tries=4)
-    agent.begin(apart, 1, np.arange(apart.n))
+    agent = Asked(Refined(make_agent("full_brake"), SCENARIO, tries=4)).begin(apart, 1)
     assert agent.act(apart, 1).tolist() == (-apart.vehicles.braking_capacity_mps2[:, 1]).tolist()
 
 
@@ -61,8 +61,7 @@ def test_refined__of_one_world_is_that_of_the_batch():
 
 
 def test_begin__of_some_rows_leaves_the_others_alone():
-    agent = Refined(make_agent("constant:5"), SCENARIO, tries=3)
-    agent.begin(WORLDS, 1, np.arange(WORLDS.n))
+    agent = Asked(Refined(make_agent("constant:5"), SCENARIO, tries=3)).begin(WORLDS, 1)
     before = agent.predicted_harm.copy()
     agent.begin(WORLDS.take([7]), 1, np.array([2]))
     assert agent.predicted_harm[2] == before[7]
@@ -96,17 +95,6 @@ def test_refined__refuses_a_number_that_is_none(name, number):
 
 def test_take__goes_on_in_some_worlds_only():
     policy = make_lineup(["ppo@shipped"], SCENARIO)["ppo@shipped"]
-    agent = Refined(policy, SCENARIO, tries=3, rounds=1)
-    agent.begin(WORLDS, 1, np.arange(WORLDS.n))
+    agent = Asked(Refined(policy, SCENARIO, tries=3, rounds=1)).begin(WORLDS, 1)
     rows = np.array([5, 90])
     assert agent.take(rows).act(WORLDS.take(rows), 1).tolist() == agent.act(WORLDS, 1)[rows].tolist()
-
-
-def test_take__of_a_policy_that_cannot_is_refused():
-    with pytest.raises(InvalidInput, match=r"no take\(rows\)"):
-        Refined(make_agent("coast"), SCENARIO).take(np.array([0]))
-
-
-def test_act__before_begin_is_refused():
-    with pytest.raises(InvalidInput, match="begin was not called"):
-        Refined(make_agent("coast"), SCENARIO).act(WORLDS, 1)

@@ -11,7 +11,8 @@ from ethbrake_marl.agents.refined import RefinedProfile
 from ethbrake_marl.agents.rollout import drive, record_commands
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.search import profile_problem, refine_commands
+from ethbrake_marl.search import profile_problem
+from tests.fixtures.asked import Asked
 
 SCENARIO = load_scenario("paper-random")
 WORLDS = SCENARIO.sample(150, 3).worlds
@@ -30,9 +31,9 @@ def problem_of(worlds=WORLDS, harm_count="first", **changes):
 def test_refined__is_never_worse_and_as_predicted(spec, harm_count):
     plain = harm(eb.make_agent(spec, scenario=SCENARIO), harm_count)
     agent = RefinedProfile(eb.make_agent(spec, scenario=SCENARIO), SCENARIO, candidates=60, harm_count=harm_count)
-    realised = harm(agent, harm_count)
+    realised, predicted = harm(agent, harm_count), Asked(agent).begin(WORLDS, 1).predicted_harm
     assert (realised <= plain).all() and (realised < plain - 0.1).any()
-    assert realised.tolist() == agent.predicted_harm.tolist()
+    assert realised.tolist() == predicted.tolist()
 
 
 @pytest.mark.parametrize(
@@ -50,9 +51,10 @@ def test_refined__of_any_line_obstacle_and_step(name, vehicle, changes):
     worlds = scenario.sample(25, 4).worlds
     plain = harm(eb.make_agent("full_brake"), "total", worlds, scenario, vehicle)
     agent = RefinedProfile(eb.make_agent("full_brake"), scenario, candidates=80, harm_count="total")
-    realised = harm(agent, "total", worlds, scenario, vehicle)
+    episodes = drive(worlds, agent, scenario, vehicle)
+    realised, predicted = episodes.ledger.world_harm("total"), episodes.memories[vehicle]["predicted_harm"]
     assert (realised <= plain).all() and (realised < plain - 0.1).any()
-    assert realised.tolist() == agent.predicted_harm.tolist()
+    assert realised.tolist() == predicted.tolist()
 
 
 @pytest.mark.slow
@@ -68,7 +70,7 @@ def test_refined__of_one_world_is_that_of_the_batch_and_of_its_rows():
     every = harm(agent)
     alone = RefinedProfile(eb.make_agent("constant:5"), SCENARIO, candidates=40)
     assert harm(alone, worlds=WORLDS.take([17])).tolist() == [every[17]]
-    agent.begin(WORLDS, 1, np.arange(WORLDS.n))
+    agent = Asked(agent).begin(WORLDS, 1)
     before = agent.predicted_harm.copy()
     agent.begin(WORLDS.take([7]), 1, np.array([2]))
     assert agent.predicted_harm[2] == before[7]
@@ -84,10 +86,10 @@ def test_refined__behind_a_shield():
 def test_refine__is_a_function_of_the_world_and_the_seed():
     problem = problem_of()
     given = np.repeat(-WORLDS.vehicles.braking_capacity_mps2[:, 1:2], int(problem.last_step.max()), axis=1)
-    found = refine_commands(problem, given, budget=300)
+    found = problem.refine(given, budget=300)
     assert found.first_impact_harm.mean() < 0.5 * harm(eb.make_agent("full_brake")).mean()
-    assert refine_commands(problem, given, budget=300).commands_mps2.tobytes() == found.commands_mps2.tobytes()
-    assert refine_commands(problem, given, budget=300, seed=1).commands_mps2.tobytes() != found.commands_mps2.tobytes()
+    assert problem.refine(given, budget=300).commands_mps2.tobytes() == found.commands_mps2.tobytes()
+    assert problem.refine(given, budget=300, seed=1).commands_mps2.tobytes() != found.commands_mps2.tobytes()
 
 
 def test_refine__refuses_what_it_cannot_search(monkeypatch):
@@ -98,16 +100,16 @@ def test_refine__refuses_what_it_cannot_search(monkeypatch):
         (np.full((150, steps), -50.0), "a command is beyond the vehicle's capacity"),
     ):
         with pytest.raises(InvalidInput, match=message):
-            refine_commands(problem, given, budget=5)
+            problem.refine(given, budget=5)
     with pytest.raises(InvalidInput, match="budget"):
-        refine_commands(problem, np.zeros((150, steps)), budget=0)
+        problem.refine(np.zeros((150, steps)), budget=0)
 
     def fail(*arguments):
         arguments[-1][4] = True
 
     monkeypatch.setattr(search, "_refine_worlds", fail)
     with pytest.raises(PhysicsError, match="world 4: its commands could not be played"):
-        refine_commands(problem, np.zeros((150, steps)), budget=5)
+        problem.refine(np.zeros((150, steps)), budget=5)
 
 
 def test_refined__needs_scripts_that_are_fixed():

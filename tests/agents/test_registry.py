@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import json
 
-import numpy as np
 import pytest
 
 import ethbrake_marl as eb
@@ -107,9 +106,6 @@ class HalfBrake:
     def __init__(self, share):
         self.share = share
 
-    def begin(self, worlds, vehicle, rows):
-        pass
-
     def act(self, worlds, vehicle):
         return -self.share * worlds.vehicles.braking_capacity_mps2[:, vehicle]
 
@@ -152,6 +148,5 @@ def test_own_horizon__is_the_scenarios():
     short = SCENARIO.replace(horizon_s=4)
     worlds = short.sample(20, 1).worlds
     ours, theirs = make_agent("e_v2x_bm", scenario=short), make_agent("e_v2x_bm", horizon_s=4.0)
-    for agent in (ours, theirs):
-        agent.begin(worlds, 1, np.arange(20))
-    assert ours.predicted_harm.tolist() == theirs.predicted_harm.tolist()
+    harms = [agent.begin(worlds, 1, {})["predicted_harm"].tolist() for agent in (ours, theirs)]
+    assert harms[0] == harms[1]

@@ -9,12 +9,11 @@ from ethbrake_marl.agents import registry
 from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import make_agent, register_agent
 from ethbrake_marl.agents.rollout import drive, script_agents
-from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.common import make_engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.dataset import Task, record_episodes
-from ethbrake_marl.evaluation.episodes import film_scenes, follow_episodes, record_episode
+from ethbrake_marl.evaluation.episodes import Task, film_scenes, follow_episodes, record_episode, record_episodes
 from ethbrake_marl.observations import observation_for, observe
 from ethbrake_marl.physics import advance
 from ethbrake_marl.rewards import RewardParams
@@ -37,36 +36,37 @@ def test_e_v2x_bm__predicts_and_beats_constants_whatever_script_the_others_follo
     scenario = with_role(role)
     worlds = scenario.sample(60, 7).worlds
     agent = make_agent("e_v2x_bm")
-    realised = harm(agent, scenario, worlds)
-    np.testing.assert_allclose(realised, agent.predicted_harm, atol=1e-6)
+    episodes = drive(worlds, agent, scenario, 1)
+    realised = episodes.ledger.world_harm("first")
+    np.testing.assert_allclose(realised, episodes.memories[1]["predicted_harm"], atol=1e-6)
     for deceleration in np.linspace(0.0, 7.0, 15):
         assert (realised <= harm(make_agent(f"constant:{deceleration}"), scenario, worlds) + 1e-6).all()
 
 
 def test_e_v2x_bm__full_braking_of_the_others_is_the_papers_case():
     worlds = PAPER.sample(40, 7).worlds
-    told, alone = make_agent("e_v2x_bm"), make_agent("e_v2x_bm")
-    drive(worlds, told, PAPER, 1)
-    alone.begin(worlds, 1, np.arange(40))
-    assert sorted(told.others) == [0, 2] and not alone.others
-    assert told.deceleration_mps2.tolist() == alone.deceleration_mps2.tolist()
+    agent = make_agent("e_v2x_bm")
+    told, alone = drive(worlds, agent, PAPER, 1).memories[1], agent.begin(worlds, 1, {})
+    assert told["deceleration_mps2"].tolist() == alone["deceleration_mps2"].tolist()
 
 
 def test_e_v2x_bm__knows_who_drives_in_the_engines_of_all_interfaces():
     scenario = PAPER.replace(
         roles={"vehicle_1": "full_brake", "vehicle_2": "e_v2x_bm", "vehicle_3": "constant:3"}, early_impacts="keep"
     )
-    scripts = script_agents(scenario)
-    assert scripts[1].others == {0: scripts[0], 2: scripts[2]}
+    scenario = scenario.replace(roles={**scenario.roles, "vehicle_1": "learner"}, obstacle_gap_m=60)
+    engine = make_engine(scenario, 4, seed=3)
+    alert = scenario.sample(4, 3, channel="training").worlds
+    told = make_agent("e_v2x_bm").begin(alert, 1, script_agents(scenario))
+    alone = make_agent("e_v2x_bm").begin(alert, 1, {})
+    assert engine.memories[1]["deceleration_mps2"].tolist() == told["deceleration_mps2"].tolist()
+    assert told["deceleration_mps2"].tolist() != alone["deceleration_mps2"].tolist()
 
 
 class Steering:
     """Brakes by what it sees: nobody can look ahead through it."""
 
     name = "steering"
-
-    def begin(self, worlds, vehicle, rows):
-        pass
 
     def act(self, worlds, vehicle):
         return -3.0 / (1.0 + worlds.gaps_m[:, vehicle - 1])
@@ -75,9 +75,8 @@ class Steering:
 def test_e_v2x_bm__refuses_others_whose_command_is_not_fixed():
     worlds = PAPER.sample(2, 7).worlds
     agent = make_agent("e_v2x_bm")
-    agent.others = {2: Steering()}
     with pytest.raises(InvalidInput, match="vehicle_3 is driven by 'steering', whose command is not fixed"):
-        agent.begin(worlds, 1, np.arange(2))
+        agent.begin(worlds, 1, {2: Steering()})
 
 
 def test_e_v2x_bm__two_that_wait_for_each_other_are_refused():
@@ -100,10 +99,11 @@ def test_hybrid__its_parts_know_the_others_too():
     scenario = with_role("constant:3")
     worlds = scenario.sample(30, 7).worlds
     hybrid = HybridAgent(make_agent("e_v2x_bm", harm_count="total"), scenario)
-    realised = harm(hybrid, scenario, worlds)
-    assert realised.tolist() == hybrid.predicted_harm.tolist()
+    episodes = drive(worlds, hybrid, scenario, 1)
+    memory = episodes.memories[1]
+    assert episodes.ledger.world_harm("first").tolist() == memory["predicted_harm"].tolist()
     best = harm(make_agent("e_v2x_bm"), scenario, worlds)
-    np.testing.assert_allclose(hybrid.bound_harm, best, atol=1e-9)
+    np.testing.assert_allclose(memory["bound_harm"], best, atol=1e-9)
 
 
 @pytest.mark.parametrize("script", ["copy_leader", "gentlest_front"])
@@ -146,10 +146,7 @@ def test_drive__a_policy_as_a_role_does_what_it_does_when_it_is_driven():
     both = with_roles(vehicle_2="learner", vehicle_3="learner")
     worlds = driven.sample(20, 7).worlds
     harm = drive(worlds, universal, driven, 1).ledger.world_harm("first")
-    for episodes in (
-        drive(worlds, braking, role, 2),
-        drive(worlds, Team({1: universal, 2: braking}, "both"), both),
-    ):
+    for episodes in (drive(worlds, braking, role, 2), drive(worlds, Team({1: universal, 2: braking}, "both"), both)):
         assert np.abs(episodes.ledger.world_harm("first") - harm).max() < 1e-9
     assert 0.0 < harm.mean() < drive(worlds, braking, driven, 1).ledger.world_harm("first").mean()
 
@@ -158,9 +155,6 @@ class Swinging:
     """Brakes the harder the later it is: every decision is another command."""
 
     name = "swinging"
-
-    def begin(self, worlds, vehicle, rows):
-        pass
 
     def act(self, worlds, vehicle):
         return -worlds.vehicles.braking_capacity_mps2[:, vehicle] * (0.3 + 0.6 * np.sin(7.0 * worlds.time_s) ** 2)

@@ -19,9 +19,9 @@ import yaml
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.results import write_per_world_csv
+from ethbrake_marl.evaluation.results import write_per_world
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.learning.train import train
+from ethbrake_marl.learning.runs import train
 from ethbrake_marl.scenario import load_scenario
 
 SCENARIO = "paper-random"
@@ -62,7 +62,7 @@ def sizes(folder: Path) -> dict[str, float]:
     scenario = load_scenario(SCENARIO)
     found = {}
     driven = evaluate(scenario.sample(1000, 7), {"full_brake": make_agent("full_brake")}, scenario=scenario)
-    write_per_world_csv(folder / "worlds.csv", driven)
+    write_per_world(folder / "worlds.csv", driven)
     found["world of evaluate --per-world (CSV)"] = (folder / "worlds.csv").stat().st_size / 1000
     settings = {"total_steps": 1, "evaluation.worlds": 100}
     grid = {"scenario": SCENARIO, "recipe": "ppo", "seed": {"count": 2}}

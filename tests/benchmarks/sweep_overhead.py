@@ -32,24 +32,25 @@ def no_work(row: list[str]) -> list[str]:
 def empty_jobs(folder: Path, jobs: int) -> None:
     """Plan and record so many jobs of no work."""
     # torch takes seconds to load, and the processes that load this file again need none
-    from ethbrake_marl.studies.sweep import Row, SweepPlan, plan_sweep, read_sweep, run_sweep
+    from ethbrake_marl.studies.sweep import Row, SweepPlan
 
     grid = {"scenario": ["paper-random", "paper-distance"], "recipe": ["ppo", "sac"], "seed": {"count": jobs // 4}}
     file = folder / "sweep.yaml"
     file.write_text(yaml.safe_dump({"grid": grid}))
     started, before = time.monotonic(), time.process_time()
-    plan = plan_sweep(read_sweep(file))
+
+    class OfNoWork(SweepPlan):
+        def job(self, row: Row, folder: Path, log: Path) -> Job:
+            return Job(row.name, no_work, (NOTHING,))
+
+    plan = OfNoWork.read(file)
     planned = time.monotonic()
-
-    def job_of(plan: SweepPlan, row: Row, folder: Path, log: Path) -> Job:
-        return Job(row.name, no_work, (NOTHING,))
-
     with closing(LocalWorkers(2)) as workers:
-        result = run_sweep(plan, folder / "out", workers, job_of=job_of)
+        result = plan.run(folder / "out", workers)
     wall_s, cpu_s = time.monotonic() - started, time.process_time() - before
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(
-        f"{result.finished:,} jobs of no work: planned in {planned - started:.0f} s, all in {wall_s:.0f} s"
+        f"{result.counts['finished']:,} jobs of no work: planned in {planned - started:.0f} s, all in {wall_s:.0f} s"
         f" ({cpu_s:.0f} s of the driver's processor time, {1000.0 * cpu_s / jobs:.2f} ms a job), peak {peak:.2f} GiB"
     )
 

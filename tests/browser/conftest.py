@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ import pytest
 
 from ethbrake_marl.evaluation import Evaluation, evaluate, summarise
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.pages.report import Report, ReportFigure, focus_of, play_for_report, write_report
+from ethbrake_marl.pages.page import Part
+from ethbrake_marl.pages.report import Report
 from ethbrake_marl.scenario import load_scenario
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -70,16 +72,15 @@ def compared() -> Evaluation:
 @pytest.fixture(scope="session")
 def report_file(compared: Evaluation, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of ``compared``."""
-    from ethbrake_marl.figures.evaluation import harm_against_total_gap
+    from ethbrake_marl.figures import harm_against_total_gap
 
     rows = summarise(compared)
-    focus = focus_of(rows)
     agents = make_lineup(AGENTS, compared.scenario)
-    figure = ReportFigure("Harm against the gap", "Mean harm by gap.", harm_against_total_gap(compared))
+    figure = Part.drawing(harm_against_total_gap(compared), "Harm against the gap", "Mean harm by gap.")
     report = Report(
-        "paper-random: four agents", rows, compared, play_for_report(compared, agents, focus), None, focus, [figure],
+        "paper-random: four agents", rows, compared, figures=[figure],
         summary="A report for the tests.", settings={"Seed": 7}, versions={"numpy": "2"},
     )  # fmt: skip
     path = tmp_path_factory.mktemp("report") / "report.html"
-    write_report(path, report)
+    replace(report.driven(agents), shield=None).write(path)
     return path

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from ethbrake_marl.defaults import LIST_SEED
+from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.evaluation import Evaluation, evaluate
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.physics import Worlds
@@ -115,7 +115,7 @@ def evaluated(worlds: Worlds, scenario: Scenario, saved: Scenario | None = None)
 
 def test_explorer__begins_with_the_world_of_the_list(open_explorer: Open, scenario: Scenario) -> None:
     page = open_explorer()
-    expected = evaluated(scenario.sample(1, LIST_SEED, first=1).worlds, scenario)
+    expected = evaluated(scenario.sample(1, DEFAULT.LIST_SEED, first=1).worlds, scenario)
     shown = harms(page)
     assert {name: shown[name] for name in AGENTS} == expected
     text = page.inner_text("[data-part=harms]")
@@ -237,11 +237,11 @@ def test_profile__is_drawn_by_hand_and_beats_the_policy(open_explorer: Open, sce
     commands = page.evaluate(f"{EXPLORER}.editor.commands")
     assert len(commands) == 75 and len(set(commands[:30])) > 5 and min(commands) >= -7.0
     drawn = harms(page)["by hand"]
-    from ethbrake_marl.pages.explorer.answer import Explored, outcome, read_profile
+    from ethbrake_marl.pages.explorer import Explored, HandDriven, outcome, read_profile
 
-    world = scenario.sample(1, LIST_SEED, first=1).worlds
+    world = scenario.sample(1, DEFAULT.LIST_SEED, first=1).worlds
     explored = Explored(scenario, make_lineup(["full_brake"], scenario))
-    expected = outcome("by hand", explored.follow(world, explored.by_hand(read_profile(commands))))
+    expected = outcome("by hand", explored.follow(world, HandDriven(read_profile(commands), scenario.time_step_s)))
     assert drawn == (expected["impacts"], expected["first"], expected["total"])
 
     wait_until(page, f"!!{EXPLORER}.best")
@@ -309,7 +309,7 @@ def test_other_world__is_fetched(open_explorer: Open, scenario: Scenario) -> Non
     page.get_by_role("button", name="World after").click()
     wait_until(page, f"{IDLE} && document.querySelector('[data-part=number]').value === '2'")
     wait_until(page, f"{EXPLORER}.found.world.conditions.includes('d')")
-    expected = evaluated(scenario.sample(1, LIST_SEED, first=2).worlds, scenario)
+    expected = evaluated(scenario.sample(1, DEFAULT.LIST_SEED, first=2).worlds, scenario)
     wait_until(page, f"{EXPLORER}.found.outcomes[0].total === {expected['full_brake'][2]}")
     assert {name: value for name, value in harms(page).items() if name in AGENTS} == expected
 

@@ -11,11 +11,12 @@ import pytest
 
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.figures.evaluation import harm_against_total_gap
-from ethbrake_marl.pages.report import Report, ReportFigure, focus_of, play_for_report, write_report
+from ethbrake_marl.figures import harm_against_total_gap
+from ethbrake_marl.pages.page import Part
+from ethbrake_marl.pages.report import Report
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies.reproduction.folder import choose_items, reproduce
-from ethbrake_marl.studies.reproduction.item import Settings
+from ethbrake_marl.studies.reproduction.items import Settings
 from tests.browser.conftest import AGENTS
 from tests.pages.hostile import HOSTILE
 from tests.pages.test_frame import whole_page
@@ -143,7 +144,7 @@ def test_report__hostile_agent_is_text_in_the_player(open_page: Open, tmp_path: 
     found = evaluate(scenario.sample(12, 7), agents, scenario=scenario, seed=7)
     rows = summarise(found)
     path = tmp_path / "report.html"
-    write_report(path, Report("t", rows, found, play_for_report(found, agents, rows[0].agent), None, rows[0].agent))
+    Report("t", rows, found, focus=rows[0].agent).driven(agents).write(path)
     page = open_page(path)
     page.on("dialog", lambda dialog: pytest.fail(dialog.message))
     for key in "123456789":
@@ -164,9 +165,9 @@ def long_names_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     agents = dict(zip(names, make_lineup(["constant:2", "constant:3"], scenario).values(), strict=True))
     found = evaluate(scenario.sample(12, 7), agents, scenario=scenario, seed=7)
     rows, focus = summarise(found), names[0]
-    played = play_for_report(found, agents, focus)
     path = tmp_path_factory.mktemp("long") / "report.html"
-    write_report(path, Report("t", rows, found, played, None, focus, versions={names[0]: "1", names[1]: "y" * 64}))
+    versions = {names[0]: "1", names[1]: "y" * 64}
+    Report("t", rows, found, focus=focus, versions=versions).driven(agents).write(path)
     return path
 
 
@@ -177,10 +178,9 @@ def test_report__of_ten_thousand_worlds_is_small_and_soon_ready(open_page: Open,
     agents = make_lineup(names, scenario)
     found = evaluate(scenario.sample(10_000, 7), agents, scenario=scenario, seed=7)
     rows = summarise(found)
-    focus = focus_of(rows)
-    figure = ReportFigure("Harm against the gap", "Mean harm by gap.", harm_against_total_gap(found))
+    figure = Part.drawing(harm_against_total_gap(found), "Harm against the gap", "Mean harm by gap.")
     path = tmp_path / "report.html"
-    write_report(path, Report("t", rows, found, play_for_report(found, agents, focus), None, focus, [figure]))
+    Report("t", rows, found, figures=[figure]).driven(agents).write(path)
     page = open_page(path)
     ready = page.evaluate("performance.now()")
     assert page.evaluate("document.querySelector('.player').classList.contains('ready')")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ethbrake_marl.search import search_profiles
+from ethbrake_marl.search import ProfileProblem
 
 
 def refused(answer, *fragments: str) -> None:
@@ -90,12 +90,13 @@ def test_scenario__a_search_without_bounds_is_refused(ethbrake, scenario_file, s
 def test_scenario__trying_a_search_has_a_budget(ethbrake, scenario_file, monkeypatch, script):
     budgets = []
 
+    search = ProfileProblem.search
+
     def watched(*args, budget, **kwargs):
         budgets.append(budget)
-        return search_profiles(*args, budget=budget, **kwargs)
+        return search(*args, budget=budget, **kwargs)
 
-    monkeypatch.setattr("ethbrake_marl.agents.planner.search_profiles", watched)
-    monkeypatch.setattr("ethbrake_marl.agents.planner.search_profiles", watched)
+    monkeypatch.setattr(ProfileProblem, "search", watched)
     path = scenario_file("\n  vehicle_3: full_brake\n", f"\n  vehicle_3: {script}\n")
     path.write_text(path.read_text().replace("early_impacts: reject", "early_impacts: keep"))
     assert ethbrake("scenario", "validate", path).status == 0
@@ -340,7 +341,7 @@ WRONG = [
     ("benchmark v2 --agent coost", "can drive no list of it: unknown agent 'coost'"),
     ("benchmark v2 --agent coast --output x.yaml", "an entry must end in .json"),
     ("benchmark table none.json", "none.json: no such file"),
-    ("benchmark table none.json --output x.pdf", "the table must end in .html or .htm or .md"),
+    ("benchmark table none.json --output x.pdf", "the table must end in .md"),
     ("benchmark table", "Missing argument"),
     (
         "evaluate --set recipe.gamma=1 --episodes 3",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -39,11 +40,11 @@ def test_bench__prints_a_table_and_the_machine(ethbrake, efforts):
     assert answer.status == 0
     lines = answer.out.splitlines()
     (engine,) = (line for line in lines if "engine step" in line)
-    assert [cell.strip() for cell in engine.split("│")[1:-1]] == [
+    assert re.split(r"  +", engine.strip()) == [
         "engine step", "1,024", "9.88 M world-steps", "9.00 M - 10.0 M", "29.6 M", "8.00 M",
     ]  # fmt: skip
     (start,) = (line for line in lines if "import and first step" in line)
-    assert [cell.strip() for cell in start.split("│")[3:-1]] == ["0.91 s", "0.9 - 0.95", "", "2"]
+    assert re.split(r"  +", start.strip())[2:] == ["0.91 s", "0.9 - 0.95", "2"]
     assert "512 worlds" in answer.out
     assert lines[-1].startswith(f"Machine: {this_machine().processor}, ")
     assert efforts == [benchmark.FULL] * 3

@@ -103,10 +103,7 @@ def test_other_worlds_or_scenarios__are_refused_in_one_line(results: Path, tmp_p
         ('[{"agent": "x", "episodes": 3}]', r"\(kind is missing\)"),
         ('{"kind": "best-harm"}', "results of best-harm cannot be compared; those of evaluate, shield"),
         ('{"kind": "evaluate-shards", "seed": 7}', "agents is missing or no list of objects"),
-        (
-            '[{"kind": "evaluate", "agent": "x", "episodes": 3}]',
-            "worlds_sha256 is missing or no str: evaluate again",
-        ),
+        ('[{"kind": "evaluate", "agent": "x", "episodes": 3}]', "worlds_sha256 is missing or no str: evaluate again"),
     ],
 )
 def test_read_result__refuses_what_is_no_result(tmp_path: Path, text: str, reason: str) -> None:

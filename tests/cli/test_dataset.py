@@ -69,7 +69,7 @@ def test_dataset__without_the_extra_says_the_line_that_installs_it(
 def test_dataset__what_cannot_be_is_refused_in_one_line(
     ethbrake: Command, options: tuple[str, ...], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ethbrake_marl.evaluation.dataset.need", lambda package: None)
+    monkeypatch.setattr("ethbrake_marl.evaluation.episodes.need", lambda package: None)
     answer = ethbrake("watch", "dataset", "--episodes", "2", *options)
     assert answer.status == 2 and message in answer.err and len(answer.err.splitlines()) == 1
     assert list(tmp_path.iterdir()) == []

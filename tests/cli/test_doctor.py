@@ -11,7 +11,7 @@ import pytest
 from packaging.requirements import Requirement
 
 from ethbrake_marl import physics, scenario
-from ethbrake_marl.agents import e_v2x_bm_kernel
+from ethbrake_marl.agents import e_v2x_bm
 from ethbrake_marl.cli import doctor
 from ethbrake_marl.cli.doctor import Check, diagnose
 
@@ -85,13 +85,13 @@ def test_physics__a_kernel_that_gives_other_harm_fails(monkeypatch):
 
 
 def test_baseline__another_optimum_fails(monkeypatch):
-    exact = e_v2x_bm_kernel.optimise_pairwise
+    exact = e_v2x_bm.optimise_pairwise
 
     def shifted(worlds, vehicle):
         best = exact(worlds, vehicle)
         return best._replace(deceleration_mps2=best.deceleration_mps2 + 1e-4)
 
-    monkeypatch.setattr(e_v2x_bm_kernel, "optimise_pairwise", shifted)
+    monkeypatch.setattr(e_v2x_bm, "optimise_pairwise", shifted)
     assert not found("baseline").ok
 
 

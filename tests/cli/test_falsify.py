@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ethbrake_marl.evaluation.inputs import named_worlds_text, read_named_worlds
+from ethbrake_marl.evaluation.inputs import NamedWorlds
 from tests.cli.conftest import Command
 
 FOUND = ("search", "falsify", "--agent", "coast", "--against", "full_brake", "--budget", "300", "--keep", "4")
@@ -22,9 +22,9 @@ def file(ethbrake: Command, tmp_path: Path) -> Path:
 
 
 def test_falsify__writes_worlds_that_evaluate_takes_and_that_read_back(ethbrake: Command, file: Path) -> None:
-    kept = read_named_worlds(file)
+    kept = NamedWorlds.read(file)
     assert [world.name for world in kept.worlds] == ["regret-1", "regret-2", "regret-3", "regret-4"]
-    assert named_worlds_text(kept) == file.read_text("utf-8")
+    assert kept.text == file.read_text("utf-8")
     answer = ethbrake("evaluate", "--initial-states", file, "--agents", "coast,full_brake", "--json")
     rows = json.loads(answer.out)
     regret = rows[0]["first_impact_harm"] - rows[1]["first_impact_harm"]
@@ -43,7 +43,7 @@ def test_falsify_again__says_who_is_worse(ethbrake: Command, file: Path) -> None
 def test_falsify__tells_the_command_that_finds_the_same(ethbrake: Command, file: Path) -> None:
     again = ethbrake(*FOUND, "--json")
     told = json.loads(again.out)
-    assert told["worlds"] == [world.model_dump(exclude_none=True) for world in read_named_worlds(file).worlds]
+    assert told["worlds"] == [world.model_dump(exclude_none=True) for world in NamedWorlds.read(file).worlds]
     assert told["found_by"].startswith("ethbrake search falsify --agent coast --measure regret --against full_brake")
 
 
@@ -51,8 +51,8 @@ def test_falsify__tells_the_command_that_finds_the_same(ethbrake: Command, file:
     ("change", "said"),
     [
         (("scenario: paper-random", "scenario: paper-distance"), "which 'paper-distance' is not, or is no longer"),
-        (("harm_count: first", "harm_count: second"), "line 8: harm_count: "),
-        (("    score: ", "    skore: "), "worlds.0.score: Field required"),
+        (("harm_count: first", "harm_count: second"), "line 8: harm_count = second: must be first or total"),
+        (("    score: ", "    skore: "), "worlds[0].skore: unknown key; did you mean score?"),
         (("name: regret-2", "name: regret-1"), "world 'regret-1' is given twice"),
         (("gap_2_m", "gap_3_m"), "gap_3_m"),
         (("version: 1", "version: 2"), "line 2: version"),
@@ -112,4 +112,4 @@ def test_falsify__as_many_worlds_as_it_keeps_read_back(ethbrake: Command, tmp_pa
         "200",
     ]
     assert ethbrake(*call, "--budget", "512", "--at-random", "--output", path).status == 0
-    assert path.stat().st_size > 64 << 10 and len(read_named_worlds(path).worlds) == 200
+    assert path.stat().st_size > 64 << 10 and len(NamedWorlds.read(path).worlds) == 200

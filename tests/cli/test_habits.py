@@ -13,10 +13,10 @@ import pytest
 from numba.core import event
 
 from ethbrake_marl import __version__
-from ethbrake_marl.cli import command, doctor, out
+from ethbrake_marl.cli import app as frame, command, doctor
 from ethbrake_marl.cli.app import app, run_command
 from ethbrake_marl.kernel_store import cache_folder
-from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.compiling import compiled
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -82,11 +82,12 @@ def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, 
     folder = tmp_path / ("ethbrake_marl-x" if temporary else "kept")
     folder.mkdir()
     monkeypatch.setattr("ethbrake_marl.kernel_store.cache_folder", lambda: folder)
-    monkeypatch.setattr("ethbrake_marl.kernel_store._loaded", loaded)
+    monkeypatch.setattr("ethbrake_marl.physics.compiling.cache_folder", lambda: folder)
+    monkeypatch.setattr("ethbrake_marl.physics.compiling._loaded", loaded)
     monkeypatch.setattr("ethbrake_marl.kernel_store._tellers", [])
     monkeypatch.setitem(event._registered, "numba:compile", [])  # nobody listens any more after this test
     monkeypatch.setattr("warnings.showwarning", None)
-    out.prepare_streams()
+    frame.prepare_streams()
 
     @compiled
     def next_number(x: int) -> int:
@@ -96,7 +97,7 @@ def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, 
     assert next_number(1.5) == 2.5
     captured = capsys.readouterr()
     assert captured.out == "" and told in captured.err and captured.err.count("\n") == 1
-    monkeypatch.setattr(out, "EVERY_S", 0.0)
+    monkeypatch.setattr(frame, "EVERY_S", 0.0)
     assert next_number(1j) == 1 + 1j
     assert re.search(r"^compiling: \d+ kernels in \d+ s so far$", capsys.readouterr().err, re.MULTILINE)
 

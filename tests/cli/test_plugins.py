@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from ethbrake_marl.cli.app import app
-from ethbrake_marl.cli.command import whole_command
+from ethbrake_marl.cli.app import app, whole_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files import plugins
 from ethbrake_marl.scenario import new_scenario_text
@@ -185,14 +184,7 @@ def test_bad_plugin__is_one_clear_error_on_every_command(ethbrake, tmp_path, con
     path = tmp_path / "bad.py"
     if content is not None:
         path.write_text(content)
-    for command in (
-        (
-            "agent",
-            "list",
-        ),
-        ("scenario", "list"),
-        ("train", "--steps", "64"),
-    ):
+    for command in (("agent", "list"), ("scenario", "list"), ("train", "--steps", "64")):
         answer = ethbrake(*command, "--plugin", path)
         assert (answer.status, answer.err.count("\n")) == (2, 1)
         assert f"plug-in '{path}'" in answer.err and told in answer.err

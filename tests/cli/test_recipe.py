@@ -11,7 +11,7 @@ import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.evaluation.inputs import load_runnable
-from ethbrake_marl.files.yaml import changed_parts, parse_overrides
+from ethbrake_marl.files.yaml import Override
 from ethbrake_marl.learning.recipe import load_recipe, new_recipe_text, read_settings, shipped_recipes
 
 Run = Callable[..., Any]
@@ -57,14 +57,14 @@ def test_new__writes_a_file_that_validates_and_never_over_another(ethbrake: Run,
 
 def test_settings__are_typed_by_the_rules_of_yaml() -> None:
     texts = ["a=1", "b=0.5", "c=true", "d=x", "e={uniform: [1, 2]}", "f.g.h=null", "i='1'"]
-    assert changed_parts({}, parse_overrides(texts)) == {
+    assert Override.put({}, Override.parse(texts)) == {
         "a": 1, "b": 0.5, "c": True, "d": "x", "e": {"uniform": [1, 2]}, "f": {"g": {"h": None}}, "i": "1",
     }  # fmt: skip
 
 
 def test_settings__go_into_mappings_and_lists_and_leave_the_rest() -> None:
     content = {"a": {"b": [1, 2], "c": 3}, "d": 4}
-    assert changed_parts(content, parse_overrides(["a.b.1=5", "a.e=6"])) == {"a": {"b": [1, 5], "c": 3, "e": 6}}
+    assert Override.put(content, Override.parse(["a.b.1=5", "a.e=6"])) == {"a": {"b": [1, 5], "c": 3, "e": 6}}
     assert content == {"a": {"b": [1, 2], "c": 3}, "d": 4}
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.evaluation.episodes import Passport, follow_episodes, issue_passport
+from ethbrake_marl.evaluation.episodes import Passport, follow_episodes
 from ethbrake_marl.scenario import load_scenario, new_scenario_text
 from tests.pages.hostile import HOSTILE, UNSEEN
 
@@ -18,7 +18,7 @@ def passport_of(spec: str, scenario_name: str | Path = "paper-random", *, seed: 
     agent = make_agent(spec, scenario=scenario)
     worlds = scenario.sample(1, 7, first=world).worlds
     (motion,) = follow_episodes(worlds, agent, scenario)
-    return str(issue_passport(motion, scenario, spec, seed=seed, number=world))
+    return str(Passport.of(motion, scenario, spec, seed=seed, number=world))
 
 
 def test_replay__is_the_same_episode_bit_for_bit(ethbrake):

@@ -17,11 +17,11 @@ from typing import Any
 import pytest
 
 from ethbrake_marl.agents.policy import LearnedAgent
-from ethbrake_marl.cli.out import Out
+from ethbrake_marl.cli.command import Out
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.figures.evaluation import learning_curve
-from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.figures import learning_curve
+from ethbrake_marl.policies import load_policy
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies import experiment as results_folder
 from ethbrake_marl.studies.experiment import write_figures
@@ -167,7 +167,7 @@ def test_run__the_learning_curve_has_the_lines_of_its_references(monkeypatch, fi
     monkeypatch.setattr(
         results_folder, "learning_curve", lambda *a, **k: drawn.append(learning_curve(*a, **k)) or drawn[0]
     )
-    monkeypatch.setattr(results_folder, "picture_bytes", lambda *given: b"")
+    monkeypatch.setattr(results_folder, "write_picture", lambda *given, **settings: None)
     course = [{"steps": 0.0, "first_impact_harm": 30.0, "total_harm": 33.0, "collision_rate": 1.0}]
     write_figures(tmp_path, result, summarise(result), course=course, course_caption="", agents=agents)
     labels = [text.get_text() for text in drawn[0].legends[0].get_texts()]

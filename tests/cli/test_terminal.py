@@ -6,8 +6,7 @@ import pytest
 import typer
 from rich.console import Console
 
-from ethbrake_marl.cli.command import command
-from ethbrake_marl.cli.out import Out
+from ethbrake_marl.cli.command import Out, command
 
 
 def test_progress__without_a_terminal_news_are_lines(capsys):
@@ -26,7 +25,7 @@ def test_progress__without_a_terminal_news_are_lines(capsys):
 
 def test_progress__without_a_terminal_every_ten_seconds_bring_a_line_with_the_time_that_is_left(capsys, monkeypatch):
     times = iter((100.0, 105.0, 110.5, 111.0, 121.0))
-    monkeypatch.setattr("ethbrake_marl.cli.out.time.monotonic", lambda: next(times))
+    monkeypatch.setattr("ethbrake_marl.cli.command.time.monotonic", lambda: next(times))
     out = Out()
     for done in (0, 100, 210, 220, 420):
         out.progress("ppo", done, 1000)

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from ethbrake_marl.evaluation.inputs import scenario_sha256, worlds_sha256
-from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.policies import load_policy
 from ethbrake_marl.scenario import load_scenario
 from tests.cli.conftest import TINY_RECIPE
 from tests.cli.test_bad_input import refused

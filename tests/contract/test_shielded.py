@@ -22,8 +22,7 @@ from ethbrake_marl.envs.gym import EthBrakeVectorEnv
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
-from tests.contract import interfaces
-from tests.contract import test_contract as bare
+from tests.contract import interfaces, test_contract as bare
 from tests.contract.interfaces import PAPER, actions
 from tests.contract.shielded import SHIELDED, STEP
 

@@ -114,8 +114,7 @@ TABLES: dict[str, How] = {
     "| agents | worlds | processor time": _by(SPEED),
     # lists of worlds
     "| Agent | Knows | Collisions": _by(
-        NIGHTLY,
-        "ethbrake evaluate --agents full_brake,e_v2x_bm,e_v2x_bm:pairwise --episodes 10000 --seed 7 --json",
+        NIGHTLY, "ethbrake evaluate --agents full_brake,e_v2x_bm,e_v2x_bm:pairwise --episodes 10000 --seed 7 --json"
     ),
     "| agent | collisions | avoidable ones": _by(
         NIGHTLY, "ethbrake evaluate --agents ladder --scenario paper-random --episodes 10000 --seed 7 --json"
@@ -214,10 +213,7 @@ PICTURES: dict[str, How] = {
     "deceleration.png": _by(
         NIGHTLY, "ethbrake watch picture deceleration --scenario paper-random --world 5 --output deceleration.png"
     ),
-    "sampled-convergence.png": _by(
-        NIGHTLY,
-        "python docs/studies/sampling.py sampled-convergence.png",
-    ),
+    "sampled-convergence.png": _by(NIGHTLY, "python docs/studies/sampling.py sampled-convergence.png"),
     "shield-robustness.png": _by(
         SEARCH, "ethbrake watch picture robustness --agent ppo@shipped --episodes 300 --output shield-robustness.png"
     ),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.figures.style import picture_bytes
+from ethbrake_marl.figures import picture_bytes
 from tests.docs.site import DOCS, load
 
 drawings = load("../drawings")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ethbrake_marl.agents.e_v2x_bm_kernel import optimise_pairwise, pairwise_harm
+from ethbrake_marl.agents.e_v2x_bm import optimise_pairwise, pairwise_harm
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.scenario import load_scenario, scenario_path, worlds_from_table
 from tests.docs.blocks import (

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.policies.shipped import shipped_policies
+from ethbrake_marl.policies import shipped_policies
 from tests.docs.site import DOCS, load
 
 ROOT = DOCS.parent

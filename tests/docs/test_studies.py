@@ -12,8 +12,8 @@ import pytest
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.figures.style import picture_bytes
-from ethbrake_marl.limits.best_harm import best_known
+from ethbrake_marl.figures import picture_bytes
+from ethbrake_marl.limits.limits import best_known
 from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.scenario import Task, load_scenario
 from ethbrake_marl.studies.speed import Effort
@@ -101,13 +101,13 @@ class Slow:
 
     name, knows = "slow", "own sensors"
 
-    def begin(self, worlds, vehicle, rows):
-        until = time.process_time() + 2e-3 * worlds.n
+    def begin(self, alert, vehicle, scripts):
+        until = time.process_time() + 2e-3 * alert.n
         while time.process_time() < until:
             pass
 
-    def act(self, worlds, vehicle):
-        return np.zeros(worlds.n)
+    def act(self, worlds, memory, vehicle):
+        return np.zeros(worlds.n), memory
 
 
 def test_equal_time__tells_the_harm_of_an_evaluation_and_the_time_it_took():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.engine import snapshot
-from ethbrake_marl.engine.snapshot import Offsets, branch, join_moments, moment_of, play_to_the_end
+from ethbrake_marl import engine as snapshot
+from ethbrake_marl.engine import Offsets, branch, first_moments, join_moments, moment_of, play_to_the_end
 from ethbrake_marl.envs.common import make_engine
 from ethbrake_marl.errors import InvalidInput
 
@@ -45,7 +45,7 @@ def test_branch__without_an_offset_is_what_the_engine_does(learners):
     to_come = [sum(r[:, vehicle] for r in rewards[k:]) for k in range(5)]
     np.testing.assert_allclose(gained, np.concatenate(to_come), rtol=1e-12)
     assert (moved == 0.0).all() and gained.min() < 0.0
-    assert all((a == b).all() for a, b in zip(before, moment_of(engine), strict=True))  # untouched
+    assert all((a == b).all() for a, b in zip(before[:4], moment_of(engine)[:4], strict=True))  # untouched
 
 
 def test_branch__discounts_from_its_own_moment_on():
@@ -116,12 +116,56 @@ def test_branch__refuses_what_it_cannot_play():
     shaped = make_engine("paper-random", 2, reward={"harm": 1.0, "shaping": 0.1})
     with pytest.raises(InvalidInput, match=r"branches: reward: shaping = 0.1: must be 0"):
         branch(shaped, moment_of(shaped))
+
+
+@pytest.mark.parametrize("script", ["planner:8", "e_v2x_bm", "ppo@shipped"])
+def test_branch__of_a_script_that_remembers_is_what_the_engine_does(script):
+    roles = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": script}
     scenario = eb.load_scenario("paper-random").replace(
-        early_impacts="keep", roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "planner:8"}
+        early_impacts="keep", roles=roles, latency_s=[0.1, 0.4, {"uniform": [0.2, 0.7]}]
     )
-    remembering = make_engine(scenario, 2)
-    with pytest.raises(InvalidInput, match="vehicle_3 is driven by 'planner:8', which remembers its episode"):
-        branch(remembering, moment_of(remembering))
+    engine = make_engine(scenario, 3, seed=3)
+    _, start = first_moments(engine, 3)
+    assert all(np.array_equal(a, b) for a, b in zip(start[:4], moment_of(engine)[:4], strict=True))
+    for _ in range(4):
+        engine.step(np.full((3, 1), -0.4))
+    rows = np.array([2, 0, 2])
+    new = branch(engine, moment_of(engine).take(rows))
+    while not engine.ended.all():
+        engine.step(np.full((3, 1), -0.6))
+    while not new.ended.all():
+        new.step(np.full((3, 1), -0.6))
+    assert new.ledger.total_harm.tolist() == engine.ledger.total_harm[rows].tolist()
+    assert new.worlds.gaps_m.tolist() == engine.worlds.gaps_m[rows].tolist()
+
+
+def ramp(seen, state):
+    """Brakes harder with every step: what it does depends on its memory alone."""
+    return -np.minimum(state, 10.0) / 10.0, state + 1.0
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"believed": True}, {"mode": "episode"}, {"mode": "robust", "uncertainty": "gaps_m=0.5"}], ids=str
+)
+def test_branch__under_a_shield_around_a_policy_with_a_memory_is_what_the_engine_does(options):
+    policy = eb.policy_agent(ramp, initial_state=lambda n: np.zeros((n, 1)), name="ramp")
+    env = eb.shield(eb.make_sb3_vec_env("paper-random", 5, seed=2), policy, **options)
+    env.reset()
+    engine = env.unwrapped.engine
+    for _ in range(4):
+        engine.step({})
+    rows = np.array([4, 0, 0, 3])
+    kept = moment_of(engine)
+    harms = []
+    for again in range(2):
+        new = branch(engine, kept.take(rows))
+        while not new.ended.all():
+            new.step({})
+        harms.append(new.ledger.total_harm.tolist())
+        while again == 0 and not engine.ended.all():
+            engine.step({})
+    assert harms == [engine.ledger.total_harm[rows].tolist()] * 2
+    assert engine.ledger.total_harm.any()
 
 
 def test_branch__ends_where_nothing_can_change_any_more(monkeypatch):

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.engine.stream import Stream
+from ethbrake_marl.engine import Engine, Stream
 from ethbrake_marl.envs.common import make_engine
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics import advance, concatenate
+from ethbrake_marl.physics import Worlds, advance
 from ethbrake_marl.scenario import initial_state_worlds, load_scenario
 
 PAPER = load_scenario("paper-random").replace(early_impacts="keep")
@@ -38,12 +37,13 @@ class Remembering:
     name = "remembering"
     refuses = False
 
-    def begin(self, worlds, vehicle, rows):
+    def begin(self, alert, vehicle, scripts):
         if self.refuses:
             raise InvalidInput("remembering: will not begin")
+        return None
 
-    def act(self, worlds, vehicle):
-        return np.full(worlds.n, -5.0)
+    def act(self, worlds, memory, vehicle):
+        return np.full(worlds.n, -5.0), memory
 
 
 @pytest.mark.parametrize("first", [None, Remembering()])
@@ -95,8 +95,8 @@ def test_renew__a_watcher_that_fails_leaves_the_running_episodes_alone():
 
 def test_renew__leaves_what_the_other_rows_wanted():
     class ByTheClock(Remembering):
-        def act(self, worlds, vehicle):
-            return -worlds.time_s
+        def act(self, worlds, memory, vehicle):
+            return -worlds.time_s, memory
 
     running = engine(third=ByTheClock())
     running.step({1: np.zeros(2)})
@@ -119,7 +119,7 @@ def test_reset__takes_worlds_at_the_alert_only():
 def test_stream__gives_every_world_of_its_list_once_and_in_order_across_its_blocks():
     scripts = {0: make_agent("full_brake"), 2: make_agent("constant:5")}
     stream = Stream(PAPER, [1], scripts, seed=4)
-    taken = concatenate([stream.take(count).alert for count in (1000, 100, 3000, 50)])
+    taken = Worlds.concatenate([stream.take(count).alert for count in (1000, 100, 3000, 50)])
     expected = PAPER.sample(4150, 4, channel="training").worlds
     assert (taken.gaps_m == expected.gaps_m).all() and (taken.speeds_mps == expected.speeds_mps).all()
 
@@ -154,16 +154,16 @@ class Counting:
 
     name = "counting"
 
-    def __init__(self, n, adds=0.1):
-        self.made, self.asked_s, self.adds = np.zeros(n, np.int64), np.zeros((n, 99)), adds
+    def __init__(self, adds=0.1):
+        self.adds = adds
 
-    def begin(self, worlds, vehicle, rows):
-        self.made[rows], self.asked_s[rows] = 0, 0.0
+    def begin(self, alert, vehicle, scripts):
+        return {"made": np.zeros(alert.n, np.int64), "asked_s": np.zeros((alert.n, 99))}
 
-    def act(self, worlds, vehicle):
-        self.asked_s[np.arange(worlds.n), self.made] = worlds.time_s
-        self.made += 1
-        return -5.0 - self.adds * (self.made % 7)
+    def act(self, worlds, memory, vehicle):
+        memory["asked_s"][np.arange(worlds.n), memory["made"]] = worlds.time_s  # its own copy
+        memory["made"] += 1
+        return -5.0 - self.adds * (memory["made"] % 7), memory
 
 
 OWN_GRID = PAPER.replace(latency_s=[0.03, {"uniform": [0.2, 0.7]}, 0.55], horizon_s=3.0)
@@ -172,9 +172,8 @@ OWN_GRID = PAPER.replace(latency_s=[0.03, {"uniform": [0.2, 0.7]}, 0.55], horizo
 @pytest.mark.parametrize("learners", [(1,), (2,), (1, 2), ()])
 def test_script__decides_on_its_own_grid_whoever_learns(learners):
     worlds = OWN_GRID.sample(5, 3).worlds
-    counting = Counting(5)
     others = {i: make_agent("full_brake") for i in (1, 2) if i not in learners}
-    running = Engine(OWN_GRID, 5, learners=learners, scripts={0: counting, **others}, worlds=worlds)
+    running = Engine(OWN_GRID, 5, learners=learners, scripts={0: Counting(), **others}, worlds=worlds)
     paid = 0.0
     while not running.ended.all():
         paid = paid + running.step(np.full((5, len(learners)), -1.0)).reward[:, 0]
@@ -182,9 +181,9 @@ def test_script__decides_on_its_own_grid_whoever_learns(learners):
     assert np.abs(paid + ledger).max() < 1e-9 and ledger.max() > 1.0
     for row, end_s in enumerate(running.worlds.time_s):
         made = decisions_before(end_s)
-        assert counting.made[row] == made
-        assert counting.asked_s[row, :made] == pytest.approx(0.03 + 0.1 * np.arange(made), abs=1e-9)
-    scripts = {0: Counting(5), 1: make_agent("full_brake"), 2: make_agent("full_brake")}
+        assert running.memories[0]["made"][row] == made
+        assert running.memories[0]["asked_s"][row, :made] == pytest.approx(0.03 + 0.1 * np.arange(made), abs=1e-9)
+    scripts = {0: Counting(), 1: make_agent("full_brake"), 2: make_agent("full_brake")}
     alone = Engine(OWN_GRID, 5, learners=(), scripts=scripts, deciders=(0,), worlds=worlds)
     while not alone.ended.all():
         alone.step({})
@@ -196,16 +195,15 @@ def decisions_before(end_s):
 
 
 def test_script__of_which_a_row_is_renewed_remembers_the_others_as_they_were():
-    counting = Counting(4)
-    scripts = {0: counting, 2: make_agent("full_brake")}
+    scripts = {0: Counting(), 2: make_agent("full_brake")}
     running = Engine(OWN_GRID, 4, learners=(1,), scripts=scripts, seed=1)
     for _ in range(4):
         running.step(np.zeros((4, 1)))
-    made, wanted, packed = counting.made.copy(), running.wanted_mps2.copy(), running.packed.state.copy()
+    made, wanted, packed = running.memories[0]["made"], running.wanted_mps2.copy(), running.packed.state.copy()
     running.renew(np.array([1]))
     start_s = running.packed.state[1, 0]
     expected = np.where(np.arange(4) == 1, decisions_before(start_s), made)
-    assert counting.made.tolist() == expected.tolist()
+    assert running.memories[0]["made"].tolist() == expected.tolist()
     for row in (0, 2, 3):
         assert running.wanted_mps2[row].tolist() == wanted[row].tolist()
         assert running.packed.state[row].tolist() == packed[row].tolist()
@@ -213,7 +211,7 @@ def test_script__of_which_a_row_is_renewed_remembers_the_others_as_they_were():
 
 def test_script__that_never_changes_its_mind_changes_no_bit():
     runs = []
-    for third in (Counting(20, adds=0.0), make_agent("constant:5")):
+    for third in (Counting(adds=0.0), make_agent("constant:5")):
         running = Engine(OWN_GRID, 20, learners=(1,), scripts={0: make_agent("full_brake"), 2: third}, seed=5)
         rng = np.random.default_rng(0)
         runs.append([running.step(rng.uniform(-1.0, 1.0, (20, 1))).reward for _ in range(20)])
@@ -223,7 +221,7 @@ def test_script__that_never_changes_its_mind_changes_no_bit():
 
 def test_jerk__of_a_learner_is_counted_over_the_step_though_a_script_decides_within_it():
     runs = []
-    for first in (Counting(3), make_agent("full_brake")):
+    for first in (Counting(), make_agent("full_brake")):
         scripts = {0: first, 2: make_agent("full_brake")}
         running = Engine(OWN_GRID, 3, learners=(1,), scripts=scripts, reward={"harm": 0.0, "jerk": 1.0}, seed=5)
         runs.append([running.step(np.full((3, 1), action)).further["jerk"][:, 1] for action in (-1.0, 0.5, -0.3, 1.0)])

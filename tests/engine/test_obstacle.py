@@ -7,7 +7,7 @@ import numpy as np
 import ethbrake_marl as eb
 from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.envs.common import make_engine
-from ethbrake_marl.physics import advance, concatenate
+from ethbrake_marl.physics import Worlds, advance
 from ethbrake_marl.scenario import load_scenario
 
 ALL = load_scenario("cooperation-4-all")
@@ -53,7 +53,7 @@ def test_infos__tell_the_same_shares_as_the_ledger():
 
 def test_engine__worlds_that_are_given_may_have_an_obstacle_or_none_whatever_the_scenario_says():
     plain = load_scenario("cooperation-3-pair")
-    given = concatenate([NEAR.sample(2, 1).worlds, plain.sample(2, 1).worlds])
+    given = Worlds.concatenate([NEAR.sample(2, 1).worlds, plain.sample(2, 1).worlds])
     for scenario in (plain, ALL.with_learners([1, 2])):
         engine = make_engine(scenario, 4, seed=1)
         engine.reset(worlds=given)

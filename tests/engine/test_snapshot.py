@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.engine.snapshot import engine_snapshot, restore_engine
+from ethbrake_marl.engine import Engine, engine_snapshot, restore_engine
 from ethbrake_marl.envs.common import make_engine
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.engine.snapshot import engine_snapshot, restore_engine
+from ethbrake_marl.engine import engine_snapshot, restore_engine
 from ethbrake_marl.envs.common import describe_worlds
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import load_scenario, read_scenario
-from ethbrake_marl.scenario.fields import quantity_columns
+from ethbrake_marl.scenario.sampling import QUANTITY
 
 MIXED = load_scenario("realistic-mixed")
 BOTH = read_scenario(
@@ -29,7 +29,7 @@ def expected(seed: int, world: int) -> dict[str, Any]:
     assert sample.scenarios is not None
     found: dict[str, Any] = {"scenario": sample.scenarios[0].item(), "world_seed": seed, "world": world}
     found |= {f"vehicle_{i + 1}_type": sample.types[0, i].item() for i in range(3)}
-    return found | {name: column[0].item() for name, column in quantity_columns(sample.worlds).items()}
+    return found | {name: column[0].item() for name, column in QUANTITY.columns(sample.worlds).items()}
 
 
 def rows(columns: dict[str, Any]) -> list[dict[str, Any]]:

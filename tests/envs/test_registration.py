@@ -51,7 +51,7 @@ def test_import__stays_light_until_a_name_is_used_and_lets_gymnasium_make_it_by_
         "import gymnasium; e = gymnasium.make('ethbrake_marl:EthBrake-v0'); print(e.unwrapped)\n"
         "e.reset(seed=0); e.step(e.action_space.sample())\n"
         "a = eb.EthBrakeEnv(render_mode='ansi'); a.reset(seed=0); a.render()\n"
-        "print(e.unwrapped.engine._memories, p.engine._memories, *{'PIL', 'pygame', 'matplotlib'} & set(sys.modules))"
+        "print(e.unwrapped.engine._watched, p.engine._watched, *{'PIL', 'pygame', 'matplotlib'} & set(sys.modules))"
     )
     first, second, third, watched_and_drawn = run(program).splitlines()
     assert first == "[]"

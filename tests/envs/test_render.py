@@ -15,8 +15,7 @@ from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import api_test, parallel_api_test, render_test
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.drawing.frame import HEIGHT, WIDTH
-from ethbrake_marl.envs.drawing.scene import BODY_M, Trace, View, follow, kept_motions, scenes
+from ethbrake_marl.envs.drawing import BODY_M, HEIGHT, WIDTH, Trace, View, follow
 from ethbrake_marl.envs.parallel import env, parallel_env
 from ethbrake_marl.errors import InvalidInput, MissingExtra
 from tests.envs.lines import CRASH, REST
@@ -99,8 +98,8 @@ def test_scene__has_the_numbers_of_the_infos_and_the_places_of_the_physics() -> 
     infos: dict[str, Any] = {}
     while environment.agents:
         infos = environment.step({"vehicle_2": [-0.3]})[4]
-    motions = kept_motions(environment.engine, trace)
-    shown = [scene for motion in motions for scene in scenes(environment.engine, motion, 0)]
+    motions = trace.motions(environment.engine)
+    shown = [scene for motion in motions for scene in motion.scenes(environment.engine, 0)]
     record = eb.record_episode(
         environment.engine.scenario.sample(1, seed=7, channel="training").worlds,
         eb.make_agent("coast"), scenario=environment.engine.scenario,

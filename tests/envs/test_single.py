@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.gym import EthBrakeEnv
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import ObservationSpec

@@ -9,14 +9,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.evaluation import (
-    Evaluation,
-    evaluate,
-    markdown_table,
-    record_episode,
-    summarise,
-    write_per_world_csv,
-)
+from ethbrake_marl.evaluation import Evaluation, SummaryTable, evaluate, record_episode, summarise, write_per_world
 from ethbrake_marl.evaluation.measures import FAR_M
 from ethbrake_marl.evaluation.rollout import ShovedFront
 from ethbrake_marl.physics import advance_sampled
@@ -124,10 +117,10 @@ def test_both__are_in_json_csv_and_the_table(evaluation: Evaluation, tmp_path: P
     assert found["sampled_harm"] == pytest.approx(outcome.sampled_harm.mean())
     low, high = found["sampled_harm_interval"]
     assert low < found["sampled_harm"] < high
-    line = next(line for line in markdown_table([row]).splitlines() if line.startswith("| gap"))
+    line = next(line for line in SummaryTable([row]).markdown().splitlines() if line.startswith("| gap"))
     assert f" {found['sampled_harm']:.2f} [" in line and f" {found['vehicle_1_shoved_m']:.2f} [" in line
     assert f" {100 * found['vehicle_1_shoved_far_rate']:.1f} % [" in line
-    write_per_world_csv(tmp_path / "out.csv", evaluation)
+    write_per_world(tmp_path / "out.csv", evaluation)
     with (tmp_path / "out.csv").open(newline="") as stream:
         lines = [line for line in csv.DictReader(stream) if line["agent"] == "gap"]
     assert [float(line["vehicle_1_shoved_m"]) for line in lines] == outcome.shoved_m.tolist()
@@ -139,8 +132,8 @@ def test_none__is_null_in_json_empty_in_csv_and_a_dash_in_the_table(tmp_path: Pa
     (row,) = summarise(result)
     found = row.to_json()
     assert found["vehicle_1_shoved_m"] is found["vehicle_1_shoved_far_rate"] is found["sampled_harm"] is None
-    write_per_world_csv(tmp_path / "out.csv", result)
+    write_per_world(tmp_path / "out.csv", result)
     with (tmp_path / "out.csv").open(newline="") as stream:
         (line,) = csv.DictReader(stream)
     assert line["vehicle_1_shoved_m"] == line["sampled_harm"] == ""
-    assert "| – | – | – |" in markdown_table([row])
+    assert "| – | – | – |" in SummaryTable([row]).markdown()

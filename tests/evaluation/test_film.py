@@ -12,7 +12,6 @@ from PIL import Image
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.envs.drawing.frame import draw_frame
 from ethbrake_marl.errors import InvalidInput, MissingExtra
 from ethbrake_marl.evaluation import episodes
 from ethbrake_marl.evaluation.episodes import film_bytes, film_scenes
@@ -60,7 +59,7 @@ def test_film__as_gif_plays_in_real_time_and_ends_with_the_longest() -> None:
 
 def test_film__a_title_of_any_length_and_kind_stays_left_of_the_clock() -> None:
     shown = film_scenes(WORLD, eb.make_agent("coast"), scenario=CRASH)[:1]
-    frames = [draw_frame(shown[0]._replace(title=title)) for title in ("", "\u202e\x1b" + "long/name " * 400)]
+    frames = [shown[0]._replace(title=title).frame() for title in ("", "\u202e\x1b" + "long/name " * 400)]
     differs = (frames[0] != frames[1]).any(axis=2)
     assert differs[:30, :560].any() and not differs[:, 560:].any() and not differs[30:].any()
 
@@ -77,7 +76,7 @@ def test_film__as_mp4_plays_in_real_time(tmp_path: Path) -> None:
 def test_film__as_mp4_without_its_library_says_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(MissingExtra, match=r"pip install 'ethbrake-marl\[render\]'"):
-        episodes.check_ending(".mp4")
+        episodes.check_film(".mp4")
 
 
 def test_film__as_svg_moves_every_vehicle_as_its_scenes_say() -> None:

@@ -42,7 +42,7 @@ def test_frame__is_made_by_the_library_that_is_there(
     planted: Any = ModuleType(library)
     planted.DataFrame = lambda columns: (library, columns)
     monkeypatch.setitem(sys.modules, library, planted)
-    monkeypatch.setattr("ethbrake_marl.evaluation.results.find_spec", lambda name: name == library or None)
+    monkeypatch.setattr("ethbrake_marl.evaluation.measures.find_spec", lambda name: name == library or None)
     made, columns = evaluation.to_frame()
     assert made == library and len(columns["agent"]) == 40
 
@@ -50,7 +50,7 @@ def test_frame__is_made_by_the_library_that_is_there(
 def test_frame__without_any_library_is_a_mapping_of_columns(
     evaluation: eb.Evaluation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ethbrake_marl.evaluation.results.find_spec", lambda name: None)
+    monkeypatch.setattr("ethbrake_marl.evaluation.measures.find_spec", lambda name: None)
     assert isinstance(evaluation.to_frame(), dict)
     with pytest.raises(UnknownName, match="did you mean 'pandas'"):
         evaluation.to_frame("panda")

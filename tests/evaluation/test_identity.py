@@ -14,7 +14,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.evaluation.inputs import policy_sha256, scenario_sha256, worlds_sha256
-from ethbrake_marl.evaluation.shield_modes import compare_modes, modes_to_json
+from ethbrake_marl.evaluation.shield_modes import compare_modes
 from ethbrake_marl.scenario import Task
 from tests.failing_worlds import plant
 
@@ -105,7 +105,7 @@ def test_shield_results__leave_the_same_worlds_out_of_the_hash() -> None:
     task = Task(SCENARIO, (1,))
     sample = replace(SAMPLE, worlds=plant(SAMPLE.worlds, [3]))
     rows = compare_modes({"ppo": eb.make_agent("ppo@shipped", scenario=SCENARIO)}, sample.worlds, task)
-    told = modes_to_json(rows, sample, task)
+    told = rows.to_json(sample, task)
     kept = np.delete(np.arange(60), 3)
     assert {row["worlds_sha256"] for row in told} == {worlds_sha256(SAMPLE.worlds.take(kept), SAMPLE.index[kept])}
     assert told[0]["episodes"] == 59

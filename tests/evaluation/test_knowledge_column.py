@@ -11,9 +11,9 @@ import pytest
 from rich.console import Console
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation import Evaluation, evaluate, markdown_table, rich_table, summarise, write_per_world_csv
+from ethbrake_marl.evaluation import Evaluation, evaluate, summarise, write_per_world
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.pages.report import Report, render_report
+from ethbrake_marl.pages.report import Report
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies.experiment import results_csv
 
@@ -27,9 +27,6 @@ BLOCKED = load_scenario("cooperation-2-blocked")
 
 class Silent:
     name = "silent"
-
-    def begin(self, worlds, vehicle, rows):
-        pass
 
     def act(self, worlds, vehicle):
         return np.zeros(worlds.n)
@@ -53,22 +50,22 @@ def clear() -> Evaluation:
 
 def terminal(result: Evaluation) -> str:
     console = Console(width=160, file=io.StringIO(), color_system=None)
-    console.print(rich_table(summarise(result)))
+    console.print(summarise(result).terminal())
     return " ".join(console.file.getvalue().split())
 
 
 def told(result: Evaluation) -> tuple[str, ...]:
     """Everything that is written about a result for people."""
-    return terminal(result), markdown_table(summarise(result)), render_report(Report("Mine", summarise(result)))
+    return terminal(result), summarise(result).markdown(), Report("Mine", summarise(result)).html
 
 
 def test_knowledge__is_a_column_of_every_table(clear: Evaluation) -> None:
     rows = summarise(clear)
     assert [row.to_json()["knows"] for row in rows] == [*KNOWN, "not stated"]
-    for text in (markdown_table(rows), render_report(Report("Mine", rows)), terminal(clear)):
+    for text in (rows.markdown(), Report("Mine", rows).html, terminal(clear)):
         for spec, known in (*zip(SPECS, KNOWN, strict=True), ("mine", "not stated")):
             assert spec in text and known in text
-    lines = markdown_table(rows).splitlines()
+    lines = rows.markdown().splitlines()
     assert lines[0].startswith("| Agent | Knows | ")
     assert lines[4].startswith("| ppo@shipped/ppo+episode | messages + true model | ")
     assert {line.count("|") for line in lines[:7]} == {lines[0].count("|")}
@@ -99,13 +96,13 @@ def test_knowledge__where_nothing_is_hidden_nobody_is_marked(v2x: object) -> Non
 
 
 def hidden_words(result: Evaluation) -> list[str]:
-    page = render_report(Report("Mine", summarise(result))).partition(">How to read the tables</h2>")[0]
-    texts = (terminal(result), markdown_table(summarise(result)), page)
+    page = Report("Mine", summarise(result)).html.partition(">How to read the tables</h2>")[0]
+    texts = (terminal(result), summarise(result).markdown(), page)
     return [word for text in texts for word in ("†", "hides", "Not stated") if word in text]
 
 
 def test_knowledge__stands_in_every_line_of_the_worlds(tmp_path: Path, hiding: Evaluation) -> None:
-    write_per_world_csv(tmp_path / "out.csv", hiding)
+    write_per_world(tmp_path / "out.csv", hiding)
     with (tmp_path / "out.csv").open(newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     assert [row["knows"] for row in rows] == [each for each in (*KNOWN, "not stated") for _ in range(12)]

@@ -10,10 +10,10 @@ import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import PhysicsError
-from ethbrake_marl.evaluation import Evaluation, evaluate, markdown_table, summarise, write_per_world_csv
+from ethbrake_marl.evaluation import Evaluation, evaluate, summarise, write_per_world
 from ethbrake_marl.evaluation.inputs import make_agents
-from ethbrake_marl.pages.report import Report, render_report
-from ethbrake_marl.physics import Floats, Ints, Worlds
+from ethbrake_marl.pages.report import Report
+from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
 from tests.failing_worlds import planted_list, without
 
@@ -26,15 +26,14 @@ class Failing:
 
     name = "failing"
 
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        self.hard = np.flatnonzero(worlds.gaps_m[:, 1] == HARD)
-        self.decisions = 0
+    def begin(self, alert: Worlds, vehicle: int, scripts: object) -> tuple[Bools, Ints]:
+        return alert.gaps_m[:, 1] == HARD, np.zeros(alert.n, np.int64)
 
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        self.decisions += 1
-        if self.decisions == 3 and self.hard.size:
-            raise PhysicsError({int(row): "planted" for row in self.hard})
-        return -worlds.vehicles.braking_capacity_mps2[:, vehicle]
+    def act(self, worlds: Worlds, memory: tuple[Bools, Ints], vehicle: int) -> tuple[Floats, tuple[Bools, Ints]]:
+        hard, decisions = memory
+        if (wrong := np.flatnonzero(hard & (decisions == 2))).size:
+            raise PhysicsError({int(row): "planted" for row in wrong})
+        return -worlds.vehicles.braking_capacity_mps2[:, vehicle], (hard, decisions + 1)
 
 
 @pytest.fixture(scope="module")
@@ -86,16 +85,16 @@ def test_table_json_and_report__say_how_many_and_which(found: Evaluation) -> Non
     assert all(row["episodes"] == 9 for row in told)
     assert all([left["world"] for left in row["left_out"]] == [3, 7, 10] for row in told)
     assert told[0]["left_out"][2] == {"world": 10, "seed": SEED, "agent": "failing", "reason": "planted"}
-    for text in (markdown_table(rows), render_report(Report("title", rows))):
+    for text in (rows.markdown(), Report("title", rows).html):
         assert "LEFT OUT for every agent: 3 of 12 worlds" in text
         assert "world 10 of seed 7 (failing: planted)" in text
     well = summarise(replace(found, left_out=()))
     assert well[0].to_json()["left_out"] == []
-    assert "LEFT OUT" not in markdown_table(well)
+    assert "LEFT OUT" not in well.markdown()
 
 
 def test_csv__has_a_row_for_each_that_says_so(found: Evaluation, tmp_path) -> None:
-    write_per_world_csv(tmp_path / "worlds.csv", found)
+    write_per_world(tmp_path / "worlds.csv", found)
     rows = list(csv.DictReader((tmp_path / "worlds.csv").read_text("utf-8").splitlines()))
     assert len(rows) == 5 * N
     lost = [row for row in rows if row["ended"].startswith("left out")]

@@ -10,8 +10,9 @@ import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.evaluation import Evaluation, check_target, evaluate, write_per_world_csv
-from ethbrake_marl.evaluation.results import REGRET_COLUMNS, write_output
+from ethbrake_marl.evaluation import Evaluation, check_target, evaluate, write_per_world
+from ethbrake_marl.evaluation.measures import Regrets
+from ethbrake_marl.evaluation.results import write_output
 from ethbrake_marl.scenario import Scenario, worlds_from_table
 
 
@@ -25,14 +26,14 @@ def column(rows: list[dict[str, str]], name: str) -> np.ndarray:
 
 
 def test_per_world__one_row_per_world_and_agent(tmp_path: Path, evaluation: Evaluation) -> None:
-    write_per_world_csv(tmp_path / "out.csv", evaluation)
+    write_per_world(tmp_path / "out.csv", evaluation)
     rows = read(tmp_path / "out.csv")
     assert [row["agent"] for row in rows] == [a for a in ("full_brake", "constant:4.5", "gap") for _ in range(200)]
     assert [int(row["world"]) for row in rows] == 3 * list(range(200))
 
 
 def test_per_world__every_number_reads_back_as_the_same_bits(tmp_path: Path, evaluation: Evaluation) -> None:
-    write_per_world_csv(tmp_path / "out.csv", evaluation)
+    write_per_world(tmp_path / "out.csv", evaluation)
     rows = [row for row in read(tmp_path / "out.csv") if row["agent"] == "gap"]
     outcome, worlds = evaluation.outcome("gap"), evaluation.worlds
     expected = {
@@ -57,11 +58,11 @@ def test_per_world__every_number_reads_back_as_the_same_bits(tmp_path: Path, eva
     for name, values in expected.items():
         np.testing.assert_array_equal(column(rows, name), values.astype(float), err_msg=name)
     assert {row["ended"] for row in rows} == {"at_rest"}
-    assert set(rows[0]) == {"agent", "knows", "world", "hidden", "ended", *expected, *REGRET_COLUMNS}
+    assert set(rows[0]) == {"agent", "knows", "world", "hidden", "ended", *expected, *Regrets.COLUMNS}
 
 
 def test_per_world__the_initial_columns_make_the_same_worlds_again(tmp_path: Path, evaluation: Evaluation) -> None:
-    write_per_world_csv(tmp_path / "out.csv", evaluation)
+    write_per_world(tmp_path / "out.csv", evaluation)
     rows = [row for row in read(tmp_path / "out.csv") if row["agent"] == "full_brake"]
     names = ("gap_1_m", "gap_2_m", "speed_1_mps", "speed_2_mps", "speed_3_mps")
     worlds = worlds_from_table({name: column(rows, name) for name in names}, evaluation.scenario)
@@ -72,7 +73,7 @@ def test_per_world__the_initial_columns_make_the_same_worlds_again(tmp_path: Pat
 def test_per_world__a_quantity_that_differs_between_worlds_has_its_columns(tmp_path: Path, pair: Scenario) -> None:
     columns = {"gap_1_m": [1.0, 1.0], "speed_1_mps": [20.0, 20.0], "speed_2_mps": [20.0, 20.0]}
     worlds = worlds_from_table({**columns, "latency_2_s": [0.5, 0.25], "mass_1_t": [4.5, 4.5]}, pair)
-    write_per_world_csv(tmp_path / "out.csv", evaluate(worlds, {"b": make_agent("full_brake")}, scenario=pair))
+    write_per_world(tmp_path / "out.csv", evaluate(worlds, {"b": make_agent("full_brake")}, scenario=pair))
     rows = read(tmp_path / "out.csv")
     assert [row["latency_2_s"] for row in rows] == ["0.5", "0.25"]
     assert [row["latency_1_s"] for row in rows] == ["0.0", "0.0"]
@@ -84,9 +85,9 @@ def test_per_world__overwrites_only_by_force(tmp_path: Path, evaluation: Evaluat
     path = tmp_path / "out.csv"
     path.write_text("mine")
     with pytest.raises(AlreadyExists, match="is there already"):
-        write_per_world_csv(path, evaluation)
+        write_per_world(path, evaluation)
     assert path.read_text() == "mine"
-    write_per_world_csv(path, evaluation, force=True)
+    write_per_world(path, evaluation, force=True)
     assert path.read_text().startswith("agent,world,gap_1_m")
     assert [file.name for file in tmp_path.iterdir()] == ["out.csv"]
 

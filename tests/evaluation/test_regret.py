@@ -11,22 +11,13 @@ import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import IncompleteTable
-from ethbrake_marl.evaluation import (
-    Evaluation,
-    Outcome,
-    evaluate,
-    markdown_table,
-    parameters,
-    summarise,
-    write_per_world_csv,
-)
-from ethbrake_marl.evaluation.measures import assess
-from ethbrake_marl.evaluation.summary import SummaryTable
+from ethbrake_marl.evaluation import Evaluation, Outcome, evaluate, summarise, write_per_world
+from ethbrake_marl.evaluation.measures import SummaryTable
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.limits import limits as limits_module
 from ethbrake_marl.limits.limits import Unproven, known_limits, unproven_because
-from ethbrake_marl.physics import concatenate
-from ethbrake_marl.physics.advance import no_obstacle_harm
+from ethbrake_marl.physics import Worlds
+from ethbrake_marl.physics.batch import Impacts
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 
 # Four worlds by hand: the first is avoidable, the second is in the table, in the third the agent is below the table,
@@ -50,7 +41,7 @@ def outcome(evaluation: Evaluation, harms: tuple[list[float], list[float]]) -> O
     first, total = (np.column_stack([harm, np.zeros(len(harm))]) for harm in harms)
     count = (total > 0.0).astype(np.int64)
     final = evaluation.worlds.take(np.arange(len(first)))
-    ledger = Ledger(first, total, count, *no_obstacle_harm(final.n), final.vehicles.mass_t)
+    ledger = Ledger(first, total, count, *Impacts.no_obstacle(final.n), final.vehicles.mass_t)
     return Outcome(ledger, final, np.ones(len(first), np.bool_), None, None)
 
 
@@ -81,7 +72,7 @@ def first_worlds(evaluation: Evaluation, n: int) -> Evaluation:
 
 @pytest.mark.filterwarnings("ignore::ethbrake_marl.errors.IncompleteTable")
 def test_best_known__is_the_witness_the_table_or_an_agent(four: Evaluation) -> None:
-    found = assess(four)
+    found = four.regrets
     assert found is not None
     assert found.first_impact_harm.tolist() == [0.0, 2.0, 3.0, 6.0]
     assert found.total_harm.tolist() == [0.0, 3.0, 5.0, 7.0]
@@ -95,7 +86,7 @@ def test_best_known__is_the_witness_the_table_or_an_agent(four: Evaluation) -> N
 @pytest.mark.filterwarnings("ignore::ethbrake_marl.errors.IncompleteTable")
 def test_best_known__rounding_below_the_table_is_not_below_it(four: Evaluation) -> None:
     close = outcome(four, ([1.0, 2.0 - 9e-7, 4.0 - 2e-6, 6.0], [1.0, 4.0, 6.0, 7.0]))
-    found = assess(Evaluation(four.scenario, (1,), four.worlds, four.index, 7, {"a": close}))
+    found = Evaluation(four.scenario, (1,), four.worlds, four.index, 7, {"a": close}).regrets
     assert found is not None
     assert found.below(close).tolist() == [False, False, True, False]
     assert found.source.tolist() == ["witness", "table", "below_table", "agents"]
@@ -127,7 +118,7 @@ def test_distance__a_best_that_is_not_known_everywhere_realises_nothing(four: Ev
     assert agent["mean_regret_total"] == 0.5
     assert full["mean_regret"] == (10.0 + 8.0 + 7.0 + 4.0) / 4.0
     assert (full["below_best_known"], agent["below_best_known"]) == (0, 1)
-    table = markdown_table(summarise(four))
+    table = summarise(four).markdown()
     assert "WARNING: the table of best known harm holds 2 of these 4 worlds" in table
     assert "≥ 0.75" in table
     assert "Found beforehand in 75.0 % of the worlds" in table
@@ -139,13 +130,13 @@ def test_limits__of_a_list_longer_than_its_table_are_told_in_a_warning_and_of_no
 ) -> None:
     agents = {"full_brake": make_agent("full_brake")}
     listed, unlisted = (paper_random.sample(8, seed).worlds for seed in (7, 4711))
-    for worlds, holds in ((listed, True), (unlisted, False), (concatenate([listed, unlisted]), None)):
+    for worlds, holds in ((listed, True), (unlisted, False), (Worlds.concatenate([listed, unlisted]), None)):
         found = evaluate(worlds, agents, scenario=paper_random, aftermath=False)
         with nullcontext() if holds is not None else pytest.warns(IncompleteTable):
             (row,) = summarise(found)
         known = row.known_best_share
         assert known is not None and (known == 1.0) == bool(holds)
-        assert (row.to_json()["best_known_warning"] is None) == ("WARNING" not in markdown_table([row]))
+        assert (row.to_json()["best_known_warning"] is None) == ("WARNING" not in SummaryTable([row]).markdown())
         assert (row.warning == "") == (holds is not None)
         assert ("WARNING" in SummaryTable([row])._repr_html_()) == (holds is None)
 
@@ -173,7 +164,7 @@ def test_summary__has_the_fields_of_the_limit(evaluation: Evaluation) -> None:
             gap = found[f"best_known_{name}"] - found["proven_harm"]
             assert 0.0 <= found[f"best_known_minus_proven_{count}"] == pytest.approx(gap, rel=1e-9)
         assert json.loads(json.dumps(found, allow_nan=False)) == found
-    assert parameters(evaluation)["no_limits_because"] is None
+    assert evaluation.conditions["no_limits_because"] is None
 
 
 @pytest.mark.parametrize(
@@ -204,9 +195,9 @@ def test_limits__an_obstacle_out_of_vehicle_1_s_own_reach_leaves_avoidability_an
     assert row["impact_proven_rate"] == other["impact_proven_rate"] > 0.0
     assert 0.0 < row["proven_harm"] <= row["best_known_first_impact_harm"] <= row["best_known_total_harm"]
     assert row["mean_regret"] is not None and row["parameters"]["no_limits_because"] is None
-    text = markdown_table(summarise(result))
+    text = summarise(result).markdown()
     assert f"proven: no less than {row['proven_harm']:.2f}" in text
-    write_per_world_csv(tmp_path / "out.csv", result)
+    write_per_world(tmp_path / "out.csv", result)
     with (tmp_path / "out.csv").open(newline="") as stream:
         lines = list(csv.DictReader(stream))
     assert sum(float(line["proven_harm"]) for line in lines) / 50 == pytest.approx(row["proven_harm"])
@@ -220,8 +211,8 @@ def test_limits__an_obstacle_out_of_vehicle_1_s_own_reach_leaves_avoidability_an
 def test_limits__do_not_apply_where_vehicle_1_may_brake_after_vehicle_2(paper_random: Scenario) -> None:
     late = paper_random.replace(latency_s=[0.6, 0.5, 0.8])
     result = evaluate(late.sample(2, 7), {"coast": make_agent("coast")}, scenario=late)
-    assert "vehicle_1 may brake later than vehicle_2" in parameters(result)["no_limits_because"]
-    assert assess(result) is None
+    assert "vehicle_1 may brake later than vehicle_2" in result.conditions["no_limits_because"]
+    assert result.regrets is None
 
 
 def test_limits__of_another_line_up_are_null_with_the_reason(pair: Scenario, tmp_path: Path) -> None:
@@ -230,16 +221,16 @@ def test_limits__of_another_line_up_are_null_with_the_reason(pair: Scenario, tmp
     assert {row[name] for name in NULLS} == {None}
     assert row["mean_regret_interval"] is None
     assert row["parameters"]["no_limits_because"] == "2 vehicles; avoidability is proven for 3"
-    write_per_world_csv(tmp_path / "out.csv", result)
+    write_per_world(tmp_path / "out.csv", result)
     with (tmp_path / "out.csv").open(newline="") as stream:
         lines = list(csv.DictReader(stream))
     assert {line["avoidable"] + line["regret_total_harm"] + line["best_known_source"] for line in lines} == {""}
-    assert "proven" not in markdown_table(summarise(result))
+    assert "proven" not in summarise(result).markdown()
 
 
 @pytest.mark.filterwarnings("ignore::ethbrake_marl.errors.IncompleteTable")
 def test_per_world__shows_the_limit_of_each_world(four: Evaluation, tmp_path: Path) -> None:
-    write_per_world_csv(tmp_path / "out.csv", four)
+    write_per_world(tmp_path / "out.csv", four)
     with (tmp_path / "out.csv").open(newline="") as stream:
         lines = [line for line in csv.DictReader(stream) if line["agent"] == "a"]
     assert [line["avoidable"] for line in lines] == ["1", "0", "0", "0"]
@@ -259,7 +250,7 @@ def test_limits__of_the_first_500_worlds_of_the_papers_random_test(name: str, un
     agents = {spec: make_agent(spec) for spec in ("full_brake", "e_v2x_bm")}
     result = evaluate(scenario.sample(500, 7), agents, scenario=scenario, seed=7)
     full, best = (row.to_json() for row in summarise(result))
-    found = assess(result)
+    found = result.regrets
     assert found is not None
     assert full["unavoidable_rate"] == best["unavoidable_rate"] == unavoidable / 500
     for spec in agents:
@@ -280,5 +271,5 @@ def test_leaning__is_contact_without_an_impact_and_no_collision(tmp_path: Path) 
     (row,) = (row.to_json() for row in summarise(result))
     assert (row["unavoidable_rate"], row["impact_proven_rate"], row["collision_rate"]) == (1.0, 0.0, 0.0)
     assert row["best_known_first_impact_harm"] == row["proven_harm"] == 0.0
-    text = markdown_table(summarise(result))
+    text = summarise(result).markdown()
     assert "In 100.0 %" in text and "avoids contact" in text and "in 0.0 %" in text and "avoids an impact" in text

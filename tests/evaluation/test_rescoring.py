@@ -11,15 +11,15 @@ import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
-from ethbrake_marl.evaluation import declared_objectives, evaluate, rescore, write_per_world_csv
-from ethbrake_marl.harm import STANDARD
+from ethbrake_marl.evaluation import evaluate, write_per_world
+from ethbrake_marl.harm import STANDARD, declared_objectives
 from ethbrake_marl.scenario import Scenario
 
 
 def test_rescored__one_impact_by_hand(pair: Scenario) -> None:
     # Harm 9, of which the vehicles bear 4.95 and 4.05 (see conftest).
     result = evaluate(pair.sample(2, 0), {"full_brake": make_agent("full_brake")}, scenario=pair)
-    rows = {row.objective: row for row in rescore(result, [*STANDARD, "weighted:1,3"]) if row.harm_count == "total"}
+    rows = {row.objective: row for row in result.rescore([*STANDARD, "weighted:1,3"]) if row.harm_count == "total"}
     borne, root = (4.95, 4.05), math.sqrt(0.5)
     expected = {
         "total": (9.0, 9.0),
@@ -41,10 +41,10 @@ def test_rescored__one_impact_by_hand(pair: Scenario) -> None:
     assert json.loads(json.dumps(found, allow_nan=False)) == found
 
 
-def test_write_per_world_csv__objectives_are_columns(pair: Scenario, tmp_path: Path) -> None:
+def test_write_per_world__objectives_are_columns(pair: Scenario, tmp_path: Path) -> None:
     result = evaluate(pair.sample(2, 0), {"full_brake": make_agent("full_brake")}, scenario=pair)
-    write_per_world_csv(tmp_path / "plain.csv", result)
-    write_per_world_csv(tmp_path / "more.csv", result, objectives=["own", "weighted:1,3"])
+    write_per_world(tmp_path / "plain.csv", result)
+    write_per_world(tmp_path / "more.csv", result, objectives=["own", "weighted:1,3"])
     plain, more = (list(csv.DictReader((tmp_path / f"{n}.csv").read_text().splitlines())) for n in ("plain", "more"))
     new = [name for name in more[0] if name not in plain[0]]
     assert new[:3] == ["own_first_1", "own_first_2", "own_total_1"] and len(new) == 8

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, Outcome, evaluate
 from ethbrake_marl.physics import advance
@@ -107,12 +107,6 @@ def test_evaluate__does_not_depend_on_the_order_of_the_worlds(evaluation: Evalua
         np.testing.assert_array_equal(array, expected[name][order], err_msg=name, strict=True)
 
 
-def test_evaluate__leaves_the_agents_as_they_are(paper_random: Scenario, gap_agent: object) -> None:
-    evaluate(paper_random.sample(3, 0), {"gap": gap_agent}, scenario=paper_random)
-    assert gap_agent.times == []
-    assert gap_agent.predicted_harm.size == 0
-
-
 def test_evaluate__takes_over_what_the_agent_says(evaluation: Evaluation) -> None:
     outcome = evaluation.outcome("gap")
     np.testing.assert_array_equal(outcome.predicted_harm, evaluation.worlds.gaps_m[:, 0], strict=True)
@@ -176,15 +170,22 @@ def test_evaluate__bad_input_is_refused(paper_random: Scenario, gap_agent: objec
 def test_evaluate__an_agent_that_predicts_for_other_worlds_is_refused(paper_random: Scenario) -> None:
     class Confused:
         name = "confused"
-        predicted_harm = np.zeros(2)
 
-        def begin(self, worlds: object, vehicle: int, rows: object) -> None: ...
+        def __init__(self, shape: tuple[int, ...]) -> None:
+            self.shape = shape
 
-        def act(self, worlds: object, vehicle: int) -> np.ndarray:
-            return np.zeros(3)
+        def begin(self, alert: object, vehicle: int, scripts: object) -> dict[str, np.ndarray]:
+            return {"predicted_harm": np.zeros(self.shape)}
 
-    with pytest.raises(InvalidInput, match=r"'confused': predicted_harm has shape \(2,\)"):
-        evaluate(paper_random.sample(3, 0), {"x": Confused()}, scenario=paper_random)
+        def act(self, worlds: object, memory: object, vehicle: int) -> tuple[np.ndarray, object]:
+            return np.zeros(3), memory
+
+    for shape, told in (
+        ((3, 2), r"'confused': predicted_harm has shape \(3, 2\)"),
+        ((2,), r"'confused' of vehicle_2: .*shape \(2,\)"),
+    ):
+        with pytest.raises(InvalidInput, match=told):
+            evaluate(paper_random.sample(3, 0), {"x": Confused(shape)}, scenario=paper_random)
 
 
 def test_outcome__of_an_agent_that_was_not_evaluated(evaluation: Evaluation) -> None:

@@ -8,7 +8,6 @@ from ethbrake_marl.evaluation import statistics
 from ethbrake_marl.evaluation.statistics import (
     interquartile_mean,
     mean_over_seeds,
-    paired_over_seeds,
     rate,
     rate_over_seeds,
     share_over_seeds,
@@ -56,22 +55,22 @@ def test_interquartile_mean__the_same_seed_the_same_interval() -> None:
     assert interquartile_mean(data, resamples=500, seed=3) == interquartile_mean(data, resamples=500, seed=3)
 
 
-def test_paired_over_seeds__by_hand() -> None:
+def test_mean_over_seeds__by_hand() -> None:
     easy_and_hard = np.array([1.0, 100.0, 1.0, 100.0])
-    better = paired_over_seeds([easy_and_hard - 1.0, easy_and_hard - 3.0], easy_and_hard)
+    better = mean_over_seeds([easy_and_hard - 1.0, easy_and_hard - 3.0], easy_and_hard)
     assert better.value == pytest.approx(-2.0)
     assert better.interval == pytest.approx((-3.0, -1.0))  # the spread of the worlds cancels, that of the seeds stays
 
 
-def test_paired_over_seeds__worlds_of_both_sides_are_drawn_together() -> None:
+def test_mean_over_seeds__worlds_of_both_sides_are_drawn_together() -> None:
     rng = np.random.default_rng(2)
     worlds = rng.uniform(0.0, 100.0, 500)
     difference = rng.normal(0.5, 1.0, 500)
-    estimate = paired_over_seeds(worlds + difference, worlds)
+    estimate = mean_over_seeds(worlds + difference, worlds)
     assert estimate.interval is not None
     half = 1.96 * difference.std(ddof=1) / 500**0.5
     assert estimate.interval == pytest.approx((difference.mean() - half, difference.mean() + half), abs=0.02)
-    assert paired_over_seeds([[1.0], [3.0]], [[1.0]]) == type(estimate)(1.0, None)
+    assert mean_over_seeds([[1.0], [3.0]], [[1.0]]) == type(estimate)(1.0, None)
 
 
 @pytest.mark.parametrize("tasks", [[], [[]], [[1.0, np.nan]], [[[1.0]]]])
@@ -81,9 +80,9 @@ def test_interquartile_mean__refuses_what_is_no_figure_per_seed(tasks: list[list
 
 
 @pytest.mark.parametrize("values", [[[1.0, 2.0]], [[np.inf, 1.0, 2.0]], [], [[[1.0, 2.0, 3.0]]]])
-def test_paired_over_seeds__refuses_what_cannot_be_paired(values: list[list[float]]) -> None:
-    with pytest.raises(InvalidInput, match="paired_over_seeds: "):
-        paired_over_seeds(values, [[1.0, 2.0, 3.0]])
+def test_mean_over_seeds__refuses_what_cannot_be_paired(values: list[list[float]]) -> None:
+    with pytest.raises(InvalidInput, match="mean_over_seeds: "):
+        mean_over_seeds(values, [[1.0, 2.0, 3.0]])
 
 
 def test_share_over_seeds__by_hand_and_wider_with_fewer_seeds() -> None:
@@ -103,7 +102,7 @@ def test_share_over_seeds__by_hand_and_wider_with_fewer_seeds() -> None:
 def test_intervals__two_worlds_have_one_and_a_single_world_has_none() -> None:
     for interval in (
         share_over_seeds([[4.0, 6.0]], [10.0, 10.0], [0.0, 0.0]),
-        paired_over_seeds([[4.0, 6.0]], [[0.0, 0.0]]),
+        mean_over_seeds([[4.0, 6.0]], [[0.0, 0.0]]),
         mean_over_seeds([[4.0, 6.0]]),
     ):
         assert interval is not None and interval.interval is not None and interval.interval[0] < interval.interval[1]

@@ -11,19 +11,14 @@ from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput, PhysicsError
-from ethbrake_marl.evaluation.shield_modes import (
-    ModeRow,
-    compare_behind_shields,
-    compare_modes,
-    modes_tables,
-)
+from ethbrake_marl.evaluation.shield_modes import ShieldModes, compare_modes
 from ethbrake_marl.evaluation.statistics import mean, paired_difference
-from ethbrake_marl.figures.evaluation import shield_modes_figure
-from ethbrake_marl.pages.frame import page
-from ethbrake_marl.pages.report import ShieldEvidence, shield_section
+from ethbrake_marl.figures import shield_modes_figure
+from ethbrake_marl.pages import page
+from ethbrake_marl.pages.report import shield_section
 from ethbrake_marl.scenario import Task, load_scenario
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver
-from ethbrake_marl.shield.review import review
+from ethbrake_marl.shield.evidence import review
 from tests.failing_worlds import plant, without
 from tests.pages.hostile import Page
 
@@ -32,11 +27,11 @@ WORLDS = PAPER.sample(60, 3).worlds
 
 
 @pytest.fixture(scope="module")
-def rows() -> list[ModeRow]:
+def rows() -> ShieldModes:
     return compare_modes({"full_brake": make_agent("full_brake")}, WORLDS, Task(PAPER, (1,)))
 
 
-def test_rows__are_what_driving_each_mode_gives(rows: list[ModeRow]) -> None:
+def test_rows__are_what_driving_each_mode_gives(rows: ShieldModes) -> None:
     step = ShieldedDriver(make_agent("full_brake"), PAPER)
     drivers = [make_agent("full_brake"), HybridAgent(make_agent("full_brake"), PAPER), step]
     driven = [drive(WORLDS, driver, PAPER, 1) for driver in drivers]
@@ -49,7 +44,7 @@ def test_rows__are_what_driving_each_mode_gives(rows: list[ModeRow]) -> None:
     assert rows[2].replaced == shield.interventions.sum() / shield.running.steps.sum() > 0.1
 
 
-def test_rows__tell_what_the_interventions_were_good_for(rows: list[ModeRow]) -> None:
+def test_rows__tell_what_the_interventions_were_good_for(rows: ShieldModes) -> None:
     for row in rows[2:]:
         assert row.verdicts is not None and sum(row.verdicts) == pytest.approx(1.0)
         assert row.verdicts[0] > 0.9 and row.above_bound == 0
@@ -57,7 +52,7 @@ def test_rows__tell_what_the_interventions_were_good_for(rows: list[ModeRow]) ->
         assert told["needed"] == row.verdicts[0] and told["against_episode_interval"][1] < 0.0
 
 
-def test_rows__do_not_depend_on_the_size_of_a_chunk(rows: list[ModeRow], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows__do_not_depend_on_the_size_of_a_chunk(rows: ShieldModes, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ethbrake_marl.evaluation.shield_modes.CHUNK", 25)
     done: list[tuple[str, int]] = []
     again = compare_modes(
@@ -67,18 +62,18 @@ def test_rows__do_not_depend_on_the_size_of_a_chunk(rows: list[ModeRow], monkeyp
     assert done == [("full_brake", 25), ("full_brake", 50), ("full_brake", 60)]
 
 
-def test_table_and_figure__show_every_row(rows: list[ModeRow]) -> None:
-    assert [table.row_count for table in modes_tables(rows)] == [5]
+def test_table_and_figure__show_every_row(rows: ShieldModes) -> None:
+    assert [len(sheet.rows) for sheet in rows.sheets()] == [5]
     axes = shield_modes_figure(rows).axes[0]
     drawn = [float(container.lines[0].get_xdata()[0]) for container in axes.containers]
     expected = [row.against_episode.value for row in rows if row.against_episode is not None]
     assert np.allclose(sorted(drawn), sorted(expected))
     with pytest.raises(InvalidInput, match="at least one agent"):
-        shield_modes_figure([])
+        shield_modes_figure(ShieldModes())
 
 
 def test_worlds_that_cannot_be_advanced__are_out_for_all_modes_and_named(
-    rows: list[ModeRow], monkeypatch: pytest.MonkeyPatch
+    rows: ShieldModes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ethbrake_marl.evaluation.shield_modes.CHUNK", 15)
     task, agents = Task(PAPER, (1,)), {"full_brake": make_agent("full_brake"), "coast": make_agent("coast")}
@@ -98,17 +93,17 @@ def test_worlds_that_cannot_be_advanced__are_out_for_all_modes_and_named(
 )
 def test_behind_shields__those_that_do_not_know_the_world_are_left_out(spec: str) -> None:
     agent = make_agent(spec, scenario=PAPER, uncertainty="gaps_m=0.5")
-    assert compare_behind_shields({spec: agent}, WORLDS, Task(PAPER, (1,))) == []
+    assert compare_modes({spec: agent}, WORLDS, Task(PAPER, (1,)), behind=True) == []
 
 
 @pytest.fixture(scope="module")
-def team_rows() -> list[ModeRow]:
+def team_rows() -> ShieldModes:
     agents = {name: make_agent(name) for name in ("full_brake", "coast")}
     return compare_modes(agents, PAIR.sample(30, 3).worlds, Task(PAIR, (1, 2), "total"))
 
 
 @pytest.mark.slow
-def test_team__rows_are_what_driving_behind_each_shield_gives(team_rows: list[ModeRow]) -> None:
+def test_team__rows_are_what_driving_behind_each_shield_gives(team_rows: ShieldModes) -> None:
     worlds = PAIR.sample(30, 3).worlds
     assert [row.mode for row in team_rows] == ["none", "step", "step-alert", "step-cap"] * 2
     alone = drive(worlds, Team.copies(make_agent("coast"), (1, 2)), PAIR).ledger.world_harm("total")
@@ -144,19 +139,19 @@ def test_team__an_intervention_is_simulated_again_without_it_for_the_whole_team(
     assert found.share("needed") > 0.5
 
 
-def test_team__tables_and_figure_show_bound_and_shares(team_rows: list[ModeRow]) -> None:
-    modes, shares = modes_tables(team_rows)
-    assert (modes.row_count, shares.row_count) == (10, 6 * 4)
-    assert [column.header for column in modes.columns][2:4] == ["minus no shield", "bound"]
+def test_team__tables_and_figure_show_bound_and_shares(team_rows: ShieldModes) -> None:
+    modes, shares = team_rows.sheets()
+    assert (len(modes.rows), len(shares.rows)) == (10, 6 * 4)
+    assert modes.headings[2:4] == ["minus no shield", "bound"]
     axes = shield_modes_figure(team_rows).axes[0]
     assert len(axes.containers) == 6 and "without a shield" in axes.get_xlabel()
     told = team_rows[1].to_json()
     assert told["vehicles"][0] == {**told["vehicles"][0], "vehicle": "vehicle_1", "replaced": None}
-    text = Page(page("Shield", [shield_section(ShieldEvidence(team_rows, "30 worlds"))])).text
+    text = Page(page.Page("Shield", [shield_section(team_rows, "30 worlds")]).html).text
     assert "Minus no shield" in text and "coast, step-cap, vehicle_3" in text.replace("\u200b", "")
 
 
 def test_team__what_is_behind_a_shield_is_compared_without_it() -> None:
     worlds, task = PAIR.sample(5, 3).worlds, Task(PAIR, (1, 2))
     agents = {name: make_agent(name, scenario=PAIR) for name in ("full_brake", "coast+step")}
-    assert {row.agent for row in compare_behind_shields(agents, worlds, task)} == {"coast"}
+    assert {row.agent for row in compare_modes(agents, worlds, task, behind=True)} == {"coast"}

@@ -5,8 +5,8 @@ import pytest
 from scipy.stats import binom, bootstrap
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.statistics import exact_rate, mean, paired_difference, rate, relative_decrease
-from ethbrake_marl.files.sheet import Estimate, estimates_to_json
+from ethbrake_marl.evaluation.statistics import mean, paired_difference, rate, relative_decrease
+from ethbrake_marl.files.sheet import Estimate
 
 T_4, T_1 = 2.7764451, 12.7062047  # 97.5 % quantiles of Student's t with 4 and 1 degrees of freedom
 Z_SQUARED = 3.8414588  # of the normal quantile at 97.5 %
@@ -96,7 +96,7 @@ def test_statistics__refuse_to_pair_lists_of_different_length() -> None:
 def test_json__of_an_estimate_has_its_interval_as_a_list_and_null_for_what_does_not_exist() -> None:
     assert Estimate(2.0, (1.0, 3.0)).to_json() == {"value": 2.0, "interval": [1.0, 3.0]}
     assert Estimate(2.0, None).to_json() == {"value": 2.0, "interval": None}
-    told = estimates_to_json({"harm": Estimate(2.0, (1.0, 3.0)), "alone": Estimate(4.0, None), "absent": None})
+    told = Estimate.side_by_side({"harm": Estimate(2.0, (1.0, 3.0)), "alone": Estimate(4.0, None), "absent": None})
     assert list(told.items()) == [
         ("harm", 2.0), ("harm_interval", [1.0, 3.0]), ("alone", 4.0), ("alone_interval", None),
         ("absent", None), ("absent_interval", None),
@@ -104,20 +104,20 @@ def test_json__of_an_estimate_has_its_interval_as_a_list_and_null_for_what_does_
 
 
 def test_exact_rate__the_textbook_interval_of_clopper_and_pearson() -> None:
-    assert exact_rate(5, 10).value == 0.5
-    assert exact_rate(5, 10).interval == pytest.approx((0.1870860, 0.8129140), abs=1e-7)
+    assert rate(5, 10, exact=True).value == 0.5
+    assert rate(5, 10, exact=True).interval == pytest.approx((0.1870860, 0.8129140), abs=1e-7)
 
 
 @pytest.mark.parametrize("count", [1, 10, 10**8])
 def test_exact_rate__none_and_all_reach_the_ends(count: int) -> None:
     reach = 1.0 - 0.025 ** (1.0 / count)
-    assert exact_rate(0, count).interval == pytest.approx((0.0, reach), rel=1e-6)
-    assert exact_rate(count, count).interval == pytest.approx((1.0 - reach, 1.0), rel=1e-9)
+    assert rate(0, count, exact=True).interval == pytest.approx((0.0, reach), rel=1e-6)
+    assert rate(count, count, exact=True).interval == pytest.approx((1.0 - reach, 1.0), rel=1e-9)
 
 
 @pytest.mark.parametrize(("successes", "count"), [(1, 3), (3, 10**8), (5 * 10**7, 10**8), (10**8 - 2, 10**8)])
 def test_exact_rate__its_ends_have_the_tails_that_they_must(successes: int, count: int) -> None:
-    low, high = exact_rate(successes, count).interval
+    low, high = rate(successes, count, exact=True).interval
     assert binom.sf(successes - 1, count, low) == pytest.approx(0.025, rel=1e-6)
     assert binom.cdf(successes, count, high) == pytest.approx(0.025, rel=1e-6)
 

@@ -10,8 +10,8 @@ from rich.console import Console
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.defaults import HARM_COUNTS
-from ethbrake_marl.evaluation import Evaluation, evaluate, markdown_table, rich_table, summarise
-from ethbrake_marl.evaluation.outcome import HYBRID_TEST, PAPER_ROWS, RANDOM_TEST, parameter_line, parameters
+from ethbrake_marl.evaluation import Evaluation, SummaryTable, evaluate, summarise
+from ethbrake_marl.evaluation.measures import PAPER_ROWS
 from ethbrake_marl.limits import limits
 from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario
 
@@ -39,7 +39,7 @@ ALWAYS = {
 
 def printed(evaluation: Evaluation, width: int = 80) -> str:
     console = Console(width=width, file=io.StringIO(), color_system=None)
-    console.print(rich_table(summarise(evaluation)))
+    console.print(summarise(evaluation).terminal())
     text = console.file.getvalue()
     assert all(len(line) <= width for line in text.splitlines())
     return text
@@ -89,7 +89,7 @@ def test_summarise__without_full_braking_there_is_no_decrease(pair: Scenario) ->
 
 
 def test_parameters__say_under_which_conditions(evaluation: Evaluation) -> None:
-    found = parameters(evaluation)
+    found = evaluation.conditions
     assert (found["scenario"], found["seed"], found["count"]) == ("paper-random", 7, 200)
     assert found["controlled_vehicle"] == "vehicle_2"
     assert found["scripts"] == {"vehicle_1": "full_brake", "vehicle_3": "full_brake"}
@@ -97,7 +97,7 @@ def test_parameters__say_under_which_conditions(evaluation: Evaluation) -> None:
     assert found["latency_s"] == [0.0, 0.5, 0.8]
     assert found["mass_t"] == [4.5, 5.5, 5.9]
     assert found["gaps_m"][1] == [evaluation.worlds.gaps_m[:, 1].min(), evaluation.worlds.gaps_m[:, 1].max()]
-    line = parameter_line(found).replace("\u00a0", " ")
+    line = found.line.replace("\u00a0", " ")
     assert line.startswith("paper-random: 200 worlds, seed 7; d = ")
     assert line.endswith("τ = (0, 0.5, 0.8) s; m = (4.5, 5.5, 5.9) t; e = 0.1")
 
@@ -151,7 +151,7 @@ def test_rich_table__has_the_papers_rows_beside_ours_and_its_conditions(evaluati
 def test_rich_table__of_another_scenario_has_none_of_the_papers_rows(pair: Scenario) -> None:
     result = evaluate(pair.sample(2, 0), {"full_brake": make_agent("full_brake")}, scenario=pair)
     assert "paper" not in printed(result).lower()
-    assert "paper" not in markdown_table(summarise(result)).lower()
+    assert "paper" not in summarise(result).markdown().lower()
 
 
 def test_rich_table__brackets_in_a_name_are_text(pair: Scenario) -> None:
@@ -161,11 +161,11 @@ def test_rich_table__brackets_in_a_name_are_text(pair: Scenario) -> None:
 
 def test_markdown_table__a_bar_in_a_name_makes_no_column(pair: Scenario) -> None:
     result = evaluate(pair.sample(2, 0), {"ppo@a|b": make_agent("full_brake")}, scenario=pair)
-    assert "| ppo@a\\|b |" in markdown_table(summarise(result))
+    assert "| ppo@a\\|b |" in summarise(result).markdown()
 
 
 def test_markdown_table__every_row_has_every_column(evaluation: Evaluation) -> None:
-    rows = [line for line in markdown_table(summarise(evaluation)).splitlines() if line.startswith("|")]
+    rows = [line for line in summarise(evaluation).markdown().splitlines() if line.startswith("|")]
     assert {line.count("|") for line in rows} == {14}
     assert len(rows) == 2 + 3 + len(PAPER_ROWS)
     estimate = summarise(evaluation)[0].first_impact_harm
@@ -173,19 +173,19 @@ def test_markdown_table__every_row_has_every_column(evaluation: Evaluation) -> N
 
 
 def test_tables__of_nothing_are_empty() -> None:
-    assert "Agent" in markdown_table([])
+    assert "Agent" in SummaryTable().markdown()
     console = Console(width=80, file=io.StringIO())
-    console.print(rich_table([]))
+    console.print(SummaryTable().terminal())
     assert "Agent" in console.file.getvalue()
 
 
 def test_paper_rows__agree_with_themselves() -> None:
     for row in PAPER_ROWS:
         assert row.collision_rate == pytest.approx(row.collisions / row.episodes, abs=5e-5)
-    random = {row.agent: row for row in PAPER_ROWS if row.table == RANDOM_TEST}
+    random = {row.agent: row for row in PAPER_ROWS if row.table == "random test"}
     for row in random.values():
         assert row.harm_decrease == pytest.approx(1.0 - row.average_harm / random["Non-E"].average_harm, abs=1e-4)
-    avoided = {row.agent: row.episodes - row.collisions for row in PAPER_ROWS if row.table == HYBRID_TEST}
+    avoided = {row.agent: row.episodes - row.collisions for row in PAPER_ROWS if row.table == "hybrid test"}
     assert avoided["Hybrid"] == 2005  # what the note says
     assert avoided["E-V2X-BM"] + avoided["Standalone DRL"] == 2000
 
@@ -194,7 +194,7 @@ def _beside_paper(scenario: Scenario, *, vehicle: int = 1, seed: int | None = 7)
     agents = {"full_brake": make_agent("full_brake")}
     driven = scenario.with_learners([vehicle])
     (row,) = summarise(evaluate(driven.sample(2, 7), agents, scenario=driven, seed=seed))
-    assert ("paper, " in markdown_table([row])) is row.beside_paper
+    assert ("paper, " in SummaryTable([row]).markdown()) is row.beside_paper
     return row.beside_paper
 
 

@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from ethbrake_marl import harm
-from ethbrake_marl import rewards as terms
+from ethbrake_marl import harm, rewards as terms
 from ethbrake_marl.agents import registry as agents
 from ethbrake_marl.evaluation import measures
 from ethbrake_marl.files import plugins

@@ -18,9 +18,9 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, Progress, UnknownName
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.learning.train import resume, train
+from ethbrake_marl.learning.runs import resume, train
 from ethbrake_marl.observations import observe
-from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.policies import load_policy
 from ethbrake_marl.scenario import scenario_json_schema
 from ethbrake_marl.scenario.features import FEATURES
 from tests.learning.tiny import TINY_PPO

@@ -14,10 +14,9 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.evaluation import markdown_table
 from ethbrake_marl.evaluation.measures import REGISTERED
 from ethbrake_marl.evaluation.statistics import mean, rate
-from ethbrake_marl.pages.report import Report, render_report
+from ethbrake_marl.pages.report import Report
 
 SCENARIO = eb.load_scenario("paper-random")
 SAMPLE = SCENARIO.sample(40, 7)
@@ -75,9 +74,9 @@ def test_measure_of_each_vehicle__stands_in_rows_frame_markdown_and_report() -> 
     assert told["metrics"]["injury_3"] == "injury, vehicle 3 (1)"
     frame = found.to_frame("columns")
     assert frame["metric_squared"] == pytest.approx(frame["total_harm"])
-    for text in (markdown_table(rows), render_report(Report("mine", rows))):
+    for text in (rows.markdown(), Report("mine", rows).html):
         assert "squared (m2/s2)" in text and "injury, vehicle 2 (1)" in text
-    assert "Squared closing speed of every impact." in render_report(Report("mine", rows))
+    assert "Squared closing speed of every impact." in Report("mine", rows).html
 
 
 def test_change_of_speed__is_the_largest_of_each_vehicle_and_0_without_an_impact() -> None:
@@ -132,7 +131,7 @@ def test_measure__one_function_and_it_stands_in_every_output(
     parts = [pyarrow.parquet.read_table(path) for path in sorted(Path("kept").rglob("*.parquet"))]
     first = [row for part in parts for row in part.to_pylist() if row["agent"] == "full_brake"][:40]
     assert [row[names[0]] for row in first] == change.tolist()
-    lines = markdown_table(eb.summarise(evaluated())).splitlines()
+    lines = eb.summarise(evaluated()).markdown().splitlines()
     assert "| change_of_rear (m/s) | hit_hard (1) |" in lines[0]
 
 

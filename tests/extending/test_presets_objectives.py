@@ -15,9 +15,9 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.evaluation.summary import declared_objectives, rescore
-from ethbrake_marl.learning.train import train
-from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.harm import declared_objectives
+from ethbrake_marl.learning.runs import train
+from ethbrake_marl.policies import load_policy
 from ethbrake_marl.scenario import scenario_json_schema
 from ethbrake_marl.scenario.v2x import CHANNELS
 from tests.learning.tiny import TINY_PPO
@@ -65,7 +65,7 @@ def test_objective__trains_and_stands_in_tables(mine: Any, tmp_path: Path) -> No
     policy = load_policy(train(TINY_PPO.replace(total_steps=1024), scenario, tmp_path / "run", measure=None).directory)
     found = eb.evaluate(scenario.sample(10, 7), {"mine": LearnedAgent(policy, "mine")}, scenario=scenario)
     assert declared_objectives(["standard"], 3)[-1] == "front-first"
-    (row,) = (row for row in rescore(found) if (row.objective, row.harm_count) == ("front-first", "total"))
+    (row,) = (row for row in found.rescore() if (row.objective, row.harm_count) == ("front-first", "total"))
     borne = found.outcome("mine").ledger.vehicle_harm("total").mean(axis=0)
     assert [each.value for each in row.each] == pytest.approx(borne + borne[0])
     env = eb.parallel_env(scenario=SCENARIO, reward={"harm": 1.0, "objective": "front-first"})

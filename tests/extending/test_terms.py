@@ -15,8 +15,8 @@ import yaml
 import ethbrake_marl as eb
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
 from ethbrake_marl.learning.recipe import load_recipe, recipe_json_schema
-from ethbrake_marl.learning.train import train
-from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.learning.runs import train
+from ethbrake_marl.policies import load_policy
 from ethbrake_marl.rewards import TERMS, StepOutcome, reward_params
 from tests.learning.tiny import TINY_PPO
 

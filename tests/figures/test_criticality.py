@@ -5,11 +5,9 @@ import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation import curves as module
-from ethbrake_marl.evaluation import evaluate
+from ethbrake_marl.evaluation import curves as module, evaluate
 from ethbrake_marl.evaluation.curves import avoidability_boundary, criticality_map
-from ethbrake_marl.figures.evaluation import criticality_figure
-from ethbrake_marl.figures.style import picture_bytes
+from ethbrake_marl.figures import criticality_figure, picture_bytes
 from ethbrake_marl.limits.limits import Limits, known_limits
 from ethbrake_marl.scenario import Scenario, Task, load_scenario, worlds_from_table
 

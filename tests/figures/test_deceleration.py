@@ -6,11 +6,9 @@ from matplotlib.figure import Figure
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation import curves as module
-from ethbrake_marl.evaluation import evaluate
+from ethbrake_marl.evaluation import curves as module, evaluate
 from ethbrake_marl.evaluation.curves import deceleration_curve, regimes_of
-from ethbrake_marl.figures.evaluation import deceleration_figure
-from ethbrake_marl.figures.style import picture_bytes
+from ethbrake_marl.figures import deceleration_figure, picture_bytes
 from ethbrake_marl.limits.limits import Limits, Proof
 from ethbrake_marl.physics import Worlds, make_worlds
 from ethbrake_marl.scenario import Scenario, Task, load_scenario, worlds_from_table

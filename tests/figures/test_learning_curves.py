@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.figures.studies import SeedCurve, at_common_steps, seed_curves
+from ethbrake_marl.figures import SeedCurve, seed_curves
 
 
 def test_at_common_steps__keeps_the_steps_that_all_have() -> None:
-    curve = at_common_steps([{0: 1.0, 10: 2.0, 15: 9.0, 20: 3.0}, {0: 5.0, 10: 6.0, 20: 7.0}])
+    curve = SeedCurve.of([{0: 1.0, 10: 2.0, 15: 9.0, 20: 3.0}, {0: 5.0, 10: 6.0, 20: 7.0}])
     assert curve.steps.tolist() == [0.0, 10.0, 20.0]
     assert curve.values.tolist() == [[1.0, 2.0, 3.0], [5.0, 6.0, 7.0]]
     with pytest.raises(InvalidInput, match="never evaluated at the same step"):
-        at_common_steps([{0: 1.0}, {1: 1.0}])
+        SeedCurve.of([{0: 1.0}, {1: 1.0}])
 
 
 def test_seed_curves__draws_means_and_bands_of_one_standard_deviation() -> None:

@@ -9,16 +9,17 @@ from matplotlib.figure import Figure
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, evaluate, record_episode, summarise
-from ethbrake_marl.evaluation.measures import assess
-from ethbrake_marl.figures.evaluation import (
+from ethbrake_marl.figures import (
     harm_against_total_gap,
     harm_by_agent,
     harm_in_parts,
+    label_text,
     learning_curve,
+    new_figure,
+    picture_bytes,
     regret_distribution,
     trajectories,
 )
-from ethbrake_marl.figures.style import label_text, new_figure, picture_bytes
 from ethbrake_marl.scenario import Scenario
 
 UNIT = re.compile(r"\((m|s|m/s|m/s²|m²/s²|ms|µs|ns)\)|steps|Worlds|Decisions")
@@ -70,7 +71,7 @@ def test_harm_in_parts__add_up_to_the_means(evaluation: Evaluation, figures: dic
 def test_regret_distribution__shares_are_those_of_the_worlds(
     evaluation: Evaluation, figures: dict[str, Figure]
 ) -> None:
-    regrets = assess(evaluation)
+    regrets = evaluation.regrets
     assert regrets is not None
     line = figures["regret"].axes[0].lines[0]
     values = regrets.regret(evaluation.outcome("full_brake"), "first")

@@ -9,8 +9,15 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import EpisodeRecord, Evaluation, evaluate, record_episode, summarise
 from ethbrake_marl.evaluation.statistics import mean
-from ethbrake_marl.figures.evaluation import harm_against_total_gap, learning_curve, trajectories
-from ethbrake_marl.figures.style import COLOURS, ShownFigure, picture_bytes, series_style
+from ethbrake_marl.figures import (
+    COLOURS,
+    ShownFigure,
+    harm_against_total_gap,
+    learning_curve,
+    picture_bytes,
+    series_style,
+    trajectories,
+)
 from ethbrake_marl.scenario import Scenario
 
 POINTS = [

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.e_v2x_bm_kernel import optimise_pairwise, pairwise_harm
-from ethbrake_marl.physics.worlds import Worlds, concatenate, make_worlds
+from ethbrake_marl.agents.e_v2x_bm import optimise_pairwise, pairwise_harm
+from ethbrake_marl.physics.worlds import Worlds, make_worlds
 
 
 def paper_world(gaps_m: tuple[float, ...], speeds_mps: tuple[float, ...], tau2: float, tau3: float) -> Worlds:
@@ -68,7 +68,7 @@ def test_closed_form__printed_harm_of_the_last_row_is_the_harm_at_its_printed_de
 
 def test_closed_form__one_call_gives_the_same_bits_as_five():
     worlds = [paper_world(gaps, speeds, *latency) for gaps, speeds, latency, *_ in GOLDEN]
-    from_batch = optimise_pairwise(concatenate(worlds), 1)
+    from_batch = optimise_pairwise(Worlds.concatenate(worlds), 1)
     for k, world in enumerate(worlds):
         alone = optimise_pairwise(world, 1)
         assert [column[k] for column in from_batch] == [column[0] for column in alone]

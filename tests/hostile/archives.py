@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.limits.best_harm import best_harm, table_bytes
+from ethbrake_marl.limits.limits import best_harm, table_bytes
 from ethbrake_marl.scenario import load_scenario
 
 SHAPE_TEXTS = (

@@ -11,9 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from ethbrake_marl.policies.actor import content_sha256
-from ethbrake_marl.policies.bundle import load_policy
-from ethbrake_marl.policies.shipped import shipped_policies
+from ethbrake_marl.policies import content_sha256, load_policy, shipped_policies
 from tests.hostile.case import NASTY, Case, damaged, write
 
 MANIFEST, WEIGHTS = "manifest.json", "weights.safetensors"

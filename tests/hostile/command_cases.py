@@ -81,19 +81,7 @@ def _taken(folder: Path) -> None:
 
 
 # Places below the case's own folder where nothing can be written, not even by the superuser.
-TARGETS = (
-    "file",
-    "file/x",
-    "full",
-    "link",
-    "dangling",
-    "loop",
-    "pipe",
-    "pipe/x",
-    f"{HERE}/loop/x",
-    "x" * 300,
-    "\0b",
-)
+TARGETS = ("file", "file/x", "full", "link", "dangling", "loop", "pipe", "pipe/x", f"{HERE}/loop/x", "x" * 300, "\0b")
 WRITERS: dict[str, tuple[str, ...]] = {
     "per world": ("evaluate", "--agents", "coast", *FEW, "--per-world"),
     "table": ("search", "best-harm", *FEW, "--budget", "1", "--output"),
@@ -114,9 +102,7 @@ def commands(rng: random.Random) -> Iterator[Case]:
 def _values() -> Iterator[Case]:
     for spec in (*SPECS, *(f"ppo@{word}" for word in WORDS), *(f"{word}:1" for word in WORDS if word)):
         yield _case(
-            "agent",
-            ("evaluate", *FEW, "--agents", spec),
-            certain=spec not in ("ppo@shipped", "ladder", "constant:-7"),
+            "agent", ("evaluate", *FEW, "--agents", spec), certain=spec not in ("ppo@shipped", "ladder", "constant:-7")
         )
     for number in NUMBERS:
         for option in ("--episodes", "--seed"):
@@ -187,10 +173,5 @@ def _variables() -> Iterator[Case]:
 
 def _case(category: str, command: tuple[str, ...], build: Build = lambda folder: None, *, certain: bool = True) -> Case:
     return Case(
-        "command",
-        category,
-        command,
-        build,
-        certain=certain,
-        may_change=("file", "file.json", "full/mine.yaml"),
+        "command", category, command, build, certain=certain, may_change=("file", "file.json", "full/mine.yaml")
     )

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.limits.best_harm import load_table
-from ethbrake_marl.policies.bundle import load_policy
-from ethbrake_marl.policies.shipped import shipped_policies
+from ethbrake_marl.limits.limits import BestHarmTable
+from ethbrake_marl.policies import load_policy, shipped_policies
 from ethbrake_marl.scenario import load_scenario, read_initial_states
 from tests.hostile.archives import good_bytes
 from tests.hostile.case import HERE, INSIDE, NASTY, OUTSIDE, Build, Case, write
@@ -66,7 +65,9 @@ def targets() -> dict[str, Target]:
             lambda p: ("evaluate", "--agents", "coast", "--initial-states", p),
             lambda p: read_initial_states(p, load_scenario("paper-random")),
         ),
-        "table": Target("t.npz", good_bytes(), lambda p: (*COMMAND[:-2], p, "--json"), lambda p: load_table(Path(p))),
+        "table": Target(
+            "t.npz", good_bytes(), lambda p: (*COMMAND[:-2], p, "--json"), lambda p: BestHarmTable.load(Path(p))
+        ),
         "manifest": _bundle_file("manifest.json"),
         "weights": _bundle_file("weights.safetensors"),
     }

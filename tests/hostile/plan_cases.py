@@ -6,16 +6,9 @@ import random
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from ethbrake_marl.evaluation.inputs import (
-    NamedWorld,
-    NamedWorlds,
-    named_worlds_text,
-    read_named_worlds,
-    scenario_sha256,
-    states_of,
-)
+from ethbrake_marl.evaluation.inputs import NamedWorld, NamedWorlds, states_of
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies.sweep import plan_sweep, read_sweep
+from ethbrake_marl.studies.sweep import SweepPlan
 from tests.hostile.case import NASTY, Case, damaged, write
 from tests.hostile.yaml_changes import CERTAIN, encoded
 from tests.hostile.yaml_parts import NOT_FINITE, quoted, replaced
@@ -119,8 +112,8 @@ IN_SWEEP: dict[str, tuple[str, tuple[str, ...]]] = {
             "  - {scenario: paper-random}",
             "  - {recipe: ppo}",
             "  - {scenario: paper-random, level: 3-pair, recipe: ppo}",
-            "  - {level: nobody, recipe: ppo}",
-            "  - {level: ../x, recipe: ppo}",
+            "  - {scenario: nobody, recipe: ppo}",
+            "  - {scenario: ../x, recipe: ppo}",
             "  - {scenario: paper-random, recipe: ppo, seed: [0]}",
             "  - {scenario: paper-random, recipe: ppo, seed: 4294967296}",
             "  - {scenario: paper-random, recipe: ppo, set: [1]}",
@@ -155,20 +148,16 @@ def worlds_text() -> str:
     """A file of two named worlds that is in order; nobody does more harm than it says."""
     scenario = load_scenario("paper-random")
     states = states_of(scenario.sample(2, 7).worlds, scenario)
-    return named_worlds_text(
-        NamedWorlds(
-            format="ethbrake-worlds",
-            version=1,
-            scenario="paper-random",
-            scenario_sha256=scenario_sha256(scenario),
-            settings=["restitution=0.1"],
-            agent="full_brake",
-            measure="harm",
-            harm_count="first",
-            found_by="ethbrake search falsify --measure harm",
-            worlds=[NamedWorld(name=f"world-{k}", score=1e6, harm=1e6, state=state) for k, state in enumerate(states)],
-        )
-    )
+    return NamedWorlds.of(
+        scenario,
+        scenario="paper-random",
+        settings=["restitution=0.1"],
+        agent="full_brake",
+        measure="harm",
+        harm_count="first",
+        found_by="ethbrake search falsify --measure harm",
+        worlds=[NamedWorld(name=f"world-{k}", score=1e6, harm=1e6, state=state) for k, state in enumerate(states)],
+    ).text
 
 
 def _in_worlds() -> dict[str, tuple[str, tuple[str, ...]]]:
@@ -264,7 +253,7 @@ def _sweep(category: str, content: bytes | str, *, certain: bool = True) -> Case
 
 
 def _planned() -> object:
-    return plan_sweep(read_sweep("mine.yaml"))
+    return SweepPlan.read("mine.yaml")
 
 
 def _worlds(category: str, content: bytes | str, *, certain: bool = True) -> Case:
@@ -278,7 +267,7 @@ def _worlds(category: str, content: bytes | str, *, certain: bool = True) -> Cas
         # who drives, and where, is looked at when the worlds are driven
         reader=None
         if category in LATER
-        else _reader(certain, lambda: read_named_worlds("mine.yaml").worlds_of(load_scenario("paper-random"), "x")),
+        else _reader(certain, lambda: NamedWorlds.read("mine.yaml").worlds_of(load_scenario("paper-random"), "x")),
     )
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ethbrake_marl.limits.best_harm import load_table
+from ethbrake_marl.limits.limits import BestHarmTable
 from tests.hostile.archives import (
     DTYPES,
     NUMBERS,
@@ -296,5 +296,5 @@ def _case(category: str, seed: float, make: Callable[[random.Random], bytes], ce
         COMMAND,
         lambda folder: write(folder / "t.npz", make(random.Random(seed))),
         certain=certain,
-        reader=None if category in ONLY_A_PROBLEM_KNOWS else lambda: load_table(Path("t.npz")),
+        reader=None if category in ONLY_A_PROBLEM_KNOWS else lambda: BestHarmTable.load(Path("t.npz")),
     )

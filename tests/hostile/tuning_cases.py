@@ -6,7 +6,7 @@ import random
 from collections.abc import Iterator
 from pathlib import Path
 
-from ethbrake_marl.studies.tuning import plan_tuning, read_tuning
+from ethbrake_marl.studies.sweep import TuningPlan
 from tests.hostile.case import Case, damaged, write
 from tests.hostile.plan_cases import NOWHERE, of_every_file, of_own_keys
 
@@ -97,5 +97,5 @@ def _case(category: str, content: bytes | str, *, certain: bool = True) -> Case:
         write(folder / "taken", "precious")
 
     command = ("study", "tune", "mine.yaml", "--output", "taken")
-    read = (lambda: plan_tuning(read_tuning("mine.yaml"))) if certain else None
+    read = (lambda: TuningPlan.read("mine.yaml")) if certain else None
     return Case("tuning", category, command, build, certain=certain, reader=read, content=content)

@@ -159,10 +159,7 @@ SCENARIO_ONLY: dict[str, tuple[bool, Change]] = {
             else f'vehicle_3: "{r.choice(SPECS)}"',
         ),
     ),
-    "role of nobody": (
-        True,
-        lambda r, t: t + f"  {r.choice(NOBODY)}: coast\n",
-    ),
+    "role of nobody": (True, lambda r, t: t + f"  {r.choice(NOBODY)}: coast\n"),
     "distribution": (
         True,
         lambda r, t: t.replace(
@@ -191,14 +188,8 @@ SCENARIO_ONLY: dict[str, tuple[bool, Change]] = {
         True,
         lambda r, t: t.replace("[4.5, 5.5, 5.9]", str([5.0] * r.choice((0, 1, 2, 4, 64, 3000)))),
     ),
-    "channel": (
-        False,
-        lambda r, t: t + f"v2x: {r.choice(CHANNELS)}\n",
-    ),
-    "objective": (
-        False,
-        lambda r, t: t + f"objective: {r.choice(OBJECTIVES)}\n",
-    ),
+    "channel": (False, lambda r, t: t + f"v2x: {r.choice(CHANNELS)}\n"),
+    "objective": (False, lambda r, t: t + f"objective: {r.choice(OBJECTIVES)}\n"),
     "long lines of vehicles": (
         False,
         lambda r, t: t.replace("vehicles: 3", f"vehicles: {r.choice((1, 0, -3, 64, 65, 10**9, 2**62))}"),
@@ -216,10 +207,7 @@ SCENARIO_ONLY: dict[str, tuple[bool, Change]] = {
         lambda r, t: (
             t.replace("horizon_s: 8", f"horizon_s: {r.choice((8, 3600))}")
             .replace("time_step_s: 0.1", f"time_step_s: {r.choice((0.1, 0.0001))}")
-            .replace(
-                "vehicle_3: full_brake",
-                f"vehicle_3: {r.choice(SEARCHING)}",
-            )
+            .replace("vehicle_3: full_brake", f"vehicle_3: {r.choice(SEARCHING)}")
         ),
     ),
 }

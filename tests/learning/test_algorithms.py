@@ -20,9 +20,9 @@ from ethbrake_marl.errors import InvalidInput, Progress
 from ethbrake_marl.learning import recipe as registry
 from ethbrake_marl.learning.algorithms import Ppo
 from ethbrake_marl.learning.recipe import PpoRecipe, TrainingRecipe, algorithm_names, load_recipe, register_algorithm
-from ethbrake_marl.learning.train import resume, train
+from ethbrake_marl.learning.runs import resume, train
 from ethbrake_marl.learning.training import load_team
-from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.policies import load_policy
 from tests.learning.tiny import TINY_PPO
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "learning.md").read_text("utf-8")

@@ -10,11 +10,13 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.training import load_team
+from tests.docs.site import load
 
 pytest.importorskip("benchmarl", reason="needs the extra marl")
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning", "ignore::FutureWarning")
 
+SCRIPT = load("../../train/benchmarl_mappo")
 PAIR = eb.load_scenario("cooperation-3-pair")
 RECIPE = load_recipe("cooperation-ppo").replace(
     n_envs=16, n_steps=16, batch_size=128, network={"policy": [16, 16], "value": [16, 16]}
@@ -61,12 +63,10 @@ def test_policy_of__acts_as_benchmarls_own_policy_does(tmp_path: Path) -> None:
     from tensordict import TensorDict
     from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-    from ethbrake_marl.learning import benchmarl as benchmarl_task
-
     recipe = RECIPE.replace(total_steps=2 * 16 * 16 * 2, scheme="centralised")
-    experiment = benchmarl_task._experiment(recipe, PAIR, str(tmp_path))
+    experiment = SCRIPT.make_experiment(recipe, PAIR, str(tmp_path))
     experiment.run()
-    policy = benchmarl_task.policy_of(experiment, recipe, PAIR)
+    policy = SCRIPT.policy_of(experiment, recipe, PAIR)
     assert policy.manifest.steps == 2 * 16 * 16 * 2
     seen = eb.make_sb3_vec_env(PAIR, 50, seed=1).reset()
     batch = TensorDict({"learners": {"observation": torch.from_numpy(seen.reshape(50, 2, -1))}}, batch_size=[50])
@@ -77,9 +77,7 @@ def test_policy_of__acts_as_benchmarls_own_policy_does(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_mappo__learns_to_beat_full_braking(tmp_path: Path) -> None:
-    from ethbrake_marl.learning.benchmarl import train_mappo
-
-    train_mappo(load_recipe("cooperation-ppo").replace(total_steps=300_000), PAIR, tmp_path / "run")
+    SCRIPT.train_mappo(load_recipe("cooperation-ppo").replace(total_steps=300_000), PAIR, tmp_path / "run")
     agents = {"full_brake": eb.make_agent("full_brake"), "team": load_team(tmp_path / "run", PAIR)}
     result = eb.evaluate(PAIR.sample(1000, 7), agents, scenario=PAIR)
     harm = {name: result.outcome(name).first_impact_harm.mean() for name in agents}

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 SCRIPT = Path(__file__).resolve().parents[2] / "train" / "benchmarl_mappo.py"
-TASK = "ethbrake_marl.learning.benchmarl"
 
 
 @pytest.mark.parametrize(
@@ -57,7 +56,7 @@ def test_script__with_the_extra_refuses_what_cannot_be_before_it_trains(
     monkeypatch.chdir(tmp_path)
     Path("there").mkdir()
     monkeypatch.setattr(sys, "argv", ["benchmarl_mappo.py", *arguments])
-    monkeypatch.setattr(f"{TASK}._experiment", lambda *_: pytest.fail("training"))
+    monkeypatch.setattr("benchmarl.experiment.Experiment.run", lambda *_: pytest.fail("training"))
     with pytest.raises(SystemExit) as ended:
         runpy.run_path(str(SCRIPT), run_name="__main__")
     assert ended.value.code == 2 and message in capsys.readouterr().err

@@ -38,10 +38,7 @@ def share(agents: dict[str, eb.Agent | eb.Team], worlds: int) -> dict[str, float
 
 @pytest.mark.parametrize(
     ("episodes", "least"),
-    [
-        pytest.param(1000, 0.9, marks=pytest.mark.slow),
-        pytest.param(10_000, 0.98, marks=pytest.mark.long),
-    ],
+    [pytest.param(1000, 0.9, marks=pytest.mark.slow), pytest.param(10_000, 0.98, marks=pytest.mark.long)],
 )
 def test_clone__of_ppo_reaches_its_share_in_other_worlds(
     script: ModuleType, tmp_path: Path, episodes: int, least: float

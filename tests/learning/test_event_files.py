@@ -11,7 +11,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
-from ethbrake_marl.learning.progress import EventFile, cut_back, event_sizes
+from ethbrake_marl.learning.runs import EventFile, cut_back, event_sizes
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 

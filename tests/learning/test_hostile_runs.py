@@ -13,7 +13,7 @@ import pytest
 import safetensors.numpy
 
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
-from ethbrake_marl.learning.train import resume
+from ethbrake_marl.learning.runs import resume
 from tests.hostile.run_cases import CHANGES
 from tests.hostile.stopped_runs import RUN, listed_anew, newest, stopped
 
@@ -60,11 +60,7 @@ def test_resume__a_listing_that_agrees_does_not_make_a_checkpoint(
         ("environment.begun", np.nan, r"'environment.begun' holds a number that is not finite"),
         ("environment.engine.script.1.act", np.zeros(3), r"'environment.engine.script.1.act' does not belong here"),
         ("random.python", np.full(625, 2**40, np.uint64), r"'random.python' is no state"),
-        (
-            "environment.engine.stream",
-            np.array([0, 2**60], np.uint64),
-            r"'environment.engine.stream' is",
-        ),
+        ("environment.engine.stream", np.array([0, 2**60], np.uint64), r"'environment.engine.stream' is"),
     ],
 )
 def test_resume__arrays_must_be_those_of_this_training(run: Path, name: str, array: object, reason: str) -> None:

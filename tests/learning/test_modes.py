@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,9 @@ import pytest
 from stable_baselines3.common.logger import Logger
 
 import ethbrake_marl as eb
-from ethbrake_marl.engine.snapshot import Moment, branch, first_moments, visit
+from ethbrake_marl.engine import branch, first_moments, visit
 from ethbrake_marl.errors import InvalidInput, Progress
-from ethbrake_marl.learning.counterfactual import (
+from ethbrake_marl.learning.algorithms import (
     ModesModel,
     NoOtherMode,
     Stage,
@@ -23,11 +24,11 @@ from ethbrake_marl.learning.counterfactual import (
     show_templates,
     stages_of,
 )
-from ethbrake_marl.learning.recipe import ModesPlan, algorithm_named, load_recipe
-from ethbrake_marl.learning.train import TrainResult, _environment, make_model, resume, train
+from ethbrake_marl.learning.recipe import ModesPlan, load_recipe
+from ethbrake_marl.learning.runs import TrainResult, make_environment, make_model, resume, train
 from ethbrake_marl.learning.training import resolve
-from ethbrake_marl.policies.bundle import load_policy
-from ethbrake_marl.search import best_templates, profile_problem
+from ethbrake_marl.policies import load_policy
+from ethbrake_marl.search import profile_problem
 
 SCENARIO = eb.load_scenario("paper-random")
 SHIPPED = load_recipe("modes")
@@ -64,9 +65,9 @@ TINY = SHIPPED.replace(
 def _model(**changes: Any) -> tuple[ModesModel, Any]:
     """A model of the tiny recipe, and the engine of its environment."""
     training = resolve(TINY.replace(**changes), SCENARIO)
-    with _environment(training) as environment:
+    with closing(make_environment(training)) as environment:
         environment.reset()
-        model = make_model(algorithm_named("counterfactual"), training, environment)
+        model = make_model(training.recipe.make_algorithm(), training, environment)
         assert isinstance(model, ModesModel)
         return model, environment.engine
 
@@ -97,16 +98,16 @@ def test_templates__are_played_as_they_were_found_and_depend_on_no_batch() -> No
     """In each world the best of its own templates; below the bound, or none."""
     worlds = SCENARIO.sample(60, 3).worlds
     problem = profile_problem(worlds, [1])
-    commands, steps = best_templates(problem, np.full(60, np.inf), number=40, seed=1)
+    commands, steps = problem.best_templates(np.full(60, np.inf), number=40, seed=1)
     assert (steps > 0).all() and (commands >= problem.bounds[:, :, 0]).all()
     some = np.array([7, 31])
-    assert np.array_equal(best_templates(problem.take(some), np.full(2, np.inf), number=40, seed=1)[0], commands[some])
-    assert not np.array_equal(best_templates(problem, np.full(60, np.inf), number=40, seed=2)[0], commands)
-    assert (best_templates(problem, np.zeros(60), number=40, seed=1)[1] == 0).all()  # no harm is below 0
+    assert np.array_equal(problem.take(some).best_templates(np.full(2, np.inf), number=40, seed=1)[0], commands[some])
+    assert not np.array_equal(problem.best_templates(np.full(60, np.inf), number=40, seed=2)[0], commands)
+    assert (problem.best_templates(np.zeros(60), number=40, seed=1)[1] == 0).all()  # no harm is below 0
     with pytest.raises(InvalidInput, match="templates: 2 vehicles; they are of one"):
-        best_templates(profile_problem(worlds, [1, 2]), np.full(60, np.inf), number=40)
+        profile_problem(worlds, [1, 2]).best_templates(np.full(60, np.inf), number=40)
     with pytest.raises(InvalidInput, match="templates"):
-        best_templates(problem, np.full(60, np.inf), number=0)
+        problem.best_templates(np.full(60, np.inf), number=0)
 
 
 def test_shown__is_what_gains_more_than_every_network() -> None:
@@ -136,7 +137,7 @@ def test_visit__every_decision_of_every_episode() -> None:
     seen, moments = visit(branch(engine, start), _full_brake)
     assert seen.shape == (len(moments.state), 1, 27)
     assert np.array_equal(moments.take(np.arange(20)).state, start.state)
-    first = branch(engine, Moment(*(array[:20] for array in moments))).observe_all(np.array([1]))
+    first = branch(engine, moments.take(np.arange(20))).observe_all(np.array([1]))
     assert np.array_equal(first, seen[:20])
 
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from ethbrake_marl.learning.progress import Course, lost_training, misleading_return
+from ethbrake_marl.learning.runs import Course, lost_training, misleading_return
 
 
 def _evaluations(returns: list[float], harms: list[float]) -> list[dict[str, float]]:

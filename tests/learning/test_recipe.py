@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.learning.recipe import LearningRate, SacRecipe, load_recipe, recipe_of, shipped_recipes
-from ethbrake_marl.policies.actor import NetworkSpec
+from ethbrake_marl.learning.recipe import LearningRate, SacRecipe, TrainingRecipe, load_recipe, shipped_recipes
+from ethbrake_marl.policies import NetworkSpec
 
 GOOD = """\
 name: mine
@@ -91,7 +91,7 @@ def test_sac_recipe__refuses_bad_input(change: dict[str, object], message: str) 
 def test_recipe__comes_back_from_its_json() -> None:
     for name in shipped_recipes():
         recipe = load_recipe(name)
-        assert recipe_of(recipe.model_dump(mode="json")) == recipe
+        assert TrainingRecipe.of(recipe.model_dump(mode="json")) == recipe
 
 
 def test_shipped_recipes__are_found_by_name() -> None:

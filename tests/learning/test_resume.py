@@ -18,11 +18,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning import train as train_module
+from ethbrake_marl.learning import runs as train_module
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.learning.train import TrainResult, resume, train
-from ethbrake_marl.learning.training import Training, create_run
-from ethbrake_marl.policies.bundle import Policy, load_policy
+from ethbrake_marl.learning.runs import TrainResult, resume, train
+from ethbrake_marl.learning.training import RunDirectory, Training
+from ethbrake_marl.policies import Policy, load_policy
 from ethbrake_marl.scenario import load_scenario
 from tests.learning.tiny import TINY_PPO
 
@@ -161,7 +161,7 @@ import os, signal, sys
 from pathlib import Path
 sys.path.insert(0, {root!r})
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
-from ethbrake_marl.learning.train import train
+from ethbrake_marl.learning.runs import train
 from tests.learning.test_resume import RECIPES, SCENARIO, _measure
 recipe, folder = RECIPES[sys.argv[1]], Path(sys.argv[2])
 step, left = EthBrakeVecEnv.step_wait, [5]
@@ -339,7 +339,7 @@ def test_resume__an_edited_configuration_is_another_training(
     ],
 )
 def test_resume__names_the_damaged_file(tmp_path: Path, file: str, content: str | dict | None, message: str) -> None:
-    run = create_run(tmp_path / "run", {"recipe": PPO.model_dump(mode="json")})
+    run = RunDirectory(tmp_path / "run").create({"recipe": PPO.model_dump(mode="json")})
     if content is None:
         (run.path / file).unlink()
     else:

@@ -10,8 +10,8 @@ import pytest
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.files.store import hold_lock, new_folder, write_file
-from ethbrake_marl.learning.progress import ProgressTable
-from ethbrake_marl.learning.training import create_run
+from ethbrake_marl.learning.runs import ProgressTable
+from ethbrake_marl.learning.training import RunDirectory
 
 
 def test_write_file__replaces_in_one_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,25 +64,28 @@ def test_hold_lock__names_what_cannot_be_one(tmp_path: Path) -> None:
 
 
 def test_create_run__refuses_what_exists(tmp_path: Path) -> None:
-    run = create_run(tmp_path / "runs" / "first", {"seeds": {"training": 3}})
+    run = RunDirectory(tmp_path / "runs" / "first").create({"seeds": {"training": 3}})
     assert json.loads(run.config.read_text()) == {"seeds": {"training": 3}}
     assert json.loads(run.status.read_text())["status"] == "running"
     with pytest.raises(
         AlreadyExists, match=r"first: is there already; give another name .*--force; make run ARGS=--force"
     ):
-        create_run(run.path, {})
+        RunDirectory(run.path).create({})
     assert run.status.is_file()
 
 
 def test_create_run__force_replaces_a_run_and_nothing_else(tmp_path: Path) -> None:
-    run = create_run(tmp_path / "first", {})
+    run = RunDirectory(tmp_path / "first").create({})
     (run.path / "old").touch()
-    assert sorted(p.name for p in create_run(run.path, {}, force=True).path.iterdir()) == ["config.json", "run.json"]
+    assert sorted(p.name for p in RunDirectory(run.path).create({}, force=True).path.iterdir()) == [
+        "config.json",
+        "run.json",
+    ]
     precious = tmp_path / "thesis"
     precious.mkdir()
     (precious / "chapter-1").touch()
     with pytest.raises(AlreadyExists, match="thesis: is there already, and is no run; give another name"):
-        create_run(precious, {}, force=True)
+        RunDirectory(precious).create({}, force=True)
     assert (precious / "chapter-1").is_file()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["first", "thesis"]
 

@@ -11,9 +11,9 @@ import torch
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput, Progress
-from ethbrake_marl.learning.counterfactual import Scout, choose_rows, draw_rows
+from ethbrake_marl.learning.algorithms import Scout, choose_rows, draw_rows
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.learning.train import resume, train
+from ethbrake_marl.learning.runs import resume, train
 
 SCENARIO = eb.load_scenario("paper-random")
 TINY = load_recipe("modes").replace(
@@ -45,8 +45,8 @@ def test_chosen__without_focus_each_row_once() -> None:
     chosen, importance = choose_rows(observed, rows, 15, 0.0, lambda seen: pytest.fail("nobody is asked"))
     assert len(set(chosen.tolist())) == 15 and set(chosen.tolist()) <= set(range(10, 30))
     assert (importance == 1.0).all()
-    assert len(choose_rows(observed, rows[:0], 15, 0.5, lambda seen: np.ones(len(seen))).rows) == 0
-    assert len(choose_rows(observed, rows, 40, 0.5, lambda seen: np.ones(len(seen))).rows) == 40
+    assert len(choose_rows(observed, rows[:0], 15, 0.5, lambda seen: np.ones(len(seen)))[0]) == 0
+    assert len(choose_rows(observed, rows, 40, 0.5, lambda seen: np.ones(len(seen)))[0]) == 40
 
 
 def test_scout__learns_the_mean_size_of_what_is_to_be_expected() -> None:

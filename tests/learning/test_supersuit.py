@@ -12,7 +12,7 @@ import torch
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.policy import LearnedAgent
-from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.policies import load_policy
 
 SCRIPT = Path(__file__).resolve().parents[2] / "train" / "supersuit_ppo.py"
 PAIR = eb.load_scenario("cooperation-3-pair")
@@ -65,10 +65,7 @@ def test_supersuit__learns_to_beat_full_braking(script: ModuleType, tmp_path: Pa
     threads = torch.get_num_threads()
     script.train(PAIR, 200_000, 0, tmp_path / "run")
     torch.set_num_threads(threads)
-    agents = {
-        "full_brake": eb.make_agent("full_brake"),
-        "ppo": LearnedAgent(load_policy(tmp_path / "run")),
-    }
+    agents = {"full_brake": eb.make_agent("full_brake"), "ppo": LearnedAgent(load_policy(tmp_path / "run"))}
     result = eb.evaluate(PAIR.sample(1000, 7), agents, scenario=PAIR)
     harm = {name: result.outcome(name).first_impact_harm.mean() for name in agents}
     assert harm["ppo"] < 0.9 * harm["full_brake"]

@@ -19,19 +19,11 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, UnknownName
-from ethbrake_marl.learning import train as train_module
-from ethbrake_marl.learning.recipe import (
-    TrainingRecipe,
-    algorithm_named,
-    check_scheme,
-    drivers,
-    load_recipe,
-    scheme_of,
-    who_drives_what,
-)
-from ethbrake_marl.learning.train import make_model, resume, train
-from ethbrake_marl.learning.training import is_team, load_team, resolve
-from ethbrake_marl.policies.bundle import PolicyTeam, load_policy
+from ethbrake_marl.learning import runs as train_module
+from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.learning.runs import make_model, resume, train
+from ethbrake_marl.learning.training import RunDirectory, load_team, resolve
+from ethbrake_marl.policies import PolicyTeam, load_policy
 from tests.learning.tiny import TINY_PPO
 
 PAIR = eb.load_scenario("cooperation-3-pair")
@@ -72,7 +64,7 @@ def test_train__leaves_a_folder_that_drives_by_itself(scheme: Any, tmp_path: Pat
     given = {name: f"policy/{name}" if separate else "policy" for name in NAMES}
     content = json.loads((tmp_path / "run" / "team.json").read_text())
     assert (content["scheme"], content["vehicles"], content["drivers"]) == (scheme, 3, given)
-    assert result.training.drivers == given and is_team(tmp_path / "run") == separate
+    assert result.training.drivers == given and RunDirectory(tmp_path / "run").is_team == separate
 
     moved = tmp_path / "elsewhere"
     shutil.move(tmp_path / "run", moved)
@@ -101,7 +93,7 @@ def _history(recipe: TrainingRecipe, folder: Path) -> list[dict[str, str]]:
     seen: list[dict[str, str]] = []
 
     def note(team: PolicyTeam) -> dict[str, float]:
-        seen.append({name: policy.manifest.weights_sha256 for name, policy in team.members.items()})
+        seen.append({name: policy.manifest.weights_sha256 for name, policy in team.drivers.items()})
         return {}
 
     often = recipe.replace(evaluation={"every_updates": 1, "worlds": 1, "seed": 7})
@@ -137,7 +129,7 @@ def test_independent__nobody_learns_from_anothers_reward(tmp_path: Path, monkeyp
 def test_independent__a_row_that_is_cut_off_gets_the_value_of_its_own_learner() -> None:
     recipe = TINY.replace(scheme="independent")
     environment = make_sb3_vec_env(PAIR, 8, appended="number", reward=recipe.reward)
-    policy: Any = make_model(algorithm_named("ppo"), resolve(recipe, PAIR), environment).policy
+    policy: Any = make_model(recipe.make_algorithm(), resolve(recipe, PAIR), environment).policy
     seen = environment.reset()
     assert seen.shape == (16, environment.engine.observation.size + 1)
     assert seen[:, -1].tolist() == [0.0, 1.0] * 8
@@ -153,7 +145,7 @@ def test_independent__a_row_that_is_cut_off_gets_the_value_of_its_own_learner() 
 def test_centralised__the_critic_sees_the_line_and_the_actor_does_not() -> None:
     recipe = TINY.replace(scheme="centralised")
     environment = make_sb3_vec_env(PAIR, 8, appended="state", reward=recipe.reward)
-    policy: Any = make_model(algorithm_named("ppo"), resolve(recipe, PAIR), environment).policy
+    policy: Any = make_model(recipe.make_algorithm(), resolve(recipe, PAIR), environment).policy
     own = environment.engine.observation.size
     seen = policy.obs_to_tensor(environment.reset())[0]
     elsewhere = seen.clone()
@@ -210,7 +202,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from tests.learning.test_teams import TINY, PAIR
-from ethbrake_marl.learning.train import train
+from ethbrake_marl.learning.runs import train
 def tell(progress):
     if progress.updates == 5:
         os.kill(os.getpid(), signal.SIGKILL)
@@ -257,17 +249,17 @@ def test_scheme__that_does_not_fit_is_refused_before_anything_is_made(tmp_path: 
         train(TINY, PAIR, tmp_path / "run", scheme="shared", turns=3)
     with pytest.raises(InvalidInput, match=r"turns = 5: 2 learners need 10 updates, .* are 8"):
         train(TINY, PAIR, tmp_path / "run", scheme="independent", turns=5)
-    with pytest.raises(UnknownName, match="did you mean 'centralised'"):
-        check_scheme("centralized")
+    with pytest.raises(InvalidInput, match="scheme = centralized: must be single, shared, independent or centralised"):
+        TINY.replace(scheme="centralized")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_scheme__of_a_recipe_and_who_drives_what() -> None:
-    assert scheme_of(TINY, ALONE) == "single" and scheme_of(TINY, PAIR) == "shared"
-    assert scheme_of(TINY.replace(scheme="centralised"), PAIR) == "centralised"
-    assert who_drives_what(drivers("shared", PAIR)) == "policy drives vehicle_2, vehicle_3"
-    told = "policy/vehicle_2 drives vehicle_2; policy/vehicle_3 drives vehicle_3"
-    assert who_drives_what(drivers("independent", PAIR)) == told
+    assert resolve(TINY, ALONE).scheme == "single" and resolve(TINY, PAIR).scheme == "shared"
+    assert resolve(TINY, PAIR, scheme="centralised").scheme == "centralised"
+    assert resolve(TINY, PAIR).who_drives() == "scheme shared: policy drives vehicle_2, vehicle_3"
+    told = "scheme independent: policy/vehicle_2 drives vehicle_2; policy/vehicle_3 drives vehicle_3"
+    assert resolve(TINY, PAIR, scheme="independent").who_drives() == told
 
 
 def test_train__takes_names_as_the_interfaces_do(tmp_path: Path) -> None:

@@ -17,13 +17,12 @@ import torch
 from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, Progress
-from ethbrake_marl.evaluation import evaluate, summarise
-from ethbrake_marl.evaluation import outcome as outcome_module
+from ethbrake_marl.evaluation import evaluate, measures as outcome_module, summarise
 from ethbrake_marl.harm import objective_harm, objectives_of
-from ethbrake_marl.learning import train as train_module
-from ethbrake_marl.learning.progress import TrainingDiverged
-from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe, recipe_of, shipped_recipes
-from ethbrake_marl.policies.bundle import Policy, load_policy
+from ethbrake_marl.learning import runs as train_module
+from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe, shipped_recipes
+from ethbrake_marl.learning.runs import TrainingDiverged
+from ethbrake_marl.policies import Policy, load_policy
 from ethbrake_marl.scenario import load_scenario
 from tests.learning.tiny import TINY_PPO
 
@@ -89,7 +88,7 @@ def test_train__leaves_a_complete_folder(recipe: TrainingRecipe, tmp_path: Path)
     assert [p.stat().st_size > 0 for p in (tmp_path / "run" / "tensorboard").iterdir()] == [True]
 
     config = json.loads((tmp_path / "run" / "config.json").read_text())
-    assert recipe_of(config["recipe"]) == recipe
+    assert TrainingRecipe.of(config["recipe"]) == recipe
     assert config["scenario"]["name"] == "paper-random"
     assert (
         config["versions"]["torch"] == torch.__version__.split("+")[0]

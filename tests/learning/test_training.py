@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.training import check_same, create_run, resolve
+from ethbrake_marl.learning.training import RunDirectory, resolve
 from ethbrake_marl.scenario import Scenario, load_scenario
 from tests.learning.tiny import TINY_PPO
 
@@ -19,7 +19,7 @@ TRAINING = resolve(TINY_PPO, SCENARIO)
 
 def folder_of(path: Path, recipe: dict[str, Any], scenario: dict[str, Any]) -> Path:
     """A run's folder with this configuration."""
-    return create_run(path, {"recipe": recipe, "scenario": scenario}).path
+    return RunDirectory(path).create({"recipe": recipe, "scenario": scenario}).path
 
 
 def written(path: Path, **changes: Any) -> Path:
@@ -30,8 +30,8 @@ def written(path: Path, **changes: Any) -> Path:
 
 def test_same__words_and_defaults_that_are_spelt_out_change_no_training(tmp_path: Path) -> None:
     words = {"title": "Another", "description": "More.", "source": "Elsewhere."}
-    check_same(written(tmp_path / "words", **words), TRAINING)
-    check_same(written(tmp_path / "defaults", v2x={"preset": "paper"}, speed_limit_mps=40), TRAINING)
+    RunDirectory(written(tmp_path / "words", **words)).check_same(TRAINING)
+    RunDirectory(written(tmp_path / "defaults", v2x={"preset": "paper"}, speed_limit_mps=40)).check_same(TRAINING)
     assert resolve(TINY_PPO.replace(**words), SCENARIO.replace(**words)).identity == TRAINING.identity
 
 
@@ -46,7 +46,7 @@ def test_same__everything_else_does_and_is_named(tmp_path: Path) -> None:
     ]
     for recipe, scenario, named in other:
         with pytest.raises(InvalidInput, match=rf"run: holds another training \(here other: {named}\); give another"):
-            check_same(folder, resolve(recipe, scenario))
+            RunDirectory(folder).check_same(resolve(recipe, scenario))
         assert resolve(recipe, scenario).identity != TRAINING.identity
 
 
@@ -55,10 +55,10 @@ def test_same__another_library_trains_other_policies(tmp_path: Path) -> None:
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps({**config, "library": "benchmarl"}))
     with pytest.raises(InvalidInput, match="was trained by benchmarl"):
-        check_same(folder, TRAINING)
+        RunDirectory(folder).check_same(TRAINING)
 
 
 def test_same__a_damaged_configuration_is_named(tmp_path: Path) -> None:
     folder = folder_of(tmp_path / "run", {}, {"name": "paper-random"})
     with pytest.raises(InvalidInput, match=r"config.json: .*missing"):
-        check_same(folder, TRAINING)
+        RunDirectory(folder).check_same(TRAINING)

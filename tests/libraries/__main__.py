@@ -24,16 +24,7 @@ from typing import Any
 from tests.libraries.environment import ENVIRONMENTS, NotInstalled, ready_python
 from tests.libraries.library import NAMES, ROOT, load
 from tests.libraries.one_table import FILES, make_table
-from tests.libraries.page import (
-    COLUMNS,
-    PAGE,
-    TABLE_HEADS,
-    cells,
-    make_page,
-    read_matrix,
-    table_cells,
-    write_matrix,
-)
+from tests.libraries.page import COLUMNS, PAGE, TABLE_HEADS, cells, make_page, read_matrix, table_cells, write_matrix
 
 NO_TIME = "skipped: no time left"
 

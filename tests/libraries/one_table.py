@@ -13,9 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import ethbrake_marl as eb
-from tests.libraries import benchmarl as benchmarl_file
-from tests.libraries import cleanrl as cleanrl_file
-from tests.libraries import torchrl as torchrl_file
+from tests.libraries import benchmarl as benchmarl_file, cleanrl as cleanrl_file, torchrl as torchrl_file
 from tests.libraries.library import ROOT
 
 WORK = ROOT / ".venvs" / "work"

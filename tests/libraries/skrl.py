@@ -7,10 +7,7 @@ from typing import Any
 from tests.libraries.library import Library
 
 LIBRARY = Library(
-    title="skrl",
-    package="skrl",
-    requires=("skrl==2.1.1",),
-    about="`wrap_env` takes the native vector environment.",
+    title="skrl", package="skrl", requires=("skrl==2.1.1",), about="`wrap_env` takes the native vector environment."
 )
 
 

@@ -10,7 +10,7 @@ import pytest
 from ethbrake_marl import load_scenario
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.limits.lower_bound import REASONS, avoidability
-from ethbrake_marl.physics import advance, concatenate, make_worlds
+from ethbrake_marl.physics import Worlds, advance, make_worlds
 from tests.limits.avoidability_worlds import random_profiles, wide_worlds, with_gap
 from tests.reference.play_profile import play_profile
 
@@ -79,7 +79,7 @@ def test_early__a_pair_that_meets_before_the_vehicle_may_act():
     front = line([1, 9], [10, 12, 9], [5, 8, 5], [1, 1, 2])  # 2 m lost in 1 s
     rear = line([9, 1], [10, 10, 12], [5, 8, 5], [1, 1, 2])
     brakes_in_time = line([9, 0.5], [10, 10, 12], [5, 8, 4], [1, 1, 0])  # 2 m/s at 4 m/s2: 0.5 m, a touch at 0.5 s
-    verdict = avoidability(concatenate([front, rear, brakes_in_time]))
+    verdict = avoidability(Worlds.concatenate([front, rear, brakes_in_time]))
     assert verdict.reason_name.tolist() == ["early", "early", ""]
     assert verdict.margin_m[:2] == pytest.approx([-1, -1])
 

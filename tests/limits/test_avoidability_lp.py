@@ -8,7 +8,7 @@ import pytest
 from ethbrake_marl import load_scenario
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.limits.lower_bound import avoidability
-from ethbrake_marl.physics import advance, concatenate, make_worlds
+from ethbrake_marl.physics import Worlds, advance, make_worlds
 from tests.limits.avoidability_worlds import wide_worlds
 from tests.reference.avoidability_lp import avoidable_by_lp, default_horizon_s
 
@@ -23,7 +23,7 @@ def drawn(n, vehicles, controlled, seed):
         return worlds.take(np.flatnonzero(reason != 1)[:n])
     rows = np.concatenate([np.flatnonzero(reason == code)[: n // 4 + 1] for code in (0, 2, 3)])
     paper = load_scenario("paper-random-early").sample(n - 3 * (n // 4), seed=seed).worlds
-    return concatenate([worlds.take(rows), paper])
+    return Worlds.concatenate([worlds.take(rows), paper])
 
 
 def compare(worlds, controlled, steps):
@@ -126,7 +126,7 @@ def test_scripted_pair_that_meets__is_unavoidable_whatever_the_others_do():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda w: avoidable_by_lp(concatenate([w, w]), (1,), 0.1), "2 worlds"),
+        (lambda w: avoidable_by_lp(Worlds.concatenate([w, w]), (1,), 0.1), "2 worlds"),
         (lambda w: avoidable_by_lp(w, (), 0.1), "controlled"),
         (lambda w: avoidable_by_lp(w, (1, 1), 0.1), "controlled"),
         (lambda w: avoidable_by_lp(w, (3,), 0.1), "controlled"),

@@ -11,16 +11,14 @@ from ethbrake_marl.agents.planner import BestHarm
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
-from ethbrake_marl.evaluation.outcome import TESTS
-from ethbrake_marl.limits.best_harm import (
+from ethbrake_marl.evaluation.measures import TESTS
+from ethbrake_marl.limits.limits import (
     LEFT_OUT,
     TABLES,
     BestHarmTable,
     best_harm,
     best_known,
-    load_table,
     realised_harm,
-    save_table,
     search_list,
     shipped_profiles,
     shipped_tables,
@@ -28,14 +26,7 @@ from ethbrake_marl.limits.best_harm import (
 )
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
-from ethbrake_marl.search import (
-    Profiles,
-    constant_profiles,
-    even_grid,
-    follow_profiles,
-    profile_problem,
-    search_profiles,
-)
+from ethbrake_marl.search import Profiles, profile_problem
 from tests.failing_worlds import planted_list, without
 
 BUDGET = 800
@@ -66,18 +57,18 @@ def two_cars() -> Worlds:
 
 def test_follow__hits_a_standing_car_with_the_closing_speed_computed_by_hand() -> None:
     problem = profile_problem(two_cars(), [1])
-    first, total = follow_profiles(problem, constant_profiles(problem, np.array([[[-5.0]]])))
+    first, total = problem.follow(problem.constant(np.array([[[-5.0]]])))
     assert first == pytest.approx([400.0 - 2 * 5 * 20])
     # 0.5 s of braking, then coasting: v^2 = 17.5^2 at the wall
     half = Profiles(np.array([[5, 80]]), np.array([[[-5.0], [0.0]]]))
-    assert follow_profiles(problem, half)[0] == pytest.approx([17.5**2])
+    assert problem.follow(half)[0] == pytest.approx([17.5**2])
     assert total[0] >= first[0]
 
 
 def test_search__cannot_beat_full_braking_before_a_standing_car() -> None:
     problem = profile_problem(two_cars(), [1])
-    start = constant_profiles(problem, np.array([[[2.0]]]))
-    found = search_profiles(problem, start, budget=2000)
+    start = problem.constant(np.array([[[2.0]]]))
+    found = problem.search(start, budget=2000)
     assert found.first_impact_harm == pytest.approx([200.0], abs=1e-3)
 
 
@@ -151,8 +142,8 @@ def test_best_harm__joint_optimum_of_two_cars_by_hand() -> None:
 def test_stored_profile__driven_in_the_engine_does_the_stored_harm_bit_for_bit(
     scenario: Scenario, worlds: Worlds, table: BestHarmTable, tmp_path: Path
 ) -> None:
-    save_table(tmp_path / "t.npz", table)
-    kept = load_table(tmp_path / "t.npz")
+    table.save(tmp_path / "t.npz")
+    kept = BestHarmTable.load(tmp_path / "t.npz")
     for harm_count in HARM_COUNTS:
         agent = BestHarm(
             lambda problem, c: kept.profiles(problem.identity, c, problem.last_step), harm_count=harm_count
@@ -160,8 +151,8 @@ def test_stored_profile__driven_in_the_engine_does_the_stored_harm_bit_for_bit(
         shuffled = np.random.default_rng(0).permutation(worlds.n)
         episodes = drive(worlds.take(shuffled), agent, scenario, 1)
         assert np.array_equal(episodes.ledger.world_harm(harm_count), table.best[harm_count].harm[shuffled])
-        assert np.array_equal(agent.predicted_harm, table.best[harm_count].harm[shuffled])
-        assert not agent.searched.any()
+        assert np.array_equal(episodes.memories[1]["predicted_harm"], table.best[harm_count].harm[shuffled])
+        assert not episodes.memories[1]["searched"].any()
 
 
 def test_best_harm_agent__searches_a_world_that_no_table_holds(scenario: Scenario, worlds: Worlds) -> None:
@@ -169,9 +160,10 @@ def test_best_harm_agent__searches_a_world_that_no_table_holds(scenario: Scenari
     agent = BestHarm(lambda problem, c: (Profiles(problem.last_step[:, None], np.zeros((problem.n, 1, 1))),
                                          np.zeros(problem.n, np.bool_)), budget=300)  # fmt: skip
     episodes = drive(few, agent, scenario, 1)
-    assert agent.searched.all()
-    assert np.array_equal(episodes.ledger.world_harm("first"), agent.predicted_harm)
-    assert (agent.predicted_harm <= optimise_coupled(few, 1).harm + 1e-7).all()
+    memory = episodes.memories[1]
+    assert memory["searched"].all()
+    assert np.array_equal(episodes.ledger.world_harm("first"), memory["predicted_harm"])
+    assert (memory["predicted_harm"] <= optimise_coupled(few, 1).harm + 1e-7).all()
 
 
 def test_table__finds_worlds_by_what_they_are(scenario: Scenario, worlds: Worlds, table: BestHarmTable) -> None:
@@ -218,7 +210,7 @@ def test_improved__takes_only_what_undercuts_by_more_than_the_tolerance(table: B
 def test_search_list__goes_on_where_it_stopped(
     scenario: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ethbrake_marl.limits.best_harm.CHUNK", 3)
+    monkeypatch.setattr("ethbrake_marl.limits.limits.CHUNK", 3)
     sample = scenario.sample(6, seed=11)
     kept = tmp_path / "parts"
     seen: list[tuple[int, int]] = []
@@ -261,20 +253,20 @@ def test_best_harm__refuses(scenario: Scenario, worlds: Worlds, arguments: dict[
 def test_profiles__beyond_a_capacity_or_out_of_order_are_refused(worlds: Worlds) -> None:
     problem = profile_problem(worlds.take([0]), [1])
     with pytest.raises(InvalidInput, match="beyond"):
-        follow_profiles(problem, constant_profiles(problem, np.array([[[-7.1]]])))
+        problem.follow(problem.constant(np.array([[[-7.1]]])))
     with pytest.raises(InvalidInput, match="in order"):
-        follow_profiles(problem, Profiles(np.array([[9, 5, 75]]), np.zeros((1, 3, 1))))
+        problem.follow(Profiles(np.array([[9, 5, 75]]), np.zeros((1, 3, 1))))
     with pytest.raises(InvalidInput, match="in order"):
-        follow_profiles(problem, Profiles(np.array([[9]]), np.zeros((1, 1, 1))))
+        problem.follow(Profiles(np.array([[9]]), np.zeros((1, 1, 1))))
 
 
 @pytest.mark.parametrize("content", [b"no table", b""])
 def test_table__a_damaged_file_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "t.npz").write_bytes(content)
     with pytest.raises(CorruptBundle, match="not a table"):
-        load_table(tmp_path / "t.npz")
+        BestHarmTable.load(tmp_path / "t.npz")
     with pytest.raises(InvalidInput, match="there is no such table"):
-        load_table(tmp_path / "other.npz")
+        BestHarmTable.load(tmp_path / "other.npz")
 
 
 def test_shipped_tables__hold_the_shipped_lists_and_their_profiles_do_the_stored_harm() -> None:
@@ -289,7 +281,7 @@ def test_shipped_tables__hold_the_shipped_lists_and_their_profiles_do_the_stored
                 assert np.isfinite(known).all()
                 problem = profile_problem(worlds, [1], harm_count=harm_count)
                 profiles, found = shipped_profiles(problem, harm_count)
-                harm = follow_profiles(problem, profiles)[harm_count == "total"]
+                harm = problem.follow(profiles)[harm_count == "total"]
                 assert np.array_equal(harm[found], known[found])
                 assert (known <= optimise_coupled(worlds, 1, harm_count=harm_count).harm + 1e-7).all()
     assert max(path.stat().st_size for path in TABLES.glob("*.npz")) < 700_000
@@ -320,7 +312,7 @@ def test_follow__phase_by_phase_agrees_with_advance_over_long_segments(worlds: W
     constants = np.linspace(-7.0, 3.0, worlds.n)
     command = -worlds.vehicles.braking_capacity_mps2
     command[:, 1] = constants
-    first, _ = follow_profiles(problem, constant_profiles(problem, constants[:, None, None]))
+    first, _ = problem.follow(problem.constant(constants[:, None, None]))
     assert first == pytest.approx(_realised(worlds, command), abs=1e-7)
 
 
@@ -328,7 +320,7 @@ def test_even_grid__ends_at_the_capacities_to_the_bit() -> None:
     low, high = -4.0, 1.2
     assert low + (high - low) > high  # an ulp beyond what the vehicle has
     worlds = replace_capacities(two_cars(), braking=-low, driving=high)
-    grid = even_grid(profile_problem(worlds, [1]), 5)
+    grid = profile_problem(worlds, [1]).even_grid(5)
     assert grid[0, [0, -1], 0].tolist() == [low, high]
     assert grid[0, :, 0] == pytest.approx([-4.0, -2.7, -1.4, -0.1, 1.2])
 

@@ -7,7 +7,7 @@ import pytest
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.evaluation.inputs import LADDER
-from ethbrake_marl.limits.best_harm import TABLES, load_table, realised_harm
+from ethbrake_marl.limits.limits import TABLES, BestHarmTable, realised_harm
 from ethbrake_marl.scenario import Task, load_scenario
 
 SMALL = ["search", "best-harm", "--scenario", "paper-random", "--episodes", "4", "--budget", "60", "--threads", "1"]
@@ -19,7 +19,7 @@ def test_best_harm_command__prints_figures_and_writes_the_table(
     file = tmp_path / "t.npz"
     assert run_command([*SMALL, "--json", "--output", str(file)]) == 0
     figures = json.loads(capsys.readouterr().out)
-    table = load_table(file)
+    table = BestHarmTable.load(file)
     assert figures["best_known_total_harm"] == pytest.approx(table.best["total"].harm.mean())
     assert figures["harmless_rate"] == (table.best["total"].harm == 0.0).mean()
     assert table.header["list_seed"] == 7
@@ -37,10 +37,10 @@ def test_best_harm_command__one_count_from_an_earlier_table(tmp_path: Path, caps
     assert run_command([*SMALL, "--harm-count", "first", "--output", str(file)]) == 0
     assert "best_known_first_impact_harm" in capsys.readouterr().out
     assert run_command([*SMALL, "--harm-count", "first", "--start", str(file), "--output", str(better)]) == 0
-    assert list(load_table(better).best) == ["first"]
-    assert "--harm-count first" in load_table(better).header["command"]
-    assert "--start t.npz" in load_table(better).header["command"]
-    assert (load_table(better).best["first"].harm <= load_table(file).best["first"].harm + 1e-6).all()
+    assert list(BestHarmTable.load(better).best) == ["first"]
+    assert "--harm-count first" in BestHarmTable.load(better).header["command"]
+    assert "--start t.npz" in BestHarmTable.load(better).header["command"]
+    assert (BestHarmTable.load(better).best["first"].harm <= BestHarmTable.load(file).best["first"].harm + 1e-6).all()
 
 
 def test_best_harm_command__takes_what_agents_do_better(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -48,7 +48,7 @@ def test_best_harm_command__takes_what_agents_do_better(tmp_path: Path, capsys: 
     small = ["search", "best-harm", "--episodes", "30", "--budget", "60", "--threads", "1"]
     assert run_command([*small, "--output", str(alone)]) == 0
     assert run_command([*small, "--agents", "planner:60,full_brake", "--output", str(folded)]) == 0
-    before, after = load_table(alone), load_table(folded)
+    before, after = BestHarmTable.load(alone), BestHarmTable.load(folded)
     assert list(after.header["lowered_by"]) == ["planner:60", "full_brake"]
     assert "--agents planner:60,full_brake" in after.header["command"]
     scenario = load_scenario("paper-random")
@@ -66,7 +66,7 @@ def test_best_harm_command__lets_the_whole_ladder_drive(tmp_path: Path, capsys: 
     file = tmp_path / "t.npz"
     small = ["search", "best-harm", "--episodes", "3", "--budget", "60", "--threads", "1", "--harm-count", "total"]
     assert run_command([*small, "--agents", "ladder", "--output", str(file)]) == 0
-    assert list(load_table(file).header["lowered_by"]) == list(LADDER)
+    assert list(BestHarmTable.load(file).header["lowered_by"]) == list(LADDER)
 
 
 @pytest.mark.parametrize(

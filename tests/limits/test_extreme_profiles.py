@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from ethbrake_marl import load_scenario
-from ethbrake_marl.limits.best_harm import KEPT, best_harm, extreme_profiles
+from ethbrake_marl.limits.limits import KEPT, best_harm, extreme_profiles
 from ethbrake_marl.limits.lower_bound import lower_bound, onset_states
 from ethbrake_marl.physics import advance
-from ethbrake_marl.search import follow_profiles, profile_problem
+from ethbrake_marl.search import profile_problem
 
 
 def of_worlds(worlds, vehicle, *, front=True, rear=True):
@@ -23,7 +23,7 @@ def of_worlds(worlds, vehicle, *, front=True, rear=True):
 
 def best_of(worlds, vehicle, **there):
     problem, profiles = of_worlds(worlds, vehicle, **there)
-    each = [follow_profiles(problem, profiles.take(slice(k, None, KEPT)))[0] for k in range(KEPT)]
+    each = [problem.follow(profiles.take(slice(k, None, KEPT)))[0] for k in range(KEPT)]
     return np.min(each, axis=0)
 
 

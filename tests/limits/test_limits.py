@@ -13,13 +13,11 @@ import yaml
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation import evaluate, outcome, parameters, rollout, summarise, write_per_world_csv
-from ethbrake_marl.evaluation.measures import assess
-from ethbrake_marl.evaluation.summary import limit_lines
-from ethbrake_marl.figures.evaluation import harm_in_parts
+from ethbrake_marl.evaluation import evaluate, measures, rollout, summarise, write_per_world
+from ethbrake_marl.figures import harm_in_parts
 from ethbrake_marl.limits import limits, lower_bound
 from ethbrake_marl.limits.limits import Limits, Proof, Unproven, known_limits, prove
-from ethbrake_marl.limits.team_bound import team_bound
+from ethbrake_marl.limits.lower_bound import team_bound
 from ethbrake_marl.pages.report import avoidable_section, worst_section
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
@@ -45,7 +43,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     watch(lower_bound, "avoidability", "avoidability")
     watch(limits, "lower_bound", "bound")
     watch(limits, "best_known", "best known")
-    watch(outcome, "known_limits", "limits")
+    watch(measures, "known_limits", "limits")
     watch(rollout._Whole, "evaluation", "evaluation")
     return found
 
@@ -72,9 +70,9 @@ def test_evaluation__whose_limits_nobody_asks_for_finds_none(
 ) -> None:
     found = evaluate(pair.sample(2, 0), {"coast": make_agent("coast")}, scenario=pair)
     assert calls["limits"] == 0
-    write_per_world_csv(tmp_path / "out.csv", found)
-    assert (len(summarise(found)), assess(found)) == (1, None)
-    assert parameters(found)["no_limits_because"]
+    write_per_world(tmp_path / "out.csv", found)
+    assert (len(summarise(found)), found.regrets) == (1, None)
+    assert found.conditions["no_limits_because"]
     assert calls["limits"] == 1
     assert found.limits is found.limits
 
@@ -140,9 +138,9 @@ def test_evaluation__of_a_team_tells_the_proven_harm_where_contact_is_not_decide
         told["proven_harm"] is not None and 0 < told["proven_harm"].value < told["best_known_first_impact_harm"].value
     )
     assert told["impact_proven_rate"] is not None and told.known_best_share == 0.0
-    [text] = limit_lines(rows)
+    [text] = rows.limit_lines()
     assert "no joint command avoids an impact (proven)" in text and "avoids contact" not in text
-    write_per_world_csv(tmp_path / "out.csv", found)
+    write_per_world(tmp_path / "out.csv", found)
     header, first = (tmp_path / "out.csv").read_text().splitlines()[:2]
     cells = dict(zip(header.split(","), first.split(","), strict=False))
     assert cells["avoidable"] == cells["unavoidable_reason"] == "" and float(cells["proven_harm"]) >= 0

@@ -10,7 +10,7 @@ import pytest
 from ethbrake_marl import load_scenario
 from ethbrake_marl.agents import optimise_coupled
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.limits.best_harm import best_known
+from ethbrake_marl.limits.limits import best_known
 from ethbrake_marl.limits.lower_bound import (
     FRONT_FIRST,
     LINE,
@@ -26,7 +26,7 @@ from ethbrake_marl.limits.lower_bound import (
     meet_rear,
     rounding,
 )
-from ethbrake_marl.physics import concatenate, make_worlds
+from ethbrake_marl.physics import Worlds, make_worlds
 from ethbrake_marl.scenario import Task
 from tests.limits.avoidability_worlds import moved_profiles, random_profiles, wide_worlds
 from tests.reference.play_profile import play_profile
@@ -203,7 +203,7 @@ def searched_worlds(n, seed):
     speeds[:, 1] = 0
     speeds[:, 2] = np.minimum(speeds[:, 2], 4)
     standing = replace(standing, speeds_mps=speeds, gaps_m=0.2 * standing.gaps_m)
-    return concatenate([*paper, wide_worlds(3 * n, 3, seed, strong=True), wide_worlds(n, 3, seed + 1), standing])
+    return Worlds.concatenate([*paper, wide_worlds(3 * n, 3, seed, strong=True), wide_worlds(n, 3, seed + 1), standing])
 
 
 def check_no_profile_below(n, harm_count, rounds, seed):

@@ -9,9 +9,9 @@ import pytest
 
 from ethbrake_marl.limits import lower_bound
 from ethbrake_marl.limits.lower_bound import (
-    CELL_OF,
     CELLS,
     FRONT_FIRST,
+    HEAP_WIDTH,
     LARGE,
     LINE,
     REAR_FIRST,
@@ -145,7 +145,7 @@ def test_soft_meetings__with_one_that_brakes_harder_end_where_it_would_have_been
 
 
 def room():
-    return empty_plan(), empty_plan(), np.empty((CELLS, CELL_OF.WIDTH))
+    return empty_plan(), empty_plan(), np.empty((CELLS, HEAP_WIDTH))
 
 
 def test_rear_first__is_impossible_where_the_leader_must_be_met_before():

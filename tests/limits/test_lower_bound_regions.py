@@ -7,7 +7,7 @@ import pytest
 
 from ethbrake_marl.limits.lower_bound import lower_bound
 from ethbrake_marl.physics import make_worlds
-from ethbrake_marl.search import constant_profiles, even_grid, profile_problem, search_profiles
+from ethbrake_marl.search import profile_problem
 
 HORIZON_S, TIME_STEP_S = 60.0, 0.1
 
@@ -106,8 +106,8 @@ def worlds_of(region, n, seed):
 
 def searched(worlds, harm_count, time_step_s, budget):
     problem = profile_problem(worlds, [1], harm_count=harm_count, horizon_s=HORIZON_S, time_step_s=time_step_s)
-    given = constant_profiles(problem, even_grid(problem, 9))
-    return search_profiles(problem, given, budget=budget).harm(harm_count)
+    given = problem.constant(problem.even_grid(9))
+    return problem.search(given, budget=budget).harm(harm_count)
 
 
 def check_region(region, n, budget, seed):

@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 
-from ethbrake_marl.limits.lower_bound import LINE
-from ethbrake_marl.limits.team_bound import behind_full_braking, gained, soft_behind
+from ethbrake_marl.limits.lower_bound import LINE, behind_full_braking, gained, soft_behind
 from ethbrake_marl.physics import advance, make_worlds
 
 STEP_S, FAR_M = 0.2, 1e4

@@ -9,18 +9,10 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.limits.lower_bound import avoidability, lower_bound
-from ethbrake_marl.limits.team_bound import team_bound
+from ethbrake_marl.limits.lower_bound import avoidability, lower_bound, team_bound
 from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.search import (
-    Profiles,
-    constant_profiles,
-    even_grid,
-    follow_profiles,
-    profile_problem,
-    search_profiles,
-)
+from ethbrake_marl.search import Profiles, profile_problem
 from tests.limits.team_worlds import REGIONS, worlds_of
 
 HORIZON_S = 60.0
@@ -178,8 +170,8 @@ def test_team_bound__refuses_what_it_does_not_cover(vehicles, given, told):
 
 
 def searched(problem, harm_count, budget):
-    given = constant_profiles(problem, even_grid(problem, 5))
-    return search_profiles(problem, given, budget=budget).harm(harm_count)
+    given = problem.constant(problem.even_grid(5))
+    return problem.search(given, budget=budget).harm(harm_count)
 
 
 def at_random(problem, rng, phases=8):
@@ -190,7 +182,7 @@ def at_random(problem, rng, phases=8):
     share = rng.uniform(0, 1, (n, phases, controlled))
     share = np.where(rng.random(share.shape) < 0.7, np.round(share), share)
     low, high = problem.bounds[:, None, :, 0], problem.bounds[:, None, :, 1]
-    return follow_profiles(problem, Profiles(ends, np.clip(low + (high - low) * share, low, high)))
+    return problem.follow(Profiles(ends, np.clip(low + (high - low) * share, low, high)))
 
 
 def check(worlds, vehicles, budget, draws, seed, steps=STEPS):

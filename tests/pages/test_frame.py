@@ -9,21 +9,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from ethbrake_marl.errors import plain_text
-from ethbrake_marl.figures.style import COLOURS, add_caption, new_figure
-from ethbrake_marl.pages.frame import (
-    Block,
-    Cell,
-    Section,
-    data,
-    facts,
-    heading,
-    opened,
-    page,
-    paragraph,
-    read_file,
-    table,
-)
-from ethbrake_marl.pages.vector import drawing, inline_svg
+from ethbrake_marl.figures import COLOURS, add_caption, inline_svg, new_figure
+from ethbrake_marl.files.sheet import Column, Sheet, Shown
+from ethbrake_marl.pages import page as pages
+from ethbrake_marl.pages.page import Part, Section, read_file
 from tests.pages.hostile import HOSTILE, UNSEEN, Page
 
 
@@ -31,13 +20,14 @@ def whole_page(text: str) -> str:
     """A page in which the text stands in every place that a text can have."""
     body = [
         text,
-        paragraph(text, "note"),
-        heading(text),
-        table([text, text], [[text, Cell(text, text, words=True)], Block(text), [text, text]], caption=text),
-        facts({text: text}),
-        opened(text, [paragraph(text)]),
+        Part.paragraph(text, "note"),
+        Part.heading(text),
+        Part.table(Sheet(text, [text, text], [[text, Shown(text, text)], text, [text, text]])),
+        Part.table(Sheet("", [text, Column(text)], [[text, text]])),
+        Part.facts({text: text}),
+        Part.opened(text, [Part.paragraph(text)]),
     ]
-    return page(text, [Section(text, body), Section(text, [text]), Section(text, [])], lead=text)
+    return pages.Page(text, [Section(text, body), Section(text, [text]), Section(text, [])], lead=text).html
 
 
 HARMLESS = Page(whole_page("Harmless"))
@@ -59,7 +49,7 @@ def test_page__no_text_becomes_markup(text: str) -> None:
 
 @pytest.mark.parametrize("text", HOSTILE)
 def test_data__stays_data(text: str) -> None:
-    html = str(data("x", {text: [text, 1.5, None]}))
+    html = str(Part.data("x", {text: [text, 1.5, None]}).html)
     inner = html.removeprefix('<script type="application/json" id="x">').removesuffix("</script>\n")
     assert not set("<>&") & set(inner)
     assert inner.isascii()
@@ -92,7 +82,7 @@ def a_figure() -> Figure:
 
 
 def test_drawing__names_of_two_figures_do_not_collide() -> None:
-    html = page("t", [Section("s", [drawing(a_figure(), "One", "d"), drawing(a_figure(), "Two", "d")])])
+    html = pages.Page("t", [Section("s", [Part.drawing(a_figure(), name, "d") for name in ("One", "Two")])]).html
     found = Page(html)
     ids = [attributes["id"] for _, attributes in found.tags if "id" in attributes]
     assert len(ids) == len(set(ids))
@@ -102,12 +92,12 @@ def test_drawing__names_of_two_figures_do_not_collide() -> None:
 
 
 def test_drawing__has_text_as_outlines_and_the_colours_of_the_page() -> None:
-    html = drawing(a_figure(), "One", "What it shows.").html
+    html = Part.drawing(a_figure(), "One", "What it shows.").html
     assert "<text" not in html and "font-family" not in html
     assert " style=" not in html and "<style" not in html
     assert all(f"var(--series-{k})" in html for k in range(len(COLOURS)))
     assert 'aria-label="One. What it shows."' in html
-    assert "var(" not in drawing(a_figure(), "One", "d", alone=True).html
+    assert "var(" not in Part.drawing(a_figure(), "One", "d", alone=True).html
 
 
 @pytest.mark.parametrize("text", HOSTILE[:24])
@@ -129,7 +119,7 @@ def test_drawing__the_caption_is_text_of_the_page() -> None:
         * 2
     )
     add_caption(figure, f"{text.strip()} Known.")
-    html = drawing(figure, "Title", "Words.", known="Known.").html
+    html = Part.drawing(figure, "Title", "Words.", known="Known.").html
     shown = Page(str(html)).text.replace("\n", " ")
     assert shown.endswith(text.strip()) and "<!--" not in html
     taken = re.search(r'viewBox="0 0 432 ([0-9.]+)"', html)

@@ -10,19 +10,10 @@ import pytest
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.evaluation import Evaluation, evaluate, summarise
-from ethbrake_marl.figures.style import new_figure
-from ethbrake_marl.pages.report import (
-    Report,
-    ReportFigure,
-    ReportTest,
-    choose_shown,
-    focus_of,
-    play_for_report,
-    render_report,
-    worst_rows,
-    write_report,
-)
-from ethbrake_marl.physics import Ints, Worlds
+from ethbrake_marl.figures import new_figure
+from ethbrake_marl.pages.page import Part
+from ethbrake_marl.pages.report import Report, choose_shown, worst_rows
+from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario
 from tests.fixtures.pictures import draw_nothing
 from tests.pages.hostile import HOSTILE, UNSEEN, Page
@@ -43,19 +34,17 @@ def report(evaluation: Evaluation) -> Report:
         title="PPO on paper-random",
         rows=summarise(part),
         evaluation=part,
-        played=play_for_report(part, agents, "constant:4.5"),
-        focus="constant:4.5",
-        figures=[ReportFigure("Learning curve", "Harm over steps.", new_figure(4.0, 3.0))],
-        tests=[ReportTest("paper-other", "Another test.", summarise(evaluation))],
+        figures=[Part.drawing(new_figure(4.0, 3.0), "Learning curve", "Harm over steps.")],
+        tests=[("paper-other", "Another test.", summarise(evaluation))],
         summary="One million steps.",
         settings={"Training seed": 5, "Command": "ethbrake run"},
         versions={"numpy": "2.4.6"},
-    )
+    ).driven(agents)
 
 
 @pytest.fixture(scope="module")
 def html(report: Report) -> str:
-    return render_report(report)
+    return report.html
 
 
 def test_report__loads_nothing_from_anywhere(html: str) -> None:
@@ -114,15 +103,14 @@ def test_report__says_who_did_not_repeat_itself(pair: Scenario, html: str) -> No
     class Fickle:
         name, drives = "fickle", iter(range(100))
 
-        def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-            self.command = -float(next(self.drives)) / 2.0
+        def begin(self, alert: Worlds, vehicle: int, scripts: object) -> np.ndarray:
+            return np.full(alert.n, -float(next(self.drives)) / 2.0)
 
-        def act(self, worlds: Worlds, vehicle: int) -> np.ndarray:
-            return np.full(worlds.n, self.command)
+        def act(self, worlds: Worlds, memory: np.ndarray, vehicle: int) -> tuple[np.ndarray, np.ndarray]:
+            return memory, memory
 
     result = evaluate(pair.sample(3, 0), {"fickle": Fickle()}, scenario=pair)
-    played = play_for_report(result, {"fickle": Fickle()}, "fickle")
-    text = render_report(Report("t", summarise(result), result, played, focus="fickle"))
+    text = Report("t", summarise(result), result).driven({"fickle": Fickle()}).html
     assert "fickle did not repeat itself in 3 worlds of these" in text
     assert "did not repeat itself" not in html
 
@@ -131,17 +119,19 @@ def test_chosen__begin_with_the_worst_and_are_the_same_each_time(report: Report)
     assert report.evaluation is not None
     chosen = choose_shown(report.evaluation, "constant:4.5")
     worst = worst_rows(report.evaluation, "constant:4.5")
-    assert [each.row for each in chosen[:10]] == worst.tolist()
+    assert list(chosen)[:10] == worst.tolist()
     assert chosen == choose_shown(report.evaluation, "constant:4.5")
-    assert len({each.kind for each in chosen}) >= 4
-    assert focus_of(report.rows) == "constant:4.5"
+    assert len({each.kind for each in chosen.values()}) >= 4
+    assert report.focus == "constant:4.5" and [one.number for one in report.played] == [
+        one.number for one in chosen.values()
+    ]
 
 
 def test_chosen__say_whose_harm_it_is(report: Report) -> None:
     assert report.evaluation is not None
     outcome = report.evaluation.outcome("full_brake")
-    for each in choose_shown(report.evaluation, "full_brake"):
-        first, total = outcome.first_impact_harm[each.row], outcome.total_harm[each.row]
+    for row, each in choose_shown(report.evaluation, "full_brake").items():
+        first, total = outcome.first_impact_harm[row], outcome.total_harm[row]
         assert each.why == f"full_brake: harm {first:.2f} first-impact, {total:.2f} total"
 
 
@@ -163,11 +153,8 @@ def test_report__hostile_names_are_text_everywhere(pair: Scenario, first: int, m
     agents = {name: make_agent("constant:4") for name in names}
     result = evaluate(pair.sample(3, 0), agents, scenario=pair)
     words, told = " ".join(names), {name: name for name in names}
-    played = play_for_report(result, agents, names[0])
-    given = Report(
-        words, summarise(result), result, played, None, names[0], summary=words, settings=told, versions=told
-    )
-    html = render_report(given)
+    given = Report(words, summarise(result), result, focus=names[0], summary=words, settings=told, versions=told)
+    html = given.driven(agents).html
     found = Page(html)
     assert found.open == []
     assert not set(html) & UNSEEN
@@ -241,7 +228,7 @@ ALLOWED = set(
 
 def test_report__of_another_scenario_leaves_the_papers_rows_out(pair: Scenario) -> None:
     result = evaluate(pair.sample(2, 0), {"full_brake": make_agent("full_brake")}, scenario=pair)
-    text = Page(render_report(Report(title="Pair", rows=summarise(result)))).text
+    text = Page(Report(title="Pair", rows=summarise(result)).html).text
     assert "9.00" in text
     assert "as printed" not in text
     assert "5.6202" not in text
@@ -249,7 +236,7 @@ def test_report__of_another_scenario_leaves_the_papers_rows_out(pair: Scenario) 
 
 def test_report__leaves_out_columns_without_a_value_and_says_so(pair: Scenario) -> None:
     result = evaluate(pair.sample(2, 0), {"coast": make_agent("coast")}, scenario=pair)
-    page = Page(render_report(Report("t", summarise(result), result, play_for_report(result, COASTING, "coast"))))
+    page = Page(Report("t", summarise(result), result).driven(COASTING).html)
     assert "left out: Decrease, first-impact; Decrease, total; Predicted harm" in page.text
     assert page.text.count("Decrease, total") == page.text.count("Predicted harm") == 1
     assert "1 − harm / harm of full braking" not in page.text
@@ -259,7 +246,7 @@ def test_report__leaves_out_columns_without_a_value_and_says_so(pair: Scenario) 
 def test_report__says_where_the_horizon_cut_episodes_off(pair: Scenario, html: str) -> None:
     short = pair.replace(horizon_s=1.0)
     result = evaluate(short.sample(2, 0), COASTING, scenario=short)
-    text = Page(render_report(Report("t", summarise(result), result, play_for_report(result, COASTING, "coast")))).text
+    text = Page(Report("t", summarise(result), result).driven(COASTING).html).text
     moving = 2 - int(result.outcome("coast").at_rest.sum())
     assert moving and f"to the horizon of 1 s: in {moving} worlds the line of some agent" in text
     assert "from the alert to rest." in html
@@ -269,20 +256,18 @@ def test_report__says_where_the_horizon_cut_episodes_off(pair: Scenario, html: s
 def test_write_report__overwrites_only_by_force(tmp_path: Path, pair: Scenario) -> None:
     rows = summarise(evaluate(pair.sample(2, 0), {"coast": make_agent("coast")}, scenario=pair))
     path = tmp_path / "report.html"
-    write_report(path, Report("Mine", rows))
-    assert path.read_text("utf-8") == render_report(Report("Mine", rows))
+    Report("Mine", rows).write(path)
+    assert path.read_text("utf-8") == Report("Mine", rows).html
     with pytest.raises(AlreadyExists):
-        write_report(path, Report("Mine", rows))
-    write_report(path, Report(title="Other", rows=[]), force=True)
+        Report("Mine", rows).write(path)
+    Report(title="Other", rows=[]).write(path, force=True)
     assert "<h1>Other</h1>" in path.read_text("utf-8")
 
 
 def test_report__counts_a_cascade_whole_but_draws_its_last_impact(pair: Scenario) -> None:
     bouncy = pair.replace(restitution=0.8)
     result = evaluate(bouncy.sample(1, 0), {"coast": make_agent("coast")}, scenario=bouncy)
-    played = play_for_report(result, {"coast": make_agent("coast")}, "coast")
-    (episode,) = episode_data(render_report(Report("t", summarise(result), result, played, focus="coast")))["worlds"][
-        0
-    ]["episodes"]
+    html = Report("t", summarise(result), result).driven(COASTING).html
+    (episode,) = episode_data(html)["worlds"][0]["episodes"]
     assert episode["impacts"][-1][4] == result.outcome("coast").impacts[0] > len(episode["impacts"]) - 1
     assert np.diff([impact[4] for impact in episode["impacts"]]).min() > 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ethbrake_marl.physics import Floats, Impacts, Worlds
-from ethbrake_marl.physics.kernel import PLASTIC_SPEED_MPS
+from ethbrake_marl.physics.kernel import BOUND
 from tests.reference.tolerances import EPS
 
 Wide = np.longdouble
@@ -36,7 +36,7 @@ def restitution_eps(before: Worlds, after: Worlds) -> Floats:
     """Two vehicles: error of the speed at which they separate, in eps of the larger speed, for those that met, [k]."""
     front, rear = before.speeds_mps[:, 0].astype(Wide), before.speeds_mps[:, 1].astype(Wide)
     closing = rear - front
-    e = np.where(closing >= PLASTIC_SPEED_MPS, before.vehicles.restitution, 0.0)
+    e = np.where(closing >= BOUND.PLASTIC_SPEED_MPS, before.vehicles.restitution, 0.0)
     separation = after.speeds_mps[:, 0].astype(Wide) - after.speeds_mps[:, 1]
     largest = np.maximum(np.abs(before.speeds_mps).max(axis=1), np.abs(after.speeds_mps).max(axis=1))
     met = (closing > 0) & (before.gaps_m[:, 0] == 0.0)

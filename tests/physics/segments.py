@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.physics import Bools, Floats, ImpactRows, Ints, Worlds, advance, make_worlds
-from ethbrake_marl.physics.kernel import TOUCH_SPEED_MPS
+from ethbrake_marl.physics.kernel import BOUND
 from tests.physics.exact_simulator import Outcome, line_of, simulate
 from tests.reference.tolerances import DISCRIMINANT_EPS, END_EPS, EPS, GAP_M
 
@@ -138,8 +138,8 @@ def _piece(motion: Solo, gaps: Floats, begin: Floats, finish: Floats, blur: Floa
         passed = np.where(closing > 0.0, 2.0 * gap / (closing + root), (root - closing) / pressing)
     result.time[meets] = (begin + passed)[meets]
     result.squared[meets] = squared[meets]
-    grazes = turns & (np.abs(squared) <= blur + TOUCH_SPEED_MPS**2)
-    gentle = meets & (squared <= blur + TOUCH_SPEED_MPS**2)
+    grazes = turns & (np.abs(squared) <= blur + BOUND.TOUCH_SPEED_MPS**2)
+    gentle = meets & (squared <= blur + BOUND.TOUCH_SPEED_MPS**2)
     result.doubt[still_apart & (length > 0.0) & (grazes | gentle)] = True
     np.minimum(result.least, np.where(still_apart, lowest, np.inf), out=result.least)
 
@@ -232,7 +232,7 @@ def _borderline(
         time, pair, closing = kernel[len(exact.hits)]
     v = float(segments.worlds.speeds_mps[k].max()) + CAPACITY_MPS2 * float(until)
     reach = float(segments.worlds.gaps_m[k].max()) + v * float(until)
-    if closing**2 - TOUCH_SPEED_MPS**2 <= DISCRIMINANT_EPS * EPS * (v**2 + 2.0 * CAPACITY_MPS2 * reach):
+    if closing**2 - BOUND.TOUCH_SPEED_MPS**2 <= DISCRIMINANT_EPS * EPS * (v**2 + 2.0 * CAPACITY_MPS2 * reach):
         return True
     if time < float(until) - A_LITTLE_S:
         return False

@@ -12,7 +12,7 @@ import pytest
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.physics import Worlds, advance, kernel, make_worlds
-from ethbrake_marl.physics.compiled import by_parts
+from ethbrake_marl.physics.compiling import by_parts
 
 
 def line(gaps, speeds, *, mass=1.0, e=0.0, latency=0.0, limit=100.0, braking=10.0, driving=10.0) -> Worlds:
@@ -67,7 +67,7 @@ def test_impact__follows_the_papers_velocity_exchange():
 
 
 def test_impact__is_listed_only_on_demand_and_then_in_one_run(monkeypatch):
-    module, runs = importlib.import_module("ethbrake_marl.physics.advance"), []
+    module, runs = importlib.import_module("ethbrake_marl.physics.batch"), []
     monkeypatch.setattr(module, "by_parts", lambda *given: runs.append(given) or by_parts(*given))
     worlds = line([10.0], [0.0, 10.0])
     assert advance(worlds, 0.0, 2.0)[1].rows is None
@@ -220,7 +220,7 @@ def test_overlap__that_no_advance_could_have_left_is_reported():
 def test_bounces__more_than_any_segment_holds_are_reported(monkeypatch):
     # e = 1 and a push of 10 m/s2 against a heavy wall: a bounce of 0.2 m/s every 0.04 s for 50,000 s
     if numba.config.DISABLE_JIT:  # a million events would take long
-        monkeypatch.setattr(kernel, "MOST_EVENTS", 50)
+        monkeypatch.setattr(kernel, "BOUND", kernel.BOUND._replace(MOST_EVENTS=50))
     wall = line([0.0], [0.0, 0.2], mass=[2.0**60, 1.0], e=1.0)
     with pytest.raises(PhysicsError, match="world 0: more than 1000000 events between 0 s and 50000 s"):
         advance(wall, [-10.0, 10.0], 50_000.0)

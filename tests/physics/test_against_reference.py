@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ethbrake_marl.physics.advance import Impacts, advance
+from ethbrake_marl.physics.batch import Impacts, advance
 from ethbrake_marl.physics.worlds import Worlds, make_worlds
 from tests.reference.tiny_steps import Outcome, simulate
 

@@ -7,8 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
 from tests.physics.exact_simulator import line_of, regression, simulate

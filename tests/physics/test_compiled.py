@@ -13,13 +13,7 @@ import pytest
 from numba.core.errors import NumbaError
 
 import ethbrake_marl
-from ethbrake_marl.physics.compiled import compiled as compile_kernel
-from ethbrake_marl.physics.compiled import (
-    compiled_apart,
-    compiled_bare,
-    compiled_bare_apart,
-    compiled_within,
-)
+from ethbrake_marl.physics.compiling import compiled as compile_kernel
 
 needs_compiler = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="compilation is switched off")
 
@@ -36,21 +30,21 @@ def test_compiled__is_strict_and_releases_the_lock():
 @pytest.mark.parametrize(
     ("way", "more"),
     [
-        (compile_kernel, {"forceinline": True}),
-        (compiled_apart, {"forceinline": False}),
-        (compiled_within, {"inline": "always"}),
-        (compiled_bare, {"forceinline": True, "_nrt": False}),
-        (compiled_bare_apart, {"forceinline": False, "_nrt": False}),
+        ({}, {"forceinline": True}),
+        ({"apart": True}, {"forceinline": False}),
+        ({"within": True}, {"inline": "always"}),
+        ({"bare": True}, {"forceinline": True, "_nrt": False}),
+        ({"apart": True, "bare": True}, {"forceinline": False, "_nrt": False}),
     ],
 )
 def test_compiled__has_these_options(way, more):
     options = {"nopython": True, "boundscheck": None, "fastmath": False, "nogil": True, "error_model": "numpy", **more}
-    assert way(lambda x: x).targetoptions == options
+    assert compile_kernel(**way)(lambda x: x).targetoptions == options
 
 
 @needs_compiler
 def test_compiled_bare__leaves_the_counts_of_references_alone():
-    @compiled_bare
+    @compile_kernel(bare=True)
     def first(values):
         return values[1:][0]
 
@@ -59,7 +53,7 @@ def test_compiled_bare__leaves_the_counts_of_references_alone():
     assert [first(values) for _ in range(5)] == [1.0] * 5
     assert sys.getrefcount(values) == before
     with pytest.raises(NumbaError, match="NRT required"):
-        compiled_bare(lambda n: np.zeros(n))(3)  # it can make no array: told at once
+        compile_kernel(bare=True)(lambda n: np.zeros(n))(3)  # it can make no array: told at once
 
 
 @needs_compiler
@@ -71,9 +65,8 @@ def test_compiled_bare__gives_no_array_back():
     bare = []
     for source in sorted(Path(ethbrake_marl.__file__).parent.rglob("*.py")):
         text = source.read_text("utf-8")
-        for node in ast.walk(ast.parse(text)) if "compiled_bare" in text else ():
-            names = {d.id for d in getattr(node, "decorator_list", ()) if isinstance(d, ast.Name)}
-            if names & {"compiled_bare", "compiled_bare_apart"}:
+        for node in ast.walk(ast.parse(text)) if "bare=True" in text else ():
+            if any("bare=True" in ast.unparse(each) for each in getattr(node, "decorator_list", ())):
                 bare.append(f"{source.name}: {node.name}")
                 words = set(re.findall(r"\w+", ast.unparse(node.returns)))
                 assert words <= {"None", "bool", "int", "float", "tuple"}, bare[-1]

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 from scipy.special import ndtri
 
-from ethbrake_marl.physics.compiled import exp, exp_each, log, normal_probability, normal_quantile, normal_quantile_each
+from ethbrake_marl.physics.compiling import (
+    exp,
+    exp_each,
+    log,
+    normal_probability,
+    normal_quantile,
+    normal_quantile_each,
+)
 
 mpmath.mp.dps = 40
 

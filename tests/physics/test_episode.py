@@ -7,17 +7,14 @@ import inspect
 import numpy as np
 import pytest
 
-from ethbrake_marl import search as search_kernel
+from ethbrake_marl import engine as engine_step, search as search_kernel
 from ethbrake_marl.agents.protocol import fixed_commands
 from ethbrake_marl.agents.rollout import drive, script_agents
-from ethbrake_marl.engine import step as engine_step
-from ethbrake_marl.physics import kernel
-from ethbrake_marl.physics import kernel as episode
-from ethbrake_marl.physics.kernel import decision_at, first_decision_s, number_of_decisions
+from ethbrake_marl.physics import kernel, kernel as episode
+from ethbrake_marl.physics.kernel import Decisions
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.search import Profiles, follow_profiles, profile_problem
-from ethbrake_marl.shield import certify_kernel
-from ethbrake_marl.shield import certify_kernel as members
+from ethbrake_marl.search import Profiles, profile_problem
+from ethbrake_marl.shield import step_shield, step_shield as members
 
 RULES = ("step_end_s", "onset_s", "command_in_force", "stands")
 PAPER = load_scenario("paper-random")
@@ -30,15 +27,11 @@ class Phases:
     name = "phases"
 
     def __init__(self, commands: np.ndarray, length: int) -> None:
-        self.commands, self.length, self.step = commands, length, 0
-
-    def begin(self, worlds, vehicle, rows):
-        self.step = 0
+        self.commands, self.length = commands, length
 
     def act(self, worlds, vehicle):
-
         started = worlds.vehicles.latency_s[:, vehicle]
-        phase = np.maximum(decision_at(worlds.time_s, started, 0.1), 0) // self.length
+        phase = np.maximum(Decisions(started, 0.1).latest(worlds.time_s), 0) // self.length
         return self.commands[np.arange(worlds.n), np.minimum(phase, self.commands.shape[1] - 1)]
 
 
@@ -54,7 +47,7 @@ def test_rules__are_the_same_objects_in_engine_search_and_shield():
 
 def test_rules__stand_nowhere_else():
     # who plays an episode by calling the kernel of segments itself would have a step of its own
-    for module in (search_kernel, certify_kernel, members):
+    for module in (search_kernel, step_shield, members):
         assert "advance_table" not in inspect.getsource(module)
     source = inspect.getsource(engine_step.step_worlds.py_func)
     assert all(f"{name}(" in source for name in (*RULES, "advance_table"))
@@ -75,7 +68,7 @@ def test_profiles__step_by_step_realise_what_the_engine_does_to_the_bit(name, le
     problem = profile_problem(worlds, [vehicle], horizon_s=scenario.horizon_s, others_mps2=others)
     ends = np.minimum((np.arange(commands.shape[1]) + 1) * length, problem.last_step[:, np.newaxis])
     ends[:, -1] = problem.last_step
-    first, total = follow_profiles(problem, Profiles(ends, commands[:, :, np.newaxis]))
+    first, total = problem.follow(Profiles(ends, commands[:, :, np.newaxis]))
     ledger = drive(worlds, Phases(commands, length), scenario, vehicle).ledger
     assert np.array_equal(first, ledger.world_harm("first"))
     assert np.array_equal(total, ledger.world_harm("total"))
@@ -83,17 +76,17 @@ def test_profiles__step_by_step_realise_what_the_engine_does_to_the_bit(name, le
 
 def test_first_decision__is_the_least_latency_of_who_decides_or_now():
     worlds = PAPER.sample(3, 1).worlds
-    assert first_decision_s(worlds, [1, 2]).tolist() == [0.5] * 3
-    assert first_decision_s(worlds, [2]).tolist() == [0.8] * 3
-    assert first_decision_s(worlds, []).tolist() == [0.0] * 3
+    assert worlds.first_decision_s([1, 2]).tolist() == [0.5] * 3
+    assert worlds.first_decision_s([2]).tolist() == [0.8] * 3
+    assert worlds.first_decision_s([]).tolist() == [0.0] * 3
 
 
 @pytest.mark.parametrize(("horizon", "number"), [(8.0, 75), (8.05, 76), (0.55, 1), (0.6, 1)])
 def test_number_of_decisions__the_last_one_ends_at_the_horizon(horizon, number):
-    assert number_of_decisions(np.array([0.5]), 0.1, horizon).tolist() == [number]
+    assert Decisions(np.array([0.5]), 0.1).before(horizon).tolist() == [number]
 
 
 def test_decision_at__is_on_the_grid_in_spite_of_rounding():
     steps = np.arange(2000)
-    assert np.array_equal(decision_at(0.5 + steps * 0.1, np.full(2000, 0.5), 0.1), steps)
-    assert decision_at(np.array([0.4999]), np.array([0.5]), 0.1).tolist() == [-1]
+    assert np.array_equal(Decisions(np.full(2000, 0.5), 0.1).latest(0.5 + steps * 0.1), steps)
+    assert Decisions(np.array([0.5]), 0.1).latest(np.array([0.4999])).tolist() == [-1]

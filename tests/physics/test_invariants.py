@@ -6,8 +6,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from ethbrake_marl.physics import Worlds, advance, make_worlds
 from tests.physics.measures import energy_rise_eps, momentum_eps, restitution_eps, rounds

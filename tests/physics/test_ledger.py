@@ -6,8 +6,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from ethbrake_marl.harm import empty_ledger, split
 from ethbrake_marl.physics import advance, make_worlds

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ethbrake_marl.physics import Impacts, advance, concatenate, make_worlds
+from ethbrake_marl.physics import Impacts, Worlds, advance, make_worlds
 from tests.physics.random_worlds import Batch, driving_lines
 from tests.physics.runs import HARMS, HORIZON_S, last_digit_errors, once, split_errors, state_bytes
 from tests.reference.tolerances import SPLIT, SPLIT_CASCADE
@@ -76,7 +76,7 @@ def test_batch__of_one_of_many_and_in_any_order_are_the_same_bits(N):
         assert getattr(shuffled[0], name)[back].tobytes() == getattr(whole[0], name).tobytes()
     assert shuffled[1].total_harm[back].tobytes() == whole[1].total_harm.tobytes()
     singles = [once(Batch(batch.worlds.take([k]), batch.command[[k]])) for k in range(300)]
-    joined = concatenate([world for world, _ in singles])
+    joined = Worlds.concatenate([world for world, _ in singles])
     harm = [np.concatenate([getattr(i, f) for _, i in singles]) for f in HARMS]
     assert state_bytes(joined, Impacts(*harm)) == state_bytes(*whole)
     assert whole[1].count.sum() > 100
@@ -110,7 +110,7 @@ def test_threads__two_give_the_bits_of_one():
     with ThreadPoolExecutor(2) as pool:
         parts = list(pool.map(once, chunks))
     harm = [np.concatenate([getattr(i, f) for _, i in parts]) for f in HARMS]
-    assert state_bytes(concatenate([world for world, _ in parts]), Impacts(*harm)) == state_bytes(*whole)
+    assert state_bytes(Worlds.concatenate([world for world, _ in parts]), Impacts(*harm)) == state_bytes(*whole)
 
 
 # ---------------------------------------------------------------- units and neighbours

@@ -10,8 +10,7 @@ import pytest
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import empty_ledger
-from ethbrake_marl.physics import Worlds, advance, advance_sampled, concatenate, forecast, make_worlds
-from ethbrake_marl.physics.kernel import obstacle_ahead, with_obstacle
+from ethbrake_marl.physics import Worlds, advance, advance_sampled, forecast, make_worlds
 from tests.physics.exact_simulator import line_of, simulate
 from tests.physics.random_worlds import Batch, Draws, driving_lines, touching_lines
 from tests.physics.runs import HARMS, HORIZON_S, state_bytes
@@ -174,12 +173,12 @@ def test_obstacle__splitting_a_segment_changes_nothing():
 def test_obstacle__ahead_of_some_worlds_only_each_is_as_alone():
     plain, ahead = driving_lines(166, 40, 3), place_ahead(driving_lines(167, 40, 3), 168)
     order = np.random.default_rng(1).permutation(80)
-    mixed = concatenate([plain.worlds, ahead.worlds]).take(order)
+    mixed = Worlds.concatenate([plain.worlds, ahead.worlds]).take(order)
     command = np.concatenate([plain.command, ahead.command])[order]
-    assert np.array_equal(obstacle_ahead(mixed), order >= 40)
+    assert np.array_equal(mixed.obstacle_ahead, order >= 40)
     whole, impacts = advance(mixed, command, until_s=HORIZON_S, record=True, threads=2)
     parts = [advance(mixed.take([k]), command[[k]], until_s=HORIZON_S, record=True) for k in range(80)]
-    alone = concatenate([world for world, _ in parts])
+    alone = Worlds.concatenate([world for world, _ in parts])
     harm = {name: np.concatenate([getattr(each, name) for _, each in parts]) for name in HARMS}
     assert state_bytes(alone, replace(impacts, **harm)) == state_bytes(whole, impacts)
     assert impacts.rows.pair.tolist() == [p for _, each in parts for p in each.rows.pair.tolist()]
@@ -188,7 +187,7 @@ def test_obstacle__ahead_of_some_worlds_only_each_is_as_alone():
 
 def test_forecast__counts_the_obstacle_as_advance_does():
     plain, ahead = driving_lines(166, 20, 3), place_ahead(driving_lines(167, 20, 3), 168, high=15.0)
-    mixed, command = concatenate([ahead.worlds, plain.worlds]), np.concatenate([ahead.command, plain.command])
+    mixed, command = Worlds.concatenate([ahead.worlds, plain.worlds]), np.concatenate([ahead.command, plain.command])
     candidates = np.stack([np.full(40, -8.0), np.zeros(40), np.full(40, 4.0)], axis=1)
     first, total = forecast(mixed, command, 0, candidates, HORIZON_S)
     for c in range(3):
@@ -222,7 +221,7 @@ def test_make_worlds__refuses_an_obstacle_at_no_distance(gap):
 
 
 def test_with_obstacle__writes_it_out_in_front():
-    worlds = with_obstacle(replace(line(12.0, [5.0], [10.0, 9.0]), obstacle_hit=np.array([True])))
+    worlds = replace(line(12.0, [5.0], [10.0, 9.0]), obstacle_hit=np.array([True])).with_obstacle()
     assert worlds.gaps_m.tolist() == [[12.0, 5.0]] and worlds.speeds_mps.tolist() == [[0.0, 10.0, 9.0]]
     assert worlds.pair_hit.tolist() == [[True, False]] and worlds.command_mps2.tolist() == [[0.0] * 3]
     v = worlds.vehicles

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics import Worlds, advance, make_worlds
-from ethbrake_marl.physics import compiled as parallel
-from ethbrake_marl.physics.compiled import by_parts
+from ethbrake_marl.physics import Worlds, advance, compiling as parallel, make_worlds
+from ethbrake_marl.physics.compiling import by_parts
 from ethbrake_marl.scenario import load_scenario
 
 

@@ -8,23 +8,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.physics import advance, make_worlds
-from ethbrake_marl.physics.advance import (
-    NO_ROWS,
-    Packed,
-    command_at,
-    gap_at,
-    harm_at,
-    has_news,
-    ledger_columns,
-    pack,
-    params_at,
-    previous_at,
-    speed_at,
-    state_width,
-    unpack,
-    with_news_columns,
-)
-from ethbrake_marl.physics.kernel import LISTED
+from ethbrake_marl.physics.batch import Packed, columns
 
 
 def worlds(n, vehicles):
@@ -50,9 +34,9 @@ def test_unpack__gives_back_every_bit_in_its_own_memory(n, vehicles, told):
         news = np.arange(float(n * vehicles**2)).reshape(n, vehicles, vehicles)
         told_of = {"own_latency_s": 0.5 * given.vehicles.latency_s, "known_from_s": news}
         given = replace(given, vehicles=replace(given.vehicles, **told_of))
-    rows = pack(given)
-    assert has_news(rows.params, vehicles) == told
-    back = unpack(rows)
+    rows = Packed.of(given)
+    assert rows.has_news == told
+    back = rows.worlds()
     rows.state[:], rows.params[:] = -1.0, -1.0
     for part, again in ((given, back), (given.vehicles, back.vehicles)):
         for name in part.__slots__:
@@ -62,21 +46,24 @@ def test_unpack__gives_back_every_bit_in_its_own_memory(n, vehicles, told):
 
 
 @pytest.mark.parametrize("told", [False, True])
-def test_with_news_columns__says_the_same_as_without(told):
+def test_widened_rows__say_the_same_as_before(told):
     given = worlds(7, 3)
     if told:
         given = replace(given, vehicles=replace(given.vehicles, own_latency_s=0.5 * given.vehicles.latency_s))
-    state, params = pack(given)
-    wide = with_news_columns(params, 3)
-    assert (params.shape, wide.shape) == ((7, 28 if told else 16), (7, 28))
-    again = unpack(Packed(state, wide)).vehicles
-    for name in again.__slots__:
-        np.testing.assert_array_equal(getattr(again, name), getattr(given.vehicles, name), strict=True)
+    rows = Packed.of(given)
+    wide = rows.widened(obstacle=True, news=True)
+    assert (rows.params.shape, wide.params.shape) == ((7, 28 if told else 16), (7, 28))
+    assert (rows.state.shape, wide.state.shape) == ((7, 20), (7, 25)) and not rows.has_obstacle and wide.has_obstacle
+    again = wide.worlds()
+    for part, other in ((given, again), (given.vehicles, again.vehicles)):
+        for name in part.__slots__:
+            if name != "vehicles":
+                np.testing.assert_array_equal(getattr(other, name), getattr(part, name), strict=True)
 
 
-def test_ledger_columns__are_in_their_own_memory():
-    rows = pack(worlds(1, 3))
-    first, total, count = ledger_columns(rows.state, 3)
+def test_ledger__is_in_its_own_memory():
+    rows = Packed.of(worlds(1, 3))
+    first, total, count, *_ = rows.ledger()
     rows.state[:] = 5.0
     assert first.tolist() == total.tolist() == count.tolist() == [[0.0, 0.0]]
     assert isinstance(rows, Packed)
@@ -84,14 +71,14 @@ def test_ledger_columns__are_in_their_own_memory():
 
 def test_columns__follow_each_other_without_a_hole():
     # 3 vehicles, 2 pairs: time | speeds 3 | commands 3 | before 3 | gaps 2 | hit 2 | first 2 | total 2 | count 2
-    at = [speed_at(3), command_at(3), previous_at(3), gap_at(3), harm_at(3)]
-    assert at == [1, 4, 7, 10, 14] and state_width(3) == 20
-    assert [params_at(group, 3) for group in range(7)] == [1, 4, 7, 10, 13, 16, 19]
-    assert pack(worlds(1, 3)).state.shape == (1, 20) and NO_ROWS.shape == (0, LISTED.WIDTH)
+    # and restitution | braking 3 | driving 3 | latency 3 | mass 3 | limit 3 | own latency 3 | news 9
+    rows = Packed.of(worlds(1, 3))
+    assert rows.column == (3, 0, 1, 4, 7, 10, 12, 14, 20, 0, 1, 4, 7, 10, 13, 16, 19, 28)
+    assert columns(rows.state) == rows.column and rows.state.shape == (1, 20) and rows.params.shape == (1, 16)
 
 
-def test_ledger_columns__are_those_of_the_harm():
-    state = np.arange(20.0)[None]
-    first, total, count = ledger_columns(state, 3)
+def test_ledger__is_that_of_the_columns_of_harm():
+    first, total, count, *of_obstacle = Packed(np.arange(25.0)[None], np.empty((1, 16))).ledger()
     assert (first.tolist(), total.tolist(), count.tolist()) == ([[14.0, 15.0]], [[16.0, 17.0]], [[18, 19]])
-    assert count.dtype == np.int64
+    assert [each.tolist() for each in of_obstacle] == [[22.0], [23.0], [24]]
+    assert count.dtype == of_obstacle[2].dtype == np.int64

@@ -14,10 +14,7 @@ from tests.physics.test_sampled import line, paper_random
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (
-            lambda w: advance_sampled(w, [0.0, 0.0, -9.0], until_s=1.0),
-            r"\[0, 2\] = -9: must be in \[-6, 10\] m/s2",
-        ),
+        (lambda w: advance_sampled(w, [0.0, 0.0, -9.0], until_s=1.0), r"\[0, 2\] = -9: must be in \[-6, 10\] m/s2"),
         (lambda w: advance_sampled(w, [0.0, math.nan, 0.0], until_s=1.0), r"command_mps2\[0, 1\] = nan"),
         (lambda w: advance_sampled(w, [0.0, 0.0], until_s=1.0), r"command_mps2: shape \(2,\) does not fit \(4, 3\)"),
         (lambda w: advance_sampled(w, 0.0, until_s=[1.0, 2.0]), r"until_s: shape \(2,\) does not fit \(4,\)"),

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics import Worlds, assign, concatenate, make_worlds
-from ethbrake_marl.physics.worlds import is_known_at_once
+from ethbrake_marl.physics import Worlds, make_worlds
 
 PARAMETERS = {
     "braking_capacity_mps2": 7.0,
@@ -84,20 +83,20 @@ def test_known_at_once__takes_no_memory_and_cannot_be_written():
     worlds = build(speeds=np.full((4, 3), 10.0), gaps=5.0, latency_s=[0.0, 0.25, 0.5])
     two = np.array([2, 0])
     some_rows = (worlds.take(two), worlds.take(np.empty(0, np.int64)))
-    for some in (worlds, *some_rows, concatenate([worlds, worlds]), assign(worlds, two, some_rows[0])):
+    for some in (worlds, *some_rows, Worlds.concatenate([worlds, worlds]), worlds.assign(two, some_rows[0])):
         news = some.vehicles.known_from_s
         assert news.tolist() == [[[0.0] * 3, [0.25] * 3, [0.5] * 3]] * some.n
-        assert is_known_at_once(some.vehicles) and (news.strides[2], news.flags.writeable) == (0, False)
+        assert some.vehicles.is_known_at_once and (news.strides[2], news.flags.writeable) == (0, False)
 
 
 def test_is_known_at_once__goes_by_the_numbers():
     vehicles = build(latency_s=[0.0, 0.25, 0.5]).vehicles
-    assert is_known_at_once(replace(vehicles, known_from_s=vehicles.known_from_s.copy()))
-    assert not is_known_at_once(replace(vehicles, latency_s=vehicles.latency_s + 0.125))
-    assert not is_known_at_once(replace(vehicles, own_latency_s=vehicles.latency_s - 0.125))
+    assert replace(vehicles, known_from_s=vehicles.known_from_s.copy()).is_known_at_once
+    assert not replace(vehicles, latency_s=vehicles.latency_s + 0.125).is_known_at_once
+    assert not replace(vehicles, own_latency_s=vehicles.latency_s - 0.125).is_known_at_once
     late = vehicles.known_from_s.copy()
     late[0, 2, 1] = np.inf
-    assert not is_known_at_once(replace(vehicles, known_from_s=late))
+    assert not replace(vehicles, known_from_s=late).is_known_at_once
 
 
 def test_make_worlds__many_gaps_make_many_worlds_of_one_set_of_speeds():
@@ -163,7 +162,7 @@ def test_take__selects_every_column_and_copies(rows):
 
 def test_concatenate__is_the_inverse_of_take():
     worlds = numbered(5)
-    joined = concatenate([worlds.take([0, 1]), worlds.take([2]), worlds.take([3, 4])])
+    joined = Worlds.concatenate([worlds.take([0, 1]), worlds.take([2]), worlds.take([3, 4])])
     for name, column in columns(worlds).items():
         assert columns(joined)[name].tolist() == column.tolist(), name
 
@@ -171,7 +170,7 @@ def test_concatenate__is_the_inverse_of_take():
 def test_assign__replaces_rows_and_leaves_the_given_worlds_alone():
     worlds, fresh = numbered(4), numbered(2, first=50)
     before = {name: column.tolist() for name, column in columns(worlds).items()}
-    result = columns(assign(worlds, np.array([3, 1]), fresh))
+    result = columns(worlds.assign(np.array([3, 1]), fresh))
     for name, column in columns(worlds).items():
         assert column.tolist() == before[name], name
         expected = column.copy()

@@ -9,7 +9,7 @@ from torch import nn
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.policies.actor import Actor, NetworkSpec, dense, squash, tensor_table
+from ethbrake_marl.policies import Actor, NetworkSpec, dense, squash
 
 Tensors = Callable[[NetworkSpec], dict[str, np.ndarray]]
 
@@ -22,8 +22,8 @@ def _observations(n: int, size: int) -> np.ndarray:
     return np.random.default_rng(1).uniform(-2.0, 2.0, (n, size)).astype(np.float32)
 
 
-def test_tensor_table__of_the_papers_network_has_the_tables_tensors() -> None:
-    shapes = {row.name: row.shape for row in tensor_table(_papers_network(27))}
+def test_tensors__of_the_papers_network_has_the_tables_tensors() -> None:
+    shapes = {row.name: row.shape for row in _papers_network(27).tensors}
     assert shapes == {
         "policy.0.weight": (256, 27),
         "policy.0.bias": (256,),
@@ -57,7 +57,7 @@ def test_actor__relu_then_output_by_hand(output: str, expected: list[float]) -> 
     spec = NetworkSpec(
         observation_size=1, action_size=1, policy_hidden=(2,), value_hidden=(1,), activation="relu", output=output
     )
-    tensors = {row.name: np.zeros(row.shape, np.float32) for row in tensor_table(spec)}
+    tensors = {row.name: np.zeros(row.shape, np.float32) for row in spec.tensors}
     tensors["policy.0.weight"][:, 0] = [1.0, -1.0]  # hidden: max(x, 0), max(-x, 0)
     tensors["policy.output.weight"][0] = [1.0, -2.0]
     action = Actor(spec, tensors)(

@@ -10,9 +10,7 @@ import onnxruntime
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.policies.actor import NetworkSpec, tensor_table
-from ethbrake_marl.policies.bundle import Policy, load_policy, make_policy, save_policy
-from ethbrake_marl.policies.shipped import onnx_model
+from ethbrake_marl.policies import NetworkSpec, Policy, load_policy, make_policy, onnx_model
 
 SCENARIO = eb.load_scenario("paper-random")
 
@@ -34,7 +32,7 @@ def _alone(mixture: Policy, number: int) -> Policy:
 
 def test_mixture__acts_as_the_network_that_the_gate_chooses(mixture: Policy) -> None:
     seen = _seen(300)
-    chosen = mixture._actor.choose(seen)
+    chosen = mixture._actor.choose(np.ascontiguousarray(seen.T))
     assert len(set(chosen)) > 1
     for number in range(3):
         rows = chosen == number
@@ -58,29 +56,29 @@ def test_mixture__the_first_of_equal_scores_acts(mixture: Policy) -> None:
         tensors[name] = np.zeros_like(tensors[name])
     fields = {name: getattr(mixture.manifest, name) for name in type(mixture.manifest).model_fields}
     del fields["weights_sha256"], fields["manifest_sha256"]
-    assert (make_policy(tensors, **fields)._actor.choose(_seen(50)) == 0).all()
+    assert (make_policy(tensors, **fields)._actor.choose(np.ascontiguousarray(_seen(50).T)) == 0).all()
 
 
 def test_mixture__as_a_bundle(mixture: Policy, tmp_path: Path) -> None:
-    save_policy(mixture, tmp_path / "mixture")
+    mixture.save(tmp_path / "mixture")
     found = load_policy(tmp_path / "mixture")
     seen = _seen(40)
     assert np.array_equal(found(seen), mixture(seen)) and found.manifest == mixture.manifest
     told = json.loads((tmp_path / "mixture" / "manifest.json").read_text())
     assert (told["format_version"], told["network"]["networks"], told["network"]["gate_hidden"]) == (3, 3, [6])
-    assert {row.name for row in tensor_table(mixture.manifest.network)} == set(mixture.tensors)
+    assert {row.name for row in mixture.manifest.network.tensors} == set(mixture.tensors)
 
 
 def test_one_network__is_written_as_ever(policy: Policy, tmp_path: Path) -> None:
     """Earlier versions of the package, which know no gate, go on reading it."""
-    save_policy(policy, tmp_path / "one")
+    policy.save(tmp_path / "one")
     told = json.loads((tmp_path / "one" / "manifest.json").read_text())
     assert told["format_version"] == 2 and not {"networks", "gate_hidden"} & told["network"].keys()
 
 
 @pytest.mark.parametrize("around", ["", "+episode", "+step", "+refined", "+refined:profile"])
 def test_mixture__drives_alone_shielded_and_refined(around: str, mixture: Policy, tmp_path: Path) -> None:
-    save_policy(mixture, tmp_path / "mixture")
+    mixture.save(tmp_path / "mixture")
     spec = f"counterfactual@{tmp_path / 'mixture'}"
     worlds = SCENARIO.sample(6, seed=7)
     agents = {name: eb.make_agent(name, scenario=SCENARIO) for name in (spec, spec + around)}

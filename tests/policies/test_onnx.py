@@ -10,9 +10,7 @@ from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.errors import MissingExtra
 from ethbrake_marl.observations import observe
 from ethbrake_marl.physics import advance
-from ethbrake_marl.policies.actor import NetworkSpec, tensor_table
-from ethbrake_marl.policies.bundle import Policy, make_policy
-from ethbrake_marl.policies.shipped import onnx_model
+from ethbrake_marl.policies import NetworkSpec, Policy, make_policy, onnx_model
 from ethbrake_marl.scenario import load_scenario
 
 STATES = 10_000
@@ -28,7 +26,7 @@ def _policy_like(policy: Policy, output: str, activation: str) -> Policy:
         output=output,
     )
     rng = np.random.default_rng(4)
-    tensors = {row.name: (rng.normal(size=row.shape) / row.shape[-1] ** 0.5).astype("f4") for row in tensor_table(spec)}
+    tensors = {row.name: (rng.normal(size=row.shape) / row.shape[-1] ** 0.5).astype("f4") for row in spec.tensors}
     tensors["policy.output.weight"] *= 3.0  # so that some actions reach the bounds
     fields = {name: getattr(policy.manifest, name) for name in type(policy.manifest).model_fields}
     del fields["weights_sha256"], fields["manifest_sha256"]

@@ -16,10 +16,9 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
+from ethbrake_marl import policies as bundle
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput
-from ethbrake_marl.policies import bundle
-from ethbrake_marl.policies.actor import content_sha256
-from ethbrake_marl.policies.bundle import Policy, load_policy, make_policy, save_policy
+from ethbrake_marl.policies import Policy, content_sha256, load_policy, make_policy
 from tests.docs.site import load
 
 Spoil = Callable[[Path], None]
@@ -171,10 +170,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "two_values": (_manifest(lambda data: data + data), r"manifest.json: Extra data"),
     "large": (_manifest(lambda data: data + b" " * (1 << 20)), r"manifest.json: larger than 1 MiB"),
     "unknown_key": (_edit(loader="os.system"), r"manifest.json: loader: unknown key"),
-    "dotted_algorithm": (
-        _edit(algorithm="subprocess.Popen"),
-        r"manifest.json: algorithm: must match",
-    ),
+    "dotted_algorithm": (_edit(algorithm="subprocess.Popen"), r"manifest.json: algorithm: must match"),
     "dotted_activation": (_edit(network__activation="torch.nn.ReLU"), r"manifest.json: network.activation"),
     "future_version": (_edit(format_version=4), r"manifest.json: format_version: must be 2 or 3"),
     "version_of_several_networks": (
@@ -299,7 +295,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
 
 
 def test_bundle__round_trip_is_exact(policy: Policy, tmp_path: Path) -> None:
-    save_policy(policy, tmp_path / "policy")
+    policy.save(tmp_path / "policy")
     loaded = load_policy(tmp_path / "policy")
     assert loaded.manifest == policy.manifest
     assert loaded.tensors.keys() == policy.tensors.keys()
@@ -312,13 +308,13 @@ def test_bundle__round_trip_is_exact(policy: Policy, tmp_path: Path) -> None:
 
 def test_bundle__the_same_policy_gives_the_same_bytes(policy: Policy, tmp_path: Path) -> None:
     for name in ("a", "b"):
-        save_policy(policy, tmp_path / name)
+        policy.save(tmp_path / name)
     for file in ("manifest.json", "weights.safetensors"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
 
 def test_load_policy__finds_the_policy_of_a_run(policy: Policy, tmp_path: Path) -> None:
-    save_policy(policy, tmp_path / "my-run" / "policy")
+    policy.save(tmp_path / "my-run" / "policy")
     assert load_policy(str(tmp_path / "my-run")).manifest == policy.manifest
 
 
@@ -332,7 +328,7 @@ def test_load_policy__where_there_is_none(name: str, message: str, tmp_path: Pat
 @pytest.mark.parametrize("name", SPOILED)
 def test_load_policy__refuses_a_damaged_bundle(name: str, policy: Policy, tmp_path: Path) -> None:
     spoil, message = SPOILED[name]
-    save_policy(policy, tmp_path / "policy")
+    policy.save(tmp_path / "policy")
     spoil(tmp_path / "policy")
     with pytest.raises(CorruptBundle, match=message) as caught:
         load_policy(tmp_path / "policy")
@@ -341,7 +337,7 @@ def test_load_policy__refuses_a_damaged_bundle(name: str, policy: Policy, tmp_pa
 
 
 def test_load_policy__refuses_a_linked_folder(policy: Policy, tmp_path: Path) -> None:
-    save_policy(policy, tmp_path / "elsewhere")
+    policy.save(tmp_path / "elsewhere")
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "policy").symlink_to(tmp_path / "elsewhere")
     for path in (tmp_path / "run", tmp_path / "run" / "policy"):
@@ -352,7 +348,7 @@ def test_load_policy__refuses_a_linked_folder(policy: Policy, tmp_path: Path) ->
 _WATCHED_LOADS = """
 import json, sys
 from ethbrake_marl.errors import CorruptBundle
-from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.policies import load_policy
 
 root, names = sys.argv[1], json.loads(sys.argv[2])
 load_policy(f"{root}/good")
@@ -377,9 +373,9 @@ print(json.dumps({"events": events, "refused": refused, "torch": "torch" in sys.
 
 
 def test_load_policy__runs_nothing_and_opens_nothing_else(policy: Policy, tmp_path: Path) -> None:
-    save_policy(policy, tmp_path / "good")
+    policy.save(tmp_path / "good")
     for name, (spoil, _) in SPOILED.items():
-        save_policy(policy, tmp_path / name)
+        policy.save(tmp_path / name)
         spoil(tmp_path / name)
     done = subprocess.run(
         [sys.executable, "-c", _WATCHED_LOADS, str(tmp_path), json.dumps(list(SPOILED))],
@@ -395,7 +391,7 @@ def test_load_policy__runs_nothing_and_opens_nothing_else(policy: Policy, tmp_pa
 
 
 def test_ship_policy__acts_the_same_without_the_critic(policy: Policy, tmp_path: Path) -> None:
-    save_policy(load("../studies/ship_policy").actor_only(policy), tmp_path / "policy")
+    load("../studies/ship_policy").actor_only(policy).save(tmp_path / "policy")
     loaded = load_policy(tmp_path / "policy")
     assert not any(name.startswith("value") for name in loaded.tensors)
     assert loaded.manifest.scenario == policy.manifest.scenario
@@ -405,7 +401,7 @@ def test_ship_policy__acts_the_same_without_the_critic(policy: Policy, tmp_path:
 
 def test_load_policy__a_hard_link_is_the_file_itself(policy: Policy, tmp_path: Path) -> None:
     """Installers link packages hard, so this is no sign of anything; what is in the file is checked all the same."""
-    save_policy(policy, tmp_path / "policy")
+    policy.save(tmp_path / "policy")
     os.link(tmp_path / "policy" / "weights.safetensors", tmp_path / "elsewhere")
     assert load_policy(tmp_path / "policy").manifest == policy.manifest
 
@@ -421,16 +417,16 @@ def test_damaged_bundles__are_as_many_as_the_page_says() -> None:
     assert f"{len(SPOILED)} damaged and malicious bundles" in " ".join(page.read_text("utf-8").split())
 
 
-def test_save_policy__does_not_replace(policy: Policy, tmp_path: Path) -> None:
-    save_policy(policy, tmp_path / "policy")
+def test_save__does_not_replace(policy: Policy, tmp_path: Path) -> None:
+    policy.save(tmp_path / "policy")
     before = (tmp_path / "policy" / "manifest.json").stat().st_mtime_ns
     with pytest.raises(AlreadyExists, match="policy: is there already"):
-        save_policy(policy, tmp_path / "policy")
+        policy.save(tmp_path / "policy")
     assert (tmp_path / "policy" / "manifest.json").stat().st_mtime_ns == before
 
 
 @pytest.mark.parametrize("failing_call", [1, 2])
-def test_save_policy__leaves_nothing_when_it_fails(
+def test_save__leaves_nothing_when_it_fails(
     failing_call: int, policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[Path] = []
@@ -444,7 +440,7 @@ def test_save_policy__leaves_nothing_when_it_fails(
 
     monkeypatch.setattr(bundle, "write_file", full_disk)
     with pytest.raises(OSError, match="No space left"):
-        save_policy(policy, tmp_path / "policy")
+        policy.save(tmp_path / "policy")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl import policies as bundle
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.evaluation.outcome import TESTS
-from ethbrake_marl.policies import shipped
-from ethbrake_marl.policies.bundle import Policy, save_policy
-from ethbrake_marl.policies.shipped import load_named_policy, shipped_name, shipped_policies
+from ethbrake_marl.evaluation.measures import TESTS
+from ethbrake_marl.policies import Policy, load_named_policy, shipped_name, shipped_policies
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import HybridAgent
 
@@ -25,9 +24,9 @@ SCENARIO = load_scenario("paper-random")
 def folder(policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A package in which four policies ship; they were trained on paper-random."""
     for name in ("ppo", "ppo-total", "ppo-paper-distance", "universal"):
-        save_policy(policy, tmp_path / name / "policy")
+        policy.save(tmp_path / name / "policy")
         (tmp_path / name / "card.md").write_text(f"# {name}\n")
-    monkeypatch.setattr(shipped, "_FOLDER", tmp_path)
+    monkeypatch.setattr(bundle, "_FOLDER", tmp_path)
     return tmp_path
 
 

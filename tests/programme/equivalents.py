@@ -12,9 +12,7 @@ ONLY_TYPES = "only the type checker, which finds it, uses the name"
 EQUIVALENT: dict[str, str] = {
     "scenario/v2x.py: 1.0 -> 2.0 in `1.0` (3)": NOT_LOST,
     "scenario/v2x.py: 1.0 -> 2.0 in `1.0` (4)": NOT_LOST,
-    "figures/evaluation.py: 1 -> 2 in `1` (5)": "how a line is dashed, which is judged by eye",
     "studies/ablation.py: `Json = dict[str, Any]` removed (1)": ONLY_TYPES,
-    "figures/evaluation.py: True -> False in `True` (2)": "two panels for two counts, always",
     "evaluation/statistics.py: 0 -> 1 in `0` (23)": "all sides have as many worlds, which was checked just before",
     "rewards.py: `Value = TypeVar('Value', float, Floats)` removed (1)": ONLY_TYPES,
 }

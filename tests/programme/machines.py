@@ -89,7 +89,7 @@ def episodes() -> dict[str, str]:
 
 def searches() -> dict[str, str]:
     from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
-    from ethbrake_marl.limits.best_harm import best_harm
+    from ethbrake_marl.limits.limits import best_harm
     from ethbrake_marl.limits.lower_bound import lower_bound
     from ethbrake_marl.scenario import load_scenario
 
@@ -112,25 +112,25 @@ def shields() -> dict[str, str]:
 
 
 def tallies() -> dict[str, str]:
-    from ethbrake_marl.evaluation.shards import Question, answer_shard, ask
-    from ethbrake_marl.evaluation.statistics import paired_over_seeds
+    from ethbrake_marl.evaluation.results import Question
+    from ethbrake_marl.evaluation.statistics import mean_over_seeds
     from ethbrake_marl.harm import injury_probability
     from ethbrake_marl.scenario import load_scenario
 
     found = {}
     for name in HARD[:2]:
-        asked = ask(Question(load_scenario(name), ("full_brake", "e_v2x_bm", "universal@shipped"), 200, 11, "total"))
-        tally = json.dumps(answer_shard(asked, 0, 200).to_json(), sort_keys=True)
+        asked = Question(load_scenario(name), ("full_brake", "e_v2x_bm", "universal@shipped"), 200, 11, "total").ask()
+        tally = json.dumps(asked.answer(0, 200).to_json(), sort_keys=True)
         found[f"tally {name}"] = hashlib.sha256(tally.encode()).hexdigest()[:16]
     rng = np.random.default_rng(0)
-    estimate = paired_over_seeds(rng.random((3, 400)), rng.random((3, 400)))
+    estimate = mean_over_seeds(rng.random((3, 400)), rng.random((3, 400)))
     found["interval over seeds"] = digest(estimate.value, estimate.interval)
     found["injury"] = digest(injury_probability(rng.uniform(-30, 30, 1_000), "front"))
     return found
 
 
 def actions() -> dict[str, str]:
-    from ethbrake_marl.policies.shipped import load_shipped, shipped_policies
+    from ethbrake_marl.policies import load_shipped, shipped_policies
 
     rng, found = np.random.default_rng(0), {}
     for name in shipped_policies():

@@ -23,40 +23,37 @@ from tests.programme.suites import ROOT
 REWARDS, V2X, ENGINE, TERMS, STEPPING, STARTS, OBJECTIVES = (
     "ethbrake_marl/rewards.py",
     "ethbrake_marl/scenario/v2x.py",
-    "ethbrake_marl/engine/engine.py",
-    "ethbrake_marl/engine/engine.py",
-    "ethbrake_marl/engine/step.py",
-    "ethbrake_marl/engine/stream.py",
+    "ethbrake_marl/engine.py",
+    "ethbrake_marl/engine.py",
+    "ethbrake_marl/engine.py",
+    "ethbrake_marl/engine.py",
     "ethbrake_marl/harm.py",
 )  # fmt: skip
 SB3 = "ethbrake_marl/envs/sb3.py"
 COMPARISON, OPTIMUM, PLAN = (
-    "ethbrake_marl/studies/ablation_report.py",
+    "ethbrake_marl/studies/ablation.py",
     "ethbrake_marl/studies/ablation.py",
     "ethbrake_marl/studies/ablation.py",
 )
 EXACT, SEEDS, TABLE, REGRET, ROLLOUT = (
     "ethbrake_marl/evaluation/statistics.py",
     "ethbrake_marl/evaluation/statistics.py",
-    "ethbrake_marl/evaluation/summary.py",
+    "ethbrake_marl/evaluation/measures.py",
     "ethbrake_marl/evaluation/measures.py",
     "ethbrake_marl/evaluation/rollout.py",
 )
-SHARDS = "ethbrake_marl/studies/shards.py"
+SHARDS = "ethbrake_marl/studies/jobs.py"
 COURSE, LOOP, EVENTS, KEPT, INDEPENDENT, RECIPE = (
-    "ethbrake_marl/learning/progress.py",
-    "ethbrake_marl/learning/train.py",
-    "ethbrake_marl/learning/progress.py",
+    "ethbrake_marl/learning/runs.py",
+    "ethbrake_marl/learning/runs.py",
+    "ethbrake_marl/learning/runs.py",
     "ethbrake_marl/learning/training.py",
     "ethbrake_marl/learning/algorithms.py",
     "ethbrake_marl/learning/recipe.py",
 )
 
 
-SAMPLING, MIXTURE = (
-    "ethbrake_marl/scenario/sampling.py",
-    "ethbrake_marl/scenario/schema.py",
-)
+SAMPLING = MIXTURE = "ethbrake_marl/scenario/sampling.py"
 
 
 class Bug(NamedTuple):
@@ -120,16 +117,13 @@ BUGS: dict[str, Bug] = {
         REWARDS, "command[:, vehicle] = np.take", "np.zeros(worlds.n)[:] = np.take", OF_REWARDS
     ),
     "potential in the other count of harm": Bug(
-        REWARDS, '[0 if params.harm_count == "first" else 1]', '[1 if params.harm_count == "first" else 0]', OF_REWARDS
+        REWARDS, '[0 if self.harm_count == "first" else 1]', '[1 if self.harm_count == "first" else 0]', OF_REWARDS
     ),
     "weights of social value orientation swapped": Bug(
         OBJECTIVES, "return float(sums[0]), float(sums[1])", "return float(sums[1]), float(sums[0])", OF_REWARDS
     ),
     "an objective's harm so far paid again in every step": Bug(
-        TERMS,
-        'step.further["harm"] = before - self.obj',
-        'step.further["harm"] = 0.0 * before - self.obj',
-        OF_REWARDS,
+        TERMS, 'step.further["harm"] = before - self.obj', 'step.further["harm"] = 0.0 * before - self.obj', OF_REWARDS
     ),
     # ------------------------------------------------------------ V2X
     "lost links heard": Bug(V2X, "    delay[u[..., 2] < channel.lost] = np.inf\n", "", OF_V2X),
@@ -166,7 +160,7 @@ BUGS: dict[str, Bug] = {
         ("tests/envs/test_parallel.py",),
     ),
     "one step more where the division rounds up": Bug(
-        "ethbrake_marl/physics/kernel.py", " / time_step_s - _ROUNDING)", " / time_step_s)", OF_ENGINE
+        "ethbrake_marl/physics/kernel.py", " / self.time_step_s - _ROUNDING)", " / self.time_step_s)", OF_ENGINE
     ),
     "rows that have ended are paid again": Bug(TERMS, "        extra[standing] = 0.0\n", "", OF_ENGINE),
     "the last observation taken from the next episode": Bug(
@@ -202,22 +196,19 @@ BUGS: dict[str, Bug] = {
     ),
     "relative decrease as if nothing were paired": Bug(
         EXACT,
-        "values.squares * y * y - 2 * x * y * products + x * x * others.squares",
-        "(n * values.squares - x * x) * y * y // n",
+        "self.squares * y * y - 2 * x * y * products + x * x * others.squares",
+        "(n * self.squares - x * x) * y * y // n",
         OF_STATISTICS,
     ),
     "the upper bits of a summand are lost": Bug(EXACT, "sign * (high >> 32)", "sign * 0", OF_STATISTICS),
     "parts of a list that are finished are driven again": Bug(
-        SHARDS, "            first = until", "            first = have", ("tests/studies/test_shards.py",)
+        SHARDS, "            if name not in done", "            if True", ("tests/studies/test_shards.py",)
     ),
     "interval over seeds without drawing worlds anew": Bug(
         SEEDS, "drawn = rng.integers(worlds, size=(size, worlds)) +", "drawn = np.arange(worlds) + 0 *", OF_STATISTICS
     ),
     "impacts counted as collisions": Bug(
-        REGRET,
-        '"collision_rate", lambda o, _: o.collided,',
-        '"collision_rate", lambda o, _: o.impacts,',
-        OF_TABLES,
+        REGRET, '"collision_rate", lambda o, _: o.collided,', '"collision_rate", lambda o, _: o.impacts,', OF_TABLES
     ),
     "regret of total harm against the best first-impact harm": Bug(
         REGRET,
@@ -229,10 +220,7 @@ BUGS: dict[str, Bug] = {
         REGRET, "own.count(KNOWN) != worlds", "own.count(KNOWN) == 0", OF_TABLES
     ),
     "an agent's prediction of the first chunk told for all": Bug(
-        ROLLOUT,
-        "else np.concatenate(found)",
-        "else np.resize(found[0], len(ledger.mass_t))",
-        OF_TABLES,
+        ROLLOUT, "else np.concatenate(found)", "else np.resize(found[0], len(ledger.mass_t))", OF_TABLES
     ),
     # ------------------------------------------------------------ types and mixtures
     "types drawn from the numbers of the quantities": Bug(
@@ -242,10 +230,7 @@ BUGS: dict[str, Bug] = {
         SAMPLING, "entry.value(typed[1][rows, i])", "entry.value(u[rows, rule.place(i)])", OF_SCENARIOS
     ),
     "worlds of a member numbered anew": Bug(
-        MIXTURE,
-        "first + np.flatnonzero(chosen == k)",
-        "first + np.arange(int((chosen == k).sum()))",
-        OF_SCENARIOS,
+        MIXTURE, "first + np.flatnonzero(chosen == k)", "first + np.arange(int((chosen == k).sum()))", OF_SCENARIOS
     ),
     "the weights of a mixture ignored": Bug(
         MIXTURE, "[member.weight for member in scenario.mixture]", "[1.0 for _ in scenario.mixture]", OF_SCENARIOS
@@ -270,7 +255,7 @@ BUGS: dict[str, Bug] = {
         RECIPE, "done = min(max(1.0 - remaining, 0.0), 1.0)", "done = 1.0", OF_LEARNING
     ),
     "the scenario left out of a training's identity": Bug(
-        KEPT, '"scenario": scenario.content(without=WORDS)', '"scenario": {}', OF_FILES
+        KEPT, '"scenario": self.scenario.content(without=WORDS)', '"scenario": {}', OF_FILES
     ),
     "event files named by the clock": Bug(EVENTS, "default=0) + 1", "default=0) * 0 + int(time.time())", OF_FILES),
     "a learner learns from the rows of another": Bug(

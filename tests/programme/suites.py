@@ -66,7 +66,7 @@ PHYSICS = Suite(
             'tests/physics/test_segment.py',
             'tests/physics/test_forecast.py',
         ),
-        'physics/advance.py': (
+        'physics/batch.py': (
             'tests/physics/test_rows.py',
             'tests/engine/test_engine.py',
             'tests/engine/test_obstacle.py',
@@ -76,12 +76,11 @@ PHYSICS = Suite(
             'tests/physics/test_manufactured.py',
             'tests/physics/test_ties.py',
             'tests/physics/test_obstacle.py',
+            'tests/physics/test_sampled_edges.py',
+            'tests/physics/test_sampled.py',
+            'tests/physics/test_sampled_input.py',
         ),
-        "physics/compiled.py": ("tests/physics/test_compiled.py", "tests/physics/test_parallel.py"),
-        "physics/sampled.py": (
-            "tests/physics/test_sampled_edges.py", "tests/physics/test_sampled.py",
-            "tests/physics/test_sampled_input.py", "tests/physics/test_obstacle.py",
-        ),
+        "physics/compiling.py": ("tests/physics/test_compiled.py", "tests/physics/test_parallel.py"),
         "harm.py": ("tests/test_harm.py", "tests/physics/test_ledger.py", "tests/physics/test_obstacle.py"),
     },
     otherwise=KERNEL,
@@ -112,19 +111,16 @@ STEPS = (
     "tests/engine/test_obstacle.py",
 )
 ENGINE = Suite(
-    files=(
-        "engine/engine.py",
-        "engine/engine.py",
-        "engine/engine.py",
-        "engine/stream.py",
-        "engine/step.py",
-        "actions.py",
-        "engine/snapshot.py",
-    ),
+    files=("engine.py", "engine.py", "engine.py", "engine.py", "engine.py", "actions.py", "engine.py"),
     quick={
-        "engine/step.py": STEPS,
+        "engine.py": (
+            "tests/test_rewards.py",
+            "tests/engine/test_engine.py",
+            "tests/envs/test_single.py",
+            "tests/engine/test_obstacle.py",
+            "tests/engine/test_snapshot.py",
+        ),
         "actions.py": ("tests/test_actions.py", *STEPS[2:3]),
-        "engine/snapshot.py": ("tests/engine/test_snapshot.py",),
     },
     otherwise=(*STEPS, "tests/envs/test_parallel.py", "tests/envs/test_sb3.py", "tests/envs/test_vector.py"),
     whole=(
@@ -134,7 +130,7 @@ ENGINE = Suite(
         "tests/envs",
         "tests/contract",
     ),
-    interpreted=frozenset({"engine/step.py", "actions.py"}),
+    interpreted=frozenset({"engine.py", "actions.py"}),
     preloaded=(*SCIENCE, *TORCH),
 )
 
@@ -146,11 +142,8 @@ ABLATION = Suite(
             "tests/studies/ablation/test_comparison.py",
             "tests/studies/ablation/test_joint_optimum.py",
             "tests/studies/ablation/test_measurement.py",
-        ),
-        "studies/ablation_report.py": (
             "tests/studies/ablation/test_longer_lines.py",
-            "tests/studies/ablation/test_comparison.py",
-        ),
+        )
     },
     otherwise=("tests/studies/ablation/test_comparison.py", "tests/studies/ablation/test_ablate_command.py"),
     whole=("tests/studies/ablation",),
@@ -161,22 +154,16 @@ OF_ITEMS = ("tests/studies/reproduction/test_items.py",)
 REPRODUCTION = Suite(
     files=("studies/reproduction/*.py",),
     quick={
-        "studies/reproduction/item.py": (
+        "studies/reproduction/items.py": (
             "tests/studies/reproduction/test_verdicts.py",
             "tests/studies/reproduction/test_folder.py",
             "tests/studies/reproduction/test_items.py",
-        ),
-        "studies/reproduction/lists.py": (
             "tests/studies/reproduction/test_printed.py",
-            "tests/studies/reproduction/test_items.py",
+            "tests/studies/reproduction/test_full.py",
         ),
         "studies/reproduction/folder.py": (
             "tests/studies/reproduction/test_folder.py",
             "tests/studies/reproduction/test_full.py",
-        ),
-        "studies/reproduction/trainings.py": (
-            "tests/studies/reproduction/test_full.py",
-            "tests/studies/reproduction/test_items.py",
         ),
     },
     otherwise=OF_ITEMS,
@@ -188,23 +175,28 @@ REPRODUCTION = Suite(
 TABLES = ("tests/evaluation/test_table.py", "tests/evaluation/test_rollout.py")
 EVALUATION = Suite(
     files=(
-        "evaluation/*.py", "figures/studies.py", "figures/evaluation.py", "figures/evaluation.py",
+        "evaluation/*.py", "figures.py",
     ),
     quick={
         "evaluation/statistics.py": ("tests/evaluation/test_statistics.py", "tests/evaluation/test_seed_statistics.py"),
-        "figures/studies.py": ("tests/figures/test_learning_curves.py",),
         "evaluation/rollout.py": ("tests/evaluation/test_rollout.py", "tests/agents/test_team.py"),
-        "evaluation/outcome.py": ("tests/evaluation/test_rollout.py", "tests/evaluation/test_left_out.py"),
-        "evaluation/measures.py": ("tests/evaluation/shards/test_shards.py", "tests/evaluation/test_regret.py",),
+        'evaluation/measures.py': (
+            'tests/evaluation/test_rollout.py',
+            'tests/evaluation/test_left_out.py',
+            'tests/evaluation/shards/test_shards.py',
+            'tests/evaluation/test_regret.py',
+            'tests/evaluation/test_rescoring.py',
+            'tests/test_objectives.py',
+        ),
         'evaluation/episodes.py': ('tests/evaluation/test_record.py', 'tests/evaluation/test_film.py',),
-        "evaluation/summary.py": ("tests/evaluation/test_rescoring.py", "tests/test_objectives.py"),
         'evaluation/curves.py': (
             'tests/figures/test_criticality.py',
             'tests/figures/test_deceleration.py',
         ),
-        'figures/evaluation.py': (
+        'figures.py': (
             'tests/figures/test_criticality.py',
             'tests/figures/test_deceleration.py',
+            'tests/figures/test_learning_curves.py',
         ),
         "evaluation/shield_modes.py": ("tests/evaluation/test_shield_modes.py",),
         "evaluation/results.py": ("tests/evaluation/test_report.py", "tests/evaluation/test_per_world.py"),
@@ -221,26 +213,25 @@ TRAINED = ("tests/learning/test_train.py", "tests/learning/test_teams.py", "test
 LEARNING = Suite(
     files=("learning/*.py", "learning/algorithms/*.py", "policies/*.py", "files/store.py"),
     quick={
-        "learning/progress.py": (
+        "learning/runs.py": (
             "tests/learning/test_progress.py",
             "tests/learning/test_run_files.py",
             "tests/learning/test_event_files.py",
             "tests/learning/test_train.py",
             "tests/learning/test_teams.py",
             "tests/learning/test_resume.py",
+            "tests/learning/test_sb3_policy.py",
         ),
         "learning/recipe.py": (
             "tests/learning/test_recipe.py",
             "tests/learning/test_algorithms.py",
             "tests/learning/test_teams.py",
         ),
-        "policies/bundle.py": (
+        "policies.py": (
             "tests/policies/test_policy.py",
             "tests/learning/test_teams.py",
-        ),
-        "policies/actor.py": (
-            "tests/policies/test_policy.py",
             "tests/policies/test_actor.py",
+            "tests/policies/test_shipped.py",
         ),
         "files/store.py": (
             "tests/files/test_plain.py",
@@ -256,19 +247,11 @@ LEARNING = Suite(
             "tests/learning/test_resume.py",
         ),
         "learning/algorithms.py": ("tests/learning/test_teams.py",),
-        "learning/train.py": (
-            "tests/learning/test_sb3_policy.py",
-            "tests/learning/test_train.py",
-            "tests/learning/test_teams.py",
-            "tests/learning/test_resume.py",
-        ),
-        "policies/shipped.py": ("tests/policies/test_shipped.py",),
-        "learning/checkpoint.py": ("tests/learning/test_resume.py",),
     },
     otherwise=TRAINED,
     whole=("tests/learning", "tests/cli/test_training_commands.py"),
     left_out=frozenset({"__init__.py", "benchmarl.py", "onnx.py"}),  # of other formats
-    interpreted=frozenset({"policies/actor.py"}),
+    interpreted=frozenset({"policies.py"}),
     preloaded=(*SCIENCE, *TORCH),
 )
 

@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import NamedTuple
 
 from ethbrake_marl.physics import kernel
-from ethbrake_marl.shield import certify_kernel
+from ethbrake_marl.shield import step_shield
 from tests.proofs import statements
 from tests.proofs.statements import Statement
 
@@ -44,27 +44,27 @@ BUGS = {
         kernel, "pool", "table[ROW.BLOCK_LOW, count] / mass", "table[ROW.BLOCK_LOW, count] / 2.0", statements.energy
     ),
     "a plastic impact is not put in order": Bug(
-        kernel, "resolve_cluster", "bounce = restitution if largest >= PLASTIC_SPEED_MPS else 0.0",
+        kernel, "resolve_cluster", "bounce = restitution if largest >= BOUND.PLASTIC_SPEED_MPS else 0.0",
         "bounce = restitution", statements.plastic,
     ),
     "the budget may rise": Bug(
-        certify_kernel, "decide_world", "    if value <= budget:\n        for c in",
+        step_shield, "decide_world", "    if value <= budget:\n        for c in",
         "    if value <= 2.0 * budget:\n        for c in", statements.decision,
     ),
     "later proposals are not certified": Bug(
-        certify_kernel, "decide_world", "    if value <= budget:\n        for c in",
+        step_shield, "decide_world", "    if value <= budget:\n        for c in",
         "    if value <= budget or step > 0:\n        for c in", statements.decision,
     ),
     "the fallback is the plan's first action": Bug(
-        certify_kernel, "decide_world", "take_steps(world, states, ended, step, plan[step], after, over)",
+        step_shield, "decide_world", "take_steps(world, states, ended, step, plan[step], after, over)",
         "take_steps(world, states, ended, step, plan[0], after, over)", statements.decision,
     ),
     "the plan is followed from the second decision on": Bug(
-        certify_kernel, "try_action", "value = worst_of_plan(world, after, over, step + 1,",
+        step_shield, "try_action", "value = worst_of_plan(world, after, over, step + 1,",
         "value = worst_of_plan(world, after, over, 1,", statements.decision,
     ),
     "a constant begins one decision late": Bug(
-        certify_kernel, "better_plan", "for j in range(step, plan.shape[0]):",
+        step_shield, "better_plan", "for j in range(step, plan.shape[0]):",
         "for j in range(step + 1, plan.shape[0]):",
         statements.decision,
     ),
@@ -78,27 +78,27 @@ BUGS = {
         statements.stopping,
     ),
     "the plan that was certified with a proposal is not kept": Bug(
-        certify_kernel, "try_action", "                copy_action(room[0, j], plan[j])", "                pass",
+        step_shield, "try_action", "                copy_action(room[0, j], plan[j])", "                pass",
         statements.decision,
     ),
     "a constant counts without being certified": Bug(
-        certify_kernel, "better_plan", "certified = worst_of_plan(world, states, ended, step, trial, most)",
+        step_shield, "better_plan", "certified = worst_of_plan(world, states, ended, step, trial, most)",
         "certified = least", statements.decision,
     ),
     "the bound of the plan is told for the proposal": Bug(
-        certify_kernel, "decide_world", "tell_action(out, plan[step], value, budget - value)",
+        step_shield, "decide_world", "tell_action(out, plan[step], value, budget - value)",
         "tell_action(out, plan[step], certified, budget - value)", statements.decision,
     ),
     "of two, what was tried last is looked at, not what is applied": Bug(
-        certify_kernel, "decide_world", "take_steps(world, states, ended, step, plan[step], after, over)",
+        step_shield, "decide_world", "take_steps(world, states, ended, step, plan[step], after, over)",
         "take_steps(world, states, ended, step, tried[1], after, over)", statements.decision_of_two,
     ),
     "the first of two that is accepted keeps the bound from before": Bug(
-        certify_kernel, "decide_world", "bound, accepted = value, accepted + 1", "accepted = accepted + 1",
+        step_shield, "decide_world", "bound, accepted = value, accepted + 1", "accepted = accepted + 1",
         statements.decision_of_two,
     ),
     "a plan for two is written for the first alone": Bug(
-        certify_kernel, "copy_action", "for c in range(to.shape[0]):", "for c in range(1):", statements.decision_of_two
+        step_shield, "copy_action", "for c in range(to.shape[0]):", "for c in range(1):", statements.decision_of_two
     ),
 }  # fmt: skip
 

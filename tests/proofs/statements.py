@@ -17,7 +17,7 @@ import numpy as np
 import z3
 
 from ethbrake_marl.physics import kernel
-from ethbrake_marl.shield import certify_kernel
+from ethbrake_marl.shield import step_shield
 from tests.proofs.paths import Condition, Ended, Symbol, SymbolicMath, exact, holds_always, is_infinite, paths, symbols
 
 Statement = Callable[[], int]  # the number of paths it was proven along
@@ -272,13 +272,13 @@ def _decided(line: _Line, usable: tuple[bool, ...]) -> int:
         plan, room = line.plan.copy(), np.zeros((2, *line.plan.shape), object)
         after, out, tried = np.zeros(1, object), np.zeros((vehicles, 4), object), np.zeros((2, vehicles), object)
         proposed = np.array([p if use else math.nan for p, use in zip(line.proposed, usable, strict=True)], object)
-        good = certify_kernel.decide_world(
+        good = step_shield.decide_world(
             None, None, np.zeros(1, bool), made, proposed, line.budget, line.certified, line.constants, plan, room,
             tried, after, np.zeros(1, bool), out,
         )  # fmt: skip
         return good, plan, out
 
-    found = list(_run(certify_kernel, decide, line.known(), line))
+    found = list(_run(step_shield, decide, line.known(), line))
     for end in found:
         good, plan, out = end.result
         assert good

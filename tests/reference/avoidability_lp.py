@@ -129,10 +129,7 @@ class _Programme:
         now, then, one = sparse.eye_array(K, K + 1), sparse.eye_array(K, K + 1, k=1), sparse.eye_array(K)
         blocks = [
             sparse.block_array(
-                [
-                    [then - now, -self._step * now, sparse.diags_array(-0.5 * self._active[i])],
-                    [None, then - now, -one],
-                ]
+                [[then - now, -self._step * now, sparse.diags_array(-0.5 * self._active[i])], [None, then - now, -one]]
             )
             for i in self._cars
         ]

@@ -40,11 +40,7 @@ def fact_table() -> str:
     """Markdown table of what PettingZoo's pages say of an environment, here with its default arguments."""
     env = ethbrake_v0.parallel_env()
     agent = env.possible_agents[0]
-    spaces = {
-        "Action": env.action_space(agent),
-        "Observation": env.observation_space(agent),
-        "State": env.state_space,
-    }
+    spaces = {"Action": env.action_space(agent), "Observation": env.observation_space(agent), "State": env.state_space}
     rows = [
         ("Import", "`from ethbrake_marl import ethbrake_v0`"),
         ("Actions", "continuous"),

@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ethbrake_marl.physics.compiled import compiled_apart
+from ethbrake_marl.physics.compiling import compiled
 
 Floats = NDArray[np.float64]
 
@@ -81,7 +81,7 @@ def simulate(
     return Outcome(first, total, count, cars[:, GAP, :-1], cars[:, V], driven, error)
 
 
-@compiled_apart
+@compiled(apart=True)
 def _run(car, harm, e, horizon, step):  # type: ignore[no-untyped-def]
     """One world, in place; returns (impulse of brakes and motors, largest momentum error of an impact)."""
     N = car.shape[1]
@@ -107,13 +107,13 @@ def _run(car, harm, e, horizon, step):  # type: ignore[no-untyped-def]
     return driven, error
 
 
-@compiled_apart
+@compiled(apart=True)
 def _rests(car, p):  # type: ignore[no-untyped-def]
     """Whether the vehicles of pair p touch and do not separate."""
     return car[GAP, p] == 0.0 and car[V, p] - car[V, p + 1] <= TOUCH_MPS
 
 
-@compiled_apart
+@compiled(apart=True)
 def _step_up_to_contact(h, car):  # type: ignore[no-untyped-def]
     """Step by h, or only to the first contact in it; fills NEW_GAP and GAIN and returns the step taken."""
     _step(h, car)
@@ -132,7 +132,7 @@ def _step_up_to_contact(h, car):  # type: ignore[no-untyped-def]
     return high
 
 
-@compiled_apart
+@compiled(apart=True)
 def _meeting(h, car):  # type: ignore[no-untyped-def]
     """Return a time in (0, h] at which some open pair has met (gap <= 0), or -1."""
     meets = -1.0
@@ -150,7 +150,7 @@ def _meeting(h, car):  # type: ignore[no-untyped-def]
     return meets
 
 
-@compiled_apart
+@compiled(apart=True)
 def _step(h, car):  # type: ignore[no-untyped-def]
     """Implicit step of all vehicles; runs of resting pairs are solved together."""
     N, head = car.shape[1], 0
@@ -167,7 +167,7 @@ def _step(h, car):  # type: ignore[no-untyped-def]
         car[NEW_GAP, p] = car[GAP, p] + h * (opening + 0.5 * (car[GAIN, p] - car[GAIN, p + 1]))
 
 
-@compiled_apart
+@compiled(apart=True)
 def _alone(h, v, command, limit):  # type: ignore[no-untyped-def]
     """Gain in speed of a vehicle that nobody touches, in a step h."""
     if command < 0.0:  # soft threshold: to rest from above or from below, and then held
@@ -175,7 +175,7 @@ def _alone(h, v, command, limit):  # type: ignore[no-untyped-def]
     return min(command * h, max(limit - v, 0.0))
 
 
-@compiled_apart
+@compiled(apart=True)
 def _press(h, car, head, tail):  # type: ignore[no-untyped-def]
     """Gains in speed of the touching vehicles head..tail in a step h; they start at one speed."""
     gains = np.zeros((tail + 1 - head, tail + 1 - head))
@@ -185,7 +185,7 @@ def _press(h, car, head, tail):  # type: ignore[no-untyped-def]
     _min_max(gains, car[GAIN, head : tail + 1])
 
 
-@compiled_apart
+@compiled(apart=True)
 def _together(h, i, j, v, car):  # type: ignore[no-untyped-def]
     """Common gain of vehicles i..j from speed v in a step h: to the minimum of their joint convex function.
 
@@ -205,7 +205,7 @@ def _together(h, i, j, v, car):  # type: ignore[no-untyped-def]
     return impulse / inertia
 
 
-@compiled_apart
+@compiled(apart=True)
 def _derivative(h, i, j, v, speed, from_above, car):  # type: ignore[no-untyped-def]
     """One-sided derivative at ``speed`` of the joint function of vehicles i..j that come from speed v."""
     total = 0.0
@@ -215,7 +215,7 @@ def _derivative(h, i, j, v, speed, from_above, car):  # type: ignore[no-untyped-
     return total
 
 
-@compiled_apart
+@compiled(apart=True)
 def _pull(command, limit, speed, from_above):  # type: ignore[no-untyped-def]
     """One-sided derivative of f: minus the acceleration that a vehicle's own brake or motor gives it there."""
     if command < 0.0:
@@ -223,7 +223,7 @@ def _pull(command, limit, speed, from_above):  # type: ignore[no-untyped-def]
     return 0.0 if speed > limit or (speed == limit and from_above) else -command
 
 
-@compiled_apart
+@compiled(apart=True)
 def _min_max(means, out):  # type: ignore[no-untyped-def]
     """Decreasing regression from the means of all runs: out_k = min over i <= k of max over j >= k of means[i, j]."""
     for k in range(out.size):
@@ -235,7 +235,7 @@ def _min_max(means, out):  # type: ignore[no-untyped-def]
             out[k] = min(out[k], largest)
 
 
-@compiled_apart
+@compiled(apart=True)
 def _collide(car, harm, e):  # type: ignore[no-untyped-def]
     """Set contacts to gap 0 and resolve every touching run; returns the largest change of total momentum."""
     N, error, head, approaching = car.shape[1], 0.0, 0, False
@@ -252,7 +252,7 @@ def _collide(car, harm, e):  # type: ignore[no-untyped-def]
     return error
 
 
-@compiled_apart
+@compiled(apart=True)
 def _momentum(car):  # type: ignore[no-untyped-def]
     """Momentum of the whole line."""
     total = 0.0
@@ -261,7 +261,7 @@ def _momentum(car):  # type: ignore[no-untyped-def]
     return total
 
 
-@compiled_apart
+@compiled(apart=True)
 def _impact(car, head, tail, harm, e):  # type: ignore[no-untyped-def]
     """Order-free impact of the touching run head..tail, in place; in each round every approaching pair bears harm."""
     while True:
@@ -274,7 +274,7 @@ def _impact(car, head, tail, harm, e):  # type: ignore[no-untyped-def]
             return
 
 
-@compiled_apart
+@compiled(apart=True)
 def _count_harm(car, head, tail, harm):  # type: ignore[no-untyped-def]
     """Book the closing speed squared of every approaching pair; returns the largest closing speed."""
     fastest = 0.0
@@ -288,7 +288,7 @@ def _count_harm(car, head, tail, harm):  # type: ignore[no-untyped-def]
     return fastest
 
 
-@compiled_apart
+@compiled(apart=True)
 def _pool(car, head, tail):  # type: ignore[no-untyped-def]
     """Fill POOLED with the mass-weighted decreasing regression of the speeds of head..tail."""
     means = np.zeros((tail + 1 - head, tail + 1 - head))

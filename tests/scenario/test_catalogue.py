@@ -20,9 +20,9 @@ from ethbrake_marl.scenario import (
     scenario_folder,
     scenario_json_schema,
     scenario_path,
+    schema as shipped_files,
 )
-from ethbrake_marl.scenario import schema as shipped_files
-from ethbrake_marl.scenario.fields import OF_EVERY_VEHICLE
+from ethbrake_marl.scenario.sampling import QUANTITY
 
 SHIPPED = [entry.path for entry in list_scenarios()]
 ROOT = Path(__file__).resolve().parents[2]
@@ -47,7 +47,7 @@ def not_used(scenario: Scenario) -> set[str]:
     gaps = "gaps_m" if scenario.gaps_m is None else "time_gaps_s"
     speeds = {"speeds_mps"} if scenario.speeds_mps is None else {"line_speed_mps", "speed_deviations_mps"}
     obstacle = {key for key in ("obstacle_gap_m", "obstacle_margin_m") if getattr(scenario, key) is None}
-    chosen = ("observation", "vehicle_types", "types", "mixture", *OF_EVERY_VEHICLE)
+    chosen = ("observation", "vehicle_types", "types", "mixture", *QUANTITY.needed)
     return {gaps, *speeds, *obstacle, *(key for key in chosen if getattr(scenario, key) is None)}
 
 
@@ -162,7 +162,7 @@ def test_json_schema__names_every_field_and_serialises():
     assert schema["required"] == ["name"]
     assert schema["if"] == {"not": {"required": ["mixture"]}}  # whose members say everything else
     every = schema["then"]["allOf"][-1]["anyOf"]
-    assert [way["required"] for way in every] == [["vehicle_types"], [*OF_EVERY_VEHICLE]]
+    assert [way["required"] for way in every] == [["vehicle_types"], [*QUANTITY.needed]]
 
 
 @pytest.mark.parametrize("name", [entry.name for entry in list_scenarios()])

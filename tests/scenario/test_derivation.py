@@ -14,8 +14,7 @@ from ethbrake_marl.scenario import (
     parse_yaml,
     read_initial_states,
 )
-from ethbrake_marl.scenario.fields import values
-from ethbrake_marl.scenario.sampling import uniform_numbers
+from ethbrake_marl.scenario.sampling import uniform_numbers, values
 
 REST = {
     "name": "given", "braking_capacity_mps2": [6, 7, 6], "driving_capacity_mps2": 6, "mass_t": 5,

@@ -2,12 +2,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from pydantic import ValidationError
 from scipy.stats import truncnorm
 
-from ethbrake_marl.scenario.fields import Choice, LogUniform, Normal, Uniform, support, values
+from ethbrake_marl.scenario.sampling import Choice, LogUniform, Normal, Uniform, support, values
 
 GRID = (np.arange(200_000) + 0.5) / 200_000
 ALMOST_ONE = np.array([1.0 - 2.0**-53])

@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.rollout import script_agents
-from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.engine.snapshot import engine_snapshot, restore_engine
+from ethbrake_marl.engine import Engine, engine_snapshot, restore_engine
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import worlds_sha256
 from ethbrake_marl.observations import choose_observation
-from ethbrake_marl.physics.messages import CHANNEL, LINK, age_s, chance, is_periodic, links_of
+from ethbrake_marl.physics.messages import CHANNEL, age_s, chance, is_periodic, newest_told
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.scenario.v2x import CHANNELS
 
@@ -50,6 +49,10 @@ def driven(engine: Engine, steps: int, action: float = -0.6) -> list[np.ndarray]
     return seen
 
 
+def ages_in(worlds):
+    return age_s(worlds.time_s, worlds.messages, worlds.N)
+
+
 def test_persistence__first_is_the_default_and_adds_nothing() -> None:
     said, unsaid = BASE.replace(v2x={"preset": "blocked", "persistence": "first"}), BASE.replace(v2x="blocked")
     one, other = said.sample(50, 3), unsaid.sample(50, 3)
@@ -80,11 +83,11 @@ def test_fixed_delay_without_loss__by_hand() -> None:
     engine = engine_of(periodic("paper", base, link_latency_s=0.2, senses="front", sensing_s=[5.0, 5.0]), n=1)
     for step in range(6):
         time = 0.5 + 0.1 * step
-        link = links_of(engine.worlds)[0, 1, 0]
+        told = newest_told(engine.worlds, 1)
         assert engine.worlds.time_s[0] == pytest.approx(time)
-        assert link[LINK.TOLD_S] == pytest.approx(time - 0.2)
-        assert link[LINK.TOLD_SPEED] == pytest.approx(20.0 - 6.0 * (time - 0.2))
-        assert link[LINK.TOLD_PLACE] == pytest.approx(20.0 * (time - 0.2) - 3.0 * (time - 0.2) ** 2)
+        assert told.at_s[0, 0] == pytest.approx(time - 0.2)
+        assert told.speed_mps[0, 0] == pytest.approx(20.0 - 6.0 * (time - 0.2))
+        assert told.place_m[0, 0] == pytest.approx(20.0 * (time - 0.2) - 3.0 * (time - 0.2) ** 2)
         seen = engine.observe(1)[0]  # moved on with the command of then, it is where Vehicle 1 is
         assert seen[8] == pytest.approx(engine.worlds.gaps_m[0, 0] / 10.0, abs=1e-6)
         engine.step(np.full((1, 1), -0.5))
@@ -112,7 +115,7 @@ def test_losses__go_on_with_the_share_and_the_bursts_of_the_channel(p: float, r:
     engine = engine_of(scenario, n=8000)
     for _ in range(30):
         engine.step(np.full((8000, 1), -1.0))
-    lost = np.rint((age_s(engine.worlds)[:, 2, 0] - 0.4) / 0.1)  # sent 0.3 to 0.4 s ago, sampled 0.4
+    lost = np.rint((ages_in(engine.worlds)[:, 2, 0] - 0.4) / 0.1)  # sent 0.3 to 0.4 s ago, sampled 0.4
     for m in (1, 2, 4):
         share = (lost >= m).mean()
         assert share == pytest.approx(p / (p + r) * (1 - r) ** (m - 1), abs=0.02)
@@ -168,7 +171,7 @@ def test_age__is_a_feature_that_grows_between_messages() -> None:
     engine = Engine(scenario, 30, learners=[1], scripts=scripts, worlds=scenario.sample(30, 7).worlds, observation=spec)
     ages = []
     for _ in range(20):
-        seen, told = engine.observe(1), age_s(engine.worlds)[:, 1]
+        seen, told = engine.observe(1), ages_in(engine.worlds)[:, 1]
         known = seen[:, 7] == 1.0
         np.testing.assert_allclose(seen[known, 27], told[known, 0], atol=1e-6)
         assert (seen[~known, 27] == 0.0).all() and (seen[known, 27] > 0.3).all()
@@ -192,7 +195,7 @@ def test_interfaces__see_the_same() -> None:
     for _ in range(5):
         seen, *_, infos = env.step({"vehicle_2": np.array([-0.5], np.float32)})
     np.testing.assert_array_equal(seen["vehicle_2"], engine.observe(1)[0])
-    np.testing.assert_array_equal(infos["vehicle_2"]["age_s"], age_s(engine.worlds)[0, 1])
+    np.testing.assert_array_equal(infos["vehicle_2"]["age_s"], ages_in(engine.worlds)[0, 1])
     many = gymnasium.make_vec("EthBrake-v0", num_envs=3, scenario=scenario)
     _, told = many.reset(seed=5)
     assert told["age_s"].shape == (3, 3) and (told["age_s"][:, 1] == 0.0).all()

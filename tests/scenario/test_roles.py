@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.scenario.fields import constant_command, is_state_free, parse_agent_spec
+from ethbrake_marl.scenario.sampling import ScriptSpec
 
 
 @pytest.mark.parametrize(
@@ -17,7 +17,7 @@ from ethbrake_marl.scenario.fields import constant_command, is_state_free, parse
     ],
 )
 def test_spec__splits_at_the_first_colon(spec, parts):
-    assert parse_agent_spec(spec) == parts
+    assert ScriptSpec.parse(spec) == parts
 
 
 @pytest.mark.parametrize(
@@ -25,21 +25,21 @@ def test_spec__splits_at_the_first_colon(spec, parts):
 )
 def test_spec__bad_syntax_is_refused_with_an_example(spec):
     with pytest.raises(InvalidInput, match=r"must be name or name:argument.*constant:3\.5"):
-        parse_agent_spec(spec)
+        ScriptSpec.parse(spec)
 
 
 def test_constant_command__of_each_state_free_script():
-    assert constant_command("full_brake", [6.0, 7.0]).tolist() == [-6.0, -7.0]
-    assert constant_command("coast", [6.0, 7.0]).tolist() == [0.0, 0.0]
-    assert constant_command("constant:3.5", [6.0, 7.0]).tolist() == [-3.5, -3.5]
-    assert constant_command("constant:-2", [6.0, 7.0], [2.0, 3.0]).tolist() == [2.0, 2.0]
-    assert constant_command("constant:6", [6.0, 7.0]).tolist() == [-6.0, -6.0]
+    assert ScriptSpec.parse("full_brake").command([6.0, 7.0]).tolist() == [-6.0, -7.0]
+    assert ScriptSpec.parse("coast").command([6.0, 7.0]).tolist() == [0.0, 0.0]
+    assert ScriptSpec.parse("constant:3.5").command([6.0, 7.0]).tolist() == [-3.5, -3.5]
+    assert ScriptSpec.parse("constant:-2").command([6.0, 7.0], [2.0, 3.0]).tolist() == [2.0, 2.0]
+    assert ScriptSpec.parse("constant:6").command([6.0, 7.0]).tolist() == [-6.0, -6.0]
 
 
 def test_constant_command__of_another_script_is_none():
-    assert constant_command("e_v2x_bm:pairwise", [6.0]) is None
-    assert not is_state_free("e_v2x_bm")
-    assert is_state_free("coast")
+    assert ScriptSpec.parse("e_v2x_bm:pairwise").command([6.0]) is None
+    assert not ScriptSpec.parse("e_v2x_bm").is_state_free()
+    assert ScriptSpec.parse("coast").is_state_free()
 
 
 @pytest.mark.parametrize(
@@ -57,5 +57,5 @@ def test_constant_command__of_another_script_is_none():
 )
 def test_constant_command__what_cannot_be_done_is_an_error(spec, reason):
     with pytest.raises(InvalidInput, match=reason) as caught:
-        constant_command(spec, [7.0, 6.0], [3.0, 2.0])
+        ScriptSpec.parse(spec).command([7.0, 6.0], [3.0, 2.0])
     assert repr(spec) in str(caught.value)

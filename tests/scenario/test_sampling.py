@@ -8,14 +8,10 @@ import pytest
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Vehicles, Worlds
 from ethbrake_marl.scenario import Scenario, load_scenario, sampling
-from ethbrake_marl.scenario.fields import BLOCK, OTHERWISE, QUANTITIES
-from ethbrake_marl.scenario.sampling import uniform_numbers
+from ethbrake_marl.scenario.sampling import BLOCK, QUANTITY, uniform_numbers
 
 # As printed by: python -c "import ethbrake_marl as eb; print(eb.load_scenario('paper-random').sample(3, 7).worlds)"
-GOLDEN_GAPS_M = [
-    [6.619524755316499, 8.488312854553527],
-    [5.330123950353819, 7.790992608679621],
-]
+GOLDEN_GAPS_M = [[6.619524755316499, 8.488312854553527], [5.330123950353819, 7.790992608679621]]
 GOLDEN_SPEEDS_MPS = [
     [20.44900720872454, 21.48658333485936, 21.023493985459318],
     [18.171640335640056, 18.728364132629064, 21.911283369281954],
@@ -92,22 +88,22 @@ def test_streams__differ_by_seed_and_channel_and_world():
     assert len(np.unique(drawn)) == drawn.size
 
 
-@pytest.mark.parametrize("changed", list(QUANTITIES))
+@pytest.mark.parametrize("changed", list(QUANTITY.usual))
 def test_columns__changing_one_quantity_leaves_all_others_alone(changed):
     fixed_values = {"speeds_mps": 20, "restitution": 0.2, "speed_limit_mps": 35}
     before = ALL_RANDOM.sample(20, 3).worlds
     after = ALL_RANDOM.replace(**{changed: fixed_values.get(changed, 2)}).sample(20, 3).worlds
-    for field in QUANTITIES:
+    for field in QUANTITY.usual:
         same = quantity(before, field).tobytes() == quantity(after, field).tobytes()
         assert same == (field != changed), field
 
 
 def test_columns__every_entry_of_a_world_has_its_own():
-    rules = [*QUANTITIES.values(), OTHERWISE["line_speed_mps"]]
+    rules = [*QUANTITY.usual.values(), QUANTITY.otherwise["line_speed_mps"]]
     places = [rule.place(index) for rule in rules for index in range(rule.count(64))]
     assert len(set(places)) == len(places)
-    assert [QUANTITIES["mass_t"].place(i) for i in range(3)] == [5, 13, 21]
-    assert OTHERWISE["line_speed_mps"].place(0) == 15  # slot 7 of vehicle_2
+    assert [QUANTITY.usual["mass_t"].place(i) for i in range(3)] == [5, 13, 21]
+    assert QUANTITY.otherwise["line_speed_mps"].place(0) == 15  # slot 7 of vehicle_2
     assert max(places) < BLOCK * 64
     assert BLOCK % 4 == 0
 

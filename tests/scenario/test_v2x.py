@@ -9,25 +9,15 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.engine.snapshot import engine_snapshot, restore_engine
+from ethbrake_marl.engine import Engine, engine_snapshot, restore_engine
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import full_state, observation_for, observe, state_features
 from ethbrake_marl.physics import advance, make_worlds
-from ethbrake_marl.physics.advance import Packed, pack, unpack, with_news_columns
+from ethbrake_marl.physics.batch import Packed
 from ethbrake_marl.physics.kernel import CLOCK
 from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario
-from ethbrake_marl.scenario.v2x import (
-    CHANNELS,
-    PER_LINK,
-    PRESETS,
-    V2X,
-    Channel,
-    burst_periods,
-    link_delays,
-    with_news,
-)
+from ethbrake_marl.scenario.v2x import CHANNELS, PER_LINK, PRESETS, V2X, Channel, burst_periods, link_delays
 from ethbrake_marl.search import identities
 
 PAPER = load_scenario("paper-random")
@@ -88,7 +78,7 @@ def test_link_delays__by_hand():
 def test_with_news__sight_goes_hop_by_hop():
     # hops drawn at the middle: 0.95 s each; nobody hears anything.
     u = np.full((1, 9 * PER_LINK), 0.5)
-    told = with_news(V2X.model_validate("sensors-only"), vehicles([0.0, 0.1, 2.5]), u)
+    told = V2X.model_validate("sensors-only").with_news(vehicles([0.0, 0.1, 2.5]), u)
     assert told.latency_s.tolist() == [[0.0, pytest.approx(0.95), 2.5]]  # 0.95 + 0.95 < 2.5, its own part
     known = told.known_from_s[0]
     assert known[0].tolist() == [0.0, pytest.approx(0.95), np.inf]
@@ -100,19 +90,19 @@ def test_with_news__sight_goes_hop_by_hop():
 def test_with_news__news_of_the_emergency_comes_by_radio_or_by_sight():
     v2x = V2X.model_validate({"preset": "nominal", "link_latency_s": 0.4, "loss_begins": None})
     u = np.full((1, 9 * PER_LINK), 0.5)
-    told = with_news(v2x, vehicles([0.0, 0.1, 0.6]), u)
+    told = v2x.with_news(vehicles([0.0, 0.1, 0.6]), u)
     assert told.latency_s.tolist() == [[0.0, 0.4, 0.6]]
     assert told.known_from_s[0].tolist() == [[0.0, 0.4, 0.4], [0.4, 0.4, 0.4], [0.6, 0.6, 0.6]]
     links = u.reshape(9, PER_LINK).copy()
     links[2 * 3 + 0, 2] = 0.0  # the link from vehicle_1 to vehicle_3 is lost
     lossy = V2X.model_validate({"preset": "nominal", "link_latency_s": 0.4, "lost": 0.1})
-    told = with_news(lossy, vehicles([0.0, 0.1, 0.6]), links.reshape(1, -1))
+    told = lossy.with_news(vehicles([0.0, 0.1, 0.6]), links.reshape(1, -1))
     assert told.latency_s.tolist() == [[0.0, 0.4, pytest.approx(0.4 + 0.95)]]
     assert told.known_from_s[0, 2].tolist() == [np.inf, pytest.approx(1.35), pytest.approx(1.35)]
 
 
 def test_with_news__front_news_only_at_the_papers_times():
-    told = with_news(V2X.model_validate({"hears": "front"}), vehicles([0.0, 0.5, 0.8]), np.zeros((1, 36)))
+    told = V2X.model_validate({"hears": "front"}).with_news(vehicles([0.0, 0.5, 0.8]), np.zeros((1, 36)))
     assert told.latency_s.tolist() == [[0.0, 0.5, 0.8]]
     assert told.known_from_s[0].tolist() == [[0.0, np.inf, np.inf], [0.5, 0.5, np.inf], [0.8, 0.8, 0.8]]
 
@@ -154,7 +144,7 @@ def slow_news(channel: Channel, own_s: list[float], links: np.ndarray) -> tuple[
 def test_with_news__is_what_a_loop_over_the_links_gives(given):
     v2x, rng = V2X.model_validate(given), np.random.default_rng(6)
     u, own = rng.random((40, 16 * PER_LINK)), rng.choice([0.0, 0.2, 0.7, 1.5], (40, 4))
-    told = with_news(v2x, vehicles(own, 40), u)
+    told = v2x.with_news(vehicles(own, 40), u)
     for k in range(40):
         latency, known = slow_news(v2x.channel, own[k].tolist(), u[k].reshape(4, 4, PER_LINK))
         assert told.latency_s[k] == pytest.approx(latency, rel=1e-12)
@@ -294,8 +284,8 @@ def test_full_state__has_the_latency_that_the_channel_has_drawn():
 
 def test_observe__writing_the_papers_news_out_by_link_changes_no_bit():
     plain = PAPER.sample(50, 7).worlds
-    rows = pack(plain)
-    told = unpack(Packed(rows.state, with_news_columns(rows.params, 3)))
+    rows = Packed.of(plain)
+    told = rows.widened(obstacle=False, news=True).worlds()
     for time in (0.0, 0.3, 0.6, 1.0):
         for i in range(3):
             now = (replace(w, time_s=np.full(50, time)) for w in (plain, told))
@@ -429,7 +419,7 @@ def test_v2x__where_nothing_is_lost_the_longest_burst_bounds_the_news(name, late
     assert v2x.latest_reaction_s(np.zeros(12)).tolist()[5:] == pytest.approx([latest] * 7)
     u = np.random.default_rng(3).random((2_000, 144 * PER_LINK))
     u.reshape(2_000, 144, PER_LINK)[:1_000, :, 1] = 0.0  # the longest bursts everywhere
-    drawn = with_news(v2x, vehicles([0.0] * 12, 2_000), u).latency_s
+    drawn = v2x.with_news(vehicles([0.0] * 12, 2_000), u).latency_s
     assert (drawn <= v2x.latest_reaction_s(np.zeros(12))).all() and drawn.max() > latest - 0.1
 
 

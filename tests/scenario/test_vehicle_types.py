@@ -14,8 +14,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import scenario_sha256, worlds_sha256
 from ethbrake_marl.scenario import Scenario, load_scenario, parse_yaml, scenario_folder
-from ethbrake_marl.scenario.fields import quantity
-from ethbrake_marl.scenario.sampling import uniform_numbers
+from ethbrake_marl.scenario.sampling import QUANTITY, uniform_numbers
 
 MIXED = load_scenario("realistic-mixed")
 N = 20_000
@@ -46,7 +45,7 @@ def test_quantities__follow_the_distribution_of_their_type():
     sample = line().sample(N, 3)
     assert sample.types is not None
     car, truck = (sample.types == name for name in ("car", "truck"))
-    mass, braking = (quantity(sample.worlds, key) for key in ("mass_t", "braking_capacity_mps2"))
+    mass, braking = (QUANTITY.declared[key].of(sample.worlds) for key in ("mass_t", "braking_capacity_mps2"))
     shape = stats.truncnorm(-2, 2, loc=8, scale=1)
     assert stats.kstest(mass[car], stats.uniform(1, 1).cdf).pvalue > 0.001
     assert stats.kstest(braking[car], shape.cdf).pvalue > 0.001
@@ -57,7 +56,7 @@ def test_quantities__follow_the_distribution_of_their_type():
 def test_with_load__moves_a_vehicles_quantities_together():
     sample = line().sample(2_000, 3)
     truck = sample.types == "truck"
-    mass, braking = (quantity(sample.worlds, key)[truck] for key in ("mass_t", "braking_capacity_mps2"))
+    mass, braking = (QUANTITY.declared[key].of(sample.worlds)[truck] for key in ("mass_t", "braking_capacity_mps2"))
     load = (mass - 14.0) / 26.0
     np.testing.assert_allclose(braking, 7.0 - 3.0 * load, rtol=1e-12)
     assert 0.0 <= load.min() < 0.01 < 0.99 < load.max() <= 1.0
@@ -98,7 +97,7 @@ def test_types__leave_all_other_draws_alone():
     typed = Scenario(**{**given, "vehicle_types": {"car": {}, "bus": {"mass_t": 12}}})
     one, other = plain.sample(500, 7).worlds, typed.sample(500, 7).worlds
     for key in ("gaps_m", "speeds_mps", "braking_capacity_mps2", "driving_capacity_mps2"):
-        assert (quantity(one, key) == quantity(other, key)).all()
+        assert (QUANTITY.declared[key].of(one) == QUANTITY.declared[key].of(other)).all()
     assert set(np.unique(other.vehicles.mass_t)) == {2.0, 12.0}
 
 
@@ -120,7 +119,7 @@ def test_types__of_refused_worlds_are_drawn_again():
     sample = near.sample(300, 7)
     assert sample.rejected > 0
     assert (sample.index == np.arange(300)).all()
-    heavy = quantity(sample.worlds, "mass_t") >= 14.0
+    heavy = QUANTITY.declared["mass_t"].of(sample.worlds) >= 14.0
     assert (heavy == (sample.types == "truck")).all()
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from ethbrake_marl.agents.rollout import drive
-from ethbrake_marl.physics import Floats, Ints, Worlds
+from ethbrake_marl.physics import Floats, Worlds
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.shield import ShieldedDriver
 
@@ -48,9 +48,6 @@ class Hostile:
 
     def __init__(self, way: str, seed: int = 5) -> None:
         self.name, self.rng = way, np.random.default_rng(seed)
-
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        """Nothing to prepare."""
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """The proposal, [n] m/s2."""

@@ -13,8 +13,7 @@ import numpy as np
 
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.search import profile_problem
-from ethbrake_marl.shield.certify import begin_running, plan_harm
-from ethbrake_marl.shield.step_shield import StepShield
+from ethbrake_marl.shield.step_shield import StepShield, begin_running, plan_harm
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 BATCH = 50_000  # worlds driven at once

@@ -105,11 +105,14 @@ class Proposing:
     def __init__(self, seed: int) -> None:
         self.seed = seed
 
-    def begin(self, worlds: Any, vehicle: int, rows: Any) -> None:
-        self.proposals = Proposals(self.seed, worlds.n)
+    def begin(self, alert: Any, vehicle: int, scripts: Any) -> Any:
+        proposals = Proposals(self.seed, alert.n)
+        return np.stack([proposals.next() for _ in range(200)], axis=1), np.zeros(alert.n, np.int64)
 
-    def act(self, worlds: Any, vehicle: int) -> np.ndarray:
-        return self.proposals.next() * worlds.vehicles.braking_capacity_mps2[:, vehicle]
+    def act(self, worlds: Any, memory: Any, vehicle: int) -> Any:
+        proposals, step = memory
+        share = proposals[np.arange(worlds.n), step % proposals.shape[1]]
+        return share * worlds.vehicles.braking_capacity_mps2[:, vehicle], (proposals, step + 1)
 
 
 def evaluation(worlds: int, seed: int) -> Harms:

@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine import Engine
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.shield import StepShield
-from ethbrake_marl.shield.certify import certify
+from ethbrake_marl.shield.step_shield import certify
 
 SCENARIOS = {
     (3, 3): "cooperation-3-pair", (4, 3): "cooperation-4-all",

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine import Engine
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.shield.certify import certify
 from ethbrake_marl.shield.guard import ShieldOptions, guard_of
+from ethbrake_marl.shield.step_shield import certify
 from tests.shield.trained import trained
 
 _ROLES = {

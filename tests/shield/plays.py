@@ -43,9 +43,6 @@ class Failing:
 
     name, fails, remembers = "failing", False, False
 
-    def begin(self, worlds: Any, vehicle: int, rows: Any) -> None:
-        pass
-
     def act(self, worlds: Any, vehicle: int) -> np.ndarray:
         if self.fails:
             raise Failure
@@ -274,13 +271,12 @@ class Evaluation(Play):
         return episode_engine(worlds, ShieldedDriver(self.policy, self.scenario), self.scenario, 1)
 
     def _policy_fails(self) -> None:
-        (policy,) = self._engine.guarded.policies.values()
-        policy.fails = True
+        self.policy.fails = True
         try:
             self._engine.step({})
             raise AssertionError("nobody asked it")
         finally:
-            policy.fails = False
+            self.policy.fails = False
 
     def engine(self) -> Any:
         return self._engine

@@ -37,15 +37,13 @@ from ethbrake_marl.evaluation.inputs import make_agents
 from ethbrake_marl.files.store import write_file
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import ShieldedDriver
-from ethbrake_marl.shield.certify import certify
-from ethbrake_marl.shield.step_shield import StepShield
+from ethbrake_marl.shield.step_shield import StepShield, certify
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 from tests.shield.corners import corners_gate, ranges_gate
 from tests.shield.inside import inside_gate
 from tests.shield.interface_attack import INTERFACES
 from tests.shield.interference import PLAYS, WRAPPERS, disturbed, wrapped
-from tests.shield.joint_attack import ADVERSARIES as JOINT_ADVERSARIES
-from tests.shield.joint_attack import joint_attack, scenario_of
+from tests.shield.joint_attack import ADVERSARIES as JOINT_ADVERSARIES, joint_attack, scenario_of
 from tests.shield.lines import ADVERSARIES, attack, line
 from tests.shield.sabotage import LEAKS
 from tests.shield.search import search

@@ -7,20 +7,19 @@ predicted here, so that only the certificate stands between the search and the b
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
 from ethbrake_marl.physics.kernel import CLOCK
 from ethbrake_marl.shield import StepShield
-from ethbrake_marl.shield.certify import Decision, Running
+from ethbrake_marl.shield.step_shield import Decision, Running
 
 Leak = Callable[[StepShield, Decision | None], None]  # changes the shield before a decision; the last one, or None
 
 
 def _with_problem(shield: StepShield, **arrays: np.ndarray) -> None:
     running = shield.running
-    shield.running = running._replace(problem=replace(running.problem, **arrays))
+    shield.running = running._replace(problem=running.problem._replace(**arrays))
 
 
 def _columns(running: Running, group: int) -> slice:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine import Engine
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield import StepShield
 from tests.shield.lines import line, most_harmful

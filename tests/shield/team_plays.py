@@ -70,7 +70,8 @@ class TeamParallel(Members, Parallel):
 
     def _watched(self) -> None:
         super()._watched()
-        team = {f"vehicle_{i + 1}": Unreliable() for i in LEARNERS}
+        self.team = {i: Unreliable() for i in LEARNERS}
+        team = {f"vehicle_{i + 1}": member for i, member in self.team.items()}
         inner = self.env.env
         self.env.close()
         self.env = HybridShield(inner, team, mode="step", cap="baseline")
@@ -83,13 +84,12 @@ class TeamParallel(Members, Parallel):
             self.fails("fails"),
             self.fails("misshapen"),
         ]
-        self.engine()._memories.clear()
+        self.engine()._watched.clear()
         Play._watched(self)
         self.env.reset(seed=int(self.rng.integers(10**6)))
 
     def members(self) -> dict[int, Unreliable]:
-        found: dict[int, Unreliable] = self.env.attached.memory.policies
-        return found
+        return self.team
 
     def asked(self) -> None:
         self.env.step({})
@@ -133,12 +133,12 @@ class TeamEvaluation(Members, Evaluation):
         self.bad = [self.fails("fails"), self.fails("misshapen")]
 
     def _driven(self, worlds: Any) -> Any:
-        team = Team({i: Unreliable() for i in LEARNERS}, "unreliable")
+        self.team = {i: Unreliable() for i in LEARNERS}
+        team = Team(self.team, "unreliable")
         return episode_engine(worlds, ShieldedDriver(team, self.scenario, cap="baseline").on(LEARNERS), self.scenario)
 
     def members(self) -> dict[int, Unreliable]:
-        found: dict[int, Unreliable] = self._engine.guarded.policies
-        return found
+        return self.team
 
     def asked(self) -> None:
         self._engine.step({})

@@ -13,6 +13,7 @@ from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import HybridAgent, HybridShield
+from tests.fixtures.asked import Asked
 
 SCENARIO = load_scenario("paper-random")
 WORLDS = SCENARIO.sample(300, 3).worlds
@@ -27,41 +28,41 @@ class LateBrake:
 
     name = "late_brake"
 
-    def begin(self, worlds, vehicle, rows):
-        pass
-
     def act(self, worlds, vehicle):
         return np.where(worlds.time_s < 0.9, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle])
+
+
+def memory_of(agent):
+    return Asked(agent).begin(WORLDS, 1).memory
 
 
 @pytest.mark.parametrize("harm_count", ["first", "total"])
 def test_coupled__is_never_worse_than_either_part(harm_count):
     hybrid = HybridAgent(LateBrake(), SCENARIO, harm_count=harm_count)
-    realised = harm(hybrid, harm_count)
+    realised, memory = harm(hybrid, harm_count), memory_of(hybrid)
     alone, baseline = harm(LateBrake(), harm_count), harm(make_agent("e_v2x_bm", harm_count=harm_count), harm_count)
     assert (realised <= baseline).all() and (realised <= alone).all()
-    assert realised.tolist() == hybrid.predicted_harm.tolist()
-    assert hybrid.chosen_policy.tolist() == (alone <= baseline).tolist()
-    assert 0 < hybrid.chosen_policy.sum() < WORLDS.n
+    assert realised.tolist() == memory["predicted_harm"].tolist()
+    assert memory["chosen_policy"].tolist() == (alone <= baseline).tolist()
+    assert 0 < memory["chosen_policy"].sum() < WORLDS.n
 
 
 def test_refined__policy_is_taken_at_its_word():
     hybrid = HybridAgent(Refined(make_agent("constant:5"), SCENARIO, tries=6), SCENARIO)
     realised = harm(hybrid)
     plain = harm(HybridAgent(make_agent("constant:5"), SCENARIO))
-    assert realised.tolist() == hybrid.predicted_harm.tolist()
+    assert realised.tolist() == memory_of(hybrid)["predicted_harm"].tolist()
     assert (realised <= plain).all() and (realised < plain).any()
 
 
 def test_pairwise__bound_is_exceeded_in_the_same_physics():
     hybrid = HybridAgent(make_agent("constant:0.5"), SCENARIO, bound="pairwise")
     realised = harm(hybrid)
-    assert (realised > hybrid.bound_harm + 1.0).mean() > 0.3
+    assert (realised > memory_of(hybrid)["bound_harm"] + 1.0).mean() > 0.3
 
 
 def test_begin__of_some_rows_leaves_the_others_alone():
-    hybrid = HybridAgent(make_agent("full_brake"), SCENARIO)
-    hybrid.begin(WORLDS, 1, np.arange(WORLDS.n))
+    hybrid = Asked(HybridAgent(make_agent("full_brake"), SCENARIO)).begin(WORLDS, 1)
     before = hybrid.bound_harm.copy()
     hybrid.begin(WORLDS.take([7]), 1, np.array([2]))
     assert hybrid.bound_harm[2] == before[7]
@@ -98,24 +99,20 @@ def test_bad_input__is_refused():
 
 
 class Counting:
-    """Full braking that counts the episodes it began."""
+    """Full braking that counts how often it was asked."""
 
     name = "counting"
 
-    def __init__(self):
-        self.begun = 0
+    def begin(self, alert, vehicle, scripts):
+        return np.zeros(alert.n)
 
-    def begin(self, worlds, vehicle, rows):
-        self.begun += len(rows)
-
-    def act(self, worlds, vehicle):
-        return -worlds.vehicles.braking_capacity_mps2[:, vehicle]
+    def act(self, worlds, memory, vehicle):
+        memory += 1.0
+        return -worlds.vehicles.braking_capacity_mps2[:, vehicle], memory
 
 
 def test_begin__the_prediction_does_not_disturb_the_policy():
-    policy = Counting()
-    HybridAgent(policy, SCENARIO).begin(WORLDS, 1, np.arange(WORLDS.n))
-    assert policy.begun == WORLDS.n
+    assert (HybridAgent(Counting(), SCENARIO).begin(WORLDS, 1, {})["policy"] == 0.0).all()
 
 
 @pytest.mark.parametrize(("bound", "harm_count"), [("pairwise", "frist"), ("coupled", "both"), ("couple", "first")])
@@ -135,10 +132,10 @@ def test_wrapper__closed_lets_go_of_the_environment():
     env, policy = parallel_env(), Counting()
     shielded = HybridShield(env, policy)
     shielded.reset(seed=0)
-    begun = shielded.attached.shield.policy.begun
+    memory = shielded.attached.shield
     shielded.close()
     env.reset(seed=1)
-    assert begun == 1 and shielded.attached.shield.policy.begun == 1
+    assert shielded.attached.shield is memory and memory["policy"].tolist() == [0.0]
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,7 @@ from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.scenario import Task, load_scenario
-from ethbrake_marl.shield import ShieldedDriver
-from ethbrake_marl.shield import guard as behind_module
+from ethbrake_marl.shield import ShieldedDriver, guard as behind_module
 from ethbrake_marl.shield.guard import drive_chunks, put_shield, stack
 
 PAIR, PAPER = (load_scenario(name) for name in ("cooperation-3-pair", "paper-random"))

@@ -24,8 +24,8 @@ PERIODIC = BASE.replace(v2x={"preset": "blocked", "persistence": "periodic"})
 def driven(agent: object, scenario: Scenario, n: int, seed: int = 7, vehicle: int = 1) -> tuple[Floats, Floats]:
     """Harm realised, and the first bound, [n] each."""
     episodes = drive(scenario.sample(n, seed).worlds, agent, scenario, vehicle)
-    told = agent if episodes.guarded is None else episodes.guarded.shield
-    return episodes.ledger.world_harm("first"), told.predicted_harm
+    told = episodes.memories[vehicle] if episodes.guarded is None else episodes.guarded.told
+    return episodes.ledger.world_harm("first"), told["predicted_harm"]
 
 
 def behind(way: str, scenario: Scenario, robust: str | None = None) -> ShieldedDriver:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import make_worlds
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search import profile_problem
-from ethbrake_marl.shield.certify import CONSTANTS, REASONS, Backup, begin_running, certify, plan_harm
+from ethbrake_marl.shield.step_shield import CONSTANTS, REASONS, Backup, begin_running, certify, plan_harm
 from tests.shield.lines import line
 
 STEPS = 81

@@ -14,13 +14,11 @@ from gymnasium.wrappers import Autoreset
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive, episode_engine
-from ethbrake_marl.engine.engine import Engine
-from ethbrake_marl.engine.step import STEP
+from ethbrake_marl.engine import STEP, Engine
 from ethbrake_marl.envs.gym import EthBrakeVectorEnv
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
-from ethbrake_marl.physics.advance import harm_at, speed_at
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import (
     HybridShield,
@@ -76,15 +74,15 @@ class Cheating(Engine):
         before = self.ended
         step = super()._advance(columns)
         rows = self.ended & ~before if self.last_only else ~before
-        vehicles = self.scenario.vehicles
+        column = self.packed.column
         if self.what == "a step":
             self._clock[rows, STEP] += 1.0
         elif self.what == "first-impact harm":
-            self._state[rows, harm_at(vehicles)] += 1e-12
+            self._state[rows, column.harm] += 1e-12
         elif self.what == "total harm":
-            self._state[rows, harm_at(vehicles) + vehicles - 1] += 1e-12
+            self._state[rows, column.harm + column.vehicles - 1] += 1e-12
         else:
-            self._state[rows, speed_at(vehicles)] += 1e-12
+            self._state[rows, column.speed] += 1e-12
         return step
 
 
@@ -134,7 +132,8 @@ def test_ledger__harm_that_nobody_predicted_is_seen_before_the_next_decision(gro
     env = shielded()
     *_, info = env.step(DRIVE)
     assert info["shield"]["trusted"]
-    env.attached.engine._state[0, harm_at(3) + 2 * group] += 1e-12
+    engine = env.attached.engine
+    engine._state[0, engine.packed.column.harm + 2 * group] += 1e-12
     *_, info = env.step(DRIVE)
     assert not info["shield"]["trusted"] and info["shield"]["reason"] == "assumption broken"
 
@@ -289,9 +288,6 @@ class DrivesOff:
 
     name = "drives_off"
 
-    def begin(self, worlds, vehicle, rows):
-        pass
-
     def act(self, worlds, vehicle):
         v = worlds.vehicles
         stands = worlds.speeds_mps[:, vehicle] == 0.0
@@ -348,12 +344,12 @@ class Counting:
 
     name = "counting"
 
-    def begin(self, worlds, vehicle, rows):
-        self.asked = 0
+    def begin(self, alert, vehicle, scripts):
+        return np.zeros(alert.n)
 
-    def act(self, worlds, vehicle):
-        self.asked += 1
-        return -min(0.3 * self.asked, 7.0) * np.ones(worlds.n)
+    def act(self, worlds, memory, vehicle):
+        memory += 1.0
+        return -np.minimum(0.3 * memory, 7.0), memory
 
 
 @pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.MovingAtHorizon")

@@ -17,8 +17,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.envs.gym import EthBrakeEnv, EthBrakeVectorEnv
-from ethbrake_marl.envs.parallel import env as aec_env
-from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.envs.parallel import env as aec_env, parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
@@ -139,9 +138,6 @@ class Speechless:
     """Proposes nothing that is a number."""
 
     name = "speechless"
-
-    def begin(self, worlds, vehicle, rows):
-        pass
 
     def act(self, worlds, vehicle):
         return np.full(worlds.n, np.nan)
@@ -350,7 +346,7 @@ def test_episode_mode__tells_the_bound_of_the_episode_that_ended(make):
     env.reset()
     told = 0
     while told < 12:
-        bound = env.attached.shield.bound_harm.copy()
+        bound = env.attached.shield["bound_harm"].copy()
         found = env.step(np.zeros((8, 1)))
         ended = np.flatnonzero(found[2] if len(found) == 4 else found[2] | found[3])
         for k in ended:
@@ -411,8 +407,8 @@ def test_policy_with_a_memory__is_asked_once_per_decision_whoever_proposes(belie
     env.reset(seed=7)
     for actions in ({"vehicle_2": [-0.3]}, {}, {"vehicle_2": [-0.9]}, {"vehicle_2": [1.0]}):
         env.step(actions)
-    assert env.attached.memory.policies[1]._steps.tolist() == [4]
+    assert env.attached.memory.policies[1]["steps"].tolist() == [4]
     with pytest.raises(InvalidInput):
         env.step({"vehicle_2": [-0.3], "vehicle_9": [0.0]})
     env.step({})
-    assert env.attached.memory.policies[1]._steps.tolist() == [5] and policy._steps.tolist() == []
+    assert env.attached.memory.policies[1]["steps"].tolist() == [5]

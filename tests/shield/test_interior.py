@@ -10,12 +10,12 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive, script_agents
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.physics.kernel import number_of_decisions
+from ethbrake_marl.physics.kernel import Decisions
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield import HybridShield, ShieldedDriver, ShieldOptions, StepShield, enclosure, parse_uncertainty
-from ethbrake_marl.shield.certify import begin_running, plan_harm
-from ethbrake_marl.shield.enclosure import Known, bound_plans, boxes_of, cell_of, wait
+from ethbrake_marl.shield.enclosure import Known, boxes_of, cell_of, wait
+from ethbrake_marl.shield.step_shield import begin_running, plan_harm
 from tests.shield.enclosed import outside
 from tests.shield.lines import line
 from tests.shield.test_certify import STEPS, two
@@ -41,8 +41,7 @@ def boxed(scenario, worlds, text):
     others = script_agents(scenario, except_for=1)
     command = fixed_commands(others, possible, "test", vehicle=1)
     problem = profile_problem(possible, [1], horizon_s=scenario.horizon_s, others_mps2=command)
-    running = begin_running(problem, possible.n // worlds.n)
-    return uncertainty, boxes_of(possible, running, scenario, others)
+    return uncertainty, boxes_of(possible, problem, worlds.n, scenario, others)
 
 
 def harm_inside(scenario, uncertainty, worlds, plan, draws, rng):
@@ -53,7 +52,7 @@ def harm_inside(scenario, uncertainty, worlds, plan, draws, rng):
 
 
 def width(scenario):
-    return int(number_of_decisions(np.zeros(1), scenario.time_step_s, scenario.horizon_s)[0]) + 1
+    return int(Decisions(np.zeros(1), scenario.time_step_s).before(scenario.horizon_s)[0]) + 1
 
 
 OPERATIONS = {
@@ -86,9 +85,9 @@ def test_by_hand__two_vehicles_the_bound_is_that_of_the_least_gap():
     _, boxes = boxed(scenario, worlds, "gaps_m=2")
     plan = np.full((1, STEPS), -1.0)
     # 13 m in the worst world: 14^2 - 2 * 5 * 13
-    assert bound_plans(boxes, plan, np.zeros(1), 1)[0] == pytest.approx(66.0, abs=1e-3)
+    assert boxes.bound(np.arange(1), plan, np.zeros(1), 1)[0] == pytest.approx(66.0, abs=1e-3)
     _, boxes = boxed(scenario, worlds, "gaps_m=2,speeds_mps.vehicle_2=1")
-    found = bound_plans(boxes, plan, np.zeros(1), 25)[0]
+    found = boxes.bound(np.arange(1), plan, np.zeros(1), 25)[0]
     assert 15.0**2 - 130.0 <= found <= 15.0**2 - 130.0 + 1.0
 
 
@@ -101,7 +100,7 @@ def test_bound__is_at_least_the_harm_of_every_world_drawn_from_the_box(name):
         worlds = scenario.sample(1, 3, first=k).worlds
         uncertainty, boxes = boxed(scenario, worlds, text)
         for plan in (np.full(width(scenario), -0.9), np.repeat(rng.uniform(-1.0, 0.6, 30), 4)[: width(scenario)]):
-            bound = bound_plans(boxes, plan[np.newaxis], np.zeros(1), 5)[0]
+            bound = boxes.bound(np.arange(1), plan[np.newaxis], np.zeros(1), 5)[0]
             finite += bool(np.isfinite(bound))
             assert harm_inside(scenario, uncertainty, worlds, plan, 25, rng).max() <= bound
     assert finite == 4
@@ -169,7 +168,7 @@ def test_bound__is_never_above_what_speeds_allow():
     worlds = scenario.sample(1, 3).worlds
     uncertainty, boxes = boxed(scenario, worlds, text)
     plan = np.full(width(scenario), -0.9)
-    bound = bound_plans(boxes, plan[np.newaxis], np.zeros(1), 1)[0]
+    bound = boxes.bound(np.arange(1), plan[np.newaxis], np.zeros(1), 1)[0]
     fastest, e = worlds.speeds_mps.max(), 0.3
     assert harm_inside(scenario, uncertainty, worlds, plan, 50, np.random.default_rng(1)).max() <= bound
     assert bound <= fastest**2 * (1.0 + (1.0 + e) ** 2) + 1e-9
@@ -194,7 +193,7 @@ def test_bound__more_parts_never_make_it_worse():
     worlds = scenario.sample(1, 7, first=11).worlds
     _, boxes = boxed(scenario, worlds, "gaps_m=0.5")
     plan = np.full((1, width(scenario)), -0.9)
-    found = [bound_plans(boxes, plan, np.zeros(1), cells)[0] for cells in (1, 5, 21)]
+    found = [boxes.bound(np.arange(1), plan, np.zeros(1), cells)[0] for cells in (1, 5, 21)]
     assert found[0] >= found[1] >= found[2] > 0.0
 
 

@@ -15,7 +15,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield import HybridShield, ShieldedDriver, ShieldedEnv, StepShield, parse_uncertainty
-from ethbrake_marl.shield.certify import REASONS, Backup, begin_running, certify, plan_harm
+from ethbrake_marl.shield.step_shield import REASONS, Backup, begin_running, certify, plan_harm
 from tests.shield.lines import line
 from tests.shield.test_certify import STEPS, two
 
@@ -30,9 +30,6 @@ class Adversary:
 
     def __init__(self, name, seed=0):
         self.name, self._rng = name, np.random.default_rng(seed)
-
-    def begin(self, worlds, vehicle, rows):
-        pass
 
     def act(self, worlds, vehicle):
         v = worlds.vehicles

@@ -7,10 +7,10 @@ import pytest
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.figures.evaluation import robustness_figure, robustness_table
+from ethbrake_marl.figures import robustness_figure
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.scenario.schema import Task
-from ethbrake_marl.shield.review import MODES, TRUTHS, robustness
+from ethbrake_marl.shield.evidence import MODES, TRUTHS, robustness
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 from tests.failing_worlds import plant, without
 
@@ -72,7 +72,7 @@ def test_interior__keeps_its_bound_inside_and_is_refused_for_what_it_cannot_cert
 
 def test_same_case__is_driven_once(monkeypatch):
     drives = []
-    monkeypatch.setattr("ethbrake_marl.shield.review.drive", lambda *given: drives.append(given) or drive(*given))
+    monkeypatch.setattr("ethbrake_marl.shield.evidence.drive", lambda *given: drives.append(given) or drive(*given))
     robustness(WORLDS.take([0]), make_agent("full_brake"), TASK, INTERVALS, widths=(0.0, 1.0))
     assert len(drives) == 1 + 5  # nothing differs at width 0, nor for step mode where the world is as told
 
@@ -92,7 +92,6 @@ def test_figure__draws_the_points(points):
     drawn = {line.get_label(): line.get_ydata().tolist() for line in above.get_lines()}
     assert drawn["step, a corner"] == [p.above for p in points if (p.mode, p.truth) == ("step", "corner")]
     assert len(excess.get_lines()) == 4
-    assert robustness_table(points).row_count == len(points)
 
 
 def test_refused__nothing_to_draw_and_widths_that_are_none():

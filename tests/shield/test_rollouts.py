@@ -14,7 +14,8 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.shield import HybridShield, ShieldedDriver, StepShield, parse_uncertainty
-from ethbrake_marl.shield.certify import REASONS, Backup, Proposer
+from ethbrake_marl.shield.step_shield import REASONS, Backup, Proposer
+from tests.fixtures.asked import Asked
 
 PAPER = load_scenario("paper-random")
 WORLDS = PAPER.sample(120, 3).worlds
@@ -35,36 +36,27 @@ class Weights:
 
 
 class Remembering:
-    """A policy whose action depends on how often it was asked in each row; it cannot be divided."""
+    """A policy whose action depends on how often it was asked in each row, which it counts in place."""
 
     name = "remembering"
 
-    def __init__(self):
-        self.asked = np.zeros(0)
+    def begin(self, alert, vehicle, scripts):
+        return {"asked": np.zeros(alert.n), "phase": np.arange(alert.n)}
 
-    def begin(self, worlds, vehicle, rows):
-        self.asked = np.zeros(rows.max() + 1)
-
-    def act(self, worlds, vehicle):
-        self.asked = self.asked + 1.0
-        wave = np.sin(2.0 * self.asked + np.arange(worlds.n))
-        return np.where(wave > 0.0, 0.0, wave * worlds.vehicles.braking_capacity_mps2[:, vehicle])
+    def act(self, worlds, memory, vehicle):
+        memory["asked"] += 1.0
+        wave = np.sin(2.0 * memory["asked"] + memory["phase"])
+        return np.where(wave > 0.0, 0.0, wave * worlds.vehicles.braking_capacity_mps2[:, vehicle]), memory
 
 
 class TwoFaced:
-    """Coasts in person, while every copy of it does otherwise."""
+    """Coasts when it is asked what it does, and does otherwise where it is tried out in some of its worlds."""
 
     name = "two-faced"
-    remembers = False  # so that the guard asks itself, and rolls a copy out
-
-    def __deepcopy__(self, memo):
-        return LearnedAgent(Weights())
-
-    def begin(self, worlds, vehicle, rows):
-        pass
 
     def act(self, worlds, vehicle):
-        return np.zeros(worlds.n)
+        other = LearnedAgent(Weights())
+        return np.zeros(worlds.n) if worlds.n == WORLDS.n else other.act(worlds, vehicle)
 
 
 def tight():
@@ -79,7 +71,7 @@ def test_by_hand__the_policy_certifies_what_plan_and_constants_do_not():
     shield, worlds = tight()
     assert REASONS[shield.decide(np.zeros(1)).reason[0]] == "no certificate"
     shield, worlds = tight()
-    decision = shield.decide(np.zeros(1), proposer=Proposer({1: make_agent("full_brake")}, worlds))
+    decision = shield.decide(np.zeros(1), proposer=Proposer({1: make_agent("full_brake")}, {1: None}, worlds))
     assert REASONS[decision.reason[0]] == "policy rollout" and not decision.intervened[0]
     assert decision.applied.tolist() == [0.0] and decision.bound.tolist() == [0.0]
     assert (shield.backup.plan[0, 0], shield.backup.plan[0, 1]) == (0.0, -1.0)
@@ -88,7 +80,7 @@ def test_by_hand__the_policy_certifies_what_plan_and_constants_do_not():
 
 def test_by_hand__a_policy_that_would_collide_certifies_nothing():
     shield, worlds = tight()
-    decision = shield.decide(np.zeros(1), proposer=Proposer({1: make_agent("constant:3.5")}, worlds))
+    decision = shield.decide(np.zeros(1), proposer=Proposer({1: make_agent("constant:3.5")}, {1: None}, worlds))
     assert REASONS[decision.reason[0]] == "no certificate" and decision.applied.tolist() == [-0.7]
     # 14 m are left, 10^2 / (2 * 3.5) = 14.29 m are needed: 2 * 3.5 * 0.2857 = 2 m2/s2
     assert decision.margin[0] == pytest.approx(-2.0)
@@ -145,10 +137,10 @@ def test_rollout__leaves_the_policys_memory_alone():
     policy = Remembering()
     guarded, _, reasons = driven(policy)
     assert (reasons == REASONS.index("no certificate")).any()
-    assert set(guarded.policies[1].asked) == {float(len(reasons))} and not policy.asked.size
+    assert set(guarded.policies[1]["asked"]) == {float(len(reasons))}
 
 
-def test_rollout__a_policy_that_does_otherwise_than_its_copies_gets_no_further_than_the_bound():
+def test_rollout__a_policy_that_does_otherwise_when_it_is_tried_out_gets_no_further_than_the_bound():
     guarded, harm, reasons = driven(TwoFaced())
     assert (reasons == REASONS.index("policy rollout")).any()
     assert harm.tolist() == guarded.shield.bound.tolist() and (harm <= guarded.shield.predicted_harm).all()
@@ -161,22 +153,10 @@ def test_rollout__of_some_worlds_alone_is_that_of_the_whole_batch():
         def __init__(self):
             self.policy = LearnedAgent(Weights())
 
-        def begin(self, worlds, vehicle, rows):
-            pass
-
         def act(self, worlds, vehicle):
             return self.policy.act(worlds, vehicle)
 
     assert driven(Whole())[1].tolist() == driven(LearnedAgent(Weights()))[1].tolist()
-
-
-def test_rollout__what_goes_wrong_when_a_policy_is_divided_is_told():
-    class Failing(LearnedAgent):
-        def take(self, rows):
-            raise InvalidInput("cannot")
-
-    with pytest.raises(InvalidInput, match="cannot"):
-        driven(Failing(Weights()))
 
 
 def test_rollout__is_refused_in_the_name_of_the_policy():
@@ -214,5 +194,5 @@ def test_refined__also_where_its_policy_cannot_be_divided():
 def test_take__of_a_refined_policy_drives_on_in_those_rows():
     worlds, rows = WORLDS.take(np.arange(6)), np.array([4, 1])
     agent = Refined(LearnedAgent(Weights()), PAPER, tries=4)
-    agent.begin(worlds, 1, np.arange(6))
+    agent = Asked(agent).begin(worlds, 1)
     assert agent.take(rows).act(worlds.take(rows), 1).tolist() == agent.act(worlds, 1)[rows].tolist()

@@ -9,12 +9,12 @@ from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.figures.evaluation import operating_figure
+from ethbrake_marl.figures import operating_figure
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.scenario.schema import Task
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver, StepShield, parse_uncertainty
-from ethbrake_marl.shield.certify import REASONS
-from ethbrake_marl.shield.review import operating_curves, review
+from ethbrake_marl.shield.evidence import operating_curves, review
+from ethbrake_marl.shield.step_shield import REASONS
 from tests.failing_worlds import plant, without
 from tests.shield.lines import ADVERSARIES, attack, line
 
@@ -29,9 +29,6 @@ class Wavering:
     """A bad driver that is not constant."""
 
     name = "wavering"
-
-    def begin(self, worlds, vehicle, rows):
-        pass
 
     def act(self, worlds, vehicle):
         wave = np.sin(17.0 * worlds.time_s + worlds.gaps_m[:, 0])
@@ -189,10 +186,9 @@ def test_agent__drives_a_batch_of_another_size_as_a_fresh_one_does(agent, sizes)
         driven = [drive(worlds, each, SCENARIO, 1) for each in (used, fresh)]
         harms = [episodes.ledger.world_harm("first").tolist() for episodes in driven]
         assert harms[0] == harms[1]
-        told = [each if episodes.guarded is None else episodes.guarded.shield for each, episodes in
-                zip((used, fresh), driven, strict=True)]  # fmt: skip
-        assert told[0].predicted_harm.tolist() == told[1].predicted_harm.tolist()
-        assert told[0].chosen_policy.tolist() == told[1].chosen_policy.tolist()
+        told = [each.memories[1] if each.guarded is None else each.guarded.told for each in driven]
+        for name in ("predicted_harm", "chosen_policy"):
+            assert told[0][name].tolist() == told[1][name].tolist()
 
 
 def test_begin__of_a_row_that_is_not_there_is_refused():
@@ -206,9 +202,6 @@ class Speechless:
     """Full braking, and nothing that is a number in the second half of each second."""
 
     name = "speechless"
-
-    def begin(self, worlds, vehicle, rows):
-        pass
 
     def act(self, worlds, vehicle):
         braking = -worlds.vehicles.braking_capacity_mps2[:, vehicle]
@@ -259,10 +252,7 @@ def test_operating_curve__leaves_worlds_out_that_cannot_be_advanced_and_names_th
         (lambda: ShieldedDriver(make_agent("coast"), "paper-random"), "scenario = 'paper-random': must be a Scenario"),
         (lambda: HybridAgent(make_agent("coast"), "paper-random"), "scenario = 'paper-random': must be a Scenario"),
         (lambda: ShieldedDriver(make_agent("coast"), SCENARIO, told=3), "told = 3: must be worlds"),
-        (
-            lambda: ShieldedDriver(make_agent("coast"), SCENARIO, mode="episode"),
-            "HybridAgent is that of mode episode",
-        ),
+        (lambda: ShieldedDriver(make_agent("coast"), SCENARIO, mode="episode"), "HybridAgent is that of mode episode"),
         (lambda: StepShield(SCENARIO, 9), "vehicle = 9: must be an index from 0 to 2"),
         (lambda: StepShield(SCENARIO, 1, allowance="1"), "allowance = '1': must be a number, at least 0"),
         (lambda: StepShield(SCENARIO, 1).decide(np.zeros(3)), "no episode has begun"),

@@ -9,7 +9,6 @@ import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.physics import make_worlds
-from ethbrake_marl.physics.worlds import is_known_at_once
 from ethbrake_marl.shield.uncertainty import MOST_CORNERS, Interval, Uncertainty, checked_uncertainty, parse_uncertainty
 
 
@@ -148,7 +147,7 @@ def test_python_form__is_checked_too():
 
 def test_draw__without_a_channel_own_part_and_news_go_with_the_latency():
     drawn = parse_uncertainty("latency_s=0.1").draw(line(), np.random.default_rng(3)).vehicles
-    assert (drawn.latency_s != line().vehicles.latency_s).all() and is_known_at_once(drawn)
+    assert (drawn.latency_s != line().vehicles.latency_s).all() and drawn.is_known_at_once
 
 
 def test_draw__over_a_channel_only_the_reaction_is_uncertain():

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ethbrake_marl.engine.engine import Engine
+from ethbrake_marl.engine import Engine
 
 STEPS, WORLDS, HIDDEN = 200_000, 64, (64, 64)
 FOLDER = Path(__file__).resolve().parent

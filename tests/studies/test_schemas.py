@@ -11,11 +11,10 @@ from jsonschema import Draft202012Validator
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import read_yaml
-from ethbrake_marl.studies.sweep import read_sweep, sweep_json_schema
-from ethbrake_marl.studies.tuning import read_tuning, tuning_json_schema
+from ethbrake_marl.studies.sweep import SweepFile, SweepPlan, TuningFile, TuningPlan
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-KINDS = {"sweep": (sweep_json_schema, read_sweep), "tuning": (tuning_json_schema, read_tuning)}
+KINDS = {"sweep": (SweepPlan.json_schema, SweepFile.read_as), "tuning": (TuningPlan.json_schema, TuningFile.read_as)}
 GOOD = {"sweep": "sweep-example", "tuning": "tuning-quick"}
 JOB = {"scenario": "paper-random", "recipe": "ppo"}
 SPACE = {"n_epochs": {"low": 1, "high": 4}}
@@ -54,8 +53,8 @@ def test_schema__lets_the_examples_pass(kind: str) -> None:
     ("kind", "change"),
     [
         ("sweep", {"grid": {**JOB, "seed": 3}}),
-        ("sweep", {"grid": {"level": ["2-paper", "3-pair"], "recipe": ["ppo"], "seed": [0, 1]}, "jobs": []}),
-        ("sweep", {"jobs": [{"level": "3-pair", "recipe": "ppo"}]}),
+        ("sweep", {"grid": {"scenario": ["a", "b"], "recipe": ["ppo"], "seed": [0, 1]}, "jobs": []}),
+        ("sweep", {"jobs": [{"scenario": "a", "recipe": "ppo"}]}),
         ("tuning", {"prune": None}),
         ("tuning", {"search": {"holds": {"choices": [[1], "x", 3]}}}),
         ("tuning", {"search": {"gamma": {"low": 0.5, "high": 1, "log": True}}}),
@@ -65,7 +64,7 @@ def test_schema__lets_pass_what_the_reader_takes(kind: str, change: dict[str, An
     content = {**read_yaml(DOCS / f"{GOOD[kind]}.yaml").content, **change}
     assert _marked(kind, content) == set()
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(content))
-    KINDS[kind][1](tmp_path / "mine.yaml")
+    KINDS[kind][1](tmp_path / "mine.yaml", "scaling", "")
 
 
 @pytest.mark.parametrize(
@@ -96,7 +95,7 @@ def test_schema__marks_what_the_reader_refuses(kind: str, change: dict[str, Any]
     assert _marked(kind, content) == {place}
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(content))
     with pytest.raises(InvalidInput):
-        KINDS[kind][1](tmp_path / "mine.yaml")
+        KINDS[kind][1](tmp_path / "mine.yaml", "scaling", "")
 
 
 @pytest.mark.parametrize(("kind", "needed"), [("sweep", {"grid", "jobs"}), ("tuning", {"search"})])

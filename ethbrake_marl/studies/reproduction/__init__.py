@@ -1,4 +1,4 @@
 """The paper's figures and tables, made again one by one, each with a verdict that is computed from the numbers.
 
-``items`` is the one table of them; ``run`` makes them and writes a folder; ``page`` and ``markdown`` show the folder.
+``items`` has the table of them and makes each; ``folder`` writes what they give, and shows it as pages.
 """

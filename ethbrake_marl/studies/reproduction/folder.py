@@ -1,12 +1,7 @@
-"""The folder of a reproduction: its settings, and for each item its result, figures and data, each written whole.
-
-``ITEMS`` is the one table of what can be made; ``reproduce`` makes items and writes a folder and its page;
-``write_docs`` shows the folder as Markdown.
-"""
+"""A reproduction: items are made one by one into a folder, which a page shows, and ``docs/reproduction.md`` too."""
 
 from __future__ import annotations
 
-import base64
 import json
 import re
 import textwrap
@@ -15,142 +10,31 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any
 from urllib.parse import quote
 
 from markupsafe import Markup
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from ethbrake_marl import __version__
 from ethbrake_marl.errors import InvalidInput, count_of, plain_text, unknown_name
-from ethbrake_marl.evaluation.results import check_target, write_output
-from ethbrake_marl.figures.style import picture_bytes
+from ethbrake_marl.evaluation import write_output
+from ethbrake_marl.figures import write_picture
+from ethbrake_marl.files.sheet import Column, Sheet, Shown
 from ethbrake_marl.files.store import read_plain, write_file
-from ethbrake_marl.learning.training import read_object
-from ethbrake_marl.pages.frame import (
-    Cell,
-    Part,
-    Section,
-    anchors,
-    facts,
-    heading,
-    opened,
-    page,
-    paragraph,
-    shown,
-    table,
-)
-from ethbrake_marl.pages.player import player_of
-from ethbrake_marl.pages.vector import kept_drawing
+from ethbrake_marl.learning import read_object
+from ethbrake_marl.pages.page import Page, Part, Section, anchors, shown
 from ethbrake_marl.studies.jobs import JobFolder
-from ethbrake_marl.studies.reproduction.item import (
+from ethbrake_marl.studies.reproduction.items import (
+    HOW_JUDGED,
+    ITEMS,
     MOST_EPISODES,
-    TOLERANCE,
-    WIDE,
     Item,
-    Made,
     Result,
     Settings,
     Table,
-    Verdict,
     summarise_verdicts,
 )
-from ethbrake_marl.studies.reproduction.lists import LIST_ITEMS
-from ethbrake_marl.studies.reproduction.trainings import CURVE_ITEMS, seconds_left, train_groups, trained_names
-from ethbrake_marl.studies.reproduction.two_scenarios import SCENARIO_ITEMS
-
-# The episodes that an item lets one watch: kept beside its result as plain data, and read again with suspicion.
-
-EPISODES = "episodes.json"
-_EPISODE_LIMIT_BYTES = 4 << 20
-_MOST = 64  # vehicles
-
-_Index = Annotated[int, Field(ge=0, lt=_MOST)]
-_Impact = Annotated[list[FiniteFloat], Field(min_length=7, max_length=7)]
-
-
-class _Plain(BaseModel):
-    """What ``player_content`` gives, and nothing else."""
-
-    model_config = ConfigDict(strict=True, extra="forbid")
-
-
-class _Episode(_Plain):
-    pieces: str
-    end: FiniteFloat
-    impacts: list[_Impact]
-    stepped: list[FiniteFloat]
-    driven: list[_Index]
-    obstacle: FiniteFloat | None
-    rest: bool
-    passport: str
-
-
-class _World(_Plain):
-    number: int
-    title: str
-    kind: str
-    why: str
-    conditions: str
-    episodes: list[_Episode]
-
-
-class _Content(_Plain):
-    vehicles: Annotated[int, Field(ge=2, le=_MOST)]
-    agents: Annotated[list[str], Field(min_length=1)]
-    shown: Annotated[list[_Index], Field(min_length=1)]
-    worlds: Annotated[list[_World], Field(min_length=1)]
-
-    @property
-    def fits(self) -> bool:
-        """Whether every world has an episode of every agent, whole pieces in each."""
-        width, episodes = 8 * (1 + 3 * self.vehicles), [each for world in self.worlds for each in world.episodes]
-        try:
-            sizes = [len(base64.b64decode(episode.pieces, validate=True)) for episode in episodes]
-        except ValueError:
-            return False
-        return (
-            all(k < len(self.agents) for k in self.shown)
-            and all(len(world.episodes) == len(self.agents) for world in self.worlds)
-            and all(size > 0 and size % width == 0 for size in sizes)
-            and all(i < self.vehicles for episode in episodes for i in episode.driven)
-        )
-
-
-def kept_player(folder: Path) -> Part | None:
-    """The player of the episodes that are kept in the folder of an item; None where there are none.
-
-    Raises ``InvalidInput`` for a file that does not hold what an item gives.
-    """
-    file = folder / EPISODES
-    if not file.is_file():
-        return None
-    try:
-        content = _Content.model_validate_json(read_plain(file, _EPISODE_LIMIT_BYTES))
-    except ValidationError as error:
-        where = ".".join(map(str, error.errors()[0]["loc"])) or "no JSON"
-        raise _damaged(file, shown(where)) from None
-    if not content.fits:
-        raise _damaged(file, "worlds")
-    return player_of(_as_text(content.model_dump()))
-
-
-def _as_text(value: Any) -> Any:
-    """The same data with every text as a page shows it."""
-    if isinstance(value, dict):
-        return {key: _as_text(each) for key, each in value.items()}
-    if isinstance(value, list):
-        return [_as_text(each) for each in value]
-    return shown(value) if isinstance(value, str) else value
-
-
-def _damaged(file: Path | str, where: str) -> InvalidInput:
-    return InvalidInput(f"{file}: {where}: is not what a reproduction writes; make it again (--force)")
-
-
-# Everything that ``ethbrake reproduce`` makes, in the order of the paper.
-
-ITEMS: tuple[Item, ...] = (*CURVE_ITEMS, *LIST_ITEMS[:2], *SCENARIO_ITEMS, *LIST_ITEMS[2:])
 
 
 def choose_items(names: Sequence[str]) -> list[Item]:
@@ -171,7 +55,7 @@ def choose_items(names: Sequence[str]) -> list[Item]:
 
 PAGE = "index.html"
 _SETTINGS, _RESULT = "reproduction.json", "result.json"
-_FORMAT = {"format": "ethbrake-reproduction", "format_version": 1}
+_FORMAT = {"format": "ethbrake-reproduction", "format_version": 2}
 _LIMIT_BYTES = 16 << 20  # of a figure that is read again
 
 
@@ -200,66 +84,46 @@ def _text(content: Mapping[str, Any]) -> bytes:
     return (json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
-def _write_item(place: Path, made: Made, result: Result) -> None:
-    """Write figures and data of an item, then its result, which makes them count."""
-    if place.is_symlink() or (place.exists() and not place.is_dir()):
-        raise InvalidInput(f"{place}: is no plain folder; move it away")
-    place.mkdir(exist_ok=True)
-    for drawn, figure in made.figures.items():
-        for ending in (".svg", ".png"):
-            file = place / f"{drawn.stem}{ending}"
-            write_output(file, picture_bytes(figure, file), force=True)
-    for stem, text in made.data.items():
-        write_output(place / f"{stem}.csv", text.encode(), force=True)
-    (place / EPISODES).unlink(missing_ok=True)
-    if made.episodes is not None:
-        write_output(place / EPISODES, json.dumps(made.episodes, allow_nan=False).encode(), force=True)
-    write_output(place / _RESULT, _text(asdict(result)), force=True)
-
-
 def read_results(folder: Path) -> list[Result]:
     """The results that are there, in the order of the paper.
 
     Raises ``InvalidInput`` for one that is damaged, or another item's.
     """
-    return [result for item in ITEMS if (result := _read_result(folder, item)) is not None]
+    files = {item.name: folder / item.name / _RESULT for item in ITEMS}
+    return [checked_result(read_object(file), file, name) for name, file in files.items() if file.is_file()]
 
 
-def _read_result(folder: Path, item: Item) -> Result | None:
-    file = folder / item.name / _RESULT
-    if not file.is_file():
-        return None
-    result = checked_result(read_object(file), file)
-    if result.name != item.name:
-        raise _damaged(file, "name")
-    return result
+def checked_result(content: Mapping[str, Any], where: Path | str, name: str) -> Result:
+    """The result in the file of an item.
 
-
-def checked_result(content: Mapping[str, Any], where: Path | str) -> Result:
-    """The result in a file; raises ``InvalidInput`` where what pages show is not there or of another kind."""
+    Raises ``InvalidInput`` where what pages show is not there or of another kind, or another item's.
+    """
+    wrong = ""
     try:
         result = TypeAdapter(Result).validate_json(json.dumps(content))
     except ValidationError as error:
-        raise _damaged(where, ": ".join(map(str, error.errors()[0]["loc"]))) from None
-    if any(Path(name).name != name for name in result.data):
-        raise _damaged(where, "data")
-    if any(
-        not table.head or len(row) != len(table.head) for table in result.tables for row in [table.head, *table.rows]
-    ):
-        raise _damaged(where, "tables: rows")
-    if result.verdict != summarise_verdicts(result.comparisons):
-        raise _damaged(where, "verdict")
+        wrong = ": ".join(map(str, error.errors()[0]["loc"]))
+    else:
+        if result.name != name:
+            wrong = "name"
+        elif any(Path(file).name != file for file in result.data):
+            wrong = "data"
+        elif not all(
+            each.head and len(row) == len(each.head) for each in result.tables for row in [each.head, *each.rows]
+        ):
+            wrong = "tables: rows"
+        elif result.verdict != summarise_verdicts(result.comparisons):
+            wrong = "verdict"
+    if wrong:
+        raise InvalidInput(f"{where}: {wrong}: is not what a reproduction writes; make it again (--force)")
     return result
-
-
-# A reproduction: train what is asked for, make item after item, and keep the page up to date as they are finished.
 
 
 def tell_cost(items: Sequence[Item], settings: Settings) -> str:
     """What is left to do and about how long it takes, in one line."""
     wanted = {group for item in items for group in item.trained} if settings.mode == "full" else set()
-    training_s = seconds_left(settings.folder, wanted)
     told = f"to do: {count_of(len(items), 'item')}, at most about {sum(item.most_s for item in items)} s of one core"
+    training_s = settings.seconds_left(wanted)
     return f"{told}; trainings before them about {training_s / 60.0:.0f} min of one core" if wanted else told
 
 
@@ -270,31 +134,26 @@ def reproduce(items: Sequence[Item], settings: Settings, *, force: bool = False)
     each item the page is written anew. Ctrl-C during a training ends all trainings, and the items are made of those
     that are finished; a second one stops at once. Raises what ``open_folder`` raises.
     """
-    full, finished = settings.mode == "full", True
+    full, finished, folder = settings.mode == "full", True, settings.folder
     with open_folder(settings, force=force).work():
         for item in sorted(items, key=lambda each: len(each.trained) if full else 0):
             if full and finished:
-                finished = train_groups(settings.folder, item.trained, settings.tell)
-            trained = trained_names(settings.folder, item.trained) if full else []
-            kept = _read_result(settings.folder, item)
-            if kept is None or list(kept.trained) != trained:
+                finished = settings.train(item.trained)
+            trained = list(settings.trained(item.trained))
+            kept = {result.name: list(result.trained) for result in read_results(folder)}
+            if kept.get(item.name) != trained:
                 _make_item(item, settings, trained)
-                write_file(settings.folder / PAGE, render_page(settings.folder, read_results(settings.folder)).encode())
-        return read_results(settings.folder), finished
+                write_file(folder / PAGE, render_page(folder, read_results(folder)).encode())
+        results = read_results(folder)
+    if settings.docs is not None:
+        write_docs(settings.docs, folder, results)
+    return results, finished
 
 
 def _make_item(item: Item, settings: Settings, trained: Sequence[str]) -> None:
-    started = time.process_time()
+    """Make an item, and write its figures and data, then its result, which makes them count."""
+    place, started = settings.folder / item.name, time.process_time()
     made = item.make(settings)
-    tables = [
-        Table(
-            each.title,
-            each.headings,
-            [[cell.in_words for cell in row] for row in each.shown() if not isinstance(row, str)],
-            each.note,
-        )
-        for each in made.tables
-    ]
     result = Result(
         name=item.name,
         labels=item.labels,
@@ -309,56 +168,53 @@ def _make_item(item: Item, settings: Settings, trained: Sequence[str]) -> None:
         verdict=summarise_verdicts(made.verdicts),
         comparisons=made.verdicts,
         parameters=made.parameters,
-        tables=tables,
+        tables=[
+            Table(each.title, each.headings, [row for row in each.shown() if not isinstance(row, str)], each.note)
+            for each in made.tables
+        ],
         figures=list(made.figures),
         data=sorted(f"{stem}.csv" for stem in made.data),
         notes=made.notes,
     )
-    _write_item(settings.folder / item.name, made, result)
+    if place.is_symlink() or (place.exists() and not place.is_dir()):
+        raise InvalidInput(f"{place}: is no plain folder; move it away")
+    place.mkdir(exist_ok=True)
+    for drawn, figure in made.figures.items():
+        for ending in (".svg", ".png"):
+            write_picture(place / f"{drawn.stem}{ending}", figure, force=True)
+    for stem, text in made.data.items():
+        write_output(place / f"{stem}.csv", text.encode(), force=True)
+    write_output(place / _RESULT, _text(asdict(result)), force=True)
 
 
-# What every page of results tells.
+# The pages: one HTML file that holds its figures and loads nothing from anywhere, and Markdown with figures beside it.
 
 _TITLE = "The paper, made again"
-_LEAD = (
-    " of How to Brake? Ethical Emergency Braking with Deep Reinforcement Learning, with the"
-    " paper's numbers and statements. Every verdict is computed: a number agrees where it is within the chance between"
-    f" two lists of worlds or {100.0 * TOLERANCE:g} % of what is printed, is undecided where that chance alone makes"
-    f" more than {100.0 * WIDE:g} %, and cannot agree where a bound that holds for every strategy excludes it."
-    " Statements are those of the paper's text; its figures hold no printed numbers."
-)
+_PAPER = "How to Brake? Ethical Emergency Braking with Deep Reinforcement Learning"
+_LEAD = f" of {_PAPER}, with the paper's numbers and statements. {HOW_JUDGED}"
 _LOAD = r", load [0-9.]+"  # of the machine, which differs from item to item
 _NUMBER = re.compile(r"[-+−]?\d[\d,.]*( ?%)?|–|")
 
 
-class _Account(NamedTuple):
-    """All results in a few sentences."""
+def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
+    """What a page of these results is about; the command that makes them; when, where and in how much time they were.
 
-    lead: str  # what a page of them is about
-    command: str  # that makes them
-    made: str  # dates, machines with versions, and processor time
-    few: str  # that lists are shorter than the paper's; empty where they are not
-
-    @classmethod
-    def of(cls, results: Sequence[Result]) -> _Account:
-        """Of these results."""
-        every = len(results) == len(ITEMS)
-        most = max((result.episodes for result in results), default=MOST_EPISODES)
-        names = [] if every else [result.name for result in results]
-        mode = "--full" if any(result.mode == "full" for result in results) else "--quick"
-        fewer = ["--episodes", str(most)] if most < MOST_EPISODES else []
-        machines = (f"{each.made_utc[:10]}, {re.sub(_LOAD, '', each.machine)}" for each in results)
-        seconds = sum(each.processor_s for each in results)
-        few = f"At most {most:,} worlds of each list are driven here; the paper has {MOST_EPISODES:,}."
-        return cls(
-            f"Every figure and table{_LEAD}" if every else f"{len(results)} of the {len(ITEMS)} items{_LEAD}",
-            " ".join(["ethbrake reproduce", *names, mode, *fewer]),
-            f"{'; '.join(dict.fromkeys(machines))}; {seconds:.0f} s of one core without the trainings",
-            few if fewer else "",
-        )
-
-
-# The page of a reproduction: one HTML file that holds its figures and loads nothing from anywhere.
+    Then that lists are shorter than the paper's, where they are.
+    """
+    every = len(results) == len(ITEMS)
+    most = max((result.episodes for result in results), default=MOST_EPISODES)
+    fewer = most < MOST_EPISODES
+    names = [] if every else [result.name for result in results]
+    mode = "--full" if any(result.mode == "full" for result in results) else "--quick"
+    command = ["ethbrake reproduce", *names, mode, *(["--episodes", str(most)] if fewer else [])]
+    machines = (f"{each.made_utc[:10]}, {re.sub(_LOAD, '', each.machine)}" for each in results)
+    seconds = sum(each.processor_s for each in results)
+    return (
+        f"Every figure and table{_LEAD}" if every else f"{len(results)} of the {len(ITEMS)} items{_LEAD}",
+        " ".join(command),
+        f"{'; '.join(dict.fromkeys(machines))}; {seconds:.0f} s of one core without the trainings",
+        [f"At most {most:,} worlds of each list are driven here; the paper has {MOST_EPISODES:,}."] if fewer else [],
+    )
 
 
 def render_page(folder: Path, results: Sequence[Result]) -> str:
@@ -366,103 +222,84 @@ def render_page(folder: Path, results: Sequence[Result]) -> str:
 
     Raises ``InvalidInput`` for a figure that is not there or holds more than a figure of ours does.
     """
-    account, (_, *names) = _Account.of(results), anchors(["Overview", *(result.title for result in results)])
+    lead, command, made, few = _account(results)
+    _, *names = anchors(["Overview", *(result.title for result in results)])
+    link = Markup('<a href="#{}">{}</a>')
     rows = [
-        [Markup('<a href="#{}">{}</a>').format(name, shown(result.title)), _told(result.verdict)]
-        for name, result in zip(names, results, strict=True)
+        [Shown(link.format(name, shown(each.title))), Shown(_outcome(each.verdict.outcome), each.verdict.because)]
+        for name, each in zip(names, results, strict=True)
     ]
-    told = Markup("<p>Made by <code>{}</code> ({}).</p>\n").format(shown(account.command), shown(account.made))
-    few = [paragraph(account.few, "note")] if account.few else []
-    overview = Section("Overview", [Part(told), *few, table(["Item", "Verdict"], rows, caption="Verdict on each item")])
-    return page(_TITLE, [overview, *(_section(folder / each.name, each) for each in results)], lead=account.lead)
+    overview = [
+        Part(Markup("<p>Made by <code>{}</code> ({}).</p>\n").format(shown(command), shown(made))),
+        *(Part.paragraph(text, "note") for text in few),
+        Part.table(Sheet("Verdict on each item", ["Item", "Verdict"], rows)),
+    ]
+    return Page(_TITLE, [Section("Overview", overview), *(_section(folder, each) for each in results)], lead).html
 
 
-def _section(place: Path, result: Result) -> Section:
+def _section(folder: Path, result: Result) -> Section:
     code, link = Markup("<code>{}</code>"), Markup('<a href="./{}/{}">{}</a>')
     data = [
         link.format(quote(result.name, ""), quote(file, ""), shown(f"{result.name}/{file}")) for file in result.data
     ]
     account = {
-        "Verdict": _outcome(result.verdict),
+        "Verdict": _outcome(result.verdict.outcome),
         "Because": result.verdict.because,
         "In the paper's source": Markup(", ").join(code.format(shown(label)) for label in result.labels),
         "Data": Markup(", ").join(data),
     }
-    body: list[str | Part] = [result.what, facts({name: value for name, value in account.items() if value})]
+    body: list[str | Part] = [result.what, Part.facts({name: value for name, value in account.items() if value})]
     body += result.notes
     for drawn in result.figures:
-        file = place / f"{drawn.stem}.svg"
-        body.append(kept_drawing(read_plain(file, _LIMIT_BYTES), drawn.title, drawn.text, str(file)))
-    played = kept_player(place)
-    body += [heading("Episodes"), played] if played else []
+        file = folder / result.name / f"{drawn.stem}.svg"
+        body.append(Part.drawing(read_plain(file, _LIMIT_BYTES), drawn.title, drawn.text, where=file))
+    for item in ITEMS:
+        if item.name == result.name and item.play is not None:
+            body += [Part.heading("Episodes"), item.play()]
     for each in result.tables:
-        body.append(table(each.head, _rows(each.rows), caption=each.title))
-        body += [paragraph(each.note, "quiet")] if each.note else []
-    compared = [[each.what, _told(each)] for each in result.comparisons]
-    comparisons = table(["What", "Verdict"], compared, caption="Comparisons with the paper")
-    rows = [[each.name, Cell(each.value, words=True), Cell(each.origin, words=True)] for each in result.parameters]
-    parameters = table(["Parameter", "Value", "Origin"], rows, caption="What shapes the item")
-    body += [opened(f"Comparisons: {len(compared)}", [comparisons]), opened(f"Parameters: {len(rows)}", [parameters])]
+        words = [not all(_NUMBER.fullmatch(value) for value, _ in column) for column in zip(*each.rows, strict=True)]
+        columns = [
+            Column(name, text=wordy) for name, wordy in zip(each.head, words or [False] * len(each.head), strict=True)
+        ]
+        rows = [[row[0].in_words, *row[1:]] for row in each.rows]
+        body.append(Part.table(Sheet(each.title, columns, rows)))
+        body += [Part.paragraph(each.note, "quiet")] if each.note else []
+    compared = [[each.what, Shown(_outcome(each.outcome), each.because)] for each in result.comparisons]
+    comparisons = Part.table(Sheet("Comparisons with the paper", ["What", "Verdict"], compared))
+    shaped = [[each.name, each.value, each.origin] for each in result.parameters]
+    parameters = Part.table(Sheet("What shapes the item", ["Parameter", "Value", "Origin"], shaped))
+    body.append(Part.opened(f"Comparisons: {len(compared)}", [comparisons]))
+    body.append(Part.opened(f"Parameters: {len(shaped)}", [parameters]))
     return Section(result.title, body)
 
 
-def _told(verdict: Verdict) -> Cell:
-    """The outcome, and the numbers that it follows from below it."""
-    return Cell(_outcome(verdict), verdict.because, words=True)
-
-
-def _outcome(verdict: Verdict) -> Markup:
+def _outcome(word: str) -> Markup:
     """The word of a verdict, with a sign and a colour."""
-    kind = verdict.outcome.replace(" ", "-")
-    return Markup('<span class="outcome {}">{}</span>').format(kind, verdict.outcome)
+    return Markup('<span class="outcome {}">{}</span>').format(word.replace(" ", "-"), word)
 
 
-def _rows(rows: Sequence[Sequence[str]]) -> list[list[str | Cell]]:
-    """Rows of a page's table: intervals below their values, and columns of more than numbers as words."""
-    split = [[re.fullmatch(r"(.*?)(?: \[([^][]*)\])?", text, re.DOTALL) for text in row] for row in rows]
-    values = [[(found[1], found[2] or "") for found in row if found] for row in split]
-    words = [not all(_NUMBER.fullmatch(value) for value, _ in column) for column in zip(*values, strict=True)]
-    return [
-        [row[0], *(Cell(*cell, words=wordy) for cell, wordy in zip(cells[1:], words[1:], strict=True))]
-        for row, cells in zip(rows, values, strict=True)
-    ]
-
-
-# docs/reproduction.md: the results of a reproduction as Markdown, with its figures and its data beside it.
-
-FIGURES, PREFIX = "figures", "reproduction-"  # of the figures beside the page
+FIGURES, PREFIX = "figures", "reproduction-"  # of the figures beside docs/reproduction.md
 _WIDTH = 99  # characters of a line
 _LONG_TABLE = 12  # rows
 _PLACES = "--output runs/reproduction --docs docs/reproduction.md"
 
 
-def check_docs(file: Path) -> None:
-    """Raise ``InvalidInput`` for a page whose name does not end in ``.md``, or that cannot be written."""
-    if file.suffix != ".md":
-        raise InvalidInput(f"{file}: must end in .md")
-    check_target(file, force=True)
-
-
 def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
-    """Write the page, the results as ``.json`` beside it, and the figures into ``figures/``; all are replaced.
-
-    Raises as ``check_docs``.
-    """
-    check_docs(file)
+    """Write the page, the results as ``.json`` beside it, and the figures into ``figures/``; all are replaced."""
     figures = file.parent / FIGURES
     figures.mkdir(exist_ok=True)
     for result in results:
         for drawn in result.figures:
             data = read_plain(folder / result.name / f"{drawn.stem}.svg", _LIMIT_BYTES)
             write_output(figures / f"{PREFIX}{drawn.stem}.svg", data, force=True)
-    content = json.dumps([asdict(each) for each in results], indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    content = json.dumps([each.in_words() for each in results], indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     write_output(file.with_suffix(".json"), content.encode(), force=True)
     write_output(file, docs_page(results).encode(), force=True)
 
 
 def docs_page(results: Sequence[Result]) -> str:
-    """The page of these results."""
-    account = _Account.of(results)
+    """The page of these results as Markdown."""
+    lead, command, made, few = _account(results)
     verdicts = [
         (f"[{_escaped(each.title)}](#{_escaped(each.name)})", each.verdict.outcome, _escaped(each.verdict.because))
         for each in results
@@ -470,43 +307,41 @@ def docs_page(results: Sequence[Result]) -> str:
     blocks = [
         f"# {_TITLE}",
         "What comes out where the paper's experiments are made again, and where it cannot?",
-        _wrapped(account.lead),
-        _wrapped(f"Made by `{account.command} {_PLACES}` ({_escaped(account.made)})."),
+        _wrapped(lead),
+        _wrapped(f"Made by `{command} {_PLACES}` ({_escaped(made)})."),
         _wrapped(
             "The page, its figures and `reproduction.json`, which holds the same as data, are written by that command"
             " and not by hand; `ethbrake reproduce` makes them again without training. [The paper, line by line]"
             "(paper.md) has the account of every equation."
         ),
-        *([_wrapped(account.few)] if account.few else []),
+        *map(_wrapped, few),
         "## Overview",
         _table(("Item", "Verdict", "Because"), verdicts),
-        *(block for each in results for block in _item(each)),
     ]
+    for result in results:
+        what = f"**{_escaped(result.title)}**. {_escaped(result.what)}"
+        labels = f" ({', '.join(map(_escaped, result.labels))})" if result.labels else ""
+        because = f"**{result.verdict.outcome}**: {_escaped(result.verdict.because)}"
+        blocks += [f"## {_escaped(result.name)}", *map(_wrapped, (what + labels, because))]
+        blocks += [_wrapped(_escaped(note)) for note in result.notes]
+        for drawn in result.figures:
+            blocks.append(f"![{_escaped(drawn.title)}. {_escaped(drawn.text)}]({FIGURES}/{PREFIX}{drawn.stem}.svg)")
+        compared = [(each.what, each.outcome, each.because) for each in result.comparisons]
+        found = [(each.name, each.value, each.origin) for each in result.parameters]
+        tables: list[tuple[str, Sequence[str], Sequence[Sequence[str]], str]] = [
+            *(
+                (each.title, each.head, [[c.in_words for c in row] for row in each.rows], each.note)
+                for each in result.tables
+            ),
+            ("Comparisons with the paper", ("What", "Verdict", "Because"), compared, ""),
+            ("Parameters", ("Parameter", "Value", "Origin"), found, ""),
+        ]
+        for title, head, rows, note in tables:
+            lines = _table([*map(_escaped, head)], [[*map(_escaped, row)] for row in rows])
+            if len(rows) > _LONG_TABLE:
+                lines = f"<details>\n<summary>{len(rows)} rows</summary>\n\n{lines}\n\n</details>"
+            blocks += [f"### {_escaped(title)}", lines, *([_wrapped(_escaped(note))] if note else [])]
     return "\n\n".join(blocks) + "\n"
-
-
-def _item(result: Result) -> list[str]:
-    """The section of one item."""
-    labels = ", ".join(_escaped(label) for label in result.labels)
-    what = f"**{_escaped(result.title)}**. {_escaped(result.what)}"
-    blocks = [f"## {_escaped(result.name)}", _wrapped(f"{what} ({labels})" if labels else what)]
-    blocks.append(_wrapped(f"**{result.verdict.outcome}**: {_escaped(result.verdict.because)}"))
-    blocks += [_wrapped(_escaped(note)) for note in result.notes]
-    for drawn in result.figures:
-        blocks.append(f"![{_escaped(drawn.title)}. {_escaped(drawn.text)}]({FIGURES}/{PREFIX}{drawn.stem}.svg)")
-    compared = [(each.what, each.outcome, each.because) for each in result.comparisons]
-    found = [(each.name, each.value, each.origin) for each in result.parameters]
-    for part in (
-        *result.tables,
-        Table("Comparisons with the paper", ("What", "Verdict", "Because"), compared),
-        Table("Parameters", ("Parameter", "Value", "Origin"), found),
-    ):
-        head, *rows = [[_escaped(cell) for cell in row] for row in (part.head, *part.rows)]
-        lines = _table(head, rows)
-        if len(rows) > _LONG_TABLE:
-            lines = f"<details>\n<summary>{len(rows)} rows</summary>\n\n{lines}\n\n</details>"
-        blocks += [f"### {_escaped(part.title)}", lines, *([_wrapped(_escaped(part.note))] if part.note else [])]
-    return blocks
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents import e_v2x_bm
-from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
-from ethbrake_marl.agents.e_v2x_bm_kernel import optimise_pairwise
+from ethbrake_marl.agents.e_v2x_bm import optimise_coupled, optimise_pairwise
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Floats, Impacts, Worlds, advance, forecast, make_worlds
 from ethbrake_marl.scenario import load_scenario

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.e_v2x_bm_kernel import (
+from ethbrake_marl.agents.e_v2x_bm import (
     CANDIDATES,
     closing_speed_squared,
     least_to_spare_front,

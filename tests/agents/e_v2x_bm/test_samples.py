@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.e_v2x_bm_kernel import (
+from ethbrake_marl.agents.e_v2x_bm import (
     MINIMA,
     Samples,
     bound_cells,

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.e_v2x_bm_kernel import Line, Samples, make_line, share_start, simulate, will_stay_apart
+from ethbrake_marl.agents.e_v2x_bm import Line, Samples, make_line, share_start, simulate, will_stay_apart
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
-from ethbrake_marl.physics.compiled import compiled
+from ethbrake_marl.physics.compiling import compiled
 from ethbrake_marl.physics.kernel import FLAG, ROW
 from tests.agents.e_v2x_bm.recorded import line_worlds
 

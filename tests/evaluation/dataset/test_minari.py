@@ -10,7 +10,7 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.dataset import Task, env_spec
+from ethbrake_marl.evaluation.episodes import Task, env_spec
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.rewards import reward_params
 from tests.contract.interfaces import FIVE, PAPER

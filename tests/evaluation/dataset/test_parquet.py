@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation import dataset
-from ethbrake_marl.evaluation.dataset import KEY, Recording, Task, decision_columns, record_episodes
+from ethbrake_marl.evaluation import episodes
+from ethbrake_marl.evaluation.episodes import KEY, Recording, Task, decision_columns, record_episodes
 from ethbrake_marl.rewards import reward_params
 from tests.contract.interfaces import PAPER
 
@@ -74,7 +74,7 @@ def test_file__has_the_columns_in_row_groups_and_tells_what_they_are(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
-    monkeypatch.setattr(dataset, "BATCH", 3)
+    monkeypatch.setattr(episodes, "BATCH", 3)
     agents = {name: eb.make_agent(name) for name in ("full_brake", "coast")}
     path = tmp_path / "a.parquet"
     summary = eb.write_dataset(path, agents, scenario=PAPER, episodes=5)
@@ -96,17 +96,13 @@ def test_file__has_the_columns_in_row_groups_and_tells_what_they_are(
 
 def test_file__appears_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pyarrow")
-    monkeypatch.setattr(dataset, "BATCH", 3)
+    monkeypatch.setattr(episodes, "BATCH", 3)
 
     def stop(agent: str, done: int) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         eb.write_dataset(
-            tmp_path / "a.parquet",
-            {"coast": eb.make_agent("coast")},
-            scenario=PAPER,
-            episodes=5,
-            on_progress=stop,
+            tmp_path / "a.parquet", {"coast": eb.make_agent("coast")}, scenario=PAPER, episodes=5, on_progress=stop
         )
     assert list(tmp_path.iterdir()) == []

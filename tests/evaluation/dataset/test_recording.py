@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.dataset import Recording, Task, record_episodes
+from ethbrake_marl.evaluation.episodes import Recording, Task, record_episodes
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.rewards import reward_params

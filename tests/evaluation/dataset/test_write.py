@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,8 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, MissingExtra, PhysicsError
-from ethbrake_marl.evaluation import dataset
-from ethbrake_marl.evaluation.dataset import Recording
+from ethbrake_marl.evaluation import episodes
+from ethbrake_marl.evaluation.episodes import Recording
 from tests.contract.interfaces import PAPER
 
 BRAKE = {"full_brake": eb.make_agent("full_brake")}
@@ -22,7 +23,7 @@ NOBODY = PAPER.replace(roles={f"vehicle_{i}": "full_brake" for i in (1, 2, 3)})
 
 @pytest.fixture(autouse=True)
 def installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dataset, "need", lambda package: None)
+    monkeypatch.setattr(episodes, "need", lambda package: None)
 
 
 @pytest.mark.parametrize(
@@ -60,10 +61,10 @@ def test_check__replaces_nothing_unasked_and_only_datasets_when_asked(tmp_path: 
     (tmp_path / "a-v0").mkdir()
     for name in ("a.parquet", "a-v0"):
         with pytest.raises(AlreadyExists, match=r"use force \(--force\)"):
-            dataset.check_dataset(tmp_path / name, PAPER)
-    assert dataset.check_dataset(tmp_path / "a.parquet", PAPER, force=True) == "parquet"
+            episodes.check_dataset(tmp_path / name, PAPER)
+    assert episodes.check_dataset(tmp_path / "a.parquet", PAPER, force=True) == "parquet"
     with pytest.raises(InvalidInput, match="is no dataset of Minari, and is not replaced"):
-        dataset.check_dataset(tmp_path / "a-v0", PAPER, force=True)
+        episodes.check_dataset(tmp_path / "a-v0", PAPER, force=True)
 
 
 def test_write__without_the_extra_names_the_line_that_installs_it(
@@ -80,9 +81,9 @@ def test_write__without_the_extra_names_the_line_that_installs_it(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_work__leaves_a_failed_world_out_and_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_work__leaves_a_failed_world_out_and_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recorded: list[Recording] = []
-    real = dataset.record_episodes
+    real = episodes.record_episodes
 
     def failing(sample: Any, *rest: Any) -> Recording:
         bad = {row: "planted" for row, number in enumerate(sample.index) if number == 4}
@@ -90,12 +91,13 @@ def test_work__leaves_a_failed_world_out_and_names_it(monkeypatch: pytest.Monkey
             raise PhysicsError(bad)
         return real(sample, *rest)
 
-    monkeypatch.setattr(dataset, "record_episodes", failing)
-    monkeypatch.setattr(dataset, "BATCH", 3)
-    task = dataset.Task(PAPER, 7, dataset.reward_params("harm"), eb.observation_for(PAPER))
+    monkeypatch.setattr(episodes, "record_episodes", failing)
+    monkeypatch.setattr(episodes, "BATCH", 3)
+    monkeypatch.setattr(episodes, "parquet_dataset", lambda path, told: nullcontext(recorded.append))
     seen: list[tuple[str, int]] = []
-    work = dataset._Work(task, 7, lambda name, done: seen.append((name, done)), {})
-    work.record("full_brake", BRAKE["full_brake"], recorded.append)
+    work = eb.write_dataset(
+        tmp_path / "some.parquet", BRAKE, scenario=PAPER, episodes=7, on_progress=lambda *done: seen.append(done)
+    )
     assert [each.index.tolist() for each in recorded] == [[0, 1, 2], [3, 5], [6]]
     assert seen == [("full_brake", 3), ("full_brake", 6), ("full_brake", 7)]
     ((world, seed, agent, reason),) = work.left_out

@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from ethbrake_marl.evaluation.shards import Question, answer_shard, ask
+from ethbrake_marl.evaluation.results import Question
 from ethbrake_marl.scenario import load_scenario
 
 AGENTS = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise")
@@ -58,12 +58,12 @@ def digest_of(tally):
 @pytest.mark.slow
 @pytest.mark.parametrize(("scenario", "harm_count"), RECORDED)
 def test_tally__is_the_one_that_was_recorded(scenario, harm_count):
-    asked = ask(Question(load_scenario(scenario), AGENTS, 1_200, 11, harm_count))
-    tally = answer_shard(asked, 0, 1_000) + answer_shard(asked, 1_000, 1_200)
+    asked = Question(load_scenario(scenario), AGENTS, 1_200, 11, harm_count).ask()
+    tally = asked.answer(0, 1_000) + asked.answer(1_000, 1_200)
     assert digest_of(tally) == RECORDED[scenario, harm_count]
 
 
 @pytest.mark.parametrize(("scenario", "harm_count"), FIRST_250)
 def test_tally__of_fewer_worlds_is_the_one_that_was_recorded(scenario, harm_count):
-    asked = ask(Question(load_scenario(scenario), AGENTS, 250, 11, harm_count))
-    assert digest_of(answer_shard(asked, 0, 250)) == FIRST_250[scenario, harm_count]
+    asked = Question(load_scenario(scenario), AGENTS, 250, 11, harm_count).ask()
+    assert digest_of(asked.answer(0, 250)) == FIRST_250[scenario, harm_count]

@@ -11,21 +11,12 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError
-from ethbrake_marl.evaluation import evaluate, rescore, summarise
+from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.evaluation.measures import measures
-from ethbrake_marl.evaluation.shards import (
-    Question,
-    Tally,
-    answer_shard,
-    ask,
-    rescore_shards,
-    shard_bounds,
-    shards_to_json,
-    summarise_shards,
-)
+from ethbrake_marl.evaluation.measures import Tally, measures
+from ethbrake_marl.evaluation.results import Question
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.studies.shards import evaluate_shards
+from ethbrake_marl.studies.jobs import evaluate_shards
 
 AGENTS = ("full_brake", "e_v2x_bm:pairwise")
 N = 3_300
@@ -37,13 +28,13 @@ from ethbrake_marl.errors import PhysicsError
 class Failing:
     name, knows = "failing", "own sensors"
 
-    def begin(self, worlds, vehicle, rows):
-        self.bad = np.flatnonzero(worlds.gaps_m[:, 0] < {below})
+    def begin(self, alert, vehicle, scripts):
+        return alert.gaps_m[:, 0] < {below}
 
-    def act(self, worlds, vehicle):
-        if self.bad.size:
-            raise PhysicsError({{int(row): "planted" for row in self.bad}})
-        return -worlds.vehicles.braking_capacity_mps2[:, vehicle]
+    def act(self, worlds, memory, vehicle):
+        if memory.any():
+            raise PhysicsError({{int(row): "planted" for row in np.flatnonzero(memory)}})
+        return -worlds.vehicles.braking_capacity_mps2[:, vehicle], memory
 
 def make():
     return Failing()
@@ -52,7 +43,7 @@ def make():
 
 @pytest.fixture(scope="module")
 def asked(paper_random: Scenario):
-    return ask(Question(paper_random, AGENTS, N, 11, objectives=("own",)))
+    return Question(paper_random, AGENTS, N, 11, objectives=("own",)).ask()
 
 
 @pytest.fixture(scope="module")
@@ -64,14 +55,14 @@ def tally(asked) -> Tally:
 def test_tally__is_the_same_bits_in_any_shards_and_blocks(asked, tally: Tally, shards: int, block: int) -> None:
     found = evaluate_shards(asked, shards=shards, block=block)
     assert found == tally
-    assert json.dumps(shards_to_json(asked, found, summarise_shards(asked, found))) == json.dumps(
-        shards_to_json(asked, tally, summarise_shards(asked, tally))
+    assert json.dumps(asked.to_json(found, asked.summarise(found))) == json.dumps(
+        asked.to_json(tally, asked.summarise(tally))
     )
 
 
 @pytest.mark.slow
 def test_tally__is_the_same_bits_from_two_processes(paper_random: Scenario) -> None:
-    asked = ask(Question(paper_random, ("full_brake", "e_v2x_bm"), 3_000, 5))
+    asked = Question(paper_random, ("full_brake", "e_v2x_bm"), 3_000, 5).ask()
     alone = evaluate_shards(asked, shards=1)
     assert evaluate_shards(asked, shards=3, jobs=2) == alone
 
@@ -79,7 +70,7 @@ def test_tally__is_the_same_bits_from_two_processes(paper_random: Scenario) -> N
 def test_rows__are_those_of_evaluate_on_the_same_worlds(asked, tally: Tally, paper_random: Scenario) -> None:
     sample = paper_random.sample(N, 11)
     evaluation = evaluate(sample, make_lineup(AGENTS, paper_random), scenario=paper_random, seed=11, chunk=777)
-    sharded, whole = summarise_shards(asked, tally), summarise(evaluation)
+    sharded, whole = asked.summarise(tally), summarise(evaluation)
     for one, other in zip(sharded, whole, strict=True):
         assert one.collision_rate.value == other.collision_rate.value
         assert one.collision_rate.interval == pytest.approx(other.collision_rate.interval, abs=4e-4)
@@ -92,13 +83,13 @@ def test_rows__are_those_of_evaluate_on_the_same_worlds(asked, tally: Tally, pap
             assert getattr(one, name) == getattr(other, name), name
         assert one.parameters == other.parameters
         assert one["mean_regret_first"] is None  # no table holds the worlds of seed 11
-    assert rescore_shards(asked, tally) == rescore(evaluation, ["own"])
+    assert tally.rescore(["own"], 3) == evaluation.rescore(["own"])
 
 
 def test_regret__where_a_table_holds_every_world(paper_random: Scenario) -> None:
     question = Question(paper_random, ("full_brake", "e_v2x_bm:pairwise"), 1_100, 7)
-    asked = ask(question)
-    found = summarise_shards(asked, evaluate_shards(asked, shards=2))
+    asked = question.ask()
+    found = asked.summarise(evaluate_shards(asked, shards=2))
     sample = paper_random.sample(1_100, 7)
     lineup = make_lineup(question.agents, paper_random)
     whole = summarise(evaluate(sample, lineup, scenario=paper_random, seed=7))
@@ -114,13 +105,13 @@ def test_worlds_that_fail__are_left_out_for_all_agents(tmp_path: Path, paper_ran
     file = tmp_path / "failing.py"
     file.write_text(FAILING.format(below=5.01))
     question = Question(paper_random, ("full_brake", f"{file}:make"), 1_100, 7)
-    asked = ask(question)
+    asked = question.ask()
     one, two = (evaluate_shards(asked, shards=k) for k in (1, 2))
     sample = paper_random.sample(1_100, 7)
     bad = np.flatnonzero(sample.worlds.gaps_m[:, 0] < 5.01)
     assert one == two and one.worlds == 1_100 - bad.size and bad.size > 0
     assert [(left.world, left.seed, left.reason) for left in one.left_out] == [(k, 7, "planted") for k in bad.tolist()]
-    rows = summarise_shards(asked, one)
+    rows = asked.summarise(one)
     good = np.setdiff1d(np.arange(1_100), bad)
     whole = summarise(
         evaluate(sample.worlds.take(good), make_lineup(["full_brake"], paper_random), scenario=paper_random)
@@ -132,9 +123,9 @@ def test_worlds_that_fail__are_left_out_for_all_agents(tmp_path: Path, paper_ran
 def test_a_list_of_which_every_world_fails__is_refused(tmp_path: Path, paper_random: Scenario) -> None:
     file = tmp_path / "failing_all.py"
     file.write_text(FAILING.format(below=1e9))
-    asked = ask(Question(paper_random, (f"{file}:make",), 1_500, 7))
+    asked = Question(paper_random, (f"{file}:make",), 1_500, 7).ask()
     with pytest.raises(PhysicsError, match="planted"):
-        summarise_shards(asked, evaluate_shards(asked, shards=2))
+        asked.summarise(evaluate_shards(asked, shards=2))
 
 
 def test_tally__comes_back_from_json_as_it_was(tally: Tally) -> None:
@@ -151,11 +142,14 @@ def test_tally__comes_back_from_json_as_it_was(tally: Tally) -> None:
 
 def test_worlds_hash__tells_another_list(paper_random: Scenario, tally: Tally) -> None:
     for scenario, seed in ((paper_random, 12), (load_scenario("paper-random-early"), 11)):
-        other = ask(Question(scenario, ("full_brake",), N, seed))
+        other = Question(scenario, ("full_brake",), N, seed).ask()
         assert evaluate_shards(other, shards=1).worlds_hash != tally.worlds_hash
 
 
-def test_shard_bounds__are_whole_leaves() -> None:
+def test_shard_bounds__are_whole_leaves(paper_random: Scenario) -> None:
+    def shard_bounds(episodes: int, shards: int) -> list[tuple[int, int]]:
+        return Question(paper_random, AGENTS, episodes, 7).bounds(shards)
+
     assert shard_bounds(10_300, 7)[-1] == (9_000, 10_300)
     assert shard_bounds(10_300, 1) == [(0, 10_300)]
     assert shard_bounds(500, 7) == [(0, 500)]
@@ -168,17 +162,17 @@ def test_shard_bounds__are_whole_leaves() -> None:
 @pytest.mark.parametrize("bounds", [(500, 1_000), (0, 999), (1_000, 1_000)])
 def test_a_shard_that_is_no_range_of_leaves__is_refused(asked, bounds: tuple[int, int]) -> None:
     with pytest.raises(InvalidInput, match="whole leaves"):
-        answer_shard(asked, *bounds)
+        asked.answer(*bounds)
 
 
 def test_a_shard__refuses_another_version_than_it_was_asked_about(asked) -> None:
     other = replace(asked, identity={**asked.identity, "versions": {"numba": "0"}})
     with pytest.raises(InvalidInput, match="versions changed"):
-        answer_shard(other, 0, 1_000)
+        other.answer(0, 1_000)
 
 
 @pytest.mark.long
 def test_a_hundred_thousand_worlds__are_the_same_bits_in_1_2_and_7_shards(paper_random: Scenario) -> None:
-    asked = ask(Question(paper_random, ("full_brake", "e_v2x_bm"), 100_000, 7))
+    asked = Question(paper_random, ("full_brake", "e_v2x_bm"), 100_000, 7).ask()
     one, two, seven = (evaluate_shards(asked, shards=k, jobs=min(k, 2)) for k in (1, 2, 7))
     assert one == two == seven

@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from ethbrake_marl.defaults import LIST_SEED
+from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.pages.explorer.answer import Explored, state_of
+from ethbrake_marl.evaluation.measures import Conditions
+from ethbrake_marl.pages.explorer import Explored
 from ethbrake_marl.scenario import Scenario, load_scenario
 
 TOKEN, PORT = "the-token-of-this-test", 4711
@@ -110,7 +111,7 @@ def explored(scenario: Scenario) -> Explored:
 @pytest.fixture
 def state(scenario: Scenario) -> dict[str, Any]:
     """World 1 of the list: nobody can avoid contact there."""
-    return state_of(scenario.sample(1, LIST_SEED, first=1).worlds)
+    return Conditions.of(scenario.sample(1, DEFAULT.LIST_SEED, first=1).worlds)
 
 
 @pytest.fixture
@@ -123,9 +124,9 @@ def folder(tmp_path: Path) -> Path:
 @pytest.fixture
 def client(explored: Explored, folder: Path) -> Iterator[Client]:
     pytest.importorskip("starlette", reason="no Starlette: pip install 'ethbrake-marl[explore]'")
-    from ethbrake_marl.pages.explorer.server import Setting, explorer_app
+    from ethbrake_marl.pages.explorer import explorer_app
 
-    yield Client(explorer_app(Setting(explored, folder, LIST_SEED, 0), TOKEN, PORT))
+    yield Client(explorer_app(explored, folder, TOKEN, PORT, seed=DEFAULT.LIST_SEED, world=0))
 
 
 def check_refused(reply: Reply, status: int) -> None:

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
-from ethbrake_marl.defaults import LIST_SEED
+from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_lineup
+from ethbrake_marl.evaluation.measures import Conditions
 from ethbrake_marl.limits.limits import Proof, prove
-from ethbrake_marl.pages.explorer.answer import Explored, read_state, state_of
-from ethbrake_marl.pages.explorer.server import explorer_page, save_state
+from ethbrake_marl.pages.explorer import Explored, explorer_page, read_state, save_state
 from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario, read_initial_states
 from tests.pages.explorer.conftest import AGENTS, Client
 
@@ -56,8 +56,8 @@ def test_search__starts_where_h_star_is_and_is_driven_again(client: Client, stat
 def test_search__is_never_worse_than_h_star(
     explored: Explored, scenario: Scenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ethbrake_marl.pages.explorer.answer.SLICE", 1)
-    worlds = scenario.sample(20, LIST_SEED).worlds
+    monkeypatch.setattr("ethbrake_marl.pages.explorer.SLICE", 1)
+    worlds = scenario.sample(20, DEFAULT.LIST_SEED).worlds
     for k in range(worlds.n):
         world = worlds.take([k])
         found = explored.search(world, np.array([0.0]), 0.0, lambda: True)
@@ -79,8 +79,8 @@ def test_profile__of_an_agent_drives_as_the_agent(client: Client, state: dict[st
 
 def test_world__is_that_of_the_list(client: Client, scenario: Scenario) -> None:
     told = client.ask("world", {"number": 12}).json["world"]
-    world = scenario.sample(1, LIST_SEED, first=12).worlds
-    assert told == state_of(world)
+    world = scenario.sample(1, DEFAULT.LIST_SEED, first=12).worlds
+    assert told == Conditions.of(world)
     read = read_state(json.loads(json.dumps(told)), scenario)
     assert np.array_equal(read.gaps_m, world.gaps_m) and np.array_equal(read.speeds_mps, world.speeds_mps)
 
@@ -88,8 +88,8 @@ def test_world__is_that_of_the_list(client: Client, scenario: Scenario) -> None:
 @pytest.mark.parametrize("name", ["paper-random", "paper-random-obstacle", "realistic-motorway", "realistic-mixed"])
 def test_saved_state__reads_back_to_the_same_harm(name: str, folder: Path) -> None:
     scenario = load_scenario(name)
-    world = scenario.sample(1, LIST_SEED, first=3).worlds
-    state = state_of(world)
+    world = scenario.sample(1, DEFAULT.LIST_SEED, first=3).worlds
+    state = Conditions.of(world)
     state["speeds_mps"][0] += 0.1 + 0.2
     changed = read_state(state, scenario)
     assert save_state(folder, "near-miss", "yaml", changed, scenario) == "near-miss.yaml"
@@ -108,7 +108,7 @@ def test_saved_state__reads_back_to_the_same_harm(name: str, folder: Path) -> No
 
 
 def test_saved_state__may_have_an_impact_before_anybody_acts(folder: Path, scenario: Scenario) -> None:
-    state = state_of(scenario.sample(1, LIST_SEED).worlds)
+    state = Conditions.of(scenario.sample(1, DEFAULT.LIST_SEED).worlds)
     state["gaps_m"][0] = 0.01
     world = read_state(state, scenario)
     save_state(folder, "early", "yaml", world, scenario)

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from ethbrake_marl.pages.explorer.server import MOST_BODY
+from ethbrake_marl.pages.explorer import MOST_BODY
 from tests.pages.explorer.conftest import HOST, PAGE, Client, Reply, check_alive, check_refused
 
 BODIES: list[bytes] = [
@@ -165,7 +165,7 @@ def test_long_questions_are_cut_off(client: Client, state: dict[str, Any]) -> No
 
 
 def test_questions_that_never_end_are_given_up(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ethbrake_marl.pages.explorer.server.PATIENCE_S", 0.05)
+    monkeypatch.setattr("ethbrake_marl.pages.explorer.PATIENCE_S", 0.05)
 
     async def ask() -> Reply:
         async def silent() -> Any:
@@ -191,7 +191,7 @@ def test_a_defect_is_told_and_survived(client: Client, state: dict[str, Any], mo
         raise RuntimeError("a\nb")
 
     with monkeypatch.context() as patched:
-        patched.setattr("ethbrake_marl.pages.explorer.answer.Explored.answer", broken)
+        patched.setattr("ethbrake_marl.pages.explorer.Explored.answer", broken)
         check_refused(client.ask("answer", {"world": state, "profile": [0.0]}), 500)
     assert client.ask("answer", {"world": state, "profile": [0.0]}).status == 200
 
@@ -208,7 +208,7 @@ def test_newest_question_wins(client: Client, state: dict[str, Any], monkeypatch
             await asyncio.sleep(0.02)
         return await asyncio.gather(*questions)
 
-    from ethbrake_marl.pages.explorer.answer import Explored
+    from ethbrake_marl.pages.explorer import Explored
 
     client.ask("answer", {"world": state, "profile": [0.0]})  # the warm-up is over
     slow, begun = Explored.answer, threading.Event()

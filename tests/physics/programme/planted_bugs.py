@@ -33,13 +33,10 @@ EVENTS, IMPACT, SEGMENT, ADVANCE = (
     "ethbrake_marl/physics/kernel.py",
     "ethbrake_marl/physics/kernel.py",
     "ethbrake_marl/physics/kernel.py",
-    "ethbrake_marl/physics/advance.py",
+    "ethbrake_marl/physics/batch.py",
 )
-HARM, OBSTACLE = "ethbrake_marl/harm.py", "ethbrake_marl/physics/kernel.py"
-FLIGHTS, LOWER_BOUND = (
-    "ethbrake_marl/limits/lower_bound.py",
-    "ethbrake_marl/limits/lower_bound.py",
-)
+HARM, WORLDS = "ethbrake_marl/harm.py", "ethbrake_marl/physics/worlds.py"
+FLIGHTS, LOWER_BOUND = ("ethbrake_marl/limits/lower_bound.py", "ethbrake_marl/limits/lower_bound.py")
 PROFILES = "ethbrake_marl/search.py"
 
 
@@ -87,12 +84,12 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     "harm counted while vehicles merely touch": (
         Patch(
             IMPACT,
-            "table[ROW.STRUCK, p] = 1.0 if table[ROW.CLOSING, p] > TOUCH_SPEED_MPS else 0.0",
+            "table[ROW.STRUCK, p] = 1.0 if table[ROW.CLOSING, p] > BOUND.TOUCH_SPEED_MPS else 0.0",
             "table[ROW.STRUCK, p] = 1.0 if table[ROW.GAP, p] <= 0.0 else 0.0",
         ),
     ),
     "plastic threshold ignored": (
-        Patch(IMPACT, "bounce = restitution if largest >= PLASTIC_SPEED_MPS else 0.0", "bounce = restitution"),
+        Patch(IMPACT, "bounce = restitution if largest >= BOUND.PLASTIC_SPEED_MPS else 0.0", "bounce = restitution"),
     ),
     "holding brake slips": (Patch(EVENTS, "        return command, -command\n", "        return 0.0, 0.0\n"),),
     "common acceleration of a block not weighted by mass": (
@@ -136,7 +133,9 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     "shares of harm given to the wrong vehicle": (
         Patch(HARM, "return rear_mass / (front_mass + rear_mass)", "return front_mass / (front_mass + rear_mass)"),
     ),
-    "obstacle that gives way a little": (Patch(OBSTACLE, "UNMOVABLE_T = math.inf", "UNMOVABLE_T = 1e9"),),
+    "obstacle that gives way a little": (
+        Patch(WORLDS, "ahead(math.inf, vehicles.mass_t)", "ahead(1e9, vehicles.mass_t)"),
+    ),
     "harm of an impact with the obstacle shared as with a vehicle": (
         Patch(
             HARM, "harm[:, 0] += self.obstacle_harm(harm_count)", "harm[:, 0] += 0.5 * self.obstacle_harm(harm_count)"
@@ -144,9 +143,9 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     ),
     "later impacts with the obstacle counted as first ones": (
         Patch(
-            OBSTACLE,
-            "np.concatenate([worlds.obstacle_hit[:, np.newaxis], worlds.pair_hit], axis=1)",
-            "np.concatenate([False & worlds.obstacle_hit[:, np.newaxis], worlds.pair_hit], axis=1)",
+            WORLDS,
+            "np.concatenate([self.obstacle_hit[:, np.newaxis], self.pair_hit], axis=1)",
+            "np.concatenate([False & self.obstacle_hit[:, np.newaxis], self.pair_hit], axis=1)",
         ),
     ),
     "plastic cluster left out of order by a last digit": (

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ethbrake_marl.physics import Impacts, Worlds, advance, concatenate
+from ethbrake_marl.physics import Impacts, Worlds, advance
 from tests.physics.programme.gates import Figure, gate
 from tests.physics.random_worlds import Batch, driving_lines, touching_lines
 from tests.physics.runs import HARMS, HORIZON_S, Split, last_digit_errors, once, split_errors, state_bytes
@@ -83,7 +83,7 @@ def batches() -> Figure:
 
     def together(parts: list[tuple[Worlds, Impacts]]) -> tuple[bytes, ...]:
         harm = [np.concatenate([getattr(i, f) for _, i in parts]) for f in HARMS]
-        return state_bytes(concatenate([world for world, _ in parts]), Impacts(*harm))
+        return state_bytes(Worlds.concatenate([world for world, _ in parts]), Impacts(*harm))
 
     def chunk(rows: np.ndarray) -> tuple[Worlds, Impacts]:
         return once(Batch(batch.worlds.take(rows), batch.command[rows]))

@@ -14,8 +14,8 @@ import pytest
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.episodes import Given, parse_passport, replay
-from ethbrake_marl.learning import train as learning_train
+from ethbrake_marl.evaluation.episodes import Passport
+from ethbrake_marl.learning import runs as learning_train
 from ethbrake_marl.learning.recipe import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.studies import trainings
 from ethbrake_marl.studies.ablation import Plan, Training, read_levels, with_scheme
@@ -104,9 +104,9 @@ def test_page__plays_the_same_worlds_at_every_level(ablation, column):
     assert content["agents"] == LEVELS.split(",")
     assert [episode["driven"] for episode in content["worlds"][0]["episodes"]] == [[], [1, 2], [1, 2]]
     assert 3 <= len(content["worlds"]) <= 7
-    passport = parse_passport(content["worlds"][2]["episodes"][column]["passport"])
+    passport = Passport.parse(content["worlds"][2]["episodes"][column]["passport"])
     (folder,) = (ablation / "trainings").glob("cooperation-3-pair-*-seed0")
-    again = replay(passport, Given(agent=f"ppo@{folder}" if column else None))
+    again = passport.replay(agent=f"ppo@{folder}" if column else None)
     assert again.same and again.passport.policy_sha == passport.policy_sha
 
 
@@ -158,6 +158,15 @@ def test_ablate__states_the_cost_first(ablation, tiny, capsys):
     assert run_command([*words, "--seeds", "3"]) == 0
     assert "to do: 2 trainings, 512 decisions at" in capsys.readouterr().err
     assert (ablation / "ablation.json").stat().st_mtime_ns == before
+
+
+def test_ablate__damaged_parts_of_a_search_are_told_with_the_cost(ablation, tmp_path, tiny, capsys):
+    folder = tmp_path / "copy"
+    shutil.copytree(ablation, folder)
+    damaged = next((folder / "optimum").glob("*/*.npz"))
+    damaged.write_bytes(b"no table")
+    assert run_command(["study", "ablate", "--output", str(folder), "--recipes", str(tiny), *SMALL, "--cost"]) == 0
+    assert f"{damaged}: is damaged; its worlds are searched again" in capsys.readouterr().err
 
 
 def test_ablate__bad_input_is_refused(tmp_path, tiny, capsys):

@@ -9,11 +9,20 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from ethbrake_marl.figures.studies import change_figure, harm_curve, signed_ticks, who_pays
+from ethbrake_marl.figures import ablation_figures, signed_ticks
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield.guard import Shielded
-from ethbrake_marl.studies.ablation import Harms, Level, Measured
-from ethbrake_marl.studies.ablation_report import FIGURES, ablation_page, compare, interval_words, levels_csv, markdown
+from ethbrake_marl.studies.ablation import (
+    FIGURES,
+    Harms,
+    Level,
+    Measured,
+    ablation_page,
+    compare,
+    interval_words,
+    levels_csv,
+    markdown,
+)
 from tests.pages.hostile import Page
 
 WORLDS, SEARCHED = 40, 10
@@ -151,14 +160,14 @@ def test_tables_and_figure__show_what_is_behind_the_shield(behind):
     assert rows[1]["shielded_first_impact_harm"] == "" and float(rows[3]["shielded_first_impact_harm"]) == 4.25
     assert float(rows[3]["actions_replaced_total_harm"]) == pytest.approx(0.05)
     assert float(rows[4]["bound_first_impact_harm"]) == pytest.approx(6.0)
-    labels = [text.get_text() for text in harm_curve(found, "40 worlds").legends[0].get_texts()]
+    labels = [text.get_text() for text in ablation_figures(found, "40 worlds")[0].legends[0].get_texts()]
     assert "ppo, shielded" in labels
-    texts = [text.get_text() for text in harm_curve(compare(behind[:2], 10), "").legends[0].get_texts()]
+    texts = [text.get_text() for text in ablation_figures(compare(behind[:2], 10), "")[0].legends[0].get_texts()]
     assert "ppo, shielded" not in texts
 
 
 def test_page__holds_the_tables_and_figures(found):
-    figures = {name: draw(found, "40 worlds") for name, draw in FIGURES.items()}
+    figures = dict(zip(FIGURES, ablation_figures(found, "40 worlds"), strict=True))
     html = ablation_page({**found, "settings": {"seeds": 2, "machine": "</script><b>"}}, "40 worlds.", figures)
     shown = Page(html)
     assert shown.open == [] and not {"script", "b", "img"} & {tag for tag, _ in shown.tags}
@@ -182,14 +191,14 @@ def test_ticks__are_a_few_round_numbers(low, high, ticks):
 
 
 def test_figures__texts_stand_inside_and_the_colour_bar_reaches_its_end(found):
-    figure = change_figure(found, "40 worlds")
+    _, figure, pays = ablation_figures(found, "40 worlds")
     FigureCanvasAgg(figure).draw()
     for axes in figure.axes:
         inside = axes.get_window_extent()
         for text in axes.texts:
             box = text.get_window_extent()
             assert inside.x0 <= box.x0 and box.x1 <= inside.x1 and box.y1 <= inside.y1
-    bar = who_pays(found, "40 worlds").axes[-1]
+    bar = pays.axes[-1]
     assert max(bar.get_yticks()) >= 0.3 * bar.get_ylim()[1]
 
 
@@ -201,7 +210,7 @@ def test_tables__name_the_algorithm_where_there_are_two(ablation):
 
 
 def test_figures__show_what_was_found(found):
-    curve, changes, pays = (draw(found, "40 worlds") for draw in (harm_curve, change_figure, who_pays))
+    curve, changes, pays = ablation_figures(found, "40 worlds")
     ticks = [label.get_text() for label in curve.axes[0].get_xticklabels()]
     assert ticks == ["0\nsensors", "2\npaper", "3\npair"]
     assert [text.get_text() for text in curve.axes[0].texts] == ["blocked"]
@@ -214,8 +223,7 @@ def test_figures__show_what_was_found(found):
 @pytest.mark.filterwarnings("error::UserWarning")
 def test_figures__of_one_change_have_room_for_their_caption(ablation):
     found = compare(ablation[:2], SEARCHED)
-    for draw in (harm_curve, change_figure, who_pays):
-        figure = draw(found, "Conditions of this figure, in many words. " * 14)
+    for figure in ablation_figures(found, "Conditions of this figure, in many words. " * 14):
         FigureCanvasAgg(figure).draw()
         bottom = min(axes.get_tightbbox().y0 for axes in figure.axes)
         assert figure._supxlabel.get_window_extent().y1 <= bottom + 1.0

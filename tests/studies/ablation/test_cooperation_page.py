@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
 from ethbrake_marl.harm import KINDS, scored
-from ethbrake_marl.learning.recipe import SCHEMES
-from ethbrake_marl.physics.worlds import is_known_at_once
+from ethbrake_marl.learning.recipe import Scheme
 from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario, parse_yaml
 from ethbrake_marl.scenario.v2x import CHANNELS, PRESETS, V2X
 
@@ -35,7 +35,7 @@ def test_page__its_presets_are_those_of_the_code():
 
 
 def test_page__names_every_training_scheme():
-    assert {re.findall("`(.*?)`", cell)[0] for cell in rows("| scheme | networks |")} == set(SCHEMES)
+    assert {re.findall("`(.*?)`", cell)[0] for cell in rows("| scheme | networks |")} == set(get_args(Scheme))
 
 
 def test_page__names_every_key_objective_and_level():
@@ -75,7 +75,7 @@ def test_page__its_level_is_a_valid_scenario():
     (text,) = re.findall("```yaml\n(.*?)```", PAGE, re.DOTALL)
     scenario = Scenario.from_document(parse_yaml(text, "docs/cooperation.md"))
     assert scenario.objective == ("total", "social:45", "total") and scenario.v2x.channel.hears == "front"
-    assert not is_known_at_once(scenario.sample(5, 0).worlds.vehicles)
+    assert not scenario.sample(5, 0).worlds.vehicles.is_known_at_once
 
 
 def test_page__its_messages_are_those_of_the_code():

@@ -13,10 +13,9 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import Progress
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.limits.best_harm import best_harm, chunks_left
+from ethbrake_marl.limits.limits import best_harm, chunks_left
 from ethbrake_marl.scenario import Sample, load_scenario
 from ethbrake_marl.studies.ablation import (
-    Cost,
     Level,
     LevelOptimum,
     Plan,
@@ -123,4 +122,3 @@ def test_questions__each_is_searched_once_and_what_is_kept_is_not_searched_again
     damaged = tmp_path / "optimum" / NAMES[2] / "0000000.npz"
     damaged.write_bytes(b"no table")
     assert left(plan, *asked[1][:2]) == (5, [damaged])
-    assert f"{damaged}: is damaged; its worlds are searched again" in str(Cost(0, 0, 0.0, 0.0, 0.0, (damaged,)))

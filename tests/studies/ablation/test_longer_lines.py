@@ -15,11 +15,10 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.policies.actor import Manifest
-from ethbrake_marl.policies.bundle import load_policy, make_policy, save_policy
+from ethbrake_marl.policies import Manifest, load_policy, make_policy
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies import ablation_report
-from ethbrake_marl.studies.ablation_report import LineQuestion, drive_longer, lengthen
+from ethbrake_marl.studies import ablation
+from ethbrake_marl.studies.ablation import LineQuestion, lengthen
 
 PAIR = load_scenario("cooperation-3-pair")
 
@@ -49,30 +48,23 @@ def test_lengthened__lists_of_pairs_and_objectives_go_on_too():
 
 def test_drive_longer__full_braking_gains_nothing_on_itself():
     question = LineQuestion(PAIR, (3, 4), 20, 7, "total", 3, 50)
-    found = drive_longer(question, [make_agent("full_brake")])
-    assert [one.vehicles for one in found] == [3, 4]
+    found = question.drive([make_agent("full_brake")])
+    assert [one["vehicles"] for one in found] == [3, 4]
     for one in found:
-        assert (one.decrease.value, one.worse_off.value, one.share.value) == (0.0, 0.0, 0.0)
+        assert (one["decrease"], one["worse_off"], one["share"]) == (0.0, 0.0, 0.0)
     three = evaluate(PAIR.sample(20, 7), {"b": make_agent("full_brake")}, scenario=PAIR).outcome("b").total_harm
-    assert found[0].reached.value == pytest.approx(three.mean(), rel=1e-12)
-
-
-@pytest.mark.slow
-def test_drive_longer__in_two_processes_finds_the_same():
-    question = LineQuestion(PAIR, (3, 4), 20, 7, "total", 3, 50)
-    alone = drive_longer(question, [make_agent("full_brake")])
-    assert drive_longer(question, [make_agent("full_brake")], processes=2) == alone
+    assert found[0]["reached"] == pytest.approx(three.mean(), rel=1e-12)
 
 
 def test_drive_longer__all_lines_are_made_before_one_is_driven(monkeypatch):
     driven = []
-    monkeypatch.setattr(ablation_report, "evaluate", lambda *_, **__: driven.append(1))
+    monkeypatch.setattr(ablation, "evaluate", lambda *_, **__: driven.append(1))
     weighted = PAIR.replace(name="mine", objective="weighted:1,2,3")
     question = LineQuestion(weighted, (3, 4), 20, 7, "total", 0, 50)
     with pytest.raises(InvalidInput, match="mine-n4"):
-        drive_longer(question, [make_agent("full_brake")])
+        question.drive([make_agent("full_brake")])
     with pytest.raises(InvalidInput, match="vehicles 3, 3: each length once"):
-        drive_longer(replace(question, vehicles=(3, 3)), [make_agent("full_brake")])
+        replace(question, vehicles=(3, 3)).drive([make_agent("full_brake")])
     assert not driven
 
 
@@ -150,7 +142,7 @@ def changed(run: Path, folder: Path, scenario: Mapping[str, object] = {}, recipe
     del fields["weights_sha256"], fields["manifest_sha256"]
     tensors = {name: tensor + np.float32(0.01) for name, tensor in policy.tensors.items()}
     other = make_policy(tensors, **{**fields, "scenario": {**policy.manifest.scenario, **scenario}})
-    save_policy(other, folder / "policy", replace=True)
+    other.save(folder / "policy", replace=True)
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps(config | {"recipe": {**config["recipe"], **recipe}}))
     return folder

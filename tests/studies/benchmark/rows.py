@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from ethbrake_marl.errors import ShownProgress
-from ethbrake_marl.studies.benchmark import Suite, load_suite, make_entry, read_leaderboard, write_entry
+from ethbrake_marl.studies.benchmark import Suite, load_suite, make_entry, read_leaderboard
 
 ROWS = (
     "full_brake", "e_v2x_bm", "ppo@shipped", "policy@shipped", "universal@shipped", "policy@shipped+step",
@@ -40,7 +40,7 @@ def page_tables() -> dict[str, str]:
     """Every table of docs/benchmark.md by its marker."""
     suite = load_suite("v2")
     found = read_leaderboard(sorted(ENTRIES.glob("*.json")), suite)
-    return {"lists": list_markdown(suite), "rows": found.markdown().rstrip("\n")}
+    return {"lists": list_markdown(suite), "rows": found.table().markdown()}
 
 
 def main(arguments: list[str]) -> None:
@@ -49,7 +49,7 @@ def main(arguments: list[str]) -> None:
     for agent in [] if arguments == ["--tables"] else arguments or ROWS:
         print(agent, flush=True)
         entry = make_entry(suite, agent, on_progress=ShownProgress())
-        write_entry(ENTRIES / f"{re.sub(r'[/:]', '-', agent)}.json", entry, force=True)
+        entry.write(ENTRIES / f"{re.sub(r'[/:]', '-', agent)}.json", force=True)
     text = PAGE.read_text("utf-8")
     for marker, table in page_tables().items():
         text = re.sub(rf"(<!-- {marker} -->\n).*?(\n<!-- end -->)", rf"\g<1>{table}\g<2>", text, flags=re.DOTALL)

@@ -13,9 +13,7 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.policies.actor import content_sha256
-from ethbrake_marl.policies.bundle import load_policy
-from ethbrake_marl.policies.shipped import shipped_policies
+from ethbrake_marl.policies import content_sha256, load_policy, shipped_policies
 from ethbrake_marl.studies.benchmark import (
     NotDriven,
     load_suite,

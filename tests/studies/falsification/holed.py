@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics import Bools, Floats, Worlds
 
 
 class Holed:
@@ -12,12 +12,11 @@ class Holed:
 
     name = "holed"
 
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        self.hole = in_hole(worlds)
+    def begin(self, alert: Worlds, vehicle: int, scripts: object) -> Bools:
+        return in_hole(alert)
 
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        command: Floats = np.where(self.hole, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle])
-        return command
+    def act(self, worlds: Worlds, memory: Bools, vehicle: int) -> tuple[Floats, Bools]:
+        return np.where(memory, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle]), memory
 
 
 def in_hole(worlds: Worlds) -> Bools:

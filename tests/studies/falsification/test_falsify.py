@@ -10,7 +10,7 @@ from ethbrake_marl.defaults import HARM_COUNTS, MeasureName
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.scenario.sampling import ranges_of
-from ethbrake_marl.studies.falsification import Measure, falsify, make_measure
+from ethbrake_marl.studies.falsification import Measure, falsify
 from tests.studies.falsification.holed import Holed, in_hole
 
 SCENARIO = load_scenario("paper-random")
@@ -40,7 +40,7 @@ def test_falsify__keeps_nothing_where_nothing_is_wrong() -> None:
 
 @pytest.mark.parametrize("harm_count", HARM_COUNTS)
 def test_falsify__the_bound_of_the_shield_holds_where_it_is_tightest(harm_count: eb.HarmCount) -> None:
-    measure = make_measure("bound", "coast+step", None, SCENARIO, harm_count)
+    measure = Measure.of("bound", "coast+step", None, SCENARIO, harm_count)
     found = falsify(measure, 256, 1)
     assert found.measured.score.max() <= 1e-9 and found.sample.worlds.n > 3
     assert np.array_equal(found.measured.score, found.measured.harm - found.measured.reference)
@@ -104,9 +104,9 @@ def test_ranges__refuses_what_cannot_be_given_world_by_world(scenario: Scenario,
 )
 def test_make_measure__refuses(name: MeasureName, agent: str, against: str | None, said: str) -> None:
     with pytest.raises(InvalidInput, match=said):
-        make_measure(name, agent, against, SCENARIO, "first")
+        Measure.of(name, agent, against, SCENARIO, "first")
 
 
 def test_falsify__bound_needs_a_shield() -> None:
     with pytest.raises(InvalidInput, match="tells no bound; --measure bound is for an agent behind a shield"):
-        falsify(make_measure("bound", "full_brake", None, SCENARIO, "first"), 10, 0)
+        falsify(Measure.of("bound", "full_brake", None, SCENARIO, "first"), 10, 0)

@@ -81,16 +81,17 @@ def test_another_question__is_refused_with_what_differs_and_nothing_is_changed(t
 
 
 def test_record__of_the_first_call_stays(tmp_path: Path) -> None:
-    with folder_of(tmp_path).work() as first:
-        assert first["owner"] == "me"
+    with folder_of(tmp_path).work():
+        first = json.loads((tmp_path / "question.json").read_text())
+    assert first["owner"] == "me"
     other = JobFolder(tmp_path, "sums", QUESTION, more={"owner": "you"})
-    with other.work() as again:
-        assert again == first and other.check() == first
+    with other.work():
+        assert not other.check() and json.loads((tmp_path / "question.json").read_text()) == first
 
 
 def test_folder_of_something_else__is_left_alone_and_what_may_stand_there_may(tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("expected")
-    assert folder_of(tmp_path).check() is None
+    assert folder_of(tmp_path).check()
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(AlreadyExists, match="holds no sums"):
         do(folder_of(tmp_path), 3)
@@ -106,3 +107,9 @@ def test_two_at_once__the_second_is_refused_and_a_killed_writers_rest_goes(tmp_p
     with folder.work(), pytest.raises(InvalidInput, match="another process works in it"):
         do(JobFolder(tmp_path, "sums"), 3)
     assert [file.name for file in tmp_path.iterdir() if file.name != ".lock"] == []
+
+
+def test_folder_without_a_question__is_none_of_another_command(tmp_path: Path) -> None:
+    do(folder_of(tmp_path), 3)
+    with pytest.raises(AlreadyExists, match=r"no folder of a sweep: question\.json of another command is there; give"):
+        JobFolder(tmp_path, "a sweep").check()

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from ethbrake_marl.files.sheet import Sheet
-from ethbrake_marl.studies.reproduction.item import Drawn, Item, Made, Settings, Verdict, stated
+from ethbrake_marl.studies.reproduction.items import Drawn, Item, Made, Settings, Verdict, stated
 
 HOSTILE = "<script>alert('x')</script>\"|*_\u202e"
 

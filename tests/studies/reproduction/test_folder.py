@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation.statistics import Estimate
-from ethbrake_marl.figures.studies import Line, lines_figure
+from ethbrake_marl.figures import estimates_figure
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.studies.reproduction.folder import (
     checked_result,
@@ -24,15 +24,15 @@ from ethbrake_marl.studies.reproduction.folder import (
     reproduce,
     write_docs,
 )
-from ethbrake_marl.studies.reproduction.item import Drawn, Settings
+from ethbrake_marl.studies.reproduction.items import HARM, Drawn, Settings
 from tests.pages.hostile import Page
 
 from .conftest import HOSTILE, made, planted
 
 
 def drawn(stem: str = "a-figure") -> dict[Drawn, Figure]:
-    line = Line.of([0.0, 1.0], [Estimate(1.0, None), Estimate(2.0, (1.0, 3.0))])
-    figure = lines_figure({"panel": {"line": line}}, x_label="x", y_label="y", caption="c")
+    line = {0.0: Estimate(1.0, None), 1.0: Estimate(2.0, (1.0, 3.0))}
+    figure = estimates_figure({"panel": {"line": line}}, x_label="x", y_label="y", caption="c")
     return {Drawn(stem, "A figure", "What it shows."): figure}
 
 
@@ -54,7 +54,7 @@ def test_reproduce__writes_figures_data_results_and_one_page(settings: Settings)
 
 def test_page__tells_everything_that_a_result_holds(settings: Settings) -> None:
     told = replace(
-        made(), tables=(Sheet("A table", ("Who", "Harm"), (("PPO", "1.50 [1.25, 1.75]"),), "Of 24 worlds."),)
+        made(), tables=(Sheet("A table", ("Who", HARM), (("PPO", Estimate(1.5, (1.25, 1.75))),), "Of 24 worlds."),)
     )
     (result,), _ = reproduce([planted("gaps", lambda s: told)], settings)
     page = Page((settings.folder / "index.html").read_text("utf-8"))
@@ -180,8 +180,8 @@ def test_page__a_figure_that_is_none_of_ours_is_refused(settings: Settings) -> N
     "change",
     [
         {"tables": "x"},
-        {"tables": [{"title": "t", "head": ["h"], "rows": [[1]], "note": ""}]},
-        {"tables": [{"title": "t", "head": ["h"], "rows": [["a"], []], "note": ""}]},
+        {"tables": [{"title": "t", "head": ["h"], "rows": [[[1]]], "note": ""}]},
+        {"tables": [{"title": "t", "head": ["h"], "rows": [[["a"]], []], "note": ""}]},
         {"tables": [{"title": "", "head": [], "rows": [], "note": ""}]},
         {"verdict": {}},
         {"figures": [1]},
@@ -209,11 +209,11 @@ def test_write_docs__page_data_and_figures(settings: Settings, tmp_path: Path) -
     results, _ = reproduce([planted("gaps", lambda s: made(figures=drawn()))], settings)
     file = tmp_path / "page.md"
     write_docs(file, settings.folder, results)
-    written = json.loads((tmp_path / "page.json").read_text("utf-8"))
-    assert file.read_text("utf-8") == docs_page([checked_result(each, "page.json") for each in written])
+    assert json.loads((tmp_path / "page.json").read_text("utf-8")) == [each.in_words() for each in results]
+    assert file.read_text("utf-8") == docs_page(read_results(settings.folder))
     assert (tmp_path / "figures" / "reproduction-a-figure.svg").is_file()
     with pytest.raises(InvalidInput, match=r"must end in \.md"):
-        write_docs(tmp_path / "page.html", settings.folder, results)
+        replace(settings, docs=tmp_path / "page.html")
 
 
 def test_pages__say_command_machine_and_how_little_was_made(settings: Settings) -> None:
@@ -230,7 +230,7 @@ def test_pages__say_command_machine_and_how_little_was_made(settings: Settings) 
 def test_pages__of_results_that_do_not_say_how_many_worlds_say_nothing_of_it(settings: Settings) -> None:
     (found,), _ = reproduce([planted("gaps", lambda s: made())], settings)
     content = {name: value for name, value in asdict(found).items() if name != "episodes"}
-    result = checked_result(content, "result.json")
+    result = checked_result(content, "result.json", "gaps")
     page = Page(render_page(settings.folder, [result]))
     assert "worlds of each list" not in page.text and "reproduce gaps --quick (" in page.text
 

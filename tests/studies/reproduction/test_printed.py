@@ -7,13 +7,16 @@ from dataclasses import replace
 import pytest
 
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.outcome import HYBRID_TEST, PAPER_ROWS, RANDOM_TEST, PaperRow
-from ethbrake_marl.studies.reproduction.item import FULL_BRAKE, NAMES, READINGS, lineup
-from ethbrake_marl.studies.reproduction.lists import (
+from ethbrake_marl.evaluation.measures import PAPER_ROWS, PaperRow
+from ethbrake_marl.studies.reproduction.items import (
+    FULL_BRAKE,
+    NAMES,
     NOBODY,
+    READINGS,
     Beside,
     compare_rows,
     decrease_verdict,
+    lineup,
     rows_table,
     selection_verdict,
 )
@@ -34,7 +37,7 @@ def beside(reading, worlds: int = 400) -> Beside:
 
 
 def test_selection__the_printed_hybrid_avoids_more_than_its_parts() -> None:
-    rows = [printed(HYBRID_TEST, agent) for agent in ("E-V2X-BM", "Standalone DRL", "Hybrid")]
+    rows = [printed("hybrid test", agent) for agent in ("E-V2X-BM", "Standalone DRL", "Hybrid")]
     verdict = selection_verdict(*rows)
     assert verdict.outcome == "cannot agree"
     assert "737 + 1,263 = 2,000 collisions; printed: 2,005" in verdict.because
@@ -43,14 +46,14 @@ def test_selection__the_printed_hybrid_avoids_more_than_its_parts() -> None:
 
 
 def test_decrease__follows_from_the_printed_harms() -> None:
-    baseline, row = printed(RANDOM_TEST, "Non-E"), printed(RANDOM_TEST, "Hybrid PPO")
+    baseline, row = printed("random test", "Non-E"), printed("random test", "Hybrid PPO")
     assert decrease_verdict(row, baseline).outcome == "agrees"
     assert decrease_verdict(replace(row, harm_decrease=0.85), baseline).outcome == "cannot agree"
 
 
 def test_compare_rows__full_braking_agrees_at_200_ms_and_the_hybrid_is_excluded_as_stated() -> None:
     besides = [beside(AS_STATED, 1_000), beside(AT_200_MS, 1_000)]
-    rows = [printed(RANDOM_TEST, agent) for agent in ("Non-E", "Hybrid PPO")]
+    rows = [printed("random test", agent) for agent in ("Non-E", "Hybrid PPO")]
     found = {verdict.what: verdict for verdict in compare_rows(rows, besides)}
     stated, early = found["Non-E, average harm (as stated)"], found[f"Non-E, average harm ({AT_200_MS.name})"]
     assert (stated.outcome, early.outcome) == ("differs", "agrees")
@@ -66,7 +69,7 @@ def test_rows_table__ends_with_what_nobody_undercuts() -> None:
     own = beside(AS_STATED)
     table = rows_table(own)
     assert table.rows[-1][0] == NOBODY
-    assert own.bounds[RATE].least.value <= own.numbers[NAMES[FULL_BRAKE]][RATE].value
+    assert own.numbers[NOBODY][RATE].value <= own.numbers[NAMES[FULL_BRAKE]][RATE].value
     assert all(len(row) == len(table.columns) for row in table.rows)
 
 

@@ -6,9 +6,8 @@ import pytest
 
 from ethbrake_marl.evaluation.statistics import rate
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.studies.reproduction.item import (
+from ethbrake_marl.studies.reproduction.items import (
     PERCENT,
-    Bound,
     Less,
     Verdict,
     compare_number,
@@ -53,8 +52,8 @@ def test_compare_number__names_the_nearest_other_reading() -> None:
 
 
 def test_compare_number__cannot_agree_below_a_bound() -> None:
-    bound = Bound("worlds in which no command avoids an impact", rate(6_256, 10_000))
-    verdict = compare_number("collisions", 0.5974, rate(6_500, 10_000), show=PERCENT, bound=bound)
+    bound = ("worlds in which no command avoids an impact", rate(6_256, 10_000))
+    verdict = compare_number("collisions", 0.5974, rate(6_500, 10_000), show=PERCENT, least=bound)
     assert verdict.outcome == "cannot agree"
     assert verdict.because == (
         "worlds in which no command avoids an impact: at least 62.6 % [61.6, 63.5], whoever drives;"
@@ -63,10 +62,10 @@ def test_compare_number__cannot_agree_below_a_bound() -> None:
 
 
 def test_compare_number__a_bound_within_chance_of_the_printed_number_proves_nothing() -> None:
-    bound = Bound("worlds", rate(6_256, 10_000))
-    assert compare_number("collisions", 0.617, rate(6_500, 10_000), bound=bound).outcome == "differs"
-    few = Bound("worlds", rate(63, 100))
-    assert compare_number("collisions", 0.5974, rate(65, 100), bound=few).outcome == "undecided"
+    bound = ("worlds", rate(6_256, 10_000))
+    assert compare_number("collisions", 0.617, rate(6_500, 10_000), least=bound).outcome == "differs"
+    few = ("worlds", rate(63, 100))
+    assert compare_number("collisions", 0.5974, rate(65, 100), least=few).outcome == "undecided"
 
 
 def test_judge_statement__holds_where_every_interval_is_below_zero() -> None:

@@ -42,7 +42,7 @@ def count(folder: Path, seed: int, steps: int, sleep_s: float) -> list[str]:
 
 def main() -> int:
     from ethbrake_marl.studies.jobs import Job, LocalWorkers, RayWorkers
-    from ethbrake_marl.studies.sweep import RUNS, Row, SweepPlan, plan_sweep, read_sweep, run_sweep
+    from ethbrake_marl.studies.sweep import RUNS, Row, SweepPlan
     from tests.studies.sweep.counting import count as job  # by a name that workers know, not of __main__
 
     parser = argparse.ArgumentParser(description=__doc__)
@@ -54,14 +54,16 @@ def main() -> int:
     parser.add_argument("--sleep", type=float, default=0.01)
     options = parser.parse_args()
 
-    def job_of(plan: SweepPlan, row: Row, folder: Path, log: Path) -> Job:
-        return Job(row.name, job, (folder.absolute() / RUNS / row.name, row.asked.seed, options.steps, options.sleep))
+    class Counting(SweepPlan):
+        def job(self, row: Row, folder: Path, log: Path) -> Job:
+            place = folder.absolute() / RUNS / row.name
+            return Job(row.name, job, (place, row.asked.seed, options.steps, options.sleep))
 
-    plan = plan_sweep(read_sweep(options.file))
+    plan = Counting.read(options.file)
     workers = LocalWorkers(options.jobs) if options.ray is None else RayWorkers(options.ray)
     with closing(workers):
-        result = run_sweep(plan, options.folder, workers, retries=5, job_of=job_of)
-    return 130 if result.interrupted else result.failed
+        result = plan.run(options.folder, workers, retries=5)
+    return 130 if result.interrupted else result.counts["failed"]
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -17,9 +16,8 @@ import yaml
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.learning.train import train
-from ethbrake_marl.studies.jobs import LocalWorkers
-from ethbrake_marl.studies.tuning import TuningStudy, place_of, plan_tuning, read_tuning, run_tuning
+from ethbrake_marl.learning.runs import train
+from ethbrake_marl.studies.sweep import TuningPlan
 from tests.studies.sweep.disturbing import PROGRAM
 from tests.studies.tuning.conftest import TRIALS
 
@@ -126,9 +124,9 @@ def test_disturbed_tuning__has_the_same_table(finished_tuning, write_tuning, tmp
 @pytest.mark.slow
 def test_broken_trials__are_marked_failed_and_others_done_in_their_place(write_tuning, tmp_path):
     file, folder = write_tuning(), tmp_path / "out"
-    plan = plan_tuning(read_tuning(file))
+    plan = TuningPlan.read(file)
     folder.mkdir()
-    TuningStudy(place_of(plan, folder, None))._study.ask()  # a command that was killed just then
+    plan.study(folder)._study.ask()  # a command that was killed just then
     with (folder / "study.journal").open("a") as journal:
         journal.write('{"op_code": 4, "worker')
     assert tune(file, folder, "--trials", "2") == 0
@@ -176,25 +174,12 @@ def test_folder_of_other_versions__is_refused_with_their_names(finished_tuning, 
     assert "(versions torch 1.0, here 2." in told and "numpy" not in told
 
 
-@pytest.mark.slow
-def test_storage__can_be_shared_by_folders(write_tuning, tmp_path):
-    plan, storage = plan_tuning(read_tuning(write_tuning())), f"sqlite:///{tmp_path / 'study.db'}"
-    with closing(LocalWorkers(2)) as workers:
-        for name, trials in (("one", 2), ("two", 1)):
-            result = run_tuning(plan, tmp_path / name, workers, trials, storage=storage)
-    assert [row["trial"] for row in read(result.table)] == ["0", "1", "2"] and result.best is not None
-    assert [len(list((tmp_path / name / "trials").iterdir())) for name in ("one", "two")] == [2, 1]
-    assert not (tmp_path / "one" / "study.journal").exists()
-
-
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
         (["--trials", "0"], "trials = 0: must be a whole number in 1..100000"),
         (["--jobs", "0"], "jobs = 0: must be a whole number in 1..4096"),
         (["--retries", "-1"], "retries = -1: must be"),
-        (["--storage", "study.db"], "must be an address such as sqlite:///study.db"),
-        (["--storage", "none://me:secret@here/x"], "storage none://...: cannot be used"),
         (["--export", "best.txt"], "must end in .yaml"),
         (["--export", "Best One.yaml"], "must be 1 to 64 lower case letters"),
         (["--export", "there.yaml"], "there.yaml: is there already"),
@@ -205,7 +190,7 @@ def test_bad_options__are_refused(write_tuning, tmp_path, monkeypatch, capsys, o
     Path("there.yaml").write_text("mine")
     assert tune(write_tuning(), tmp_path / "new", *options) == 2
     told = capsys.readouterr().err
-    assert reason in told and "secret" not in told and not (tmp_path / "new" / "trials.csv").exists()
+    assert reason in told and not (tmp_path / "new" / "trials.csv").exists()
     assert Path("there.yaml").read_text() == "mine"
 
 

@@ -1,21 +1,34 @@
-"""The one way in which this package compiles a kernel: strict floating point, kept safely by ``kernel_store``.
+"""The one way in which this package compiles a kernel: strict floating point, kept safely for later processes.
 
 numba's own cache goes by a function's own file: editing a *callee* in another file would silently keep the stale
 machine code; and its index, which is read, changed and written back, is not safe where processes share a folder.
+
+Here each kernel and signature has one file, named by all that makes it: a hash of the sources, of the versions, of the
+signature and of the processor, and nothing of where the package lies. An edit compiles anew what can call it, and a
+second environment or a moved checkout finds what the first one compiled. There is no index. A file is written under
+another name and renamed when it is whole, so any number of processes may share a folder.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
+import os
 import pickle
+import re
 import sys
-from collections.abc import Callable
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from functools import cache, partial
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from types import CodeType
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar, overload
 
 import llvmlite
 import numba
@@ -32,7 +45,7 @@ from numba.core.types.misc import unliteral
 from numba.core.typing import make_concrete_template
 
 from ethbrake_marl.errors import check_whole_number
-from ethbrake_marl.kernel_store import alone, digest_of_sources, keep_kernel, load_kernel, place_of, tell_compilation
+from ethbrake_marl.kernel_store import cache_folder, tell_compilation
 from ethbrake_marl.physics.worlds import Floats
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -42,6 +55,16 @@ _SETTINGS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DEBUGINFO
 # Instructions of the levels of x86-64 for which kernels are built ahead, the better one first.
 _V2 = {"+cx16", "+popcnt", "+sse4.2", "+ssse3"}
 _LEVELS = {"x86-64-v3": _V2 | {"+avx2", "+bmi", "+bmi2", "+f16c", "+fma", "+lzcnt", "+movbe"}, "x86-64-v2": _V2}
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+_MARK = b"\n@compiled"  # of a decorator, at the start of its line
+_IMPORT = re.compile(rb"^ *from (ethbrake_marl[.\w]*) import (\([^)]*\)|.*)$", re.MULTILINE)
+_CONSTANT = re.compile(r"\b[A-Z][A-Z0-9_]*\b")
+_DIGEST_BYTES = 32
+_LONGEST_WAIT_S = 600.0  # for another process that compiles the same kernel: it may have been stopped
+_UNKEPT = "each process compiles for itself; set the clock, or their dates (find FOLDER -exec touch {} +)"
+_IMPORTED_S = time.time()
+_loaded: list[str] = []
 
 
 class _Linkable(JITCodeLibrary):  # type: ignore[misc]
@@ -73,7 +96,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
             return self.overloads[tuple(arguments)].entry_point
 
     def _compile(self, sig: Any) -> Any:
-        tell_compilation()
+        tell_compilation(not _loaded)
         super().compile(sig)
         made = self.overloads[tuple(normalize_signature(sig)[0])]
         if not _KNOWN:
@@ -138,7 +161,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         name = self._name(way, kinds)
         kept = load_kernel(name) or (self._ready_made(kinds) if way == "entry" else None)
         if kept is None:
-            with alone(name):
+            with _alone(name):
                 kept = load_kernel(name)  # another process may have made it meanwhile
                 if kept is None:
                     unkept, made = make()
@@ -167,7 +190,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
             (way, sys.implementation.cache_tag, sys.flags.optimize, numba.__version__, llvmlite.__version__),
             [str(getattr(numba_config, setting)) for setting in _SETTINGS],
             processor or self.targetctx.codegen().magic_tuple(),
-            (own, digest, place_of(source), self.__module__, self.__qualname__, code.co_firstlineno, code.co_code),
+            (own, digest, _place_of(source), self.__module__, self.__qualname__, code.co_firstlineno, code.co_code),
             [constant for constant in code.co_consts if not isinstance(constant, CodeType)],
             sorted(self.targetoptions.items()),
             [_described(kind) for kind in kinds],
@@ -192,52 +215,159 @@ def _described(kind: Any) -> str:
     return f"{kind} {getattr(kind, 'fields', '')} {parts}"
 
 
-def compiled(function: Function) -> Function:
-    """Compile ``function`` with numba: no fast-math, no bounds checks, releases the GIL, cached on disk.
+def load_kernel(name: str, *, ready_made: bool = False) -> bytes | None:
+    """What was kept, or installed, under a name; nothing where it is missing, damaged, or not this user's or root's.
+
+    Who else could write there could have us run anything.
+    """
+    folder = _ready_made_folder() if ready_made else cache_folder()
+    try:
+        with (folder / name).open("rb") as file:
+            about, content = os.fstat(file.fileno()), file.read()
+    except OSError:
+        return None
+    digest, kept = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+    trusted = not hasattr(os, "getuid") or about.st_uid in (0, os.getuid())
+    if not trusted or _digest_of(name, kept) != digest:
+        return None
+    _loaded.append(name)
+    return kept
+
+
+def keep_kernel(name: str, content: bytes) -> None:
+    """Keep what ``load_kernel`` gives back; a disk that is full costs a warning, and the next process compiles anew."""
+    folder = cache_folder()
+    try:
+        handle, part = tempfile.mkstemp(dir=folder, prefix=".")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(_digest_of(name, content) + content)
+            os.replace(part, folder / name)
+        except OSError:
+            Path(part).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        warnings.warn(f"{folder}: a compiled kernel could not be kept: {error}", stacklevel=2)
+
+
+def _digest_of(name: str, content: bytes) -> bytes:
+    return hashlib.sha256(name.encode() + content).digest()
+
+
+@contextmanager
+def _alone(name: str) -> Iterator[None]:
+    """No other process that asks for the same name is inside meanwhile, unless the folder's disk knows no locks."""
+    if not name:
+        yield
+        return
+    from filelock import FileLock, Timeout  # needed by who compiles only
+
+    lock = FileLock(cache_folder() / f".{name}.lock", timeout=_LONGEST_WAIT_S)
+    with suppress(Timeout, OSError, NotImplementedError):
+        lock.acquire()
+    try:
+        yield
+    finally:
+        if lock.is_locked:
+            Path(lock.lock_file).unlink(missing_ok=True)
+            lock.release()
+
+
+@cache
+def _ready_made_folder() -> Path:
+    """Folder of the kernels that the distribution ethbrake-marl-kernels brings, or one that does not exist."""
+    found = find_spec("ethbrake_marl_kernels")
+    return Path(found.origin).parent if found and found.origin else Path(os.devnull)
+
+
+@cache
+def digest_of_sources(source: Path) -> str:
+    """Hash of all files that the kernels of one file may be made of; empty where that is not known.
+
+    That is so for code in no file (a shell), and for a file that was edited after this process began: its code may
+    have been read before. A date in the future cannot be told from that, and costs a warning.
+    """
+    digest = hashlib.sha256()
+    for file in kernel_sources(source) if source.is_file() else ():
+        written_s = file.stat().st_mtime
+        if written_s > time.time():
+            warnings.warn(f"{_PACKAGE}: dates of files lie in the future: {_UNKEPT}", stacklevel=2)
+        if written_s > _IMPORTED_S:
+            return ""
+        digest.update(f"{_place_of(file)} {file.stat().st_size} ".encode() + file.read_bytes())
+    return digest.hexdigest() if source.is_file() else ""
+
+
+def _place_of(file: Path) -> str:
+    """Where a file lies inside this package, wherever that lies; of another file its whole path."""
+    return file.relative_to(_PACKAGE).as_posix() if file.is_relative_to(_PACKAGE) else str(file)
+
+
+def kernel_sources(source: Path) -> list[Path]:
+    """The file, and all of this package that its kernels may be made of, sorted by name.
+
+    These are the files with kernels that it imports, theirs, and so on; and files from which any of them imports a
+    constant (a name in capitals).
+    """
+    found, follow = {source}, [source]
+    while follow:
+        for imported, has_kernels in _imports(follow.pop()):
+            if imported not in found:
+                found.add(imported)
+                follow += [imported] * has_kernels
+    return sorted(found)
+
+
+@cache
+def _imports(source: Path) -> list[tuple[Path, bool]]:
+    """The files with kernels or constants that a file imports, and whether they have kernels."""
+    found = []
+    for module, names in _IMPORT.findall(source.read_bytes()):
+        for imported, taken in _homes(module.decode(), set(re.findall(r"\w+", names.decode()))):
+            has_kernels = _MARK in imported.read_bytes()
+            if has_kernels or any(_CONSTANT.fullmatch(name) for name in taken):
+                found.append((imported, has_kernels))
+    return found
+
+
+def _homes(module: str, names: set[str]) -> list[tuple[Path, set[str]]]:
+    """(file, names taken from it) for names of a module or, through its front door, of a folder."""
+    place = _PACKAGE.joinpath(*module.split(".")[1:])
+    if place.with_suffix(".py").is_file():
+        return [(place.with_suffix(".py"), names)]
+    found = [(place / f"{name}.py", set[str]()) for name in names if (place / f"{name}.py").is_file()]
+    for home, offered in _IMPORT.findall((place / "__init__.py").read_bytes()):
+        if taken := names & set(re.findall(r"\w+", offered.decode())):
+            found += _homes(home.decode(), taken)
+    return found
+
+
+@overload
+def compiled(function: Function) -> Function: ...
+@overload
+def compiled(*, apart: bool = False, within: bool = False, bare: bool = False) -> Callable[[Function], Function]: ...
+def compiled(function: Any = None, *, apart: bool = False, within: bool = False, bare: bool = False) -> Any:
+    """Compile a function with numba: no fast-math, no bounds checks, releases the GIL, cached on disk.
 
     What a kernel calls becomes part of it (``forceinline``): a call would count references to its arrays, atomically,
-    which cost more than half of the physics.
+    which cost more than half of the physics. ``apart``: calls of it stay calls, for what is large, shared, and seldom
+    called. Made part of every caller, such functions would be compiled once for each: minutes instead of seconds.
+
+    ``within``: it is written into its callers before they are compiled, for a level of its own. ``forceinline`` still
+    counts references at each level through which an array is handed on; this does not.
+
+    ``bare``: without any counting of references, for what makes no array and gives none back. Whoever calls it holds
+    the arrays. What is ``forceinline`` inside still counts them, unless it is bare, too.
     """
-    return _compile(function, inline=True)
-
-
-def compiled_apart(function: Function) -> Function:
-    """Compile as ``compiled`` does, but leave calls of it calls: for what is large, shared, and seldom called.
-
-    Made part of every caller, such functions would be compiled once for each of them: minutes instead of seconds.
-    """
-    return _compile(function, inline=False)
-
-
-def compiled_within(function: Function) -> Function:
-    """Compile as ``compiled`` does, and write it into its callers before they are compiled: for a level of its own.
-
-    ``forceinline`` still counts references at each level through which an array is handed on; this does not.
-    """
-    return _compile(function, inline=False, within=True)
-
-
-def compiled_bare(function: Function) -> Function:
-    """Compile as ``compiled`` does, without any counting of references: for what makes no array and gives none back.
-
-    Whoever calls it holds the arrays. What is ``forceinline`` inside still counts them, unless it is bare, too.
-    """
-    return _compile(function, inline=True, bare=True)
-
-
-def compiled_bare_apart(function: Function) -> Function:
-    """Compile as ``compiled_bare`` does, but leave calls of it calls."""
-    return _compile(function, inline=False, bare=True)
-
-
-def _compile(function: Function, *, inline: bool, within: bool = False, bare: bool = False) -> Function:
+    if function is None:
+        return partial(compiled, apart=apart, within=within, bare=bare)
     config: Any = numba_config  # its settings are made at run time
     if config.DISABLE_JIT:
         return function
-    how: dict[str, Any] = {"inline": "always"} if within else {"forceinline": inline}
+    how: dict[str, Any] = {"inline": "always"} if within else {"forceinline": not apart}
     if bare:
         how["_nrt"] = False
-    return cast(Function, Kernel(function, targetoptions=_OPTIONS | how))
+    return Kernel(function, targetoptions=_OPTIONS | how)
 
 
 Result = TypeVar("Result")
@@ -264,12 +394,12 @@ def by_parts(work: Callable[[slice], Result], n: int, threads: int) -> list[Resu
 #
 # The C library and numpy choose their own exp, log and pow by processor, with other last bits on each. These take the
 # same IEEE operations in the same order everywhere, so the worlds of a list are the same bits on any machine. Each
-# error
-# bound is the largest error that a comparison with 40 digits found, rounded up (tests/physics/test_elementary.py).
+# error bound is the largest error that a comparison with 40 digits found, rounded up
+# (tests/physics/test_elementary.py).
 
 PER_LN2 = 1.4426950408889634
-LN2_HIGH = 0.693147180369123816490  # its last 32 bits are 0: times a whole number below 2^32 it is exact
-LN2_LOW = 1.90821492927058770002e-10
+_LN2_HIGH = 0.693147180369123816490  # its last 32 bits are 0: times a whole number below 2^32 it is exact
+_LN2_LOW = 1.90821492927058770002e-10
 _SQRT2 = 1.4142135623730951
 _PER_SQRT_2PI = 0.3989422804014327
 _LARGEST_EXPONENT = 709.782712893384  # of e; from here on the result is beyond the doubles
@@ -331,24 +461,23 @@ def power_of_two(k: int) -> float:
 
 
 @compiled
-def exp_of_small(s: float) -> float:
-    """``e^s`` for ``|s| <= ln(2) / 2``: Taylor's series to s^13, which leaves 5e-18."""
-    return _polynomial(_EXP, s)
+def exp_rest(x: float, k: int) -> float:
+    """``e^x / 2^k`` for the k that leaves ``|x - k ln(2)| <= ln(2) / 2``: Taylor's series to the 13th power (5e-18)."""
+    return _polynomial(_EXP, (x - k * _LN2_HIGH) - k * _LN2_LOW)
 
 
 @compiled
 def exp(x: float) -> float:
     """``e^x`` within 1.5 ulp; infinite above 709.78, 0 below -708.
 
-    ``e^x = 2^k e^s`` with k whole and s small.
+    ``e^x = 2^k e^(x - k ln 2)`` with k whole.
     """
     if not x < _LARGEST_EXPONENT:
         return np.inf if x >= _LARGEST_EXPONENT else np.nan
     if x < _LEAST_EXPONENT:
         return 0.0
     k = math.floor(x * PER_LN2 + 0.5)
-    s = (x - k * LN2_HIGH) - k * LN2_LOW
-    return exp_of_small(s) * power_of_two(k - 1) * 2.0
+    return exp_rest(x, k) * power_of_two(k - 1) * 2.0
 
 
 @compiled
@@ -368,7 +497,7 @@ def _log_parts(x: float) -> tuple[float, float]:
     s = f / (2.0 + f)
     half = 0.5 * f * f
     z = s * s
-    return k * LN2_HIGH, f - (half - (s * (half + z * _polynomial(_LOG, z)) + k * LN2_LOW))
+    return k * _LN2_HIGH, f - (half - (s * (half + z * _polynomial(_LOG, z)) + k * _LN2_LOW))
 
 
 @compiled

@@ -10,16 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import action_to_command
-from ethbrake_marl.agents.protocol import Agent, AgentAround, Driver, Team, team_of
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents import Agent, AgentAround, Driver, Team, drive, team_of
+from ethbrake_marl.engine import Memory, Script
 from ethbrake_marl.errors import InvalidInput, count_of, renumbered
-from ethbrake_marl.physics import Bools, Floats, Ints, LeftOutRows, Worlds, measured_without_failed
-from ethbrake_marl.physics.kernel import decision_at, first_decision_s
-from ethbrake_marl.scenario.schema import Task
-from ethbrake_marl.shield.certify import proposed_action
+from ethbrake_marl.physics import Bools, Decisions, Floats, Ints, LeftOutRows, Worlds, measured_without_failed
+from ethbrake_marl.scenario import Task
 from ethbrake_marl.shield.enclosure import CORNERS, checked_robust
 from ethbrake_marl.shield.guard import ShieldedDriver, put_shield, shielded_episodes
-from ethbrake_marl.shield.step_shield import StepShield
+from ethbrake_marl.shield.step_shield import StepShield, proposed_action
 from ethbrake_marl.shield.uncertainty import Uncertainty
 
 SAME_HARM = 1e-9  # harms (m2/s2) closer than this are one harm
@@ -108,22 +106,20 @@ def operating_curves(
     def measured(at: Ints) -> dict[str, list[OperatingPoint]]:
         curves = {}
         for name, policy in policies.items():
-            curves[name] = _operating_points(worlds.take(at), policy, task, allowances)
+            points = []
+            for allowance in allowances:
+                found = shielded_episodes(
+                    drive(worlds.take(at), put_shield(policy, task, allowance=allowance), task.scenario), task
+                )
+                rate = float(found.replaced.sum() / (found.decisions.sum() * found.replaced.shape[1]))
+                points.append(OperatingPoint(float(allowance), rate, float(found.harm.mean())))
+            curves[name] = points
             if on_progress is not None:
                 on_progress(name)
         return curves
 
     curves, _, left_out = measured_without_failed(measured, worlds.n)
     return {name: [point._replace(left_out=left_out) for point in points] for name, points in curves.items()}
-
-
-def _operating_points(worlds: Worlds, policy: Driver, task: Task, allowances: Sequence[float]) -> list[OperatingPoint]:
-    points = []
-    for allowance in allowances:
-        found = shielded_episodes(drive(worlds, put_shield(policy, task, allowance=allowance), task.scenario), task)
-        rate = float(found.replaced.sum() / (found.decisions.sum() * found.replaced.shape[1]))
-        points.append(OperatingPoint(float(allowance), rate, float(found.harm.mean())))
-    return points
 
 
 class _Released(AgentAround):
@@ -135,18 +131,16 @@ class _Released(AgentAround):
         super().__init__(policy, "released")
         self._actions, self._release, self._time_step_s = actions, release, time_step_s
         self._deciding = deciding  # vehicles that decide together
-        self._first_s: Floats = np.zeros(0)  # [m] time of the first decision
 
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
-        super().begin(worlds, vehicle, rows)
-        self._first_s = first_decision_s(worlds, self._deciding)
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+        return {"policy": super().begin(alert, vehicle, scripts), "first_s": alert.first_decision_s(self._deciding)}
 
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        own = proposed_action(self.policy, worlds, vehicle)
-        step = decision_at(worlds.time_s, self._first_s, self._time_step_s)
+    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+        own, policy = proposed_action(self.policy, worlds, memory["policy"], vehicle)
+        step = Decisions(memory["first_s"], self._time_step_s).latest(worlds.time_s)
         held = self._actions[np.arange(len(step)), np.clip(step, 0, self._actions.shape[1] - 1)]
         action = np.where(step < self._release, held, own)
-        return action_to_command(action, worlds.vehicles, vehicle)
+        return action_to_command(action, worlds.vehicles, vehicle), {**memory, "policy": policy}
 
 
 # The cost of not knowing: robust mode's price, and harm where the truth is not what the shield believes.
@@ -214,7 +208,14 @@ def robustness(
                 driven = worlds
                 if key[1] != "as told":  # drawn for all worlds: a truth does not depend on which of them are left out
                     driven = intervals.draw(worlds, np.random.default_rng(seed), corners=truth == "corner")
-                known[key] = _point(driven.take(at), shielded, task)
+                episodes = drive(driven.take(at), shielded, task.scenario, task.vehicle)
+                harm, shield = episodes.ledger.world_harm(task.harm_count), episodes.guarded.shield
+                bound = shield.predicted_harm
+                above = np.maximum(harm - bound, 0.0)
+                known[key] = RobustnessPoint(
+                    mode, truth, width, float(harm.mean()), float(bound.mean()), float((above > 0.0).mean()),
+                    float(above.mean()), float(shield.distrusted.mean()),
+                )  # fmt: skip
             points.append(known[key]._replace(mode=mode, truth=truth, width=width))
             if on_progress is not None:
                 on_progress(f"{mode}, {truth}, width {width:g}", worlds.n)
@@ -222,21 +223,3 @@ def robustness(
 
     found, _, left_out = measured_without_failed(measured, worlds.n)
     return [point._replace(left_out=left_out) for point in found]
-
-
-def _point(worlds: Worlds, shielded: ShieldedDriver, task: Task) -> RobustnessPoint:
-    """What a shield makes of the worlds that it is driven through; which case that is, the caller says."""
-    episodes = drive(worlds, shielded, task.scenario, task.vehicle)
-    harm, shield = episodes.ledger.world_harm(task.harm_count), episodes.guarded.shield
-    bound = shield.predicted_harm
-    above = np.maximum(harm - bound, 0.0)
-    return RobustnessPoint(
-        mode="",
-        truth="",
-        width=0.0,
-        harm=float(harm.mean()),
-        bound=float(bound.mean()),
-        above=float((above > 0.0).mean()),
-        excess=float(above.mean()),
-        distrusted=float(shield.distrusted.mean()),
-    )

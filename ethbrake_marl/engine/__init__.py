@@ -1,1 +1,0 @@
-"""The engine: reset and step for n worlds, their stream, their snapshots."""

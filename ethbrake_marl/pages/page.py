@@ -1,0 +1,419 @@
+"""Every HTML page: one file that loads nothing, opens from disk, and shows whatever it is told as text.
+
+A page is a title, a sentence or two, and sections. What a section holds are strings, which become paragraphs, and
+parts: tables, figures, the player of episodes. Strings are never markup: they are escaped, and control and direction
+characters are written as in Python.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from ethbrake_marl.agents import Driver, team_of
+from ethbrake_marl.defaults import HarmCount
+from ethbrake_marl.envs import BODY_M
+from ethbrake_marl.errors import InvalidInput, plain_text
+from ethbrake_marl.evaluation import Conditions, EpisodeMotion, Passport, follow_episodes, policies_of
+from ethbrake_marl.files.sheet import Column, Sheet
+from ethbrake_marl.physics import Worlds
+from ethbrake_marl.scenario import Scenario
+
+if TYPE_CHECKING:
+    from ethbrake_marl.figures import Figure
+
+_STAY = "\u00a0"  # a blank at which no line is broken
+_AFTER_SIGN = re.compile(r"(?<=[:+@,/])(?=.)")
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A piece of a page, and what it needs there: names of style sheets and scripts of this folder."""
+
+    html: Markup
+    styles: tuple[str, ...] = ()
+    scripts: tuple[str, ...] = ()
+
+    @classmethod
+    def paragraph(cls, text: str, kind: str = "") -> Part:
+        """Text as a paragraph: ``quiet`` (conditions), ``note`` (what must not be overlooked), or a plain one."""
+        return cls(Markup('<p class="{}">{}</p>\n').format(kind, shown(text)))
+
+    @classmethod
+    def heading(cls, text: str) -> Part:
+        """A heading inside a section."""
+        return cls(Markup("<h3>{}</h3>\n").format(shown(text)))
+
+    @classmethod
+    def facts(cls, found: Mapping[str, object]) -> Part:
+        """Names and values, one below the other."""
+        lines = [Markup("<dt>{}</dt><dd>{}</dd>").format(shown(name), _text(value)) for name, value in found.items()]
+        return cls(Markup("<dl>\n{}\n</dl>\n").format(Markup("\n").join(lines)))
+
+    @classmethod
+    def opened(cls, title: str, parts: Sequence[Part]) -> Part:
+        """Parts that show when their title is chosen."""
+        inside = Markup("").join(part.html for part in parts)
+        styles, scripts = (tuple(n for part in parts for n in getattr(part, what)) for what in ("styles", "scripts"))
+        return cls(
+            Markup("<details><summary>{}</summary>\n{}</details>\n").format(shown(title), inside), styles, scripts
+        )
+
+    @classmethod
+    def data(cls, name: str, content: object, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = ()) -> Part:
+        """Plain data for a script of the page: JSON in which nothing can end the element or begin another."""
+        text = json.dumps(content, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+        for sign in "<>&":
+            text = text.replace(sign, f"\\u{ord(sign):04x}")
+        html = Markup('<script type="application/json" id="{}">{}</script>\n').format(name, Markup(text))
+        return cls(html, styles, scripts)
+
+    @classmethod
+    def template(cls, file: str, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = (), **values: object) -> Part:
+        """A template of this folder with these values; all of them are text but what is Markup already."""
+        return cls(Markup(_environment().get_template(file).render(**values)), styles, scripts)
+
+    @classmethod
+    def table(cls, sheet: Sheet) -> Part:
+        """A table that scrolls by itself where it is wider than the page, intervals below their values.
+
+        The first cell of a row is its heading. The text of a column after it may be broken into lines if the column is
+        one of texts. A cell may be a ``Shown`` of Markup.
+        """
+        caption, headings = sheet.title, sheet.headings
+        wordy = [not isinstance(column, Column) or column.text for column in sheet.columns]
+        kinds = [Markup(' class="words"') if k and sheet.rows and words else Markup() for k, words in enumerate(wordy)]
+        lines = [Markup('<div class="wide" tabindex="0" role="region" aria-label="{}"><table>').format(
+            shown(caption or f"Table: {headings[0]}")
+        )]  # fmt: skip
+        lines += [Markup("<caption>{}</caption>").format(shown(caption))] if caption else []
+        head = [
+            Markup('<th scope="col"{}>{}</th>').format(kind, shown(text))
+            for kind, text in zip(kinds, headings, strict=True)
+        ]
+        lines += [Markup("<thead><tr>{}</tr></thead>").format(Markup("").join(head)), Markup("<tbody>")]
+        for row in sheet.shown():
+            if isinstance(row, str):
+                section = Markup('<tr class="block"><th colspan="{}" scope="rowgroup">{}</th></tr>')
+                lines.append(section.format(len(headings), shown(row)))
+                continue
+            name = row[0].value  # a long one such as e_v2x_bm:pairwise is broken after a sign before inside a word
+            if not isinstance(name, Markup):
+                name = Markup("<wbr>").join(_AFTER_SIGN.split(shown(name)))
+            cells = [Markup('<th scope="row">{}</th>').format(name)]
+            for kind, (value, below) in zip(kinds[1:], row[1:], strict=True):
+                under = Markup('<span class="interval">{}</span>').format(shown(below)) if below else Markup()
+                cells.append(Markup("<td{}>{}{}</td>").format(kind, _text(value), under))
+            lines.append(Markup("<tr>{}</tr>").format(Markup("").join(cells)))
+        lines.append(Markup("</tbody></table></div>\n"))
+        return cls(Markup("\n").join(lines))
+
+    @classmethod
+    def drawing(
+        cls,
+        figure: Figure | bytes,
+        title: str,
+        description: str,
+        *,
+        alone: bool = False,
+        known: str = "",
+        where: object = "",
+    ) -> Part:
+        """A figure, or the SVG of one of ours, with its title and, in words, what it shows.
+
+        The caption is taken out of the SVG and stands below it as text of the page, which a phone can show.
+
+        Args:
+            figure: in the colours of the page, light or dark.
+            title: above it.
+            description: in words, what it shows.
+            alone: in colours that must not change, such as those of a map; it then stands on white.
+            known: what its caption need not say, because the page does.
+            where: the file that the SVG was read from, for the error where that holds what no figure of ours does.
+
+        """
+        from ethbrake_marl.figures import inline_svg  # matplotlib takes a second to load, and some pages draw nothing
+
+        try:
+            svg, caption = inline_svg(figure, f"{title}. {description}", recolour=not alone)
+        except InvalidInput as error:
+            raise InvalidInput(f"{where}: {error}") from None
+        for told in (known.strip(), description):
+            caption = caption.replace(told, "").strip() if told else caption
+        below = Markup('<p class="quiet">{}</p>').format(shown(caption)) if caption else Markup()
+        return cls(
+            Markup(
+                "<figure><figcaption><strong>{}</strong> <span>{}</span></figcaption>"
+                '<div class="drawing{}" tabindex="0" role="group" aria-label="{}">{}</div>{}</figure>\n'
+            ).format(shown(title), shown(description), " map" * alone, shown(title), Markup(svg), below)
+        )
+
+    @classmethod
+    def player(
+        cls,
+        worlds: Sequence[Played],
+        driven: Sequence[int] | Mapping[str, Sequence[int]],
+        *,
+        focus: str = "",
+        shown_first: Sequence[int] = (),
+    ) -> Part:
+        """The player of these worlds, all driven by the same agents.
+
+        Args:
+            worlds: at least one.
+            driven: indices (0 = front) of the vehicles that the agents drive; by agent where they drive others.
+            focus: the agent that is shown from the beginning, between the first and the last.
+            shown_first: numbers of the agents that are shown from the beginning, where those are others.
+
+        """
+        agents, one = list(worlds[0].motions), next(iter(worlds[0].motions.values())).world
+        by_agent = driven if isinstance(driven, Mapping) else dict.fromkeys(agents, driven)
+        middle = [agents.index(focus)] if focus in agents else []
+        order = dict.fromkeys([*middle, 0, *reversed(range(len(agents)))])
+        told: list[dict[str, Any]] = []
+        for world in worlds:
+            alert = next(iter(world.motions.values())).world
+            title = shown(world.title or f"World {world.number}")
+            episodes = [
+                Played.episode(motion, by_agent[agent]) | {"passport": shown(world.passports[agent])}
+                for agent, motion in world.motions.items()
+            ]
+            told.append({
+                "conditions": f"{title}: {Conditions.of(alert).quantities}.",
+                "episodes": episodes,
+                "number": world.number,
+                "title": title,
+                "kind": shown(world.kind),
+                "why": shown(world.why),
+            })  # fmt: skip
+        content = {
+            "vehicles": one.N,
+            "agents": [shown(agent) for agent in agents],
+            # the first, the focus, and as many of the last as there is room for
+            "shown": list(shown_first) or sorted(list(order)[:3]),
+            "worlds": told,
+        }
+        shielded = any(episode["stepped"] for world in told for episode in world["episodes"])
+        return cls.live_player(one.N, shielded=shielded, name=_DATA, episodes=cls.data(_DATA, content).html)
+
+    @classmethod
+    def live_player(
+        cls, vehicles: int, *, shielded: bool, name: str | None = None, episodes: Markup | str = ""
+    ) -> Part:
+        """A player for a page whose own script gives it one world after another, or of the data of that name."""
+        values: dict[str, Any] = {
+            "vehicles": vehicles,
+            "shielded": shielded,
+            "name": name,
+            "episodes": episodes,
+            "body": BODY_M,
+        }
+        return cls.template("player.html.j2", ("player.css",), _PLAYER_SCRIPTS, **values)
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A section of a page: strings, which become paragraphs, and parts."""
+
+    title: str
+    body: Sequence[str | Part]
+
+    @property
+    def parts(self) -> list[Part]:
+        """The body, every string as a paragraph."""
+        return [Part.paragraph(each) if isinstance(each, str) else each for each in self.body]
+
+
+@dataclass(frozen=True)
+class Page:
+    """A whole page.
+
+    Args:
+        title: of the page.
+        sections: in this order, each with an entry in the table of contents.
+        lead: what the page is about, in a sentence or two below its title.
+        served: it comes from a server of ours, which its script may ask; else it asks nobody.
+
+    >>> from ethbrake_marl.pages.page import Page, Part, Section
+    >>> section = Section("Results", ["Text with <b> stays text.", Part.paragraph("small print")])
+    >>> "Text with &lt;b&gt; stays text." in Page("A page", [section]).html
+    True
+
+    """
+
+    title: str
+    sections: Sequence[Section]
+    lead: str = ""
+    served: bool = False
+
+    @cached_property
+    def _parts(self) -> list[Part]:
+        return [part for section in self.sections for part in section.parts]
+
+    @cached_property
+    def _code(self) -> tuple[str, str]:
+        """Its own styles and script: each file once, one after the other."""
+        styles = dict.fromkeys(["page.css", *(name for part in self._parts for name in part.styles)])
+        scripts = dict.fromkeys(name for part in self._parts for name in part.scripts)
+        return "\n".join(map(read_file, styles)), "\n".join(map(read_file, scripts))
+
+    @property
+    def policy(self) -> str:
+        """Its content security policy: its own styles and script, pictures inside it, and nothing else."""
+        styles, script = (
+            f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" if text else "'none'"
+            for text in self._code
+        )
+        policy = (
+            f"default-src 'none'; style-src {styles}; script-src {script}; img-src data:;"
+            " base-uri 'none'; form-action 'none'"
+        )
+        return f"{policy}; connect-src 'self'" if self.served else policy
+
+    @cached_property
+    def html(self) -> str:
+        """The page as text."""
+        styles, script = self._code
+        names = anchors([section.title for section in self.sections])
+        whole = Part.template(
+            "page.html.j2",
+            title=self.title,
+            lead=self.lead,
+            sections=list(zip(names, self.sections, strict=True)),
+            policy=self.policy,
+            served=self.served,
+            style=Markup(styles),
+            script=Markup(script),
+        )
+        return str(whole.html)
+
+
+def shown(value: object) -> str:
+    """A value as the text that a page shows: no control or direction character, whoever wrote it."""
+    return plain_text(str(value), keep=_STAY)
+
+
+def anchors(titles: Sequence[str]) -> list[str]:
+    """The name of each section of a page with these titles, for links: of letters and digits, no two alike."""
+    found: list[str] = []
+    for k, title in enumerate(titles):
+        name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:40]
+        found.append(f"{name}-{k + 1}" if name in found or not name else name)
+    return found
+
+
+@cache
+def read_file(name: str) -> str:
+    """A file of this folder, as text."""
+    return files(__package__).joinpath(name).read_text("utf-8")
+
+
+@cache
+def _environment() -> Environment:
+    return Environment(
+        loader=PackageLoader("ethbrake_marl.pages", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=lambda value: value if isinstance(value, Markup) else shown(value),
+    )
+
+
+def _text(value: object) -> str:
+    return value if isinstance(value, Markup) else shown(value)
+
+
+# The episode player: what a page holds of each episode, exact between events, and the script that plays it.
+
+_PLAYER_SCRIPTS = ("player-motion.js", "player-view.js", "player.js")
+_DATA = "episode_data"  # the name of its data in a page, which no section has
+_BIN_S = 1e-3  # of the later impacts of a pair in so short a time the last one is drawn; all are counted
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """One world, driven by every agent."""
+
+    number: int  # in the list
+    kind: str  # why it was chosen, as a heading
+    why: str  # what is special about it, in a few words
+    motions: dict[str, EpisodeMotion] = field(default_factory=dict)  # by agent
+    passports: dict[str, str] = field(default_factory=dict)  # by agent
+    title: str = ""  # what the world is called; empty: World and its number
+
+    @staticmethod
+    def drive(
+        played: Sequence[Played],
+        worlds: Worlds,
+        name: str,
+        agent: Driver,
+        scenario: Scenario,
+        spelling: str,
+        *,
+        seed: int | None,
+        harm_count: HarmCount = "first",
+    ) -> None:
+        """Let one agent drive the worlds of ``played`` and keep each motion and passport there, by the agent's name.
+
+        Args:
+            played: one for each world.
+            worlds: at the alert, in the same order.
+            name: of the agent on the page.
+            agent: is left as it is.
+            scenario: of the worlds, with the vehicles that are driven as its learners.
+            spelling: how the agent is written on a command line.
+            seed: of the list of worlds; None: they came from a file.
+            harm_count: that the agent minimised.
+
+        """
+        drivers = team_of(agent, scenario.learners).drivers
+        policies = policies_of(drivers)
+        for one, motion in zip(played, follow_episodes(worlds, agent, scenario), strict=True):
+            passport = Passport.of(
+                motion, scenario, spelling, seed=seed, number=one.number, harm_count=harm_count, policies=policies
+            )
+            one.motions[name] = motion
+            one.passports[name] = str(passport)
+
+    @staticmethod
+    def episode(motion: EpisodeMotion, driven: Sequence[int]) -> dict[str, Any]:
+        """What the player needs of one episode, in which an agent drove these vehicles."""
+        obstacle = float(motion.world.obstacle_gap_m[0])
+        pieces = np.ascontiguousarray(motion.pieces, np.dtype("<f8"))
+        return {
+            "pieces": base64.b64encode(pieces.tobytes()).decode("ascii"),
+            "end": motion.end_s,
+            "impacts": _impacts(motion),
+            "stepped": motion.stepped_in_s.tolist(),
+            "driven": list(driven),
+            "rest": motion.at_rest,
+            "obstacle": obstacle if np.isfinite(obstacle) else None,
+        }
+
+
+def _impacts(motion: EpisodeMotion) -> list[list[float]]:
+    """Each impact with what has been counted by then; at the last one, that is the ledger to the bit."""
+    rows = motion.impacts
+    order = np.argsort(rows.time_s, kind="stable")
+    harm = rows.closing_speed_mps[order] ** 2
+    first, total = np.cumsum(harm * rows.first[order]), np.cumsum(harm)
+    if len(harm):
+        first[np.flatnonzero(rows.first[order])[-1] :], total[-1] = motion.harm
+    told: dict[tuple[int, int, bool], list[float]] = {}
+    for number, k in enumerate(order.tolist()):
+        time, pair, is_first = float(rows.time_s[k]), int(rows.pair[k]), bool(rows.first[k])
+        entry = [time, pair, float(rows.closing_speed_mps[k]), int(is_first), number + 1]
+        told[pair, int(time / _BIN_S), is_first] = [*entry, float(first[number]), float(total[number])]
+    return sorted(told.values(), key=lambda entry: (entry[0], entry[4]))

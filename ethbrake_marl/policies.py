@@ -1,0 +1,771 @@
+"""A policy as a folder of two plain files: ``manifest.json`` (what it is) and ``weights.safetensors`` (numbers).
+
+Reading one runs no code from it: no pickle, no names to import, no torch. Everything is checked against our own
+table of tensors before any of it is used, and what is damaged or unknown is refused by name.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import re
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import version
+from operator import not_
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, Self
+
+import numpy as np
+import safetensors.numpy
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, JsonValue, ValidationError, model_validator
+from safetensors import SafetensorError
+
+from ethbrake_marl.defaults import HarmCount
+from ethbrake_marl.errors import CorruptBundle, InvalidInput, naming_extras, unknown_name
+from ethbrake_marl.files.arrays import ArrayRow, check_arrays, safetensors_headers
+from ethbrake_marl.files.store import new_folder, read_plain, write_file
+from ethbrake_marl.files.yaml import FileModel, first_mistake, read_json_model
+from ethbrake_marl.observations import ObservationSpec, choose_observation
+from ethbrake_marl.physics import PER_LN2, compiled, exp_rest
+from ethbrake_marl.scenario import FEATURES, Of, Scenario, registered_in
+
+# The manifest of a policy: network, observation, training, versions and hashes.
+
+_PACKAGES = ("ethbrake-marl", "gymnasium", "numba", "numpy", "safetensors", "stable-baselines3", "torch")
+
+
+def installed_versions() -> dict[str, str]:
+    """Name -> version of this package, Python and every package that a training's numbers depend on."""
+    return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}
+
+
+Activation = Literal["relu", "tanh"]
+Width = Annotated[int, Field(ge=1, le=4096)]
+PerhapsHidden = Annotated[tuple[Width, ...], Field(max_length=8)]
+
+
+class TensorRow(NamedTuple):
+    """One tensor: its name in a bundle, its shape, and its name in Stable-Baselines3's policy (PPO's or SAC's)."""
+
+    name: str
+    shape: tuple[int, ...]
+    sb3_name: str
+
+
+class NetworkSpec(FileModel):
+    """An actor, and perhaps a critic, both multilayer perceptrons on the same observation.
+
+    The action is ``output(actor(observation))`` in [-1, 1]: ``clip`` cuts the actor's mean at the bounds (PPO's
+    Gaussian, whose noise is one number per action), ``tanh`` squashes it (SAC's Gaussian, whose noise is a second
+    head of the actor). Without ``value_hidden`` there is no critic: a policy needs none to act.
+
+    With ``networks`` above 1 there are as many actors of this shape, and a gate with ``gate_hidden`` layers that gives
+    each a score: the actor of the highest score acts, the first of equal ones. The gate is asked at each decision and
+    remembers nothing. There is neither noise nor critic then.
+    """
+
+    observation_size: Annotated[int, Field(ge=1, le=4096)]
+    action_size: Annotated[int, Field(ge=1, le=64)]
+    policy_hidden: Annotated[PerhapsHidden, Field(min_length=1)]
+    value_hidden: PerhapsHidden
+    activation: Activation
+    output: Literal["clip", "tanh"]
+    networks: Annotated[int, Field(ge=1, le=16, exclude_if=lambda networks: networks == 1)] = 1
+    gate_hidden: Annotated[PerhapsHidden, Field(exclude_if=not_)] = ()
+
+    @model_validator(mode="after")
+    def _a_gate_between_several(self) -> NetworkSpec:
+        if (self.networks > 1) != bool(self.gate_hidden):
+            raise ValueError(
+                f"networks = {self.networks} with gate_hidden = {list(self.gate_hidden)}; several need a gate"
+            )
+        if self.networks > 1 and self.value_hidden:
+            raise ValueError(f"value_hidden = {list(self.value_hidden)}: must be empty beside several networks")
+        return self
+
+    @property
+    def actors(self) -> tuple[str, ...]:
+        """How the tensors' names of each actor begin."""
+        return ("policy",) if self.networks == 1 else tuple(f"network_{m + 1}" for m in range(self.networks))
+
+    @property
+    def format_version(self) -> Literal[2, 3]:
+        """Of a bundle with this network."""
+        return 2 if self.networks == 1 else 3
+
+    @property
+    def tensors(self) -> tuple[TensorRow, ...]:
+        """Every tensor, all float32; weights are [outputs, inputs] as in ``y = W x + b``."""
+        inputs, hidden = self.observation_size, self.policy_hidden
+        rows: list[TensorRow] = []
+        if self.networks > 1:
+            for m, name in enumerate(self.actors):
+                rows += _network(
+                    name, f"members.{m}.mlp_extractor.policy_net", inputs, hidden, f"members.{m}.action_net",
+                    self.action_size,
+                )  # fmt: skip
+            gate, head = self.gate_hidden, f"gate.average.{2 * len(self.gate_hidden)}"
+            return (*rows, *_network("gate", "gate.average", inputs, gate, head, self.networks))
+        if self.output == "clip":
+            rows += _network("policy", "mlp_extractor.policy_net", inputs, hidden, "action_net", self.action_size)
+            rows += [TensorRow("policy.log_std", (self.action_size,), "log_std")]
+        else:
+            rows += _network("policy", "actor.latent_pi", inputs, hidden, "actor.mu", self.action_size)
+            rows += _layer("policy.log_std", "actor.log_std", hidden[-1], self.action_size)
+        if self.value_hidden:
+            rows += _network("value", "mlp_extractor.value_net", inputs, self.value_hidden, "value_net", 1)
+        return tuple(rows)
+
+
+def _network(
+    name: str, sb3_name: str, inputs: int, hidden: tuple[int, ...], sb3_head: str, outputs: int
+) -> list[TensorRow]:
+    """Hidden layers and the last one; the training library counts activations too, so its index is twice ours."""
+    rows: list[TensorRow] = []
+    for k, width in enumerate(hidden):
+        rows += _layer(f"{name}.{k}", f"{sb3_name}.{2 * k}", inputs, width)
+        inputs = width
+    return rows + _layer(f"{name}.output", sb3_head, inputs, outputs)
+
+
+def _layer(name: str, sb3_name: str, inputs: int, outputs: int) -> list[TensorRow]:
+    return [
+        TensorRow(f"{name}.weight", (outputs, inputs), f"{sb3_name}.weight"),
+        TensorRow(f"{name}.bias", (outputs,), f"{sb3_name}.bias"),
+    ]
+
+
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Neighbours = Annotated[int, Field(ge=0, le=64)]
+
+
+class _Strict(FileModel):
+    model_config = ConfigDict(allow_inf_nan=False)
+
+
+class FeatureDefinition(_Strict):
+    """A registered feature as it was when the policy was trained."""
+
+    name: Annotated[str, Field(max_length=64)]
+    of: Of
+    unit: str
+    scale: float
+    low: float
+    high: float
+    unknown: float
+    tried: Annotated[tuple[float, ...], Field(max_length=64)]  # what it gave in a few worlds
+
+
+class ObservationSchema(_Strict):
+    """What the policy sees: neighbours on each side, feature names in order, and a hash of how each is scaled."""
+
+    front: Neighbours
+    rear: Neighbours
+    features: Annotated[tuple[str, ...], Field(min_length=1, max_length=4096)]
+    scaling_sha256: Sha256
+    registered: Annotated[tuple[FeatureDefinition, ...], Field(max_length=4096, exclude_if=not_)] = ()
+
+    @classmethod
+    def of(cls, spec: ObservationSpec) -> Self:
+        """Describe ``spec`` so that a later change of a name, unit, scale or bound is noticed."""
+        names = tuple(f.name for f in spec.features)
+        scaling = [[f.name, f.unit, f.scale, f.low, f.high] for f in spec.features]
+        return cls(
+            front=spec.front,
+            rear=spec.rear,
+            features=names,
+            scaling_sha256=hashlib.sha256(json.dumps(scaling).encode()).hexdigest(),
+            registered=tuple(
+                FeatureDefinition(
+                    name=name, of=entry.of, unit=entry.feature.unit, scale=entry.feature.scale, low=entry.feature.low,
+                    high=entry.feature.high, unknown=entry.unknown, tried=entry.tried,
+                )
+                for name, entry in registered_in(names).items()
+            ),
+        )  # fmt: skip
+
+    @property
+    def spec(self) -> ObservationSpec:
+        """The observation as the environment builds it, from the names; raises ``UnknownName``."""
+        return choose_observation(self.features)
+
+
+class Manifest(_Strict):
+    """Everything about a policy but its tensors; ``action`` is a fraction of the own capacity, -1 = full braking.
+
+    Format 3 is for policies of several networks; one network is written as ever, for earlier versions too.
+    """
+
+    format: Literal["ethbrake-policy"] = "ethbrake-policy"
+    format_version: Literal[2, 3] = 2
+    algorithm: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
+    network: NetworkSpec
+    observation: ObservationSchema
+    action: Literal["fraction_of_own_capacity"] = "fraction_of_own_capacity"
+    learners: Annotated[tuple[str, ...], Field(min_length=1)]
+    scenario: dict[str, JsonValue]
+    reward: dict[str, JsonValue]
+    seeds: dict[str, int]
+    steps: Annotated[int, Field(ge=0)]
+    versions: dict[str, str]
+    weights_sha256: Sha256
+    manifest_sha256: Sha256  # of everything above, see ``content_sha256``
+
+    @model_validator(mode="after")
+    def _parts_fit(self) -> Manifest:
+        network, features, step = self.network, self.observation.features, self.scenario.get("time_step_s")
+        if self.format_version != network.format_version:
+            raise ValueError(
+                f"format_version: {self.format_version} for {network.networks} networks; must be"
+                f" {network.format_version}"
+            )
+        if len(features) != network.observation_size:
+            raise ValueError(
+                f"{len(features)} observation features for a network that takes {network.observation_size}"
+            )
+        if any(name.startswith(("contact.", "contact_far.")) for name in features) and (
+            isinstance(step, bool) or not isinstance(step, int | float) or not step > 0.0
+        ):
+            raise ValueError(f"scenario: time_step_s = {step!r}; contact features need a number above 0")
+        for name in self.learners:
+            if re.fullmatch(r"vehicle_[1-9][0-9]?", name) is None:
+                raise ValueError(f"learners: {name!r} is no vehicle; vehicles are vehicle_1, vehicle_2, ...")
+        if len(set(self.learners)) < len(self.learners):
+            raise ValueError(f"learners: {', '.join(self.learners)}: each vehicle learns once")
+        vehicles, roles = self.scenario.get("vehicles"), self.scenario.get("roles")
+        for name in self.learners:
+            if isinstance(vehicles, int) and int(name.removeprefix("vehicle_")) > vehicles:
+                raise ValueError(f"learners: {name}: the scenario has {vehicles} vehicles")
+            if isinstance(roles, dict) and roles.get(name) != "learner":
+                raise ValueError(f"learners: {name}: does not learn in the scenario's roles")
+        return self
+
+
+def content_sha256(content: Mapping[str, Any]) -> str:
+    """SHA-256 of a manifest's plain content without its own hash: sorted keys, no blanks, ASCII.
+
+    It binds names, architecture and weights together, against accidents and edits; it is no signature.
+    """
+    hashed = {key: value for key, value in content.items() if key != "manifest_sha256"}
+    return hashlib.sha256(json.dumps(hashed, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+# The hyperbolic tangent from products, sums and one quotient: the same bits in any batch and on any machine.
+#
+# Vector units and mathematics libraries round their own ``tanh`` differently, by machine and even by where in an array
+# a number stands. Here it is a fixed sequence of IEEE operations in double precision, rounded to single at the end.
+
+_SATURATED = 10.0  # from 9.02 on the single-precision result is 1
+_SMALL = 1e-4  # below, x - x^3 / 3 is exact to double precision
+
+
+@compiled
+def squash(values: NDArray[np.float32]) -> None:
+    """Replace ``values`` [k, rows] by their hyperbolic tangents, within half a unit of the last place (and a hair)."""
+    for j in range(values.shape[0]):
+        row = values[j]
+        for r in range(row.shape[0]):
+            x = float(row[r])
+            a = min(abs(x), _SATURATED)
+            z = 2.0 * a
+            k = int(z * PER_LN2 + 0.5)
+            t = 1.0 - 2.0 / (exp_rest(z, k) * float(1 << k) + 1.0)
+            if a < _SMALL:
+                t = a - a * a * a / 3.0
+            row[r] = np.float32(t if x >= 0.0 else -t)
+
+
+Float32s = NDArray[np.float32]
+
+Layers = list[tuple[Float32s, Float32s]]  # weights and biases, from the first layer to the last
+
+BLOCK_ROWS = 256  # worlds handled together: their activations stay in the cache; changes no bit of any of them
+
+
+class Actor:
+    """The deterministic policy: observation [n, F] float32 -> action [n, A] float32 in [-1, 1].
+
+    Of several networks only the one that the gate chooses is computed in a row.
+    """
+
+    def __init__(self, spec: NetworkSpec, tensors: Mapping[str, Float32s]) -> None:
+        """Take the layers out of ``tensors``, which must fit ``spec`` (see ``NetworkSpec.tensors``)."""
+        self.spec = spec
+        self._networks = [_layers_of(name, len(spec.policy_hidden), tensors) for name in spec.actors]
+        self._gate = _layers_of("gate", len(spec.gate_hidden), tensors) if spec.networks > 1 else []
+
+    def __call__(self, observation: Float32s) -> Float32s:
+        """Return the action of each row; raises ``InvalidInput`` on a wrong shape, dtype or a non-finite entry."""
+        seen = self._check(observation)
+        action = np.empty((seen.shape[0], self.spec.action_size), dtype=np.float32)
+        for start in range(0, seen.shape[0], BLOCK_ROWS):
+            rows = slice(start, start + BLOCK_ROWS)
+            action[rows] = self._block(np.ascontiguousarray(seen[rows].T)).T
+        return action
+
+    def choose(self, x: Float32s) -> NDArray[np.int64]:
+        """[F, rows] -> which of several networks acts, [rows] from 0."""
+        chosen: NDArray[np.int64] = self._forward(self._gate, x).argmax(axis=0)
+        return chosen
+
+    def _block(self, x: Float32s) -> Float32s:
+        """[F, rows] -> [A, rows]."""
+        if len(self._networks) == 1:
+            y = self._forward(self._networks[0], x)
+        else:
+            chosen = self.choose(x)
+            y = np.empty((self.spec.action_size, x.shape[1]), dtype=np.float32)
+            for m, layers in enumerate(self._networks):
+                rows = np.flatnonzero(chosen == m)
+                y[:, rows] = self._forward(layers, np.ascontiguousarray(x[:, rows]))
+        if self.spec.output == "clip":
+            return np.clip(y, np.float32(-1.0), np.float32(1.0))
+        squash(y)
+        return y
+
+    def _forward(self, layers: Layers, x: Float32s) -> Float32s:
+        """[F, rows] -> [outputs, rows] of one network."""
+        for weight, bias in layers[:-1]:
+            y = np.empty((weight.shape[0], x.shape[1]), dtype=np.float32)
+            dense(weight, bias, x, y)
+            if self.spec.activation == "relu":
+                x = np.maximum(y, np.float32(0.0))
+            else:
+                squash(y)
+                x = y
+        weight, bias = layers[-1]
+        y = np.empty((weight.shape[0], x.shape[1]), dtype=np.float32)
+        dense(weight, bias, x, y)
+        return y
+
+    def _check(self, observation: Float32s) -> Float32s:
+        wanted = (observation.shape[0] if observation.ndim else 0, self.spec.observation_size)
+        if observation.shape != wanted or observation.dtype != np.float32:
+            raise InvalidInput(
+                f"observation: {observation.dtype} of shape {observation.shape};"
+                f" this policy takes float32 [n, {self.spec.observation_size}]"
+            )
+        if not np.isfinite(observation).all():
+            row, column = np.argwhere(~np.isfinite(observation))[0]
+            raise InvalidInput(f"observation[{row}, {column}] = {observation[row, column]}: must be finite")
+        return observation
+
+
+def _layers_of(name: str, hidden: int, tensors: Mapping[str, Float32s]) -> Layers:
+    names = [f"{name}.{k}" for k in range(hidden)] + [f"{name}.output"]
+    return [
+        (np.ascontiguousarray(tensors[f"{layer}.weight"]), np.ascontiguousarray(tensors[f"{layer}.bias"]))
+        for layer in names
+    ]
+
+
+@compiled
+def dense(weight: Float32s, bias: Float32s, x: Float32s, y: Float32s) -> None:
+    """Fill ``y = weight x + bias`` for weight [O, K], bias [O], x [K, rows], y [O, rows]; rows are independent.
+
+    Inputs are added in groups of four, ``(a + b) + (c + d)``, always in this order and never fused or reordered
+    (no fastmath): half the rounding of a plain running sum, and the same result whatever the other rows hold.
+    """
+    inputs = weight.shape[1]
+    whole = inputs - inputs % 4
+    for j in range(weight.shape[0]):
+        out = y[j]
+        out[:] = bias[j]
+        for k in range(0, whole, 4):
+            w0, w1, w2, w3 = weight[j, k], weight[j, k + 1], weight[j, k + 2], weight[j, k + 3]
+            x0, x1, x2, x3 = x[k], x[k + 1], x[k + 2], x[k + 3]
+            for r in range(out.shape[0]):
+                out[r] += (w0 * x0[r] + w1 * x1[r]) + (w2 * x2[r] + w3 * x3[r])
+        for k in range(whole, inputs):
+            for r in range(out.shape[0]):
+                out[r] += weight[j, k] * x[k, r]
+
+
+MANIFEST = "manifest.json"
+WEIGHTS = "weights.safetensors"
+_LIMITS_BYTES = {MANIFEST: 1 << 20, WEIGHTS: 256 << 20}
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy in memory: its manifest, its tensors, and ``policy(observation)`` for the deterministic action.
+
+    >>> import ethbrake_marl as eb
+    >>> import numpy as np
+    >>> policy = eb.load_shipped("ppo")
+    >>> policy.manifest.algorithm, policy.observation.size
+    ('ppo', 27)
+    >>> policy(np.zeros((2, 27), np.float32)).shape
+    (2, 1)
+
+    """
+
+    manifest: Manifest
+    tensors: Mapping[str, Float32s]
+
+    def __repr__(self) -> str:
+        told, scenario = self.manifest, self.manifest.scenario.get("name")
+        return (
+            f"Policy({told.algorithm!r}, {self.observation.size} observations, {told.steps:,} steps on"
+            f" {scenario!r:.66}, sha256 {told.manifest_sha256[:12]})"
+        )
+
+    @cached_property
+    def _actor(self) -> Actor:
+        return Actor(self.manifest.network, self.tensors)
+
+    def __call__(self, observation: Float32s) -> Float32s:
+        """Map observation [n, F] float32 to action [n, A] float32 in [-1, 1]; row k depends on row k alone."""
+        return self._actor(observation)
+
+    @cached_property
+    def observation(self) -> ObservationSpec:
+        """What to observe for this policy, at the time steps of the scenario that it was trained on.
+
+        Found from the names at first use, which takes as long as to act. Raises ``UnknownName``.
+        """
+        spec, step = self.manifest.observation.spec, self.manifest.scenario.get("time_step_s")
+        return spec.at_steps_of(float(step)) if isinstance(step, int | float) else spec
+
+    @property
+    def steps(self) -> int:
+        """Decisions of learners after which it was taken."""
+        return self.manifest.steps
+
+    @property
+    def drivers(self) -> dict[str, Policy]:
+        """The policy that drives each of its learners."""
+        return dict.fromkeys(self.manifest.learners, self)
+
+    def save(self, folder: Path, *, replace: bool = False) -> None:
+        """Write it as the new folder ``folder``, completely or not at all; raises ``AlreadyExists``.
+
+        With ``replace`` a folder that is there goes once the new one is written.
+        """
+        with new_folder(folder, replace=replace) as partial:
+            write_file(partial / WEIGHTS, _serialise(self.tensors))
+            write_file(partial / MANIFEST, self.manifest.model_dump_json(indent=2).encode() + b"\n")
+
+
+def make_policy(
+    tensors: Mapping[str, Float32s], *, observation: ObservationSpec | ObservationSchema, **manifest: Any
+) -> Policy:
+    """Build a policy from ``tensors`` and the fields of ``Manifest`` (all but hashes and format, which follow).
+
+    ``versions`` are the installed ones where they are not given. Raises ``InvalidInput`` naming the tensor or field
+    that does not fit.
+    """
+    data = _serialise(tensors)
+    seen = observation if isinstance(observation, ObservationSchema) else ObservationSchema.of(observation)
+    given = {"versions": installed_versions(), **manifest, "format_version": manifest["network"].format_version}
+    try:
+        weights = hashlib.sha256(data).hexdigest()
+        draft = Manifest(**given, observation=seen, weights_sha256=weights, manifest_sha256="0" * 64)
+        own = content_sha256(draft.model_dump(mode="json"))
+        checked = draft.model_copy(update={"manifest_sha256": own})
+        return Policy(checked, _tensors(data, checked))
+    except ValidationError as error:
+        raise InvalidInput(f"policy: {first_mistake(error)}") from None
+    except ValueError as error:
+        raise InvalidInput(f"policy: {error}") from None
+
+
+def has_bundle(folder: Path) -> bool:
+    """Whether the files of a bundle stand in ``folder``; they are not read."""
+    return all((folder / name).is_file() for name in (MANIFEST, WEIGHTS))
+
+
+def load_policy(path: str | os.PathLike[str]) -> Policy:
+    """Read the bundle at ``path``: a bundle's own folder, or a run's folder (then its ``policy/``).
+
+    Raises ``InvalidInput`` when there is none, ``CorruptBundle`` (file, what is wrong) when it cannot be trusted.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise InvalidInput(f"policy {path!r:.60}: must be the path of a run or of a policy bundle")
+    folder = _bundle_folder(Path(path))
+    found = {entry.name for entry in os.scandir(folder)}
+    for name in sorted({MANIFEST, WEIGHTS} - found):
+        raise CorruptBundle(f"{folder / name}: is missing")
+    for name in sorted(found - {MANIFEST, WEIGHTS}):
+        raise CorruptBundle(f"{folder / name}: does not belong into a bundle, which is {MANIFEST} and {WEIGHTS} only")
+    place = folder / MANIFEST
+    data = _read(place)
+    try:
+        content, manifest = read_json_model(data, Manifest)
+    except ValueError as error:
+        raise CorruptBundle(f"{place}: {error}") from None
+    own = content_sha256(content)
+    if own != manifest.manifest_sha256:
+        raise CorruptBundle(
+            f"{place}: its content has SHA-256 {own}, but it says {manifest.manifest_sha256}; it was changed after it"
+            " was saved"
+        )
+    _check_observed(place, manifest)
+    data = _read(folder / WEIGHTS)
+    sha256 = hashlib.sha256(data).hexdigest()
+    if sha256 != manifest.weights_sha256:
+        raise CorruptBundle(f"{folder / WEIGHTS}: SHA-256 is {sha256}, the manifest says {manifest.weights_sha256}")
+    try:
+        return Policy(manifest, _tensors(data, manifest))
+    except ValueError as error:
+        raise CorruptBundle(f"{folder / WEIGHTS}: {error}") from None
+
+
+def _bundle_folder(path: Path) -> Path:
+    for folder in (path, path / "policy"):
+        try:
+            found = (folder / MANIFEST).exists() or (folder / WEIGHTS).exists()
+        except OSError as error:
+            raise InvalidInput(f"{str(path)!r:.120}: cannot be read ({error.strerror})") from None
+        if found:
+            if folder.is_symlink():
+                raise CorruptBundle(f"{folder}: is a symbolic link; give the folder it points to")
+            return folder
+    members = sorted((path / "policy").glob("vehicle_*"))
+    if members:
+        raise InvalidInput(f"{path}: each of its learners has a policy of its own; name one, for instance {members[0]}")
+    reason = "holds no policy" if path.is_dir() else "is not a folder"
+    raise InvalidInput(f"{path}: {reason}; give a policy bundle ({MANIFEST}, {WEIGHTS}) or a run that finished")
+
+
+def _read(path: Path) -> bytes:
+    return read_plain(path, _LIMITS_BYTES[path.name], refusal=CorruptBundle, follow_links=False)
+
+
+def _check_observed(path: Path, manifest: Manifest) -> None:
+    """Compare what the policy observes with what these features are now.
+
+    Raises ``InvalidInput`` naming a registered feature that is missing or was changed, ``CorruptBundle`` for features
+    that this version does not have, or scales otherwise.
+    """
+    seen = manifest.observation
+    for was in seen.registered:
+        of = f"{path}: the policy observes {was.name!r:.80}"
+        if was.name not in FEATURES:
+            raise InvalidInput(
+                f"{of}, which is not registered; import the file that registers it (eb.register_feature) first"
+            )
+        entry = FEATURES[was.name]
+        now = {name: getattr(entry.feature, name) for name in ("unit", "scale", "low", "high")}
+        for key, value in (now | {"of": entry.of, "unknown": entry.unknown}).items():
+            if getattr(was, key) != value:
+                raise InvalidInput(
+                    f"{of}, whose {key} was {getattr(was, key)!r:.60} when it was trained and is {value!r:.60} now;"
+                    " register it as it was, or train again"
+                )
+        if len(was.tried) != len(entry.tried) or not np.allclose(was.tried, entry.tried, rtol=1e-6, atol=1e-6):
+            raise InvalidInput(
+                f"{of}, whose function gives other numbers than when it was trained; register it as it was, or train"
+                " again"
+            )
+    with suppress(InvalidInput):  # a feature that there is no more
+        today = ObservationSchema.of(seen.spec)
+        known = seen.model_copy(update={"registered": today.registered})  # compared above, within rounding
+        if known == today and [each.name for each in seen.registered] == [each.name for each in today.registered]:
+            return
+    raise CorruptBundle(
+        f"{path}: observation: features or their scaling are not those of this version of the package;"
+        f" use the one it was made with ({manifest.versions.get('ethbrake-marl', 'unknown')}), or train again"
+    )
+
+
+def _serialise(tensors: Mapping[str, Float32s]) -> bytes:
+    return safetensors.numpy.save({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()})
+
+
+def _tensors(data: bytes, manifest: Manifest) -> dict[str, Float32s]:
+    """Check ``data`` against the tensor table, then read it; raises ``ValueError`` naming the tensor."""
+    rows = [ArrayRow(row.name, "F32", row.shape) for row in manifest.network.tensors]
+    check_arrays(safetensors_headers(data), rows, "tensor")
+    try:
+        tensors = safetensors.numpy.load(data)
+    except SafetensorError as error:
+        raise ValueError(f"not a safetensors file ({error})") from None
+    for name, tensor in tensors.items():
+        if not np.isfinite(tensor).all():
+            raise ValueError(f"tensor {name!r} holds a number that is not finite")
+        tensor.setflags(write=False)
+    return tensors
+
+
+# Policies of several learners that were trained together, one for each: in memory and as a folder of bundles.
+
+
+@dataclass(frozen=True)
+class PolicyTeam:
+    """One policy for each learner, by the vehicle's name, front to rear."""
+
+    drivers: Mapping[str, Policy]
+
+    @property
+    def steps(self) -> int:
+        """Decisions of learners after which they were taken."""
+        return next(iter(self.drivers.values())).steps
+
+    def save(self, folder: Path, *, replace: bool = False) -> None:
+        """Write a folder ``vehicle_i/`` for each learner with its bundle, as ``Policy.save`` writes one."""
+        with new_folder(folder, replace=replace) as partial:
+            for name, policy in self.drivers.items():
+                policy.save(partial / name)
+
+
+Trained = Policy | PolicyTeam  # what a training makes: one policy for all its learners, or one for each
+
+
+def read_trained(folder: Path) -> Trained:
+    """Read what their ``save`` wrote; raises ``CorruptBundle``, and what ``load_policy`` raises."""
+    if (folder / MANIFEST).exists():
+        return load_policy(folder)
+    names = sorted((path.name for path in folder.glob("vehicle_*")), key=lambda name: int(name.split("_")[1]))
+    if not names:
+        raise CorruptBundle(f"{folder}: holds neither a bundle nor one for each learner")
+    return PolicyTeam({name: load_policy(folder / name) for name in names})
+
+
+# Policies that come with the package, and how they are chosen by name.
+#
+# Each is a folder of ``_policies/``: a bundle, and beside it ``card.md``, which says what it was trained on, how good
+# it is and where it is bad.
+
+SHIPPED = "shipped"
+_BEST_FIRST = ("counterfactual", "ppo", "sac", "universal")  # of ``policy``, where several are
+
+_FOLDER = Path(__file__).resolve().parent / "_policies"
+
+
+def shipped_policies() -> dict[str, Path]:
+    """Name -> folder of every policy that ships."""
+    return {path.parent.name: path.parent for path in sorted(_FOLDER.glob("*/policy"))}
+
+
+def shipped_name(kind: str, scenario: str | None, harm_count: HarmCount) -> str:
+    """Name of the policy of this kind for ``scenario``, of those trained for ``harm_count`` if there is one.
+
+    ``universal`` is for all scenarios, ``ppo`` and ``sac`` are for the one that they were trained on, ``ppo-SCENARIO``
+    and ``sac-SCENARIO`` for that one; ``-total`` behind says that a policy was trained for total harm. ``policy`` is
+    the best of all kinds. Raises ``InvalidInput`` listing what ships.
+    """
+    names = shipped_policies()
+    for each in _BEST_FIRST if kind == "policy" else ():
+        with suppress(InvalidInput):
+            return shipped_name(each, scenario, harm_count)
+    plain = [kind] if kind == "universal" or scenario is None else [f"{kind}-{scenario}", kind]
+    for stem in plain:
+        for name in (f"{stem}-total", stem) if harm_count == "total" else (stem,):
+            if name in names and (
+                stem != kind
+                or kind == "universal"
+                or scenario is None
+                or load_shipped(name).manifest.scenario.get("name") == scenario
+            ):
+                return name
+    wanted = kind if scenario is None or kind == "universal" else f"{kind} for scenario {scenario!r}"
+    every = ", ".join(names) or "none"
+    raise InvalidInput(f"shipped policy {wanted}: there is none; shipped are: {every} (each as {SHIPPED}/NAME)")
+
+
+def load_shipped(name: str) -> Policy:
+    """The shipped policy called ``name``; raises ``UnknownName`` with a suggestion."""
+    folders = shipped_policies()
+    if name not in folders:
+        raise unknown_name("shipped policy", name, folders)
+    return load_policy(folders[name])
+
+
+def load_named_policy(
+    path: str, kind: str = "ppo", scenario: Scenario | None = None, harm_count: HarmCount = "first"
+) -> Policy:
+    """The policy of a run or bundle at ``path``; ``shipped``: the one of this kind for ``scenario``; ``shipped/NAME``.
+
+    A folder that is called so is ``./shipped``. Raises what ``load_policy`` and the functions above raise.
+    """
+    head, slash, name = path.partition("/")
+    if head != SHIPPED:
+        return load_policy(path)
+    if slash:
+        return load_shipped(name)
+    return load_shipped(shipped_name(kind, None if scenario is None else scenario.name, harm_count))
+
+
+# A policy as an ONNX model: observation in, acceleration out. Needs the extra ``export``.
+
+OPSET = 17
+IR_VERSION = 8  # old enough for every runtime since 2022
+
+
+def onnx_model(policy: Policy) -> bytes:
+    """The serialised model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
+
+    The acceleration is the action times the own braking (below 0) or driving capacity (above 0), which the observation
+    holds. Products are summed in another order than in our forward pass: results agree within rounding, not to the
+    bit. Raises ``MissingExtra`` where the package onnx is not installed.
+    """
+    with naming_extras():
+        import onnx  # only here: an extra
+    helper, float32, manifest, spec = onnx.helper, onnx.TensorProto.FLOAT, policy.manifest, policy.manifest.network
+    nodes: list[Any] = []
+    constants: list[Any] = []
+
+    def constant(name: str, array: NDArray[Any]) -> str:
+        constants.append(onnx.numpy_helper.from_array(np.ascontiguousarray(array), name))
+        return name
+
+    def node(operator: str, inputs: list[str], *, output: str = "", **attributes: Any) -> str:
+        name = output or f"{operator.lower()}_{len(nodes)}"
+        nodes.append(helper.make_node(operator, inputs, [name], **attributes))
+        return name
+
+    def network(name: str, hidden: int) -> str:
+        """One network of the policy, from the observation on."""
+        x = "observation"
+        for layer in [*(f"{name}.{k}" for k in range(hidden)), f"{name}.output"]:
+            weight, bias = (
+                constant(f"{layer}.{part}", policy.tensors[f"{layer}.{part}"]) for part in ("weight", "bias")
+            )
+            x = node("Gemm", [x, weight, bias], transB=1)
+            if not layer.endswith("output"):
+                x = node("Relu" if spec.activation == "relu" else "Tanh", [x])
+        return x
+
+    outputs = [network(name, len(spec.policy_hidden)) for name in spec.actors]
+    x = outputs[0]
+    if len(outputs) > 1:  # the one that the gate chooses
+        chosen = node("ArgMax", [network("gate", len(spec.gate_hidden))], axis=1, keepdims=1)
+        x = node("GatherElements", [node("Concat", outputs, axis=1), chosen], axis=1)
+    if spec.output == "tanh":
+        action = node("Tanh", [x], output="action")
+    else:
+        bounds = [constant(name, np.array(at, np.float32)) for name, at in (("lowest", -1.0), ("highest", 1.0))]
+        action = node("Clip", [x, *bounds], output="action")
+    capacities = []  # in m/s2, [n, 1]
+    features = [f.name for f in policy.observation.features]
+    for name in ("own.braking_capacity", "own.driving_capacity"):
+        column = features.index(name)
+        index = constant(f"{name}.column", np.array([column], np.int64))
+        unit = constant(f"{name}.scale", np.array([policy.observation.features[column].scale], np.float32))
+        capacities.append(node("Mul", [node("Gather", ["observation", index], axis=1), unit]))
+    zero = constant("zero", np.zeros(1, np.float32))
+    below = node("Mul", [node("Min", [action, zero]), capacities[0]])
+    above = node("Mul", [node("Max", [action, zero]), capacities[1]])
+    node("Add", [below, above], output="acceleration_mps2")
+
+    given = [helper.make_tensor_value_info("observation", float32, ["n", spec.observation_size])]
+    found = [helper.make_tensor_value_info(name, float32, ["n", 1]) for name in ("action", "acceleration_mps2")]
+    graph = helper.make_graph(nodes, "policy", given, found, constants)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="ethbrake-marl")
+    model.ir_version = IR_VERSION
+    told = {
+        "algorithm": manifest.algorithm,
+        "manifest_sha256": manifest.manifest_sha256,
+        "features": ",".join(manifest.observation.features),
+    }
+    helper.set_model_props(model, told)
+    onnx.checker.check_model(model)
+    data: bytes = model.SerializeToString()
+    return data

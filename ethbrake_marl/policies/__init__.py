@@ -1,1 +1,0 @@
-"""Policies as plain files: read, checked and run without torch."""
