@@ -142,6 +142,60 @@ class Suite:
         """The seeds of its lists, which no training and no choice of a policy may use."""
         return frozenset(each.content.seed for each in self.lists)
 
+    def make_entry(self, spec: str, *, on_progress: OnProgress | None = None) -> Entry:
+        """Let an agent drive every list.
+
+        Args:
+            spec: the agent, as ``make_agent`` takes it; it minimises each list's own count of harm.
+            on_progress: is told how many worlds of which list have been driven.
+
+        Raises ``InvalidInput`` for an agent that can drive no list (the first one's reason), a policy that was trained
+        or chosen with a seed of the suite, and worlds or physics that are not those of the suite.
+
+        """
+        lists: dict[str, ListResult | NotDriven] = {}
+        for each in self.lists:
+            sample = each.sample()  # an error here is the suite's, not the agent's
+            count = each.content.harm_count
+            try:
+                lineup = make_lineup([spec], each.scenario, harm_count=count)
+                if len(lineup) != 1:
+                    raise InvalidInput(f"agent {spec!r}: stands for {len(lineup)} agents; an entry is of one")
+                check_agents(lineup, sample.worlds, each.scenario)
+            except (InvalidInput, PhysicsError) as error:
+                lists[each.name] = NotDriven(not_driven=one_line(str(error))[:1000])
+                continue
+            (driver,) = lineup.values()
+            seeds = policy_seeds(driver, each)
+            for vehicle, purposes in seeds.items():
+                for purpose, seed in purposes.items():
+                    if seed in self.seeds:
+                        raise InvalidInput(
+                            f"agent {spec!r}: its policy of {vehicle} was made with {purpose} seed {seed}, which is"
+                            f" suite {self.name}'s own: the suite would not measure it, but what it was made with"
+                        )
+            lists[each.name] = _drive_list(each, sample, lineup, seeds, on_progress)
+        driven = [each for each in lists.values() if isinstance(each, ListResult)]
+        if not driven:
+            reasons = [each.not_driven for each in lists.values() if isinstance(each, NotDriven)]
+            raise InvalidInput(f"suite {self.name}: {spec!r} can drive no list of it: {reasons[0]}")
+        shares = mean_of_lists([each.realised_share for each in driven])
+        entry = Entry(
+            format="ethbrake-benchmark-entry",
+            format_version=1,
+            suite=self.name,
+            suite_sha256=self.sha256,
+            agent=spec,
+            command=shlex.join(["ethbrake", "benchmark", self.name, "--agent", spec, "--output", "ENTRY.json"]),
+            versions=result_versions(),
+            lists=dict(lists),
+            lists_driven=len(driven),
+            mean_of_driven=shares,
+            overall=shares if len(driven) == len(self.lists) else None,
+            entry_sha256="0" * 64,
+        )
+        return entry.model_copy(update={"entry_sha256": entry.content_sha256()})
+
 
 def suite_names(folder: Path | None = None) -> list[str]:
     """The suites of a folder; of the package, if none is given."""
@@ -319,62 +373,6 @@ class Entry(Strict):
                 rows.append([name, each.realised_share, *harms, each.collision_rate, each.horizon_ends / each.worlds])
         reasons = [f"{name}: {each.not_driven}" for name, each in self.lists.items() if isinstance(each, NotDriven)]
         return Sheet("", columns, rows, "\n".join(reasons), gap=2)
-
-
-def make_entry(suite: Suite, spec: str, *, on_progress: OnProgress | None = None) -> Entry:
-    """Let an agent drive every list of the suite.
-
-    Args:
-        suite: what is driven.
-        spec: the agent, as ``make_agent`` takes it; it minimises each list's own count of harm.
-        on_progress: is told how many worlds of which list have been driven.
-
-    Raises ``InvalidInput`` for an agent that can drive no list (the first one's reason), a policy that was trained or
-    chosen with a seed of the suite, and worlds or physics that are not those of the suite.
-
-    """
-    lists: dict[str, ListResult | NotDriven] = {}
-    for each in suite.lists:
-        sample = each.sample()  # an error here is the suite's, not the agent's
-        count = each.content.harm_count
-        try:
-            lineup = make_lineup([spec], each.scenario, harm_count=count)
-            if len(lineup) != 1:
-                raise InvalidInput(f"agent {spec!r}: stands for {len(lineup)} agents; an entry is of one")
-            check_agents(lineup, sample.worlds, each.scenario)
-        except (InvalidInput, PhysicsError) as error:
-            lists[each.name] = NotDriven(not_driven=one_line(str(error))[:1000])
-            continue
-        (driver,) = lineup.values()
-        seeds = policy_seeds(driver, each)
-        for vehicle, purposes in seeds.items():
-            for purpose, seed in purposes.items():
-                if seed in suite.seeds:
-                    raise InvalidInput(
-                        f"agent {spec!r}: its policy of {vehicle} was made with {purpose} seed {seed}, which is suite"
-                        f" {suite.name}'s own: the suite would not measure it, but what it was made with"
-                    )
-        lists[each.name] = _drive_list(each, sample, lineup, seeds, on_progress)
-    driven = [each for each in lists.values() if isinstance(each, ListResult)]
-    if not driven:
-        reasons = [each.not_driven for each in lists.values() if isinstance(each, NotDriven)]
-        raise InvalidInput(f"suite {suite.name}: {spec!r} can drive no list of it: {reasons[0]}")
-    shares = mean_of_lists([each.realised_share for each in driven])
-    entry = Entry(
-        format="ethbrake-benchmark-entry",
-        format_version=1,
-        suite=suite.name,
-        suite_sha256=suite.sha256,
-        agent=spec,
-        command=shlex.join(["ethbrake", "benchmark", suite.name, "--agent", spec, "--output", "ENTRY.json"]),
-        versions=result_versions(),
-        lists=dict(lists),
-        lists_driven=len(driven),
-        mean_of_driven=shares,
-        overall=shares if len(driven) == len(suite.lists) else None,
-        entry_sha256="0" * 64,
-    )
-    return entry.model_copy(update={"entry_sha256": entry.content_sha256()})
 
 
 def read_entry(path: Path) -> Entry:

@@ -70,8 +70,7 @@ from ethbrake_marl.learning import (
 )
 from ethbrake_marl.policies import Policy, has_bundle, installed_versions, read_trained
 from ethbrake_marl.scenario import Scenario, check_file_name, load_scenario
-from ethbrake_marl.studies.jobs import Attempt, Job, JobFolder, Workers
-from ethbrake_marl.studies.trainings import Timed, TrainingJob, time_training, told_seconds
+from ethbrake_marl.studies.jobs import Attempt, Job, JobFolder, Timed, TrainingJob, Workers
 
 if TYPE_CHECKING:
     from optuna import Trial
@@ -379,15 +378,6 @@ class Row:
         }
 
 
-class SweepCost(NamedTuple):
-    """What is left to do of a sweep."""
-
-    states: Mapping[str, str]  # by job's name: finished, begun or new
-    decisions: int
-    work_s: float  # seconds of one core; begun jobs are reckoned whole
-    in_words: str
-
-
 @dataclass(frozen=True)
 class SweepPlan:
     """All jobs, in the order of the table. What they have in common is loaded once."""
@@ -466,28 +456,31 @@ class SweepPlan:
                     results[row.name] = values
         return results, damaged
 
-    def cost(self, path: Path, processes: int) -> SweepCost:
-        """Time a short training of the first job of each recipe, and reckon up what is left."""
+    def cost(self, path: Path, processes: int) -> tuple[dict[str, Any], str]:
+        """Every job and its state, and what is left in seconds of one core, as plain data; the latter in words.
+
+        A short training of the first job of each recipe is timed; begun jobs are reckoned whole.
+        """
         results, _ = self.kept(path)
-        states, left, decisions, work_s = {}, dict[object, list[Row]](), 0, 0.0
+        jobs, left = [], [row for row in self.rows if row.name not in results]
         for row in self.rows:
-            begun = (path / RUNS / row.name / "run.json").is_file()
-            states[row.name] = "finished" if row.name in results else "begun" if begun else "new"
-            if row.name not in results:
-                left.setdefault(row.asked[1:-1], []).append(row)
+            begun = "begun" if (path / RUNS / row.name / "run.json").is_file() else "new"
+            state = "finished" if row.name in results else begun
+            jobs.append({"hash": row.identity, "job": row.name, "set": row.settings, "state": state})
         timed: dict[str, Timed] = {}
-        for rows in left.values():
-            recipe, training = rows[0].asked.recipe, rows[0].first
-            if recipe not in timed:
-                timed[recipe] = time_training(training)
-            decisions += len(rows) * training.recipe.total_steps
-            work_s += timed[recipe].seconds(training, len(rows) * training.recipe.total_steps)
+        work_s = 0.0
+        for row in left:
+            job = TrainingJob(row.first, path)
+            if row.asked.recipe not in timed:
+                timed[row.asked.recipe] = job.time()
+            work_s += timed[row.asked.recipe]._replace(job=job).seconds(row.first.recipe.total_steps)
+        decisions = sum(row.first.recipe.total_steps for row in left)
         words = (
-            f"to do: {count_of(len(self.rows) - len(results), 'job')}, {decisions:,} decisions: about"
-            f" {told_seconds(work_s)} of one core, {told_seconds(work_s / processes)} with {processes} at once"
+            f"to do: {count_of(len(left), 'job')}, {decisions:,} decisions: about"
+            f" {Timed.in_words(work_s)} of one core, {Timed.in_words(work_s / processes)} with {processes} at once"
             f" (a few updates of {count_of(len(timed), 'recipe')} timed on this machine)"
         )
-        return SweepCost(states, decisions, work_s, words if left else "to do: nothing")
+        return {"jobs": jobs, "decisions_left": decisions, "core_s_left": work_s}, words if left else "to do: nothing"
 
     def run(self, path: Path, workers: Workers, *, retries: int = 2, tell: OnProgress | None = None) -> StudyResult:
         """Run what is left of a sweep and write its tables, after Ctrl-C too.
@@ -823,10 +816,10 @@ class TuningPlan:
     def cost(self, trials: int, processes: int) -> tuple[float, str]:
         """Seconds of one core for a training with the recipe's own values, by a short one; of all trials in words."""
         training = self.training({})
-        each_s = time_training(training).seconds(training, training.recipe.total_steps)
+        each_s = TrainingJob(training, Path()).time().seconds(training.recipe.total_steps)
         return each_s, (
             f"{count_of(trials, 'trial')} of {self.recipe.total_steps:,} decisions:"
-            f" about {told_seconds(trials * each_s)} of one core, {told_seconds(trials * each_s / processes)} with"
+            f" about {Timed.in_words(trials * each_s)} of one core, {Timed.in_words(trials * each_s / processes)} with"
             f" {processes} at once; less where trials are pruned or have ended already"
             " (a few updates of the recipe timed on this machine)"
         )
