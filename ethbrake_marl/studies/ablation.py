@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -256,21 +255,16 @@ class Plan:
             if level.trained:
                 worlds, task = samples[level.name].worlds, Task(level.scenario, level.scenario.learners)
                 braking = make_single_agent("full_brake")
-                drive_chunks(braking, worlds.take([0]), task)  # compiles
-                started = time.monotonic()
-                drive_chunks(braking, worlds, task)
                 often = self.episodes * self.seeds * len(self.recipes) * len(HARM_COUNTS)
-                driving_s += (time.monotonic() - started) / worlds.n * often
+                driving_s += often * Timed.each_s(worlds, partial(drive_chunks, braking, task=task))
         search_s, damaged = 0.0, []
         for level, part, _ in questions(self, lists):
             number, broken = chunks_left(level.scenario, part, budget=self.budget, chunks=self.optimum_folder(level))
             damaged += broken
             if number:
                 worlds = part.worlds.take(np.arange(min(_TIMED_WORLDS, part.worlds.n)))
-                best_harm(level.scenario, worlds.take([0]), budget=100, threads=1)
-                started = time.monotonic()
-                best_harm(level.scenario, worlds, budget=self.budget, threads=1)
-                search_s += (time.monotonic() - started) / worlds.n * number
+                searching = partial(best_harm, level.scenario, budget=self.budget, threads=1)
+                search_s += number * Timed.each_s(worlds, searching)
         speed = f" at {decisions.total() / training_s:,.0f}/s" if training_s > 0.0 else ""
         told, whole_s = Timed.in_words, training_s + driving_s + search_s
         line = (
@@ -888,9 +882,7 @@ def ablation_page(found: Json, conditions: str, figures: Mapping[str, Figure], e
         Part.drawing(figure, *FIGURES[name], alone=name == "ablation-who-pays.png", known=conditions)
         for name, figure in figures.items()
     ]
-    sections = [Section("Conditions", [conditions])]
-    sections += [Section("Figures", drawn)] if drawn else []
-    sections += episodes
+    sections = [Section("Conditions", [conditions]), *([Section("Figures", drawn)] if drawn else []), *episodes]
     for title, sheets in _blocks(found):
         parts = []
         for sheet in sheets:

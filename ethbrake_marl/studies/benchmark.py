@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
+from pydantic import Field, JsonValue
 
 from ethbrake_marl.agents import Driver, knowledge_text, team_of
 from ethbrake_marl.defaults import HarmCount
-from ethbrake_marl.errors import EthBrakeError, InvalidInput, OnProgress, PhysicsError, Progress, one_line, unknown_name
+from ethbrake_marl.errors import InvalidInput, OnProgress, PhysicsError, Progress, one_line, unknown_name
 from ethbrake_marl.evaluation import (
     PROGRESS_EVERY,
     check_agents,
@@ -36,8 +36,8 @@ from ethbrake_marl.evaluation import (
     write_output,
 )
 from ethbrake_marl.files.sheet import DASH, Column, Estimate, Sheet
-from ethbrake_marl.files.store import parse_strict_json, read_plain
-from ethbrake_marl.files.yaml import first_mistake
+from ethbrake_marl.files.store import read_plain
+from ethbrake_marl.files.yaml import FileModel, read_json_model
 from ethbrake_marl.limits import BestHarmTable, world_identity
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.policies import Policy
@@ -57,16 +57,10 @@ Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,63}$")]
 Mean = Annotated[float, Field(ge=0.0)]
 
 
-class Strict(BaseModel):
-    """What is read from a file: nothing is unknown, converted or infinite."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+Content = TypeVar("Content", bound=FileModel)
 
 
-Content = TypeVar("Content", bound=Strict)
-
-
-class ListContent(Strict):
+class ListContent(FileModel):
     """One list, as the suite's file says it; harms are means over its worlds under ``harm_count`` (m2/s2)."""
 
     name: Name
@@ -81,7 +75,7 @@ class ListContent(Strict):
     best_known_harm: Mean  # of the table: the score 1
 
 
-class SuiteContent(Strict):
+class SuiteContent(FileModel):
     """The whole of a suite's file."""
 
     format: Literal["ethbrake-suite"]
@@ -228,16 +222,13 @@ def load_suite(name: str, folder: Path | None = None) -> Suite:
 
 def read_content(file: Path, kind: type[Content]) -> Content:
     """A JSON file as ``kind``; raises ``InvalidInput`` naming the file and the first mistake."""
+    data = read_plain(file, _LIMIT_BYTES)
     try:
-        data = read_plain(file, _LIMIT_BYTES)
-        parse_strict_json(data)  # no key twice, no NaN
-        return kind.model_validate_json(data)
-    except ValidationError as error:
-        raise InvalidInput(f"{file}: {first_mistake(error)}") from None
-    except ValueError as error:
-        if isinstance(error, EthBrakeError):
-            raise
+        return read_json_model(data, kind)[1]
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InvalidInput(f"{file}: is no JSON, or was not written to its end: {error}") from None
+    except ValueError as error:
+        raise InvalidInput(f"{file}: {error}") from None
 
 
 def plain_sha256(content: Any) -> str:
@@ -282,9 +273,9 @@ def mean_of_lists(shares: Sequence[Estimate]) -> Estimate:
     if not shares:
         raise InvalidInput("mean over lists: there is none")
     value = math.fsum(share.value for share in shares) / len(shares)
-    halves = [0.5 * (share.interval[1] - share.interval[0]) for share in shares if share.interval is not None]
-    if len(halves) < len(shares):
+    if any(share.interval is None for share in shares):
         return Estimate(value, None)
+    halves = [0.5 * (share.ends[1] - share.ends[0]) for share in shares]
     half = math.sqrt(math.fsum(half * half for half in halves)) / len(shares)
     return Estimate(value, (value - half, value + half))
 
@@ -294,7 +285,7 @@ _SAME_HARM = 1e-6  # of means (m2/s2), relative or absolute: what another machin
 Count = Annotated[int, Field(ge=0)]
 
 
-class ListResult(Strict):
+class ListResult(FileModel):
     """What an agent did on one list; harms are means per world (m2/s2)."""
 
     worlds: Count
@@ -312,13 +303,13 @@ class ListResult(Strict):
     outcome_sha256: Sha256  # of the harm of every pair in every world
 
 
-class NotDriven(Strict):
+class NotDriven(FileModel):
     """A list that the agent cannot drive, and why."""
 
     not_driven: Annotated[str, Field(min_length=1, max_length=1000)]
 
 
-class Entry(Strict):
+class Entry(FileModel):
     """One agent on a suite. ``overall`` is the mean share over all lists, null unless all of them were driven."""
 
     format: Literal["ethbrake-benchmark-entry"]
@@ -452,13 +443,11 @@ def _drive_list(
 
 # Entries of one suite, sorted by their score: as a table, as Markdown and as a page.
 
-_SCORE = (
+_NOTES = (
     "Realised share of what is possible, in %: (full braking - agent) / (full braking - best known) of the mean harm"
-    " of a list; 0 is full braking, 100 the best known. 95 % intervals in brackets."
-)
-_RANK = (
+    " of a list; 0 is full braking, 100 the best known. 95 % intervals in brackets.",
     "Only who drives every list is ranked, by the mean over all lists. A mean over some of them is shown, and is no"
-    " score: those lists may be the easy ones."
+    " score: those lists may be the easy ones.",
 )
 
 
@@ -472,7 +461,7 @@ class Leaderboard:
     @property
     def notes(self) -> tuple[str, ...]:
         """What the figures are, who is ranked, and the suite."""
-        return _SCORE, _RANK, f"Suite {self.suite.name}, SHA-256 {self.suite.sha256}"
+        return *_NOTES, f"Suite {self.suite.name}, SHA-256 {self.suite.sha256}"
 
     def sheet(self) -> Sheet:
         """One line per entry, for a terminal; lists that were not driven show a dash."""

@@ -17,7 +17,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import reduce
+from functools import partial, reduce
 from itertools import count
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
@@ -25,8 +25,6 @@ from multiprocessing.process import BaseProcess
 from operator import add
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
-
-import numpy as np
 
 from ethbrake_marl.errors import (
     AlreadyExists,
@@ -50,6 +48,7 @@ from ethbrake_marl.files.store import (
     write_file,
 )
 from ethbrake_marl.learning import RunDirectory, Training, load_team, read_object, stop_on_signal
+from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Sample
 
 if TYPE_CHECKING:
@@ -462,12 +461,9 @@ class TrainingJob:
 
     def world_seconds(self, sample: Sample) -> float:
         """Seconds per world that its team drives."""
-        scenario, worlds = self.training.scenario, sample.worlds
-        team = {"team": load_team(self.folder, scenario)}
-        evaluate(worlds.take(np.arange(min(5, worlds.n))), team, scenario=scenario, aftermath=False)  # compiles
-        started = time.monotonic()
-        evaluate(sample, team, scenario=scenario, aftermath=False)
-        return (time.monotonic() - started) / worlds.n
+        team = {"team": load_team(self.folder, self.training.scenario)}
+        drive = partial(evaluate, agents=team, scenario=self.training.scenario, aftermath=False)
+        return Timed.each_s(sample.worlds, drive)
 
 
 class Timed(NamedTuple):
@@ -485,6 +481,14 @@ class Timed(NamedTuple):
         recipe = self.job.training.recipe
         times = recipe.total_steps // self.job.per_update // recipe.evaluation.every_updates + 2
         return steps * self.decision_s + steps / recipe.total_steps * times * recipe.evaluation.worlds * self.world_s
+
+    @staticmethod
+    def each_s(worlds: Worlds, work: Callable[[Worlds], object]) -> float:
+        """Seconds per world of some work, which one world has done before: it compiles."""
+        work(worlds.take([0]))
+        started = time.monotonic()
+        work(worlds)
+        return (time.monotonic() - started) / worlds.n
 
     @staticmethod
     def in_words(seconds: float) -> str:

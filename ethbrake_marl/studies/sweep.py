@@ -903,9 +903,8 @@ class TuningPlan:
                     else:
                         study.enqueue(own)
                 say(note)
-                yield from (self._job(study, kept, number) for number in begun)
-                for _ in range(total - len(known)):
-                    yield self._job(study, kept, study.ask())
+                yield from (self._job(kept, number) for number in begun)
+                yield from (self._job(kept, study.ask()) for _ in range(total - len(known)))
 
             def note(attempt: Attempt) -> None:
                 """Tell the study how an attempt at a trial has ended."""
@@ -945,20 +944,9 @@ class TuningPlan:
         counts = Counter[str](trial.state for trial in found)
         return StudyResult(path / TRIAL_TABLE, dict(counts), not whole, study.best())
 
-    def _job(self, study: TuningStudy, folder: JobFolder, number: int) -> Job:
-        name, known = f"{number:04d}", study.trials()
-        try:
-            training = self.training(known[number].values)
-        except InvalidInput as error:
-            return Job(name, refuse_trial, (str(error),))
-        study.running(number).set_user_attr(_HASH, training.identity)
-        for other in known:
-            if other.state == "finished" and other.identity == training.identity:
-                return Job(name, repeat_end, (False, other.results))
-        noted = _texts_of({**self.file.settings, **known[number].values})
-        job = TrainingJob(training, folder.path.absolute() / TRIALS / name, noted)
-        where = (study.journal, study.identity, study.file)
-        return Job(name, do_trial, (job, where, number, self.updates(training.recipe), folder.log(name)))
+    def _job(self, folder: JobFolder, number: int) -> Job:
+        name = f"{number:04d}"
+        return Job(name, do_trial, (self, folder.path.absolute(), number, folder.log(name)))
 
     def best_recipe(self, values: Values, file: Path, source: str) -> str:
         """The text of a recipe that trains what the trial with these values trained, named as its file.
@@ -1050,20 +1038,19 @@ class TuningStudy:
 
     def __init__(self, journal: Path, identity: str, file: TuningFile) -> None:
         with naming_extras():
-            import optuna
-        from optuna.pruners import NopPruner, PercentilePruner
-        from optuna.storages import JournalStorage
-        from optuna.storages.journal import JournalFileBackend
-
+            import optuna.storages.journal
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        self.journal, self.identity, self.file = journal, identity, file
-        pruner: BasePruner = NopPruner()
+        self.journal, self.file, self._optuna = journal, file, optuna
+        pruner: BasePruner = optuna.pruners.NopPruner()
         if file.prune is not None:
             few, early = file.prune.after_trials, file.prune.after_times
-            pruner = PercentilePruner(100.0 * file.prune.keep, n_startup_trials=few, n_warmup_steps=early)
+            pruner = optuna.pruners.PercentilePruner(
+                100.0 * file.prune.keep, n_startup_trials=few, n_warmup_steps=early
+            )
         try:
+            backend = optuna.storages.journal.JournalFileBackend(str(journal))
             self._study = optuna.create_study(
-                storage=JournalStorage(JournalFileBackend(str(journal))),
+                storage=optuna.storages.JournalStorage(backend),
                 study_name=f"ethbrake-{identity[:_DIGITS]}",
                 pruner=pruner,
                 direction="minimize",
@@ -1083,14 +1070,12 @@ class TuningStudy:
 
     def ask(self) -> int:
         """Propose a trial, and give its number."""
-        from optuna.samplers import RandomSampler, TPESampler
-
-        trial, asked = self._study.ask(), self.file.sampler
+        trial, asked, samplers = self._study.ask(), self.file.sampler, self._optuna.samplers
         seed = int(np.random.SeedSequence([asked.seed, trial.number]).generate_state(1)[0])
         if asked.name == "random":
-            self._study.sampler = RandomSampler(seed=seed)
+            self._study.sampler = samplers.RandomSampler(seed=seed)
         else:
-            self._study.sampler = TPESampler(seed=seed, n_startup_trials=asked.random_trials)
+            self._study.sampler = samplers.TPESampler(seed=seed, n_startup_trials=asked.random_trials)
         for key, dimension in self.file.search.items():
             trial._suggest(key, dimension.distribution())  # what suggest_float and its like call
         return trial.number
@@ -1109,18 +1094,14 @@ class TuningStudy:
         self, number: int, state: State, results: Sequence[str] = (), harm: float | None = None, reason: str = ""
     ) -> None:
         """End a trial that is finished, with its harm, that was pruned, or that failed, with the reason."""
-        from optuna.trial import TrialState
-
         noted = (_REASON, reason) if state == "failed" else (_RESULTS, json.dumps(list(results)))
         self.running(number).set_user_attr(*noted)
         names = {told: name for name, told in _STATES.items()}
-        self._study.tell(number, harm if state == "finished" else None, TrialState[names[state]])
+        self._study.tell(number, harm if state == "finished" else None, self._optuna.trial.TrialState[names[state]])
 
     def running(self, number: int) -> Trial:
         """A trial that another call, or another process, has asked for."""
-        import optuna
-
-        return optuna.Trial(self._study, self._frozen(number)._trial_id)
+        return self._optuna.Trial(self._study, self._frozen(number)._trial_id)
 
     def _frozen(self, number: int) -> FrozenTrial:
         return next(each for each in self._study.get_trials(deepcopy=False) if each.number == number)
@@ -1144,24 +1125,30 @@ class TuningStudy:
 PRUNED = "pruned: too much harm for so many decisions"
 
 
-def do_trial(
-    job: TrainingJob, where: tuple[Path, str, TuningFile], number: int, updates: int, log: Path
-) -> dict[str, Any] | None:
+def do_trial(plan: TuningPlan, path: Path, number: int, log: Path) -> dict[str, Any] | None:
     """Train to the end, or to where the trial is pruned: ``pruned`` and ``results``, the values of ``RESULTS``.
 
-    None where it was stopped from outside. Raises what ``reach_results`` raises.
+    Where the same training has come to its end before, that end, at once; None where it was stopped from outside.
+    Raises ``InvalidInput`` for values that do not go together, and what ``reach_results`` raises.
 
     Args:
-        job: the training.
-        where: its ``TuningStudy``.
+        plan: of the tuning.
+        path: its folder.
         number: of the trial.
-        updates: of a whole training.
         log: see ``reach_results``.
 
     """
-    study = TuningStudy(*where)
-    times, pruned = study.file.measure.times, False
-    harm = HARM_METRIC[job.training.recipe.reward.harm_count]
+    study = plan.study(path)
+    known = study.trials()
+    training = plan.training(known[number].values)
+    study.running(number).set_user_attr(_HASH, training.identity)
+    for other in known:
+        if other.state == "finished" and other.identity == training.identity:
+            return {"pruned": False, "results": list(other.results)}
+    noted = _texts_of({**plan.file.settings, **known[number].values})
+    job = TrainingJob(training, path / TRIALS / f"{number:04d}", noted)
+    times, updates, pruned = plan.file.measure.times, plan.updates(training.recipe), False
+    harm = HARM_METRIC[training.recipe.reward.harm_count]
 
     def judge(evaluation: Mapping[str, float]) -> str | None:
         nonlocal pruned
@@ -1171,19 +1158,9 @@ def do_trial(
         return PRUNED if pruned else None
 
     if RunDirectory(job.folder).progress.is_file() and study.running(number).should_prune():
-        return repeat_end(True, _read_results(job))  # it was killed before it could say so
+        return {"pruned": True, "results": _read_results(job)}  # it was killed before it could say so
     found = reach_results(job, log, judge)
     if found is None and not pruned:
         return None
     log.unlink(missing_ok=True)
-    return repeat_end(pruned, found or _read_results(job))
-
-
-def repeat_end(pruned: bool, results: Sequence[str]) -> dict[str, Any]:
-    """The end of a trial; of one of which the same training has ended before, at once."""
-    return {"pruned": pruned, "results": list(results)}
-
-
-def refuse_trial(reason: str) -> None:
-    """A trial whose values do not go together; raises ``InvalidInput``."""
-    raise InvalidInput(reason)
+    return {"pruned": pruned, "results": found or _read_results(job)}
