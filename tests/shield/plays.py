@@ -7,6 +7,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import pytest
 from pettingzoo.utils import BaseParallelWrapper
 
 from ethbrake_marl.agents.rollout import episode_engine
@@ -232,11 +233,16 @@ class Sb3(Vector):
         self.bad = [
             lambda: self.env.step(self._one_bad(np.nan)),
             lambda: self.env.step(np.zeros((self.env.num_envs, 2))),
-            lambda: self.env.env_method("no_such_method"),
+            self._missing,
             self._options,
         ]
         Play._watched(self)
         self.env.reset()
+
+    def _missing(self) -> None:
+        with pytest.raises(AttributeError, match="no_such_method"):
+            self.env.env_method("no_such_method")
+        raise Failure
 
     def _options(self) -> None:
         self.env.set_options({"initial_state": {"gaps_m": [1], "speeds_mps": [1]}})
