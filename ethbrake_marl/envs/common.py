@@ -19,7 +19,7 @@ from ethbrake_marl.engine import Engine, Step
 from ethbrake_marl.errors import InvalidInput, check_one_learner, check_whole_number
 from ethbrake_marl.harm import front_share
 from ethbrake_marl.observations import Observation, ObservationSpec, choose_observation
-from ethbrake_marl.physics import Bools, Floats, Ints, Packed, Worlds, age_s, columns, compiled
+from ethbrake_marl.physics import Bools, Floats, Ints, Messages, Packed, Worlds, columns, compiled
 from ethbrake_marl.rewards import Reward, RewardParams
 from ethbrake_marl.scenario import (
     QUANTITY,
@@ -342,7 +342,7 @@ def report(engine: Engine, step: Step | None = None, rows: Ints | None = None) -
     known = shown.known_from_s if shown.has_news else None
     cost, terms = _of_the_step(engine, step, rows)
     time_s, messages = state[:, shown.column.time], params[:, shown.column.messages :]
-    age = age_s(time_s, messages, N) if shown.has_messages else None
+    age = Messages(messages, N).age_s(time_s) if shown.has_messages else None
     return Report(values, cost, terms, engine.roster.seed, world, known, age)
 
 

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
         QuantityRule as QuantityRule,
         Sample as Sample,
         ScriptSpec as ScriptSpec,
-        Texts as Texts,
         Uniform as Uniform,
         initial_state_worlds as initial_state_worlds,
         make_sample as make_sample,
@@ -52,10 +51,6 @@ if TYPE_CHECKING:
         scenario_path as scenario_path,
         shipped_folder as shipped_folder,
     )
-    from ethbrake_marl.scenario.v2x import (
-        CHANNELS as CHANNELS,
-        hidden_from as hidden_from,
-        register_preset as register_preset,
-    )
+    from ethbrake_marl.scenario.v2x import CHANNELS as CHANNELS, register_preset as register_preset
 else:
     __getattr__ = front_door(__name__, __file__)

@@ -15,7 +15,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
-from ethbrake_marl.physics import Floats, Worlds, age_s, make_worlds
+from ethbrake_marl.physics import Floats, Messages, Worlds, make_worlds
 
 MOST_NEIGHBOURS = 64  # on each side
 
@@ -155,7 +155,7 @@ class RegisteredFeature:
 
 def age(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
     """Time since the sample that was last told of it, [n] s; 0 where the present is known."""
-    told = age_s(worlds.time_s, worlds.messages, worlds.N)[:, vehicle, neighbour]
+    told = Messages.of(worlds).age_s(worlds.time_s)[:, vehicle, neighbour]
     return np.where(np.isfinite(told), told, 0.0)
 
 

@@ -398,7 +398,7 @@ def values(quantity: float | Uniform | LogUniform | Normal | Choice, u: Floats) 
 
 # A part of a list of worlds: the worlds, where they stand in the list, and what they were drawn as.
 
-Texts = NDArray[np.str_]
+_Texts = NDArray[np.str_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -415,8 +415,8 @@ class Sample:
     worlds: Worlds  # at t = 0
     index: Ints  # [n] number of each world in the list of its seed
     rejected: int  # draws refused because of an early impact
-    types: Texts | None = None  # [n, N] type of every vehicle, where a scenario has types; empty: it has none
-    scenarios: Texts | None = None  # [n] the scenario of a mixture that each world was drawn from
+    types: _Texts | None = None  # [n, N] type of every vehicle, where a scenario has types; empty: it has none
+    scenarios: _Texts | None = None  # [n] the scenario of a mixture that each world was drawn from
 
     def __repr__(self) -> str:
         numbers = f"numbers {self.index.min()} to {self.index.max()}" if len(self.index) else "no numbers"
@@ -433,7 +433,7 @@ class Sample:
         """The worlds of all parts in the order of their numbers; all have types, or scenarios, or none has."""
         index = np.concatenate([part.index for part in parts])
         order = np.argsort(index)
-        joined: dict[str, Texts] = {}
+        joined: dict[str, _Texts] = {}
         for name in ("types", "scenarios"):
             given = [getattr(part, name) for part in parts if getattr(part, name) is not None]
             joined |= {name: np.concatenate(given)[order]} if given else {}
@@ -441,7 +441,7 @@ class Sample:
         return Sample(worlds, index[order], rejected, **joined)
 
     @property
-    def kinds(self) -> dict[str, Texts]:
+    def kinds(self) -> dict[str, _Texts]:
         """``scenario`` of a mixture and ``vehicle_K_type``, each [n], where the worlds were drawn with such."""
         columns = {} if self.scenarios is None else {"scenario": self.scenarios}
         types = () if self.types is None else self.types.T
