@@ -18,18 +18,10 @@ from ethbrake_marl.agents import script_agents
 from ethbrake_marl.engine import Engine, Step
 from ethbrake_marl.errors import InvalidInput, check_one_learner, check_whole_number
 from ethbrake_marl.harm import front_share
-from ethbrake_marl.observations import Observation, ObservationSpec, choose_observation
+from ethbrake_marl.observations import Feature, Observation, ObservationSpec, choose_observation
 from ethbrake_marl.physics import Bools, Floats, Ints, Messages, Packed, Worlds, columns, compiled
 from ethbrake_marl.rewards import Reward, RewardParams
-from ethbrake_marl.scenario import (
-    QUANTITY,
-    Feature,
-    Sample,
-    Scenario,
-    initial_state_worlds,
-    load_scenario,
-    read_scenario,
-)
+from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, initial_state_worlds, load_scenario, read_scenario
 
 AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping: what a file would say
 

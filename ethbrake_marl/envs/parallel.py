@@ -28,9 +28,10 @@ from ethbrake_marl.envs.common import (
 )
 from ethbrake_marl.envs.drawing import Viewer
 from ethbrake_marl.errors import InvalidInput, check_whole_number, unknown_name
-from ethbrake_marl.observations import Observation, Observations, full_state, state_features
+from ethbrake_marl.observations import Observation, Observations
 from ethbrake_marl.physics import Ints
 from ethbrake_marl.rewards import Reward
+from ethbrake_marl.scenario import full_state, state_features
 
 # PettingZoo's interface with agents acting in turn (AEC), around a parallel one.
 

@@ -27,10 +27,10 @@ from ethbrake_marl.envs.common import (
     warn_of_unknown,
 )
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.observations import Appended, Observation, Observations, full_state, row_features
+from ethbrake_marl.observations import Observation, Observations
 from ethbrake_marl.physics import Bools, Ints, Packed, Worlds
 from ethbrake_marl.rewards import Reward
-from ethbrake_marl.scenario import initial_state_worlds
+from ethbrake_marl.scenario import Appended, full_state, initial_state_worlds, row_features
 
 Rewards = NDArray[np.float32]
 

@@ -54,8 +54,9 @@ class ShovedFront:
         if command is None:
             return None
         columns = (worlds.speeds_mps[:, 0], command, vehicles.latency_s[:, 0], vehicles.speed_limit_mps[:, 0])
-        of_first = (np.array(column, np.float64)[:, np.newaxis] for column in columns)
-        return cls(worlds, move_on(*of_first, np.full((worlds.n, 1), task.scenario.horizon_s))[1][:, 0])
+        speed, command, latency, limit = (np.array(column, np.float64)[:, np.newaxis] for column in columns)
+        _, way = move_on(speed, command, latency, limit, np.full(speed.shape, task.scenario.horizon_s))
+        return cls(worlds, way[:, 0])
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
         """Add the way of one step, by a post ahead: the world's own obstacle, or one out of reach."""

@@ -27,9 +27,10 @@ from ethbrake_marl.files.yaml import (
     refuse,
     schema_lines,
 )
+from ethbrake_marl.observations import ListedFeatures, listed_features
 from ethbrake_marl.policies import Activation, NetworkSpec
 from ethbrake_marl.rewards import RewardParams, registered_terms, setting_names
-from ethbrake_marl.scenario import ListedFeatures, Scenario, check_file_name, listed_features, shipped_folder
+from ethbrake_marl.scenario import Scenario, check_file_name, shipped_folder
 
 WORDS = ("title", "description", "source")  # fields that tell about a recipe and change nothing
 

@@ -381,7 +381,8 @@ def advance(
 def _advance_part(arrays: tuple[NDArray[Any], ...], capacity: int, part: slice) -> tuple[Floats, int, int]:
     """Advance the worlds of ``part`` in place: the impacts that fit, the number of all, and the part's first world."""
     rows = np.empty((capacity, LISTED.WIDTH))
-    return rows, advance_rows(*(array[part] for array in arrays), rows), part.start
+    state, params, command, until, failed = (array[part] for array in arrays)
+    return rows, advance_rows(state, params, command, until, failed, rows), part.start
 
 
 def _shaped(name: str, value: ArrayLike | None, shape: tuple[int, ...]) -> Floats:

@@ -153,7 +153,7 @@ class Messages(NamedTuple):
     @property
     def periodic(self) -> Bools:
         """In which worlds messages go on after the first one, so that what is known grows old, [n]."""
-        return (self.columns[:, CHANNEL.PERIOD : CHANNEL.PERIOD + 1] > 0.0).any(axis=1)
+        return np.asarray((self.columns[:, CHANNEL.PERIOD : CHANNEL.PERIOD + 1] > 0.0).any(axis=1))
 
     def newest_told(self, vehicle: int) -> Told:
         """What ``vehicle`` was last told, in worlds with columns of messages."""

@@ -6,21 +6,13 @@ from ethbrake_marl.doors import front_door
 
 if TYPE_CHECKING:
     from ethbrake_marl.files.yaml import parse_yaml as parse_yaml
-    from ethbrake_marl.scenario.features import (
-        CONTACT_COMMANDS as CONTACT_COMMANDS,
-        CONTACT_SIDES as CONTACT_SIDES,
-        FEATURES as FEATURES,
-        GROUPS as GROUPS,
-        MOST_NEIGHBOURS as MOST_NEIGHBOURS,
-        Feature as Feature,
-        ListedFeatures as ListedFeatures,
-        Of as Of,
-        RegisteredFeature as RegisteredFeature,
-        feature_named as feature_named,
-        listed_features as listed_features,
-        register_feature as register_feature,
-        registered_in as registered_in,
-        side_of as side_of,
+    from ethbrake_marl.scenario.observed import (
+        Appended as Appended,
+        appending as appending,
+        full_state as full_state,
+        observation_for as observation_for,
+        row_features as row_features,
+        state_features as state_features,
     )
     from ethbrake_marl.scenario.sampling import (
         LEARNER as LEARNER,

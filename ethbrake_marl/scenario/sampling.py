@@ -35,6 +35,7 @@ from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.files.store import read_plain
 from ethbrake_marl.files.yaml import UNITS, UNSHOWN, FileModel, YamlPath, parse_numeral, refuse, suggestion
 from ethbrake_marl.harm import ObjectiveName, objectives_of
+from ethbrake_marl.observations import ListedFeatures, listed_features
 from ethbrake_marl.physics import (
     Bools,
     Floats,
@@ -48,7 +49,6 @@ from ethbrake_marl.physics import (
     normal_quantile_each,
     stopping_distances,
 )
-from ethbrake_marl.scenario.features import ListedFeatures, listed_features
 from ethbrake_marl.scenario.v2x import V2X
 
 BLOCK = 8  # uniform numbers per vehicle and world; a multiple of 4, the numbers of one Philox counter

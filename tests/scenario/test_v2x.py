@@ -12,11 +12,18 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine import Engine, engine_snapshot, restore_engine
 from ethbrake_marl.envs.parallel import parallel_env
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.observations import full_state, observation_for, observe, state_features
+from ethbrake_marl.observations import observe
 from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.physics.batch import Packed
 from ethbrake_marl.physics.kernel import CLOCK
-from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario
+from ethbrake_marl.scenario import (
+    Scenario,
+    full_state,
+    initial_state_worlds,
+    load_scenario,
+    observation_for,
+    state_features,
+)
 from ethbrake_marl.scenario.v2x import CHANNELS, PER_LINK, PRESETS, V2X, Channel, burst_periods, link_delays
 from ethbrake_marl.search import identities
 
