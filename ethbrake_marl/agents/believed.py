@@ -21,7 +21,7 @@ from ethbrake_marl.agents.rollout import script_agents
 from ethbrake_marl.engine import Memory, Script, ask_script, begin_script, renew_memory
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Bools, Floats, Messages, Vehicles, Worlds, move_on
-from ethbrake_marl.scenario import Scenario, make_sample
+from ethbrake_marl.scenario import Scenario
 
 TOUCHING_M = 1e-9  # a gap below this is a contact: places are told with rounding
 OF_OTHERS = ("place", "speeds_mps", "braking_capacity_mps2", "mass_t", "latency_s", "news_s")  # what may be uncertain
@@ -137,7 +137,7 @@ def ranges_of(scenario: Scenario, vehicle: int) -> Ranges:
             f"scenario {scenario.name!r}: is a mixture, and a vehicle that is not known could be of any of {names};"
             " believed agents need one of these"
         )
-    world = make_sample(scenario, lambda width, of: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
+    world = scenario.sample_by(lambda width, of: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
     bounds = {key: np.array(scenario.bounds(key)).T for key in ("gaps_m", *OF_OTHERS[1:5])}
     named = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "speed_limit_mps")
     middle = {

@@ -21,7 +21,7 @@ from ethbrake_marl.harm import front_share
 from ethbrake_marl.observations import Feature, Observation, ObservationSpec, choose_observation
 from ethbrake_marl.physics import Bools, Floats, Ints, Messages, Packed, Worlds, columns, compiled
 from ethbrake_marl.rewards import Reward, RewardParams
-from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, initial_state_worlds, load_scenario, read_scenario
+from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, load_scenario
 
 AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping: what a file would say
 
@@ -109,8 +109,6 @@ def learner_actions(engine: Engine, actions: Mapping[str, Any]) -> Floats | dict
 
 def resolve_scenario(scenario: AnyScenario) -> Scenario:
     """The scenario of a shipped name, of a YAML file, of what such a file would say, or itself."""
-    if isinstance(scenario, Mapping):
-        return read_scenario(scenario)
     return scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
 
 
@@ -147,7 +145,7 @@ def fresh_seed() -> int:
 def restart(engine: Engine, seed: int | None, options: Mapping[str, Any] | None) -> None:
     """Start new episodes in all worlds: the stream of ``seed`` from its start, or where the stream stands.
 
-    ``options["initial_state"]`` (see ``scenario.initial_state_worlds``) is the start of every world instead;
+    ``options["initial_state"]`` (see ``Scenario.worlds_from_state``) is the start of every world instead;
     ``options["listed_world"] = {"seed": 7, "number": 3}`` starts in that world of the list on which agents are
     evaluated, a batch in that one and those after it. With autoreset, later episodes come from the stream. Other
     options warn with ``UnknownResetOption`` and are ignored. Raises ``InvalidInput``, with nothing changed, for a seed
@@ -167,7 +165,7 @@ def _wanted_worlds(engine: Engine, options: Mapping[str, Any]) -> Worlds | None:
     if LISTED_WORLD not in options:
         if INITIAL_STATE not in options:
             return None
-        return initial_state_worlds(options[INITIAL_STATE], engine.scenario).take(np.zeros(engine.n, np.int64))
+        return engine.scenario.worlds_from_state(options[INITIAL_STATE]).take(np.zeros(engine.n, np.int64))
     if INITIAL_STATE in options:
         raise InvalidInput(f"reset: {INITIAL_STATE} and {LISTED_WORLD} are both given; an episode has one start")
     wanted = options[LISTED_WORLD]

@@ -478,7 +478,7 @@ def recipe_path(name_or_path: str | Path) -> Path:
 
 def shipped_recipes() -> dict[str, Path]:
     """Name -> file of every recipe that comes with the package: the checkout's ``train/``, or the installed copy."""
-    return {file.stem: file for file in sorted(shipped_folder("train", "recipes").glob("*.yaml"))}
+    return {file.stem: file for file in sorted(shipped_folder("train").glob("*.yaml"))}
 
 
 def _checked(source: Path | Document) -> TrainingRecipe:

@@ -973,6 +973,156 @@ class ScenarioFields(FileModel):
         assert farthest is not None
         return float(farthest[0])
 
+    def sample(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
+        """Worlds ``first`` to ``first + n - 1`` of the endless list that belongs to ``seed``.
+
+        World k is the same bits whatever ``n`` and ``first`` are. The channels ``"list"`` (evaluation) and
+        ``"training"`` are independent of each other. Raises ``InvalidInput`` for a negative seed or ``first``,
+        ``n < 1``, or when early impacts are rejected and (almost) every draw has one.
+
+        World k of a mixture is drawn from one member, by weight, and is then that member's own world k under the same
+        seed, bit for bit. So results on a mixture can be compared with results on its members, world by world.
+        """
+        for name, value, least in (("n", n, 1), ("seed", seed, 0), ("first", first, 0)):
+            check_whole_number(f"sample: {name}", value, least)
+        if not n <= MOST_AT_ONCE:
+            raise InvalidInput(f"sample: n = {n}: at most {MOST_AT_ONCE:,} worlds at once; draw a longer list in parts")
+        if not int(first) + int(n) <= _MOST_WORLDS:
+            raise InvalidInput(f"sample: first = {first!r}: a list has {_MOST_WORLDS} worlds")
+        if channel not in CHANNELS:
+            raise InvalidInput(f"sample: channel {channel!r}: must be one of {', '.join(CHANNELS)}")
+        if self.mixture is None:
+            return _draw_numbers(self, np.arange(first, first + n, dtype=np.int64), int(seed), channel)
+        cumulative = np.cumsum([member.weight for member in self.mixture])
+        u = uniform_numbers(int(seed), channel, 0, first, n, MIXTURE_WIDTH, of=MIXTURE)[:, 0]
+        chosen = np.searchsorted(cumulative / cumulative[-1], u, side="right")
+        typed = any(member.vehicle_types is not None for member in self.members)
+        parts = []
+        for k, member in enumerate(self.members):
+            index = first + np.flatnonzero(chosen == k)
+            if len(index):
+                drawn = _draw_numbers(member, index, int(seed), channel)
+                no_type = np.full((len(index), self.vehicles), "") if typed and drawn.types is None else drawn.types
+                parts.append(replace(drawn, types=no_type, scenarios=np.full(len(index), member.name)))
+        return Sample.join(parts, sum(part.rejected for part in parts))
+
+    def sample_by(self, numbers: Callable[[int, tuple[int, ...]], Floats], index: Ints) -> Sample:
+        """The worlds of ``numbers(width, of)``, uniform numbers [n, width] of a stream, ``()`` the first; all of them.
+
+        An early impact is not refused here.
+        """
+        line, typed = self.types_of_line, None
+        if line is not None:
+            u = numbers(PER_TYPE * self.vehicles, TYPES)
+            typed = line.draw(u.reshape(len(u), self.vehicles, PER_TYPE))
+        drawn = drawn_quantities(self, numbers(BLOCK * self.vehicles, ()), typed)
+        obstacle_gap_m = obstacle_gap(
+            self, drawn, lambda key: values(self.quantities(key)[0], numbers(OBSTACLE_WIDTH, OBSTACLE)[:, 0])
+        )
+        restitution, gaps, speeds = drawn.pop("restitution")[:, 0], drawn.pop("gaps_m"), drawn.pop("speeds_mps")
+        worlds = make_worlds(gaps, speeds, restitution=restitution, obstacle_gap_m=obstacle_gap_m, **drawn)
+        if self.v2x.by_link:
+            u = numbers(self.v2x.width(self.vehicles), V2X_NEWS)
+            periodic = self.v2x.channel.persistence == "periodic"
+            key = numbers(KEY_WIDTH, LATER_LOSSES)[:, 0] if periodic else np.zeros(len(u))
+            worlds = self.v2x.with_channel(worlds, u, key, self.time_step_s)
+        return Sample(worlds, index, 0, None if typed is None or line is None else np.array(line.names)[typed[0]])
+
+    @property
+    def table_columns(self) -> dict[str, Entry]:
+        """Columns that a table of initial states may have for this scenario: ``gap_1_m``, ``speed_1_mps``, ..."""
+        return {
+            rule.column_of(index): (field, index)
+            for field, rule in _quantities(self).items()
+            for index in range(rule.count(self.vehicles))
+        }
+
+    def read_worlds(self, path: str | Path) -> Worlds:
+        """Read worlds from a CSV file with a header line; columns as in ``worlds_from_table``.
+
+        Raises ``InvalidInput`` with file, line and column for an unknown, repeated or missing column, a value that is
+        not a number or out of range, a row of another length, a file without rows, or one beyond ``SIZE_LIMIT``.
+        """
+        file = Path(path)
+        header, rows, lines = _read_csv(file)
+        entries = _known_columns(header, self, f"{file}, line 1")
+        table = np.empty((len(rows), len(header)))
+        for r, row in enumerate(rows):
+            if len(row) != len(header):
+                right = f"the header has {len(header)} columns"
+                raise InvalidInput(f"{file}, line {lines[r]}: {len(row)} values, but {right}")
+            for c, text in enumerate(row):
+                number = parse_numeral(text.strip())
+                if number is None:
+                    raise InvalidInput(f"{file}, line {lines[r]}, column {header[c]}: {text!r:.60} is not a number")
+                table[r, c] = number
+        given = {entry: table[:, c] for c, entry in enumerate(entries)}
+        return _worlds(given, self, _Naming(str(file), "file", lines))
+
+    def worlds_from_table(self, columns: Mapping[str, ArrayLike]) -> Worlds:
+        """Worlds from columns of equal length n: ``gap_1_m`` ..., ``speed_1_mps`` ..., and optionally the others.
+
+        Optional: ``braking_capacity_1_mps2``, ``driving_capacity_1_mps2``, ``latency_1_s``, ``mass_1_t``,
+        ``speed_limit_1_mps`` and so on for each vehicle, ``restitution``, and ``obstacle_gap_m`` where the scenario has
+        it. What is left out comes from the scenario, where it must be a fixed number. Raises ``InvalidInput`` naming
+        the column and the row (from 0).
+        """
+        entries = _known_columns(list(columns), self, "initial states")
+        given = {
+            entry: _numbers(f"initial states: {name}", column)
+            for entry, (name, column) in zip(entries, columns.items(), strict=True)
+        }
+        shapes = {column.shape for column in given.values()}
+        if len(shapes) != 1 or len(next(iter(shapes))) != 1:
+            lengths = ", ".join(f"{name} {list(np.shape(column))}" for name, column in columns.items())
+            raise InvalidInput(f"initial states: columns must be lists of one and the same length, not {lengths}")
+        return _worlds(given, self, _Naming("initial states", "table"))
+
+    def worlds_from_state(self, initial_state: Mapping[str, Any]) -> Worlds:
+        """The one world of ``{"gaps_m": [7, 7], "speeds_mps": [20, 18, 20], ...}``; keys are a scenario's quantities.
+
+        A single number stands for every vehicle. What is left out comes from the scenario, where it must be a fixed
+        number. Raises ``InvalidInput`` naming the key and the entry.
+        """
+        if not isinstance(initial_state, Mapping):
+            raise InvalidInput(f"initial_state = {initial_state!r}: must be a mapping such as {{'gaps_m': [7, 7]}}")
+        given: dict[Entry, Floats] = {}
+        known = _quantities(self)
+        for field, value in initial_state.items():
+            if field not in known:
+                if field in QUANTITY.optional:
+                    raise InvalidInput(f"initial_state: {field} is not of this scenario: {self.name!r} has no {field}")
+                hint = suggestion(str(field), known) or f"known: {', '.join(known)}"
+                raise InvalidInput(f"initial_state: unknown key {field!r}; {hint}")
+            count = known[field].count(self.vehicles)
+            numbers = _numbers(f"initial_state: {field}", value)
+            if numbers.shape not in ((), (count,)):
+                several = f"{self.vehicles} vehicles need {count} numbers, or one for all"
+                right = "must be one number" if known[field].per == "world" else several
+                raise InvalidInput(f"initial_state: {field} has shape {list(numbers.shape)}; {right}")
+            for index, number in enumerate(np.broadcast_to(numbers, (count,))):
+                given[field, index] = np.array([number])
+        return _worlds(given, self, _Naming("initial_state", "state"))
+
+    def ranges(self) -> Ranges:
+        """Every number that the scenario draws.
+
+        Raises ``InvalidInput`` for a scenario that draws nothing, a mixture, and a channel whose delays are drawn:
+        worlds of these cannot be given one by one.
+        """
+        if self.members:
+            members = ", ".join(member.name for member in self.members)
+            raise InvalidInput(f"scenario {self.name!r}: is a mixture; take one of its scenarios: {members}")
+        if self.v2x.by_link:
+            raise InvalidInput(
+                f"scenario {self.name!r}: v2x: draws delays and losses, which no table of worlds holds; give v2x: paper"
+                " (--set v2x=paper)"
+            )
+        found = {**_of_types(self), **_of_quantities(self)}
+        if not found:
+            raise InvalidInput(f"scenario {self.name!r}: draws nothing: all its worlds are the same")
+        return Ranges(self, tuple(found), tuple(found.values()))
+
 
 # From what a scenario declares, or a table gives, to worlds.
 
@@ -1073,36 +1223,6 @@ def uniform_numbers(
     return upper * 2.0**-53
 
 
-def draw(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
-    """Worlds ``first`` to ``first + n - 1`` of the scenario's list; see ``Scenario.sample``.
-
-    World k of a mixture is drawn from one member, by weight, and is then that member's own world k under the same seed,
-    bit for bit. So results on a mixture can be compared with results on its members, world by world.
-    """
-    for name, value, least in (("n", n, 1), ("seed", seed, 0), ("first", first, 0)):
-        check_whole_number(f"sample: {name}", value, least)
-    if not n <= MOST_AT_ONCE:
-        raise InvalidInput(f"sample: n = {n}: at most {MOST_AT_ONCE:,} worlds at once; draw a longer list in parts")
-    if not int(first) + int(n) <= _MOST_WORLDS:
-        raise InvalidInput(f"sample: first = {first!r}: a list has {_MOST_WORLDS} worlds")
-    if channel not in CHANNELS:
-        raise InvalidInput(f"sample: channel {channel!r}: must be one of {', '.join(CHANNELS)}")
-    if scenario.mixture is None:
-        return _draw_numbers(scenario, np.arange(first, first + n, dtype=np.int64), int(seed), channel)
-    cumulative = np.cumsum([member.weight for member in scenario.mixture])
-    u = uniform_numbers(int(seed), channel, 0, first, n, MIXTURE_WIDTH, of=MIXTURE)[:, 0]
-    chosen = np.searchsorted(cumulative / cumulative[-1], u, side="right")
-    typed = any(member.vehicle_types is not None for member in scenario.members)
-    parts = []
-    for k, member in enumerate(scenario.members):
-        index = first + np.flatnonzero(chosen == k)
-        if len(index):
-            drawn = _draw_numbers(member, index, int(seed), channel)
-            no_type = np.full((len(index), scenario.vehicles), "") if typed and drawn.types is None else drawn.types
-            parts.append(replace(drawn, types=no_type, scenarios=np.full(len(index), member.name)))
-    return Sample.join(parts, sum(part.rejected for part in parts))
-
-
 def _draw_numbers(scenario: ScenarioFields, index: Ints, seed: int, channel: Channel) -> Sample:
     """The worlds with these numbers (ascending) of the scenario's list."""
     drawn = _draw(scenario, seed, channel, 0, index)
@@ -1176,29 +1296,7 @@ def _draw(scenario: ScenarioFields, seed: int, channel: Channel, attempt: int, i
         u = uniform_numbers(seed, channel, attempt, first, last - first + 1, width, of=of)
         return u if len(u) == len(index) else u[index - first]
 
-    return make_sample(scenario, numbers, index)
-
-
-def make_sample(scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...]], Floats], index: Ints) -> Sample:
-    """The worlds that ``numbers(width, of)`` describe: uniform numbers [n, width] of a stream, ``()`` the first one."""
-    line, typed = scenario.types_of_line, None
-    if line is not None:
-        u = numbers(PER_TYPE * scenario.vehicles, TYPES)
-        typed = line.draw(u.reshape(len(u), scenario.vehicles, PER_TYPE))
-    drawn = drawn_quantities(scenario, numbers(BLOCK * scenario.vehicles, ()), typed)
-    obstacle_gap_m = obstacle_gap(
-        scenario, drawn, lambda key: values(scenario.quantities(key)[0], numbers(OBSTACLE_WIDTH, OBSTACLE)[:, 0])
-    )
-    restitution = drawn.pop("restitution")[:, 0]
-    worlds = make_worlds(
-        drawn.pop("gaps_m"), drawn.pop("speeds_mps"), restitution=restitution, obstacle_gap_m=obstacle_gap_m, **drawn
-    )
-    if scenario.v2x.by_link:
-        u = numbers(scenario.v2x.width(scenario.vehicles), V2X_NEWS)
-        periodic = scenario.v2x.channel.persistence == "periodic"
-        key = numbers(KEY_WIDTH, LATER_LOSSES)[:, 0] if periodic else np.zeros(len(u))
-        worlds = scenario.v2x.with_channel(worlds, u, key, scenario.time_step_s)
-    return Sample(worlds, index, 0, None if typed is None or line is None else np.array(line.names)[typed[0]])
+    return scenario.sample_by(numbers, index)
 
 
 # Worlds whose initial conditions the user gives: a table (one row per world) or one state for ``reset``.
@@ -1234,84 +1332,6 @@ class _Naming:
 def _quantities(scenario: ScenarioFields) -> dict[str, QuantityRule]:
     """What a world of this scenario has."""
     return {**QUANTITY.usual, **QUANTITY.optional} if scenario.has_obstacle else QUANTITY.usual
-
-
-def table_columns(scenario: ScenarioFields) -> dict[str, Entry]:
-    """Columns that a table of initial states may have for this scenario: ``gap_1_m``, ``speed_1_mps``, ..."""
-    return {
-        rule.column_of(index): (field, index)
-        for field, rule in _quantities(scenario).items()
-        for index in range(rule.count(scenario.vehicles))
-    }
-
-
-def read_initial_states(path: str | Path, scenario: ScenarioFields) -> Worlds:
-    """Read worlds from a CSV file with a header line; columns as ``worlds_from_table``.
-
-    Raises ``InvalidInput`` with file, line and column for an unknown, repeated or missing column, a value that is
-    not a number or out of range, a row of another length, a file without rows, or one beyond ``SIZE_LIMIT``.
-    """
-    file = Path(path)
-    header, rows, lines = _read_csv(file)
-    entries = _known_columns(header, scenario, f"{file}, line 1")
-    table = np.empty((len(rows), len(header)))
-    for r, row in enumerate(rows):
-        if len(row) != len(header):
-            raise InvalidInput(f"{file}, line {lines[r]}: {len(row)} values, but the header has {len(header)} columns")
-        for c, text in enumerate(row):
-            number = parse_numeral(text.strip())
-            if number is None:
-                raise InvalidInput(f"{file}, line {lines[r]}, column {header[c]}: {text!r:.60} is not a number")
-            table[r, c] = number
-    given = {entry: table[:, c] for c, entry in enumerate(entries)}
-    return _worlds(given, scenario, _Naming(str(file), "file", lines))
-
-
-def worlds_from_table(columns: Mapping[str, ArrayLike], scenario: ScenarioFields) -> Worlds:
-    """Worlds from columns of equal length n: ``gap_1_m`` ..., ``speed_1_mps`` ..., and optionally the others.
-
-    Optional: ``braking_capacity_1_mps2``, ``driving_capacity_1_mps2``, ``latency_1_s``, ``mass_1_t``,
-    ``speed_limit_1_mps`` and so on for each vehicle, ``restitution``, and ``obstacle_gap_m`` where the scenario has it.
-    What is left out comes from the scenario, where it must be a fixed number. Raises ``InvalidInput`` naming the column
-    and the row (from 0).
-    """
-    entries = _known_columns(list(columns), scenario, "initial states")
-    given = {
-        entry: _numbers(f"initial states: {name}", column)
-        for entry, (name, column) in zip(entries, columns.items(), strict=True)
-    }
-    shapes = {column.shape for column in given.values()}
-    if len(shapes) != 1 or len(next(iter(shapes))) != 1:
-        lengths = ", ".join(f"{name} {list(np.shape(column))}" for name, column in columns.items())
-        raise InvalidInput(f"initial states: columns must be lists of one and the same length, not {lengths}")
-    return _worlds(given, scenario, _Naming("initial states", "table"))
-
-
-def initial_state_worlds(initial_state: Mapping[str, Any], scenario: ScenarioFields) -> Worlds:
-    """The one world of ``{"gaps_m": [7, 7], "speeds_mps": [20, 18, 20], ...}``; keys are a scenario's quantities.
-
-    A single number stands for every vehicle. What is left out comes from the scenario, where it must be a fixed
-    number. Raises ``InvalidInput`` naming the key and the entry.
-    """
-    if not isinstance(initial_state, Mapping):
-        raise InvalidInput(f"initial_state = {initial_state!r}: must be a mapping such as {{'gaps_m': [7, 7]}}")
-    given: dict[Entry, Floats] = {}
-    known = _quantities(scenario)
-    for field, value in initial_state.items():
-        if field not in known:
-            if field in QUANTITY.optional:
-                raise InvalidInput(f"initial_state: {field} is not of this scenario: {scenario.name!r} has no {field}")
-            hint = suggestion(str(field), known) or f"known: {', '.join(known)}"
-            raise InvalidInput(f"initial_state: unknown key {field!r}; {hint}")
-        count = known[field].count(scenario.vehicles)
-        numbers = _numbers(f"initial_state: {field}", value)
-        if numbers.shape not in ((), (count,)):
-            several = f"{scenario.vehicles} vehicles need {count} numbers, or one for all"
-            right = "must be one number" if known[field].per == "world" else several
-            raise InvalidInput(f"initial_state: {field} has shape {list(numbers.shape)}; {right}")
-        for index, number in enumerate(np.broadcast_to(numbers, (count,))):
-            given[field, index] = np.array([number])
-    return _worlds(given, scenario, _Naming("initial_state", "state"))
 
 
 def _worlds(given: Mapping[Entry, Floats], scenario: ScenarioFields, naming: _Naming) -> Worlds:
@@ -1378,7 +1398,7 @@ def _require_all(good: Bools, naming: _Naming, entry: Entry, column: Floats, rig
 
 def _known_columns(header: list[str], scenario: ScenarioFields, where: str) -> list[Entry]:
     """The entry of each column; unknown, repeated and missing columns are errors."""
-    known = table_columns(scenario)
+    known = scenario.table_columns
     if twice := [name for name, times in Counter(header).items() if times > 1]:
         raise InvalidInput(f"{where}: column {twice[0]!r} is given twice")
     for name in header:
@@ -1453,30 +1473,10 @@ class Ranges:
         streams = {of: np.full((n, width), _UNUSED) for of, width in widths.items()}
         for (of, column), u in zip(self.places, points.T, strict=True):
             streams[of][:, column] = u
-        found = make_sample(self.scenario, lambda _, of: streams[of], np.arange(n, dtype=np.int64))
+        found = self.scenario.sample_by(lambda _, of: streams[of], np.arange(n, dtype=np.int64))
         if self.scenario.early_impacts == "keep" or not self.scenario.learners:
             return found, np.ones(n, np.bool_)
         return found, ~early_impact(self.scenario, found.worlds)
-
-
-def ranges_of(scenario: ScenarioFields) -> Ranges:
-    """Every number that the scenario draws.
-
-    Raises ``InvalidInput`` for a scenario that draws nothing, a mixture, and a channel whose delays are drawn: worlds
-    of these cannot be given one by one.
-    """
-    if scenario.members:
-        members = ", ".join(member.name for member in scenario.members)
-        raise InvalidInput(f"scenario {scenario.name!r}: is a mixture; take one of its scenarios: {members}")
-    if scenario.v2x.by_link:
-        raise InvalidInput(
-            f"scenario {scenario.name!r}: v2x: draws delays and losses, which no table of worlds holds; give v2x: paper"
-            " (--set v2x=paper)"
-        )
-    found = {**_of_types(scenario), **_of_quantities(scenario)}
-    if not found:
-        raise InvalidInput(f"scenario {scenario.name!r}: draws nothing: all its worlds are the same")
-    return Ranges(scenario, tuple(found), tuple(found.values()))
 
 
 def _of_quantities(scenario: ScenarioFields) -> dict[str, Place]:
