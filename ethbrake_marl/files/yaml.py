@@ -307,6 +307,12 @@ def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
     raise PydanticCustomError("refused", "{right}", {"right": right, "value": shown, "at": at})
 
 
+def require(holds: bool, at: YamlPath, value: Any, right: str) -> None:
+    """``refuse`` the value unless ``holds``."""
+    if not holds:
+        refuse(at, value, right)
+
+
 class Wording:
     """What messages know of one kind of file: its keys by the fields of its model, and what a missing one needs."""
 

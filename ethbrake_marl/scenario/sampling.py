@@ -33,7 +33,7 @@ from pydantic_core import CoreSchema, PydanticCustomError
 
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.files.store import read_plain
-from ethbrake_marl.files.yaml import UNITS, UNSHOWN, FileModel, YamlPath, parse_numeral, refuse, suggestion
+from ethbrake_marl.files.yaml import UNITS, UNSHOWN, FileModel, YamlPath, parse_numeral, refuse, require, suggestion
 from ethbrake_marl.harm import ObjectiveName, objectives_of
 from ethbrake_marl.observations import ListedFeatures, listed_features
 from ethbrake_marl.physics import (
@@ -213,6 +213,7 @@ _MEANING = {key: rule.meaning for key, rule in QUANTITY.declared.items()}
 # Each distribution is a pure function of one uniform number ``u`` in [0, 1): its inverse cumulative distribution
 # function. One quantity therefore uses up exactly one uniform number, whatever its distribution is.
 
+_LEAVE_OUT = "must be a number or a distribution; a key that is not used is left out"
 LEAST_MASS = 1e-6  # of a normal distribution inside its bounds; below it the inverse loses its digits
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -231,7 +232,7 @@ class Uniform(_Distribution):
 
     @model_validator(mode="after")
     def _ordered(self) -> Uniform:
-        _require(self.uniform[0] <= self.uniform[1], "uniform", self.uniform, "low must not be above high")
+        require(self.uniform[0] <= self.uniform[1], ("uniform",), self.uniform, "low must not be above high")
         return self
 
     @property
@@ -256,8 +257,8 @@ class LogUniform(_Distribution):
     @model_validator(mode="after")
     def _ordered(self) -> LogUniform:
         low, high = self.loguniform
-        _require(low > 0.0, "loguniform", self.loguniform, "low must be above 0")
-        _require(low <= high, "loguniform", self.loguniform, "low must not be above high")
+        require(low > 0.0, ("loguniform",), self.loguniform, "low must be above 0")
+        require(low <= high, ("loguniform",), self.loguniform, "low must not be above high")
         return self
 
     @property
@@ -288,12 +289,11 @@ class Normal(_Distribution):
     @model_validator(mode="after")
     def _possible(self) -> Normal:
         shape = self.normal
-        declared = shape.model_dump()
-        _require(shape.sd > 0.0, "normal", declared, "sd must be above 0")
-        _require(shape.low < shape.high, "normal", declared, "low must be below high")
+        require(shape.sd > 0.0, ("normal",), shape, "sd must be above 0")
+        require(shape.low < shape.high, ("normal",), shape, "low must be below high")
         below, above = self._bounds()
         right = f"[low, high] must hold at least {LEAST_MASS:g} of the untruncated distribution"
-        _require(above - below >= LEAST_MASS, "normal", declared, right)
+        require(above - below >= LEAST_MASS, ("normal",), shape, right)
         return self
 
     def _bounds(self) -> tuple[float, float]:
@@ -325,9 +325,9 @@ class Choice(_Distribution):
     def _weighted(self) -> Choice:
         if self.weights is not None:
             fits = f"must have as many entries as choice, {len(self.choice)}"
-            _require(len(self.weights) == len(self.choice), "weights", self.weights, fits)
+            require(len(self.weights) == len(self.choice), ("weights",), self.weights, fits)
             positive = all(w > 0.0 for w in self.weights) and math.isfinite(sum(self.weights))
-            _require(positive, "weights", self.weights, "every weight must be above 0, and their sum finite")
+            require(positive, ("weights",), self.weights, "every weight must be above 0, and their sum finite")
         return self
 
     @property
@@ -356,12 +356,6 @@ class WithLoad(_Distribution):
         """``empty + (full - empty) load``, in the shape of ``load`` in [0, 1]; never beyond either end."""
         empty, full = self.with_load
         return np.clip(empty + (full - empty) * load, *self.support)
-
-
-def _require(holds: bool, key: str, value: Any, right: str) -> None:
-    """Refuse the value of ``key`` unless ``holds``; ``right`` says what would do."""
-    if not holds:
-        refuse((key,), value, right)
 
 
 def _kind(value: object) -> str | None:
@@ -604,25 +598,21 @@ class VehicleType(FileModel):
     @field_validator(*QUANTITY.of_a_type)
     @classmethod
     def _in_range(cls, value: Any, info: ValidationInfo) -> Any:
-        if value is None:
-            refuse((), value, "must be a number or a distribution; a key that is not used is left out")
+        require(value is not None, (), value, _LEAVE_OUT)
         rule = QUANTITY.declared[str(info.field_name)]
-        if not rule.allows(*support(value)):
-            refuse((), value, f"must be {rule.interval}")
+        require(rule.allows(*support(value)), (), value, f"must be {rule.interval}")
         return value
 
     @field_validator("load")
     @classmethod
     def _share(cls, value: Any) -> Any:
         low, high = support(value)
-        if not (low >= 0.0 and high <= 1.0):
-            refuse((), value, "must be in [0, 1]: 0 empty, 1 full")
+        require(low >= 0.0 and high <= 1.0, (), value, "must be in [0, 1]: 0 empty, 1 full")
         return value
 
 
 def _check_type_names(kinds: dict[str, VehicleType]) -> dict[str, VehicleType]:
-    if ANY in kinds:
-        refuse((ANY,), UNSHOWN, f"{ANY} stands for every type; give another name")
+    require(ANY not in kinds, (ANY,), UNSHOWN, f"{ANY} stands for every type; give another name")
     return kinds
 
 
@@ -771,8 +761,7 @@ class ScenarioFields(FileModel):
     @classmethod
     def _given(cls, value: Any) -> Any:
         """``null`` is no value: a key that is not used is left out."""
-        if value is None:
-            refuse((), value, "must be a number or a distribution; a key that is not used is left out")
+        require(value is not None, (), value, _LEAVE_OUT)
         return value
 
     @field_validator(*QUANTITY.needed, mode="before")
@@ -782,26 +771,22 @@ class ScenarioFields(FileModel):
         key, data = str(info.field_name), info.data
         kinds = data.get("vehicle_types")
         without = None if kinds is None else next((k for k, kind in kinds.items() if getattr(kind, key) is None), None)
-        if value is _LEFT_OUT:
-            if data.get("mixture") is not None or not {"vehicle_types", "mixture"} <= data.keys():
-                return None
+        if value is not _LEFT_OUT:
+            require(value is not None, (), value, _LEAVE_OUT)
+            require(kinds is None or without is not None, (), value, "every type declares it; leave it out")
+            return value
+        if data.get("mixture") is None and {"vehicle_types", "mixture"} <= data.keys():
             if kinds is None:
                 raise PydanticCustomError("missing", "missing", {"at": ()})
-            if without is not None:
-                right = f"type {without} does not declare it: give it there, or here for every type that does not"
-                refuse((), UNSHOWN, right)
-            return None
-        if value is None:
-            refuse((), value, "must be a number or a distribution; a key that is not used is left out")
-        if kinds is not None and without is None:
-            refuse((), value, "every type declares it; leave it out")
-        return value
+            right = f"type {without} does not declare it: give it there, or here for every type that does not"
+            require(without is None, (), UNSHOWN, right)
+        return None
 
     @field_validator("vehicle_types", "types", "mixture", mode="before")
     @classmethod
     def _not_empty(cls, value: Any) -> Any:
-        if value is None or (isinstance(value, dict | list | tuple) and not value):
-            refuse((), value, "must not be empty; a key that is not used is left out")
+        empty = value is None or (isinstance(value, dict | list | tuple) and not value)
+        require(not empty, (), value, "must not be empty; a key that is not used is left out")
         return value
 
     @field_validator("types")
@@ -811,20 +796,18 @@ class ScenarioFields(FileModel):
         if not {"vehicles", "vehicle_types"} <= info.data.keys():
             return value
         vehicles, kinds = info.data["vehicles"], info.data["vehicle_types"]
-        if kinds is None:
-            refuse((), value, "needs vehicle_types, which says what the types are")
+        require(kinds is not None, (), value, "needs vehicle_types, which says what the types are")
         listed = isinstance(value, tuple)
-        if listed and len(value) != vehicles:
-            refuse((), UNSHOWN, f"has {len(value)} entries; {vehicles} vehicles need {vehicles}, or one for all")
+        right = f"has {len(value)} entries; {vehicles} vehicles need {vehicles}, or one for all"
+        require(not listed or len(value) == vehicles, (), UNSHOWN, right)
         for index, entry in enumerate(value if listed else (value,)):
             at: YamlPath = (index,) if listed else ()
             names = [entry] if isinstance(entry, str) else list(entry)
-            if not names:
-                refuse(at, entry, "must name a type")
+            require(len(names) > 0, at, entry, "must name a type")
             for name in names:
-                if name not in kinds and not (name == ANY and isinstance(entry, str)):
-                    hint = suggestion(name, kinds) or f"known: {', '.join(kinds)}"
-                    refuse(at, entry, f"unknown type {name}; {hint}")
+                hint = suggestion(name, kinds) or f"known: {', '.join(kinds)}"
+                known = name in kinds or (name == ANY and isinstance(entry, str))
+                require(known, at, entry, f"unknown type {name}; {hint}")
         return value
 
     @field_validator(*QUANTITY.declared)
@@ -835,15 +818,15 @@ class ScenarioFields(FileModel):
         if value is None:
             return value
         listed = isinstance(value, tuple)
-        if listed and vehicles is not None and len(value) != rule.count(vehicles):
-            per = "one per pair" if rule.per == "pair" else "one per vehicle"
-            right = f"has {len(value)} entries; {vehicles} vehicles need {rule.count(vehicles)} ({per}), or one for all"
-            refuse((), UNSHOWN, right)
+        if listed and vehicles is not None:
+            count, per = rule.count(vehicles), "one per pair" if rule.per == "pair" else "one per vehicle"
+            right = f"has {len(value)} entries; {vehicles} vehicles need {count} ({per}), or one for all"
+            require(len(value) == count, (), UNSHOWN, right)
         for index, entry in enumerate(value if listed else (value,)):
             low, high = support(entry)
-            if not rule.allows(low, high):
-                overlap = "; a negative gap means overlapping vehicles" if rule.per == "pair" and low < 0.0 else ""
-                refuse((index,) if listed else (), entry, f"must be {rule.interval}{overlap}")
+            overlap = "; a negative gap means overlapping vehicles" if rule.per == "pair" and low < 0.0 else ""
+            at = (index,) if listed else ()
+            require(rule.allows(low, high), at, entry, f"must be {rule.interval}{overlap}")
         return value
 
     @field_validator("roles")
@@ -854,16 +837,14 @@ class ScenarioFields(FileModel):
             return value
         names = [f"vehicle_{i + 1}" for i in range(vehicles)]
         for name, role in value.items():
-            if name not in names:
-                close = [] if name.startswith("vehicle_") else get_close_matches(name, names, n=1)
-                hint = f"did you mean {close[0]}?" if close else f"this scenario has vehicle_1 ... vehicle_{vehicles}"
-                refuse((name,), role, f"unknown vehicle; {hint}")
+            close = [] if name.startswith("vehicle_") else get_close_matches(name, names, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"this scenario has vehicle_1 ... vehicle_{vehicles}"
+            require(name in names, (name,), role, f"unknown vehicle; {hint}")
             try:
                 ScriptSpec.parse(role).is_state_free()
             except InvalidInput as error:
                 refuse((name,), role, str(error))
-            if role.startswith(f"{LEARNER}:"):
-                refuse((name,), role, f"{LEARNER} takes no argument")
+            require(not role.startswith(f"{LEARNER}:"), (name,), role, f"{LEARNER} takes no argument")
         return Roles.complete(value, vehicles)
 
     @field_validator("objective", mode="before")
