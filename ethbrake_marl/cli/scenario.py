@@ -35,10 +35,7 @@ def scenario_list(out: Out) -> None:
     width = max(len(entry.name) for entry in entries)
     out.result(
         [{"name": e.name, "title": e.title, "path": str(e.path), "origin": e.origin} for e in entries],
-        *(
-            f"{e.name:{width}}  {e.title}{'' if e.origin == scenarios.SHIPPED else f'  (from {e.origin})'}"
-            for e in entries
-        ),
+        *(f"{e.name:{width}}  {e.title}{'' if e.shipped else f'  (from {e.origin})'}" for e in entries),
     )
 
 
