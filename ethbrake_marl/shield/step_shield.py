@@ -87,7 +87,7 @@ from ethbrake_marl.physics import (
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search import ProfileProblem, profile_problem, state_columns, worlds_at
 from ethbrake_marl.shield.enclosure import CORNERS, INTERIOR, Boxes, boxes_of, check_possible, checked_robust
-from ethbrake_marl.shield.uncertainty import MOST_CORNERS, Uncertainty, check_amount, check_scenario, checked_vehicles
+from ethbrake_marl.shield.uncertainty import MOST_CORNERS, Uncertainty, check_amount, check_scenario
 
 # The compiled decisions of the step shield, for one shielded vehicle or several of one line.
 #
@@ -985,8 +985,15 @@ class StepShield:
         check_harm_count(harm_count)
         check_scenario(scenario, "shield")
         check_amount("allowance", allowance, "shield", " m2/s2")
-        self.vehicle = checked_vehicles(vehicle, scenario)
-        self.vehicles = (self.vehicle,) if isinstance(self.vehicle, int) else self.vehicle
+        several = isinstance(vehicle, Sequence) and not isinstance(vehicle, str)
+        each: tuple[Any, ...] = tuple(cast(Sequence[Any], vehicle)) if several else (vehicle,)
+        known = range(scenario.vehicles)
+        if not each or any(not isinstance(i, int | np.integer) or isinstance(i, bool) or i not in known for i in each):
+            raise InvalidInput(f"shield: vehicle = {vehicle!r}: must be an index from 0 to {scenario.vehicles - 1}")
+        if list(each) != sorted(set(each)):
+            raise InvalidInput(f"shield: vehicle = {vehicle!r}: several are named front to rear, each once")
+        self.vehicles = tuple(map(int, each))
+        self.vehicle = self.vehicles if several else self.vehicles[0]
         if uncertainty is not None and (len(self.vehicles) > 1 or cap is not None):
             what = "several vehicles" if cap is None else "a cap"
             raise InvalidInput(f"shield: uncertainty: {what} with it: not covered; mode robust shields one vehicle")
@@ -1403,9 +1410,10 @@ class BelievedShield:
         vehicle, ranges = self._ranges
         return 1 if self.robust is None else 1 + 2 ** len(ranges.uncertain(vehicle))
 
-    def branch(self) -> BelievedShield:
-        """A copy that goes on apart: what it decides leaves this one as it is."""
-        apart = copy.copy(self)
+    def __copy__(self) -> BelievedShield:
+        """One that goes on apart: what it decides leaves this one as it is."""
+        apart = object.__new__(BelievedShield)
+        apart.__dict__.update(self.__dict__)
         apart.shield = copy.copy(self.shield)
         for name in PER_WORLD:
             setattr(apart, name, getattr(self, name).copy())
@@ -1413,7 +1421,7 @@ class BelievedShield:
 
     def take(self, rows: Ints) -> BelievedShield:
         """The shield of some rows, which goes on apart."""
-        apart = self.branch()
+        apart = copy.copy(self)
         apart.shield = None if self.shield is None else self.shield.take(rows)
         apart._odometer = take_memory(self._odometer, rows)
         for name in (*PER_WORLD, *(("_totals",) if len(self._totals) else ())):

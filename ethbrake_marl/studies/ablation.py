@@ -48,7 +48,7 @@ from ethbrake_marl.pages.page import Page, Part, Played, Section
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.policies import Policy, load_policy
 from ethbrake_marl.scenario import LEARNER, QUANTITY, Sample, Scenario, Task
-from ethbrake_marl.shield import Shielded, drive_chunks, stack
+from ethbrake_marl.shield import Shielded
 from ethbrake_marl.studies.jobs import JobFolder
 from ethbrake_marl.studies.trainings import (
     TIMED_DRIVES,
@@ -279,9 +279,9 @@ class Plan:
             if level.trained:
                 worlds, task = samples[level.name].worlds, Task(level.scenario, level.scenario.learners)
                 braking = make_single_agent("full_brake")
-                drive_chunks(braking, worlds.take([0]), task)  # compiles
+                Shielded.driven(braking, worlds.take([0]), task)  # compiles
                 started = time.monotonic()
-                drive_chunks(braking, worlds, task)
+                Shielded.driven(braking, worlds, task)
                 often = self.episodes * self.seeds * len(self.recipes) * len(HARM_COUNTS)
                 driving_s += (time.monotonic() - started) / worlds.n * often
         search_s, damaged = 0.0, []
@@ -513,10 +513,10 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
             for harm_count in HARM_COUNTS if plan.shield else ():
                 task, parts = Task(level.scenario, level.scenario.learners, harm_count), []
                 for team in own:
-                    parts.append(drive_chunks(team, sample.worlds, task))
+                    parts.append(Shielded.driven(team, sample.worlds, task))
                     name = f"driving {team.name} behind the shield, {harm_count}"
                     say(Progress(name, sample.worlds.n, sample.worlds.n))
-                behind[harm_count] = stack(parts)
+                behind[harm_count] = Shielded.stack(parts)
             found.append(Measured(level, algorithm, reached, braking, best, about, behind or None))
     return found
 
