@@ -61,7 +61,6 @@ from ethbrake_marl.errors import InvalidInput, UncertifiedStep, check_one_learne
 from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.physics import Bools, Floats, Ints, Vehicles, Worlds
 from ethbrake_marl.scenario import Scenario, Task
-from ethbrake_marl.search import state_columns
 from ethbrake_marl.shield.enclosure import CORNERS, INTERIOR, checked_robust
 from ethbrake_marl.shield.step_shield import (
     CAPS,
@@ -385,10 +384,10 @@ class StepGuard(ShieldGuard):
         goes_on, finished = ~running.ended, shield.running.finished  # type: ignore[union-attr]  # it has begun
         worlds = running.worlds if self._policies or self._told is not None else None  # made anew each time
         proposed, memories = self._asked(worlds, memory.policies, proposed)
-        after = copy.copy(shield)
+        after, seen = copy.copy(shield), seen_columns(running.packed)
         decision = after.decide(
             proposed if self._several else proposed[:, 0],
-            seen=seen_columns(running.packed) if worlds is None or self._told is None else state_columns(worlds),
+            seen=seen if self._told is None else seen[:, : (3 * seen.shape[1] + 2) // 5],  # without harm
             only=goes_on,
             proposer=self._proposer(memories, worlds) if self._later_rollouts else None,
         )

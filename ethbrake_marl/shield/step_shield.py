@@ -85,7 +85,7 @@ from ethbrake_marl.physics import (
     step_again,
 )
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search import ProfileProblem, profile_problem, state_columns, worlds_at
+from ethbrake_marl.search import ProfileProblem, profile_problem, worlds_at
 from ethbrake_marl.shield.enclosure import CORNERS, INTERIOR, Boxes, boxes_of, check_possible, checked_robust
 from ethbrake_marl.shield.uncertainty import MOST_CORNERS, Uncertainty, check_amount, check_scenario
 
@@ -1552,12 +1552,10 @@ class BelievedShield:
     def _is_surprised(self, believed: Worlds, heard: Bools) -> Bools:
         """Where somebody of whom was ``heard`` [n, N] is not within what the shield foretold, [n]."""
         assert self.shield is not None and self.shield.running is not None
-        seen, wrong = state_columns(believed), np.zeros(believed.n, np.bool_)
-        first = (seen.shape[1] + 2) // 3 - believed.N  # 1: an obstacle ahead is vehicle 0 of the columns
+        seen, wrong = seen_columns(Packed.of(believed)), np.zeros(believed.n, np.bool_)
+        first = (seen.shape[1] + 4) // 5 - believed.N  # 1: an obstacle ahead is vehicle 0 of the columns
         foretold = self.shield.running.states.reshape(believed.n, self.shield.running.members, -1)
-        outside: Bools = (seen < (foretold.min(axis=1) - SURPRISE)[:, : seen.shape[1]]) | (
-            seen > (foretold.max(axis=1) + SURPRISE)[:, : seen.shape[1]]
-        )
+        outside: Bools = (seen < foretold.min(axis=1) - SURPRISE) | (seen > foretold.max(axis=1) + SURPRISE)
         for i in range(believed.N):
             wrong |= heard[:, i] & outside[:, first + i]
         for p in range(believed.N - 1):

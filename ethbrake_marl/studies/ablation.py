@@ -43,7 +43,7 @@ from ethbrake_marl.learning import (
     read_settings,
     resolve,
 )
-from ethbrake_marl.limits import BestHarmTable, best_harm, chunks_left, realised_harm, search_list, world_identity
+from ethbrake_marl.limits import BestHarmTable, best_harm, chunks_left, search_list, task_problem
 from ethbrake_marl.pages.page import Page, Part, Played, Section
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.policies import Policy, load_policy
@@ -385,7 +385,7 @@ def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample
     for level, sample in zip(plan.levels, samples, strict=True):
         if level.trained:
             part = sample.take(rows)
-            identity = world_identity(part.worlds, Task(level.scenario, level.scenario.learners)).tobytes()
+            identity = task_problem(part.worlds, Task(level.scenario, level.scenario.learners)).identity.tobytes()
             found.setdefault(identity, (level, part, []))[2].append(level)
     return list(found.values())
 
@@ -446,7 +446,7 @@ def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[
     worlds = replace(other.worlds, obstacle_gap_m=own.worlds.obstacle_gap_m).take(rows)
     for best in other.searched.best.values():
         kept = best._replace(harm=best.harm[rows], profiles=best.profiles.take(rows))
-        yield dict(zip(HARM_COUNTS, realised_harm(worlds, task, kept), strict=True))
+        yield dict(zip(HARM_COUNTS, task_problem(worlds, task).follow(kept.profiles), strict=True))
     for team in other.teams:
         driven = evaluate(worlds, {team.name: team}, scenario=scenario, aftermath=False).complete()
         ledger = driven.outcome(team.name).ledger

@@ -11,12 +11,11 @@ from ethbrake_marl.actions import action_to_command, command_to_action
 from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.agents.rollout import script_agents
 from ethbrake_marl.engine import Engine, Memory, Script, ask_script, begin_script
-from ethbrake_marl.physics import Bools, Floats, Worlds
+from ethbrake_marl.physics import Bools, Floats, Packed, Worlds
 from ethbrake_marl.physics.messages import CHANNEL, LINK, _links, age_s, is_periodic, link_at, place_at, ring_at
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search import state_columns
 from ethbrake_marl.shield import ShieldedDriver
-from ethbrake_marl.shield.step_shield import Proposer, proposed_action
+from ethbrake_marl.shield.step_shield import Proposer, proposed_action, seen_columns
 
 
 def changed_decisions(
@@ -83,7 +82,9 @@ class Hosted:
         if self.driver.options.believed:
             applied = shield.decide(worlds, vehicle, proposed, proposer)
         else:
-            applied = shield.decide(proposed, seen=state_columns(worlds), proposer=proposer).applied
+            applied = shield.decide(
+                proposed, seen=seen_columns(Packed.of(worlds))[:, : 3 * worlds.N - 2], proposer=proposer
+            ).applied
         return action_to_command(applied, worlds.vehicles, vehicle), (memory[0], policy)
 
 
