@@ -6,7 +6,6 @@ import hashlib
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -654,21 +653,6 @@ def profile_problem(
         chosen, np.concatenate(start, axis=1), clock, np.ascontiguousarray(bounds), command, v.latency_s, v.mass_t,
         v.speed_limit_mps, identities(worlds, command, clock, chosen),
     )  # fmt: skip
-
-
-def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
-    """These worlds in the states [n, S] of a problem with them: speeds, gaps, hit flags, and those of the obstacle."""
-    added = int(worlds.obstacle_ahead.any())  # columns in front of each group
-    N = worlds.N + added
-    gaps, hit = states[:, N : 2 * N - 1], states[:, 2 * N - 1 : 3 * N - 2] == 1.0
-    return replace(
-        worlds,
-        speeds_mps=states[:, added:N].copy(),
-        gaps_m=gaps[:, added:].copy(),
-        pair_hit=hit[:, added:].copy(),
-        obstacle_gap_m=gaps[:, 0].copy() if added else worlds.obstacle_gap_m,
-        obstacle_hit=hit[:, 0].copy() if added else worlds.obstacle_hit,
-    )
 
 
 def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -> UInt64s:

@@ -1550,16 +1550,20 @@ def onset_states(worlds: Worlds, i: int, time_step_s: float | Floats | None) -> 
         LINE.TIME_STEP: 0.0 if time_step_s is None else time_step_s,
     }
     if i > 0:
-        columns[LINE.GAP_L] = worlds.gaps_m[:, i - 1]
-        columns[LINE.V_L] = worlds.speeds_mps[:, i - 1]
-        columns[LINE.A_L] = v.braking_capacity_mps2[:, i - 1]
-        columns[LINE.FRONT_SHARE] = v.mass_t[:, i - 1] / (v.mass_t[:, i - 1] + v.mass_t[:, i])
+        columns |= {
+            LINE.GAP_L: worlds.gaps_m[:, i - 1],
+            LINE.V_L: worlds.speeds_mps[:, i - 1],
+            LINE.A_L: v.braking_capacity_mps2[:, i - 1],
+            LINE.FRONT_SHARE: v.mass_t[:, i - 1] / (v.mass_t[:, i - 1] + v.mass_t[:, i]),
+        }
     if i < worlds.N - 1:
-        columns[LINE.GAP_R] = worlds.gaps_m[:, i]
-        columns[LINE.V_R] = worlds.speeds_mps[:, i + 1]
-        columns[LINE.A_R] = v.braking_capacity_mps2[:, i + 1]
-        columns[LINE.ONSET_R] = np.maximum(v.latency_s[:, i + 1] - worlds.time_s, 0.0)
-        columns[LINE.REAR_SHARE] = v.mass_t[:, i + 1] / (v.mass_t[:, i + 1] + v.mass_t[:, i])
+        columns |= {
+            LINE.GAP_R: worlds.gaps_m[:, i],
+            LINE.V_R: worlds.speeds_mps[:, i + 1],
+            LINE.A_R: v.braking_capacity_mps2[:, i + 1],
+            LINE.ONSET_R: np.maximum(v.latency_s[:, i + 1] - worlds.time_s, 0.0),
+            LINE.REAR_SHARE: v.mass_t[:, i + 1] / (v.mass_t[:, i + 1] + v.mass_t[:, i]),
+        }
     for column, values in columns.items():
         at[:, column] = values
     return at

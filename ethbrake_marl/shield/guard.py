@@ -189,10 +189,12 @@ class ShieldOptions:
             uncertainty=checked_uncertainty(self.uncertainty), robust=self.robust, logging=self.logging,
         )  # fmt: skip
 
-    def believed_shield(self, scenario: Scenario, others: Mapping[int, Script] | None = None) -> BelievedShield:
+    def believed_shield(
+        self, scenario: Scenario, vehicle: int, others: Mapping[int, Script] | None = None
+    ) -> BelievedShield:
         """... and on what was received."""
         robust = self.robust if self.mode == "robust" else None
-        return BelievedShield(scenario, harm_count=self.harm_count, robust=robust, others=others)
+        return BelievedShield(scenario, vehicle, harm_count=self.harm_count, robust=robust, others=others)
 
 
 def proposing_agent(policy: object, where: str) -> Agent:
@@ -384,7 +386,8 @@ class StepGuard(ShieldGuard):
         goes_on, finished = ~running.ended, shield.running.finished  # type: ignore[union-attr]  # it has begun
         worlds = running.worlds if self._policies or self._told is not None else None  # made anew each time
         proposed, memories = self._asked(worlds, memory.policies, proposed)
-        after, seen = copy.copy(shield), seen_columns(running.packed)
+        seen = seen_columns(running.packed)
+        after = copy.copy(shield)
         decision = after.decide(
             proposed if self._several else proposed[:, 0],
             seen=seen if self._told is None else seen[:, : (3 * seen.shape[1] + 2) // 5],  # without harm
@@ -467,10 +470,10 @@ class BelievedGuard(ShieldGuard):
                 f"{self.options.where}: believed = True: shields one learner, not several; pass learners=['vehicle_2']"
                 " to the environment"
             )
-        return self.options.believed_shield(self.scenario, self.scripts)
+        return self.options.believed_shield(self.scenario, self.vehicles[0], self.scripts)
 
     def _started(self, shield: BelievedShield, alert: Worlds, rows: Ints) -> BelievedShield:
-        shield.begin(alert, self.vehicles[0], rows)
+        shield.begin(alert, rows)
         return shield
 
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
@@ -479,7 +482,7 @@ class BelievedGuard(ShieldGuard):
         proposed, memories = self._asked(worlds, memory.policies, proposed)
         after = copy.copy(memory.shield)
         before, proposer = after.interventions, self._proposer(memories, worlds)
-        applied = after.decide(worlds, self.vehicles[0], proposed[:, 0], proposer)[:, np.newaxis]
+        applied = after.decide(worlds, proposed[:, 0], proposer)[:, np.newaxis]
         stepped_in = after.interventions > before
         return Ruling(proposed, applied, stepped_in, ~running.ended, after.decision, Guarded(after, memories))
 
@@ -489,7 +492,7 @@ class BelievedGuard(ShieldGuard):
         robust, n, shield = believed.robust is not None, len(believed.predicted_harm), believed.shield
         told: dict[str, Any] = {"mode": self.options.mode, **told_of(ruling)}
         told |= {"bound_harm": np.inf, "settles": False, "believed": True, "trusted": robust}
-        if ruling is not None and shield is not None:
+        if ruling is not None:
             told["bound_harm"] = np.where(np.isfinite(believed.predicted_harm), shield.bound, np.inf)
             told["settles"] = shield.settles
         if robust:
@@ -759,10 +762,9 @@ class ShieldedDriver:
         self._guard: dict[str, Any] = {} if self.options.believed else {"later_rollouts": later_rollouts, "told": told}
         robust = "" if self.options.robust == CORNERS else f":{self.options.robust}"
         self.name = f"{policy.name}+{self.options.mode}{robust}{':believed' if self.options.believed else ''}"
-        if self.options.believed:
-            self.options.believed_shield(scenario)  # refuses bad settings at once
-        elif not isinstance(policy, Team):
-            self.options.step_shield(scenario, scenario.learners[0] if len(scenario.learners) == 1 else 0)
+        make = self.options.believed_shield if self.options.believed else self.options.step_shield
+        if self.options.believed or not isinstance(policy, Team):
+            make(scenario, scenario.learners[0] if len(scenario.learners) == 1 else 0)  # refuses bad settings at once
 
     @property
     def adds(self) -> Source:

@@ -125,7 +125,12 @@ class Uncertainty:
                 f" {MOST_CORNERS} can be certified: name vehicles or pairs, for instance {DEFAULT.UNCERTAINTY_EXAMPLE}"
             )
         parts = [worlds] + [_placed(worlds, sides, lambda k, c=c: c >> k & 1) for c in range(corners)]  # type: ignore[misc]
-        order = np.arange(worlds.n * len(parts)).reshape(len(parts), worlds.n).T.ravel()
+        return self.interleaved(parts)
+
+    @staticmethod
+    def interleaved(parts: list[Worlds]) -> Worlds:
+        """The worlds [n] of all M parts as one list [n * M]: the first one of each part, then the second ones."""
+        order = np.arange(parts[0].n * len(parts)).reshape(len(parts), parts[0].n).T.ravel()
         return Worlds.concatenate(parts).take(order)
 
     def draw(self, worlds: Worlds, rng: np.random.Generator, *, corners: bool = False) -> Worlds:

@@ -9,14 +9,14 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.vector import VectorWrapper
+from gymnasium.vector import VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from ethbrake_marl.agents import Agent, LearnedPolicy
-from ethbrake_marl.envs import EthBrakeVectorEnv, InTurns, in_turns
+from ethbrake_marl.envs import InTurns, in_turns
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats
@@ -183,9 +183,11 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
 
     """
 
-    def __init__(self, env: EthBrakeVectorEnv, policy: Agent | LearnedPolicy | None = None, **options: Any) -> None:
+    def __init__(
+        self, env: VectorEnv[Any, Any, Any], policy: Agent | LearnedPolicy | None = None, **options: Any
+    ) -> None:
         maker = "gymnasium.make_vec('EthBrake-v0')"
-        self.attached = Attached(env, gymnasium.vector.VectorEnv, maker, policy, "ShieldedVectorEnv", options)
+        self.attached = Attached(env, VectorEnv, maker, policy, "ShieldedVectorEnv", options)
         super().__init__(env)
 
     def reset(
@@ -241,7 +243,7 @@ def shield(env: Any, policy: Proposing | None = None, mode: str = "step", **opti
                 f"shield: {inside} acts in turns: put the shield inside it, as eb.shielded_aec(parallel)"
             )
         return shielded_aec(inside, policy, **settings)
-    if isinstance(env, gymnasium.vector.VectorEnv):
+    if isinstance(env, VectorEnv):
         return ShieldedVectorEnv(env, policy, **settings)  # type: ignore[arg-type]
     if isinstance(env, gymnasium.Env):
         return ShieldedEnv(env, policy, **settings)  # type: ignore[arg-type]

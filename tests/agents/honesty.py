@@ -68,8 +68,8 @@ class Hosted:
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         options, scenario = self.driver.options, self.driver.scenario
         if options.believed:
-            shield = options.believed_shield(scenario, scripts)
-            shield.begin(alert, vehicle, np.arange(alert.n))
+            shield = options.believed_shield(scenario, vehicle, scripts)
+            shield.begin(alert, np.arange(alert.n))
         else:
             shield = options.step_shield(scenario, vehicle, scripts)
             shield.begin(alert, np.arange(alert.n), {vehicle: self.policy})
@@ -80,7 +80,7 @@ class Hosted:
         proposed, policy = proposed_action(self.policy, worlds, policy, vehicle)
         proposer = Proposer({vehicle: self.policy}, {vehicle: policy}, worlds)
         if self.driver.options.believed:
-            applied = shield.decide(worlds, vehicle, proposed, proposer)
+            applied = shield.decide(worlds, proposed, proposer)
         else:
             applied = shield.decide(
                 proposed, seen=seen_columns(Packed.of(worlds))[:, : 3 * worlds.N - 2], proposer=proposer

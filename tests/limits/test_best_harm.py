@@ -67,8 +67,8 @@ def test_follow__hits_a_standing_car_with_the_closing_speed_computed_by_hand() -
 def test_search__cannot_beat_full_braking_before_a_standing_car() -> None:
     problem = profile_problem(two_cars(), [1])
     start = problem.constant(np.array([[[2.0]]]))
-    found = problem.search(start, budget=2000)
-    assert found.first_impact_harm == pytest.approx([200.0], abs=1e-3)
+    _, harm = problem.search(start, budget=2000)
+    assert harm["first"] == pytest.approx([200.0], abs=1e-3)
 
 
 def test_profiles__say_which_command_is_in_force() -> None:
