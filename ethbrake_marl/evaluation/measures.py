@@ -225,9 +225,7 @@ class Evaluation:
     seed: int | None  # of the list; None for worlds that were given
     outcomes: dict[str, Outcome]  # by the agent's name
     left_out: tuple[LeftOut, ...] = ()  # worlds of the list that are in none of the arrays, the same for all agents
-    kinds: Mapping[str, NDArray[np.str_]] = field(
-        default_factory=dict
-    )  # ``scenario`` of a mixture, ``vehicle_2_type``, ...: [n]
+    kinds: Mapping[str, NDArray[np.str_]] = field(default_factory=dict)  # ``scenario``, ``vehicle_2_type``: each [n]
 
     def __repr__(self) -> str:
         drivers = [f"{agent!r:.42}" for agent in list(self.outcomes)[:_SHOWN_AGENTS]]
