@@ -126,7 +126,6 @@ def evaluate_command(
     PATH is a run or a policy bundle, or shipped.
     """
     from ethbrake_marl.evaluation import (
-        PROGRESS_EVERY,
         Evaluation,
         Question,
         Rescored,
@@ -165,7 +164,6 @@ def evaluate_command(
         lineup,
         scenario=chosen,
         seed=drawn_by,
-        chunk=PROGRESS_EVERY,
         on_progress=lambda agent, done: out.progress(agent, done, sample.worlds.n),
     )
     summary, told = summarise(evaluation), evaluation.rescore(objectives)

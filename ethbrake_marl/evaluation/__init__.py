@@ -25,7 +25,6 @@ if TYPE_CHECKING:
         write_dataset as write_dataset,
     )
     from ethbrake_marl.evaluation.inputs import (
-        PROGRESS_EVERY as PROGRESS_EVERY,
         NamedWorld as NamedWorld,
         NamedWorlds as NamedWorlds,
         check_agents as check_agents,
@@ -78,7 +77,7 @@ if TYPE_CHECKING:
         write_output as write_output,
         write_per_world as write_per_world,
     )
-    from ethbrake_marl.evaluation.rollout import controlled_vehicle as controlled_vehicle, evaluate as evaluate
+    from ethbrake_marl.evaluation.rollout import evaluate as evaluate
     from ethbrake_marl.evaluation.shield_modes import ShieldModes as ShieldModes, compare_modes as compare_modes
     from ethbrake_marl.evaluation.statistics import (
         interquartile_mean as interquartile_mean,

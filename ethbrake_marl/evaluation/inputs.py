@@ -238,7 +238,6 @@ def states_of(worlds: Worlds, scenario: Scenario) -> list[dict[str, float]]:
     return [{name: float(values[k]) for name, values in columns.items()} for k in range(worlds.n)]
 
 
-PROGRESS_EVERY = 2_500  # worlds between two signs of life
 TRIED_CANDIDATES = 16  # of a script that searches, when a scenario is only checked
 
 LADDER = (  # from no decision at all up to the best that is known

@@ -65,6 +65,7 @@ _ALWAYS_TOLD = (
     "speeds_mps",
     "obstacle_gap_m",
 )  # quantities of those files that may be the same in all worlds
+_COLUMNS = ("at_rest", "predicted_harm", "chosen_policy", "shoved_m", "sampled_harm")  # of an outcome, [n]
 _LIBRARIES = ("pandas", "polars", "columns")  # of a frame, in the order of preference
 
 
@@ -100,12 +101,21 @@ class Outcome:
 
     def take(self, rows: Ints | Bools) -> Outcome:
         """That of some of the worlds."""
-        names = ("predicted_harm", "chosen_policy", "shoved_m", "sampled_harm")
-        columns: dict[str, Any] = {name: getattr(self, name) for name in names}
-        columns = {name: None if column is None else column[rows] for name, column in columns.items()}
+        found = {name: getattr(self, name) for name in _COLUMNS}
+        columns: dict[str, Any] = {name: None if column is None else column[rows] for name, column in found.items()}
         metrics = {name: column[rows] for name, column in self.metrics.items()}
-        ledger, final = self.ledger.take(rows), self.final.take(rows)
-        return replace(self, ledger=ledger, final=final, at_rest=self.at_rest[rows], metrics=metrics, **columns)
+        return replace(self, ledger=self.ledger.take(rows), final=self.final.take(rows), metrics=metrics, **columns)
+
+    @classmethod
+    def join(cls, parts: Sequence[Outcome]) -> Outcome:
+        """One from those of consecutive worlds."""
+        first = parts[0]
+        given = [name for name in _COLUMNS if getattr(first, name) is not None]
+        columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in given}
+        ledger = Ledger(*(np.concatenate([getattr(part.ledger, f.name) for part in parts]) for f in fields(Ledger)))
+        final = Worlds.concatenate([part.final for part in parts])
+        metrics = {name: np.concatenate([part.metrics[name] for part in parts]) for name in first.metrics}
+        return replace(first, ledger=ledger, final=final, metrics=metrics, **columns)
 
     @property
     def named_policies(self) -> dict[str, str]:

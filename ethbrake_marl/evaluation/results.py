@@ -49,7 +49,7 @@ from ethbrake_marl.evaluation.measures import (
     SummaryTable,
     Tally,
 )
-from ethbrake_marl.evaluation.rollout import evaluate_block
+from ethbrake_marl.evaluation.rollout import evaluate_list
 from ethbrake_marl.evaluation.statistics import paired_difference, unpaired_difference
 from ethbrake_marl.files.sheet import Estimate, parquet_file
 from ethbrake_marl.files.store import check_writable, parse_strict_json, read_plain, write_file
@@ -632,7 +632,7 @@ def _answer_block(
     """The statistics of worlds that are advanced together."""
     question = asked.question
     sample = question.scenario.sample(end - first, question.seed, first=first)
-    evaluation, left_out = evaluate_block(sample, lineup, scenario=question.scenario, seed=question.seed)
+    evaluation, left_out = evaluate_list(sample, lineup, question.scenario, question.seed)
     if evaluation is None:
         return Tally(left_out=left_out)
     if write is not None:

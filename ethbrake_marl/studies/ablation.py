@@ -18,7 +18,6 @@ from ethbrake_marl.agents import Agent, Driver, LearnedAgent, Team, make_single_
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, count_of
 from ethbrake_marl.evaluation import (
-    PROGRESS_EVERY,
     evaluate,
     interquartile_mean,
     load_runnable,
@@ -525,7 +524,7 @@ def _drive(scenario: Scenario, sample: Sample, drivers: Sequence[Driver], tell: 
     """Harms of several drivers of one level on the same worlds."""
     outcomes = []
     for driver in drivers:
-        result = evaluate(sample, {driver.name: driver}, scenario=scenario, chunk=PROGRESS_EVERY).complete()
+        result = evaluate(sample, {driver.name: driver}, scenario=scenario).complete()
         outcomes.append(result.outcome(driver.name))
         tell(Progress(f"driving {driver.name}", sample.worlds.n, sample.worlds.n))
     ledgers = [outcome.ledger for outcome in outcomes]

@@ -22,7 +22,6 @@ from ethbrake_marl.agents import Driver, knowledge_text, team_of
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, OnProgress, PhysicsError, Progress, one_line, unknown_name
 from ethbrake_marl.evaluation import (
-    PROGRESS_EVERY,
     check_agents,
     content_sha256,
     driving_policy,
@@ -418,7 +417,6 @@ def _drive_list(
             {**make_lineup([REFERENCE], each.scenario), **lineup},
             scenario=each.scenario,
             seed=content.seed,
-            chunk=PROGRESS_EVERY,
             on_progress=tell,
             aftermath=False,
         ).complete()

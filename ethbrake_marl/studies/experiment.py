@@ -17,16 +17,14 @@ import numpy as np
 
 from ethbrake_marl.agents import Agent, LearnedAgent
 from ethbrake_marl.defaults import DEFAULT
-from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, count_of
+from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, check_one_learner, count_of
 from ethbrake_marl.evaluation import (
     BASELINE,
     PER_WORLD,
-    PROGRESS_EVERY,
     TESTS,
     Evaluation,
     SummaryRow,
     SummaryTable,
-    controlled_vehicle,
     evaluate,
     make_agents,
     other_tests,
@@ -204,7 +202,8 @@ def run_experiment(
     """
     started = time.monotonic()
     tell = on_progress or (lambda progress: None)
-    vehicle = controlled_vehicle(scenario, None)
+    names = [scenario.vehicle_names[i] for i in scenario.learners]
+    check_one_learner(scenario.name, names, "say which vehicle the agents drive")
     sample = scenario.sample(episodes, list_seed)
     trained = train(
         recipe,
@@ -230,9 +229,7 @@ def run_experiment(
             sample,
             agents,
             scenario=scenario,
-            vehicle=vehicle,
             seed=list_seed,
-            chunk=PROGRESS_EVERY,
             on_progress=lambda name, done: tell(Progress(name, done, total)),
         )
         others, done = other_tests(scenario), count()

@@ -44,7 +44,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     watch(limits, "lower_bound", "bound")
     watch(limits, "best_known", "best known")
     watch(measures, "known_limits", "limits")
-    watch(rollout._Whole, "evaluation", "evaluation")
+    watch(rollout, "evaluate_list", "evaluation")
     return found
 
 

@@ -23,7 +23,6 @@ from ethbrake_marl.agents import Agent, LearnedAgent
 from ethbrake_marl.errors import InvalidInput, OnProgress, Progress
 from ethbrake_marl.evaluation import (
     PAPER_ROWS,
-    PROGRESS_EVERY,
     EpisodeRecord,
     Evaluation,
     PaperRow,
@@ -480,7 +479,6 @@ def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, s
         agents,
         scenario=scenario,
         seed=LIST_SEED,
-        chunk=PROGRESS_EVERY,
         aftermath=False,
         on_progress=lambda name, done: settings.tell(Progress(scenario.name, done, episodes)),
     )
@@ -1460,12 +1458,7 @@ def _measure(scenario: Scenario, alternative: Alternative, episodes: int) -> Hea
         agents[NAMES[PPO]] = hybrid(load_shipped("ppo"), own, alternative.bound)
     seed = LIST_SEED if alternative.seed is None else alternative.seed
     evaluation = evaluate(
-        own.sample(episodes, seed),
-        agents,
-        scenario=own,
-        seed=seed,
-        chunk=PROGRESS_EVERY,
-        aftermath=alternative.harm == "sampled",
+        own.sample(episodes, seed), agents, scenario=own, seed=seed, aftermath=alternative.harm == "sampled"
     )
     harm = {}
     for name, outcome in evaluation.outcomes.items():
