@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
+from numpy.typing import NDArray
 
 from ethbrake_marl.agents import Driver
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
@@ -25,12 +27,11 @@ from ethbrake_marl.evaluation import (
     write_output,
 )
 from ethbrake_marl.figures import harm_by_agent, harm_in_parts, regret_distribution
-from ethbrake_marl.files.sheet import DASH, Column, Estimate, Sheet, Shown
+from ethbrake_marl.files.sheet import Column, Sheet, Shown
 from ethbrake_marl.limits import Unproven
 from ethbrake_marl.pages.page import Page, Part, Played, Section
 from ethbrake_marl.physics import Bools, Floats, Ints
 from ethbrake_marl.scenario import Task
-from ethbrake_marl.shield import VERDICTS
 
 # The worlds that a report shows: the worst, the typical, and some drawn at random; and every agent in each.
 
@@ -88,23 +89,26 @@ def worst_section(evaluation: Evaluation, focus: str, watched: Sequence[int]) ->
     """The ten worlds in which an agent did worst; those that the page plays have a button."""
     regrets, outcome = evaluation.regrets, evaluation.outcome(focus)
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
-    known = [] if regrets is None else ["Best known, first", "Best known, total"]
-    known += [] if avoidable is None else ["Contact"]
-    head = ["World", "First-impact harm", "Total harm", *known, "Impacts"]
-    columns = [outcome.first_impact_harm, outcome.total_harm]
-    columns += [] if regrets is None else [regrets.best(count) for count in HARM_COUNTS]
+    columns: dict[str, NDArray[Any] | None] = {
+        "First-impact harm": outcome.first_impact_harm,
+        "Total harm": outcome.total_harm,
+        "Best known, first": None if regrets is None else regrets.first_impact_harm,
+        "Best known, total": None if regrets is None else regrets.total_harm,
+        "Contact": None if avoidable is None else np.where(avoidable, "avoidable", "unavoidable"),
+        "Impacts": outcome.impacts,
+    }
+    told = {name: column.tolist() for name, column in columns.items() if column is not None}
     rows = []
     for k in worst_rows(evaluation, focus).tolist():
         number = int(evaluation.index[k])
         button = Markup('{} <button type="button" data-watch="{}">Watch</button>').format(number, number)
-        contact = [] if avoidable is None else ["avoidable" if avoidable[k] else "unavoidable"]
-        harms = (f"{column[k]:.2f}" for column in columns)
-        rows.append([Shown(button) if number in watched else number, *harms, *contact, int(outcome.impacts[k])])
-    why = "as nothing is proven of these worlds" if regrets is None else "above the best known"
-    told = f"Of {focus}, by total harm{',' * (regrets is None)} {why}. Harm in m²/s²."
-    if not rows:
-        return Section("Worst ten worlds", [f"{focus} did no harm above the best known in any of these worlds."])
-    return Section("Worst ten worlds", [told, Part.table(Sheet(f"Worlds of {focus}", list(map(Column, head)), rows))])
+        rows.append([Shown(button) if number in watched else number, *(column[k] for column in told.values())])
+    why = ", as nothing is proven of these worlds" if regrets is None else " above the best known"
+    body: list[str | Part] = [f"{focus} did no harm above the best known in any of these worlds."]
+    if rows:
+        table = Part.table(Sheet(f"Worlds of {focus}", list(map(Column, ("World", *told))), rows))
+        body = [f"Of {focus}, by total harm{why}. Harm in m²/s².", table]
+    return Section("Worst ten worlds", body)
 
 
 def avoidable_section(evaluation: Evaluation) -> Section:
@@ -112,11 +116,11 @@ def avoidable_section(evaluation: Evaluation) -> Section:
     regrets = evaluation.regrets
     body: list[str | Part] = []
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
-    if regrets is None or avoidable is None:
+    if isinstance(evaluation.limits, Unproven):
         told = "Nothing is proven of these worlds, so what was avoidable is not told apart."
-        if regrets is not None:
-            told = "Where contact can be avoided is not decided for these vehicles, so that is not told apart."
-        body.append(f"{told} Reason: {evaluation.limits.because}." if isinstance(evaluation.limits, Unproven) else told)
+        body.append(f"{told} Reason: {evaluation.limits.because}.")
+    elif regrets is None or avoidable is None:
+        body.append("Where contact can be avoided is not decided for these vehicles, so that is not told apart.")
     else:
         share = rate(int(avoidable.sum()), len(avoidable)).in_words(digits=1, scale=100.0, unit=" %")
         body.append(
@@ -124,16 +128,18 @@ def avoidable_section(evaluation: Evaluation) -> Section:
         )
         for where, among in (("Contact avoidable", avoidable), ("Contact unavoidable", ~avoidable)):
             if among.any():
-                rows = []
-                for agent, each in evaluation.outcomes.items():
-                    harms = [each.ledger.world_harm(count) for count in HARM_COUNTS]
-                    means = [
-                        mean(values[among]) for values in (*harms, *(regrets.regret(each, c) for c in HARM_COUNTS))
-                    ]
-                    collided = rate(int((each.collided & among).sum()), int(among.sum()))
-                    rows.append([agent, _cell(collided, 100.0, 1, " %"), *map(_cell, means)])
-                caption = f"{where}: {count_of(int(among.sum()), 'world')}"
-                body.append(Part.table(Sheet(caption, list(map(Column, _SPLIT)), rows)))
+                part = evaluation.take(among)
+                caption = f"{where}: {count_of(part.worlds.n, 'world')}"
+                rows = [
+                    (
+                        agent,
+                        rate(int(each.collided.sum()), part.worlds.n),
+                        *(mean(each.world_harm(count)) for count in HARM_COUNTS),
+                        *(mean(regrets.regret(evaluation.outcomes[agent], count)[among]) for count in HARM_COUNTS),
+                    )
+                    for agent, each in part.outcomes.items()
+                ]
+                body.append(Part.table(Sheet(caption, _SPLIT, rows)))
         about = "Mean harm per world as the least that is known, and what each agent did above it."
         body.append(Part.drawing(harm_in_parts(evaluation), "What the harm is made of", about))
     title, words = "Harm world by world", "For each harm x, the share of the worlds in which an agent did more."
@@ -144,49 +150,23 @@ def avoidable_section(evaluation: Evaluation) -> Section:
     return Section("What was avoidable", body)
 
 
-_SPLIT = ("Agent", "Collided", "First-impact harm", "Total harm", "Regret, first-impact", "Regret, total")
+_SPLIT = (
+    "Agent", Column("Collided", digits=1, scale=100.0, unit=" %"),
+    *map(Column, ("First-impact harm", "Total harm", "Regret, first-impact", "Regret, total")),
+)  # fmt: skip
 
 
 def shield_section(rows: ShieldModes, conditions: str) -> Section:
     """The modes of the shield on the same worlds, and what each intervention of step mode was good for."""
-    teams = rows.of_teams
-    head = ["Agent, mode", "Harm", "Minus no shield" if teams else "Minus episode mode", "Decisions replaced"]
-    head += [*VERDICTS, "Worlds above the bound"]
-    lines = []
-    for row in rows:
-        shares = map(_share, (row.replaced, *(row.verdicts or [None] * len(VERDICTS))))
-        above = DASH if row.above_bound is None else row.above_bound
-        against = row.against_none if teams else row.against_episode
-        told_against = DASH if against is None else _cell(against)
-        lines.append([f"{row.agent}, {row.mode}", _cell(row.harm), told_against, *shares, above])
     told = (
         "Each agent alone and behind every mode of the shield. Each decision that step mode replaced was simulated"
         " again without it: needed (harm would have been higher), harmless (the same), costly (lower)."
     )
-    body: list[str | Part] = [told, Part.table(Sheet("Modes of the shield", list(map(Column, head)), lines))]
-    if teams:
-        head = ["Agent, mode, vehicle", "Decisions replaced", "Bears", "Under the baseline plan", "Worlds with more"]
-        lines = [
-            [f"{row.agent}, {row.mode}, {each.vehicle}", _share(each.replaced), f"{each.harm:.2f}",
-             f"{each.baseline:.2f}", _share(each.above_baseline)]
-            for row in rows
-            for each in row.vehicles
-        ]  # fmt: skip
-        body.append(Part.table(Sheet("What each vehicle bears", list(map(Column, head)), lines)))
-    body.append(Part.paragraph(conditions, "quiet"))
+    body = [told, *map(Part.table, rows.sheets()), Part.paragraph(conditions, "quiet")]
     if left_out := rows[0].left_out:
         told_of = count_of(len(left_out), "world")
         body.append(Part.paragraph(f"Left out: {told_of}, which the physics could not advance.", "note"))
     return Section("Shield", body)
-
-
-def _share(share: float | None) -> str:
-    return DASH if share is None else f"{100.0 * share:.1f} %"
-
-
-def _cell(estimate: Estimate, scale: float = 1.0, digits: int = 2, unit: str = "") -> Shown:
-    value, *ends = (f"{scale * each:.{digits}f}" for each in (estimate.value, *(estimate.interval or ())))
-    return Shown(f"{value}{unit}".replace("-", "−"), ", ".join(ends).replace("-", "−"))
 
 
 _OTHERS = ("sampled_harm", "vehicle_1_shoved_m", "vehicle_1_shoved_far_rate", "predicted_harm")
