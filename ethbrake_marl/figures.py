@@ -760,7 +760,8 @@ _MISMATCH = (
     ("robust", "corner", 2, "robust, a corner"),
     ("robust", "inside", 3, "robust, inside"),
 )
-_ROBUSTNESS = (  # of each panel: title, unit, and its lines: mode, truth, what is drawn, number of the style, label
+# of each panel: title, unit, and its lines: mode, truth, what is drawn, number of the style, label
+_ROBUSTNESS: tuple[tuple[str, str, list[tuple[str, str, str, int, str]]], ...] = (
     (
         "The world is as told",
         "Mean over worlds (m²/s²)",
@@ -769,12 +770,12 @@ _ROBUSTNESS = (  # of each panel: title, unit, and its lines: mode, truth, what 
     (
         "The truth differs: above the bound",
         "Worlds above the bound at the alert",
-        [(mode, truth, "above", *told) for mode, truth, *told in _MISMATCH],
+        [(mode, truth, "above", number, label) for mode, truth, number, label in _MISMATCH],
     ),
     (
         "The truth differs: excess",
         "Mean excess (m²/s²)",
-        [(mode, truth, "excess", *told) for mode, truth, *told in _MISMATCH],
+        [(mode, truth, "excess", number, label) for mode, truth, number, label in _MISMATCH],
     ),
 )
 

@@ -530,14 +530,15 @@ def explore_command(
 
     It listens on this machine alone, and its address holds a token that is new each time. Ctrl-C ends it.
     """
+    from ethbrake_marl.evaluation import make_agents
     from ethbrake_marl.pages.explorer import Explored, serve_explorer
 
-    chosen = _asked_task(scenario, vehicle, settings, alone=True).scenario
-    explored = Explored(chosen, _make_drivers(agents, chosen, harm_count), harm_count)
+    task = _asked_task(scenario, vehicle, settings, harm_count, alone=True)
+    explored = Explored(task, make_agents(agents.split(","), task.scenario, harm_count=harm_count))
 
     def ready(address: str) -> None:
         out.show(address)
-        out.note(f"explore {chosen.name} there; files go to {folder.resolve()}; Ctrl-C ends it")
+        out.note(f"explore {task.scenario.name} there; files go to {folder.resolve()}; Ctrl-C ends it")
         if not no_browser:
             webbrowser.open(address)
 

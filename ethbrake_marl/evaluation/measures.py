@@ -414,14 +414,13 @@ class Evaluation:
 
     def _repr_html_(self) -> str:
         """What each agent did, for a notebook."""
-        harms = {"First-impact harm": "first_impact_harm", "Total harm": "total_harm"}
-        rows = []
-        for agent, outcome in self.outcomes.items():
-            collided = rate(int(outcome.collided.sum()), self.worlds.n)
-            means = [mean(getattr(outcome, name)).in_words() for name in harms.values()]
-            rows.append((agent, collided.in_words(digits=1, scale=100.0, unit=" %"), *means))
+        share = Column("Collisions", digits=1, scale=100.0, unit=" %")
+        rows = [
+            (agent, rate(int(each.collided.sum()), self.worlds.n), mean(each.first_impact_harm), mean(each.total_harm))
+            for agent, each in self.outcomes.items()
+        ]
         note = "Means per world in m²/s², with their 95 % intervals. eb.summarise tells more."
-        return Sheet(repr(self), ("Agent", "Collisions", *harms), rows, note).html()
+        return Sheet(repr(self), ("Agent", share, Column("First-impact harm"), Column("Total harm")), rows, note).html()
 
     def complete(self) -> Evaluation:
         """The evaluation itself, for who needs every world; raises ``PhysicsError`` if some were left out."""
@@ -1505,34 +1504,21 @@ class SummaryTable(list[SummaryRow]):
             bound = row.known_best_share is not None and row.known_best_share < 1.0
             cells["mean_regret_first"] = Shown(f"≥ {value}" if bound else value, interval)
             lines.append((row.agent, SEES_THROUGH * row.sees_through + knowledge_text(row.knows), *cells.values()))
-        for name, paper in self._papers().items():
-            lines += [
-                f"paper, {name}",
-                *((agent, None, *(cells.get(c.name) for c in columns)) for agent, cells in paper),
-            ]
-        return Sheet("", ["Agent", "Knows", *columns], lines)
-
-    def _papers(self) -> dict[str, list[tuple[str, dict[str, str]]]]:
-        """The paper's rows that belong beside these, by table, with the digits that it prints."""
-        found: dict[str, list[tuple[str, dict[str, str]]]] = {}
-        for row in PAPER_ROWS if self and self[0].beside_paper else ():
-            cells = {
-                "collision_rate": f"{100 * row.collision_rate:.4g} %",
-                "first_impact_harm": f"{row.average_harm:.6g}",
+        for paper in PAPER_ROWS if self and self[0].beside_paper else ():
+            printed = {
+                "collision_rate": f"{100 * paper.collision_rate:.4g} %",
+                "first_impact_harm": f"{paper.average_harm:.6g}",
             }
-            if row.harm_decrease is not None:
-                cells["harm_decrease_first"] = f"{100 * row.harm_decrease:.4g} %"
-            found.setdefault(row.table, []).append((row.agent, cells))
-        return found
-
-    def paper_lines(self) -> list[str]:
-        """The conditions of the paper's rows beside these, by table; the last is what must be known of them."""
-        found = [f"{name}: {PAPER_PARAMETERS[name]}." for name in self._papers()]
-        return [*found, PAPER_NOTE] if found else []
+            if paper.harm_decrease is not None:
+                printed["harm_decrease_first"] = f"{100 * paper.harm_decrease:.4g} %"
+            section = f"paper, {paper.table}"
+            lines += [] if section in lines else [section]
+            lines.append((paper.agent, None, *(printed.get(column.name) for column in columns)))
+        return Sheet("", ["Agent", "Knows", *columns], lines)
 
     def terminal(self) -> Sheet:
         """The table for a terminal of 80 columns or more: ours, then the paper's rows, then the conditions of each."""
-        narrow = (*_ALWAYS_SHOWN, *_NARROW[bool(self.limit_lines())])
+        narrow = (*_ALWAYS_SHOWN, *_NARROW[bool(self.limit_line())])
         columns = [
             replace(each, wide=each.name not in narrow, interval="below" if each.name in _BELOW else "hidden")
             for each in (measure.column() for measure in measures() if measure.heading)
@@ -1556,43 +1542,45 @@ class SummaryTable(list[SummaryRow]):
     def _conditions(self) -> str:
         if not self:
             return ""
-        texts = [
+        ours = (
             f"Ours: {self[0].parameters.line}. Harms are means per world in m²/s²; in brackets or"
             " below a value: its 95 % interval; decreases are relative to full braking."
-        ]
-        texts += self.left_out_lines() + self.warning_lines() + self.limit_lines() + self.knowledge_lines()
-        *paper, note = self.paper_lines() or [""]
-        return "\n\n".join([*texts, *(f"Paper, {line}" for line in paper), *([note] if note else [])])
+        )
+        return "\n\n".join([ours, *(text for _, text in self.notes())])
 
-    def left_out_lines(self) -> list[str]:
-        """Which worlds no row counts, as a sentence; none where every world counts."""
-        left_out = self[0].left_out if self else ()
-        if not left_out:
-            return []
-        whole = self[0].episodes + len(left_out)
-        return [LeftOut.line([str(left) for left in left_out], whole)]
+    def notes(self) -> list[tuple[str, str]]:
+        """What must be told beside the table: ``quiet`` or ``note`` (it must not be overlooked), and the sentences.
 
-    def warning_lines(self) -> list[str]:
-        """That a table of best known harm lacks some of these worlds, and where the horizon cut a motion off.
-
-        None where all is well.
+        Which worlds no row counts, that a table of best known harm lacks some of these worlds, where the horizon cut a
+        motion off, the limits, who knows what, and the conditions of the paper's rows.
         """
-        lines = [f"WARNING: {self[0].warning}."] if self and self[0].warning else []
-        moving = [f"{row.agent} {row.horizon_ends:,}" for row in self if row.horizon_ends]
-        if moving:
-            lines.append(
-                f"At the horizon ({self[0].parameters['horizon_s']:g} s) something still moved, and what came after"
-                f" counts nowhere; worlds, of {self[0].episodes:,}: {', '.join(moving)}."
-            )
-        return lines
+        if not self:
+            return []
+        row = self[0]
+        left_out = LeftOut.line([str(left) for left in row.left_out], row.episodes + len(row.left_out))
+        moving = ", ".join(f"{each.agent} {each.horizon_ends:,}" for each in self if each.horizon_ends)
+        cut_off = (
+            f"At the horizon ({row.parameters['horizon_s']:g} s) something still moved, and what came after"
+            f" counts nowhere; worlds, of {row.episodes:,}: {moving}."
+        )
+        paper = [("quiet", f"Paper, {name}: {told}.") for name, told in PAPER_PARAMETERS.items()]
+        told = [
+            ("note", left_out if row.left_out else ""),
+            ("note", f"WARNING: {row.warning}." if row.warning else ""),
+            ("note", cut_off if moving else ""),
+            ("quiet", self.limit_line()),
+            ("note", self._knowledge_line()),
+            *([*paper, ("note", PAPER_NOTE)] if row.beside_paper else []),
+        ]
+        return [(kind, text) for kind, text in told if text]
 
-    def limit_lines(self) -> list[str]:
-        """What nobody could avoid here and the best known harm, as sentences; none where nothing is proven."""
+    def limit_line(self) -> str:
+        """What nobody could avoid here and the best known harm, as sentences; empty where nothing is proven."""
         first, total = (
             (self[0][f"best_known_{name}_harm"] for name in ("first_impact", "total")) if self else (None, None)
         )
         if first is None or total is None:
-            return []
+            return ""
         row = self[0]
         driven = row.parameters.get("controlled_vehicle")
         command = f"command of {str(driven).replace('vehicle_', 'Vehicle ')}" if driven else "joint command"
@@ -1622,21 +1610,21 @@ class SummaryTable(list[SummaryRow]):
         below = [
             f"{each.agent} in {count_of(each.below_best_known, 'world')}" for each in self if each.below_best_known
         ]
-        return [text + (f" Below what was known: {', '.join(below)}." if below else "")]
+        return text + (f" Below what was known: {', '.join(below)}." if below else "")
 
-    def identity_lines(self) -> list[str]:
-        """By which hashes this result is recognised, as a sentence; none without rows."""
+    def identity_line(self) -> str:
+        """By which hashes this result is recognised, as a sentence; empty without rows."""
         if not self:
-            return []
+            return ""
         policies = [f"{row.agent} ({', '.join(row.policy_sha256.values())})" for row in self if row.policy_sha256]
         text = f"SHA-256 of the worlds {self[0].worlds_sha256}, of the scenario {self[0].scenario_sha256}"
-        return [f"{text}{', of policies: ' + '; '.join(policies) if policies else ''}."]
+        return f"{text}{', of policies: ' + '; '.join(policies) if policies else ''}."
 
-    def knowledge_lines(self) -> list[str]:
-        """Who sees through the channel, and who does not say, as sentences; none where the channel hides nothing."""
-        hidden = self[0].hidden_share if self else 0.0
+    def _knowledge_line(self) -> str:
+        """Who sees through the channel, and who does not say, as sentences; empty where the channel hides nothing."""
+        hidden = self[0].hidden_share
         if not hidden:
-            return []
+            return ""
         text = (
             f"In {100 * hidden:.1f} % of these worlds the channel hides something of the line from a driven vehicle at"
             " its first decision: news that has not arrived, or how late another vehicle will react."
@@ -1648,7 +1636,7 @@ class SummaryTable(list[SummaryRow]):
                 " compare with, and nothing that a vehicle on this channel could do."
             )
         silent = ", ".join(row.agent for row in self if Source.UNSTATED in row.knows)
-        return [text + (f" Not stated what it knows: {silent}." if silent else "")]
+        return text + (f" Not stated what it knows: {silent}." if silent else "")
 
 
 def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTable:

@@ -150,7 +150,7 @@ def avoidable_section(evaluation: Evaluation) -> Section:
     return Section("What was avoidable", body)
 
 
-_SPLIT = (
+_SPLIT: tuple[Column | str, ...] = (
     "Agent", Column("Collided", digits=1, scale=100.0, unit=" %"),
     *map(Column, ("First-impact harm", "Total harm", "Regret, first-impact", "Regret, total")),
 )  # fmt: skip
@@ -158,11 +158,13 @@ _SPLIT = (
 
 def shield_section(rows: ShieldModes, conditions: str) -> Section:
     """The modes of the shield on the same worlds, and what each intervention of step mode was good for."""
+    if not rows:
+        return Section("Shield", ())
     told = (
         "Each agent alone and behind every mode of the shield. Each decision that step mode replaced was simulated"
         " again without it: needed (harm would have been higher), harmless (the same), costly (lower)."
     )
-    body = [told, *map(Part.table, rows.sheets()), Part.paragraph(conditions, "quiet")]
+    body: list[str | Part] = [told, *map(Part.table, rows.sheets()), Part.paragraph(conditions, "quiet")]
     if left_out := rows[0].left_out:
         told_of = count_of(len(left_out), "world")
         body.append(Part.paragraph(f"Left out: {told_of}, which the physics could not advance.", "note"))
@@ -178,7 +180,7 @@ class Report:
 
     title: str
     rows: Sequence[SummaryRow]
-    evaluation: Evaluation | None = None  # that the rows sum up
+    evaluation: Evaluation  # that the rows sum up
     played: Sequence[Played] = ()  # episodes to watch
     shield: Section | None = None  # what is behind a shield
     focus: str = ""  # the agent whose worst worlds are shown
@@ -209,7 +211,6 @@ class Report:
 
         """
         evaluation = self.evaluation
-        assert evaluation is not None
         learned = [row.agent for row in self.rows if row.policy_sha256]
         focus = self.focus or [*[row.agent for row in self.rows][-1:], *learned][-1]
         chosen = choose_shown(evaluation, focus)
@@ -226,33 +227,23 @@ class Report:
         modes = compare_modes(agents, some, Task(evaluation.scenario, evaluation.vehicles, harm_count), behind=True)
         line = Conditions({**evaluation.conditions, "count": some.n}).line
         count = "First-impact" if harm_count == "first" else "Total"
-        shield = shield_section(modes, f"{count} harm, which the shield bounds, in m²/s². {line}.") if modes else None
+        shield = shield_section(modes, f"{count} harm, which the shield bounds, in m²/s². {line}.")
         return replace(self, played=played, shield=shield, focus=focus)
 
     @property
     def html(self) -> str:
         """The page; it loads nothing from anywhere."""
-        sections = [self._results(), *self._episodes()]
-        if self.evaluation is not None:
-            if self.focus:
-                sections.append(worst_section(self.evaluation, self.focus, [one.number for one in self.played]))
-            sections.append(avoidable_section(self.evaluation))
-        sections += [self.shield] if self.shield is not None else []
-        sections += [Section("Figures", self.figures)] if self.figures else []
+        sections: list[Section | None] = [self._results(), self._episodes()]
+        if self.focus:
+            sections.append(worst_section(self.evaluation, self.focus, [one.number for one in self.played]))
+        sections += [avoidable_section(self.evaluation), self.shield, Section("Figures", self.figures)]
         all_rows = SummaryTable(self.rows)
-        sheet, nowhere = all_rows.sheet(), set(_empty(self.rows))
+        sheet, nowhere = all_rows.sheet(), set(_empty(all_rows))
         for title, about, told_rows in self.tests:
             rows = SummaryTable(told_rows)
-            body: list[str | Part] = [about, _table(rows.sheet(), title, {"Knows"})]
-            if empty := _empty(rows):
-                told = f"Columns without a value in any row are left out: {'; '.join(empty)}."
-                body.append(Part.paragraph(told, "quiet"))
-            if rows:
-                lines = [f"{rows[0].parameters.line}.", *rows.limit_lines(), *rows.identity_lines()]
-                body += [Part.paragraph(text, "note") for text in rows.warning_lines()]
-                body += [Part.paragraph(text, "quiet") for text in lines]
-            sections.append(Section(title, body))
-            nowhere.intersection_update(empty)
+            told = [_table(rows.sheet(), title, {"Knows"}), *_told(rows), Part.paragraph(rows.identity_line(), "quiet")]
+            sections.append(Section(title, [about, *told]))
+            nowhere.intersection_update(_empty(rows))
         ours = replace(sheet, rows=sheet.rows[: len(self.rows)])
         others = _table(ours, "In the same worlds", set(sheet.names) - {"Knows", *_OTHERS})
         meanings = {}
@@ -260,45 +251,37 @@ class Report:
             about_it = {column for column in sheet.headings[2:] if column.startswith(name)}
             if not about_it or about_it - nowhere:
                 meanings[name] = meaning
-        sections.append(Section("Other measures", [others]))
-        sections.append(Section("How to read the tables", [Part.facts(meanings)]))
-        if self.settings:
-            sections.append(Section("Settings and seeds", [Part.facts(self.settings)]))
         versions = [Part.facts(self.versions)] if self.versions else []
-        versions += [Part.paragraph(text, "quiet") for text in all_rows.identity_lines()]
-        sections += [Section("Versions", versions)] if versions else []
-        return Page(self.title, sections, lead=self.summary).html
+        versions += [Part.paragraph(all_rows.identity_line(), "quiet")] if all_rows else []
+        sections += [
+            Section("Other measures", [others]),
+            Section("How to read the tables", [Part.facts(meanings)]),
+            Section("Settings and seeds", [Part.facts(self.settings)] if self.settings else ()),
+            Section("Versions", versions),
+        ]
+        shown = [section for section in sections if section is not None and section.body]
+        return Page(self.title, shown, lead=self.summary).html
 
     def write(self, path: str | Path, *, force: bool = False) -> None:
         """Write the page; raises ``AlreadyExists`` unless ``force``, ``InvalidInput`` without a folder."""
         write_output(path, self.html.encode("utf-8"), force=force)
 
     def _results(self) -> Section:
-        rows, quiet = SummaryTable(self.rows), []
+        rows = SummaryTable(self.rows)
         body: list[str | Part] = []
         if rows:
             about = "Mean per world of the squared closing speed of impacts: each pair's first one, and every one."
             body.append(Part.drawing(harm_by_agent(rows), "Harm of each agent", about))
-            quiet.append(f"{rows[0].parameters.line}. Harm in m²/s².")
-        body.append(_table(rows.sheet(), "Means with 95 % intervals", {"Knows", *_OTHERS}))
-        if empty := _empty(rows):
-            limits = self.evaluation.limits if self.evaluation is not None else None
-            because = f" Nothing is proven of these worlds: {limits.because}." if isinstance(limits, Unproven) else ""
-            quiet.append(f"Columns without a value in any row are left out: {'; '.join(empty)}.{because}")
-        body += [Part.paragraph(text, "quiet") for text in quiet]
-        body += [Part.paragraph(text, "note") for text in (*rows.left_out_lines(), *rows.warning_lines())]
-        body += [Part.paragraph(f"The limit: {text}", "quiet") for text in rows.limit_lines()]
-        body += [Part.paragraph(f"Who knows what: {text}", "note") for text in rows.knowledge_lines()]
-        *paper, note = rows.paper_lines() or [""]
-        body += [Part.paragraph(f"The paper's {line}", "quiet") for line in paper]
-        body += [Part.paragraph(note, "note")] if note else []
-        return Section("Results", body)
+        limits = self.evaluation.limits
+        because = f" Nothing is proven of these worlds: {limits.because}." if isinstance(limits, Unproven) else ""
+        table = _table(rows.sheet(), "Means with 95 % intervals", {"Knows", *_OTHERS})
+        return Section("Results", [*body, table, *_told(rows, because)])
 
-    def _episodes(self) -> list[Section]:
+    def _episodes(self) -> Section:
         """The episodes to watch; which agents drove otherwise when they drove once more, and where episodes end."""
         evaluation, played = self.evaluation, self.played
-        if not played or evaluation is None:
-            return []
+        if not played:
+            return Section("Episodes", ())
         rows = {int(number): row for row, number in enumerate(evaluation.index)}
         unrepeated: dict[str, int] = {}
         for world in played:
@@ -313,22 +296,29 @@ class Report:
             if count
         ]
         moving = sum(not all(motion.at_rest for motion in world.motions.values()) for world in played)
-        until = "from the alert to rest"
-        if moving:
-            until += (
-                f", or to the horizon of {evaluation.scenario.horizon_s:g} s: in {count_of(moving, 'world')} the line"
-                " of some agent was not at rest then, and the player says whose"
-            )
+        until = (
+            f"from the alert to rest, or to the horizon of {evaluation.scenario.horizon_s:g} s: in"
+            f" {count_of(moving, 'world')} the line of some agent was not at rest then, and the player says whose"
+        )
+        until = until if moving else "from the alert to rest"
         shown, every = len(played), evaluation.worlds.n
         told = f"{shown} of the {every:,} worlds" if shown < every else f"All {shown} worlds"
         player = Part.player(played, evaluation.vehicles, focus=self.focus)
         body: list[str | Part] = [f"{told}, {until}.", *(Part.paragraph(text, "note") for text in notes), player]
-        return [Section("Episodes", body)]
+        return Section("Episodes", body)
 
 
-def _empty(rows: Sequence[SummaryRow]) -> list[str]:
+def _told(rows: SummaryTable, because: str = "") -> list[Part]:
+    """What stands below the table of these rows; ``because``: why columns of it may be empty."""
+    told = [("quiet", f"{row.parameters.line}. Harm in m²/s².") for row in rows[:1]]
+    if empty := _empty(rows):
+        told.append(("quiet", f"Columns without a value in any row are left out: {'; '.join(empty)}.{because}"))
+    return [Part.paragraph(text, kind) for kind, text in (*told, *rows.notes())]
+
+
+def _empty(rows: SummaryTable) -> list[str]:
     """Columns of the table of these rows in which no line has a value."""
-    sheet = SummaryTable(rows).sheet()
+    sheet = rows.sheet()
     filled = sheet.filled()
     return [name for k, name in enumerate(sheet.headings) if k not in filled]
 
