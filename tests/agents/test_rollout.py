@@ -10,7 +10,7 @@ from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.agents.registry import make_agent, register_agent
 from ethbrake_marl.agents.rollout import drive, script_agents
 from ethbrake_marl.engine import Engine
-from ethbrake_marl.envs.common import make_engine
+from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.episodes import Task, film_scenes, follow_episodes, record_episode, record_episodes

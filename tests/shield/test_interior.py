@@ -8,7 +8,7 @@ import pytest
 from ethbrake_marl.agents.protocol import fixed_commands
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.agents.rollout import drive, script_agents
-from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.envs.interfaces import parallel_env
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.physics.kernel import Decisions
 from ethbrake_marl.scenario import load_scenario
