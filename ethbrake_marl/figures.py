@@ -45,7 +45,6 @@ from ethbrake_marl.envs import (
 )
 from ethbrake_marl.errors import InvalidInput, count_of, plain_text
 from ethbrake_marl.evaluation import (
-    NO_REGION,
     Conditions,
     CriticalityMap,
     DecelerationCurve,
@@ -54,9 +53,9 @@ from ethbrake_marl.evaluation import (
     ShieldModes,
     SummaryRow,
     mean,
-    write_output,
 )
 from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.files.store import write_output
 from ethbrake_marl.limits import Unproven
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.shield import OperatingPoint, RobustnessPoint
@@ -701,7 +700,7 @@ def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
     for row, (pair, names) in enumerate(curve.regimes.items()):
         for start, stop in pairwise([0, *(np.flatnonzero(changes[pair]) + 1), len(names)]):
             name, left, right = str(names[start]), at[start], at[min(stop, len(at) - 1)]
-            if name != NO_REGION:
+            if name in _REGIMES:
                 colour = _REGIMES[name][0]
                 strips.barh(-row, right - left, left=left, height=0.8, color=colour, edgecolor=GREY, linewidth=0.6)
                 present.append(name)

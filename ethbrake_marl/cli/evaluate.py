@@ -42,11 +42,12 @@ def _asked_task(
     alone: bool = False,
 ) -> Task:
     """The scenario that is named, with its settings and with who is driven; ``alone``: that is one vehicle."""
-    from ethbrake_marl.evaluation import load_driven
+    from ethbrake_marl.evaluation import load_runnable
     from ethbrake_marl.learning import read_settings
     from ethbrake_marl.scenario import Task
 
-    chosen = load_driven(scenario, vehicle, read_settings(settings).scenario, alone=alone)
+    given = read_settings(settings).scenario
+    chosen = load_runnable(scenario, given, vehicle=vehicle, drives="one" if alone else "some")
     return Task(chosen, chosen.learners, harm_count)
 
 
@@ -128,7 +129,6 @@ def evaluate_command(
     from ethbrake_marl.evaluation import (
         Evaluation,
         Question,
-        Rescored,
         check_agents,
         choose_worlds,
         evaluate,
@@ -183,7 +183,7 @@ def evaluate_command(
     out.result(results, *shown)
     _tell_horizon(out, summary, sample.worlds.n, chosen)
     if told and not out.as_json:
-        out.show(Rescored.sheet(told, harm_count))
+        out.show(told.sheet(harm_count))
 
 
 def _check_shards(
@@ -210,12 +210,12 @@ def _check_shards(
 
 def _check_outputs(out: Out, per_world: Path | None, report: Path | None) -> None:
     """Refuse outputs that cannot be written, or that would replace one another, before any work."""
-    from ethbrake_marl.evaluation import check_per_world
-
     out.check(report, *PAGES, what="a report")
     if per_world is None:
         return
-    check_per_world(per_world)
+    out.check(per_world, ".csv", ".parquet", what="a file of every world")
+    if per_world.suffix.lower() == ".parquet":
+        need("pyarrow")
     for file in (per_world, _beside(per_world)):
         out.check(file)
         if report is not None and file.resolve() == report.resolve():
@@ -231,7 +231,6 @@ def _evaluate_in_shards(
     out: Out, question: Question, shards: int, jobs: int, ray: str | None, output: Path | None, rows: bool
 ) -> None:
     """Drive the list shard by shard, and print the table that is printed without shards."""
-    from ethbrake_marl.evaluation import Rescored
     from ethbrake_marl.files.store import write_file
     from ethbrake_marl.studies.jobs import evaluate_shards, open_workers
 
@@ -253,7 +252,7 @@ def _evaluate_in_shards(
     _tell_horizon(out, summary, tally.worlds, question.scenario)
     if question.objectives and not out.as_json:
         told = tally.rescore(question.objectives, question.scenario.vehicles)
-        out.show(Rescored.sheet(told, question.harm_count))
+        out.show(told.sheet(question.harm_count))
 
 
 def _json_text(content: object) -> str:
@@ -429,18 +428,14 @@ def record_command(
     uncertainty: str | None = None,
 ) -> None:
     """Agents in one world of the list, in real time: the road to scale, commands, impacts, harm."""
-    from ethbrake_marl.evaluation import check_film, film_bytes, film_scenes
+    from ethbrake_marl.evaluation import film
 
-    check_film(output.suffix.lower(), len(agents.split(",")))
     out.check(output)
     chosen = _asked_task(scenario, vehicle, None).scenario
     lineup = _make_drivers(agents, chosen, uncertainty=uncertainty)
     worlds = chosen.sample(1, seed, first=world).worlds
-    films = {
-        f"{name}: world {world} of {chosen.name}": film_scenes(worlds, agent, scenario=chosen)
-        for name, agent in lineup.items()
-    }
-    out.write(output, film_bytes(films, output.suffix.lower()), what="film")
+    titled = {f"{name}: world {world} of {chosen.name}": agent for name, agent in lineup.items()}
+    out.write(output, film(worlds, titled, output.suffix.lower(), scenario=chosen), what="film")
 
 
 @command(watch_group, "replay", "watch replay PASSPORT --output again.html", json=True, force=True)
@@ -467,13 +462,11 @@ def replay_command(
 
     Exit status 1 where the world or the episode is another one than the passport's.
     """
-    from ethbrake_marl.evaluation import Passport, check_film, film_bytes, film_scenes
+    from ethbrake_marl.evaluation import Passport, film
     from ethbrake_marl.learning import read_settings
     from ethbrake_marl.shield import parse_uncertainty
 
     named = Passport.parse(passport)
-    if output is not None and output.suffix.lower() not in PAGES:
-        check_film(output.suffix.lower())
     out.check(output)
     intervals = None if uncertainty is None else parse_uncertainty(uncertainty)
     found = named.replay(
@@ -488,8 +481,8 @@ def replay_command(
         *(f"Differs: {each}." for each in found.differences),
     ]
     if output is not None and output.suffix.lower() not in PAGES:
-        scenes = film_scenes(found.worlds, found.agent, scenario=found.scenario)
-        out.write(output, film_bytes({found.title: scenes}, output.suffix.lower()))
+        drivers = {found.title: found.agent}
+        out.write(output, film(found.worlds, drivers, output.suffix.lower(), scenario=found.scenario))
     elif output is not None:
         from ethbrake_marl.pages.page import Page, Part, Played, Section
 
@@ -567,10 +560,9 @@ def dataset_command(
     As one Parquet file of any agents and learners, or as a dataset of Minari of one learner. The recorded actions
     replay to the same bits. The reward counts the harm of --harm-count, too.
     """
-    from ethbrake_marl.evaluation import check_agents, check_dataset, write_dataset
+    from ethbrake_marl.evaluation import check_agents, write_dataset
 
     chosen = _asked_task(scenario, vehicle, settings, harm_count).scenario
-    kind = check_dataset(output, chosen, format, force=out.force)
     lineup = _make_drivers(agents, chosen, harm_count, uncertainty)
     check_agents(lineup, chosen.sample(1, seed).worlds, chosen)
     summary = write_dataset(
@@ -579,7 +571,7 @@ def dataset_command(
         scenario=chosen,
         episodes=episodes,
         seed=seed,
-        format=kind,
+        format=format,
         reward="harm" if harm_count == "first" else "total-harm",
         force=out.force,
         on_progress=lambda agent, done: out.progress(agent, done, episodes),

@@ -67,21 +67,14 @@ def best_harm_command(
     """
     import numpy as np
 
-    from ethbrake_marl.evaluation import (
-        load_runnable,
-        make_agents,
-        proven_of_table,
-        result_identity,
-        shipped_bounds,
-        shipped_sheet,
-    )
+    from ethbrake_marl.evaluation import load_runnable, make_agents, proven_of_table, result_identity, shipped_bounds
     from ethbrake_marl.learning import read_settings
     from ethbrake_marl.limits import BestHarmTable, search_list
     from ethbrake_marl.scenario import Task
 
     if shipped:
-        found = shipped_bounds()
-        out.result(found, *shipped_sheet(found).markdown().splitlines())
+        found, sheet = shipped_bounds()
+        out.result(found, *sheet.markdown().splitlines())
         return
     out.check(output, ".npz", what="a table")
     given = read_settings(settings)
@@ -193,7 +186,7 @@ def falsify_command(
     """
     import numpy as np
 
-    from ethbrake_marl.evaluation import NamedWorlds, check_agents, load_driven, result_versions
+    from ethbrake_marl.evaluation import NamedWorlds, check_agents, load_runnable, result_versions
     from ethbrake_marl.files.sheet import Sheet
     from ethbrake_marl.learning import read_settings
     from ethbrake_marl.studies.falsification import Measure, falsify
@@ -212,7 +205,7 @@ def falsify_command(
     agent = agent or "policy@shipped"
     out.check(output, ".yaml", ".yml", what="a file of worlds")
     given = read_settings(settings)
-    chosen = load_driven(scenario, vehicle, given.scenario, alone=False)
+    chosen = load_runnable(scenario, given.scenario, vehicle=vehicle, drives="some")
     measured_by = Measure.of(measure, agent, against, chosen, harm_count)
     check_agents(measured_by.agents, chosen.replace(early_impacts="keep").sample(1, seed).worlds, chosen)
     found = falsify(
@@ -237,7 +230,7 @@ def falsify_command(
         f" tried, {f'the first after {first:,}' if first else 'none'}."
         " The search looks for bad worlds: shares of it say nothing about a list."
     )
-    told["worlds"] = [world.model_dump(exclude_none=True) for world in worlds]
+    told["worlds"] = []
     if worlds:
         kept = NamedWorlds.of(
             measured_by.scenario,
@@ -257,7 +250,7 @@ def falsify_command(
         beside = {"harm": [], "bound": ["Bound"]}.get(measure, ["Reference's harm"])
         columns = ("World", measure.capitalize(), "Harm", *beside, "State")
         rows = []
-        for world in worlds:
+        for world in kept.worlds:
             reference = [] if world.reference is None else [f"{world.reference:.2f}"]
             state = ", ".join(f"{name} {value:.4g}" for name, value in world.state.items())
             rows.append((world.name, f"{world.score:.4g}", f"{world.harm:.2f}", *reference, state))
@@ -274,7 +267,7 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
     import numpy as np
 
     from ethbrake_marl.agents import parse_spec
-    from ethbrake_marl.evaluation import NamedWorlds, load_driven
+    from ethbrake_marl.evaluation import NamedWorlds, load_runnable
     from ethbrake_marl.files.sheet import Sheet
     from ethbrake_marl.learning import read_settings
     from ethbrake_marl.scenario import Sample
@@ -287,7 +280,7 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
                 f"{file}: names an agent that is code ({code[0]}), which is not run because a file names it; --agent"
                 " names another one, and who is compared with is edited in the file"
             )
-    chosen = load_driven(kept.scenario, None, read_settings(kept.settings).scenario, alone=False)
+    chosen = load_runnable(kept.scenario, read_settings(kept.settings).scenario, drives="some")
     measured_by = Measure.of(kept.measure, agent or kept.agent, kept.against, chosen, kept.harm_count)
     worlds = kept.worlds_of(chosen, str(file))
     measured = measured_by(Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0))

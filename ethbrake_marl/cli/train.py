@@ -55,7 +55,7 @@ def run_command(
     one of the three tests (paper-random, -brake-only, -obstacle) the policy also drives the other two.
     Ctrl-C ends the training early, and what it has is evaluated; a second Ctrl-C stops at once.
     """
-    from ethbrake_marl.evaluation import PER_WORLD, load_driven, results_to_json
+    from ethbrake_marl.evaluation import load_runnable, results_to_json
     from ethbrake_marl.learning import load_recipe, read_settings
 
     # torch takes seconds to load, here and in the other commands that learn
@@ -63,7 +63,7 @@ def run_command(
 
     plan = load_recipe(recipe)
     given = read_settings(settings, [plan])
-    chosen, plan = load_driven(scenario, vehicle, given.scenario), given.change(plan, out.note)
+    chosen, plan = load_runnable(scenario, given.scenario, vehicle=vehicle, drives="one"), given.change(plan, out.note)
     folder = run_folder(chosen, plan, seed=seed, name=name, output=output)
     result = run_experiment(
         chosen,
@@ -78,7 +78,7 @@ def run_command(
         settings=given.texts,
         on_progress=out.show_progress,
     )
-    told = results_to_json(result.rows, per_world=result.directory / PER_WORLD)
+    told = results_to_json(result.rows, per_world=result.per_world)
     show_run(out, result.rows, result.beside, told)
     out.note(f"report: {result.report}")
     _end(out, result.status, result.steps, folder)

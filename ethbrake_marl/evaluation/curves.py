@@ -149,8 +149,6 @@ def _worlds_at(scenario: Scenario, gap_1_m: Floats, gap_2_m: Floats) -> Worlds:
 # decelerations in the engine, where the other vehicles follow their scripts.
 
 POINTS = 2001  # evenly spaced decelerations; the breakpoints of the closed form come on top
-NO_REGION = "none"
-
 _LONG_S = 1e4  # whoever still coasts has met or will never meet
 
 
@@ -239,4 +237,4 @@ def regimes_of(worlds: Worlds, pair: int, deceleration_mps2: Floats) -> NDArray[
     meets_s[rows.world[rows.first]] = rows.time_s[rows.first]
     coasting, stands = meets_s <= v.latency_s[:, pair + 1], meets_s >= stop_s[:, 0]
     cases = [np.isinf(meets_s), meets_s < v.latency_s[:, pair], coasting & stands, coasting, stands]
-    return np.select(cases, [NO_REGION, "early", "A'", "A", "C"], "B")
+    return np.select(cases, ["none", "early", "A'", "A", "C"], "B")

@@ -78,10 +78,10 @@ from ethbrake_marl.evaluation.inputs import (
     worlds_sha256,
 )
 from ethbrake_marl.evaluation.measures import LeftOut, Tape
-from ethbrake_marl.evaluation.results import PARQUET, check_target
+from ethbrake_marl.evaluation.results import PARQUET
 from ethbrake_marl.evaluation.rollout import ShovedFront, controlled_vehicle
 from ethbrake_marl.files.sheet import parquet_file
-from ethbrake_marl.files.store import check_writable, new_folder
+from ethbrake_marl.files.store import check_target, check_writable, new_folder
 from ethbrake_marl.files.yaml import Override
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.observations import Observation, ObservationSpec, choose_observation, observation_for
@@ -106,6 +106,7 @@ class EpisodeMotion:
     ledger: Ledger  # n = 1
     final: Worlds  # n = 1, as the episode left it
     at_rest: bool  # the line came to rest; else the horizon cut the episode off
+    policies: Mapping[str, str]  # SHA-256 of the policy that drove a vehicle, by vehicle, where one did
 
     @property
     def harm(self) -> tuple[float, float]:
@@ -141,6 +142,7 @@ class _Follower(Tape):
         self._first_s = worlds.first_decision_s(list(team.drivers))
         self._stepped_in: list[list[float]] = [[] for _ in range(worlds.n)]
         self._engine, self._ruling = engine, engine.ruling
+        self._policies = policies_of(team.drivers)
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
         """Keep one step."""
@@ -175,6 +177,7 @@ class _Follower(Tape):
                     ledger,
                     final,
                     bool(episodes.at_rest[k]),
+                    self._policies,
                 )
             )
         return found
@@ -361,6 +364,13 @@ def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float 
     return shown
 
 
+def film(world: Worlds, agents: Mapping[str, Driver], ending: str, *, scenario: Scenario) -> bytes:
+    """``film_bytes`` of what agents, each under its title, do in one world; refuses before any work what it can."""
+    check_film(ending, len(agents))
+    films = {title: film_scenes(world, agent, scenario=scenario) for title, agent in agents.items()}
+    return film_bytes(films, ending)
+
+
 def film_bytes(films: Films, ending: str, *, fps: int = FILM_FPS) -> bytes:
     """Films of one world, titled and one below the other, in real time: an endless GIF or SVG, or an MP4.
 
@@ -509,7 +519,6 @@ class Passport:
         seed: int | None,
         number: int,
         harm_count: HarmCount = "first",
-        policies: Mapping[str, str] | None = None,
     ) -> Passport:
         """The passport of an episode that was driven.
 
@@ -520,10 +529,9 @@ class Passport:
             seed: of the list of worlds; None: they came from a file.
             number: of the world in its list.
             harm_count: that agents minimise.
-            policies: SHA-256 of the policy that drives a vehicle, by vehicle, where one does.
 
         """
-        shas = list((policies or {}).values())
+        shas = list(motion.policies.values())
         joined = shas[0] if len(shas) == 1 else hashlib.sha256("".join(shas).encode()).hexdigest()
         return cls(
             scenario=scenario.name,
@@ -634,10 +642,7 @@ class Passport:
             raise InvalidInput(f"passport: agent {spelling!r}: {error}{hint}") from None
         (driver,) = lineup.values()
         (motion,) = follow_episodes(world, driver, played)
-        policies = policies_of(team_of(driver, played.learners).drivers)
-        now = Passport.of(
-            motion, played, spelling, seed=self.seed, number=self.number, harm_count=self.harm_count, policies=policies
-        )
+        now = Passport.of(motion, played, spelling, seed=self.seed, number=self.number, harm_count=self.harm_count)
         same = (self.world_sha, self.episode_sha) == (now.world_sha, now.episode_sha)
         return Replay(now, played, world, driver, motion, tuple(self.differences(now)), same)
 

@@ -90,7 +90,7 @@ class Outcome:
     knows: Knowledge = (Source.UNSTATED,)  # what the agent says it knows of the line
     shoved_m: Floats | None = None  # [n] how far Vehicle 1 ends beyond where it would by itself
     sampled_harm: Floats | None = None  # [n] the paper's sum over samples of the same commands
-    policies: Mapping[int, str] = field(default_factory=dict)  # vehicle (0 = front) -> SHA-256 of its policy's manifest
+    policies: Mapping[str, str] = field(default_factory=dict)  # vehicle's name -> SHA-256 of its policy's manifest
     metrics: Mapping[str, Floats] = field(default_factory=dict)  # registered measures by column, [n]
 
     def __repr__(self) -> str:
@@ -116,11 +116,6 @@ class Outcome:
         final = Worlds.concatenate([part.final for part in parts])
         metrics = {name: np.concatenate([part.metrics[name] for part in parts]) for name in first.metrics}
         return replace(first, ledger=ledger, final=final, metrics=metrics, **columns)
-
-    @property
-    def named_policies(self) -> dict[str, str]:
-        """``policies`` by the vehicles' names."""
-        return {f"vehicle_{i + 1}": sha for i, sha in self.policies.items()}
 
     @property
     def collided(self) -> Bools:
@@ -403,14 +398,16 @@ class Evaluation:
             raise InvalidInput(f"to_frame: {chosen} is not installed: {sys.executable} -m pip install {chosen}")
         return import_module(chosen).DataFrame(self.arrays())
 
-    def rescore(self, declared: Sequence[Declared] | None = None) -> list[Rescored]:
+    def rescore(self, declared: Sequence[Declared] | None = None) -> Rescores:
         """Every agent under every objective and both counts, in that order."""
-        return [
-            Rescored(agent, objective, harm_count, tuple(mean(column) for column in values.T))
-            for agent, outcome in self.outcomes.items()
-            for harm_count in HARM_COUNTS
-            for objective, values in scored(outcome.ledger, harm_count, declared).items()
-        ]
+        return Rescores(
+            [
+                Rescored(agent, objective, harm_count, tuple(mean(column) for column in values.T))
+                for agent, outcome in self.outcomes.items()
+                for harm_count in HARM_COUNTS
+                for objective, values in scored(outcome.ledger, harm_count, declared).items()
+            ]
+        )
 
     def _repr_html_(self) -> str:
         """What each agent did, for a notebook."""
@@ -973,14 +970,18 @@ class Tally:
             raise InvalidInput(f"is no tally of a shard: {error!r}") from None
         return tally
 
-    def rescore(self, objectives: Sequence[str], vehicles: int) -> list[Rescored]:
+    def rescore(self, objectives: Sequence[str], vehicles: int) -> Rescores:
         """Every agent under these objectives and both counts, as ``Evaluation.rescore``."""
-        return [
-            Rescored(name, each, count, tuple(own.moments[f"{each}_{count}_{i + 1}"].estimate for i in range(vehicles)))
-            for name, own in self.agents.items()
-            for count in HARM_COUNTS
-            for each in objectives
-        ]
+        return Rescores(
+            [
+                Rescored(
+                    name, each, count, tuple(own.moments[f"{each}_{count}_{i + 1}"].estimate for i in range(vehicles))
+                )
+                for name, own in self.agents.items()
+                for count in HARM_COUNTS
+                for each in objectives
+            ]
+        )
 
 
 def _estimate_all(
@@ -1214,56 +1215,53 @@ def proven_of_table(worlds: Worlds, task: Task, table: BestHarmTable) -> dict[st
     return leaving_out_failed(of, np.arange(worlds.n))[0]
 
 
-def shipped_bounds(tables: Iterable[BestHarmTable] | None = None) -> list[dict[str, Any]]:
-    """The least harm known, the proven one, and the gap of every shipped table, as plain data, by name of its file.
+def shipped_bounds(tables: Iterable[BestHarmTable] | None = None) -> tuple[list[dict[str, Any]], Sheet]:
+    """The least harm known, the proven one, and the gap of every shipped table: plain data, and means as a sheet.
 
     A header names a shipped scenario and a list of it, of which every world is compared; raises ``InvalidInput`` if
     the table does not hold them. A gap is best known minus proven harm, as a share of the best known.
     """
-    found = []
-    for table in shipped_tables() if tables is None else tables:
-        header = table.header
-        scenario = load_scenario(header["scenario"])
-        names, seed, episodes = tuple(header["vehicles"]), int(header["list_seed"]), int(header["episodes"])
-        task = Task(scenario, tuple(scenario.vehicle_names.index(name) for name in names))
-        sample = scenario.sample(episodes, seed)
-        worlds = sample.worlds
-        table.check_holds_any(world_identity(worlds, task))
-        why = unproven_because(worlds, task)
-        proven = None if why is not None else proven_of_table(worlds, task, table)
-        known = {c: float(table.best[c].harm.mean()) if c in table.best else None for c in HARM_COUNTS}
-        told = result_identity("best-harm", scenario, sample)
-        told |= {"scenario": scenario.name, "vehicles": names, "list_seed": seed, "worlds": len(table.identity)}
-        told |= {f"best_known_{harm_count}": best for harm_count, best in known.items()}
-        told |= {"proven": proven, "nothing_proven_because": why}
-        for harm_count, best in known.items():
-            gap = None
-            if proven is not None and best is not None:
-                gap = 1.0 - proven["proven_harm"] / best if best > 0.0 else 0.0
-            told[f"gap_{harm_count}"] = gap
-        found.append(told)
-    return found
-
-
-def shipped_sheet(found: Sequence[Mapping[str, Any]]) -> Sheet:
-    """The table of all of them; harms are means over the worlds, m2/s2."""
     harm, share = partial(Column, digits=3, sign="-"), partial(Column, digits=1, scale=100.0, unit=" %", sign="-")
     columns = (
         "list", Column("worlds"), harm("proven"), harm("best known, first"), share("gap"), harm("best known, total"),
         share("gap"), share("contact proven"), share("impact proven"), share("between"),
         harm("best known there, first"), share("next to none there"),
     )  # fmt: skip
-    rows = []
-    for one in found:
-        proven = one["proven"] or {}
-        inside = proven.get("between") or {}
-        why = f": {one['nothing_proven_because']}" if one["nothing_proven_because"] else ""
-        row: list[Cell] = [f"{one['scenario']} (seed {one['list_seed']}){why}", f"{one['worlds']:,}"]
-        row += [proven.get("proven_harm")]
-        row += [one[name] for name in ("best_known_first", "gap_first", "best_known_total", "gap_total")]
-        row += [proven.get("contact_proven_rate"), proven.get("impact_proven_rate")]
-        rows.append([*row, *(inside.get(name) for name in ("rate", "mean_first", "harmless_rate"))])
-    return Sheet("", columns, rows)
+    found, rows = [], []
+    for table in shipped_tables() if tables is None else tables:
+        header = table.header
+        scenario = load_scenario(header["scenario"])
+        names, seed = tuple(header["vehicles"]), int(header["list_seed"])
+        task = Task(scenario, tuple(scenario.vehicle_names.index(name) for name in names))
+        sample = scenario.sample(int(header["episodes"]), seed)
+        table.check_holds_any(world_identity(sample.worlds, task))
+        why = unproven_because(sample.worlds, task)
+        proven = None if why is not None else proven_of_table(sample.worlds, task, table)
+        known = {c: float(table.best[c].harm.mean()) if c in table.best else None for c in HARM_COUNTS}
+        gaps: dict[str, float | None] = dict.fromkeys(known)
+        for harm_count, best in known.items():
+            if proven is not None and best is not None:
+                gaps[harm_count] = 1.0 - proven["proven_harm"] / best if best > 0.0 else 0.0
+        found.append({
+            **result_identity("best-harm", scenario, sample),
+            "scenario": scenario.name,
+            "vehicles": names,
+            "list_seed": seed,
+            "worlds": len(table.identity),
+            **{f"best_known_{harm_count}": best for harm_count, best in known.items()},
+            "proven": proven,
+            "nothing_proven_because": why,
+            **{f"gap_{harm_count}": gap for harm_count, gap in gaps.items()},
+        })  # fmt: skip
+        told = proven or {}
+        inside = told.get("between") or {}
+        rows.append((
+            f"{scenario.name} (seed {seed}){f': {why}' if why else ''}", f"{len(table.identity):,}",
+            told.get("proven_harm"), known["first"], gaps["first"], known["total"], gaps["total"],
+            told.get("contact_proven_rate"), told.get("impact_proven_rate"),
+            inside.get("rate"), inside.get("mean_first"), inside.get("harmless_rate"),
+        ))  # fmt: skip
+    return found, Sheet("", columns, rows)
 
 
 @dataclass(frozen=True, slots=True)
@@ -1280,10 +1278,13 @@ class Rescored:
         each = Estimate.side_by_side({f"vehicle_{i + 1}": estimate for i, estimate in enumerate(self.each)})
         return {"objective": self.objective, "harm_count": self.harm_count, **each}
 
-    @staticmethod
-    def sheet(rows: Sequence[Rescored], harm_count: HarmCount) -> Sheet:
+
+class Rescores(list[Rescored]):
+    """Agents under objectives and counts."""
+
+    def sheet(self, harm_count: HarmCount) -> Sheet:
         """The means under one count: one line per agent and objective, one column per vehicle."""
-        shown = [row for row in rows if row.harm_count == harm_count]
+        shown = [row for row in self if row.harm_count == harm_count]
         vehicles = range(len(shown[0].each) if shown else 0)
         columns = [Column(f"Vehicle {i + 1}", interval="hidden") for i in vehicles]
         names = ["" if k and shown[k - 1].agent == row.agent else row.agent for k, row in enumerate(shown)]
@@ -1647,7 +1648,7 @@ def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTab
         evaluation.conditions,
         evaluation.task,
         {name: outcome.knows for name, outcome in evaluation.outcomes.items()},
-        {name: outcome.named_policies for name, outcome in evaluation.outcomes.items()},
+        {name: outcome.policies for name, outcome in evaluation.outcomes.items()},
         baseline=baseline,
         between=None if regrets is None else regrets.between,
         warning=limits.warning if isinstance(limits, Limits) else "",

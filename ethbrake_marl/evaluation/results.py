@@ -7,7 +7,6 @@ import hashlib
 import io
 import json
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
@@ -22,7 +21,6 @@ import numpy as np
 from ethbrake_marl.agents import Driver, Knowledge, knowledge_of, knowledge_text, team_of
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import (
-    AlreadyExists,
     EthBrakeError,
     InvalidInput,
     PhysicsError,
@@ -52,7 +50,7 @@ from ethbrake_marl.evaluation.measures import (
 from ethbrake_marl.evaluation.rollout import evaluate_list
 from ethbrake_marl.evaluation.statistics import paired_difference, unpaired_difference
 from ethbrake_marl.files.sheet import Estimate, parquet_file
-from ethbrake_marl.files.store import check_writable, parse_strict_json, read_plain, write_file
+from ethbrake_marl.files.store import check_target, parse_strict_json, read_plain, write_output
 from ethbrake_marl.harm import Declared
 from ethbrake_marl.limits import Unproven, known_limits
 from ethbrake_marl.physics import Floats
@@ -62,39 +60,6 @@ from ethbrake_marl.shield import parse_uncertainty
 # One row per agent and world: its columns, and its file, written whole and never over another by accident.
 
 
-def check_target(path: str | Path, *, force: bool = False) -> Path:
-    """Refuse a file that exists (``AlreadyExists``, unless ``force``) or cannot be written (``InvalidInput``).
-
-    Even ``force`` replaces plain files only: no folder, device, pipe or symbolic link. Call it before long work whose
-    result goes there.
-    """
-    target = Path(path)
-    try:
-        if target.is_symlink():
-            raise InvalidInput(f"{target}: is a symbolic link; give the file it points to")
-        if target.is_dir():
-            raise InvalidInput(f"{target}: is a folder; give the name of a file")
-        if target.exists() and not target.is_file():
-            raise InvalidInput(f"{target}: is a device or a pipe, not a plain file; give another name")
-        if not target.parent.is_dir():
-            raise InvalidInput(f"{target}: there is no folder {target.parent}; make it first")
-        if os.path.lexists(target) and not force:
-            raise AlreadyExists(f"{target}: is there already; give another name or use force (--force)")
-        check_writable(target.parent)
-    except (InvalidInput, AlreadyExists):
-        raise
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InvalidInput(f"{target!s:.200}: cannot be written ({reason})") from None
-    return target
-
-
-def write_output(path: str | Path, data: bytes, *, force: bool = False) -> None:
-    """Write ``data`` in one step; raises as ``check_target``."""
-    write_file(check_target(path, force=force), data)
-
-
-PER_WORLD = "per_world.csv"  # its name in the folder of a run
 CSV, PARQUET = ".csv", ".parquet"
 HARMS = ("first_impact_harm", "total_harm")
 _HARMS = ("agent", "world", *HARMS)

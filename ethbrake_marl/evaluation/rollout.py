@@ -23,7 +23,7 @@ from ethbrake_marl.errors import (
     check_whole_number,
     unknown_name,
 )
-from ethbrake_marl.evaluation.inputs import policy_sha256
+from ethbrake_marl.evaluation.inputs import policies_of
 from ethbrake_marl.evaluation.measures import REGISTERED, Evaluation, LeftOut, Outcome, Tape
 from ethbrake_marl.physics import (
     FLAG,
@@ -357,7 +357,7 @@ def _roll_out(
         knowledge_of(team),
         None if shoved is None else shoved.metres,
         None if sampled is None else sampled.finish(),
-        {vehicle: sha for vehicle, agent in team.drivers.items() if (sha := policy_sha256(agent)) is not None},
+        policies_of(team.drivers),
         {} if impacts is None else impacts.measured(),
     )
 

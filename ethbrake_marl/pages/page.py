@@ -21,11 +21,11 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from ethbrake_marl.agents import Driver, team_of
+from ethbrake_marl.agents import Driver
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.envs import BODY_M
 from ethbrake_marl.errors import InvalidInput, plain_text
-from ethbrake_marl.evaluation import Conditions, EpisodeMotion, Passport, follow_episodes, policies_of
+from ethbrake_marl.evaluation import Conditions, EpisodeMotion, Passport, follow_episodes
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario
@@ -378,12 +378,8 @@ class Played:
             harm_count: that the agent minimised.
 
         """
-        drivers = team_of(agent, scenario.learners).drivers
-        policies = policies_of(drivers)
         for one, motion in zip(played, follow_episodes(worlds, agent, scenario), strict=True):
-            passport = Passport.of(
-                motion, scenario, spelling, seed=seed, number=one.number, harm_count=harm_count, policies=policies
-            )
+            passport = Passport.of(motion, scenario, spelling, seed=seed, number=one.number, harm_count=harm_count)
             one.motions[name] = motion
             one.passports[name] = str(passport)
 

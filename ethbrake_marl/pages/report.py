@@ -24,10 +24,10 @@ from ethbrake_marl.evaluation import (
     compare_modes,
     mean,
     rate,
-    write_output,
 )
 from ethbrake_marl.figures import harm_by_agent, harm_in_parts, regret_distribution
 from ethbrake_marl.files.sheet import Column, Sheet, Shown
+from ethbrake_marl.files.store import write_output
 from ethbrake_marl.limits import Unproven
 from ethbrake_marl.pages.page import Page, Part, Played, Section
 from ethbrake_marl.physics import Bools, Floats, Ints

@@ -32,10 +32,9 @@ from ethbrake_marl.evaluation import (
     relative_decrease,
     result_versions,
     worlds_sha256,
-    write_output,
 )
 from ethbrake_marl.files.sheet import DASH, Column, Estimate, Sheet
-from ethbrake_marl.files.store import parse_strict_json, read_plain
+from ethbrake_marl.files.store import parse_strict_json, read_plain, write_output
 from ethbrake_marl.files.yaml import first_mistake
 from ethbrake_marl.limits import BestHarmTable, world_identity
 from ethbrake_marl.physics import Floats
@@ -436,7 +435,7 @@ def _drive_list(
     return ListResult(
         worlds=content.worlds,
         worlds_sha256=content.worlds_sha256,
-        policies=outcome.named_policies,
+        policies=dict(outcome.policies),
         policy_seeds=seeds,
         knows=knowledge_text(outcome.knows),
         realised_share=realised_share(harm, full, best),

@@ -20,7 +20,6 @@ from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, check_one_learner, count_of
 from ethbrake_marl.evaluation import (
     BASELINE,
-    PER_WORLD,
     TESTS,
     Evaluation,
     SummaryRow,
@@ -31,11 +30,11 @@ from ethbrake_marl.evaluation import (
     record_episode,
     results_to_json,
     summarise,
-    write_output,
     write_per_world,
 )
 from ethbrake_marl.figures import harm_against_total_gap, learning_curve, trajectories, write_picture
 from ethbrake_marl.files.sheet import csv_text
+from ethbrake_marl.files.store import write_output
 from ethbrake_marl.learning import (
     RunDirectory,
     RunStatus,
@@ -147,6 +146,7 @@ class ExperimentResult:
     steps: int
     rows: SummaryTable
     report: Path
+    per_world: Path
     beside: Mapping[str, SummaryTable] = field(default_factory=dict)  # by test: the other two of the three tests
 
 
@@ -247,7 +247,7 @@ def run_experiment(
             driven = evaluate(part, _agents(trained.policy, other, BESIDE), scenario=other, seed=list_seed)
             beside[other.name] = summarise(driven)
         begin("results and figures")
-        per_world = run.path / PER_WORLD
+        per_world = run.path / "per_world.csv"
         write_per_world(per_world, evaluation, force=True)
         write_results(run.path, "results", rows, per_world)
         if beside:
@@ -255,7 +255,7 @@ def run_experiment(
         wall_s = time.monotonic() - started
         report = _show(run, evaluation, rows, beside, trained, agents, begin, wall_s=wall_s)
         begin("")
-    return ExperimentResult(run.path, trained.status, trained.steps, rows, report, beside)
+    return ExperimentResult(run.path, trained.status, trained.steps, rows, report, per_world, beside)
 
 
 def _agents(policy: Policy, scenario: Scenario, baselines: Sequence[str] = BASELINES) -> dict[str, Agent]:

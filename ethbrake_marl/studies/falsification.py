@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ethbrake_marl.agents import Driver
 from ethbrake_marl.defaults import DEFAULT, HarmCount, MeasureName
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
-from ethbrake_marl.evaluation import NamedWorld, evaluate, make_lineup, states_of
+from ethbrake_marl.evaluation import evaluate, make_lineup, states_of
 from ethbrake_marl.physics import Floats, Ints
 from ethbrake_marl.scenario import Sample, Scenario, ranges_of
 
@@ -191,19 +191,19 @@ class Falsified:
         good = self.scores[np.isfinite(self.scores)]
         return float((good > 0.0).mean()) if len(good) else 0.0
 
-    def named_worlds(self, measure: Measure) -> list[NamedWorld]:
-        """The kept worlds, worst first."""
+    def named_worlds(self, measure: Measure) -> list[dict[str, Any]]:
+        """The kept worlds, worst first, as a file of named worlds holds them."""
         if not self.sample.worlds.n:
             return []
         states, measured = states_of(self.sample.worlds, measure.scenario), self.measured
         return [
-            NamedWorld(
-                name=f"{measure.name}-{k + 1}",
-                score=float(measured.score[k]),
-                harm=float(measured.harm[k]),
-                reference=None if measured.reference is None else float(measured.reference[k]),
-                state=state,
-            )
+            {
+                "name": f"{measure.name}-{k + 1}",
+                "score": float(measured.score[k]),
+                "harm": float(measured.harm[k]),
+                "reference": None if measured.reference is None else float(measured.reference[k]),
+                "state": state,
+            }
             for k, state in enumerate(states)
         ]
 

@@ -32,7 +32,7 @@ from ethbrake_marl.errors import (
     naming_extras,
     one_line,
 )
-from ethbrake_marl.evaluation import BLOCK, Asked, Tally
+from ethbrake_marl.evaluation import Asked, Tally
 from ethbrake_marl.files.plugins import Plugin, load_the_same, loaded_plugins
 from ethbrake_marl.files.store import (
     check_writable,
@@ -614,7 +614,7 @@ def evaluate_shards(
     workers: Workers | None = None,
     folder: Path | None = None,
     with_rows: bool = False,
-    block: int = BLOCK,
+    block: int = 4_000,
     tell: OnProgress | None = None,
 ) -> Tally:
     """The merged tally of all worlds of a list; the same bits whatever ``shards``, ``jobs`` and ``block`` are.

@@ -10,9 +10,9 @@ import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.evaluation import Evaluation, check_target, evaluate, write_per_world
+from ethbrake_marl.evaluation import Evaluation, evaluate, write_per_world
 from ethbrake_marl.evaluation.measures import Regrets
-from ethbrake_marl.evaluation.results import write_output
+from ethbrake_marl.files.store import check_target, write_output
 from ethbrake_marl.scenario import Scenario, worlds_from_table
 
 

@@ -18,10 +18,9 @@ from pydantic import TypeAdapter, ValidationError
 
 from ethbrake_marl import __version__
 from ethbrake_marl.errors import InvalidInput, count_of, plain_text, unknown_name
-from ethbrake_marl.evaluation import write_output
 from ethbrake_marl.figures import write_picture
 from ethbrake_marl.files.sheet import Column, Sheet, Shown
-from ethbrake_marl.files.store import read_plain, write_file
+from ethbrake_marl.files.store import read_plain, write_file, write_output
 from ethbrake_marl.learning import read_object
 from ethbrake_marl.pages.page import Page, Part, Section, anchors, shown
 from ethbrake_marl.studies.jobs import JobFolder

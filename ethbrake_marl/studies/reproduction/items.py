@@ -26,7 +26,6 @@ from ethbrake_marl.evaluation import (
     EpisodeRecord,
     Evaluation,
     PaperRow,
-    check_target,
     evaluate,
     interquartile_mean,
     make_agents,
@@ -48,6 +47,7 @@ from ethbrake_marl.figures import (
     trajectories,
 )
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown
+from ethbrake_marl.files.store import check_target
 from ethbrake_marl.learning import RETURN, RunDirectory, TrainingRecipe, load_recipe
 from ethbrake_marl.limits import Unproven
 from ethbrake_marl.pages.page import Part, Played
