@@ -563,11 +563,8 @@ def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | No
     if not bins >= 1:
         raise InvalidInput(f"harm_against_total_gap: bins = {bins}; at least 1 is needed")
     gap, gaps = evaluation.worlds.gaps_m.sum(axis=1), [f"d{p}" for p in range(1, evaluation.worlds.N)]
-    low, high = float(gap.min()), float(gap.max())
-    part = np.zeros(len(gap), np.int64)
-    if high > low:
-        part = np.minimum(((gap - low) / (high - low) * bins).astype(np.int64), bins - 1)
-    groups = [part == k for k in range(bins) if (part == k).any()]
+    part = np.minimum(((gap - gap.min()) / (np.ptp(gap) or 1.0) * bins).astype(np.int64), bins - 1)
+    groups = [part == k for k in np.unique(part)]
     sum_of_gaps = " + ".join(gaps) if len(gaps) <= 3 else f"d1 + … + {gaps[-1]}"
     figure, panels = new_panels((10.0, 4.6), columns=2, sharey=True)
     for axes, (name, label) in zip(panels, _PANELS[:2], strict=True):

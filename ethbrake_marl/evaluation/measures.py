@@ -316,9 +316,8 @@ class Evaluation:
     @property
     def hidden(self) -> Bools:
         """Worlds in which the channel hides something of the line from a driven vehicle, [n]; see ``v2x``."""
-        hidden = np.zeros(self.worlds.n, np.bool_)
-        for vehicle in self.vehicles:
-            hidden |= hidden_from(self.worlds.vehicles, vehicle) | is_periodic(self.worlds)
+        from_each = [hidden_from(self.worlds.vehicles, i) | is_periodic(self.worlds) for i in self.vehicles]
+        hidden: Bools = np.logical_or.reduce([np.zeros(self.worlds.n, np.bool_), *from_each])
         return hidden
 
     @cached_property

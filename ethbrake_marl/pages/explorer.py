@@ -6,7 +6,6 @@ The server needs the extra ``explore``.
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import re
 import secrets
@@ -346,13 +345,8 @@ class Guard:
             await send(message)
 
         why = self._refusal(scope)
-        if not why:
-            await self._app(scope, receive, send_guarded)
-            return
-        body = json.dumps({"error": why}).encode()
-        told = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
-        await send_guarded({"type": "http.response.start", "status": 403, "headers": told})
-        await send_guarded({"type": "http.response.body", "body": body})
+        answer: Any = _reply({"error": why}, HTTPStatus.FORBIDDEN) if why else self._app
+        await answer(scope, receive, send_guarded)
 
     def _refusal(self, scope: Scope) -> str:
         """Why a request is not answered; empty for one that is."""
@@ -579,9 +573,8 @@ def explorer_app(
 
     if warm_up:
         answers.warm_up(first)
-    routes = [Route("/{token}/", show_page, methods=["GET"])]
-    for name in answers.questions:
-        routes.append(Route(f"/{{token}}/{name}", partial(answers.reply_to, name), methods=["POST"]))
+    asked = [Route(f"/{{token}}/{n}", partial(answers.reply_to, n), methods=["POST"]) for n in answers.questions]
+    routes = [Route("/{token}/", show_page, methods=["GET"]), *asked]
     app = Starlette(routes=routes, exception_handlers={HTTPException: refuse})
     app.router.redirect_slashes = False
     return Guard(app, token, port)
