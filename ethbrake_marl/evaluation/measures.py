@@ -57,6 +57,7 @@ _SHOWN_AGENTS = 5  # by name, in ``repr``
 _NAMED = 10  # worlds left out that are named one by one; all stand in the JSON
 COLUMN = "metric_"  # before the name of a registered measure, in JSON and in files with every world
 Columns = dict[str, list[Any]]  # of one row per world
+Values = NDArray[Any]  # [n]
 
 # Columns of files with every world that hold texts, but for the types of vehicles.
 _TEXT_COLUMNS = {"agent", "scenario", "unavoidable_reason", "best_known_source", "ended", "knows"}
@@ -162,10 +163,16 @@ class Outcome:
                 told[f"{objective}_{harm_count}"] = values
         return {f"{name}_{i + 1}": each[:, i] for name, each in told.items() for i in range(each.shape[1])}
 
-    def columns(self) -> Columns:
+    def columns(self) -> dict[str, Values | None]:
         """What happened in each world, by the names of ``--per-world``; None where the agent says nothing."""
-        final = self.final
-        found: dict[str, Any] = {
+        final, obstacle = self.final, {}
+        if np.isfinite(final.obstacle_gap_m).all():  # of the harm above, what Vehicle 1's impacts with the obstacle did
+            obstacle = {
+                "obstacle_first_impact_harm": self.ledger.obstacle_harm("first"),
+                "obstacle_total_harm": self.ledger.obstacle_harm("total"),
+                "final_obstacle_gap_m": final.obstacle_gap_m,
+            }
+        return {
             "collided": self.collided + 0,
             "impacts": self.impacts,
             **self.borne(),
@@ -173,19 +180,15 @@ class Outcome:
             "total_harm": self.total_harm,
             "sampled_harm": self.sampled_harm,
             "vehicle_1_shoved_m": self.shoved_m,
+            **obstacle,
+            **{f"final_gap_{p + 1}_m": final.gaps_m[:, p] for p in range(final.N - 1)},
+            **{f"final_speed_{i + 1}_mps": final.speeds_mps[:, i] for i in range(final.N)},
+            "end_s": final.time_s,
+            "ended": self.ended,
+            "predicted_harm": self.predicted_harm,
+            "chosen_policy": None if self.chosen_policy is None else self.chosen_policy + 0,
+            **{COLUMN + name: column + 0 for name, column in self.metrics.items()},  # truths as 0 and 1
         }
-        if np.isfinite(final.obstacle_gap_m).all():  # of the harm above, what Vehicle 1's impacts with the obstacle did
-            found["obstacle_first_impact_harm"] = self.ledger.obstacle_harm("first")
-            found["obstacle_total_harm"] = self.ledger.obstacle_harm("total")
-            found["final_obstacle_gap_m"] = final.obstacle_gap_m
-        found |= {f"final_gap_{p + 1}_m": final.gaps_m[:, p] for p in range(final.N - 1)}
-        found |= {f"final_speed_{i + 1}_mps": final.speeds_mps[:, i] for i in range(final.N)}
-        chosen = None if self.chosen_policy is None else self.chosen_policy + 0
-        found |= {"end_s": final.time_s, "ended": self.ended}
-        found |= {"predicted_harm": self.predicted_harm, "chosen_policy": chosen}
-        found |= {COLUMN + name: column + 0 for name, column in self.metrics.items()}  # truths as 0 and 1
-        nothing = [None] * len(self.collided)
-        return {name: nothing if column is None else column.tolist() for name, column in found.items()}
 
 
 class LeftOut(NamedTuple):
@@ -356,17 +359,19 @@ class Evaluation:
             values = rule.of(self.worlds)
             if not limits or key in _ALWAYS_TOLD or np.ptp(values, axis=0).any():
                 initial |= {rule.column_of(i): values[:, i].tolist() for i in range(values.shape[1])}
-        hidden: Columns = {"hidden": self.hidden.astype(int).tolist()}
         found: Columns = {}
         for agent, outcome in self.outcomes.items():
-            columns: Columns = {"agent": [agent] * n, **initial, **outcome.columns()}
-            if regrets is not None:
-                columns |= regrets.columns(outcome)
-            elif limits:
-                columns |= {name: [None] * n for name in Regrets.COLUMNS}
-            told = outcome.borne(objectives)
-            columns |= {name: column.tolist() for name, column in told.items() if name not in columns}
-            columns |= {"knows": [knowledge_text(outcome.knows)] * n, **hidden}
+            told = outcome.columns()
+            for name, of in _KNOWN_OF_WORLDS.items() if limits else ():
+                told[name] = None if regrets is None else of(regrets, outcome)
+            told |= {name: column for name, column in outcome.borne(objectives).items() if name not in told}
+            columns: Columns = {
+                "agent": [agent] * n,
+                **initial,
+                **{name: [None] * n if column is None else column.tolist() for name, column in told.items()},
+                "knows": [knowledge_text(outcome.knows)] * n,
+                "hidden": self.hidden.astype(int).tolist(),
+            }
             for left in self.left_out if limits else ():
                 told_of = {"agent": agent, "world": left.world, "ended": f"left out: {left.agent}: {left.reason}"}
                 columns = {name: [*values, told_of.get(name)] for name, values in columns.items()}
@@ -636,26 +641,19 @@ class Regrets:
             return None
         return Between.of(~self.avoidable, self.limits.proof.impact, self.first_impact_harm, self.total_harm)
 
-    COLUMNS = (
-        "avoidable", "unavoidable_reason", "best_known_first_impact_harm", "best_known_total_harm", "best_known_source",
-        "impact_proven", "proven_harm", "regret_first_impact_harm", "regret_total_harm",
-    )  # fmt: skip
 
-    def columns(self, outcome: Outcome) -> Columns:
-        """What was avoidable and the best known in each world, by the names of ``--per-world``."""
-        n, proof = len(outcome.collided), self.limits.proof
-        columns = (
-            np.full(n, None) if proof.avoidable is None else proof.avoidable + 0,
-            np.full(n, None) if proof.reason is None else proof.reason,
-            self.first_impact_harm,
-            self.total_harm,
-            self.source,
-            proof.impact + 0,
-            proof.harm,
-            self.regret(outcome, "first"),
-            self.regret(outcome, "total"),
-        )
-        return {name: column.tolist() for name, column in zip(self.COLUMNS, columns, strict=True)}
+# What was avoidable and the best known in each world, by the names of ``--per-world``.
+_KNOWN_OF_WORLDS: dict[str, Callable[[Regrets, Outcome], Values | None]] = {
+    "avoidable": lambda r, _: None if r.avoidable is None else r.avoidable + 0,
+    "unavoidable_reason": lambda r, _: r.limits.proof.reason,
+    "best_known_first_impact_harm": lambda r, _: r.first_impact_harm,
+    "best_known_total_harm": lambda r, _: r.total_harm,
+    "best_known_source": lambda r, _: r.source,
+    "impact_proven": lambda r, _: r.limits.proof.impact + 0,
+    "proven_harm": lambda r, _: r.limits.proof.harm,
+    "regret_first_impact_harm": lambda r, o: r.regret(o, "first"),
+    "regret_total_harm": lambda r, o: r.regret(o, "total"),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -695,7 +693,6 @@ class Between:
 
 BASELINE = "full_brake"
 FAR_M = 5.0  # Vehicle 1 counts as shoved far beyond this
-Values = NDArray[Any]  # [n]
 
 
 @dataclass(frozen=True, slots=True)
