@@ -36,7 +36,6 @@ if TYPE_CHECKING:
         worlds_sha256 as worlds_sha256,
     )
     from ethbrake_marl.evaluation.measures import (
-        BASELINE as BASELINE,
         PAPER_ROWS as PAPER_ROWS,
         REGISTERED as REGISTERED,
         TESTS as TESTS,
@@ -56,7 +55,6 @@ if TYPE_CHECKING:
         summarise_by as summarise_by,
     )
     from ethbrake_marl.evaluation.results import (
-        Asked as Asked,
         Question as Question,
         compare_results as compare_results,
         read_result as read_result,

@@ -9,7 +9,7 @@ import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from itertools import pairwise
 from operator import add
@@ -447,6 +447,12 @@ class Question:
     harm_count: HarmCount = "first"
     uncertainty: str | None = None
     objectives: tuple[str, ...] = ()
+    # what ``ask`` looks up
+    identity: Mapping[str, Any] = field(default_factory=dict)  # plain data: all that the answer depends on
+    knows: Mapping[str, Knowledge] = field(default_factory=dict)  # by agent
+    policies: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # by agent: vehicle -> its policy's SHA-256
+    limits: bool = False  # the best known harm of its worlds is looked up
+    because: str | None = None  # why nothing is proven for its worlds; None where something is
 
     def __post_init__(self) -> None:
         check_whole_number("episodes", self.episodes, 1, MOST_EPISODES)
@@ -470,10 +476,11 @@ class Question:
         ends = [min(leaves * k // shards * LEAF, self.episodes) for k in range(shards + 1)]
         return list(pairwise(ends))
 
-    def ask(self) -> Asked:
-        """Look up what it is about: hashes of scenario, policies and user files, versions, and what is proven.
+    def ask(self) -> Question:
+        """The same with what it is about, looked up once and told to every process.
 
-        Raises what ``lineup`` raises.
+        That are hashes of scenario, policies and user files, versions, and what is proven. Raises what ``lineup``
+        raises.
         """
         lineup, scenario = self.lineup(), self.scenario
         teams = {name: team_of(agent, scenario.learners) for name, agent in lineup.items()}
@@ -501,19 +508,8 @@ class Question:
             "versions": result_versions(),
         }
         limits = all(not isinstance(each, Unproven) and bool(each.known.all()) for each in found)
-        return Asked(self, identity, knows, policies, limits, because)
-
-
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """A question with everything that its answer depends on, looked up once and told to every process."""
-
-    question: Question
-    identity: Mapping[str, Any]  # plain data
-    knows: Mapping[str, Knowledge]  # by agent
-    policies: Mapping[str, Mapping[str, str]]  # by agent: vehicle's name -> SHA-256 of its policy
-    limits: bool  # the best known harm of its worlds is looked up
-    because: str | None  # why nothing is proven for its worlds; None where something is
+        told = {"identity": identity, "knows": knows, "policies": policies, "limits": limits, "because": because}
+        return replace(self, **told)  # type: ignore[arg-type]
 
     @property
     def sha256(self) -> str:
@@ -532,32 +528,32 @@ class Asked:
         Raises ``InvalidInput`` for a policy that is not the one that was asked about, and what driving raises.
 
         """
-        if first % LEAF or block % LEAF or not (end % LEAF == 0 or end == self.question.episodes) or not first < end:
+        if first % LEAF or block % LEAF or not (end % LEAF == 0 or end == self.episodes) or not first < end:
             raise InvalidInput(
                 f"shard from {first} to {end} in blocks of {block}: must be whole leaves of {LEAF:,} worlds"
             )
         lineup, starts = self._lineup(), range(first, end, block)
-        with nullcontext(None) if rows is None else rows_file(rows, self.question.objectives) as write:
+        with nullcontext(None) if rows is None else rows_file(rows, self.objectives) as write:
             return reduce(add, (_answer_block(self, lineup, k, min(k + block, end), write) for k in starts), Tally())
 
     def _lineup(self) -> Mapping[str, Driver]:
         """The agents in this process, once."""
         if self.sha256 not in _LINEUPS:
-            here = self.question.ask()
+            here = self.ask()
             if here.sha256 != self.sha256:
                 changed = sorted(key for key in self.identity if here.identity.get(key) != self.identity[key])
                 raise InvalidInput(f"shards: {', '.join(changed)} changed since the evaluation began; begin it again")
-            _LINEUPS[self.sha256] = self.question.lineup()
+            _LINEUPS[self.sha256] = self.lineup()
         return _LINEUPS[self.sha256]
 
     def summarise(self, tally: Tally) -> SummaryTable:
         """One row per agent, as ``summarise``; rates with exact intervals. ``PhysicsError`` if no world is left."""
         if not tally.worlds:
             raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in tally.left_out})
-        task, told = self.question.task, Conditions.of_ranges(tally.ranges)
+        task, told = self.task, Conditions.of_ranges(tally.ranges)
         return SummaryTable.of_tallies(
             {name: tally.agents[name].knowing(tally.worlds) for name in self.identity["agents"]},
-            Conditions.of_test(task, self.question.seed, tally.worlds, self.because, told),
+            Conditions.of_test(task, self.seed, tally.worlds, self.because, told),
             task,
             self.knows,
             self.policies,
@@ -571,9 +567,9 @@ class Asked:
 
     def to_json(self, tally: Tally, rows: Sequence[SummaryRow]) -> list[dict[str, Any]]:
         """What a results file holds: one object per agent, each vehicle's harm and the kind of intervals in it."""
-        question, vehicles = self.question, self.question.scenario.vehicles
-        settings = {"harm_count": question.harm_count, "uncertainty": question.uncertainty}
-        found = results_to_json(rows, told=tally.rescore(question.objectives, vehicles), settings=settings)
+        vehicles = self.scenario.vehicles
+        settings = {"harm_count": self.harm_count, "uncertainty": self.uncertainty}
+        found = results_to_json(rows, told=tally.rescore(self.objectives, vehicles), settings=settings)
         names = [f"{name}_{i + 1}" for name in HARMS for i in range(vehicles)]
         told = {"kind": "evaluate-shards", "intervals": INTERVALS}
         return [
@@ -592,10 +588,9 @@ _LINEUPS: dict[str, Mapping[str, Driver]] = {}  # of this process; an evaluation
 
 
 def _answer_block(
-    asked: Asked, lineup: Mapping[str, Driver], first: int, end: int, write: Callable[[Evaluation], None] | None
+    question: Question, lineup: Mapping[str, Driver], first: int, end: int, write: Callable[[Evaluation], None] | None
 ) -> Tally:
     """The statistics of worlds that are advanced together."""
-    question = asked.question
     sample = question.scenario.sample(end - first, question.seed, first=first)
     evaluation, left_out = evaluate_list(sample, lineup, question.scenario, question.seed)
     if evaluation is None:
@@ -609,7 +604,7 @@ def _answer_block(
     }
     leaves = [np.flatnonzero(index // LEAF == number) for number in np.unique(index // LEAF)]
     hashes = sum(int(worlds_sha256(worlds.take(leaf), index[leaf]), 16) for leaf in leaves)
-    agents = evaluation.tally(limits=asked.limits, objectives=question.objectives)
+    agents = evaluation.tally(limits=question.limits, objectives=question.objectives)
     return Tally(worlds.n, int(evaluation.hidden.sum()), hashes, ranges, left_out, agents)
 
 

@@ -15,7 +15,6 @@ from ethbrake_marl.agents import Driver
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation import (
-    BASELINE,
     Conditions,
     Evaluation,
     ShieldModes,
@@ -39,6 +38,7 @@ MOST_WORLDS = 50
 WORST = 10
 _EACH = 5  # of the other kinds
 _RANDOM_SEED = 0
+_BASELINE = "full_brake"
 
 
 def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS) -> dict[int, Played]:
@@ -58,10 +58,10 @@ def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS)
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
     if avoidable is not None:
         add(f"Avoidable, and {focus} collided", _largest(total, outcome.collided & avoidable), _EACH)
-    if BASELINE in evaluation.outcomes and focus != BASELINE:
-        saved = evaluation.outcome(BASELINE).total_harm - total
-        add(f"Where {focus} saved most against {BASELINE}", _largest(saved, saved > 0.0), _EACH)
-        add(f"Where {focus} did more harm than {BASELINE}", _largest(-saved, saved < 0.0), _EACH)
+    if _BASELINE in evaluation.outcomes and focus != _BASELINE:
+        saved = evaluation.outcome(_BASELINE).total_harm - total
+        add(f"Where {focus} saved most against {_BASELINE}", _largest(saved, saved > 0.0), _EACH)
+        add(f"Where {focus} did more harm than {_BASELINE}", _largest(-saved, saved < 0.0), _EACH)
     order = np.argsort(total, kind="stable")
     add(f"Typical of {focus}", [order[int(q * (len(order) - 1))] for q in (0.5, 0.6, 0.7, 0.8, 0.9)], _EACH)
     add("Drawn at random", np.random.default_rng(_RANDOM_SEED).permutation(len(total))[: 2 * most], most)

@@ -19,7 +19,6 @@ from ethbrake_marl.agents import Agent, LearnedAgent
 from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, check_one_learner, count_of
 from ethbrake_marl.evaluation import (
-    BASELINE,
     TESTS,
     Evaluation,
     SummaryRow,
@@ -125,7 +124,7 @@ def learned_name(evaluation: Evaluation) -> str:
 
 def telling_world(evaluation: Evaluation) -> int:
     """Row of the world to draw: median saving of the policy among the worlds where full braking harms, else row 0."""
-    before = evaluation.outcome(BASELINE).first_impact_harm
+    before = evaluation.outcome(BESIDE[0]).first_impact_harm
     rows = np.flatnonzero(before > 0.0)
     if not len(rows):
         return 0
