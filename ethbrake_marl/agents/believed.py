@@ -20,8 +20,8 @@ from ethbrake_marl.agents.protocol import Agent, AgentAround, Knowledge, Source,
 from ethbrake_marl.agents.rollout import script_agents
 from ethbrake_marl.engine import Memory, Script, ask_script, begin_script, renew_memory
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics import Bools, Floats, Vehicles, Worlds, is_periodic, move_on, newest_told
-from ethbrake_marl.scenario import Scenario, make_sample
+from ethbrake_marl.physics import Bools, Floats, Messages, Vehicles, Worlds, move_on
+from ethbrake_marl.scenario import Scenario
 
 TOUCHING_M = 1e-9  # a gap below this is a contact: places are told with rounding
 OF_OTHERS = ("place", "speeds_mps", "braking_capacity_mps2", "mass_t", "latency_s", "news_s")  # what may be uncertain
@@ -65,7 +65,7 @@ def told_to(worlds: Worlds, vehicle: int) -> Told:
         known, at_s, place, worlds.speeds_mps.copy(), worlds.command_mps2.copy(),
         worlds.obstacle_gap_m + place[:, 0], worlds.obstacle_hit.copy(), hit,
     )  # fmt: skip
-    if (periodic := is_periodic(worlds)).any():
+    if (periodic := Messages.of(worlds).periodic).any():
         told = _told_by_messages(worlds, vehicle, told, periodic)
     for pair, other in ((vehicle - 1, vehicle - 1), (vehicle, vehicle + 1)):
         if 0 <= pair < N - 1:
@@ -87,7 +87,7 @@ def _places_of(worlds: Worlds, vehicle: int) -> Floats:
 
 def _told_by_messages(worlds: Worlds, vehicle: int, told: Told, periodic: Bools) -> Told:
     """The same where what is known is as old as the newest message, or the present of who is in sight."""
-    newest = newest_told(worlds, vehicle)
+    newest = Messages.of(worlds).newest_told(vehicle)
     other = periodic[:, np.newaxis] & (np.arange(worlds.N) != vehicle)
     stale = other & (newest.at_s < worlds.time_s[:, np.newaxis])
     told.place_m[stale] = (newest.place_m - newest.own_place_m[:, np.newaxis])[stale]
@@ -137,7 +137,7 @@ def ranges_of(scenario: Scenario, vehicle: int) -> Ranges:
             f"scenario {scenario.name!r}: is a mixture, and a vehicle that is not known could be of any of {names};"
             " believed agents need one of these"
         )
-    world = make_sample(scenario, lambda width, of: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
+    world = scenario.sample_by(lambda width, of: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
     bounds = {key: np.array(scenario.bounds(key)).T for key in ("gaps_m", *OF_OTHERS[1:5])}
     named = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "speed_limit_mps")
     middle = {

@@ -45,13 +45,13 @@ from ethbrake_marl.physics import (
     Floats,
     ImpactRows,
     Ints,
+    Messages,
     Worlds,
     advance,
-    is_periodic,
     leaving_out_failed,
     make_worlds,
 )
-from ethbrake_marl.scenario import QUANTITY, Scenario, Task, Texts, hidden_from, load_scenario
+from ethbrake_marl.scenario import QUANTITY, Scenario, Task, load_scenario
 
 _SHOWN_AGENTS = 5  # by name, in ``repr``
 _NAMED = 10  # worlds left out that are named one by one; all stand in the JSON
@@ -233,7 +233,9 @@ class Evaluation:
     seed: int | None  # of the list; None for worlds that were given
     outcomes: dict[str, Outcome]  # by the agent's name
     left_out: tuple[LeftOut, ...] = ()  # worlds of the list that are in none of the arrays, the same for all agents
-    kinds: Mapping[str, Texts] = field(default_factory=dict)  # ``scenario`` of a mixture, ``vehicle_2_type``, ...: [n]
+    kinds: Mapping[str, NDArray[np.str_]] = field(
+        default_factory=dict
+    )  # ``scenario`` of a mixture, ``vehicle_2_type``, ...: [n]
 
     def __repr__(self) -> str:
         drivers = [f"{agent!r:.42}" for agent in list(self.outcomes)[:_SHOWN_AGENTS]]
@@ -319,7 +321,7 @@ class Evaluation:
     @property
     def hidden(self) -> Bools:
         """Worlds in which the channel hides something of the line from a driven vehicle, [n]; see ``v2x``."""
-        from_each = [hidden_from(self.worlds.vehicles, i) | is_periodic(self.worlds) for i in self.vehicles]
+        from_each = [self.worlds.vehicles.hide_from(i) | Messages.of(self.worlds).periodic for i in self.vehicles]
         hidden: Bools = np.logical_or.reduce([np.zeros(self.worlds.n, np.bool_), *from_each])
         return hidden
 
@@ -362,7 +364,7 @@ class Evaluation:
         found: Columns = {}
         for agent, outcome in self.outcomes.items():
             told = outcome.columns()
-            for name, of in _KNOWN_OF_WORLDS.items() if limits else ():
+            for name, of in KNOWN_OF_WORLDS.items() if limits else ():
                 told[name] = None if regrets is None else of(regrets, outcome)
             told |= {name: column for name, column in outcome.borne(objectives).items() if name not in told}
             columns: Columns = {
@@ -643,7 +645,7 @@ class Regrets:
 
 
 # What was avoidable and the best known in each world, by the names of ``--per-world``.
-_KNOWN_OF_WORLDS: dict[str, Callable[[Regrets, Outcome], Values | None]] = {
+KNOWN_OF_WORLDS: dict[str, Callable[[Regrets, Outcome], Values | None]] = {
     "avoidable": lambda r, _: None if r.avoidable is None else r.avoidable + 0,
     "unavoidable_reason": lambda r, _: r.limits.proof.reason,
     "best_known_first_impact_harm": lambda r, _: r.first_impact_harm,

@@ -27,9 +27,10 @@ from ethbrake_marl.files.yaml import (
     refuse,
     schema_lines,
 )
+from ethbrake_marl.observations import ListedFeatures, listed_features
 from ethbrake_marl.policies import Activation, NetworkSpec
 from ethbrake_marl.rewards import RewardParams, registered_terms, setting_names
-from ethbrake_marl.scenario import ListedFeatures, Scenario, check_file_name, listed_features, shipped_folder
+from ethbrake_marl.scenario import Scenario, check_file_name, shipped_folder
 
 WORDS = ("title", "description", "source")  # fields that tell about a recipe and change nothing
 
@@ -477,7 +478,7 @@ def recipe_path(name_or_path: str | Path) -> Path:
 
 def shipped_recipes() -> dict[str, Path]:
     """Name -> file of every recipe that comes with the package: the checkout's ``train/``, or the installed copy."""
-    return {file.stem: file for file in sorted(shipped_folder("train", "recipes").glob("*.yaml"))}
+    return {file.stem: file for file in sorted(shipped_folder("train").glob("*.yaml"))}
 
 
 def _checked(source: Path | Document) -> TrainingRecipe:

@@ -32,9 +32,9 @@ from ethbrake_marl.files.plugins import check_plugins, noted_plugins
 from ethbrake_marl.files.store import new_folder, parse_strict_json, read_plain, write_file
 from ethbrake_marl.files.yaml import Document, FileModel, Wording, read_model, refuse
 from ethbrake_marl.learning.recipe import WORDS, SacRecipe, Scheme, TrainingRecipe, load_recipe
-from ethbrake_marl.observations import ObservationSpec, choose_observation, observation_for
+from ethbrake_marl.observations import ObservationSpec, choose_observation
 from ethbrake_marl.policies import SHIPPED, Policy, installed_versions, load_named_policy, load_policy
-from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.scenario import Scenario, load_scenario, observation_for
 
 if TYPE_CHECKING:  # torch takes seconds, and what is asked of a run needs none
     from stable_baselines3.common.base_class import BaseAlgorithm

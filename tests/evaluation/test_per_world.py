@@ -11,9 +11,9 @@ import pytest
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation import Evaluation, evaluate, write_per_world
-from ethbrake_marl.evaluation.measures import Regrets
+from ethbrake_marl.evaluation.measures import KNOWN_OF_WORLDS
 from ethbrake_marl.files.store import check_target, write_output
-from ethbrake_marl.scenario import Scenario, worlds_from_table
+from ethbrake_marl.scenario import Scenario
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -58,21 +58,21 @@ def test_per_world__every_number_reads_back_as_the_same_bits(tmp_path: Path, eva
     for name, values in expected.items():
         np.testing.assert_array_equal(column(rows, name), values.astype(float), err_msg=name)
     assert {row["ended"] for row in rows} == {"at_rest"}
-    assert set(rows[0]) == {"agent", "knows", "world", "hidden", "ended", *expected, *Regrets.COLUMNS}
+    assert set(rows[0]) == {"agent", "knows", "world", "hidden", "ended", *expected, *KNOWN_OF_WORLDS}
 
 
 def test_per_world__the_initial_columns_make_the_same_worlds_again(tmp_path: Path, evaluation: Evaluation) -> None:
     write_per_world(tmp_path / "out.csv", evaluation)
     rows = [row for row in read(tmp_path / "out.csv") if row["agent"] == "full_brake"]
     names = ("gap_1_m", "gap_2_m", "speed_1_mps", "speed_2_mps", "speed_3_mps")
-    worlds = worlds_from_table({name: column(rows, name) for name in names}, evaluation.scenario)
+    worlds = evaluation.scenario.worlds_from_table({name: column(rows, name) for name in names})
     again = evaluate(worlds, {"b": make_agent("full_brake")}, scenario=evaluation.scenario).outcome("b")
     np.testing.assert_array_equal(again.total_harm, evaluation.outcome("full_brake").total_harm, strict=True)
 
 
 def test_per_world__a_quantity_that_differs_between_worlds_has_its_columns(tmp_path: Path, pair: Scenario) -> None:
     columns = {"gap_1_m": [1.0, 1.0], "speed_1_mps": [20.0, 20.0], "speed_2_mps": [20.0, 20.0]}
-    worlds = worlds_from_table({**columns, "latency_2_s": [0.5, 0.25], "mass_1_t": [4.5, 4.5]}, pair)
+    worlds = pair.worlds_from_table({**columns, "latency_2_s": [0.5, 0.25], "mass_1_t": [4.5, 4.5]})
     write_per_world(tmp_path / "out.csv", evaluate(worlds, {"b": make_agent("full_brake")}, scenario=pair))
     rows = read(tmp_path / "out.csv")
     assert [row["latency_2_s"] for row in rows] == ["0.5", "0.25"]
