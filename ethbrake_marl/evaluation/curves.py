@@ -71,9 +71,9 @@ def criticality_map(
         raise InvalidInput(f"criticality map: scenario {scenario.name!r} has one gap; at least two are needed")
     if not cells >= 2:
         raise InvalidInput(f"criticality map: cells = {cells}; at least 2 are needed")
-    ranges = [gap_range_m] * 2 if gap_range_m else []
-    for low, high in scenario.bounds("gaps_m")[:2] if not ranges else ():  # drawn, or around a fixed number
-        ranges.append((low, high) if low < high else (FIXED_GAP[0] * low, FIXED_GAP[1] * high))
+    bounds = scenario.bounds("gaps_m")[:2]
+    drawn = [(low, high) if low < high else (FIXED_GAP[0] * low, FIXED_GAP[1] * high) for low, high in bounds]
+    ranges = [gap_range_m] * 2 if gap_range_m else drawn
     for low, high in ranges:
         if not 0.0 <= low < high < np.inf:
             raise InvalidInput(f"criticality map: gaps from {low:g} to {high:g} m; must be 0 <= low < high")

@@ -1309,6 +1309,10 @@ _NARROW = (  # in a narrow terminal too, where there is no regret to show, and w
     ("harm_decrease_first", "harm_decrease_total"),
     ("mean_regret_first", "realised_share_first"),
 )
+_IN_NOTEBOOKS = (
+    *("Agent", "Knows", "collision_rate", "first_impact_harm", "total_harm"),
+    *("mean_regret_first", "harm_decrease_first", "realised_share_first"),
+)
 _BELOW = ("collision_rate", "first_impact_harm", "total_harm")  # a terminal shows their intervals; JSON has all
 
 
@@ -1420,20 +1424,12 @@ class SummaryTable(list[SummaryRow]):
     """
 
     def _repr_html_(self) -> str:
-        share = partial(Column, digits=1, scale=100.0, unit=" %")
-        columns = (
-            "Agent", "Knows", share("Collisions"), Column("First-impact harm"), Column("Total harm"),
-            Column("Regret, first"), share("Decrease, first"), share("Realised share, first"),
-        )  # fmt: skip
-        names = ("collision_rate", "first_impact_harm", "total_harm", "mean_regret_first", "harm_decrease_first")
-        rows = [
-            (row.agent, knowledge_text(row.knows), *(row[name] for name in (*names, "realised_share_first")))
-            for row in self
-        ]
         note = "Harm: means per world in m²/s². In brackets: 95 % intervals. Decrease: of full braking's harm."
         note += f" WARNING: {self[0].warning}." if self and self[0].warning else ""
         worlds = f"{self[0].parameters['scenario']}, {count_of(self[0].episodes, 'world')}" if self else "no agent"
-        return Sheet(worlds, columns, rows, note).html()
+        sheet = self.sheet()
+        ours = replace(sheet, title=worlds, rows=sheet.rows[: len(self)], note=note)
+        return ours.only(k for k, name in enumerate(sheet.names) if name in _IN_NOTEBOOKS).html()
 
     @classmethod
     def of_tallies(

@@ -27,7 +27,6 @@ from ethbrake_marl.errors import (
     check_whole_number,
     count_of,
     naming_extras,
-    need,
     unknown_name,
 )
 from ethbrake_marl.evaluation.inputs import (
@@ -72,10 +71,12 @@ def write_per_world(
 
     docs/evaluation.md lists the columns; ``objectives`` adds theirs. A world that was left out has a row with nothing
     but its number and, in ``ended``, why. The file appears whole or not at all. Raises ``AlreadyExists`` unless
-    ``force``, ``InvalidInput`` without a folder, and as ``check_per_world``.
+    ``force``, ``InvalidInput`` without a folder or for another ending, ``MissingExtra`` without pyarrow for Parquet.
     """
-    check_per_world(path)
-    if Path(path).suffix.lower() == PARQUET:
+    ending = Path(path).suffix.lower()
+    if ending not in (CSV, PARQUET):
+        raise InvalidInput(f"{path}: must end in {CSV} or {PARQUET}")
+    if ending == PARQUET:
         with naming_extras():
             import pyarrow
         columns = evaluation.arrays(objectives)
@@ -88,18 +89,6 @@ def write_per_world(
     writer.writerow(told)
     writer.writerows(zip(*told.values(), strict=True))
     write_output(path, text.getvalue().encode(), force=force)
-
-
-def check_per_world(path: str | Path) -> None:
-    """Refuse a file that ``write_per_world`` cannot write, before work whose result goes there.
-
-    Raises ``InvalidInput`` for another ending than .csv or .parquet, ``MissingExtra`` without pyarrow for Parquet.
-    """
-    ending = Path(path).suffix.lower()
-    if ending not in (CSV, PARQUET):
-        raise InvalidInput(f"{path}: must end in {CSV} or {PARQUET}")
-    if ending == PARQUET:
-        need("pyarrow")
 
 
 def read_harms(path: Path, data: bytes) -> dict[str, dict[int, tuple[float, ...]]]:

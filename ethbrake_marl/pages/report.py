@@ -246,11 +246,13 @@ class Report:
             nowhere.intersection_update(_empty(rows))
         ours = replace(sheet, rows=sheet.rows[: len(self.rows)])
         others = _table(ours, "In the same worlds", set(sheet.names) - {"Knows", *_OTHERS})
-        meanings = {}
-        for name, meaning in all_rows.meanings().items():
-            about_it = {column for column in sheet.headings[2:] if column.startswith(name)}
-            if not about_it or about_it - nowhere:
-                meanings[name] = meaning
+        unseen = tuple(name for name in sheet.headings[2:] if name in nowhere)
+        seen = tuple(name for name in sheet.headings[2:] if name not in nowhere)
+        meanings = {
+            name: meaning
+            for name, meaning in all_rows.meanings().items()
+            if any(each.startswith(name) for each in seen) or not any(each.startswith(name) for each in unseen)
+        }
         versions = [Part.facts(self.versions)] if self.versions else []
         versions += [Part.paragraph(all_rows.identity_line(), "quiet")] if all_rows else []
         sections += [
