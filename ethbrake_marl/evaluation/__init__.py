@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         write_dataset as write_dataset,
     )
     from ethbrake_marl.evaluation.inputs import (
+        NamedWorld as NamedWorld,
         NamedWorlds as NamedWorlds,
         check_agents as check_agents,
         choose_worlds as choose_worlds,
