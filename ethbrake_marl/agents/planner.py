@@ -110,10 +110,10 @@ class Planner:
         seed = 0
         while True:
             given = _with_constants(problem, plan)
-            found = problem.search(given, budget=self._candidates, seed=seed)
-            plan, seed = found.profiles, seed + 1
+            plan, harm = problem.search(given, budget=self._candidates, seed=seed)
+            seed += 1
             if time.perf_counter() >= stop:
-                return plan, found.harm(self._harm_count)
+                return plan, harm[self._harm_count]
 
 
 def _with_constants(problem: ProfileProblem, plan: Profiles) -> Profiles:
@@ -226,7 +226,7 @@ class BestHarm:
         with renumbered(unknown):
             coupled = optimise_coupled(part, vehicle, harm_count=harm_count, horizon_s=horizon_s, others_mps2=theirs)
             given = problem.constant(-coupled.deceleration_mps2[:, np.newaxis, np.newaxis])
-            found = problem.search(given, budget=self._budget).profiles
+            found, _ = problem.search(given, budget=self._budget)
         whole, found = Profiles.padded([profiles, found], MOST_PHASES)
         whole.ends[unknown] = found.ends
         whole.commands_mps2[unknown] = found.commands_mps2

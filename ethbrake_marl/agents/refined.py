@@ -17,7 +17,7 @@ from ethbrake_marl.errors import InvalidInput, check_whole_number, renumbered
 from ethbrake_marl.harm import check_harm_count
 from ethbrake_marl.physics import CLOCK, Decisions, Floats, Worlds
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search import ProfileProblem, Refinement, profile_problem
+from ethbrake_marl.search import ProfileProblem, profile_problem
 
 # The compiled refinement of a policy: a search around its own episode at the alert, which then drives.
 
@@ -66,11 +66,11 @@ class RefinedProfile(AgentAround):
         others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
         problem = self._problem(alert, vehicle, others)
         own = record_commands(self.policy, alert, self.scenario, vehicle, int(problem.last_step.max()))
-        found = self._search(problem, own)
+        commands, harm = self._search(problem, own)
         return {
-            "commands_mps2": np.pad(found.commands_mps2, ((0, 0), (0, self._steps - own.shape[1])), mode="edge"),
+            "commands_mps2": np.pad(commands, ((0, 0), (0, self._steps - own.shape[1])), mode="edge"),
             "start_s": problem.clock[:, CLOCK.START].copy(),  # of the first decision
-            "predicted_harm": found.first_impact_harm if self.harm_count == "first" else found.total_harm,
+            "predicted_harm": harm,
         }
 
     def _problem(self, worlds: Worlds, vehicle: int, others_mps2: Floats) -> ProfileProblem:
@@ -83,8 +83,8 @@ class RefinedProfile(AgentAround):
             others_mps2=others_mps2,
         )
 
-    def _search(self, problem: ProfileProblem, commands_mps2: Floats) -> Refinement:
-        """The best that is found around these commands."""
+    def _search(self, problem: ProfileProblem, commands_mps2: Floats) -> tuple[Floats, Floats]:
+        """The best commands that are found around these, and their harm."""
         return problem.refine(commands_mps2, budget=self.candidates)
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
@@ -153,18 +153,18 @@ class RefinedAgain(RefinedProfile):
         step = Decisions(held["start_s"], self.scenario.time_step_s).latest(worlds.time_s)
         later = step[:, np.newaxis] + np.arange(int(problem.last_step.max()))
         rows, last = np.arange(worlds.n)[:, np.newaxis], self._steps - 1
-        found = self._search(problem, plan[rows, np.minimum(later, last)]).commands_mps2
+        found = self._search(problem, plan[rows, np.minimum(later, last)])[0]
         inside = later <= last
         plan[np.broadcast_to(rows, later.shape)[inside], later[inside]] = found[inside]
         return plan
 
-    def _search(self, problem: ProfileProblem, commands_mps2: Floats) -> Refinement:
+    def _search(self, problem: ProfileProblem, commands_mps2: Floats) -> tuple[Floats, Floats]:
         """The best that is found around these commands in the budget."""
         stop = time.perf_counter() + 1e-6 * self._microseconds * problem.n
         found, seed = problem.refine(commands_mps2, budget=self.candidates), 0
         while time.perf_counter() < stop:
             seed += 1
-            found = problem.refine(found.commands_mps2, budget=self.candidates, seed=seed)
+            found = problem.refine(found[0], budget=self.candidates, seed=seed)
         return found
 
 

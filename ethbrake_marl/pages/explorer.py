@@ -37,12 +37,12 @@ from ethbrake_marl.evaluation import Conditions, EpisodeMotion, follow_episodes
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import check_writable, parse_strict_json
 from ethbrake_marl.files.yaml import flow_text
-from ethbrake_marl.limits import Unproven, driven_profiles, prove, scripted_commands
+from ethbrake_marl.limits import Unproven, driven_profiles, prove, scripted_commands, task_problem
 from ethbrake_marl.pages.page import Page, Part, Played, Section, shown
 from ethbrake_marl.physics import Decisions, Floats, Worlds
 from ethbrake_marl.policies import Policy
 from ethbrake_marl.scenario import QUANTITY, Scenario, Task
-from ethbrake_marl.search import Profiles, profile_problem
+from ethbrake_marl.search import Profiles
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver
 
 if TYPE_CHECKING:
@@ -257,15 +257,12 @@ class Explored:
         """
         begin = time.monotonic()
         scenario, harm_count = self.task.scenario, self.task.harm_count
-        problem = profile_problem(
-            world, self.task.vehicles, harm_count=harm_count, horizon_s=scenario.horizon_s,
-            time_step_s=scenario.time_step_s, others_mps2=scripted_commands(world, self.task),
-        )  # fmt: skip
+        problem = task_problem(world, self.task)
         constant = np.full((1, 1, 1), -self.best_constant(world)["deceleration_mps2"])
         given = problem.constant(np.concatenate([constant, problem.even_grid(CONSTANTS)], axis=1))
         used = 0
         while used == 0 or not (time.monotonic() - begin >= seconds or stop()):
-            given = problem.search(given, budget=SLICE, seed=used // SLICE).profiles
+            given, _ = problem.search(given, budget=SLICE, seed=used // SLICE)
             used += SLICE
         commands = _step_by_step(given)
         both = [HandDriven(np.array(each), scenario.time_step_s) for each in (commands, profile.tolist())]
