@@ -26,7 +26,6 @@ from ethbrake_marl.errors import InvalidInput, Progress as PartProgress, check_w
 
 _KEPT = "\n\t\N{NO-BREAK SPACE}"  # in lines of a result; the last stands between a number and its unit
 EVERY_S = 10.0  # between two signs of life where stderr is no terminal
-INTERRUPTED = 130  # 128 + SIGINT, as shells expect
 
 
 def say(text: str) -> None:
@@ -97,7 +96,7 @@ class Out:
     def interrupted(self, told: str) -> NoReturn:
         """End the command as Ctrl-C does, with one line."""
         self.note(told)
-        raise typer.Exit(INTERRUPTED)
+        raise typer.Exit(130)  # 128 + SIGINT, as shells expect
 
     def progress(
         self, name: str, done: int, total: int, metrics: Mapping[str, float] | None = None, note: str = ""

@@ -260,7 +260,7 @@ class Plan:
             number, broken = chunks_left(level.scenario, part, budget=self.budget, chunks=self.optimum_folder(level))
             damaged += broken
             if number:
-                worlds = part.worlds.take(np.arange(min(_TIMED_WORLDS, part.worlds.n)))
+                worlds = part.worlds.take(np.arange(min(4, part.worlds.n)))
                 searching = partial(best_harm, level.scenario, budget=self.budget, threads=1)
                 search_s += number * Timed.each_s(worlds, searching)
         speed = f" at {decisions.total() / training_s:,.0f}/s" if training_s > 0.0 else ""
@@ -271,9 +271,6 @@ class Plan:
             f" together about {told(whole_s)} of one core"
         )
         return "\n".join([line, *(f"{file}: is damaged; its worlds are searched again" for file in damaged)])
-
-
-_TIMED_WORLDS = 4  # of the search
 
 
 def with_scheme(recipe: TrainingRecipe, scheme: str | None) -> TrainingRecipe:
@@ -680,10 +677,8 @@ class LineQuestion:
 def lengthen(scenario: Scenario, vehicles: int) -> Scenario:
     """The scenario with a line of ``vehicles``: shorter ones lose the rear, vehicle i > N is like vehicle i - 2.
 
-    All followers learn; Vehicle 1 keeps its role. Raises ``InvalidInput`` for fewer than 2 vehicles.
+    All followers learn; Vehicle 1 keeps its role.
     """
-    if not vehicles >= 2:
-        raise InvalidInput(f"line of {vehicles} vehicles: at least 2 are needed")
     given = scenario.model_dump(mode="json", exclude_unset=True)
     changes: dict[str, Any] = {"vehicles": vehicles, "name": f"{scenario.name}-n{vehicles}"}
     for key in (*QUANTITY.declared, "objective", "types"):

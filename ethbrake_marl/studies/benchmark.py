@@ -279,7 +279,6 @@ def mean_of_lists(shares: Sequence[Estimate]) -> Estimate:
 
 
 REFERENCE = "full_brake"
-_SAME_HARM = 1e-6  # of means (m2/s2), relative or absolute: what another machine may round otherwise
 Count = Annotated[int, Field(ge=0)]
 
 
@@ -416,7 +415,7 @@ def _drive_list(
         ("full braking", float(full.mean()), content.full_brake_harm),
         ("the best known", float(best.mean()), content.best_known_harm),
     ):
-        if not abs(found - frozen) <= _SAME_HARM * max(1.0, frozen):
+        if not abs(found - frozen) <= 1e-6 * max(1.0, frozen):  # what another machine may round otherwise
             raise InvalidInput(
                 f"list {each.name}: the harm of {what} is {found:.9g} m2/s2 here, {frozen:.9g} in the suite: this"
                 " version has another physics"

@@ -53,8 +53,6 @@ from ethbrake_marl.shield import HybridAgent
 # The results of an experiment beside its policy: CSV and JSON, every world, three figures and one page.
 
 BESIDE = ("full_brake", "e_v2x_bm")  # beside the policy: in its figures, and on the other two of the three tests
-BESIDE_EPISODES = 2_000  # at most so many worlds of each of these tests
-BASELINES = (*BESIDE, "e_v2x_bm:pairwise")
 RUNS = Path("runs")
 
 
@@ -241,7 +239,7 @@ def run_experiment(
         rows = summarise(evaluation)
         beside: dict[str, SummaryTable] = {}
         for other in others:  # the policy was trained on ``scenario`` alone
-            part = other.sample(min(episodes, BESIDE_EPISODES), list_seed)
+            part = other.sample(min(episodes, 2_000), list_seed)
             begin(f"the same policy on {other.name}: {count_of(part.worlds.n, 'world')}")
             driven = evaluate(part, _agents(trained.policy, other, BESIDE), scenario=other, seed=list_seed)
             beside[other.name] = summarise(driven)
@@ -257,7 +255,9 @@ def run_experiment(
     return ExperimentResult(run.path, trained.status, trained.steps, rows, report, per_world, beside)
 
 
-def _agents(policy: Policy, scenario: Scenario, baselines: Sequence[str] = BASELINES) -> dict[str, Agent]:
+def _agents(
+    policy: Policy, scenario: Scenario, baselines: Sequence[str] = (*BESIDE, "e_v2x_bm:pairwise")
+) -> dict[str, Agent]:
     """The baselines, the policy alone (``ppo`` or ``sac``), and the policy behind its shield (``hybrid``)."""
     name = policy.manifest.algorithm
     learned: dict[str, Agent] = {

@@ -384,7 +384,6 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any], inside: str 
 
 # Trainings as jobs: one that is finished is kept, one that is begun goes on; what it costs.
 
-_UPDATES = 4  # of the training that is timed; the first one does not count
 TIMED_DRIVES = 50  # worlds that the timed policy drives
 
 
@@ -451,7 +450,7 @@ class TrainingJob:
         with tempfile.TemporaryDirectory(prefix="ethbrake-") as folder:
             path = Path(folder) / "timed"
             train(short, scenario, path, steps=1)  # compiles and warms up
-            train(short, scenario, path, steps=_UPDATES * self.per_update, force=True, on_progress=told.append)
+            train(short, scenario, path, steps=4 * self.per_update, force=True, on_progress=told.append)
             updates = [one for one in told if one.updates >= 1]
             last = updates[-1]
             first = updates[0] if updates[0].done < last.done else Progress("begun", 0, 0)
@@ -634,8 +633,6 @@ def _end_with(parent: BaseProcess) -> None:
 # A Ray cluster, or a Ray of this machine alone that nobody else can reach.
 
 _LOCAL = "local"
-_LOOK_S = 10.0  # between two looks at how large the cluster is
-_AHEAD = 2  # jobs per core that Ray holds: one runs, one waits
 
 
 class RayWorkers:
@@ -667,9 +664,9 @@ class RayWorkers:
 
     def room(self) -> int:
         """So many that no core has to wait for us, however many join the cluster or leave it."""
-        if time.monotonic() - self._looked > _LOOK_S:
+        if time.monotonic() - self._looked > 10.0:
             self._cores, self._looked = int(self._ray.cluster_resources().get("CPU", 0)), time.monotonic()
-        most = _AHEAD * self._cores if self._most is None else self._most
+        most = 2 * self._cores if self._most is None else self._most  # on each core one runs, one waits
         return most - len(self._running)
 
     def begin(self, number: int, call: bytes) -> None:
