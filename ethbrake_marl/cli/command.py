@@ -81,13 +81,13 @@ class Out:
             return
         if endings and path.suffix.lower() not in endings:
             raise InvalidInput(f"{path}: {what} must end in {' or '.join(endings)}")
-        from ethbrake_marl.evaluation import check_target
+        from ethbrake_marl.files.store import check_target
 
         check_target(path, force=self.force)
 
     def write(self, path: Path, content: bytes | str, what: str | None = None) -> None:
         """Write a file in one step, and say ``what`` it is."""
-        from ethbrake_marl.evaluation import write_output
+        from ethbrake_marl.files.store import write_output
 
         write_output(path, content.encode() if isinstance(content, str) else content, force=self.force)
         if what is not None:

@@ -18,19 +18,17 @@ from ethbrake_marl.agents import Agent, Driver, LearnedAgent, Team, make_single_
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, count_of
 from ethbrake_marl.evaluation import (
-    PROGRESS_EVERY,
     evaluate,
     interquartile_mean,
     load_runnable,
     mean_over_seeds,
     policy_sha256,
-    rate_over_seeds,
     result_identity,
     share_over_seeds,
-    write_output,
 )
 from ethbrake_marl.figures import Figure, ablation_figures, write_picture
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
+from ethbrake_marl.files.store import write_output
 from ethbrake_marl.files.yaml import Override
 from ethbrake_marl.learning import (
     HARM_METRIC,
@@ -489,7 +487,7 @@ def _drive(scenario: Scenario, sample: Sample, drivers: Sequence[Driver], tell: 
     """Harms of several drivers of one level on the same worlds."""
     outcomes = []
     for driver in drivers:
-        result = evaluate(sample, {driver.name: driver}, scenario=scenario, chunk=PROGRESS_EVERY).complete()
+        result = evaluate(sample, {driver.name: driver}, scenario=scenario).complete()
         outcomes.append(result.outcome(driver.name))
         tell(Progress(f"driving {driver.name}", sample.worlds.n, sample.worlds.n))
     ledgers = [outcome.ledger for outcome in outcomes]
@@ -497,7 +495,7 @@ def _drive(scenario: Scenario, sample: Sample, drivers: Sequence[Driver], tell: 
         {harm_count: np.stack([each.world_harm(harm_count) for each in ledgers]) for harm_count in HARM_COUNTS},
         {harm_count: np.stack([each.vehicle_harm(harm_count) for each in ledgers]) for harm_count in HARM_COUNTS},
         np.stack([outcome.collided for outcome in outcomes]),
-        tuple(outcome.named_policies for outcome in outcomes),
+        tuple(dict(outcome.policies) for outcome in outcomes),
     )
 
 
@@ -637,7 +635,7 @@ class LineQuestion:
             "decrease": share_over_seeds(own, worst, np.zeros_like(worst)),
             "best_known": best_known,  # in the worlds that were searched
             "share": share,  # of the joint optimum's reduction, there
-            "worse_off": rate_over_seeds((reached.vehicle[count] > braking.vehicle[count] + TOLERANCE).any(axis=2)),
+            "worse_off": mean_over_seeds((reached.vehicle[count] > braking.vehicle[count] + TOLERANCE).any(axis=2)),
         }
         return {
             **result_identity("generalise", scenario, sample),
@@ -754,7 +752,7 @@ def _level(one: Measured, searched: int) -> Json:
         "learners": [scenario.vehicle_names[i] for i in scenario.learners],
         "seeds": len(one.reached.collided),
         "worlds": one.reached.collided.shape[1],
-        "collision_rate": rate_over_seeds(one.reached.collided).to_json(),
+        "collision_rate": mean_over_seeds(one.reached.collided).to_json(),
     }
     for harm_count in HARM_COUNTS:
         reached, braking = one.reached.world[harm_count], one.full_brake.world[harm_count]
@@ -791,10 +789,10 @@ def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: 
         "above_bound": int((shielded.harm > shielded.bound).sum()),
         "replaced": float(shielded.replaced.sum() / actions.sum()),
         "replaced_vehicles": (shielded.replaced.sum(axis=(0, 1)) / shielded.decisions.sum()).tolist(),
-        "stepped_in": rate_over_seeds((shielded.replaced > 0).any(axis=2)).to_json(),
+        "stepped_in": mean_over_seeds((shielded.replaced > 0).any(axis=2)).to_json(),
         "vehicles": [mean_over_seeds(column).to_json() for column in np.moveaxis(after - before, 2, 0)],
-        "worse_off": rate_over_seeds((after > before + TOLERANCE).any(axis=2)).to_json(),
-        "above_baseline": rate_over_seeds((after > shielded.baseline + TOLERANCE).any(axis=2)).to_json(),
+        "worse_off": mean_over_seeds((after > before + TOLERANCE).any(axis=2)).to_json(),
+        "above_baseline": mean_over_seeds((after > shielded.baseline + TOLERANCE).any(axis=2)).to_json(),
         "moving": int(shielded.moving.sum()),
         "searched": {"harm": mean_over_seeds(shielded.harm[:, :searched]).to_json()},
     }
@@ -811,7 +809,7 @@ def _change(before: Measured, after: Measured, algorithm: str) -> Json:
         found[harm_count] = {
             "difference": mean_over_seeds(after.reached.world[harm_count], before.reached.world[harm_count]).to_json(),
             "vehicles": [mean_over_seeds(new, old).to_json() for new, old in pairs],
-            "worse_off": rate_over_seeds(worse.any(axis=2)).to_json(),
+            "worse_off": mean_over_seeds(worse.any(axis=2)).to_json(),
             "worse_off_vehicles": [float(share) for share in worse.mean(axis=(0, 1))],
         }
     return found

@@ -22,7 +22,6 @@ from ethbrake_marl.agents import Driver, knowledge_text, team_of
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import InvalidInput, OnProgress, PhysicsError, Progress, one_line, unknown_name
 from ethbrake_marl.evaluation import (
-    PROGRESS_EVERY,
     check_agents,
     content_sha256,
     driving_policy,
@@ -33,10 +32,9 @@ from ethbrake_marl.evaluation import (
     relative_decrease,
     result_versions,
     worlds_sha256,
-    write_output,
 )
 from ethbrake_marl.files.sheet import DASH, Column, Estimate, Sheet
-from ethbrake_marl.files.store import read_plain
+from ethbrake_marl.files.store import read_plain, write_output
 from ethbrake_marl.files.yaml import FileModel, read_json_model
 from ethbrake_marl.limits import BestHarmTable, task_problem
 from ethbrake_marl.physics import Floats
@@ -406,7 +404,6 @@ def _drive_list(
             {**make_lineup([REFERENCE], each.scenario), **lineup},
             scenario=each.scenario,
             seed=content.seed,
-            chunk=PROGRESS_EVERY,
             on_progress=tell,
             aftermath=False,
         ).complete()
@@ -426,7 +423,7 @@ def _drive_list(
     return ListResult(
         worlds=content.worlds,
         worlds_sha256=content.worlds_sha256,
-        policies=outcome.named_policies,
+        policies=dict(outcome.policies),
         policy_seeds=seeds,
         knows=knowledge_text(outcome.knows),
         realised_share=realised_share(harm, full, best),

@@ -37,7 +37,7 @@ from ethbrake_marl.errors import (
     naming_extras,
     one_line,
 )
-from ethbrake_marl.evaluation import BLOCK, Asked, Tally, evaluate
+from ethbrake_marl.evaluation import Question, Tally, evaluate
 from ethbrake_marl.files.plugins import Plugin, load_the_same, loaded_plugins
 from ethbrake_marl.files.store import (
     check_writable,
@@ -745,14 +745,14 @@ def open_workers(ray: str | None, jobs: int | None) -> Workers:
 
 
 def evaluate_shards(
-    asked: Asked,
+    asked: Question,
     *,
     shards: int,
     jobs: int = 1,
     workers: Workers | None = None,
     folder: Path | None = None,
     with_rows: bool = False,
-    block: int = BLOCK,
+    block: int = 4_000,
     tell: OnProgress | None = None,
 ) -> Tally:
     """The merged tally of all worlds of a list; the same bits whatever ``shards``, ``jobs`` and ``block`` are.
@@ -767,11 +767,11 @@ def evaluate_shards(
         block: worlds advanced together, a multiple of 1,000.
         tell: is told the worlds done so far.
 
-    Raises what ``Asked.answer`` and ``JobFolder.work`` raise, ``WorkerLost`` where a shard was lost again and again.
+    Raises what ``Question.answer`` and ``JobFolder.work`` raise, ``WorkerLost`` where a shard was lost again and again.
 
     """
     run, note = run_jobs, ""
-    bounds = {f"{first:013d}-{end:013d}": (first, end) for first, end in asked.question.bounds(shards)}
+    bounds = {f"{first:013d}-{end:013d}": (first, end) for first, end in asked.bounds(shards)}
     files = {} if folder is None else {name: folder.absolute() / f"worlds-{name}.parquet" for name in bounds}
     done: dict[str, Any] = {}
     with ExitStack() as stack:
@@ -796,7 +796,7 @@ def evaluate_shards(
 
         def say(note: str = "") -> None:
             if tell is not None:
-                tell(Progress("worlds", worlds, asked.question.episodes, note=note))
+                tell(Progress("worlds", worlds, asked.episodes, note=note))
 
         def take(job: Job, found: dict[str, Any]) -> None:
             nonlocal whole, worlds
@@ -815,7 +815,7 @@ def evaluate_shards(
         return whole
 
 
-def _answer(asked: Asked, first: int, end: int, rows: Path | None, block: int) -> dict[str, Any]:
+def _answer(asked: Question, first: int, end: int, rows: Path | None, block: int) -> dict[str, Any]:
     tally = asked.answer(first, end, rows, block)
     size = None if rows is None else rows.stat().st_size
     return {"first": first, "end": end, "rows_bytes": size, "tally": tally.to_json()}

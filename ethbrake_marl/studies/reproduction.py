@@ -29,11 +29,9 @@ from ethbrake_marl.agents import Agent, LearnedAgent
 from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, count_of, plain_text, unknown_name
 from ethbrake_marl.evaluation import (
     PAPER_ROWS,
-    PROGRESS_EVERY,
     EpisodeRecord,
     Evaluation,
     PaperRow,
-    check_target,
     evaluate,
     interquartile_mean,
     make_agents,
@@ -43,7 +41,6 @@ from ethbrake_marl.evaluation import (
     record_episode,
     relative_decrease,
     unpaired_difference,
-    write_output,
 )
 from ethbrake_marl.figures import (
     Figure,
@@ -57,7 +54,7 @@ from ethbrake_marl.figures import (
     write_picture,
 )
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown, csv_text as csv_of
-from ethbrake_marl.files.store import read_plain, write_file
+from ethbrake_marl.files.store import check_target, read_plain, write_file, write_output
 from ethbrake_marl.learning import RETURN, RunDirectory, TrainingRecipe, load_recipe, read_object
 from ethbrake_marl.limits import Unproven
 from ethbrake_marl.pages.page import Page, Part, Played, Section, anchors, shown
@@ -591,7 +588,6 @@ def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, s
         agents,
         scenario=scenario,
         seed=LIST_SEED,
-        chunk=PROGRESS_EVERY,
         aftermath=False,
         on_progress=lambda name, done: settings.tell(Progress(scenario.name, done, episodes)),
     )
@@ -1578,12 +1574,7 @@ def _measure(scenario: Scenario, alternative: Alternative, episodes: int) -> Hea
         agents[NAMES[PPO]] = hybrid(load_shipped("ppo"), own, alternative.bound)
     seed = LIST_SEED if alternative.seed is None else alternative.seed
     evaluation = evaluate(
-        own.sample(episodes, seed),
-        agents,
-        scenario=own,
-        seed=seed,
-        chunk=PROGRESS_EVERY,
-        aftermath=alternative.harm == "sampled",
+        own.sample(episodes, seed), agents, scenario=own, seed=seed, aftermath=alternative.harm == "sampled"
     )
     harm = {}
     for name, outcome in evaluation.outcomes.items():
