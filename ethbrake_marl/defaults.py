@@ -10,7 +10,6 @@ HARM_COUNTS: tuple[HarmCount, ...] = get_args(HarmCount)
 DatasetFormat = Literal["parquet", "minari"]
 
 MeasureName = Literal["harm", "regret", "difference", "bound"]  # what ``falsify`` searches for
-MEASURES: tuple[MeasureName, ...] = get_args(MeasureName)
 
 
 class _Defaults(NamedTuple):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import platform
+import re
 import subprocess
 import sys
 import tempfile
@@ -132,10 +133,8 @@ def _requirements() -> list[tuple[str, Requirement]]:
 
 def _pinned_versions(constraints: Path) -> dict[str, str]:
     """Lower-case name -> version of every ``name==version`` line; empty outside a checkout."""
-    if not constraints.is_file():
-        return {}
-    lines = [line.split("#")[0].strip() for line in constraints.read_text("utf-8").splitlines()]
-    return {name.lower(): pin for name, _, pin in (line.partition("==") for line in lines) if pin}
+    text = constraints.read_text("utf-8") if constraints.is_file() else ""
+    return {name.lower(): pin for name, pin in re.findall(r"^([^\s#=]+)==([^\s#]+)", text, re.MULTILINE)}
 
 
 def _processor() -> tuple[bool, str]:

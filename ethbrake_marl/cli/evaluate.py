@@ -28,10 +28,6 @@ if TYPE_CHECKING:
 
 PAGES = (".html", ".htm")
 _PROPOSERS = "ppo@shipped,full_brake,constant:3"
-_INTERVALS = (
-    "Intervals: rates exact (Clopper-Pearson), means by Student's t; all from exact sums, the same bits in any"
-    " number of shards."
-)
 _HARMS = {"first_impact_harm": "First-impact harm", "total_harm": "Total harm", "harm": "Harm"}
 _POLICIES = {"same": "the same", "other": "another", "none": ""}
 
@@ -170,8 +166,13 @@ def evaluate_command(
     groups = {} if by is None else evaluation.summarise_by(found, by)
     if per_world is not None:
         evaluation.write_per_world(per_world, found, objectives=objectives, force=out.force)
-    agents_told = {"harm_count": harm_count, "uncertainty": uncertainty}
-    results = evaluation.results_to_json(summary, told=told, groups=groups, per_world=per_world, settings=agents_told)
+    results = evaluation.results_to_json(
+        summary,
+        told=told,
+        groups=groups,
+        per_world=per_world,
+        settings={"harm_count": harm_count, "uncertainty": uncertainty},
+    )
     if per_world is not None:
         out.write(_beside(per_world), _json_text(results))
         out.note(f"every world: {per_world}; the results: {_beside(per_world)}")
@@ -241,7 +242,12 @@ def _evaluate_in_shards(
     if output is not None:
         write_file(output / "results.json", _json_text(results).encode())
         out.note(f"finished shards: {output}; the results: {output / 'results.json'}")
-    out.result(results, *summary.tables(), _INTERVALS)
+    out.result(
+        results,
+        *summary.tables(),
+        "Intervals: rates exact (Clopper-Pearson), means by Student's t; all from exact sums, the same bits in any"
+        " number of shards.",
+    )
     _tell_horizon(out, _moving(summary), tally.worlds, question.scenario.horizon_s)
     if question.objectives and not out.as_json:
         told = tally.rescore(question.objectives, question.scenario.vehicles)
@@ -428,11 +434,13 @@ def replay_command(
     """
     named = evaluation.Passport.parse(passport)
     out.check(output)
-    intervals = _intervals(uncertainty)
     found = named.replay(
-        scenario=scenario, settings=learning.read_settings(settings).scenario, agent=agent,
-        initial_states=initial_states, uncertainty=intervals,
-    )  # fmt: skip
+        scenario=scenario,
+        settings=learning.read_settings(settings).scenario,
+        agent=agent,
+        initial_states=initial_states,
+        uncertainty=_intervals(uncertainty),
+    )
     first, total = found.motion.harm
     impacts = int(found.motion.ledger.impacts[0])
     lines = [
@@ -640,16 +648,13 @@ def picture_shield(
 
     The agents propose, and --harm-count is the harm that is guaranteed.
     """
-    from ethbrake_marl.shield import ALLOWANCES, operating_curves
+    from ethbrake_marl.shield import operating_curves
 
     figures = _figures(out, output)
     task = _asked_task(scenario, vehicle, settings, harm_count)
     worlds = task.scenario.sample(episodes, DEFAULT.LIST_SEED).worlds
     lineup = evaluation.make_lineup(agents.split(","), task.scenario, harm_count=harm_count, bare=True)
-    curves = operating_curves(
-        worlds, lineup, task, ALLOWANCES,
-        on_progress=lambda name: out.progress(name, episodes, episodes),
-    )  # fmt: skip
+    curves = operating_curves(worlds, lineup, task, on_progress=lambda name: out.progress(name, episodes, episodes))
     left_out = next(iter(curves.values()))[0].left_out
     rest = f"; step shield, {harm_count} harm. Beside the points: what certificates may reach above the bound (m²/s²)."
     figure = figures.operating_figure(list(curves.items()), caption=_caption(task.scenario, episodes, rest, left_out))

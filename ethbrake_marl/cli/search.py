@@ -7,13 +7,13 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
 
 from ethbrake_marl import evaluation, learning, limits
 from ethbrake_marl.cli.command import Out, app
-from ethbrake_marl.defaults import DEFAULT, HARM_COUNTS, MEASURES, HarmCount, MeasureName
+from ethbrake_marl.defaults import DEFAULT, HARM_COUNTS, HarmCount, MeasureName
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.files.sheet import Sheet
 
@@ -148,7 +148,9 @@ def falsify_command(
     ] = None,
     measure: Annotated[
         MeasureName,
-        typer.Option(metavar="|".join(MEASURES), help="What is searched for: harm, regret, a difference, a bound."),
+        typer.Option(
+            metavar="|".join(get_args(MeasureName)), help="What is searched for: harm, regret, a difference, a bound."
+        ),
     ] = "regret",
     against: Annotated[
         str | None,

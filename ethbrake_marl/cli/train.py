@@ -77,7 +77,7 @@ def run_command(
         shown += [Text(f"\n{evaluation.TESTS[test]}\n"), found.terminal()]
     out.result(told, *shown)
     out.note(f"report: {result.report}")
-    _end(out, result.status, result.steps, folder)
+    _end(out, result.trained)
 
 
 train = app.group(
@@ -208,15 +208,15 @@ def _tell(out: Out, result: learning.TrainResult) -> None:
         "policy_steps": next(iter(result.policies.values())).manifest.steps,
         "alarms": list(result.alarms),
     })  # fmt: skip
-    _end(out, result.status, result.steps, result.directory)
+    _end(out, result)
 
 
-def _end(out: Out, status: str, steps: int, folder: Path) -> None:
+def _end(out: Out, result: learning.TrainResult) -> None:
     """Say what a training left; an interrupted one ends with that status."""
-    if status == "interrupted":
-        left = f"go on with: ethbrake train resume {folder} (its policy is there)"
-        out.interrupted(f"interrupted after {steps:,} training steps; {left}")
-    out.note(f"{status} after {steps:,} training steps: {folder}")
+    if result.status == "interrupted":
+        left = f"go on with: ethbrake train resume {result.directory} (its policy is there)"
+        out.interrupted(f"interrupted after {result.steps:,} training steps; {left}")
+    out.note(f"{result.status} after {result.steps:,} training steps: {result.directory}")
 
 
 # The commands of many trainings or evaluations: ``study``, ``reproduce`` and ``benchmark``.
@@ -297,11 +297,7 @@ def sweep_command(
     told = f"{counts['finished']:,} of {counts['jobs']:,} jobs finished; table: {result.table}"
     if counts["failed"]:
         told += f"; {counts['failed']:,} failed: {output / 'failures.csv'}"
-    if result.interrupted:
-        out.interrupted(f"interrupted; {told}; {KEPT_IN_FOLDER}")
-    out.note(told)
-    if counts["failed"]:
-        raise typer.Exit(1)
+    _end_study(out, told, interrupted=result.interrupted, failed=counts["failed"] > 0)
 
 
 @study_group.add("tune", "study tune tuning.yaml --output runs/tuning --trials 30 --export best.yaml",
@@ -371,12 +367,23 @@ def tune_command(
             source = f"trial {best.number}, harm {best.harm!r} on the list of seed {plan.file.measure.seed}"
             out.write(export, plan.best_recipe(best.values, export, f"ethbrake study tune: {source}"))
             told += f"; recipe: {export}"
-    counts = {"trials": result.counts, "interrupted": result.interrupted, "table": str(result.table)}
-    out.result({"best": shown, **counts, "exported": None if export is None else str(export)}, *lines)
-    if result.interrupted:
+    found = {
+        "best": shown,
+        "trials": result.counts,
+        "interrupted": result.interrupted,
+        "table": str(result.table),
+        "exported": None if export is None else str(export),
+    }
+    out.result(found, *lines)
+    _end_study(out, told, interrupted=result.interrupted, failed=best is None)
+
+
+def _end_study(out: Out, told: str, *, interrupted: bool, failed: bool) -> None:
+    """Say what a sweep or a tuning came to, and end with its status."""
+    if interrupted:
         out.interrupted(f"interrupted; {told}; {KEPT_IN_FOLDER}")
     out.note(told)
-    if best is None:
+    if failed:
         raise typer.Exit(1)
 
 
@@ -439,8 +446,6 @@ def ablate_command(
         episodes=episodes, list_seed=list_seed, search_episodes=search_episodes, budget=budget, shield=shield,
         folder=output,
     )  # fmt: skip
-    if not cost:
-        plan.job_folder().check()
     out.note(plan.cost())
     if cost:
         return

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from ethbrake_marl.learning.training import (
         RETURN as RETURN,
         RunDirectory as RunDirectory,
-        RunStatus as RunStatus,
         Training as Training,
         load_team as load_team,
         read_object as read_object,

@@ -8,7 +8,6 @@ from ethbrake_marl.doors import front_door
 
 if TYPE_CHECKING:
     from ethbrake_marl.shield.evidence import (
-        ALLOWANCES as ALLOWANCES,
         SAME_HARM as SAME_HARM,
         VERDICTS as VERDICTS,
         OperatingPoint as OperatingPoint,
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
         robustness as robustness,
     )
     from ethbrake_marl.shield.guard import (
-        Bound as Bound,
         HybridAgent as HybridAgent,
         MovingAtHorizon as MovingAtHorizon,
         Shielded as Shielded,

@@ -93,7 +93,7 @@ def operating_curves(
     worlds: Worlds,
     policies: Mapping[str, Driver],
     task: Task,
-    allowances: Sequence[float],
+    allowances: Sequence[float] = ALLOWANCES,
     *,
     on_progress: Callable[[str], None] | None = None,
 ) -> dict[str, list[OperatingPoint]]:

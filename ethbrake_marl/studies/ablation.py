@@ -47,7 +47,7 @@ from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.policies import Policy, load_policy
 from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, Task
 from ethbrake_marl.shield import Shielded
-from ethbrake_marl.studies.jobs import TIMED_DRIVES, JobFolder, Timed, TrainingJob
+from ethbrake_marl.studies.jobs import JobFolder, Timed, TrainingJob
 
 # Levels of cooperation that belong together: the same lines; what differs is who learns, knows and cares.
 
@@ -80,11 +80,6 @@ class Level:
     def name(self) -> str:
         """The scenario's name."""
         return self.scenario.name
-
-    @property
-    def trained(self) -> bool:
-        """Whether anybody learns; else all follow their scripts."""
-        return bool(self.scenario.learners)
 
 
 def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list[Level]:
@@ -155,7 +150,6 @@ def _values(name: str, level: Level, sample: Sample) -> Floats:
 SETTINGS = "settings.json"  # inside the ablation's folder
 _QUICK = {"seeds": 2, "steps_per_learner": 200_000, "episodes": 500, "search_episodes": 40, "budget": 2_000}
 _FULL = {"seeds": 5, "steps_per_learner": 400_000, "episodes": 4_000, "search_episodes": 600, "budget": 20_000}
-_NUMBERS = ("seeds", "steps_per_learner", "episodes", "list_seed", "search_episodes", "budget")
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +178,7 @@ class Plan:
         for seed in range(self.seeds):
             for recipe in self.recipes:
                 for level in self.levels:
-                    if level.trained:
+                    if level.scenario.learners:
                         yield level, _algorithm(recipe), self.training(level, recipe, seed)
 
     def training(self, level: Level, recipe: TrainingRecipe, seed: int) -> TrainingJob:
@@ -199,10 +193,13 @@ class Plan:
 
     def settings(self) -> dict[str, Any]:
         """Everything that shapes the results, as plain data."""
-        scenarios = [level.scenario.model_dump(mode="json", exclude=set(WORDS)) for level in self.levels]
-        recipes = [recipe.model_dump(mode="json", exclude=set(WORDS)) for recipe in self.recipes]
-        numbers = {name: getattr(self, name) for name in _NUMBERS}
-        return {"levels": scenarios, "recipes": recipes, **numbers, "shield": self.shield}
+        numbers = ("seeds", "steps_per_learner", "episodes", "list_seed", "search_episodes", "budget")
+        return {
+            "levels": [level.scenario.model_dump(mode="json", exclude=set(WORDS)) for level in self.levels],
+            "recipes": [recipe.model_dump(mode="json", exclude=set(WORDS)) for recipe in self.recipes],
+            **{name: getattr(self, name) for name in numbers},
+            "shield": self.shield,
+        }
 
     def job_folder(self) -> JobFolder:
         """The folder, which no ablation with other settings may have: its results would be lost."""
@@ -233,42 +230,38 @@ class Plan:
         raises for a finished training that cannot drive.
         """
         left = [(level, algorithm, training, training.steps_left()) for level, algorithm, training in self.trainings()]
-        for level, _, training, steps in left:
+        decisions: Counter[tuple[str, str]] = Counter()
+        for level, algorithm, training, steps in left:
+            decisions[level.name, algorithm] += steps
             if not steps:
                 load_team(training.folder, level.scenario)
         lists = common_worlds(self.levels, self.episodes, self.list_seed)
-        timed = np.arange(min(TIMED_DRIVES, self.episodes))
-        samples = {level.name: sample.take(timed) for level, sample in zip(self.levels, lists, strict=True)}
+        samples = {level.name: sample for level, sample in zip(self.levels, lists, strict=True)}
         kinds = {(level.name, algorithm): training for level, algorithm, training, _ in left}
-        decisions: Counter[tuple[str, str]] = Counter()
-        for level, algorithm, _, steps in left:
-            decisions[level.name, algorithm] += steps
         short = {kind: kinds[kind].time(samples[kind[0]]) for kind, steps in decisions.items() if steps}
         training_s = sum(each.seconds(decisions[kind]) for kind, each in short.items())
-        worlds_s = [each.world_s for each in short.values()]
-        if not worlds_s:
-            worlds_s.append(left[0][2].world_seconds(samples[left[0][0].name]))
+        level, _, first, _ = left[0]
+        worlds_s = [each.world_s for each in short.values()] or [first.world_seconds(samples[level.name])]
         driving_s = sum(worlds_s) / len(worlds_s) * self.episodes * (len(left) + len(self.levels))
         for level in self.levels if self.shield else ():  # learners that brake fully are replaced most often
-            if level.trained:
-                worlds, task = samples[level.name].worlds, Task(level.scenario, level.scenario.learners)
-                braking = make_single_agent("full_brake")
-                often = self.episodes * self.seeds * len(self.recipes) * len(HARM_COUNTS)
-                driving_s += often * Timed.each_s(worlds, partial(Shielded.driven, braking, task=task))
+            if level.scenario.learners:
+                task, often = Task(level.scenario, level.scenario.learners), self.seeds * len(self.recipes)
+                shielded = partial(Shielded.driven, make_single_agent("full_brake"), task=task)
+                world_s = Timed.each_s(samples[level.name].worlds, shielded)
+                driving_s += self.episodes * often * len(HARM_COUNTS) * world_s
         search_s, damaged = 0.0, []
         for level, part, _ in questions(self, lists):
             number, broken = chunks_left(level.scenario, part, budget=self.budget, chunks=self.optimum_folder(level))
             damaged += broken
             if number:
-                worlds = part.worlds.take(np.arange(min(4, part.worlds.n)))
                 searching = partial(best_harm, level.scenario, budget=self.budget, threads=1)
-                search_s += number * Timed.each_s(worlds, searching)
+                search_s += number * Timed.each_s(part.worlds, searching, most=4)
         speed = f" at {decisions.total() / training_s:,.0f}/s" if training_s > 0.0 else ""
-        told, whole_s = Timed.in_words, training_s + driving_s + search_s
+        told = Timed.in_words
         line = (
             f"to do: {sum(steps > 0 for *_, steps in left)} trainings, {decisions.total():,} decisions{speed}:"
             f" {told(training_s)}; joint optima {told(search_s)}; driving the common worlds {told(driving_s)};"
-            f" together about {told(whole_s)} of one core"
+            f" together about {told(training_s + driving_s + search_s)} of one core"
         )
         return "\n".join([line, *(f"{file}: is damaged; its worlds are searched again" for file in damaged)])
 
@@ -315,9 +308,9 @@ def plan_ablation(
         raise InvalidInput(
             f"search-episodes {plan.search_episodes}: must be at most the {plan.episodes} worlds of --episodes"
         )
-    if not any(level.trained for level in plan.levels):
+    if not any(level.scenario.learners for level in plan.levels):
         raise InvalidInput("levels: nobody learns in any of them; give at least one with a learner")
-    JobFolder(plan.folder, "an ablation").check()
+    plan.job_folder().check()
     common_worlds(plan.levels, 5, plan.list_seed)
     list(plan.trainings())  # one that cannot be is refused
     return plan
@@ -345,7 +338,7 @@ def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample
     found: dict[bytes, tuple[Level, Sample, list[Level]]] = {}
     rows = np.arange(plan.search_episodes)
     for level, sample in zip(plan.levels, samples, strict=True):
-        if level.trained:
+        if level.scenario.learners:
             part = sample.take(rows)
             identity = task_problem(part.worlds, Task(level.scenario, level.scenario.learners)).identity.tobytes()
             found.setdefault(identity, (level, part, []))[2].append(level)
@@ -453,7 +446,7 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
     tables = search_all(plan, samples, jobs, say)
     answers = {}
     for level, sample in zip(plan.levels, samples, strict=True):
-        if level.trained:
+        if level.scenario.learners:
             own = [team for algorithm in plan.algorithms for team in teams[level.name, algorithm]]
             part = sample.worlds.take(np.arange(plan.search_episodes))
             answers[level.name] = LevelOptimum(level, part, tables[level.name], tuple(own))
@@ -462,7 +455,7 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
         alike = level.scenario.replace(roles=dict.fromkeys(level.scenario.vehicle_names, "full_brake"))
         braking = _drive(alike, sample, [Team({}, f"full braking in {level.name}")], say)
         about = result_identity("ablate", level.scenario, sample)
-        if not level.trained:
+        if not level.scenario.learners:
             scripts = _drive(level.scenario, sample, [Team({}, f"scripts of {level.name}")], say)
             found.append(Measured(level, None, scripts, braking, None, about))
             continue
@@ -531,29 +524,24 @@ def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
     played = choose_worlds(measured)
     rows = np.array([each.number for each in played], np.int64)
     driven: dict[str, tuple[int, ...]] = {}
-    for name, level, driver, spelling in _drivers(plan):
+    for level in plan.levels:
         worlds = level.scenario.sample(plan.episodes, plan.list_seed).worlds.take(rows)
-        Played.drive(played, worlds, name, driver, level.scenario, spelling, seed=plan.list_seed)
-        driven[name] = level.scenario.learners
+        drivers = {level.name: (Team({}, level.name), "full_brake")}  # who drives nobody changes nothing
+        if level.scenario.learners:
+            drivers = {}
+            for recipe in plan.recipes:
+                folder = plan.training(level, recipe, 0).folder
+                name = level.name if len(plan.recipes) == 1 else f"{level.name}, {_algorithm(recipe)}"
+                drivers[name] = load_team(folder, level.scenario, name), f"{recipe.algorithm}@{folder}"
+        for name, (team, spelling) in drivers.items():
+            Played.drive(played, worlds, name, team, level.scenario, spelling, seed=plan.list_seed)
+            driven[name] = level.scenario.learners
     told = (
         f"{count_of(len(played), 'world')}, the same line at every level; of several seeds the first drives."
         f" The conditions are those of {plan.levels[0].name}: delays of messages and an obstacle ahead are each"
         " level's own."
     )
     return Section("Episodes", [told, Part.player(played, driven)])
-
-
-def _drivers(plan: Plan) -> Iterator[tuple[str, Level, Driver, str]]:
-    """Name, level, who drives (of several seeds the first) and how that is written on a command line."""
-    for level in plan.levels:
-        if not level.trained:  # who drives nobody changes nothing
-            yield level.name, level, Team({}, level.name), "full_brake"
-            continue
-        for recipe in plan.recipes:
-            training = plan.training(level, recipe, 0)
-            name = level.name if len(plan.recipes) == 1 else f"{level.name}, {_algorithm(recipe)}"
-            team = load_team(training.folder, level.scenario, name)
-            yield name, level, team, f"{recipe.algorithm}@{training.folder}"
 
 
 # The same weights on longer lines: policies of one line length drive every learner of lines of other lengths.
@@ -833,8 +821,13 @@ def levels_csv(measured: Sequence[Measured], searched: int) -> str:
 
 def _seed_row(one: Measured, seed: int, searched: int) -> Json:
     collided = one.reached.collided[seed]
-    about: Json = {"level": one.level.name, "algorithm": one.algorithm, "seed": seed if one.algorithm else None}
-    about |= {"worlds": len(collided), "collision_rate": float(collided.mean())}
+    about: Json = {
+        "level": one.level.name,
+        "algorithm": one.algorithm,
+        "seed": seed if one.algorithm else None,
+        "worlds": len(collided),
+        "collision_rate": float(collided.mean()),
+    }
     vehicles: Json = {}
     shield: Json = {}
     for harm_count in HARM_COUNTS:

@@ -168,9 +168,9 @@ class Suite:
                         )
             lists[each.name] = _drive_list(each, sample, lineup, seeds, on_progress)
         driven = [each for each in lists.values() if isinstance(each, ListResult)]
+        refused = [each for each in lists.values() if isinstance(each, NotDriven)]
         if not driven:
-            reasons = [each.not_driven for each in lists.values() if isinstance(each, NotDriven)]
-            raise InvalidInput(f"suite {self.name}: {spec!r} can drive no list of it: {reasons[0]}")
+            raise InvalidInput(f"suite {self.name}: {spec!r} can drive no list of it: {refused[0].not_driven}")
         shares = mean_of_lists([each.realised_share for each in driven])
         entry = Entry(
             format="ethbrake-benchmark-entry",
@@ -183,7 +183,7 @@ class Suite:
             lists=dict(lists),
             lists_driven=len(driven),
             mean_of_driven=shares,
-            overall=shares if len(driven) == len(self.lists) else None,
+            overall=None if refused else shares,
             entry_sha256="0" * 64,
         )
         return entry.model_copy(update={"entry_sha256": entry.content_sha256()})
@@ -236,7 +236,6 @@ def plain_sha256(content: Any) -> str:
 
 # The score of an agent on a list: how much of what is possible it realises, and how it does where it does worst.
 
-WORST = 0.1  # share of the worlds that the worst ones are
 TOLERANCE = 1e-6  # m2/s2; an agent that is less than this below the best known is not below it
 
 
@@ -253,23 +252,21 @@ def realised_share(harm: Floats, full_brake: Floats, best_known: Floats) -> Esti
     return share
 
 
-def worst_mean(regret: Floats, share: float = WORST) -> Estimate:
-    """Mean regret of the ``share`` of worlds where it is greatest (m2/s2), with its interval.
+def worst_mean(regret: Floats) -> Estimate:
+    """Mean regret of the tenth of the worlds where it is greatest (m2/s2), with its interval.
 
-    With q the quantile at ``1 - share``, that mean is the mean over all worlds of ``q + max(regret - q, 0) / share``
+    With q the quantile at ``1 - 0.1``, that mean is the mean over all worlds of ``q + max(regret - q, 0) / 0.1``
     (the conditional value at risk); the interval is the t interval of this mean, which holds for many worlds.
     """
-    q = float(np.quantile(regret, 1.0 - share, method="inverted_cdf"))
-    return mean(q + np.maximum(regret - q, 0.0) / share)
+    q = float(np.quantile(regret, 1.0 - 0.1, method="inverted_cdf"))
+    return mean(q + np.maximum(regret - q, 0.0) / 0.1)
 
 
 def mean_of_lists(shares: Sequence[Estimate]) -> Estimate:
     """Mean over lists, each with the same weight. The lists share no world, so half-widths add as squares.
 
-    No interval where one of them has none. Raises ``InvalidInput`` for no list.
+    No interval where one of them has none.
     """
-    if not shares:
-        raise InvalidInput("mean over lists: there is none")
     value = math.fsum(share.value for share in shares) / len(shares)
     if any(share.interval is None for share in shares):
         return Estimate(value, None)
@@ -326,11 +323,6 @@ class Entry(FileModel):
     def driven(self) -> dict[str, ListResult]:
         """The results by list, of those that were driven."""
         return {name: each for name, each in self.lists.items() if isinstance(each, ListResult)}
-
-    @property
-    def policies(self) -> list[str]:
-        """Every policy that drove for it."""
-        return sorted({sha256 for each in self.driven.values() for sha256 in each.policies.values()})
 
     def content_sha256(self) -> str:
         """What ``entry_sha256`` must be."""
@@ -439,13 +431,6 @@ def _drive_list(
 
 # Entries of one suite, sorted by their score: as a table, as Markdown and as a page.
 
-_NOTES = (
-    "Realised share of what is possible, in %: (full braking - agent) / (full braking - best known) of the mean harm"
-    " of a list; 0 is full braking, 100 the best known. 95 % intervals in brackets.",
-    "Only who drives every list is ranked, by the mean over all lists. A mean over some of them is shown, and is no"
-    " score: those lists may be the easy ones.",
-)
-
 
 @dataclass(frozen=True, slots=True)
 class Leaderboard:
@@ -457,7 +442,13 @@ class Leaderboard:
     @property
     def notes(self) -> tuple[str, ...]:
         """What the figures are, who is ranked, and the suite."""
-        return *_NOTES, f"Suite {self.suite.name}, SHA-256 {self.suite.sha256}"
+        return (
+            "Realised share of what is possible, in %: (full braking - agent) / (full braking - best known) of the mean"
+            " harm of a list; 0 is full braking, 100 the best known. 95 % intervals in brackets.",
+            "Only who drives every list is ranked, by the mean over all lists. A mean over some of them is shown, and"
+            " is no score: those lists may be the easy ones.",
+            f"Suite {self.suite.name}, SHA-256 {self.suite.sha256}",
+        )
 
     def sheet(self) -> Sheet:
         """One line per entry, for a terminal; lists that were not driven show a dash."""
@@ -490,7 +481,7 @@ class Leaderboard:
                 "overall": None if entry.overall is None else entry.overall.to_json(),
                 "mean_of_driven": entry.mean_of_driven.to_json(),
                 "lists_driven": entry.lists_driven,
-                "policies": entry.policies,
+                "policies": sorted({sha256 for each in entry.driven.values() for sha256 in each.policies.values()}),
                 "lists": {name: each.model_dump(mode="json") for name, each in entry.lists.items()},
             }
             for path, entry in self.entries
@@ -523,9 +514,8 @@ def read_leaderboard(paths: Sequence[Path], suite: Suite | None = None) -> Leade
         raise InvalidInput("leaderboard: no entries given; ethbrake benchmark writes them")
     entries = [(path, read_entry(path)) for path in paths]
     suite = load_suite(entries[0][1].suite) if suite is None else suite
-    names = {each.name for each in suite.lists}
     for path, entry in entries:
-        if entry.suite_sha256 != suite.sha256 or entry.lists.keys() != names:
+        if entry.suite_sha256 != suite.sha256 or entry.lists.keys() != {each.name for each in suite.lists}:
             raise InvalidInput(
                 f"{path}: is about another suite: {entry.suite} with SHA-256 {entry.suite_sha256:.12}, and"
                 f" this is {suite.name} with {suite.sha256:.12}"

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -34,15 +33,7 @@ from ethbrake_marl.evaluation import (
 from ethbrake_marl.figures import harm_against_total_gap, learning_curve, trajectories, write_picture
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import write_output
-from ethbrake_marl.learning import (
-    RunDirectory,
-    RunStatus,
-    TrainingRecipe,
-    TrainResult,
-    algorithm_names,
-    read_object,
-    train,
-)
+from ethbrake_marl.learning import RunDirectory, TrainingRecipe, TrainResult, algorithm_names, read_object, train
 from ethbrake_marl.pages.page import Part
 from ethbrake_marl.pages.report import Report
 from ethbrake_marl.policies import Policy, installed_versions
@@ -131,16 +122,11 @@ def telling_world(evaluation: Evaluation) -> int:
     return int(rows[order[(len(order) - 1) // 2]])
 
 
-Ended = Literal["finished", "interrupted"]
-
-
 @dataclass(frozen=True, slots=True)
 class ExperimentResult:
     """What an experiment left behind."""
 
-    directory: Path
-    status: Ended  # interrupted: the policy was not trained to the end, everything else is there
-    steps: int
+    trained: TrainResult  # interrupted: the policy was not trained to the end, everything else is there
     rows: SummaryTable
     report: Path
     per_world: Path
@@ -252,7 +238,7 @@ def run_experiment(
         wall_s = time.monotonic() - started
         report = _show(run, evaluation, rows, beside, trained, agents, begin, wall_s=wall_s)
         begin("")
-    return ExperimentResult(run.path, trained.status, trained.steps, rows, report, per_world, beside)
+    return ExperimentResult(trained, rows, report, per_world, beside)
 
 
 def _agents(
@@ -325,7 +311,7 @@ def _show(
 
 
 @contextmanager
-def _status(run: RunDirectory, status: Ended) -> Iterator[None]:
+def _status(run: RunDirectory, status: str) -> Iterator[None]:
     """Keep ``run.json`` true while the evaluation runs: ``running``, then the training's status or what went wrong."""
     _note(run, "running", "evaluation", None)
     try:
@@ -336,7 +322,7 @@ def _status(run: RunDirectory, status: Ended) -> Iterator[None]:
     _note(run, status, "report", None)
 
 
-def _note(run: RunDirectory, status: RunStatus, stage: str, reason: str | None) -> None:
+def _note(run: RunDirectory, status: str, stage: str, reason: str | None) -> None:
     """Bring ``run.json`` up to date; its steps and ``wall_s`` stay those of the training."""
     content = read_object(run.status)
     ended = None if status == "running" else datetime.now(UTC).isoformat(timespec="seconds")

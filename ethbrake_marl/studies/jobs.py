@@ -384,8 +384,6 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any], inside: str 
 
 # Trainings as jobs: one that is finished is kept, one that is begun goes on; what it costs.
 
-TIMED_DRIVES = 50  # worlds that the timed policy drives
-
 
 @dataclass(frozen=True, slots=True)
 class TrainingJob:
@@ -441,7 +439,7 @@ class TrainingJob:
         return True if ended.status == "finished" else None
 
     def time(self, sample: Sample | None = None) -> Timed:
-        """Time a few updates, and the policy on the worlds of ``sample``; None: some of the recipe's list."""
+        """Time a few updates, and the policy on the first worlds of ``sample``; None: of the recipe's list."""
         from ethbrake_marl.learning import train
 
         told: list[Progress] = []
@@ -455,7 +453,7 @@ class TrainingJob:
             last = updates[-1]
             first = updates[0] if updates[0].done < last.done else Progress("begun", 0, 0)
             decision_s = (last.wall_s - first.wall_s) / (last.done - first.done)
-            worlds = scenario.sample(TIMED_DRIVES, recipe.evaluation.seed) if sample is None else sample
+            worlds = scenario.sample(50, recipe.evaluation.seed) if sample is None else sample
             return Timed(self, decision_s, replace(self, folder=path).world_seconds(worlds))
 
     def world_seconds(self, sample: Sample) -> float:
@@ -482,12 +480,12 @@ class Timed(NamedTuple):
         return steps * self.decision_s + steps / recipe.total_steps * times * recipe.evaluation.worlds * self.world_s
 
     @staticmethod
-    def each_s(worlds: Worlds, work: Callable[[Worlds], object]) -> float:
-        """Seconds per world of some work, which one world has done before: it compiles."""
+    def each_s(worlds: Worlds, work: Callable[[Worlds], object], most: int = 50) -> float:
+        """Seconds per world of some work on at most so many, which one world has done before: it compiles."""
         work(worlds.take([0]))
-        started = time.monotonic()
-        work(worlds)
-        return (time.monotonic() - started) / worlds.n
+        some, started = worlds.take(range(min(worlds.n, most))), time.monotonic()
+        work(some)
+        return (time.monotonic() - started) / some.n
 
     @staticmethod
     def in_words(seconds: float) -> str:

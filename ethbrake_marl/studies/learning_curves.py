@@ -76,20 +76,24 @@ class LearningCurves(NamedTuple):
         each of its seeds kept. Raises ``InvalidInput`` when they have no evaluation in common.
         """
         scenario, curves, lists = self.scenario, self._curves(), set()
-        about = result_identity("learning-curves", scenario, None)
-        summary: dict[str, Any] = {**about, "scenario": scenario.name, "recipes": {}}
+        summary: dict[str, Any] = {
+            **result_identity("learning-curves", scenario, None),
+            "scenario": scenario.name,
+            "recipes": {},
+        }
         for recipe, seeds in self.plan:
             values = curves[HARM_METRIC[recipe.reward.harm_count]][recipe.name].values
             fixed = scenario.sample(recipe.evaluation.worlds, recipe.evaluation.seed)
             lists.add((recipe.evaluation.worlds, recipe.evaluation.seed))
-            policies = [load_policy(self._run(recipe, seed)) for seed in range(seeds)]
             reached = {}
             for name, harms in {"kept": values.min(axis=1), "last": values[:, -1]}.items():
                 mean, each = interquartile_mean([harms]).to_json(), harms.tolist()
                 reached[name] = {"interquartile_mean": mean["value"], "interval": mean["interval"], "each": each}
             summary["recipes"][recipe.name] = {
                 "worlds_sha256": worlds_sha256(fixed.worlds, fixed.index),
-                "policy_sha256": [policy.manifest.manifest_sha256 for policy in policies],
+                "policy_sha256": [
+                    load_policy(self._run(recipe, seed)).manifest.manifest_sha256 for seed in range(seeds)
+                ],
                 "seeds": seeds,
                 **reached,
             }
@@ -105,8 +109,8 @@ class LearningCurves(NamedTuple):
             for seed, values in enumerate(curve.values)
             for step, value in zip(curve.steps, values, strict=True)
         ]
-        content = json.dumps(summary, indent=2, allow_nan=False) + "\n"
-        for ending, text in (("csv", csv_text(rows)), ("json", content)):
+        texts = {"csv": csv_text(rows), "json": json.dumps(summary, indent=2, allow_nan=False) + "\n"}
+        for ending, text in texts.items():
             write_output(self.folder / f"learning_curves.{ending}", text.encode(), force=True)
         return summary
 

@@ -13,10 +13,10 @@ import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
-from functools import cache, cached_property, partial
+from functools import cache, cached_property, lru_cache, partial
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_args
+from typing import Annotated, Any, Literal, get_args
 from urllib.parse import quote
 
 import numpy as np
@@ -61,7 +61,7 @@ from ethbrake_marl.pages.page import Page, Part, Played, Section, anchors, shown
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.policies import Policy, load_policy, load_shipped
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.shield import Bound, HybridAgent
+from ethbrake_marl.shield import HybridAgent
 from ethbrake_marl.studies.jobs import JobFolder
 
 # Verdicts on the paper's numbers and statements, computed from ours; nobody writes one by hand.
@@ -222,7 +222,6 @@ def summarise_verdicts(verdicts: Sequence[Verdict]) -> Verdict:
     return Verdict("all", first.outcome, f"{lead}{first.what}: {first.because}")
 
 
-Shared = TypeVar("Shared")
 Mode = Literal["quick", "full"]
 LIST_SEED = 7
 MOST_EPISODES = 10_000
@@ -234,7 +233,7 @@ _FORMAT = {"format": "ethbrake-reproduction", "format_version": 2}
 _LIMIT_BYTES = 16 << 20  # of a figure that is read again
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Reproduction:
     """What a reproduction is asked for."""
 
@@ -244,7 +243,6 @@ class Reproduction:
     tell: OnProgress = lambda progress: None
     machine: str = ""  # in words
     docs: Path | None = None  # a page of the results as Markdown
-    shared: dict[tuple[object, ...], Any] = field(default_factory=dict)  # what several items show, made once
 
     def __post_init__(self) -> None:
         """Refuse a page whose name does not end in ``.md``, or that cannot be written."""
@@ -253,20 +251,16 @@ class Reproduction:
                 raise InvalidInput(f"{self.docs}: must end in .md")
             check_target(self.docs, force=True)
 
-    def once(self, key: tuple[object, ...], make: Callable[[], Shared]) -> Shared:
-        """What ``make`` gives, made by the first item that asks for it by this key."""
-        if key not in self.shared:
-            self.shared[key] = make()
-        found: Shared = self.shared[key]
-        return found
-
     def seeds_of(self, wanted: Collection[str]) -> list[tuple[Group, str, list[Path]]]:
         """Each recipe of these groups of trainings, in their order, with the folders of its seeds; none of --quick."""
-        chosen = [group for group in groups().values() if group.name in wanted and self.mode == "full"]
-        place = self.folder / "trainings"
         return [
-            (group, name, [place / group.name / f"{name}-seed{seed}" for seed in range(group.seeds)])
-            for group in chosen
+            (
+                group,
+                name,
+                [self.folder / "trainings" / group.name / f"{name}-seed{seed}" for seed in range(group.seeds)],
+            )
+            for group in groups().values()
+            if group.name in wanted and self.mode == "full"
             for name in group.trained
         ]
 
@@ -281,7 +275,7 @@ class Reproduction:
     def seconds_left(self, wanted: Collection[str]) -> float:
         """Seconds of one core that the trainings of these groups still take, begun ones reckoned whole."""
         return sum(
-            group.trained[name][0].seconds
+            group.trained[name][0].decisions / group.trained[name][0].per_s
             for group, name, paths in self.seeds_of(wanted)
             for path in paths
             if not RunDirectory(path).is_finished
@@ -325,8 +319,7 @@ class Reproduction:
     def open_folder(self, *, force: bool = False) -> JobFolder:
         """The folder, in which the same settings go on; with ``force`` its results go and its trainings stay.
 
-        Raises ``InvalidInput`` for one that cannot be made or written to, or a reproduction with other settings unless
-        ``force``; ``AlreadyExists`` for one that holds something else.
+        Raises ``InvalidInput`` for a link.
         """
         path, question = self.folder, {"episodes": self.episodes, "version": __version__}
         if path.is_symlink():
@@ -336,18 +329,17 @@ class Reproduction:
                 (path / item.name / _RESULT).unlink(missing_ok=True)
             write_file(path / _SETTINGS, _text({**_FORMAT, **question}))
         advice = "give another folder (--output), or replace it with force (--force)"
-        folder = JobFolder(
+        return JobFolder(
             path, "reproduction", question, record=_SETTINGS, more=_FORMAT, advice=advice, beside=("trainings",)
         )
-        folder.check()
-        return folder
 
     def make(self, items: Sequence[Item], *, force: bool = False) -> tuple[list[Result], bool]:
         """Make the items; gives every result that the folder then holds, and whether nothing stopped the trainings.
 
         Items that need no training come first. One whose result is there, with the same trainings behind it, is kept.
         After each item the page is written anew. Ctrl-C during a training ends all trainings, and the items are made
-        of those that are finished; a second one stops at once. Raises what ``open_folder`` raises.
+        of those that are finished; a second one stops at once. Raises what ``open_folder`` and ``JobFolder.work``
+        raise.
         """
         full, finished = self.mode == "full", True
         with self.open_folder(force=force).work():
@@ -630,11 +622,6 @@ class TrainedRecipe:
     every_updates: int
     per_s: int
 
-    @property
-    def seconds(self) -> float:
-        """Of one core, for one training."""
-        return self.decisions / self.per_s
-
     def load(self, name: str, **changes: Any) -> TrainingRecipe:
         """The recipe under this name, with ``changes``."""
         found = load_recipe(self.recipe)
@@ -704,7 +691,7 @@ def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:
     return load_shipped(_STAND_IN), about
 
 
-def hybrid(policy: Policy, scenario: Scenario, bound: Bound) -> Agent:
+def hybrid(policy: Policy, scenario: Scenario, bound: Literal["coupled", "pairwise"]) -> Agent:
     """Algorithm 1 around a policy."""
     return HybridAgent(LearnedAgent(policy, "policy"), scenario, bound=bound)
 
@@ -723,6 +710,7 @@ _DONE = 0.9  # of the fall of the harm: when a training has converged
 _NUMBER, _DECISIONS = Column("Final return", digits=3), Column("Decisions", digits=0)
 
 
+@lru_cache(maxsize=1)  # both figures show them
 def _shipped_ends(settings: Reproduction) -> Made:
     """What finished policies reach at both delays, in both readings of when Vehicle 2 acts."""
     episodes = min(2_000, settings.episodes)
@@ -812,7 +800,7 @@ def reproduce_curves(delay: str, settings: Reproduction) -> Made:
         }
         for each in (HIGH, LOW)
     }
-    ends = settings.once(("finished policies",), lambda: _shipped_ends(settings))
+    ends = _shipped_ends(settings)
     verdicts = [*_judge(delay, courses), *ends.verdicts]
     parameters = [
         *scenario_parameters(load_scenario(f"paper-delay-{delay}"), latency_s="", gaps_m="", speeds_mps=""),
@@ -1249,11 +1237,14 @@ def _beside_printed(
     notes: Sequence[str] = (),
 ) -> Made:
     """A table of the paper, and ours in each reading."""
-    head = ["Strategy", "Collisions", "Rate", "Average harm"]
-    rows = [[r.agent, f"{r.collisions:,}", f"{100.0 * r.collision_rate:g} %", f"{r.average_harm:g}"] for r in printed]
+    columns: dict[str, list[str]] = {
+        "Strategy": [row.agent for row in printed],
+        "Collisions": [f"{row.collisions:,}" for row in printed],
+        "Rate": [f"{100.0 * row.collision_rate:g} %" for row in printed],
+        "Average harm": [f"{row.average_harm:g}" for row in printed],
+    }
     if any(row.harm_decrease for row in printed):
-        head.append("Decrease")
-        rows = [[*own, f"{100.0 * (r.harm_decrease or 0.0):g} %"] for own, r in zip(rows, printed, strict=True)]
+        columns["Decrease"] = [f"{100.0 * (row.harm_decrease or 0.0):g} %" for row in printed]
     data = [
         (beside.title, name, quantity, beside.evaluation.worlds.n, numbers[quantity])
         for beside in besides
@@ -1262,7 +1253,10 @@ def _beside_printed(
         if quantity in numbers
     ]
     csv = csv_text(("reading", "strategy", "quantity", "worlds", "value", "low", "high"), data)
-    tables = [Sheet("The paper's rows, as printed", head, rows), *map(rows_table, besides)]
+    tables = [
+        Sheet("The paper's rows, as printed", [*columns], [*zip(*columns.values(), strict=True)]),
+        *map(rows_table, besides),
+    ]
     return Made([*arithmetic, *compare_rows(printed, besides)], parameters, tables, data={stem: csv}, notes=notes)
 
 
@@ -1272,18 +1266,17 @@ _RANDOM, _HYBRID_WORLDS, _RANDOM_WORLDS, _KINDS = "paper-random", 5_000, 10_000,
 _ALONE, _REALISED, _AS_PRINTED = "policy alone", "hybrid, realised H*", "hybrid, predicted H*"
 
 
+@lru_cache(maxsize=2 * len(READINGS))  # figure and table share what they drive
 def _drive_hybrid(name: str, settings: Reproduction, reading: Reading) -> Evaluation:
-    """The strategies on the worlds of a scenario; figure and table share those of the figure."""
-    scenario, (policy, about) = reading.scenario(name), unconverged_policy(settings)
+    """The strategies on the worlds of a scenario."""
+    scenario, (policy, _) = reading.scenario(name), unconverged_policy(settings)
     agents: dict[str, Agent] = {
         **lineup(scenario, PAIRWISE, COUPLED),
         _ALONE: LearnedAgent(policy, "policy"),
         _REALISED: hybrid(policy, scenario, "coupled"),
         _AS_PRINTED: hybrid(policy, scenario, "pairwise"),
     }
-    episodes = min(_HYBRID_WORLDS, settings.episodes)
-    key = ("hybrid", name, reading.name, about)
-    return settings.once(key, lambda: drive_list(scenario, agents, episodes, settings))
+    return drive_list(scenario, agents, min(_HYBRID_WORLDS, settings.episodes), settings)
 
 
 def reproduce_illustration(settings: Reproduction) -> Made:
@@ -1636,7 +1629,7 @@ def reproduce_trajectories(settings: Reproduction) -> Made:
 def reproduce_accelerations(settings: Reproduction) -> Made:
     """Commands of Vehicle 2 in both scenarios."""
     records, verdicts = _record_all(settings), []
-    driven = {key: _Driven.of(record) for key, record in records.items()}
+    driven = {key: _asked_of_vehicle_2(record) for key, record in records.items()}
     panels = {
         f"{name}, Scenario {number}": {reading.name: records[reading, number, name] for reading in READINGS}
         for name in _POLICIES
@@ -1646,28 +1639,28 @@ def reproduce_accelerations(settings: Reproduction) -> Made:
     figures = {Drawn("accelerations", "Acceleration profiles", text): profiles_figure(panels, caption=text)}
     for reading in READINGS:
         one, two = _apart(records, reading, "command_mps2")
-        ppo, sac = (driven[reading, 2, name] for name in _POLICIES)
+        (first, ppo_changes, _), (_, sac_changes, braking) = (driven[reading, 2, name] for name in _POLICIES)
         claims = {
             "the profiles are more alike in Scenario 1 than in 2": (
                 f"root mean square difference {one:.2f} m/s² against {two:.2f} m/s²", one, two,
             ),
-            "Scenario 2: PPO accelerates before it brakes": (f"first command {ppo.first:+.2f} m/s²", 0.0, ppo.first),
+            "Scenario 2: PPO accelerates before it brakes": (f"first command {first:+.2f} m/s²", 0.0, first),
             "Scenario 2: SAC decelerates throughout most of it": (
-                f"braking in {100.0 * sac.braking:.0f} % of the time it moves", 0.5, sac.braking,
+                f"braking in {100.0 * braking:.0f} % of the time it moves", 0.5, braking,
             ),
             "Scenario 2: PPO's profile is the smoother one": (
-                f"ups and downs {ppo.changes:.1f} m/s² under PPO, {sac.changes:.1f} m/s² under SAC", ppo.changes,
-                sac.changes,
+                f"ups and downs {ppo_changes:.1f} m/s² under PPO, {sac_changes:.1f} m/s² under SAC", ppo_changes,
+                sac_changes,
             ),
         }  # fmt: skip
         verdicts += _judge_one_world(claims, reading, Column("Command", unit=" m/s²"))
     rows = [
         (
-            *(reading.name, number, name, f"{own.first:+.2f}"),
+            *(reading.name, number, name, f"{first:+.2f}"),
             f"{records[reading, number, name].command_mps2[:, 1].min():+.2f}",
-            *(f"{100.0 * own.braking:.0f} %", f"{own.changes:.1f}"),
+            *(f"{100.0 * braking:.0f} %", f"{changes:.1f}"),
         )
-        for (reading, number, name), own in driven.items()
+        for (reading, number, name), (first, changes, braking) in driven.items()
     ]
     head = ("Reading", "Scenario", "Strategy", "First command", "Hardest", "Braking while it moves", "Ups and downs")
     note = "Commands of Vehicle 2 in m/s². One world each: no intervals."
@@ -1735,26 +1728,26 @@ def _judge_one_world(claims: Mapping[str, tuple[str, float, float]], reading: Re
     ]
 
 
-class _Driven(NamedTuple):
-    """What Vehicle 2 is asked for from its first decision on."""
+def _asked_of_vehicle_2(record: EpisodeRecord) -> tuple[float, float, float]:
+    """Its command at its first decision (m/s2), how far that goes up and down from then on (m/s2), and its braking.
 
-    first: float  # command at that decision, m/s2
-    changes: float  # how far its command goes up and down, m/s2
-    braking: float  # share of the time until its standstill in which it brakes
-
-    @classmethod
-    def of(cls, record: EpisodeRecord) -> _Driven:
-        """Of a record."""
-        acting = record.time_s >= float(record.initial.vehicles.latency_s[0, 1])
-        command, moving = record.command_mps2[acting, 1], record.speeds_mps[acting, 1] > 0.0
-        braking = float((command[moving] < 0.0).mean()) if moving.any() else 0.0
-        return cls(float(command[0]), float(np.abs(np.diff(command)).sum()), braking)
+    That is the share of the time until its standstill in which it brakes.
+    """
+    acting = record.time_s >= float(record.initial.vehicles.latency_s[0, 1])
+    command, moving = record.command_mps2[acting, 1], record.speeds_mps[acting, 1] > 0.0
+    braking = float((command[moving] < 0.0).mean()) if moving.any() else 0.0
+    return float(command[0]), float(np.abs(np.diff(command)).sum()), braking
 
 
 def _csv(records: Records) -> str:
     every = range(1, 4)
-    head = ["reading", "scenario", "strategy", "time_s", *(f"position_{i}_m" for i in every)]
-    head += [*(f"speed_{i}_mps" for i in every), "gap_1_m", "gap_2_m", *(f"command_{i}_mps2" for i in every)]
+    head = [
+        *("reading", "scenario", "strategy", "time_s"),
+        *(f"position_{i}_m" for i in every),
+        *(f"speed_{i}_mps" for i in every),
+        *("gap_1_m", "gap_2_m"),
+        *(f"command_{i}_mps2" for i in every),
+    ]
     rows = [
         [reading.name, number, name, round(float(time_s), 9), *(value for column in columns for value in column[k])]
         for (reading, number, name), record in records.items()

@@ -111,14 +111,9 @@ def measure(*, quick: bool = False, tell: OnProgress | None = None) -> list[Spee
     return [replace(speed, relative=speed.value / first) if speed.unit == WORLD_STEPS else speed for speed in found]
 
 
-def first_decisions(n: int) -> Worlds:
-    """Worlds of the scenario's training stream at their first decision."""
-    return make_engine(SCENARIO, n, seed=SEED).worlds
-
-
 def braking(n: int, share: float) -> Work:
     """Worlds from their first decision until all are at rest; Vehicle 2 brakes with a share of its capacity."""
-    worlds = first_decisions(n)
+    worlds = make_engine(SCENARIO, n, seed=SEED).worlds
     command = -worlds.vehicles.braking_capacity_mps2
     command[:, 1] *= share
     return until_rest(worlds, command)

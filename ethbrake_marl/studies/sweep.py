@@ -164,8 +164,7 @@ def reach_results(job: TrainingJob, log: Path, stop_at: StopAt | None = None) ->
         if run.status.is_file():
             run.wait_for_others(60.0)  # a worker that has lost its driver may hold the folder for a moment
             run.check_same(job.training)
-            bundles = [job.folder / place for place in job.training.drivers.values()]
-            if run.is_finished and not all(map(has_bundle, bundles)):
+            if run.is_finished and not all(has_bundle(run.path / place) for place in job.training.drivers.values()):
                 remove_folder(job.folder)  # a finished run has no checkpoint: it is trained anew
         try:
             finished = job.finish(stop_at=stop_at)
@@ -461,11 +460,13 @@ class SweepPlan:
         A short training of the first job of each recipe is timed; begun jobs are reckoned whole.
         """
         results, _ = self.kept(path)
-        jobs, left = [], [row for row in self.rows if row.name not in results]
-        for row in self.rows:
-            begun = "begun" if (path / RUNS / row.name / "run.json").is_file() else "new"
-            state = "finished" if row.name in results else begun
-            jobs.append({"hash": row.identity, "job": row.name, "set": row.settings, "state": state})
+        left = [row for row in self.rows if row.name not in results]
+        begun = {row.name for row in left if (path / RUNS / row.name / "run.json").is_file()}
+        states = {**dict.fromkeys(results, "finished"), **dict.fromkeys(begun, "begun")}
+        jobs = [
+            {"hash": row.identity, "job": row.name, "set": row.settings, "state": states.get(row.name, "new")}
+            for row in self.rows
+        ]
         timed: dict[str, Timed] = {}
         work_s = 0.0
         for row in left:
@@ -781,16 +782,22 @@ class TuningPlan:
         recipe = recipe.replace(seed=file.seed)
         with at(("scenario",)):
             content = resolve(recipe, scenario).content()
-        told: dict[str, Any] = {"training": content}
-        told |= file.model_dump(mode="json", include={"search", "measure", "prune", "sampler"})
-        told |= {"order": [*file.search], "versions": installed_versions(), "plugins": noted_plugins()}
+        told = {
+            "training": content,
+            **file.model_dump(mode="json", include={"search", "measure", "prune", "sampler"}),
+            "order": [*file.search],
+            "versions": installed_versions(),
+            "plugins": noted_plugins(),
+        }
         plan = cls(file, recipe, scenario, told)
         for key, dimension in file.search.items():
             with at(("search", key)):
                 plan._check_dimension(key, dimension)
         random = np.random.default_rng(0)  # all low, all high, and points by chance, the same ones each time
-        points = [{key: dimension.ends[end] for key, dimension in file.search.items()} for end in (0, -1)]
-        points += [{key: each.draw(random) for key, each in file.search.items()} for _ in range(_TRIED)]
+        points = [
+            *({key: each.ends[end] for key, each in file.search.items()} for end in (0, -1)),
+            *({key: each.draw(random) for key, each in file.search.items()} for _ in range(_TRIED)),
+        ]
         with at(("search",)):
             for point in points:
                 plan._check_point(point)
@@ -1040,9 +1047,8 @@ class TuningStudy:
         self.journal, self.file, self._optuna = journal, file, optuna
         pruner: BasePruner = optuna.pruners.NopPruner()
         if file.prune is not None:
-            few, early = file.prune.after_trials, file.prune.after_times
             pruner = optuna.pruners.PercentilePruner(
-                100.0 * file.prune.keep, n_startup_trials=few, n_warmup_steps=early
+                100.0 * file.prune.keep, n_startup_trials=file.prune.after_trials, n_warmup_steps=file.prune.after_times
             )
         try:
             backend = optuna.storages.journal.JournalFileBackend(str(journal))

@@ -11,8 +11,9 @@ import os
 import statistics
 import time
 
+from ethbrake_marl.envs import make_engine
 from ethbrake_marl.physics import advance
-from ethbrake_marl.studies.speed import first_decisions
+from ethbrake_marl.studies.speed import SCENARIO, SEED
 
 HARM_COUNTS = (1000, 3000, 10_000, 30_000, 100_000)
 REPETITIONS, WORLD_STEPS = 15, 200_000
@@ -21,7 +22,7 @@ REPETITIONS, WORLD_STEPS = 15, 200_000
 def main() -> None:
     """Print one line for each number of worlds."""
     for n in HARM_COUNTS:
-        worlds = first_decisions(n)
+        worlds = make_engine(SCENARIO, n, seed=SEED).worlds
         command = -worlds.vehicles.braking_capacity_mps2
         calls = max(3, WORLD_STEPS // n)
         found: dict[int, list[float]] = {1: [], 2: []}

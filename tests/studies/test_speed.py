@@ -11,6 +11,7 @@ import numba
 import numpy as np
 import pytest
 
+from ethbrake_marl.envs import make_engine
 from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.studies import speed as benchmark
 from ethbrake_marl.studies.speed import (
@@ -58,7 +59,7 @@ def test_measure__sets_world_steps_against_the_first_figure(monkeypatch: pytest.
 
 
 def test_braking__counts_world_steps_to_rest() -> None:
-    worlds = benchmark.first_decisions(5)
+    worlds = make_engine(benchmark.SCENARIO, 5, seed=benchmark.SEED).worlds
     command = -worlds.vehicles.braking_capacity_mps2
     steps = 0
     while worlds.speeds_mps.any():

@@ -17,7 +17,7 @@ def test_read_levels__the_standard_set_is_a_ladder_and_its_worse_channels():
         "cooperation-2-blocked": "cooperation-2-paper",
         "cooperation-3-congested": "cooperation-3-pair",
     }
-    assert [level.trained for level in levels] == [False] + [True] * (len(levels) - 1)
+    assert [bool(level.scenario.learners) for level in levels] == [False] + [True] * (len(levels) - 1)
 
 
 def test_read_levels__a_channel_belongs_to_the_level_that_came_before_it(tmp_path):

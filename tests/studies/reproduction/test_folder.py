@@ -106,9 +106,9 @@ def test_open_folder__refuses_what_holds_something_else(settings: Reproduction, 
     (tmp_path / "mine" / "thesis.txt").write_text("text")
     for force in (False, True):
         with pytest.raises(AlreadyExists, match="holds no reproduction"):
-            replace(settings, folder=tmp_path / "mine").open_folder(force=force)
+            replace(settings, folder=tmp_path / "mine").open_folder(force=force).check()
     with pytest.raises(InvalidInput, match="is a file"):
-        replace(settings, folder=tmp_path / "mine" / "thesis.txt").open_folder()
+        replace(settings, folder=tmp_path / "mine" / "thesis.txt").open_folder().check()
     (tmp_path / "link").symlink_to(tmp_path / "mine")
     with pytest.raises(InvalidInput, match="no plain folder"):
         replace(settings, folder=tmp_path / "link").open_folder()
@@ -117,7 +117,7 @@ def test_open_folder__refuses_what_holds_something_else(settings: Reproduction, 
 def test_open_folder__other_settings_need_force(settings: Reproduction) -> None:
     settings.make([planted("gaps", lambda s: made())])
     with pytest.raises(InvalidInput, match="episodes 24, here 30"):
-        replace(settings, episodes=30).open_folder()
+        replace(settings, episodes=30).open_folder().check()
     replace(settings, episodes=30).open_folder(force=True)
     assert read_results(settings.folder) == []
 
