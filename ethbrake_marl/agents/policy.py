@@ -17,7 +17,7 @@ from gymnasium.wrappers import NormalizeObservation, RescaleObservation
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import LARGEST, action_to_command
-from ethbrake_marl.agents.protocol import Source
+from ethbrake_marl.agents.registry import Source
 from ethbrake_marl.engine import Memory, Script, checked_memory, map_memory, take_memory
 from ethbrake_marl.errors import AgentFailed, InvalidInput, describe_error, naming_extras
 from ethbrake_marl.observations import (

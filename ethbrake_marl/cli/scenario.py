@@ -50,7 +50,7 @@ def scenario_show(out: Out, scenario: NameArgument) -> None:
 @command(scenario_group, "validate", "scenario validate my-scenario.yaml", json=True)
 def scenario_validate(out: Out, path: NameArgument) -> None:
     """Check a scenario: one line, OK or what is wrong; then what may not be meant."""
-    from ethbrake_marl.agents import Team, drive, make_single_agent
+    from ethbrake_marl.agents import Team, drive, make_agent
     from ethbrake_marl.evaluation import load_runnable
     from ethbrake_marl.scenario import ScriptSpec
 
@@ -59,7 +59,7 @@ def scenario_validate(out: Out, path: NameArgument) -> None:
     names = [scenario.vehicle_names[i] for i in scenario.learners]
     free = {i for i, script in scenario.scripts.items() if ScriptSpec.parse(script).is_state_free()}
     deciding = [i for i in range(scenario.vehicles) if i not in free]
-    braking = Team.copies(make_single_agent("full_brake"), deciding)
+    braking = Team.of(make_agent("full_brake"), deciding)
     moving = int((~drive(sample.worlds, braking, scenario).at_rest).sum())
     late = int((sample.worlds.vehicles.latency_s[:, 0] > 0.0).sum())
     told = {"name": scenario.name, "vehicles": scenario.vehicles, "learners": names, "worlds": CHECKED_DRAWS}
@@ -215,14 +215,14 @@ def agent_list(out: Out) -> None:
 
     What begins with + goes behind any agent, for instance full_brake+step: +refined first, then one shield.
     """
-    from ethbrake_marl.agents import agent_entries, knowledge_text, sees_through
+    from ethbrake_marl.agents import Knowledge, agent_entries
     from ethbrake_marl.files.sheet import Sheet
 
     told, rows = [], []
     for entry in agent_entries():
-        omniscient, added = sees_through(entry.knows), "also " if entry.form.startswith("+") else ""
-        told.append({"agent": entry.form, "about": entry.about, "knows": list(entry.knows), "omniscient": omniscient})
-        rows.append((entry.form, entry.about, f"{added}{knowledge_text(entry.knows)}{' †' if omniscient else ''}"))
+        knows, added = Knowledge.of(entry), "also " if entry.form.startswith("+") else ""
+        told.append({"agent": entry.form, "about": entry.about, "knows": list(knows), "omniscient": knows.sees_through})
+        rows.append((entry.form, entry.about, f"{added}{knows.text}{' †' if knows.sees_through else ''}"))
     out.result(
         told,
         Sheet("", ("Agent", "Drives by", "Knows"), rows, gap=2),

@@ -25,18 +25,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import command_to_action
-from ethbrake_marl.agents import (
-    Agent,
-    Driver,
-    Episodes,
-    Team,
-    drive,
-    episode_engine,
-    parse_spec,
-    play,
-    script_agents,
-    team_of,
-)
+from ethbrake_marl.agents import Agent, Driver, Episodes, Team, drive, episode_engine, parse_spec, script_agents
 from ethbrake_marl.defaults import DEFAULT, HARM_COUNTS, DatasetFormat, HarmCount
 from ethbrake_marl.engine import Engine, Step
 from ethbrake_marl.envs import (
@@ -125,10 +114,10 @@ def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[E
     Raises ``PhysicsError`` naming the worlds that could not be advanced.
 
     """
-    team = team_of(agent, scenario.learners)
+    team = Team.of(agent, scenario.learners)
     engine = episode_engine(worlds, team, scenario)
     follower = _Follower(worlds, team, engine)
-    episodes = play(engine, worlds, [follower])
+    episodes = Episodes.of(engine, worlds, [follower])
     return follower.motions(episodes)
 
 
@@ -345,7 +334,7 @@ def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float 
     """
     if world.n != 1:
         raise InvalidInput(f"film_scenes: {count_of(world.n, 'world')} given; exactly 1 is needed: worlds.take([0])")
-    engine = episode_engine(world, team_of(agent, scenario.learners), scenario)
+    engine = episode_engine(world, Team.of(agent, scenario.learners), scenario)
     trace = Trace(engine, whole=True, alert=world)
     while not engine.ended.all():
         engine.step({})
@@ -634,7 +623,7 @@ class Passport:
             raise InvalidInput(f"passport: agent {spelling!r}: {error}{hint}") from None
         (driver,) = lineup.values()
         (motion,) = follow_episodes(world, driver, played)
-        policies = policies_of(team_of(driver, played.learners).drivers)
+        policies = policies_of(Team.of(driver, played.learners).drivers)
         now = Passport.of(
             motion, played, spelling, seed=self.seed, number=self.number, harm_count=self.harm_count, policies=policies
         )
@@ -776,7 +765,7 @@ def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Re
     Raises ``PhysicsError`` naming worlds that could not be advanced, and what ``episode_engine`` raises.
     """
     scenario, learners = task.scenario, task.scenario.learners
-    engine = episode_engine(sample.worlds, team_of(driver, learners), scenario)
+    engine = episode_engine(sample.worlds, Team.of(driver, learners), scenario)
     asked = []
     while not engine.ended.all():
         engine.step({})
@@ -1164,7 +1153,7 @@ def check_dataset(
 def tell(task: Task, agents: Mapping[str, Driver], episodes: int) -> dict[str, Any]:
     """What is recorded, as plain data: the metadata of every dataset."""
     scenario = task.scenario
-    teams = {name: team_of(driver, scenario.learners).drivers for name, driver in agents.items()}
+    teams = {name: Team.of(driver, scenario.learners).drivers for name, driver in agents.items()}
     return {
         "scenario": scenario.declared(),
         "scenario_sha256": scenario_sha256(scenario),

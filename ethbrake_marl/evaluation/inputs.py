@@ -24,10 +24,8 @@ from ethbrake_marl.agents import (
     Team,
     episode_engine,
     make_agent,
-    make_single_agent,
     parse_spec,
     script_agents,
-    team_of,
 )
 from ethbrake_marl.defaults import DEFAULT, HarmCount
 from ethbrake_marl.engine import ask_script, begin_script
@@ -268,7 +266,8 @@ def load_runnable(name_or_path: str, settings: Sequence[Override] = ()) -> Scena
     worlds = scenario.replace(early_impacts="keep").sample(1, DEFAULT.LIST_SEED).worlds
     for vehicle, script in scenario.scripts.items():
         try:
-            agent = make_single_agent(script, horizon_s=scenario.horizon_s, most_candidates=TRIED_CANDIDATES)
+            driver = make_agent(script, horizon_s=scenario.horizon_s, most_candidates=TRIED_CANDIDATES)
+            agent = Team.of(driver, [vehicle]).drivers[vehicle]
             ask_script(agent, worlds, begin_script(agent, worlds, vehicle, {}), vehicle)
         except InvalidInput as error:
             role = scenario.vehicle_names[vehicle]
@@ -307,7 +306,7 @@ def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenari
     Scripts that need no state are tried on all worlds, which takes no time; all others on the first.
     """
     for name, agent in agents.items():
-        team = team_of(agent, scenario.learners)
+        team = Team.of(agent, scenario.learners)
         scripts = script_agents(scenario, except_for=team.drivers)
         if team.shield is not None:
             with AgentFailed.naming(name, [script.name for script in scripts.values()]):

@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents import Knowledge, Source, knowledge_text, sees_through
+from ethbrake_marl.agents import Knowledge, Source
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import (
     AlreadyExists,
@@ -59,6 +59,7 @@ COLUMN = "metric_"  # before the name of a registered measure, in JSON and in fi
 Columns = dict[str, list[Any]]  # of one row per world
 
 # Columns of files with every world that hold texts, but for the types of vehicles.
+UNSTATED = Knowledge((Source.UNSTATED,))
 _TEXT_COLUMNS = {"agent", "scenario", "unavoidable_reason", "best_known_source", "ended", "knows"}
 _ALWAYS_TOLD = (
     "gaps_m",
@@ -86,7 +87,7 @@ class Outcome:
     at_rest: Bools  # [n] the line came to rest; else the horizon cut the episode off
     predicted_harm: Floats | None  # [n] what the agent expected at the alert, if it predicts and drives alone
     chosen_policy: Bools | None  # [n] a hybrid drove by its policy; else by its backup
-    knows: Knowledge = (Source.UNSTATED,)  # what the agent says it knows of the line
+    knows: Knowledge = UNSTATED  # what the agent says it knows of the line
     shoved_m: Floats | None = None  # [n] how far Vehicle 1 ends beyond where it would by itself
     sampled_harm: Floats | None = None  # [n] the paper's sum over samples of the same commands
     policies: Mapping[int, str] = field(default_factory=dict)  # vehicle (0 = front) -> SHA-256 of its policy's manifest
@@ -362,7 +363,7 @@ class Evaluation:
                 columns |= {name: [None] * n for name in Regrets.COLUMNS}
             told = outcome.borne(objectives)
             columns |= {name: column.tolist() for name, column in told.items() if name not in columns}
-            columns |= {"knows": [knowledge_text(outcome.knows)] * n, **hidden}
+            columns |= {"knows": [outcome.knows.text] * n, **hidden}
             for left in self.left_out if limits else ():
                 told_of = {"agent": agent, "world": left.world, "ended": f"left out: {left.agent}: {left.reason}"}
                 columns = {name: [*values, told_of.get(name)] for name, values in columns.items()}
@@ -1332,7 +1333,7 @@ class SummaryRow:
     warning: str = ""  # a table of best known harm holds some of the worlds, and not the others
     left_out: tuple[LeftOut, ...] = ()  # worlds of the list that no row counts: they could not be advanced
     beside_paper: bool = False  # these are results of the test that the paper's rows are about
-    knows: Knowledge = (Source.UNSTATED,)  # what the agent says it knows of the line
+    knows: Knowledge = UNSTATED  # what the agent says it knows of the line
     hidden_share: float = 0.0  # worlds in which the channel hides something from a driven vehicle, whoever drives
     worlds_sha256: str = ""  # of the list; results on the same worlds have the same
     scenario_sha256: str = ""  # of all that shapes an episode
@@ -1366,7 +1367,7 @@ class SummaryRow:
     @property
     def sees_through(self) -> bool:
         """Whether the channel hides something here that this agent reads all the same."""
-        return self.hidden_share > 0.0 and sees_through(self.knows)
+        return self.hidden_share > 0.0 and self.knows.sees_through
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON; what does not exist is null, intervals are ``[low, high]``."""
@@ -1376,7 +1377,7 @@ class SummaryRow:
         return {
             "kind": "evaluate",
             "agent": self.agent,
-            "knows": knowledge_text(self.knows),
+            "knows": self.knows.text,
             "sees_through_channel": self.sees_through,
             "hidden_share": self.hidden_share,
             "episodes": self.episodes,
@@ -1418,10 +1419,7 @@ class SummaryTable(list[SummaryRow]):
             Column("Regret, first"), share("Decrease, first"), share("Realised share, first"),
         )  # fmt: skip
         names = ("collision_rate", "first_impact_harm", "total_harm", "mean_regret_first", "harm_decrease_first")
-        rows = [
-            (row.agent, knowledge_text(row.knows), *(row[name] for name in (*names, "realised_share_first")))
-            for row in self
-        ]
+        rows = [(row.agent, row.knows.text, *(row[name] for name in (*names, "realised_share_first"))) for row in self]
         note = "Harm: means per world in m²/s². In brackets: 95 % intervals. Decrease: of full braking's harm."
         note += f" WARNING: {self[0].warning}." if self and self[0].warning else ""
         worlds = f"{self[0].parameters['scenario']}, {count_of(self[0].episodes, 'world')}" if self else "no agent"
@@ -1494,7 +1492,7 @@ class SummaryTable(list[SummaryRow]):
             value, interval = Column("", sign="-").show(row["mean_regret_first"])
             bound = row.known_best_share is not None and row.known_best_share < 1.0
             cells["mean_regret_first"] = Shown(f"≥ {value}" if bound else value, interval)
-            lines.append((row.agent, SEES_THROUGH * row.sees_through + knowledge_text(row.knows), *cells.values()))
+            lines.append((row.agent, SEES_THROUGH * row.sees_through + row.knows.text, *cells.values()))
         for name, paper in self._papers().items():
             lines += [
                 f"paper, {name}",

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents import Driver, Shielding, Team, check_agent, drive, knowledge_of, script_agents, team_of
+from ethbrake_marl.agents import Driver, Knowledge, Team, check_agent, drive, script_agents
 from ethbrake_marl.engine import check_alert, is_state_free
 from ethbrake_marl.errors import (
     AgentFailed,
@@ -301,9 +301,8 @@ def _check_request(worlds: object, agents: object, scenario: object, chunk: obje
     if not agents:
         raise InvalidInput("evaluate: no agents given; at least one is needed, for instance full_brake")
     for name, agent in agents.items():
-        if not isinstance(agent, Team | Shielding):
-            check_agent(agent, f"evaluate: agent {name!r}")
-        knowledge_of(agent)  # refuses what is no statement
+        check_agent(agent, f"evaluate: agent {name!r}", alone=False)
+        Knowledge.of(agent)  # refuses what is no statement
     check_whole_number("evaluate: chunk", chunk, 1)
 
 
@@ -380,7 +379,7 @@ class _Chunk(NamedTuple):
 
     def roll_out(self, rows: Ints) -> Outcome:
         """The outcome in these worlds alone, of a fresh team."""
-        return _roll_out(self.worlds.take(rows), team_of(self.agent, self.driven), self.scenario, self.aftermath)
+        return _roll_out(self.worlds.take(rows), Team.of(self.agent, self.driven), self.scenario, self.aftermath)
 
 
 def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -> Outcome:
@@ -400,7 +399,7 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -
         episodes.at_rest,
         None if predicted is None else predicted.astype(np.float64),
         None if chosen is None else chosen.astype(np.bool_),
-        knowledge_of(team),
+        Knowledge.of(team),
         None if shoved is None else shoved.metres,
         None if sampled is None else sampled.finish(),
         {vehicle: sha for vehicle, agent in team.drivers.items() if (sha := policy_sha256(agent)) is not None},

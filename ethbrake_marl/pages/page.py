@@ -21,7 +21,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from ethbrake_marl.agents import Driver, team_of
+from ethbrake_marl.agents import Driver, Team
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.envs import BODY_M
 from ethbrake_marl.errors import InvalidInput, plain_text
@@ -378,7 +378,7 @@ class Played:
             harm_count: that the agent minimised.
 
         """
-        drivers = team_of(agent, scenario.learners).drivers
+        drivers = Team.of(agent, scenario.learners).drivers
         policies = policies_of(drivers)
         for one, motion in zip(played, follow_episodes(worlds, agent, scenario), strict=True):
             passport = Passport.of(

@@ -45,21 +45,16 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.actions import action_to_command, command_of, command_to_action
 from ethbrake_marl.agents import (
-    SUFFIX,
     Agent,
     AgentAround,
-    Foretold,
     Odometer,
     Ranges,
     Team,
     Told,
-    believed_worlds,
     episode_engine,
     fixed_commands,
     optimise_coupled,
-    ranges_of,
     script_agents,
-    told_to,
     write_down,
 )
 from ethbrake_marl.defaults import HarmCount
@@ -1374,7 +1369,7 @@ class BelievedShield:
         others: Mapping[int, Script] | None = None,
     ) -> None:
         self.scenario = scenario
-        self.robust = None if robust is None else checked_robust(robust, SUFFIX)
+        self.robust = None if robust is None else checked_robust(robust, "believed")
         self.shield: StepShield | None = None
         self.predicted_harm: Floats = np.zeros(0)
         self.interventions: Ints = np.zeros(0, np.int64)  # [n] so far in the running episodes
@@ -1387,7 +1382,7 @@ class BelievedShield:
         self._wanted: Floats = np.zeros(0)  # [n] actions
         self._totals: Floats = np.zeros((0, 0, 0))  # [n, M, pairs] foretold total harm at the last decision (m2/s2)
         self._impact_s: Floats = np.zeros((0, 0))  # [n, N] last time at which an impact of this vehicle was foretold
-        self._ranges: tuple[int, Ranges] | None = None
+        self._ranges: Ranges | None = None
         self._ranges_of(scenario.learners[0] if scenario.learners else 0)
         if len(scenario.learners) == 1:
             self._make(scenario.learners[0])  # refuses at once what interior mode cannot certify
@@ -1400,8 +1395,7 @@ class BelievedShield:
     def members(self) -> int:
         """Worlds that are certified for each one: the middle, and all corners."""
         assert self._ranges is not None
-        vehicle, ranges = self._ranges
-        return 1 if self.robust is None else 1 + 2 ** len(ranges.uncertain(vehicle))
+        return 1 if self.robust is None else 1 + 2 ** len(self._ranges.uncertain)
 
     def branch(self) -> BelievedShield:
         """A copy that goes on apart: what it decides leaves this one as it is."""
@@ -1448,7 +1442,7 @@ class BelievedShield:
         """
         n, shield = worlds.n, self.shield
         if shield is None or n > len(self._heard):
-            raise InvalidInput(f"shield: {SUFFIX}: act on {count_of(n, 'world')}, but begin was not called for each")
+            raise InvalidInput(f"shield: believed: act on {count_of(n, 'world')}, but begin was not called for each")
         self._odometer = odometer = Odometer(*self._odometer).look(worlds, vehicle)
         past = worlds.vehicles.latency_s[:, vehicle] <= worlds.time_s
         due = past & (worlds.time_s != self._asked_s) & (worlds.time_s < self.scenario.horizon_s)
@@ -1466,7 +1460,7 @@ class BelievedShield:
 
     def _begin_anew(self, worlds: Worlds, believed: Worlds, vehicle: int, way_m: Floats, due: Bools) -> None:
         """Let the shield begin where it has not, or where what was heard was not foretold."""
-        shield, told = self.shield, told_to(worlds, vehicle)
+        shield, told = self.shield, Told.to(worlds, vehicle)
         assert shield is not None
         heard = np.concatenate([told.known, told.reacts], axis=1).astype(np.float64)
         fresh, begun = np.isnan(self._heard[:, 0]), shield.running is not None
@@ -1506,7 +1500,7 @@ class BelievedShield:
                 assert before.running is not None
                 expected = worlds_at(believed, before.running.states[rows * before.running.members + m])
                 known = keeps.any(axis=1, keepdims=True)
-                foretold = Foretold(replace(expected, pair_hit=expected.pair_hit & known), keeps)
+                foretold = replace(expected, pair_hit=expected.pair_hit & known), keeps
             parts.append(self._believe(worlds, vehicle, way_m, share, foretold))
         if self.robust is not None:
             shield.uncertainty = cast(Uncertainty, _Corners(parts))
@@ -1559,7 +1553,7 @@ class BelievedShield:
     def _corners(self, vehicle: int) -> list[dict[tuple[str, int], float]]:
         if self.robust is None:
             return []
-        uncertain = self._ranges_of(vehicle).uncertain(vehicle)
+        uncertain = self._ranges_of(vehicle).uncertain
         return [dict(zip(uncertain, shares, strict=True)) for shares in product((0.0, 1.0), repeat=len(uncertain))]
 
     def _believe(
@@ -1568,20 +1562,18 @@ class BelievedShield:
         vehicle: int,
         way_m: Floats,
         share: dict[tuple[str, int], float] | None,
-        foretold: Foretold | None = None,
+        foretold: tuple[Worlds, Bools] | None = None,
     ) -> Worlds:
-        others, ranges = self._others, self._ranges_of(vehicle)
-        others = script_agents(self.scenario, except_for=vehicle) if others is None else others
-        return believed_worlds(worlds, vehicle, ranges, others, way_m, share=share, foretold=foretold)
+        return self._ranges_of(vehicle).believe(worlds, way_m, share, foretold)
 
     def _ranges_of(self, vehicle: int) -> Ranges:
-        if self._ranges is None or self._ranges[0] != vehicle:
-            ranges = ranges_of(self.scenario, vehicle)
-            numbers = len(ranges.uncertain(vehicle))
+        if self._ranges is None or self._ranges.vehicle != vehicle:
+            ranges = Ranges.of(self.scenario, vehicle, self._others)
+            numbers = len(ranges.uncertain)
             if self.robust is not None and 2**numbers > MOST_CORNERS:
                 raise InvalidInput(
-                    f"robust:{SUFFIX}: scenario {self.scenario.name!r} leaves {numbers} numbers of the other vehicles"
+                    f"robust:believed: scenario {self.scenario.name!r} leaves {numbers} numbers of the other vehicles"
                     f" open, which make {2**numbers} corners; at most {MOST_CORNERS} can be certified"
                 )
-            self._ranges = vehicle, ranges
-        return self._ranges[1]
+            self._ranges = ranges
+        return self._ranges

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ethbrake_marl.agents import Agent, Driver, LearnedAgent, Team, make_single_agent
+from ethbrake_marl.agents import Agent, Driver, LearnedAgent, Team, make_agent
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, count_of
 from ethbrake_marl.evaluation import (
@@ -278,7 +278,7 @@ class Plan:
         for level in self.levels if self.shield else ():  # learners that brake fully are replaced most often
             if level.trained:
                 worlds, task = samples[level.name].worlds, Task(level.scenario, level.scenario.learners)
-                braking = make_single_agent("full_brake")
+                braking = make_agent("full_brake")
                 drive_chunks(braking, worlds.take([0]), task)  # compiles
                 started = time.monotonic()
                 drive_chunks(braking, worlds, task)
@@ -660,7 +660,7 @@ class LineQuestion:
 
     def _drive_line(self, scenario: Scenario, sample: Sample, agents: Sequence[Agent], tell: OnProgress | None) -> Json:
         count, say = self.harm_count, tell or (lambda progress: None)
-        braking = _drive(scenario, sample, [make_single_agent("full_brake")], say)
+        braking = _drive(scenario, sample, [make_agent("full_brake")], say)
         reached = _drive(scenario, sample, agents, say)
         worst, own = braking.world[count], reached.world[count]
         best_known, share = None, None

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from pettingzoo.utils import BaseParallelWrapper
 
-from ethbrake_marl.agents.rollout import episode_engine
+from ethbrake_marl.agents.registry import episode_engine
 from ethbrake_marl.envs.gym import EthBrakeVectorEnv
 from ethbrake_marl.envs.parallel import EthBrakeParallelEnv, parallel_env
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
