@@ -138,9 +138,9 @@ recipe_group = new_group(
 @command(recipe_group, "list", "recipe list", json=True)
 def recipe_list(out: Out) -> None:
     """List the shipped recipes: name, algorithm and title."""
-    from ethbrake_marl.learning import load_recipe, shipped_recipes
+    from ethbrake_marl.learning import TrainingRecipe, load_recipe
 
-    found = {name: (load_recipe(name), path) for name, path in shipped_recipes().items()}
+    found = {name: (load_recipe(name), path) for name, path in TrainingRecipe.shipped().items()}
     width = max(map(len, found))
     out.result(
         [
@@ -154,10 +154,10 @@ def recipe_list(out: Out) -> None:
 @command(recipe_group, "show", "recipe show ppo")
 def recipe_show(out: Out, recipe: NameArgument) -> None:
     """Print the YAML of a recipe that is in order."""
-    from ethbrake_marl.learning import load_recipe, recipe_path
+    from ethbrake_marl.learning import TrainingRecipe, load_recipe
 
     load_recipe(recipe)
-    _show_file(out, recipe_path(recipe))
+    _show_file(out, TrainingRecipe.file(recipe))
 
 
 @command(recipe_group, "validate", "recipe validate my-recipe.yaml")
@@ -176,9 +176,9 @@ def recipe_validate(out: Out, path: NameArgument) -> None:
 @command(recipe_group, "new", "recipe new my-recipe --based-on sac", force=True)
 def recipe_new(out: Out, name: NewNameArgument, based_on: BasedOnOption = "ppo", output: FolderOption = Path()) -> None:
     """Write a commented NAME.yaml with every key."""
-    from ethbrake_marl.learning import new_recipe_text
+    from ethbrake_marl.learning import load_recipe
 
-    _write_new(out, "recipe", output / f"{name}.yaml", new_recipe_text(name, based_on))
+    _write_new(out, "recipe", output / f"{name}.yaml", load_recipe(based_on).new_text(name))
 
 
 @command(recipe_group, "schema", "recipe schema > recipe.schema.json")
@@ -187,9 +187,9 @@ def recipe_schema(out: Out) -> None:
 
     For editors that complete and check YAML.
     """
-    from ethbrake_marl.learning import recipe_json_schema
+    from ethbrake_marl.learning import TrainingRecipe
 
-    out.print_json(recipe_json_schema())
+    out.print_json(TrainingRecipe.json_schema())
 
 
 def _show_file(out: Out, path: Path) -> None:

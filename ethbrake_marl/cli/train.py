@@ -118,7 +118,7 @@ def start_command(
     Ctrl-C ends the training after the update in progress and keeps the policy; `ethbrake train resume FOLDER` goes on.
     """
     from ethbrake_marl.evaluation import load_runnable
-    from ethbrake_marl.learning import load_recipe, read_settings, resolve, train
+    from ethbrake_marl.learning import Training, load_recipe, read_settings, train
     from ethbrake_marl.studies.experiment import run_folder
 
     plan = load_recipe(recipe)
@@ -126,7 +126,7 @@ def start_command(
     chosen, plan = load_runnable(scenario, given.scenario), given.change(plan, out.note)
     if scheme is not None:
         plan = plan.replace(scheme=scheme)
-    training = resolve(plan, chosen)
+    training = Training.of(plan, chosen)
     begun = [training.who_drives()]
 
     def tell(progress: Progress) -> None:

@@ -50,15 +50,16 @@ from ethbrake_marl.engine import (
 )
 from ethbrake_marl.envs import EthBrakeVecEnv
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
-from ethbrake_marl.learning.recipe import (
+from ethbrake_marl.learning.training import (
+    Algorithm,
     CounterfactualRecipe,
     ModesPlan,
     NetworkShape,
     PpoRecipe,
     SacRecipe,
     SquashedShape,
+    Training,
 )
-from ethbrake_marl.learning.training import Algorithm, Training
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats, Ints, Packed, Worlds
 from ethbrake_marl.policies import Activation, Float32s, NetworkSpec, Policy, load_named_policy

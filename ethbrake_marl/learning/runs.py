@@ -56,14 +56,14 @@ from ethbrake_marl.files.store import (
 from ethbrake_marl.files.yaml import FileModel, read_json_model
 from ethbrake_marl.harm import objective_harm
 from ethbrake_marl.learning.algorithms import tensors_of
-from ethbrake_marl.learning.recipe import Scheme, TrainingRecipe
 from ethbrake_marl.learning.training import (
     Algorithm,
     RunDirectory,
     RunStatus,
+    Scheme,
     Training,
+    TrainingRecipe,
     read_object,
-    resolve,
     stop_on_signal,
 )
 from ethbrake_marl.observations import Appended
@@ -167,8 +167,8 @@ def measure_on_list(training: Training) -> Evaluate:
         if objectives:
             harm = objective_harm(outcome.ledger, recipe.reward.harm_count, objectives)
             each = {names[i]: mean(harm[:, i]).value for i in scenario.learners}
-            metrics[OBJECTIVE] = sum(each.values()) / len(each)
-            metrics |= {f"{OBJECTIVE}_{name}": value for name, value in each.items()}
+            metrics[RunDirectory.OBJECTIVE] = sum(each.values()) / len(each)
+            metrics |= {f"{RunDirectory.OBJECTIVE}_{name}": value for name, value in each.items()}
         return metrics
 
     return measure
@@ -219,7 +219,7 @@ def train(
 
     """
     changes = {"scheme": scheme, "turns": turns, "seed": seed, "total_steps": steps}
-    training = resolve(recipe, scenario, **{name: value for name, value in changes.items() if value is not None})
+    training = Training.of(recipe, scenario, **{name: value for name, value in changes.items() if value is not None})
     run = RunDirectory(Path(directory))
     begin = partial(run.create, training.config(settings), team=training.team(), force=force)
     return _run(run, begin, training, _Wishes(measure, stop_when_lost, stop_at, Progress.listener(on_progress)))
@@ -615,8 +615,6 @@ EPISODE_COLUMNS = {
     "rollout/total_harm": "world_total_harm",
     "rollout/collision_rate": "collided",
 }
-HARM_METRIC: dict[HarmCount, str] = {"first": "first_impact_harm", "total": "total_harm"}
-OBJECTIVE = "objective"  # mean over the learners of their objectives' harm, where one is another than total
 RETURN = "episode_return"
 AT_HORIZON = "horizon_rate"  # share of the fixed list's episodes in which something still moves at the horizon
 
@@ -663,7 +661,7 @@ class Course:
         """Take in an evaluation of ``policy``; gives the alarm, if this one raises it."""
         extra = {} if episode_return is None else {RETURN: episode_return}
         self.evaluations.append({"steps": self.steps, "updates": self.updates, **metrics, **extra})
-        name = chosen_by(self.evaluations, self.harm_count)
+        name = RunDirectory.chosen_by(self.evaluations, self.harm_count)
         if name in metrics and metrics[name] < self.best_harm:
             self.best, self.best_harm = policy, metrics[name]
         self.lost = lost_training(self.evaluations, name)
@@ -687,12 +685,6 @@ class Course:
         self.alarms = list(content["alarms"])
         self.best_harm = math.inf if content["best_harm"] is None else float(content["best_harm"])
         self.wall_before_s = float(content["wall_s"])
-
-
-def chosen_by(evaluations: Sequence[Mapping[str, Any]], harm_count: HarmCount, prefix: str = "") -> str:
-    """Name of what the best policy has least of: the objective, or the line's harm where an evaluation tells none."""
-    found = evaluations and all(entry.get(prefix + OBJECTIVE) not in (None, "") for entry in evaluations)
-    return prefix + (OBJECTIVE if found else HARM_METRIC[harm_count])
 
 
 def misleading_return(evaluations: Sequence[Mapping[str, float]], harm: str) -> str | None:

@@ -33,15 +33,13 @@ from ethbrake_marl.figures import Figure, ablation_figures, write_picture
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
 from ethbrake_marl.files.yaml import Override
 from ethbrake_marl.learning import (
-    HARM_METRIC,
     WORDS,
     RunDirectory,
+    Training as Resolved,
     TrainingRecipe,
     load_recipe,
-    load_team,
     read_object,
     read_settings,
-    resolve,
 )
 from ethbrake_marl.limits import BestHarmTable, best_harm, chunks_left, realised_harm, search_list, world_identity
 from ethbrake_marl.pages.page import Page, Part, Played, Section
@@ -180,7 +178,7 @@ class Training:
 
     def job(self) -> TrainingJob:
         """What brings it to its end."""
-        return TrainingJob(resolve(self.recipe, self.level.scenario), self.folder, self.noted)
+        return TrainingJob(Resolved.of(self.recipe, self.level.scenario), self.folder, self.noted)
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,7 +257,7 @@ class Plan:
         left = [(training, training.job().steps_left()) for training in self.trainings()]
         for training, steps in left:
             if not steps:
-                load_team(training.folder, training.level.scenario)
+                RunDirectory(training.folder).load_team(training.level.scenario)
         lists = common_worlds(self.levels, self.episodes, self.list_seed)
         timed = np.arange(min(TIMED_DRIVES, self.episodes))
         samples = {level.name: sample.take(timed) for level, sample in zip(self.levels, lists, strict=True)}
@@ -485,7 +483,7 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
     say = tell or (lambda progress: None)
     teams: dict[tuple[str, str], list[Team]] = {}
     for training in plan.trainings():
-        team = load_team(training.folder, training.level.scenario, training.folder.name)
+        team = RunDirectory(training.folder).load_team(training.level.scenario, training.folder.name)
         teams.setdefault((training.level.name, training.algorithm), []).append(team)
     samples = common_worlds(plan.levels, plan.episodes, plan.list_seed)
     tables = search_all(plan, samples, jobs, say)
@@ -593,7 +591,7 @@ def _drivers(plan: Plan) -> Iterator[tuple[str, Level, Driver, str]]:
         for algorithm in plan.algorithms:
             training = trained[level.name, algorithm]
             name = level.name if len(plan.algorithms) == 1 else f"{level.name}, {algorithm}"
-            team = load_team(training.folder, level.scenario, name)
+            team = RunDirectory(training.folder).load_team(level.scenario, name)
             yield name, level, team, f"{training.recipe.algorithm}@{training.folder}"
 
 
@@ -879,7 +877,7 @@ def levels_csv(measured: Sequence[Measured], searched: int) -> str:
             vehicles: Json = {}
             behind: Json = {}
             for harm_count in HARM_COUNTS:
-                name = HARM_METRIC[harm_count]
+                name = RunDirectory.HARM[harm_count]
                 reached, braking = one.reached.world[harm_count][seed], one.full_brake.world[harm_count]
                 about |= {
                     name: float(reached.mean()),

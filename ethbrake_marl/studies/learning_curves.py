@@ -12,7 +12,7 @@ from ethbrake_marl.errors import InvalidInput, OnProgress, count_of
 from ethbrake_marl.evaluation import interquartile_mean, result_identity, worlds_sha256, write_output
 from ethbrake_marl.figures import SeedCurve, seed_curves, write_picture
 from ethbrake_marl.files.sheet import csv_text
-from ethbrake_marl.learning import HARM_METRIC, RETURN, RunDirectory, TrainingRecipe, load_recipe, resolve
+from ethbrake_marl.learning import RunDirectory, Training, TrainingRecipe, load_recipe
 from ethbrake_marl.policies import load_policy
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.studies.jobs import JobFolder
@@ -64,7 +64,9 @@ def train_all(
     """
     trainings = [
         TrainingJob(
-            resolve(each.recipe, scenario, seed=seed, total_steps=each.recipe.total_steps if steps is None else steps),
+            Training.of(
+                each.recipe, scenario, seed=seed, total_steps=each.recipe.total_steps if steps is None else steps
+            ),
             folder / f"{each.recipe.name}-seed{seed}",
             tuple(settings),
         )
@@ -89,7 +91,7 @@ def write_curves(scenario: Scenario, plan: Sequence[Trainings], folder: Path) ->
     lists = set()
     for trainings in plan:
         recipe = trainings.recipe
-        values = curves[HARM_METRIC[recipe.reward.harm_count]][recipe.name].values
+        values = curves[RunDirectory.HARM[recipe.reward.harm_count]][recipe.name].values
         fixed = scenario.sample(recipe.evaluation.worlds, recipe.evaluation.seed)
         lists.add((recipe.evaluation.worlds, recipe.evaluation.seed))
         runs = [folder / f"{recipe.name}-seed{seed}" for seed in range(trainings.seeds)]
@@ -125,13 +127,13 @@ def write_curves(scenario: Scenario, plan: Sequence[Trainings], folder: Path) ->
 def _read_curves(plan: Sequence[Trainings], folder: Path) -> dict[str, dict[str, SeedCurve]]:
     """What the trainings of ``folder`` reached, by metric and recipe; without what no episode told."""
     counts = {trainings.recipe.reward.harm_count for trainings in plan}
-    metrics = [HARM_METRIC[count] for count in ("first", "total") if count in counts]
+    metrics = [RunDirectory.HARM[count] for count in ("first", "total") if count in counts]
     curves: dict[str, dict[str, SeedCurve]] = {metric: {} for metric in (*metrics, _RETURNED)}
     for trainings in plan:
         name = trainings.recipe.name
         runs = [RunDirectory(folder / f"{name}-seed{seed}") for seed in range(trainings.seeds)]
         for metric in curves:
-            values = [run.column(RETURN if metric == _RETURNED else f"eval/{metric}") for run in runs]
+            values = [run.column(RunDirectory.RETURN if metric == _RETURNED else f"eval/{metric}") for run in runs]
             if metric != _RETURNED or all(values):  # no episode may have ended in a very short training
                 curves[metric][name] = SeedCurve.of(values)
     return {metric: lines for metric, lines in curves.items() if lines}

@@ -56,18 +56,7 @@ from ethbrake_marl.files.yaml import (
     read_model,
     read_yaml,
 )
-from ethbrake_marl.learning import (
-    HARM_METRIC,
-    OBJECTIVE,
-    RunDirectory,
-    StopAt,
-    Training,
-    TrainingRecipe,
-    chosen_by,
-    load_recipe,
-    read_settings,
-    resolve,
-)
+from ethbrake_marl.learning import RunDirectory, StopAt, Training, TrainingRecipe, load_recipe, read_settings
 from ethbrake_marl.policies import Policy, has_bundle, installed_versions, read_trained
 from ethbrake_marl.scenario import Scenario, check_file_name, load_scenario
 from ethbrake_marl.studies.jobs import Attempt, Job, JobFolder, Workers
@@ -142,7 +131,7 @@ RESULTS = (
     "steps",  # decisions of learners in whole updates
     "policy_steps",  # decisions after which the kept policy was taken: the best one on the recipe's list
     *_MEASURED,  # of the kept policy on that list
-    OBJECTIVE,  # likewise, where a learner has another objective than total
+    RunDirectory.OBJECTIVE,  # likewise, where a learner has another objective than total
     *(f"last_{name}" for name in _MEASURED),  # of the last one
     "policy_sha256",  # of the kept policy's manifest, of several vehicle_i=... each
 )
@@ -184,7 +173,7 @@ def _read_results(job: TrainingJob) -> list[str]:
     table = [row for row in run.rows() if row.get(f"eval/{_MEASURED[0]}")]
     if not table:
         raise InvalidInput(f"{run.progress}: holds no evaluation; delete its folder to train anew")
-    harm = chosen_by(table, job.training.recipe.reward.harm_count, "eval/")
+    harm = RunDirectory.chosen_by(table, job.training.recipe.reward.harm_count, "eval/")
     kept, last = min(table, key=lambda row: float(row[harm])), table[-1]
     trained = read_trained(run.policy)
     if isinstance(trained, Policy):
@@ -192,7 +181,7 @@ def _read_results(job: TrainingJob) -> list[str]:
     else:
         sha256 = " ".join(f"{name}={policy.manifest.manifest_sha256}" for name, policy in trained.drivers.items())
     measured, later = ([row[f"eval/{name}"] for name in _MEASURED] for row in (kept, last))
-    return [last["steps"], kept["steps"], *measured, kept.get(f"eval/{OBJECTIVE}", ""), *later, sha256]
+    return [last["steps"], kept["steps"], *measured, kept.get(f"eval/{RunDirectory.OBJECTIVE}", ""), *later, sha256]
 
 
 @contextmanager
@@ -420,7 +409,7 @@ class SweepPlan:
             if kind not in firsts:
                 try:
                     scenario, recipe = _load_parts(*kind)
-                    first = resolve(recipe, scenario, seed=asked.seed)
+                    first = Training.of(recipe, scenario, seed=asked.seed)
                 except InvalidInput as error:
                     raise type(error)(f"{file.where(asked, _refused_part(*kind))}: {asked}: {error}") from None
                 firsts[kind] = first, first.content()
@@ -438,7 +427,7 @@ class SweepPlan:
 
     def training(self, row: Row) -> Training:
         """What is to be trained."""
-        return resolve(row.first.recipe, row.first.scenario, seed=row.asked.seed)
+        return Training.of(row.first.recipe, row.first.scenario, seed=row.asked.seed)
 
     def job(self, row: Row, folder: Path, log: Path) -> Job:
         """What trains the job of a row in the folder of a sweep."""
@@ -789,7 +778,7 @@ class TuningPlan:
                 raise
         recipe = recipe.replace(seed=file.seed)
         with at(("scenario",)):
-            content = resolve(recipe, scenario).content()
+            content = Training.of(recipe, scenario).content()
         told: dict[str, Any] = {"training": content}
         told |= file.model_dump(mode="json", include={"search", "measure", "prune", "sampler"})
         told |= {"order": [*file.search], "versions": installed_versions(), "plugins": noted_plugins()}
@@ -814,7 +803,7 @@ class TuningPlan:
         asked = self.file.measure
         every = -(-self.updates(recipe) // asked.times)
         listed = {"every_updates": every, "worlds": asked.worlds, "seed": asked.seed}
-        return resolve(recipe.replace(evaluation=listed), self.scenario)
+        return Training.of(recipe.replace(evaluation=listed), self.scenario)
 
     def updates(self, recipe: TrainingRecipe) -> int:
         """Updates of a whole training."""
@@ -927,7 +916,9 @@ class TuningPlan:
                     say(f"trial {number}: {attempt.reason}; {kept.log(attempt.job.name)}")
                     return
                 results = dict(zip(RESULTS, end["results"], strict=True))
-                harm = float(results[OBJECTIVE] or results[HARM_METRIC[self.recipe.reward.harm_count]])
+                harm = float(
+                    results[RunDirectory.OBJECTIVE] or results[RunDirectory.HARM[self.recipe.reward.harm_count]]
+                )
                 study.end(number, "pruned" if end["pruned"] else "finished", end["results"], harm)
                 best = study.best()
                 is_best = best is not None and best.number == number
@@ -1168,12 +1159,12 @@ def do_trial(
     """
     study = TuningStudy(*where)
     times, pruned = study.file.measure.times, False
-    harm = HARM_METRIC[job.training.recipe.reward.harm_count]
+    harm = RunDirectory.HARM[job.training.recipe.reward.harm_count]
 
     def judge(evaluation: Mapping[str, float]) -> str | None:
         nonlocal pruned
         step = int(times * evaluation["updates"]) // updates
-        study.report(number, step, evaluation.get(OBJECTIVE, evaluation[harm]))
+        study.report(number, step, evaluation.get(RunDirectory.OBJECTIVE, evaluation[harm]))
         pruned = bool(step < times and study.running(number).should_prune())
         return PRUNED if pruned else None
 

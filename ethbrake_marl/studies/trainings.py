@@ -14,7 +14,7 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, OnProgress, Progress
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.learning import RunDirectory, StopAt, Training, load_team, read_object, resume, train
+from ethbrake_marl.learning import RunDirectory, StopAt, Training, read_object, resume, train
 from ethbrake_marl.scenario import Sample, Scenario
 from ethbrake_marl.studies.jobs import Job, JobFolder, each, run_jobs
 
@@ -141,7 +141,7 @@ def time_training(training: Training, sample: Sample | None = None) -> Timed:
 
 def world_seconds(folder: Path, scenario: Scenario, sample: Sample) -> float:
     """Seconds per world that a trained team drives."""
-    team = load_team(folder, scenario)
+    team = RunDirectory(folder).load_team(scenario)
     evaluate(sample.worlds.take(np.arange(min(5, sample.worlds.n))), {"warm": team}, scenario=scenario, aftermath=False)
     started = time.monotonic()
     evaluate(sample, {"team": team}, scenario=scenario, aftermath=False)

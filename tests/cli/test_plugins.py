@@ -230,7 +230,7 @@ def test_changed_file__is_refused_in_the_same_process(ethbrake, parts):
 
 @pytest.mark.slow
 def test_worker_processes__load_the_plugins_of_their_parent(tmp_path, parts, monkeypatch):
-    from ethbrake_marl.learning.recipe import load_recipe
+    from ethbrake_marl.learning.training import load_recipe
     from ethbrake_marl.scenario import load_scenario
     from ethbrake_marl.studies.ablation import Level, Training
 

@@ -49,7 +49,7 @@ from ethbrake_marl.figures import (
     trajectories,
 )
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown
-from ethbrake_marl.learning import RETURN, RunDirectory, TrainingRecipe, load_recipe
+from ethbrake_marl.learning import RunDirectory, TrainingRecipe, load_recipe
 from ethbrake_marl.limits import Unproven
 from ethbrake_marl.pages.page import Part, Played
 from ethbrake_marl.physics import Bools, Floats
@@ -702,7 +702,7 @@ def reproduce_curves(delay: str, settings: Settings) -> Made:
         runs = {name: [RunDirectory(path) for path in paths] for name, paths in found.items()}
         courses[each] = {
             name.partition("/")[2]: Course(
-                *(SeedCurve.of([run.column(what) for run in own]) for what in (RETURN, _HARM))
+                *(SeedCurve.of([run.column(what) for run in own]) for what in (RunDirectory.RETURN, _HARM))
             )
             for name, own in runs.items()
         }

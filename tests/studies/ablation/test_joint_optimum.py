@@ -11,7 +11,7 @@ import pytest
 from ethbrake_marl.agents.registry import Team, make_agent
 from ethbrake_marl.errors import Progress
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.limits.limits import best_harm, chunks_left
 from ethbrake_marl.scenario import Sample, load_scenario
 from ethbrake_marl.studies.ablation import (

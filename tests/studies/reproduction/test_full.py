@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.figures import SeedCurve
-from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.studies.reproduction import items
 from ethbrake_marl.studies.reproduction.folder import choose_items, reproduce, tell_cost
 from ethbrake_marl.studies.reproduction.items import ITEMS, Course, Group, Settings, TrainedRecipe
