@@ -107,8 +107,7 @@ class Step(NamedTuple):
     @property
     def failed(self) -> Ints:
         """What went wrong in the worlds that could not be advanced (a status of the kernel), 0 elsewhere, [n]."""
-        status: Ints = self.outcome[FAILED].astype(np.int64)
-        return status
+        return np.asarray(self.outcome[FAILED], np.int64)
 
     @property
     def safe_end(self) -> Bools:
@@ -118,14 +117,12 @@ class Step(NamedTuple):
     @property
     def first_impact_harm(self) -> Floats:
         """Of the whole line in this step, [n]."""
-        harm: Floats = self.outcome[STEP_FIRST_HARM]
-        return harm
+        return np.asarray(self.outcome[STEP_FIRST_HARM], np.float64)
 
     @property
     def total_harm(self) -> Floats:
         """Likewise, every impact counted, [n]."""
-        harm: Floats = self.outcome[STEP_TOTAL_HARM]
-        return harm
+        return np.asarray(self.outcome[STEP_TOTAL_HARM], np.float64)
 
     @property
     def shared(self) -> dict[str, Floats]:
@@ -135,20 +132,10 @@ class Step(NamedTuple):
     @property
     def counted_harm(self) -> Floats:
         """Harm of the whole line in this step, as the reward counts impacts, [n]."""
-        harm: Floats = self.outcome[self._counted]
-        return harm
-
-    @property
-    def _counted(self) -> int:
-        return STEP_FIRST_HARM if self.params.harm_count == "first" else STEP_TOTAL_HARM
-
-    def ending(self, world: int) -> tuple[bool, bool]:
-        """Whether this step terminated the episode of one world, and whether it truncated it."""
-        return self.outcome.item(TERMINATED, world) == 1.0, self.outcome.item(TRUNCATED, world) == 1.0
+        return self.first_impact_harm if self.params.harm_count == "first" else self.total_harm
 
     def _is(self, row: int) -> Bools:
-        truth: Bools = self.outcome[row] == 1.0
-        return truth
+        return np.asarray(self.outcome[row] == 1.0, np.bool_)
 
 
 @compiled
@@ -352,6 +339,28 @@ def checked_memory(memory: Memory, n: int, what: str = "state") -> Memory:
     return map_memory(check, memory)
 
 
+Arrays = dict[str, NDArray[Any]]
+
+
+def _flat(memory: Memory) -> Arrays:
+    """The arrays of a memory, by their place in it; an empty one stands for what is not remembered yet."""
+    if isinstance(memory, Mapping | tuple):
+        parts = memory.items() if isinstance(memory, Mapping) else enumerate(memory)
+        return {f"{key}.{name}" if name else str(key): array for key, of in parts for name, array in _flat(of).items()}
+    return {"": np.zeros(0) if memory is None else np.array(memory)}
+
+
+def _unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
+    """The memory whose arrays stand at a place, in its own arrays; numbers are places in a tuple."""
+    if place in arrays:
+        return np.array(arrays[place]) if arrays[place].shape != (0,) else None
+    inner = dict.fromkeys(name[len(place) + 1 :].partition(".")[0] for name in arrays if name.startswith(f"{place}."))
+    if not inner:
+        raise InvalidInput(f"engine snapshot: {place} is nothing; the memory of that vehicle's script is needed")
+    parts = {name: _unflat(arrays, f"{place}.{name}") for name in inner}
+    return tuple(parts[str(k)] for k in range(len(parts))) if "0" in parts else parts
+
+
 def _check_kept(before: Memory, after: Memory, who: str) -> None:
     """Raise ``InvalidInput`` for a memory of another form than it began with: rows that begin anew would not fit."""
     began, told = (map_memory(lambda array: (array.dtype, *array.shape[1:]), each) for each in (before, after))
@@ -543,10 +552,9 @@ class Stream:
         self.known = {i: script for i, script in scripts.items() if i not in self._deciders}  # to who looks ahead
         self.restart(seed)
 
-    def restart(self, seed: int) -> None:
-        """Go back to the first world of ``seed``."""
-        self.seed = seed
-        self._drawn = 0
+    def restart(self, seed: int, position: int = 0) -> None:
+        """Go to a world of ``seed``, the first one where no other is named."""
+        self.seed, self._drawn = seed, position
         self._pool: Start | None = None
         self._next = 0
 
@@ -565,30 +573,25 @@ class Stream:
         return taken
 
     def _fill(self, count: int) -> None:
-        left = None
-        if self._pool is not None:
-            left = self._pool.part(self._next, len(self._pool.clock) - self._next).alert
-        size = max(4 * count, _SAMPLED_AT_ONCE)
-        sample = self._scenario.sample(size, self.seed, first=self._drawn, channel="training")
-        self._pool = self._prepare_all(sample.worlds if left is None else Worlds.concatenate([left, sample.worlds]))
-        self._drawn += size
-        self._next = 0
+        """Draw and prepare more worlds behind those that are left.
 
-    def _prepare_all(self, alert: Worlds) -> Start:
-        """``prepare``; a world that cannot be advanced to its first decision gives its place to the next one that can.
-
-        A ``FailedWorld`` warning names it. So worlds keep their places in the stream, and a training goes on.
+        One that cannot be advanced to its first decision gives its place to the next one that can; a ``FailedWorld``
+        warning names it. So worlds keep their places in the stream, and a training goes on.
         """
+        first, size = self.position, max(4 * count, _SAMPLED_AT_ONCE)
+        alert = self._scenario.sample(size, self.seed, first=self._drawn, channel="training").worlds
+        if self._pool is not None:
+            alert = Worlds.concatenate([self._pool.part(self._next, self._drawn - first).alert, alert])
         start, kept, failed = leaving_out_failed(lambda rows: self.prepare(alert.take(rows)), np.arange(alert.n))
         if start is None:
             raise PhysicsError(failed)
-        if not failed:
-            return start
-        first = self.position
         for row, reason in failed.items():
             warnings.warn(FailedWorld(f"world {first + row} of seed {self.seed}: {reason}; left out"), stacklevel=2)
-        later = np.searchsorted(kept, np.arange(alert.n)) % len(kept)
-        return self.prepare(alert.take(kept[later]))
+        if failed:
+            later = np.searchsorted(kept, np.arange(alert.n)) % len(kept)
+            start = self.prepare(alert.take(kept[later]))
+        self._pool, self._next = start, 0
+        self._drawn += size
 
     def prepare(self, alert: Worlds) -> Start:
         """Worlds at t = 0, made ready for their first decision. Raises ``InvalidInput`` if nobody may ever decide."""
@@ -633,84 +636,9 @@ def moved(alert: Worlds, wanted: Floats, start_s: Floats) -> Packed:
     return packed
 
 
-# The running episodes of a batch: their rows, and what can be read from them.
-
 _NO_ROWS = np.empty((0, LISTED.WIDTH))  # no list of impacts is kept
 
 RUNNING = ("_state", "_params", "_clock", "_wanted", "_potential")  # arrays of an engine that every step changes
-
-
-class Running:
-    """``n`` running episodes of one scenario, to be read; ``Engine`` moves them."""
-
-    scenario: Scenario  # of every episode
-    n: int  # worlds that are advanced together
-    roster: Roster  # who runs in which row, and which worlds failed
-    _state: Floats  # of the running episodes, as rows of ``physics.batch``
-    _params: Floats
-    _clock: Floats  # [n, CLOCK_WIDTH]
-    _wanted: Floats  # [n, N] m/s2
-    _potential: Floats  # [n, N]
-    _obstacle: bool  # the rows have columns of an obstacle
-    _by_link: bool  # ... of news by link
-    _plan: Plan  # of what a vehicle observes
-
-    @property
-    def packed(self) -> Packed:
-        """The running worlds themselves, as rows of ``physics.batch``: for kernels to read, not to be changed."""
-        return Packed(self._state, self._params)
-
-    @property
-    def wanted_mps2(self) -> Floats:
-        """What each vehicle wanted in the last step, [n, N]: for kernels to read, not to be changed."""
-        return self._wanted
-
-    @property
-    def worlds(self) -> Worlds:
-        """The worlds as they are now, in their own memory."""
-        return self.packed.worlds()
-
-    @property
-    def ledger(self) -> Ledger:
-        """Harm of the running episodes so far, in its own memory."""
-        packed, column = self.packed, self.packed.column
-        return Ledger(*packed.ledger(), packed.params[:, column.mass : column.limit].copy())
-
-    @property
-    def known_from_s(self) -> Floats:
-        """From when on vehicle i acts on news of vehicle j, [n, N, N]: ``known_from_s`` of the worlds' vehicles."""
-        return self.packed.known_from_s
-
-    @property
-    def ended(self) -> Bools:
-        """Episodes that have ended, [n]."""
-        ended: Bools = self._clock[:, ENDED] == 1.0
-        return ended
-
-    @property
-    def steps(self) -> Ints:
-        """Steps that the running episodes have taken, [n]."""
-        return self._clock[:, STEP].astype(np.int64)
-
-    def observe(self, vehicle: int) -> Observations:
-        """Current observation of one vehicle, [n, F]."""
-        if not 0 <= vehicle < self.scenario.vehicles:
-            raise InvalidInput(f"observe: vehicle index {vehicle}; must be in 0..{self.scenario.vehicles - 1}")
-        return self.observe_all(np.array([vehicle]))[:, 0]
-
-    def observe_all(self, vehicles: Ints, rows: Ints | None = None) -> Observations:
-        """Current observations of several vehicles, [n, len(vehicles), F]; only of the worlds ``rows`` if given."""
-        state, params = self._state, self._params
-        if rows is not None:
-            state, params = state.take(rows, axis=0), params.take(rows, axis=0)
-        if not self._plan.extras:
-            return self._plan.observe(state, params, vehicles)
-        steps = self._clock[:, STEP] if rows is None else self._clock[rows, STEP]
-        return self._plan.observe(state, params, vehicles, steps)
-
-    def _kept(self, packed: Packed) -> Packed:
-        """Rows as wide as they are kept: with columns of an obstacle, and of news by link, if the first had such."""
-        return packed.widened(self._obstacle, self._by_link)
 
 
 # Terms of the reward that the compiled step does not know: they need the motion, the future or an objective.
@@ -730,21 +658,20 @@ class Terms:
         self.params, self._objectives = reward_params(reward).settled(scenario.objective, scenario.vehicles)
         self._learners, self._learner_index = tuple(learners), np.array(learners, np.int64)
         self._moving, self._own = self.params.moving, self.params.registered
-        self._moves_reward = bool(self._moving or self._own)
         self.by_objective = bool(self._objectives)  # each vehicle's harm by an objective
         self.are_foreign = bool(self._own)  # one is code that somebody registered, and so may fail
-        self.add_something = self._moves_reward or self.params.shaping > 0.0 or self.by_objective
+        self.add_something = bool(self._moving or self._own) or self.params.shaping > 0.0 or self.by_objective
 
     @property
     def shared_harm(self) -> float:
         """Weight of the harm of the whole line, which the compiled step counts: 0 where each has its objective."""
         return 0.0 if self._objectives else self.params.harm
 
-    def objective_harm(self, running: Running) -> Floats:
+    def objective_harm(self, running: Engine) -> Floats:
         """What the objective of each vehicle makes of the harm so far, [n, N]; only where there are objectives."""
         return objective_harm(running.ledger, self.params.harm_count, self._objectives)
 
-    def add(self, step: Step, running: Running, before: Floats | None) -> None:
+    def add(self, step: Step, running: Engine, before: Floats | None) -> None:
         """Add what a step has brought to its reward; nothing for rows that stood still.
 
         ``before``: ``objective_harm`` before the step, None without objectives.
@@ -752,45 +679,36 @@ class Terms:
         if before is not None and self.params.harm > 0.0:
             step.further["harm"] = before - self.objective_harm(running)
         standing = running.ended & ~step.ended
-        if self._moves_reward:
-            outcome = self._outcome(step, running)
+        if self._moving or self._own:
+            (state, params), column = running.packed, running.packed.column
+            outcome = StepOutcome(
+                step.first_impact_harm,
+                step.total_harm,
+                step.safe_end,
+                state[:, column.gap : column.hit],
+                state[:, column.speed : column.command],
+                state[:, column.command : column.previous],
+                state[:, column.previous : column.gap],
+                running.scenario.time_step_s,
+                state[:, column.time],
+                params[:, column.braking : column.driving],
+                params[:, column.driving : column.latency],
+                params[:, column.latency : column.mass],
+                params[:, column.mass : column.limit],
+                self._learner_index.view(),
+            )
             step.further.update(outcome.built_in(self._moving, self.params))
             if self._own:
                 counts = ~standing & (step.failed == 0)
                 step.further.update(outcome.registered(self._own, counts, running.steps))
-        if self.params.shaping > 0.0:
-            step.further["shaping"] = self._shaping(running, step.terminated)
+        if self.params.shaping > 0.0:  # potentials are 0 where an episode terminated
+            old = running._potential
+            running._potential = self.potentials(running.worlds, running.scenario)
+            running._potential[step.terminated] = 0.0
+            step.further["shaping"] = self.params.shaping_discount * running._potential - old
         extra = self.params.weighted_sum(step.further, step.reward.shape)
         extra[standing] = 0.0
         step.reward[:] += extra
-
-    def _outcome(self, step: Step, running: Running) -> StepOutcome:
-        """What terms are computed from: views of the running rows."""
-        (state, params), column = running.packed, running.packed.column
-        return StepOutcome(
-            step.first_impact_harm,
-            step.total_harm,
-            step.safe_end,
-            state[:, column.gap : column.hit],
-            state[:, column.speed : column.command],
-            state[:, column.command : column.previous],
-            state[:, column.previous : column.gap],
-            running.scenario.time_step_s,
-            state[:, column.time],
-            params[:, column.braking : column.driving],
-            params[:, column.driving : column.latency],
-            params[:, column.latency : column.mass],
-            params[:, column.mass : column.limit],
-            self._learner_index.view(),
-        )
-
-    def _shaping(self, running: Running, terminated: Bools) -> Floats:
-        """The shaping term [n, N] of this step; keeps the new potentials, which are 0 where an episode terminated."""
-        before = running._potential
-        running._potential = self.potentials(running.worlds, running.scenario)
-        running._potential[terminated] = 0.0
-        shaping: Floats = self.params.shaping_discount * running._potential - before
-        return shaping
 
     def potentials(self, worlds: Worlds, scenario: Scenario) -> Floats:
         """Potential of every learner, 0 for other vehicles, [n, N]."""
@@ -850,14 +768,38 @@ class Guard(Protocol):
     def begin(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
         """The memory once episodes start in these rows, None before; ``alert`` holds those worlds only, at t = 0."""
 
-    def decide(self, running: Running, memory: Any, proposed: Floats) -> Ruling:
+    def decide(self, running: Engine, memory: Any, proposed: Floats) -> Ruling:
         """What is applied instead of the actions [n, L]. A column of NaN: nothing was proposed for that learner."""
 
-    def check(self, ruling: Ruling, after: Running) -> Any:
+    def check(self, ruling: Ruling, after: Engine) -> Any:
         """The memory now that the step led to ``after``. Raises ``UncertifiedStep``: then it was not made."""
 
 
-class Engine(Running):
+class Moment(NamedTuple):
+    """Running worlds between two steps, row by row."""
+
+    state: Floats  # as rows of ``physics.batch``
+    params: Floats
+    clock: Floats
+    wanted: Floats
+    memories: dict[int, Memory]  # by vehicle, of the scripts that remember
+    guarded: Any = None  # what the engine's guard remembers; None without one
+
+    def take(self, rows: Ints) -> Moment:
+        """Some of the rows, or one of them several times."""
+        guarded = None if self.guarded is None else self.guarded.take(rows)
+        state, params, clock, wanted, memories = take_memory(self[:5], rows)
+        return Moment(state, params, clock, wanted, memories, guarded)
+
+    @staticmethod
+    def join(moments: list[Moment]) -> Moment:
+        """The rows of all of them, one after the other; all are of one engine without a guard."""
+        if moments[0].guarded is not None:
+            raise InvalidInput("moments: a shield stands in their engine; what it remembers is not joined")
+        return Moment(*map_memory(lambda *parts: np.concatenate(parts), *(moment[:5] for moment in moments)))
+
+
+class Engine:
     """A batch of ``n`` running episodes of one scenario.
 
     Steps start when the first of the ``deciders`` may act; with none, at t = 0. A ``guard`` (a shield) may stand
@@ -883,6 +825,16 @@ class Engine(Running):
     (4, (1,), array([0.5, 0.5, 0.5, 0.5]))
 
     """
+
+    roster: Roster  # who runs in which row, and which worlds failed
+    _state: Floats  # of the running episodes, as rows of ``physics.batch``
+    _params: Floats
+    _clock: Floats  # [n, CLOCK_WIDTH]
+    _wanted: Floats  # [n, N] m/s2
+    _potential: Floats  # [n, N]
+    _obstacle: bool  # the rows have columns of an obstacle
+    _by_link: bool  # ... of news by link
+    _plan: Plan  # of what a vehicle observes
 
     def __init__(
         self,
@@ -934,6 +886,57 @@ class Engine(Running):
     def seed(self) -> int:
         """Seed of the training stream."""
         return self._stream.seed
+
+    @property
+    def packed(self) -> Packed:
+        """The running worlds themselves, as rows of ``physics.batch``: for kernels to read, not to be changed."""
+        return Packed(self._state, self._params)
+
+    @property
+    def wanted_mps2(self) -> Floats:
+        """What each vehicle wanted in the last step, [n, N]: for kernels to read, not to be changed."""
+        return self._wanted
+
+    @property
+    def worlds(self) -> Worlds:
+        """The worlds as they are now, in their own memory."""
+        return self.packed.worlds()
+
+    @property
+    def ledger(self) -> Ledger:
+        """Harm of the running episodes so far, in its own memory."""
+        packed, column = self.packed, self.packed.column
+        return Ledger(*packed.ledger(), packed.params[:, column.mass : column.limit].copy())
+
+    @property
+    def ended(self) -> Bools:
+        """Episodes that have ended, [n]."""
+        return np.asarray(self._clock[:, ENDED] == 1.0, np.bool_)
+
+    @property
+    def steps(self) -> Ints:
+        """Steps that the running episodes have taken, [n]."""
+        return self._clock[:, STEP].astype(np.int64)
+
+    def observe(self, vehicle: int) -> Observations:
+        """Current observation of one vehicle, [n, F]."""
+        if not 0 <= vehicle < self.scenario.vehicles:
+            raise InvalidInput(f"observe: vehicle index {vehicle}; must be in 0..{self.scenario.vehicles - 1}")
+        return self.observe_all(np.array([vehicle]))[:, 0]
+
+    def observe_all(self, vehicles: Ints, rows: Ints | None = None) -> Observations:
+        """Current observations of several vehicles, [n, len(vehicles), F]; only of the worlds ``rows`` if given."""
+        state, params = self._state, self._params
+        if rows is not None:
+            state, params = state.take(rows, axis=0), params.take(rows, axis=0)
+        if not self._plan.extras:
+            return self._plan.observe(state, params, vehicles)
+        steps = self._clock[:, STEP] if rows is None else self._clock[rows, STEP]
+        return self._plan.observe(state, params, vehicles, steps)
+
+    def _kept(self, packed: Packed) -> Packed:
+        """Rows as wide as they are kept: with columns of an obstacle, and of news by link, if the first had such."""
+        return packed.widened(self._obstacle, self._by_link)
 
     def memory(self, watcher: Watcher) -> Any:
         """What a watcher remembers of the running episodes."""
@@ -1223,253 +1226,69 @@ class Engine(Running):
             before = then
         yield before, last_mps2, self._state[:, self.packed.column.time].copy()
 
+    def snapshot(self) -> Arrays:
+        """Copies of everything that changes while it runs: its rows, its place in the stream, the scripts' memories.
 
-# A running engine as plain arrays, and back: its worlds go on as if nothing had happened, to the same bits.
+        The stream is one number: worlds are pure functions of the seed and of where they stand in it.
+        """
+        arrays: Arrays = {name.lstrip("_"): getattr(self, name).copy() for name in RUNNING}
+        arrays["stream"] = np.array([self.seed, self._stream.position], np.uint64)
+        return arrays | {f"script.{name}": array for name, array in _flat(self.memories).items()}
 
-Arrays = dict[str, NDArray[Any]]
+    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Go on from the ``snapshot`` of an engine of the same scenario, size and scripts, as if nothing had happened.
 
+        Raises ``InvalidInput``, before anything is changed, naming the array that is missing or has another shape, and
+        where a shield stands in the engine, which would know nothing of these worlds.
+        """
+        if self.guard is not None:
+            raise InvalidInput(
+                "engine snapshot: a shield stands in this engine; restore first, then put the shield around"
+            )
+        for name in RUNNING:
+            have, wanted = arrays.get(name.lstrip("_")), getattr(self, name)
+            if have is None or have.shape != wanted.shape:
+                shape = "nothing" if have is None else have.shape
+                raise InvalidInput(f"engine snapshot: {name.lstrip('_')} is {shape}; {wanted.shape} is needed")
+        memories = {vehicle: checked_memory(_unflat(arrays, f"script.{vehicle}"), self.n) for vehicle in self.memories}
+        for name in RUNNING:
+            setattr(self, name, np.array(arrays[name.lstrip("_")], np.float64))
+        seed, taken = (int(number) for number in arrays["stream"])
+        self._stream.restart(seed, taken)
+        self.roster = Roster(self.n, seed, None)  # a snapshot does not keep the numbers of running episodes
+        self.memories = memories
 
-def engine_snapshot(engine: Engine) -> Arrays:
-    """Copies of everything that changes while the engine runs: its rows, its place in the stream, scripts' memories.
+    def moment(self) -> Moment:
+        """The present moment of all rows, in its own memory."""
+        rows = [array.copy() for array in (self._state, self._params, self._clock, self._wanted)]
+        return Moment(rows[0], rows[1], rows[2], rows[3], self.memories, self.guarded)
 
-    The stream is one number: worlds are pure functions of the seed and of where they stand in it.
-    """
-    arrays: Arrays = {name.lstrip("_"): getattr(engine, name).copy() for name in RUNNING}
-    stream = engine._stream
-    arrays["stream"] = np.array([stream.seed, stream.position], np.uint64)
-    return arrays | {f"script.{name}": array for name, array in _flat(engine.memories).items()}
+    def first_moments(self, count: int) -> tuple[Worlds, Moment]:
+        """The first ``count`` worlds of the training stream, at the alert, and at their first decision."""
+        stream = copy.copy(self._stream)
+        stream.restart(self.seed)
+        alert, new = stream.take(count).alert, self._unwatched(count)
+        new.protect(None)
+        new.reset(worlds=alert)
+        return alert, new.moment()
 
+    def branch(self, moment: Moment) -> Engine:
+        """An engine of the same scenario whose rows go on from ``moment``, under the same guard; this one stays.
 
-def restore_engine(engine: Engine, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Bring an engine of the same scenario, size and scripts to the state of ``engine_snapshot``.
+        Raises ``InvalidInput`` for an engine with a reward that is shaped, which tells of more than what happens.
+        """
+        if self.reward.shaping > 0.0:
+            raise InvalidInput(f"branches: reward: shaping = {self.reward.shaping:g}: must be 0; a branch has an end")
+        new = self._unwatched(len(moment.state))
+        new.memories, new.guarded, new.ruling = moment.memories, moment.guarded, None
+        new.roster = Roster(new.n, self.seed, None)
+        new.roster.warns = False
+        new._state, new._params, new._clock, new._wanted = (array.copy() for array in moment[:4])
+        new._potential = np.zeros(moment.wanted.shape)
+        return new
 
-    Raises ``InvalidInput``, before anything is changed, naming the array that is missing or has another shape, and
-    where a shield stands in the engine, which would know nothing of these worlds.
-    """
-    if engine.guard is not None:
-        raise InvalidInput("engine snapshot: a shield stands in this engine; restore first, then put the shield around")
-    for name in RUNNING:
-        have, wanted = arrays.get(name.lstrip("_")), getattr(engine, name)
-        if have is None or have.shape != wanted.shape:
-            shape = "nothing" if have is None else have.shape
-            raise InvalidInput(f"engine snapshot: {name.lstrip('_')} is {shape}; {wanted.shape} is needed")
-    memories = {vehicle: checked_memory(_unflat(arrays, f"script.{vehicle}"), engine.n) for vehicle in engine.memories}
-    for name in RUNNING:
-        setattr(engine, name, np.array(arrays[name.lstrip("_")], np.float64))
-    seed, taken = (int(number) for number in arrays["stream"])
-    engine._stream.restart(seed)
-    engine._stream._drawn = taken
-    engine.roster = Roster(engine.n, seed, None)  # a snapshot does not keep the numbers of running episodes
-    engine.memories = memories
-
-
-def _flat(memory: Memory) -> Arrays:
-    """The arrays of a memory, by their place in it; an empty one stands for what is not remembered yet."""
-    if isinstance(memory, Mapping | tuple):
-        parts = memory.items() if isinstance(memory, Mapping) else enumerate(memory)
-        return {f"{key}.{name}" if name else str(key): array for key, of in parts for name, array in _flat(of).items()}
-    return {"": np.zeros(0) if memory is None else np.array(memory)}
-
-
-def _unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
-    """The memory whose arrays stand at a place, in its own arrays; numbers are places in a tuple."""
-    if place in arrays:
-        return np.array(arrays[place]) if arrays[place].shape != (0,) else None
-    inner = dict.fromkeys(name[len(place) + 1 :].partition(".")[0] for name in arrays if name.startswith(f"{place}."))
-    if not inner:
-        raise InvalidInput(f"engine snapshot: {place} is nothing; the memory of that vehicle's script is needed")
-    parts = {name: _unflat(arrays, f"{place}.{name}") for name in inner}
-    return tuple(parts[str(k)] for k in range(len(parts))) if "0" in parts else parts
-
-
-# Branches of running episodes: the same moment, played on to the end in more than one way.
-#
-# A learner's action is moved by an offset for a few steps; then the policy goes on in closed loop. What two branches
-# gain differs by nothing but the offset: everything else in them is the same, to the bit.
-
-ROUNDING_MPS2 = 1e-5  # a command that differs by less is the same: networks round by the size of their batch
-
-Act = Callable[[Observations], NDArray[np.float32]]  # observations [rows, F] -> actions [rows] in [-1, 1]
-
-Decide = Callable[[Observations, Ints, int], Floats]  # what is seen [m, L, F] in rows [m], steps made -> actions [m, L]
-
-
-class Moment(NamedTuple):
-    """Running worlds between two steps, row by row."""
-
-    state: Floats  # as rows of ``physics.batch``
-    params: Floats
-    clock: Floats
-    wanted: Floats
-    memories: dict[int, Memory]  # by vehicle, of the scripts that remember
-    guarded: Any = None  # what the engine's guard remembers; None without one
-
-    def take(self, rows: Ints) -> Moment:
-        """Some of the rows, or one of them several times."""
-        guarded = None if self.guarded is None else self.guarded.take(rows)
-        state, params, clock, wanted, memories = take_memory(self[:5], rows)
-        return Moment(state, params, clock, wanted, memories, guarded)
-
-
-class Offsets(NamedTuple):
-    """How one learner's actions in each row differ from those of its policy."""
-
-    learner: Ints  # [n] place among the learners
-    size: Floats  # [n] added to its action, which stays in [-1, 1]
-    steps: Ints  # [n] for so many steps, at least 1
-
-
-def no_offsets(n: int) -> Offsets:
-    """Of the first learner in ``n`` rows: its policy drives."""
-    return Offsets(np.zeros(n, np.int64), np.zeros(n), np.zeros(n, np.int64))
-
-
-def moment_of(engine: Engine) -> Moment:
-    """The present moment of all rows, in its own memory."""
-    rows = [array.copy() for array in (engine._state, engine._params, engine._clock, engine._wanted)]
-    return Moment(rows[0], rows[1], rows[2], rows[3], engine.memories, engine.guarded)
-
-
-def first_moments(engine: Engine, count: int) -> tuple[Worlds, Moment]:
-    """The first ``count`` worlds of the engine's training stream, at the alert, and at their first decision."""
-    stream = copy.copy(engine._stream)
-    stream.restart(engine.seed)
-    alert, new = stream.take(count).alert, _unwatched(engine, count)
-    new.protect(None)
-    new.reset(worlds=alert)
-    return alert, moment_of(new)
-
-
-def join_moments(moments: list[Moment]) -> Moment:
-    """The rows of all of them, one after the other; all are of one engine without a guard."""
-    if moments[0].guarded is not None:
-        raise InvalidInput("moments: a shield stands in their engine; what it remembers is not joined")
-    return Moment(*map_memory(lambda *parts: np.concatenate(parts), *(moment[:5] for moment in moments)))
-
-
-def branch(engine: Engine, moment: Moment) -> Engine:
-    """An engine of the same scenario whose rows go on from ``moment``, under the same guard; ``engine`` is not touched.
-
-    Raises ``InvalidInput`` for an engine with a reward that is shaped, which tells of more than what happens.
-    """
-    if engine.reward.shaping > 0.0:
-        raise InvalidInput(f"branches: reward: shaping = {engine.reward.shaping:g}: must be 0; a branch has an end")
-    new = _unwatched(engine, len(moment.state))
-    new.memories, new.guarded, new.ruling = moment.memories, moment.guarded, None
-    new.roster = Roster(new.n, engine.seed, None)
-    new.roster.warns = False
-    new._state, new._params, new._clock, new._wanted = (array.copy() for array in moment[:4])
-    new._potential = np.zeros(moment.wanted.shape)
-    return new
-
-
-def _unwatched(engine: Engine, n: int) -> Engine:
-    """An engine of the same scenario for ``n`` worlds, which nobody watches; its rows are still to be set."""
-    new = copy.copy(engine)
-    new.n, new._watched = n, {}
-    return new
-
-
-def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) -> tuple[Floats, Floats]:
-    """Play every row to the end of its episode; what its learner of ``offsets`` gains, and how far it was moved.
-
-    Args:
-        engine: branches, which this changes.
-        act: drives all learners, by nothing but what is seen.
-        offsets: whose actions are moved in each row, how far, and how long.
-        gamma: discount of one time step.
-
-    Returns the return [n] of that learner from now on (NaN for a row that could not be advanced), and the sum of the
-    offsets that its actions, which stay in [-1, 1], had room for [n]. Where the reward is of harm alone, a row ends as
-    soon as nothing can change any more.
-
-    """
-    moved, most = np.zeros(engine.n), int(offsets.steps.max(initial=0))
-
-    def decide(seen: Observations, rows: Ints, number: int) -> Floats:
-        wanted = act(seen.reshape(-1, seen.shape[2])).astype(np.float64).reshape(seen.shape[:2])
-        if number < most:
-            _add(wanted, offsets, rows, number, moved)
-        return wanted
-
-    gained = play_on(engine, decide, gamma, at_least=most)
-    return gained[np.arange(engine.n), offsets.learner], moved
-
-
-def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) -> Floats:
-    """Play every row to the end of its episode, ``at_least`` so many steps; what each learner gains, [n, L].
-
-    ``decide`` gives the learners' actions. The rest is as for ``play_to_the_end``.
-    """
-    vehicles = np.array(engine.learners, np.int64)
-    gained, actions = np.zeros((engine.n, len(vehicles))), np.zeros((engine.n, len(vehicles)))
-    running, discount, number = np.flatnonzero(~engine.ended), 1.0, 0
-    only_harm = set(engine.reward_terms) <= {"harm"}
-    while len(running):
-        before = engine._state.take(running, axis=0)
-        actions[running] = decide(engine.observe_all(vehicles, running), running, number)
-        step = engine.step(actions)
-        gained[running] += discount * step.reward[running][:, vehicles]
-        goes_on = ~engine.ended[running]
-        if only_harm and number >= at_least:
-            goes_on &= ~_stands_for_good(engine, before, running)
-        running = running[goes_on]
-        discount *= gamma
-        number += 1
-    gained[list(engine.roster.failed)] = np.nan
-    return gained
-
-
-def visit(engine: Engine, act: Act) -> tuple[Observations, Moment]:
-    """Play every row to its end by ``act``: what is seen at each decision [m, L, F], and those moments [m]."""
-    seen_then, moments = [], []
-
-    def decide(seen: Observations, rows: Ints, number: int) -> Floats:
-        seen_then.append(seen)
-        moments.append(moment_of(engine).take(rows))
-        return act(seen.reshape(-1, seen.shape[2])).astype(np.float64).reshape(seen.shape[:2])
-
-    play_on(engine, decide, 1.0)
-    return np.concatenate(seen_then), join_moments(moments)
-
-
-def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
-    """In which of ``rows`` everything stands as it stood ``before`` [rows], and the same is going to be done again.
-
-    A policy that sees the same does the same, and no latency or news is left that could change what it sees.
-    """
-    if engine.packed.has_messages:
-        return np.zeros(len(rows), np.bool_)  # what is still on its way may change what it sees
-    stands = np.empty(len(rows), np.bool_)
-    find_standing(engine._state, before, engine._params, rows, stands)
-    return stands
-
-
-@compiled
-def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, stands: Bools) -> None:
-    """Fill ``stands`` [m] for ``rows`` [m] of ``state``, which stood as ``before`` [m]."""
-    column = columns(state)
-    by_link = params.shape[1] > column.own_latency
-    for m in range(rows.shape[0]):
-        k, same = rows[m], True
-        for c in range(column.speed, column.command):
-            same = same and before[m, c] == 0.0 and state[k, c] == 0.0
-        if same:
-            for c in range(column.gap, column.harm):
-                same = same and state[k, c] == before[m, c]
-            for c in range(column.command, column.previous):
-                same = same and abs(state[k, c] - before[m, c]) < ROUNDING_MPS2
-            for c in range(column.latency, params.shape[1]):
-                known = column.latency <= c < column.mass or (by_link and c >= column.news)
-                same = same and (not known or params[k, c] < before[m, column.time] or np.isinf(params[k, c]))
-        stands[m] = same
-
-
-def _add(wanted: Floats, offsets: Offsets, running: Ints, number: int, moved: Floats) -> None:
-    """Add the offsets that still last to the actions ``wanted`` [running, L], and to what was ``moved`` so far."""
-    some = np.flatnonzero(number < offsets.steps[running])
-    rows = running[some]
-    before = wanted[some, offsets.learner[rows]]
-    after = np.clip(before + offsets.size[rows], -1.0, 1.0)
-    wanted[some, offsets.learner[rows]] = after
-    moved[rows] += after - before
+    def _unwatched(self, n: int) -> Engine:
+        """An engine of the same scenario for ``n`` worlds, which nobody watches; its rows are still to be set."""
+        new = copy.copy(self)
+        new.n, new._watched = n, {}
+        return new

@@ -10,7 +10,7 @@ import pytest
 
 from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.engine import Engine, engine_snapshot, restore_engine
+from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import FailedWorld, PhysicsError
 from ethbrake_marl.physics import Worlds, advance, forecast, leaving_out_failed
 from ethbrake_marl.scenario import Scenario, load_scenario
@@ -109,7 +109,7 @@ def test_engine__cuts_the_episode_off_names_the_world_and_steps_the_others():
 
 def test_engine__after_a_snapshot_names_the_row():
     running, other = engine(), engine(seed=9)
-    restore_engine(other, engine_snapshot(running))
+    other.restore(running.snapshot())
     break_row(other, 2)
     with pytest.warns(FailedWorld, match=r"^the world of row 2: a contact was missed"):
         other.step(np.zeros((3, 1)))

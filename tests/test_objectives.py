@@ -9,7 +9,7 @@ import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine import Engine
-from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.envs.interfaces import parallel_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import STANDARD, Ledger, objective_harm, objectives_of, parse_objective, scored
 from ethbrake_marl.physics.batch import Impacts

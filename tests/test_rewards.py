@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from ethbrake_marl import rewards as terms
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine import Engine
-from ethbrake_marl.envs.common import make_engine
+from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import InvalidInput, UnknownName, WithoutEffect
 from ethbrake_marl.physics import advance, forecast, make_worlds
 from ethbrake_marl.rewards import REWARDS, RewardParams, StepOutcome, reward_params

@@ -5,16 +5,6 @@ from typing import TYPE_CHECKING
 from ethbrake_marl.doors import front_door
 
 if TYPE_CHECKING:
-    from ethbrake_marl.envs.common import (
-        COLUMNS as COLUMNS,
-        LISTED_WORLD as LISTED_WORLD,
-        Report as Report,
-        action_box as action_box,
-        feature_box as feature_box,
-        make_engine as make_engine,
-        report as report,
-        resolve_scenario as resolve_scenario,
-    )
     from ethbrake_marl.envs.drawing import (
         BODY_M as BODY_M,
         COLOURS as COLOURS,
@@ -24,14 +14,23 @@ if TYPE_CHECKING:
         animate_films as animate_films,
         vehicle_colour as vehicle_colour,
     )
-    from ethbrake_marl.envs.gym import EthBrakeEnv as EthBrakeEnv, EthBrakeVectorEnv as EthBrakeVectorEnv
-    from ethbrake_marl.envs.parallel import (
+    from ethbrake_marl.envs.interfaces import (
+        COLUMNS as COLUMNS,
+        LISTED_WORLD as LISTED_WORLD,
+        EthBrakeEnv as EthBrakeEnv,
         EthBrakeParallelEnv as EthBrakeParallelEnv,
+        EthBrakeVectorEnv as EthBrakeVectorEnv,
         InTurns as InTurns,
+        Report as Report,
+        action_box as action_box,
         env as env,
+        feature_box as feature_box,
         in_turns as in_turns,
+        make_engine as make_engine,
         parallel_env as parallel_env,
         raw_env as raw_env,
+        report as report,
+        resolve_scenario as resolve_scenario,
     )
     from ethbrake_marl.envs.registration import (
         GYMNASIUM_ID as GYMNASIUM_ID,

@@ -15,9 +15,7 @@ def register_environments() -> None:
         if id_ in gymnasium.registry:
             continue
         gymnasium.register(
-            id_,
-            entry_point="ethbrake_marl.envs.gym:EthBrakeEnv",
-            vector_entry_point="ethbrake_marl.envs.gym:EthBrakeVectorEnv",
+            id_, entry_point="ethbrake_marl.envs:EthBrakeEnv", vector_entry_point="ethbrake_marl.envs:EthBrakeVectorEnv"
         )
     if PETTINGZOO_ID not in pettingzoo.parallel_registry:
         pettingzoo.register("parallel", PETTINGZOO_ID, "ethbrake_marl.ethbrake_v0:parallel_env")

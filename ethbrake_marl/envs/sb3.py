@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
-from ethbrake_marl.engine import Arrays, Engine, Step, engine_snapshot, restore_engine
-from ethbrake_marl.envs.common import (
+from ethbrake_marl.engine import Arrays, Engine, Step
+from ethbrake_marl.envs.interfaces import (
     INITIAL_STATE,
     AnyScenario,
     action_box,
@@ -23,7 +23,6 @@ from ethbrake_marl.envs.common import (
     make_engine,
     plain_infos,
     report,
-    restart_from,
     warn_of_unknown,
 )
 from ethbrake_marl.errors import InvalidInput
@@ -121,7 +120,7 @@ class EthBrakeVecEnv(VecEnv):
         self.horizon_is_end = horizon_is_end
         self.appended = appended
         self.step_infos = step_infos
-        self._next_seed: int | None = seed
+        self._next_seed: int | None = int(seed)
         self._learners = np.array(engine.learners, np.int64)
         self._actions: NDArray[Any] | None = None
         rows = engine.n * len(engine.learners)
@@ -146,7 +145,7 @@ class EthBrakeVecEnv(VecEnv):
             worlds = self._read_options()
         finally:
             self._reset_options()
-        restart_from(self.engine, self._next_seed, worlds)
+        self.engine.reset(seed=self._next_seed, worlds=worlds)
         self._next_seed = None
         self._return[:], self._steps[:] = 0.0, 0
         self._started = True
@@ -181,7 +180,7 @@ class EthBrakeVecEnv(VecEnv):
         return self._observe(), reward.astype(np.float32), self._by_row(over), infos
 
     def describe_worlds(self) -> dict[str, NDArray[Any]]:
-        """What each running world was drawn as: columns by name, each [worlds]; see ``envs.common``."""
+        """What each running world was drawn as: columns by name, each [worlds]."""
         if not self._started:
             raise InvalidInput("describe_worlds: no episode was started; call reset first")
         return describe_worlds(self.engine)
@@ -191,13 +190,13 @@ class EthBrakeVecEnv(VecEnv):
 
     def snapshot(self) -> Arrays:
         """Copies of everything that changes while it runs, between two steps."""
-        arrays = {f"engine.{name}": array for name, array in engine_snapshot(self.engine).items()}
+        arrays = {f"engine.{name}": array for name, array in self.engine.snapshot().items()}
         return arrays | {"return": self._return.copy(), "steps": self._steps.copy(), "begun": self._begun.copy()}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Go on from a ``snapshot`` of the same scenario and size, without a reset; raises ``InvalidInput``."""
         prefix = "engine."
-        restore_engine(self.engine, {n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)})
+        self.engine.restore({n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)})
         self._return, self._steps = arrays["return"].copy(), arrays["steps"].copy()
         self._begun = arrays["begun"].copy()
         self._next_seed, self._started = None, True

@@ -34,20 +34,7 @@ from torch.optim import Optimizer
 
 from ethbrake_marl.actions import command_to_action
 from ethbrake_marl.defaults import HarmCount
-from ethbrake_marl.engine import (
-    Act,
-    Engine,
-    Moment,
-    Offsets,
-    branch,
-    first_moments,
-    join_moments,
-    moment_of,
-    no_offsets,
-    play_on,
-    play_to_the_end,
-    visit,
-)
+from ethbrake_marl.engine import Engine, Moment
 from ethbrake_marl.envs import EthBrakeVecEnv
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.learning.training import (
@@ -61,7 +48,7 @@ from ethbrake_marl.learning.training import (
     Training,
 )
 from ethbrake_marl.observations import Observations
-from ethbrake_marl.physics import Bools, Floats, Ints, Packed, Worlds
+from ethbrake_marl.physics import Bools, Floats, Ints, Packed, Worlds, columns, compiled
 from ethbrake_marl.policies import Activation, Float32s, NetworkSpec, Policy, load_named_policy
 from ethbrake_marl.search import profile_problem
 
@@ -334,6 +321,125 @@ def sac_arguments(shape: SquashedShape) -> dict[str, Any]:
     }
 
 
+# Branches of running episodes: the same moment, played on to the end in more than one way.
+#
+# A learner's action is moved by an offset for a few steps; then the policy goes on in closed loop. What two branches
+# gain differs by nothing but the offset: everything else in them is the same, to the bit.
+
+ROUNDING_MPS2 = 1e-5  # a command that differs by less is the same: networks round by the size of their batch
+
+Act = Callable[[Observations], Float32s]  # observations [rows, F] -> actions [rows] in [-1, 1]
+
+Decide = Callable[[Observations, Ints, int], Floats]  # what is seen [m, L, F] in rows [m], steps made -> actions [m, L]
+
+
+class Offsets(NamedTuple):
+    """How one learner's actions in each row differ from those of its policy."""
+
+    learner: Ints  # [n] place among the learners
+    size: Floats  # [n] added to its action, which stays in [-1, 1]
+    steps: Ints  # [n] for so many steps, at least 1
+
+
+def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) -> tuple[Floats, Floats]:
+    """Play every row to the end of its episode; what its learner of ``offsets`` gains, and how far it was moved.
+
+    Args:
+        engine: branches, which this changes.
+        act: drives all learners, by nothing but what is seen.
+        offsets: whose actions are moved in each row, how far, and how long.
+        gamma: discount of one time step.
+
+    Returns the return [n] of that learner from now on (NaN for a row that could not be advanced), and the sum of the
+    offsets that its actions, which stay in [-1, 1], had room for [n]. Where the reward is of harm alone, a row ends as
+    soon as nothing can change any more.
+
+    """
+    moved, most = np.zeros(engine.n), int(offsets.steps.max(initial=0))
+
+    def decide(seen: Observations, rows: Ints, number: int) -> Floats:
+        wanted = act(seen.reshape(-1, seen.shape[2])).astype(np.float64).reshape(seen.shape[:2])
+        some = np.flatnonzero(number < offsets.steps[rows])  # whose offset still lasts
+        lasting = rows[some]
+        before = wanted[some, offsets.learner[lasting]]
+        after = np.clip(before + offsets.size[lasting], -1.0, 1.0)
+        wanted[some, offsets.learner[lasting]] = after
+        moved[lasting] += after - before
+        return wanted
+
+    gained = play_on(engine, decide, gamma, at_least=most)
+    return gained[np.arange(engine.n), offsets.learner], moved
+
+
+def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) -> Floats:
+    """Play every row to the end of its episode, ``at_least`` so many steps; what each learner gains, [n, L].
+
+    ``decide`` gives the learners' actions. The rest is as for ``play_to_the_end``.
+    """
+    vehicles = np.array(engine.learners, np.int64)
+    gained, actions = np.zeros((engine.n, len(vehicles))), np.zeros((engine.n, len(vehicles)))
+    running, discount, number = np.flatnonzero(~engine.ended), 1.0, 0
+    only_harm = set(engine.reward_terms) <= {"harm"}
+    while len(running):
+        before = engine.packed.state.take(running, axis=0)
+        actions[running] = decide(engine.observe_all(vehicles, running), running, number)
+        step = engine.step(actions)
+        gained[running] += discount * step.reward[running][:, vehicles]
+        goes_on = ~engine.ended[running]
+        if only_harm and number >= at_least:
+            goes_on &= ~_stands_for_good(engine, before, running)
+        running = running[goes_on]
+        discount *= gamma
+        number += 1
+    gained[list(engine.roster.failed)] = np.nan
+    return gained
+
+
+def visit(engine: Engine, act: Act) -> tuple[Observations, Moment]:
+    """Play every row to its end by ``act``: what is seen at each decision [m, L, F], and those moments [m]."""
+    seen_then, moments = [], []
+
+    def decide(seen: Observations, rows: Ints, number: int) -> Floats:
+        seen_then.append(seen)
+        moments.append(engine.moment().take(rows))
+        return act(seen.reshape(-1, seen.shape[2])).astype(np.float64).reshape(seen.shape[:2])
+
+    play_on(engine, decide, 1.0)
+    return np.concatenate(seen_then), Moment.join(moments)
+
+
+def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
+    """In which of ``rows`` everything stands as it stood ``before`` [rows], and the same is going to be done again.
+
+    A policy that sees the same does the same, and no latency or news is left that could change what it sees.
+    """
+    if engine.packed.has_messages:
+        return np.zeros(len(rows), np.bool_)  # what is still on its way may change what it sees
+    (state, params), stands = engine.packed, np.empty(len(rows), np.bool_)
+    find_standing(state, before, params, rows, stands)
+    return stands
+
+
+@compiled
+def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, stands: Bools) -> None:
+    """Fill ``stands`` [m] for ``rows`` [m] of ``state``, which stood as ``before`` [m]."""
+    column = columns(state)
+    by_link = params.shape[1] > column.own_latency
+    for m in range(rows.shape[0]):
+        k, same = rows[m], True
+        for c in range(column.speed, column.command):
+            same = same and before[m, c] == 0.0 and state[k, c] == 0.0
+        if same:
+            for c in range(column.gap, column.harm):
+                same = same and state[k, c] == before[m, c]
+            for c in range(column.command, column.previous):
+                same = same and abs(state[k, c] - before[m, c]) < ROUNDING_MPS2
+            for c in range(column.latency, params.shape[1]):
+                known = column.latency <= c < column.mass or (by_link and c >= column.news)
+                same = same and (not known or params[k, c] < before[m, column.time] or np.isinf(params[k, c]))
+        stands[m] = same
+
+
 # Learning from exact counterfactuals: one actor, or several networks and a gate between them.
 #
 # The actor drives without exploration; some of its decisions are tried with a little more and a little less, each
@@ -347,7 +453,7 @@ class Counterfactual(Algorithm):
         """The model, from the policy of ``start`` if the recipe names one."""
         recipe = training.recipe
         assert isinstance(recipe, CounterfactualRecipe)
-        branch(environment.engine, moment_of(environment.engine))  # refuses what cannot be branched before it begins
+        environment.engine.branch(environment.engine.moment())  # refuses what cannot be branched before it begins
         model = (CounterfactualModel if recipe.modes is None else ModesModel)(environment, recipe)
         if recipe.start is not None:  # ppo@PATH, ppo@shipped or universal@shipped
             kind, _, path = recipe.start.partition("@")
@@ -565,14 +671,14 @@ class CounterfactualModel(BaseAlgorithm):
         for _ in range(self.recipe.n_steps):
             observations: Any = self._last_obs
             seen.append(observations)
-            moments.append(moment_of(self.engine))
+            moments.append(self.engine.moment())
             new_obs, rewards, dones, infos = self.rows.step(act(observations)[:, np.newaxis])
             self.num_timesteps += self.n_envs
             self._update_info_buffer([infos[row] for row in np.flatnonzero(dones)], dones[dones])  # others tell nothing
             self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]
             told.update_locals(locals())
             told.on_step()
-        return np.stack(seen), join_moments(moments)
+        return np.stack(seen), Moment.join(moments)
 
     def _try_out(self, seen: Float32s, moments: Moment, actor: _Deterministic) -> Tried:
         """Try some of the visited decisions with more and with less, each to the end of its episode."""
@@ -584,7 +690,7 @@ class CounterfactualModel(BaseAlgorithm):
         sizes: Floats = least * (most / least) ** torch.rand(len(rows), dtype=torch.float64).numpy()
         holds = np.array(recipe.holds, np.int64)[torch.randint(len(recipe.holds), (len(rows),)).numpy()]
         worlds: Ints = np.tile(rows // learners, 2)
-        engine = branch(self.engine, moments.take(worlds))
+        engine = self.engine.branch(moments.take(worlds))
         offsets = Offsets(np.tile(rows % learners, 2), np.concatenate([sizes, -sizes]), np.tile(holds, 2))
         gained, moved = (np.split(each, 2) for each in play_to_the_end(engine, actor.act, offsets, recipe.gamma))
         limit = recipe.gradient_limit
@@ -799,7 +905,7 @@ class Shown(NamedTuple):
 
 def explore(engine: Engine, plan: ModesPlan, acts: Sequence[Act], gamma: float) -> Explored:
     """The first worlds of the training, each driven by every network from its start to its end."""
-    alert, start = first_moments(engine, plan.worlds)
+    alert, start = engine.first_moments(plan.worlds)
     gained, harm = np.full(plan.worlds, -np.inf), np.full(plan.worlds, np.inf)
     for act in acts:
         its_gain, its_harm = drive_from(engine, start, act, gamma)
@@ -814,8 +920,9 @@ def drive_from(
 
     The harm is of the reward's count unless another one is given.
     """
-    rows = branch(engine, start)
-    gained, _ = play_to_the_end(rows, act, no_offsets(rows.n), gamma)
+    rows = engine.branch(start)
+    nowhere = np.zeros(rows.n, np.int64)
+    gained, _ = play_to_the_end(rows, act, Offsets(nowhere, np.zeros(rows.n), nowhere), gamma)
     return gained, rows.ledger.world_harm(engine.reward.harm_count if count is None else count)
 
 
@@ -844,7 +951,7 @@ def show_templates(engine: Engine, plan: ModesPlan, found: Explored, gamma: floa
         wanted: Floats = actions[some, number][:, np.newaxis]
         return wanted
 
-    gained = play_on(branch(engine, found.start.take(rows)), decide, gamma)[:, 0]
+    gained = play_on(engine.branch(found.start.take(rows)), decide, gamma)[:, 0]
     better: Bools = gained > found.gained[rows] + plan.gain
     if not where:
         return Shown(np.zeros((0, engine.observation.size), np.float32), np.zeros(0, np.float32))
@@ -929,7 +1036,7 @@ class ModesModel(CounterfactualModel):
         if stage.does == "further":  # whole episodes in some of the stage's own worlds
             assert self._own is not None
             some = torch.randint(len(self._own.state), (self.n_envs,)).numpy()
-            found, moments = visit(branch(self.engine, self._own.take(some)), member.act)
+            found, moments = visit(self.engine.branch(self._own.take(some)), member.act)
             seen = found.reshape(1, -1, found.shape[2])
             self.num_timesteps += each
         else:

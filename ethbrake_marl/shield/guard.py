@@ -47,7 +47,6 @@ from ethbrake_marl.engine import (
     Guard,
     Memory,
     Ruling,
-    Running,
     Script,
     ask_script,
     begin_script,
@@ -240,7 +239,7 @@ class ShieldGuard(ABC):
         """The shield once episodes start in these rows; the one that is given may be changed."""
 
     @abstractmethod
-    def decide(self, running: Running, memory: Guarded, proposed: Floats) -> Ruling:
+    def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
         """What is applied instead of the actions [n, L]."""
 
     @abstractmethod
@@ -254,7 +253,7 @@ class ShieldGuard(ABC):
         policies = renew_memory(policies, rows, begun) if policies else begun
         return Guarded(self._started(self._apart(shield), alert, rows), policies)
 
-    def check(self, ruling: Ruling, after: Running) -> Guarded:
+    def check(self, ruling: Ruling, after: Engine) -> Guarded:
         """The memory as the ruling says: only step mode compares what a step led to."""
         memory: Guarded = ruling.memory
         return memory
@@ -340,7 +339,7 @@ class StepGuard(ShieldGuard):
             )
         return shield
 
-    def decide(self, running: Running, memory: Guarded, proposed: Floats) -> Ruling:
+    def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
         """What is certified. In a world whose episode is over as far as the shield foretold it is full braking."""
         shield: StepShield = memory.shield
         goes_on, finished = ~running.ended, shield.running.finished  # type: ignore[union-attr]  # it has begun
@@ -357,7 +356,7 @@ class StepGuard(ShieldGuard):
         stepped_in: Bools = np.any(decision.intervened.reshape(proposed.shape), axis=1)
         return Ruling(proposed, applied, stepped_in, goes_on & ~finished, decision, Guarded(after, memories))
 
-    def check(self, ruling: Ruling, after: Running) -> Guarded:
+    def check(self, ruling: Ruling, after: Engine) -> Guarded:
         """Compare what the step led to with what was certified, the last step included.
 
         Where something else was ``told`` than is, a difference makes the world distrusted. Worlds that the physics
@@ -438,7 +437,7 @@ class BelievedGuard(ShieldGuard):
         shield.begin(alert, self.vehicles[0], rows)
         return shield
 
-    def decide(self, running: Running, memory: Guarded, proposed: Floats) -> Ruling:
+    def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
         """What is certified in the believed worlds."""
         worlds = running.worlds
         proposed, memories = self._asked(worlds, memory.policies, proposed)
@@ -551,7 +550,7 @@ class EpisodeGuard(ShieldGuard):
         begun = begin_script(self._hybrid, alert, self.vehicles[0], self.scripts)
         return begun if shield is None else renew_memory(shield, rows, begun)
 
-    def decide(self, running: Running, memory: Guarded, proposed: Floats) -> Ruling:
+    def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
         """What the chosen agent does."""
         worlds = running.worlds
         command, hybrid = ask_script(self._hybrid, worlds, memory.shield, self.vehicles[0])

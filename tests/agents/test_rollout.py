@@ -8,7 +8,7 @@ import pytest
 from ethbrake_marl.agents import registry
 from ethbrake_marl.agents.registry import Team, drive, make_agent, register_agent, script_agents
 from ethbrake_marl.engine import Engine
-from ethbrake_marl.envs.common import make_engine
+from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.episodes import Task, film_scenes, follow_episodes, record_episode, record_episodes

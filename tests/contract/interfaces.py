@@ -11,8 +11,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from ethbrake_marl.envs.gym import EthBrakeEnv, EthBrakeVectorEnv
-from ethbrake_marl.envs.parallel import EthBrakeParallelEnv
+from ethbrake_marl.envs.interfaces import EthBrakeEnv, EthBrakeParallelEnv, EthBrakeVectorEnv
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario, load_scenario

@@ -15,7 +15,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from ethbrake_marl import ethbrake_v0
-from ethbrake_marl.envs.common import UnknownResetOption
+from ethbrake_marl.envs.interfaces import UnknownResetOption
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from tests.contract.interfaces import FIVE, PAPER, SCENARIOS
 

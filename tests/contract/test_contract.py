@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.envs.common import UnknownResetOption
+from ethbrake_marl.envs.interfaces import UnknownResetOption
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import Scenario
 from tests.contract.interfaces import (

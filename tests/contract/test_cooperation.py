@@ -10,7 +10,7 @@ from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
 
 from ethbrake_marl import ethbrake_v0
 from ethbrake_marl.defaults import HARM_COUNTS
-from ethbrake_marl.envs.common import make_engine
+from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.harm import empty_ledger
 from ethbrake_marl.physics import advance
@@ -104,7 +104,7 @@ def test_batch__of_one_is_row_k_of_a_batch_where_the_channel_is_fixed(name: str)
 def test_stable_baselines3__tells_the_news_of_each_learner_at_an_episodes_start() -> None:
     vec = make_sb3_vec_env(line(4), 3, seed=5)
     vec.reset()
-    known = vec.engine.known_from_s
+    known = vec.engine.packed.known_from_s
     told = [info["known_from_s"].tolist() for info in vec.reset_infos]
     assert told == [known[k, i].tolist() for k in range(3) for i in range(4)]
 

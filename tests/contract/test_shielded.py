@@ -17,9 +17,7 @@ from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, see
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.envs.common import UnknownResetOption
-from ethbrake_marl.envs.gym import EthBrakeVectorEnv
-from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.envs.interfaces import EthBrakeVectorEnv, UnknownResetOption, parallel_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from tests.contract import interfaces, test_contract as bare

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl import engine as snapshot
-from ethbrake_marl.engine import Offsets, branch, first_moments, join_moments, moment_of, play_to_the_end
-from ethbrake_marl.envs.common import make_engine
+from ethbrake_marl.engine import Moment
+from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.learning import algorithms
+from ethbrake_marl.learning.algorithms import Offsets, play_to_the_end
 
 PAIR = ["vehicle_2", "vehicle_3"]
 
@@ -34,25 +35,25 @@ def test_branch__without_an_offset_is_what_the_engine_does(learners):
     engine = make_engine("paper-random", 6, learners=learners, seed=3)
     moments, rewards = [], []
     for _ in range(90):
-        moments.append(moment_of(engine))
+        moments.append(engine.moment())
         rewards.append(step_by_policy(engine).reward)
     last = len(learners) - 1
-    whole = join_moments(moments[:5])
+    whole = Moment.join(moments[:5])
     offsets = Offsets(np.full(30, last), np.zeros(30), np.ones(30, np.int64))
-    before = moment_of(engine)
-    gained, moved = play_to_the_end(branch(engine, whole), act, offsets, 1.0)
+    before = engine.moment()
+    gained, moved = play_to_the_end(engine.branch(whole), act, offsets, 1.0)
     vehicle = engine.learners[last]
     to_come = [sum(r[:, vehicle] for r in rewards[k:]) for k in range(5)]
     np.testing.assert_allclose(gained, np.concatenate(to_come), rtol=1e-12)
     assert (moved == 0.0).all() and gained.min() < 0.0
-    assert all((a == b).all() for a, b in zip(before[:4], moment_of(engine)[:4], strict=True))  # untouched
+    assert all((a == b).all() for a, b in zip(before[:4], engine.moment()[:4], strict=True))  # untouched
 
 
 def test_branch__discounts_from_its_own_moment_on():
     engine = make_engine("paper-random", 4, seed=3)
-    whole = moment_of(engine)
+    whole = engine.moment()
     rewards = np.array([step_by_policy(engine).reward[:, 1] for _ in range(90)])
-    gained, _ = play_to_the_end(branch(engine, whole), act, no_offsets(4), 0.9)
+    gained, _ = play_to_the_end(engine.branch(whole), act, no_offsets(4), 0.9)
     np.testing.assert_allclose(gained, (0.9 ** np.arange(90)) @ rewards, rtol=1e-12)
 
 
@@ -61,12 +62,12 @@ def test_branch__moves_one_learner_for_some_steps_within_its_bounds():
     engine = make_engine("paper-random", 8, learners=PAIR, seed=5)
     for _ in range(3):
         step_by_policy(engine)
-    moment = moment_of(engine)
+    moment = engine.moment()
     sizes = np.array([0.2, -0.2, 0.05, -0.3, 1.9, -1.9, 0.1, -0.1])
     offsets = Offsets(np.array([0, 1] * 4), sizes, np.array([1, 2, 4, 1, 2, 4, 1, 2]))
-    gained, moved = play_to_the_end(branch(engine, moment), act, offsets, 1.0)
+    gained, moved = play_to_the_end(engine.branch(moment), act, offsets, 1.0)
     for k in range(8):
-        one = branch(engine, moment.take(np.array([k])))
+        one = engine.branch(moment.take(np.array([k])))
         total, way, number = 0.0, 0.0, 0
         while not one.ended[0]:
             seen = one.observe_all(np.array(one.learners))[0]
@@ -96,7 +97,7 @@ def test_branch__difference_is_the_gradient_of_the_harm():
     size = 1e-3
     both = Offsets(np.zeros(2, np.int64), np.array([size, -size]), np.ones(2, np.int64))
     half = np.float32(-0.5)
-    new = branch(engine, moment_of(engine).take(np.zeros(2, np.int64)))
+    new = engine.branch(engine.moment().take(np.zeros(2, np.int64)))
     gained, moved = play_to_the_end(new, lambda seen: np.full(len(seen), half), both, 1.0)
     assert gained.mean() == pytest.approx(-(400.0 - 6.0))
     assert (gained[0] - gained[1]) / (moved[0] - moved[1]) == pytest.approx(-12.0, rel=1e-6)
@@ -104,9 +105,9 @@ def test_branch__difference_is_the_gradient_of_the_harm():
 
 def test_branch__row_that_cannot_be_advanced_tells_nothing():
     engine = make_engine("paper-random", 3, seed=3)
-    moment = moment_of(engine)
+    moment = engine.moment()
     moment.state[1, -1 - 5] = np.nan
-    new = branch(engine, moment)
+    new = engine.branch(moment)
     new.roster.failed[1] = "a contact was missed"
     gained, _ = play_to_the_end(new, act, no_offsets(3), 1.0)
     assert np.isnan(gained[1]) and np.isfinite(gained[[0, 2]]).all()
@@ -115,7 +116,7 @@ def test_branch__row_that_cannot_be_advanced_tells_nothing():
 def test_branch__refuses_what_it_cannot_play():
     shaped = make_engine("paper-random", 2, reward={"harm": 1.0, "shaping": 0.1})
     with pytest.raises(InvalidInput, match=r"branches: reward: shaping = 0.1: must be 0"):
-        branch(shaped, moment_of(shaped))
+        shaped.branch(shaped.moment())
 
 
 @pytest.mark.parametrize("script", ["planner:8", "e_v2x_bm", "ppo@shipped"])
@@ -125,12 +126,12 @@ def test_branch__of_a_script_that_remembers_is_what_the_engine_does(script):
         early_impacts="keep", roles=roles, latency_s=[0.1, 0.4, {"uniform": [0.2, 0.7]}]
     )
     engine = make_engine(scenario, 3, seed=3)
-    _, start = first_moments(engine, 3)
-    assert all(np.array_equal(a, b) for a, b in zip(start[:4], moment_of(engine)[:4], strict=True))
+    _, start = engine.first_moments(3)
+    assert all(np.array_equal(a, b) for a, b in zip(start[:4], engine.moment()[:4], strict=True))
     for _ in range(4):
         engine.step(np.full((3, 1), -0.4))
     rows = np.array([2, 0, 2])
-    new = branch(engine, moment_of(engine).take(rows))
+    new = engine.branch(engine.moment().take(rows))
     while not engine.ended.all():
         engine.step(np.full((3, 1), -0.6))
     while not new.ended.all():
@@ -155,10 +156,10 @@ def test_branch__under_a_shield_around_a_policy_with_a_memory_is_what_the_engine
     for _ in range(4):
         engine.step({})
     rows = np.array([4, 0, 0, 3])
-    kept = moment_of(engine)
+    kept = engine.moment()
     harms = []
     for again in range(2):
-        new = branch(engine, kept.take(rows))
+        new = engine.branch(kept.take(rows))
         while not new.ended.all():
             new.step({})
         harms.append(new.ledger.total_harm.tolist())
@@ -179,8 +180,8 @@ def test_branch__ends_where_nothing_can_change_any_more(monkeypatch):
     taken = []
     for stop in (True, False):
         if not stop:
-            monkeypatch.setattr(snapshot, "_stands_for_good", lambda engine, before, rows: np.zeros(len(rows), bool))
-        new = branch(engine, moment_of(engine))
+            monkeypatch.setattr(algorithms, "_stands_for_good", lambda engine, before, rows: np.zeros(len(rows), bool))
+        new = engine.branch(engine.moment())
         taken.append((play_to_the_end(new, press, offsets, 1.0), new.steps.copy()))
     (early, some), (whole, every) = taken
     assert (early[0] == whole[0]).all() and (early[1] == whole[1]).all()

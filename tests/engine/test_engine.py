@@ -7,7 +7,7 @@ import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine import Engine, Stream
-from ethbrake_marl.envs.common import make_engine
+from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Worlds, advance
 from ethbrake_marl.scenario import initial_state_worlds, load_scenario

@@ -6,7 +6,7 @@ import numpy as np
 
 import ethbrake_marl as eb
 from ethbrake_marl.defaults import HARM_COUNTS
-from ethbrake_marl.envs.common import make_engine
+from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.physics import Worlds, advance
 from ethbrake_marl.scenario import load_scenario
 

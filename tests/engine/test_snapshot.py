@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.engine import Engine, engine_snapshot, restore_engine
-from ethbrake_marl.envs.common import make_engine
+from ethbrake_marl.engine import Engine
+from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.rewards import RewardParams
@@ -56,13 +56,13 @@ def test_restore_engine__the_next_steps_are_the_same_to_the_bit(scenario: Scenar
     first = make_engine(scenario, WORLDS, reward=given, seed=3)
     rng = np.random.default_rng(0)
     _steps(first, rng, before)
-    kept = {name: array.copy() for name, array in engine_snapshot(first).items()}
+    kept = {name: array.copy() for name, array in first.snapshot().items()}
     state = rng.bit_generator.state
     expected = _steps(first, rng, 50)
 
     second = make_engine(scenario, WORLDS, reward=given, seed=99)
     _steps(second, np.random.default_rng(5), 7)
-    restore_engine(second, kept)
+    second.restore(kept)
     rng.bit_generator.state = state
     for k, (a, b) in enumerate(zip(expected, _steps(second, rng, 50), strict=True)):
         assert np.array_equal(a, b), k
@@ -73,22 +73,22 @@ def test_restore_engine__the_next_steps_are_the_same_to_the_bit(scenario: Scenar
 
 def test_engine_snapshot__is_a_copy() -> None:
     engine = make_engine(SCENARIO, WORLDS, seed=3)
-    kept = engine_snapshot(engine)
+    kept = engine.snapshot()
     before = {name: array.copy() for name, array in kept.items()}
     _steps(engine, np.random.default_rng(0), 20)
     assert all(np.array_equal(kept[name], before[name]) for name in kept)
 
 
 def test_restore_engine__refuses_another_size_before_it_changes_anything() -> None:
-    kept = engine_snapshot(make_engine(SCENARIO, WORLDS, seed=3))
+    kept = make_engine(SCENARIO, WORLDS, seed=3).snapshot()
     other = make_engine(SCENARIO, WORLDS + 1, seed=3)
-    before = engine_snapshot(other)
+    before = other.snapshot()
     with pytest.raises(InvalidInput, match=r"engine snapshot: state is \(6, \d+\); \(7, \d+\) is needed"):
-        restore_engine(other, kept)
+        other.restore(kept)
     del kept["params"]
     with pytest.raises(InvalidInput, match="params is nothing"):
-        restore_engine(make_engine(SCENARIO, WORLDS, seed=3), kept)
-    assert all(np.array_equal(before[name], array) for name, array in engine_snapshot(other).items())
+        make_engine(SCENARIO, WORLDS, seed=3).restore(kept)
+    assert all(np.array_equal(before[name], array) for name, array in other.snapshot().items())
 
 
 def test_vec_env_snapshot__returns_and_lengths_of_running_episodes_go_on() -> None:

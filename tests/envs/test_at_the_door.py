@@ -10,7 +10,7 @@ import pytest
 from pettingzoo.test import api_test, parallel_api_test
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.parallel import env, parallel_env
+from ethbrake_marl.envs.interfaces import env, parallel_env
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.scenario import load_scenario
 

@@ -10,7 +10,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import NormalizeObservation
 
-from ethbrake_marl.envs.gym import EthBrakeEnv, EthBrakeVectorEnv
+from ethbrake_marl.envs.interfaces import EthBrakeEnv, EthBrakeVectorEnv
 from tests.contract.interfaces import PAPER, actions, initial_state
 
 MODES = ("NextStep", "SameStep")

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.engine import engine_snapshot, restore_engine
-from ethbrake_marl.envs.common import describe_worlds
+from ethbrake_marl.envs.interfaces import describe_worlds
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import load_scenario, read_scenario
 from ethbrake_marl.scenario.sampling import QUANTITY
@@ -100,7 +99,7 @@ def test_given_worlds__are_told_until_others_take_their_places():
 def test_after_a_snapshot__nobody_knows():
     env = eb.EthBrakeVectorEnv(num_envs=2, scenario=MIXED)
     env.reset(seed=3)
-    restore_engine(env.engine, engine_snapshot(env.engine))
+    env.engine.restore(env.engine.snapshot())
     with pytest.raises(InvalidInput, match="go on from a snapshot, which does not keep what they were drawn as"):
         env.describe_worlds()
     env.reset()

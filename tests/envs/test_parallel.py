@@ -9,7 +9,7 @@ import pytest
 from pettingzoo.utils.conversions import aec_to_parallel
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.parallel import EthBrakeParallelEnv, env, parallel_env, raw_env
+from ethbrake_marl.envs.interfaces import EthBrakeParallelEnv, env, parallel_env, raw_env
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from tests.contract.interfaces import FIVE, PAPER, actions
 from tests.envs.lines import CRASH, REST

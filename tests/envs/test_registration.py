@@ -11,8 +11,7 @@ import pytest
 
 import ethbrake_marl
 from ethbrake_marl import ethbrake_v0
-from ethbrake_marl.envs.gym import EthBrakeEnv
-from ethbrake_marl.envs.parallel import EthBrakeParallelEnv
+from ethbrake_marl.envs.interfaces import EthBrakeEnv, EthBrakeParallelEnv
 from ethbrake_marl.envs.registration import GYMNASIUM_ID, PETTINGZOO_ID, register_environments
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -16,7 +16,7 @@ from pettingzoo.test import api_test, parallel_api_test, render_test
 
 import ethbrake_marl as eb
 from ethbrake_marl.envs.drawing import BODY_M, HEIGHT, WIDTH, Trace, View, follow
-from ethbrake_marl.envs.parallel import env, parallel_env
+from ethbrake_marl.envs.interfaces import env, parallel_env
 from ethbrake_marl.errors import InvalidInput, MissingExtra
 from tests.envs.lines import CRASH, REST
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.engine import Engine
-from ethbrake_marl.envs.gym import EthBrakeEnv
+from ethbrake_marl.envs.interfaces import EthBrakeEnv
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.rewards import RewardParams

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.envs.common import action_box, feature_box
+from ethbrake_marl.envs.interfaces import action_box, feature_box
 from ethbrake_marl.observations import ObservationSpec, full_state, state_features
 from ethbrake_marl.physics import make_worlds
 from ethbrake_marl.scenario import Scenario

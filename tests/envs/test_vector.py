@@ -9,7 +9,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
-from ethbrake_marl.envs.gym import EthBrakeEnv, EthBrakeVectorEnv
+from ethbrake_marl.envs.interfaces import EthBrakeEnv, EthBrakeVectorEnv
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import Scenario
 from tests.contract.interfaces import FIVE, PAPER, actions, initial_state

@@ -12,7 +12,6 @@ import pytest
 from stable_baselines3.common.logger import Logger
 
 import ethbrake_marl as eb
-from ethbrake_marl.engine import branch, first_moments, visit
 from ethbrake_marl.errors import InvalidInput, Progress
 from ethbrake_marl.learning.algorithms import (
     ModesModel,
@@ -23,6 +22,7 @@ from ethbrake_marl.learning.algorithms import (
     own_worlds,
     show_templates,
     stages_of,
+    visit,
 )
 from ethbrake_marl.learning.runs import TrainResult, make_environment, make_model, resume, train
 from ethbrake_marl.learning.training import ModesPlan, Training, load_recipe
@@ -132,11 +132,11 @@ def test_own_worlds__are_those_within_the_margin() -> None:
 
 def test_visit__every_decision_of_every_episode() -> None:
     _, engine = _model()
-    _, start = first_moments(engine, 20)
-    seen, moments = visit(branch(engine, start), _full_brake)
+    _, start = engine.first_moments(20)
+    seen, moments = visit(engine.branch(start), _full_brake)
     assert seen.shape == (len(moments.state), 1, 27)
     assert np.array_equal(moments.take(np.arange(20)).state, start.state)
-    first = branch(engine, moments.take(np.arange(20))).observe_all(np.array([1]))
+    first = engine.branch(moments.take(np.arange(20))).observe_all(np.array([1]))
     assert np.array_equal(first, seen[:20])
 
 

@@ -104,7 +104,7 @@ def own_rollout(policy: Any, n: int) -> Any:
     from torchrl.envs.utils import ExplorationType, set_exploration_type
 
     import ethbrake_marl as eb
-    from ethbrake_marl.envs.common import report
+    from ethbrake_marl.envs.interfaces import report
     from ethbrake_marl.learning.benchmarl import LineEnv
 
     env = LineEnv(eb.load_scenario("paper-random"), n, 7, "harm")

@@ -109,8 +109,8 @@ BUGS: dict[str, Bug] = {
     ),
     "discount on the wrong side of the shaping": Bug(
         TERMS,
-        "self.params.shaping_discount * running._potential - before",
-        "running._potential - self.params.shaping_discount * before",
+        "self.params.shaping_discount * running._potential - old",
+        "running._potential - self.params.shaping_discount * old",
         OF_REWARDS,
     ),
     "potential of several learners with everybody's first choice": Bug(

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import script_agents
-from ethbrake_marl.engine import Engine, engine_snapshot, restore_engine
-from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.engine import Engine
+from ethbrake_marl.envs.interfaces import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import worlds_sha256
@@ -64,7 +64,7 @@ def test_persistence__first_is_the_default_and_adds_nothing() -> None:
 def test_periodic__the_first_news_and_the_motion_are_those_of_first() -> None:
     scenario = periodic("blocked")
     one, other = engine_of(scenario), engine_of(first_only(scenario))
-    assert np.array_equal(one.known_from_s, other.known_from_s)
+    assert np.array_equal(one.packed.known_from_s, other.packed.known_from_s)
     driven(one, 20), driven(other, 20)
     assert np.array_equal(one.worlds.speeds_mps, other.worlds.speeds_mps)
     assert np.array_equal(one.worlds.gaps_m, other.worlds.gaps_m)
@@ -145,7 +145,7 @@ def test_resume__goes_on_to_the_same_bits() -> None:
     scenario = periodic("congested")
     one, other = engine_of(scenario), engine_of(scenario, seed=8)
     driven(one, 4)
-    restore_engine(other, engine_snapshot(one))
+    other.restore(one.snapshot())
     for left, right in zip(driven(one, 10), driven(other, 10), strict=True):
         np.testing.assert_array_equal(left, right)
     assert np.array_equal(one.worlds.messages, other.worlds.messages)

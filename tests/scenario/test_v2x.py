@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.engine import Engine, engine_snapshot, restore_engine
-from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.engine import Engine
+from ethbrake_marl.envs.interfaces import parallel_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import full_state, observation_for, observe, state_features
 from ethbrake_marl.physics import advance, make_worlds
@@ -326,12 +326,12 @@ def engine(scenario, n=20, **settings):
 def test_engine__tells_what_is_known_when_and_starts_when_a_learner_may_act():
     running = engine(channel_of("blocked"), seed=3)
     vehicles = running.worlds.vehicles
-    assert running.known_from_s.tolist() == vehicles.known_from_s.tolist()
+    assert running.packed.known_from_s.tolist() == vehicles.known_from_s.tolist()
     assert running.worlds.time_s.tolist() == vehicles.latency_s[:, 1].tolist()
     assert np.ptp(running.worlds.time_s) > 0.2
-    before = running.known_from_s.copy()
+    before = running.packed.known_from_s.copy()
     running.renew(np.array([4]))
-    after = running.known_from_s
+    after = running.packed.known_from_s
     assert (np.delete(after, 4, 0) == np.delete(before, 4, 0)).all() and (after[4] != before[4]).any()
 
 
@@ -339,33 +339,33 @@ def test_engine__takes_worlds_with_and_without_news_by_link():
     plain = PAPER.sample(20, 7).worlds
     running = engine(channel_of("nominal"))
     running.reset(worlds=plain)
-    assert running.known_from_s.tolist() == plain.vehicles.known_from_s.tolist()
+    assert running.packed.known_from_s.tolist() == plain.vehicles.known_from_s.tolist()
     running.renew(np.array([0]))
     running.step(np.zeros((20, 1)))
     of_paper = engine(PAPER)
     of_paper.reset(worlds=channel_of("nominal").sample(20, 7).worlds)
     of_paper.renew(np.array([0]))
-    assert of_paper.known_from_s[0].tolist() == plain.vehicles.known_from_s[0].tolist()
+    assert of_paper.packed.known_from_s[0].tolist() == plain.vehicles.known_from_s[0].tolist()
 
 
 def test_engine__snapshot_keeps_the_news():
     running, other = engine(channel_of("blocked"), seed=3), engine(channel_of("blocked"), seed=4)
-    restore_engine(other, engine_snapshot(running))
-    assert other.known_from_s.tobytes() == running.known_from_s.tobytes()
+    other.restore(running.snapshot())
+    assert other.packed.known_from_s.tobytes() == running.packed.known_from_s.tobytes()
     assert other.observe(1).tobytes() == running.observe(1).tobytes()
 
 
 def test_engine__a_snapshot_of_another_shape_is_refused():
     other = engine(channel_of("blocked"), seed=4)
-    kept = engine_snapshot(engine(channel_of("blocked"), seed=3))
+    kept = engine(channel_of("blocked"), seed=3).snapshot()
     with pytest.raises(InvalidInput, match=r"params is \(20, 20\); \(20, 28\) is needed"):
-        restore_engine(other, {**kept, "params": kept["params"][:, :20]})
+        other.restore({**kept, "params": kept["params"][:, :20]})
 
 
 def test_infos__tell_the_news_only_where_there_is_a_channel():
     env = parallel_env(channel_of("congested"))
     _, infos = env.reset(seed=5)
-    known = env.engine.known_from_s[0]
+    known = env.engine.packed.known_from_s[0]
     assert all(infos[f"vehicle_{i + 1}"]["known_from_s"].tolist() == known[i].tolist() for i in range(3))
     _, _, _, _, infos = env.step({"vehicle_2": np.zeros(1, np.float32)})
     assert infos["vehicle_2"]["known_from_s"].tolist() == known[1].tolist()

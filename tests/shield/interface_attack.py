@@ -8,8 +8,7 @@ import gymnasium
 import numpy as np
 
 from ethbrake_marl.agents.registry import drive
-from ethbrake_marl.envs.gym import EthBrakeVectorEnv
-from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.envs.interfaces import EthBrakeVectorEnv, parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.shield import HybridShield, ShieldedDriver, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv

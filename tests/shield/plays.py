@@ -7,11 +7,11 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import pytest
 from pettingzoo.utils import BaseParallelWrapper
 
 from ethbrake_marl.agents.registry import episode_engine
-from ethbrake_marl.envs.gym import EthBrakeVectorEnv
-from ethbrake_marl.envs.parallel import EthBrakeParallelEnv, parallel_env
+from ethbrake_marl.envs.interfaces import EthBrakeParallelEnv, EthBrakeVectorEnv, parallel_env
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.shield import HybridShield, ShieldedDriver, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
@@ -233,11 +233,16 @@ class Sb3(Vector):
         self.bad = [
             lambda: self.env.step(self._one_bad(np.nan)),
             lambda: self.env.step(np.zeros((self.env.num_envs, 2))),
-            lambda: self.env.env_method("no_such_method"),
+            self._missing,
             self._options,
         ]
         Play._watched(self)
         self.env.reset()
+
+    def _missing(self) -> None:
+        with pytest.raises(AttributeError, match="no_such_method"):
+            self.env.env_method("no_such_method")
+        raise Failure
 
     def _options(self) -> None:
         self.env.set_options({"initial_state": {"gaps_m": [1], "speeds_mps": [1]}})

@@ -8,7 +8,7 @@ from pettingzoo.test import parallel_api_test
 
 from ethbrake_marl.agents.planner import Refined
 from ethbrake_marl.agents.registry import drive, make_agent
-from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.envs.interfaces import parallel_env
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import HybridAgent, HybridShield

@@ -14,8 +14,7 @@ from gymnasium.wrappers import Autoreset
 
 from ethbrake_marl.agents.registry import drive, episode_engine, make_agent
 from ethbrake_marl.engine import STEP, Engine
-from ethbrake_marl.envs.gym import EthBrakeVectorEnv
-from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.envs.interfaces import EthBrakeVectorEnv, parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
 from ethbrake_marl.scenario import load_scenario

@@ -16,8 +16,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.envs.gym import EthBrakeEnv, EthBrakeVectorEnv
-from ethbrake_marl.envs.parallel import env as aec_env, parallel_env
+from ethbrake_marl.envs.interfaces import EthBrakeEnv, EthBrakeVectorEnv, env as aec_env, parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import drive, fixed_commands, make_agent, script_agents
-from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.envs.interfaces import parallel_env
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.physics.kernel import Decisions
 from ethbrake_marl.scenario import load_scenario

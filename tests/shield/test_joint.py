@@ -8,7 +8,7 @@ from pettingzoo.utils import BaseParallelWrapper
 
 from ethbrake_marl.agents.registry import Team, drive, make_agent
 from ethbrake_marl.engine import Engine
-from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.envs.interfaces import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.rollout import evaluate

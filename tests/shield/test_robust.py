@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.registry import drive, make_agent
-from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.envs.interfaces import parallel_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search import profile_problem

@@ -8,7 +8,7 @@ import pytest
 from ethbrake_marl.agents.planner import Refined
 from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.agents.registry import drive, make_agent
-from ethbrake_marl.envs.parallel import parallel_env
+from ethbrake_marl.envs.interfaces import parallel_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.scenario import Scenario, load_scenario

@@ -1,0 +1,866 @@
+"""The interfaces of PettingZoo and Gymnasium, and what they share with Stable-Baselines3's: spaces, seeds, infos."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+from pettingzoo import AECEnv, ParallelEnv
+from pettingzoo.utils.conversions import parallel_to_aec_wrapper
+from pettingzoo.utils.wrappers import OrderEnforcingWrapper
+
+from ethbrake_marl.actions import action_of, checked_action
+from ethbrake_marl.agents import script_agents
+from ethbrake_marl.engine import Engine, Step
+from ethbrake_marl.envs.drawing import Viewer
+from ethbrake_marl.errors import InvalidInput, check_one_learner, check_whole_number, unknown_name
+from ethbrake_marl.harm import front_share
+from ethbrake_marl.observations import (
+    Observation,
+    Observations,
+    ObservationSpec,
+    choose_observation,
+    full_state,
+    state_features,
+)
+from ethbrake_marl.physics import Bools, Floats, Ints, Packed, Worlds, age_s, columns, compiled
+from ethbrake_marl.rewards import Reward, RewardParams
+from ethbrake_marl.scenario import (
+    QUANTITY,
+    Feature,
+    Sample,
+    Scenario,
+    initial_state_worlds,
+    load_scenario,
+    read_scenario,
+)
+
+AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping: what a file would say
+
+
+def feature_box(features: Sequence[Feature]) -> Box[np.float32]:
+    """Float32 box [F] with the features' bounds, which are finite."""
+    low, high = (np.array([getattr(f, side) for f in features], np.float32) for side in ("low", "high"))
+    return Box(low, high, dtype=np.float32)
+
+
+def action_box() -> Box[np.float32]:
+    """Float32 box [1]: -1 full braking capacity, 0 coasts, +1 full driving capacity."""
+    return Box(-1.0, 1.0, (1,), dtype=np.float32)
+
+
+def make_engine(
+    scenario: AnyScenario,
+    n: int,
+    *,
+    learners: Sequence[str | int] | None = None,
+    reward: Reward = "harm",
+    observation: Observation | None = None,
+    seed: int = 0,
+) -> Engine:
+    """Build ``n`` running worlds of a scenario: a shipped name, a path to a YAML file, its content, or a ``Scenario``.
+
+    ``learners`` (names such as ``vehicle_2``, or indices from 0) replace the scenario's own; a vehicle that learned
+    and is not listed brakes fully. Scripts come from the scenario's roles.
+    """
+    check_whole_number("number of worlds", n, 1)
+    loaded = resolve_scenario(scenario)
+    if not (observation is None or isinstance(observation, ObservationSpec | list | tuple | Mapping)):
+        raise InvalidInput(
+            f"observation = {observation!r}: must be an ObservationSpec, for instance ObservationSpec(1, 1), its fields"
+            " as a mapping, or a list of groups and features, for instance ['own', 'front_1']"
+        )
+    chosen = None if observation is None else choose_observation(observation)
+    if learners is not None and not isinstance(learners, Iterable):
+        raise InvalidInput(f"learners = {learners!r}: must be a list of vehicles, for instance ['vehicle_2']")
+    if learners is not None:
+        loaded = loaded.with_learners(learners)
+    return Engine(
+        loaded,
+        int(n),
+        learners=loaded.learners,
+        scripts=script_agents(loaded),
+        reward=reward,
+        observation=chosen,
+        seed=seed,
+    )
+
+
+def only_learner(engine: Engine) -> int:
+    """Index of the one learner; ``InvalidInput`` when there is none or more than one."""
+    check_one_learner(
+        engine.scenario.name,
+        [engine.scenario.vehicle_names[i] for i in engine.learners],
+        "this environment needs exactly one: pass learners=['vehicle_2'], or use parallel_env or make_sb3_vec_env",
+    )
+    return engine.learners[0]
+
+
+def learner_actions(engine: Engine, actions: Mapping[str, Any]) -> Floats | dict[int, Floats]:
+    """The learners' actions of one world as [1, L], from an action [1] for each by name; behind a shield by vehicle.
+
+    Raises ``InvalidInput`` naming the vehicle whose action is missing or misshapen; the engine checks the range. Behind
+    a shield an action may be missing.
+    """
+    names, columns = engine.scenario.vehicle_names, np.empty((1, len(engine.learners)))
+    for c, vehicle in enumerate(engine.learners):
+        name = names[vehicle]
+        if actions.get(name) is None:
+            if engine.guard is not None:
+                given = {
+                    i: np.atleast_1d(actions[names[i]]) for i in engine.learners if actions.get(names[i]) is not None
+                }
+                return {i: checked_action(each, (1,), names[i]) for i, each in given.items()}
+            raise InvalidInput(f"step: no action for the learner {name}")
+        action = np.asarray(actions[name])
+        if action.shape != (1,) or action.dtype.kind not in "fiu":
+            action = checked_action(actions[name], (1,), name)
+        columns[0, c] = action.item()
+    return columns
+
+
+def resolve_scenario(scenario: AnyScenario) -> Scenario:
+    """The scenario of a shipped name, of a YAML file, of what such a file would say, or itself."""
+    if isinstance(scenario, Mapping):
+        return read_scenario(scenario)
+    return scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
+
+
+INITIAL_STATE = "initial_state"
+LISTED_WORLD = "listed_world"
+
+
+class UnknownResetOption(UserWarning):
+    """A key of ``reset``'s options is not known to this environment; it is ignored."""
+
+
+def fresh_seed() -> int:
+    """A seed of 63 bits from the operating system's entropy, for an environment that was never given one."""
+    entropy = np.random.SeedSequence().entropy
+    assert isinstance(entropy, int)  # always, when SeedSequence chooses it itself
+    return entropy % 2**63  # fits the integers of every library that infos are handed to
+
+
+def restart(engine: Engine, seed: int | None, options: Mapping[str, Any] | None) -> None:
+    """Start new episodes in all worlds: the stream of ``seed`` from its start, or where the stream stands.
+
+    ``options["initial_state"]`` (see ``scenario.initial_state_worlds``) is the start of every world instead;
+    ``options["listed_world"] = {"seed": 7, "number": 3}`` starts in that world of the list on which agents are
+    evaluated, a batch in that one and those after it. With autoreset, later episodes come from the stream. Other
+    options warn with ``UnknownResetOption`` and are ignored. Raises ``InvalidInput``, with nothing changed, for a seed
+    that is not a whole number >= 0, a bad initial state or listed world, or both of them.
+    """
+    check_seed(seed)
+    if not (options is None or isinstance(options, Mapping)):
+        raise InvalidInput(
+            f"reset: options = {options!r}: must be None or a mapping, for instance {{'{INITIAL_STATE}': ...}}"
+        )
+    warn_of_unknown(options or (), (INITIAL_STATE, LISTED_WORLD))
+    engine.reset(seed=None if seed is None else int(seed), worlds=_wanted_worlds(engine, options or {}))
+
+
+def _wanted_worlds(engine: Engine, options: Mapping[str, Any]) -> Worlds | None:
+    """The worlds that the options ask for, one for each row; None for the stream's."""
+    if LISTED_WORLD not in options:
+        if INITIAL_STATE not in options:
+            return None
+        return initial_state_worlds(options[INITIAL_STATE], engine.scenario).take(np.zeros(engine.n, np.int64))
+    if INITIAL_STATE in options:
+        raise InvalidInput(f"reset: {INITIAL_STATE} and {LISTED_WORLD} are both given; an episode has one start")
+    wanted = options[LISTED_WORLD]
+    if not isinstance(wanted, Mapping) or set(wanted) != {"seed", "number"}:
+        raise InvalidInput(
+            f"reset: {LISTED_WORLD} = {wanted!r}: must name a world of a list, for instance {{'seed': 7, 'number': 3}}"
+        )
+    for name in ("seed", "number"):
+        check_whole_number(f"reset: {LISTED_WORLD}: {name}", wanted[name], 0)
+    return engine.scenario.sample(engine.n, int(wanted["seed"]), first=int(wanted["number"])).worlds
+
+
+def check_seed(seed: int | None) -> None:
+    """Refuse a seed that is neither None nor a whole number >= 0."""
+    if seed is None:
+        return
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not seed >= 0:
+        raise InvalidInput(f"reset: seed = {seed!r}: must be None or a whole number, at least 0")
+
+
+def warn_of_unknown(options: Iterable[str], known: Sequence[str]) -> None:
+    """One warning for all option names that are not ``known``."""
+    unknown = sorted({str(name) for name in options} - set(known))
+    if unknown:
+        names, right = ", ".join(unknown), ", ".join(known)
+        warnings.warn(f"reset: unknown option {names}, ignored; known: {right}", UnknownResetOption, stacklevel=4)
+
+
+# The draws behind the worlds of an environment: every quantity at the alert, type and scenario, as flat columns.
+#
+# Worlds are pure functions of scenario, seed and number, so nothing is kept while episodes run: it costs nothing until
+# somebody asks, and then the worlds are drawn again.
+
+_MOST_APART = 1024  # numbers between two worlds that are still drawn in one go
+
+Columns = dict[str, NDArray[Any]]
+
+
+def describe_worlds(engine: Engine) -> Columns:
+    """What each running world was drawn as: column -> values [n].
+
+    Quantities of the world at the alert, named as in a table of initial states (``gap_1_m``, ``mass_2_t``); where there
+    is such, ``scenario`` of a mixture and ``vehicle_2_type``; and ``world_seed`` and ``world`` as in the infos. Where
+    worlds were given and others have taken the places of some since, types are of these only. Raises ``InvalidInput``
+    for worlds of which nobody knows: after a snapshot was restored, or where a world could not be advanced to its first
+    decision and another one stands in its place.
+    """
+    numbers, given = engine.roster.numbers, engine.roster.given
+    named = {"world_seed": np.full(engine.n, engine.roster.seed), "world": numbers.copy()}
+    own, found = numbers < 0, dict[str, NDArray[Any]]()
+    if own.any():
+        if given is None:
+            raise InvalidInput(
+                "describe_worlds: these episodes go on from a snapshot, which does not keep what they were drawn as;"
+                " ask again once they have ended, or after a reset"
+            )
+        found = QUANTITY.columns(given)
+    if not own.all():
+        sample = _drawn_again(engine, numbers[~own])
+        drawn, started = {**sample.kinds, **QUANTITY.columns(sample.worlds)}, found
+        found = {name: np.zeros(engine.n, column.dtype) for name, column in drawn.items()}
+        for name, column in drawn.items():
+            found[name][~own] = column
+            if name in started:
+                found[name][own] = started[name][own]
+    return {**found, **named}
+
+
+def _drawn_again(engine: Engine, numbers: Ints) -> Sample:
+    """These worlds of the training stream, in the order of ``numbers``; ``InvalidInput`` if they do not run here."""
+    ordered, places = np.unique(numbers, return_inverse=True)
+    breaks = np.flatnonzero(np.diff(ordered) > _MOST_APART) + 1
+    parts = []
+    for run in np.split(ordered, breaks):
+        first = int(run[0])
+        span = engine.scenario.sample(int(run[-1]) - first + 1, engine.roster.seed, first=first, channel="training")
+        parts.append(span.take(run - first))
+    sample = Sample.join(parts, 0).take(places)
+    rows = np.flatnonzero(engine.roster.numbers >= 0)
+    running, drawn = engine.worlds.vehicles.take(rows), sample.worlds.vehicles
+    same = np.ones(len(rows), np.bool_)
+    for name in ("mass_t", "braking_capacity_mps2", "driving_capacity_mps2", "latency_s"):
+        same &= (getattr(running, name) == getattr(drawn, name)).all(axis=1)
+    if not same.all():
+        k = int(rows[np.argmin(same)])
+        raise InvalidInput(
+            f"describe_worlds: world {engine.roster.numbers[k]} of seed {engine.roster.seed} could not be advanced to"
+            f" its first decision; another one stands in row {k}"
+        )
+    return sample
+
+
+# Infos of every interface, computed once for all vehicles of all worlds: the same keys after a reset and a step.
+#
+# ``time_s``, ``command_in_force_mps2`` (in force now; 0 until the latency has elapsed), ``chosen_command_mps2`` and
+# ``chosen_action`` (what the vehicle asked for, whoever chose it; 0 before a learner's first step), the vehicle's share
+# of the harm so far under both counts, the same for the whole world, and whether anything has collided. Of the last
+# step: ``cost`` (the harm it added to the line, as the reward counts impacts; for safe-RL libraries) and
+# ``reward_NAME``, each term of the reward before its weight; after a reset they are 0. ``world_seed`` and ``world``
+# name the world, so that it can be played again (-1: it was given). Where the scenario has a ``v2x`` channel also
+# ``known_from_s`` [N]: from when on this vehicle acts on news of each one (infinite: never; of itself: its latency);
+# and where its messages are periodic ``age_s`` [N]: how old the newest sample is that it was told of each (infinite:
+# none).
+
+COLUMNS = (
+    "time_s",
+    "command_in_force_mps2",
+    "first_impact_harm",
+    "total_harm",
+    "world_first_impact_harm",
+    "world_total_harm",
+    "collided",
+    "chosen_command_mps2",
+    "chosen_action",
+)
+_FLOAT32 = np.dtype(np.float32)
+
+
+class Report(NamedTuple):
+    """What there is to tell about n worlds of N vehicles."""
+
+    values: Floats  # [n, N, len(COLUMNS)]
+    cost: Floats  # [n] harm of the step (m2/s2); 0 without one
+    terms: dict[str, Floats]  # reward terms of the step, each [n], shared by all vehicles, or [n, N]; 0 without one
+    world_seed: int
+    world: Ints  # [n] numbers in the stream of that seed
+    known_from_s: Floats | None  # [n, N, N] where there is a channel
+    age_s: Floats | None  # [n, N, N] where its messages are periodic
+
+
+def report(engine: Engine, step: Step | None = None, rows: Ints | None = None) -> Report:
+    """The engine's worlds as they are now, before any of them is renewed; only the worlds ``rows`` if given."""
+    (state, params), wanted, world = engine.packed, engine.wanted_mps2, engine.roster.numbers
+    if rows is not None:
+        state, params, wanted = (array.take(rows, axis=0) for array in (state, params, wanted))
+        world = world.take(rows)
+    values = np.empty((*wanted.shape, len(COLUMNS)))
+    _report_rows(state, params, wanted, values)
+    N = wanted.shape[1]
+    shown = Packed(state, params)
+    known = shown.known_from_s if shown.has_news else None
+    cost = np.zeros(len(world))
+    terms = dict.fromkeys(engine.reward_terms, cost)
+    if step is not None:
+        every = step.shared | step.further
+        terms = {name: every[name] for name in engine.reward_terms}
+        cost = step.counted_harm
+        if rows is not None:
+            cost, terms = cost.take(rows), {name: term.take(rows, axis=0) for name, term in terms.items()}
+    time_s, messages = state[:, shown.column.time], params[:, shown.column.messages :]
+    age = age_s(time_s, messages, N) if shown.has_messages else None
+    return Report(values, cost, terms, engine.roster.seed, world, known, age)
+
+
+@compiled
+def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> None:
+    """Fill ``out`` [n, N, ...] with the columns of AFTER_A_STEP."""
+    n, N = wanted.shape
+    column = columns(state)
+    P, harm, mass, obstacle = N - 1, column.harm, column.mass, column.obstacle
+    for k in range(n):
+        first, total, impacts = 0.0, 0.0, 0.0
+        for i in range(N):
+            out[k, i, 2] = 0.0
+            out[k, i, 3] = 0.0
+        if state.shape[1] > obstacle:
+            first, total, impacts = state[k, obstacle + 2], state[k, obstacle + 3], state[k, obstacle + 4]
+        for p in range(P):
+            for count in range(2):
+                value = state[k, harm + count * P + p]
+                front = front_share(value, params[k, mass + p], params[k, mass + p + 1])
+                out[k, p, 2 + count] += front
+                out[k, p + 1, 2 + count] += value - front
+            first += state[k, harm + p]
+            total += state[k, harm + P + p]
+            impacts += state[k, harm + 2 * P + p]
+        if state.shape[1] > obstacle:  # after the pairs, as in the ledger
+            out[k, 0, 2] += state[k, obstacle + 2]
+            out[k, 0, 3] += state[k, obstacle + 3]
+        for i in range(N):
+            out[k, i, 0] = state[k, column.time]
+            out[k, i, 1] = state[k, column.command + i]
+            out[k, i, 4] = first
+            out[k, i, 5] = total
+            out[k, i, 6] = 1.0 if impacts > 0.0 else 0.0
+            out[k, i, 7] = wanted[k, i]
+            braking, driving = params[k, column.braking + i], params[k, column.driving + i]
+            out[k, i, 8] = action_of(wanted[k, i], braking, driving)
+
+
+def plain_infos(told: Report, vehicles: Ints | None = None) -> list[dict[str, Any]]:
+    """Infos of these vehicles (None: of all), world by world, as plain numbers; ``chosen_action`` is an array [1]."""
+    shown = np.arange(told.values.shape[1]) if vehicles is None else vehicles
+    worlds: list[list[list[Any]]] = told.values.take(shown, axis=1).tolist()
+    numbers, costs = told.world.tolist(), told.cost.tolist()
+    terms = {
+        f"reward_{name}": (
+            term[:, np.newaxis].repeat(len(shown), axis=1) if term.ndim == 1 else term[:, shown]
+        ).tolist()
+        for name, term in told.terms.items()
+    }
+    infos: list[dict[str, Any]] = []
+    for k, world in enumerate(worlds):
+        for v, (time, force, first, total, world_first, world_total, collided, chosen, action) in enumerate(world):
+            chosen_action = np.empty(1, _FLOAT32)
+            chosen_action[0] = action
+            info = {
+                "time_s": time,
+                "command_in_force_mps2": force,
+                "first_impact_harm": first,
+                "total_harm": total,
+                "world_first_impact_harm": world_first,
+                "world_total_harm": world_total,
+                "collided": collided == 1.0,
+                "chosen_command_mps2": chosen,
+                "chosen_action": chosen_action,
+                "cost": costs[k],
+                "world_seed": told.world_seed,
+                "world": numbers[k],
+            }
+            infos.append(info | {name: term[k][v] for name, term in terms.items()})
+    for name, news in (("known_from_s", told.known_from_s), ("age_s", told.age_s)):
+        if news is not None:
+            of_shown = news.take(shown, axis=1)
+            for info, row in zip(infos, of_shown.reshape(-1, of_shown.shape[2]), strict=True):
+                info[name] = row.copy()
+    return infos
+
+
+def batch_info(told: Report, vehicle: int, rows: Bools, stepped: Bools) -> dict[str, Any]:
+    """One vehicle in many worlds as Gymnasium's vector infos: ``name`` [n] and its mask ``_name`` [n].
+
+    The worlds marked by ``rows`` are told of. What a step brought is 0 but in the worlds marked by ``stepped``.
+    """
+    columns: dict[str, NDArray[Any]] = {name: told.values[:, vehicle, c] for c, name in enumerate(COLUMNS)}
+    columns["collided"] = columns["collided"] == 1.0
+    columns["chosen_action"] = columns["chosen_action"].astype(np.float32)[:, np.newaxis]
+    columns["cost"] = np.where(stepped, told.cost, 0.0)
+    columns["world_seed"], columns["world"] = np.full(len(rows), told.world_seed), told.world
+    for name, term in told.terms.items():
+        columns[f"reward_{name}"] = np.where(stepped, term if term.ndim == 1 else term[:, vehicle], 0.0)
+    if told.known_from_s is not None:
+        columns["known_from_s"] = told.known_from_s[:, vehicle]
+    if told.age_s is not None:
+        columns["age_s"] = told.age_s[:, vehicle]
+    masked: dict[str, Any] = {}
+    for name, column in columns.items():
+        masked[name] = np.zeros_like(column, order="C")
+        masked[name][rows] = column[rows]
+        masked[f"_{name}"] = rows.copy()
+    return masked
+
+
+class _Begun:
+    """What the interfaces share: an engine in which episodes have begun, or not yet."""
+
+    engine: Engine
+    _started = False
+
+    def _restart(self, seed: int | None, options: Mapping[str, Any] | None) -> int | None:
+        """Start episodes, the first ones from fresh entropy where no seed is given; the seed that was used."""
+        if seed is None and not self._started:
+            seed = fresh_seed()  # kept by Gymnasium: reset(seed=env.np_random_seed) repeats it
+        restart(self.engine, seed, options)
+        self._started = True
+        return seed
+
+    def _check_started(self, what: str) -> None:
+        if not self._started:
+            raise InvalidInput(f"{what}: no episode was started; call reset first")
+
+
+class _OneWorld(_Begun):
+    """... of one world, which is shown by a viewer."""
+
+    viewer: Viewer
+
+    def describe_world(self) -> dict[str, Any]:
+        """What the running world was drawn as: flat numbers and texts by name; see ``describe_worlds``."""
+        self._check_started("describe_world")
+        return {name: column[0].item() for name, column in describe_worlds(self.engine).items()}
+
+    def render(self) -> Any:
+        """What the render mode says: a frame [H, W, 3] uint8, a list of new ones, a text, or None for ``human``."""
+        return self.viewer.render()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self.viewer.close()
+
+
+# Gymnasium's interface: one learner, one world.
+
+
+class EthBrakeEnv(_OneWorld, gymnasium.Env[Observations, NDArray[Any]]):
+    """One learner brakes in a line of vehicles that follow their scripts: ``gymnasium.make("EthBrake-v0")``.
+
+    Observation: float32 [F], the features of ``ObservationSpec``. Action: [1] in [-1, 1]; -1 full braking capacity, 0
+    coasts, +1 full driving capacity. Terminated: all at rest and no command that would move one. Truncated: the
+    horizon. Infos: see docs/environment.md. ``reset(seed=s)`` starts the stream of worlds of s, ``reset()`` goes on in
+    it; ``options={"initial_state": {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}}`` starts from there. Raises
+    ``InvalidInput`` for more or fewer than one learner, an action outside [-1, 1], a step without an episode.
+
+    Args:
+        scenario: a shipped name, the path of a YAML file, or a ``Scenario``.
+        render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/environment.md, Watching).
+        learners: the one vehicle that learns instead of the scenario's, by name (``vehicle_2``) or index from 0.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        observation: what the learner observes; None: ``observation_for(scenario)``.
+
+    >>> import ethbrake_marl as eb
+    >>> env = eb.EthBrakeEnv("paper-random")
+    >>> observation, info = env.reset(seed=7)
+    >>> observation.shape, info["time_s"]
+    ((27,), 0.5)
+    >>> observation, reward, terminated, truncated, info = env.step([-1.0])
+    >>> reward, terminated, truncated
+    (0.0, False, False)
+
+    """
+
+    _spec: EnvSpec | None = None
+    metadata: dict[str, Any] = dict(Viewer.METADATA)  # noqa: RUF012  # as Gymnasium declares it
+
+    def __init__(
+        self,
+        scenario: AnyScenario = "paper-random",
+        render_mode: str | None = None,
+        learners: Sequence[str | int] | None = None,
+        reward: Reward = "harm",
+        observation: Observation | None = None,
+    ) -> None:
+        self.engine = make_engine(scenario, 1, learners=learners, reward=reward, observation=observation)
+        self.render_mode, self.viewer = render_mode, Viewer(self.engine, render_mode)
+        self.metadata = {**self.metadata, **self.viewer.metadata}
+        self.learner = only_learner(self.engine)
+        self._column = np.array([self.learner])
+        self._name = self.engine.scenario.vehicle_names[self.learner]
+        self.observation_space = feature_box(self.engine.observation.features)
+        self.action_space = action_box()
+        self._running = False
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How it was made, in plain settings; None where no id was used."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        """Objects among the settings are kept as plain mappings, so that JSON keeps them."""
+        if spec is not None:
+            kwargs = dict(spec.kwargs)
+            for name, value in kwargs.items():
+                if isinstance(value, Scenario):
+                    kwargs[name] = value.declared()
+                elif isinstance(value, RewardParams):
+                    kwargs[name] = value.model_dump(mode="json")
+                elif isinstance(value, ObservationSpec):
+                    kwargs[name] = asdict(value)
+            spec = replace(spec, kwargs=kwargs)
+        self._spec = spec
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Start an episode; see ``restart``."""
+        super().reset(seed=self._restart(seed, options))
+        self._running = True
+        self.viewer.began()
+        return self._observe(), plain_infos(report(self.engine), self._column)[0]
+
+    def step(self, action: NDArray[Any]) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
+        """Advance by one time step."""
+        if not self._running:
+            raise InvalidInput("step: no episode is running; call reset first")
+        step = self.engine.step(learner_actions(self.engine, {self._name: action}))
+        self._running = not step.ended[0]
+        if self.render_mode is not None:
+            self.viewer.play()
+        info = plain_infos(report(self.engine, step), self._column)[0]
+        reward = float(step.reward[0, self.learner])
+        return self._observe(), reward, bool(step.terminated[0]), bool(step.truncated[0]), info
+
+    def _observe(self) -> Observations:
+        observation: Observations = self.engine.observe(self.learner)[0].copy()
+        return observation
+
+
+# Gymnasium's vector interface: one learner, many worlds, advanced together.
+
+_MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
+
+
+class EthBrakeVectorEnv(_Begun, VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
+    """Many worlds of ``EthBrakeEnv``: ``gymnasium.make_vec("EthBrake-v0", num_envs=4096, scenario=...)``.
+
+    All worlds take their episodes from one stream: row k of ``reset(seed=s)`` is world k of s, and each new episode is
+    the next world of it. Every array that is returned has its own memory.
+
+    Args:
+        num_envs: worlds that are advanced together, at least 1.
+        scenario: a shipped name, the path of a YAML file, or a ``Scenario``.
+        render_mode: ``rgb_array``, ``ansi``, or None; ``render`` gives one frame or text for each world.
+        learners: the one vehicle that learns instead of the scenario's, by name (``vehicle_2``) or index from 0.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        observation: what the learner observes; None: ``observation_for(scenario)``.
+        autoreset_mode: Gymnasium's. ``NextStep``, its default and ours, returns the last observation and spends the
+            next step, whose action is ignored and whose reward is 0, on the reset. ``SameStep`` returns the first
+            observation of the new episode, with the last one of the old in ``infos["final_obs"]`` and its infos in
+            ``infos["final_info"]``.
+
+    >>> import ethbrake_marl as eb
+    >>> import numpy as np
+    >>> env = eb.EthBrakeVectorEnv(num_envs=4, scenario="paper-random")
+    >>> observations, infos = env.reset(seed=7)
+    >>> observations, rewards, terminated, truncated, infos = env.step(np.full((4, 1), -1.0))
+    >>> observations.shape, rewards.shape
+    ((4, 27), (4,))
+
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scenario: AnyScenario = "paper-random",
+        render_mode: str | None = None,
+        learners: Sequence[str | int] | None = None,
+        reward: Reward = "harm",
+        observation: Observation | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+    ) -> None:
+        self.autoreset_mode = _check_mode(autoreset_mode)
+        self.engine = make_engine(scenario, num_envs, learners=learners, reward=reward, observation=observation)
+        self.render_mode, self.viewer = render_mode, Viewer(self.engine, render_mode, batch=True)
+        self.metadata = {"autoreset_mode": self.autoreset_mode, **self.viewer.metadata}
+        self.learner = only_learner(self.engine)
+        self.num_envs = num_envs
+        self.single_observation_space = feature_box(self.engine.observation.features)
+        self.single_action_space = action_box()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Start an episode in every world; see ``restart``."""
+        super().reset(seed=self._restart(seed, options))
+        every = np.ones(self.num_envs, np.bool_)
+        return self.engine.observe(self.learner), batch_info(report(self.engine), self.learner, every, ~every)
+
+    def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
+        """Advance every world by one time step, and start new episodes as the autoreset mode says."""
+        if not self._started:
+            raise InvalidInput("step: no episode is running; call reset first")
+        engine, before = self.engine, self.engine.ended
+        step = engine.step(self._fill_ignored(actions, before))
+        # all that have ended: an interrupted step may have left some that nobody renewed
+        renewed = engine.ended if self.autoreset_mode is AutoresetMode.SAME_STEP else before
+        infos: dict[str, Any] = {}
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and renewed.any():
+            infos = self._final_infos(step)
+        engine.renew(np.flatnonzero(renewed))
+        every = np.ones(self.num_envs, np.bool_)
+        infos |= batch_info(report(engine, step), self.learner, every, ~renewed)
+        reward = step.reward[:, self.learner].copy()
+        return engine.observe(self.learner), reward, step.terminated, step.truncated, infos
+
+    def describe_worlds(self) -> dict[str, NDArray[Any]]:
+        """What each running world was drawn as: columns by name, each [worlds]; see ``describe_worlds`` of the file."""
+        self._check_started("describe_worlds")
+        return describe_worlds(self.engine)
+
+    def render(self) -> tuple[Any, ...]:
+        """A frame [H, W, 3] uint8, or a text, of every world; of a world that has just been renewed, its start."""
+        return tuple(self.viewer.render())
+
+    def _fill_ignored(self, actions: NDArray[Any], before: Bools) -> NDArray[Any]:
+        """The actions with those that the autoreset mode ignores replaced: their worlds had ended ``before``."""
+        ignoring = self.autoreset_mode is AutoresetMode.NEXT_STEP and before.any()
+        if not ignoring or np.shape(actions)[:1] != (self.num_envs,):
+            return actions
+        heeded = np.array(actions)
+        heeded[before] = 0.0
+        return heeded
+
+    def _final_infos(self, step: Step) -> dict[str, Any]:
+        """The last observation and infos of the episodes that ended with this step."""
+        ended = step.ended
+        observations = self.engine.observe(self.learner)
+        final = np.full(self.num_envs, None, dtype=object)
+        for row in np.flatnonzero(ended):
+            final[row] = observations[row].copy()
+        info = batch_info(report(self.engine, step), self.learner, ended, ended)
+        return {"final_obs": final, "_final_obs": ended, "final_info": info, "_final_info": ended.copy()}
+
+
+def _check_mode(mode: str | AutoresetMode) -> AutoresetMode:
+    for known in _MODES:
+        if mode in (known, known.value):
+            return known
+    raise InvalidInput(f"autoreset_mode = {mode!r}: must be {' or '.join(repr(m.value) for m in _MODES)}")
+
+
+# PettingZoo's interface: the vehicles of one world are agents, to the end; and around it the one
+# in which they act in turn (AEC).
+
+
+class InTurns(parallel_to_aec_wrapper):  # type: ignore[misc]  # PettingZoo is untyped
+    """As PettingZoo's, but an unusable action is refused in its agent's own turn, which stays: nothing is lost."""
+
+    def step(self, action: Any) -> None:
+        """Take the action of ``agent_selection``; the last one's advances all by one step.
+
+        Raises ``InvalidInput`` for an unusable action of a learner, and for any but None once its episode is over.
+        """
+        agent, engine = self.agent_selection, self.env.unwrapped.engine
+        assert isinstance(engine, Engine)
+        if self.terminations[agent] or self.truncations[agent]:
+            if action is not None:
+                raise InvalidInput(f"step: the episode of {agent} is over; only None may follow, or reset")
+        elif engine.scenario.vehicle_names.index(agent) in engine.learners and not (action is None and engine.guard):
+            checked_action(action, (1,), agent)  # left out: a shield may choose alone
+        super().step(action)
+
+
+def in_turns(env: ParallelEnv[str, Observations, NDArray[Any]]) -> AECEnv[str, Observations, NDArray[Any]]:
+    """The AEC environment of a parallel one of this package, whatever wraps it; order is enforced."""
+    return OrderEnforcingWrapper(InTurns(env))
+
+
+Infos = dict[str, dict[str, Any]]
+WhoIsAgent = Literal["all", "learners"]
+
+
+class EthBrakeParallelEnv(_OneWorld, ParallelEnv[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
+    """A line of vehicles ``vehicle_1`` (front) ... ``vehicle_N``, all of them agents from the alert to the end.
+
+    Learners need an action [1] in [-1, 1] in each step: -1 full braking capacity, 0 coasts, +1 full driving capacity.
+    What is passed for scripted vehicles is ignored; ``infos[agent]`` shows what their script did. All agents end
+    together: terminated when all are at rest and no command would move one, truncated at the horizon. ``state()`` is
+    the full state of the line, for central critics. Observations, rewards, infos and ``reset`` are those of
+    ``EthBrakeEnv``.
+
+    Args:
+        scenario: a shipped name, the path of a YAML file, its content as a mapping, or a ``Scenario``.
+        render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/environment.md, Watching).
+        learners: vehicles that learn instead of the scenario's, by name (``vehicle_2``) or index from 0; any number.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        observation: what every vehicle observes; None: ``observation_for(scenario)``.
+        agents: ``all`` vehicles, or ``learners`` only, for trainers that learn from every agent.
+        max_cycles: truncates an episode after so many steps, if it is not over before; None: the horizon does.
+
+    >>> import ethbrake_marl as eb
+    >>> env = eb.parallel_env(scenario="paper-random")
+    >>> observations, infos = env.reset(seed=7)
+    >>> while env.agents:
+    ...     observations, rewards, terminations, truncations, infos = env.step({"vehicle_2": [-1.0]})
+    >>> terminations["vehicle_2"], round(infos["vehicle_2"]["world_total_harm"], 2)
+    (True, 39.95)
+
+    """
+
+    metadata: dict[str, Any] = {"name": "ethbrake_v0", "is_parallelizable": True, **Viewer.METADATA}  # noqa: RUF012
+
+    def __init__(
+        self,
+        scenario: AnyScenario = "paper-random",
+        render_mode: str | None = None,
+        learners: Sequence[str | int] | None = None,
+        reward: Reward = "harm",
+        observation: Observation | None = None,
+        agents: WhoIsAgent = "all",
+        max_cycles: int | None = None,
+    ) -> None:
+        if max_cycles is not None:
+            check_whole_number("max_cycles", max_cycles, 1)
+        self.render_mode, self.max_cycles = render_mode, max_cycles
+        self.engine = make_engine(scenario, 1, learners=learners, reward=reward, observation=observation)
+        self.viewer = Viewer(self.engine, render_mode)
+        self.metadata = {**self.metadata, **self.viewer.metadata}
+        names = self.engine.scenario.vehicle_names
+        self._vehicles = _agent_vehicles(self.engine, agents)
+        self.possible_agents = [names[i] for i in self._vehicles.tolist()]
+        self.agents: list[str] = []
+        features = self.engine.observation.features
+        self.observation_spaces = {agent: feature_box(features) for agent in self.possible_agents}
+        self.action_spaces = {agent: action_box() for agent in self.possible_agents}
+        self.state_space = feature_box(state_features(self.engine.scenario))
+        self.np_random = np.random.default_rng()  # for wrappers that draw (SuperSuit's); nothing here does
+
+    def observation_space(self, agent: str) -> Any:
+        """Float32 box [F], the same object on each call."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Any:
+        """Float32 box [1], the same object on each call."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Observations], Infos]:
+        """Start an episode; see ``restart``."""
+        given = self._restart(seed, options)
+        if given is not None:
+            self.np_random = np.random.default_rng(given)
+        self.agents = self.possible_agents[:]
+        self.viewer.began()
+        return self._observations(), self._infos(report(self.engine))
+
+    def step(
+        self, actions: Mapping[str, Any]
+    ) -> tuple[dict[str, Observations], dict[str, float], dict[str, bool], dict[str, bool], Infos]:
+        """Advance by one time step. Raises ``InvalidInput`` naming the agent whose action is missing or unusable."""
+        if not self.agents:
+            raise InvalidInput("step: no episode is running; call reset first")
+        if not isinstance(actions, (dict, Mapping)):  # dict first: it is found out sooner
+            raise InvalidInput(f"step: actions = {actions!r}: must be a mapping such as {{'vehicle_2': [-1.0]}}")
+        for agent in actions:
+            if agent not in self.action_spaces:
+                raise unknown_name("agent", agent, self.possible_agents)
+        step = self.engine.step(learner_actions(self.engine, actions))
+        agents = self.possible_agents
+        (rewards,) = step.reward.take(self._vehicles, axis=1).tolist()
+        terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
+        if self.max_cycles is not None and not terminated:
+            truncated = truncated or int(self.engine.steps[0]) >= self.max_cycles
+        infos = self._infos(report(self.engine, step))
+        if terminated or truncated:
+            self.agents = []
+        if self.render_mode is not None:
+            self.viewer.play()
+        return (
+            self._observations(),
+            dict(zip(agents, rewards, strict=True)),
+            dict.fromkeys(agents, terminated),
+            dict.fromkeys(agents, truncated),
+            infos,
+        )
+
+    def state(self) -> Observations:
+        """The full state of all vehicles, float32 [S] within ``state_space``."""
+        self._check_started("state")
+        state: Observations = full_state(self.engine.worlds, self.engine.scenario)[0].copy()
+        return state
+
+    def _observations(self) -> dict[str, Observations]:
+        every = self.engine.observe_all(self._vehicles)
+        return {agent: every[0, i] for i, agent in enumerate(self.possible_agents)}
+
+    def _infos(self, told: Report) -> Infos:
+        return dict(zip(self.possible_agents, plain_infos(told, self._vehicles), strict=True))
+
+
+def _agent_vehicles(engine: Engine, agents: WhoIsAgent) -> Ints:
+    """Indices of the vehicles that are agents."""
+    if agents not in get_args(WhoIsAgent):
+        raise InvalidInput(f"agents = {agents!r}: must be 'all' or 'learners'")
+    if agents == "all":
+        return np.arange(engine.scenario.vehicles)
+    if not engine.learners:
+        raise InvalidInput(
+            f"agents = 'learners': nobody learns in {engine.scenario.name!r}; name learners, or take 'all'"
+        )
+    return np.array(engine.learners)
+
+
+parallel_env = EthBrakeParallelEnv
+
+
+def raw_env(**settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
+    """The same environment with agents acting in turn (AEC), front to rear; arguments as ``parallel_env``.
+
+    >>> import ethbrake_marl as eb
+    >>> env = eb.raw_env(scenario="paper-random")
+    >>> env.reset(seed=7)
+    >>> env.agent_selection
+    'vehicle_1'
+
+    """
+    return in_turns(parallel_env(**settings))
+
+
+def env(**settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
+    """The AEC environment with PettingZoo's usual wrapper, order enforcement, which ``raw_env`` already has.
+
+    Actions are not clipped and nothing ends an episode early: an unusable action is an ``InvalidInput`` in its agent's
+    turn, which stays.
+    """
+    return raw_env(**settings)
