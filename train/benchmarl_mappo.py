@@ -21,7 +21,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
 from ethbrake_marl.learning.training import PpoRecipe, RunDirectory, Training, load_recipe
 from ethbrake_marl.observations import observation_for
-from ethbrake_marl.policies import NetworkSpec, Policy, make_policy
+from ethbrake_marl.policies import NetworkSpec, Policy
 
 
 def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> None:
@@ -104,7 +104,7 @@ def policy_of(experiment: Any, recipe: PpoRecipe, scenario: eb.Scenario) -> Poli
         activation=recipe.network.activation,
         output="tanh",
     )
-    return make_policy(
+    return Policy.make(
         tensors_of(actor, len(recipe.network.policy)),
         algorithm="ppo",
         network=network,

@@ -25,7 +25,7 @@ from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.files.store import new_folder
 from ethbrake_marl.learning.algorithms import tensors_of
 from ethbrake_marl.learning.training import Training
-from ethbrake_marl.policies import NetworkSpec, Policy, make_policy
+from ethbrake_marl.policies import NetworkSpec, Policy
 from ethbrake_marl.rewards import reward_params
 
 # 1. What to train: the same settings as train/ppo.yaml, in smaller networks.
@@ -161,7 +161,7 @@ def learn(scenario: eb.Scenario, steps: int, seed: int) -> Policy:
         activation="relu",
         output="clip",
     )
-    return make_policy(
+    return Policy.make(
         tensors_of(model.policy, network),
         algorithm="ppo",
         network=network,

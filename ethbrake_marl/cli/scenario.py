@@ -241,7 +241,7 @@ def agent_export(
 
     Needs the package onnx, which the extra `export` brings.
     """
-    from ethbrake_marl.policies import load_named_policy, onnx_model
+    from ethbrake_marl.policies import load_named_policy
 
     out.check(onnx)
-    out.write(onnx, onnx_model(load_named_policy(policy)), what="written")
+    out.write(onnx, load_named_policy(policy).to_onnx(), what="written")

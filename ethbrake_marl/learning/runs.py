@@ -67,7 +67,7 @@ from ethbrake_marl.learning.training import (
     stop_on_signal,
 )
 from ethbrake_marl.observations import Appended
-from ethbrake_marl.policies import Policy, PolicyTeam, Sha256, Trained, installed_versions, make_policy, read_trained
+from ethbrake_marl.policies import Policy, PolicyTeam, Sha256, Trained, installed_versions, read_trained
 from ethbrake_marl.scenario import Scenario
 
 Model = BaseAlgorithm  # of Stable-Baselines3
@@ -591,7 +591,7 @@ def trained_policies(training: Training, algorithm: Algorithm, model: Model) -> 
     names, actors = tuple(training.drivers), algorithm.actors(model)
     apart = training.scheme == "independent"
     policies = [
-        make_policy(
+        Policy.make(
             tensors_of(actor, network),
             algorithm=recipe.algorithm,
             network=network,

@@ -57,7 +57,7 @@ from ethbrake_marl.files.yaml import (
     read_yaml,
 )
 from ethbrake_marl.learning import RunDirectory, StopAt, Training, TrainingRecipe, load_recipe, read_settings
-from ethbrake_marl.policies import Policy, has_bundle, installed_versions, read_trained
+from ethbrake_marl.policies import Policy, installed_versions, read_trained
 from ethbrake_marl.scenario import Scenario, check_file_name, load_scenario
 from ethbrake_marl.studies.jobs import Attempt, Job, JobFolder, Workers
 from ethbrake_marl.studies.trainings import Timed, TrainingJob, time_training, told_seconds
@@ -156,7 +156,7 @@ def reach_results(job: TrainingJob, log: Path, stop_at: StopAt | None = None) ->
             run.wait_for_others(_FREE_S)
             run.check_same(job.training)
             bundles = [job.folder / place for place in job.training.drivers.values()]
-            if run.is_finished and not all(map(has_bundle, bundles)):
+            if run.is_finished and not all(map(Policy.stands_in, bundles)):
                 remove_folder(job.folder)  # a finished run has no checkpoint: it is trained anew
         try:
             finished = job.finish(stop_at=stop_at)
@@ -451,7 +451,7 @@ class SweepPlan:
                 run, values = RunDirectory(path / RUNS / row.name), found[row.name]
                 hashes = values[RESULTS.index("policy_sha256")].split()
                 named = [text.rpartition("=")[0] for text in hashes]  # vehicle_i of several, of one policy nothing
-                if run.status.is_file() and all(has_bundle(run.policy / name) for name in named):
+                if run.status.is_file() and all(Policy.stands_in(run.policy / name) for name in named):
                     results[row.name] = values
         return results, damaged
 

@@ -12,7 +12,6 @@ from ethbrake_marl.agents import registry
 from ethbrake_marl.agents.registry import drive
 from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.evaluation.inputs import policy_sha256
-from ethbrake_marl.policies import onnx_model
 from ethbrake_marl.shield.guard import ShieldedDriver
 from tests.fixtures.asked import Asked
 
@@ -155,7 +154,7 @@ def test_onnx__path_and_session_drive_as_the_policy_does(tmp_path: Path):
     pytest.importorskip("onnx")
     policy = eb.load_shipped("ppo")
     path = tmp_path / "shipped.onnx"
-    path.write_bytes(onnx_model(policy))
+    path.write_bytes(policy.to_onnx())
     expected = harms(eb.LearnedAgent(policy))
     session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     for given in (path, session):
