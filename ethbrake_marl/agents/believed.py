@@ -121,12 +121,16 @@ class Ranges:
         world = make_sample(scenario, lambda width, of: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
         low, high = ({key: np.array(scenario.bounds(key)).T[k] for key in ("gaps_m", *OF_OTHERS[1:5])} for k in (0, 1))
         named = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "speed_limit_mps")
+        one, N = np.ones((1, scenario.vehicles)), scenario.vehicles
+        heard = Vehicles.at_once(one, one, np.zeros((1, N)), one, one, np.zeros(1))  # no latency but that of the news
+        if scenario.v2x.by_link:
+            heard = scenario.v2x.with_news(heard, np.full((1, scenario.v2x.width(N)), 0.5))
         middle = {
             "place": _places(world.gaps_m[0], world.gaps_m[0], vehicle),
             "speeds_mps": world.speeds_mps[0],
             **{key: getattr(world.vehicles, key)[0] for key in named},
             "latency_s": world.vehicles.own_latency_s[0],
-            "news_s": _middle_news(scenario),
+            "news_s": heard.latency_s[0],
         }
         low["place"] = _places(low["gaps_m"], high["gaps_m"], vehicle)
         high["place"] = _places(high["gaps_m"], low["gaps_m"], vehicle)
@@ -212,16 +216,6 @@ class Ranges:
             command_mps2=np.where((latency <= worlds.time_s[:, np.newaxis]), command, 0.0),
             obstacle_gap_m=np.maximum(obstacle - place[:, 0], 0.0),
         )
-
-
-def _middle_news(scenario: Scenario) -> Floats:
-    """When each vehicle has heard of the emergency where every number of the channel is in the middle, [N] s."""
-    one, N = np.ones((1, scenario.vehicles)), scenario.vehicles
-    vehicles = Vehicles.at_once(one, one, np.zeros((1, N)), one, one, np.zeros(1))
-    if scenario.v2x.by_link:
-        vehicles = scenario.v2x.with_news(vehicles, np.full((1, scenario.v2x.width(N)), 0.5))
-    news: Floats = vehicles.latency_s[0]
-    return news
 
 
 def _places(ahead_m: Floats, behind_m: Floats, vehicle: int) -> Floats:

@@ -1082,7 +1082,11 @@ def optimise_coupled(
     check_harm_count(harm_count)
     capacity = worlds.vehicles.braking_capacity_mps2
     command = -capacity if others_mps2 is None else np.array(others_mps2, dtype=np.float64)
-    told = _braking_as_told(worlds, vehicle, command)
+    # The closed form lets the others brake with all their capacity: it is what they are told. Who is told to coast or
+    # to drive keeps the capacity: the closed form cannot say what that one does.
+    braking = np.where(command < 0.0, -command, capacity)
+    braking[:, vehicle] = capacity[:, vehicle]
+    told = replace(worlds, vehicles=replace(worlds.vehicles, braking_capacity_mps2=braking))
     best = optimise_pairwise(told, vehicle).deceleration_mps2
     command[:, vehicle] = -best
     _, impacts = advance(worlds, command, until_s=horizon_s)
@@ -1095,16 +1099,6 @@ def optimise_coupled(
         for column, values in zip((best, *harms), found, strict=True):
             column[hit] = values
     return CoupledOptimum(best, first if harm_count == "first" else total, first, total)
-
-
-def _braking_as_told(worlds: Worlds, vehicle: int, command: Floats) -> Worlds:
-    """The worlds for the closed form, which lets the others brake with all their capacity: it is what they are told.
-
-    Who is told to coast or to drive keeps the capacity: the closed form cannot say what that one does.
-    """
-    capacity = np.where(command < 0.0, -command, worlds.vehicles.braking_capacity_mps2)
-    capacity[:, vehicle] = worlds.vehicles.braking_capacity_mps2[:, vehicle]
-    return replace(worlds, vehicles=replace(worlds.vehicles, braking_capacity_mps2=capacity))
 
 
 def _minimise(

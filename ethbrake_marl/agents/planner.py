@@ -85,7 +85,6 @@ def _rounds(seconds: float) -> Iterator[int]:
 CANDIDATES = 256  # per world and decision
 ROUND = 256  # candidates between two looks at the clock
 MOST_MILLISECONDS = 60_000.0  # per world and decision
-_CONSTANTS = 15
 
 
 class Planner:
@@ -167,7 +166,7 @@ class Planner:
 
     def _search(self, problem: ProfileProblem, plan: Profiles) -> tuple[Profiles, Floats]:
         """The best plans found from these and from constants, with their harm under the own count."""
-        constants = problem.constant(problem.even_grid(_CONSTANTS))
+        constants = problem.constant(problem.even_grid(15))
         for seed in _rounds(self._seconds * problem.n):
             n, K = plan.ends.shape  # each world's plan, then its constants: [n * Q]
             ends = np.concatenate([plan.ends[:, np.newaxis], constants.ends.reshape(n, -1, K)], axis=1)
@@ -340,7 +339,6 @@ class RefinedProfile(AgentAround):
 
 # The compiled refinement once more at every decision, from the worlds as they are then.
 
-ROUND_AGAIN = 50  # candidates between two looks at the clock
 MOST_MICROSECONDS = 60_000_000
 
 
@@ -368,7 +366,7 @@ class RefinedAgain(RefinedProfile):
     """
 
     def __init__(self, policy: Agent, scenario: Scenario, argument: str, *, harm_count: HarmCount = "first") -> None:
-        budget = _budget(argument, "us", MOST_MICROSECONDS, ROUND_AGAIN)
+        budget = _budget(argument, "us", MOST_MICROSECONDS, 50)  # candidates between two looks at the clock
         if budget is None:
             raise InvalidInput(
                 f"+refined:{argument}: must be profile (one search at the alert), a number of candidates per decision,"

@@ -319,7 +319,7 @@ def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
         ScriptSpec.parse(spec)  # says what is right
     while True:
         before, plus, last = core.rpartition("+")
-        if not plus or not is_around(last):
+        if not plus or not (last in AROUND or _WITH_BUDGET.fullmatch(last)):
             break
         core, around = before, [last, *around]
     if plus and _is_meant_around(before, core, last):
@@ -331,11 +331,6 @@ def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
             " instance ppo@shipped+refined+step"
         )
     return core, tuple(around)
-
-
-def is_around(word: str) -> bool:
-    """Whether this stands behind a ``+``: one of ``AROUND``, or a refinement with a budget for each decision."""
-    return word in AROUND or _WITH_BUDGET.fullmatch(word) is not None
 
 
 def _is_meant_around(before: str, core: str, last: str) -> bool:
@@ -682,7 +677,7 @@ class Watch(Protocol):
 
 def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | None = None) -> dict[int, Agent]:
     """Agents for the scenario's scripts, by vehicle."""
-    left_out = () if except_for is None else (except_for,) if isinstance(except_for, int) else except_for
+    left_out = (except_for,) if isinstance(except_for, int) else except_for or ()
     made = {
         i: make_agent(spec, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s)
         for i, spec in scenario.scripts.items()

@@ -306,9 +306,8 @@ def _run(
 def _newest(run: RunDirectory, training: str, other_versions: bool) -> tuple[TrainingState | None, list[str]]:
     """The newest whole checkpoint, if there is one, and what was wrong with newer ones."""
     remove_unfinished(run.path)
-    if not run.checkpoints.is_dir():
-        return None, []
-    remove_unfinished(run.checkpoints)
+    if run.checkpoints.is_dir():
+        remove_unfinished(run.checkpoints)
     state, damaged = newest_usable(run.checkpoints)
     if state is None:
         return None, damaged
@@ -988,7 +987,6 @@ _NUMBERS, _ARRAYS, _TABLE, _POLICY, _BEST, _MEMORY = (
     "best",
     "replay",
 )
-_LISTING_LIMIT_BYTES = 1 << 20
 _HELD_LIMITS_BYTES = {_NUMBERS: 256 << 20, _ARRAYS: 1 << 30, _TABLE: 256 << 20}  # of what is read as a whole
 _SIZE_LIMIT_BYTES = 1 << 36  # of any other file: a replay memory of ten million decisions
 _DTYPES = {"BOOL", "F32", "F64", "I32", "I64", "U8", "U32", "U64"}
@@ -1106,9 +1104,9 @@ def newest_usable(folder: Path) -> tuple[TrainingState | None, list[str]]:
 
 def _check_files(folder: Path) -> tuple[Listing, dict[str, bytes]]:
     """The listing, and the content of the files beside it; every file is there, and is what the listing says."""
-    path = folder / LISTING
+    path, read = folder / LISTING, partial(read_plain, refusal=CorruptBundle, follow_links=False)
     try:
-        data = _read(path, _LISTING_LIMIT_BYTES)
+        data = read(path, 1 << 20)
         content = parse_strict_json(data)
         version = content.get("format_version") if isinstance(content, dict) else None
         if type(version) is int and version != FORMAT_VERSION:
@@ -1130,7 +1128,7 @@ def _check_files(folder: Path) -> tuple[Listing, dict[str, bytes]]:
     held = {}
     for name, entry in files.items():
         if name in _HELD_LIMITS_BYTES:
-            held[name] = _read(found[name], _HELD_LIMITS_BYTES[name])
+            held[name] = read(found[name], _HELD_LIMITS_BYTES[name])
             digest, size = hashlib.sha256(held[name]), len(held[name])
         else:
             with open_plain(found[name], _SIZE_LIMIT_BYTES, refusal=CorruptBundle, follow_links=False) as stream:
@@ -1138,10 +1136,6 @@ def _check_files(folder: Path) -> tuple[Listing, dict[str, bytes]]:
         if (size, digest.hexdigest()) != (entry.bytes, entry.sha256):
             raise CorruptBundle(f"{found[name]}: is not the file that was written (size or SHA-256 differ)")
     return listing, held
-
-
-def _read(path: Path, limit_bytes: int) -> bytes:
-    return read_plain(path, limit_bytes, refusal=CorruptBundle, follow_links=False)
 
 
 def _is_folder(path: Path) -> bool:

@@ -1047,7 +1047,6 @@ def stop_on_signal() -> Iterator[Callable[[], bool]]:
 
 # ``team.json`` in a run's folder: which bundle drives which vehicle. Reading a team needs no torch.
 
-_TEAM_LIMIT_BYTES = 1 << 20
 _RIGHT_TEAM = (
     'right is, for instance, {"scheme": "shared", "vehicles": 3, "drivers": {"vehicle_2": "policy", "vehicle_3":'
     ' "policy"}}'
@@ -1077,7 +1076,7 @@ class _TeamFile(FileModel):
 
 
 def _read_team(file: Path) -> _TeamFile:
-    data = read_plain(file, _TEAM_LIMIT_BYTES)
+    data = read_plain(file, 1 << 20)
     try:
         document = Document(str(file), parse_strict_json(data), {})
     except ValueError as error:
