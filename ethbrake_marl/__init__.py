@@ -42,11 +42,8 @@ if TYPE_CHECKING:
     from ethbrake_marl.physics import Worlds as Worlds, advance as advance, make_worlds as make_worlds
 
     # Observations and rewards
-    from ethbrake_marl.observations import (
-        ObservationSpec as ObservationSpec,
-        choose_observation as choose_observation,
-        observation_for as observation_for,
-    )
+    from ethbrake_marl.observations import ObservationSpec as ObservationSpec, choose_observation as choose_observation
+    from ethbrake_marl.scenario import observation_for as observation_for
     from ethbrake_marl.rewards import RewardParams as RewardParams
 
     # Agents, teams and policies
@@ -106,7 +103,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.files.plugins import load_plugin as load_plugin
     from ethbrake_marl.learning import register_algorithm as register_algorithm
     from ethbrake_marl.harm import register_objective as register_objective
-    from ethbrake_marl.scenario import register_feature as register_feature
+    from ethbrake_marl.observations import register_feature as register_feature
     from ethbrake_marl.rewards import register_term as register_term
     from ethbrake_marl.scenario import register_scenarios as register_scenarios
     from ethbrake_marl.scenario import register_preset as register_preset

@@ -31,7 +31,7 @@ from ethbrake_marl.errors import (
     renumbered,
 )
 from ethbrake_marl.harm import Ledger, objective_harm
-from ethbrake_marl.observations import Observations, ObservationSpec, Plan, observation_for
+from ethbrake_marl.observations import Observations, ObservationSpec, Plan
 from ethbrake_marl.physics import (
     BOUND,
     FLAG,
@@ -56,7 +56,7 @@ from ethbrake_marl.physics import (
     step_end_s,
 )
 from ethbrake_marl.rewards import Reward, RewardParams, StepOutcome, reward_params
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario import Scenario, observation_for
 
 # The compiled step of the engine: actions to commands, motion, episode ends, the terms of reward that all share.
 #

@@ -28,7 +28,7 @@ from pydantic_core import CoreSchema
 from ethbrake_marl.defaults import HARM_COUNTS as HARM_COUNTS, HarmCount as HarmCount
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, count_of, describe_error, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
-from ethbrake_marl.physics import Bools, Floats, Impacts, Ints, Worlds, compiled, logistic, unwritable
+from ethbrake_marl.physics import Bools, Floats, Impacts, Ints, Worlds, compiled, logistic
 
 _INJURY_SLOPE = 0.177  # per m/s of speed change
 _INJURY_OFFSET = {"front": -4.457, "rear": -4.888}  # side of the car that is hit
@@ -261,7 +261,7 @@ def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
 def objective_harm(ledger: Ledger, harm_count: HarmCount, objectives: Sequence[Objective]) -> Floats:
     """What the objective of each vehicle makes of the harm so far, [n, N] (m2/s2): less is better."""
     told = ledger.vehicle_harm(harm_count), ledger.world_harm(harm_count), ledger.mass_t
-    harm = HarmSoFar(*(unwritable(each) for each in told))
+    harm = HarmSoFar(*(np.broadcast_to(each, each.shape) for each in told))  # read-only
     return np.stack([KINDS[o.kind].amount(o, harm, i) for i, o in enumerate(objectives)], axis=1)
 
 

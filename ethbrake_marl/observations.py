@@ -6,7 +6,7 @@ with its ``known`` flag 0. There are no running statistics: an observation means
 (``v2x``), ``latency_left`` and what follows from it count the own part of a latency only: nobody knows beforehand when
 news that has not arrived will.
 
-Where an obstacle stands ahead of Vehicle 1 (``observation_for``), the vehicle's place in the line and what it knows of
+Where an obstacle stands ahead of Vehicle 1, the vehicle's place in the line and what it knows of
 the obstacle follow. Vehicle 1 sees it; any other vehicle knows of it as soon as it has Vehicle 1's news.
 
 Where an observation lists the group ``contact``, it is followed by what three forecasts say (``observations.contact``).
@@ -15,16 +15,22 @@ Where an observation lists the group ``contact``, it is followed by what three f
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from difflib import get_close_matches
 from functools import cache
 from itertools import product
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
-from ethbrake_marl.errors import InvalidInput, PhysicsError, unknown_name
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, PhysicsError, unknown_name
 from ethbrake_marl.physics import (
     BOUND,
     CONTACT,
@@ -33,29 +39,271 @@ from ethbrake_marl.physics import (
     Bools,
     Floats,
     Ints,
+    Messages,
     Packed,
-    Vehicles,
     Worlds,
     columns,
     compiled,
     estimate_rows,
     forecast_contacts,
+    make_worlds,
     place_obstacle,
     stopping_distance,
 )
-from ethbrake_marl.scenario import (
-    CONTACT_COMMANDS,
-    CONTACT_SIDES,
-    GROUPS,
-    MOST_NEIGHBOURS,
-    Feature,
-    RegisteredFeature,
-    Scenario,
-    feature_named,
-    listed_features,
-    registered_in,
-    side_of,
+
+# The named features, built in or registered.
+
+MOST_NEIGHBOURS = 64  # on each side
+
+Of = Literal["own", "neighbour"]
+
+
+@dataclass(frozen=True, slots=True)
+class Feature:
+    """One number of an observation: ``clip(value / scale, low, high)``."""
+
+    name: str
+    unit: str
+    scale: float
+    low: float
+    high: float
+    meaning: str
+
+
+CONTACT_COMMANDS = ("brake", "coast", "drive")  # own commands that are forecast: full braking, none, full driving
+CONTACT_SIDES = ("front", "rear")  # own pairs; in front of Vehicle 1 an obstacle
+
+
+class Groups(NamedTuple):
+    """The built-in features by group; those of contacts are told of each of ``CONTACT_COMMANDS`` in turn."""
+
+    own: tuple[Feature, ...]
+    role: tuple[Feature, ...]
+    obstacle: tuple[Feature, ...]
+    contact: tuple[Feature, ...]
+    contact_far: tuple[Feature, ...]
+    neighbour: tuple[Feature, ...]  # of each that is listed, ``front_1`` and so on
+
+
+_contact: list[Feature] = []
+_far: list[Feature] = []
+for _command, _held in zip(CONTACT_COMMANDS, ("braking fully", "coasting", "driving fully"), strict=True):
+    for _side, _where in zip(CONTACT_SIDES, ("in front", "behind"), strict=True):  # four numbers of each own pair
+        _pair, _told = f"{_command}_{_side}", f"{_held}: time to the first impact {_where}"
+        _contact += [
+            Feature(f"{_pair}_time", "s", 2.0, 0.0, 2.0, _told),
+            Feature(f"{_pair}_closing_speed", "m/s", 10.0, 0.0, 4.0, "its closing speed; 0 without one"),
+            Feature(f"{_pair}_fraction", "1", 1.0, 0.0, 1.0, "where in its decision step it falls"),
+            Feature(f"{_pair}_steps", "1", 10.0, 0.0, 2.0, "whole decision steps before that one"),
+        ]
+        _far += [Feature(f"{_pair}_time", "s", 5.0, 0.0, 2.0, _told)]
+    _contact += [  # then the harm of the line
+        Feature(f"{_command}_first_impact_harm", "m2/s2", 50.0, 0.0, 4.0, f"{_held}: first-impact harm of the line"),
+        Feature(f"{_command}_total_harm", "m2/s2", 50.0, 0.0, 4.0, f"{_held}: total harm of the line"),
+    ]
+    _far += [  # what is late or hard: beyond the bounds of those above
+        Feature(f"{_command}_first_impact_speed", "m/s", 10.0, 0.0, 6.0, "square root of the first-impact harm"),
+        Feature(f"{_command}_total_speed", "m/s", 10.0, 0.0, 6.0, "square root of the total harm"),
+    ]
+GROUPS = Groups(
+    own=(
+        Feature("speed", "m/s", 20.0, -2.0, 4.0, "own speed"),
+        Feature("acceleration", "m/s2", 10.0, -2.0, 2.0, "own command in force"),
+        Feature("braking_capacity", "m/s2", 10.0, 0.0, 2.0, "own largest deceleration"),
+        Feature("driving_capacity", "m/s2", 10.0, 0.0, 2.0, "own largest forward acceleration"),
+        Feature("mass", "t", 10.0, 0.0, 8.0, "own mass"),
+        Feature("latency_left", "s", 1.0, 0.0, 4.0, "time until own commands take effect"),
+        Feature("restitution", "1", 1.0, 0.0, 1.0, "coefficient of restitution"),
+    ),
+    role=(
+        Feature(
+            "vehicles_ahead", "1", 1.0, 0.0, 2.0, "how many vehicles are ahead in the line; 2 stands for 2 or more"
+        ),
+        Feature("vehicles_behind", "1", 1.0, 0.0, 2.0, "how many are behind"),
+    ),
+    obstacle=(
+        Feature(
+            "known", "1", 1.0, 0.0, 1.0, "1 if there is an obstacle ahead of the line and this vehicle knows of it"
+        ),
+        Feature("gap", "m", 10.0, 0.0, 10.0, "free distance to it, vehicles between not counted as length"),
+        Feature("hit", "1", 1.0, 0.0, 1.0, "1 if Vehicle 1 has had an impact with it"),
+        Feature(
+            "stopping_margin", "m", 10.0, -15.0, 20.0, "distance left at rest after braking fully as soon as possible"
+        ),
+        Feature(
+            "fitting_deceleration", "m/s2", 10.0, 0.0, 2.0, "own constant deceleration that ends at rest, touching it"
+        ),
+    ),
+    contact=tuple(_contact),
+    contact_far=tuple(_far),
+    neighbour=(
+        Feature("known", "1", 1.0, 0.0, 1.0, "1 if this neighbour exists and its message has arrived"),
+        Feature("gap", "m", 10.0, 0.0, 10.0, "free distance to it, other vehicles between not counted as length"),
+        Feature("closing_speed", "m/s", 10.0, -4.0, 4.0, "positive when the two approach"),
+        Feature("acceleration", "m/s2", 10.0, -2.0, 2.0, "its command in force"),
+        Feature("braking_capacity", "m/s2", 10.0, 0.0, 2.0, "its largest deceleration"),
+        Feature("mass", "t", 10.0, 0.0, 8.0, "its mass"),
+        Feature("latency_left", "s", 1.0, 0.0, 4.0, "time until its commands take effect"),
+        Feature("hit", "1", 1.0, 0.0, 1.0, "1 if the pair on its side has had an impact"),
+        Feature("stopping_margin", "m", 10.0, -15.0, 20.0, "gap left at rest if both brake fully as soon as they can"),
+        Feature(
+            "fitting_deceleration",
+            "m/s2",
+            10.0,
+            0.0,
+            2.0,
+            "own constant deceleration with which the two would come to rest touching, the neighbour braking fully",
+        ),
+    ),
 )
+_SIDE = re.compile(r"(front|rear)_([1-9][0-9]?)")
+
+
+@dataclass(frozen=True, slots=True)
+class RegisteredFeature:
+    """A feature that somebody registered, or one of ours that belongs to no group."""
+
+    feature: Feature
+    function: Callable[..., Floats]
+    of: Of
+    unknown: float  # in the feature's unit
+    tried: tuple[float, ...]  # what it gave in a few worlds: a changed function shows there
+
+    def scaled(self, value: Floats) -> Floats:
+        """``clip(value / scale, low, high)``."""
+        feature = self.feature
+        return np.clip(value * (1.0 / feature.scale), feature.low, feature.high)
+
+    def checked(self, worlds: Worlds, vehicle: int, neighbour: int | None, counts: Any, steps: Floats | None) -> Floats:
+        """What it gives, scaled, [n]; ``unknown`` where it does not count.
+
+        ``steps`` [n], if known, is told in the message. Raises ``InvalidInput`` that names feature, vehicle and world.
+        """
+        name = self.feature.name
+        given = (worlds, vehicle) if neighbour is None else (worlds, vehicle, neighbour)
+        value = np.asarray(self.function(*given))
+        if value.shape != (worlds.n,) or value.dtype.kind not in "fiub":
+            raise InvalidInput(
+                f"feature {name!r}: gave {value.dtype} of shape {value.shape}; must be numbers of shape ({worlds.n},),"
+                " one per world"
+            )
+        told = np.where(counts, value, self.unknown)
+        if not np.isfinite(told).all():
+            world = int(np.argmin(np.isfinite(told)))
+            step = "" if steps is None else f" after step {int(steps[world])}"
+            raise InvalidInput(
+                f"feature {name!r}: is {told[world]} for vehicle_{vehicle + 1} in world {world} at"
+                f" {worlds.time_s[world]:g} s{step}; must be finite"
+            )
+        return self.scaled(told)
+
+
+def age(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
+    """Time since the sample that was last told of it, [n] s; 0 where the present is known."""
+    told = Messages.of(worlds).age_s(worlds.time_s)[:, vehicle, neighbour]
+    return np.where(np.isfinite(told), told, 0.0)
+
+
+_AGE = Feature(
+    "age", "s", 1.0, 0.0, 8.0, "time since the sample that was last told of it; 0 where the present is known"
+)
+FEATURES: dict[str, RegisteredFeature] = {"age": RegisteredFeature(_AGE, age, "neighbour", 0.0, (0.0, 0.0, 0.0))}
+
+
+def listed_features(listed: object) -> tuple[str, ...]:
+    """The full names of the features that a list of groups (``own``, ``front_1``) and single features stands for.
+
+    Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for what is no list, is empty, or names one twice.
+    """
+    if isinstance(listed, str) or not isinstance(listed, Sequence) or not listed:
+        raise InvalidInput("observation: must be a list of groups and features, for instance [own, front_1, rear_1]")
+    names = [name for each in listed for name in _expanded(each)]
+    for name, times in Counter(names).items():
+        if times > 1:
+            raise InvalidInput(f"observation: {name} is listed twice")
+    return tuple(names)
+
+
+class _ListSchema:
+    """The JSON schema of an observation: a list of what is known when it is asked for."""
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        further = {"type": "string", "pattern": r"^(front|rear)_[1-9][0-9]?(\.[a-z0-9_]+)?$"}
+        items = {"anyOf": [{"type": "string", "enum": choices()}, further]}
+        return {"type": "array", "items": items, "minItems": 1, "uniqueItems": True}
+
+
+ListedFeatures = Annotated[tuple[str, ...], Field(strict=False), _ListSchema]
+
+
+def feature_named(name: str) -> Feature:
+    """One feature by its full name; raises ``UnknownName``."""
+    group, dot, own = name.partition(".")
+    if name in FEATURES and FEATURES[name].of == "own":
+        return FEATURES[name].feature
+    if _is_side(group) and own in FEATURES and FEATURES[own].of == "neighbour":
+        return replace(FEATURES[own].feature, name=name)
+    for feature in _group(group) if dot else ():
+        if feature.name == own:
+            return replace(feature, name=name)
+    raise _unknown(name)
+
+
+def side_of(name: str) -> tuple[str, int] | None:
+    """Of which neighbour a feature with this full name is: ``("front", 1)``; None: of none."""
+    match = _SIDE.fullmatch(name.partition(".")[0])
+    return (match[1], int(match[2])) if match and int(match[2]) <= MOST_NEIGHBOURS else None
+
+
+def registered_in(names: Iterable[str]) -> dict[str, RegisteredFeature]:
+    """The registered features among those of full names, by their own names."""
+    own = [name.partition(".")[2] or name for name in names]
+    return {name: FEATURES[name] for name in own if name in FEATURES}
+
+
+def built_in_names() -> set[str]:
+    """Names of groups and of the features in them."""
+    return {*GROUPS._fields[:-1], *(feature.name for group in GROUPS for feature in group)}
+
+
+def choices(sides: Iterable[str] = ("front_1", "rear_1")) -> list[str]:
+    """What an ``observation:`` may list: groups, then single features, of these neighbours."""
+    groups = ["own", *sides, "role", "obstacle", "contact", "contact_far"]
+    single = [f"{group}.{feature.name}" for group in groups for feature in _group(group)]
+    own = [name for name, entry in FEATURES.items() if entry.of == "own"]
+    each = [f"{side}.{name}" for side in sides for name, entry in FEATURES.items() if entry.of == "neighbour"]
+    return [*groups, *single, *own, *each]
+
+
+def _expanded(each: object) -> tuple[str, ...]:
+    if not isinstance(each, str):
+        raise InvalidInput(f"observation: {each!r:.60}: must be the name of a group or a feature")
+    if group := _group(each):
+        return tuple(f"{each}.{feature.name}" for feature in group)
+    return (feature_named(each).name,)
+
+
+def _group(name: str) -> tuple[Feature, ...]:
+    if _is_side(name):
+        return GROUPS.neighbour
+    return getattr(GROUPS, name) if name in GROUPS._fields[:-1] else ()
+
+
+def _is_side(name: str) -> bool:
+    return side_of(name) is not None and "." not in name
+
+
+def _unknown(name: str) -> InvalidInput:
+    if name in FEATURES:
+        return InvalidInput(f"feature {name!r} is of a neighbour: write front_1.{name} or rear_1.{name}")
+    side = name.partition(".")[0]
+    sides = ["front_1", "rear_1"] + ([side] if _is_side(side) else [])
+    known = choices(dict.fromkeys(sides))
+    if not get_close_matches(name, known, n=1):
+        known = [each for each in known if "." not in each]  # a hundred single ones would hide the groups
+    return unknown_name("feature", name, known, may_be_own=True)
+
 
 # The features that an observation holds, in order.
 
@@ -116,11 +364,7 @@ class ObservationSpec:
         groups += [("obstacle", GROUPS.obstacle)] if self.obstacle else []
         groups += [("contact", GROUPS.contact)] if self.contact else []
         groups += [("contact_far", GROUPS.contact_far)] if self.far else []
-        return tuple(
-            Feature(f"{prefix}.{f.name}", f.unit, f.scale, f.low, f.high, f.meaning)
-            for prefix, group in groups
-            for f in group
-        )
+        return tuple(replace(f, name=f"{prefix}.{f.name}") for prefix, group in groups for f in group)
 
     @property
     def far(self) -> bool:
@@ -184,17 +428,6 @@ def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool, bool]:
     front, rear = (max((k for at, k in sides if at == wanted), default=0) for wanted in ("front", "rear"))
     groups = {name.partition(".")[0] for name in names}
     return front, rear, "role" in groups, "obstacle" in groups, bool(groups & {"contact", "contact_far"})
-
-
-def observation_for(scenario: Scenario) -> ObservationSpec:
-    """What vehicles observe in this scenario unless somebody says otherwise: what it declares.
-
-    Where it declares nothing: one neighbour on each side; where Vehicle 1 has an obstacle ahead, also the own place in
-    the line and the obstacle.
-    """
-    if scenario.observation is not None:
-        return choose_observation(scenario.observation, scenario.time_step_s)
-    return ObservationSpec(role=scenario.has_obstacle, obstacle=scenario.has_obstacle)
 
 
 # The contact features: what three forecasts of the vehicle's own command say of its next impacts.
@@ -531,69 +764,89 @@ def _fitting_deceleration(speed: float, latency_left: float, room: float) -> flo
     return speed * speed / (2.0 * left)
 
 
-# The full state of a line as one vector, for centralised critics: all vehicles, all pairs, the time.
-#
-# It reuses the features of ``observations`` and hides nothing: no latency keeps a value from a critic. Rows of learners
-# may end with it, or with the learner's place among the learners (``appended``).
+# Features that somebody registers: checked when they are, and whenever they are evaluated.
 
-Appended = Literal["number", "state"]  # what a row holds behind the vehicle's own observation
-
-_OWN_ONLY = ObservationSpec(front=0, rear=0)
-_PAIR_MEANING = {"gap": "free distance between the two", "hit": "1 if the pair has had an impact"}
-_OBSTACLE_FEATURES = tuple(
-    replace(f, name=f"obstacle.{f.name}", meaning=meaning)
-    for f in GROUPS.obstacle
-    for name, meaning in (("gap", "distance from Vehicle 1 to the obstacle"), ("hit", f.meaning))
-    if f.name == name
-)
-_PAIR_FEATURES = tuple(replace(f, meaning=_PAIR_MEANING[f.name]) for f in GROUPS.neighbour if f.name in _PAIR_MEANING)
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 
-def state_features(scenario: Scenario) -> tuple[Feature, ...]:
-    """Every number of the state in order: each vehicle's own features, each pair's gap and hit flag, the time.
+def register_feature(
+    name: str,
+    function: Callable[..., Floats],
+    *,
+    unit: str,
+    scale: float,
+    low: float,
+    high: float,
+    of: Of = "own",
+    unknown: float = 0.0,
+) -> None:
+    """Make ``name`` a feature that an ``observation:`` may list; its docstring says what it means.
 
-    Where there is an obstacle ahead of Vehicle 1, its gap and hit flag follow.
+    Args:
+        name: lower case letters, digits and ``_``, listed as it is; one of a neighbour as ``front_1.name``.
+        function: from worlds and the vehicle (0 = front) to its value [n], in ``unit``; of a neighbour: from worlds,
+            the vehicle and the neighbour. It must work for lines of any length and see the world through nothing else.
+        unit: of the value.
+        scale: what is observed is ``clip(value / scale, low, high)``; above 0.
+        low: see ``scale``.
+        high: see ``scale``; above ``low``.
+        of: whose it is, ``own`` or ``neighbour``. Of a neighbour it is told only where the vehicle has its news.
+        unknown: what a feature of a neighbour is where the vehicle knows nothing of it, in ``unit``.
+
+    What an own feature tells of other vehicles is up to its author: a channel hides nothing of it. Registering the same
+    again changes nothing. Raises ``AlreadyExists`` for a name that is taken, ``InvalidInput`` for what cannot be used,
+    a function among that which fails, or gives another shape or a number that is not finite, in a few worlds.
+
     """
-    vehicles = [replace(f, name=f"{name}.{f.name}") for name in scenario.vehicle_names for f in GROUPS.own]
-    pairs = [replace(f, name=f"pair_{p}.{f.name}") for p in range(1, scenario.vehicles) for f in _PAIR_FEATURES]
-    time = Feature("time", "s", scenario.horizon_s, 0.0, 1.0, "time since Vehicle 1 began to brake; scale: the horizon")
-    obstacle = _OBSTACLE_FEATURES if scenario.has_obstacle else ()
-    return (*vehicles, *pairs, time, *obstacle)
+    if not isinstance(name, str) or _NAME.fullmatch(name) is None:
+        raise InvalidInput(f"feature {name!r:.80}: must be 1 to 64 of a-z, 0-9 and _, beginning with a letter")
+    if not callable(function) or not (function.__doc__ or "").strip():
+        raise InvalidInput(f"feature {name!r}: needs a function with a docstring that says what it means")
+    _check_numbers(name, scale=scale, low=low, high=high, unknown=unknown)
+    if of not in get_args(Of) or (of == "own" and unknown != 0.0):
+        raise InvalidInput(
+            f"feature {name!r}: of = {of!r}, unknown = {unknown:g}: must be own, or neighbour (with any unknown)"
+        )
+
+    feature = Feature(name, str(unit), float(scale), float(low), float(high), " ".join(str(function.__doc__).split()))
+    entry = RegisteredFeature(feature, function, of, float(unknown), ())
+    entry = replace(entry, tried=_tried(entry))
+    if name in _taken() or FEATURES.setdefault(name, entry) != entry:
+        raise AlreadyExists(f"feature {name!r} is registered already; give another name")
 
 
-def full_state(worlds: Worlds, scenario: Scenario) -> Observations:
-    """State of every world, [n, S] float32 in its own memory; S = 7 N + 2 P + 1, and 2 more with an obstacle ahead."""
-    latency = worlds.vehicles.latency_s  # whole, with what a channel has drawn
-    whole_latency = replace(worlds.vehicles, own_latency_s=latency, known_from_s=Vehicles.known_at_once(latency))
-    vehicles = [observe(replace(worlds, vehicles=whole_latency), i, _OWN_ONLY) for i in range(worlds.N)]
-    pair_values = {"gap": worlds.gaps_m, "hit": worlds.pair_hit.astype(np.float64)}
-    columns = [pair_values[f.name][:, p] for p in range(worlds.N - 1) for f in _PAIR_FEATURES]
-    columns.append(worlds.time_s)
-    if scenario.has_obstacle:
-        columns += [worlds.obstacle_gap_m, worlds.obstacle_hit.astype(np.float64)]
-    features = state_features(scenario)[-len(columns) :]
-    rest = [np.clip(c / f.scale, f.low, f.high) for c, f in zip(columns, features, strict=True)]
-    return np.concatenate([*vehicles, np.stack(rest, axis=1)], axis=1, dtype=np.float32)
+def _taken() -> set[str]:
+    return {*built_in_names(), *(f"{side}_{k}" for side in ("front", "rear") for k in range(MOST_NEIGHBOURS + 1))}
 
 
-def row_features(own: tuple[Feature, ...], appended: Appended | None, scenario: Scenario) -> tuple[Feature, ...]:
-    """Every number of a learner's row in order; raises ``InvalidInput`` for another word than ``Appended`` has."""
-    if appended not in (None, *get_args(Appended)):
-        raise InvalidInput(f"appended = {appended!r}: must be {' or '.join(get_args(Appended))}, or None")
-    if appended is None:
-        return own
-    if appended == "state":
-        return (*own, *state_features(scenario))
-    last = len(scenario.learners) - 1
-    return (*own, Feature("learner", "1", 1.0, 0.0, float(max(last, 1)), "the learner's place among the learners"))
+def _check_numbers(name: str, **numbers: float) -> None:
+    for key, value in numbers.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+            raise InvalidInput(f"feature {name!r}: {key} = {value!r}: must be a finite number")
+    if not numbers["scale"] > 0.0:
+        raise InvalidInput(f"feature {name!r}: scale = {numbers['scale']:g}: must be above 0")
+    if not numbers["low"] < numbers["high"]:
+        raise InvalidInput(f"feature {name!r}: low = {numbers['low']:g}: must be below high ({numbers['high']:g})")
 
 
-def appending(appended: Appended, scenario: Scenario) -> Callable[[Worlds, int], Observations]:
-    """What stands behind the own observation of one learner, from worlds and vehicle: [n, features]."""
-
-    def number(worlds: Worlds, vehicle: int) -> Observations:
-        if vehicle not in scenario.learners:
-            raise InvalidInput(f"appended = 'number': vehicle_{vehicle + 1} is no learner of {scenario.name!r}")
-        return np.full((worlds.n, 1), scenario.learners.index(vehicle), np.float32)
-
-    return number if appended == "number" else lambda worlds, _: full_state(worlds, scenario)
+def _tried(entry: RegisteredFeature) -> tuple[float, ...]:
+    worlds = make_worlds(
+        [[8.0, 6.0], [3.0, 21.0], [0.5, 40.0]],
+        [[20.0, 18.0, 22.0], [9.0, 13.0, 11.0], [31.0, 30.0, 33.0]],
+        braking_capacity_mps2=[6.0, 7.0, 5.0],
+        driving_capacity_mps2=[1.0, 2.0, 3.0],
+        latency_s=[0.0, 0.5, 0.25],
+        mass_t=[4.5, 15.5, 5.9],
+        restitution=[0.0, 0.1, 0.3],
+    ).read_only()
+    seen = [(0, None), (1, None), (2, None)] if entry.of == "own" else [(1, 0), (1, 2), (2, 0)]
+    try:
+        values = [entry.checked(worlds, vehicle, neighbour, True, None) for vehicle, neighbour in seen]
+    except InvalidInput:
+        raise
+    except Exception as error:
+        raise InvalidInput(
+            f"feature {entry.feature.name!r}: its function fails for a line of three vehicles: {type(error).__name__}:"
+            f" {error}"
+        ) from error
+    return tuple(float(value) for each in values for value in each)

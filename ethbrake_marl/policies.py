@@ -32,9 +32,9 @@ from ethbrake_marl.errors import CorruptBundle, InvalidInput, naming_extras, unk
 from ethbrake_marl.files.arrays import ArrayRow, check_arrays, safetensors_headers
 from ethbrake_marl.files.store import new_folder, read_plain, write_file
 from ethbrake_marl.files.yaml import FileModel, first_mistake, read_json_model
-from ethbrake_marl.observations import ObservationSpec, choose_observation
+from ethbrake_marl.observations import FEATURES, ObservationSpec, Of, choose_observation, registered_in
 from ethbrake_marl.physics import PER_LN2, compiled, exp_rest
-from ethbrake_marl.scenario import FEATURES, Of, Scenario, registered_in
+from ethbrake_marl.scenario import Scenario
 
 # The manifest of a policy: network, observation, training, versions and hashes.
 

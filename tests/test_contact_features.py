@@ -12,10 +12,10 @@ import ethbrake_marl as eb
 from ethbrake_marl import observations
 from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.errors import InvalidInput, PhysicsError
-from ethbrake_marl.observations import FORECAST_S, ObservationSpec, choose_observation, observation_for, observe
+from ethbrake_marl.observations import FORECAST_S, GROUPS, ObservationSpec, choose_observation, observe
 from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.policies import NetworkSpec, Policy
-from ethbrake_marl.scenario.features import GROUPS
+from ethbrake_marl.scenario import observation_for
 
 SCENARIO = eb.load_scenario("paper-random")
 STEP_S = 0.1

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.observations import ObservationSpec, observation_for, observe
+from ethbrake_marl.observations import ObservationSpec, observe
 from ethbrake_marl.physics import advance, make_worlds
-from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.scenario import load_scenario, observation_for
 
 SPEC = ObservationSpec(front=2, rear=1)
 

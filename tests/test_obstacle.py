@@ -22,7 +22,7 @@ from ethbrake_marl.limits.limits import best_harm, realised_harm
 from ethbrake_marl.limits.lower_bound import avoidability, lower_bound
 from ethbrake_marl.physics import Worlds, advance
 from ethbrake_marl.policies import ObservationSchema
-from ethbrake_marl.scenario import Scenario, Task, initial_state_worlds, load_scenario, worlds_from_table
+from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield.guard import ShieldedDriver
 from tests.reference.avoidability_lp import avoidable_by_lp
@@ -62,16 +62,16 @@ def test_scenario__vehicle_1_learns_only_with_something_to_lose():
 
 def test_initial_state__may_place_the_obstacle_where_the_scenario_has_one():
     state = {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
-    assert initial_state_worlds(state, ALL).obstacle_gap_m.tolist() == [42.0]
-    assert initial_state_worlds({**state, "obstacle_gap_m": 30}, NEAR).obstacle_gap_m.tolist() == [30.0]
+    assert ALL.worlds_from_state(state).obstacle_gap_m.tolist() == [42.0]
+    assert NEAR.worlds_from_state({**state, "obstacle_gap_m": 30}).obstacle_gap_m.tolist() == [30.0]
     with pytest.raises(InvalidInput, match="obstacle_gap_m is missing, and random in scenario"):
-        initial_state_worlds(state, NEAR)
+        NEAR.worlds_from_state(state)
     with pytest.raises(InvalidInput, match="obstacle_gap_m is not of this scenario: 'paper-random' has no"):
-        initial_state_worlds({**state, "obstacle_gap_m": 30}, load_scenario("paper-random"))
+        load_scenario("paper-random").worlds_from_state({**state, "obstacle_gap_m": 30})
     with pytest.raises(InvalidInput, match=r"initial_state: obstacle_gap_m = 0: must be finite and in \(0, 10000\] m"):
-        initial_state_worlds({**state, "obstacle_gap_m": 0}, ALL)
+        ALL.worlds_from_state({**state, "obstacle_gap_m": 0})
     columns = {"gap_1_m": [7, 8], "gap_2_m": [7, 8], "speed_1_mps": [20, 19], "speed_2_mps": 2 * [18]}
-    table = worlds_from_table({**columns, "speed_3_mps": [20, 20], "obstacle_gap_m": [30, 35]}, NEAR)
+    table = NEAR.worlds_from_table({**columns, "speed_3_mps": [20, 20], "obstacle_gap_m": [30, 35]})
     assert table.obstacle_gap_m.tolist() == [30.0, 35.0]
 
 

@@ -12,7 +12,7 @@ from ethbrake_marl.agents import optimise_pairwise
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.evaluation.measures import PAPER_NOTE, PAPER_ROWS
-from ethbrake_marl.scenario import Scenario, load_scenario, worlds_from_table
+from ethbrake_marl.scenario import Scenario, load_scenario
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 PAGE = (DOCS / "paper.md").read_text("utf-8")
@@ -104,7 +104,7 @@ def test_5000_worlds__cannot_come_from_the_speeds_of_the_figure_of_distances() -
 
 def first_total(scenario: Scenario, spec: str) -> str:
     state = {"gap_1_m": [7], "gap_2_m": [7], "speed_1_mps": [20], "speed_2_mps": [18], "speed_3_mps": [20]}
-    worlds = worlds_from_table(state, scenario)
+    worlds = scenario.worlds_from_table(state)
     outcome = evaluate(worlds, make_lineup([spec], scenario), scenario=scenario).outcome(spec)
     return f"{outcome.first_impact_harm.mean():.2f}, {outcome.total_harm.mean():.2f}".replace("0.00", "0")
 

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
 from ethbrake_marl.learning.training import PpoRecipe, RunDirectory, Training, load_recipe
-from ethbrake_marl.observations import observation_for
 from ethbrake_marl.policies import NetworkSpec, Policy
+from ethbrake_marl.scenario import observation_for
 
 
 def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> None:

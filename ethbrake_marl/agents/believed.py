@@ -19,8 +19,8 @@ import numpy as np
 from ethbrake_marl.agents.registry import Agent, AgentAround, Knowledge, Source, fixed_commands, script_agents
 from ethbrake_marl.engine import Memory, Script, ask_script, begin_script, renew_memory
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics import Bools, Floats, Vehicles, Worlds, is_periodic, move_on, newest_told
-from ethbrake_marl.scenario import Scenario, make_sample
+from ethbrake_marl.physics import Bools, Floats, Messages, Vehicles, Worlds, move_on
+from ethbrake_marl.scenario import Scenario
 
 TOUCHING_M = 1e-9  # a gap below this is a contact: places are told with rounding
 OF_OTHERS = ("place", "speeds_mps", "braking_capacity_mps2", "mass_t", "latency_s", "news_s")  # what may be uncertain
@@ -57,7 +57,7 @@ class Told(NamedTuple):
             known, at_s, place, worlds.speeds_mps.copy(), worlds.command_mps2.copy(),
             worlds.obstacle_gap_m + place[:, 0], worlds.obstacle_hit.copy(), hit,
         )  # fmt: skip
-        if (periodic := is_periodic(worlds)).any():
+        if (periodic := Messages.of(worlds).periodic).any():
             told._hear_messages(worlds, vehicle, periodic)
         for pair, other in ((vehicle - 1, vehicle - 1), (vehicle, vehicle + 1)):
             if 0 <= pair < N - 1:
@@ -68,7 +68,7 @@ class Told(NamedTuple):
 
     def _hear_messages(self, worlds: Worlds, vehicle: int, periodic: Bools) -> None:
         """What is known is as old as the newest message, or the present of who is in sight."""
-        newest = newest_told(worlds, vehicle)
+        newest = Messages.of(worlds).newest_told(vehicle)
         other = periodic[:, np.newaxis] & (np.arange(worlds.N) != vehicle)
         stale = other & (newest.at_s < worlds.time_s[:, np.newaxis])
         self.place_m[stale] = (newest.place_m - newest.own_place_m[:, np.newaxis])[stale]
@@ -118,7 +118,7 @@ class Ranges:
                 f"scenario {scenario.name!r}: is a mixture, and a vehicle that is not known could be of any of {names};"
                 " believed agents need one of these"
             )
-        world = make_sample(scenario, lambda width, of: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
+        world = scenario.sample_by(lambda width, of: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
         low, high = ({key: np.array(scenario.bounds(key)).T[k] for key in ("gaps_m", *OF_OTHERS[1:5])} for k in (0, 1))
         named = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "speed_limit_mps")
         one, N = np.ones((1, scenario.vehicles)), scenario.vehicles

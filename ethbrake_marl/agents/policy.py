@@ -20,19 +20,9 @@ from ethbrake_marl.actions import LARGEST, action_to_command
 from ethbrake_marl.agents.registry import Source
 from ethbrake_marl.engine import Memory, Script, checked_memory, map_memory, take_memory
 from ethbrake_marl.errors import AgentFailed, InvalidInput, describe_error, naming_extras
-from ethbrake_marl.observations import (
-    Appended,
-    Observation,
-    Observations,
-    ObservationSpec,
-    appending,
-    choose_observation,
-    observation_for,
-    observe,
-    row_features,
-)
+from ethbrake_marl.observations import Observation, Observations, ObservationSpec, choose_observation, observe
 from ethbrake_marl.physics import Floats, Ints, Worlds
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario import Appended, Scenario, appending, observation_for, row_features
 
 # Policies of other libraries, each as one function: ``(observation, state) -> (action, state)``.
 

@@ -318,8 +318,9 @@ def part_names() -> list[tuple[str, str]]:
     from ethbrake_marl.evaluation import REGISTERED
     from ethbrake_marl.harm import KINDS
     from ethbrake_marl.learning import algorithm_names
+    from ethbrake_marl.observations import FEATURES
     from ethbrake_marl.rewards import TERMS
-    from ethbrake_marl.scenario import CHANNELS, FEATURES
+    from ethbrake_marl.scenario import CHANNELS
 
     own = [name if entry.of == "own" else f"front_K.{name}, rear_K.{name}" for name, entry in FEATURES.items()]
     return [

@@ -157,10 +157,10 @@ def _kernel_cache() -> tuple[bool, str]:
 
 
 def _scenarios() -> tuple[bool, str]:
-    from ethbrake_marl.scenario import SHIPPED, list_scenarios, scenario_folder
+    from ethbrake_marl.scenario import list_scenarios, shipped_folder
 
-    found = [entry for entry in list_scenarios() if entry.origin == SHIPPED]
-    return len(found) > 0, f"{len(found)} in {scenario_folder()}"
+    found = [entry for entry in list_scenarios() if entry.shipped]
+    return len(found) > 0, f"{len(found)} in {shipped_folder()}"
 
 
 def _golden_impact() -> tuple[bool, str]:

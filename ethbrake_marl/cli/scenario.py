@@ -28,13 +28,13 @@ scenario_group = new_group(
 @command(scenario_group, "list", "scenario list", json=True)
 def scenario_list(out: Out) -> None:
     """List the scenarios that have a name: that and the title, and the folder of those that a plug-in registers."""
-    from ethbrake_marl.scenario import SHIPPED, list_scenarios
+    from ethbrake_marl.scenario import list_scenarios
 
     entries = list_scenarios()
     width = max(len(entry.name) for entry in entries)
     out.result(
         [{"name": e.name, "title": e.title, "path": str(e.path), "origin": e.origin} for e in entries],
-        *(f"{e.name:{width}}  {e.title}{'' if e.origin == SHIPPED else f'  (from {e.origin})'}" for e in entries),
+        *(f"{e.name:{width}}  {e.title}{'' if e.shipped else f'  (from {e.origin})'}" for e in entries),
     )
 
 

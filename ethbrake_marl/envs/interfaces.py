@@ -25,25 +25,10 @@ from ethbrake_marl.engine import Engine, Step
 from ethbrake_marl.envs.drawing import Viewer
 from ethbrake_marl.errors import InvalidInput, check_one_learner, check_whole_number, unknown_name
 from ethbrake_marl.harm import front_share
-from ethbrake_marl.observations import (
-    Observation,
-    Observations,
-    ObservationSpec,
-    choose_observation,
-    full_state,
-    state_features,
-)
-from ethbrake_marl.physics import Bools, Floats, Ints, Packed, Worlds, age_s, columns, compiled
+from ethbrake_marl.observations import Feature, Observation, Observations, ObservationSpec, choose_observation
+from ethbrake_marl.physics import Bools, Floats, Ints, Messages, Packed, Worlds, columns, compiled
 from ethbrake_marl.rewards import Reward, RewardParams
-from ethbrake_marl.scenario import (
-    QUANTITY,
-    Feature,
-    Sample,
-    Scenario,
-    initial_state_worlds,
-    load_scenario,
-    read_scenario,
-)
+from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, full_state, load_scenario, state_features
 
 AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping: what a file would say
 
@@ -131,8 +116,6 @@ def learner_actions(engine: Engine, actions: Mapping[str, Any]) -> Floats | dict
 
 def resolve_scenario(scenario: AnyScenario) -> Scenario:
     """The scenario of a shipped name, of a YAML file, of what such a file would say, or itself."""
-    if isinstance(scenario, Mapping):
-        return read_scenario(scenario)
     return scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
 
 
@@ -154,7 +137,7 @@ def fresh_seed() -> int:
 def restart(engine: Engine, seed: int | None, options: Mapping[str, Any] | None) -> None:
     """Start new episodes in all worlds: the stream of ``seed`` from its start, or where the stream stands.
 
-    ``options["initial_state"]`` (see ``scenario.initial_state_worlds``) is the start of every world instead;
+    ``options["initial_state"]`` (see ``Scenario.worlds_from_state``) is the start of every world instead;
     ``options["listed_world"] = {"seed": 7, "number": 3}`` starts in that world of the list on which agents are
     evaluated, a batch in that one and those after it. With autoreset, later episodes come from the stream. Other
     options warn with ``UnknownResetOption`` and are ignored. Raises ``InvalidInput``, with nothing changed, for a seed
@@ -174,7 +157,7 @@ def _wanted_worlds(engine: Engine, options: Mapping[str, Any]) -> Worlds | None:
     if LISTED_WORLD not in options:
         if INITIAL_STATE not in options:
             return None
-        return initial_state_worlds(options[INITIAL_STATE], engine.scenario).take(np.zeros(engine.n, np.int64))
+        return engine.scenario.worlds_from_state(options[INITIAL_STATE]).take(np.zeros(engine.n, np.int64))
     if INITIAL_STATE in options:
         raise InvalidInput(f"reset: {INITIAL_STATE} and {LISTED_WORLD} are both given; an episode has one start")
     wanted = options[LISTED_WORLD]
@@ -325,7 +308,7 @@ def report(engine: Engine, step: Step | None = None, rows: Ints | None = None) -
         if rows is not None:
             cost, terms = cost.take(rows), {name: term.take(rows, axis=0) for name, term in terms.items()}
     time_s, messages = state[:, shown.column.time], params[:, shown.column.messages :]
-    age = age_s(time_s, messages, N) if shown.has_messages else None
+    age = Messages(messages, N).age_s(time_s) if shown.has_messages else None
     return Report(values, cost, terms, engine.roster.seed, world, known, age)
 
 

@@ -26,10 +26,10 @@ from ethbrake_marl.envs.interfaces import (
     warn_of_unknown,
 )
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.observations import Appended, Observation, Observations, full_state, row_features
+from ethbrake_marl.observations import Observation, Observations
 from ethbrake_marl.physics import Bools, Ints, Packed, Worlds
 from ethbrake_marl.rewards import Reward
-from ethbrake_marl.scenario import initial_state_worlds
+from ethbrake_marl.scenario import Appended, full_state, row_features
 
 Rewards = NDArray[np.float32]
 
@@ -283,7 +283,7 @@ class EthBrakeVecEnv(VecEnv):
                     " learners of a world the same options"
                 )
         return Worlds.concatenate(
-            [initial_state_worlds(row[INITIAL_STATE], self.engine.scenario) for row in options[::width]]
+            [self.engine.scenario.worlds_from_state(row[INITIAL_STATE]) for row in options[::width]]
         )
 
     def _refuse_some_rows(self, what: str, indices: VecEnvIndices) -> None:

@@ -15,7 +15,7 @@ from ethbrake_marl.evaluation.measures import Evaluation, Outcome
 from ethbrake_marl.evaluation.rollout import controlled_vehicle, evaluate
 from ethbrake_marl.limits import Limits, Unproven, avoidability, known_limits, scripted_commands, undecided_because
 from ethbrake_marl.physics import Bools, Floats, Worlds, advance, forecast, make_worlds
-from ethbrake_marl.scenario import QUANTITY, Scenario, Task, worlds_from_table
+from ethbrake_marl.scenario import QUANTITY, Scenario, Task
 
 CELLS = 81  # along each gap
 CHUNK = 500  # worlds between two reports of progress
@@ -140,7 +140,7 @@ def _worlds_at(scenario: Scenario, gap_1_m: Floats, gap_2_m: Floats) -> Worlds:
                 )
             if field in ("gaps_m", "speeds_mps"):  # a table needs those; the rest it takes from the scenario
                 columns[name] = np.full(gap_1_m.size, low)
-    return worlds_from_table(columns, scenario)
+    return scenario.worlds_from_table(columns)
 
 
 # Harm against the constant deceleration of one vehicle in one world: predicted, realised, and the best known.

@@ -73,10 +73,10 @@ from ethbrake_marl.files.sheet import parquet_file
 from ethbrake_marl.files.store import check_writable, new_folder
 from ethbrake_marl.files.yaml import Override
 from ethbrake_marl.harm import Ledger
-from ethbrake_marl.observations import Observation, ObservationSpec, choose_observation, observation_for
+from ethbrake_marl.observations import Observation, ObservationSpec, choose_observation
 from ethbrake_marl.physics import Bools, Floats, ImpactRows, Ints, Worlds, advance, leaving_out_failed, segment_pieces
 from ethbrake_marl.rewards import Reward, RewardParams, reward_params
-from ethbrake_marl.scenario import Sample, Scenario
+from ethbrake_marl.scenario import Sample, Scenario, observation_for
 from ethbrake_marl.shield import HybridAgent, Uncertainty
 
 _SAME = 1e-9  # m, m/s: a piece that goes on like the one before it is part of it

@@ -34,7 +34,7 @@ from ethbrake_marl.files.plugins import files_run
 from ethbrake_marl.files.yaml import FileModel, Override, Wording, flow_text, read_model, read_yaml
 from ethbrake_marl.physics import Ints, Worlds
 from ethbrake_marl.policies import Policy
-from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, load_scenario, read_initial_states, worlds_from_table
+from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, load_scenario
 from ethbrake_marl.shield import ShieldedDriver, Uncertainty
 
 # The identity of a result: the worlds, the scenario and the policies that it is about, and what computed it.
@@ -210,7 +210,7 @@ class NamedWorlds(FileModel):
         for k, world in enumerate(self.worlds):
             if world.state.keys() != columns:
                 raise InvalidInput(f"{where}: worlds[{k}].state has other columns than worlds[0]; all need the same")
-        return worlds_from_table({name: [world.state[name] for world in self.worlds] for name in columns}, scenario)
+        return scenario.worlds_from_table({name: [world.state[name] for world in self.worlds] for name in columns})
 
 
 class _Words(Wording):
@@ -377,5 +377,5 @@ def choose_worlds(
     if initial_states.suffix.lower() in (".yaml", ".yml"):
         worlds = NamedWorlds.read(initial_states).worlds_of(scenario, str(initial_states))
     else:
-        worlds = read_initial_states(initial_states, scenario)
+        worlds = scenario.read_worlds(initial_states)
     return Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0), None

@@ -45,13 +45,13 @@ from ethbrake_marl.physics import (
     Floats,
     ImpactRows,
     Ints,
+    Messages,
     Worlds,
     advance,
-    is_periodic,
     leaving_out_failed,
     make_worlds,
 )
-from ethbrake_marl.scenario import QUANTITY, Scenario, Task, Texts, hidden_from, load_scenario
+from ethbrake_marl.scenario import QUANTITY, Scenario, Task, load_scenario
 
 _SHOWN_AGENTS = 5  # by name, in ``repr``
 _NAMED = 10  # worlds left out that are named one by one; all stand in the JSON
@@ -226,7 +226,9 @@ class Evaluation:
     seed: int | None  # of the list; None for worlds that were given
     outcomes: dict[str, Outcome]  # by the agent's name
     left_out: tuple[LeftOut, ...] = ()  # worlds of the list that are in none of the arrays, the same for all agents
-    kinds: Mapping[str, Texts] = field(default_factory=dict)  # ``scenario`` of a mixture, ``vehicle_2_type``, ...: [n]
+    kinds: Mapping[str, NDArray[np.str_]] = field(
+        default_factory=dict
+    )  # ``scenario`` of a mixture, ``vehicle_2_type``, ...: [n]
 
     def __repr__(self) -> str:
         drivers = [f"{agent!r:.42}" for agent in list(self.outcomes)[:_SHOWN_AGENTS]]
@@ -314,7 +316,7 @@ class Evaluation:
         """Worlds in which the channel hides something of the line from a driven vehicle, [n]; see ``v2x``."""
         hidden = np.zeros(self.worlds.n, np.bool_)
         for vehicle in self.vehicles:
-            hidden |= hidden_from(self.worlds.vehicles, vehicle) | is_periodic(self.worlds)
+            hidden |= self.worlds.vehicles.hide_from(vehicle) | Messages.of(self.worlds).periodic
         return hidden
 
     @cached_property

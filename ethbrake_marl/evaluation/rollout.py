@@ -25,25 +25,7 @@ from ethbrake_marl.errors import (
 from ethbrake_marl.evaluation.inputs import policy_sha256
 from ethbrake_marl.evaluation.measures import REGISTERED, Evaluation, LeftOut, Outcome, Tape
 from ethbrake_marl.harm import Ledger
-from ethbrake_marl.physics import (
-    FLAG,
-    LISTED,
-    ROW,
-    Bools,
-    Decisions,
-    Floats,
-    Ints,
-    Worlds,
-    advance_table,
-    compiled,
-    leaving_out_failed,
-    onset_s,
-    place_obstacle,
-    sample_numbers,
-    sample_worlds,
-    solo_motion,
-    sum_rows,
-)
+from ethbrake_marl.physics import Decisions, Floats, Ints, Worlds, advance, advance_sampled, leaving_out_failed, move_on
 from ethbrake_marl.scenario import Sample, Scenario, ScriptSpec, Task
 
 # The aftermath of a line: where Vehicle 1 ends, and how much of that others pushed it.
@@ -71,67 +53,22 @@ class ShovedFront:
         command = None if script is None else ScriptSpec.parse(script).command(vehicles.braking_capacity_mps2[:, 0])
         if command is None:
             return None
-        columns = (worlds.speeds_mps, vehicles.latency_s, vehicles.speed_limit_mps)
-        speed, latency, limit = (column[:, 0] for column in columns)
-        way = np.empty(worlds.n)
-        find_own_ways(speed, np.asarray(command, np.float64), latency, limit, task.scenario.horizon_s, way)
-        return cls(worlds, way)
+        columns = (worlds.speeds_mps[:, 0], command, vehicles.latency_s[:, 0], vehicles.speed_limit_mps[:, 0])
+        speed, command, latency, limit = (np.array(column, np.float64)[:, np.newaxis] for column in columns)
+        _, way = move_on(speed, command, latency, limit, np.full(speed.shape, task.scenario.horizon_s))
+        return cls(worlds, way[:, 0])
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
         """Add the way of one step, by a post ahead: the world's own obstacle, or one out of reach."""
-        v = before.vehicles
-        post_m = before.with_post_ahead(until_s - before.time_s).obstacle_gap_m
-        status = np.full(before.n, FLAG.DONE)
-        add_front_ways(
-            post_m, before.obstacle_hit, before.gaps_m, before.speeds_mps, before.time_s, before.pair_hit, command_mps2,
-            until_s, v.latency_s, v.mass_t, v.speed_limit_mps, v.restitution, self._way_m, status,
-        )  # fmt: skip
-        if (status != FLAG.DONE).any():
-            raise FLAG.failure(status, before.time_s, until_s)
+        post = before.with_post_ahead(until_s - before.time_s)
+        after, _ = advance(post, command_mps2, until_s=until_s)
+        self._way_m += post.obstacle_gap_m - after.obstacle_gap_m
 
     @property
     def metres(self) -> Floats:
         """How far Vehicle 1 was shoved in each world so far, [n]."""
         shoved: Floats = self._way_m - self._own_way_m
         return shoved
-
-
-@compiled
-def find_own_ways(speed: Floats, command: Floats, latency: Floats, limit: Floats, duration: float, way: Floats) -> None:
-    """How far each of n vehicles comes on its own, into ``way`` [n] (m)."""
-    for k in range(way.shape[0]):
-        way[k] = solo_motion(speed[k], command[k], latency[k], limit[k], duration)[1]
-
-
-@compiled
-def add_front_ways(
-    post: Floats, post_hit: Bools, gaps: Floats, speeds: Floats, time: Floats, hit: Bools, command: Floats,
-    until: Floats, latency: Floats, mass: Floats, limit: Floats, restitution: Floats, way: Floats, status: Ints,
-) -> None:  # fmt: skip
-    """Add to ``way`` [n] how far Vehicle 1 comes in the step to ``until``: the change of its gap to the ``post``.
-
-    As ``advance`` of these worlds with the post as their obstacle, to the same bits. Worlds that have ended stay;
-    ``status`` [n] tells which could not be advanced.
-    """
-    vehicles = speeds.shape[1]
-    table = np.zeros((ROW.OF_SEGMENT, vehicles + 1))
-    no_rows = np.empty((0, LISTED.WIDTH))
-    for k in range(speeds.shape[0]):
-        if not until[k] > time[k]:
-            continue
-        place_obstacle(table, post[k], 1.0 if post_hit[k] else 0.0)
-        table[ROW.SPEED, 0] = 0.0
-        for i in range(vehicles):
-            table[ROW.COMMAND, i + 1] = command[k, i]
-            table[ROW.SPEED, i + 1] = speeds[k, i]
-            table[ROW.MASS, i + 1] = mass[k, i]
-            table[ROW.LIMIT, i + 1] = limit[k, i]
-            table[ROW.ONSET, i + 1] = onset_s(latency[k, i], time[k])
-        for p in range(vehicles - 1):
-            table[ROW.GAP, p + 1] = gaps[k, p]
-            table[ROW.HIT, p + 1] = 1.0 if hit[k, p] else 0.0
-        status[k] = advance_table(table, restitution[k], until[k] - time[k], time[k], k, no_rows, 0)[1]
-        way[k] += post[k] - table[ROW.GAP, 0]
 
 
 VEHICLE_2 = 1  # the map's samples begin with its latency
@@ -145,9 +82,7 @@ class SampledHarm:
     """
 
     def __init__(self, worlds: Worlds, scenario: Scenario) -> None:
-        self._vehicles = worlds.vehicles
-        self._gaps_m, self._speeds_mps = worlds.gaps_m.copy(), worlds.speeds_mps.copy()
-        self._time_s, self._pair_hit = worlds.time_s.copy(), worlds.pair_hit.copy()
+        self._worlds = worlds
         self._command = np.zeros(worlds.speeds_mps.shape)
         self._harm = np.zeros(worlds.n)
         self._start_s = worlds.first_decision_s([VEHICLE_2])
@@ -176,20 +111,13 @@ class SampledHarm:
         """Go on by one step: every world to its next sample, none beyond its first one at or after the horizon."""
         self._samples += 1
         next_s = np.minimum(Decisions(self._start_s, self._step_s).at(self._samples), self._horizon_s)
-        until_s, v = np.maximum(next_s, self._time_s), self._vehicles
-        first, last = sample_numbers(self._time_s, until_s, v.latency_s[:, VEHICLE_2], self._step_s)
-        shape = self._gaps_m.shape
-        harm = np.zeros(shape)
-        sample_worlds(
-            self._gaps_m, self._speeds_mps, self._time_s, self._pair_hit, self._command, until_s, self._step_s, first,
-            last, v.latency_s, v.mass_t, v.speed_limit_mps, v.restitution, np.zeros(shape), harm,
-            np.zeros(shape, np.int64),
-        )  # fmt: skip
-        self._harm += sum_rows(harm)
+        until_s = np.maximum(next_s, self._worlds.time_s)
+        self._worlds, impacts = advance_sampled(self._worlds, self._command, until_s=until_s, step_s=self._step_s)
+        self._harm += impacts.total_harm.sum(axis=1)
 
     def finish(self) -> Floats:
         """Go on to the horizon; gives the sum of each world, [n] m2/s2."""
-        while (self._time_s < self._horizon_s - 1e-6 * self._step_s).any():
+        while (self._worlds.time_s < self._horizon_s - 1e-6 * self._step_s).any():
             self._move()
         return self._harm
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import copy
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn, TypeVar, get_args
@@ -73,8 +73,11 @@ DEPTH_LIMIT = 16  # mappings and lists inside each other
 
 YamlPath = tuple[str | int, ...]
 
-_NULL = {"", "~", "null", "Null", "NULL"}
-_BOOLEAN = {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
+_PLAIN_VALUES: dict[str, bool | None] = {
+    **dict.fromkeys(("", "~", "null", "Null", "NULL")),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+}
 _INTEGER = re.compile(r"(?P<decimal>[-+]?[0-9]+)|0o(?P<octal>[0-7]+)|0x(?P<hexadecimal>[0-9a-fA-F]+)")
 _BASES = {"decimal": 10, "octal": 8, "hexadecimal": 16}
 _NOT_FINITE = re.compile(r"(?P<sign>[-+]?)\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
@@ -128,15 +131,6 @@ class Document:
         return InvalidInput(f"{where}: {_describe(shown, path, wording)}{f' (and {more} more)' if more else ''}")
 
 
-@dataclass(slots=True)
-class _Open:
-    """A mapping or list whose end has not been seen; ``key`` waits for its value."""
-
-    container: dict[str, Any] | list[Any]
-    path: YamlPath
-    key: str | None = None
-
-
 def read_yaml(path: str | Path, limit: int = SIZE_LIMIT) -> Document:
     """Read one YAML file of at most ``limit`` bytes.
 
@@ -160,10 +154,9 @@ def parse_yaml(text: str | bytes, file: str = "<text>", limit: int = SIZE_LIMIT)
 
 
 def _parse(text: str, file: str) -> Document:
-    builder = _Builder(file)
+    reader = _Reader(file, text)
     try:
-        for event in yaml.parse(text, Loader=yaml.SafeLoader):
-            builder.take(event)
+        content = reader.read()
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         at = (mark.line, mark.column) if mark is not None else None
@@ -175,8 +168,8 @@ def _parse(text: str, file: str) -> Document:
     except InvalidInput:
         raise
     except (yaml.YAMLError, RecursionError, ValueError, LookupError, AttributeError, TypeError) as error:
-        _fail(file, builder.at, f"not valid YAML: {error}")
-    return Document(file, builder.content, builder.lines)
+        _fail(file, reader.at, f"not valid YAML: {error}")
+    return Document(file, content, reader.lines)
 
 
 def _fail(file: str, at: tuple[int, int] | None, reason: str) -> NoReturn:
@@ -184,95 +177,84 @@ def _fail(file: str, at: tuple[int, int] | None, reason: str) -> NoReturn:
     raise InvalidInput(f"{where}: {reason}") from None
 
 
-@dataclass(slots=True)
-class _Builder:
-    """Builds the content from the events of one document."""
+class _Reader:
+    """Reads the content of one document from its events."""
 
-    file: str
-    content: Any = None
-    lines: dict[YamlPath, int] = field(default_factory=dict)
-    at: tuple[int, int] = (0, 0)  # line and column of the event in hand, from 0
-    _stack: list[_Open] = field(default_factory=list)
-    _documents: int = 0
+    def __init__(self, file: str, text: str) -> None:
+        self.file, self.lines, self.at = file, dict[YamlPath, int](), (0, 0)  # line and column of the event in hand
+        self._events = yaml.parse(text, Loader=yaml.SafeLoader)
 
-    def take(self, event: yaml.Event) -> None:
-        if event.start_mark is not None:
+    def read(self) -> Any:
+        """The value of the whole document; None where there is nothing."""
+        content, documents = None, 0
+        for event in iter(self._next, None):
+            if isinstance(event, yaml.DocumentStartEvent):
+                documents += 1
+                if documents > 1:
+                    self._fail("a second document starts here; one file holds one document")
+                if event.tags or (event.version or (1, 2)) != (1, 2):
+                    self._fail("directives are not supported here")
+            elif isinstance(event, yaml.NodeEvent):
+                content = self._value(event, ())
+        return content
+
+    def _next(self) -> Any:
+        event = next(self._events, None)
+        if event is not None and event.start_mark is not None:
             self.at = (event.start_mark.line, event.start_mark.column)
-        if isinstance(event, yaml.DocumentStartEvent):
-            self._start_document(event)
-        elif isinstance(event, yaml.NodeEvent):
-            self._take_node(event)
-        elif isinstance(event, yaml.CollectionEndEvent):
-            self._stack.pop()
+        return event
 
-    def fail(self, reason: str) -> NoReturn:
+    def _fail(self, reason: str) -> NoReturn:
         _fail(self.file, self.at, reason)
 
-    def _start_document(self, event: yaml.DocumentStartEvent) -> None:
-        self._documents += 1
-        if self._documents > 1:
-            self.fail("a second document starts here; one file holds one document")
-        if event.tags or (event.version or (1, 2)) != (1, 2):
-            self.fail("directives are not supported here")
-
-    def _take_node(self, event: yaml.NodeEvent) -> None:
-        if isinstance(event, yaml.AliasEvent):
-            self.fail(f"alias *{event.anchor} is not supported; write the value out")
-        if event.anchor is not None:
-            self.fail(f"anchor &{event.anchor} is not supported; write the value out where it is needed")
-        if isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent) and event.tag is not None:
-            self.fail(f"tag {event.tag} is not supported; write a plain value")
-        inside = self._stack[-1] if self._stack else None
-        if inside is not None and isinstance(inside.container, dict) and inside.key is None:
-            inside.key = self._key(event, inside)
-            self.lines[(*inside.path, inside.key)] = self.at[0] + 1
-            return
-        path = self._attach(event, inside)
+    def _value(self, event: Any, path: YamlPath) -> Any:
+        """What begins with this event, at this path."""
+        self._check_plain(event)
         self.lines.setdefault(path, self.at[0] + 1)
+        if isinstance(event, yaml.ScalarEvent):
+            return self._scalar(event)
+        if len(path) >= DEPTH_LIMIT:
+            self._fail(f"nested deeper than {DEPTH_LIMIT} levels")
+        if isinstance(event, yaml.SequenceStartEvent):
+            entries: list[Any] = []
+            while not isinstance(inner := self._next(), yaml.SequenceEndEvent):
+                entries.append(self._value(inner, (*path, len(entries))))
+            return entries
+        values: dict[str, Any] = {}
+        while not isinstance(inner := self._next(), yaml.MappingEndEvent):
+            self._check_plain(inner)
+            key = self._key(inner, values, path)
+            self.lines[(*path, key)] = self.at[0] + 1
+            values[key] = self._value(self._next(), (*path, key))
+        return values
 
-    def _key(self, event: yaml.NodeEvent, inside: _Open) -> str:
+    def _check_plain(self, event: Any) -> None:
+        if isinstance(event, yaml.AliasEvent):
+            self._fail(f"alias *{event.anchor} is not supported; write the value out")
+        if event.anchor is not None:
+            self._fail(f"anchor &{event.anchor} is not supported; write the value out where it is needed")
+        if event.tag is not None:
+            self._fail(f"tag {event.tag} is not supported; write a plain value")
+
+    def _key(self, event: Any, before: Collection[str], path: YamlPath) -> str:
         if not isinstance(event, yaml.ScalarEvent):
-            self.fail("a key must be text, not a list or a mapping")
+            self._fail("a key must be text, not a list or a mapping")
         key = self._scalar(event)
         if event.implicit[0] and event.value == "<<":
-            self.fail("merge key << is not supported; write the values out")
+            self._fail("merge key << is not supported; write the values out")
         if not isinstance(key, str):
-            self.fail(f"key {event.value!r} must be text; quote it if that is what is meant")
-        if key in inside.container:
-            self.fail(f"key {key!r} is given twice, first on line {self.lines[(*inside.path, key)]}")
+            self._fail(f"key {event.value!r} must be text; quote it if that is what is meant")
+        if key in before:
+            self._fail(f"key {key!r} is given twice, first on line {self.lines[(*path, key)]}")
         return key
-
-    def _attach(self, event: yaml.NodeEvent, inside: _Open | None) -> YamlPath:
-        """Put the event's value where it belongs and return its path."""
-        value: Any = {} if isinstance(event, yaml.MappingStartEvent) else []
-        if isinstance(event, yaml.ScalarEvent):
-            value = self._scalar(event)
-        path: YamlPath = ()
-        if inside is None:
-            self.content = value
-        elif isinstance(inside.container, list):
-            path = (*inside.path, len(inside.container))
-            inside.container.append(value)
-        else:
-            key = str(inside.key)
-            path = (*inside.path, key)
-            inside.container[key] = value
-            inside.key = None
-        if isinstance(event, yaml.CollectionStartEvent):
-            if len(self._stack) >= DEPTH_LIMIT:
-                self.fail(f"nested deeper than {DEPTH_LIMIT} levels")
-            self._stack.append(_Open(value, path))
-        return path
 
     def _scalar(self, event: yaml.ScalarEvent) -> str | int | float | bool | None:
         """Core schema of YAML 1.2; a quoted or block scalar is always text."""
         text = str(event.value)
         if not event.implicit[0]:
             return text
-        if text in _NULL:
-            return None
-        if text in _BOOLEAN:
-            return _BOOLEAN[text]
+        if text in _PLAIN_VALUES:
+            return _PLAIN_VALUES[text]
         if integer := _INTEGER.fullmatch(text):
             return self._integer(integer)
         if (number := parse_numeral(text)) is not None:
@@ -287,7 +269,7 @@ class _Builder:
         digits = match[base]
         value = int(digits, _BASES[base]) if len(digits) <= 64 else _LARGEST_INTEGER
         if not -_LARGEST_INTEGER < value < _LARGEST_INTEGER:
-            self.fail(f"integer {digits[:24]}{'...' if len(digits) > 24 else ''} does not fit into 64 bits")
+            self._fail(f"integer {digits[:24]}{'...' if len(digits) > 24 else ''} does not fit into 64 bits")
         return value
 
 
@@ -323,6 +305,12 @@ def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
     """Raise the error for ``value`` at ``at`` (inside the field being checked): ``right`` says what would do."""
     shown = "" if value is UNSHOWN else flow_text(value, 60)
     raise PydanticCustomError("refused", "{right}", {"right": right, "value": shown, "at": at})
+
+
+def require(holds: bool, at: YamlPath, value: Any, right: str) -> None:
+    """``refuse`` the value unless ``holds``."""
+    if not holds:
+        refuse(at, value, right)
 
 
 class Wording:

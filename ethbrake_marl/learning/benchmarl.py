@@ -18,9 +18,8 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ethbrake_marl.envs import feature_box, make_engine, resolve_scenario
-from ethbrake_marl.observations import full_state, observation_for, state_features
 from ethbrake_marl.rewards import Reward
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario import Scenario, full_state, observation_for, state_features
 
 GROUP = "learners"
 

@@ -66,9 +66,8 @@ from ethbrake_marl.learning.training import (
     read_object,
     stop_on_signal,
 )
-from ethbrake_marl.observations import Appended
 from ethbrake_marl.policies import Policy, PolicyTeam, Sha256, Trained, installed_versions, read_trained
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario import Appended, Scenario
 
 Model = BaseAlgorithm  # of Stable-Baselines3
 Evaluate = Callable[[Any], Mapping[str, float]]  # of what is trained: a ``Policy``, or a ``PolicyTeam``

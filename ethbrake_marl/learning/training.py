@@ -49,7 +49,7 @@ from ethbrake_marl.files.yaml import (
     refuse,
     schema_lines,
 )
-from ethbrake_marl.observations import ObservationSpec, choose_observation, observation_for
+from ethbrake_marl.observations import ListedFeatures, ObservationSpec, choose_observation, listed_features
 from ethbrake_marl.policies import (
     SHIPPED,
     Activation,
@@ -60,14 +60,7 @@ from ethbrake_marl.policies import (
     load_policy,
 )
 from ethbrake_marl.rewards import RewardParams, registered_terms, setting_names
-from ethbrake_marl.scenario import (
-    ListedFeatures,
-    Scenario,
-    check_file_name,
-    listed_features,
-    load_scenario,
-    shipped_folder,
-)
+from ethbrake_marl.scenario import Scenario, check_file_name, load_scenario, observation_for, shipped_folder
 
 if TYPE_CHECKING:  # torch takes seconds, and what is asked of a run needs none
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -268,7 +261,7 @@ class TrainingRecipe(FileModel):
     @staticmethod
     def shipped() -> dict[str, Path]:
         """Name -> file of every recipe that comes with the package: of the checkout's ``train/``, or installed."""
-        return {file.stem: file for file in sorted(shipped_folder("train", "recipes").glob("*.yaml"))}
+        return {file.stem: file for file in sorted(shipped_folder("train").glob("*.yaml"))}
 
     @staticmethod
     def file(name_or_path: str | Path) -> Path:

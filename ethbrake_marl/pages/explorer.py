@@ -43,7 +43,7 @@ from ethbrake_marl.limits import Unproven, driven_profiles, prove, scripted_comm
 from ethbrake_marl.pages.page import Page, Part, Played, Section, shown
 from ethbrake_marl.physics import Decisions, Floats, Worlds
 from ethbrake_marl.policies import Policy
-from ethbrake_marl.scenario import QUANTITY, QuantityRule, Scenario, Task, initial_state_worlds, table_columns
+from ethbrake_marl.scenario import QUANTITY, Scenario, Task
 from ethbrake_marl.search import Profiles, profile_problem
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver
 
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 # A state is plain data: a quantity of every vehicle or pair is a list, one of the whole world a number.
 
 State = dict[str, Any]
-_RULES: dict[str, QuantityRule] = {**QUANTITY.usual, **QUANTITY.optional}
+_RULES = {**QUANTITY.usual, **QUANTITY.optional}
 
 
 # title, least, greatest and step of a slider, and whether it is shown at once
@@ -105,7 +105,7 @@ def slider_groups(scenario: Scenario, state: State) -> list[dict[str, Any]]:
 def read_state(given: object, scenario: Scenario) -> Worlds:
     """The world (n = 1) that a page asks for; every quantity must be there.
 
-    Raises ``InvalidInput`` for an unknown or missing key, what is no number, and what ``initial_state_worlds`` refuses.
+    Raises ``InvalidInput`` for an unknown or missing key, what is no number, and as ``Scenario.worlds_from_state``.
     """
     if not isinstance(given, Mapping):
         raise InvalidInput("world: must be an object such as {'gaps_m': [7, 7], ...}")
@@ -120,7 +120,7 @@ def read_state(given: object, scenario: Scenario) -> Worlds:
             raise InvalidInput(f"world: {key}: must be a list of {rule.count(scenario.vehicles)} numbers")
         for i, each in enumerate(given[key]):
             read_number(each, f"world: {key}[{i}]")
-    return initial_state_worlds(given, scenario)
+    return scenario.worlds_from_state(given)
 
 
 def read_number(value: object, what: str) -> float:
@@ -492,7 +492,7 @@ def table_text(world: Worlds, scenario: Scenario) -> str:
     state: dict[str, Any] = Conditions.of(world)
     columns = {
         column: repr(float(state[field][index] if isinstance(state[field], list) else state[field]))
-        for column, (field, index) in table_columns(scenario).items()
+        for column, (field, index) in scenario.table_columns.items()
     }
     return csv_text([columns])
 

@@ -10,8 +10,6 @@ from ethbrake_marl.physics.batch import (
     columns as columns,
     leaving_out_failed as leaving_out_failed,
     measured_without_failed as measured_without_failed,
-    sample_numbers as sample_numbers,
-    sample_worlds as sample_worlds,
 )
 from ethbrake_marl.physics.compiling import (
     PER_LN2 as PER_LN2,
@@ -66,14 +64,10 @@ from ethbrake_marl.physics.kernel import (
     value_of as value_of,
 )
 from ethbrake_marl.physics.messages import (
-    age_s as age_s,
+    Messages as Messages,
     estimate_rows as estimate_rows,
     hear_rows as hear_rows,
-    is_periodic as is_periodic,
     move_on as move_on,
-    newest_told as newest_told,
-    ring_length as ring_length,
-    silent_messages as silent_messages,
 )
 from ethbrake_marl.physics.worlds import (
     Bools as Bools,
@@ -83,6 +77,4 @@ from ethbrake_marl.physics.worlds import (
     Vehicles as Vehicles,
     Worlds as Worlds,
     make_worlds as make_worlds,
-    sum_rows as sum_rows,
-    unwritable as unwritable,
 )

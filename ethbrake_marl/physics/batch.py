@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import pairwise
 from typing import Any, NamedTuple, TypeVar
@@ -19,7 +19,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError, renumbered
 from ethbrake_marl.physics.compiling import by_parts, compiled
-from ethbrake_marl.physics.kernel import BOUND, FLAG, LISTED, ROW, advance_table, command_in_force, onset_s, solo_motion
+from ethbrake_marl.physics.kernel import (
+    BOUND,
+    FLAG,
+    LISTED,
+    ROW,
+    advance_table,
+    command_in_force,
+    onset_s,
+    place_obstacle,
+    solo_motion,
+)
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds
 
 # Worlds that cannot be advanced: left out, named, and never at the expense of the others.
@@ -59,9 +69,6 @@ def leaving_out_failed(work: Callable[[Ints], Result], rows: Ints) -> tuple[Resu
     return None, rows, failed
 
 
-_BAD_COMMAND, _BAD_END = 10, 11
-
-
 @dataclass(frozen=True, slots=True)
 class ImpactRows:
     """Every impact of a segment, by world and then by time; arrays [k]."""
@@ -91,231 +98,6 @@ class Impacts:
     def no_obstacle(n: int) -> tuple[Floats, Floats, Ints]:
         """Harm, by both counts, and impacts of ``n`` worlds without an obstacle."""
         return np.zeros(n), np.zeros(n), np.zeros(n, np.int64)
-
-
-@compiled
-def advance_worlds(
-    gaps: Floats, speeds: Floats, time: Floats, hit: Bools, in_force: Floats, command: Floats, until: Floats,
-    braking: Floats, driving: Floats, latency: Floats, mass: Floats, limit: Floats, restitution: Floats,
-    first_harm: Floats, total_harm: Floats, count: Ints, failed: Ints, rows: Floats,
-) -> tuple[int, int, int]:  # fmt: skip
-    """Advance every world to its ``until``, in place (the first five arrays and the harm).
-
-    ``rows`` [capacity, LISTED.WIDTH] receives the impacts that fit. Returns their whole number, the world whose end or
-    command is refused (or -1) and why. A world in which a check fails is marked with its status in ``failed`` [n] (else
-    DONE) and stays where it was; the others go on.
-    """
-    n, vehicles = speeds.shape
-    table = np.zeros((ROW.OF_SEGMENT, vehicles))
-    recorded = 0
-    for k in range(n):
-        duration = until[k] - time[k]
-        if not 0.0 <= duration < math.inf:
-            return recorded, k, _BAD_END
-        for i in range(vehicles):
-            wanted = command[k, i]
-            if not -braking[k, i] <= wanted <= driving[k, i]:
-                return recorded, k, _BAD_COMMAND
-            table[ROW.COMMAND, i] = wanted
-            table[ROW.SPEED, i] = speeds[k, i]
-            table[ROW.MASS, i] = mass[k, i]
-            table[ROW.LIMIT, i] = limit[k, i]
-            table[ROW.ONSET, i] = onset_s(latency[k, i], time[k])
-            in_force[k, i] = command_in_force(wanted, latency[k, i], until[k])
-        for p in range(vehicles - 1):
-            table[ROW.GAP, p] = gaps[k, p]
-            table[ROW.HIT, p] = 1.0 if hit[k, p] else 0.0
-        recorded, status = advance_table(table, restitution[k], duration, time[k], k, rows, recorded)
-        failed[k] = status
-        if status != FLAG.DONE:
-            continue
-        time[k] = until[k]
-        for i in range(vehicles):
-            speeds[k, i] = table[ROW.SPEED, i]
-        for p in range(vehicles - 1):
-            gaps[k, p] = table[ROW.GAP, p]
-            hit[k, p] = table[ROW.HIT, p] == 1.0
-            first_harm[k, p] = table[ROW.FIRST_HARM, p]
-            total_harm[k, p] = table[ROW.TOTAL_HARM, p]
-            count[k, p] = int(table[ROW.COUNT, p])
-    return recorded, -1, FLAG.DONE
-
-
-def advance(
-    worlds: Worlds,
-    command_mps2: ArrayLike,
-    duration_s: ArrayLike | None = None,
-    *,
-    until_s: ArrayLike | None = None,
-    record: bool = False,
-    threads: int = 1,
-) -> tuple[Worlds, Impacts]:
-    """Advance ``worlds`` exactly, each under its constant command, and report the impacts on the way.
-
-    Raises ``InvalidInput`` for an unusable command, end or ``threads``, ``PhysicsError`` naming the worlds that failed.
-
-    Args:
-        worlds: n worlds of N vehicles.
-        command_mps2: signed acceleration wanted, [n, N] m/s2, within capacities; nothing before the latency elapsed.
-        duration_s: length of the segment, one number or [n], s; or give ``until_s``.
-        until_s: its absolute end, not before the worlds' time.
-        record: also report every impact, as ``Impacts.rows``.
-        threads: pay from about 10,000 worlds on; neither they nor the batch change a result.
-
-    """
-    command = _shaped("command_mps2", command_mps2, worlds.speeds_mps.shape)
-    if (duration_s is None) == (until_s is None):
-        raise InvalidInput("advance: give either duration_s or until_s")
-    end = until_s if duration_s is None else worlds.time_s + _shaped("duration_s", duration_s, (worlds.n,))
-    until = _shaped("until_s", end, (worlds.n,))
-    obstacle = worlds.obstacle_ahead
-    if not obstacle.any():
-        return _advance(worlds, command, until, record, threads)
-    _refuse_bad(worlds, command, until, (until >= worlds.time_s) & (until < math.inf))
-    if obstacle.all():
-        return _advance_with_obstacle(worlds, command, until, record, threads)
-    return _advance_mixed(worlds, command, until, record, threads, obstacle)
-
-
-def _advance(worlds: Worlds, command: Floats, until: Floats, record: bool, threads: int) -> tuple[Worlds, Impacts]:
-    """``advance`` of worlds without an obstacle, or with one that is written out as a vehicle."""
-    vehicles = worlds.vehicles
-    capacity = 4 * worlds.n + 64 if record else 0
-    while True:
-        after = Worlds(
-            vehicles, worlds.gaps_m.copy(), worlds.speeds_mps.copy(), worlds.time_s.copy(), worlds.pair_hit.copy(),
-            np.empty(worlds.speeds_mps.shape), worlds.obstacle_gap_m.copy(), worlds.obstacle_hit.copy(),
-            worlds.messages.copy(),
-        )  # fmt: skip
-        shape = worlds.gaps_m.shape
-        first_harm, total_harm, count = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64)
-        failed = np.empty(worlds.n, np.int64)
-        arrays = (
-            after.gaps_m, after.speeds_mps, after.time_s, after.pair_hit, after.command_mps2, command, until,
-            vehicles.braking_capacity_mps2, vehicles.driving_capacity_mps2, vehicles.latency_s, vehicles.mass_t,
-            vehicles.speed_limit_mps, vehicles.restitution, first_harm, total_harm, count,
-            failed,
-        )  # fmt: skip
-        parts = by_parts(partial(_advance_part, arrays, capacity), worlds.n, threads)
-        for part in parts:
-            if part.status != FLAG.DONE:
-                raise _refusal(worlds, command, until, part.world, part.status)
-        if (failed != FLAG.DONE).any():
-            raise FLAG.failure(failed, worlds.time_s, until)
-        impacts = Impacts(first_harm, total_harm, count, *Impacts.no_obstacle(worlds.n))
-        if not record:
-            return after, impacts
-        most = max(part.recorded for part in parts)
-        if most <= capacity:
-            return after, replace(impacts, rows=_impact_rows(parts))
-        capacity = most
-
-
-def _advance_with_obstacle(
-    worlds: Worlds, command: Floats, until: Floats, record: bool, threads: int
-) -> tuple[Worlds, Impacts]:
-    """``advance`` of worlds that all have an obstacle: pair 0 of the lines in which it is written out."""
-    whole = np.concatenate([np.zeros((worlds.n, 1)), command], axis=1)
-    after, found = _advance(worlds.with_obstacle(), whole, until, record, threads)
-    first, total, count = found.first_impact_harm, found.total_harm, found.count
-    impacts = Impacts(
-        first[:, 1:].copy(), total[:, 1:].copy(), count[:, 1:].copy(), first[:, 0].copy(), total[:, 0].copy(),
-        count[:, 0].copy(), None if found.rows is None else replace(found.rows, pair=found.rows.pair - 1),
-    )  # fmt: skip
-    return after.without_obstacle(worlds.vehicles), impacts
-
-
-def _advance_mixed(
-    worlds: Worlds, command: Floats, until: Floats, record: bool, threads: int, obstacle: Bools
-) -> tuple[Worlds, Impacts]:
-    """``advance`` of worlds of which only those marked have an obstacle."""
-    places = [np.flatnonzero(~obstacle), np.flatnonzero(obstacle)]
-    parts = []
-    for run, at in zip((_advance, _advance_with_obstacle), places, strict=True):
-        with renumbered(at):
-            parts.append(run(worlds.take(at), command[at], until[at], record, threads))
-    order = np.argsort(np.concatenate(places))
-    after = Worlds.concatenate([part for part, _ in parts]).take(order)
-    found = [impacts for _, impacts in parts]
-
-    def joined(name: str) -> NDArray[Any]:
-        return np.concatenate([getattr(impacts, name) for impacts in found])[order]
-
-    impacts = Impacts(
-        joined("first_impact_harm"), joined("total_harm"), joined("count"), joined("obstacle_first_harm"),
-        joined("obstacle_total_harm"), joined("obstacle_count"),
-    )  # fmt: skip
-    lists = [each.rows for each in found if each.rows is not None]
-    if not lists:
-        return after, impacts
-    world = np.concatenate([at[rows.world] for at, rows in zip(places, lists, strict=True)])
-    columns = (np.concatenate([getattr(rows, f.name) for rows in lists]) for f in fields(ImpactRows)[1:])
-    by_world = np.argsort(world, kind="stable")
-    return after, replace(impacts, rows=ImpactRows(world[by_world], *(column[by_world] for column in columns)))
-
-
-class _Part(NamedTuple):
-    """How the kernel fared on a part of the worlds."""
-
-    first: int  # world of the whole batch with which the part begins
-    rows: Floats  # the impacts that fit; worlds are counted from ``first``
-    recorded: int  # all impacts
-    world: int  # whose end or command is refused, counted from the batch's first world
-    status: int
-
-
-def _advance_part(arrays: tuple[NDArray[Any], ...], capacity: int, part: slice) -> _Part:
-    """Advance the worlds of ``part`` in place."""
-    whole = part.stop - part.start == len(arrays[0])
-    rows = np.empty((capacity, LISTED.WIDTH))
-    mine = (*arrays, rows) if whole else (*(array[part] for array in arrays), rows)
-    recorded, world, status = advance_worlds(*mine)
-    return _Part(part.start, rows, recorded, part.start + world, status)
-
-
-def _shaped(name: str, value: ArrayLike | None, shape: tuple[int, ...]) -> Floats:
-    given = np.asarray(value, np.float64)
-    if given.shape == shape:
-        return np.ascontiguousarray(given)
-    if given.ndim == 0:
-        return np.full(shape, given)
-    try:
-        return np.ascontiguousarray(np.broadcast_to(given, shape))
-    except ValueError:
-        raise InvalidInput(f"{name}: shape {given.shape} does not fit {shape}") from None
-
-
-def _refusal(worlds: Worlds, command: Floats, until: Floats, k: int, status: int) -> InvalidInput:
-    """The error for the world where the kernel stopped."""
-    if status == _BAD_END:
-        return InvalidInput(f"advance: world {k} is at {worlds.time_s[k]:g} s and cannot be advanced to {until[k]:g} s")
-    low, high = -worlds.vehicles.braking_capacity_mps2[k], worlds.vehicles.driving_capacity_mps2[k]
-    i = int(np.argmin((command[k] >= low) & (command[k] <= high)))
-    return InvalidInput(f"command_mps2[{k}, {i}] = {command[k, i]:g}: must be in [{low[i]:g}, {high[i]:g}] m/s2")
-
-
-def _refuse_bad(worlds: Worlds, command: Floats, until: Floats, in_time: Bools) -> None:
-    """Refuse what the kernel would refuse, by the numbers of the vehicles as everybody knows them."""
-    vehicles = worlds.vehicles
-    in_range = (command >= -vehicles.braking_capacity_mps2) & (command <= vehicles.driving_capacity_mps2)
-    good = in_time & in_range.all(axis=1)
-    if not good.all():
-        k = int(np.argmin(good))
-        raise _refusal(worlds, command, until, k, _BAD_COMMAND if in_time[k] else _BAD_END)
-
-
-def _impact_rows(parts: list[_Part]) -> ImpactRows:
-    rows = np.concatenate([part.rows[: part.recorded] for part in parts])
-    first = np.repeat([part.first for part in parts], [part.recorded for part in parts])
-    return ImpactRows(
-        first + rows[:, LISTED.WORLD].astype(np.int64),
-        rows[:, LISTED.PAIR].astype(np.int64),
-        rows[:, LISTED.TIME].copy(),
-        rows[:, LISTED.CLOSING].copy(),
-        rows[:, LISTED.FIRST] > 0.0,
-        rows[:, LISTED.FRONT_CHANGE].copy(),
-        rows[:, LISTED.REAR_CHANGE].copy(),
-    )
 
 
 # One row per world: the layout in which worlds are kept while they run.
@@ -477,6 +259,167 @@ class Packed(NamedTuple):
             harm, whole, hits = (state[:, column.obstacle + g].copy() for g in (2, 3, 4))
             of_obstacle = harm, whole, hits.astype(np.int64)
         return first, total, count.astype(np.int64), *of_obstacle
+
+
+# Advancing worlds that are packed into rows.
+
+
+@compiled
+def advance_row(
+    state: Floats, params: Floats, column: Columns, command: Floats, until: float, post: float, table: Floats,
+    world: int, rows: Floats, recorded: int,
+) -> tuple[int, int]:  # fmt: skip
+    """Take one world, a row of state and one of parameters, to ``until`` in place, and add its harm.
+
+    ``table`` has a column for each vehicle, or one more in front of them: the world's obstacle, or where it has none a
+    post that is ``post`` (m) ahead of Vehicle 1. Gives what ``advance_table`` gives; a world in which a check fails
+    stays where it was.
+    """
+    N, time = column.vehicles, state[column.time]
+    speed, in_force, gap, harm, obstacle = column.speed, column.command, column.gap, column.harm, column.obstacle
+    P, latency, at = N - 1, column.latency, table.shape[1] - N
+    with_obstacle = state.shape[0] > obstacle and state[obstacle] < math.inf
+    if at == 1:
+        place_obstacle(table, state[obstacle] if with_obstacle else post, state[obstacle + 1] if with_obstacle else 0.0)
+        table[ROW.SPEED, 0] = 0.0
+    for i in range(N):
+        table[ROW.COMMAND, at + i] = command[i]
+        table[ROW.SPEED, at + i] = state[speed + i]
+        table[ROW.MASS, at + i] = params[column.mass + i]
+        table[ROW.LIMIT, at + i] = params[column.limit + i]
+        table[ROW.ONSET, at + i] = onset_s(params[latency + i], time)
+    for p in range(P):
+        table[ROW.GAP, at + p] = state[gap + p]
+        table[ROW.HIT, at + p] = state[gap + P + p]
+    recorded, status = advance_table(table, params[column.restitution], until - time, time, world, rows, recorded)
+    if status != FLAG.DONE:
+        return recorded, status
+    state[column.time] = until
+    for i in range(N):
+        state[speed + i] = table[ROW.SPEED, at + i]
+        state[in_force + i] = command_in_force(command[i], params[latency + i], until)
+    for p in range(P):
+        state[gap + p] = table[ROW.GAP, at + p]
+        state[gap + P + p] = table[ROW.HIT, at + p]
+        state[harm + p] += table[ROW.FIRST_HARM, at + p]
+        state[harm + P + p] += table[ROW.TOTAL_HARM, at + p]
+        state[harm + 2 * P + p] += table[ROW.COUNT, at + p]
+    if with_obstacle:
+        state[obstacle] = table[ROW.GAP, 0]
+        state[obstacle + 1] = table[ROW.HIT, 0]
+        state[obstacle + 2] += table[ROW.FIRST_HARM, 0]
+        state[obstacle + 3] += table[ROW.TOTAL_HARM, 0]
+        state[obstacle + 4] += table[ROW.COUNT, 0]
+    return recorded, status
+
+
+@compiled
+def advance_rows(
+    state: Floats, params: Floats, command: Floats, until: Floats, failed: Ints, rows: Floats
+) -> int:  # fmt: skip
+    """Advance every world to its ``until`` [n] under ``command`` [n, N], in place.
+
+    ``rows`` [capacity, LISTED.WIDTH] receives the impacts that fit; gives their whole number. A world in which a check
+    fails is marked with its status in ``failed`` [n] (else DONE) and stays where it was; the others go on.
+    """
+    column = columns(state)
+    at = 1 if state.shape[1] > column.obstacle else 0
+    table = np.zeros((ROW.OF_SEGMENT, column.vehicles + at))
+    recorded = 0
+    for k in range(state.shape[0]):
+        recorded, failed[k] = advance_row(
+            state[k], params[k], column, command[k], until[k], BOUND.FAR_AWAY_M, table, k, rows, recorded
+        )
+    return recorded
+
+
+def advance(
+    worlds: Worlds,
+    command_mps2: ArrayLike,
+    duration_s: ArrayLike | None = None,
+    *,
+    until_s: ArrayLike | None = None,
+    record: bool = False,
+    threads: int = 1,
+) -> tuple[Worlds, Impacts]:
+    """Advance ``worlds`` exactly, each under its constant command, and report the impacts on the way.
+
+    Raises ``InvalidInput`` for an unusable command, end or ``threads``, ``PhysicsError`` naming the worlds that failed.
+
+    Args:
+        worlds: n worlds of N vehicles.
+        command_mps2: signed acceleration wanted, [n, N] m/s2, within capacities; nothing before the latency elapsed.
+        duration_s: length of the segment, one number or [n], s; or give ``until_s``.
+        until_s: its absolute end, not before the worlds' time.
+        record: also report every impact, as ``Impacts.rows``.
+        threads: pay from about 10,000 worlds on; neither they nor the batch change a result.
+
+    """
+    command = _shaped("command_mps2", command_mps2, worlds.speeds_mps.shape)
+    if (duration_s is None) == (until_s is None):
+        raise InvalidInput("advance: give either duration_s or until_s")
+    end = until_s if duration_s is None else worlds.time_s + _shaped("duration_s", duration_s, (worlds.n,))
+    until = _shaped("until_s", end, (worlds.n,))
+    _refuse_bad(worlds, command, until, (until >= worlds.time_s) & (until < math.inf))
+    before, failed = Packed.of(worlds), np.empty(worlds.n, np.int64)
+    capacity = 4 * worlds.n + 64 if record else 0
+    while True:
+        after = before._replace(state=before.state.copy())
+        arrays = (*after, command, until, failed)
+        parts = by_parts(partial(_advance_part, arrays, capacity), worlds.n, threads)
+        most = max(recorded for _, recorded, _ in parts)
+        if most <= capacity or not record:
+            break
+        capacity = most
+    if (failed != FLAG.DONE).any():
+        raise FLAG.failure(failed, worlds.time_s, until)
+    return after.worlds(worlds.vehicles), Impacts(
+        *after.ledger(), _impact_rows(parts, int(after.has_obstacle)) if record else None
+    )
+
+
+def _advance_part(arrays: tuple[NDArray[Any], ...], capacity: int, part: slice) -> tuple[Floats, int, int]:
+    """Advance the worlds of ``part`` in place: the impacts that fit, the number of all, and the part's first world."""
+    rows = np.empty((capacity, LISTED.WIDTH))
+    state, params, command, until, failed = (array[part] for array in arrays)
+    return rows, advance_rows(state, params, command, until, failed, rows), part.start
+
+
+def _shaped(name: str, value: ArrayLike | None, shape: tuple[int, ...]) -> Floats:
+    given = np.asarray(value, np.float64)
+    try:
+        return np.array(np.broadcast_to(given, shape), order="C")
+    except ValueError:
+        raise InvalidInput(f"{name}: shape {given.shape} does not fit {shape}") from None
+
+
+def _refuse_bad(worlds: Worlds, command: Floats, until: Floats, in_time: Bools) -> None:
+    """Refuse the first world whose end is not ``in_time`` [n], or with a command beyond a vehicle's capacity."""
+    low, high = -worlds.vehicles.braking_capacity_mps2, worlds.vehicles.driving_capacity_mps2
+    in_range = (command >= low) & (command <= high)
+    good = in_time & in_range.all(axis=1)
+    if good.all():
+        return
+    k = int(np.argmin(good))
+    if not in_time[k]:
+        raise InvalidInput(f"advance: world {k} is at {worlds.time_s[k]:g} s and cannot be advanced to {until[k]:g} s")
+    i = int(np.argmin(in_range[k]))
+    raise InvalidInput(f"command_mps2[{k}, {i}] = {command[k, i]:g}: must be in [{low[k, i]:g}, {high[k, i]:g}] m/s2")
+
+
+def _impact_rows(parts: list[tuple[Floats, int, int]], ahead: int) -> ImpactRows:
+    """The impacts of all parts; ``ahead`` columns of their tables stand before that of Vehicle 1."""
+    rows = np.concatenate([listed[:recorded] for listed, recorded, _ in parts])
+    first = np.repeat([start for _, _, start in parts], [recorded for _, recorded, _ in parts])
+    return ImpactRows(
+        first + rows[:, LISTED.WORLD].astype(np.int64),
+        rows[:, LISTED.PAIR].astype(np.int64) - ahead,
+        rows[:, LISTED.TIME].copy(),
+        rows[:, LISTED.CLOSING].copy(),
+        rows[:, LISTED.FIRST] > 0.0,
+        rows[:, LISTED.FRONT_CHANGE].copy(),
+        rows[:, LISTED.REAR_CHANGE].copy(),
+    )
 
 
 # The paper's fixed-step map (eq. dynamics2): impacts are looked for, and take effect, at sample times only.
@@ -683,15 +626,7 @@ def _samples(worlds: Worlds, until: Floats, step_s: float) -> tuple[Ints, Ints]:
             f"advance_sampled: world {k} has a negative speed at {worlds.time_s[k]:g} s, before its first sample at"
             f" {start[k]:g} s; the map knows no impacts before that"
         )
-    return sample_numbers(worlds.time_s, until, start, step_s)
-
-
-def sample_numbers(time_s: Floats, until_s: Floats, start_s: Floats, step_s: float) -> tuple[Ints, Ints]:
-    """The samples at ``time_s`` and at or after ``until_s`` [n] of worlds whose first one is at ``start_s``, from 0.
-
-    -1 stands for a time before that. Times on the grid may be rounded.
-    """
-    position, end = (time_s - start_s) / step_s, (until_s - start_s) / step_s
-    first = np.where(position < -_ON_SAMPLE, -1.0, np.rint(position))
+    end = (until - start) / step_s  # times on the grid may be rounded
+    first = np.where(before, -1.0, np.rint(position))
     last = np.where(end < -_ON_SAMPLE, -1.0, np.ceil(end - _ON_SAMPLE))
     return first.astype(np.int64), last.astype(np.int64)

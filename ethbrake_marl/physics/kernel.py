@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.errors import InvalidInput, PhysicsError, renumbered
+from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.physics.compiling import compiled
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds
 
@@ -943,33 +943,13 @@ def forecast(
         raise InvalidInput(
             f"forecast: candidate {candidates_mps2[~good][0]:g} m/s2 is beyond vehicle_{vehicle + 1}'s capacity"
         )
-    obstacle = worlds.obstacle_ahead
-    if not obstacle.any():
-        return _forecast(worlds, command_mps2, vehicle, candidates_mps2, until_s)
-    first, total = np.empty(candidates_mps2.shape), np.empty(candidates_mps2.shape)
-    with_one, without = np.flatnonzero(obstacle), np.flatnonzero(~obstacle)
-    lines = worlds.take(with_one).with_obstacle()
-    command = np.concatenate([np.zeros((len(with_one), 1)), command_mps2[with_one]], axis=1)
-    with renumbered(with_one):
-        first[with_one], total[with_one] = _forecast(lines, command, vehicle + 1, candidates_mps2[with_one], until_s)
-    with renumbered(without):
-        first[without], total[without] = _forecast(
-            worlds.take(without), command_mps2[without], vehicle, candidates_mps2[without], until_s
-        )
-    return first, total
-
-
-def _forecast(
-    worlds: Worlds, command_mps2: Floats, vehicle: int, candidates_mps2: Floats, until_s: float
-) -> tuple[Floats, Floats]:
-    """``forecast`` of worlds without an obstacle, or with one that is written out as a vehicle."""
-    v = worlds.vehicles
     first, total = np.zeros(candidates_mps2.shape), np.zeros(candidates_mps2.shape)
-    failed = np.zeros(worlds.n, np.bool_)
+    ahead = np.minimum(worlds.obstacle_gap_m, BOUND.FAR_AWAY_M) if worlds.obstacle_ahead.any() else np.empty(0)
+    failed = np.zeros(n, np.bool_)
     forecast_worlds(
-        worlds.gaps_m, worlds.speeds_mps, worlds.time_s, worlds.pair_hit, np.ascontiguousarray(command_mps2), vehicle,
-        np.ascontiguousarray(candidates_mps2), until_s, v.latency_s, v.mass_t, v.speed_limit_mps, v.restitution, first,
-        total, failed,
+        worlds.gaps_m, worlds.speeds_mps, worlds.time_s, worlds.pair_hit, ahead, worlds.obstacle_hit,
+        np.ascontiguousarray(command_mps2), vehicle, np.ascontiguousarray(candidates_mps2), until_s, v.latency_s,
+        v.mass_t, v.speed_limit_mps, v.restitution, first, total, failed,
     )  # fmt: skip
     if failed.any():
         raise PhysicsError({k: f"a forecast could not reach {until_s:g} s" for k in np.flatnonzero(failed).tolist()})
@@ -978,32 +958,39 @@ def _forecast(
 
 @compiled
 def forecast_worlds(
-    gaps: Floats, speeds: Floats, time: Floats, hit: Bools, command: Floats, vehicle: int, candidates: Floats,
-    until_s: float, latency: Floats, mass: Floats, limit: Floats, restitution: Floats, first: Floats, total: Floats,
-    failed: Bools,
+    gaps: Floats, speeds: Floats, time: Floats, hit: Bools, ahead: Floats, ahead_hit: Bools, command: Floats,
+    vehicle: int, candidates: Floats, until_s: float, latency: Floats, mass: Floats, limit: Floats, restitution: Floats,
+    first: Floats, total: Floats, failed: Bools,
 ) -> None:  # fmt: skip
-    """Fill ``first`` and ``total`` [n, K], and ``failed`` [n] where a check failed."""
+    """Fill ``first`` and ``total`` [n, K], and ``failed`` [n] where a check failed.
+
+    ``ahead`` [n] is where an obstacle is, ``FAR_AWAY_M`` for none; empty where no world has one.
+    """
     n, vehicles = speeds.shape
-    table = np.zeros((ROW.OF_SEGMENT, vehicles))
+    at = min(ahead.shape[0], 1)  # vehicle i stands in column at + i, behind an obstacle
+    table = np.zeros((ROW.OF_SEGMENT, at + vehicles))
     no_rows = np.empty((0, LISTED.WIDTH))
     for k in range(n):
         duration = until_s - time[k]
         if not duration > 0.0:
             continue
         for c in range(candidates.shape[1]):
+            if at == 1:
+                place_obstacle(table, ahead[k], 1.0 if ahead_hit[k] else 0.0)
+                table[ROW.SPEED, 0] = 0.0
             for i in range(vehicles):
-                table[ROW.SPEED, i] = speeds[k, i]
-                table[ROW.COMMAND, i] = candidates[k, c] if i == vehicle else command[k, i]
-                table[ROW.MASS, i] = mass[k, i]
-                table[ROW.LIMIT, i] = limit[k, i]
-                table[ROW.ONSET, i] = onset_s(latency[k, i], time[k])
+                table[ROW.SPEED, at + i] = speeds[k, i]
+                table[ROW.COMMAND, at + i] = candidates[k, c] if i == vehicle else command[k, i]
+                table[ROW.MASS, at + i] = mass[k, i]
+                table[ROW.LIMIT, at + i] = limit[k, i]
+                table[ROW.ONSET, at + i] = onset_s(latency[k, i], time[k])
             for p in range(vehicles - 1):
-                table[ROW.GAP, p] = gaps[k, p]
-                table[ROW.HIT, p] = 1.0 if hit[k, p] else 0.0
+                table[ROW.GAP, at + p] = gaps[k, p]
+                table[ROW.HIT, at + p] = 1.0 if hit[k, p] else 0.0
             if advance_table(table, restitution[k], duration, 0.0, k, no_rows, 0)[1] != FLAG.DONE:
                 failed[k] = True
                 break
-            for p in range(vehicles - 1):
+            for p in range(at + vehicles - 1):
                 first[k, c] += table[ROW.FIRST_HARM, p]
                 total[k, c] += table[ROW.TOTAL_HARM, p]
 

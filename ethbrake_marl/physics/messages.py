@@ -24,18 +24,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.physics.batch import Columns, columns
+from ethbrake_marl.physics.batch import Columns, advance_row, columns
 from ethbrake_marl.physics.compiling import compiled
-from ethbrake_marl.physics.kernel import (
-    FLAG,
-    LISTED,
-    ROW,
-    advance_table,
-    command_in_force,
-    onset_s,
-    place_obstacle,
-    solo_motion,
-)
+from ethbrake_marl.physics.kernel import FLAG, LISTED, ROW, command_in_force, solo_motion
 from ethbrake_marl.physics.worlds import Bools, Floats, Worlds
 
 
@@ -97,11 +88,6 @@ def ring_at(vehicles: int) -> int:
     return CHANNEL.WIDTH + vehicles + LINK.WIDTH * vehicles * vehicles
 
 
-def ring_length(delay_s: float, time_step_s: float) -> int:
-    """Samples that a message may still carry when it arrives: those of its delay, and one at each end."""
-    return math.ceil(delay_s / time_step_s - _ON_GRID) + 3
-
-
 class Told(NamedTuple):
     """The newest state that a vehicle was told of each other one, [n, N] each; views of the columns."""
 
@@ -114,45 +100,80 @@ class Told(NamedTuple):
     obstacle_place_m: Floats  # [n] where the obstacle ahead is
 
 
-def newest_told(worlds: Worlds, vehicle: int) -> Told:
-    """What ``vehicle`` was last told, in worlds with columns of messages."""
-    links = _links(worlds.messages, worlds.N)[:, vehicle]
-    own, obstacle = worlds.messages[:, place_at(worlds.N) + vehicle], worlds.messages[:, CHANNEL.OBSTACLE_PLACE]
-    at_s, place, speed, command, hit = (links[..., entry] for entry in range(LINK.TOLD_S, LINK.WIDTH))
-    return Told(at_s, place, speed, command, hit, own, obstacle)
+class Messages(NamedTuple):
+    """What periodic messages have told whom, in n worlds."""
 
+    columns: Floats  # [n, M]; M is 0 without periodic messages
+    vehicles: int
 
-def silent_messages(
-    heard_s: Floats, seen_s: Floats, key: Floats, samples: int, *, period_s: float, delay_s: float,
-    loss_begins: float, loss_ends: float,
-) -> Floats:  # fmt: skip
-    """The columns [n, M] before any message is sent.
+    @classmethod
+    def of(cls, worlds: Worlds) -> Messages:
+        """Those of these worlds."""
+        return cls(worlds.messages, worlds.N)
 
-    Args:
-        heard_s: when the first message of vehicle j is of use to vehicle i, [n, N, N]; infinite: never.
-        seen_s: from when on i measures j, [n, N, N]; infinite: never.
-        key: [n], a whole number below 2^53, by which later messages are lost or not.
-        samples: in the ring, see ``ring_length``.
-        period_s: between two messages of a link.
-        delay_s: from sending a message to its use.
-        loss_begins: probability that a good channel turns bad, per message.
-        loss_ends: probability that a bad one turns good again.
+    @staticmethod
+    def ring_length(delay_s: float, time_step_s: float) -> int:
+        """Samples that a message may still carry when it arrives: those of its delay, and one at each end."""
+        return math.ceil(delay_s / time_step_s - _ON_GRID) + 3
 
-    """
-    n, N = heard_s.shape[:2]
-    columns = np.zeros((n, ring_at(N) + samples * (RING_HEAD + 3 * N)))
-    columns[:, : CHANNEL.KEY] = period_s, delay_s, loss_begins, loss_ends
-    columns[:, CHANNEL.KEY] = key
-    links, itself = _links(columns, N), np.eye(N, dtype=np.bool_)
-    links[..., LINK.NEXT_SENT] = np.where(itself, np.inf, heard_s - delay_s)
-    links[..., LINK.SEEN_FROM] = np.where(itself, np.inf, seen_s)
-    links[..., LINK.TOLD_S] = -1.0
-    return columns
+    @classmethod
+    def silent(
+        cls, heard_s: Floats, seen_s: Floats, key: Floats, samples: int, *, period_s: float, delay_s: float,
+        loss_begins: float, loss_ends: float,
+    ) -> Messages:  # fmt: skip
+        """The columns before any message is sent.
 
+        Args:
+            heard_s: when the first message of vehicle j is of use to vehicle i, [n, N, N]; infinite: never.
+            seen_s: from when on i measures j, [n, N, N]; infinite: never.
+            key: [n], a whole number below 2^53, by which later messages are lost or not.
+            samples: in the ring, see ``ring_length``.
+            period_s: between two messages of a link.
+            delay_s: from sending a message to its use.
+            loss_begins: probability that a good channel turns bad, per message.
+            loss_ends: probability that a bad one turns good again.
 
-def _links(messages: Floats, N: int) -> Floats:
-    """The columns of every link, [n, N, N, LINK]: a view of the columns of ``messages`` [n, M]."""
-    return messages[:, link_at(0, 0, N) : ring_at(N)].reshape(-1, N, N, LINK.WIDTH)
+        """
+        n, N = heard_s.shape[:2]
+        silent = cls(np.zeros((n, ring_at(N) + samples * (RING_HEAD + 3 * N))), N)
+        silent.columns[:, : CHANNEL.KEY] = period_s, delay_s, loss_begins, loss_ends
+        silent.columns[:, CHANNEL.KEY] = key
+        links, itself = silent.links, np.eye(N, dtype=np.bool_)
+        links[..., LINK.NEXT_SENT] = np.where(itself, np.inf, heard_s - delay_s)
+        links[..., LINK.SEEN_FROM] = np.where(itself, np.inf, seen_s)
+        links[..., LINK.TOLD_S] = -1.0
+        return silent
+
+    @property
+    def links(self) -> Floats:
+        """The columns of every link, [n, N, N, LINK]: a view."""
+        N = self.vehicles
+        return self.columns[:, link_at(0, 0, N) : ring_at(N)].reshape(-1, N, N, LINK.WIDTH)
+
+    @property
+    def periodic(self) -> Bools:
+        """In which worlds messages go on after the first one, so that what is known grows old, [n]."""
+        return np.asarray((self.columns[:, CHANNEL.PERIOD : CHANNEL.PERIOD + 1] > 0.0).any(axis=1))
+
+    def newest_told(self, vehicle: int) -> Told:
+        """What ``vehicle`` was last told, in worlds with columns of messages."""
+        own, obstacle = self.columns[:, place_at(self.vehicles) + vehicle], self.columns[:, CHANNEL.OBSTACLE_PLACE]
+        told = self.links[:, vehicle]
+        at_s, place, speed, command, hit = (told[..., entry] for entry in range(LINK.TOLD_S, LINK.WIDTH))
+        return Told(at_s, place, speed, command, hit, own, obstacle)
+
+    def age_s(self, time_s: Floats) -> Floats:
+        """How old what vehicle i was last told of vehicle j is at ``time_s`` [n], [n, N, N] s: since it was sampled.
+
+        0 without periodic messages, where the present is known; infinite where nothing has been told yet. Whether i may
+        act on it is another question (``Vehicles.known_from_s``).
+        """
+        age, periodic = np.zeros((len(time_s), self.vehicles, self.vehicles)), self.periodic
+        if periodic.any():
+            told_s = self.links[..., LINK.TOLD_S]
+            age[periodic] = np.where(told_s >= 0.0, time_s[:, np.newaxis, np.newaxis] - told_s, np.inf)[periodic]
+            age[:, np.arange(self.vehicles), np.arange(self.vehicles)] = 0.0
+        return age
 
 
 @compiled
@@ -221,36 +242,14 @@ def _move(
     state: Floats, params: Floats, column: Columns, wanted: Floats, end: float, table: Floats, no_rows: Floats
 ) -> bool:
     """One world moved to ``end``, its places included; False, and nothing moved, where the kernel cannot."""
-    N, time = column.vehicles, state[column.time]
-    speed, command, gap, obstacle = column.speed, column.command, column.gap, column.obstacle
-    with_obstacle = state.shape[0] > obstacle and state[obstacle] < math.inf
-    ahead = state[obstacle] if with_obstacle else POST_M
-    place_obstacle(table, ahead, state[obstacle + 1] if with_obstacle else 0.0)
-    latency = column.latency
-    for i in range(N):
-        table[ROW.SPEED, i + 1] = state[speed + i]
-        table[ROW.COMMAND, i + 1] = wanted[i]
-        table[ROW.MASS, i + 1] = params[column.mass + i]
-        table[ROW.LIMIT, i + 1] = params[column.limit + i]
-        table[ROW.ONSET, i + 1] = onset_s(params[latency + i], time)
-    for p in range(N - 1):
-        table[ROW.GAP, p + 1] = state[gap + p]
-        table[ROW.HIT, p + 1] = state[gap + N - 1 + p]
-    if advance_table(table, params[column.restitution], end - time, time, 0, no_rows, 0)[1] != FLAG.DONE:
+    N, gap, obstacle = column.vehicles, column.gap, column.obstacle
+    ahead = state[obstacle] if state.shape[0] > obstacle and state[obstacle] < math.inf else POST_M
+    if advance_row(state, params, column, wanted, end, POST_M, table, 0, no_rows, 0)[1] != FLAG.DONE:
         return False
     place = column.messages + place_at(N)
     params[place] += ahead - table[ROW.GAP, 0]
-    state[column.time] = end
-    for i in range(N):
-        state[speed + i] = table[ROW.SPEED, i + 1]
-        state[command + i] = command_in_force(wanted[i], params[latency + i], end)
     for p in range(N - 1):
-        state[gap + p] = table[ROW.GAP, p + 1]
-        state[gap + N - 1 + p] = table[ROW.HIT, p + 1]
-        params[place + p + 1] = params[place + p] - table[ROW.GAP, p + 1]
-    if with_obstacle:
-        state[obstacle] = table[ROW.GAP, 0]
-        state[obstacle + 1] = table[ROW.HIT, 0]
+        params[place + p + 1] = params[place + p] - state[gap + p]
     return True
 
 
@@ -361,30 +360,6 @@ def moved_on(speed: float, command: float, limit: float, duration: float) -> tup
     force = abs(command)
     braking = min(duration, -speed / force) if force > 0.0 else duration
     return min(speed + force * braking, 0.0), (speed + 0.5 * force * braking) * braking
-
-
-def is_periodic(worlds: Worlds) -> Bools:
-    """In which worlds messages go on after the first one, so that what is known grows old, [n]."""
-    if worlds.messages.shape[1] == 0:
-        return np.zeros(worlds.n, np.bool_)
-    periodic: Bools = worlds.messages[:, CHANNEL.PERIOD] > 0.0
-    return periodic
-
-
-def age_s(time_s: Floats, messages: Floats, vehicles: int) -> Floats:
-    """How old what vehicle i was last told of vehicle j is, [n, N, N] s: since the state was sampled.
-
-    Of worlds at ``time_s`` [n] with columns of ``messages`` [n, M]. 0 without periodic messages, where the present is
-    known; infinite where nothing has been told yet. Whether i may act on it is another question
-    (``Vehicles.known_from_s``).
-    """
-    age = np.zeros((len(time_s), vehicles, vehicles))
-    if messages.shape[1] == 0:
-        return age
-    periodic, told_s = messages[:, CHANNEL.PERIOD] > 0.0, _links(messages, vehicles)[..., LINK.TOLD_S]
-    age[periodic] = np.where(told_s >= 0.0, time_s[:, np.newaxis, np.newaxis] - told_s, np.inf)[periodic]
-    age[:, np.arange(vehicles), np.arange(vehicles)] = 0.0
-    return age
 
 
 @compiled

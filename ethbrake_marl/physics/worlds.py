@@ -81,6 +81,17 @@ class Vehicles:
         view.flags.writeable = False
         return view
 
+    def hide_from(self, vehicle: int) -> Bools:
+        """Worlds in which a channel hides something of the line from ``vehicle`` at its first decision, [n].
+
+        Either news of another vehicle has not arrived by then, or another one reacts later than the own part of its
+        latency, which is all that a message tells. Never without a channel.
+        """
+        late = self.latency_s > self.own_latency_s
+        hidden = (self.known_from_s[:, vehicle] > self.latency_s[:, [vehicle]]) | late
+        hidden[:, vehicle] = False
+        return np.asarray(hidden.any(axis=1))
+
     @property
     def is_known_at_once(self) -> bool:
         """Whether nothing comes link by link, whatever memory says so: no channel, or one that changes nothing."""
@@ -206,19 +217,6 @@ class Worlds:
             self.messages,
         )
 
-    def without_obstacle(self, vehicles: Vehicles) -> Worlds:
-        """Back from ``with_obstacle``: its columns beside those of the pairs; ``vehicles`` are the real ones."""
-        return replace(
-            self,
-            vehicles=vehicles,
-            gaps_m=self.gaps_m[:, 1:].copy(),
-            speeds_mps=self.speeds_mps[:, 1:].copy(),
-            pair_hit=self.pair_hit[:, 1:].copy(),
-            command_mps2=self.command_mps2[:, 1:].copy(),
-            obstacle_gap_m=self.gaps_m[:, 0].copy(),
-            obstacle_hit=self.pair_hit[:, 0].copy(),
-        )
-
     def with_post_ahead(self, duration_s: Floats) -> Worlds:
         """These worlds, each with an obstacle ahead: its own, or one that Vehicle 1 cannot reach in ``duration_s`` [n].
 
@@ -229,7 +227,7 @@ class Worlds:
         """
         vehicles = self.vehicles
         driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]
-        energy = sum_rows(vehicles.mass_t * (self.speeds_mps * self.speeds_mps / 2.0 + driving))
+        energy = (vehicles.mass_t * (self.speeds_mps * self.speeds_mps / 2.0 + driving)).sum(axis=1)
         farthest = 1.01 * duration_s * np.sqrt(2.0 * energy / vehicles.mass_t[:, 0])
         return replace(self, obstacle_gap_m=np.where(self.obstacle_ahead, self.obstacle_gap_m, farthest + 1.0))
 
@@ -265,17 +263,6 @@ def _assigned(whole: NDArray[Any], rows: Ints, part: NDArray[Any]) -> NDArray[An
     copy = whole.copy()
     copy[rows] = part
     return copy
-
-
-def sum_rows(values: Floats) -> Floats:
-    """``values.sum(axis=1)`` to the same bits; faster where a row is short, which NumPy adds up entry by entry."""
-    if not 0 < values.shape[1] < 8:
-        total: Floats = values.sum(axis=1)
-        return total
-    total = values[:, 0].copy()
-    for column in values.T[1:]:
-        total += column
-    return total
 
 
 def make_worlds(

@@ -6,56 +6,32 @@ from ethbrake_marl.doors import front_door
 
 if TYPE_CHECKING:
     from ethbrake_marl.files.yaml import parse_yaml as parse_yaml
-    from ethbrake_marl.scenario.features import (
-        CONTACT_COMMANDS as CONTACT_COMMANDS,
-        CONTACT_SIDES as CONTACT_SIDES,
-        FEATURES as FEATURES,
-        GROUPS as GROUPS,
-        MOST_NEIGHBOURS as MOST_NEIGHBOURS,
-        Feature as Feature,
-        ListedFeatures as ListedFeatures,
-        Of as Of,
-        RegisteredFeature as RegisteredFeature,
-        feature_named as feature_named,
-        listed_features as listed_features,
-        register_feature as register_feature,
-        registered_in as registered_in,
-        side_of as side_of,
+    from ethbrake_marl.scenario.observed import (
+        Appended as Appended,
+        appending as appending,
+        full_state as full_state,
+        observation_for as observation_for,
+        row_features as row_features,
+        state_features as state_features,
     )
     from ethbrake_marl.scenario.sampling import (
-        LEARNER as LEARNER,
         QUANTITY as QUANTITY,
-        QuantityRule as QuantityRule,
         Sample as Sample,
         ScriptSpec as ScriptSpec,
-        Texts as Texts,
         Uniform as Uniform,
-        initial_state_worlds as initial_state_worlds,
-        make_sample as make_sample,
-        ranges_of as ranges_of,
-        read_initial_states as read_initial_states,
-        table_columns as table_columns,
-        worlds_from_table as worlds_from_table,
     )
     from ethbrake_marl.scenario.schema import (
-        SHIPPED as SHIPPED,
         Scenario as Scenario,
         Task as Task,
         check_file_name as check_file_name,
         list_scenarios as list_scenarios,
         load_scenario as load_scenario,
         new_scenario_text as new_scenario_text,
-        read_scenario as read_scenario,
         register_scenarios as register_scenarios,
-        scenario_folder as scenario_folder,
         scenario_json_schema as scenario_json_schema,
         scenario_path as scenario_path,
         shipped_folder as shipped_folder,
     )
-    from ethbrake_marl.scenario.v2x import (
-        CHANNELS as CHANNELS,
-        hidden_from as hidden_from,
-        register_preset as register_preset,
-    )
+    from ethbrake_marl.scenario.v2x import CHANNELS as CHANNELS, register_preset as register_preset
 else:
     __getattr__ = front_door(__name__, __file__)

@@ -33,8 +33,9 @@ from pydantic_core import CoreSchema, PydanticCustomError
 
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.files.store import read_plain
-from ethbrake_marl.files.yaml import UNITS, UNSHOWN, FileModel, YamlPath, parse_numeral, refuse, suggestion
+from ethbrake_marl.files.yaml import UNITS, UNSHOWN, FileModel, YamlPath, parse_numeral, refuse, require, suggestion
 from ethbrake_marl.harm import ObjectiveName, objectives_of
+from ethbrake_marl.observations import ListedFeatures, listed_features
 from ethbrake_marl.physics import (
     Bools,
     Floats,
@@ -48,7 +49,6 @@ from ethbrake_marl.physics import (
     normal_quantile_each,
     stopping_distances,
 )
-from ethbrake_marl.scenario.features import ListedFeatures, listed_features
 from ethbrake_marl.scenario.v2x import V2X
 
 BLOCK = 8  # uniform numbers per vehicle and world; a multiple of 4, the numbers of one Philox counter
@@ -213,6 +213,7 @@ _MEANING = {key: rule.meaning for key, rule in QUANTITY.declared.items()}
 # Each distribution is a pure function of one uniform number ``u`` in [0, 1): its inverse cumulative distribution
 # function. One quantity therefore uses up exactly one uniform number, whatever its distribution is.
 
+_LEAVE_OUT = "must be a number or a distribution; a key that is not used is left out"
 LEAST_MASS = 1e-6  # of a normal distribution inside its bounds; below it the inverse loses its digits
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -231,7 +232,7 @@ class Uniform(_Distribution):
 
     @model_validator(mode="after")
     def _ordered(self) -> Uniform:
-        _require(self.uniform[0] <= self.uniform[1], "uniform", self.uniform, "low must not be above high")
+        require(self.uniform[0] <= self.uniform[1], ("uniform",), self.uniform, "low must not be above high")
         return self
 
     @property
@@ -256,8 +257,8 @@ class LogUniform(_Distribution):
     @model_validator(mode="after")
     def _ordered(self) -> LogUniform:
         low, high = self.loguniform
-        _require(low > 0.0, "loguniform", self.loguniform, "low must be above 0")
-        _require(low <= high, "loguniform", self.loguniform, "low must not be above high")
+        require(low > 0.0, ("loguniform",), self.loguniform, "low must be above 0")
+        require(low <= high, ("loguniform",), self.loguniform, "low must not be above high")
         return self
 
     @property
@@ -288,12 +289,11 @@ class Normal(_Distribution):
     @model_validator(mode="after")
     def _possible(self) -> Normal:
         shape = self.normal
-        declared = shape.model_dump()
-        _require(shape.sd > 0.0, "normal", declared, "sd must be above 0")
-        _require(shape.low < shape.high, "normal", declared, "low must be below high")
+        require(shape.sd > 0.0, ("normal",), shape, "sd must be above 0")
+        require(shape.low < shape.high, ("normal",), shape, "low must be below high")
         below, above = self._bounds()
         right = f"[low, high] must hold at least {LEAST_MASS:g} of the untruncated distribution"
-        _require(above - below >= LEAST_MASS, "normal", declared, right)
+        require(above - below >= LEAST_MASS, ("normal",), shape, right)
         return self
 
     def _bounds(self) -> tuple[float, float]:
@@ -325,9 +325,9 @@ class Choice(_Distribution):
     def _weighted(self) -> Choice:
         if self.weights is not None:
             fits = f"must have as many entries as choice, {len(self.choice)}"
-            _require(len(self.weights) == len(self.choice), "weights", self.weights, fits)
+            require(len(self.weights) == len(self.choice), ("weights",), self.weights, fits)
             positive = all(w > 0.0 for w in self.weights) and math.isfinite(sum(self.weights))
-            _require(positive, "weights", self.weights, "every weight must be above 0, and their sum finite")
+            require(positive, ("weights",), self.weights, "every weight must be above 0, and their sum finite")
         return self
 
     @property
@@ -356,12 +356,6 @@ class WithLoad(_Distribution):
         """``empty + (full - empty) load``, in the shape of ``load`` in [0, 1]; never beyond either end."""
         empty, full = self.with_load
         return np.clip(empty + (full - empty) * load, *self.support)
-
-
-def _require(holds: bool, key: str, value: Any, right: str) -> None:
-    """Refuse the value of ``key`` unless ``holds``; ``right`` says what would do."""
-    if not holds:
-        refuse((key,), value, right)
 
 
 def _kind(value: object) -> str | None:
@@ -398,7 +392,7 @@ def values(quantity: float | Uniform | LogUniform | Normal | Choice, u: Floats) 
 
 # A part of a list of worlds: the worlds, where they stand in the list, and what they were drawn as.
 
-Texts = NDArray[np.str_]
+_Texts = NDArray[np.str_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -415,8 +409,8 @@ class Sample:
     worlds: Worlds  # at t = 0
     index: Ints  # [n] number of each world in the list of its seed
     rejected: int  # draws refused because of an early impact
-    types: Texts | None = None  # [n, N] type of every vehicle, where a scenario has types; empty: it has none
-    scenarios: Texts | None = None  # [n] the scenario of a mixture that each world was drawn from
+    types: _Texts | None = None  # [n, N] type of every vehicle, where a scenario has types; empty: it has none
+    scenarios: _Texts | None = None  # [n] the scenario of a mixture that each world was drawn from
 
     def __repr__(self) -> str:
         numbers = f"numbers {self.index.min()} to {self.index.max()}" if len(self.index) else "no numbers"
@@ -433,7 +427,7 @@ class Sample:
         """The worlds of all parts in the order of their numbers; all have types, or scenarios, or none has."""
         index = np.concatenate([part.index for part in parts])
         order = np.argsort(index)
-        joined: dict[str, Texts] = {}
+        joined: dict[str, _Texts] = {}
         for name in ("types", "scenarios"):
             given = [getattr(part, name) for part in parts if getattr(part, name) is not None]
             joined |= {name: np.concatenate(given)[order]} if given else {}
@@ -441,7 +435,7 @@ class Sample:
         return Sample(worlds, index[order], rejected, **joined)
 
     @property
-    def kinds(self) -> dict[str, Texts]:
+    def kinds(self) -> dict[str, _Texts]:
         """``scenario`` of a mixture and ``vehicle_K_type``, each [n], where the worlds were drawn with such."""
         columns = {} if self.scenarios is None else {"scenario": self.scenarios}
         types = () if self.types is None else self.types.T
@@ -604,25 +598,21 @@ class VehicleType(FileModel):
     @field_validator(*QUANTITY.of_a_type)
     @classmethod
     def _in_range(cls, value: Any, info: ValidationInfo) -> Any:
-        if value is None:
-            refuse((), value, "must be a number or a distribution; a key that is not used is left out")
+        require(value is not None, (), value, _LEAVE_OUT)
         rule = QUANTITY.declared[str(info.field_name)]
-        if not rule.allows(*support(value)):
-            refuse((), value, f"must be {rule.interval}")
+        require(rule.allows(*support(value)), (), value, f"must be {rule.interval}")
         return value
 
     @field_validator("load")
     @classmethod
     def _share(cls, value: Any) -> Any:
         low, high = support(value)
-        if not (low >= 0.0 and high <= 1.0):
-            refuse((), value, "must be in [0, 1]: 0 empty, 1 full")
+        require(low >= 0.0 and high <= 1.0, (), value, "must be in [0, 1]: 0 empty, 1 full")
         return value
 
 
 def _check_type_names(kinds: dict[str, VehicleType]) -> dict[str, VehicleType]:
-    if ANY in kinds:
-        refuse((ANY,), UNSHOWN, f"{ANY} stands for every type; give another name")
+    require(ANY not in kinds, (ANY,), UNSHOWN, f"{ANY} stands for every type; give another name")
     return kinds
 
 
@@ -771,8 +761,7 @@ class ScenarioFields(FileModel):
     @classmethod
     def _given(cls, value: Any) -> Any:
         """``null`` is no value: a key that is not used is left out."""
-        if value is None:
-            refuse((), value, "must be a number or a distribution; a key that is not used is left out")
+        require(value is not None, (), value, _LEAVE_OUT)
         return value
 
     @field_validator(*QUANTITY.needed, mode="before")
@@ -782,26 +771,22 @@ class ScenarioFields(FileModel):
         key, data = str(info.field_name), info.data
         kinds = data.get("vehicle_types")
         without = None if kinds is None else next((k for k, kind in kinds.items() if getattr(kind, key) is None), None)
-        if value is _LEFT_OUT:
-            if data.get("mixture") is not None or not {"vehicle_types", "mixture"} <= data.keys():
-                return None
+        if value is not _LEFT_OUT:
+            require(value is not None, (), value, _LEAVE_OUT)
+            require(kinds is None or without is not None, (), value, "every type declares it; leave it out")
+            return value
+        if data.get("mixture") is None and {"vehicle_types", "mixture"} <= data.keys():
             if kinds is None:
                 raise PydanticCustomError("missing", "missing", {"at": ()})
-            if without is not None:
-                right = f"type {without} does not declare it: give it there, or here for every type that does not"
-                refuse((), UNSHOWN, right)
-            return None
-        if value is None:
-            refuse((), value, "must be a number or a distribution; a key that is not used is left out")
-        if kinds is not None and without is None:
-            refuse((), value, "every type declares it; leave it out")
-        return value
+            right = f"type {without} does not declare it: give it there, or here for every type that does not"
+            require(without is None, (), UNSHOWN, right)
+        return None
 
     @field_validator("vehicle_types", "types", "mixture", mode="before")
     @classmethod
     def _not_empty(cls, value: Any) -> Any:
-        if value is None or (isinstance(value, dict | list | tuple) and not value):
-            refuse((), value, "must not be empty; a key that is not used is left out")
+        empty = value is None or (isinstance(value, dict | list | tuple) and not value)
+        require(not empty, (), value, "must not be empty; a key that is not used is left out")
         return value
 
     @field_validator("types")
@@ -811,20 +796,18 @@ class ScenarioFields(FileModel):
         if not {"vehicles", "vehicle_types"} <= info.data.keys():
             return value
         vehicles, kinds = info.data["vehicles"], info.data["vehicle_types"]
-        if kinds is None:
-            refuse((), value, "needs vehicle_types, which says what the types are")
+        require(kinds is not None, (), value, "needs vehicle_types, which says what the types are")
         listed = isinstance(value, tuple)
-        if listed and len(value) != vehicles:
-            refuse((), UNSHOWN, f"has {len(value)} entries; {vehicles} vehicles need {vehicles}, or one for all")
+        right = f"has {len(value)} entries; {vehicles} vehicles need {vehicles}, or one for all"
+        require(not listed or len(value) == vehicles, (), UNSHOWN, right)
         for index, entry in enumerate(value if listed else (value,)):
             at: YamlPath = (index,) if listed else ()
             names = [entry] if isinstance(entry, str) else list(entry)
-            if not names:
-                refuse(at, entry, "must name a type")
+            require(len(names) > 0, at, entry, "must name a type")
             for name in names:
-                if name not in kinds and not (name == ANY and isinstance(entry, str)):
-                    hint = suggestion(name, kinds) or f"known: {', '.join(kinds)}"
-                    refuse(at, entry, f"unknown type {name}; {hint}")
+                hint = suggestion(name, kinds) or f"known: {', '.join(kinds)}"
+                known = name in kinds or (name == ANY and isinstance(entry, str))
+                require(known, at, entry, f"unknown type {name}; {hint}")
         return value
 
     @field_validator(*QUANTITY.declared)
@@ -835,15 +818,15 @@ class ScenarioFields(FileModel):
         if value is None:
             return value
         listed = isinstance(value, tuple)
-        if listed and vehicles is not None and len(value) != rule.count(vehicles):
-            per = "one per pair" if rule.per == "pair" else "one per vehicle"
-            right = f"has {len(value)} entries; {vehicles} vehicles need {rule.count(vehicles)} ({per}), or one for all"
-            refuse((), UNSHOWN, right)
+        if listed and vehicles is not None:
+            count, per = rule.count(vehicles), "one per pair" if rule.per == "pair" else "one per vehicle"
+            right = f"has {len(value)} entries; {vehicles} vehicles need {count} ({per}), or one for all"
+            require(len(value) == count, (), UNSHOWN, right)
         for index, entry in enumerate(value if listed else (value,)):
             low, high = support(entry)
-            if not rule.allows(low, high):
-                overlap = "; a negative gap means overlapping vehicles" if rule.per == "pair" and low < 0.0 else ""
-                refuse((index,) if listed else (), entry, f"must be {rule.interval}{overlap}")
+            overlap = "; a negative gap means overlapping vehicles" if rule.per == "pair" and low < 0.0 else ""
+            at = (index,) if listed else ()
+            require(rule.allows(low, high), at, entry, f"must be {rule.interval}{overlap}")
         return value
 
     @field_validator("roles")
@@ -854,16 +837,14 @@ class ScenarioFields(FileModel):
             return value
         names = [f"vehicle_{i + 1}" for i in range(vehicles)]
         for name, role in value.items():
-            if name not in names:
-                close = [] if name.startswith("vehicle_") else get_close_matches(name, names, n=1)
-                hint = f"did you mean {close[0]}?" if close else f"this scenario has vehicle_1 ... vehicle_{vehicles}"
-                refuse((name,), role, f"unknown vehicle; {hint}")
+            close = [] if name.startswith("vehicle_") else get_close_matches(name, names, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"this scenario has vehicle_1 ... vehicle_{vehicles}"
+            require(name in names, (name,), role, f"unknown vehicle; {hint}")
             try:
                 ScriptSpec.parse(role).is_state_free()
             except InvalidInput as error:
                 refuse((name,), role, str(error))
-            if role.startswith(f"{LEARNER}:"):
-                refuse((name,), role, f"{LEARNER} takes no argument")
+            require(not role.startswith(f"{LEARNER}:"), (name,), role, f"{LEARNER} takes no argument")
         return Roles.complete(value, vehicles)
 
     @field_validator("objective", mode="before")
@@ -973,6 +954,156 @@ class ScenarioFields(FileModel):
         assert farthest is not None
         return float(farthest[0])
 
+    def sample(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
+        """Worlds ``first`` to ``first + n - 1`` of the endless list that belongs to ``seed``.
+
+        World k is the same bits whatever ``n`` and ``first`` are. The channels ``"list"`` (evaluation) and
+        ``"training"`` are independent of each other. Raises ``InvalidInput`` for a negative seed or ``first``,
+        ``n < 1``, or when early impacts are rejected and (almost) every draw has one.
+
+        World k of a mixture is drawn from one member, by weight, and is then that member's own world k under the same
+        seed, bit for bit. So results on a mixture can be compared with results on its members, world by world.
+        """
+        for name, value, least in (("n", n, 1), ("seed", seed, 0), ("first", first, 0)):
+            check_whole_number(f"sample: {name}", value, least)
+        if not n <= MOST_AT_ONCE:
+            raise InvalidInput(f"sample: n = {n}: at most {MOST_AT_ONCE:,} worlds at once; draw a longer list in parts")
+        if not int(first) + int(n) <= _MOST_WORLDS:
+            raise InvalidInput(f"sample: first = {first!r}: a list has {_MOST_WORLDS} worlds")
+        if channel not in CHANNELS:
+            raise InvalidInput(f"sample: channel {channel!r}: must be one of {', '.join(CHANNELS)}")
+        if self.mixture is None:
+            return _draw_numbers(self, np.arange(first, first + n, dtype=np.int64), int(seed), channel)
+        cumulative = np.cumsum([member.weight for member in self.mixture])
+        u = uniform_numbers(int(seed), channel, 0, first, n, MIXTURE_WIDTH, of=MIXTURE)[:, 0]
+        chosen = np.searchsorted(cumulative / cumulative[-1], u, side="right")
+        typed = any(member.vehicle_types is not None for member in self.members)
+        parts = []
+        for k, member in enumerate(self.members):
+            index = first + np.flatnonzero(chosen == k)
+            if len(index):
+                drawn = _draw_numbers(member, index, int(seed), channel)
+                no_type = np.full((len(index), self.vehicles), "") if typed and drawn.types is None else drawn.types
+                parts.append(replace(drawn, types=no_type, scenarios=np.full(len(index), member.name)))
+        return Sample.join(parts, sum(part.rejected for part in parts))
+
+    def sample_by(self, numbers: Callable[[int, tuple[int, ...]], Floats], index: Ints) -> Sample:
+        """The worlds of ``numbers(width, of)``, uniform numbers [n, width] of a stream, ``()`` the first; all of them.
+
+        An early impact is not refused here.
+        """
+        line, typed = self.types_of_line, None
+        if line is not None:
+            u = numbers(PER_TYPE * self.vehicles, TYPES)
+            typed = line.draw(u.reshape(len(u), self.vehicles, PER_TYPE))
+        drawn = drawn_quantities(self, numbers(BLOCK * self.vehicles, ()), typed)
+        obstacle_gap_m = obstacle_gap(
+            self, drawn, lambda key: values(self.quantities(key)[0], numbers(OBSTACLE_WIDTH, OBSTACLE)[:, 0])
+        )
+        restitution, gaps, speeds = drawn.pop("restitution")[:, 0], drawn.pop("gaps_m"), drawn.pop("speeds_mps")
+        worlds = make_worlds(gaps, speeds, restitution=restitution, obstacle_gap_m=obstacle_gap_m, **drawn)
+        if self.v2x.by_link:
+            u = numbers(self.v2x.width(self.vehicles), V2X_NEWS)
+            periodic = self.v2x.channel.persistence == "periodic"
+            key = numbers(KEY_WIDTH, LATER_LOSSES)[:, 0] if periodic else np.zeros(len(u))
+            worlds = self.v2x.with_channel(worlds, u, key, self.time_step_s)
+        return Sample(worlds, index, 0, None if typed is None or line is None else np.array(line.names)[typed[0]])
+
+    @property
+    def table_columns(self) -> dict[str, Entry]:
+        """Columns that a table of initial states may have for this scenario: ``gap_1_m``, ``speed_1_mps``, ..."""
+        return {
+            rule.column_of(index): (field, index)
+            for field, rule in _quantities(self).items()
+            for index in range(rule.count(self.vehicles))
+        }
+
+    def read_worlds(self, path: str | Path) -> Worlds:
+        """Read worlds from a CSV file with a header line; columns as in ``worlds_from_table``.
+
+        Raises ``InvalidInput`` with file, line and column for an unknown, repeated or missing column, a value that is
+        not a number or out of range, a row of another length, a file without rows, or one beyond ``SIZE_LIMIT``.
+        """
+        file = Path(path)
+        header, rows, lines = _read_csv(file)
+        entries = _known_columns(header, self, f"{file}, line 1")
+        table = np.empty((len(rows), len(header)))
+        for r, row in enumerate(rows):
+            if len(row) != len(header):
+                right = f"the header has {len(header)} columns"
+                raise InvalidInput(f"{file}, line {lines[r]}: {len(row)} values, but {right}")
+            for c, text in enumerate(row):
+                number = parse_numeral(text.strip())
+                if number is None:
+                    raise InvalidInput(f"{file}, line {lines[r]}, column {header[c]}: {text!r:.60} is not a number")
+                table[r, c] = number
+        given = {entry: table[:, c] for c, entry in enumerate(entries)}
+        return _worlds(given, self, _Naming(str(file), "file", lines))
+
+    def worlds_from_table(self, columns: Mapping[str, ArrayLike]) -> Worlds:
+        """Worlds from columns of equal length n: ``gap_1_m`` ..., ``speed_1_mps`` ..., and optionally the others.
+
+        Optional: ``braking_capacity_1_mps2``, ``driving_capacity_1_mps2``, ``latency_1_s``, ``mass_1_t``,
+        ``speed_limit_1_mps`` and so on for each vehicle, ``restitution``, and ``obstacle_gap_m`` where the scenario has
+        it. What is left out comes from the scenario, where it must be a fixed number. Raises ``InvalidInput`` naming
+        the column and the row (from 0).
+        """
+        entries = _known_columns(list(columns), self, "initial states")
+        given = {
+            entry: _numbers(f"initial states: {name}", column)
+            for entry, (name, column) in zip(entries, columns.items(), strict=True)
+        }
+        shapes = {column.shape for column in given.values()}
+        if len(shapes) != 1 or len(next(iter(shapes))) != 1:
+            lengths = ", ".join(f"{name} {list(np.shape(column))}" for name, column in columns.items())
+            raise InvalidInput(f"initial states: columns must be lists of one and the same length, not {lengths}")
+        return _worlds(given, self, _Naming("initial states", "table"))
+
+    def worlds_from_state(self, initial_state: Mapping[str, Any]) -> Worlds:
+        """The one world of ``{"gaps_m": [7, 7], "speeds_mps": [20, 18, 20], ...}``; keys are a scenario's quantities.
+
+        A single number stands for every vehicle. What is left out comes from the scenario, where it must be a fixed
+        number. Raises ``InvalidInput`` naming the key and the entry.
+        """
+        if not isinstance(initial_state, Mapping):
+            raise InvalidInput(f"initial_state = {initial_state!r}: must be a mapping such as {{'gaps_m': [7, 7]}}")
+        given: dict[Entry, Floats] = {}
+        known = _quantities(self)
+        for field, value in initial_state.items():
+            if field not in known:
+                if field in QUANTITY.optional:
+                    raise InvalidInput(f"initial_state: {field} is not of this scenario: {self.name!r} has no {field}")
+                hint = suggestion(str(field), known) or f"known: {', '.join(known)}"
+                raise InvalidInput(f"initial_state: unknown key {field!r}; {hint}")
+            count = known[field].count(self.vehicles)
+            numbers = _numbers(f"initial_state: {field}", value)
+            if numbers.shape not in ((), (count,)):
+                several = f"{self.vehicles} vehicles need {count} numbers, or one for all"
+                right = "must be one number" if known[field].per == "world" else several
+                raise InvalidInput(f"initial_state: {field} has shape {list(numbers.shape)}; {right}")
+            for index, number in enumerate(np.broadcast_to(numbers, (count,))):
+                given[field, index] = np.array([number])
+        return _worlds(given, self, _Naming("initial_state", "state"))
+
+    def ranges(self) -> Ranges:
+        """Every number that the scenario draws.
+
+        Raises ``InvalidInput`` for a scenario that draws nothing, a mixture, and a channel whose delays are drawn:
+        worlds of these cannot be given one by one.
+        """
+        if self.members:
+            members = ", ".join(member.name for member in self.members)
+            raise InvalidInput(f"scenario {self.name!r}: is a mixture; take one of its scenarios: {members}")
+        if self.v2x.by_link:
+            raise InvalidInput(
+                f"scenario {self.name!r}: v2x: draws delays and losses, which no table of worlds holds; give v2x: paper"
+                " (--set v2x=paper)"
+            )
+        found = {**_of_types(self), **_of_quantities(self)}
+        if not found:
+            raise InvalidInput(f"scenario {self.name!r}: draws nothing: all its worlds are the same")
+        return Ranges(self, tuple(found), tuple(found.values()))
+
 
 # From what a scenario declares, or a table gives, to worlds.
 
@@ -1073,36 +1204,6 @@ def uniform_numbers(
     return upper * 2.0**-53
 
 
-def draw(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
-    """Worlds ``first`` to ``first + n - 1`` of the scenario's list; see ``Scenario.sample``.
-
-    World k of a mixture is drawn from one member, by weight, and is then that member's own world k under the same seed,
-    bit for bit. So results on a mixture can be compared with results on its members, world by world.
-    """
-    for name, value, least in (("n", n, 1), ("seed", seed, 0), ("first", first, 0)):
-        check_whole_number(f"sample: {name}", value, least)
-    if not n <= MOST_AT_ONCE:
-        raise InvalidInput(f"sample: n = {n}: at most {MOST_AT_ONCE:,} worlds at once; draw a longer list in parts")
-    if not int(first) + int(n) <= _MOST_WORLDS:
-        raise InvalidInput(f"sample: first = {first!r}: a list has {_MOST_WORLDS} worlds")
-    if channel not in CHANNELS:
-        raise InvalidInput(f"sample: channel {channel!r}: must be one of {', '.join(CHANNELS)}")
-    if scenario.mixture is None:
-        return _draw_numbers(scenario, np.arange(first, first + n, dtype=np.int64), int(seed), channel)
-    cumulative = np.cumsum([member.weight for member in scenario.mixture])
-    u = uniform_numbers(int(seed), channel, 0, first, n, MIXTURE_WIDTH, of=MIXTURE)[:, 0]
-    chosen = np.searchsorted(cumulative / cumulative[-1], u, side="right")
-    typed = any(member.vehicle_types is not None for member in scenario.members)
-    parts = []
-    for k, member in enumerate(scenario.members):
-        index = first + np.flatnonzero(chosen == k)
-        if len(index):
-            drawn = _draw_numbers(member, index, int(seed), channel)
-            no_type = np.full((len(index), scenario.vehicles), "") if typed and drawn.types is None else drawn.types
-            parts.append(replace(drawn, types=no_type, scenarios=np.full(len(index), member.name)))
-    return Sample.join(parts, sum(part.rejected for part in parts))
-
-
 def _draw_numbers(scenario: ScenarioFields, index: Ints, seed: int, channel: Channel) -> Sample:
     """The worlds with these numbers (ascending) of the scenario's list."""
     drawn = _draw(scenario, seed, channel, 0, index)
@@ -1176,29 +1277,7 @@ def _draw(scenario: ScenarioFields, seed: int, channel: Channel, attempt: int, i
         u = uniform_numbers(seed, channel, attempt, first, last - first + 1, width, of=of)
         return u if len(u) == len(index) else u[index - first]
 
-    return make_sample(scenario, numbers, index)
-
-
-def make_sample(scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...]], Floats], index: Ints) -> Sample:
-    """The worlds that ``numbers(width, of)`` describe: uniform numbers [n, width] of a stream, ``()`` the first one."""
-    line, typed = scenario.types_of_line, None
-    if line is not None:
-        u = numbers(PER_TYPE * scenario.vehicles, TYPES)
-        typed = line.draw(u.reshape(len(u), scenario.vehicles, PER_TYPE))
-    drawn = drawn_quantities(scenario, numbers(BLOCK * scenario.vehicles, ()), typed)
-    obstacle_gap_m = obstacle_gap(
-        scenario, drawn, lambda key: values(scenario.quantities(key)[0], numbers(OBSTACLE_WIDTH, OBSTACLE)[:, 0])
-    )
-    restitution = drawn.pop("restitution")[:, 0]
-    worlds = make_worlds(
-        drawn.pop("gaps_m"), drawn.pop("speeds_mps"), restitution=restitution, obstacle_gap_m=obstacle_gap_m, **drawn
-    )
-    if scenario.v2x.by_link:
-        u = numbers(scenario.v2x.width(scenario.vehicles), V2X_NEWS)
-        periodic = scenario.v2x.channel.persistence == "periodic"
-        key = numbers(KEY_WIDTH, LATER_LOSSES)[:, 0] if periodic else np.zeros(len(u))
-        worlds = scenario.v2x.with_channel(worlds, u, key, scenario.time_step_s)
-    return Sample(worlds, index, 0, None if typed is None or line is None else np.array(line.names)[typed[0]])
+    return scenario.sample_by(numbers, index)
 
 
 # Worlds whose initial conditions the user gives: a table (one row per world) or one state for ``reset``.
@@ -1234,84 +1313,6 @@ class _Naming:
 def _quantities(scenario: ScenarioFields) -> dict[str, QuantityRule]:
     """What a world of this scenario has."""
     return {**QUANTITY.usual, **QUANTITY.optional} if scenario.has_obstacle else QUANTITY.usual
-
-
-def table_columns(scenario: ScenarioFields) -> dict[str, Entry]:
-    """Columns that a table of initial states may have for this scenario: ``gap_1_m``, ``speed_1_mps``, ..."""
-    return {
-        rule.column_of(index): (field, index)
-        for field, rule in _quantities(scenario).items()
-        for index in range(rule.count(scenario.vehicles))
-    }
-
-
-def read_initial_states(path: str | Path, scenario: ScenarioFields) -> Worlds:
-    """Read worlds from a CSV file with a header line; columns as ``worlds_from_table``.
-
-    Raises ``InvalidInput`` with file, line and column for an unknown, repeated or missing column, a value that is
-    not a number or out of range, a row of another length, a file without rows, or one beyond ``SIZE_LIMIT``.
-    """
-    file = Path(path)
-    header, rows, lines = _read_csv(file)
-    entries = _known_columns(header, scenario, f"{file}, line 1")
-    table = np.empty((len(rows), len(header)))
-    for r, row in enumerate(rows):
-        if len(row) != len(header):
-            raise InvalidInput(f"{file}, line {lines[r]}: {len(row)} values, but the header has {len(header)} columns")
-        for c, text in enumerate(row):
-            number = parse_numeral(text.strip())
-            if number is None:
-                raise InvalidInput(f"{file}, line {lines[r]}, column {header[c]}: {text!r:.60} is not a number")
-            table[r, c] = number
-    given = {entry: table[:, c] for c, entry in enumerate(entries)}
-    return _worlds(given, scenario, _Naming(str(file), "file", lines))
-
-
-def worlds_from_table(columns: Mapping[str, ArrayLike], scenario: ScenarioFields) -> Worlds:
-    """Worlds from columns of equal length n: ``gap_1_m`` ..., ``speed_1_mps`` ..., and optionally the others.
-
-    Optional: ``braking_capacity_1_mps2``, ``driving_capacity_1_mps2``, ``latency_1_s``, ``mass_1_t``,
-    ``speed_limit_1_mps`` and so on for each vehicle, ``restitution``, and ``obstacle_gap_m`` where the scenario has it.
-    What is left out comes from the scenario, where it must be a fixed number. Raises ``InvalidInput`` naming the column
-    and the row (from 0).
-    """
-    entries = _known_columns(list(columns), scenario, "initial states")
-    given = {
-        entry: _numbers(f"initial states: {name}", column)
-        for entry, (name, column) in zip(entries, columns.items(), strict=True)
-    }
-    shapes = {column.shape for column in given.values()}
-    if len(shapes) != 1 or len(next(iter(shapes))) != 1:
-        lengths = ", ".join(f"{name} {list(np.shape(column))}" for name, column in columns.items())
-        raise InvalidInput(f"initial states: columns must be lists of one and the same length, not {lengths}")
-    return _worlds(given, scenario, _Naming("initial states", "table"))
-
-
-def initial_state_worlds(initial_state: Mapping[str, Any], scenario: ScenarioFields) -> Worlds:
-    """The one world of ``{"gaps_m": [7, 7], "speeds_mps": [20, 18, 20], ...}``; keys are a scenario's quantities.
-
-    A single number stands for every vehicle. What is left out comes from the scenario, where it must be a fixed
-    number. Raises ``InvalidInput`` naming the key and the entry.
-    """
-    if not isinstance(initial_state, Mapping):
-        raise InvalidInput(f"initial_state = {initial_state!r}: must be a mapping such as {{'gaps_m': [7, 7]}}")
-    given: dict[Entry, Floats] = {}
-    known = _quantities(scenario)
-    for field, value in initial_state.items():
-        if field not in known:
-            if field in QUANTITY.optional:
-                raise InvalidInput(f"initial_state: {field} is not of this scenario: {scenario.name!r} has no {field}")
-            hint = suggestion(str(field), known) or f"known: {', '.join(known)}"
-            raise InvalidInput(f"initial_state: unknown key {field!r}; {hint}")
-        count = known[field].count(scenario.vehicles)
-        numbers = _numbers(f"initial_state: {field}", value)
-        if numbers.shape not in ((), (count,)):
-            several = f"{scenario.vehicles} vehicles need {count} numbers, or one for all"
-            right = "must be one number" if known[field].per == "world" else several
-            raise InvalidInput(f"initial_state: {field} has shape {list(numbers.shape)}; {right}")
-        for index, number in enumerate(np.broadcast_to(numbers, (count,))):
-            given[field, index] = np.array([number])
-    return _worlds(given, scenario, _Naming("initial_state", "state"))
 
 
 def _worlds(given: Mapping[Entry, Floats], scenario: ScenarioFields, naming: _Naming) -> Worlds:
@@ -1378,7 +1379,7 @@ def _require_all(good: Bools, naming: _Naming, entry: Entry, column: Floats, rig
 
 def _known_columns(header: list[str], scenario: ScenarioFields, where: str) -> list[Entry]:
     """The entry of each column; unknown, repeated and missing columns are errors."""
-    known = table_columns(scenario)
+    known = scenario.table_columns
     if twice := [name for name, times in Counter(header).items() if times > 1]:
         raise InvalidInput(f"{where}: column {twice[0]!r} is given twice")
     for name in header:
@@ -1453,30 +1454,10 @@ class Ranges:
         streams = {of: np.full((n, width), _UNUSED) for of, width in widths.items()}
         for (of, column), u in zip(self.places, points.T, strict=True):
             streams[of][:, column] = u
-        found = make_sample(self.scenario, lambda _, of: streams[of], np.arange(n, dtype=np.int64))
+        found = self.scenario.sample_by(lambda _, of: streams[of], np.arange(n, dtype=np.int64))
         if self.scenario.early_impacts == "keep" or not self.scenario.learners:
             return found, np.ones(n, np.bool_)
         return found, ~early_impact(self.scenario, found.worlds)
-
-
-def ranges_of(scenario: ScenarioFields) -> Ranges:
-    """Every number that the scenario draws.
-
-    Raises ``InvalidInput`` for a scenario that draws nothing, a mixture, and a channel whose delays are drawn: worlds
-    of these cannot be given one by one.
-    """
-    if scenario.members:
-        members = ", ".join(member.name for member in scenario.members)
-        raise InvalidInput(f"scenario {scenario.name!r}: is a mixture; take one of its scenarios: {members}")
-    if scenario.v2x.by_link:
-        raise InvalidInput(
-            f"scenario {scenario.name!r}: v2x: draws delays and losses, which no table of worlds holds; give v2x: paper"
-            " (--set v2x=paper)"
-        )
-    found = {**_of_types(scenario), **_of_quantities(scenario)}
-    if not found:
-        raise InvalidInput(f"scenario {scenario.name!r}: draws nothing: all its worlds are the same")
-    return Ranges(scenario, tuple(found), tuple(found.values()))
 
 
 def _of_quantities(scenario: ScenarioFields) -> dict[str, Place]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ValidationError, model_validator
@@ -35,12 +35,9 @@ from ethbrake_marl.scenario.sampling import (
     NAME_PATTERN,
     QUANTITY,
     STATE_FREE,
-    Channel,
     Member,
-    Sample,
     ScenarioFields,
     ScriptSpec,
-    draw,
     support,
 )
 
@@ -370,15 +367,6 @@ class Scenario(ScenarioFields):
             ]
         return content
 
-    def sample(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
-        """Worlds ``first`` to ``first + n - 1`` of the endless list that belongs to ``seed``.
-
-        World k is the same bits whatever ``n`` and ``first`` are. The channels ``"list"`` (evaluation) and
-        ``"training"`` are independent of each other. Raises ``InvalidInput`` for a negative seed or ``first``,
-        ``n < 1``, or when early impacts are rejected and (almost) every draw has one.
-        """
-        return draw(self, n, seed, first=first, channel=channel)
-
     def replace(self, **changes: Any) -> Scenario:
         """The same scenario with other values in some fields, checked again.
 
@@ -494,22 +482,21 @@ class Task:
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
-def shipped_folder(folder: str, meaning: str) -> Path:
-    """The checkout's ``folder``, or the copy inside an installed package.
+def shipped_folder(folder: Literal["scenarios", "train"] = "scenarios") -> Path:
+    """The scenarios, or recipes, that ship: the checkout's ``folder``, or the copy inside an installed package.
 
-    Raises ``InvalidInput``, in which ``meaning`` says what is missing, when neither is there: the installation is
-    damaged.
+    Raises ``InvalidInput`` when neither is there: the installation is damaged.
     """
     checkout, installed = _PACKAGE.parent / folder, _PACKAGE / "_data" / folder
     if (_PACKAGE.parent / "pyproject.toml").is_file() and checkout.is_dir():
         return checkout
     if not installed.is_dir():
+        meaning = "recipes" if folder == "train" else folder
         raise InvalidInput(f"the shipped {meaning} are missing: neither {checkout} nor {installed} exists; reinstall")
     return installed
 
 
 _SUFFIXES = (".yaml", ".yml")
-SHIPPED = "shipped"
 FOLDERS: dict[str, Path] = {}  # registered, by their path
 
 
@@ -520,7 +507,12 @@ class CatalogueEntry:
     name: str
     title: str
     path: Path
-    origin: str = SHIPPED  # or the registered folder
+    origin: str = "shipped"  # or the registered folder
+
+    @property
+    def shipped(self) -> bool:
+        """Whether this package brings it."""
+        return self.origin == "shipped"
 
 
 def register_scenarios(folder: str | os.PathLike[str]) -> None:
@@ -545,21 +537,16 @@ def register_scenarios(folder: str | os.PathLike[str]) -> None:
         raise
 
 
-def scenario_folder() -> Path:
-    """The shipped scenarios: the checkout's ``scenarios/``, or the copy inside an installed package.
-
-    Raises ``InvalidInput`` when neither is there, which means that the installation is damaged.
-    """
-    return shipped_folder("scenarios", "scenarios")
-
-
-def load_scenario(name_or_path: str | Path) -> Scenario:
-    """Load a shipped or registered scenario by name, or a file by path; see ``scenario_path``.
+def load_scenario(scenario: str | Path | Mapping[str, Any]) -> Scenario:
+    """Load a shipped or registered scenario by name, or a file by path (see ``scenario_path``), or what one would say.
 
     Raises ``UnknownName`` with a suggestion for an unknown name, and ``InvalidInput`` with file, line, path inside
     it and value for a file that does not describe a scenario, or whose name differs from the file's.
     """
-    return _load(scenario_path(name_or_path))
+    if isinstance(scenario, Mapping):
+        document = _with_members(Document("scenario", dict(scenario), {}), Path())
+        return Scenario(**document.content)
+    return _load(scenario_path(scenario))
 
 
 def scenario_path(name_or_path: str | Path) -> Path:
@@ -589,7 +576,7 @@ def list_scenarios() -> list[CatalogueEntry]:
     shipped = _shipped_paths()
     scenarios = [(_load(path), path) for path in _known_paths().values()]
     entries = [
-        CatalogueEntry(s.name, s.title, path, SHIPPED if s.name in shipped else str(path.parent))
+        CatalogueEntry(s.name, s.title, path, "shipped" if s.name in shipped else str(path.parent))
         for s, path in scenarios
     ]
     return sorted(entries, key=lambda entry: entry.name)
@@ -615,7 +602,7 @@ def _files_of(folder: Path) -> list[Path]:
 
 
 def _shipped_paths() -> dict[str, Path]:
-    return {path.stem: path for path in sorted(scenario_folder().rglob("*.yaml"))}
+    return {path.stem: path for path in sorted(shipped_folder().rglob("*.yaml"))}
 
 
 def _load(path: Path) -> Scenario:
@@ -627,15 +614,6 @@ def _load(path: Path) -> Scenario:
             f" (or rename the file to {scenario.name}{path.suffix})"
         )
     return scenario
-
-
-def read_scenario(content: Mapping[str, Any]) -> Scenario:
-    """A scenario from what its file would say; the members of a mixture may be named as there.
-
-    Raises ``InvalidInput`` as ``Scenario``, and what ``load_scenario`` raises for a name.
-    """
-    document = _with_members(Document("scenario", dict(content), {}), Path())
-    return Scenario(**document.content)
 
 
 def _with_members(document: Document, folder: Path) -> Document:

@@ -36,7 +36,7 @@ from pydantic_core import CoreSchema
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.files.yaml import Document, FileModel, Wording, refuse
-from ethbrake_marl.physics import Bools, Floats, Ints, Vehicles, Worlds, ring_length, silent_messages
+from ethbrake_marl.physics import Floats, Ints, Messages, Vehicles, Worlds
 
 PER_LINK = 4  # uniform numbers of one link: wait, burst, loss, hop; one Philox counter
 
@@ -73,7 +73,7 @@ class Channel(NamedTuple):
 
     def samples(self, time_step_s: float) -> int:
         """Samples of its state that a vehicle keeps for messages on their way; 0 without periodic messages."""
-        return ring_length(self.delay_s, time_step_s) if self.persistence == "periodic" else 0
+        return Messages.ring_length(self.delay_s, time_step_s) if self.persistence == "periodic" else 0
 
 
 CHANNELS = {
@@ -255,11 +255,11 @@ class V2X(FileModel):
         if channel.persistence == "first":
             return worlds
         heard, seen = self.heard_and_seen(worlds.vehicles, u)
-        messages = silent_messages(
+        messages = Messages.silent(
             heard, seen, key * 2.0**53, channel.samples(time_step_s), period_s=channel.message_period_s,
             delay_s=channel.delay_s, loss_begins=channel.loss_begins, loss_ends=channel.loss_ends,
         )  # fmt: skip
-        return replace(worlds, messages=messages)
+        return replace(worlds, messages=messages.columns)
 
     def with_fixed_news(self, worlds: Worlds, time_step_s: float, where: str) -> Worlds:
         """Worlds that somebody gives with this channel; ``InvalidInput`` where it leaves something to chance."""
@@ -306,19 +306,6 @@ def link_delays(channel: Channel, u: Floats) -> Floats:
         delay = (u[..., 0] + periods) * channel.message_period_s + after_sending
     delay[u[..., 2] < channel.lost] = np.inf
     return delay
-
-
-def hidden_from(vehicles: Vehicles, vehicle: int) -> Bools:
-    """Worlds in which the channel hides something of the line from ``vehicle`` at its first decision, [n].
-
-    Either news of another vehicle has not arrived by then, or another one reacts later than the own part of its
-    latency, which is all that a message tells. Never without a channel.
-    """
-    late = vehicles.latency_s > vehicles.own_latency_s
-    hidden = (vehicles.known_from_s[:, vehicle] > vehicles.latency_s[:, [vehicle]]) | late
-    hidden[:, vehicle] = False
-    some: Bools = np.any(hidden, axis=1)
-    return some
 
 
 # Presets of the V2X channel that somebody registers.

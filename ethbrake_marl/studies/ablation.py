@@ -45,7 +45,7 @@ from ethbrake_marl.limits import BestHarmTable, best_harm, chunks_left, realised
 from ethbrake_marl.pages.page import Page, Part, Played, Section
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.policies import Policy, load_policy
-from ethbrake_marl.scenario import LEARNER, QUANTITY, Sample, Scenario, Task
+from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, Task
 from ethbrake_marl.shield import Shielded, drive_chunks, stack
 from ethbrake_marl.studies.jobs import JobFolder
 from ethbrake_marl.studies.trainings import (
@@ -730,7 +730,7 @@ def lengthen(scenario: Scenario, vehicles: int) -> Scenario:
                 values = [*values, values[-2] if len(values) > 1 else values[-1]]
             changes[key] = values[:wanted]
     first = scenario.roles.get("vehicle_1", "full_brake")
-    roles = {"vehicle_1": first} | {f"vehicle_{i + 1}": LEARNER for i in range(1, vehicles)}
+    roles = {"vehicle_1": first} | {f"vehicle_{i + 1}": "learner" for i in range(1, vehicles)}
     return scenario.replace(**changes, roles=roles)
 
 

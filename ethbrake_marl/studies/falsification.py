@@ -14,7 +14,7 @@ from ethbrake_marl.defaults import DEFAULT, HarmCount, MeasureName
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.evaluation import NamedWorld, evaluate, make_lineup, states_of
 from ethbrake_marl.physics import Floats, Ints
-from ethbrake_marl.scenario import Sample, Scenario, ranges_of
+from ethbrake_marl.scenario import Sample, Scenario
 
 # Measures of an agent's weakness, world by world.
 
@@ -216,9 +216,9 @@ def falsify(
     Worlds without harm, regret or difference are not kept: the result may hold none.
 
     Raises ``InvalidInput`` where the scenario draws nothing, or has none of the worlds that were tried, and what
-    ``ranges_of`` raises.
+    ``Scenario.ranges`` raises.
     """
-    ranges = ranges_of(measure.scenario)
+    ranges = measure.scenario.ranges()
 
     def score(points: Floats) -> Floats:
         sample, accepted = ranges.sample(points)

@@ -11,7 +11,7 @@ from ethbrake_marl.actions import action_to_command, command_to_action
 from ethbrake_marl.agents.registry import Agent, script_agents
 from ethbrake_marl.engine import Engine, Memory, Script, ask_script, begin_script
 from ethbrake_marl.physics import Bools, Floats, Worlds
-from ethbrake_marl.physics.messages import CHANNEL, LINK, _links, age_s, is_periodic, link_at, place_at, ring_at
+from ethbrake_marl.physics.messages import CHANNEL, LINK, Messages, link_at, place_at, ring_at
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search import state_columns
 from ethbrake_marl.shield import ShieldedDriver
@@ -93,8 +93,8 @@ def alter_unreceived(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> 
     unknown = vehicles.known_from_s[:, vehicle] > now
     unknown[:, vehicle] = False  # of itself it knows
     stale = unknown.copy()  # whose present it does not know
-    if is_periodic(worlds).all():
-        stale |= age_s(worlds.time_s, worlds.messages, worlds.N)[:, vehicle] > 0.0
+    if Messages.of(worlds).periodic.all():
+        stale |= Messages.of(worlds).age_s(worlds.time_s)[:, vehicle] > 0.0
     far = np.array([pair if pair < vehicle else pair + 1 for pair in range(N - 1)])  # of each pair, seen from here
 
     def other(values: Floats, low: float, high: float, where: Bools) -> Floats:
@@ -147,7 +147,7 @@ def _alter_messages(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> F
     columns, N = worlds.messages.copy(), worlds.N
     if not columns.shape[1]:
         return columns
-    kept = _links(worlds.messages, N)[:, vehicle].copy()
+    kept = Messages.of(worlds).links[:, vehicle].copy()
     own = columns[:, place_at(N) + vehicle].copy()
     columns[:, [CHANNEL.KEY, CHANNEL.TAKEN]] += 5.0
     columns[:, place_at(N) :] += rng.uniform(0.5, 3.0, columns[:, place_at(N) :].shape)

@@ -14,9 +14,9 @@ from ethbrake_marl.agents.believed import Told
 from ethbrake_marl.agents.registry import Agent, Knowledge, Source, Team, agent_entries, find_entry, parse_spec
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.physics.messages import is_periodic
+from ethbrake_marl.physics import Messages
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.scenario.v2x import PRESETS, hidden_from
+from ethbrake_marl.scenario.v2x import PRESETS
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 from tests.agents.honesty import changed_decisions
 from tests.test_contact_features import contact_policy
@@ -207,7 +207,7 @@ def test_own_sensors_and_messages__nor_where_an_obstacle_is_that_was_not_receive
 @pytest.mark.parametrize("channel", HIDING, ids=str)
 def test_channels__hide_something_to_be_altered(channel):
     worlds = BLOCKED.replace(v2x=channel).sample(60, 11).worlds
-    assert (hidden_from(worlds.vehicles, 1) | is_periodic(worlds)).sum() > 3
+    assert (worlds.vehicles.hide_from(1) | Messages.of(worlds).periodic).sum() > 3
 
 
 @pytest.mark.parametrize("channel", ["blocked", {"preset": "blocked", "persistence": "periodic"}], ids=str)
@@ -273,7 +273,7 @@ def test_true_state_and_model__is_not_said_without_need(spec):
 
 def test_hidden__only_where_news_or_a_reaction_is_late():
     def hidden(v2x):
-        return hidden_from(BLOCKED.replace(v2x=v2x).sample(200, 7).worlds.vehicles, 1)
+        return BLOCKED.replace(v2x=v2x).sample(200, 7).worlds.vehicles.hide_from(1)
 
     assert not hidden("paper").any()
     assert not hidden({"preset": "paper", "link_latency_s": 0.1, "senses": "both"}).any()  # clear: all in time
@@ -290,5 +290,5 @@ def test_hidden__a_late_reaction_of_another_vehicle_counts():
     latency = vehicles.latency_s.copy()
     latency[1, 2] += 0.5
     late = replace(vehicles, latency_s=latency)
-    assert hidden_from(late, 1).tolist() == [False, True]
-    assert hidden_from(late, 2).tolist() == [False, False]  # its own reaction is not hidden from it
+    assert late.hide_from(1).tolist() == [False, True]
+    assert late.hide_from(2).tolist() == [False, False]  # its own reaction is not hidden from it

@@ -12,10 +12,10 @@ from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.episodes import Task, film_scenes, follow_episodes, record_episode, record_episodes
-from ethbrake_marl.observations import observation_for, observe
+from ethbrake_marl.observations import observe
 from ethbrake_marl.physics import advance
 from ethbrake_marl.rewards import RewardParams
-from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.scenario import load_scenario, observation_for
 from ethbrake_marl.shield import HybridAgent
 
 PAPER = load_scenario("paper-random")

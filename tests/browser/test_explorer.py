@@ -17,7 +17,7 @@ from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.evaluation import Evaluation, evaluate
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.physics import Worlds
-from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario, read_initial_states
+from ethbrake_marl.scenario import Scenario, load_scenario
 
 pytestmark = pytest.mark.slow  # what the server answers is tried without a browser, too
 
@@ -137,7 +137,7 @@ def test_slider__is_answered_by_the_engine(open_explorer: Open, scenario: Scenar
     assert (state["mass_t"][2], state["restitution"]) == (12.5, 0.35)
     assert str(round(state["gaps_m"][0], 4)) == page.get_by_label("Gap, 1 to 2 in m", exact=True).input_value()
     shown = harms(page)
-    assert {name: shown[name] for name in AGENTS} == evaluated(initial_state_worlds(state, scenario), scenario)
+    assert {name: shown[name] for name in AGENTS} == evaluated(scenario.worlds_from_state(state), scenario)
     assert shown != before
 
 
@@ -152,7 +152,7 @@ def test_fast_moves__are_answered_for_the_newest_place(open_explorer: Open, scen
     state = page.evaluate(f"{EXPLORER}.state")
     assert state["gaps_m"][1] == 9.0 and len(asked) == 2
     shown = harms(page)
-    assert {name: shown[name] for name in AGENTS} == evaluated(initial_state_worlds(state, scenario), scenario)
+    assert {name: shown[name] for name in AGENTS} == evaluated(scenario.worlds_from_state(state), scenario)
 
 
 def test_world_that_cannot_be__is_told_and_left_again(open_explorer: Open) -> None:
@@ -283,7 +283,7 @@ def test_save__reads_back_to_the_same_harm(open_explorer: Open, served: Served, 
     shown = {name: value for name, value in harms(page).items() if name in AGENTS}
     saved = load_scenario(served.folder / "near-miss.yaml")
     assert evaluated(saved.sample(1, 3).worlds, scenario, saved) == shown
-    assert evaluated(read_initial_states(served.folder / "near-miss.csv", scenario), scenario) == shown
+    assert evaluated(scenario.read_worlds(served.folder / "near-miss.csv"), scenario) == shown
     page.get_by_role("button", name="Save as a scenario").click()
     wait_until(page, "document.querySelector('[data-part=saved]').textContent.includes('is there already')")
 

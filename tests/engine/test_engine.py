@@ -10,7 +10,7 @@ from ethbrake_marl.engine import Engine, Stream
 from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Worlds, advance
-from ethbrake_marl.scenario import initial_state_worlds, load_scenario
+from ethbrake_marl.scenario import load_scenario
 
 PAPER = load_scenario("paper-random").replace(early_impacts="keep")
 
@@ -28,7 +28,7 @@ def state(running):
 def too_weak(n):
     """Worlds in which vehicle 3 cannot brake with 5 m/s2."""
     given = {"gaps_m": 3, "braking_capacity_mps2": 4, "speeds_mps": 20}
-    return initial_state_worlds(given, PAPER).take(np.zeros(n, np.int64))
+    return PAPER.worlds_from_state(given).take(np.zeros(n, np.int64))
 
 
 class Remembering:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.envs.interfaces import EthBrakeEnv
-from ethbrake_marl.scenario.features import Feature
+from ethbrake_marl.observations import Feature
 from tests.envs.lines import REST
 from tests.reference.docs_tables import environment_tables, feature_table
 

@@ -12,11 +12,11 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.envs.interfaces import describe_worlds
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.scenario import load_scenario, read_scenario
+from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.scenario.sampling import QUANTITY
 
 MIXED = load_scenario("realistic-mixed")
-BOTH = read_scenario(
+BOTH = load_scenario(
     {"name": "both", "mixture": [{"scenario": "realistic-mixed"}, {"scenario": "realistic-truck"}]}
 )  # types in one of the two
 

@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 from ethbrake_marl.envs.interfaces import EthBrakeEnv, parallel_env
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.observations import full_state
+from ethbrake_marl.scenario import full_state
 from tests.contract.interfaces import FIVE, PAPER, actions, initial_state
 from tests.envs.lines import CRASH, REST
 

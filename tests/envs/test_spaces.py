@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.envs.interfaces import action_box, feature_box
-from ethbrake_marl.observations import ObservationSpec, full_state, state_features
+from ethbrake_marl.observations import Feature, ObservationSpec
 from ethbrake_marl.physics import make_worlds
-from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.scenario.features import Feature
+from ethbrake_marl.scenario import Scenario, full_state, state_features
 from tests.contract.interfaces import FIVE, PAPER
 
 

@@ -13,7 +13,7 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation import Evaluation, check_target, evaluate, write_per_world
 from ethbrake_marl.evaluation.measures import Regrets
 from ethbrake_marl.evaluation.results import write_output
-from ethbrake_marl.scenario import Scenario, worlds_from_table
+from ethbrake_marl.scenario import Scenario
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -65,14 +65,14 @@ def test_per_world__the_initial_columns_make_the_same_worlds_again(tmp_path: Pat
     write_per_world(tmp_path / "out.csv", evaluation)
     rows = [row for row in read(tmp_path / "out.csv") if row["agent"] == "full_brake"]
     names = ("gap_1_m", "gap_2_m", "speed_1_mps", "speed_2_mps", "speed_3_mps")
-    worlds = worlds_from_table({name: column(rows, name) for name in names}, evaluation.scenario)
+    worlds = evaluation.scenario.worlds_from_table({name: column(rows, name) for name in names})
     again = evaluate(worlds, {"b": make_agent("full_brake")}, scenario=evaluation.scenario).outcome("b")
     np.testing.assert_array_equal(again.total_harm, evaluation.outcome("full_brake").total_harm, strict=True)
 
 
 def test_per_world__a_quantity_that_differs_between_worlds_has_its_columns(tmp_path: Path, pair: Scenario) -> None:
     columns = {"gap_1_m": [1.0, 1.0], "speed_1_mps": [20.0, 20.0], "speed_2_mps": [20.0, 20.0]}
-    worlds = worlds_from_table({**columns, "latency_2_s": [0.5, 0.25], "mass_1_t": [4.5, 4.5]}, pair)
+    worlds = pair.worlds_from_table({**columns, "latency_2_s": [0.5, 0.25], "mass_1_t": [4.5, 4.5]})
     write_per_world(tmp_path / "out.csv", evaluate(worlds, {"b": make_agent("full_brake")}, scenario=pair))
     rows = read(tmp_path / "out.csv")
     assert [row["latency_2_s"] for row in rows] == ["0.5", "0.25"]

@@ -6,7 +6,7 @@ import pytest
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, evaluate, record_episode
-from ethbrake_marl.scenario import Scenario, initial_state_worlds
+from ethbrake_marl.scenario import Scenario
 
 IMPACT_S = 0.5 + 0.25 / 3.0  # see PAIR
 
@@ -85,7 +85,7 @@ def test_record__samples_are_as_fine_as_asked_and_never_change_the_motion(
 
 def test_record__an_impact_at_the_very_alert_is_there(pair: Scenario) -> None:
     at_once = pair.replace(latency_s=[0.0, 0.0])
-    world = initial_state_worlds({"gaps_m": [0.0], "speeds_mps": [18.0, 20.0]}, at_once)
+    world = at_once.worlds_from_state({"gaps_m": [0.0], "speeds_mps": [18.0, 20.0]})
     record = record_episode(world, make_agent("full_brake"), scenario=at_once)
     assert record.impacts.time_s[0] == 0.0
     assert record.impacts.closing_speed_mps[0] == 2.0

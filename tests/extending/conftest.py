@@ -7,16 +7,16 @@ from typing import Any
 
 import pytest
 
-from ethbrake_marl import harm, rewards as terms
+from ethbrake_marl import harm, observations, rewards as terms
 from ethbrake_marl.agents import registry as agents
 from ethbrake_marl.evaluation import measures
 from ethbrake_marl.files import plugins
 from ethbrake_marl.learning import training as algorithms
-from ethbrake_marl.scenario import features, schema, v2x
+from ethbrake_marl.scenario import schema, v2x
 
 TABLES = (
     (schema, "FOLDERS"),
-    (features, "FEATURES"),
+    (observations, "FEATURES"),
     (v2x, "CHANNELS"),
     (harm, "KINDS"),
     (agents, "_ENTRIES"),

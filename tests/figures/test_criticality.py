@@ -9,7 +9,7 @@ from ethbrake_marl.evaluation import curves as module, evaluate
 from ethbrake_marl.evaluation.curves import avoidability_boundary, criticality_map
 from ethbrake_marl.figures import criticality_figure, picture_bytes
 from ethbrake_marl.limits.limits import Limits, known_limits
-from ethbrake_marl.scenario import Scenario, Task, load_scenario, worlds_from_table
+from ethbrake_marl.scenario import Scenario, Task, load_scenario
 
 DISTANCE = load_scenario("paper-distance")
 FULL = {"full_brake": make_agent("full_brake")}
@@ -19,7 +19,7 @@ def test_map__its_cells_are_the_worlds_of_both_gaps() -> None:
     found = criticality_map(DISTANCE, FULL, cells=3)
     assert found.gap_1_m.tolist() == found.gap_2_m.tolist() == [5.0, 7.5, 10.0]
     columns = {"gap_1_m": [10.0], "gap_2_m": [5.0], "speed_1_mps": [20.0], "speed_2_mps": [18.0], "speed_3_mps": [20.0]}
-    world = worlds_from_table(columns, DISTANCE)
+    world = DISTANCE.worlds_from_table(columns)
     alone = evaluate(world, FULL, scenario=DISTANCE).outcome("full_brake")
     assert found.harm("first")[0, 2] == alone.first_impact_harm[0]  # row: gap 2, column: gap 1
     assert found.harm("total")[0, 2] == alone.total_harm[0]

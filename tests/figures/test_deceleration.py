@@ -11,7 +11,7 @@ from ethbrake_marl.evaluation.curves import deceleration_curve, regimes_of
 from ethbrake_marl.figures import deceleration_figure, picture_bytes
 from ethbrake_marl.limits.limits import Limits, Proof
 from ethbrake_marl.physics import Worlds, make_worlds
-from ethbrake_marl.scenario import Scenario, Task, load_scenario, worlds_from_table
+from ethbrake_marl.scenario import Scenario, Task, load_scenario
 
 
 def pair_world(gap_m: float, speeds_mps: tuple[float, float], latency_s: tuple[float, float]) -> Worlds:
@@ -23,7 +23,7 @@ def pair_world(gap_m: float, speeds_mps: tuple[float, float], latency_s: tuple[f
 
 def seven_seven(scenario: Scenario) -> Worlds:
     columns = {"gap_1_m": [7.0], "gap_2_m": [7.0], "speed_1_mps": [20.0], "speed_2_mps": [18.0], "speed_3_mps": [20.0]}
-    return worlds_from_table(columns, scenario)
+    return scenario.worlds_from_table(columns)
 
 
 def texts(figure: Figure) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Iterator
 
-from ethbrake_marl.scenario import load_scenario, read_initial_states
+from ethbrake_marl.scenario import load_scenario
 from tests.hostile.case import NASTY, Case, damaged, write
 from tests.hostile.yaml_parts import NOT_FINITE, NOT_NUMBERS
 
@@ -72,5 +72,5 @@ def _case(category: str, seed: float, make: Make, certain: bool) -> Case:
         ("evaluate", "--agents", "coast", "--initial-states", "worlds.csv"),
         lambda folder: write(folder / "worlds.csv", make(random.Random(seed))),
         certain=certain,
-        reader=lambda: read_initial_states("worlds.csv", load_scenario("paper-random")),
+        reader=lambda: load_scenario("paper-random").read_worlds("worlds.csv"),
     )

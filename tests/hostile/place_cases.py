@@ -14,7 +14,7 @@ from pathlib import Path
 from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.limits.limits import BestHarmTable
 from ethbrake_marl.policies import load_policy, shipped_policies
-from ethbrake_marl.scenario import load_scenario, read_initial_states
+from ethbrake_marl.scenario import load_scenario
 from tests.hostile.archives import good_bytes
 from tests.hostile.case import HERE, INSIDE, NASTY, OUTSIDE, Build, Case, write
 from tests.hostile.csv_cases import TABLE
@@ -63,7 +63,7 @@ def targets() -> dict[str, Target]:
             "w.csv",
             TABLE.encode(),
             lambda p: ("evaluate", "--agents", "coast", "--initial-states", p),
-            lambda p: read_initial_states(p, load_scenario("paper-random")),
+            lambda p: load_scenario("paper-random").read_worlds(p),
         ),
         "table": Target(
             "t.npz", good_bytes(), lambda p: (*COMMAND[:-2], p, "--json"), lambda p: BestHarmTable.load(Path(p))

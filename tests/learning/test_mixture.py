@@ -17,11 +17,11 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning import runs as train_module
 from ethbrake_marl.learning.runs import resume, train
 from ethbrake_marl.learning.training import RunDirectory, Training
-from ethbrake_marl.scenario import load_scenario, read_scenario
+from ethbrake_marl.scenario import load_scenario
 from tests.learning.tiny import TINY_PPO
 
 RECIPE = TINY_PPO.replace(total_steps=8 * 128)
-MIXTURE = read_scenario(
+MIXTURE = load_scenario(
     {"name": "both", "mixture": [{"scenario": "realistic-mixed"}, {"scenario": "realistic-truck", "weight": 2}]}
 )
 

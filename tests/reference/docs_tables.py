@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from ethbrake_marl import ethbrake_v0
-from ethbrake_marl.observations import ObservationSpec, choose_observation, state_features
+from ethbrake_marl.observations import Feature, ObservationSpec, choose_observation
 from ethbrake_marl.rewards import REWARDS, TERMS, RewardParams, Term
-from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.scenario.features import Feature
+from ethbrake_marl.scenario import load_scenario, state_features
 
 
 def feature_table(features: Sequence[Feature], first: int = 0) -> str:

@@ -16,11 +16,10 @@ from ethbrake_marl.scenario import (
     load_scenario,
     new_scenario_text,
     parse_yaml,
-    read_scenario,
-    scenario_folder,
     scenario_json_schema,
     scenario_path,
     schema as shipped_files,
+    shipped_folder,
 )
 from ethbrake_marl.scenario.sampling import QUANTITY
 
@@ -60,7 +59,7 @@ def test_list__is_sorted_and_has_the_papers_scenarios():
 
 
 def test_shipped_names__are_unique():
-    stems = [path.stem for path in scenario_folder().rglob("*.yaml")]
+    stems = [path.stem for path in shipped_folder().rglob("*.yaml")]
     assert len(stems) == len(set(stems))
 
 
@@ -141,7 +140,7 @@ def test_path__name_and_file_must_agree(tmp_path: Path):
 def test_new__has_every_key_and_the_values_it_is_based_on(path):
     text = new_scenario_text("mine", based_on=path.stem)
     own = {"name", "title", "description", "source"}
-    new, base = read_scenario(parse_yaml(text).content), load_scenario(path.stem)
+    new, base = load_scenario(parse_yaml(text).content), load_scenario(path.stem)
     assert new.model_dump(exclude=own) == base.model_dump(exclude=own)
     assert new.name == "mine"
     assert all(re.search(rf"^# .*\n(# )?{key}:", text, re.MULTILINE) for key in Scenario.model_fields)
@@ -219,7 +218,7 @@ def test_docs__the_example_is_a_valid_scenario():
     ],
 )
 def test_docs__the_mistakes_are_answered_as_printed(old, new):
-    text = (scenario_folder() / "paper" / "paper-random.yaml").read_text()
+    text = (shipped_folder() / "paper" / "paper-random.yaml").read_text()
     assert old in text
     with pytest.raises(InvalidInput) as caught:
         Scenario.from_document(parse_yaml(text.replace(old, new), "my.yaml"))
@@ -229,13 +228,13 @@ def test_docs__the_mistakes_are_answered_as_printed(old, new):
 def test_folder__of_an_installed_package_is_inside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(shipped_files, "_PACKAGE", tmp_path / "ethbrake_marl")
     with pytest.raises(InvalidInput, match=r"the shipped scenarios are missing: .*reinstall"):
-        scenario_folder()
+        shipped_folder()
     installed = tmp_path / "ethbrake_marl" / "_data" / "scenarios"
     installed.mkdir(parents=True)
     (tmp_path / "scenarios").mkdir()  # somebody else's folder: no pyproject.toml beside it
-    assert scenario_folder() == installed
+    assert shipped_folder() == installed
     (tmp_path / "pyproject.toml").touch()
-    assert scenario_folder() == tmp_path / "scenarios"
+    assert shipped_folder() == tmp_path / "scenarios"
 
 
 def test_folder__of_recipes_follows_the_same_rule(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.scenario import (
-    Scenario,
-    initial_state_worlds,
-    load_scenario,
-    new_scenario_text,
-    parse_yaml,
-    read_initial_states,
-)
+from ethbrake_marl.scenario import Scenario, load_scenario, new_scenario_text, parse_yaml
 from ethbrake_marl.scenario.sampling import uniform_numbers, values
 
 REST = {
@@ -155,24 +148,24 @@ def test_replace__the_new_way_takes_the_place_of_the_old_one():
 
 def test_initial_state__a_time_gap_is_at_the_given_speed():
     scenario = build(time_gaps_s=[0.5, 1], **{"line_speed_mps": 20}, **DEVIATIONS)
-    assert initial_state_worlds({"speeds_mps": [30, 20, 10]}, scenario).gaps_m.tolist() == [[10.0, 10.0]]
-    assert initial_state_worlds({"speeds_mps": 20, "gaps_m": [7, 8]}, scenario).gaps_m.tolist() == [[7.0, 8.0]]
-    assert initial_state_worlds({}, scenario.replace(speeds_mps=[0, 1, 2])).gaps_m.tolist() == [[0.5, 2.0]]
+    assert scenario.worlds_from_state({"speeds_mps": [30, 20, 10]}).gaps_m.tolist() == [[10.0, 10.0]]
+    assert scenario.worlds_from_state({"speeds_mps": 20, "gaps_m": [7, 8]}).gaps_m.tolist() == [[7.0, 8.0]]
+    assert scenario.replace(speeds_mps=[0, 1, 2]).worlds_from_state({}).gaps_m.tolist() == [[0.5, 2.0]]
     with pytest.raises(
         InvalidInput, match=r"initial_state: speeds_mps\[0\] is missing, and random in scenario 'given'"
     ):
-        initial_state_worlds({"gaps_m": 7}, scenario)
+        scenario.worlds_from_state({"gaps_m": 7})
     with pytest.raises(InvalidInput, match=r"initial_state: gaps_m\[0\] is missing, and random in scenario 'given'"):
-        initial_state_worlds({"speeds_mps": 20}, build(**LINE))
+        build(**LINE).worlds_from_state({"speeds_mps": 20})
     with pytest.raises(InvalidInput, match=r"gaps_m\[1\] = 12000: must be finite and in \[0, 10000\] m"):
         state = {"speeds_mps": [20, 20, 200], "speed_limit_mps": 200}
-        initial_state_worlds(state, build(time_gaps_s=[1, 60], speeds_mps=20))
+        build(time_gaps_s=[1, 60], speeds_mps=20).worlds_from_state(state)
 
 
 def test_csv__gaps_and_speeds_as_always(tmp_path):
     path = tmp_path / "worlds.csv"
     path.write_text("gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps\n10,8,20,18,20\n")
-    worlds = read_initial_states(path, build(**LINE, **DEVIATIONS))
+    worlds = build(**LINE, **DEVIATIONS).read_worlds(path)
     assert (worlds.gaps_m.tolist(), worlds.speeds_mps.tolist()) == ([[10.0, 8.0]], [[20.0, 18.0, 20.0]])
 
 

@@ -7,13 +7,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.scenario import (
-    initial_state_worlds,
-    load_scenario,
-    read_initial_states,
-    table_columns,
-    worlds_from_table,
-)
+from ethbrake_marl.scenario import load_scenario
 
 PAPER = load_scenario("paper-random")
 HEADER = "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps"
@@ -26,7 +20,7 @@ def write(folder: Path, text: str) -> Path:
 
 
 def test_csv__gives_the_state_and_the_scenario_the_rest(tmp_path: Path):
-    worlds = read_initial_states(write(tmp_path, f"{HEADER}\n10,8,20,18,20\n5,9,22,1.8e1, 20\n"), PAPER)
+    worlds = PAPER.read_worlds(write(tmp_path, f"{HEADER}\n10,8,20,18,20\n5,9,22,1.8e1, 20\n"))
     assert worlds.gaps_m.tolist() == [[10.0, 8.0], [5.0, 9.0]]
     assert worlds.speeds_mps.tolist() == [[20.0, 18.0, 20.0], [22.0, 18.0, 20.0]]
     assert worlds.vehicles.latency_s.tolist() == [[0.0, 0.5, 0.8]] * 2
@@ -36,7 +30,7 @@ def test_csv__gives_the_state_and_the_scenario_the_rest(tmp_path: Path):
 
 def test_csv__optional_columns_in_any_order_with_a_byte_order_mark(tmp_path: Path):
     text = f"\ufefflatency_2_s,restitution,mass_3_t,speed_limit_1_mps,{HEADER}\n0.2,0.3,6,30,10,8,20,18,20\n"
-    worlds = read_initial_states(write(tmp_path, text), PAPER)
+    worlds = PAPER.read_worlds(write(tmp_path, text))
     assert worlds.vehicles.latency_s.tolist() == [[0.0, 0.2, 0.8]]
     assert worlds.vehicles.restitution.tolist() == [0.3]
     assert worlds.vehicles.mass_t.tolist() == [[4.5, 5.5, 6.0]]
@@ -79,24 +73,24 @@ def test_csv__optional_columns_in_any_order_with_a_byte_order_mark(tmp_path: Pat
 def test_csv__defects_name_file_line_and_column(tmp_path: Path, text: str, message: str):
     path = write(tmp_path, text)
     with pytest.raises(InvalidInput) as caught:
-        read_initial_states(path, PAPER)
+        PAPER.read_worlds(path)
     assert str(caught.value).startswith(str(path))
     assert message in str(caught.value)
 
 
 @pytest.mark.parametrize("end", ["", "\n", "\n\n", "\r\n\r\n"])
 def test_csv__blank_lines_at_the_end_are_nothing(tmp_path: Path, end: str):
-    assert read_initial_states(write(tmp_path, f"{HEADER}\n10,8,20,18,20{end}"), PAPER).n == 1
+    assert PAPER.read_worlds(write(tmp_path, f"{HEADER}\n10,8,20,18,20{end}")).n == 1
 
 
 def test_csv__beyond_the_limit_is_not_read_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     path = write(tmp_path, f"{HEADER}\n10,8,20,18,20\n")
     monkeypatch.setattr("ethbrake_marl.scenario.sampling.SIZE_LIMIT", path.stat().st_size)
-    assert read_initial_states(path, PAPER).n == 1
+    assert PAPER.read_worlds(path).n == 1
     larger = write(tmp_path, f"{HEADER}\n10,8,20,18,20\n\n")
     for file, reason in ((larger, "larger than 0 KiB, the limit for such a file"), (Path("/dev/zero"), "a device")):
         with pytest.raises(InvalidInput, match=reason):
-            read_initial_states(file, PAPER)
+            PAPER.read_worlds(file)
 
 
 def test_csv__of_a_hundred_thousand_columns_is_refused_at_once(tmp_path: Path):
@@ -105,26 +99,26 @@ def test_csv__of_a_hundred_thousand_columns_is_refused_at_once(tmp_path: Path):
         path = write(tmp_path, ",".join(["gap_1_m"] * columns) + "\n1\n")
         began = time.process_time()
         with pytest.raises(InvalidInput, match="column 'gap_1_m' is given twice"):
-            read_initial_states(path, PAPER)
+            PAPER.read_worlds(path)
         spent.append(time.process_time() - began)
     assert spent[1] < 40.0 * spent[0]  # a hundred times when every column was counted anew
 
 
 def test_csv__that_is_missing_or_not_text(tmp_path: Path):
     with pytest.raises(InvalidInput, match=r"none\.csv: no such file"):
-        read_initial_states(tmp_path / "none.csv", PAPER)
+        PAPER.read_worlds(tmp_path / "none.csv")
     path = tmp_path / "bytes.csv"
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InvalidInput, match="cannot be read as CSV"):
-        read_initial_states(path, PAPER)
+        PAPER.read_worlds(path)
 
 
 def test_csv__a_random_quantity_must_be_a_column(tmp_path: Path):
     path = write(tmp_path, f"{HEADER}\n10,8,20,18,20\n")
     random = PAPER.replace(mass_t=[4.5, {"uniform": [5, 6]}, 5.9])
     with pytest.raises(InvalidInput, match=r"column mass_2_t is missing, and random in scenario 'paper-random'"):
-        read_initial_states(path, random)
-    worlds = read_initial_states(write(tmp_path, f"{HEADER},mass_2_t\n10,8,20,18,20,5.2\n"), random)
+        random.read_worlds(path)
+    worlds = random.read_worlds(write(tmp_path, f"{HEADER},mass_2_t\n10,8,20,18,20,5.2\n"))
     assert worlds.vehicles.mass_t.tolist() == [[4.5, 5.2, 5.9]]
 
 
@@ -133,15 +127,15 @@ def test_table__columns_of_a_line_of_two():
         vehicles=2, braking_capacity_mps2=6, driving_capacity_mps2=6, mass_t=5, latency_s=0,
         roles={"vehicle_2": "learner"},
     )  # fmt: skip
-    assert list(table_columns(two))[:4] == ["gap_1_m", "speed_1_mps", "speed_2_mps", "braking_capacity_1_mps2"]
-    assert len(table_columns(two)) == 1 + 6 * 2 + 1
+    assert list(two.table_columns)[:4] == ["gap_1_m", "speed_1_mps", "speed_2_mps", "braking_capacity_1_mps2"]
+    assert len(two.table_columns) == 1 + 6 * 2 + 1
 
 
 def test_table__equals_the_same_worlds_sampled():
     sampled = PAPER.sample(50, 3).worlds
     columns = {f"gap_{i + 1}_m": sampled.gaps_m[:, i] for i in range(2)}
     columns |= {f"speed_{i + 1}_mps": sampled.speeds_mps[:, i] for i in range(3)}
-    worlds = worlds_from_table(columns, PAPER)
+    worlds = PAPER.worlds_from_table(columns)
     assert np.array_equal(worlds.gaps_m, sampled.gaps_m)
     assert np.array_equal(worlds.speeds_mps, sampled.speeds_mps)
     assert np.array_equal(worlds.vehicles.mass_t, sampled.vehicles.mass_t)
@@ -162,22 +156,22 @@ def test_table__equals_the_same_worlds_sampled():
 def test_table__defects_name_column_and_row(changes, message):
     columns = {name: [7, 8, 9] for name in HEADER.split(",")} | changes
     with pytest.raises(InvalidInput) as caught:
-        worlds_from_table(columns, PAPER)
+        PAPER.worlds_from_table(columns)
     assert message in str(caught.value)
 
 
 def test_initial_state__the_scenario_fills_in_fixed_fields():
-    worlds = initial_state_worlds({"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}, PAPER)
+    worlds = PAPER.worlds_from_state({"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]})
     assert worlds.n == 1
     assert worlds.gaps_m.tolist() == [[7.0, 7.0]]
     assert worlds.vehicles.braking_capacity_mps2.tolist() == [[6.0, 7.0, 6.0]]
-    one_for_all = initial_state_worlds({"gaps_m": 7, "speeds_mps": np.full(3, 20), "restitution": 0.0}, PAPER)
+    one_for_all = PAPER.worlds_from_state({"gaps_m": 7, "speeds_mps": np.full(3, 20), "restitution": 0.0})
     assert one_for_all.speeds_mps.tolist() == [[20.0, 20.0, 20.0]]
     assert one_for_all.vehicles.restitution.tolist() == [0.0]
 
 
 def test_initial_state__of_a_fixed_scenario_may_be_empty():
-    assert initial_state_worlds({}, load_scenario("paper-scenario-1")).gaps_m.tolist() == [[10.0, 8.0]]
+    assert load_scenario("paper-scenario-1").worlds_from_state({}).gaps_m.tolist() == [[10.0, 8.0]]
 
 
 @pytest.mark.parametrize(
@@ -201,5 +195,5 @@ def test_initial_state__of_a_fixed_scenario_may_be_empty():
 )
 def test_initial_state__defects_name_key_and_entry(state, message):
     with pytest.raises(InvalidInput) as caught:
-        initial_state_worlds(state, PAPER)
+        PAPER.worlds_from_state(state)
     assert message in str(caught.value)

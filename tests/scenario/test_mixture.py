@@ -16,14 +16,14 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import scenario_sha256, worlds_sha256
 from ethbrake_marl.learning.training import Training
 from ethbrake_marl.physics import Worlds
-from ethbrake_marl.scenario import Scenario, load_scenario, read_scenario
+from ethbrake_marl.scenario import Scenario, load_scenario
 
 DELAYS = load_scenario("mixture-delays")
 MEMBERS = ("paper-delay-low", "paper-delay-middle", "paper-delay-high")
 
 
 def mixed(*members: str, **beside: object) -> Scenario:
-    return read_scenario({"name": "mixed", "mixture": [{"scenario": name} for name in members], **beside})
+    return load_scenario({"name": "mixed", "mixture": [{"scenario": name} for name in members], **beside})
 
 
 def same(one: Worlds, other: Worlds) -> bool:
@@ -70,7 +70,7 @@ def test_members_with_a_channel_and_without__are_one_batch():
 
 def test_weights__decide_how_often():
     entries = [{"scenario": name, "weight": weight} for name, weight in zip(MEMBERS, (1, 2, 5), strict=True)]
-    names = read_scenario({"name": "mixed", "mixture": entries}).sample(20_000, 3).scenarios
+    names = load_scenario({"name": "mixed", "mixture": entries}).sample(20_000, 3).scenarios
     seen = [int((names == name).sum()) for name in MEMBERS]
     assert stats.chisquare(seen, np.array([1, 2, 5]) / 8 * 20_000).pvalue > 0.001
 

@@ -7,14 +7,7 @@ import pytest
 
 from ethbrake_marl import observation_for
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.scenario import (
-    Scenario,
-    initial_state_worlds,
-    load_scenario,
-    new_scenario_text,
-    parse_yaml,
-    worlds_from_table,
-)
+from ethbrake_marl.scenario import Scenario, load_scenario, new_scenario_text, parse_yaml
 
 REST = {
     "name": "given", "gaps_m": 7, "braking_capacity_mps2": [5, 7, 6], "driving_capacity_mps2": 6, "mass_t": 5,
@@ -55,14 +48,14 @@ def test_margin__has_the_random_number_of_the_distance():
 def test_margin__a_given_world_gets_the_obstacle_of_its_own_speed():
     scenario = build(obstacle_margin_m=1.5)
     table = {f"gap_{p}_m": [7, 7] for p in (1, 2)} | {f"speed_{i}_mps": [10, 20] for i in (1, 2, 3)}
-    assert worlds_from_table(table, scenario).obstacle_gap_m.tolist() == [5 + 10 + 1.5, 51.5]
-    given = worlds_from_table({**table, "obstacle_gap_m": [30, 31]}, scenario)
+    assert scenario.worlds_from_table(table).obstacle_gap_m.tolist() == [5 + 10 + 1.5, 51.5]
+    given = scenario.worlds_from_table({**table, "obstacle_gap_m": [30, 31]})
     assert given.obstacle_gap_m.tolist() == [30, 31]
     state = {"gaps_m": 7, "speeds_mps": 20, "latency_s": 0, "braking_capacity_mps2": 4}
-    assert initial_state_worlds(state, scenario).obstacle_gap_m.tolist() == [51.5]
+    assert scenario.worlds_from_state(state).obstacle_gap_m.tolist() == [51.5]
     drawn = scenario.replace(obstacle_margin_m={"uniform": [1, 2]})
     with pytest.raises(InvalidInput, match=r"column obstacle_gap_m is missing, and random in scenario 'given'"):
-        worlds_from_table(table, drawn)
+        drawn.worlds_from_table(table)
 
 
 def test_margin__is_an_obstacle_for_everybody():
@@ -80,7 +73,7 @@ def test_key__of_an_earlier_version_is_unknown():
     with pytest.raises(InvalidInput, match="hazard_gap_m: unknown key; known: "):
         build(hazard_gap_m=42)
     with pytest.raises(InvalidInput, match="initial_state: unknown key 'hazard_gap_m'; "):
-        initial_state_worlds({"gaps_m": 7, "speeds_mps": 20, "hazard_gap_m": 60}, build(obstacle_margin_m=1.5))
+        build(obstacle_margin_m=1.5).worlds_from_state({"gaps_m": 7, "speeds_mps": 20, "hazard_gap_m": 60})
 
 
 def yaml_of(content: dict[str, object]) -> str:

@@ -15,7 +15,7 @@ from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import worlds_sha256
 from ethbrake_marl.observations import choose_observation
-from ethbrake_marl.physics.messages import CHANNEL, age_s, chance, is_periodic, newest_told
+from ethbrake_marl.physics.messages import CHANNEL, Messages, chance
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.scenario.v2x import CHANNELS
 
@@ -50,7 +50,7 @@ def driven(engine: Engine, steps: int, action: float = -0.6) -> list[np.ndarray]
 
 
 def ages_in(worlds):
-    return age_s(worlds.time_s, worlds.messages, worlds.N)
+    return Messages.of(worlds).age_s(worlds.time_s)
 
 
 def test_persistence__first_is_the_default_and_adds_nothing() -> None:
@@ -83,7 +83,7 @@ def test_fixed_delay_without_loss__by_hand() -> None:
     engine = engine_of(periodic("paper", base, link_latency_s=0.2, senses="front", sensing_s=[5.0, 5.0]), n=1)
     for step in range(6):
         time = 0.5 + 0.1 * step
-        told = newest_told(engine.worlds, 1)
+        told = Messages.of(engine.worlds).newest_told(1)
         assert engine.worlds.time_s[0] == pytest.approx(time)
         assert told.at_s[0, 0] == pytest.approx(time - 0.2)
         assert told.speed_mps[0, 0] == pytest.approx(20.0 - 6.0 * (time - 0.2))
@@ -191,7 +191,7 @@ def test_interfaces__see_the_same() -> None:
     env = parallel_env(scenario=scenario)
     seen, _ = env.reset(seed=5)
     engine = env.unwrapped.engine
-    assert is_periodic(engine.worlds).all() and not (engine.worlds.messages[:, CHANNEL.KEY] == 0.0).any()
+    assert Messages.of(engine.worlds).periodic.all() and not (engine.worlds.messages[:, CHANNEL.KEY] == 0.0).any()
     for _ in range(5):
         seen, *_, infos = env.step({"vehicle_2": np.array([-0.5], np.float32)})
     np.testing.assert_array_equal(seen["vehicle_2"], engine.observe(1)[0])
@@ -249,5 +249,5 @@ def test_mixture__its_scenarios_share_the_persistence() -> None:
         Scenario(name="mixed", mixture=members)
     members[1]["scenario"]["v2x"] = {"preset": "blocked", "persistence": "periodic"}
     mixed = Scenario(name="mixed", mixture=members)
-    assert is_periodic(mixed.sample(30, 3).worlds).all()
+    assert Messages.of(mixed.sample(30, 3).worlds).periodic.all()
     driven(engine_of(mixed), 5)

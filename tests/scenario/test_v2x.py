@@ -12,11 +12,11 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.interfaces import parallel_env
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.observations import full_state, observation_for, observe, state_features
+from ethbrake_marl.observations import observe
 from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.physics.batch import Packed
 from ethbrake_marl.physics.kernel import CLOCK
-from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario
+from ethbrake_marl.scenario import Scenario, full_state, load_scenario, observation_for, state_features
 from ethbrake_marl.scenario.v2x import CHANNELS, PER_LINK, PRESETS, V2X, Channel, burst_periods, link_delays
 from ethbrake_marl.search import identities
 
@@ -375,9 +375,9 @@ def test_infos__tell_the_news_only_where_there_is_a_channel():
 def test_initial_state__needs_a_channel_without_chance():
     given = {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
     with pytest.raises(InvalidInput, match="the scenario draws what each vehicle knows when"):
-        initial_state_worlds(given, channel_of("nominal"))
+        channel_of("nominal").worlds_from_state(given)
     fixed = channel_of("nominal", link_latency_s=0.25, sensing_s=[1, 1])
-    assert initial_state_worlds(given, fixed).vehicles.latency_s.tolist() == [[0.0, 0.25, 0.25]]
+    assert fixed.worlds_from_state(given).vehicles.latency_s.tolist() == [[0.0, 0.25, 0.25]]
 
 
 @pytest.mark.parametrize(

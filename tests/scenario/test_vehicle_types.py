@@ -13,7 +13,7 @@ from scipy import stats
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import scenario_sha256, worlds_sha256
-from ethbrake_marl.scenario import Scenario, load_scenario, parse_yaml, scenario_folder
+from ethbrake_marl.scenario import Scenario, load_scenario, parse_yaml, shipped_folder
 from ethbrake_marl.scenario.sampling import QUANTITY, uniform_numbers
 
 MIXED = load_scenario("realistic-mixed")
@@ -159,7 +159,7 @@ def test_scenario__copies_and_is_told_by_its_hash():
     ],
 )  # fmt: skip
 def test_bad_types__are_one_error_with_its_line(given: str, message: str):
-    text = (scenario_folder() / "paper" / "paper-random.yaml").read_text()
+    text = (shipped_folder() / "paper" / "paper-random.yaml").read_text()
     with pytest.raises(InvalidInput) as caught:
         Scenario.from_document(parse_yaml(f"{text}\n{given}\n", "my.yaml"))
     assert message in str(caught.value), str(caught.value)

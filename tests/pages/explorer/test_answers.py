@@ -17,7 +17,7 @@ from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.evaluation.measures import Conditions
 from ethbrake_marl.limits.limits import Proof, prove
 from ethbrake_marl.pages.explorer import Explored, explorer_page, read_state, save_state
-from ethbrake_marl.scenario import Scenario, initial_state_worlds, load_scenario, read_initial_states
+from ethbrake_marl.scenario import Scenario, load_scenario
 from tests.pages.explorer.conftest import AGENTS, Client
 
 
@@ -25,7 +25,7 @@ def test_answer__is_the_evaluation_of_that_world(client: Client, scenario: Scena
     state["gaps_m"][0], state["mass_t"][2], state["restitution"] = 7.25, 11.0, 0.3
     reply = client.ask("answer", {"world": state, "profile": [-100.0]})
     assert reply.status == 200
-    worlds = initial_state_worlds(state, scenario)
+    worlds = scenario.worlds_from_state(state)
     expected = evaluate(worlds, make_lineup(AGENTS, scenario), scenario=scenario)
     *others, hand = reply.json["outcomes"]
     for told, (name, outcome) in zip(others, expected.outcomes.items(), strict=True):
@@ -100,7 +100,7 @@ def test_saved_state__reads_back_to_the_same_harm(name: str, folder: Path) -> No
     for worlds, where in (
         (changed, scenario),
         (saved.sample(1, 99).worlds, saved),
-        (read_initial_states(folder / "near-miss.csv", scenario), scenario),
+        (scenario.read_worlds(folder / "near-miss.csv"), scenario),
     ):
         outcome = evaluate(worlds, agents, scenario=where, aftermath=False).outcome("full_brake")
         harms.append((float(outcome.first_impact_harm[0]), float(outcome.total_harm[0])))

@@ -9,7 +9,6 @@ import ethbrake_marl as eb
 from ethbrake_marl.defaults import HARM_COUNTS, MeasureName
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.scenario.sampling import ranges_of
 from ethbrake_marl.studies.falsification import Measure, falsify
 from tests.studies.falsification.holed import Holed, in_hole
 
@@ -47,7 +46,7 @@ def test_falsify__the_bound_of_the_shield_holds_where_it_is_tightest(harm_count:
 
 
 def test_ranges__cover_what_a_scenario_draws() -> None:
-    ranges = ranges_of(SCENARIO)
+    ranges = SCENARIO.ranges()
     assert len(ranges.names) == 5
     sample, accepted = ranges.sample(np.full((1, 5), 0.5))
     assert sample.worlds.gaps_m.tolist() == [[7.5, 7.5]] and sample.worlds.speeds_mps.tolist() == [[20.0, 20.0, 20.0]]
@@ -60,7 +59,7 @@ def test_ranges__cover_what_a_scenario_draws() -> None:
 def test_ranges__points_are_as_likely_as_a_list(name: str) -> None:
     """Worlds of even points have the means of a list, in every quantity."""
     scenario = load_scenario(name).replace(early_impacts="keep")
-    ranges = ranges_of(scenario)
+    ranges = scenario.ranges()
     points = np.random.default_rng(0).random((5_000, len(ranges.names)))
     found, listed = ranges.sample(points)[0].worlds, scenario.sample(5_000, 7).worlds
     for one, other in (
@@ -76,8 +75,8 @@ def test_ranges__points_are_as_likely_as_a_list(name: str) -> None:
 
 def test_ranges__a_refused_world_does_not_count() -> None:
     scenario = load_scenario("stress-wide")
-    points = np.random.default_rng(0).random((2_000, len(ranges_of(scenario).names)))
-    _, accepted = ranges_of(scenario).sample(points)
+    points = np.random.default_rng(0).random((2_000, len(scenario.ranges().names)))
+    _, accepted = scenario.ranges().sample(points)
     assert 0.9 < accepted.mean() < 0.99
 
 
@@ -91,7 +90,7 @@ def test_ranges__a_refused_world_does_not_count() -> None:
 )
 def test_ranges__refuses_what_cannot_be_given_world_by_world(scenario: Scenario, said: str) -> None:
     with pytest.raises(InvalidInput, match=said):
-        ranges_of(scenario)
+        scenario.ranges()
 
 
 @pytest.mark.parametrize(
