@@ -8,16 +8,20 @@ from pathlib import Path
 
 import pytest
 
-from ethbrake_marl.studies.reproduction.folder import FIGURES, ITEMS, PREFIX, checked_result, choose_items, docs_page
-from ethbrake_marl.studies.reproduction.items import (
+from ethbrake_marl.studies.reproduction import (
+    FIGURES,
     FULL_BRAKE,
     GAPS,
+    ITEMS,
     NAMES,
     PERCENT,
+    PREFIX,
     READINGS,
+    Reproduction,
     Result,
-    Settings,
+    checked_result,
     collision_rate,
+    docs_page,
     drive_list,
     lineup,
     summarise_verdicts,
@@ -63,8 +67,8 @@ def test_verdict__is_that_of_the_comparisons(name: str) -> None:
 
 
 def test_trajectories__are_as_committed(tmp_path: Path) -> None:
-    (item,) = choose_items(["trajectories"])
-    made = item.make(Settings("quick", tmp_path))
+    (item,) = Reproduction.choose(["trajectories"])
+    made = item.make(Reproduction("quick", tmp_path))
     committed = RESULTS["trajectories"]
     assert made.verdicts == committed.comparisons
     (table,), (kept,) = made.tables, committed.tables
@@ -77,7 +81,7 @@ def test_random_table__full_braking_is_as_committed(tmp_path: Path) -> None:
     tables = {table.title: table for table in RESULTS["random-table"].tables}
     for reading in READINGS:
         scenario = reading.scenario("paper-random")
-        evaluation = drive_list(scenario, lineup((FULL_BRAKE,), scenario), 10_000, Settings("quick", tmp_path))
+        evaluation = drive_list(scenario, lineup(scenario, FULL_BRAKE), 10_000, Reproduction("quick", tmp_path))
         outcome = evaluation.outcome(NAMES[FULL_BRAKE])
         (row,) = (row for row in tables[reading.name].rows if row[0].value == NAMES[FULL_BRAKE])
         assert row[1].value == PERCENT.show(collision_rate(outcome.collided)).in_words

@@ -27,7 +27,6 @@ from ethbrake_marl.errors import InvalidInput, Progress as PartProgress, check_w
 _KEPT = "\n\t\N{NO-BREAK SPACE}"  # in lines of a result; the last stands between a number and its unit
 EVERY_S = 10.0  # between two signs of life where stderr is no terminal
 INTERRUPTED = 130  # 128 + SIGINT, as shells expect
-PAGES = (".html", ".htm")
 
 
 def say(text: str) -> None:
@@ -51,12 +50,12 @@ class Out:
         self._last_label, self._last_done, self._said_s = "", False, 0.0
         self._begun: dict[str, tuple[float, int]] = {}  # when each part was first heard of, and how far it was
 
-    def result(self, content: Any, *shown: RenderableType) -> None:
+    def result(self, content: Any, *shown: RenderableType, end: str = "\n") -> None:
         """The result: ``content`` as JSON where that is asked for, else what is ``shown``."""
         if self.as_json:
             self.print_json(content)
         else:
-            self.show(*shown)
+            self.show(*shown, end=end)
 
     def print_json(self, content: Any) -> None:
         """JSON on stdout, asked for or not."""
@@ -101,21 +100,14 @@ class Out:
         raise typer.Exit(INTERRUPTED)
 
     def progress(
-        self,
-        name: str,
-        done: int,
-        total: int,
-        metrics: Mapping[str, float] | None = None,
-        note: str = "",
-        label: str | None = None,
+        self, name: str, done: int, total: int, metrics: Mapping[str, float] | None = None, note: str = ""
     ) -> None:
         """The part ``name`` has come to ``done`` of ``total``; ``note`` is said once, above the bars.
 
-        On a terminal one bar per part, else a line: news, and every ten seconds. ``label`` is what stands before the
-        figures, by default the name and the harm.
+        On a terminal one bar per part, else a line: news, and every ten seconds.
         """
         harm = (metrics or {}).get("first_impact_harm")
-        label = one_line(label or (name if harm is None else f"{name}, first-impact harm {harm:.2f}"))
+        label = one_line(name if harm is None else f"{name}, first-impact harm {harm:.2f}")
         if not self._stderr.is_terminal:
             if note:
                 say(note)
@@ -168,12 +160,16 @@ class _PlainConsole(Console):
 
 Run = TypeVar("Run", bound=Callable[..., None])
 
-MOST_JOBS = 64
 
+def whole_number(least: int, most: int | None = None) -> Callable[[typer.CallbackParam, int | None], int | None]:
+    """The callback of an option that is a whole number in this range."""
 
-def _check_jobs(jobs: int) -> int:
-    check_whole_number("jobs", jobs, 1, MOST_JOBS)
-    return jobs
+    def check(option: typer.CallbackParam, value: int | None) -> int | None:
+        if value is not None:
+            check_whole_number(str(option.name).replace("_", "-"), value, least, most)
+        return value
+
+    return check
 
 
 OPTIONS: dict[str, Any] = {  # of parameters that bring no option of their own, by their name
@@ -193,9 +189,7 @@ OPTIONS: dict[str, Any] = {  # of parameters that bring no option of their own, 
         metavar="QUANTITY=WIDTH,...",
         help=f"What the robust shield does not know, such as {DEFAULT.UNCERTAINTY_EXAMPLE}.",
     ),
-    "jobs": typer.Option(
-        help=f"So many at once, up to {MOST_JOBS}, a process each; changes no result.", callback=_check_jobs
-    ),
+    "jobs": typer.Option(help="So many at once, a process each; changes no result.", callback=whole_number(1, 64)),
     "ray": typer.Option(metavar="local|ADDRESS", help="Do the work on Ray, not in processes of our own."),
     "force": typer.Option("--force", help="Replace what is already there."),
     "as_json": typer.Option("--json", help="Print the figures as JSON, and nothing else, on stdout."),
@@ -234,73 +228,11 @@ PARTS = [  # as ``part_names`` tells them: to ask for them takes the engine, and
 ]
 
 
-def command(
-    group: typer.Typer,
-    name: str,
-    example: str,
-    *,
-    kept: str = "nothing was written",
-    needs: tuple[str, ...] = (),
-    json: bool = False,
-    force: bool = False,
-    parts: bool = False,
-) -> Callable[[Run], Run]:
-    """Make a function the command ``name`` of a group; its first argument is the command's ``Out``.
-
-    Args:
-        group: that gets it.
-        name: of the command.
-        example: of its use, behind ``ethbrake``.
-        kept: what Ctrl-C leaves, in words.
-        needs: packages of extras, without which it ends before any work.
-        json: it has the option --json; its ``Out`` knows whether that was given.
-        force: the same of --force.
-        parts: its help ends with what recipes and scenarios may name.
-
-    """
-
-    def register(run: Run) -> Run:
-        hints = get_type_hints(run, include_extras=True)
-        given = [_option(each, hints[each.name]) for each in list(signature(run).parameters.values())[1:]]
-        flags = [flag for flag, wanted in (("force", force), ("as_json", json)) if wanted]
-        given += [_option(Parameter(each, Parameter.KEYWORD_ONLY, default=False), bool) for each in flags]
-
-        @wraps(run)
-        def call(**options: Any) -> None:
-            out = Out(**{flag: options.pop(flag) for flag in flags}, kept=kept)
-            with redirect_stdout(sys.stderr):
-                for package in needs:
-                    need(package)
-                register_environments()
-                try:
-                    run(out, **options)
-                except KeyboardInterrupt:
-                    out.interrupted(f"interrupted; {out.kept}")
-                finally:
-                    out.end_progress()
-
-        call.__signature__ = Signature(given)  # type: ignore[attr-defined]  # what Typer reads
-        call.__annotations__ = {each.name: each.annotation for each in given}
-        cls = CommandWithParts if parts else TyperCommand
-        group.command(name, cls=cls, epilog=f"Example: ethbrake {example}")(call)
-        return run
-
-    return register
-
-
 def _option(parameter: Parameter, hint: Any) -> Parameter:
     """A parameter as Typer reads it, with the shared option of its name where it brings none."""
     if get_origin(hint) is not Annotated and hint is not typer.Context:
         hint = Annotated[hint, OPTIONS[parameter.name]]
     return parameter.replace(annotation=hint, kind=Parameter.KEYWORD_ONLY)
-
-
-def new_group(name: str, about: str, *examples: str, inside: typer.Typer | None = None) -> typer.Typer:
-    """A group of commands, in ``ethbrake`` or inside another group; its help page shows the examples."""
-    shown = "\n\n".join(f"Example: ethbrake {example}" for example in examples)
-    group = typer.Typer(cls=Group, rich_markup_mode=None, help=about, epilog=shown)
-    (app if inside is None else inside).add_typer(group, name=name)
-    return group
 
 
 class CommandWithParts(TyperCommand):
@@ -408,7 +340,70 @@ def _places(group: Any, path: str) -> Mapping[str, str]:
     return found
 
 
-app = typer.Typer(
+class Commands(typer.Typer):
+    """A group of commands: those of ``ethbrake`` itself, or of one group inside another."""
+
+    def group(self, name: str, about: str, *examples: str) -> Commands:
+        """A new group inside this one; its help page shows the examples."""
+        shown = "\n\n".join(f"Example: ethbrake {example}" for example in examples)
+        group = Commands(cls=Group, rich_markup_mode=None, help=about, epilog=shown)
+        self.add_typer(group, name=name)
+        return group
+
+    def add(
+        self,
+        name: str,
+        example: str,
+        *,
+        kept: str = "nothing was written",
+        needs: tuple[str, ...] = (),
+        json: bool = False,
+        force: bool = False,
+        parts: bool = False,
+    ) -> Callable[[Run], Run]:
+        """Make a function a command of this group; its first argument is the command's ``Out``.
+
+        Args:
+            name: of the command.
+            example: of its use, behind ``ethbrake``.
+            kept: what Ctrl-C leaves, in words.
+            needs: packages of extras, without which it ends before any work.
+            json: it has the option --json; its ``Out`` knows whether that was given.
+            force: the same of --force.
+            parts: its help ends with what recipes and scenarios may name.
+
+        """
+
+        def register(run: Run) -> Run:
+            hints = get_type_hints(run, include_extras=True)
+            given = [_option(each, hints[each.name]) for each in list(signature(run).parameters.values())[1:]]
+            flags = [flag for flag, wanted in (("force", force), ("as_json", json)) if wanted]
+            given += [_option(Parameter(each, Parameter.KEYWORD_ONLY, default=False), bool) for each in flags]
+
+            @wraps(run)
+            def call(**options: Any) -> None:
+                out = Out(**{flag: options.pop(flag) for flag in flags}, kept=kept)
+                with redirect_stdout(sys.stderr):
+                    for package in needs:
+                        need(package)
+                    register_environments()
+                    try:
+                        run(out, **options)
+                    except KeyboardInterrupt:
+                        out.interrupted(f"interrupted; {out.kept}")
+                    finally:
+                        out.end_progress()
+
+            call.__signature__ = Signature(given)  # type: ignore[attr-defined]  # what Typer reads
+            call.__annotations__ = {each.name: each.annotation for each in given}
+            cls = CommandWithParts if parts else TyperCommand
+            self.command(name, cls=cls, epilog=f"Example: ethbrake {example}")(call)
+            return run
+
+        return register
+
+
+app = Commands(
     cls=Group,
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,

@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ethbrake_marl import __version__
-from ethbrake_marl.cli.command import EVERY_S, Out, command, new_group
+from ethbrake_marl.cli.command import EVERY_S, Out, app
+from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.kernel_store import cache_folder, is_temporary
 
 if TYPE_CHECKING:
@@ -229,12 +230,12 @@ def _call(arguments: tuple[str, ...], folder: str) -> str:
     return (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1] if done.returncode else ""
 
 
-doctor = new_group(
+doctor = app.group(
     "doctor", "Check this installation, or measure its speed.", "doctor --compile", "doctor speed --quick"
 )
 
 
-@command(doctor, "check", "doctor", json=True)
+@doctor.add("check", "doctor", json=True)
 def check_command(
     out: Out,
     compile_all: Annotated[
@@ -253,7 +254,7 @@ def check_command(
         raise typer.Exit(1)
 
 
-@command(doctor, "speed", "doctor speed --quick", needs=("stable_baselines3",), json=True)
+@doctor.add("speed", "doctor speed --quick", needs=("stable_baselines3",), json=True)
 def speed_command(
     out: Out,
     quick: Annotated[bool, typer.Option("--quick", help="In about 20 s instead of a minute or two; coarser.")] = False,
@@ -262,23 +263,22 @@ def speed_command(
 
     Medians over repetitions. Other programs that run at the same time make all figures worse.
     """
-    from ethbrake_marl.files.sheet import Column, Sheet
-    from ethbrake_marl.studies.speed import BENCHMARKS, FULL, QUICK, WORLD_STEPS, measure, this_machine
+    from ethbrake_marl.studies.speed import measure, this_machine
 
-    machine, figures, rows = this_machine(), [], []
-    for speed in measure(QUICK if quick else FULL):
-        figures.append(asdict(speed))
-        steps = speed.unit == WORLD_STEPS
-        rows.append((
+    machine, figures = this_machine(), list(measure(quick=quick, tell=out.show_progress))
+    rows = [
+        (
             *(speed.name, f"{speed.worlds:,}", f"{_plain(speed.value)} {speed.unit.removesuffix('/s')}"),
             f"{_plain(speed.lowest)} - {_plain(speed.highest)}",
-            _plain(speed.value * speed.vehicles) if steps else "",
+            "" if speed.relative is None else _plain(speed.value * speed.vehicles),  # of world-steps alone
             "" if speed.floor is None else _plain(speed.floor),
-        ))  # fmt: skip
-        out.progress("speed", len(rows), len(BENCHMARKS))
+        )
+        for speed in figures
+    ]
     columns: list[Column | str] = ["per CPU-second", *map(Column, ("worlds", "median", "range", "x vehicles", "aim"))]
     note = "Medians over repetitions, and their range. Aim: at least, for seconds at most."
-    out.result({"machine": asdict(machine), "figures": figures}, Sheet("", columns, rows, note), f"Machine: {machine}")
+    told = {"machine": asdict(machine), "figures": [asdict(speed) for speed in figures]}
+    out.result(told, Sheet("", columns, rows, note), f"Machine: {machine}")
 
 
 def _plain(value: float) -> str:

@@ -8,22 +8,25 @@ import webbrowser
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.text import Text
 
-from ethbrake_marl.cli.command import PAGES, Out, app, command, new_group
+from ethbrake_marl import evaluation, learning
+from ethbrake_marl.cli.command import Out, app, whole_number
 from ethbrake_marl.defaults import DEFAULT, DatasetFormat, HarmCount
-from ethbrake_marl.errors import InvalidInput, check_whole_number, count_of, need
+from ethbrake_marl.errors import InvalidInput, count_of, need
+from ethbrake_marl.files.sheet import Column, Sheet
+from ethbrake_marl.files.store import write_file
 
 if TYPE_CHECKING:
     from ethbrake_marl.agents import Driver
-    from ethbrake_marl.evaluation import Evaluation, Question, ShieldModes, SummaryRow, SummaryTable
     from ethbrake_marl.physics import LeftOutRows
     from ethbrake_marl.scenario import Sample, Scenario, Task
+    from ethbrake_marl.shield import Uncertainty
 
-_MOST_PROCESSES = 256
+PAGES = (".html", ".htm")
 _PROPOSERS = "ppo@shipped,full_brake,constant:3"
 _INTERVALS = (
     "Intervals: rates exact (Clopper-Pearson), means by Student's t; all from exact sums, the same bits in any"
@@ -42,32 +45,30 @@ def _asked_task(
     alone: bool = False,
 ) -> Task:
     """The scenario that is named, with its settings and with who is driven; ``alone``: that is one vehicle."""
-    from ethbrake_marl.evaluation import load_driven
-    from ethbrake_marl.learning import read_settings
     from ethbrake_marl.scenario import Task
 
-    chosen = load_driven(scenario, vehicle, read_settings(settings).scenario, alone=alone)
+    chosen = evaluation.load_driven(scenario, vehicle, learning.read_settings(settings).scenario, alone=alone)
     return Task(chosen, chosen.learners, harm_count)
+
+
+def _intervals(uncertainty: str | None) -> Uncertainty | None:
+    """What the robust shield does not know."""
+    from ethbrake_marl.shield import parse_uncertainty
+
+    return None if uncertainty is None else parse_uncertainty(uncertainty)
 
 
 def _make_drivers(
     agents: str, scenario: Scenario, harm_count: HarmCount = "first", uncertainty: str | None = None
 ) -> dict[str, Driver]:
     """Who is named on the command line, with commas between them."""
-    from ethbrake_marl.evaluation import make_lineup
-    from ethbrake_marl.shield import parse_uncertainty
-
-    intervals = None if uncertainty is None else parse_uncertainty(uncertainty)
-    return make_lineup(agents.split(","), scenario, harm_count=harm_count, uncertainty=intervals)
+    return evaluation.make_lineup(
+        agents.split(","), scenario, harm_count=harm_count, uncertainty=_intervals(uncertainty)
+    )
 
 
-@command(
-    app,
-    "evaluate",
-    "evaluate --agents full_brake,constant:3.5,e_v2x_bm --episodes 1000",
-    json=True,
-    force=True,
-    parts=True,
+@app.add(
+    "evaluate", "evaluate --agents full_brake,constant:3.5,e_v2x_bm --episodes 1000", json=True, force=True, parts=True
 )
 def evaluate_command(
     out: Out,
@@ -104,9 +105,17 @@ def evaluate_command(
         typer.Option(metavar="COLUMN", help="Also tell the results by group: scenario (a mixture), vehicle_2_type."),
     ] = None,
     shards: Annotated[
-        int | None, typer.Option(metavar="K", help="Evaluate the list in K parts, in flat memory; changes no figure.")
+        int | None,
+        typer.Option(
+            metavar="K",
+            help="Evaluate the list in K parts, in flat memory; changes no figure.",
+            callback=whole_number(1),
+        ),
     ] = None,
-    jobs: Annotated[int, typer.Option(metavar="N", help="With --shards: processes; changes no figure.")] = 1,
+    jobs: Annotated[
+        int,
+        typer.Option(metavar="N", help="With --shards: processes; changes no figure.", callback=whole_number(1, 256)),
+    ] = 1,
     ray: Annotated[
         str | None,
         typer.Option(metavar="local|ADDRESS", help="With --shards: on Ray, on all its cores or on --jobs of them."),
@@ -125,19 +134,6 @@ def evaluate_command(
     +refined, then one shield, +episode, +step or +robust; for instance full_brake+step or ppo@PATH+refined+episode.
     PATH is a run or a policy bundle, or shipped.
     """
-    from ethbrake_marl.evaluation import (
-        PROGRESS_EVERY,
-        Evaluation,
-        Question,
-        Rescored,
-        check_agents,
-        choose_worlds,
-        evaluate,
-        results_to_json,
-        summarise,
-        summarise_by,
-        write_per_world,
-    )
     from ethbrake_marl.harm import declared_objectives
 
     whole = {"--per-world": per_world, "--report": report, "--initial-states": initial_states, "--by": by}
@@ -146,46 +142,46 @@ def evaluate_command(
     chosen = _asked_task(scenario, vehicle, settings).scenario
     objectives = declared_objectives(objective or (), chosen.vehicles)
     if shards is not None:
+        number = DEFAULT.EPISODES if episodes is None else episodes
+        list_seed = DEFAULT.LIST_SEED if seed is None else seed
         lineup = _make_drivers(agents, chosen, harm_count, uncertainty)
-        number, list_seed = (
-            DEFAULT.EPISODES if episodes is None else episodes,
-            DEFAULT.LIST_SEED if seed is None else seed,
+        question = evaluation.Question(
+            chosen, tuple(lineup), number, list_seed, harm_count, uncertainty, tuple(objectives)
         )
-        question = Question(chosen, tuple(lineup), number, list_seed, harm_count, uncertainty, tuple(objectives))
-        check_agents(lineup, chosen.sample(1, list_seed).worlds, chosen)
+        evaluation.check_agents(lineup, chosen.sample(1, list_seed).worlds, chosen)
         _evaluate_in_shards(out, question, shards, jobs, ray, output, rows)
         return
-    sample, drawn_by = choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
+    sample, drawn_by = evaluation.choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
     if by is not None:
-        Evaluation.check_group(sample.kinds, by)
+        evaluation.Evaluation.check_group(sample.kinds, by)
     lineup = _make_drivers(agents, chosen, harm_count, uncertainty)
-    check_agents(lineup, sample.worlds, chosen)
-    evaluation = evaluate(
+    evaluation.check_agents(lineup, sample.worlds, chosen)
+    found = evaluation.evaluate(
         sample,
         lineup,
         scenario=chosen,
         seed=drawn_by,
-        chunk=PROGRESS_EVERY,
+        chunk=evaluation.PROGRESS_EVERY,
         on_progress=lambda agent, done: out.progress(agent, done, sample.worlds.n),
     )
-    summary, told = summarise(evaluation), evaluation.rescore(objectives)
+    summary, told = evaluation.summarise(found), found.rescore(objectives)
     if report is not None:
-        _write_report(out, report, evaluation, summary, lineup, harm_count)
-    groups = {} if by is None else summarise_by(evaluation, by)
+        _write_report(out, report, found, summary, lineup, harm_count)
+    groups = {} if by is None else evaluation.summarise_by(found, by)
     if per_world is not None:
-        write_per_world(per_world, evaluation, objectives=objectives, force=out.force)
+        evaluation.write_per_world(per_world, found, objectives=objectives, force=out.force)
     agents_told = {"harm_count": harm_count, "uncertainty": uncertainty}
-    results = results_to_json(summary, told=told, groups=groups, per_world=per_world, settings=agents_told)
+    results = evaluation.results_to_json(summary, told=told, groups=groups, per_world=per_world, settings=agents_told)
     if per_world is not None:
         out.write(_beside(per_world), _json_text(results))
         out.note(f"every world: {per_world}; the results: {_beside(per_world)}")
-    shown = _tables(summary)
+    shown: list[Any] = [*summary.tables()]
     for name, of_group in groups.items():
         shown += [f"\n{name}: {count_of(of_group[0].episodes, 'world')}\n", of_group.terminal()]
     out.result(results, *shown)
-    _tell_horizon(out, summary, sample.worlds.n, chosen)
+    _tell_horizon(out, _moving(summary), sample.worlds.n, chosen.horizon_s)
     if told and not out.as_json:
-        out.show(Rescored.sheet(told, harm_count))
+        out.show(evaluation.Rescored.sheet(told, harm_count))
 
 
 def _check_shards(
@@ -200,24 +196,18 @@ def _check_shards(
     if given := [name for name, value in whole.items() if value]:
         more = "; for one row per world give --output FOLDER --rows" if "--per-world" in given else ""
         raise InvalidInput(f"{given[0]}: needs every world at once, and --shards keeps none{more}")
-    check_whole_number("shards", shards, 1)
-    check_whole_number("jobs", jobs, 1, _MOST_PROCESSES)
     if rows and output is None:
         raise InvalidInput("--rows: needs a folder for them: --output FOLDER")
     if rows:
         need("pyarrow")
-    if ray is not None:
-        need("ray")
 
 
 def _check_outputs(out: Out, per_world: Path | None, report: Path | None) -> None:
     """Refuse outputs that cannot be written, or that would replace one another, before any work."""
-    from ethbrake_marl.evaluation import check_per_world
-
     out.check(report, *PAGES, what="a report")
     if per_world is None:
         return
-    check_per_world(per_world)
+    evaluation.check_per_world(per_world)
     for file in (per_world, _beside(per_world)):
         out.check(file)
         if report is not None and file.resolve() == report.resolve():
@@ -230,11 +220,9 @@ def _beside(per_world: Path) -> Path:
 
 
 def _evaluate_in_shards(
-    out: Out, question: Question, shards: int, jobs: int, ray: str | None, output: Path | None, rows: bool
+    out: Out, question: evaluation.Question, shards: int, jobs: int, ray: str | None, output: Path | None, rows: bool
 ) -> None:
     """Drive the list shard by shard, and print the table that is printed without shards."""
-    from ethbrake_marl.evaluation import Rescored
-    from ethbrake_marl.files.store import write_file
     from ethbrake_marl.studies.jobs import evaluate_shards, open_workers
 
     asked = question.ask()
@@ -251,57 +239,37 @@ def _evaluate_in_shards(
     if output is not None:
         write_file(output / "results.json", _json_text(results).encode())
         out.note(f"finished shards: {output}; the results: {output / 'results.json'}")
-    out.result(results, *_tables(summary), _INTERVALS)
-    _tell_horizon(out, summary, tally.worlds, question.scenario)
+    out.result(results, *summary.tables(), _INTERVALS)
+    _tell_horizon(out, _moving(summary), tally.worlds, question.scenario.horizon_s)
     if question.objectives and not out.as_json:
         told = tally.rescore(question.objectives, question.scenario.vehicles)
-        out.show(Rescored.sheet(told, question.harm_count))
+        out.show(evaluation.Rescored.sheet(told, question.harm_count))
 
 
 def _json_text(content: object) -> str:
     return json.dumps(content, indent=2, allow_nan=False) + "\n"
 
 
-def _tables(rows: SummaryTable) -> list[Any]:
-    return [rows.terminal(), *([rows.metrics_sheet()] if rows and rows[0].metrics else [])]
-
-
-def horizon_note(moving: Mapping[str, int], worlds: int, horizon_s: float) -> str:
-    """What must be said of shielded drivers: in how many worlds, by driver, something still ``moving`` was cut off.
-
-    Empty where there is nothing to say.
-    """
+def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: float) -> None:
+    """Say of shielded drivers in how many worlds, by driver, something still ``moving`` was cut off, if in any."""
     found = ", ".join(f"{name} {count}" for name, count in moving.items() if count)
-    if not found:
-        return ""
-    return (
-        f"note: bounds of the shield end at the horizon ({horizon_s:g} s) and say nothing of what comes after;"
-        f" worlds, of {worlds}, that were not at rest then: {found}"
-    )
+    if found:
+        out.note(
+            f"note: bounds of the shield end at the horizon ({horizon_s:g} s) and say nothing of what comes after;"
+            f" worlds, of {worlds}, that were not at rest then: {found}"
+        )
 
 
-def _tell_horizon(out: Out, rows: Sequence[SummaryRow], worlds: int, scenario: Scenario) -> None:
-    """Say in how many worlds something still moves at the horizon, if in any."""
-    moving = {row.agent: row.horizon_ends for row in rows if row.policy_share is not None}
-    if note := horizon_note(moving, worlds, scenario.horizon_s):
-        out.note(note)
-
-
-def show_run(out: Out, rows: SummaryTable, beside: Mapping[str, SummaryTable], results: Any) -> None:
-    """The table of a run, and those of the other tests, each below what its test asks."""
-    from ethbrake_marl.evaluation import TESTS
-
-    shown = _tables(rows)
-    for test, found in beside.items():
-        shown += [Text(f"\n{TESTS[test]}\n"), found.terminal()]
-    out.result(results, *shown)
+def _moving(rows: Sequence[evaluation.SummaryRow]) -> dict[str, int]:
+    """In how many worlds something still moves at the horizon, by shielded driver."""
+    return {row.agent: row.horizon_ends for row in rows if row.policy_share is not None}
 
 
 def _write_report(
     out: Out,
     path: Path,
-    evaluation: Evaluation,
-    rows: Sequence[SummaryRow],
+    found: evaluation.Evaluation,
+    rows: Sequence[evaluation.SummaryRow],
     agents: Mapping[str, Driver],
     harm_count: HarmCount,
 ) -> None:
@@ -315,12 +283,12 @@ def _write_report(
         done.append(agent)
         out.progress("report: episodes", len(done), len(agents))
 
-    scenario, names, asked = evaluation.scenario, ", ".join(row.agent for row in rows), rows[0].parameters
+    scenario, names, asked = found.scenario, ", ".join(row.agent for row in rows), rows[0].parameters
     scripts = ", ".join(f"{vehicle} by {script}" for vehicle, script in asked["scripts"].items())
     report = Report(
         f"{scenario.name}: {names}" if len(names) <= 60 else f"{scenario.name}: {len(rows)} agents compared",
         rows,
-        evaluation,
+        found,
         summary=scenario.title or "Agents on the same worlds.",
         settings={
             "Command": "ethbrake " + " ".join(sys.argv[1:]),
@@ -340,17 +308,14 @@ def _write_report(
 _FILE = typer.Argument(metavar="RESULTS.json", help="Results of evaluate, shield (--json) or run.")
 
 
-@command(app, "compare", "compare before.csv.json after.csv.json", json=True)
+@app.add("compare", "compare before.csv.json after.csv.json", json=True)
 def compare_command(out: Out, first: Annotated[Path, _FILE], second: Annotated[Path, _FILE]) -> None:
     """Tell the difference of harm between two results.
 
     The second minus the first, for agents of the same name. Both must be of one command, and about the same worlds of
     the same scenario. Intervals are paired by world where the files of --per-world lie beside both results.
     """
-    from ethbrake_marl.evaluation import compare_results, read_result
-    from ethbrake_marl.files.sheet import Column, Sheet
-
-    found = compare_results(read_result(first), read_result(second))
+    found = evaluation.compare_results(evaluation.read_result(first), evaluation.read_result(second))
     names = [_HARMS[name] for name in found.differences[0].harms]
     rows = [[each.agent, _POLICIES[each.policy], *each.harms.values()] for each in found.differences]
     out.result(found.to_json(), Sheet("", ["Agent", Column("Policy", text=True), *map(Column, names)], rows))
@@ -364,7 +329,7 @@ def compare_command(out: Out, first: Annotated[Path, _FILE], second: Annotated[P
         out.note(f"note: {name} {one} in the first, {other} in the second")
 
 
-@command(app, "shield", "shield --agents ppo@shipped,full_brake --episodes 500", json=True)
+@app.add("shield", "shield --agents ppo@shipped,full_brake --episodes 500", json=True)
 def shield_command(
     out: Out,
     agents: str = _PROPOSERS,
@@ -386,32 +351,28 @@ def shield_command(
     out.result(rows.to_json(sample, task), *rows.sheets())
     _tell_left_out(out, rows[0].left_out, episodes)
     moving = {f"{row.agent} ({row.mode})": row.horizon_ends for row in rows if row.mode != "none"}
-    if note := horizon_note(moving, episodes - len(rows[0].left_out), task.scenario.horizon_s):
-        out.note(note)
+    _tell_horizon(out, moving, episodes - len(rows[0].left_out), task.scenario.horizon_s)
 
 
-def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> ShieldModes:
+def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> evaluation.ShieldModes:
     """The rows of these agents, with progress on stderr."""
-    from ethbrake_marl.evaluation import compare_modes, make_lineup
-
-    lineup = make_lineup(agents.split(","), task.scenario, harm_count=task.harm_count, bare=True)
+    lineup = evaluation.make_lineup(agents.split(","), task.scenario, harm_count=task.harm_count, bare=True)
     n = sample.worlds.n
-    return compare_modes(lineup, sample.worlds, task, on_progress=lambda name, done: out.progress(name, done, n))
+    return evaluation.compare_modes(
+        lineup, sample.worlds, task, on_progress=lambda name, done: out.progress(name, done, n)
+    )
 
 
 def _tell_left_out(out: Out, left_out: LeftOutRows, whole: int) -> None:
     """Name the worlds that count in no figure, of ``whole``, in a line on stderr; none where every world counts."""
-    from ethbrake_marl.evaluation import LeftOut
-
     if left_out:
-        out.note(
-            LeftOut.line([f"world {world} of seed {DEFAULT.LIST_SEED} ({reason})" for world, reason in left_out], whole)
-        )
+        told = [f"world {world} of seed {DEFAULT.LIST_SEED} ({reason})" for world, reason in left_out]
+        out.note(evaluation.LeftOut.line(told, whole))
 
 
 # The commands ``watch ...``: films, episodes played again, the explorer, pictures, and what was seen as a dataset.
 
-watch_group = new_group(
+watch_group = app.group(
     "watch",
     "See and keep episodes: films, replays, pictures, data.",
     "watch record --agents full_brake,e_v2x_bm --world 3 --output both.gif",
@@ -419,7 +380,7 @@ watch_group = new_group(
 )
 
 
-@command(watch_group, "record", "watch record --agents full_brake,e_v2x_bm --world 3 --output both.gif", force=True)
+@watch_group.add("record", "watch record --agents full_brake,e_v2x_bm --world 3 --output both.gif", force=True)
 def record_command(
     out: Out,
     output: Annotated[Path, typer.Option(metavar="FILE.gif|FILE.mp4|FILE.svg", help="The film to write.")],
@@ -431,21 +392,19 @@ def record_command(
     uncertainty: str | None = None,
 ) -> None:
     """Agents in one world of the list, in real time: the road to scale, commands, impacts, harm."""
-    from ethbrake_marl.evaluation import check_film, film_bytes, film_scenes
-
-    check_film(output.suffix.lower(), len(agents.split(",")))
+    evaluation.check_film(output.suffix.lower(), len(agents.split(",")))
     out.check(output)
     chosen = _asked_task(scenario, vehicle, None).scenario
     lineup = _make_drivers(agents, chosen, uncertainty=uncertainty)
     worlds = chosen.sample(1, seed, first=world).worlds
     films = {
-        f"{name}: world {world} of {chosen.name}": film_scenes(worlds, agent, scenario=chosen)
+        f"{name}: world {world} of {chosen.name}": evaluation.film_scenes(worlds, agent, scenario=chosen)
         for name, agent in lineup.items()
     }
-    out.write(output, film_bytes(films, output.suffix.lower()), what="film")
+    out.write(output, evaluation.film_bytes(films, output.suffix.lower()), what="film")
 
 
-@command(watch_group, "replay", "watch replay PASSPORT --output again.html", json=True, force=True)
+@watch_group.add("replay", "watch replay PASSPORT --output again.html", json=True, force=True)
 def replay_command(
     out: Out,
     passport: Annotated[str, typer.Argument(metavar="PASSPORT", help="As it stands under an episode of a report.")],
@@ -469,18 +428,14 @@ def replay_command(
 
     Exit status 1 where the world or the episode is another one than the passport's.
     """
-    from ethbrake_marl.evaluation import Passport, check_film, film_bytes, film_scenes
-    from ethbrake_marl.learning import read_settings
-    from ethbrake_marl.shield import parse_uncertainty
-
-    named = Passport.parse(passport)
+    named = evaluation.Passport.parse(passport)
     if output is not None and output.suffix.lower() not in PAGES:
-        check_film(output.suffix.lower())
+        evaluation.check_film(output.suffix.lower())
     out.check(output)
-    intervals = None if uncertainty is None else parse_uncertainty(uncertainty)
+    intervals = _intervals(uncertainty)
     found = named.replay(
-        scenario=scenario, settings=read_settings(settings).scenario, agent=agent, initial_states=initial_states,
-        uncertainty=intervals,
+        scenario=scenario, settings=learning.read_settings(settings).scenario, agent=agent,
+        initial_states=initial_states, uncertainty=intervals,
     )  # fmt: skip
     first, total = found.motion.harm
     impacts = int(found.motion.ledger.impacts[0])
@@ -490,8 +445,8 @@ def replay_command(
         *(f"Differs: {each}." for each in found.differences),
     ]
     if output is not None and output.suffix.lower() not in PAGES:
-        scenes = film_scenes(found.worlds, found.agent, scenario=found.scenario)
-        out.write(output, film_bytes({found.title: scenes}, output.suffix.lower()))
+        scenes = evaluation.film_scenes(found.worlds, found.agent, scenario=found.scenario)
+        out.write(output, evaluation.film_bytes({found.title: scenes}, output.suffix.lower()))
     elif output is not None:
         from ethbrake_marl.pages.page import Page, Part, Played, Section
 
@@ -514,7 +469,7 @@ def replay_command(
         raise typer.Exit(1)
 
 
-@command(watch_group, "explore", "watch explore --agents full_brake,ppo@shipped", needs=("starlette", "uvicorn"))
+@watch_group.add("explore", "watch explore --agents full_brake,ppo@shipped", needs=("starlette", "uvicorn"))
 def explore_command(
     out: Out,
     scenario: str = "paper-random",
@@ -547,7 +502,7 @@ def explore_command(
     out.note("ended")
 
 
-@command(watch_group, "dataset", "watch dataset --agents best_harm --episodes 1000 --output best.parquet", force=True)
+@watch_group.add("dataset", "watch dataset --agents best_harm --episodes 1000 --output best.parquet", force=True)
 def dataset_command(
     out: Out,
     output: Annotated[Path, typer.Option(metavar="FILE.parquet|NAME-v0", help="The dataset to write.")],
@@ -568,13 +523,11 @@ def dataset_command(
     As one Parquet file of any agents and learners, or as a dataset of Minari of one learner. The recorded actions
     replay to the same bits. The reward counts the harm of --harm-count, too.
     """
-    from ethbrake_marl.evaluation import check_agents, check_dataset, write_dataset
-
     chosen = _asked_task(scenario, vehicle, settings, harm_count).scenario
-    kind = check_dataset(output, chosen, format, force=out.force)
+    kind = evaluation.check_dataset(output, chosen, format, force=out.force)
     lineup = _make_drivers(agents, chosen, harm_count, uncertainty)
-    check_agents(lineup, chosen.sample(1, seed).worlds, chosen)
-    summary = write_dataset(
+    evaluation.check_agents(lineup, chosen.sample(1, seed).worlds, chosen)
+    summary = evaluation.write_dataset(
         output,
         lineup,
         scenario=chosen,
@@ -596,19 +549,17 @@ def dataset_command(
         out.note(f"load it: MINARI_DATASETS_PATH={folder}, minari.load_dataset({summary.path.name!r})")
 
 
-picture_group = new_group(
+picture_group = watch_group.group(
     "picture",
     "Draw what is critical in a scenario, what one world asks for, or what the shield does.",
     "watch picture criticality --output map.png",
     "watch picture shield-modes --episodes 500 --output modes.png",
-    inside=watch_group,
 )
 PictureOption = Annotated[Path, typer.Option(metavar="FILE", help="The picture to write: .png, .svg or .pdf.")]
 
 
-@command(
-    picture_group, "criticality",
-    "watch picture criticality --scenario paper-distance --agent e_v2x_bm --output map.png", force=True,
+@picture_group.add(
+    "criticality", "watch picture criticality --scenario paper-distance --agent e_v2x_bm --output map.png", force=True,
 )  # fmt: skip
 def picture_criticality(
     out: Out,
@@ -627,23 +578,20 @@ def picture_criticality(
 
     Everything else must be a fixed number in the scenario.
     """
-    from ethbrake_marl.evaluation import criticality_map, make_agents
-
-    _check_picture(out, output)
+    figures = _figures(out, output)
     chosen = _asked_task(scenario, None, settings, alone=True).scenario
-    lineup = make_agents([agent], chosen, harm_count=harm_count)
-    found = criticality_map(chosen, lineup, cells=cells, gap_range_m=gaps, on_progress=out.progress)
-    from ethbrake_marl.figures import criticality_figure  # matplotlib takes a second to load
-
-    _write_picture(out, output, criticality_figure(found))
+    lineup = evaluation.make_agents([agent], chosen, harm_count=harm_count)
+    found = evaluation.criticality_map(chosen, lineup, cells=cells, gap_range_m=gaps, on_progress=out.progress)
+    _write_picture(out, output, figures.criticality_figure(found))
 
 
-def _check_picture(out: Out, output: Path) -> None:
-    """Refuse a picture that cannot be written, before any work."""
-    from ethbrake_marl.figures import picture_ending
+def _figures(out: Out, output: Path) -> ModuleType:
+    """What draws (matplotlib takes a second to load); refuses a picture that cannot be written, before any work."""
+    from ethbrake_marl import figures
 
-    picture_ending(output)
+    figures.picture_ending(output)
     out.check(output)
+    return figures
 
 
 def _write_picture(out: Out, output: Path, figure: Any, left_out: LeftOutRows = (), whole: int = 0) -> None:
@@ -661,9 +609,8 @@ def _caption(scenario: Scenario, episodes: int, rest: str, left_out: LeftOutRows
     return told + (f" Left out: {len(left_out):,}, which the physics could not advance." if left_out else "")
 
 
-@command(
-    picture_group, "deceleration",
-    "watch picture deceleration --scenario paper-scenario-1 --world 0 --output curve.png", force=True,
+@picture_group.add(
+    "deceleration", "watch picture deceleration --scenario paper-scenario-1 --world 0 --output curve.png", force=True,
 )  # fmt: skip
 def picture_deceleration(
     out: Out,
@@ -675,19 +622,14 @@ def picture_deceleration(
     settings: list[str] | None = None,
 ) -> None:
     """Harm of one world against the constant deceleration of one vehicle: predicted, realised, and the best known."""
-    from ethbrake_marl.evaluation import deceleration_curve
-    from ethbrake_marl.figures import deceleration_figure
-
-    _check_picture(out, output)
+    figures = _figures(out, output)
     task = _asked_task(scenario, vehicle, settings, alone=True)
-    curve = deceleration_curve(task.scenario.sample(1, seed, first=world).worlds, task)
+    curve = evaluation.deceleration_curve(task.scenario.sample(1, seed, first=world).worlds, task)
     title = f"{task.scenario.name}, world {world} of the list of seed {seed}"
-    _write_picture(out, output, deceleration_figure(curve, title=title))
+    _write_picture(out, output, figures.deceleration_figure(curve, title=title))
 
 
-@command(
-    picture_group, "shield", "watch picture shield --agents ppo@shipped,full_brake --output shield.png", force=True
-)
+@picture_group.add("shield", "watch picture shield --agents ppo@shipped,full_brake --output shield.png", force=True)
 def picture_shield(
     out: Out,
     output: PictureOption,
@@ -702,25 +644,23 @@ def picture_shield(
 
     The agents propose, and --harm-count is the harm that is guaranteed.
     """
-    from ethbrake_marl.evaluation import make_lineup
-    from ethbrake_marl.figures import operating_figure
     from ethbrake_marl.shield import ALLOWANCES, operating_curves
 
-    _check_picture(out, output)
+    figures = _figures(out, output)
     task = _asked_task(scenario, vehicle, settings, harm_count)
     worlds = task.scenario.sample(episodes, DEFAULT.LIST_SEED).worlds
-    lineup = make_lineup(agents.split(","), task.scenario, harm_count=harm_count, bare=True)
+    lineup = evaluation.make_lineup(agents.split(","), task.scenario, harm_count=harm_count, bare=True)
     curves = operating_curves(
         worlds, lineup, task, ALLOWANCES,
         on_progress=lambda name: out.progress(name, episodes, episodes),
     )  # fmt: skip
     left_out = next(iter(curves.values()))[0].left_out
     rest = f"; step shield, {harm_count} harm. Beside the points: what certificates may reach above the bound (m²/s²)."
-    figure = operating_figure(list(curves.items()), caption=_caption(task.scenario, episodes, rest, left_out))
+    figure = figures.operating_figure(list(curves.items()), caption=_caption(task.scenario, episodes, rest, left_out))
     _write_picture(out, output, figure, left_out, episodes)
 
 
-@command(picture_group, "shield-modes", "watch picture shield-modes --episodes 500 --output modes.png", force=True)
+@picture_group.add("shield-modes", "watch picture shield-modes --episodes 500 --output modes.png", force=True)
 def picture_shield_modes(
     out: Out,
     output: PictureOption,
@@ -732,19 +672,17 @@ def picture_shield_modes(
     settings: list[str] | None = None,
 ) -> None:
     """Harm without a shield and in step mode beside episode mode, as ``ethbrake shield`` measures it."""
-    from ethbrake_marl.figures import shield_modes_figure
-
-    _check_picture(out, output)
+    figures = _figures(out, output)
     task = _asked_task(scenario, vehicle, settings, harm_count)
     rows = _measure_modes(out, agents, task.scenario.sample(episodes, DEFAULT.LIST_SEED), task)
     rest = f", {harm_count} harm; mean and 95 % interval of the difference, paired by world."
-    figure = shield_modes_figure(rows, caption=_caption(task.scenario, episodes, rest, rows[0].left_out))
+    figure = figures.shield_modes_figure(rows, caption=_caption(task.scenario, episodes, rest, rows[0].left_out))
     _write_picture(out, output, figure, rows[0].left_out, episodes)
 
 
-@command(
-    picture_group, "robustness",
-    "watch picture robustness --agent ppo@shipped --episodes 100 --output robust.png", json=True, force=True,
+@picture_group.add(
+    "robustness", "watch picture robustness --agent ppo@shipped --episodes 100 --output robust.png",
+    json=True, force=True,
 )  # fmt: skip
 def picture_robustness(
     out: Out,
@@ -769,16 +707,13 @@ def picture_robustness(
     Prints the figures, too.
     """
     from ethbrake_marl.agents import Agent
-    from ethbrake_marl.evaluation import make_lineup, result_identity
-    from ethbrake_marl.figures import robustness_figure
-    from ethbrake_marl.files.sheet import Column, Sheet
     from ethbrake_marl.shield import parse_uncertainty, robustness
 
-    _check_picture(out, output)
+    figures = _figures(out, output)
     intervals = parse_uncertainty(uncertainty)
     task = _asked_task(scenario, vehicle, settings, harm_count, alone=True)
     sample = task.scenario.sample(episodes, DEFAULT.LIST_SEED)
-    (policy,) = make_lineup([agent], task.scenario, harm_count=harm_count, bare=True).values()
+    (policy,) = evaluation.make_lineup([agent], task.scenario, harm_count=harm_count, bare=True).values()
     assert isinstance(policy, Agent)  # one vehicle learns
     points = robustness(
         sample.worlds, policy, task, intervals, robust=robust,
@@ -789,8 +724,8 @@ def picture_robustness(
         f" Robust mode certifies their {robust}." if robust != "corners" else ""
     )
     caption = _caption(task.scenario, episodes, rest, left_out)
-    about = result_identity("robustness", task.scenario, sample, [world for world, _ in left_out])
-    _write_picture(out, output, robustness_figure(points, caption=caption), left_out, episodes)
+    about = evaluation.result_identity("robustness", task.scenario, sample, [world for world, _ in left_out])
+    _write_picture(out, output, figures.robustness_figure(points, caption=caption), left_out, episodes)
     columns: list[Column | str] = ["shield", "truth", "width", Column("mean harm"), Column("mean bound")]
     columns += [Column("above bound", digits=1, scale=100.0, unit="%"), Column("mean excess", digits=3)]
     columns += [Column("noticed", digits=1, scale=100.0, unit="%")]

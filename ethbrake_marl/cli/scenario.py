@@ -7,8 +7,11 @@ from typing import Annotated
 
 import typer
 
-from ethbrake_marl.cli.command import Out, command, new_group
+from ethbrake_marl import evaluation, learning, scenario as scenarios
+from ethbrake_marl.cli.command import Out, app
 from ethbrake_marl.defaults import DEFAULT
+from ethbrake_marl.files.sheet import Sheet
+from ethbrake_marl.files.store import read_plain
 
 CHECKED_DRAWS = 1000  # worlds that `scenario validate` draws
 
@@ -17,7 +20,7 @@ NewNameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Of the new
 BasedOnOption = Annotated[str, typer.Option(metavar="NAME|PATH", help="Whose values to start from.")]
 FolderOption = Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the new file.")]
 
-scenario_group = new_group(
+scenario_group = app.group(
     "scenario",
     "Look at scenarios, check one, start one, draw worlds.",
     "scenario show paper-random",
@@ -25,12 +28,10 @@ scenario_group = new_group(
 )
 
 
-@command(scenario_group, "list", "scenario list", json=True)
+@scenario_group.add("list", "scenario list", json=True)
 def scenario_list(out: Out) -> None:
     """List the scenarios that have a name: that and the title, and the folder of those that a plug-in registers."""
-    from ethbrake_marl.scenario import list_scenarios
-
-    entries = list_scenarios()
+    entries = scenarios.list_scenarios()
     width = max(len(entry.name) for entry in entries)
     out.result(
         [{"name": e.name, "title": e.title, "path": str(e.path), "origin": e.origin} for e in entries],
@@ -38,26 +39,22 @@ def scenario_list(out: Out) -> None:
     )
 
 
-@command(scenario_group, "show", "scenario show paper-random")
+@scenario_group.add("show", "scenario show paper-random")
 def scenario_show(out: Out, scenario: NameArgument) -> None:
     """Print the YAML of a scenario that is in order."""
-    from ethbrake_marl.scenario import load_scenario, scenario_path
-
-    load_scenario(scenario)
-    _show_file(out, scenario_path(scenario))
+    scenarios.load_scenario(scenario)
+    _show_file(out, scenarios.scenario_path(scenario))
 
 
-@command(scenario_group, "validate", "scenario validate my-scenario.yaml", json=True)
+@scenario_group.add("validate", "scenario validate my-scenario.yaml", json=True)
 def scenario_validate(out: Out, path: NameArgument) -> None:
     """Check a scenario: one line, OK or what is wrong; then what may not be meant."""
     from ethbrake_marl.agents import Team, drive, make_agent
-    from ethbrake_marl.evaluation import load_runnable
-    from ethbrake_marl.scenario import ScriptSpec
 
-    scenario = load_runnable(path)
+    scenario = evaluation.load_runnable(path)
     sample = scenario.sample(CHECKED_DRAWS, DEFAULT.LIST_SEED)
     names = [scenario.vehicle_names[i] for i in scenario.learners]
-    free = {i for i, script in scenario.scripts.items() if ScriptSpec.parse(script).is_state_free()}
+    free = {i for i, script in scenario.scripts.items() if scenarios.ScriptSpec.parse(script).is_state_free()}
     deciding = [i for i in range(scenario.vehicles) if i not in free]
     braking = Team.of(make_agent("full_brake"), deciding)
     moving = int((~drive(sample.worlds, braking, scenario).at_rest).sum())
@@ -76,30 +73,24 @@ def scenario_validate(out: Out, path: NameArgument) -> None:
     out.result({**told, "rejected": sample.rejected, "moving_at_horizon": moving, "vehicle_1_late": late}, *shown)
 
 
-@command(scenario_group, "new", "scenario new my-scenario --based-on paper-distance", force=True)
+@scenario_group.add("new", "scenario new my-scenario --based-on paper-distance", force=True)
 def scenario_new(
     out: Out, name: NewNameArgument, based_on: BasedOnOption = "paper-random", output: FolderOption = Path()
 ) -> None:
     """Write a commented NAME.yaml with every key."""
-    from ethbrake_marl.scenario import new_scenario_text
-
-    _write_new(out, "scenario", output / f"{name}.yaml", new_scenario_text(name, based_on))
+    _write_new(out, "scenario", output / f"{name}.yaml", scenarios.new_scenario_text(name, based_on))
 
 
-@command(scenario_group, "schema", "scenario schema > scenario.schema.json")
+@scenario_group.add("schema", "scenario schema > scenario.schema.json")
 def scenario_schema(out: Out) -> None:
     """Print the JSON Schema of scenario files.
 
     For editors that complete and check YAML.
     """
-    from ethbrake_marl.scenario import scenario_json_schema
-
-    out.print_json(scenario_json_schema())
+    out.print_json(scenarios.scenario_json_schema())
 
 
-@command(
-    scenario_group, "sample", "scenario sample paper-random --episodes 10 --output worlds.csv", json=True, force=True
-)
+@scenario_group.add("sample", "scenario sample paper-random --episodes 10 --output worlds.csv", json=True, force=True)
 def scenario_sample(
     out: Out,
     scenario: NameArgument,
@@ -114,12 +105,9 @@ def scenario_sample(
 
     A column is what the scenario does not fix. The same list, seed and number are the same worlds on every machine.
     """
-    from ethbrake_marl.evaluation import load_runnable, states_of
-    from ethbrake_marl.learning import read_settings
-
     out.check(output, ".csv", what="a table of worlds")
-    chosen = load_runnable(scenario, read_settings(settings).scenario)
-    states = states_of(chosen.sample(episodes, seed).worlds, chosen)
+    chosen = evaluation.load_runnable(scenario, learning.read_settings(settings).scenario)
+    states = evaluation.states_of(chosen.sample(episodes, seed).worlds, chosen)
     lines = [",".join(states[0]), *(",".join(map(repr, state.values())) for state in states)]
     if output is not None:
         out.write(output, "\n".join([*lines, ""]), what="worlds")
@@ -127,7 +115,7 @@ def scenario_sample(
         out.result(states, *lines)
 
 
-recipe_group = new_group(
+recipe_group = app.group(
     "recipe",
     "Look at training recipes, check one, or start a new one.",
     "recipe show ppo",
@@ -135,12 +123,10 @@ recipe_group = new_group(
 )
 
 
-@command(recipe_group, "list", "recipe list", json=True)
+@recipe_group.add("list", "recipe list", json=True)
 def recipe_list(out: Out) -> None:
     """List the shipped recipes: name, algorithm and title."""
-    from ethbrake_marl.learning import TrainingRecipe, load_recipe
-
-    found = {name: (load_recipe(name), path) for name, path in TrainingRecipe.shipped().items()}
+    found = {name: (learning.load_recipe(name), path) for name, path in learning.TrainingRecipe.shipped().items()}
     width = max(map(len, found))
     out.result(
         [
@@ -151,21 +137,17 @@ def recipe_list(out: Out) -> None:
     )
 
 
-@command(recipe_group, "show", "recipe show ppo")
+@recipe_group.add("show", "recipe show ppo")
 def recipe_show(out: Out, recipe: NameArgument) -> None:
     """Print the YAML of a recipe that is in order."""
-    from ethbrake_marl.learning import TrainingRecipe, load_recipe
-
-    load_recipe(recipe)
-    _show_file(out, TrainingRecipe.file(recipe))
+    learning.load_recipe(recipe)
+    _show_file(out, learning.TrainingRecipe.file(recipe))
 
 
-@command(recipe_group, "validate", "recipe validate my-recipe.yaml")
+@recipe_group.add("validate", "recipe validate my-recipe.yaml")
 def recipe_validate(out: Out, path: NameArgument) -> None:
     """Check a recipe: one line, OK or what is wrong."""
-    from ethbrake_marl.learning import load_recipe
-
-    recipe = load_recipe(path)
+    recipe = learning.load_recipe(path)
     others = ", ".join(name for name in recipe.schemes if name not in ("single", "shared"))
     scheme = recipe.scheme or f"single, or shared for several learners{f'; also {others}' if others else ''}"
     out.show(
@@ -173,27 +155,22 @@ def recipe_validate(out: Out, path: NameArgument) -> None:
     )
 
 
-@command(recipe_group, "new", "recipe new my-recipe --based-on sac", force=True)
+@recipe_group.add("new", "recipe new my-recipe --based-on sac", force=True)
 def recipe_new(out: Out, name: NewNameArgument, based_on: BasedOnOption = "ppo", output: FolderOption = Path()) -> None:
     """Write a commented NAME.yaml with every key."""
-    from ethbrake_marl.learning import load_recipe
-
-    _write_new(out, "recipe", output / f"{name}.yaml", load_recipe(based_on).new_text(name))
+    _write_new(out, "recipe", output / f"{name}.yaml", learning.load_recipe(based_on).new_text(name))
 
 
-@command(recipe_group, "schema", "recipe schema > recipe.schema.json")
+@recipe_group.add("schema", "recipe schema > recipe.schema.json")
 def recipe_schema(out: Out) -> None:
     """Print the JSON Schema of recipe files.
 
     For editors that complete and check YAML.
     """
-    from ethbrake_marl.learning import TrainingRecipe
-
-    out.print_json(TrainingRecipe.json_schema())
+    out.print_json(learning.TrainingRecipe.json_schema())
 
 
 def _show_file(out: Out, path: Path) -> None:
-    from ethbrake_marl.files.store import read_plain
     from ethbrake_marl.files.yaml import SIZE_LIMIT
 
     out.show(read_plain(path, SIZE_LIMIT).decode("utf-8"), end="")
@@ -204,19 +181,18 @@ def _write_new(out: Out, kind: str, file: Path, text: str) -> None:
     out.note(f"written: {file}; change it, then: ethbrake {kind} validate {file}")
 
 
-agent_group = new_group(
+agent_group = app.group(
     "agent", "List who can drive, or hand a policy on.", "agent list", "agent export runs/early --onnx early.onnx"
 )
 
 
-@command(agent_group, "list", "agent list", json=True)
+@agent_group.add("list", "agent list", json=True)
 def agent_list(out: Out) -> None:
     """List all agents: how each is written, what it does, what it knows.
 
     What begins with + goes behind any agent, for instance full_brake+step: +refined first, then one shield.
     """
     from ethbrake_marl.agents import Knowledge, agent_entries
-    from ethbrake_marl.files.sheet import Sheet
 
     told, rows = [], []
     for entry in agent_entries():
@@ -231,7 +207,7 @@ def agent_list(out: Out) -> None:
     )
 
 
-@command(agent_group, "export", "agent export runs/early --onnx early.onnx", force=True)
+@agent_group.add("export", "agent export runs/early --onnx early.onnx", force=True)
 def agent_export(
     out: Out,
     policy: Annotated[str, typer.Argument(metavar="FOLDER", help="A run, a policy bundle, or shipped/NAME.")],

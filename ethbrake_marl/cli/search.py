@@ -7,20 +7,19 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from ethbrake_marl.cli.command import Out, command, new_group
+from ethbrake_marl import evaluation, learning, limits
+from ethbrake_marl.cli.command import Out, app
 from ethbrake_marl.defaults import DEFAULT, HARM_COUNTS, MEASURES, HarmCount, MeasureName
 from ethbrake_marl.errors import InvalidInput, count_of
-
-if TYPE_CHECKING:
-    pass
+from ethbrake_marl.files.sheet import Sheet
 
 ROUNDING = 1e-6  # m2/s2
 
-search_group = new_group(
+search_group = app.group(
     "search",
     "Search for the least harm, or for an agent's worst worlds.",
     "search best-harm --episodes 200 --budget 20000 --json",
@@ -28,7 +27,7 @@ search_group = new_group(
 )
 
 
-@command(search_group, "best-harm", "search best-harm --episodes 200 --budget 20000 --json", json=True, force=True)
+@search_group.add("best-harm", "search best-harm --episodes 200 --budget 20000 --json", json=True, force=True)
 def best_harm_command(
     out: Out,
     scenario: str = "paper-random",
@@ -67,40 +66,30 @@ def best_harm_command(
     """
     import numpy as np
 
-    from ethbrake_marl.evaluation import (
-        load_runnable,
-        make_agents,
-        proven_of_table,
-        result_identity,
-        shipped_bounds,
-        shipped_sheet,
-    )
-    from ethbrake_marl.learning import read_settings
-    from ethbrake_marl.limits import BestHarmTable, search_list
     from ethbrake_marl.scenario import Task
 
     if shipped:
-        found = shipped_bounds()
-        out.result(found, *shipped_sheet(found).markdown().splitlines())
+        found = evaluation.shipped_bounds()
+        out.result(found, *evaluation.shipped_sheet(found).markdown().splitlines())
         return
     out.check(output, ".npz", what="a table")
-    given = read_settings(settings)
-    chosen = load_runnable(scenario, given.scenario)
+    given = learning.read_settings(settings)
+    chosen = evaluation.load_runnable(scenario, given.scenario)
     names = None if vehicles is None else [name.strip() for name in vehicles.split(",")]
     controlled = None if names is None else chosen.with_learners(names).learners
     if controlled is None and not chosen.learners:
         raise InvalidInput(f"scenario {chosen.name!r} has no learner; say who is controlled: --vehicles vehicle_2")
-    known = None if start is None else BestHarmTable.load(start)
+    known = None if start is None else limits.BestHarmTable.load(start)
     sample = chosen.sample(episodes, seed)
     counts: Sequence[HarmCount] = HARM_COUNTS if harm_count is None else (harm_count,)
     specs = [] if agents is None else [spec.strip() for spec in agents.split(",")]
     if specs and (len(chosen.learners) != 1 or controlled not in (None, chosen.learners)):
         raise InvalidInput("--agents: drive the scenario's only learner; leave out --vehicles")
-    lineups = {each: make_agents(specs, chosen, harm_count=each) for each in counts}
+    lineups = {each: evaluation.make_agents(specs, chosen, harm_count=each) for each in counts}
     parts = None if output is None else output.with_name(f".{output.name}.parts")
     if parts is not None:
         out.kept = f"{parts} keeps what was found; the same command goes on"
-    table = search_list(
+    table = limits.search_list(
         chosen, sample, chunks=parts, counts=counts, vehicles=controlled, budget=budget, seed=search_seed,
         threads=threads, known=known, on_progress=lambda done, total: out.progress("best harm", done, total),
     )  # fmt: skip
@@ -123,13 +112,13 @@ def best_harm_command(
         counted = "first_impact" if each == "first" else "total"
         figures[f"best_known_{counted}_harm"] = float(best.harm.mean())
         figures["harmless_rate"] = float((best.harm == 0.0).mean())
-    proven = proven_of_table(sample.worlds, Task(chosen, controlled or chosen.learners), table)
+    proven = evaluation.proven_of_table(sample.worlds, Task(chosen, controlled or chosen.learners), table)
     if proven is not None:
         inside = {f"between_{name}": value for name, value in (proven.pop("between") or {}).items()}
         figures |= {name: value for name, value in {**proven, **inside}.items() if value is not None}
     if out.as_json:  # worlds that were left out are in no hash
         left_out = np.flatnonzero(np.isin(sample.index, [int(world) for world in table.left_out]))
-        figures |= result_identity("best-harm", chosen, sample, left_out.tolist())
+        figures |= evaluation.result_identity("best-harm", chosen, sample, left_out.tolist())
     lines = (
         f"{name:36} {value:.4f}" if isinstance(value, float) else f"{name:36} {value}"
         for name, value in figures.items()
@@ -148,8 +137,7 @@ def _spelled(name: str, **options: Any) -> str:
     return shlex.join(words)
 
 
-@command(
-    search_group, "falsify", "search falsify --agent ppo@shipped --against e_v2x_bm --output worst.yaml",
+@search_group.add("falsify", "search falsify --agent ppo@shipped --against e_v2x_bm --output worst.yaml",
     json=True, force=True, parts=True,
 )  # fmt: skip
 def falsify_command(
@@ -193,10 +181,7 @@ def falsify_command(
     """
     import numpy as np
 
-    from ethbrake_marl.evaluation import NamedWorlds, check_agents, load_driven, result_versions
-    from ethbrake_marl.files.sheet import Sheet
-    from ethbrake_marl.learning import read_settings
-    from ethbrake_marl.studies.falsification import Measure, falsify
+    from ethbrake_marl.studies.falsification import Measure
     from ethbrake_marl.studies.speed import this_machine
 
     if again is not None:
@@ -211,15 +196,15 @@ def falsify_command(
         return
     agent = agent or "policy@shipped"
     out.check(output, ".yaml", ".yml", what="a file of worlds")
-    given = read_settings(settings)
-    chosen = load_driven(scenario, vehicle, given.scenario, alone=False)
+    given = learning.read_settings(settings)
+    chosen = evaluation.load_driven(scenario, vehicle, given.scenario, alone=False)
     measured_by = Measure.of(measure, agent, against, chosen, harm_count)
-    check_agents(measured_by.agents, chosen.replace(early_impacts="keep").sample(1, seed).worlds, chosen)
-    found = falsify(
-        measured_by, budget, seed, most=keep, adaptive=not at_random,
+    evaluation.check_agents(measured_by.agents, chosen.replace(early_impacts="keep").sample(1, seed).worlds, chosen)
+    found = measured_by.falsify(
+        budget, seed, most=keep, adaptive=not at_random,
         on_round=lambda done, total: out.progress(agent, done, total),
     )  # fmt: skip
-    worlds, good = found.named_worlds(measured_by), found.scores[np.isfinite(found.scores)]
+    worlds, good = found.worlds, found.scores[np.isfinite(found.scores)]
     told: dict[str, Any] = {
         "tried": budget,
         "counted": len(good),
@@ -239,7 +224,7 @@ def falsify_command(
     )
     told["worlds"] = [world.model_dump(exclude_none=True) for world in worlds]
     if worlds:
-        kept = NamedWorlds.of(
+        kept = evaluation.NamedWorlds.of(
             measured_by.scenario,
             scenario=scenario,
             settings=[*given.texts, *([f"roles={{{vehicle}: learner}}"] if vehicle else [])],
@@ -266,7 +251,7 @@ def falsify_command(
             out.write(output, kept.text, what="the worlds")
     elif output is not None:
         out.note(f"nothing was found, and {output} not written")
-    out.result({**told, "versions": result_versions()}, *shown, summary)
+    out.result({**told, "versions": evaluation.result_versions()}, *shown, summary)
 
 
 def _drive_again(out: Out, file: Path, agent: str | None) -> None:
@@ -274,20 +259,17 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
     import numpy as np
 
     from ethbrake_marl.agents import parse_spec
-    from ethbrake_marl.evaluation import NamedWorlds, load_driven
-    from ethbrake_marl.files.sheet import Sheet
-    from ethbrake_marl.learning import read_settings
     from ethbrake_marl.scenario import Sample
     from ethbrake_marl.studies.falsification import Measure
 
-    kept = NamedWorlds.read(file)
+    kept = evaluation.NamedWorlds.read(file)
     for spec in (*([kept.agent] if agent is None else []), *([kept.against] if kept.against else [])):
         if (code := parse_spec(spec).file) is not None:
             raise InvalidInput(
                 f"{file}: names an agent that is code ({code[0]}), which is not run because a file names it; --agent"
                 " names another one, and who is compared with is edited in the file"
             )
-    chosen = load_driven(kept.scenario, None, read_settings(kept.settings).scenario, alone=False)
+    chosen = evaluation.load_driven(kept.scenario, None, learning.read_settings(kept.settings).scenario, alone=False)
     measured_by = Measure.of(kept.measure, agent or kept.agent, kept.against, chosen, kept.harm_count)
     worlds = kept.worlds_of(chosen, str(file))
     measured = measured_by(Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0))

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
+from rich.text import Text
 
-from ethbrake_marl.cli.command import Out, app, command, new_group
-from ethbrake_marl.cli.evaluate import show_run
+from ethbrake_marl import evaluation, learning
+from ethbrake_marl.cli.command import Out, app, whole_number
 from ethbrake_marl.defaults import DEFAULT, HarmCount
 from ethbrake_marl.errors import InvalidInput, Progress, check_one_learner, check_whole_number, need
-
-if TYPE_CHECKING:
-    from ethbrake_marl.learning import TrainResult
-    from ethbrake_marl.studies.sweep import StudyResult, SweepPlan, TuningPlan
-
+from ethbrake_marl.files.sheet import Column, Sheet
 
 KEPT = (
     "if the training had begun, the run's folder keeps the last good policy, and ethbrake train resume FOLDER goes on"
@@ -34,7 +29,7 @@ NameOption = Annotated[
 OutputOption = Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder of the run, instead of --name.")]
 
 
-@command(app, "run", "run --steps 200000 --seed 1", kept=KEPT, json=True, force=True)
+@app.add("run", "run --steps 200000 --seed 1", kept=KEPT, json=True, force=True)
 def run_command(
     out: Out,
     scenario: str = "paper-random",
@@ -55,15 +50,12 @@ def run_command(
     one of the three tests (paper-random, -brake-only, -obstacle) the policy also drives the other two.
     Ctrl-C ends the training early, and what it has is evaluated; a second Ctrl-C stops at once.
     """
-    from ethbrake_marl.evaluation import PER_WORLD, load_driven, results_to_json
-    from ethbrake_marl.learning import load_recipe, read_settings
-
     # torch takes seconds to load, here and in the other commands that learn
     from ethbrake_marl.studies.experiment import run_experiment, run_folder
 
-    plan = load_recipe(recipe)
-    given = read_settings(settings, [plan])
-    chosen, plan = load_driven(scenario, vehicle, given.scenario), given.change(plan, out.note)
+    plan = learning.load_recipe(recipe)
+    given = learning.read_settings(settings, [plan])
+    chosen, plan = evaluation.load_driven(scenario, vehicle, given.scenario), given.change(plan, out.note)
     folder = run_folder(chosen, plan, seed=seed, name=name, output=output)
     result = run_experiment(
         chosen,
@@ -78,13 +70,16 @@ def run_command(
         settings=given.texts,
         on_progress=out.show_progress,
     )
-    told = results_to_json(result.rows, per_world=result.directory / PER_WORLD)
-    show_run(out, result.rows, result.beside, told)
+    told = evaluation.results_to_json(result.rows, per_world=result.directory / evaluation.PER_WORLD)
+    shown: list[Any] = [*result.rows.tables()]
+    for test, found in result.beside.items():  # each below what its test asks
+        shown += [Text(f"\n{evaluation.TESTS[test]}\n"), found.terminal()]
+    out.result(told, *shown)
     out.note(f"report: {result.report}")
     _end(out, result.status, result.steps, folder)
 
 
-train = new_group(
+train = app.group(
     "train",
     "Train a policy, go on with a training, or draw learning curves.",
     "train --scenario paper-random-early --steps 200000 --name early",
@@ -92,7 +87,7 @@ train = new_group(
 )
 
 
-@command(train, "start", "train --recipe sac --name sac", kept=KEPT, json=True, force=True, parts=True)
+@train.add("start", "train --recipe sac --name sac", kept=KEPT, json=True, force=True, parts=True)
 def start_command(
     out: Out,
     scenario: str = "paper-random",
@@ -117,24 +112,21 @@ def start_command(
     Afterwards: `ethbrake evaluate --agents full_brake,ppo@FOLDER,ppo@FOLDER+episode`; of several: `team@FOLDER`.
     Ctrl-C ends the training after the update in progress and keeps the policy; `ethbrake train resume FOLDER` goes on.
     """
-    from ethbrake_marl.evaluation import load_runnable
-    from ethbrake_marl.learning import Training, load_recipe, read_settings, train
     from ethbrake_marl.studies.experiment import run_folder
 
-    plan = load_recipe(recipe)
-    given = read_settings(settings, [plan])
-    chosen, plan = load_runnable(scenario, given.scenario), given.change(plan, out.note)
+    plan = learning.load_recipe(recipe)
+    given = learning.read_settings(settings, [plan])
+    chosen, plan = evaluation.load_runnable(scenario, given.scenario), given.change(plan, out.note)
     if scheme is not None:
         plan = plan.replace(scheme=scheme)
-    training = Training.of(plan, chosen)
-    begun = [training.who_drives()]
+    begun = [learning.Training.of(plan, chosen).who_drives()]
 
     def tell(progress: Progress) -> None:
         if begun:  # all input is known to be good
             out.note(begun.pop())
         out.show_progress(progress)
 
-    result = train(
+    result = learning.train(
         plan,
         chosen,
         run_folder(chosen, plan, seed=seed, name=name, output=output),
@@ -148,7 +140,7 @@ def start_command(
     _tell(out, result)
 
 
-@command(train, "resume", "train resume runs/paper-random-ppo-seed0", kept=KEPT, json=True)
+@train.add("resume", "train resume runs/paper-random-ppo-seed0", kept=KEPT, json=True)
 def resume_command(
     out: Out,
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the run.")],
@@ -164,14 +156,13 @@ def resume_command(
 
     The policy is the one that the training would have come to without the stop, bit for bit.
     """
-    from ethbrake_marl.learning import resume
-
-    _tell(
-        out, resume(folder, stop_when_lost=stop_when_lost, on_progress=out.show_progress, other_versions=other_versions)
+    ended = learning.resume(
+        folder, stop_when_lost=stop_when_lost, on_progress=out.show_progress, other_versions=other_versions
     )
+    _tell(out, ended)
 
 
-@command(train, "curves", "train curves --scenario paper-delay-low --output runs/low-delay", kept=KEPT, json=True)
+@train.add("curves", "train curves --scenario paper-delay-low --output runs/low-delay", kept=KEPT, json=True)
 def curves_command(
     out: Out,
     output: Annotated[
@@ -189,29 +180,33 @@ def curves_command(
 
     The same command goes on after an interruption: finished trainings are kept, begun ones go on.
     """
-    from ethbrake_marl.evaluation import load_runnable
-    from ethbrake_marl.learning import read_settings
-    from ethbrake_marl.studies.learning_curves import parse_trainings, train_all, write_curves
+    from ethbrake_marl.studies.learning_curves import LearningCurves
 
-    plan = parse_trainings(recipes)
-    given = read_settings(settings, [trainings.recipe for trainings in plan])
-    chosen = load_runnable(scenario, given.scenario)
-    plan = [trainings._replace(recipe=given.change(trainings.recipe, out.note)) for trainings in plan]
+    plan = LearningCurves.parse(recipes)
+    given = learning.read_settings(settings, [recipe for recipe, _ in plan])
+    chosen = evaluation.load_runnable(scenario, given.scenario)
+    changed = [(given.change(recipe, out.note), seeds) for recipe, seeds in plan]
     names = [chosen.vehicle_names[i] for i in chosen.learners]
     check_one_learner(chosen.name, names, "learning curves need exactly one")
-    if not train_all(chosen, plan, output, steps=steps, jobs=jobs, tell=out.show_progress, settings=given.texts):
+    curves = LearningCurves(chosen, changed, output)
+    if not curves.train(steps=steps, jobs=jobs, tell=out.show_progress, settings=given.texts):
         out.interrupted(f"interrupted; the same command goes on with what is in {output}")
-    out.result(write_curves(chosen, plan, output))
+    out.result(curves.write())
     out.note(f"figure: {output / 'learning_curves.png'}")
 
 
-def _tell(out: Out, result: TrainResult) -> None:
+def _tell(out: Out, result: learning.TrainResult) -> None:
     """What a training came to."""
-    last = result.evaluations[-1] if result.evaluations else None
-    content = {"directory": str(result.directory), "status": result.status, "steps": result.steps}
-    best = next(iter(result.policies.values())).manifest.steps
-    team = {"scheme": result.training.scheme, "drivers": dict(result.training.drivers)}
-    out.result({**content, **team, "evaluation": last, "policy_steps": best, "alarms": list(result.alarms)})
+    out.result({
+        "directory": str(result.directory),
+        "status": result.status,
+        "steps": result.steps,
+        "scheme": result.training.scheme,
+        "drivers": dict(result.training.drivers),
+        "evaluation": result.evaluations[-1] if result.evaluations else None,
+        "policy_steps": next(iter(result.policies.values())).manifest.steps,
+        "alarms": list(result.alarms),
+    })  # fmt: skip
     _end(out, result.status, result.steps, result.directory)
 
 
@@ -226,17 +221,18 @@ def _end(out: Out, status: str, steps: int, folder: Path) -> None:
 # The commands of many trainings or evaluations: ``study``, ``reproduce`` and ``benchmark``.
 
 KEPT_IN_FOLDER = "the same command goes on with what is in the folder"
-PAPER_EPISODES = 10_000
-_MOST_WORKERS, _MOST_TRIALS, _MOST_RETRIES = 4096, 100_000, 100
+PAPER_EPISODES, MOST_WORKERS = 10_000, 4096
 
 FolderOption = Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of everything.")]
-RetriesOption = Annotated[int, typer.Option(help="Further attempts at a job whose process was lost.")]
+RetriesOption = Annotated[
+    int, typer.Option(help="Further attempts at a job whose process was lost.", callback=whole_number(0, 100))
+]
 DryRunOption = Annotated[
     bool, typer.Option("--dry-run", help="Print what would be done and what it takes; do nothing.")
 ]
 CostOption = Annotated[bool, typer.Option("--cost", help="Say what is left to do and what it takes; stop.")]
 
-study_group = new_group(
+study_group = app.group(
     "study",
     "Train and compare many: a grid, settings, cooperation, lines.",
     "study sweep sweep.yaml --output runs/sweep",
@@ -244,36 +240,37 @@ study_group = new_group(
 )
 
 
-def _schema_option(schema: Callable[[], dict[str, Any]]) -> Any:
+def _schema_option(plan: str) -> Any:
     """The option ``--schema`` of a command that reads files of one kind: print their JSON Schema and exit."""
 
     def show_schema(asked: bool) -> None:
         if asked:
-            Out().print_json(schema())
+            from ethbrake_marl.studies import sweep
+
+            Out().print_json(getattr(sweep, plan).json_schema())
             raise typer.Exit
 
     told = "Print the JSON Schema of the file, and exit."
     return Annotated[bool, typer.Option("--schema", is_eager=True, callback=show_schema, help=told)]
 
 
-def _sweep_schema() -> dict[str, Any]:
-    from ethbrake_marl.studies.sweep import SweepPlan
-
-    return SweepPlan.json_schema()
-
-
-@command(study_group, "sweep", "study sweep sweep.yaml --output runs/sweep", kept=KEPT_IN_FOLDER, json=True)
+@study_group.add("sweep", "study sweep sweep.yaml --output runs/sweep", kept=KEPT_IN_FOLDER, json=True)
 def sweep_command(
     out: Out,
     file: Annotated[Path, typer.Argument(metavar="SWEEP.yaml", help="A grid or a list of jobs.")],
     output: FolderOption,
     jobs: Annotated[
-        int | None, typer.Option(help="Jobs at once, a process with one thread each.", show_default="the usable cores")
+        int | None,
+        typer.Option(
+            help="Jobs at once, a process with one thread each.",
+            show_default="the usable cores",
+            callback=whole_number(1, MOST_WORKERS),
+        ),
     ] = None,
     ray: str | None = None,
     retries: RetriesOption = 2,
     dry_run: DryRunOption = False,
-    schema: _schema_option(_sweep_schema) = False,  # type: ignore[valid-type]  # made here, read by Typer
+    schema: _schema_option("SweepPlan") = False,  # type: ignore[valid-type]  # made here, read by Typer
 ) -> None:
     """Train every job of a file, and write one table of what they reached.
 
@@ -283,37 +280,17 @@ def sweep_command(
     from ethbrake_marl.studies.jobs import open_workers
     from ethbrake_marl.studies.sweep import SweepPlan
 
-    number = len(os.sched_getaffinity(0)) if jobs is None else jobs
-    _check_workers(number, retries, ray)
     plan = SweepPlan.read(file)
     plan.folder(output).check()
     if dry_run:
-        _show_sweep(out, plan, output, number)
+        left, words = plan.cost(output, len(os.sched_getaffinity(0)) if jobs is None else jobs)
+        lines = ([f"{job['state']:8}", job["job"], *map("=".join, job["set"].items())] for job in left["jobs"])
+        out.result(left, *map("  ".join, lines))
+        if not out.as_json:
+            out.note(words)
         return
     with closing(open_workers(ray, jobs)) as workers:
         result = plan.run(output, workers, retries=retries, tell=out.show_progress)
-    _tell_sweep(out, result, output)
-
-
-def _check_workers(jobs: int, retries: int, ray: str | None) -> None:
-    check_whole_number("jobs", jobs, 1, _MOST_WORKERS)
-    check_whole_number("retries", retries, 0, _MOST_RETRIES)
-    if ray is not None:
-        need("ray")
-
-
-def _show_sweep(out: Out, plan: SweepPlan, output: Path, number: int) -> None:
-    """Every job and its state, and what is left takes."""
-    cost = plan.cost(output, number)
-    states = [(row, cost.states[row.name]) for row in plan.rows]
-    jobs = [{"hash": row.identity, "job": row.name, "set": row.settings, "state": state} for row, state in states]
-    lines = ["  ".join([f"{state:8}", row.name, *row.asked.settings]) for row, state in states]
-    out.result({"jobs": jobs, "decisions_left": cost.decisions, "core_s_left": cost.work_s}, *lines)
-    if not out.as_json:
-        out.note(cost.in_words)
-
-
-def _tell_sweep(out: Out, result: StudyResult, output: Path) -> None:
     counts = result.counts
     out.result({**counts, "interrupted": result.interrupted, "table": str(result.table)})
     told = f"{counts['finished']:,} of {counts['jobs']:,} jobs finished; table: {result.table}"
@@ -326,29 +303,30 @@ def _tell_sweep(out: Out, result: StudyResult, output: Path) -> None:
         raise typer.Exit(1)
 
 
-def _tuning_schema() -> dict[str, Any]:
-    from ethbrake_marl.studies.sweep import TuningPlan
-
-    return TuningPlan.json_schema()
-
-
-@command(
-    study_group, "tune", "study tune tuning.yaml --output runs/tuning --trials 30 --export best.yaml",
+@study_group.add("tune", "study tune tuning.yaml --output runs/tuning --trials 30 --export best.yaml",
     kept=KEPT_IN_FOLDER, needs=("optuna",), json=True, force=True,
 )  # fmt: skip
 def tune_command(
     out: Out,
     file: Annotated[Path, typer.Argument(metavar="TUNING.yaml", help="A training and the ranges of its settings.")],
     output: FolderOption,
-    trials: Annotated[int, typer.Option(help="Trials that the folder shall have altogether.")] = 30,
-    jobs: Annotated[int, typer.Option(help="Trials at once, a process each; more than one change what is tried.")] = 1,
+    trials: Annotated[
+        int, typer.Option(help="Trials that the folder shall have altogether.", callback=whole_number(1, 100_000))
+    ] = 30,
+    jobs: Annotated[
+        int,
+        typer.Option(
+            help="Trials at once, a process each; more than one change what is tried.",
+            callback=whole_number(1, MOST_WORKERS),
+        ),
+    ] = 1,
     ray: str | None = None,
     retries: RetriesOption = 2,
     export: Annotated[
         Path | None, typer.Option(metavar="NAME.yaml", help="Write the best trial as a recipe of this name.")
     ] = None,
     dry_run: DryRunOption = False,
-    schema: _schema_option(_tuning_schema) = False,  # type: ignore[valid-type]  # made here, read by Typer
+    schema: _schema_option("TuningPlan") = False,  # type: ignore[valid-type]  # made here, read by Typer
 ) -> None:
     """Search the settings of a recipe that do least harm on a list of worlds of its own.
 
@@ -358,65 +336,42 @@ def tune_command(
     from ethbrake_marl.studies.jobs import open_workers
     from ethbrake_marl.studies.sweep import TuningPlan
 
-    check_whole_number("trials", trials, 1, _MOST_TRIALS)
-    _check_workers(jobs, retries, ray)
     plan = TuningPlan.read(file)
     plan.folder(output).check()
-    _check_export(out, plan, export)
+    if export is not None:  # raise now what would be raised at the end
+        if export.is_file():  # what this tuning wrote before is replaced: the same command goes on
+            head = plan.export_head(export).encode()
+            out.force = out.force or export.read_bytes().startswith(head)
+        if export.suffix != ".yaml":
+            raise InvalidInput(f"export {export}: must end in .yaml, as recipes do")
+        plan.best_recipe({}, export, "")
+        out.check(export)
     if dry_run:
-        _show_tuning(out, plan, trials, jobs)
+        (per_trial, words), own = plan.cost(trials, jobs), plan.own_values()
+        space = {key: dimension.model_dump(mode="json") for key, dimension in plan.file.search.items()}
+        now = {key: "not in the space" if own is None else f"the recipe has {own[key]}" for key in space}
+        out.result(
+            {"search": space, "own_values": own, "core_s_per_trial": per_trial, "trials": trials},
+            *(f"{key}  {dimension}  ({now[key]})" for key, dimension in plan.file.search.items()),
+        )
+        if not out.as_json:
+            out.note(words)
         return
     with closing(open_workers(ray, jobs)) as workers:
         result = plan.run(output, workers, trials, retries=retries, tell=out.show_progress)
-    _tell_tuning(out, plan, result, export)
-
-
-def _check_export(out: Out, plan: TuningPlan, export: Path | None) -> None:
-    """Raise before the work begins what would be raised at its end.
-
-    A file that this tuning wrote before is replaced: the same command goes on.
-    """
-    if export is None:
-        return
-    if export.is_file():
-        head = plan.export_head(export).encode()
-        with export.open("rb") as file:
-            out.force = out.force or file.read(len(head)) == head
-    if export.suffix != ".yaml":
-        raise InvalidInput(f"export {export}: must end in .yaml, as recipes do")
-    plan.best_recipe({}, export, "")
-    out.check(export)
-
-
-def _show_tuning(out: Out, plan: TuningPlan, trials: int, jobs: int) -> None:
-    """The space, and what the trials take."""
-    (per_trial, words), own = plan.cost(trials, jobs), plan.own_values()
-    space = {key: dimension.model_dump(mode="json") for key, dimension in plan.file.search.items()}
-    now = {key: "not in the space" if own is None else f"the recipe has {own[key]}" for key in space}
-    out.result(
-        {"search": space, "own_values": own, "core_s_per_trial": per_trial, "trials": trials},
-        *(f"{key}  {dimension}  ({now[key]})" for key, dimension in plan.file.search.items()),
-    )
-    if not out.as_json:
-        out.note(words)
-
-
-def _tell_tuning(out: Out, plan: TuningPlan, result: StudyResult, export: Path | None) -> None:
-    best = result.best
-    export = None if best is None or result.interrupted else export  # what goes on exports at its end
-    if best is not None and export is not None:
-        told = (
-            f"ethbrake study tune: trial {best.number}, harm {best.harm!r} on the list of seed {plan.file.measure.seed}"
-        )
-        out.write(export, plan.best_recipe(best.values, export, told))
-    shown = None if best is None else {"trial": best.number, "harm": best.harm, "values": best.values}
-    counts = {"trials": result.counts, "interrupted": result.interrupted, "table": str(result.table)}
-    lines = [] if best is None else [f"best: trial {best.number}, harm {best.harm:.4f}"]
-    lines += [] if best is None else [f"  {key} = {value}" for key, value in best.values.items()]
-    out.result({"best": shown, **counts, "exported": None if export is None else str(export)}, *lines)
     counted = ", ".join(f"{number:,} {state}" for state, number in sorted(result.counts.items()))
-    told = f"trials: {counted or 'none'}; table: {result.table}"
-    told += f"; recipe: {export}" if export is not None else ""
+    told, best, shown, lines = f"trials: {counted or 'none'}; table: {result.table}", result.best, None, []
+    export = None if best is None or result.interrupted else export  # what goes on exports at its end
+    if best is not None:
+        shown = {"trial": best.number, "harm": best.harm, "values": best.values}
+        lines = [f"best: trial {best.number}, harm {best.harm:.4f}"]
+        lines += [f"  {key} = {value}" for key, value in best.values.items()]
+        if export is not None:
+            source = f"trial {best.number}, harm {best.harm!r} on the list of seed {plan.file.measure.seed}"
+            out.write(export, plan.best_recipe(best.values, export, f"ethbrake study tune: {source}"))
+            told += f"; recipe: {export}"
+    counts = {"trials": result.counts, "interrupted": result.interrupted, "table": str(result.table)}
+    out.result({"best": shown, **counts, "exported": None if export is None else str(export)}, *lines)
     if result.interrupted:
         out.interrupted(f"interrupted; {told}; {KEPT_IN_FOLDER}")
     out.note(told)
@@ -424,7 +379,7 @@ def _tell_tuning(out: Out, plan: TuningPlan, result: StudyResult, export: Path |
         raise typer.Exit(1)
 
 
-@command(study_group, "ablate", "study ablate --quick --output runs/ablation-quick", kept=KEPT_IN_FOLDER, json=True)
+@study_group.add("ablate", "study ablate --quick --output runs/ablation-quick", kept=KEPT_IN_FOLDER, json=True)
 def ablate_command(
     out: Out,
     output: FolderOption,
@@ -438,17 +393,28 @@ def ablate_command(
             metavar="NAME", help="How several learners are trained.", show_default="the recipe's; else shared"
         ),
     ] = None,
-    seeds: Annotated[int | None, typer.Option(help="Trainings of each, seeds 0, 1, ...", show_default="5")] = None,
-    steps: Annotated[
-        int | None, typer.Option(help="Decisions per training, for each of its learners.", show_default="400000")
+    seeds: Annotated[
+        int | None, typer.Option(help="Trainings of each, seeds 0, 1, ...", show_default="5", callback=whole_number(1))
     ] = None,
-    episodes: Annotated[int | None, typer.Option(help="Common worlds to measure on.", show_default="4000")] = None,
+    steps: Annotated[
+        int | None,
+        typer.Option(
+            help="Decisions per training, for each of its learners.", show_default="400000", callback=whole_number(1)
+        ),
+    ] = None,
+    episodes: Annotated[
+        int | None, typer.Option(help="Common worlds to measure on.", show_default="4000", callback=whole_number(1))
+    ] = None,
     list_seed: Annotated[int, typer.Option(help="Seed of the common worlds.")] = DEFAULT.LIST_SEED,
     search_episodes: Annotated[
-        int | None, typer.Option(help="Worlds of the joint optimum, the first ones.", show_default="600")
+        int | None,
+        typer.Option(help="Worlds of the joint optimum, the first ones.", show_default="600", callback=whole_number(1)),
     ] = None,
     budget: Annotated[
-        int | None, typer.Option(help="Candidates per world and count of that search.", show_default="20000")
+        int | None,
+        typer.Option(
+            help="Candidates per world and count of that search.", show_default="20000", callback=whole_number(1)
+        ),
     ] = None,
     shield: Annotated[
         str | None,
@@ -464,7 +430,7 @@ def ablate_command(
     Says first what it will take. The same command goes on after an interruption: finished trainings are kept, begun
     ones go on. Writes ablation.html, ablation.md, ablation.csv, ablation.json and three figures.
     """
-    from ethbrake_marl.studies.ablation import plan_ablation, write_ablation
+    from ethbrake_marl.studies.ablation import plan_ablation
     from ethbrake_marl.studies.speed import this_machine
 
     plan = plan_ablation(
@@ -477,20 +443,16 @@ def ablate_command(
     out.note(plan.cost())
     if cost:
         return
-    measured = plan.run(jobs, out.show_progress)
-    if measured is None:
+    written = plan.run(jobs, str(this_machine()), out.show_progress)
+    if written is None:
         out.interrupted(f"interrupted; {KEPT_IN_FOLDER}")
-    found, (page, text, *figures) = write_ablation(plan, measured, str(this_machine()))
-    if out.as_json:
-        out.print_json(found)
-    else:
-        out.show(text.read_text("utf-8"), end="")
+    found, (page, text, *figures) = written
+    out.result(found, text.read_text("utf-8"), end="")
     drawn = f"; figures: {', '.join(map(str, figures))}" if figures else ""
     out.note(f"page: {page}; tables: {text}{drawn}")
 
 
-@command(
-    study_group, "generalise", "study generalise --runs runs/cooperation-4-all-cooperation-seed0 --vehicles 3,5,10",
+@study_group.add("generalise", "study generalise --runs runs/cooperation-4-all-cooperation-seed0 --vehicles 3,5,10",
     json=True,
 )  # fmt: skip
 def generalise_command(
@@ -500,39 +462,33 @@ def generalise_command(
     vehicles: Annotated[
         str, typer.Option(metavar="N,N,...", help="Lengths of the lines; vehicle i > 3 is like vehicle i - 2.")
     ] = "3,4,5,6,7,8,9,10",
-    episodes: Annotated[int, typer.Option(help="Worlds of each length.")] = 1000,
+    episodes: Annotated[int, typer.Option(help="Worlds of each length.", callback=whole_number(1))] = 1000,
     seed: int = DEFAULT.LIST_SEED,
     harm_count: HarmCount = "total",
     search_episodes: Annotated[int, typer.Option(help="Worlds of the joint optimum; 0: none.")] = 0,
-    budget: Annotated[int, typer.Option(help="Candidates per world of that search.")] = 20_000,
+    budget: Annotated[
+        int, typer.Option(help="Candidates per world of that search.", callback=whole_number(1))
+    ] = 20_000,
     settings: list[str] | None = None,
 ) -> None:
     """Let trained policies drive longer lines with the same weights.
 
     They drive every follower, and Vehicle 1 where it learns in the scenario.
     """
-    from ethbrake_marl.evaluation import load_runnable
-    from ethbrake_marl.learning import read_settings
     from ethbrake_marl.studies.ablation import LineQuestion
 
     lengths = tuple(int(each) if each.strip().isdecimal() else 0 for each in vehicles.split(","))
     if not all(2 <= each <= 64 for each in lengths):
         raise InvalidInput(f"vehicles {vehicles!r}: must be lengths from 2 to 64, for instance 3,4,5")
-    check_whole_number("episodes", episodes, 1)
     check_whole_number("search-episodes", search_episodes, 0, episodes)
-    check_whole_number("budget", budget, 1)
-    line = load_runnable(scenario, read_settings(settings).scenario)
+    line = evaluation.load_runnable(scenario, learning.read_settings(settings).scenario)
     question = LineQuestion(line, lengths, episodes, seed, harm_count, search_episodes, budget)
     agents = question.load_runs([each.strip() for each in runs.split(",")])
     found = question.drive(agents, out.show_progress)
-    if out.as_json:
-        out.print_json(found)
-    else:
-        out.show(question.markdown(found, len(agents)), end="")
+    out.result(found, question.markdown(found, len(agents)), end="")
 
 
-@command(
-    app, "reproduce", "reproduce random-table harm-distance --quick --output runs/paper",
+@app.add("reproduce", "reproduce random-table harm-distance --quick --output runs/paper",
     kept=KEPT_IN_FOLDER, json=True, force=True,
 )  # fmt: skip
 def reproduce_command(
@@ -543,7 +499,12 @@ def reproduce_command(
     quick: Annotated[bool, typer.Option("--quick", help="Train nothing: shipped policies (the default).")] = False,
     full: Annotated[bool, typer.Option("--full", help="Train learning curves and a policy stopped early.")] = False,
     output: FolderOption = Path("runs/reproduction"),
-    episodes: Annotated[int, typer.Option(help="The most worlds of any list; the paper has 10,000.")] = PAPER_EPISODES,
+    episodes: Annotated[
+        int,
+        typer.Option(
+            help="The most worlds of any list; the paper has 10,000.", callback=whole_number(2, PAPER_EPISODES)
+        ),
+    ] = PAPER_EPISODES,
     docs: Annotated[
         Path | None, typer.Option(metavar="FILE.md", help="Write the results as Markdown, too, figures beside it.")
     ] = None,
@@ -555,36 +516,33 @@ def reproduce_command(
     Writes one page (index.html), and for each item its figures, its data and its result. Says first what it will take.
     The same command goes on after an interruption.
     """
-    from ethbrake_marl.files.sheet import Column, Sheet
-    from ethbrake_marl.studies.reproduction.folder import PAGE, choose_items, reproduce, tell_cost
-    from ethbrake_marl.studies.reproduction.items import Settings
+    from ethbrake_marl.studies.reproduction import Reproduction
     from ethbrake_marl.studies.speed import this_machine
 
-    chosen = choose_items(names or ())
-    if listed:
-        rows = [(item.name, ", ".join(item.labels), item.title) for item in chosen]
-        columns = (Column("Item", "name"), Column("Label in the paper", "labels"), Column("What", "title"))
-        sheet = Sheet("", [replace(column, text=True) for column in columns], rows)
-        out.result(sheet.json(), sheet)
-        return
     if quick and full:
         raise InvalidInput("--quick and --full: give one of the two")
-    check_whole_number("episodes", episodes, 2, PAPER_EPISODES)
+    chosen = Reproduction.choose(names or ())
+    if listed:
+        rows = [(item.name, ", ".join(item.labels), item.title) for item in chosen]
+        known = {"Item": "name", "Label in the paper": "labels", "What": "title"}
+        sheet = Sheet("", [Column(heading, key, text=True) for heading, key in known.items()], rows)
+        out.result(sheet.json(), sheet)
+        return
     if full:
         need("torch")
-    settings = Settings("full" if full else "quick", output, episodes, out.show_progress, str(this_machine()), docs)
-    out.note(tell_cost(chosen, settings))
+    asked = Reproduction("full" if full else "quick", output, episodes, out.show_progress, str(this_machine()), docs)
+    out.note(asked.cost(chosen))
     if cost:
         return
-    results, finished = reproduce(chosen, settings, force=out.force)
+    results, finished = asked.make(chosen, force=out.force)
     verdicts = [(result.name, result.verdict.outcome, result.verdict.because) for result in results]
     out.result([result.in_words() for result in results], Sheet("", ("Item", "Verdict", "Because"), verdicts))
-    out.note(f"page: {output / PAGE}")
+    out.note(f"page: {output / 'index.html'}")
     if not finished:
         out.interrupted(f"interrupted: items are made of the trainings that were finished; {KEPT_IN_FOLDER}")
 
 
-benchmark_group = new_group(
+benchmark_group = app.group(
     "benchmark",
     "Score an agent on a frozen suite, or show entries as a table.",
     "benchmark v2 --agent ppo@shipped --output mine.json",
@@ -592,7 +550,7 @@ benchmark_group = new_group(
 )
 
 
-@command(benchmark_group, "drive", "benchmark v2 --agent ppo@shipped --output mine.json", json=True, force=True)
+@benchmark_group.add("drive", "benchmark v2 --agent ppo@shipped --output mine.json", json=True, force=True)
 def drive_command(
     out: Out,
     suite: Annotated[str, typer.Argument(metavar="SUITE", help="A suite that ships, such as v2.")],
@@ -606,11 +564,11 @@ def drive_command(
     The score of a list is the realised share of what is possible, 0 for full braking and 1 for the best known. A list
     that the agent cannot drive has none, and then there is no overall score.
     """
-    from ethbrake_marl.studies.benchmark import load_suite, make_entry
+    from ethbrake_marl.studies.benchmark import load_suite
 
     out.check(output, ".json", what="an entry")
     chosen = load_suite(suite)
-    entry = make_entry(chosen, agent, on_progress=out.show_progress)
+    entry = chosen.make_entry(agent, on_progress=out.show_progress)
     if output is not None:
         entry.write(output, force=out.force)
         out.note(f"entry: {output}")
@@ -625,7 +583,7 @@ def drive_command(
     out.result(entry.model_dump(mode="json"), entry.sheet(), told)
 
 
-@command(benchmark_group, "table", "benchmark table mine.json theirs.json --output table.md", json=True, force=True)
+@benchmark_group.add("table", "benchmark table mine.json theirs.json --output table.md", json=True, force=True)
 def table_command(
     out: Out,
     entries: Annotated[list[Path], typer.Argument(metavar="ENTRY.json...", help="Entries of one suite.")],

@@ -1534,10 +1534,11 @@ class SummaryTable(list[SummaryRow]):
             lines.append(row)
         return Sheet("", [Column("Agent,\nwhat it knows", text=True), *columns], lines, self._conditions(), gap=1)
 
-    def metrics_sheet(self) -> Sheet:
-        """The registered measures: one line per agent, the mean per world with its interval."""
+    def tables(self) -> list[Sheet]:
+        """``terminal``, and below it the registered measures: a line per agent, the mean per world, its interval."""
         lines = [(row.agent, _heading(column), value) for row in self for column, value in row.metrics.items()]
-        return Sheet("Measures", ["Agent", Column("Measure", text=True), Column("Mean or rate")], lines)
+        own = Sheet("Measures", ["Agent", Column("Measure", text=True), Column("Mean or rate")], lines)
+        return [self.terminal(), own] if lines else [self.terminal()]
 
     def markdown(self) -> str:
         """The table for a document, with the conditions of ours and of the paper's below it."""

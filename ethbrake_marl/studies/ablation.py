@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -35,7 +35,7 @@ from ethbrake_marl.files.yaml import Override
 from ethbrake_marl.learning import (
     WORDS,
     RunDirectory,
-    Training as Resolved,
+    Training,
     TrainingRecipe,
     load_recipe,
     read_object,
@@ -47,15 +47,7 @@ from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.policies import Policy, load_policy
 from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, Task
 from ethbrake_marl.shield import Shielded, drive_chunks, stack
-from ethbrake_marl.studies.jobs import JobFolder
-from ethbrake_marl.studies.trainings import (
-    TIMED_DRIVES,
-    TrainingJob,
-    finish_trainings,
-    time_training,
-    told_seconds,
-    world_seconds,
-)
+from ethbrake_marl.studies.jobs import TIMED_DRIVES, JobFolder, Timed, TrainingJob
 
 # Levels of cooperation that belong together: the same lines; what differs is who learns, knows and cares.
 
@@ -167,21 +159,6 @@ _NUMBERS = ("seeds", "steps_per_learner", "episodes", "list_seed", "search_episo
 
 
 @dataclass(frozen=True, slots=True)
-class Training:
-    """One training: a level, a recipe with its seed, and where it stands."""
-
-    level: Level
-    algorithm: str
-    recipe: TrainingRecipe
-    folder: Path
-    noted: tuple[str, ...] = ()  # by which scenario and recipe differ from their files, for ``config.json``
-
-    def job(self) -> TrainingJob:
-        """What brings it to its end."""
-        return TrainingJob(Resolved.of(self.recipe, self.level.scenario), self.folder, self.noted)
-
-
-@dataclass(frozen=True, slots=True)
 class Plan:
     """An ablation."""
 
@@ -194,7 +171,7 @@ class Plan:
     search_episodes: int  # of these, worlds in which the joint optimum is searched
     budget: int  # candidates per world and count of that search
     folder: Path
-    noted: tuple[str, ...] = ()  # see ``Training``
+    noted: tuple[str, ...] = ()  # by which scenarios and recipes differ from their files, for ``config.json``
     shield: str | None = None  # "step": everything drives a second time, behind it
 
     @property
@@ -202,23 +179,23 @@ class Plan:
         """Names of what is compared: recipes with the scheme."""
         return tuple(_algorithm(recipe) for recipe in self.recipes)
 
-    def trainings(self) -> Iterator[Training]:
-        """Seed by seed, so that a first result over all levels is there early."""
+    def trainings(self) -> Iterator[tuple[Level, str, TrainingJob]]:
+        """Level, algorithm and training; seed by seed, so that a first result over all levels is there early."""
         for seed in range(self.seeds):
             for recipe in self.recipes:
                 for level in self.levels:
                     if level.trained:
-                        yield self.training(level, recipe, seed)
+                        yield level, _algorithm(recipe), self.training(level, recipe, seed)
 
-    def training(self, level: Level, recipe: TrainingRecipe, seed: int) -> Training:
-        """The training of one seed."""
+    def training(self, level: Level, recipe: TrainingRecipe, seed: int) -> TrainingJob:
+        """The training of one seed; raises ``InvalidInput`` where recipe and level do not go together."""
         learners = len(level.scenario.learners)
         changes: dict[str, Any] = {"seed": seed, "total_steps": self.steps_per_learner * learners}
         if learners == 1:  # the same training whatever the scheme of several learners
             changes |= dict.fromkeys({"scheme", "turns"} & type(recipe).model_fields.keys())
         name = recipe.name if learners == 1 else _algorithm(recipe)
         folder = self.folder / "trainings" / f"{level.name}-{name}-seed{seed}"
-        return Training(level, _algorithm(recipe), recipe.replace(**changes), folder, self.noted)
+        return TrainingJob(Training.of(recipe.replace(**changes), level.scenario), folder, self.noted)
 
     def settings(self) -> dict[str, Any]:
         """Everything that shapes the results, as plain data."""
@@ -236,16 +213,17 @@ class Plan:
         """Where the parts of its search stand."""
         return self.folder / "optimum" / level.name
 
-    def run(self, jobs: int = 1, tell: OnProgress | None = None) -> list[Measured] | None:
-        """Bring every training to its end, ``jobs`` at a time, and measure; None when Ctrl-C stopped the trainings.
+    def run(self, jobs: int = 1, machine: str = "", tell: OnProgress | None = None) -> tuple[Json, list[Path]] | None:
+        """Bring every training to its end, ``jobs`` at a time, measure, and write all files, replacing earlier ones.
 
-        Raises what ``JobFolder.work``, ``finish_trainings`` and ``measure`` raise.
+        What ``ablation.json`` holds; page, Markdown and figures. None when Ctrl-C stopped the trainings. Raises what
+        ``JobFolder.work``, ``JobFolder.train`` and ``measure`` raise.
         """
         kept = self.job_folder()
         with kept.work():
-            if not finish_trainings([training.job() for training in self.trainings()], jobs, tell, kept=kept):
+            if not kept.train([training for _, _, training in self.trainings()], jobs, tell):
                 return None
-            return measure(self, jobs, tell)
+            return write_ablation(self, measure(self, jobs, tell), machine)
 
     def cost(self) -> str:
         """What is left to do, in seconds of one core, and a line for each damaged part of a search.
@@ -254,50 +232,43 @@ class Plan:
         counts as well, for seconds are of the clock. Raises as ``TrainingJob.steps_left``, and what ``load_team``
         raises for a finished training that cannot drive.
         """
-        left = [(training, training.job().steps_left()) for training in self.trainings()]
-        for training, steps in left:
+        left = [(level, algorithm, training, training.steps_left()) for level, algorithm, training in self.trainings()]
+        for level, _, training, steps in left:
             if not steps:
-                RunDirectory(training.folder).load_team(training.level.scenario)
+                RunDirectory(training.folder).load_team(level.scenario)
         lists = common_worlds(self.levels, self.episodes, self.list_seed)
         timed = np.arange(min(TIMED_DRIVES, self.episodes))
         samples = {level.name: sample.take(timed) for level, sample in zip(self.levels, lists, strict=True)}
-        training_s, worlds_s = 0.0, []
-        for kind in {training.folder.name.rpartition("-seed")[0]: training for training, _ in left}.values():
-            same = (kind.level.name, kind.algorithm)
-            steps = sum(number for training, number in left if (training.level.name, training.algorithm) == same)
-            if steps:
-                measured = time_training(kind.job().training, samples[kind.level.name])
-                worlds_s.append(measured.world_s)
-                training_s += measured.seconds(kind.job().training, steps)
+        kinds = {(level.name, algorithm): training for level, algorithm, training, _ in left}
+        decisions: Counter[tuple[str, str]] = Counter()
+        for level, algorithm, _, steps in left:
+            decisions[level.name, algorithm] += steps
+        short = {kind: kinds[kind].time(samples[kind[0]]) for kind, steps in decisions.items() if steps}
+        training_s = sum(each.seconds(decisions[kind]) for kind, each in short.items())
+        worlds_s = [each.world_s for each in short.values()]
         if not worlds_s:
-            first = left[0][0]
-            worlds_s.append(world_seconds(first.folder, first.level.scenario, samples[first.level.name]))
+            worlds_s.append(left[0][2].world_seconds(samples[left[0][0].name]))
         driving_s = sum(worlds_s) / len(worlds_s) * self.episodes * (len(left) + len(self.levels))
         for level in self.levels if self.shield else ():  # learners that brake fully are replaced most often
             if level.trained:
                 worlds, task = samples[level.name].worlds, Task(level.scenario, level.scenario.learners)
                 braking = make_agent("full_brake")
-                drive_chunks(braking, worlds.take([0]), task)  # compiles
-                started = time.monotonic()
-                drive_chunks(braking, worlds, task)
                 often = self.episodes * self.seeds * len(self.recipes) * len(HARM_COUNTS)
-                driving_s += (time.monotonic() - started) / worlds.n * often
+                driving_s += often * Timed.each_s(worlds, partial(drive_chunks, braking, task=task))
         search_s, damaged = 0.0, []
         for level, part, _ in questions(self, lists):
             number, broken = chunks_left(level.scenario, part, budget=self.budget, chunks=self.optimum_folder(level))
             damaged += broken
             if number:
                 worlds = part.worlds.take(np.arange(min(_TIMED_WORLDS, part.worlds.n)))
-                best_harm(level.scenario, worlds.take([0]), budget=100, threads=1)
-                started = time.monotonic()
-                best_harm(level.scenario, worlds, budget=self.budget, threads=1)
-                search_s += (time.monotonic() - started) / worlds.n * number
-        trainings, decisions = sum(1 for _, steps in left if steps), sum(steps for _, steps in left)
-        speed = f" at {decisions / training_s:,.0f}/s" if training_s > 0.0 else ""
+                searching = partial(best_harm, level.scenario, budget=self.budget, threads=1)
+                search_s += number * Timed.each_s(worlds, searching)
+        speed = f" at {decisions.total() / training_s:,.0f}/s" if training_s > 0.0 else ""
+        told, whole_s = Timed.in_words, training_s + driving_s + search_s
         line = (
-            f"to do: {trainings} trainings, {decisions:,} decisions{speed}: {told_seconds(training_s)};"
-            f" joint optima {told_seconds(search_s)}; driving the common worlds {told_seconds(driving_s)};"
-            f" together about {told_seconds(training_s + driving_s + search_s)} of one core"
+            f"to do: {sum(steps > 0 for *_, steps in left)} trainings, {decisions.total():,} decisions{speed}:"
+            f" {told(training_s)}; joint optima {told(search_s)}; driving the common worlds {told(driving_s)};"
+            f" together about {told(whole_s)} of one core"
         )
         return "\n".join([line, *(f"{file}: is damaged; its worlds are searched again" for file in damaged)])
 
@@ -341,9 +312,6 @@ def plan_ablation(
     called = [recipe.name for recipe in loaded]
     if len(set(called)) < len(called):
         raise InvalidInput(f"recipes {', '.join(called)}: give at least one, each with a name of its own")
-    for name in _NUMBERS:
-        if name != "list_seed" and not getattr(plan, name) >= 1:
-            raise InvalidInput(f"{name.replace('_', '-')} {getattr(plan, name)}: must be at least 1")
     if plan.shield not in (None, "step"):
         raise InvalidInput(f"shield {plan.shield!r}: must be step; episode and robust shield one vehicle")
     if plan.search_episodes > plan.episodes:
@@ -354,8 +322,7 @@ def plan_ablation(
         raise InvalidInput("levels: nobody learns in any of them; give at least one with a learner")
     JobFolder(plan.folder, "an ablation").check()
     common_worlds(plan.levels, 5, plan.list_seed)
-    for training in plan.trainings():
-        training.recipe.scheme_for(training.level.scenario)
+    list(plan.trainings())  # one that cannot be is refused
     return plan
 
 
@@ -482,9 +449,9 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
     """
     say = tell or (lambda progress: None)
     teams: dict[tuple[str, str], list[Team]] = {}
-    for training in plan.trainings():
-        team = RunDirectory(training.folder).load_team(training.level.scenario, training.folder.name)
-        teams.setdefault((training.level.name, training.algorithm), []).append(team)
+    for level, algorithm, training in plan.trainings():
+        team = RunDirectory(training.folder).load_team(level.scenario, training.folder.name)
+        teams.setdefault((level.name, algorithm), []).append(team)
     samples = common_worlds(plan.levels, plan.episodes, plan.list_seed)
     tables = search_all(plan, samples, jobs, say)
     answers = {}
@@ -580,19 +547,16 @@ def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
 
 
 def _drivers(plan: Plan) -> Iterator[tuple[str, Level, Driver, str]]:
-    """Name, level, who drives and how that is written on a command line, level by level."""
-    trained: dict[tuple[str, str], Training] = {}
-    for training in plan.trainings():
-        trained.setdefault((training.level.name, training.algorithm), training)
+    """Name, level, who drives (of several seeds the first) and how that is written on a command line."""
     for level in plan.levels:
         if not level.trained:  # who drives nobody changes nothing
             yield level.name, level, Team({}, level.name), "full_brake"
             continue
-        for algorithm in plan.algorithms:
-            training = trained[level.name, algorithm]
-            name = level.name if len(plan.algorithms) == 1 else f"{level.name}, {algorithm}"
+        for recipe in plan.recipes:
+            training = plan.training(level, recipe, 0)
+            name = level.name if len(plan.recipes) == 1 else f"{level.name}, {_algorithm(recipe)}"
             team = RunDirectory(training.folder).load_team(level.scenario, name)
-            yield name, level, team, f"{training.recipe.algorithm}@{training.folder}"
+            yield name, level, team, f"{recipe.algorithm}@{training.folder}"
 
 
 # The same weights on longer lines: policies of one line length drive every learner of lines of other lengths.
@@ -869,33 +833,35 @@ def levels_csv(measured: Sequence[Measured], searched: int) -> str:
 
     ``searched``: over the worlds in which the joint optimum was searched.
     """
-    rows = []
-    for one in measured:
-        for seed, collided in enumerate(one.reached.collided):
-            about: Json = {"level": one.level.name, "algorithm": one.algorithm, "seed": seed if one.algorithm else None}
-            about |= {"worlds": len(collided), "collision_rate": float(collided.mean())}
-            vehicles: Json = {}
-            behind: Json = {}
-            for harm_count in HARM_COUNTS:
-                name = RunDirectory.HARM[harm_count]
-                reached, braking = one.reached.world[harm_count][seed], one.full_brake.world[harm_count]
-                about |= {
-                    name: float(reached.mean()),
-                    f"full_brake_{name}": float(braking.mean()),
-                    f"searched_{name}": float(reached[:searched].mean()),
-                    f"searched_full_brake_{name}": float(braking[:, :searched].mean()),
-                    f"searched_best_known_{name}": None if one.best is None else float(one.best[harm_count].mean()),
-                }
-                each = one.reached.vehicle[harm_count][seed].mean(axis=0)
-                vehicles |= {f"{name}_{i + 1}": float(harm) for i, harm in enumerate(each)}
-                behind |= dict.fromkeys((f"shielded_{name}", f"bound_{name}", f"actions_replaced_{name}"))
-                if one.shielded is not None:
-                    found = one.shielded[harm_count]
-                    actions = found.decisions[seed].sum() * found.replaced.shape[2]
-                    shares = found.harm[seed].mean(), found.bound[seed].mean(), found.replaced[seed].sum() / actions
-                    behind |= dict(zip([*behind][-3:], map(float, shares), strict=True))
-            rows.append({**about, **vehicles, **behind})
-    return csv_text(rows)
+    return csv_text(_seed_row(one, seed, searched) for one in measured for seed in range(len(one.reached.collided)))
+
+
+def _seed_row(one: Measured, seed: int, searched: int) -> Json:
+    collided = one.reached.collided[seed]
+    about: Json = {"level": one.level.name, "algorithm": one.algorithm, "seed": seed if one.algorithm else None}
+    about |= {"worlds": len(collided), "collision_rate": float(collided.mean())}
+    vehicles: Json = {}
+    shield: Json = {}
+    for harm_count in HARM_COUNTS:
+        name = RunDirectory.HARM[harm_count]
+        reached, braking = one.reached.world[harm_count][seed], one.full_brake.world[harm_count]
+        about |= {
+            name: float(reached.mean()),
+            f"full_brake_{name}": float(braking.mean()),
+            f"searched_{name}": float(reached[:searched].mean()),
+            f"searched_full_brake_{name}": float(braking[:, :searched].mean()),
+            f"searched_best_known_{name}": None if one.best is None else float(one.best[harm_count].mean()),
+        }
+        each = one.reached.vehicle[harm_count][seed].mean(axis=0)
+        vehicles |= {f"{name}_{i + 1}": float(harm) for i, harm in enumerate(each)}
+        behind = None if one.shielded is None else one.shielded[harm_count]
+        actions = 1 if behind is None else behind.decisions[seed].sum() * behind.replaced.shape[2]
+        shield |= {
+            f"shielded_{name}": None if behind is None else float(behind.harm[seed].mean()),
+            f"bound_{name}": None if behind is None else float(behind.bound[seed].mean()),
+            f"actions_replaced_{name}": None if behind is None else float(behind.replaced[seed].sum() / actions),
+        }
+    return {**about, **vehicles, **shield}
 
 
 _ALGORITHM = "Algorithm"
@@ -914,9 +880,7 @@ def ablation_page(found: Json, conditions: str, figures: Mapping[str, Figure], e
         Part.drawing(figure, *FIGURES[name], alone=name == "ablation-who-pays.png", known=conditions)
         for name, figure in figures.items()
     ]
-    sections = [Section("Conditions", [conditions])]
-    sections += [Section("Figures", drawn)] if drawn else []
-    sections += episodes
+    sections = [Section("Conditions", [conditions]), *([Section("Figures", drawn)] if drawn else []), *episodes]
     for title, sheets in _blocks(found):
         parts = []
         for sheet in sheets:
@@ -940,54 +904,64 @@ def _blocks(found: Json) -> list[tuple[str, list[Sheet]]]:
     )
     both = [{**change, "change": f"{change['from']} to {change['to']}"} for change in steps + channels]
     vehicles = range(len(both[0]["first"]["vehicles"]) if both else 0)
+    worlds = levels[0]["first"]["searched"]["worlds"]
+    braking = _harm("All brake fully")
     about: _Columns = [("Level", "level"), (_ALGORITHM, "algorithm")]
     changed: _Columns = [("From", "from"), ("To", "to"), (_ALGORITHM, "algorithm")]
-    sheets: dict[str, list[Sheet]] = {"levels": [], "optima": [], "shielded": [], "pays": []}
     for count in HARM_COUNTS:
-        reached, braking = _harm(f"Reached, {_HARM[count]}"), _harm("All brake fully")
-        drive: _Columns = [(_share("Collisions"), "collision_rate"), (braking, f"{count} full_brake value")]
-        sheets["levels"].append(_sheet(levels, [*about, *drive, (reached, f"{count} harm")]))
-        known = [level for level in levels if level[count]["searched"]["best_known"] is not None]
-        optima: _Columns = [
-            (braking, f"{count} searched full_brake value"),
-            (reached, f"{count} searched harm"),
-            (_harm("Joint optimum"), f"{count} searched best_known value"),
-            (_share("Share of its reduction"), f"{count} searched realised_share"),
-        ]
-        sheets["optima"].append(_sheet(known, [*about, *optima]))
-        behind: _Columns = [
-            (_harm(f"Without, {_HARM[count]}"), f"{count} harm value"),
-            (_harm("With"), f"{count} shielded harm value"),
-            (_harm("Change", "+"), f"{count} shielded difference"),
-            (_harm("Bound"), f"{count} shielded bound value"),
-            (_share("Replaced"), f"{count} shielded replaced"),
-            (_share("Stepped in"), f"{count} shielded stepped_in"),
-            (_share("Somebody worse off"), f"{count} shielded worse_off"),
-            (_share("Above the baseline plan"), f"{count} shielded above_baseline"),
-            (Column("Above the bound"), f"{count} shielded above_bound"),
-        ]
-        sheets["shielded"].append(_sheet([level for level in levels if level[count]["shielded"]], [*about, *behind]))
         changed += [
             (_harm(f"Change of {_HARM[count]}", "+"), f"{count} difference"),
             (_share(f"Somebody worse off, {_HARM[count]}"), f"{count} worse_off"),
         ]
-        pays: _Columns = [(f"Change of {_HARM[count]}", "change"), (_ALGORITHM, "algorithm")]
-        pays += [(_harm(f"Vehicle {i + 1}", "+"), f"{count} vehicles {i}") for i in vehicles]
-        pays += [(_share(f"Vehicle {i + 1} worse off"), f"{count} worse_off_vehicles {i}") for i in vehicles]
-        sheets["pays"].append(_sheet(both, pays))
-    worlds = found["levels"][0]["first"]["searched"]["worlds"]
-    blocks = [
-        ("Levels", sheets["levels"]),
-        (f"How near the joint optimum, in the first {count_of(worlds, 'world')}", sheets["optima"]),
-    ]
-    if any(level["first"]["shielded"] for level in levels):
-        blocks.append(("Behind the step shield that guards the count of the table", sheets["shielded"]))
-    for title, changes in (("What each step is worth", steps), ("Price of lost messages", channels)):
-        if changes:
-            blocks.append((title, [_sheet(changes, changed)]))
-    if both:
-        blocks.append(("Who pays", sheets["pays"]))
-    return blocks
+    blocks = {
+        "Levels": [
+            _sheet(levels, [
+                *about,
+                (_share("Collisions"), "collision_rate"),
+                (braking, f"{count} full_brake value"),
+                (_harm(f"Reached, {_HARM[count]}"), f"{count} harm"),
+            ])
+            for count in HARM_COUNTS
+        ],
+        f"How near the joint optimum, in the first {count_of(worlds, 'world')}": [
+            _sheet([level for level in levels if level[count]["searched"]["best_known"] is not None], [
+                *about,
+                (braking, f"{count} searched full_brake value"),
+                (_harm(f"Reached, {_HARM[count]}"), f"{count} searched harm"),
+                (_harm("Joint optimum"), f"{count} searched best_known value"),
+                (_share("Share of its reduction"), f"{count} searched realised_share"),
+            ])
+            for count in HARM_COUNTS
+        ],
+        "Behind the step shield that guards the count of the table": [
+            _sheet([level for level in levels if level[count]["shielded"]], [
+                *about,
+                (_harm(f"Without, {_HARM[count]}"), f"{count} harm value"),
+                (_harm("With"), f"{count} shielded harm value"),
+                (_harm("Change", "+"), f"{count} shielded difference"),
+                (_harm("Bound"), f"{count} shielded bound value"),
+                (_share("Replaced"), f"{count} shielded replaced"),
+                (_share("Stepped in"), f"{count} shielded stepped_in"),
+                (_share("Somebody worse off"), f"{count} shielded worse_off"),
+                (_share("Above the baseline plan"), f"{count} shielded above_baseline"),
+                (Column("Above the bound"), f"{count} shielded above_bound"),
+            ])
+            for count in HARM_COUNTS
+        ],
+        "What each step is worth": [_sheet(steps, changed)],
+        "Price of lost messages": [_sheet(channels, changed)],
+        "Who pays": [
+            _sheet(both, [
+                (f"Change of {_HARM[count]}", "change"),
+                (_ALGORITHM, "algorithm"),
+                *((_harm(f"Vehicle {i + 1}", "+"), f"{count} vehicles {i}") for i in vehicles),
+                *((_share(f"Vehicle {i + 1} worse off"), f"{count} worse_off_vehicles {i}") for i in vehicles),
+            ])
+            for count in HARM_COUNTS
+        ],
+    }  # fmt: skip
+    always = [*blocks][:2]
+    return [(title, sheets) for title, sheets in blocks.items() if title in always or any(s.rows for s in sheets)]
 
 
 _Columns = list[tuple[Column | str, str]]

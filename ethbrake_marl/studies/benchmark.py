@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
+from pydantic import Field, JsonValue
 
 from ethbrake_marl.agents import Driver, Team
 from ethbrake_marl.defaults import HarmCount
-from ethbrake_marl.errors import EthBrakeError, InvalidInput, OnProgress, PhysicsError, Progress, one_line, unknown_name
+from ethbrake_marl.errors import InvalidInput, OnProgress, PhysicsError, Progress, one_line, unknown_name
 from ethbrake_marl.evaluation import (
     PROGRESS_EVERY,
     check_agents,
@@ -36,8 +36,8 @@ from ethbrake_marl.evaluation import (
     write_output,
 )
 from ethbrake_marl.files.sheet import DASH, Column, Estimate, Sheet
-from ethbrake_marl.files.store import parse_strict_json, read_plain
-from ethbrake_marl.files.yaml import first_mistake
+from ethbrake_marl.files.store import read_plain
+from ethbrake_marl.files.yaml import FileModel, read_json_model
 from ethbrake_marl.limits import BestHarmTable, world_identity
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.policies import Policy
@@ -57,16 +57,10 @@ Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,63}$")]
 Mean = Annotated[float, Field(ge=0.0)]
 
 
-class Strict(BaseModel):
-    """What is read from a file: nothing is unknown, converted or infinite."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+Content = TypeVar("Content", bound=FileModel)
 
 
-Content = TypeVar("Content", bound=Strict)
-
-
-class ListContent(Strict):
+class ListContent(FileModel):
     """One list, as the suite's file says it; harms are means over its worlds under ``harm_count`` (m2/s2)."""
 
     name: Name
@@ -81,7 +75,7 @@ class ListContent(Strict):
     best_known_harm: Mean  # of the table: the score 1
 
 
-class SuiteContent(Strict):
+class SuiteContent(FileModel):
     """The whole of a suite's file."""
 
     format: Literal["ethbrake-suite"]
@@ -142,6 +136,60 @@ class Suite:
         """The seeds of its lists, which no training and no choice of a policy may use."""
         return frozenset(each.content.seed for each in self.lists)
 
+    def make_entry(self, spec: str, *, on_progress: OnProgress | None = None) -> Entry:
+        """Let an agent drive every list.
+
+        Args:
+            spec: the agent, as ``make_agent`` takes it; it minimises each list's own count of harm.
+            on_progress: is told how many worlds of which list have been driven.
+
+        Raises ``InvalidInput`` for an agent that can drive no list (the first one's reason), a policy that was trained
+        or chosen with a seed of the suite, and worlds or physics that are not those of the suite.
+
+        """
+        lists: dict[str, ListResult | NotDriven] = {}
+        for each in self.lists:
+            sample = each.sample()  # an error here is the suite's, not the agent's
+            count = each.content.harm_count
+            try:
+                lineup = make_lineup([spec], each.scenario, harm_count=count)
+                if len(lineup) != 1:
+                    raise InvalidInput(f"agent {spec!r}: stands for {len(lineup)} agents; an entry is of one")
+                check_agents(lineup, sample.worlds, each.scenario)
+            except (InvalidInput, PhysicsError) as error:
+                lists[each.name] = NotDriven(not_driven=one_line(str(error))[:1000])
+                continue
+            (driver,) = lineup.values()
+            seeds = policy_seeds(driver, each)
+            for vehicle, purposes in seeds.items():
+                for purpose, seed in purposes.items():
+                    if seed in self.seeds:
+                        raise InvalidInput(
+                            f"agent {spec!r}: its policy of {vehicle} was made with {purpose} seed {seed}, which is"
+                            f" suite {self.name}'s own: the suite would not measure it, but what it was made with"
+                        )
+            lists[each.name] = _drive_list(each, sample, lineup, seeds, on_progress)
+        driven = [each for each in lists.values() if isinstance(each, ListResult)]
+        if not driven:
+            reasons = [each.not_driven for each in lists.values() if isinstance(each, NotDriven)]
+            raise InvalidInput(f"suite {self.name}: {spec!r} can drive no list of it: {reasons[0]}")
+        shares = mean_of_lists([each.realised_share for each in driven])
+        entry = Entry(
+            format="ethbrake-benchmark-entry",
+            format_version=1,
+            suite=self.name,
+            suite_sha256=self.sha256,
+            agent=spec,
+            command=shlex.join(["ethbrake", "benchmark", self.name, "--agent", spec, "--output", "ENTRY.json"]),
+            versions=result_versions(),
+            lists=dict(lists),
+            lists_driven=len(driven),
+            mean_of_driven=shares,
+            overall=shares if len(driven) == len(self.lists) else None,
+            entry_sha256="0" * 64,
+        )
+        return entry.model_copy(update={"entry_sha256": entry.content_sha256()})
+
 
 def suite_names(folder: Path | None = None) -> list[str]:
     """The suites of a folder; of the package, if none is given."""
@@ -174,16 +222,13 @@ def load_suite(name: str, folder: Path | None = None) -> Suite:
 
 def read_content(file: Path, kind: type[Content]) -> Content:
     """A JSON file as ``kind``; raises ``InvalidInput`` naming the file and the first mistake."""
+    data = read_plain(file, _LIMIT_BYTES)
     try:
-        data = read_plain(file, _LIMIT_BYTES)
-        parse_strict_json(data)  # no key twice, no NaN
-        return kind.model_validate_json(data)
-    except ValidationError as error:
-        raise InvalidInput(f"{file}: {first_mistake(error)}") from None
-    except ValueError as error:
-        if isinstance(error, EthBrakeError):
-            raise
+        return read_json_model(data, kind)[1]
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InvalidInput(f"{file}: is no JSON, or was not written to its end: {error}") from None
+    except ValueError as error:
+        raise InvalidInput(f"{file}: {error}") from None
 
 
 def plain_sha256(content: Any) -> str:
@@ -228,9 +273,9 @@ def mean_of_lists(shares: Sequence[Estimate]) -> Estimate:
     if not shares:
         raise InvalidInput("mean over lists: there is none")
     value = math.fsum(share.value for share in shares) / len(shares)
-    halves = [0.5 * (share.interval[1] - share.interval[0]) for share in shares if share.interval is not None]
-    if len(halves) < len(shares):
+    if any(share.interval is None for share in shares):
         return Estimate(value, None)
+    halves = [0.5 * (share.ends[1] - share.ends[0]) for share in shares]
     half = math.sqrt(math.fsum(half * half for half in halves)) / len(shares)
     return Estimate(value, (value - half, value + half))
 
@@ -240,7 +285,7 @@ _SAME_HARM = 1e-6  # of means (m2/s2), relative or absolute: what another machin
 Count = Annotated[int, Field(ge=0)]
 
 
-class ListResult(Strict):
+class ListResult(FileModel):
     """What an agent did on one list; harms are means per world (m2/s2)."""
 
     worlds: Count
@@ -258,13 +303,13 @@ class ListResult(Strict):
     outcome_sha256: Sha256  # of the harm of every pair in every world
 
 
-class NotDriven(Strict):
+class NotDriven(FileModel):
     """A list that the agent cannot drive, and why."""
 
     not_driven: Annotated[str, Field(min_length=1, max_length=1000)]
 
 
-class Entry(Strict):
+class Entry(FileModel):
     """One agent on a suite. ``overall`` is the mean share over all lists, null unless all of them were driven."""
 
     format: Literal["ethbrake-benchmark-entry"]
@@ -319,62 +364,6 @@ class Entry(Strict):
                 rows.append([name, each.realised_share, *harms, each.collision_rate, each.horizon_ends / each.worlds])
         reasons = [f"{name}: {each.not_driven}" for name, each in self.lists.items() if isinstance(each, NotDriven)]
         return Sheet("", columns, rows, "\n".join(reasons), gap=2)
-
-
-def make_entry(suite: Suite, spec: str, *, on_progress: OnProgress | None = None) -> Entry:
-    """Let an agent drive every list of the suite.
-
-    Args:
-        suite: what is driven.
-        spec: the agent, as ``make_agent`` takes it; it minimises each list's own count of harm.
-        on_progress: is told how many worlds of which list have been driven.
-
-    Raises ``InvalidInput`` for an agent that can drive no list (the first one's reason), a policy that was trained or
-    chosen with a seed of the suite, and worlds or physics that are not those of the suite.
-
-    """
-    lists: dict[str, ListResult | NotDriven] = {}
-    for each in suite.lists:
-        sample = each.sample()  # an error here is the suite's, not the agent's
-        count = each.content.harm_count
-        try:
-            lineup = make_lineup([spec], each.scenario, harm_count=count)
-            if len(lineup) != 1:
-                raise InvalidInput(f"agent {spec!r}: stands for {len(lineup)} agents; an entry is of one")
-            check_agents(lineup, sample.worlds, each.scenario)
-        except (InvalidInput, PhysicsError) as error:
-            lists[each.name] = NotDriven(not_driven=one_line(str(error))[:1000])
-            continue
-        (driver,) = lineup.values()
-        seeds = policy_seeds(driver, each)
-        for vehicle, purposes in seeds.items():
-            for purpose, seed in purposes.items():
-                if seed in suite.seeds:
-                    raise InvalidInput(
-                        f"agent {spec!r}: its policy of {vehicle} was made with {purpose} seed {seed}, which is suite"
-                        f" {suite.name}'s own: the suite would not measure it, but what it was made with"
-                    )
-        lists[each.name] = _drive_list(each, sample, lineup, seeds, on_progress)
-    driven = [each for each in lists.values() if isinstance(each, ListResult)]
-    if not driven:
-        reasons = [each.not_driven for each in lists.values() if isinstance(each, NotDriven)]
-        raise InvalidInput(f"suite {suite.name}: {spec!r} can drive no list of it: {reasons[0]}")
-    shares = mean_of_lists([each.realised_share for each in driven])
-    entry = Entry(
-        format="ethbrake-benchmark-entry",
-        format_version=1,
-        suite=suite.name,
-        suite_sha256=suite.sha256,
-        agent=spec,
-        command=shlex.join(["ethbrake", "benchmark", suite.name, "--agent", spec, "--output", "ENTRY.json"]),
-        versions=result_versions(),
-        lists=dict(lists),
-        lists_driven=len(driven),
-        mean_of_driven=shares,
-        overall=shares if len(driven) == len(suite.lists) else None,
-        entry_sha256="0" * 64,
-    )
-    return entry.model_copy(update={"entry_sha256": entry.content_sha256()})
 
 
 def read_entry(path: Path) -> Entry:
@@ -454,13 +443,11 @@ def _drive_list(
 
 # Entries of one suite, sorted by their score: as a table, as Markdown and as a page.
 
-_SCORE = (
+_NOTES = (
     "Realised share of what is possible, in %: (full braking - agent) / (full braking - best known) of the mean harm"
-    " of a list; 0 is full braking, 100 the best known. 95 % intervals in brackets."
-)
-_RANK = (
+    " of a list; 0 is full braking, 100 the best known. 95 % intervals in brackets.",
     "Only who drives every list is ranked, by the mean over all lists. A mean over some of them is shown, and is no"
-    " score: those lists may be the easy ones."
+    " score: those lists may be the easy ones.",
 )
 
 
@@ -474,7 +461,7 @@ class Leaderboard:
     @property
     def notes(self) -> tuple[str, ...]:
         """What the figures are, who is ranked, and the suite."""
-        return _SCORE, _RANK, f"Suite {self.suite.name}, SHA-256 {self.suite.sha256}"
+        return *_NOTES, f"Suite {self.suite.name}, SHA-256 {self.suite.sha256}"
 
     def sheet(self) -> Sheet:
         """One line per entry, for a terminal; lists that were not driven show a dash."""

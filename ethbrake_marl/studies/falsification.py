@@ -67,6 +67,50 @@ class Measure:
         score[rows] = np.abs(more) if self.name == "difference" else more
         return Measured(score, harm, reference)
 
+    def falsify(
+        self, budget: int, seed: int, *, most: int = 20, adaptive: bool = True, on_round: Watcher | None = None
+    ) -> Falsified:
+        """Try ``budget`` worlds of the scenario, and keep the worst, at most ``most``, that are far apart.
+
+        Worlds without harm, regret or difference are not kept: the result may hold none.
+
+        Raises ``InvalidInput`` where the scenario draws nothing, or has none of the worlds that were tried, and what
+        ``Scenario.ranges`` raises.
+        """
+        ranges = self.scenario.ranges()
+
+        def score(points: Floats) -> Floats:
+            sample, accepted = ranges.sample(points)
+            found, rows = np.full(len(points), -np.inf), np.flatnonzero(accepted)
+            if len(rows):
+                found[rows] = self(sample.take(rows)).score
+            return found
+
+        tried = search(score, len(ranges.names), budget, seed, adaptive=adaptive, on_round=on_round)
+        worst = far_apart(tried, most)
+        if self.name != "bound":
+            worst = worst[tried.scores[worst] > 0.0]
+        if not np.isfinite(tried.scores).any():
+            raise InvalidInput(
+                f"scenario {self.scenario.name!r}: none of {budget:,} worlds tried counts: all have an impact before"
+                " anybody may act, or the physics fails; give early_impacts: keep, or a larger --budget"
+            )
+        above = np.flatnonzero(tried.scores > 0.0)
+        sample, kept = ranges.sample(tried.points[worst])[0], []
+        if len(worst):
+            found = self(sample)
+            kept = [
+                NamedWorld(
+                    name=f"{self.name}-{k + 1}",
+                    score=float(found.score[k]),
+                    harm=float(found.harm[k]),
+                    reference=None if found.reference is None else float(found.reference[k]),
+                    state=state,
+                )
+                for k, state in enumerate(states_of(sample.worlds, self.scenario))
+            ]
+        return Falsified(sample, kept, tried.scores, int(above[0]) + 1 if len(above) else None)
+
     @classmethod
     def of(
         cls, name: MeasureName, agent: str, against: str | None, scenario: Scenario, harm_count: HarmCount
@@ -181,7 +225,7 @@ class Falsified:
     """The worst worlds that a search found, worst first, and what all that it tried were like."""
 
     sample: Sample  # the worst worlds
-    measured: Measured  # in them
+    worlds: list[NamedWorld]  # the same by name, and what was measured in them
     scores: Floats  # of every world tried, in their order; minus infinity: the scenario does not have it
     first_above: int | None  # how many worlds were tried until one had a score above zero
 
@@ -190,53 +234,3 @@ class Falsified:
         """Share of the tried worlds, of those that count, with a score above zero."""
         good = self.scores[np.isfinite(self.scores)]
         return float((good > 0.0).mean()) if len(good) else 0.0
-
-    def named_worlds(self, measure: Measure) -> list[NamedWorld]:
-        """The kept worlds, worst first."""
-        if not self.sample.worlds.n:
-            return []
-        states, measured = states_of(self.sample.worlds, measure.scenario), self.measured
-        return [
-            NamedWorld(
-                name=f"{measure.name}-{k + 1}",
-                score=float(measured.score[k]),
-                harm=float(measured.harm[k]),
-                reference=None if measured.reference is None else float(measured.reference[k]),
-                state=state,
-            )
-            for k, state in enumerate(states)
-        ]
-
-
-def falsify(
-    measure: Measure, budget: int, seed: int, *, most: int = 20, adaptive: bool = True, on_round: Watcher | None = None
-) -> Falsified:
-    """Try ``budget`` worlds of the measure's scenario, and keep the worst, at most ``most``, that are far apart.
-
-    Worlds without harm, regret or difference are not kept: the result may hold none.
-
-    Raises ``InvalidInput`` where the scenario draws nothing, or has none of the worlds that were tried, and what
-    ``Scenario.ranges`` raises.
-    """
-    ranges = measure.scenario.ranges()
-
-    def score(points: Floats) -> Floats:
-        sample, accepted = ranges.sample(points)
-        found, rows = np.full(len(points), -np.inf), np.flatnonzero(accepted)
-        if len(rows):
-            found[rows] = measure(sample.take(rows)).score
-        return found
-
-    tried = search(score, len(ranges.names), budget, seed, adaptive=adaptive, on_round=on_round)
-    worst = far_apart(tried, most)
-    if measure.name != "bound":
-        worst = worst[tried.scores[worst] > 0.0]
-    if not np.isfinite(tried.scores).any():
-        raise InvalidInput(
-            f"scenario {measure.scenario.name!r}: none of {budget:,} worlds tried counts: all have an impact before"
-            " anybody may act, or the physics fails; give early_impacts: keep, or a larger --budget"
-        )
-    above = np.flatnonzero(tried.scores > 0.0)
-    sample, _ = ranges.sample(tried.points[worst])
-    measured = measure(sample) if len(worst) else Measured(np.empty(0), np.empty(0), None)
-    return Falsified(sample, measured, tried.scores, int(above[0]) + 1 if len(above) else None)

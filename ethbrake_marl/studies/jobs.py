@@ -1,4 +1,7 @@
-"""Jobs: a folder in which each is done once, and where they run: processes of one thread each, here or on Ray."""
+"""Jobs: a folder in which each is done once, and where they run: processes of one thread each, here or on Ray.
+
+Trainings and the shards of an evaluation are jobs of this kind.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import hashlib
 import json
 import os
 import pickle
+import tempfile
 import threading
 import time
 from collections import deque
@@ -13,13 +17,14 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import reduce
+from functools import partial, reduce
+from itertools import count
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from operator import add
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ethbrake_marl.errors import (
     AlreadyExists,
@@ -32,7 +37,7 @@ from ethbrake_marl.errors import (
     naming_extras,
     one_line,
 )
-from ethbrake_marl.evaluation import BLOCK, Asked, Tally
+from ethbrake_marl.evaluation import BLOCK, Asked, Tally, evaluate
 from ethbrake_marl.files.plugins import Plugin, load_the_same, loaded_plugins
 from ethbrake_marl.files.store import (
     check_writable,
@@ -42,7 +47,12 @@ from ethbrake_marl.files.store import (
     remove_unfinished,
     write_file,
 )
-from ethbrake_marl.learning import read_object, stop_on_signal
+from ethbrake_marl.learning import RunDirectory, Training, read_object, stop_on_signal
+from ethbrake_marl.physics import Worlds
+from ethbrake_marl.scenario import Sample
+
+if TYPE_CHECKING:
+    from ethbrake_marl.learning import StopAt
 
 # One job as every place runs it: a function and what it is given, as bytes, and what came of it.
 
@@ -330,6 +340,21 @@ class JobFolder:
                     damaged += 1
         return found, damaged
 
+    def train(self, trainings: Sequence[TrainingJob], processes: int = 1, tell: OnProgress | None = None) -> bool:
+        """Bring every training to its end, ``processes`` at a time; False when Ctrl-C stopped it.
+
+        The policies do not depend on ``processes`` or on interruptions. Raises, before any is begun, what
+        ``steps_left`` raises, and what the first training raises that fails.
+        """
+        say, done = tell or (lambda progress: None), count(1)
+        left = [training for training in trainings if training.steps_left()]
+        if processes == 1 or len(left) < 2:
+            jobs = [Job(one.folder.name, one.finish, (say,)) for one in left]
+            return self.run(jobs, 1, lambda attempt: None)
+        say(Progress("trainings", 0, len(left)))
+        jobs = [Job(one.folder.name, one.finish, ()) for one in left]
+        return self.run(jobs, processes, each(lambda job, found: say(Progress("trainings", next(done), len(left)))))
+
     def log(self, name: str) -> Path:
         """Where a job may print; absolute, for a worker may stand elsewhere."""
         (self.path / "logs").mkdir(exist_ok=True)
@@ -355,6 +380,122 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any], inside: str 
             plain = not isinstance(old, list | dict) and not isinstance(new, list | dict)
             found.append(f"{told} {old!s:.40}, here {new!s:.40}" if plain else told)
     return found
+
+
+# Trainings as jobs: one that is finished is kept, one that is begun goes on; what it costs.
+
+_UPDATES = 4  # of the training that is timed; the first one does not count
+TIMED_DRIVES = 50  # worlds that the timed policy drives
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingJob:
+    """A training and its folder."""
+
+    training: Training
+    folder: Path
+    noted: tuple[str, ...] = ()  # by which scenario and recipe differ from their files, for ``config.json``
+
+    @property
+    def per_update(self) -> int:
+        """Decisions of all learners between two updates."""
+        return self.training.recipe.n_envs * len(self.training.scenario.learners) * self.training.recipe.rounds
+
+    def steps_left(self) -> int:
+        """Decisions that are still to do; raises ``InvalidInput`` for a folder that holds another training."""
+        run, total = RunDirectory(self.folder), self.training.recipe.total_steps
+        if not run.status.exists():
+            if self.folder.exists():
+                raise InvalidInput(f"{self.folder}: is no training; move it away, or give another --output")
+            return total
+        try:
+            status = read_object(run.status)
+        except InvalidInput as error:
+            raise InvalidInput(f"{error}; delete its folder to train anew") from None
+        run.check_same(self.training)
+        if status.get("status") == "finished":
+            return 0
+        steps = status.get("steps", 0)
+        return max(total - (steps if isinstance(steps, int) else 0), 1)
+
+    def finish(self, tell: OnProgress | None = None, *, stop_at: StopAt | None = None) -> bool | None:
+        """Bring it to its end; None where it was stopped before, by ``stop_at`` too, as ``train`` has it.
+
+        Raises what ``train`` and ``resume`` raise.
+        """
+        from ethbrake_marl.learning import resume, train  # torch takes seconds to load
+
+        def say(progress: Progress) -> None:
+            if tell is not None:
+                tell(replace(progress, name=self.folder.name))
+
+        run, asked = RunDirectory(self.folder), self.training
+        if run.is_finished:
+            return True
+        if run.status.is_file():
+            ended = resume(self.folder, stop_at=stop_at, on_progress=say)
+        else:
+            self.folder.parent.mkdir(parents=True, exist_ok=True)
+            ended = train(
+                asked.recipe, asked.scenario, self.folder, settings=self.noted, stop_at=stop_at, on_progress=say
+            )
+        return True if ended.status == "finished" else None
+
+    def time(self, sample: Sample | None = None) -> Timed:
+        """Time a few updates, and the policy on the worlds of ``sample``; None: some of the recipe's list."""
+        from ethbrake_marl.learning import train
+
+        told: list[Progress] = []
+        recipe, scenario = self.training.recipe, self.training.scenario
+        short = recipe.replace(evaluation={**recipe.evaluation.model_dump(), "worlds": 10, "every_updates": 1000})
+        with tempfile.TemporaryDirectory(prefix="ethbrake-") as folder:
+            path = Path(folder) / "timed"
+            train(short, scenario, path, steps=1)  # compiles and warms up
+            train(short, scenario, path, steps=_UPDATES * self.per_update, force=True, on_progress=told.append)
+            updates = [one for one in told if one.updates >= 1]
+            last = updates[-1]
+            first = updates[0] if updates[0].done < last.done else Progress("begun", 0, 0)
+            decision_s = (last.wall_s - first.wall_s) / (last.done - first.done)
+            worlds = scenario.sample(TIMED_DRIVES, recipe.evaluation.seed) if sample is None else sample
+            return Timed(self, decision_s, replace(self, folder=path).world_seconds(worlds))
+
+    def world_seconds(self, sample: Sample) -> float:
+        """Seconds per world that its team drives."""
+        team = {"team": RunDirectory(self.folder).load_team(self.training.scenario)}
+        drive = partial(evaluate, agents=team, scenario=self.training.scenario, aftermath=False)
+        return Timed.each_s(sample.worlds, drive)
+
+
+class Timed(NamedTuple):
+    """Seconds of one core, by the clock, that a training takes."""
+
+    job: TrainingJob
+    decision_s: float  # of a learner, its share of the learning included
+    world_s: float  # that the policy drives
+
+    def seconds(self, steps: int) -> float:
+        """Of ``steps`` decisions, of as many trainings as they make, with what is measured on the way.
+
+        A training measures its policies on the fixed list at first, now and then, and at the end.
+        """
+        recipe = self.job.training.recipe
+        times = recipe.total_steps // self.job.per_update // recipe.evaluation.every_updates + 2
+        return steps * self.decision_s + steps / recipe.total_steps * times * recipe.evaluation.worlds * self.world_s
+
+    @staticmethod
+    def each_s(worlds: Worlds, work: Callable[[Worlds], object]) -> float:
+        """Seconds per world of some work, which one world has done before: it compiles."""
+        work(worlds.take([0]))
+        started = time.monotonic()
+        work(worlds)
+        return (time.monotonic() - started) / worlds.n
+
+    @staticmethod
+    def in_words(seconds: float) -> str:
+        """Seconds, minutes or hours."""
+        if seconds < 90.0:
+            return f"{seconds:.0f} s"
+        return f"{seconds / 60.0:.0f} min" if seconds < 36_000.0 else f"{seconds / 3600.0:.0f} h"
 
 
 # Processes of this machine.

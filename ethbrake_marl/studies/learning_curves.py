@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import InvalidInput, OnProgress, count_of
 from ethbrake_marl.evaluation import interquartile_mean, result_identity, worlds_sha256, write_output
 from ethbrake_marl.figures import SeedCurve, seed_curves, write_picture
@@ -15,8 +16,7 @@ from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.learning import RunDirectory, Training, TrainingRecipe, load_recipe
 from ethbrake_marl.policies import load_policy
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.studies.jobs import JobFolder
-from ethbrake_marl.studies.trainings import TrainingJob, finish_trainings
+from ethbrake_marl.studies.jobs import JobFolder, TrainingJob
 
 _RETURNED = "return"  # what it is called here
 _LABELS = {
@@ -26,114 +26,103 @@ _LABELS = {
 }
 
 
-class Trainings(NamedTuple):
-    """The seeds 0 to ``seeds - 1`` of one recipe."""
+class LearningCurves(NamedTuple):
+    """Trainings of several recipes on one scenario: ``folder/RECIPE-seedK`` for the seeds 0, 1, ... of each."""
 
-    recipe: TrainingRecipe
-    seeds: int
+    scenario: Scenario
+    plan: Sequence[tuple[TrainingRecipe, int]]  # recipes, each with its number of seeds
+    folder: Path
 
+    @staticmethod
+    def parse(text: str) -> list[tuple[TrainingRecipe, int]]:
+        """Read ``ppo:5,sac:3``: recipes (names, or paths) with their numbers of seeds; raises ``InvalidInput``."""
+        found = []
+        for part in text.split(","):
+            match = re.fullmatch(r"(.+):([1-9][0-9]{0,3})", part)
+            if match is None:
+                raise InvalidInput(f"recipes {text!r}: {part!r} must be RECIPE:SEEDS, for instance ppo:5,sac:3")
+            found.append((load_recipe(match[1]), int(match[2])))
+        if len({recipe.name for recipe, _ in found}) < len(found):
+            raise InvalidInput(f"recipes {text!r}: two recipes have the same name")
+        return found
 
-def parse_trainings(text: str) -> list[Trainings]:
-    """Read ``ppo:5,sac:3``: recipes (names, or paths) with their numbers of seeds; raises ``InvalidInput``."""
-    found = []
-    for part in text.split(","):
-        match = re.fullmatch(r"(.+):([1-9][0-9]{0,3})", part)
-        if match is None:
-            raise InvalidInput(f"recipes {text!r}: {part!r} must be RECIPE:SEEDS, for instance ppo:5,sac:3")
-        found.append(Trainings(load_recipe(match[1]), int(match[2])))
-    names = [trainings.recipe.name for trainings in found]
-    if len(set(names)) < len(names):
-        raise InvalidInput(f"recipes {text!r}: two recipes have the same name")
-    return found
+    def train(
+        self, *, steps: int | None = None, settings: Sequence[str] = (), jobs: int = 1, tell: OnProgress | None = None
+    ) -> bool:
+        """Train every seed of every recipe, ``jobs`` at a time: finished ones are kept, begun ones go on.
 
+        Gives False when Ctrl-C stopped it. Raises ``InvalidInput`` for a folder that holds another training than this
+        one would be (``learning.training``), before any is begun, besides what ``train`` raises.
+        """
+        trainings = [
+            TrainingJob(
+                Training.of(
+                    recipe, self.scenario, seed=seed, total_steps=recipe.total_steps if steps is None else steps
+                ),
+                self._run(recipe, seed),
+                tuple(settings),
+            )
+            for recipe, seeds in self.plan
+            for seed in range(seeds)
+        ]
+        kept = JobFolder(self.folder, "learning curves")
+        with kept.work():
+            return kept.train(trainings, jobs, tell)
 
-def train_all(
-    scenario: Scenario,
-    plan: Sequence[Trainings],
-    folder: Path,
-    *,
-    steps: int | None = None,
-    settings: Sequence[str] = (),
-    jobs: int = 1,
-    tell: OnProgress | None = None,
-) -> bool:
-    """Train every seed of every recipe into ``folder/RECIPE-seedK``: finished ones are kept, begun ones go on.
+    def write(self) -> dict[str, Any]:
+        """Draw the finished trainings, write figure, table and summary, and give the summary.
 
-    ``jobs`` of them at a time. Gives False when Ctrl-C stopped it. Raises ``InvalidInput`` for a folder that holds
-    another training than this one would be (``learning.training``), before any is begun, besides what ``train`` raises.
-    """
-    trainings = [
-        TrainingJob(
-            Training.of(
-                each.recipe, scenario, seed=seed, total_steps=each.recipe.total_steps if steps is None else steps
-            ),
-            folder / f"{each.recipe.name}-seed{seed}",
-            tuple(settings),
-        )
-        for each in plan
-        for seed in range(each.seeds)
-    ]
-    kept = JobFolder(folder, "learning curves")
-    with kept.work():
-        return finish_trainings(trainings, jobs, tell, kept=kept)
+        For each recipe: interquartile mean over seeds, with its stratified bootstrap interval, of the harm of the
+        policy that each training kept, and of the last one; hashes of the recipe's fixed list, and of the policy that
+        each of its seeds kept. Raises ``InvalidInput`` when they have no evaluation in common.
+        """
+        scenario, curves, lists = self.scenario, self._curves(), set()
+        about = result_identity("learning-curves", scenario, None)
+        summary: dict[str, Any] = {**about, "scenario": scenario.name, "recipes": {}}
+        for recipe, seeds in self.plan:
+            values = curves[RunDirectory.HARM[recipe.reward.harm_count]][recipe.name].values
+            fixed = scenario.sample(recipe.evaluation.worlds, recipe.evaluation.seed)
+            lists.add((recipe.evaluation.worlds, recipe.evaluation.seed))
+            policies = [load_policy(self._run(recipe, seed)) for seed in range(seeds)]
+            reached = {}
+            for name, harms in {"kept": values.min(axis=1), "last": values[:, -1]}.items():
+                mean, each = interquartile_mean([harms]).to_json(), harms.tolist()
+                reached[name] = {"interquartile_mean": mean["value"], "interval": mean["interval"], "each": each}
+            summary["recipes"][recipe.name] = {
+                "worlds_sha256": worlds_sha256(fixed.worlds, fixed.index),
+                "policy_sha256": [policy.manifest.manifest_sha256 for policy in policies],
+                "seeds": seeds,
+                **reached,
+            }
+        fixed_lists = "; ".join(f"{count_of(worlds, 'world')} of seed {seed}" for worlds, seed in sorted(lists))
+        caption = f"{scenario.name}: mean over seeds, bands: one standard deviation. Fixed list: {fixed_lists}."
+        panels = {_LABELS[metric]: lines for metric, lines in curves.items()}
+        figure = seed_curves(panels, logarithmic=[_LABELS[m] for m in curves if m != _RETURNED], caption=caption)
+        write_picture(self.folder / "learning_curves.png", figure, force=True)
+        rows = [
+            {"figure": metric, "recipe": recipe, "seed": seed, "steps": int(step), "value": float(value)}
+            for metric, lines in curves.items()
+            for recipe, curve in lines.items()
+            for seed, values in enumerate(curve.values)
+            for step, value in zip(curve.steps, values, strict=True)
+        ]
+        content = json.dumps(summary, indent=2, allow_nan=False) + "\n"
+        for ending, text in (("csv", csv_text(rows)), ("json", content)):
+            write_output(self.folder / f"learning_curves.{ending}", text.encode(), force=True)
+        return summary
 
+    def _run(self, recipe: TrainingRecipe, seed: int) -> Path:
+        return self.folder / f"{recipe.name}-seed{seed}"
 
-def write_curves(scenario: Scenario, plan: Sequence[Trainings], folder: Path) -> dict[str, Any]:
-    """Draw the finished trainings of ``folder``, write figure, table and summary, and give the summary.
-
-    For each recipe: interquartile mean over seeds, with its stratified bootstrap interval, of the harm of the policy
-    that each training kept, and of the last one; hashes of the recipe's fixed list, and of the policy that each of its
-    seeds kept. Raises ``InvalidInput`` when they have no evaluation in common.
-    """
-    curves = _read_curves(plan, folder)
-    about = result_identity("learning-curves", scenario, None)
-    summary: dict[str, Any] = {**about, "scenario": scenario.name, "recipes": {}}
-    lists = set()
-    for trainings in plan:
-        recipe = trainings.recipe
-        values = curves[RunDirectory.HARM[recipe.reward.harm_count]][recipe.name].values
-        fixed = scenario.sample(recipe.evaluation.worlds, recipe.evaluation.seed)
-        lists.add((recipe.evaluation.worlds, recipe.evaluation.seed))
-        runs = [folder / f"{recipe.name}-seed{seed}" for seed in range(trainings.seeds)]
-        reached = {}
-        for name, harms in {"kept": values.min(axis=1), "last": values[:, -1]}.items():
-            told = interquartile_mean([harms]).to_json()
-            each = [float(harm) for harm in harms]
-            reached[name] = {"interquartile_mean": told["value"], "interval": told["interval"], "each": each}
-        summary["recipes"][recipe.name] = {
-            "worlds_sha256": worlds_sha256(fixed.worlds, fixed.index),
-            "policy_sha256": [load_policy(run).manifest.manifest_sha256 for run in runs],
-            "seeds": trainings.seeds,
-            **reached,
-        }
-    fixed_lists = "; ".join(f"{count_of(worlds, 'world')} of seed {seed}" for worlds, seed in sorted(lists))
-    caption = f"{scenario.name}: mean over seeds, bands: one standard deviation. Fixed list: {fixed_lists}."
-    panels = {_LABELS[metric]: lines for metric, lines in curves.items()}
-    figure = seed_curves(panels, logarithmic=[_LABELS[m] for m in curves if m != _RETURNED], caption=caption)
-    write_picture(folder / "learning_curves.png", figure, force=True)
-    rows = [
-        {"figure": metric, "recipe": recipe, "seed": seed, "steps": int(step), "value": float(value)}
-        for metric, lines in curves.items()
-        for recipe, curve in lines.items()
-        for seed, values in enumerate(curve.values)
-        for step, value in zip(curve.steps, values, strict=True)
-    ]
-    write_output(folder / "learning_curves.csv", csv_text(rows).encode(), force=True)
-    content = json.dumps(summary, indent=2, allow_nan=False) + "\n"
-    write_output(folder / "learning_curves.json", content.encode(), force=True)
-    return summary
-
-
-def _read_curves(plan: Sequence[Trainings], folder: Path) -> dict[str, dict[str, SeedCurve]]:
-    """What the trainings of ``folder`` reached, by metric and recipe; without what no episode told."""
-    counts = {trainings.recipe.reward.harm_count for trainings in plan}
-    metrics = [RunDirectory.HARM[count] for count in ("first", "total") if count in counts]
-    curves: dict[str, dict[str, SeedCurve]] = {metric: {} for metric in (*metrics, _RETURNED)}
-    for trainings in plan:
-        name = trainings.recipe.name
-        runs = [RunDirectory(folder / f"{name}-seed{seed}") for seed in range(trainings.seeds)]
-        for metric in curves:
-            values = [run.column(RunDirectory.RETURN if metric == _RETURNED else f"eval/{metric}") for run in runs]
-            if metric != _RETURNED or all(values):  # no episode may have ended in a very short training
-                curves[metric][name] = SeedCurve.of(values)
-    return {metric: lines for metric, lines in curves.items() if lines}
+    def _curves(self) -> dict[str, dict[str, SeedCurve]]:
+        """What the trainings reached, by metric and recipe; without what no episode told."""
+        counts = {recipe.reward.harm_count for recipe, _ in self.plan}
+        metrics = [RunDirectory.HARM[count] for count in HARM_COUNTS if count in counts]
+        curves: dict[str, dict[str, SeedCurve]] = {metric: {} for metric in (*metrics, _RETURNED)}
+        for recipe, seeds in self.plan:
+            runs = [RunDirectory(self._run(recipe, seed)) for seed in range(seeds)]
+            for metric in curves:
+                values = [run.column(RunDirectory.RETURN if metric == _RETURNED else f"eval/{metric}") for run in runs]
+                if metric != _RETURNED or all(values):  # no episode may have ended in a very short training
+                    curves[metric][recipe.name] = SeedCurve.of(values)
+        return {metric: lines for metric, lines in curves.items() if lines}

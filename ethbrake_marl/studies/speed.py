@@ -14,7 +14,7 @@ import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import version
@@ -26,6 +26,7 @@ import numpy as np
 import ethbrake_marl as eb
 from ethbrake_marl.agents import optimise_coupled, optimise_pairwise
 from ethbrake_marl.envs import make_engine, parallel_env
+from ethbrake_marl.errors import OnProgress, Progress
 from ethbrake_marl.harm import empty_ledger
 from ethbrake_marl.physics import Floats, Worlds, advance, compiled, forecast
 from ethbrake_marl.scenario import load_scenario
@@ -99,13 +100,15 @@ class Benchmark:
         return Speed(self.name, self.workload, self.worlds, _VEHICLES, self.unit, middle, low, high, self.floor)
 
 
-def measure(effort: Effort) -> Iterator[Speed]:
-    """Every figure of ``BENCHMARKS``, one after the other."""
-    calibration = None
+def measure(*, quick: bool = False, tell: OnProgress | None = None) -> list[Speed]:
+    """Every figure of ``BENCHMARKS``, one after the other; world-steps are set against the first, the calibration."""
+    found: list[Speed] = []
     for benchmark in BENCHMARKS:
-        speed = benchmark.measure(effort)
-        calibration = speed.value if calibration is None else calibration
-        yield replace(speed, relative=speed.value / calibration) if speed.unit == WORLD_STEPS else speed
+        found.append(benchmark.measure(QUICK if quick else FULL))
+        if tell is not None:
+            tell(Progress("speed", len(found), len(BENCHMARKS)))
+    first = found[0].value
+    return [replace(speed, relative=speed.value / first) if speed.unit == WORLD_STEPS else speed for speed in found]
 
 
 def first_decisions(n: int) -> Worlds:

@@ -59,8 +59,7 @@ from ethbrake_marl.files.yaml import (
 from ethbrake_marl.learning import RunDirectory, StopAt, Training, TrainingRecipe, load_recipe, read_settings
 from ethbrake_marl.policies import Policy, installed_versions, read_trained
 from ethbrake_marl.scenario import Scenario, check_file_name, load_scenario
-from ethbrake_marl.studies.jobs import Attempt, Job, JobFolder, Workers
-from ethbrake_marl.studies.trainings import Timed, TrainingJob, time_training, told_seconds
+from ethbrake_marl.studies.jobs import Attempt, Job, JobFolder, Timed, TrainingJob, Workers
 
 if TYPE_CHECKING:
     from optuna import Trial
@@ -368,15 +367,6 @@ class Row:
         }
 
 
-class SweepCost(NamedTuple):
-    """What is left to do of a sweep."""
-
-    states: Mapping[str, str]  # by job's name: finished, begun or new
-    decisions: int
-    work_s: float  # seconds of one core; begun jobs are reckoned whole
-    in_words: str
-
-
 @dataclass(frozen=True)
 class SweepPlan:
     """All jobs, in the order of the table. What they have in common is loaded once."""
@@ -455,28 +445,31 @@ class SweepPlan:
                     results[row.name] = values
         return results, damaged
 
-    def cost(self, path: Path, processes: int) -> SweepCost:
-        """Time a short training of the first job of each recipe, and reckon up what is left."""
+    def cost(self, path: Path, processes: int) -> tuple[dict[str, Any], str]:
+        """Every job and its state, and what is left in seconds of one core, as plain data; the latter in words.
+
+        A short training of the first job of each recipe is timed; begun jobs are reckoned whole.
+        """
         results, _ = self.kept(path)
-        states, left, decisions, work_s = {}, dict[object, list[Row]](), 0, 0.0
+        jobs, left = [], [row for row in self.rows if row.name not in results]
         for row in self.rows:
-            begun = (path / RUNS / row.name / "run.json").is_file()
-            states[row.name] = "finished" if row.name in results else "begun" if begun else "new"
-            if row.name not in results:
-                left.setdefault(row.asked[1:-1], []).append(row)
+            begun = "begun" if (path / RUNS / row.name / "run.json").is_file() else "new"
+            state = "finished" if row.name in results else begun
+            jobs.append({"hash": row.identity, "job": row.name, "set": row.settings, "state": state})
         timed: dict[str, Timed] = {}
-        for rows in left.values():
-            recipe, training = rows[0].asked.recipe, rows[0].first
-            if recipe not in timed:
-                timed[recipe] = time_training(training)
-            decisions += len(rows) * training.recipe.total_steps
-            work_s += timed[recipe].seconds(training, len(rows) * training.recipe.total_steps)
+        work_s = 0.0
+        for row in left:
+            job = TrainingJob(row.first, path)
+            if row.asked.recipe not in timed:
+                timed[row.asked.recipe] = job.time()
+            work_s += timed[row.asked.recipe]._replace(job=job).seconds(row.first.recipe.total_steps)
+        decisions = sum(row.first.recipe.total_steps for row in left)
         words = (
-            f"to do: {count_of(len(self.rows) - len(results), 'job')}, {decisions:,} decisions: about"
-            f" {told_seconds(work_s)} of one core, {told_seconds(work_s / processes)} with {processes} at once"
+            f"to do: {count_of(len(left), 'job')}, {decisions:,} decisions: about"
+            f" {Timed.in_words(work_s)} of one core, {Timed.in_words(work_s / processes)} with {processes} at once"
             f" (a few updates of {count_of(len(timed), 'recipe')} timed on this machine)"
         )
-        return SweepCost(states, decisions, work_s, words if left else "to do: nothing")
+        return {"jobs": jobs, "decisions_left": decisions, "core_s_left": work_s}, words if left else "to do: nothing"
 
     def run(self, path: Path, workers: Workers, *, retries: int = 2, tell: OnProgress | None = None) -> StudyResult:
         """Run what is left of a sweep and write its tables, after Ctrl-C too.
@@ -812,10 +805,10 @@ class TuningPlan:
     def cost(self, trials: int, processes: int) -> tuple[float, str]:
         """Seconds of one core for a training with the recipe's own values, by a short one; of all trials in words."""
         training = self.training({})
-        each_s = time_training(training).seconds(training, training.recipe.total_steps)
+        each_s = TrainingJob(training, Path()).time().seconds(training.recipe.total_steps)
         return each_s, (
             f"{count_of(trials, 'trial')} of {self.recipe.total_steps:,} decisions:"
-            f" about {told_seconds(trials * each_s)} of one core, {told_seconds(trials * each_s / processes)} with"
+            f" about {Timed.in_words(trials * each_s)} of one core, {Timed.in_words(trials * each_s / processes)} with"
             f" {processes} at once; less where trials are pruned or have ended already"
             " (a few updates of the recipe timed on this machine)"
         )
@@ -899,9 +892,8 @@ class TuningPlan:
                     else:
                         study.enqueue(own)
                 say(note)
-                yield from (self._job(study, kept, number) for number in begun)
-                for _ in range(total - len(known)):
-                    yield self._job(study, kept, study.ask())
+                yield from (self._job(kept, number) for number in begun)
+                yield from (self._job(kept, study.ask()) for _ in range(total - len(known)))
 
             def note(attempt: Attempt) -> None:
                 """Tell the study how an attempt at a trial has ended."""
@@ -916,9 +908,8 @@ class TuningPlan:
                     say(f"trial {number}: {attempt.reason}; {kept.log(attempt.job.name)}")
                     return
                 results = dict(zip(RESULTS, end["results"], strict=True))
-                harm = float(
-                    results[RunDirectory.OBJECTIVE] or results[RunDirectory.HARM[self.recipe.reward.harm_count]]
-                )
+                chosen = RunDirectory.HARM[self.recipe.reward.harm_count]
+                harm = float(results[RunDirectory.OBJECTIVE] or results[chosen])
                 study.end(number, "pruned" if end["pruned"] else "finished", end["results"], harm)
                 best = study.best()
                 is_best = best is not None and best.number == number
@@ -943,20 +934,9 @@ class TuningPlan:
         counts = Counter[str](trial.state for trial in found)
         return StudyResult(path / TRIAL_TABLE, dict(counts), not whole, study.best())
 
-    def _job(self, study: TuningStudy, folder: JobFolder, number: int) -> Job:
-        name, known = f"{number:04d}", study.trials()
-        try:
-            training = self.training(known[number].values)
-        except InvalidInput as error:
-            return Job(name, refuse_trial, (str(error),))
-        study.running(number).set_user_attr(_HASH, training.identity)
-        for other in known:
-            if other.state == "finished" and other.identity == training.identity:
-                return Job(name, repeat_end, (False, other.results))
-        noted = _texts_of({**self.file.settings, **known[number].values})
-        job = TrainingJob(training, folder.path.absolute() / TRIALS / name, noted)
-        where = (study.journal, study.identity, study.file)
-        return Job(name, do_trial, (job, where, number, self.updates(training.recipe), folder.log(name)))
+    def _job(self, folder: JobFolder, number: int) -> Job:
+        name = f"{number:04d}"
+        return Job(name, do_trial, (self, folder.path.absolute(), number, folder.log(name)))
 
     def best_recipe(self, values: Values, file: Path, source: str) -> str:
         """The text of a recipe that trains what the trial with these values trained, named as its file.
@@ -1048,20 +1028,19 @@ class TuningStudy:
 
     def __init__(self, journal: Path, identity: str, file: TuningFile) -> None:
         with naming_extras():
-            import optuna
-        from optuna.pruners import NopPruner, PercentilePruner
-        from optuna.storages import JournalStorage
-        from optuna.storages.journal import JournalFileBackend
-
+            import optuna.storages.journal
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        self.journal, self.identity, self.file = journal, identity, file
-        pruner: BasePruner = NopPruner()
+        self.journal, self.file, self._optuna = journal, file, optuna
+        pruner: BasePruner = optuna.pruners.NopPruner()
         if file.prune is not None:
             few, early = file.prune.after_trials, file.prune.after_times
-            pruner = PercentilePruner(100.0 * file.prune.keep, n_startup_trials=few, n_warmup_steps=early)
+            pruner = optuna.pruners.PercentilePruner(
+                100.0 * file.prune.keep, n_startup_trials=few, n_warmup_steps=early
+            )
         try:
+            backend = optuna.storages.journal.JournalFileBackend(str(journal))
             self._study = optuna.create_study(
-                storage=JournalStorage(JournalFileBackend(str(journal))),
+                storage=optuna.storages.JournalStorage(backend),
                 study_name=f"ethbrake-{identity[:_DIGITS]}",
                 pruner=pruner,
                 direction="minimize",
@@ -1081,14 +1060,12 @@ class TuningStudy:
 
     def ask(self) -> int:
         """Propose a trial, and give its number."""
-        from optuna.samplers import RandomSampler, TPESampler
-
-        trial, asked = self._study.ask(), self.file.sampler
+        trial, asked, samplers = self._study.ask(), self.file.sampler, self._optuna.samplers
         seed = int(np.random.SeedSequence([asked.seed, trial.number]).generate_state(1)[0])
         if asked.name == "random":
-            self._study.sampler = RandomSampler(seed=seed)
+            self._study.sampler = samplers.RandomSampler(seed=seed)
         else:
-            self._study.sampler = TPESampler(seed=seed, n_startup_trials=asked.random_trials)
+            self._study.sampler = samplers.TPESampler(seed=seed, n_startup_trials=asked.random_trials)
         for key, dimension in self.file.search.items():
             trial._suggest(key, dimension.distribution())  # what suggest_float and its like call
         return trial.number
@@ -1107,18 +1084,14 @@ class TuningStudy:
         self, number: int, state: State, results: Sequence[str] = (), harm: float | None = None, reason: str = ""
     ) -> None:
         """End a trial that is finished, with its harm, that was pruned, or that failed, with the reason."""
-        from optuna.trial import TrialState
-
         noted = (_REASON, reason) if state == "failed" else (_RESULTS, json.dumps(list(results)))
         self.running(number).set_user_attr(*noted)
         names = {told: name for name, told in _STATES.items()}
-        self._study.tell(number, harm if state == "finished" else None, TrialState[names[state]])
+        self._study.tell(number, harm if state == "finished" else None, self._optuna.trial.TrialState[names[state]])
 
     def running(self, number: int) -> Trial:
         """A trial that another call, or another process, has asked for."""
-        import optuna
-
-        return optuna.Trial(self._study, self._frozen(number)._trial_id)
+        return self._optuna.Trial(self._study, self._frozen(number)._trial_id)
 
     def _frozen(self, number: int) -> FrozenTrial:
         return next(each for each in self._study.get_trials(deepcopy=False) if each.number == number)
@@ -1142,24 +1115,30 @@ class TuningStudy:
 PRUNED = "pruned: too much harm for so many decisions"
 
 
-def do_trial(
-    job: TrainingJob, where: tuple[Path, str, TuningFile], number: int, updates: int, log: Path
-) -> dict[str, Any] | None:
+def do_trial(plan: TuningPlan, path: Path, number: int, log: Path) -> dict[str, Any] | None:
     """Train to the end, or to where the trial is pruned: ``pruned`` and ``results``, the values of ``RESULTS``.
 
-    None where it was stopped from outside. Raises what ``reach_results`` raises.
+    Where the same training has come to its end before, that end, at once; None where it was stopped from outside.
+    Raises ``InvalidInput`` for values that do not go together, and what ``reach_results`` raises.
 
     Args:
-        job: the training.
-        where: its ``TuningStudy``.
+        plan: of the tuning.
+        path: its folder.
         number: of the trial.
-        updates: of a whole training.
         log: see ``reach_results``.
 
     """
-    study = TuningStudy(*where)
-    times, pruned = study.file.measure.times, False
-    harm = RunDirectory.HARM[job.training.recipe.reward.harm_count]
+    study = plan.study(path)
+    known = study.trials()
+    training = plan.training(known[number].values)
+    study.running(number).set_user_attr(_HASH, training.identity)
+    for other in known:
+        if other.state == "finished" and other.identity == training.identity:
+            return {"pruned": False, "results": list(other.results)}
+    noted = _texts_of({**plan.file.settings, **known[number].values})
+    job = TrainingJob(training, path / TRIALS / f"{number:04d}", noted)
+    times, updates, pruned = plan.file.measure.times, plan.updates(training.recipe), False
+    harm = RunDirectory.HARM[training.recipe.reward.harm_count]
 
     def judge(evaluation: Mapping[str, float]) -> str | None:
         nonlocal pruned
@@ -1169,19 +1148,9 @@ def do_trial(
         return PRUNED if pruned else None
 
     if RunDirectory(job.folder).progress.is_file() and study.running(number).should_prune():
-        return repeat_end(True, _read_results(job))  # it was killed before it could say so
+        return {"pruned": True, "results": _read_results(job)}  # it was killed before it could say so
     found = reach_results(job, log, judge)
     if found is None and not pruned:
         return None
     log.unlink(missing_ok=True)
-    return repeat_end(pruned, found or _read_results(job))
-
-
-def repeat_end(pruned: bool, results: Sequence[str]) -> dict[str, Any]:
-    """The end of a trial; of one of which the same training has ended before, at once."""
-    return {"pruned": pruned, "results": list(results)}
-
-
-def refuse_trial(reason: str) -> None:
-    """A trial whose values do not go together; raises ``InvalidInput``."""
-    raise InvalidInput(reason)
+    return {"pruned": pruned, "results": found or _read_results(job)}

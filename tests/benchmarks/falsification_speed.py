@@ -16,7 +16,7 @@ import numpy as np
 
 import ethbrake_marl as eb
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies.falsification import Measure, falsify
+from ethbrake_marl.studies.falsification import Measure
 from tests.programme.copies import KERNELS, working_copy
 from tests.programme.planting import plant
 from tests.shield.planted_bugs import BUGS
@@ -34,7 +34,7 @@ def hole(seeds: int) -> None:
     for adaptive in (True, False):
         rows = []
         for seed in range(seeds):
-            hits = np.flatnonzero(falsify(measure, BUDGET, seed, adaptive=adaptive).scores > 0.0) + 1
+            hits = np.flatnonzero(measure.falsify(BUDGET, seed, adaptive=adaptive).scores > 0.0) + 1
             rows.append([*(hits[k] if len(hits) > k else np.inf for k in (0, 9)), len(hits)])
         first, tenth, count = np.median(rows, axis=0)
         name = "adaptive" if adaptive else "at random"

@@ -15,8 +15,7 @@ from ethbrake_marl.figures import harm_against_total_gap
 from ethbrake_marl.pages.page import Part
 from ethbrake_marl.pages.report import Report
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies.reproduction.folder import choose_items, reproduce
-from ethbrake_marl.studies.reproduction.items import Settings
+from ethbrake_marl.studies.reproduction import Reproduction
 from tests.browser.conftest import AGENTS
 from tests.pages.hostile import HOSTILE
 from tests.pages.test_frame import whole_page
@@ -41,8 +40,8 @@ def test_reproduction__never_scrolls_sideways(open_page: Open, reproduction_file
 @pytest.fixture(scope="module")
 def reproduction_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of three items of the paper made again in few worlds."""
-    settings = Settings("quick", tmp_path_factory.mktemp("reproduction") / "out", 10)
-    reproduce(choose_items(["harm-distance", "accelerations", "gaps"]), settings)
+    settings = Reproduction("quick", tmp_path_factory.mktemp("reproduction") / "out", 10)
+    settings.make(Reproduction.choose(["harm-distance", "accelerations", "gaps"]))
     return settings.folder / "index.html"
 
 

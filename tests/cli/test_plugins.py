@@ -17,7 +17,7 @@ from ethbrake_marl.cli.app import app, whole_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files import plugins
 from ethbrake_marl.scenario import new_scenario_text
-from ethbrake_marl.studies.trainings import finish_trainings
+from ethbrake_marl.studies.jobs import JobFolder, TrainingJob
 from tests.cli.conftest import TINY_RECIPE
 from tests.extending.conftest import restore, tables
 
@@ -230,16 +230,16 @@ def test_changed_file__is_refused_in_the_same_process(ethbrake, parts):
 
 @pytest.mark.slow
 def test_worker_processes__load_the_plugins_of_their_parent(tmp_path, parts, monkeypatch):
-    from ethbrake_marl.learning.training import load_recipe
+    from ethbrake_marl.learning.training import Training, load_recipe
     from ethbrake_marl.scenario import load_scenario
-    from ethbrake_marl.studies.ablation import Level, Training
 
     monkeypatch.setenv("PYTHONPATH", os.getcwd())
     plugins.load_plugin(parts)
     recipe = load_recipe(str(write_recipe(tmp_path, reward={"harm": 1.0, "calm": 0.01})))
-    level = Level(load_scenario("paper-random"))
-    wanted = [Training(level, "ppo", recipe.replace(seed=seed), tmp_path / f"seed{seed}") for seed in (0, 1)]
-    assert finish_trainings([training.job() for training in wanted], 2)
+    scenario, kept = load_scenario("paper-random"), JobFolder(tmp_path / "trainings", "trainings")
+    wanted = [TrainingJob(Training.of(recipe, scenario, seed=seed), tmp_path / f"seed{seed}") for seed in (0, 1)]
+    with kept.work():
+        assert kept.train(wanted, 2)
     for training in wanted:
         config = json.loads((training.folder / "config.json").read_text())
         assert [each["name"] for each in config["plugins"]] == ["my_parts.py"]

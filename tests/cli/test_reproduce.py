@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from ethbrake_marl.studies.reproduction.folder import ITEMS
+from ethbrake_marl.studies.reproduction import ITEMS
 
 
 def test_reproduce__lists_every_item(ethbrake) -> None:

@@ -296,7 +296,7 @@ def test_command_line__a_table_on_a_narrow_stdout_is_still_printed_and_needs_no_
         "try:\n    main()\n"
         "except SystemExit as end:\n    assert not end.code\n"
         "print('loaded:', *{'torch', 'stable_baselines3', 'matplotlib'} & set(sys.modules))\n"
-        "import ethbrake_marl.studies.reproduction.folder, ethbrake_marl.studies.reproduction.folder\n"
+        "import ethbrake_marl.studies.reproduction\n"
         "print('with the items of the paper:', *{'torch'} & set(sys.modules))",
         PYTHONIOENCODING=encoding,
     )

@@ -6,7 +6,7 @@ import pytest
 import typer
 from rich.console import Console
 
-from ethbrake_marl.cli.command import Out, command
+from ethbrake_marl.cli.command import Commands, Out
 
 
 def test_progress__without_a_terminal_news_are_lines(capsys):
@@ -55,9 +55,9 @@ def test_progress__on_a_terminal_each_part_has_one_bar_above_what_comes_next(mon
 
 
 def test_command__ctrl_c_is_one_line_and_the_status_of_an_interruption(capsys):
-    group = typer.Typer()
+    group = Commands()
 
-    @command(group, "wait", "wait", kept="what was found is kept")
+    @group.add("wait", "wait", kept="what was found is kept")
     def wait(out: Out) -> None:
         """Wait."""
         raise KeyboardInterrupt

@@ -135,7 +135,7 @@ ENGINE = Suite(
 )
 
 ABLATION = Suite(
-    files=("studies/ablation/*.py",),
+    files=("studies/ablation.py",),
     quick={
         "studies/ablation.py": (
             "tests/studies/ablation/test_levels.py",
@@ -152,23 +152,18 @@ ABLATION = Suite(
 
 OF_ITEMS = ("tests/studies/reproduction/test_items.py",)
 REPRODUCTION = Suite(
-    files=("studies/reproduction/*.py",),
+    files=("studies/reproduction.py",),
     quick={
-        "studies/reproduction/items.py": (
+        "studies/reproduction.py": (
             "tests/studies/reproduction/test_verdicts.py",
             "tests/studies/reproduction/test_folder.py",
             "tests/studies/reproduction/test_items.py",
             "tests/studies/reproduction/test_printed.py",
             "tests/studies/reproduction/test_full.py",
-        ),
-        "studies/reproduction/folder.py": (
-            "tests/studies/reproduction/test_folder.py",
-            "tests/studies/reproduction/test_full.py",
-        ),
+        )
     },
     otherwise=OF_ITEMS,
     whole=("tests/studies/reproduction", "tests/test_reproduction_page.py", "tests/cli/test_reproduce.py"),
-    left_out=frozenset({"__init__.py"}),
     preloaded=SCIENCE,
 )
 

@@ -52,7 +52,7 @@ def test_measure__sets_world_steps_against_the_first_figure(monkeypatch: pytest.
 
     figures = (figure("world-steps/s", 7.0, 8.0, 9.0), figure("s", 4.0), figure("world-steps/s", 1.0, 2.0, 2.0))
     monkeypatch.setattr(benchmark, "BENCHMARKS", figures)
-    found = list(measure(SHORT))
+    found = measure()
     assert [speed.relative for speed in found] == [1.0, None, 0.25]
     assert [(speed.lowest, speed.value, speed.highest) for speed in found] == [(7, 8, 9), (4, 4, 4), (1, 2, 2)]
 

@@ -17,8 +17,8 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.episodes import Passport
 from ethbrake_marl.learning import runs as learning_train
 from ethbrake_marl.learning.training import Scheme, TrainingRecipe, load_recipe
-from ethbrake_marl.studies import trainings
-from ethbrake_marl.studies.ablation import Plan, Training, read_levels, with_scheme
+from ethbrake_marl.studies.ablation import Plan, read_levels, with_scheme
+from ethbrake_marl.studies.jobs import TrainingJob
 from tests.fixtures.pictures import draw_nothing
 
 LEVELS = "cooperation-0-sensors,cooperation-3-pair,cooperation-3-congested"
@@ -122,9 +122,9 @@ def test_ablate__goes_on_where_it_was_stopped_to_the_same_result(ablation, tmp_p
             monkeypatch.setattr(learning_train.Session, "_after_update", _stopping(calls, learning_train.Session))
         return keep(recipe, scenario, path, **options)
 
-    keep = trainings.train
+    keep = learning_train.train
     with monkeypatch.context() as patch:
-        patch.setattr(trainings, "train", stop_in_the_second)
+        patch.setattr(learning_train, "train", stop_in_the_second)
         patch.setattr(learning_train.Session, "_after_update", learning_train.Session._after_update)
         assert run_command(["study", "ablate", "--output", str(folder), "--recipes", str(tiny), *SMALL]) == 130
     monkeypatch.undo()
@@ -172,7 +172,7 @@ def test_ablate__damaged_parts_of_a_search_are_told_with_the_cost(ablation, tmp_
 def test_ablate__bad_input_is_refused(tmp_path, tiny, capsys):
     start = ["--output", tmp_path / "new", "--recipes", tiny]
     assert "cooperation-3-pair" in refused(capsys, *start, "--levels", "cooperation-3-par,cooperation-2-paper")
-    assert "seeds 0: must be at least 1" in refused(capsys, *start, "--seeds", "0")
+    assert "seeds = 0: must be a whole number, at least 1" in refused(capsys, *start, "--seeds", "0")
     assert "at most the 10 worlds" in refused(capsys, *start, "--episodes", "10", "--search-episodes", "11")
     assert "scheme" in refused(capsys, *start, "--scheme", "shard")
     assert "jobs = 0: must be a whole number in 1..64" in refused(capsys, *start, "--jobs", "0")
@@ -240,29 +240,29 @@ def test_ablate__the_cost_of_a_new_folder_makes_nothing(tmp_path, tiny, capsys):
     assert not list(tmp_path.iterdir())
 
 
-def planned(recipe: TrainingRecipe, scheme: Scheme | None) -> list[Training]:
+def planned(recipe: TrainingRecipe, scheme: Scheme | None) -> list[tuple[str, TrainingJob, TrainingRecipe]]:
+    """Algorithm, training and its recipe, level by level."""
     levels = tuple(read_levels(["cooperation-2-paper", "cooperation-3-pair"]))
-    return list(Plan(levels, (with_scheme(recipe, scheme),), 1, 300, 10, 7, 5, 10, Path("any")).trainings())
+    plan = Plan(levels, (with_scheme(recipe, scheme),), 1, 300, 10, 7, 5, 10, Path("any"))
+    return [(algorithm, job, job.training.recipe) for _, algorithm, job in plan.trainings()]
 
 
 def test_plan__one_learner_is_trained_alone_whatever_the_scheme(tiny):
     recipe = load_recipe(str(tiny))
-    alone, pair = planned(recipe, None)
-    assert (alone.recipe.scheme, pair.recipe.scheme) == (None, "shared")
-    assert (alone.recipe.total_steps, pair.recipe.total_steps) == (300, 600)
-    assert pair.folder.name == "cooperation-3-pair-tiny-shared-seed0"
-    again, shared = planned(recipe, "shared")
-    assert (again.recipe, again.folder) == (alone.recipe, alone.folder)
-    assert (
-        again.folder.name == "cooperation-2-paper-tiny-seed0" and again.algorithm == shared.algorithm == "tiny-shared"
-    )
+    (_, _, alone), (_, job, pair) = first, _ = planned(recipe, None)
+    assert (alone.scheme, pair.scheme) == (None, "shared")
+    assert (alone.total_steps, pair.total_steps) == (300, 600)
+    assert job.folder.name == "cooperation-3-pair-tiny-shared-seed0"
+    again, (shared, _, _) = planned(recipe, "shared")
+    assert again[1:] == first[1:]
+    assert again[1].folder.name == "cooperation-2-paper-tiny-seed0" and again[0] == shared == "tiny-shared"
 
 
 def test_plan__the_recipes_own_scheme_holds_and_turns_are_for_several(tiny):
     recipe = load_recipe(str(tiny))
-    assert [each.recipe.scheme for each in planned(recipe.replace(scheme="shared"), None)] == [None, "shared"]
-    alone, pair = planned(recipe.replace(scheme="independent", turns=5), None)
-    assert (alone.recipe.turns, pair.recipe.turns) == (None, 5)
+    assert [own.scheme for *_, own in planned(recipe.replace(scheme="shared"), None)] == [None, "shared"]
+    (*_, alone), (*_, pair) = planned(recipe.replace(scheme="independent", turns=2), None)
+    assert (alone.turns, pair.turns) == (None, 2)
     with pytest.raises(InvalidInput, match="turns"):
         planned(recipe.replace(scheme="independent", turns=5), "shared")
 

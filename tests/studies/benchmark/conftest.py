@@ -8,7 +8,7 @@ import pytest
 
 from ethbrake_marl.limits.limits import search_list
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.studies.benchmark import Suite, load_suite, make_entry
+from ethbrake_marl.studies.benchmark import Suite, load_suite
 from tests.docs.site import load
 
 freezing = load("../studies/freeze_suite")
@@ -41,5 +41,5 @@ def entries(suites: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with an entry of full_brake, coast (all lists) and full_brake+episode (two lists); not to be changed."""
     suite, folder = load_suite("tiny", suites), tmp_path_factory.mktemp("entries")
     for spec in ("full_brake", "coast", "full_brake+episode"):
-        make_entry(suite, spec).write(folder / f"{spec}.json")
+        suite.make_entry(spec).write(folder / f"{spec}.json")
     return folder

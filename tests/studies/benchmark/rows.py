@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from ethbrake_marl.errors import ShownProgress
-from ethbrake_marl.studies.benchmark import Suite, load_suite, make_entry, read_leaderboard
+from ethbrake_marl.studies.benchmark import Suite, load_suite, read_leaderboard
 
 ROWS = (
     "full_brake", "e_v2x_bm", "ppo@shipped", "policy@shipped", "universal@shipped", "policy@shipped+step",
@@ -48,7 +48,7 @@ def main(arguments: list[str]) -> None:
     suite = load_suite("v2")
     for agent in [] if arguments == ["--tables"] else arguments or ROWS:
         print(agent, flush=True)
-        entry = make_entry(suite, agent, on_progress=ShownProgress())
+        entry = suite.make_entry(agent, on_progress=ShownProgress())
         entry.write(ENTRIES / f"{re.sub(r'[/:]', '-', agent)}.json", force=True)
     text = PAGE.read_text("utf-8")
     for marker, table in page_tables().items():

@@ -14,15 +14,7 @@ from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.policies import content_sha256, load_policy, shipped_policies
-from ethbrake_marl.studies.benchmark import (
-    NotDriven,
-    load_suite,
-    make_entry,
-    mean_of_lists,
-    read_entry,
-    realised_share,
-    worst_mean,
-)
+from ethbrake_marl.studies.benchmark import NotDriven, load_suite, mean_of_lists, read_entry, realised_share, worst_mean
 from tests.docs.site import load
 
 
@@ -97,9 +89,9 @@ def test_lists_that_an_agent_cannot_drive__have_no_score_and_so_has_the_whole(en
 
 def test_agents_that_drive_nothing__are_refused_with_the_reason(tiny):
     with pytest.raises(InvalidInput, match="can drive no list of it: unknown agent 'full_break'"):
-        make_entry(tiny, "full_break")
+        tiny.make_entry("full_break")
     with pytest.raises(InvalidInput, match="can drive no list of it: agent 'ladder': stands for"):
-        make_entry(tiny, "ladder")
+        tiny.make_entry("ladder")
 
 
 @pytest.mark.parametrize("purpose", ["training", "evaluation"])
@@ -107,9 +99,9 @@ def test_policies_made_with_a_seed_of_the_suite__are_refused(tiny, tmp_path, pur
     bundle = copied_policy(tmp_path, {"training": 3, purpose: 902})
     told = f"its policy of vehicle_2 was made with {purpose} seed 902, which is suite tiny's own"
     with pytest.raises(InvalidInput, match=told):
-        make_entry(tiny, f"ppo@{bundle}")
+        tiny.make_entry(f"ppo@{bundle}")
     with pytest.raises(InvalidInput, match=told):
-        make_entry(tiny, f"ppo@{bundle}+episode")
+        tiny.make_entry(f"ppo@{bundle}+episode")
 
 
 def copied_policy(folder, seeds):
@@ -131,7 +123,7 @@ def test_another_world__is_refused(suites, tmp_path, tiny, monkeypatch):
     gaps[5, 1] = np.nextafter(gaps[5, 1], 99.0)  # one bit
     monkeypatch.setattr(type(each.scenario), "sample", lambda *a, **k: replace(sample, worlds=moved(sample, gaps)))
     with pytest.raises(InvalidInput, match="list paper-random: the worlds drawn here have SHA-256"):
-        make_entry(tiny, "coast")
+        tiny.make_entry("coast")
 
 
 def moved(sample, gaps):
@@ -164,7 +156,7 @@ def test_another_table__is_refused(suites, tmp_path):
     shutil.copytree(suites, tmp_path / "copy")
     (tmp_path / "copy/tiny/paper-random.npz").write_bytes((tmp_path / "copy/tiny/cooperation-3-pair.npz").read_bytes())
     with pytest.raises(InvalidInput, match="is not the table that belongs to the suite"):
-        make_entry(load_suite("tiny", tmp_path / "copy"), "coast")
+        load_suite("tiny", tmp_path / "copy").make_entry("coast")
 
 
 def test_frozen_suites__stay(suites):

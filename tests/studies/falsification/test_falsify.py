@@ -9,7 +9,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.defaults import HARM_COUNTS, MeasureName
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.studies.falsification import Measure, falsify
+from ethbrake_marl.studies.falsification import Measure
 from tests.studies.falsification.holed import Holed, in_hole
 
 SCENARIO = load_scenario("paper-random")
@@ -21,28 +21,29 @@ def _measure(name: MeasureName) -> Measure:
 
 @pytest.mark.parametrize("name", ["regret", "difference"])
 def test_falsify__finds_a_hole_in_a_thousandth_of_the_worlds(name: MeasureName) -> None:
-    found = falsify(_measure(name), 4_000, 0)
+    found = _measure(name).falsify(4_000, 0)
     assert in_hole(found.sample.worlds).all() and found.sample.worlds.n >= 3
-    assert (np.diff(found.measured.score) <= 0.0).all() and found.measured.score[-1] > 0.0
-    at_random = falsify(_measure(name), 4_000, 0, adaptive=False)
+    scores = [world.score for world in found.worlds]
+    assert (np.diff(scores) <= 0.0).all() and scores[-1] > 0.0
+    at_random = _measure(name).falsify(4_000, 0, adaptive=False)
     assert found.share_above > 20.0 * at_random.share_above
-    assert found.measured.score[0] > 0.98 * at_random.measured.score[0]
+    assert scores[0] > 0.98 * at_random.worlds[0].score
 
 
 def test_falsify__keeps_nothing_where_nothing_is_wrong() -> None:
     same = Measure(
         "difference", {"a": eb.make_agent("full_brake"), "b": eb.make_agent("full_brake")}, SCENARIO, "first"
     )
-    found = falsify(same, 300, 0)
-    assert found.sample.worlds.n == 0 and found.first_above is None and found.share_above == 0.0
+    found = same.falsify(300, 0)
+    assert found.sample.worlds.n == 0 and not found.worlds and found.first_above is None and found.share_above == 0.0
 
 
 @pytest.mark.parametrize("harm_count", HARM_COUNTS)
 def test_falsify__the_bound_of_the_shield_holds_where_it_is_tightest(harm_count: eb.HarmCount) -> None:
     measure = Measure.of("bound", "coast+step", None, SCENARIO, harm_count)
-    found = falsify(measure, 256, 1)
-    assert found.measured.score.max() <= 1e-9 and found.sample.worlds.n > 3
-    assert np.array_equal(found.measured.score, found.measured.harm - found.measured.reference)
+    found = measure.falsify(256, 1)
+    assert max(world.score for world in found.worlds) <= 1e-9 and found.sample.worlds.n > 3
+    assert all(world.score == world.harm - (world.reference or 0.0) for world in found.worlds)
 
 
 def test_ranges__cover_what_a_scenario_draws() -> None:
@@ -108,4 +109,4 @@ def test_make_measure__refuses(name: MeasureName, agent: str, against: str | Non
 
 def test_falsify__bound_needs_a_shield() -> None:
     with pytest.raises(InvalidInput, match="tells no bound; --measure bound is for an agent behind a shield"):
-        falsify(Measure.of("bound", "full_brake", None, SCENARIO, "first"), 10, 0)
+        Measure.of("bound", "full_brake", None, SCENARIO, "first").falsify(10, 0)

@@ -7,15 +7,15 @@ import pytest
 from matplotlib.figure import Figure
 
 from ethbrake_marl.files.sheet import Sheet
-from ethbrake_marl.studies.reproduction.items import Drawn, Item, Made, Settings, Verdict, stated
+from ethbrake_marl.studies.reproduction import Drawn, Item, Made, Reproduction, Verdict, stated
 
 HOSTILE = "<script>alert('x')</script>\"|*_\u202e"
 
 
 @pytest.fixture
-def settings(tmp_path: Path) -> Settings:
+def settings(tmp_path: Path) -> Reproduction:
     """Quick, and few worlds."""
-    return Settings("quick", tmp_path / "out", 24, machine="a machine")
+    return Reproduction("quick", tmp_path / "out", 24, machine="a machine")
 
 
 def made(text: str = "told", figures: Mapping[Drawn, Figure] | None = None) -> Made:

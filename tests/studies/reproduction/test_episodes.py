@@ -8,8 +8,7 @@ import pytest
 
 from ethbrake_marl.evaluation.episodes import Passport
 from ethbrake_marl.files.yaml import Override
-from ethbrake_marl.studies.reproduction.folder import choose_items, reproduce
-from ethbrake_marl.studies.reproduction.items import Settings
+from ethbrake_marl.studies.reproduction import Reproduction
 from tests.pages.hostile import Page
 
 from .conftest import made, planted
@@ -19,7 +18,7 @@ from .conftest import made, planted
 def page(tmp_path_factory: pytest.TempPathFactory) -> str:
     """That of the trajectories, made again."""
     path = tmp_path_factory.mktemp("trajectories") / "out"
-    reproduce(choose_items(["trajectories"]), Settings("quick", path, 10))
+    Reproduction("quick", path, 10).make(Reproduction.choose(["trajectories"]))
     return (path / "index.html").read_text("utf-8")
 
 
@@ -47,6 +46,6 @@ def test_trajectories__passports_play_them_again(page: str, world: int) -> None:
     assert again.same and again.differences == ()
 
 
-def test_page__of_a_result_without_episodes_has_no_player(settings: Settings) -> None:
-    reproduce([planted("gaps", lambda s: made())], settings)
+def test_page__of_a_result_without_episodes_has_no_player(settings: Reproduction) -> None:
+    settings.make([planted("gaps", lambda s: made())])
     assert "data-episodes" not in (settings.folder / "index.html").read_text("utf-8")

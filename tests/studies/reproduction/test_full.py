@@ -10,9 +10,8 @@ import pytest
 
 from ethbrake_marl.figures import SeedCurve
 from ethbrake_marl.learning.training import load_recipe
-from ethbrake_marl.studies.reproduction import items
-from ethbrake_marl.studies.reproduction.folder import choose_items, reproduce, tell_cost
-from ethbrake_marl.studies.reproduction.items import ITEMS, Course, Group, Settings, TrainedRecipe
+from ethbrake_marl.studies import reproduction
+from ethbrake_marl.studies.reproduction import ITEMS, Course, Group, Reproduction, TrainedRecipe
 from tests.learning.tiny import TINY_PPO
 
 from .conftest import made, planted
@@ -25,17 +24,17 @@ def tiny_groups(monkeypatch: pytest.MonkeyPatch) -> None:
     """One training of a second at either delay, in the place of all."""
     trained = {"ppo": (TrainedRecipe("ppo", TINY.total_steps, 1, 1000), TINY)}
     groups = {delay: Group(delay, f"paper-delay-{delay}", trained, 1) for delay in ("low", "high")}
-    monkeypatch.setattr(items, "groups", lambda: groups)
-    monkeypatch.setattr(items, "CURVES", {"low": ("low",), "high": ("high",)})
+    monkeypatch.setattr(reproduction, "groups", lambda: groups)
+    monkeypatch.setattr(reproduction, "CURVES", {"low": ("low",), "high": ("high",)})
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_full__trains_draws_and_keeps_what_is_trained(tiny_groups, settings: Settings) -> None:
+def test_full__trains_draws_and_keeps_what_is_trained(tiny_groups, settings: Reproduction) -> None:
     full = replace(settings, mode="full", episodes=5)
-    (item,) = choose_items(["learning-low"])
+    (item,) = Reproduction.choose(["learning-low"])
     small = replace(item, trained=("low", "high"))
     assert full.seconds_left(small.trained) == pytest.approx(2 * 1.024)
-    (result,), finished = reproduce([small], full)
+    (result,), finished = full.make([small])
     assert finished and result.trained == ["low/ppo", "high/ppo"]
     assert [each.stem for each in result.figures] == ["learning-low-ours"]
     assert "1 seeds of ppo to 1,024 decisions" in result.notes[0] and "sac" in result.notes[1]
@@ -43,35 +42,35 @@ def test_full__trains_draws_and_keeps_what_is_trained(tiny_groups, settings: Set
     assert higher.outcome in ("agrees", "differs")
     assert full.seconds_left(small.trained) == 0.0
     before = sorted(path.stat().st_mtime_ns for path in (full.folder / "trainings").rglob("run.json"))
-    reproduce([small], full, force=True)
+    full.make([small], force=True)
     assert sorted(path.stat().st_mtime_ns for path in (full.folder / "trainings").rglob("run.json")) == before
 
 
-def test_full__interrupted_makes_the_items_of_what_is_finished(settings: Settings, monkeypatch) -> None:
+def test_full__interrupted_makes_the_items_of_what_is_finished(settings: Reproduction, monkeypatch) -> None:
     asked = []
-    monkeypatch.setattr(Settings, "train", lambda *given: bool(asked.append(given)))
+    monkeypatch.setattr(Reproduction, "train", lambda *given: bool(asked.append(given)))
     chosen = [replace(planted("gaps", lambda s: made()), trained=("open",)), planted("harm-delays", lambda s: made())]
-    results, finished = reproduce(chosen, replace(settings, mode="full"))
+    results, finished = replace(settings, mode="full").make(chosen)
     assert not finished and len(asked) == 1
     assert [each.name for each in results] == ["harm-delays", "gaps"]
 
 
-def test_full__an_item_is_made_again_when_more_is_trained(settings: Settings, monkeypatch) -> None:
+def test_full__an_item_is_made_again_when_more_is_trained(settings: Reproduction, monkeypatch) -> None:
     trained: dict[str, list[Path]] = {}
-    monkeypatch.setattr(Settings, "train", lambda *given: True)
-    monkeypatch.setattr(Settings, "trained", lambda *given: trained)
+    monkeypatch.setattr(Reproduction, "train", lambda *given: True)
+    monkeypatch.setattr(Reproduction, "trained", lambda *given: trained)
     calls = []
     chosen = [replace(planted("gaps", lambda s: calls.append(1) or made()), trained=("open",))]
     for expected in (1, 1):
-        reproduce(chosen, replace(settings, mode="full"))
+        replace(settings, mode="full").make(chosen)
         assert len(calls) == expected
     trained["open/ppo-paper"] = []
-    reproduce(chosen, replace(settings, mode="full"))
+    replace(settings, mode="full").make(chosen)
     assert len(calls) == 2
 
 
 def test_groups__fit_their_recipes_and_every_item_names_groups_that_exist() -> None:
-    found = items.groups()
+    found = reproduction.groups()
     assert {name for item in ITEMS for name in item.trained} == set(found)
     for group in found.values():
         for name, (asked, recipe) in group.trained.items():
@@ -83,10 +82,10 @@ def test_groups__fit_their_recipes_and_every_item_names_groups_that_exist() -> N
 
 
 def test_cost__is_told_before_and_at_most_an_hour(tmp_path: Path) -> None:
-    settings = Settings("full", tmp_path)
-    assert "trainings before them about" in tell_cost(ITEMS, settings)
-    assert 600.0 < settings.seconds_left(list(items.groups())) <= 3_600.0
-    assert "trainings" not in tell_cost(ITEMS, replace(settings, mode="quick"))
+    settings = Reproduction("full", tmp_path)
+    assert "trainings before them about" in settings.cost(ITEMS)
+    assert 600.0 < settings.seconds_left(list(reproduction.groups())) <= 3_600.0
+    assert "trainings" not in replace(settings, mode="quick").cost(ITEMS)
     assert settings.trained(["low"]) == {}
 
 
@@ -112,5 +111,5 @@ def test_returns__of_a_shaped_reward_say_nothing_between_delays_so_its_harm_is_c
     better = course([[-10.0] * 20, [-9.99] * 20], [[10.0] * 20, [8.0] * 20])  # of lower returns
     for recipe, outcome, told in (("ppo", "agrees", "minus its harm"), ("ppo-paper", "differs", "ppo-paper")):
         assert bool(load_recipe(recipe).reward.shaping) == (recipe == "ppo")
-        verdict = items._higher_when_low({"high": {recipe: worse}, "low": {recipe: better}})
+        verdict = reproduction._higher_when_low({"high": {recipe: worse}, "low": {recipe: better}})
         assert (verdict.outcome, told in verdict.because) == (outcome, True)

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.studies.reproduction.folder import ITEMS, choose_items
-from ethbrake_marl.studies.reproduction.items import GAPS, Item, Made, Settings, summarise_verdicts
+from ethbrake_marl.studies.reproduction import GAPS, ITEMS, Item, Made, Reproduction, summarise_verdicts
 
 PAPER = Path(__file__).resolve().parents[3] / "docs" / "paper.md"
 
@@ -19,7 +18,7 @@ OUTCOMES = {"agrees", "differs", "cannot agree", "undecided", "not run"}
 @pytest.fixture(scope="module")
 def made_of(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Made]:
     """Every item of ten worlds, made once."""
-    settings = Settings("quick", tmp_path_factory.mktemp("reproduction"), 10)
+    settings = Reproduction("quick", tmp_path_factory.mktemp("reproduction"), 10)
     return {item.name: item.make(settings) for item in ITEMS}
 
 
@@ -57,12 +56,15 @@ def test_trajectories__of_the_scenarios_have_no_impact_under_the_policies(made_o
 
 
 def test_choose_items__in_the_order_of_the_paper() -> None:
-    assert [item.name for item in choose_items(["random-table", "harm-delays"])] == ["harm-delays", "random-table"]
-    assert len(choose_items([])) == len(ITEMS)
+    assert [item.name for item in Reproduction.choose(["random-table", "harm-delays"])] == [
+        "harm-delays",
+        "random-table",
+    ]
+    assert len(Reproduction.choose([])) == len(ITEMS)
     with pytest.raises(UnknownName, match="did you mean 'harm-delays'"):
-        choose_items(["harm-delay"])
+        Reproduction.choose(["harm-delay"])
     with pytest.raises(InvalidInput, match="given twice"):
-        choose_items(["gaps", "gaps"])
+        Reproduction.choose(["gaps", "gaps"])
 
 
 def test_register__every_gap_says_what_the_paper_says_and_what_is_measured() -> None:

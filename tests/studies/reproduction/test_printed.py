@@ -8,7 +8,7 @@ import pytest
 
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.measures import PAPER_ROWS, PaperRow
-from ethbrake_marl.studies.reproduction.items import (
+from ethbrake_marl.studies.reproduction import (
     FULL_BRAKE,
     NAMES,
     NOBODY,
@@ -31,7 +31,7 @@ def printed(table: str, agent: str) -> PaperRow:
 
 def beside(reading, worlds: int = 400) -> Beside:
     scenario = reading.scenario("paper-random")
-    agents = lineup((FULL_BRAKE,), scenario)
+    agents = lineup(scenario, FULL_BRAKE)
     evaluation = evaluate(scenario.sample(worlds, 7), agents, scenario=scenario, aftermath=False)
     return Beside(reading.name, evaluation, {"Non-E": (NAMES[FULL_BRAKE],), "Hybrid PPO": (NAMES[FULL_BRAKE],)})
 

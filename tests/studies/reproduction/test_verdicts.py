@@ -6,7 +6,7 @@ import pytest
 
 from ethbrake_marl.evaluation.statistics import rate
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.studies.reproduction.items import (
+from ethbrake_marl.studies.reproduction import (
     PERCENT,
     Less,
     Verdict,
