@@ -6,7 +6,6 @@ import hashlib
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -522,8 +521,10 @@ class ProfileProblem(NamedTuple):
         if not ordered:
             raise InvalidInput("profiles: phases must end in order, the last one at the last step")
 
-    def search(self, given: Profiles, *, budget: int, seed: int = 0, threads: int = 1) -> SearchResult:
+    def search(self, given: Profiles, *, budget: int, seed: int = 0, threads: int = 1) -> Found:
         """The best profiles of at most ``MOST_PHASES`` phases that about ``budget`` candidates per world find.
+
+        And their harm [n] under each count (m2/s2), as the engine counts it.
 
         ``given`` [n * Q]: Q profiles of each world, world by world, from which to start; the result is never worse than
         any of them. Raises ``InvalidInput`` for a budget below 1 and ``PhysicsError`` naming the worlds of which no
@@ -548,11 +549,14 @@ class ProfileProblem(NamedTuple):
                 used = list(pool.map(work, range(n)))
         if 0 in used:
             raise PhysicsError({k: "no profile could be followed" for k in range(n) if used[k] == 0})
-        return SearchResult(best, *self.follow(best))
+        first, total = self.follow(best)
+        return best, {"first": first, "total": total}
 
-    def refine(self, commands_mps2: Floats, *, budget: int, seed: int = 0) -> Refinement:
+    def refine(self, commands_mps2: Floats, *, budget: int, seed: int = 0) -> tuple[Floats, Floats]:
         """Search around ``commands_mps2`` [n, T] of the one controlled vehicle, with ``budget`` candidates per world.
 
+        Returns the commands found, never worse than the given ones, and their harm [n] under the problem's count, as
+        the engine counts it (m2/s2).
         Worlds are independent of each other. Raises ``InvalidInput`` for several vehicles, commands of another shape or
         beyond a capacity, or a budget below 1, ``PhysicsError`` naming worlds in which the given commands cannot be
         played.
@@ -571,7 +575,7 @@ class ProfileProblem(NamedTuple):
         _refine_worlds(self, seeded(self.identity, seed), budget, best, first, total, failed)
         if failed.any():
             raise PhysicsError({k: "its commands could not be played" for k in np.flatnonzero(failed).tolist()})
-        return Refinement(best, first, total)
+        return best, np.where(self.clock[:, CLOCK.HARM_IS_TOTAL] == 1.0, total, first)
 
     def best_templates(self, bound: Floats, *, number: int, seed: int = 0) -> tuple[Floats, Ints]:
         """The best of ``number`` templates below ``bound`` [n] (m2/s2) in each world, of the one controlled vehicle.
@@ -649,34 +653,6 @@ def profile_problem(
         chosen, np.concatenate(start, axis=1), clock, np.ascontiguousarray(bounds), command, v.latency_s, v.mass_t,
         v.speed_limit_mps, identities(worlds, command, clock, chosen),
     )  # fmt: skip
-
-
-def state_columns(worlds: Worlds) -> Floats:
-    """The worlds as they are now, in the columns of ``ProfileProblem.start`` before the harm: speeds, gaps, hit flags.
-
-    Raises ``InvalidInput`` for worlds of which only some have an obstacle ahead.
-    """
-    obstacle = worlds.obstacle_ahead
-    if obstacle.any():
-        if not obstacle.all():
-            raise InvalidInput("profiles: only some of the worlds have an obstacle ahead (obstacle_gap_m), not all")
-        worlds = worlds.with_obstacle()
-    return np.concatenate([worlds.speeds_mps, worlds.gaps_m, worlds.pair_hit], axis=1)
-
-
-def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
-    """These worlds in the states [n, S] of a problem with them: speeds, gaps, hit flags, and those of the obstacle."""
-    added = int(worlds.obstacle_ahead.any())  # columns in front of each group
-    N = worlds.N + added
-    gaps, hit = states[:, N : 2 * N - 1], states[:, 2 * N - 1 : 3 * N - 2] == 1.0
-    return replace(
-        worlds,
-        speeds_mps=states[:, added:N].copy(),
-        gaps_m=gaps[:, added:].copy(),
-        pair_hit=hit[:, added:].copy(),
-        obstacle_gap_m=gaps[:, 0].copy() if added else worlds.obstacle_gap_m,
-        obstacle_hit=hit[:, 0].copy() if added else worlds.obstacle_hit,
-    )
 
 
 def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -> UInt64s:
@@ -758,16 +734,7 @@ class Profiles(NamedTuple):
         return Profiles(np.pad(self.ends, ((0, more), (0, 0))), np.pad(self.commands_mps2, ((0, more), (0, 0), (0, 0))))
 
 
-class SearchResult(NamedTuple):
-    """What a search found in each world."""
-
-    profiles: Profiles
-    first_impact_harm: Floats  # [n] of the profile, as the engine counts it (m2/s2)
-    total_harm: Floats  # [n] likewise
-
-    def harm(self, harm_count: HarmCount) -> Floats:
-        """Harm under one count, [n] m2/s2."""
-        return self.first_impact_harm if harm_count == "first" else self.total_harm
+Found = tuple[Profiles, dict[HarmCount, Floats]]
 
 
 @compiled
@@ -816,14 +783,6 @@ LN_SMALLEST_CHANGE = (
 )  # amounts that are added range over three decades below the whole range of commands
 WORSE = 5.0  # m2/s2: a template may be worse by so much before it is climbed from
 NO_HARM = 1e-9  # m2/s2
-
-
-class Refinement(NamedTuple):
-    """What was found in each world, never worse than what was given."""
-
-    commands_mps2: Floats  # [n, T] in each step
-    first_impact_harm: Floats  # [n] m2/s2, as the engine counts it
-    total_harm: Floats  # [n]
 
 
 class Plan(NamedTuple):

@@ -18,7 +18,7 @@ from ethbrake_marl.evaluation.episodes import record_episode
 from ethbrake_marl.evaluation.results import write_per_world
 from ethbrake_marl.figures import trajectories
 from ethbrake_marl.harm import empty_ledger
-from ethbrake_marl.limits.limits import best_harm, realised_harm
+from ethbrake_marl.limits.limits import best_harm, task_problem
 from ethbrake_marl.limits.lower_bound import avoidability, lower_bound
 from ethbrake_marl.physics import Worlds, advance
 from ethbrake_marl.policies import ObservationSchema
@@ -118,7 +118,7 @@ def test_best_harm__of_the_whole_line_is_no_worse_than_of_its_followers():
     followers = best_harm(level_3, worlds, counts=("total",), budget=3_000, threads=1)
     whole, part = together.best["total"].harm, followers.best["total"].harm
     assert whole.mean() < part.mean()
-    _, again = realised_harm(worlds, Task(ALL, (0, 1, 2)), together.best["total"])
+    _, again = task_problem(worlds, Task(ALL, (0, 1, 2))).follow(together.best["total"].profiles)
     assert again.tobytes() == whole.tobytes()
 
 

@@ -173,9 +173,8 @@ class Planner:
             commands = constants.commands_mps2.reshape(n, -1, K, 1)
             commands = np.concatenate([plan.commands_mps2[:, np.newaxis], commands], axis=1)
             given = Profiles(ends.reshape(-1, K), commands.reshape(-1, K, 1))
-            found = problem.search(given, budget=self._candidates, seed=seed)
-            plan = found.profiles
-        return plan, found.harm(self._outlook.harm_count)
+            plan, harm = problem.search(given, budget=self._candidates, seed=seed)
+        return plan, harm[self._outlook.harm_count]
 
 
 def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
@@ -266,7 +265,7 @@ class BestHarm:
                 worlds, vehicle, harm_count=outlook.harm_count, horizon_s=outlook.horizon_s, others_mps2=others
             )
             given = problem.constant(-coupled.deceleration_mps2[:, np.newaxis, np.newaxis])
-            return problem.search(given, budget=self._budget).profiles
+            return problem.search(given, budget=self._budget)[0]
 
 
 # The compiled refinement of a policy: a search around its own episode at the alert, which then drives.
@@ -332,9 +331,8 @@ class RefinedProfile(AgentAround):
     def _search(self, problem: ProfileProblem, commands_mps2: Floats) -> tuple[Floats, Floats]:
         """The best that is found around these commands in the budget, with its harm under the own count."""
         for seed in _rounds(self._seconds * problem.n):
-            found = problem.refine(commands_mps2, budget=self._candidates, seed=seed)
-            commands_mps2 = found.commands_mps2
-        return commands_mps2, found.first_impact_harm if self._outlook.harm_count == "first" else found.total_harm
+            commands_mps2, harm = problem.refine(commands_mps2, budget=self._candidates, seed=seed)
+        return commands_mps2, harm
 
 
 # The compiled refinement once more at every decision, from the worlds as they are then.

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     )
     from ethbrake_marl.envs.interfaces import (
         COLUMNS as COLUMNS,
-        LISTED_WORLD as LISTED_WORLD,
         EthBrakeEnv as EthBrakeEnv,
         EthBrakeParallelEnv as EthBrakeParallelEnv,
         EthBrakeVectorEnv as EthBrakeVectorEnv,
@@ -32,14 +31,7 @@ if TYPE_CHECKING:
         report as report,
         resolve_scenario as resolve_scenario,
     )
-    from ethbrake_marl.envs.registration import (
-        GYMNASIUM_ID as GYMNASIUM_ID,
-        register_environments as register_environments,
-    )
-    from ethbrake_marl.envs.sb3 import (
-        EthBrakeVecEnv as EthBrakeVecEnv,
-        Rewards as Rewards,
-        make_sb3_vec_env as make_sb3_vec_env,
-    )
+    from ethbrake_marl.envs.registration import register_environments as register_environments
+    from ethbrake_marl.envs.sb3 import EthBrakeVecEnv as EthBrakeVecEnv, make_sb3_vec_env as make_sb3_vec_env
 else:
     __getattr__ = front_door(__name__, __file__)

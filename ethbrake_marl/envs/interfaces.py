@@ -127,29 +127,18 @@ class UnknownResetOption(UserWarning):
     """A key of ``reset``'s options is not known to this environment; it is ignored."""
 
 
-def fresh_seed() -> int:
-    """A seed of 63 bits from the operating system's entropy, for an environment that was never given one."""
-    entropy = np.random.SeedSequence().entropy
-    assert isinstance(entropy, int)  # always, when SeedSequence chooses it itself
-    return entropy % 2**63  # fits the integers of every library that infos are handed to
+def chosen_seed(seed: int | None) -> int:
+    """A seed as it is; for None one of 63 bits from the operating system's entropy.
 
-
-def restart(engine: Engine, seed: int | None, options: Mapping[str, Any] | None) -> None:
-    """Start new episodes in all worlds: the stream of ``seed`` from its start, or where the stream stands.
-
-    ``options["initial_state"]`` (see ``Scenario.worlds_from_state``) is the start of every world instead;
-    ``options["listed_world"] = {"seed": 7, "number": 3}`` starts in that world of the list on which agents are
-    evaluated, a batch in that one and those after it. With autoreset, later episodes come from the stream. Other
-    options warn with ``UnknownResetOption`` and are ignored. Raises ``InvalidInput``, with nothing changed, for a seed
-    that is not a whole number >= 0, a bad initial state or listed world, or both of them.
+    Raises ``InvalidInput`` for what is neither None nor a whole number >= 0.
     """
-    check_seed(seed)
-    if not (options is None or isinstance(options, Mapping)):
-        raise InvalidInput(
-            f"reset: options = {options!r}: must be None or a mapping, for instance {{'{INITIAL_STATE}': ...}}"
-        )
-    warn_of_unknown(options or (), (INITIAL_STATE, LISTED_WORLD))
-    engine.reset(seed=None if seed is None else int(seed), worlds=_wanted_worlds(engine, options or {}))
+    if seed is None:
+        entropy = np.random.SeedSequence().entropy
+        assert isinstance(entropy, int)  # always, when SeedSequence chooses it itself
+        return entropy % 2**63  # fits the integers of every library that infos are handed to
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not seed >= 0:
+        raise InvalidInput(f"reset: seed = {seed!r}: must be None or a whole number, at least 0")
+    return int(seed)
 
 
 def _wanted_worlds(engine: Engine, options: Mapping[str, Any]) -> Worlds | None:
@@ -168,14 +157,6 @@ def _wanted_worlds(engine: Engine, options: Mapping[str, Any]) -> Worlds | None:
     for name in ("seed", "number"):
         check_whole_number(f"reset: {LISTED_WORLD}: {name}", wanted[name], 0)
     return engine.scenario.sample(engine.n, int(wanted["seed"]), first=int(wanted["number"])).worlds
-
-
-def check_seed(seed: int | None) -> None:
-    """Refuse a seed that is neither None nor a whole number >= 0."""
-    if seed is None:
-        return
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not seed >= 0:
-        raise InvalidInput(f"reset: seed = {seed!r}: must be None or a whole number, at least 0")
 
 
 def warn_of_unknown(options: Iterable[str], known: Sequence[str]) -> None:
@@ -287,6 +268,66 @@ class Report(NamedTuple):
     known_from_s: Floats | None  # [n, N, N] where there is a channel
     age_s: Floats | None  # [n, N, N] where its messages are periodic
 
+    def plain_infos(self, vehicles: Ints) -> list[dict[str, Any]]:
+        """Infos of these vehicles, world by world, as plain numbers; ``chosen_action`` is an array [1]."""
+        worlds: list[list[list[Any]]] = self.values.take(vehicles, axis=1).tolist()
+        numbers, costs = self.world.tolist(), self.cost.tolist()
+        terms = {
+            f"reward_{name}": (
+                term[:, np.newaxis].repeat(len(vehicles), axis=1) if term.ndim == 1 else term[:, vehicles]
+            ).tolist()
+            for name, term in self.terms.items()
+        }
+        infos: list[dict[str, Any]] = []
+        for k, world in enumerate(worlds):
+            for v, (time, force, first, total, world_first, world_total, collided, chosen, action) in enumerate(world):
+                chosen_action = np.empty(1, _FLOAT32)
+                chosen_action[0] = action
+                info = {
+                    "time_s": time,
+                    "command_in_force_mps2": force,
+                    "first_impact_harm": first,
+                    "total_harm": total,
+                    "world_first_impact_harm": world_first,
+                    "world_total_harm": world_total,
+                    "collided": collided == 1.0,
+                    "chosen_command_mps2": chosen,
+                    "chosen_action": chosen_action,
+                    "cost": costs[k],
+                    "world_seed": self.world_seed,
+                    "world": numbers[k],
+                }
+                infos.append(info | {name: term[k][v] for name, term in terms.items()})
+        for name, news in (("known_from_s", self.known_from_s), ("age_s", self.age_s)):
+            if news is not None:
+                of_these = news.take(vehicles, axis=1)
+                for info, row in zip(infos, of_these.reshape(-1, of_these.shape[2]), strict=True):
+                    info[name] = row.copy()
+        return infos
+
+    def batch_info(self, vehicle: int, rows: Bools, stepped: Bools) -> dict[str, Any]:
+        """One vehicle in many worlds as Gymnasium's vector infos: ``name`` [n] and its mask ``_name`` [n].
+
+        The worlds marked by ``rows`` are told of. What a step brought is 0 but in the worlds marked by ``stepped``.
+        """
+        columns: dict[str, NDArray[Any]] = {name: self.values[:, vehicle, c] for c, name in enumerate(COLUMNS)}
+        columns["collided"] = columns["collided"] == 1.0
+        columns["chosen_action"] = columns["chosen_action"].astype(np.float32)[:, np.newaxis]
+        columns["cost"] = np.where(stepped, self.cost, 0.0)
+        columns["world_seed"], columns["world"] = np.full(len(rows), self.world_seed), self.world
+        for name, term in self.terms.items():
+            columns[f"reward_{name}"] = np.where(stepped, term if term.ndim == 1 else term[:, vehicle], 0.0)
+        if self.known_from_s is not None:
+            columns["known_from_s"] = self.known_from_s[:, vehicle]
+        if self.age_s is not None:
+            columns["age_s"] = self.age_s[:, vehicle]
+        masked: dict[str, Any] = {}
+        for name, column in columns.items():
+            masked[name] = np.zeros_like(column, order="C")
+            masked[name][rows] = column[rows]
+            masked[f"_{name}"] = rows.copy()
+        return masked
+
 
 def report(engine: Engine, step: Step | None = None, rows: Ints | None = None) -> Report:
     """The engine's worlds as they are now, before any of them is renewed; only the worlds ``rows`` if given."""
@@ -348,89 +389,43 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
             out[k, i, 8] = action_of(wanted[k, i], braking, driving)
 
 
-def plain_infos(told: Report, vehicles: Ints | None = None) -> list[dict[str, Any]]:
-    """Infos of these vehicles (None: of all), world by world, as plain numbers; ``chosen_action`` is an array [1]."""
-    shown = np.arange(told.values.shape[1]) if vehicles is None else vehicles
-    worlds: list[list[list[Any]]] = told.values.take(shown, axis=1).tolist()
-    numbers, costs = told.world.tolist(), told.cost.tolist()
-    terms = {
-        f"reward_{name}": (
-            term[:, np.newaxis].repeat(len(shown), axis=1) if term.ndim == 1 else term[:, shown]
-        ).tolist()
-        for name, term in told.terms.items()
-    }
-    infos: list[dict[str, Any]] = []
-    for k, world in enumerate(worlds):
-        for v, (time, force, first, total, world_first, world_total, collided, chosen, action) in enumerate(world):
-            chosen_action = np.empty(1, _FLOAT32)
-            chosen_action[0] = action
-            info = {
-                "time_s": time,
-                "command_in_force_mps2": force,
-                "first_impact_harm": first,
-                "total_harm": total,
-                "world_first_impact_harm": world_first,
-                "world_total_harm": world_total,
-                "collided": collided == 1.0,
-                "chosen_command_mps2": chosen,
-                "chosen_action": chosen_action,
-                "cost": costs[k],
-                "world_seed": told.world_seed,
-                "world": numbers[k],
-            }
-            infos.append(info | {name: term[k][v] for name, term in terms.items()})
-    for name, news in (("known_from_s", told.known_from_s), ("age_s", told.age_s)):
-        if news is not None:
-            of_shown = news.take(shown, axis=1)
-            for info, row in zip(infos, of_shown.reshape(-1, of_shown.shape[2]), strict=True):
-                info[name] = row.copy()
-    return infos
-
-
-def batch_info(told: Report, vehicle: int, rows: Bools, stepped: Bools) -> dict[str, Any]:
-    """One vehicle in many worlds as Gymnasium's vector infos: ``name`` [n] and its mask ``_name`` [n].
-
-    The worlds marked by ``rows`` are told of. What a step brought is 0 but in the worlds marked by ``stepped``.
-    """
-    columns: dict[str, NDArray[Any]] = {name: told.values[:, vehicle, c] for c, name in enumerate(COLUMNS)}
-    columns["collided"] = columns["collided"] == 1.0
-    columns["chosen_action"] = columns["chosen_action"].astype(np.float32)[:, np.newaxis]
-    columns["cost"] = np.where(stepped, told.cost, 0.0)
-    columns["world_seed"], columns["world"] = np.full(len(rows), told.world_seed), told.world
-    for name, term in told.terms.items():
-        columns[f"reward_{name}"] = np.where(stepped, term if term.ndim == 1 else term[:, vehicle], 0.0)
-    if told.known_from_s is not None:
-        columns["known_from_s"] = told.known_from_s[:, vehicle]
-    if told.age_s is not None:
-        columns["age_s"] = told.age_s[:, vehicle]
-    masked: dict[str, Any] = {}
-    for name, column in columns.items():
-        masked[name] = np.zeros_like(column, order="C")
-        masked[name][rows] = column[rows]
-        masked[f"_{name}"] = rows.copy()
-    return masked
-
-
-class _Begun:
+class Begun:
     """What the interfaces share: an engine in which episodes have begun, or not yet."""
 
     engine: Engine
     _started = False
 
     def _restart(self, seed: int | None, options: Mapping[str, Any] | None) -> int | None:
-        """Start episodes, the first ones from fresh entropy where no seed is given; the seed that was used."""
-        if seed is None and not self._started:
-            seed = fresh_seed()  # kept by Gymnasium: reset(seed=env.np_random_seed) repeats it
-        restart(self.engine, seed, options)
+        """Start new episodes in all worlds: the stream of ``seed`` from its start, or where the stream stands.
+
+        The first ones without a seed come from fresh entropy. ``options["initial_state"]`` (see
+        ``Scenario.worlds_from_state``) is the start of every world instead; ``options["listed_world"] = {"seed": 7,
+        "number": 3}`` starts in that world of the list on which agents are evaluated, a batch in that one and those
+        after it. With autoreset, later episodes come from the stream. Other options warn with ``UnknownResetOption``
+        and are ignored. Returns the seed that was used. Raises ``InvalidInput``, with nothing changed, for a seed that
+        is not a whole number >= 0, a bad initial state or listed world, or both of them.
+        """
+        used = None if seed is None and self._started else chosen_seed(seed)
+        if not (options is None or isinstance(options, Mapping)):
+            raise InvalidInput(
+                f"reset: options = {options!r}: must be None or a mapping, for instance {{'{INITIAL_STATE}': ...}}"
+            )
+        warn_of_unknown(options or (), (INITIAL_STATE, LISTED_WORLD))
+        self.engine.reset(seed=used, worlds=_wanted_worlds(self.engine, options or {}))
         self._started = True
-        return seed
+        return used
 
     def _check_started(self, what: str) -> None:
         if not self._started:
             raise InvalidInput(f"{what}: no episode was started; call reset first")
 
+    def describe_worlds(self) -> Columns:
+        """What each running world was drawn as: columns by name, each [worlds]; see ``describe_worlds`` of the file."""
+        self._check_started("describe_worlds")
+        return describe_worlds(self.engine)
 
-class _OneWorld(_Begun):
+
+class _OneWorld(Begun):
     """... of one world, which is shown by a viewer."""
 
     viewer: Viewer
@@ -523,11 +518,11 @@ class EthBrakeEnv(_OneWorld, gymnasium.Env[Observations, NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode; see ``restart``."""
+        """Start an episode; see docs/environment.md."""
         super().reset(seed=self._restart(seed, options))
         self._running = True
         self.viewer.began()
-        return self._observe(), plain_infos(report(self.engine), self._column)[0]
+        return self._observe(), report(self.engine).plain_infos(self._column)[0]
 
     def step(self, action: NDArray[Any]) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
         """Advance by one time step."""
@@ -537,7 +532,7 @@ class EthBrakeEnv(_OneWorld, gymnasium.Env[Observations, NDArray[Any]]):
         self._running = not step.ended[0]
         if self.render_mode is not None:
             self.viewer.play()
-        info = plain_infos(report(self.engine, step), self._column)[0]
+        info = report(self.engine, step).plain_infos(self._column)[0]
         reward = float(step.reward[0, self.learner])
         return self._observe(), reward, bool(step.terminated[0]), bool(step.truncated[0]), info
 
@@ -551,7 +546,7 @@ class EthBrakeEnv(_OneWorld, gymnasium.Env[Observations, NDArray[Any]]):
 _MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
 
 
-class EthBrakeVectorEnv(_Begun, VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
+class EthBrakeVectorEnv(Begun, VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
     """Many worlds of ``EthBrakeEnv``: ``gymnasium.make_vec("EthBrake-v0", num_envs=4096, scenario=...)``.
 
     All worlds take their episodes from one stream: row k of ``reset(seed=s)`` is world k of s, and each new episode is
@@ -603,10 +598,10 @@ class EthBrakeVectorEnv(_Begun, VectorEnv[Observations, NDArray[Any], NDArray[An
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode in every world; see ``restart``."""
+        """Start an episode in every world; see docs/environment.md."""
         super().reset(seed=self._restart(seed, options))
         every = np.ones(self.num_envs, np.bool_)
-        return self.engine.observe(self.learner), batch_info(report(self.engine), self.learner, every, ~every)
+        return self.engine.observe(self.learner), report(self.engine).batch_info(self.learner, every, ~every)
 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
         """Advance every world by one time step, and start new episodes as the autoreset mode says."""
@@ -621,14 +616,9 @@ class EthBrakeVectorEnv(_Begun, VectorEnv[Observations, NDArray[Any], NDArray[An
             infos = self._final_infos(step)
         engine.renew(np.flatnonzero(renewed))
         every = np.ones(self.num_envs, np.bool_)
-        infos |= batch_info(report(engine, step), self.learner, every, ~renewed)
+        infos |= report(engine, step).batch_info(self.learner, every, ~renewed)
         reward = step.reward[:, self.learner].copy()
         return engine.observe(self.learner), reward, step.terminated, step.truncated, infos
-
-    def describe_worlds(self) -> dict[str, NDArray[Any]]:
-        """What each running world was drawn as: columns by name, each [worlds]; see ``describe_worlds`` of the file."""
-        self._check_started("describe_worlds")
-        return describe_worlds(self.engine)
 
     def render(self) -> tuple[Any, ...]:
         """A frame [H, W, 3] uint8, or a text, of every world; of a world that has just been renewed, its start."""
@@ -650,7 +640,7 @@ class EthBrakeVectorEnv(_Begun, VectorEnv[Observations, NDArray[Any], NDArray[An
         final = np.full(self.num_envs, None, dtype=object)
         for row in np.flatnonzero(ended):
             final[row] = observations[row].copy()
-        info = batch_info(report(self.engine, step), self.learner, ended, ended)
+        info = report(self.engine, step).batch_info(self.learner, ended, ended)
         return {"final_obs": final, "_final_obs": ended, "final_info": info, "_final_info": ended.copy()}
 
 
@@ -759,7 +749,7 @@ class EthBrakeParallelEnv(_OneWorld, ParallelEnv[str, Observations, NDArray[Any]
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observations], Infos]:
-        """Start an episode; see ``restart``."""
+        """Start an episode; see docs/environment.md."""
         given = self._restart(seed, options)
         if given is not None:
             self.np_random = np.random.default_rng(given)
@@ -808,7 +798,7 @@ class EthBrakeParallelEnv(_OneWorld, ParallelEnv[str, Observations, NDArray[Any]
         return {agent: every[0, i] for i, agent in enumerate(self.possible_agents)}
 
     def _infos(self, told: Report) -> Infos:
-        return dict(zip(self.possible_agents, plain_infos(told, self._vehicles), strict=True))
+        return dict(zip(self.possible_agents, told.plain_infos(self._vehicles), strict=True))
 
 
 def _agent_vehicles(engine: Engine, agents: WhoIsAgent) -> Ints:

@@ -15,13 +15,11 @@ from ethbrake_marl.engine import Arrays, Engine, Step
 from ethbrake_marl.envs.interfaces import (
     INITIAL_STATE,
     AnyScenario,
+    Begun,
     action_box,
-    check_seed,
-    describe_worlds,
+    chosen_seed,
     feature_box,
-    fresh_seed,
     make_engine,
-    plain_infos,
     report,
     warn_of_unknown,
 )
@@ -68,13 +66,12 @@ def make_sb3_vec_env(
     (4, 27)
 
     """
-    check_seed(seed)
+    begin = chosen_seed(seed)
     engine = make_engine(scenario, n_envs, learners=learners, reward=reward, observation=observation)
-    begin = fresh_seed() if seed is None else seed
     return EthBrakeVecEnv(engine, begin, horizon_is_end=horizon_is_end, appended=appended, step_infos=step_infos)
 
 
-class EthBrakeVecEnv(VecEnv):
+class EthBrakeVecEnv(Begun, VecEnv):
     """Rows are learners: row ``k * L + l`` is learner l (front to rear) of world k, for L learners in each world.
 
     With several learners all rows share one policy, and the rows of a world end together. All worlds take their
@@ -120,20 +117,18 @@ class EthBrakeVecEnv(VecEnv):
         self.horizon_is_end = horizon_is_end
         self.appended = appended
         self.step_infos = step_infos
-        self._next_seed: int | None = int(seed)
+        self._next_seed: int | None = seed
         self._learners = np.array(engine.learners, np.int64)
         self._actions: NDArray[Any] | None = None
         rows = engine.n * len(engine.learners)
         self._return = np.zeros(rows)
         self._steps = np.zeros(rows, np.int64)
         self._begun = np.zeros(0)  # values of the report at each episode's beginning
-        self._started = False
         super().__init__(rows, feature_box(features), action_box())
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Start the stream of ``seed`` at the next reset (None: fresh entropy); one stream serves all rows."""
-        check_seed(seed)
-        self._next_seed = fresh_seed() if seed is None else int(seed)
+        self._next_seed = chosen_seed(seed)
         return [self._next_seed] * self.num_envs
 
     def reset(self) -> Observations:
@@ -170,7 +165,7 @@ class EthBrakeVecEnv(VecEnv):
         reward = step.reward.take(learners, axis=1).reshape(-1)
         self._return += reward
         self._steps += 1
-        infos = plain_infos(report(engine, step), learners) if self.step_infos else [{} for _ in range(self.num_envs)]
+        infos = report(engine, step).plain_infos(learners) if self.step_infos else [{} for _ in range(self.num_envs)]
         over = engine.ended  # all that have ended: an interrupted step may have left some that nobody renewed
         ended = np.flatnonzero(over)
         if len(ended):
@@ -178,12 +173,6 @@ class EthBrakeVecEnv(VecEnv):
             engine.renew(ended)
             self._begun[ended] = report(engine, rows=ended).values
         return self._observe(), reward.astype(np.float32), self._by_row(over), infos
-
-    def describe_worlds(self) -> dict[str, NDArray[Any]]:
-        """What each running world was drawn as: columns by name, each [worlds]."""
-        if not self._started:
-            raise InvalidInput("describe_worlds: no episode was started; call reset first")
-        return describe_worlds(self.engine)
 
     def close(self) -> None:
         """Nothing to release."""
@@ -222,7 +211,7 @@ class EthBrakeVecEnv(VecEnv):
     def _close_episodes(self, ended: Ints, step: Step, infos: list[dict[str, Any]]) -> None:
         """Fill in the infos of the rows whose world has ended, before the next episodes start."""
         rows, final = self._rows(ended), self._observe(ended)
-        told = plain_infos(report(self.engine, step, ended), self._learners)
+        told = report(self.engine, step, ended).plain_infos(self._learners)
         truncated = self._by_row(step.truncated[ended]).tolist()
         gained, steps = self._return.take(rows).tolist(), self._steps.take(rows).tolist()
         for row, info, cut, seen, gain, count in zip(rows.tolist(), told, truncated, final, gained, steps, strict=True):
@@ -242,7 +231,7 @@ class EthBrakeVecEnv(VecEnv):
         """The infos with which the running episodes began, row by row; made when they are asked for."""
         if not self._started:
             return [{} for _ in range(self.num_envs)]
-        return plain_infos(report(self.engine)._replace(values=self._begun), self._learners)
+        return report(self.engine)._replace(values=self._begun).plain_infos(self._learners)
 
     @reset_infos.setter
     def reset_infos(self, infos: list[dict[str, Any]]) -> None:

@@ -28,19 +28,7 @@ from ethbrake_marl.actions import command_to_action
 from ethbrake_marl.agents import Agent, Driver, Episodes, Team, drive, episode_engine, parse_spec, script_agents
 from ethbrake_marl.defaults import DEFAULT, HARM_COUNTS, DatasetFormat, HarmCount
 from ethbrake_marl.engine import Engine, Step
-from ethbrake_marl.envs import (
-    COLUMNS,
-    GYMNASIUM_ID,
-    LISTED_WORLD,
-    Frame,
-    Report,
-    Scene,
-    Trace,
-    action_box,
-    animate_films,
-    feature_box,
-    report,
-)
+from ethbrake_marl.envs import COLUMNS, Frame, Report, Scene, Trace, action_box, animate_films, feature_box, report
 from ethbrake_marl.errors import (
     AlreadyExists,
     InvalidInput,
@@ -993,7 +981,7 @@ def env_spec(task: Task) -> EnvSpec:
     check_one_learner(
         task.scenario.name, names, "a dataset of Minari is one learner's: --vehicle NAME, or --format parquet"
     )
-    spec = copy.deepcopy(gymnasium.spec(GYMNASIUM_ID))
+    spec = copy.deepcopy(gymnasium.spec("EthBrake-v0"))
     spec.kwargs = {"scenario": task.scenario.declared(), "reward": task.reward.model_dump(mode="json")}
     if task.observation != observation_for(task.scenario):
         spec.kwargs["observation"] = [feature.name for feature in task.observation.features]
@@ -1011,7 +999,7 @@ def _episodes(recording: Recording) -> Iterator[dict[str, Any]]:
     for k, (world, end) in enumerate(zip(recording.index.tolist(), recording.decisions.tolist(), strict=True)):
         yield {
             "seed": seed,
-            "options": {LISTED_WORLD: {"seed": seed, "number": world}},
+            "options": {"listed_world": {"seed": seed, "number": world}},
             "observations": recording.observations[: end + 1, k, 0],
             "actions": recording.actions[:end, k],
             "rewards": reward[:end, k],

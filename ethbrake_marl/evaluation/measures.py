@@ -37,8 +37,8 @@ from ethbrake_marl.limits import (
     known_limits,
     prove,
     shipped_tables,
+    task_problem,
     unproven_because,
-    world_identity,
 )
 from ethbrake_marl.physics import (
     Bools,
@@ -1193,7 +1193,7 @@ def proven_of_table(worlds: Worlds, task: Task, table: BestHarmTable) -> dict[st
 
     def of(rows: Ints) -> dict[str, Any] | None:
         some = worlds.take(rows)
-        proof, identity = prove(some, task), world_identity(some, task)
+        proof, identity = prove(some, task), task_problem(some, task).identity
         if isinstance(proof, Unproven):
             return None
         known = (table.harm(identity, harm_count) for harm_count in HARM_COUNTS)
@@ -1222,7 +1222,7 @@ def shipped_bounds(tables: Iterable[BestHarmTable] | None = None) -> list[dict[s
         task = Task(scenario, tuple(scenario.vehicle_names.index(name) for name in names))
         sample = scenario.sample(episodes, seed)
         worlds = sample.worlds
-        table.check_holds_any(world_identity(worlds, task))
+        table.check_holds_any(task_problem(worlds, task).identity)
         why = unproven_because(worlds, task)
         proven = None if why is not None else proven_of_table(worlds, task, table)
         known = {c: float(table.best[c].harm.mean()) if c in table.best else None for c in HARM_COUNTS}

@@ -17,17 +17,7 @@ from ethbrake_marl.evaluation.statistics import mean, paired_difference
 from ethbrake_marl.files.sheet import Column, Estimate, Row, Sheet
 from ethbrake_marl.physics import Floats, Ints, LeftOutRows, Worlds, measured_without_failed
 from ethbrake_marl.scenario import Sample, Task
-from ethbrake_marl.shield import (
-    SAME_HARM,
-    VERDICTS,
-    HybridAgent,
-    Shielded,
-    ShieldedDriver,
-    join,
-    put_shield,
-    review,
-    shielded_episodes,
-)
+from ethbrake_marl.shield import SAME_HARM, VERDICTS, HybridAgent, Shielded, ShieldedDriver, put_shield, review
 
 # ``step-alert``: rollout at the alert only; ``step-cap``: no vehicle above its cap.
 Mode = Literal["none", "episode", "step", "step-alert", "step-cap"]
@@ -203,7 +193,7 @@ def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[Mode, _Part]:
     behind |= {"step-cap": {"cap": "baseline"}} if several else {}
     for mode, settings in behind.items():
         episodes = drive(worlds, put_shield(agent, task, logging=True, **settings), task.scenario)
-        shielded = shielded_episodes(episodes, task)
+        shielded = Shielded.of(episodes, task)
         verdict = review(episodes.guarded.shield, agent, worlds).verdict
         counted = np.array([int((verdict == each).sum()) for each in VERDICTS])
         found[mode] = _Part(shielded.harm, int(shielded.moving.sum()), shielded, counted)
@@ -221,7 +211,7 @@ def _row(agent: str, mode: Mode, parts: list[_Part], harm: Mapping[Mode, Floats]
     shielded = [part.shielded for part in parts if part.shielded is not None]
     if not shielded:
         return row
-    whole = join(shielded)
+    whole = Shielded.join(shielded)
     counted = np.sum([part.verdicts for part in parts if part.verdicts is not None], axis=0).tolist()
     decisions, replaced = int(whole.decisions.sum()), sum(counted)
     each = dict(zip(task.vehicles, (whole.replaced.sum(axis=0) / decisions).tolist(), strict=True))

@@ -14,13 +14,12 @@ if TYPE_CHECKING:
         driven_profiles as driven_profiles,
         known_limits as known_limits,
         prove as prove,
-        realised_harm as realised_harm,
         scripted_commands as scripted_commands,
         search_list as search_list,
         shipped_tables as shipped_tables,
+        task_problem as task_problem,
         undecided_because as undecided_because,
         unproven_because as unproven_because,
-        world_identity as world_identity,
     )
     from ethbrake_marl.limits.lower_bound import avoidability as avoidability
 else:

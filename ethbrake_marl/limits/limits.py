@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import io
 import json
-import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -41,17 +40,7 @@ from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError, chec
 from ethbrake_marl.files.arrays import ArrayArchive, ArrayRow
 from ethbrake_marl.files.store import parse_strict_json, read_plain, write_file
 from ethbrake_marl.files.yaml import first_mistake
-from ethbrake_marl.limits.lower_bound import (
-    FRONT_FIRST,
-    REAR_FIRST,
-    avoidability,
-    empty_plan,
-    lower_bound,
-    meet_front,
-    meet_rear,
-    onset_states,
-    team_bound,
-)
+from ethbrake_marl.limits.lower_bound import avoidability, extreme_profiles, lower_bound, onset_states, team_bound
 from ethbrake_marl.physics import (
     CLOCK,
     Bools,
@@ -60,25 +49,11 @@ from ethbrake_marl.physics import (
     UInt64s,
     Worlds,
     advance,
-    compiled,
-    follow_whole,
     leaving_out_failed,
     stopping_distances,
 )
 from ethbrake_marl.scenario import Sample, Scenario, Task
-from ethbrake_marl.search import (
-    MOST_PHASES,
-    ProfileProblem,
-    Profiles,
-    SearchResult,
-    SearchWorld,
-    allowed,
-    copy_profile,
-    copy_rows,
-    largest,
-    make_search_world,
-    profile_problem,
-)
+from ethbrake_marl.search import MOST_PHASES, Found, ProfileProblem, Profiles, profile_problem
 
 # Tables of best known harm: small files that are looked up by what a world is, never by its place in a list.
 
@@ -220,13 +195,13 @@ class BestHarmTable:
         learners = [scenario.vehicle_names[i] for i in scenario.learners]
         check_one_learner(scenario.name, learners, "agents whose episodes are kept drive exactly one")
         task = Task(scenario, scenario.learners)
-        table, identity = self, world_identity(worlds, task)
+        table, identity = self, task_problem(worlds, task).identity
         known = np.max([table.harm(identity, harm_count) for harm_count in table.best], axis=0)
         hard = np.flatnonzero(known > 0.0)
         lowered = dict.fromkeys(table.best, 0)
         if hard.size:
             worlds, identity = worlds.take(hard), identity[hard]
-            problem = _problem(worlds, task)
+            problem = task_problem(worlds, task)
             for agent in agents.values():
 
                 def work(at: Ints, agent: Agent = agent) -> Profiles:
@@ -332,102 +307,6 @@ def _used(ends: NDArray[np.int64]) -> NDArray[np.int64]:
 #
 # What is found is realised harm: an upper bound of the true minimum, never below it. See docs/best-harm.md.
 
-# Profiles of full drive and full braking from which a search starts: drive, brake to the leader, drive; or the mirror.
-#
-# The proof of the lower bound says what the least harm looks like: the vehicle drives as hard as it can for a while,
-# then brakes as hard as it can until it meets the leader; or it brakes, then drives until the rear one meets it. After
-# that it goes the other way (docs/avoidability.md). A random search seldom finds such a narrow optimum.
-
-KEPT = 12  # profiles of each world
-_LATEST_S = 2.0  # of the first change of command, at first
-_TIMES = 24  # of it that are tried in each round
-_ROUNDS = 3  # each closer around the best one
-_PHASES = 5  # before the first change, its step, up to the second one, its step, after it
-
-
-def extreme_profiles(problem: ProfileProblem, states: Floats, has_front: Bools, has_rear: Bools) -> Profiles:
-    """The ``KEPT`` best such profiles of each world [n * KEPT], world by world, of the one controlled vehicle.
-
-    ``states`` [n, WIDTH] is each world at the first decision (as of the bound). It tells only when the two would
-    meet, so a neighbour that does not brake fully makes the profiles less good, not wrong. A neighbour that is not
-    there [n] is not met.
-    """
-    n, last = problem.n, problem.last_step
-    ends = np.repeat(last, KEPT * MOST_PHASES).reshape(n, KEPT, MOST_PHASES)
-    commands = np.zeros((n, KEPT, MOST_PHASES, 1))
-    _fill_extremes(problem, states, has_front, has_rear, ends, commands)
-    return Profiles(ends.reshape(-1, MOST_PHASES), commands.reshape(-1, MOST_PHASES, 1))
-
-
-@compiled
-def _fill_extremes(
-    problem: ProfileProblem, states: Floats, has_front: Bools, has_rear: Bools, ends: Ints, commands: Floats
-) -> None:
-    """Fill ``ends`` [n, KEPT, K] and ``commands`` [n, KEPT, K, 1]."""
-    no_random = np.zeros(states.shape[0], np.uint64)
-    for k in range(states.shape[0]):
-        world = make_search_world(problem, k, no_random)
-        values = np.full(KEPT, math.inf)
-        for kind, there in ((FRONT_FIRST, has_front[k]), (REAR_FIRST, has_rear[k])):
-            low, high = 0.0, _LATEST_S
-            for _ in range(_ROUNDS if there else 0):
-                best = try_changes(world, kind, states[k], problem.start[k], low, high, ends[k], commands[k], values)
-                around = 1.5 * (high - low) / (_TIMES - 1)
-                low, high = max(best - around, 0.0), best + around
-
-
-@compiled(apart=True)
-def try_changes(
-    world: SearchWorld, kind: int, at: Floats, start: Floats, low: float, high: float, ends: Ints, commands: Floats,
-    values: Floats,
-) -> float:  # fmt: skip
-    """Try first changes of command from ``low`` to ``high`` (s) and keep the best profiles; the best change."""
-    plan, other = empty_plan(), empty_plan()
-    states = np.zeros((_PHASES + 1, start.shape[0]))
-    copy_rows(start.reshape(1, -1), states, 1)
-    tried_ends, tried = np.zeros(_PHASES, np.int64), np.zeros((_PHASES, 1))
-    least, best = math.inf, low
-    for k in range(_TIMES):
-        change = low + (high - low) * k / (_TIMES - 1)
-        meeting = meet_front(at, change, plan, other) if kind == FRONT_FIRST else meet_rear(at, change, plan, other)
-        for early, share in ((0, 0.0), (0, 0.5), (0, 1.0), (1, 0.5)):
-            fill_extreme(world, kind, change, meeting, early, share, tried_ends, tried)
-            value, reached = follow_whole(world.episode, tried_ends, tried, states, math.inf)
-            if reached < 0:
-                continue
-            if value < least:
-                least, best = value, change
-            worst = largest(values)
-            if value < values[worst]:
-                values[worst] = value
-                copy_profile(tried_ends, tried, ends[worst], commands[worst])
-                for phase in range(_PHASES, commands.shape[1]):
-                    commands[worst, phase, 0] = tried[_PHASES - 1, 0]
-    return best
-
-
-@compiled
-def fill_extreme(
-    world: SearchWorld, kind: int, change: float, meeting: float, early: int, share: float, ends: Ints, commands: Floats
-) -> None:
-    """One profile: from ``change`` to ``meeting`` (s) the other command; ``share`` of the first one in the step of it.
-
-    In the step of the change the command leads to the speed that the change would. ``early``: so many steps earlier.
-    """
-    low, high, step = world.bounds[0, 0], world.bounds[0, 1], world.episode.clock[CLOCK.TIME_STEP]
-    last = int(world.episode.clock[CLOCK.LAST_STEP])
-    first, second = (high, low) if kind == FRONT_FIRST else (low, high)
-    turn = min(int(change / step), last)
-    back = max(int(min(meeting / step, last)) - early, turn + 1)
-    commands[0, 0], commands[2, 0], commands[4, 0] = first, second, first
-    commands[1, 0] = second + (change / step - turn) * (first - second)
-    commands[3, 0] = second + share * (first - second)
-    ends[0], ends[1], ends[2], ends[3], ends[4] = turn, turn + 1, back, back + 1, last
-    for k in range(_PHASES):
-        ends[k] = min(ends[k], last)
-        commands[k, 0] = allowed(commands[k, 0], low, high)
-
-
 CHUNK = 200  # worlds between two reports of progress
 LEFT_OUT = "left_out"  # key of a table's header: number in the list -> why the world is in no row
 CONSTANTS = 29  # even grid of constant commands from which every search also starts
@@ -457,36 +336,35 @@ def best_harm(
     """
     if not counts or not set(counts) <= set(HARM_COUNTS) or len(set(counts)) != len(counts):
         raise InvalidInput(f"counts {tuple(counts)}: must be first, total, or both")
-    chosen = scenario.learners if vehicles is None else tuple(vehicles)
-    workers = (os.cpu_count() or 1) if threads is None else threads
-    search = _Search(scenario, worlds, scripted_commands(worlds, Task(scenario, chosen)), budget, seed, workers)
-    found: list[SearchResult] = []
-    identity = search.problem(chosen).identity
+    task = Task(scenario, scenario.learners if vehicles is None else tuple(vehicles))
+    others, problem = scripted_commands(worlds, task), task_problem(worlds, task)
+    identity = problem.identity
     if known is not None:
-        known.check_fits(search.problem(chosen))
+        known.check_fits(problem)
+    effort = {"budget": budget, "seed": seed, "threads": (os.cpu_count() or 1) if threads is None else threads}
+    found: list[Found] = []
     for count in counts:
-        given = [earlier.profiles for earlier in found]
+        given = [profiles for profiles, _ in found]
         if known is not None:
-            given.append(_startable(known.profiles(identity, count, search.problem(chosen).last_step)[0]))
-        found.append(search.best(chosen, count, given))
+            given.append(_startable(known.profiles(identity, count, problem.last_step)[0]))
+        found.append(_searched(worlds, replace(task, harm_count=count), others, given, task.vehicles, effort))
     rows = np.arange(worlds.n)
     best: dict[HarmCount, BestKnown] = {}
     for count in counts:
-        harms = np.stack([result.harm(count) for result in found])
+        harms = np.stack([harm[count] for _, harm in found])
         pick = np.argmin(harms, axis=0)
-        ends = np.stack([result.profiles.ends for result in found])[pick, rows]
-        commands = np.stack([result.profiles.commands_mps2 for result in found])[pick, rows]
+        ends = np.stack([profiles.ends for profiles, _ in found])[pick, rows]
+        commands = np.stack([profiles.commands_mps2 for profiles, _ in found])[pick, rows]
         best[count] = BestKnown(harms[pick, rows], Profiles(ends, commands))
-    names = [scenario.vehicle_names[i] for i in chosen]
+    names = [scenario.vehicle_names[i] for i in task.vehicles]
     header = {"scenario": scenario.name, "vehicles": names, "budget": budget, "search_seed": seed}
     table = BestHarmTable(identity, best, header)
     if known is None:
         return table
-    for harm_count in [harm_count for harm_count in table.best if harm_count in known.best]:
-        nowhere = np.zeros(len(table.identity), np.int64)
-        kept, has_profile = known.profiles(table.identity, harm_count, nowhere + 1)
+    for count in [count for count in counts if count in known.best]:
+        kept, has_profile = known.profiles(identity, count, np.ones(worlds.n, np.int64))
         kept.ends[~has_profile] = 0
-        table, _ = table.improved(table.identity, harm_count, known.harm(table.identity, harm_count), kept)
+        table, _ = table.improved(identity, count, known.harm(identity, count), kept)
     return replace(table, header={**table.header, "after": dict(known.header)})
 
 
@@ -515,7 +393,7 @@ def search_list(
     left_out: dict[int, str] = {}
     n, task = sample.worlds.n, Task(scenario, scenario.learners if vehicles is None else tuple(vehicles))
     if known is not None:
-        every, _, _ = leaving_out_failed(lambda at: world_identity(sample.worlds.take(at), task), np.arange(n))
+        every, _, _ = leaving_out_failed(lambda at: task_problem(sample.worlds.take(at), task).identity, np.arange(n))
         if every is not None:
             known.check_holds_any(every)
     options = {"counts": counts, "budget": budget, "seed": seed, "threads": threads, "known": known}
@@ -551,7 +429,7 @@ def _kept_or_searched(
     question |= {} if known is None else {"after": dict(known.header)}
     if file is not None:
         with suppress(CorruptBundle):
-            part = kept_chunk(file, world_identity(worlds, task), question)
+            part = kept_chunk(file, task_problem(worlds, task).identity, question)
             if part is not None:
                 return part
     part = best_harm(task.scenario, worlds, vehicles=task.vehicles, **options)
@@ -564,7 +442,7 @@ def _kept_or_searched(
 def chunks_left(scenario: Scenario, sample: Sample, *, budget: int, chunks: Path) -> tuple[int, list[Path]]:
     """Worlds that ``search_list`` would search, with both counts, not finding them kept; and what it finds damaged."""
     left, damaged = 0, []
-    identity = world_identity(sample.worlds, Task(scenario, scenario.learners))
+    identity = task_problem(sample.worlds, Task(scenario, scenario.learners)).identity
     question = {"counts": list(HARM_COUNTS), "budget": budget, "search_seed": 0}
     for first in range(0, len(identity), CHUNK):
         file, wanted = chunk_file(chunks, first), identity[first : first + CHUNK]
@@ -591,16 +469,6 @@ def kept_chunk(file: Path, identity: UInt64s, question: Mapping[str, object]) ->
     return table if asked == question and np.array_equal(table.identity, identity) else None
 
 
-def world_identity(worlds: Worlds, task: Task) -> UInt64s:
-    """What tells the problem in one world (at t = 0) from that in any other, [n]: ``search.profiles.identities``."""
-    return _problem(worlds, task).identity
-
-
-def realised_harm(worlds: Worlds, task: Task, best: BestKnown) -> tuple[Floats, Floats]:
-    """First-impact and total harm [n] of the stored profiles, driven again in these worlds."""
-    return _problem(worlds, task).follow(best.profiles)
-
-
 def scripted_commands(worlds: Worlds, task: Task) -> Floats:
     """The commands [n, N] of all vehicles but those of the task; full braking in the columns of these.
 
@@ -610,65 +478,46 @@ def scripted_commands(worlds: Worlds, task: Task) -> Floats:
     return fixed_commands(others, worlds, f"scenario {task.scenario.name!r}, search for the best profiles")
 
 
-def _problem(worlds: Worlds, task: Task) -> ProfileProblem:
-    return _Search(task.scenario, worlds, scripted_commands(worlds, task), 1, 0, 1).problem(task.vehicles)
+def task_problem(worlds: Worlds, task: Task) -> ProfileProblem:
+    """The problem of choosing the profiles of the task's vehicles in worlds at t = 0.
+
+    Its ``identity`` tells a world from any other; that does not depend on the count.
+    """
+    return _problem(worlds, task, scripted_commands(worlds, task), task.vehicles)
 
 
-@dataclass(frozen=True, slots=True)
-class _Search:
-    """Searches in given worlds."""
+def _problem(worlds: Worlds, task: Task, others: Floats, deciders: Sequence[int]) -> ProfileProblem:
+    scenario = task.scenario
+    return profile_problem(
+        worlds, task.vehicles, harm_count=task.harm_count, horizon_s=scenario.horizon_s,
+        time_step_s=scenario.time_step_s, others_mps2=others, deciders=deciders,
+    )  # fmt: skip
 
-    scenario: Scenario
-    worlds: Worlds
-    others: Floats  # [n, N]
-    budget: int
-    seed: int
-    threads: int
 
-    def problem(
-        self, vehicles: Sequence[int], harm_count: HarmCount = "first", deciders: Sequence[int] | None = None
-    ) -> ProfileProblem:
-        return profile_problem(
-            self.worlds,
-            vehicles,
-            harm_count=harm_count,
-            horizon_s=self.scenario.horizon_s,
-            time_step_s=self.scenario.time_step_s,
-            others_mps2=self.others,
-            deciders=deciders,
+def _searched(
+    worlds: Worlds, task: Task, others: Floats, given: Sequence[Profiles], deciders: Sequence[int],
+    effort: dict[str, int],
+) -> Found:  # fmt: skip
+    """The best profiles that start from constants, from ``given``, and from each vehicle's own best profile."""
+    problem = _problem(worlds, task, others, deciders)
+    starts = [problem.constant(problem.even_grid(CONSTANTS)), *given]
+    if len(task.vehicles) == 1:
+        coupled = optimise_coupled(
+            worlds, task.vehicle, harm_count=task.harm_count, horizon_s=task.scenario.horizon_s, others_mps2=others
         )
-
-    def best(
-        self,
-        vehicles: Sequence[int],
-        harm_count: HarmCount,
-        given: Sequence[Profiles] = (),
-        deciders: Sequence[int] | None = None,
-    ) -> SearchResult:
-        """The best profiles that start from constants, from ``given``, and from each vehicle's own best profile."""
-        problem = self.problem(vehicles, harm_count, deciders)
-        starts = [problem.constant(problem.even_grid(CONSTANTS)), *given]
-        if len(vehicles) == 1:
-            coupled = optimise_coupled(
-                self.worlds,
-                vehicles[0],
-                harm_count=harm_count,
-                horizon_s=self.scenario.horizon_s,
-                others_mps2=self.others,
-            )
-            starts.insert(0, problem.constant(-coupled.deceleration_mps2[:, np.newaxis, np.newaxis]))
-            at, _ = advance(self.worlds, self.others, until_s=problem.clock[:, CLOCK.START])
-            forward = np.all(at.speeds_mps >= 0.0, axis=1)
-            neighbours = (forward & there for there in (vehicles[0] > 0, vehicles[0] < at.N - 1))
-            starts.append(extreme_profiles(problem, onset_states(at, vehicles[0], None), *neighbours))
-        else:
-            for c, vehicle in enumerate(vehicles):
-                alone = self.best([vehicle], harm_count, (), vehicles if deciders is None else deciders).profiles
-                least = problem.bounds[:, np.newaxis, :, 0]
-                commands = np.broadcast_to(least, (*alone.ends.shape, len(vehicles))).copy()
-                commands[..., c] = alone.commands_mps2[..., 0]
-                starts.append(Profiles(alone.ends, commands))
-        return problem.search(_joined(starts, problem.n), budget=self.budget, seed=self.seed, threads=self.threads)
+        starts.insert(0, problem.constant(-coupled.deceleration_mps2[:, np.newaxis, np.newaxis]))
+        at, _ = advance(worlds, others, until_s=problem.clock[:, CLOCK.START])
+        forward = np.all(at.speeds_mps >= 0.0, axis=1)
+        neighbours = (forward & there for there in (task.vehicle > 0, task.vehicle < at.N - 1))
+        starts.append(extreme_profiles(problem, onset_states(at, task.vehicle, None), *neighbours))
+    else:
+        for c, vehicle in enumerate(task.vehicles):
+            alone, _ = _searched(worlds, replace(task, vehicles=(vehicle,)), others, (), deciders, effort)
+            least = problem.bounds[:, np.newaxis, :, 0]
+            commands = np.broadcast_to(least, (*alone.ends.shape, len(task.vehicles))).copy()
+            commands[..., c] = alone.commands_mps2[..., 0]
+            starts.append(Profiles(alone.ends, commands))
+    return problem.search(_joined(starts, problem.n), **effort)
 
 
 def _startable(profiles: Profiles) -> Profiles:
@@ -726,7 +575,7 @@ def best_known(worlds: Worlds, task: Task) -> dict[HarmCount, Floats]:
     horizon and the driven vehicles. Raises ``InvalidInput`` for a script whose command is not fixed at the alert, as no
     search knows it.
     """
-    identity = world_identity(worlds, task)
+    identity = task_problem(worlds, task).identity
     known = {harm_count: np.full(worlds.n, np.nan) for harm_count in HARM_COUNTS}
     for table in shipped_tables():
         known = {harm_count: np.fmin(harm, table.harm(identity, harm_count)) for harm_count, harm in known.items()}

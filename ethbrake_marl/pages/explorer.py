@@ -39,12 +39,12 @@ from ethbrake_marl.evaluation import Conditions, EpisodeMotion, follow_episodes
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import check_writable, parse_strict_json
 from ethbrake_marl.files.yaml import flow_text
-from ethbrake_marl.limits import Unproven, driven_profiles, prove, scripted_commands
+from ethbrake_marl.limits import Unproven, driven_profiles, prove, scripted_commands, task_problem
 from ethbrake_marl.pages.page import Page, Part, Played, Section, shown
 from ethbrake_marl.physics import Decisions, Floats, Worlds
 from ethbrake_marl.policies import Policy
 from ethbrake_marl.scenario import QUANTITY, Scenario, Task
-from ethbrake_marl.search import Profiles, profile_problem
+from ethbrake_marl.search import Profiles
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver
 
 if TYPE_CHECKING:
@@ -217,7 +217,7 @@ class Explored:
     @cached_property
     def task(self) -> Task:
         """What agents are asked."""
-        return Task(self.scenario, (self.vehicle,))
+        return Task(self.scenario, (self.vehicle,), self.harm_count)
 
     def answer(self, world: Worlds, profile: Floats) -> dict[str, Any]:
         """Every agent and the profile ``by hand`` in one world (n = 1), and what is known of it, as plain data."""
@@ -276,19 +276,12 @@ class Explored:
         the profile driven again by the engine.
         """
         begin = time.monotonic()
-        problem = profile_problem(
-            world,
-            [self.vehicle],
-            harm_count=self.harm_count,
-            horizon_s=self.scenario.horizon_s,
-            time_step_s=self.scenario.time_step_s,
-            others_mps2=scripted_commands(world, self.task),
-        )
+        problem = task_problem(world, self.task)
         constant = np.full((1, 1, 1), -self.best_constant(world)["deceleration_mps2"])
         given = problem.constant(np.concatenate([constant, problem.even_grid(CONSTANTS)], axis=1))
         used = 0
         while True:
-            given = problem.search(given, budget=SLICE, seed=used // SLICE).profiles
+            given, _ = problem.search(given, budget=SLICE, seed=used // SLICE)
             used += SLICE
             if time.monotonic() - begin >= seconds or stop():
                 break

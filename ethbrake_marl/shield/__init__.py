@@ -24,11 +24,7 @@ if TYPE_CHECKING:
         Shielded as Shielded,
         ShieldedDriver as ShieldedDriver,
         ShieldOptions as ShieldOptions,
-        drive_chunks as drive_chunks,
-        join as join,
         put_shield as put_shield,
-        shielded_episodes as shielded_episodes,
-        stack as stack,
     )
     from ethbrake_marl.shield.sb3 import ShieldedVecEnv as ShieldedVecEnv
     from ethbrake_marl.shield.step_shield import StepShield as StepShield

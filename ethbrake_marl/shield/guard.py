@@ -34,6 +34,7 @@ from ethbrake_marl.agents import (
     Driver,
     Episodes,
     Knowledge,
+    LearnedAgent,
     LearnedPolicy,
     Refined,
     Source,
@@ -41,7 +42,7 @@ from ethbrake_marl.agents import (
     check_agent,
     drive,
 )
-from ethbrake_marl.defaults import HarmCount
+from ethbrake_marl.defaults import DEFAULT, HarmCount
 from ethbrake_marl.engine import (
     Engine,
     Guard,
@@ -54,9 +55,9 @@ from ethbrake_marl.engine import (
     take_memory,
 )
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep, check_one_learner, count_of, renumbered, unknown_name
+from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.physics import Bools, Floats, Ints, Vehicles, Worlds
 from ethbrake_marl.scenario import Scenario, Task
-from ethbrake_marl.search import state_columns
 from ethbrake_marl.shield.enclosure import CORNERS, INTERIOR, checked_robust
 from ethbrake_marl.shield.step_shield import (
     CAPS,
@@ -70,19 +71,31 @@ from ethbrake_marl.shield.step_shield import (
     proposed_actions,
     seen_columns,
 )
-from ethbrake_marl.shield.uncertainty import (
-    Uncertainty,
-    check_amount,
-    check_scenario,
-    checked_uncertainty,
-    mode_uncertainty,
-    proposing_agent,
-    proposing_agents,
-)
+from ethbrake_marl.shield.uncertainty import Uncertainty, check_amount, check_scenario, parse_uncertainty
 
 # The options of a shield around an interface, and their checks, the same for every interface.
 
 MODES = ("episode", "step", "robust")
+
+
+def checked_uncertainty(given: object) -> Uncertainty | None:
+    """An ``Uncertainty``, given as such or in its written form; None stays None. Raises ``InvalidInput`` otherwise."""
+    if given is None or isinstance(given, Uncertainty):
+        return given
+    if isinstance(given, str):
+        return parse_uncertainty(given)
+    raise InvalidInput(
+        f"uncertainty = {given!r}: must be an Uncertainty or text, for instance {DEFAULT.UNCERTAINTY_EXAMPLE!r}"
+    )
+
+
+def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None:
+    """The uncertainty that goes with a mode: needed by ``robust``, refused by every other one with ``InvalidInput``."""
+    uncertainty = checked_uncertainty(given)
+    if (mode == "robust") != (uncertainty is not None):
+        what = "needs an uncertainty" if uncertainty is None else "takes no uncertainty; robust does"
+        raise InvalidInput(f"{where}: mode {mode} {what}, for instance {DEFAULT.UNCERTAINTY_EXAMPLE}")
+    return uncertainty
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +150,15 @@ class ShieldOptions:
             if not isinstance(getattr(self, name), bool):
                 raise InvalidInput(f"{self.where}: {name} = {getattr(self, name)!r}: must be True or False")
         if self.believed:
-            self._check_believed(mode)
+            if mode == "episode":
+                raise InvalidInput(f"{self.where}: believed = True: mode episode takes none; step and robust do")
+            without = {"uncertainty": None, "allowance": 0.0, "cap": None, "logging": False, "shares": False}
+            for name, value in without.items():
+                if getattr(self, name) != value:
+                    raise InvalidInput(
+                        f"{self.where}: {name} = {getattr(self, name)!r}: not together with believed = True, which"
+                        " certifies against what was not received"
+                    )
         uncertainty = None if self.believed else mode_uncertainty(mode, self.uncertainty, self.where)
         given = [name for name in ("allowance", "logging", "shares") if getattr(self, name)]
         if mode == "episode" and given:
@@ -156,18 +177,6 @@ class ShieldOptions:
         object.__setattr__(self, "mode", mode)
         object.__setattr__(self, "uncertainty", uncertainty)
 
-    def _check_believed(self, mode: str) -> None:
-        """Raise ``InvalidInput`` for what a shield on what was received does not take."""
-        if mode == "episode":
-            raise InvalidInput(f"{self.where}: believed = True: mode episode takes none; step and robust do")
-        without = {"uncertainty": None, "allowance": 0.0, "cap": None, "logging": False, "shares": False}
-        for name, value in without.items():
-            if getattr(self, name) != value:
-                raise InvalidInput(
-                    f"{self.where}: {name} = {getattr(self, name)!r}: not together with believed = True, which"
-                    " certifies against what was not received"
-                )
-
     def step_shield(
         self, scenario: Scenario, vehicle: int | tuple[int, ...], others: Mapping[int, Script] | None = None
     ) -> StepShield:
@@ -177,10 +186,45 @@ class ShieldOptions:
             uncertainty=checked_uncertainty(self.uncertainty), robust=self.robust, logging=self.logging,
         )  # fmt: skip
 
-    def believed_shield(self, scenario: Scenario, others: Mapping[int, Script] | None = None) -> BelievedShield:
+    def believed_shield(
+        self, scenario: Scenario, vehicle: int, others: Mapping[int, Script] | None = None
+    ) -> BelievedShield:
         """... and on what was received."""
         robust = self.robust if self.mode == "robust" else None
-        return BelievedShield(scenario, harm_count=self.harm_count, robust=robust, others=others)
+        return BelievedShield(scenario, vehicle, harm_count=self.harm_count, robust=robust, others=others)
+
+
+def proposing_agent(policy: object, where: str) -> Agent:
+    """An agent as it is, a loaded policy as an agent. Raises ``InvalidInput`` for anything else."""
+    if not isinstance(policy, type):
+        if isinstance(policy, Agent):
+            return policy
+        if callable(policy) and isinstance(getattr(policy, "observation", None), ObservationSpec):
+            return LearnedAgent(policy)  # type: ignore[arg-type]  # it is callable, and says what it observes
+    raise InvalidInput(
+        f"{where}: policy = {policy!r}: must be an agent or a policy (eb.load_policy), which says what it observes"
+    )
+
+
+def proposing_agents(
+    policy: Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy], vehicles: Sequence[int], where: str
+) -> dict[int, Agent]:
+    """Who proposes for each shielded vehicle: a team, policies by name of vehicle, or one for all.
+
+    Raises ``InvalidInput`` for what is none of these, and a team of other vehicles.
+    """
+    if isinstance(policy, Team):
+        given: dict[int, Agent] = policy.drivers
+    elif isinstance(policy, Mapping):
+        by_name = {f"vehicle_{i + 1}": i for i in vehicles}
+        given = {by_name.get(name, -1): proposing_agent(each, where) for name, each in policy.items()}
+    else:
+        agent = proposing_agent(policy, where)
+        return dict.fromkeys(vehicles, agent)
+    if set(given) != set(vehicles):
+        names = ", ".join(f"vehicle_{i + 1}" for i in vehicles)
+        raise InvalidInput(f"{where}: policy: one for each of {names} is needed, and for nobody else")
+    return {i: given[i] for i in vehicles}
 
 
 def read_options(where: str, given: Mapping[str, Any]) -> ShieldOptions:
@@ -251,16 +295,12 @@ class ShieldGuard(ABC):
         shield, policies = memory or Guarded(self._fresh, {})
         begun = {i: begin_script(policy, alert, i, self.scripts) for i, policy in self._policies.items()}
         policies = renew_memory(policies, rows, begun) if policies else begun
-        return Guarded(self._started(self._apart(shield), alert, rows), policies)
+        return Guarded(self._started(copy.copy(shield), alert, rows), policies)
 
     def check(self, ruling: Ruling, after: Engine) -> Guarded:
         """The memory as the ruling says: only step mode compares what a step led to."""
         memory: Guarded = ruling.memory
         return memory
-
-    def _apart(self, shield: Any) -> Any:
-        """A shield that goes on apart."""
-        return copy.copy(shield)
 
     def _asked(
         self, worlds: Worlds | None, memories: dict[int, Memory], proposed: Floats
@@ -284,9 +324,7 @@ class ShieldGuard(ABC):
 def by_row(columns: Any, n: int, learners: int) -> NDArray[Any]:
     """What is told, [], [n] of a world, or [n, L], with the axis of learners: [n, L]."""
     each = np.asarray(columns)
-    if each.ndim == 1:
-        each = each[:, np.newaxis]
-    return each if each.shape == (n, learners) else np.broadcast_to(each, (n, learners))
+    return np.broadcast_to(each[:, np.newaxis] if each.ndim == 1 else each, (n, learners))
 
 
 class StepGuard(ShieldGuard):
@@ -345,10 +383,11 @@ class StepGuard(ShieldGuard):
         goes_on, finished = ~running.ended, shield.running.finished  # type: ignore[union-attr]  # it has begun
         worlds = running.worlds if self._policies or self._told is not None else None  # made anew each time
         proposed, memories = self._asked(worlds, memory.policies, proposed)
+        seen = seen_columns(running.packed)
         after = copy.copy(shield)
         decision = after.decide(
             proposed if self._several else proposed[:, 0],
-            seen=seen_columns(running.packed) if worlds is None or self._told is None else state_columns(worlds),
+            seen=seen if self._told is None else seen[:, : (3 * seen.shape[1] + 2) // 5],  # without harm
             only=goes_on,
             proposer=self._proposer(memories, worlds) if self._later_rollouts else None,
         )
@@ -401,11 +440,11 @@ class StepGuard(ShieldGuard):
         return {name: by_row(columns, shield.running.n, len(self.vehicles)) for name, columns in told.items()}
 
 
-def told_of(ruling: Ruling | None, decision: Decision | None = None) -> dict[str, Any]:
+def told_of(ruling: Ruling | None) -> dict[str, Any]:
     """What is told of a certified decision; nothing was proposed or chosen without one."""
     if ruling is None:
         return {"proposed_action": 0.0, "chosen_action": 0.0, "intervened": False, "reason": "", "margin": 0.0}
-    decided: Decision = ruling.decision if decision is None else decision
+    decided: Decision = ruling.decision
     return {
         "proposed_action": ruling.proposed,
         "chosen_action": ruling.applied,
@@ -428,22 +467,19 @@ class BelievedGuard(ShieldGuard):
                 f"{self.options.where}: believed = True: shields one learner, not several; pass learners=['vehicle_2']"
                 " to the environment"
             )
-        return self.options.believed_shield(self.scenario, self.scripts)
-
-    def _apart(self, shield: BelievedShield) -> BelievedShield:
-        return shield.branch()
+        return self.options.believed_shield(self.scenario, self.vehicles[0], self.scripts)
 
     def _started(self, shield: BelievedShield, alert: Worlds, rows: Ints) -> BelievedShield:
-        shield.begin(alert, self.vehicles[0], rows)
+        shield.begin(alert, rows)
         return shield
 
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
         """What is certified in the believed worlds."""
         worlds = running.worlds
         proposed, memories = self._asked(worlds, memory.policies, proposed)
-        after = memory.shield.branch()
+        after = copy.copy(memory.shield)
         before, proposer = after.interventions, self._proposer(memories, worlds)
-        applied = after.decide(worlds, self.vehicles[0], proposed[:, 0], proposer)[:, np.newaxis]
+        applied = after.decide(worlds, proposed[:, 0], proposer)[:, np.newaxis]
         stepped_in = after.interventions > before
         return Ruling(proposed, applied, stepped_in, ~running.ended, after.decision, Guarded(after, memories))
 
@@ -452,10 +488,10 @@ class BelievedGuard(ShieldGuard):
         believed: BelievedShield = memory.shield
         robust, n, shield = believed.robust is not None, len(believed.predicted_harm), believed.shield
         told: dict[str, Any] = {"mode": self.options.mode, **told_of(ruling)}
-        told |= {"bound_harm": np.full(n, np.inf), "settles": False, "believed": True, "trusted": robust}
-        if ruling is not None and shield is not None:
-            told |= {"bound_harm": np.where(np.isfinite(believed.predicted_harm), shield.bound, np.inf)}
-            told |= {"settles": shield.settles}
+        told |= {"bound_harm": np.inf, "settles": False, "believed": True, "trusted": robust}
+        if ruling is not None:
+            told["bound_harm"] = np.where(np.isfinite(believed.predicted_harm), shield.bound, np.inf)
+            told["settles"] = shield.settles
         if robust:
             told["members"] = believed.members
         return {name: by_row(columns, n, 1) for name, columns in told.items()}
@@ -560,56 +596,40 @@ class EpisodeGuard(ShieldGuard):
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, NDArray[Any]]:
         """The keys of ``infos[agent]["shield"]``; ``proposed_action`` is NaN where nothing was proposed."""
-        hybrid = memory.shield
-        proposed = applied = np.zeros((len(hybrid["policy_harm"]), 1))
-        if ruling is not None:
-            proposed, applied = ruling.proposed, ruling.applied
+        nothing = np.zeros((1, 1))
+        proposed, applied = (nothing, nothing) if ruling is None else (ruling.proposed, ruling.applied)
         told = {
             "mode": "episode",
             "proposed_action": proposed,
             "chosen_action": applied,
             "intervened": abs(applied - proposed) > ROUNDING,
-            "chosen_policy": hybrid["chosen_policy"],
-            "policy_harm": hybrid["policy_harm"],
-            "bound_harm": hybrid["bound_harm"],
+            **{name: memory.shield[name] for name in ("chosen_policy", "policy_harm", "bound_harm")},
         }
-        return {name: by_row(columns, len(proposed), 1) for name, columns in told.items()}
-
-
-def shielded_vehicles(engine: Engine, options: ShieldOptions) -> tuple[int, ...]:
-    """Indices of the learners, which are shielded, front to rear.
-
-    Raises ``InvalidInput`` when there is none, or more than one in another mode than ``step``.
-    """
-    where, mode = options.where, options.mode
-    if mode == "step" and len(engine.learners) > 1:
-        return engine.learners
-    if not engine.learners:
-        raise InvalidInput(
-            f"{where}: no vehicle of scenario {engine.scenario.name!r} learns, so there is nobody to shield; pass"
-            " learners=['vehicle_2'] to the environment"
-        )
-    check_one_learner(
-        engine.scenario.name,
-        [engine.scenario.vehicle_names[i] for i in engine.learners],
-        f"{where} needs exactly one learner in mode {mode}: what it certifies is known only if every other vehicle"
-        " follows a script; mode step shields several together; or pass learners=['vehicle_2'] to the environment",
-    )
-    return engine.learners
+        return {name: by_row(columns, len(memory.shield["bound_harm"]), 1) for name, columns in told.items()}
 
 
 def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -> ShieldGuard:
     """The guard of the options' mode for all learners of an engine, who proposes among them.
 
-    Raises ``InvalidInput`` for a number of learners that the mode does not shield, and for what is no policy.
+    Raises ``InvalidInput`` where nobody learns, for several learners in another mode than ``step``, and for what is no
+    policy.
     """
-    vehicles = shielded_vehicles(engine, options)
-    if options.mode == "episode":
-        policies = {vehicles[0]: proposing_agent(policy, options.where)}
-    else:
-        policies = {} if policy is None else proposing_agents(policy, vehicles, options.where)
-    if options.mode == "episode":
-        return EpisodeGuard(engine, policies, options)
+    where, mode, scenario, vehicles = options.where, options.mode, engine.scenario, engine.learners
+    if not vehicles:
+        raise InvalidInput(
+            f"{where}: no vehicle of scenario {scenario.name!r} learns, so there is nobody to shield; pass"
+            " learners=['vehicle_2'] to the environment"
+        )
+    if mode != "step":
+        check_one_learner(
+            scenario.name,
+            [scenario.vehicle_names[i] for i in vehicles],
+            f"{where} needs exactly one learner in mode {mode}: what it certifies is known only if every other vehicle"
+            " follows a script; mode step shields several together; or pass learners=['vehicle_2'] to the environment",
+        )
+    if mode == "episode":
+        return EpisodeGuard(engine, {vehicles[0]: proposing_agent(policy, where)}, options)
+    policies = {} if policy is None else proposing_agents(policy, vehicles, where)
     if options.believed:
         return BelievedGuard(engine, policies, options)
     return StepGuard(engine, policies, options, warns=True)
@@ -738,10 +758,9 @@ class ShieldedDriver:
         self._guard: dict[str, Any] = {} if self.options.believed else {"later_rollouts": later_rollouts, "told": told}
         robust = "" if self.options.robust == CORNERS else f":{self.options.robust}"
         self.name = f"{policy.name}+{self.options.mode}{robust}{':believed' if self.options.believed else ''}"
-        if self.options.believed:
-            self.options.believed_shield(scenario)  # refuses bad settings at once
-        elif not isinstance(policy, Team):
-            self.options.step_shield(scenario, scenario.learners[0] if len(scenario.learners) == 1 else 0)
+        make = self.options.believed_shield if self.options.believed else self.options.step_shield
+        if self.options.believed or not isinstance(policy, Team):
+            make(scenario, scenario.learners[0] if len(scenario.learners) == 1 else 0)  # refuses bad settings at once
 
     @property
     def adds(self) -> Source:
@@ -778,6 +797,42 @@ class Shielded(NamedTuple):
     decisions: Ints  # [n] of each of them
     moving: Bools  # [n] the horizon cut the episode off
 
+    @staticmethod
+    def of(episodes: Episodes, task: Task) -> Shielded:
+        """What a step shield did in these episodes."""
+        shield: StepShield = episodes.guarded.shield
+        assert shield.running is not None
+        return Shielded(
+            episodes.ledger.world_harm(task.harm_count),
+            episodes.ledger.vehicle_harm(task.harm_count),
+            shield.predicted_harm,
+            shield.baseline_shares,
+            shield.replaced.reshape(len(shield.replaced), -1),
+            shield.running.steps.copy(),
+            ~episodes.at_rest,
+        )
+
+    @staticmethod
+    def driven(driver: Driver, worlds: Worlds, task: Task, **settings: Any) -> Shielded:
+        """A copy of the ``driver`` drives every world behind a step shield, ``CHUNK`` at a time; as ``put_shield``."""
+        parts = []
+        for first in range(0, worlds.n, CHUNK):
+            rows = np.arange(first, min(first + CHUNK, worlds.n))
+            with renumbered(rows):
+                episodes = drive(worlds.take(rows), put_shield(driver, task, **settings), task.scenario)
+            parts.append(Shielded.of(episodes, task))
+        return Shielded.join(parts)
+
+    @staticmethod
+    def join(parts: Sequence[Shielded]) -> Shielded:
+        """Consecutive worlds as one."""
+        return Shielded(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+    @staticmethod
+    def stack(parts: Sequence[Shielded]) -> Shielded:
+        """Several drivers in the same worlds, on an axis in front."""
+        return Shielded(*(np.stack(columns) for columns in zip(*parts, strict=True)))
+
 
 def put_shield(driver: Driver, task: Task, **settings: Any) -> Team:
     """A copy of the ``driver`` behind one step shield, on the task's vehicles; settings as of ``ShieldedDriver``."""
@@ -786,42 +841,6 @@ def put_shield(driver: Driver, task: Task, **settings: Any) -> Team:
     elif isinstance(driver, Agent) and len(task.vehicles) > 1:
         driver = Team.of(driver, task.vehicles)
     return ShieldedDriver(driver, task.scenario, harm_count=task.harm_count, **settings).on(task.vehicles)
-
-
-def shielded_episodes(episodes: Episodes, task: Task) -> Shielded:
-    """What a step shield did in these episodes."""
-    shield: StepShield = episodes.guarded.shield
-    assert shield.running is not None
-    return Shielded(
-        episodes.ledger.world_harm(task.harm_count),
-        episodes.ledger.vehicle_harm(task.harm_count),
-        shield.predicted_harm,
-        shield.baseline_shares,
-        shield.replaced.reshape(len(shield.replaced), -1),
-        shield.running.steps.copy(),
-        ~episodes.at_rest,
-    )
-
-
-def drive_chunks(driver: Driver, worlds: Worlds, task: Task, **settings: Any) -> Shielded:
-    """Let a copy of the ``driver`` drive every world behind a step shield, ``CHUNK`` at a time; as ``put_shield``."""
-    parts = []
-    for first in range(0, worlds.n, CHUNK):
-        rows = np.arange(first, min(first + CHUNK, worlds.n))
-        with renumbered(rows):
-            episodes = drive(worlds.take(rows), put_shield(driver, task, **settings), task.scenario)
-        parts.append(shielded_episodes(episodes, task))
-    return join(parts)
-
-
-def join(parts: Sequence[Shielded]) -> Shielded:
-    """Consecutive worlds as one."""
-    return Shielded(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
-
-
-def stack(parts: Sequence[Shielded]) -> Shielded:
-    """Several drivers in the same worlds, on an axis in front."""
-    return Shielded(*(np.stack(columns) for columns in zip(*parts, strict=True)))
 
 
 # Factories of what the registry puts around an agent: the shields, with and without ``:believed``.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from ethbrake_marl.envs import EthBrakeVecEnv, Rewards
+from ethbrake_marl.envs import EthBrakeVecEnv
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools
 from ethbrake_marl.shield.guard import Attached, Proposing
@@ -47,7 +47,7 @@ class ShieldedVecEnv(VecEnvWrapper):
         self.attached.check_open()
         self.venv.step_async(actions)
 
-    def step_wait(self) -> tuple[Observations, Rewards, Bools, list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[Observations, NDArray[np.float32], Bools, list[dict[str, Any]]]:
         """Advance every world by one step with the actions certified or replaced."""
         self.attached.check_open()
         observation, reward, done, infos = self.venv.step_wait()

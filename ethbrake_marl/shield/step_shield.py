@@ -80,9 +80,9 @@ from ethbrake_marl.physics import (
     step_again,
 )
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search import ProfileProblem, profile_problem, state_columns, worlds_at
+from ethbrake_marl.search import ProfileProblem, profile_problem
 from ethbrake_marl.shield.enclosure import CORNERS, INTERIOR, Boxes, boxes_of, check_possible, checked_robust
-from ethbrake_marl.shield.uncertainty import MOST_CORNERS, Uncertainty, check_amount, check_scenario, checked_vehicles
+from ethbrake_marl.shield.uncertainty import MOST_CORNERS, Uncertainty, check_amount, check_scenario
 
 # The compiled decisions of the step shield, for one shielded vehicle or several of one line.
 #
@@ -710,6 +710,21 @@ def seen_columns(packed: Packed) -> Floats:
     return np.concatenate([speeds, state[:, first : first + len(GROUPS) * pairs]], axis=1)
 
 
+def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
+    """These worlds in the states [n, S] of a problem with them: speeds, gaps, hit flags, and those of the obstacle."""
+    added = int(worlds.obstacle_ahead.any())  # columns in front of each group
+    N = worlds.N + added
+    gaps, hit = states[:, N : 2 * N - 1], states[:, 2 * N - 1 : 3 * N - 2] == 1.0
+    return replace(
+        worlds,
+        speeds_mps=states[:, added:N].copy(),
+        gaps_m=gaps[:, added:].copy(),
+        pair_hit=hit[:, added:].copy(),
+        obstacle_gap_m=gaps[:, 0].copy() if added else worlds.obstacle_gap_m,
+        obstacle_hit=hit[:, 0].copy() if added else worlds.obstacle_hit,
+    )
+
+
 def difference(predicted: Floats, seen: Floats) -> str:
     """The first number in which a world as seen [S] is not as predicted [S], in words; "nothing" where all are."""
     vehicles = (len(predicted) + 4) // 5
@@ -980,8 +995,15 @@ class StepShield:
         check_harm_count(harm_count)
         check_scenario(scenario, "shield")
         check_amount("allowance", allowance, "shield", " m2/s2")
-        self.vehicle = checked_vehicles(vehicle, scenario)
-        self.vehicles = (self.vehicle,) if isinstance(self.vehicle, int) else self.vehicle
+        several = isinstance(vehicle, Sequence) and not isinstance(vehicle, str)
+        each: tuple[Any, ...] = tuple(cast(Sequence[Any], vehicle)) if several else (vehicle,)
+        known = range(scenario.vehicles)
+        if not each or any(not isinstance(i, int | np.integer) or isinstance(i, bool) or i not in known for i in each):
+            raise InvalidInput(f"shield: vehicle = {vehicle!r}: must be an index from 0 to {scenario.vehicles - 1}")
+        if list(each) != sorted(set(each)):
+            raise InvalidInput(f"shield: vehicle = {vehicle!r}: several are named front to rear, each once")
+        self.vehicles = tuple(map(int, each))
+        self.vehicle = self.vehicles if several else self.vehicles[0]
         if uncertainty is not None and (len(self.vehicles) > 1 or cap is not None):
             what = "several vehicles" if cap is None else "a cap"
             raise InvalidInput(f"shield: uncertainty: {what} with it: not covered; mode robust shields one vehicle")
@@ -1056,10 +1078,18 @@ class StepShield:
             setattr(part, name, getattr(self, name)[rows])
         return part
 
-    def begin(self, worlds: Worlds, rows: Ints, policy: Agent | Mapping[int, Agent] | None = None) -> None:
+    def begin(
+        self,
+        worlds: Worlds,
+        rows: Ints,
+        policy: Agent | Mapping[int, Agent] | None = None,
+        *,
+        possible: Worlds | None = None,
+    ) -> None:
         """New episodes start in these rows; ``worlds`` holds those rows only, at the alert, as they are believed.
 
-        The ``policy`` that proposes (of several vehicles: one for each, by index) is rolled out from there.
+        The ``policy`` that proposes (of several vehicles: one for each, by index) is rolled out from there. Certified
+        are the members of the ``uncertainty``, or the ``possible`` worlds [n * M], each world's own one first.
         Rows 0 to k - 1 together may also begin a larger batch. Raises ``InvalidInput`` for rows that are not there.
         """
         running_rows = len(self.first_bound)
@@ -1069,12 +1099,15 @@ class StepShield:
                 " rows at once"
             )
         new = copy.copy(self)
-        new._begin(worlds, rows, policy)
+        new._begin(worlds, rows, policy, possible)
         self.__dict__.update(new.__dict__)
 
-    def _begin(self, worlds: Worlds, rows: Ints, policy: Agent | Mapping[int, Agent] | None) -> None:
+    def _begin(
+        self, worlds: Worlds, rows: Ints, policy: Agent | Mapping[int, Agent] | None, possible: Worlds | None
+    ) -> None:
         """Find the plan to start with in each of these worlds, and keep it in their rows."""
-        possible = worlds if self.uncertainty is None else self.uncertainty.members(worlds)
+        if possible is None:
+            possible = worlds if self.uncertainty is None else self.uncertainty.members(worlds)
         members, vehicles, horizon_s = possible.n // worlds.n, self.vehicles, self.scenario.horizon_s
         latest = possible.vehicles.latency_s[:, list(vehicles)].min(axis=1).max()
         if members > 1 and not latest < horizon_s:
@@ -1336,18 +1369,6 @@ def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
     )
 
 
-class _Corners:
-    """Worlds that are certified together, in the place of an ``Uncertainty``: the middle ones first."""
-
-    def __init__(self, parts: list[Worlds]) -> None:
-        order = np.arange(parts[0].n * len(parts)).reshape(len(parts), parts[0].n).T.ravel()
-        self._members = Worlds.concatenate(parts).take(order)
-
-    def members(self, worlds: Worlds) -> Worlds:
-        """The members [n * M], for each world its middle, then its corners."""
-        return self._members
-
-
 class BelievedShield:
     """A ``StepShield`` that certifies what one vehicle proposes on what was really received.
 
@@ -1363,43 +1384,47 @@ class BelievedShield:
     def __init__(
         self,
         scenario: Scenario,
+        vehicle: int,
         *,
         harm_count: HarmCount = "first",
         robust: str | None = None,
         others: Mapping[int, Script] | None = None,
     ) -> None:
-        self.scenario = scenario
+        self.scenario, self.vehicle = scenario, vehicle
         self.robust = None if robust is None else checked_robust(robust, "believed")
-        self.shield: StepShield | None = None
         self.predicted_harm: Floats = np.zeros(0)
         self.interventions: Ints = np.zeros(0, np.int64)  # [n] so far in the running episodes
         self.decision: Decision | None = None  # the last one
         self._harm_count: HarmCount = harm_count
-        self._others = others  # None: the scenario's scripts
+        self._others = script_agents(scenario, except_for=vehicle) if others is None else others
         self._odometer: tuple[Floats, ...] = ()  # an ``Odometer``
         self._heard: Floats = np.zeros((0, 0))  # what the shield began on; NaN where it has not begun
         self._asked_s: Floats = np.zeros(0)  # [n] time of the last decision
         self._wanted: Floats = np.zeros(0)  # [n] actions
         self._totals: Floats = np.zeros((0, 0, 0))  # [n, M, pairs] foretold total harm at the last decision (m2/s2)
         self._impact_s: Floats = np.zeros((0, 0))  # [n, N] last time at which an impact of this vehicle was foretold
-        self._ranges: Ranges | None = None
-        self._ranges_of(scenario.learners[0] if scenario.learners else 0)
-        if len(scenario.learners) == 1:
-            self._make(scenario.learners[0])  # refuses at once what interior mode cannot certify
+        self._ranges = Ranges.of(scenario, vehicle, self._others)
+        numbers = len(self._ranges.uncertain)
+        if self.robust is not None and 2**numbers > MOST_CORNERS:
+            raise InvalidInput(
+                f"robust:believed: scenario {scenario.name!r} leaves {numbers} numbers of the other vehicles open,"
+                f" which make {2**numbers} corners; at most {MOST_CORNERS} can be certified"
+            )
+        self.shield = self._make()
 
-    def _make(self, vehicle: int) -> StepShield:
+    def _make(self) -> StepShield:
         certain = self.robust or CORNERS
-        return StepShield(self.scenario, vehicle, harm_count=self._harm_count, others=self._others, robust=certain)
+        return StepShield(self.scenario, self.vehicle, harm_count=self._harm_count, others=self._others, robust=certain)
 
     @property
     def members(self) -> int:
         """Worlds that are certified for each one: the middle, and all corners."""
-        assert self._ranges is not None
-        return 1 if self.robust is None else 1 + 2 ** len(self._ranges.uncertain)
+        return 1 + len(self._corners())
 
-    def branch(self) -> BelievedShield:
-        """A copy that goes on apart: what it decides leaves this one as it is."""
-        apart = copy.copy(self)
+    def __copy__(self) -> BelievedShield:
+        """One that goes on apart: what it decides leaves this one as it is."""
+        apart = object.__new__(BelievedShield)
+        apart.__dict__.update(self.__dict__)
         apart.shield = copy.copy(self.shield)
         for name in PER_WORLD:
             setattr(apart, name, getattr(self, name).copy())
@@ -1407,48 +1432,49 @@ class BelievedShield:
 
     def take(self, rows: Ints) -> BelievedShield:
         """The shield of some rows, which goes on apart."""
-        apart = self.branch()
-        apart.shield = None if self.shield is None else self.shield.take(rows)
+        apart = copy.copy(self)
+        if self.shield.running is not None:
+            apart.shield = self.shield.take(rows)
         apart._odometer = take_memory(self._odometer, rows)
         for name in (*PER_WORLD, *(("_totals",) if len(self._totals) else ())):
             setattr(apart, name, getattr(self, name)[rows])
         return apart
 
-    def begin(self, worlds: Worlds, vehicle: int, rows: Ints) -> None:
+    def begin(self, worlds: Worlds, rows: Ints) -> None:
         """Remember where these episodes start; nothing has been received yet."""
-        self._ranges_of(vehicle)
-        if len(rows) >= len(self._wanted) or self.shield is None or self.shield.vehicle != vehicle:
-            self.shield, self._wanted, self._totals = self._make(vehicle), np.zeros(0), np.zeros((0, 0, 0))
+        if len(rows) >= len(self._wanted):
+            self.shield, self._wanted, self._totals = self._make(), np.zeros(0), np.zeros((0, 0, 0))
         n, N, fresh = len(rows), worlds.N, self._wanted.size == 0
         begun = {
-            "_odometer": Odometer.begun(worlds, vehicle), "predicted_harm": np.full(n, np.nan),
+            "_odometer": Odometer.begun(worlds, self.vehicle), "predicted_harm": np.full(n, np.nan),
             "_heard": np.full((n, 2 * N), np.nan), "_impact_s": np.full((n, N), -1.0), "_asked_s": np.full(n, np.nan),
             "_wanted": np.zeros(n), "interventions": np.zeros(n, np.int64),
         }  # fmt: skip
         for name, part in begun.items():
             setattr(self, name, part if fresh else renew_memory(getattr(self, name), rows, part))
 
-    def decide(self, worlds: Worlds, vehicle: int, proposed: Floats, proposer: Proposer | None = None) -> Floats:
+    def decide(self, worlds: Worlds, proposed: Floats, proposer: Proposer | None = None) -> Floats:
         """The certified actions [n], 0 before the vehicle's latency has elapsed; the same if asked again.
 
         Args:
             worlds: as they are; of them only what the vehicle received is read.
-            vehicle: index from 0, the one that began.
             proposed: actions [n].
             proposer: is rolled out in the believed worlds where nothing else certifies a proposal.
 
         Raises ``InvalidInput`` if an episode never began.
 
         """
-        n, shield = worlds.n, self.shield
-        if shield is None or n > len(self._heard):
-            raise InvalidInput(f"shield: believed: act on {count_of(n, 'world')}, but begin was not called for each")
+        shield, vehicle = self.shield, self.vehicle
+        if worlds.n > len(self._heard):
+            raise InvalidInput(
+                f"shield: believed: act on {count_of(worlds.n, 'world')}, but begin was not called for each"
+            )
         self._odometer = odometer = Odometer(*self._odometer).look(worlds, vehicle)
         past = worlds.vehicles.latency_s[:, vehicle] <= worlds.time_s
         due = past & (worlds.time_s != self._asked_s) & (worlds.time_s < self.scenario.horizon_s)
         if due.any():
-            believed = self._believe(worlds, vehicle, odometer.way_m, None)
-            self._begin_anew(worlds, believed, vehicle, odometer.way_m, due)
+            believed = self._believe(worlds, odometer.way_m, None)
+            self._begin_anew(worlds, believed, odometer.way_m, due)
             assert shield.running is not None
             due &= ~shield.running.finished
             proposer = None if proposer is None else proposer._replace(worlds=believed)
@@ -1458,17 +1484,17 @@ class BelievedShield:
             self._asked_s[due] = worlds.time_s[due]
         return self._wanted.copy()
 
-    def _begin_anew(self, worlds: Worlds, believed: Worlds, vehicle: int, way_m: Floats, due: Bools) -> None:
+    def _begin_anew(self, worlds: Worlds, believed: Worlds, way_m: Floats, due: Bools) -> None:
         """Let the shield begin where it has not, or where what was heard was not foretold."""
-        shield, told = self.shield, Told.to(worlds, vehicle)
-        assert shield is not None
+        shield, vehicle = self.shield, self.vehicle
+        told = Told.to(worlds, vehicle)
         heard = np.concatenate([told.known, told.reacts], axis=1).astype(np.float64)
         fresh, begun = np.isnan(self._heard[:, 0]), shield.running is not None
         keeps, anew = np.zeros_like(told.known), fresh
         if self.robust != INTERIOR:  # its plans are certified from the first decision on, whatever is heard later
             if begun:
                 self._note_impacts(worlds)
-            keeps = self._keeps(told, worlds.time_s, vehicle)
+            keeps = self._keeps(told, worlds.time_s)
             surprised = self._is_surprised(believed, told.known & ~keeps) if begun else fresh
             anew = fresh | surprised | (heard != self._heard).any(axis=1)
         rows = np.flatnonzero(due & anew)
@@ -1477,7 +1503,7 @@ class BelievedShield:
             return
         before = copy.copy(shield) if begun and self.robust != INTERIOR else None
         keeps = keeps & ~fresh[:, np.newaxis]
-        self._begin_shield(worlds.take(rows), believed.take(rows), vehicle, way_m[rows], rows, keeps[rows], before)
+        self._begin_shield(worlds.take(rows), believed.take(rows), way_m[rows], rows, keeps[rows], before)
         if before is not None and (held_before := rows[~fresh[rows]]).size:
             _hold_better(shield, held_before, before)
         rows = rows[due[rows]]  # the others begin anew at their own first decision
@@ -1487,28 +1513,23 @@ class BelievedShield:
         self.predicted_harm[first] = np.where(felt, np.inf, shield.backup.harm[first])
 
     def _begin_shield(
-        self, worlds: Worlds, believed: Worlds, vehicle: int, way_m: Floats, rows: Ints, keeps: Bools,
-        before: StepShield | None,
-    ) -> None:  # fmt: skip
+        self, worlds: Worlds, believed: Worlds, way_m: Floats, rows: Ints, keeps: Bools, before: StepShield | None
+    ) -> None:
         """Begin in ``rows``: in the middle of what is open, and for a robust shield in its corners."""
-        shield, shares = self.shield, [None, *self._corners(vehicle)]
-        assert shield is not None
         parts = []
-        for m, share in enumerate(shares):
+        for m, share in enumerate([None, *self._corners()]):
             foretold = None
             if before is not None:
                 assert before.running is not None
                 expected = worlds_at(believed, before.running.states[rows * before.running.members + m])
                 known = keeps.any(axis=1, keepdims=True)
-                foretold = replace(expected, pair_hit=expected.pair_hit & known), keeps
-            parts.append(self._believe(worlds, vehicle, way_m, share, foretold))
-        if self.robust is not None:
-            shield.uncertainty = cast(Uncertainty, _Corners(parts))
-        shield.begin(parts[0], rows)
+                foretold = (replace(expected, pair_hit=expected.pair_hit & known), keeps)
+            parts.append(self._believe(worlds, way_m, share, foretold))
+        self.shield.begin(parts[0], rows, possible=Uncertainty.interleaved(parts))
 
-    def _keeps(self, told: Told, time_s: Floats, vehicle: int) -> Bools:
+    def _keeps(self, told: Told, time_s: Floats) -> Bools:
         """Whose foretold state tells more than what was told, [n, N]: nobody told anything, or not since an impact."""
-        running = None if self.shield is None else self.shield.running
+        running = self.shield.running
         if running is None:
             return np.zeros(told.known.shape, np.bool_)
         n, N = told.known.shape
@@ -1519,13 +1540,13 @@ class BelievedShield:
         pressed[:, :-1], pressed[:, 1:] = touching, pressed[:, 1:] | touching
         since = (told.at_s < self._impact_s) | (pressed[:, whole - N :] & (told.at_s < time_s[:, np.newaxis]))
         keeps: Bools = ~told.known | ((self._heard[:, :N] == 1.0) & since)
-        keeps[:, vehicle] = False
+        keeps[:, self.vehicle] = False
         return keeps
 
     def _note_impacts(self, worlds: Worlds) -> None:
         """Write down which vehicles met in some member since the last decision."""
-        assert self.shield is not None and self.shield.running is not None
         running = self.shield.running
+        assert running is not None
         pairs = (running.states.shape[1] - 1) // 5
         totals = running.states[:, -pairs:].reshape(worlds.n, running.members, pairs)
         if self._totals.shape == totals.shape:
@@ -1537,43 +1558,27 @@ class BelievedShield:
 
     def _is_surprised(self, believed: Worlds, heard: Bools) -> Bools:
         """Where somebody of whom was ``heard`` [n, N] is not within what the shield foretold, [n]."""
-        assert self.shield is not None and self.shield.running is not None
-        seen, wrong = state_columns(believed), np.zeros(believed.n, np.bool_)
-        first = (seen.shape[1] + 2) // 3 - believed.N  # 1: an obstacle ahead is vehicle 0 of the columns
+        assert self.shield.running is not None
+        seen, wrong = seen_columns(Packed.of(believed)), np.zeros(believed.n, np.bool_)
+        first = (seen.shape[1] + 4) // 5 - believed.N  # 1: an obstacle ahead is vehicle 0 of the columns
         foretold = self.shield.running.states.reshape(believed.n, self.shield.running.members, -1)
-        outside: Bools = (seen < (foretold.min(axis=1) - SURPRISE)[:, : seen.shape[1]]) | (
-            seen > (foretold.max(axis=1) + SURPRISE)[:, : seen.shape[1]]
-        )
+        outside: Bools = (seen < foretold.min(axis=1) - SURPRISE) | (seen > foretold.max(axis=1) + SURPRISE)
         for i in range(believed.N):
             wrong |= heard[:, i] & outside[:, first + i]
         for p in range(believed.N - 1):
             wrong |= heard[:, p] & heard[:, p + 1] & outside[:, 2 * first + believed.N + p]
         return wrong
 
-    def _corners(self, vehicle: int) -> list[dict[tuple[str, int], float]]:
-        if self.robust is None:
-            return []
-        uncertain = self._ranges_of(vehicle).uncertain
-        return [dict(zip(uncertain, shares, strict=True)) for shares in product((0.0, 1.0), repeat=len(uncertain))]
+    def _corners(self) -> list[dict[tuple[str, int], float]]:
+        uncertain = self._ranges.uncertain
+        shares = [] if self.robust is None else product((0.0, 1.0), repeat=len(uncertain))
+        return [dict(zip(uncertain, each, strict=True)) for each in shares]
 
     def _believe(
         self,
         worlds: Worlds,
-        vehicle: int,
         way_m: Floats,
         share: dict[tuple[str, int], float] | None,
         foretold: tuple[Worlds, Bools] | None = None,
     ) -> Worlds:
-        return self._ranges_of(vehicle).believe(worlds, way_m, share, foretold)
-
-    def _ranges_of(self, vehicle: int) -> Ranges:
-        if self._ranges is None or self._ranges.vehicle != vehicle:
-            ranges = Ranges.of(self.scenario, vehicle, self._others)
-            numbers = len(ranges.uncertain)
-            if self.robust is not None and 2**numbers > MOST_CORNERS:
-                raise InvalidInput(
-                    f"robust:believed: scenario {self.scenario.name!r} leaves {numbers} numbers of the other vehicles"
-                    f" open, which make {2**numbers} corners; at most {MOST_CORNERS} can be certified"
-                )
-            self._ranges = ranges
-        return self._ranges
+        return self._ranges.believe(worlds, way_m, share, foretold)

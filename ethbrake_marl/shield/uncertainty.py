@@ -9,17 +9,15 @@ numbers. What robust mode proves, it proves for the members (``docs/shield.md``)
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from numbers import Real
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents import Agent, LearnedAgent, LearnedPolicy, Team
 from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.physics import Floats, Vehicles, Worlds
 from ethbrake_marl.scenario import QUANTITY, Scenario
 
@@ -41,64 +39,6 @@ def check_scenario(scenario: object, where: str) -> None:
     """Raise ``InvalidInput`` for what is not a ``Scenario``, its name among that."""
     if not isinstance(scenario, Scenario):
         raise InvalidInput(f"{where}: scenario = {scenario!r}: must be a Scenario; eb.load_scenario(name) loads one")
-
-
-def proposing_agent(policy: object, where: str) -> Agent:
-    """An agent as it is, a loaded policy as an agent. Raises ``InvalidInput`` for anything else."""
-    if not isinstance(policy, type):
-        if isinstance(policy, Agent):
-            return policy
-        if callable(policy) and isinstance(getattr(policy, "observation", None), ObservationSpec):
-            return LearnedAgent(policy)  # type: ignore[arg-type]  # it is callable, and says what it observes
-    raise InvalidInput(
-        f"{where}: policy = {policy!r}: must be an agent or a policy (eb.load_policy), which says what it observes"
-    )
-
-
-def checked_vehicles(vehicle: object, scenario: Scenario) -> int | tuple[int, ...]:
-    """An index as it is, several as a tuple; ``InvalidInput`` unless they are there, each once, front to rear."""
-    several = isinstance(vehicle, Sequence) and not isinstance(vehicle, str)
-    each = tuple(vehicle) if isinstance(vehicle, Sequence) and several else (vehicle,)
-    known = range(scenario.vehicles)
-    if not each or not all(isinstance(i, int | np.integer) and not isinstance(i, bool) and i in known for i in each):
-        raise InvalidInput(f"shield: vehicle = {vehicle!r}: must be an index from 0 to {scenario.vehicles - 1}")
-    if list(each) != sorted(set(each)):
-        raise InvalidInput(f"shield: vehicle = {vehicle!r}: several are named front to rear, each once")
-    return tuple(map(int, each)) if several else int(each[0])
-
-
-def policies_of(
-    policy: Agent | Mapping[int, Agent] | None, vehicle: int | tuple[int, ...]
-) -> Mapping[int, Agent] | None:
-    """Who proposes, by vehicle, front to rear. Raises ``InvalidInput`` for another one than is shielded."""
-    if policy is None:
-        return None
-    vehicles = (vehicle,) if isinstance(vehicle, int) else vehicle
-    given = policy if isinstance(policy, Mapping) else dict.fromkeys(vehicles[:1], policy)
-    if set(given) != set(vehicles):
-        raise InvalidInput(f"shield: policies for vehicles {sorted(given)}, shielded are {list(vehicles)}")
-    return {i: given[i] for i in vehicles}
-
-
-def proposing_agents(
-    policy: Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy], vehicles: Sequence[int], where: str
-) -> dict[int, Agent]:
-    """Who proposes for each shielded vehicle: a team, policies by name of vehicle, or one for all.
-
-    Raises ``InvalidInput`` for what is none of these, and a team of other vehicles.
-    """
-    if isinstance(policy, Team):
-        given: dict[int, Agent] = policy.drivers
-    elif isinstance(policy, Mapping):
-        by_name = {f"vehicle_{i + 1}": i for i in vehicles}
-        given = {by_name.get(name, -1): proposing_agent(each, where) for name, each in policy.items()}
-    else:
-        agent = proposing_agent(policy, where)
-        return dict.fromkeys(vehicles, agent)
-    if set(given) != set(vehicles):
-        names = ", ".join(f"vehicle_{i + 1}" for i in vehicles)
-        raise InvalidInput(f"{where}: policy: one for each of {names} is needed, and for nobody else")
-    return {i: given[i] for i in vehicles}
 
 
 OF_VEHICLES = ("braking_capacity_mps2", "driving_capacity_mps2", "latency_s", "mass_t")  # fields of ``Vehicles``
@@ -138,13 +78,7 @@ class Interval:
         return f"{self.quantity}{where}={width}"
 
 
-class Side(NamedTuple):
-    """One uncertain number of every world: which it is, its least and its largest value."""
-
-    quantity: str
-    place: int
-    low: Floats  # [n]
-    high: Floats  # [n]
+_Side = tuple[str, int, Floats, Floats]  # an uncertain number of every world: quantity, place, least and largest value
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +125,12 @@ class Uncertainty:
                 f" {MOST_CORNERS} can be certified: name vehicles or pairs, for instance {DEFAULT.UNCERTAINTY_EXAMPLE}"
             )
         parts = [worlds] + [_placed(worlds, sides, lambda k, c=c: c >> k & 1) for c in range(corners)]  # type: ignore[misc]
-        order = np.arange(worlds.n * len(parts)).reshape(len(parts), worlds.n).T.ravel()
+        return self.interleaved(parts)
+
+    @staticmethod
+    def interleaved(parts: list[Worlds]) -> Worlds:
+        """The worlds [n] of all M parts as one list [n * M]: the first one of each part, then the second ones."""
+        order = np.arange(parts[0].n * len(parts)).reshape(len(parts), parts[0].n).T.ravel()
         return Worlds.concatenate(parts).take(order)
 
     def draw(self, worlds: Worlds, rng: np.random.Generator, *, corners: bool = False) -> Worlds:
@@ -202,17 +141,34 @@ class Uncertainty:
             shares = np.round(shares)
         return _placed(worlds, sides, lambda k: shares[k])
 
-    def _sides(self, worlds: Worlds) -> list[Side]:
+    def _sides(self, worlds: Worlds) -> list[_Side]:
         """The uncertain numbers of these worlds."""
-        sides = []
+        sides: list[_Side] = []
         for interval in self.intervals:
-            told = _values(worlds, interval.quantity)
+            every, name = _values(worlds, interval.quantity), interval.quantity
             if interval.half_width == 0.0:
                 continue
-            if interval.place is not None and interval.place >= told.shape[1]:
-                raise InvalidInput(f"uncertainty: {interval}: the line has only {told.shape[1]} of these")
-            for place in range(told.shape[1]) if interval.place is None else (interval.place,):
-                sides.append(_side(worlds, interval, place))
+            if interval.place is not None and interval.place >= every.shape[1]:
+                raise InvalidInput(f"uncertainty: {interval}: the line has only {every.shape[1]} of these")
+            for place in range(every.shape[1]) if interval.place is None else (interval.place,):
+                told = every[:, place]
+                half = interval.half_width * told if interval.relative else np.full(worlds.n, interval.half_width)
+                low, high = told - half, told + half
+                if name in POSITIVE and not (low > 0.0).all():
+                    k = int(np.argmin(low))
+                    raise InvalidInput(
+                        f"uncertainty: {interval}: {told[k]:g} of vehicle_{place + 1} in world {k} may be as low as"
+                        f" {low[k]:g}; it must stay above 0"
+                    )
+                most = worlds.vehicles.speed_limit_mps[:, place] if name == "speeds_mps" else np.inf
+                high, rule = np.minimum(high, most), QUANTITY.declared[name]
+                if not (high <= rule.high).all():
+                    k = int(np.argmax(high))
+                    raise InvalidInput(
+                        f"uncertainty: {interval}: {told[k]:g} of {rule.owner(place)} in world {k} may be as high as"
+                        f" {high[k]:g}; must be {rule.interval}"
+                    )
+                sides.append((name, place, np.maximum(low, 0.0), high))
         return sides
 
 
@@ -241,65 +197,22 @@ def parse_uncertainty(text: str) -> Uncertainty:
     return Uncertainty(tuple(intervals))
 
 
-def checked_uncertainty(given: object) -> Uncertainty | None:
-    """An ``Uncertainty``, given as such or in its written form; None stays None. Raises ``InvalidInput`` otherwise."""
-    if given is None or isinstance(given, Uncertainty):
-        return given
-    if isinstance(given, str):
-        return parse_uncertainty(given)
-    raise InvalidInput(
-        f"uncertainty = {given!r}: must be an Uncertainty or text, for instance {DEFAULT.UNCERTAINTY_EXAMPLE!r}"
-    )
-
-
-def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None:
-    """The uncertainty that goes with a mode: needed by ``robust``, refused by every other one with ``InvalidInput``."""
-    uncertainty = checked_uncertainty(given)
-    if (mode == "robust") != (uncertainty is not None):
-        what = "needs an uncertainty" if uncertainty is None else "takes no uncertainty; robust does"
-        raise InvalidInput(f"{where}: mode {mode} {what}, for instance {DEFAULT.UNCERTAINTY_EXAMPLE}")
-    return uncertainty
-
-
 def _values(worlds: Worlds, quantity: str) -> Floats:
     """What was told, [n, N] or [n, P]."""
     return np.asarray(getattr(worlds.vehicles if quantity in OF_VEHICLES else worlds, quantity), np.float64)
 
 
-def _side(worlds: Worlds, interval: Interval, place: int) -> Side:
-    """Least and largest value of one uncertain number."""
-    told = _values(worlds, interval.quantity)[:, place]
-    half = interval.half_width * told if interval.relative else np.full(worlds.n, interval.half_width)
-    low, high = told - half, told + half
-    if interval.quantity in POSITIVE and not (low > 0.0).all():
-        k = int(np.argmin(low))
-        raise InvalidInput(
-            f"uncertainty: {interval}: {told[k]:g} of vehicle_{place + 1} in world {k} may be as low as {low[k]:g}; it"
-            " must stay above 0"
-        )
-    most = worlds.vehicles.speed_limit_mps[:, place] if interval.quantity == "speeds_mps" else np.inf
-    high, rule = np.minimum(high, most), QUANTITY.declared[interval.quantity]
-    if not (high <= rule.high).all():
-        k = int(np.argmax(high))
-        raise InvalidInput(
-            f"uncertainty: {interval}: {told[k]:g} of {rule.owner(place)} in world {k} may be as high as {high[k]:g};"
-            f" must be {rule.interval}"
-        )
-    return Side(interval.quantity, place, np.maximum(low, 0.0), high)
-
-
-def _placed(worlds: Worlds, sides: list[Side], share: Callable[[int], Floats | int]) -> Worlds:
+def _placed(worlds: Worlds, sides: list[_Side], share: Callable[[int], Floats | int]) -> Worlds:
     """The worlds with each uncertain number at ``share(k)`` of its interval: 0 its least value, 1 its largest.
 
     Without a channel an uncertain latency is also what others are told, and when the news is known. With one, only the
     reaction is uncertain.
     """
     changed: dict[str, Any] = {}
-    for k, side in enumerate(sides):
-        values = changed.setdefault(side.quantity, _values(worlds, side.quantity).copy())
-        at = np.broadcast_to(np.asarray(share(k), np.float64), side.low.shape)
-        inside = side.low + at * (side.high - side.low)
-        values[:, side.place] = np.where(at == 0.0, side.low, np.where(at == 1.0, side.high, inside))
+    for k, (quantity, place, low, high) in enumerate(sides):
+        values = changed.setdefault(quantity, _values(worlds, quantity).copy())
+        at = np.broadcast_to(np.asarray(share(k), np.float64), low.shape)
+        values[:, place] = np.where(at == 0.0, low, np.where(at == 1.0, high, low + at * (high - low)))
     if "latency_s" in changed and worlds.vehicles.is_known_at_once:
         latency = changed["latency_s"]
         changed |= {"own_latency_s": latency, "known_from_s": Vehicles.known_at_once(latency)}

@@ -9,14 +9,14 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
-from gymnasium.vector import VectorWrapper
+from gymnasium.vector import VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from ethbrake_marl.agents import Agent, LearnedPolicy
-from ethbrake_marl.envs import EthBrakeVectorEnv, InTurns, in_turns
+from ethbrake_marl.envs import InTurns, in_turns
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats
@@ -25,7 +25,18 @@ from ethbrake_marl.shield.guard import Attached, Proposing
 Told = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # what a step of the environment returns
 
 
-class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
+class _Closing:
+    """A wrapper that lets go of the engine before what is inside closes."""
+
+    attached: Attached
+
+    def close(self, **settings: Any) -> None:
+        """Let go of the environment, and close it."""
+        self.attached.close()
+        super().close(**settings)  # type: ignore[misc]  # of the wrapper's own library
+
+
+class HybridShield(_Closing, BaseParallelWrapper[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
     """Shield the learners of a parallel environment, who are driven by the caller's actions or by a policy.
 
     Mode ``episode`` is the paper's Algorithm 1: policy or E-V2X-BM drives a whole episode, whatever is proposed. Mode
@@ -60,12 +71,16 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
         **options: Any,
     ) -> None:
         maker = "eb.parallel_env; with agents acting in turn eb.shielded_aec(that)"
-        asked = None if agents is None else _names(agents)
+        if isinstance(agents, str) or not (agents is None or isinstance(agents, Iterable)):
+            raise InvalidInput(
+                f"HybridShield: agents = {agents!r}: must be a list of names, for instance ['vehicle_2']"
+            )
         self.attached = Attached(env, ParallelEnv, maker, policy, "HybridShield", {"mode": mode, **options})
         super().__init__(env)
         engine = self.attached.engine
         self.shielded = tuple(engine.scenario.vehicle_names[i] for i in engine.learners)  # front to rear
-        if asked is not None and set(asked) != set(self.shielded):
+        asked = self.shielded if agents is None else tuple(agents)
+        if set(asked) != set(self.shielded):
             self.attached.close()
             raise InvalidInput(
                 f"HybridShield: shields every learner, {self.shielded}, and nobody else; got {asked}. What an"
@@ -94,11 +109,6 @@ class HybridShield(BaseParallelWrapper[str, Observations, NDArray[Any]]):  # typ
                 found[1][agent] -= self.attached.options.intervention_penalty
         return found
 
-    def close(self) -> None:
-        """Let go of the environment, and close it."""
-        self.attached.close()
-        super().close()
-
 
 def shielded_aec(env: ParallelEnv[str, Observations, NDArray[Any]], *args: Any, **settings: Any) -> Any:
     """``HybridShield`` with agents acting in turn (AEC), front to rear; arguments as ``HybridShield``.
@@ -108,13 +118,9 @@ def shielded_aec(env: ParallelEnv[str, Observations, NDArray[Any]], *args: Any, 
     return in_turns(HybridShield(env, *args, **settings))
 
 
-def _names(agents: object) -> tuple[Any, ...]:
-    if isinstance(agents, str) or not isinstance(agents, Iterable):
-        raise InvalidInput(f"HybridShield: agents = {agents!r}: must be a list of names, for instance ['vehicle_2']")
-    return tuple(agents)
-
-
-class ShieldedEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArray[Any]], RecordConstructorArgs):
+class ShieldedEnv(
+    _Closing, gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArray[Any]], RecordConstructorArgs
+):
     """``EthBrake-v0`` behind a shield, by default in mode ``step``: each action is certified, or replaced.
 
     The ``options`` are those of ``ShieldOptions``. ``info["shield"]`` says what was done. ``policy`` (in mode ``step``
@@ -157,13 +163,8 @@ class ShieldedEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, ND
         paid = float(reward) - self.attached.options.intervention_penalty * float(told["intervened"])
         return observation, paid, terminated, truncated, info
 
-    def close(self) -> None:
-        """Let go of the environment, and close it."""
-        self.attached.close()
-        super().close()
 
-
-class ShieldedVectorEnv(VectorWrapper):
+class ShieldedVectorEnv(_Closing, VectorWrapper):
     """``EthBrakeVectorEnv`` behind a shield, by default in mode ``step``: each row's action is certified, or replaced.
 
     The ``options`` are those of ``ShieldOptions``.
@@ -182,9 +183,11 @@ class ShieldedVectorEnv(VectorWrapper):
 
     """
 
-    def __init__(self, env: EthBrakeVectorEnv, policy: Agent | LearnedPolicy | None = None, **options: Any) -> None:
+    def __init__(
+        self, env: VectorEnv[Any, Any, Any], policy: Agent | LearnedPolicy | None = None, **options: Any
+    ) -> None:
         maker = "gymnasium.make_vec('EthBrake-v0')"
-        self.attached = Attached(env, gymnasium.vector.VectorEnv, maker, policy, "ShieldedVectorEnv", options)
+        self.attached = Attached(env, VectorEnv, maker, policy, "ShieldedVectorEnv", options)
         super().__init__(env)
 
     def reset(
@@ -205,11 +208,6 @@ class ShieldedVectorEnv(VectorWrapper):
         told = self._told(running)
         penalty = self.attached.options.intervention_penalty * (told["shield"]["intervened"] & running)
         return observation, reward - penalty, terminated, truncated, infos | told
-
-    def close(self, **kwargs: Any) -> None:
-        """Let go of the environment, and close it."""
-        self.attached.close()
-        super().close(**kwargs)
 
     def _told(self, rows: Bools) -> dict[str, Any]:
         return {"shield": {name: column[:, 0].copy() for name, column in self.attached.tell().items()}, "_shield": rows}
@@ -245,7 +243,7 @@ def shield(env: Any, policy: Proposing | None = None, mode: str = "step", **opti
                 f"shield: {inside} acts in turns: put the shield inside it, as eb.shielded_aec(parallel)"
             )
         return shielded_aec(inside, policy, **settings)
-    if isinstance(env, gymnasium.vector.VectorEnv):
+    if isinstance(env, VectorEnv):
         return ShieldedVectorEnv(env, policy, **settings)  # type: ignore[arg-type]
     if isinstance(env, gymnasium.Env):
         return ShieldedEnv(env, policy, **settings)  # type: ignore[arg-type]

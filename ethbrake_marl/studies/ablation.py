@@ -41,12 +41,12 @@ from ethbrake_marl.learning import (
     read_object,
     read_settings,
 )
-from ethbrake_marl.limits import BestHarmTable, best_harm, chunks_left, realised_harm, search_list, world_identity
+from ethbrake_marl.limits import BestHarmTable, best_harm, chunks_left, search_list, task_problem
 from ethbrake_marl.pages.page import Page, Part, Played, Section
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.policies import Policy, load_policy
 from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, Task
-from ethbrake_marl.shield import Shielded, drive_chunks, stack
+from ethbrake_marl.shield import Shielded
 from ethbrake_marl.studies.jobs import TIMED_DRIVES, JobFolder, Timed, TrainingJob
 
 # Levels of cooperation that belong together: the same lines; what differs is who learns, knows and cares.
@@ -254,7 +254,7 @@ class Plan:
                 worlds, task = samples[level.name].worlds, Task(level.scenario, level.scenario.learners)
                 braking = make_agent("full_brake")
                 often = self.episodes * self.seeds * len(self.recipes) * len(HARM_COUNTS)
-                driving_s += often * Timed.each_s(worlds, partial(drive_chunks, braking, task=task))
+                driving_s += often * Timed.each_s(worlds, partial(Shielded.driven, braking, task=task))
         search_s, damaged = 0.0, []
         for level, part, _ in questions(self, lists):
             number, broken = chunks_left(level.scenario, part, budget=self.budget, chunks=self.optimum_folder(level))
@@ -350,7 +350,7 @@ def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample
     for level, sample in zip(plan.levels, samples, strict=True):
         if level.trained:
             part = sample.take(rows)
-            identity = world_identity(part.worlds, Task(level.scenario, level.scenario.learners)).tobytes()
+            identity = task_problem(part.worlds, Task(level.scenario, level.scenario.learners)).identity.tobytes()
             found.setdefault(identity, (level, part, []))[2].append(level)
     return list(found.values())
 
@@ -411,7 +411,7 @@ def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[
     worlds = replace(other.worlds, obstacle_gap_m=own.worlds.obstacle_gap_m).take(rows)
     for best in other.searched.best.values():
         kept = best._replace(harm=best.harm[rows], profiles=best.profiles.take(rows))
-        yield dict(zip(HARM_COUNTS, realised_harm(worlds, task, kept), strict=True))
+        yield dict(zip(HARM_COUNTS, task_problem(worlds, task).follow(kept.profiles), strict=True))
     for team in other.teams:
         driven = evaluate(worlds, {team.name: team}, scenario=scenario, aftermath=False).complete()
         ledger = driven.outcome(team.name).ledger
@@ -478,10 +478,10 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
             for harm_count in HARM_COUNTS if plan.shield else ():
                 task, parts = Task(level.scenario, level.scenario.learners, harm_count), []
                 for team in own:
-                    parts.append(drive_chunks(team, sample.worlds, task))
+                    parts.append(Shielded.driven(team, sample.worlds, task))
                     name = f"driving {team.name} behind the shield, {harm_count}"
                     say(Progress(name, sample.worlds.n, sample.worlds.n))
-                behind[harm_count] = stack(parts)
+                behind[harm_count] = Shielded.stack(parts)
             found.append(Measured(level, algorithm, reached, braking, best, about, behind or None))
     return found
 

@@ -38,7 +38,7 @@ from ethbrake_marl.evaluation import (
 from ethbrake_marl.files.sheet import DASH, Column, Estimate, Sheet
 from ethbrake_marl.files.store import read_plain
 from ethbrake_marl.files.yaml import FileModel, read_json_model
-from ethbrake_marl.limits import BestHarmTable, world_identity
+from ethbrake_marl.limits import BestHarmTable, task_problem
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.policies import Policy
 from ethbrake_marl.scenario import Sample, Scenario, Task
@@ -117,7 +117,7 @@ class SuiteList:
         if hashlib.sha256(read_plain(file, _TABLE_BYTES)).hexdigest() != self.content.table_sha256:
             raise InvalidInput(f"{file}: is not the table that belongs to the suite")
         task = Task(self.scenario, self.scenario.learners, self.content.harm_count)
-        harm = BestHarmTable.load(file).harm(world_identity(sample.worlds, task), self.content.harm_count)
+        harm = BestHarmTable.load(file).harm(task_problem(sample.worlds, task).identity, self.content.harm_count)
         if not np.isfinite(harm).all():
             raise InvalidInput(f"{file}: holds {int(np.isfinite(harm).sum())} of the {len(harm)} worlds of its list")
         return harm

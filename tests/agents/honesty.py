@@ -10,12 +10,11 @@ import numpy as np
 from ethbrake_marl.actions import action_to_command, command_to_action
 from ethbrake_marl.agents.registry import Agent, script_agents
 from ethbrake_marl.engine import Engine, Memory, Script, ask_script, begin_script
-from ethbrake_marl.physics import Bools, Floats, Worlds
+from ethbrake_marl.physics import Bools, Floats, Packed, Worlds
 from ethbrake_marl.physics.messages import CHANNEL, LINK, Messages, link_at, place_at, ring_at
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search import state_columns
 from ethbrake_marl.shield import ShieldedDriver
-from ethbrake_marl.shield.step_shield import Proposer, proposed_action
+from ethbrake_marl.shield.step_shield import Proposer, proposed_action, seen_columns
 
 
 def changed_decisions(
@@ -68,8 +67,8 @@ class Hosted:
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         options, scenario = self.driver.options, self.driver.scenario
         if options.believed:
-            shield = options.believed_shield(scenario, scripts)
-            shield.begin(alert, vehicle, np.arange(alert.n))
+            shield = options.believed_shield(scenario, vehicle, scripts)
+            shield.begin(alert, np.arange(alert.n))
         else:
             shield = options.step_shield(scenario, vehicle, scripts)
             shield.begin(alert, np.arange(alert.n), {vehicle: self.policy})
@@ -80,9 +79,11 @@ class Hosted:
         proposed, policy = proposed_action(self.policy, worlds, policy, vehicle)
         proposer = Proposer({vehicle: self.policy}, {vehicle: policy}, worlds)
         if self.driver.options.believed:
-            applied = shield.decide(worlds, vehicle, proposed, proposer)
+            applied = shield.decide(worlds, proposed, proposer)
         else:
-            applied = shield.decide(proposed, seen=state_columns(worlds), proposer=proposer).applied
+            applied = shield.decide(
+                proposed, seen=seen_columns(Packed.of(worlds))[:, : 3 * worlds.N - 2], proposer=proposer
+            ).applied
         return action_to_command(applied, worlds.vehicles, vehicle), (memory[0], policy)
 
 

@@ -18,11 +18,10 @@ from ethbrake_marl.limits.limits import (
     BestHarmTable,
     best_harm,
     best_known,
-    realised_harm,
     search_list,
     shipped_profiles,
     shipped_tables,
-    world_identity,
+    task_problem,
 )
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
@@ -68,8 +67,8 @@ def test_follow__hits_a_standing_car_with_the_closing_speed_computed_by_hand() -
 def test_search__cannot_beat_full_braking_before_a_standing_car() -> None:
     problem = profile_problem(two_cars(), [1])
     start = problem.constant(np.array([[[2.0]]]))
-    found = problem.search(start, budget=2000)
-    assert found.first_impact_harm == pytest.approx([200.0], abs=1e-3)
+    _, harm = problem.search(start, budget=2000)
+    assert harm["first"] == pytest.approx([200.0], abs=1e-3)
 
 
 def test_profiles__say_which_command_is_in_force() -> None:
@@ -122,7 +121,9 @@ def test_best_harm__two_vehicles_together_are_not_worse_than_one_of_them(
     assert (joint.best["first"].harm <= alone + 1e-6).all()
     assert joint.best["first"].harm.sum() < 0.9 * alone.sum()
     assert joint.best["first"].profiles.commands_mps2.shape[2] == 2
-    assert np.array_equal(realised_harm(few, Task(scenario, (0, 1)), joint.best["first"])[0], joint.best["first"].harm)
+    assert np.array_equal(
+        task_problem(few, Task(scenario, (0, 1))).follow(joint.best["first"].profiles)[0], joint.best["first"].harm
+    )
 
 
 def test_best_harm__joint_optimum_of_two_cars_by_hand() -> None:
@@ -168,7 +169,7 @@ def test_best_harm_agent__searches_a_world_that_no_table_holds(scenario: Scenari
 
 def test_table__finds_worlds_by_what_they_are(scenario: Scenario, worlds: Worlds, table: BestHarmTable) -> None:
     order = np.random.default_rng(1).permutation(worlds.n)
-    identity = world_identity(worlds.take(order), Task(scenario, scenario.learners))
+    identity = task_problem(worlds.take(order), Task(scenario, scenario.learners)).identity
     assert np.array_equal(table.harm(identity, "total"), table.best["total"].harm[order])
 
 
@@ -189,7 +190,7 @@ def test_table__does_not_know_a_world_that_differs_in_anything(
         scenario = scenario.replace(roles={**scenario.roles, "vehicle_3": "constant:5"})
     else:
         vehicles = (2,)
-    assert np.isnan(table.harm(world_identity(worlds, Task(scenario, vehicles)), "first")).all()
+    assert np.isnan(table.harm(task_problem(worlds, Task(scenario, vehicles)).identity, "first")).all()
 
 
 def test_improved__takes_only_what_undercuts_by_more_than_the_tolerance(table: BestHarmTable) -> None:

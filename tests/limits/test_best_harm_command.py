@@ -7,7 +7,7 @@ import pytest
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.evaluation.inputs import LADDER
-from ethbrake_marl.limits.limits import TABLES, BestHarmTable, realised_harm
+from ethbrake_marl.limits.limits import TABLES, BestHarmTable, task_problem
 from ethbrake_marl.scenario import Task, load_scenario
 
 SMALL = ["search", "best-harm", "--scenario", "paper-random", "--episodes", "4", "--budget", "60", "--threads", "1"]
@@ -58,7 +58,7 @@ def test_best_harm_command__takes_what_agents_do_better(tmp_path: Path, capsys: 
         lowered = after.header["lowered_by"]["planner:60"][count]
         assert lowered >= changed.sum()  # in some worlds by the agents of both counts
         assert count == "first" or changed.sum() >= 3
-        again = realised_harm(scenario.sample(30, 7).worlds, Task(scenario, (1,)), after.best[count])[k]
+        again = task_problem(scenario.sample(30, 7).worlds, Task(scenario, (1,))).follow(after.best[count].profiles)[k]
         assert again.tolist() == after.best[count].harm.tolist()
 
 

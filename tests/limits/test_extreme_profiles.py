@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ethbrake_marl import load_scenario
-from ethbrake_marl.limits.limits import KEPT, best_harm, extreme_profiles
-from ethbrake_marl.limits.lower_bound import lower_bound, onset_states
+from ethbrake_marl.limits.limits import best_harm
+from ethbrake_marl.limits.lower_bound import KEPT, extreme_profiles, lower_bound, onset_states
 from ethbrake_marl.physics import advance
 from ethbrake_marl.search import profile_problem
 

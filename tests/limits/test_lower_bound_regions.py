@@ -107,7 +107,7 @@ def worlds_of(region, n, seed):
 def searched(worlds, harm_count, time_step_s, budget):
     problem = profile_problem(worlds, [1], harm_count=harm_count, horizon_s=HORIZON_S, time_step_s=time_step_s)
     given = problem.constant(problem.even_grid(9))
-    return problem.search(given, budget=budget).harm(harm_count)
+    return problem.search(given, budget=budget)[1][harm_count]
 
 
 def check_region(region, n, budget, seed):

@@ -171,7 +171,7 @@ def test_team_bound__refuses_what_it_does_not_cover(vehicles, given, told):
 
 def searched(problem, harm_count, budget):
     given = problem.constant(problem.even_grid(5))
-    return problem.search(given, budget=budget).harm(harm_count)
+    return problem.search(given, budget=budget)[1][harm_count]
 
 
 def at_random(problem, rng, phases=8):

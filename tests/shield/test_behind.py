@@ -7,7 +7,7 @@ import numpy as np
 from ethbrake_marl.agents.registry import Team, drive, make_agent
 from ethbrake_marl.scenario import Task, load_scenario
 from ethbrake_marl.shield import ShieldedDriver, guard as behind_module
-from ethbrake_marl.shield.guard import drive_chunks, put_shield, stack
+from ethbrake_marl.shield.guard import Shielded, put_shield
 
 PAIR, PAPER = (load_scenario(name) for name in ("cooperation-3-pair", "paper-random"))
 
@@ -17,7 +17,7 @@ def test_drive_chunks__is_what_the_shielded_team_does_whatever_the_chunk(monkeyp
     team = ShieldedDriver(Team.of(make_agent("coast"), (1, 2)), PAIR, harm_count="total", logging=True)
     episodes = drive(worlds, team.on((1, 2)), PAIR)
     ledger, shield = episodes.ledger, episodes.guarded.shield
-    whole = drive_chunks(make_agent("coast"), worlds, task)
+    whole = Shielded.driven(make_agent("coast"), worlds, task)
     assert whole.harm.tolist() == ledger.world_harm("total").tolist()
     assert whole.vehicle_harm.tolist() == ledger.vehicle_harm("total").tolist()
     assert whole.bound.tolist() == shield.predicted_harm.tolist() and (whole.harm <= whole.bound).all()
@@ -28,9 +28,9 @@ def test_drive_chunks__is_what_the_shielded_team_does_whatever_the_chunk(monkeyp
     assert whole.replaced.tolist() == logged.tolist() and (logged.sum(axis=0) > 0).all()
     assert (whole.replaced <= whole.decisions[:, np.newaxis]).all()
     monkeypatch.setattr(behind_module, "CHUNK", 5)
-    parts = drive_chunks(make_agent("coast"), worlds, task)
+    parts = Shielded.driven(make_agent("coast"), worlds, task)
     assert all(np.array_equal(*columns) for columns in zip(whole, parts, strict=True))
-    assert stack([whole, parts]).replaced.shape == (2, 12, 2)
+    assert Shielded.stack([whole, parts]).replaced.shape == (2, 12, 2)
 
 
 def test_put_shield__of_one_learner_it_is_the_shield_of_one():
@@ -38,7 +38,7 @@ def test_put_shield__of_one_learner_it_is_the_shield_of_one():
     behind = put_shield(Team({1: make_agent("full_brake")}, "one"), task, allowance=2.0)
     assert list(behind.drivers) == [1] and behind.name == "full_brake+step"
     worlds = PAPER.sample(20, 3).worlds
-    found = drive_chunks(make_agent("full_brake"), worlds, task, allowance=2.0)
+    found = Shielded.driven(make_agent("full_brake"), worlds, task, allowance=2.0)
     assert found.replaced.shape == (20, 1) and found.baseline.shape == (20, 3)
     alone = drive(worlds, make_agent("full_brake+step", scenario=PAPER), PAPER, 1).ledger.world_harm("first")
     assert (found.harm <= found.bound).all() and (found.bound > alone).all()

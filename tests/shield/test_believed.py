@@ -58,7 +58,7 @@ def test_interior__a_box_that_is_the_middle_alone_is_found(monkeypatch: pytest.M
         return boxes._replace(low=half, high=half)
 
     monkeypatch.setattr(enclosure, "boxes_of", middle)
-    monkeypatch.setattr(BelievedShield, "_corners", lambda self, vehicle: [{}])
+    monkeypatch.setattr(BelievedShield, "_corners", lambda self: [{}])
     harm, bound, _ = shielded("coast", INSIDE["never heard"], 12, 7, robust="interior")
     assert (harm > bound + 1.0).any()
 
@@ -119,10 +119,10 @@ def test_believed__shields_beside_an_obstacle() -> None:
 def test_believed__asked_again_at_the_same_moment_says_the_same() -> None:
     worlds, proposed = PERIODIC.sample(5, 3).worlds, np.zeros(5)
     later = drive(worlds, make_agent("full_brake", scenario=PERIODIC), PERIODIC, 1).final
-    shield = BelievedShield(PERIODIC)
-    shield.begin(worlds, 1, np.arange(5))
-    first = shield.decide(later, 1, proposed)
-    assert np.array_equal(first, shield.decide(later, 1, proposed + 1.0))
+    shield = BelievedShield(PERIODIC, 1)
+    shield.begin(worlds, np.arange(5))
+    first = shield.decide(later, proposed)
+    assert np.array_equal(first, shield.decide(later, proposed + 1.0))
 
 
 def test_robust__too_many_open_numbers_are_refused() -> None:

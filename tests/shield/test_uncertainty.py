@@ -9,7 +9,8 @@ import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.physics import make_worlds
-from ethbrake_marl.shield.uncertainty import MOST_CORNERS, Interval, Uncertainty, checked_uncertainty, parse_uncertainty
+from ethbrake_marl.shield.guard import checked_uncertainty
+from ethbrake_marl.shield.uncertainty import MOST_CORNERS, Interval, Uncertainty, parse_uncertainty
 
 
 def line(n=2):

@@ -7,7 +7,7 @@ import pytest
 from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.limits.limits import BestHarmTable, realised_harm
+from ethbrake_marl.limits.limits import BestHarmTable, task_problem
 from ethbrake_marl.scenario import Task
 from ethbrake_marl.studies.benchmark import load_suite, suite_names
 
@@ -38,6 +38,6 @@ def test_tables_of_v2__tell_harms_that_their_profiles_do():
         each = next(each for each in V2.lists if each.name == name)
         table = BestHarmTable.load(each.folder / f"{name}.npz")
         task = Task(each.scenario, each.scenario.learners, each.content.harm_count)
-        first, total = realised_harm(each.sample().worlds, task, table.best[each.content.harm_count])
+        first, total = task_problem(each.sample().worlds, task).follow(table.best[each.content.harm_count].profiles)
         driven = first if each.content.harm_count == "first" else total
         assert driven == pytest.approx(table.best[each.content.harm_count].harm, abs=1e-6)
