@@ -11,7 +11,7 @@ import re
 import textwrap
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -45,7 +45,6 @@ from ethbrake_marl.envs import (
 )
 from ethbrake_marl.errors import InvalidInput, count_of, plain_text
 from ethbrake_marl.evaluation import (
-    NO_REGION,
     Conditions,
     CriticalityMap,
     DecelerationCurve,
@@ -54,9 +53,9 @@ from ethbrake_marl.evaluation import (
     ShieldModes,
     SummaryRow,
     mean,
-    write_output,
 )
 from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.files.store import write_output
 from ethbrake_marl.limits import Unproven
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.shield import OperatingPoint, RobustnessPoint
@@ -135,12 +134,10 @@ def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **
 
 def name_axes(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
     """What a panel shows, above it, and what its axes mean."""
-    if title:
-        axes.set_title(title, loc="left", fontsize=10)
-    if x:
-        axes.set_xlabel(x, fontsize=9)
-    if y:
-        axes.set_ylabel(y, fontsize=9)
+    in_style = ((title, partial(axes.set_title, loc="left"), 10), (x, axes.set_xlabel, 9), (y, axes.set_ylabel, 9))
+    for text, write, size in in_style:
+        if text:
+            write(text, fontsize=size)
 
 
 def finish(
@@ -340,18 +337,15 @@ def harm_by_agent(rows: Sequence[SummaryRow]) -> Figure:
     if not rows:
         raise InvalidInput("harm_by_agent: no rows; evaluate at least one agent")
     figure, panels = new_panels((10.0, 1.2 + 0.36 * len(rows)), columns=2, sharey=True)
-    for axes, count in zip(panels, HARM_COUNTS, strict=True):
+    for axes, count, name in zip(panels, HARM_COUNTS, ("first_impact_harm", "total_harm"), strict=True):
         for k, row in enumerate(rows):
-            estimate = row.first_impact_harm if count == "first" else row.total_harm
-            axes.barh(k, estimate.value, height=0.62, color=COLOURS[2])
-            ends = estimate.ends
+            value, ends = getattr(row, name).value, getattr(row, name).ends
+            axes.barh(k, value, height=0.62, color=COLOURS[2])
             axes.hlines(k, *ends, color=COLOURS[0], linewidth=1.6)
             axes.annotate(
-                f"{estimate.value:.2f}", (ends[1], k), xytext=(5, 0), textcoords="offset points", va="center",
-                fontsize=9,
-            )  # fmt: skip
-        best = rows[0]["best_known_first_impact_harm" if count == "first" else "best_known_total_harm"]
-        if best is not None:
+                f"{value:.2f}", (ends[1], k), xytext=(5, 0), textcoords="offset points", va="center", fontsize=9
+            )
+        if (best := rows[0][f"best_known_{name}"]) is not None:
             axes.axvline(best.value, color=COLOURS[3], linewidth=1.6, linestyle="--", label="best known")
         name_axes(axes, x=_TITLES[count])
         axes.margins(x=0.14)
@@ -446,10 +440,12 @@ def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> 
         panels[k].set_title(told, loc="left", fontsize=9.5)
         name_axes(axes, x="Time since Vehicle 1 began to brake (s)")
     positions, gaps, commands = panels[::columns]
-    ends = []  # the first sampled time from which no vehicle moves any more, or the end
-    for record in records.values():
-        moving = np.flatnonzero((record.speeds_mps != 0.0).any(axis=1))
-        ends.append(float(record.time_s[min(moving[-1] + 1 if len(moving) else 0, len(record.time_s) - 1)]))
+    moving = [np.flatnonzero((each.speeds_mps != 0.0).any(axis=1)) for each in records.values()]
+    # to the first sampled time from which no vehicle moves any more, or the end
+    ends = [
+        float(each.time_s[min(rows[-1] + 1 if len(rows) else 0, len(each.time_s) - 1)])
+        for each, rows in zip(records.values(), moving, strict=True)
+    ]
     positions.set_xlim(0.0, 1.1 * max(ends))
     gaps.set_ylim(bottom=0.0)
     commands.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
@@ -469,15 +465,7 @@ _NOTE = "Figures at impacts: closing speed in m/s. Vehicles are drawn without le
 
 def _positions(axes: Axes, record: EpisodeRecord) -> None:
     for i in range(record.positions_m.shape[1]):
-        colour, dashes = _vehicle_style(i)
-        axes.plot(
-            record.time_s,
-            record.positions_m[:, i],
-            color=colour,
-            linestyle=dashes,
-            linewidth=1.6,
-            label=f"Vehicle {i + 1}",
-        )
+        axes.plot(record.time_s, record.positions_m[:, i], label=f"Vehicle {i + 1}", **_vehicle_style(i))
     if np.isfinite(record.initial.obstacle_gap_m[0]):
         axes.axhline(float(record.initial.obstacle_gap_m[0]), color="black", linewidth=2.5, label="obstacle")
     rows = record.impacts
@@ -503,8 +491,7 @@ def _positions(axes: Axes, record: EpisodeRecord) -> None:
 
 def _gaps(axes: Axes, record: EpisodeRecord) -> None:
     for p in range(record.gaps_m.shape[1]):
-        colour, dashes = _vehicle_style(p + 1)
-        axes.plot(record.time_s, record.gaps_m[:, p], color=colour, linestyle=dashes, linewidth=1.6)
+        axes.plot(record.time_s, record.gaps_m[:, p], **_vehicle_style(p + 1))
     times = record.impacts.time_s[record.impacts.first]
     axes.scatter(
         times, np.zeros(len(times)), marker="X", s=60.0, facecolor="black", edgecolor="black", linewidth=0.8, zorder=5,
@@ -515,9 +502,7 @@ def _gaps(axes: Axes, record: EpisodeRecord) -> None:
 def _command(axes: Axes, record: EpisodeRecord) -> None:
     i = record.vehicle
     axes.axhline(0.0, color=GREY, linewidth=0.8)
-    axes.plot(
-        record.time_s, record.command_mps2[:, i], drawstyle="steps-post", color=_vehicle_style(i)[0], linewidth=1.4
-    )
+    axes.plot(record.time_s, record.command_mps2[:, i], drawstyle="steps-post", color=vehicle_colour(i), linewidth=1.4)
     latency = float(record.initial.vehicles.latency_s[0, i])
     axes.axvline(latency, color=GREY, linewidth=0.8, linestyle=":")
     axes.annotate(
@@ -526,9 +511,9 @@ def _command(axes: Axes, record: EpisodeRecord) -> None:
     )  # fmt: skip
 
 
-def _vehicle_style(i: int) -> tuple[str, str | tuple[int, tuple[int, ...]]]:
+def _vehicle_style(i: int) -> dict[str, Any]:
     """Colour and dashes of Vehicle ``i + 1``, and of the gap ahead of it."""
-    return vehicle_colour(i), DASHES[i % len(DASHES)]
+    return {"color": vehicle_colour(i), "linestyle": DASHES[i % len(DASHES)], "linewidth": 1.6}
 
 
 # The figures of a run.
@@ -578,11 +563,8 @@ def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | No
     if not bins >= 1:
         raise InvalidInput(f"harm_against_total_gap: bins = {bins}; at least 1 is needed")
     gap, gaps = evaluation.worlds.gaps_m.sum(axis=1), [f"d{p}" for p in range(1, evaluation.worlds.N)]
-    low, high = float(gap.min()), float(gap.max())
-    part = np.zeros(len(gap), np.int64)
-    if high > low:
-        part = np.minimum(((gap - low) / (high - low) * bins).astype(np.int64), bins - 1)
-    groups = [part == k for k in range(bins) if (part == k).any()]
+    part = np.minimum(((gap - gap.min()) / (np.ptp(gap) or 1.0) * bins).astype(np.int64), bins - 1)
+    groups = [part == k for k in np.unique(part)]
     sum_of_gaps = " + ".join(gaps) if len(gaps) <= 3 else f"d1 + … + {gaps[-1]}"
     figure, panels = new_panels((10.0, 4.6), columns=2, sharey=True)
     for axes, (name, label) in zip(panels, _PANELS[:2], strict=True):
@@ -715,7 +697,7 @@ def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
     for row, (pair, names) in enumerate(curve.regimes.items()):
         for start, stop in pairwise([0, *(np.flatnonzero(changes[pair]) + 1), len(names)]):
             name, left, right = str(names[start]), at[start], at[min(stop, len(at) - 1)]
-            if name != NO_REGION:
+            if name in _REGIMES:
                 colour = _REGIMES[name][0]
                 strips.barh(-row, right - left, left=left, height=0.8, color=colour, edgecolor=GREY, linewidth=0.6)
                 present.append(name)
@@ -767,8 +749,31 @@ def operating_figure(curves: Sequence[tuple[str, Sequence[OperatingPoint]]], *, 
     return finish(figure, caption)
 
 
-_MISMATCH = (("step", "corner"), ("step", "inside"), ("robust", "corner"), ("robust", "inside"))
-_PRICE = (("step", "harm", 0), ("robust", "harm", 3), ("robust", "bound", 2))  # with the number of the style
+_PRICE = (("step", "harm", 0, "harm"), ("robust", "harm", 3, "harm"), ("robust", "bound", 2, "bound at the alert"))
+_MISMATCH = (
+    ("step", "corner", 0, "step, a corner"),
+    ("step", "inside", 1, "step, inside"),
+    ("robust", "corner", 2, "robust, a corner"),
+    ("robust", "inside", 3, "robust, inside"),
+)
+# of each panel: title, unit, and its lines: mode, truth, what is drawn, number of the style, label
+_ROBUSTNESS: tuple[tuple[str, str, list[tuple[str, str, str, int, str]]], ...] = (
+    (
+        "The world is as told",
+        "Mean over worlds (m²/s²)",
+        [(mode, "as told", what, number, f"{mode}: {words}") for mode, what, number, words in _PRICE],
+    ),
+    (
+        "The truth differs: above the bound",
+        "Worlds above the bound at the alert",
+        [(mode, truth, "above", number, label) for mode, truth, number, label in _MISMATCH],
+    ),
+    (
+        "The truth differs: excess",
+        "Mean excess (m²/s²)",
+        [(mode, truth, "excess", number, label) for mode, truth, number, label in _MISMATCH],
+    ),
+)
 
 
 def robustness_figure(points: Sequence[RobustnessPoint], *, caption: str = "") -> Figure:
@@ -778,31 +783,18 @@ def robustness_figure(points: Sequence[RobustnessPoint], *, caption: str = "") -
     """
     if not points:
         raise InvalidInput("robustness_figure: at least one point is needed")
-    figure, (price, above, excess) = new_panels((11.0, 4.0), columns=3)
-    for mode, what, number in _PRICE:
-        label = f"{mode}: {'harm' if what == 'harm' else 'bound at the alert'}"
-        _curve(price, points, mode, "as told", what, number, label)
-    for number, (mode, truth) in enumerate(_MISMATCH):
-        label = f"{mode}, {'a corner' if truth == 'corner' else 'inside'}"
-        _curve(above, points, mode, truth, "above", number, label)
-        _curve(excess, points, mode, truth, "excess", number, label)
-    above.yaxis.set_major_formatter(PercentFormatter(1.0))
-    titles = ("The world is as told", "The truth differs: above the bound", "The truth differs: excess")
-    units = ("Mean over worlds (m²/s²)", "Worlds above the bound at the alert", "Mean excess (m²/s²)")
-    for axes, title, unit in zip((price, above, excess), titles, units, strict=True):
+    figure, panels = new_panels((11.0, 4.0), columns=3)
+    for axes, (title, unit, lines) in zip(panels, _ROBUSTNESS, strict=True):
+        for mode, truth, what, number, label in lines:
+            chosen = [point for point in points if (point.mode, point.truth) == (mode, truth)]
+            values = [float(getattr(point, what)) for point in chosen]
+            axes.plot([point.width for point in chosen], values, label=label, **series_style(number))
         axes.set_title(title, fontsize=9.5, loc="left")
         name_axes(axes, x="Width of the intervals (1: as given)", y=unit)
         axes.set_ylim(bottom=0.0)
         axes.legend(fontsize=8, frameon=False)
+    panels[1].yaxis.set_major_formatter(PercentFormatter(1.0))
     return finish(figure, caption)
-
-
-def _curve(
-    axes: Axes, points: Sequence[RobustnessPoint], mode: str, truth: str, what: str, number: int, label: str
-) -> None:
-    chosen = [p for p in points if (p.mode, p.truth) == (mode, truth)]
-    values = [float(getattr(p, what)) for p in chosen]
-    axes.plot([p.width for p in chosen], values, label=label, **series_style(number))
 
 
 _OFFSETS = {"none": -0.2, "step": 0.0, "step-alert": 0.2, "step-cap": 0.35}
@@ -825,16 +817,10 @@ def shield_modes_figure(rows: ShieldModes, *, caption: str = "") -> Figure:
     figure, (axes,) = new_panels((7.2, 1.4 + 0.55 * len(agents)))
     for number, mode in enumerate(_OFFSETS):
         for row in (row for row in rows if row.mode == mode):
-            against = row.against_none if rows.of_teams else row.against_episode
-            if against is None:
-                continue
-            value, (low, high) = against.value, against.ends
-            style = {**series_style(number), "linestyle": "none"}
-            place = agents.index(row.agent)
-            axes.errorbar(
-                [value], [place + _OFFSETS[mode]], xerr=[[value - low], [high - value]], capsize=2.5,
-                label=_LABELS[mode] if place == 0 else None, **style,
-            )  # fmt: skip
+            against, place = row.against_none if rows.of_teams else row.against_episode, agents.index(row.agent)
+            if against is not None:
+                style = {**series_style(number), "linestyle": "none", "label": _LABELS[mode] if place == 0 else None}
+                _with_intervals(axes, [place + _OFFSETS[mode]], [against], upright=False, capsize=2.5, **style)
     axes.axvline(0.0, color=GREY, linewidth=1.0)
     axes.set_xscale("symlog", linthresh=1.0)
     axes.xaxis.set_major_formatter(FuncFormatter(_plain))
@@ -897,13 +883,11 @@ def _change_figure(found: Json, caption: str) -> Figure:
         axes.axvline(0.0, color=GREY, linewidth=0.9)
         for row, change in enumerate(changes):
             estimate = Estimate(**change[harm_count]["difference"])
-            value, (low, high) = estimate.value, estimate.ends
+            low, high = estimate.ends
             colour = COLOURS[3] if high < 0.0 else COLOURS[1] if low > 0.0 else GREY
-            axes.errorbar(
-                value, row, xerr=[[value - low], [high - value]], fmt="o", color=colour, capsize=3, markersize=5
-            )
+            _with_intervals(axes, [row], [estimate], upright=False, fmt="o", color=colour, capsize=3, markersize=5)
             share = 100.0 * change[harm_count]["worse_off"]["value"]
-            text = f"{value:+.2f} [{low:+.2f}, {high:+.2f}]\nsomebody worse off in {share:.0f} %"
+            text = f"{estimate.value:+.2f} [{low:+.2f}, {high:+.2f}]\nsomebody worse off in {share:.0f} %"
             axes.text(
                 0.99, row - 0.12, text, transform=axes.get_yaxis_transform(), ha="right", va="bottom", fontsize=7,
                 color=GREY, bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
@@ -972,34 +956,43 @@ def _reached(
 ) -> None:
     """One algorithm: its ladder, and its worse channels beside their clear ones, each seed a dot."""
     own = [level for level in levels if level["algorithm"] in (None, algorithm)]
-    steps = [level for level in own if level["clear"] is None]
     style = series_style(number + 1 if number == 0 else number + 3)
-    x = [_place(level, ladder) + 0.06 * number for level in steps]
-    _with_intervals(axes, x, [level[harm_count]["searched"]["harm"] for level in steps], label=algorithm, **style)
+    hollow = {**style, "linestyle": "none", "markerfacecolor": "white"}
+    steps, worse = ([level for level in own if (level["clear"] is None) == clear] for clear in (True, False))
     shielded = [level for level in own if level["first"].get("shielded") is not None]
-    if shielded:  # what the same teams do behind the step shield, as crosses to the left
-        left = [_place(level, ladder) + 0.06 * number - 0.12 for level in shielded]
-        harms = [level[harm_count]["shielded"]["searched"]["harm"] for level in shielded]
-        _with_intervals(axes, left, harms, fmt="x", color=COLOURS[2], label=f"{algorithm}, shielded")
-    worse = [level for level in own if level["clear"] is not None]
-    beside = [_place(level, ladder) + 0.06 * number for level in worse]
-    if worse:
-        hollow = {**style, "linestyle": "none", "markerfacecolor": "white"}
-        harms = [level[harm_count]["searched"]["harm"] for level in worse]
-        _with_intervals(axes, beside, harms, label=f"{algorithm}, worse channel", **hollow)
-        for place, level in zip(beside, worse, strict=True):
-            channel = level["level"].rpartition("-")[2]
-            spot = (place, level[harm_count]["searched"]["full_brake"]["value"])
+    for some, told, beside, look in (
+        (steps, steps, 0.0, {**style, "label": algorithm}),
+        # what the same teams do behind the step shield, as crosses to the left
+        (
+            shielded, [{harm_count: level[harm_count]["shielded"]} for level in shielded], -0.12,
+            {"fmt": "x", "color": COLOURS[2], "label": f"{algorithm}, shielded"},
+        ),
+        (worse, worse, 0.0, {**hollow, "label": f"{algorithm}, worse channel"}),
+    ):  # fmt: skip
+        x = [_place(level, ladder) + 0.06 * number + beside for level in some]
+        if some:
+            harms = [Estimate(**each[harm_count]["searched"]["harm"]) for each in told]
+            _with_intervals(axes, x, harms, capsize=3, **look)
+    for level in [*steps, *worse]:
+        place, found = _place(level, ladder) + 0.06 * number, level[harm_count]["searched"]
+        if level["clear"] is not None:
+            channel, spot = level["level"].rpartition("-")[2], (place, found["full_brake"]["value"])
             axes.annotate(channel, spot, xytext=(0, 4), textcoords="offset points", ha="center", fontsize=8)
-    for place, level in zip([*x, *beside], [*steps, *worse], strict=True):
-        dots = level[harm_count]["searched"]["each_seed"]
+        dots = found["each_seed"]
         if len(dots) > 1:
             axes.scatter([place + 0.05] * len(dots), dots, s=6, color=str(style["color"]), alpha=0.5, linewidths=0)
 
 
-def _with_intervals(axes: Axes, x: Sequence[float], harms: Sequence[Json], **style: Any) -> None:
-    values, ends = np.array([harm["value"] for harm in harms]), np.array([Estimate(**h).ends for h in harms]).T
-    axes.errorbar(x, values, yerr=np.abs(ends - values), capsize=3, **style)
+def _with_intervals(
+    axes: Axes, at: Sequence[float], estimates: Sequence[Estimate], *, upright: bool = True, **style: Any
+) -> None:
+    """Marks with whiskers: ``at`` is where they stand, along the other axis."""
+    values = np.array([each.value for each in estimates])
+    errors = np.abs(np.array([each.ends for each in estimates]).T - values)
+    if upright:
+        axes.errorbar(at, values, yerr=errors, **style)
+    else:
+        axes.errorbar(values, at, xerr=errors, **style)
 
 
 def _algorithms(found: Json) -> list[str]:

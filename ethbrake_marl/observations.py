@@ -262,11 +262,6 @@ def registered_in(names: Iterable[str]) -> dict[str, RegisteredFeature]:
     return {name: FEATURES[name] for name in own if name in FEATURES}
 
 
-def built_in_names() -> set[str]:
-    """Names of groups and of the features in them."""
-    return {*GROUPS._fields[:-1], *(feature.name for group in GROUPS for feature in group)}
-
-
 def choices(sides: Iterable[str] = ("front_1", "rear_1")) -> list[str]:
     """What an ``observation:`` may list: groups, then single features, of these neighbours."""
     groups = ["own", *sides, "role", "obstacle", "contact", "contact_far"]
@@ -374,9 +369,7 @@ class ObservationSpec:
     @property
     def size(self) -> int:
         """Length F of an observation."""
-        further = self.role * len(GROUPS.role) + self.obstacle * len(GROUPS.obstacle)
-        further += self.contact * len(GROUPS.contact)
-        return len(self.chosen) or len(GROUPS.own) + (self.front + self.rear) * len(GROUPS.neighbour) + further
+        return len(self.features)
 
     @property
     def plan(self) -> Plan:
@@ -811,12 +804,10 @@ def register_feature(
     feature = Feature(name, str(unit), float(scale), float(low), float(high), " ".join(str(function.__doc__).split()))
     entry = RegisteredFeature(feature, function, of, float(unknown), ())
     entry = replace(entry, tried=_tried(entry))
-    if name in _taken() or FEATURES.setdefault(name, entry) != entry:
+    sides = (f"{side}_{k}" for side in ("front", "rear") for k in range(MOST_NEIGHBOURS + 1))
+    taken = {*GROUPS._fields[:-1], *sides, *(feature.name for group in GROUPS for feature in group)}
+    if name in taken or FEATURES.setdefault(name, entry) != entry:
         raise AlreadyExists(f"feature {name!r} is registered already; give another name")
-
-
-def _taken() -> set[str]:
-    return {*built_in_names(), *(f"{side}_{k}" for side in ("front", "rear") for k in range(MOST_NEIGHBOURS + 1))}
 
 
 def _check_numbers(name: str, **numbers: float) -> None:

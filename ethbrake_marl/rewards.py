@@ -30,7 +30,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, WithoutEffect, describe_error, unknown_name
-from ethbrake_marl.files.yaml import UNSHOWN, FileModel, first_mistake, refuse
+from ethbrake_marl.files.yaml import UNSHOWN, FileModel, first_mistake, require
 from ethbrake_marl.harm import Declared, Objective, check_declared, objectives_of
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, forecast, logistic
 
@@ -88,10 +88,6 @@ class Term:
     registered: bool = False  # by somebody else; its function takes the step alone
 
 
-TERMS: dict[str, Term] = {}
-SETTINGS: set[str] = set()  # names of a reward's other settings
-
-
 def register_term(name: str, function: TermFunction, *, weight: float = 0.0, unit: str = "1") -> None:
     """Make ``name`` a term of every reward: a weight in a recipe, in ``RewardParams(terms=...)``, a column of infos.
 
@@ -114,7 +110,7 @@ def register_term(name: str, function: TermFunction, *, weight: float = 0.0, uni
     if isinstance(weight, bool) or not isinstance(weight, int | float) or not 0.0 <= weight < float("inf"):
         raise InvalidInput(f"reward term {name!r}: weight = {weight!r}: must be a number, at least 0")
     term = Term(name, " ".join((function.__doc__ or "").split()), str(unit), float(weight), function, registered=True)
-    if name in SETTINGS or TERMS.setdefault(name, term) != term:
+    if name in RewardParams.model_fields or TERMS.setdefault(name, term) != term:
         raise AlreadyExists(f"reward term {name!r} is registered already; give another name")
 
 
@@ -244,14 +240,10 @@ class RewardParams(FileModel):
         """Harm weighs 1 by default, and an objective is about harm: neither may hold without being meant."""
         given = {*self.model_fields_set, *(self.terms if "terms" in self.model_fields_set else ())}
         beside = [name for name, weight in self.weights.items() if weight > 0.0 and name in given]
-        if beside and "harm" not in given:
-            refuse(("harm",), UNSHOWN, f"is left out, and would weigh 1 beside {beside[0]}; say harm: 1, or 0 for none")
-        if self.objective is not None and self.harm == 0.0:
-            refuse(
-                ("objective",),
-                UNSHOWN,
-                "changes the term harm alone, whose weight is 0; give that a weight, or leave it out",
-            )
+        right = f"is left out, and would weigh 1 beside {''.join(beside[:1])}; say harm: 1, or 0 for none"
+        require(not beside or "harm" in given, ("harm",), UNSHOWN, right)
+        right = "changes the term harm alone, whose weight is 0; give that a weight, or leave it out"
+        require(self.objective is None or self.harm > 0.0, ("objective",), UNSHOWN, right)
         return self
 
     def weight(self, term: str) -> float:
@@ -338,7 +330,44 @@ class RewardParams(FileModel):
         return -least
 
 
-SETTINGS.update(RewardParams.model_fields)
+# The terms of a reward as functions of one step.
+
+
+def _collision(params: RewardParams, step: StepOutcome) -> Floats:
+    return (-params.k_energy * step.total_harm).repeat(step.speeds_mps.shape[1]).reshape(step.speeds_mps.shape)
+
+
+def _jerk(params: RewardParams, step: StepOutcome) -> Floats:
+    rate = (step.command_mps2 - step.previous_mps2) / step.time_step_s
+    return -rate * rate
+
+
+def _risk(params: RewardParams, step: StepOutcome) -> Floats:
+    closing = step.speeds_mps[:, 1:] - step.speeds_mps[:, :-1]
+    room = np.maximum(step.gaps_m - params.safety_buffer_m, 0.0)
+    approaching = closing > 0.0
+    time_to_collision = room / np.where(approaching, closing, 1.0)
+    urgency = np.where(approaching, logistic(-time_to_collision / params.ttc_scale_s), 0.0)
+    nearness = logistic(params.distance_slope_per_m * (params.target_gap_m - step.gaps_m))
+    pair_risk = -(urgency + nearness)
+    risk = np.zeros(step.speeds_mps.shape)
+    risk[:, :-1] += pair_risk
+    risk[:, 1:] += pair_risk
+    return risk
+
+
+TERMS: dict[str, Term] = {
+    term.name: term
+    for term in (
+        Term("harm", "minus the harm of the step, as `harm_count` and `objective` count it", "m2/s2", 1.0, None),
+        Term("collision", "minus `k_energy` times the harm of every impact of the step", "m2/s2", 0.0, _collision),
+        Term("risk", "minus how near and how soon a collision of each own pair is, 0 to 2 a pair", "1", 0.0, _risk),
+        Term("jerk", "minus the squared rate of change of the own command", "m2/s6", 0.0, _jerk),
+        Term("terminal", "1 when an episode ends without any collision", "1", 0.0, None),
+        Term("shaping", "difference of potentials: minus the least harm ahead, for learners", "m2/s2", 0.0, None),
+    )
+}
+
 
 REWARDS = {
     "harm": RewardParams(),
@@ -381,42 +410,3 @@ def reward_params(reward: Reward) -> RewardParams:
 def setting_names() -> list[str]:
     """The keys that a reward may have: its own, then the registered terms."""
     return [*RewardParams.model_fields, *registered_terms()]
-
-
-# The terms of a reward as functions of one step.
-
-
-def _collision(params: RewardParams, step: StepOutcome) -> Floats:
-    return (-params.k_energy * step.total_harm).repeat(step.speeds_mps.shape[1]).reshape(step.speeds_mps.shape)
-
-
-def _jerk(params: RewardParams, step: StepOutcome) -> Floats:
-    rate = (step.command_mps2 - step.previous_mps2) / step.time_step_s
-    return -rate * rate
-
-
-def _risk(params: RewardParams, step: StepOutcome) -> Floats:
-    closing = step.speeds_mps[:, 1:] - step.speeds_mps[:, :-1]
-    room = np.maximum(step.gaps_m - params.safety_buffer_m, 0.0)
-    approaching = closing > 0.0
-    time_to_collision = room / np.where(approaching, closing, 1.0)
-    urgency = np.where(approaching, logistic(-time_to_collision / params.ttc_scale_s), 0.0)
-    nearness = logistic(params.distance_slope_per_m * (params.target_gap_m - step.gaps_m))
-    pair_risk = -(urgency + nearness)
-    risk = np.zeros(step.speeds_mps.shape)
-    risk[:, :-1] += pair_risk
-    risk[:, 1:] += pair_risk
-    return risk
-
-
-TERMS.update(
-    (term.name, term)
-    for term in (
-        Term("harm", "minus the harm of the step, as `harm_count` and `objective` count it", "m2/s2", 1.0, None),
-        Term("collision", "minus `k_energy` times the harm of every impact of the step", "m2/s2", 0.0, _collision),
-        Term("risk", "minus how near and how soon a collision of each own pair is, 0 to 2 a pair", "1", 0.0, _risk),
-        Term("jerk", "minus the squared rate of change of the own command", "m2/s6", 0.0, _jerk),
-        Term("terminal", "1 when an episode ends without any collision", "1", 0.0, None),
-        Term("shaping", "difference of potentials: minus the least harm ahead, for learners", "m2/s2", 0.0, None),
-    )
-)

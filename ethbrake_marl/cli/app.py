@@ -26,9 +26,6 @@ from ethbrake_marl.kernel_store import is_temporary, on_first_compilation
 
 __all__ = ["app", "doctor", "evaluate", "main", "run_command", "scenario", "search", "train"]
 
-BAD_INPUT = 2
-_NO_VARIABLE = ""  # by which no shell can ask for completion
-
 
 def main() -> None:
     """Entry point: run the command line and exit with its status."""
@@ -44,7 +41,7 @@ def run_command(arguments: Sequence[str]) -> int:
     """
     asked = _shell_asks(os.environ)
     try:
-        variable = None if asked else _NO_VARIABLE  # None: the usual one
+        variable = None if asked else ""  # the usual one, or one by which no shell can ask for completion
         with naming_extras():
             status = whole_command()(arguments, prog_name="ethbrake", standalone_mode=False, complete_var=variable)
         sys.stdout.flush()
@@ -80,7 +77,7 @@ def _shell_asks(environment: Mapping[str, str]) -> bool:
 def _refuse(reason: str) -> int:
     """Say why, in one line; gives the exit status."""
     Out().note(f"ethbrake: error: {reason}")
-    return BAD_INPUT
+    return 2
 
 
 def prepare_streams() -> None:

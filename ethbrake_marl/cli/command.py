@@ -26,7 +26,6 @@ from ethbrake_marl.errors import InvalidInput, Progress as PartProgress, check_w
 
 _KEPT = "\n\t\N{NO-BREAK SPACE}"  # in lines of a result; the last stands between a number and its unit
 EVERY_S = 10.0  # between two signs of life where stderr is no terminal
-INTERRUPTED = 130  # 128 + SIGINT, as shells expect
 
 
 def say(text: str) -> None:
@@ -82,13 +81,13 @@ class Out:
             return
         if endings and path.suffix.lower() not in endings:
             raise InvalidInput(f"{path}: {what} must end in {' or '.join(endings)}")
-        from ethbrake_marl.evaluation import check_target
+        from ethbrake_marl.files.store import check_target
 
         check_target(path, force=self.force)
 
     def write(self, path: Path, content: bytes | str, what: str | None = None) -> None:
         """Write a file in one step, and say ``what`` it is."""
-        from ethbrake_marl.evaluation import write_output
+        from ethbrake_marl.files.store import write_output
 
         write_output(path, content.encode() if isinstance(content, str) else content, force=self.force)
         if what is not None:
@@ -97,7 +96,7 @@ class Out:
     def interrupted(self, told: str) -> NoReturn:
         """End the command as Ctrl-C does, with one line."""
         self.note(told)
-        raise typer.Exit(INTERRUPTED)
+        raise typer.Exit(130)  # 128 + SIGINT, as shells expect
 
     def progress(
         self, name: str, done: int, total: int, metrics: Mapping[str, float] | None = None, note: str = ""

@@ -52,7 +52,6 @@ for given in ({}, {"reward": {"harm": 0.05, "shaping": 0.05}}):  # shaped, as PP
     env.reset(seed=0)
     env.step({agent: env.action_space(agent).sample() for agent in env.agents})
 """
-OLDEST_PYTHON = (3, 11)
 _PACKAGE = Path(__file__).resolve().parents[1]
 _CHECKOUT = _PACKAGE.parent  # or the folder of installed packages, where there is no pyproject.toml
 
@@ -74,7 +73,7 @@ def diagnose(*, compile_all: bool = False) -> list[Check]:
     has_torch = find_spec("torch") is not None
     return [
         Check("ethbrake_marl", True, f"{__version__} in {_PACKAGE}"),
-        _check("python", _python),
+        Check("python", True, f"{platform.python_version()} at {sys.executable}"),
         *_dependencies(),
         _check("processor", _processor),
         _check("kernel cache", _kernel_cache),
@@ -91,12 +90,6 @@ def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
         return Check(name, *look())
     except Exception as error:
         return Check(name, False, f"{type(error).__name__}: {error}")
-
-
-def _python() -> tuple[bool, str]:
-    oldest = ".".join(map(str, OLDEST_PYTHON))
-    found = f"{platform.python_version()} at {sys.executable}"
-    return (True, found) if sys.version_info >= OLDEST_PYTHON else (False, f"{found}; needs {oldest} or newer")
 
 
 def _dependencies() -> Iterator[Check]:

@@ -47,7 +47,8 @@ def _asked_task(
     """The scenario that is named, with its settings and with who is driven; ``alone``: that is one vehicle."""
     from ethbrake_marl.scenario import Task
 
-    chosen = evaluation.load_driven(scenario, vehicle, learning.read_settings(settings).scenario, alone=alone)
+    given = learning.read_settings(settings).scenario
+    chosen = evaluation.load_runnable(scenario, given, vehicle=vehicle, drives="one" if alone else "some")
     return Task(chosen, chosen.learners, harm_count)
 
 
@@ -161,7 +162,6 @@ def evaluate_command(
         lineup,
         scenario=chosen,
         seed=drawn_by,
-        chunk=evaluation.PROGRESS_EVERY,
         on_progress=lambda agent, done: out.progress(agent, done, sample.worlds.n),
     )
     summary, told = evaluation.summarise(found), found.rescore(objectives)
@@ -181,7 +181,7 @@ def evaluate_command(
     out.result(results, *shown)
     _tell_horizon(out, _moving(summary), sample.worlds.n, chosen.horizon_s)
     if told and not out.as_json:
-        out.show(evaluation.Rescored.sheet(told, harm_count))
+        out.show(told.sheet(harm_count))
 
 
 def _check_shards(
@@ -207,7 +207,9 @@ def _check_outputs(out: Out, per_world: Path | None, report: Path | None) -> Non
     out.check(report, *PAGES, what="a report")
     if per_world is None:
         return
-    evaluation.check_per_world(per_world)
+    out.check(per_world, ".csv", ".parquet", what="a file of every world")
+    if per_world.suffix.lower() == ".parquet":
+        need("pyarrow")
     for file in (per_world, _beside(per_world)):
         out.check(file)
         if report is not None and file.resolve() == report.resolve():
@@ -243,7 +245,7 @@ def _evaluate_in_shards(
     _tell_horizon(out, _moving(summary), tally.worlds, question.scenario.horizon_s)
     if question.objectives and not out.as_json:
         told = tally.rescore(question.objectives, question.scenario.vehicles)
-        out.show(evaluation.Rescored.sheet(told, question.harm_count))
+        out.show(told.sheet(question.harm_count))
 
 
 def _json_text(content: object) -> str:
@@ -392,16 +394,12 @@ def record_command(
     uncertainty: str | None = None,
 ) -> None:
     """Agents in one world of the list, in real time: the road to scale, commands, impacts, harm."""
-    evaluation.check_film(output.suffix.lower(), len(agents.split(",")))
     out.check(output)
     chosen = _asked_task(scenario, vehicle, None).scenario
     lineup = _make_drivers(agents, chosen, uncertainty=uncertainty)
     worlds = chosen.sample(1, seed, first=world).worlds
-    films = {
-        f"{name}: world {world} of {chosen.name}": evaluation.film_scenes(worlds, agent, scenario=chosen)
-        for name, agent in lineup.items()
-    }
-    out.write(output, evaluation.film_bytes(films, output.suffix.lower()), what="film")
+    titled = {f"{name}: world {world} of {chosen.name}": agent for name, agent in lineup.items()}
+    out.write(output, evaluation.film(worlds, titled, output.suffix.lower(), scenario=chosen), what="film")
 
 
 @watch_group.add("replay", "watch replay PASSPORT --output again.html", json=True, force=True)
@@ -429,8 +427,6 @@ def replay_command(
     Exit status 1 where the world or the episode is another one than the passport's.
     """
     named = evaluation.Passport.parse(passport)
-    if output is not None and output.suffix.lower() not in PAGES:
-        evaluation.check_film(output.suffix.lower())
     out.check(output)
     intervals = _intervals(uncertainty)
     found = named.replay(
@@ -445,8 +441,8 @@ def replay_command(
         *(f"Differs: {each}." for each in found.differences),
     ]
     if output is not None and output.suffix.lower() not in PAGES:
-        scenes = evaluation.film_scenes(found.worlds, found.agent, scenario=found.scenario)
-        out.write(output, evaluation.film_bytes({found.title: scenes}, output.suffix.lower()))
+        drivers = {found.title: found.agent}
+        out.write(output, evaluation.film(found.worlds, drivers, output.suffix.lower(), scenario=found.scenario))
     elif output is not None:
         from ethbrake_marl.pages.page import Page, Part, Played, Section
 
@@ -487,14 +483,15 @@ def explore_command(
 
     It listens on this machine alone, and its address holds a token that is new each time. Ctrl-C ends it.
     """
+    from ethbrake_marl.evaluation import make_agents
     from ethbrake_marl.pages.explorer import Explored, serve_explorer
 
-    chosen = _asked_task(scenario, vehicle, settings, alone=True).scenario
-    explored = Explored(chosen, _make_drivers(agents, chosen, harm_count), harm_count)
+    task = _asked_task(scenario, vehicle, settings, harm_count, alone=True)
+    explored = Explored(task, make_agents(agents.split(","), task.scenario, harm_count=harm_count))
 
     def ready(address: str) -> None:
         out.show(address)
-        out.note(f"explore {chosen.name} there; files go to {folder.resolve()}; Ctrl-C ends it")
+        out.note(f"explore {task.scenario.name} there; files go to {folder.resolve()}; Ctrl-C ends it")
         if not no_browser:
             webbrowser.open(address)
 
@@ -524,7 +521,6 @@ def dataset_command(
     replay to the same bits. The reward counts the harm of --harm-count, too.
     """
     chosen = _asked_task(scenario, vehicle, settings, harm_count).scenario
-    kind = evaluation.check_dataset(output, chosen, format, force=out.force)
     lineup = _make_drivers(agents, chosen, harm_count, uncertainty)
     evaluation.check_agents(lineup, chosen.sample(1, seed).worlds, chosen)
     summary = evaluation.write_dataset(
@@ -533,7 +529,7 @@ def dataset_command(
         scenario=chosen,
         episodes=episodes,
         seed=seed,
-        format=kind,
+        format=format,
         reward="harm" if harm_count == "first" else "total-harm",
         force=out.force,
         on_progress=lambda agent, done: out.progress(agent, done, episodes),

@@ -69,8 +69,8 @@ def best_harm_command(
     from ethbrake_marl.scenario import Task
 
     if shipped:
-        found = evaluation.shipped_bounds()
-        out.result(found, *evaluation.shipped_sheet(found).markdown().splitlines())
+        found, sheet = evaluation.shipped_bounds()
+        out.result(found, *sheet.markdown().splitlines())
         return
     out.check(output, ".npz", what="a table")
     given = learning.read_settings(settings)
@@ -197,7 +197,7 @@ def falsify_command(
     agent = agent or "policy@shipped"
     out.check(output, ".yaml", ".yml", what="a file of worlds")
     given = learning.read_settings(settings)
-    chosen = evaluation.load_driven(scenario, vehicle, given.scenario, alone=False)
+    chosen = evaluation.load_runnable(scenario, given.scenario, vehicle=vehicle, drives="some")
     measured_by = Measure.of(measure, agent, against, chosen, harm_count)
     evaluation.check_agents(measured_by.agents, chosen.replace(early_impacts="keep").sample(1, seed).worlds, chosen)
     found = measured_by.falsify(
@@ -269,7 +269,7 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
                 f"{file}: names an agent that is code ({code[0]}), which is not run because a file names it; --agent"
                 " names another one, and who is compared with is edited in the file"
             )
-    chosen = evaluation.load_driven(kept.scenario, None, learning.read_settings(kept.settings).scenario, alone=False)
+    chosen = evaluation.load_runnable(kept.scenario, learning.read_settings(kept.settings).scenario, drives="some")
     measured_by = Measure.of(kept.measure, agent or kept.agent, kept.against, chosen, kept.harm_count)
     worlds = kept.worlds_of(chosen, str(file))
     measured = measured_by(Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0))

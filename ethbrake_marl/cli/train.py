@@ -55,7 +55,8 @@ def run_command(
 
     plan = learning.load_recipe(recipe)
     given = learning.read_settings(settings, [plan])
-    chosen, plan = evaluation.load_driven(scenario, vehicle, given.scenario), given.change(plan, out.note)
+    chosen = evaluation.load_runnable(scenario, given.scenario, vehicle=vehicle, drives="one")
+    plan = given.change(plan, out.note)
     folder = run_folder(chosen, plan, seed=seed, name=name, output=output)
     result = run_experiment(
         chosen,
@@ -70,7 +71,7 @@ def run_command(
         settings=given.texts,
         on_progress=out.show_progress,
     )
-    told = evaluation.results_to_json(result.rows, per_world=result.directory / evaluation.PER_WORLD)
+    told = evaluation.results_to_json(result.rows, per_world=result.per_world)
     shown: list[Any] = [*result.rows.tables()]
     for test, found in result.beside.items():  # each below what its test asks
         shown += [Text(f"\n{evaluation.TESTS[test]}\n"), found.terminal()]

@@ -6,7 +6,6 @@ from ethbrake_marl.doors import front_door
 
 if TYPE_CHECKING:
     from ethbrake_marl.evaluation.curves import (
-        NO_REGION as NO_REGION,
         CriticalityMap as CriticalityMap,
         DecelerationCurve as DecelerationCurve,
         criticality_map as criticality_map,
@@ -16,27 +15,21 @@ if TYPE_CHECKING:
         EpisodeMotion as EpisodeMotion,
         EpisodeRecord as EpisodeRecord,
         Passport as Passport,
-        check_dataset as check_dataset,
-        check_film as check_film,
-        film_bytes as film_bytes,
-        film_scenes as film_scenes,
+        film as film,
         follow_episodes as follow_episodes,
         record_episode as record_episode,
         write_dataset as write_dataset,
     )
     from ethbrake_marl.evaluation.inputs import (
-        PROGRESS_EVERY as PROGRESS_EVERY,
         NamedWorld as NamedWorld,
         NamedWorlds as NamedWorlds,
         check_agents as check_agents,
         choose_worlds as choose_worlds,
         content_sha256 as content_sha256,
         driving_policy as driving_policy,
-        load_driven as load_driven,
         load_runnable as load_runnable,
         make_agents as make_agents,
         make_lineup as make_lineup,
-        policies_of as policies_of,
         policy_sha256 as policy_sha256,
         result_identity as result_identity,
         result_versions as result_versions,
@@ -44,7 +37,6 @@ if TYPE_CHECKING:
         worlds_sha256 as worlds_sha256,
     )
     from ethbrake_marl.evaluation.measures import (
-        BASELINE as BASELINE,
         PAPER_ROWS as PAPER_ROWS,
         REGISTERED as REGISTERED,
         TESTS as TESTS,
@@ -53,7 +45,6 @@ if TYPE_CHECKING:
         LeftOut as LeftOut,
         Outcome as Outcome,
         PaperRow as PaperRow,
-        Rescored as Rescored,
         SummaryRow as SummaryRow,
         SummaryTable as SummaryTable,
         Tally as Tally,
@@ -61,24 +52,17 @@ if TYPE_CHECKING:
         proven_of_table as proven_of_table,
         register_measure as register_measure,
         shipped_bounds as shipped_bounds,
-        shipped_sheet as shipped_sheet,
         summarise as summarise,
         summarise_by as summarise_by,
     )
     from ethbrake_marl.evaluation.results import (
-        BLOCK as BLOCK,
-        PER_WORLD as PER_WORLD,
-        Asked as Asked,
         Question as Question,
-        check_per_world as check_per_world,
-        check_target as check_target,
         compare_results as compare_results,
         read_result as read_result,
         results_to_json as results_to_json,
-        write_output as write_output,
         write_per_world as write_per_world,
     )
-    from ethbrake_marl.evaluation.rollout import controlled_vehicle as controlled_vehicle, evaluate as evaluate
+    from ethbrake_marl.evaluation.rollout import evaluate as evaluate
     from ethbrake_marl.evaluation.shield_modes import ShieldModes as ShieldModes, compare_modes as compare_modes
     from ethbrake_marl.evaluation.statistics import (
         interquartile_mean as interquartile_mean,
@@ -86,7 +70,6 @@ if TYPE_CHECKING:
         mean_over_seeds as mean_over_seeds,
         paired_difference as paired_difference,
         rate as rate,
-        rate_over_seeds as rate_over_seeds,
         relative_decrease as relative_decrease,
         share_over_seeds as share_over_seeds,
         unpaired_difference as unpaired_difference,

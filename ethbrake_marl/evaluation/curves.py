@@ -71,9 +71,9 @@ def criticality_map(
         raise InvalidInput(f"criticality map: scenario {scenario.name!r} has one gap; at least two are needed")
     if not cells >= 2:
         raise InvalidInput(f"criticality map: cells = {cells}; at least 2 are needed")
-    ranges = [gap_range_m] * 2 if gap_range_m else []
-    for low, high in scenario.bounds("gaps_m")[:2] if not ranges else ():  # drawn, or around a fixed number
-        ranges.append((low, high) if low < high else (FIXED_GAP[0] * low, FIXED_GAP[1] * high))
+    bounds = scenario.bounds("gaps_m")[:2]
+    drawn = [(low, high) if low < high else (FIXED_GAP[0] * low, FIXED_GAP[1] * high) for low, high in bounds]
+    ranges = [gap_range_m] * 2 if gap_range_m else drawn
     for low, high in ranges:
         if not 0.0 <= low < high < np.inf:
             raise InvalidInput(f"criticality map: gaps from {low:g} to {high:g} m; must be 0 <= low < high")
@@ -149,8 +149,6 @@ def _worlds_at(scenario: Scenario, gap_1_m: Floats, gap_2_m: Floats) -> Worlds:
 # decelerations in the engine, where the other vehicles follow their scripts.
 
 POINTS = 2001  # evenly spaced decelerations; the breakpoints of the closed form come on top
-NO_REGION = "none"
-
 _LONG_S = 1e4  # whoever still coasts has met or will never meet
 
 
@@ -240,4 +238,4 @@ def regimes_of(worlds: Worlds, pair: int, deceleration_mps2: Floats) -> NDArray[
     meets_s[rows.world[rows.first]] = rows.time_s[rows.first]
     coasting, stands = meets_s <= v.latency_s[:, pair + 1], meets_s >= stop_s[:, 0]
     cases = [np.isinf(meets_s), meets_s < v.latency_s[:, pair], coasting & stands, coasting, stands]
-    return np.select(cases, [NO_REGION, "early", "A'", "A", "C"], "B")
+    return np.select(cases, ["none", "early", "A'", "A", "C"], "B")

@@ -55,10 +55,10 @@ from ethbrake_marl.evaluation.inputs import (
     worlds_sha256,
 )
 from ethbrake_marl.evaluation.measures import LeftOut, Tape
-from ethbrake_marl.evaluation.results import PARQUET, check_target
+from ethbrake_marl.evaluation.results import PARQUET
 from ethbrake_marl.evaluation.rollout import ShovedFront, controlled_vehicle
 from ethbrake_marl.files.sheet import parquet_file
-from ethbrake_marl.files.store import check_writable, new_folder
+from ethbrake_marl.files.store import check_target, check_writable, new_folder
 from ethbrake_marl.files.yaml import Override
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.observations import Observation, ObservationSpec, choose_observation
@@ -83,6 +83,7 @@ class EpisodeMotion:
     ledger: Ledger  # n = 1
     final: Worlds  # n = 1, as the episode left it
     at_rest: bool  # the line came to rest; else the horizon cut the episode off
+    policies: Mapping[str, str]  # SHA-256 of the policy that drove a vehicle, by vehicle, where one did
 
     @property
     def harm(self) -> tuple[float, float]:
@@ -118,6 +119,7 @@ class _Follower(Tape):
         self._first_s = worlds.first_decision_s(list(team.drivers))
         self._stepped_in: list[list[float]] = [[] for _ in range(worlds.n)]
         self._engine, self._ruling = engine, engine.ruling
+        self._policies = policies_of(team.drivers)
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
         """Keep one step."""
@@ -152,6 +154,7 @@ class _Follower(Tape):
                     ledger,
                     final,
                     bool(episodes.at_rest[k]),
+                    self._policies,
                 )
             )
         return found
@@ -338,6 +341,13 @@ def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float 
     return shown
 
 
+def film(world: Worlds, agents: Mapping[str, Driver], ending: str, *, scenario: Scenario) -> bytes:
+    """``film_bytes`` of what agents, each under its title, do in one world; refuses before any work what it can."""
+    check_film(ending, len(agents))
+    films = {title: film_scenes(world, agent, scenario=scenario) for title, agent in agents.items()}
+    return film_bytes(films, ending)
+
+
 def film_bytes(films: Films, ending: str, *, fps: int = FILM_FPS) -> bytes:
     """Films of one world, titled and one below the other, in real time: an endless GIF or SVG, or an MP4.
 
@@ -486,7 +496,6 @@ class Passport:
         seed: int | None,
         number: int,
         harm_count: HarmCount = "first",
-        policies: Mapping[str, str] | None = None,
     ) -> Passport:
         """The passport of an episode that was driven.
 
@@ -497,10 +506,9 @@ class Passport:
             seed: of the list of worlds; None: they came from a file.
             number: of the world in its list.
             harm_count: that agents minimise.
-            policies: SHA-256 of the policy that drives a vehicle, by vehicle, where one does.
 
         """
-        shas = list((policies or {}).values())
+        shas = list(motion.policies.values())
         joined = shas[0] if len(shas) == 1 else hashlib.sha256("".join(shas).encode()).hexdigest()
         return cls(
             scenario=scenario.name,
@@ -611,10 +619,7 @@ class Passport:
             raise InvalidInput(f"passport: agent {spelling!r}: {error}{hint}") from None
         (driver,) = lineup.values()
         (motion,) = follow_episodes(world, driver, played)
-        policies = policies_of(Team.of(driver, played.learners).drivers)
-        now = Passport.of(
-            motion, played, spelling, seed=self.seed, number=self.number, harm_count=self.harm_count, policies=policies
-        )
+        now = Passport.of(motion, played, spelling, seed=self.seed, number=self.number, harm_count=self.harm_count)
         same = (self.world_sha, self.episode_sha) == (now.world_sha, now.episode_sha)
         return Replay(now, played, world, driver, motion, tuple(self.differences(now)), same)
 
@@ -840,6 +845,7 @@ def _refuse_failed(engine: Engine) -> None:
 KEY = "ethbrake_marl"  # of the file's metadata: what was recorded, as JSON
 
 Columns = dict[str, NDArray[Any]]
+_OF_STEPS = ("reward", "terminated", "truncated")
 
 
 @contextmanager
@@ -863,7 +869,7 @@ def parquet_dataset(path: Path, told: Mapping[str, Any]) -> Iterator[Callable[[R
 def decision_columns(recording: Recording) -> Columns:
     """One entry per decision, world by world; docs/datasets.md lists the columns."""
     running = recording.running
-    before, after = recording.told, recording.reports[1:]
+    before = recording.told
 
     def each(values: NDArray[Any]) -> NDArray[Any]:
         """Values [T or T + 1, n, ...], of each decision's begin, decision by decision."""
@@ -873,6 +879,9 @@ def decision_columns(recording: Recording) -> Columns:
         """A value of each episode [n] in all of its rows."""
         return np.repeat(values, recording.decisions)
 
+    in_force, chosen = before("command_in_force_mps2"), before("chosen_command_mps2")[1:]
+    terms = recording.terms()
+    stacked = {name: np.stack([getattr(step, name) for step in recording.steps]) for name in _OF_STEPS}
     columns: Columns = {
         "agent": np.full(int(running.sum()), recording.agent),
         "world_seed": np.full(int(running.sum()), recording.task.seed),
@@ -880,26 +889,28 @@ def decision_columns(recording: Recording) -> Columns:
         "decision": np.nonzero(running)[1],
         "time_s": each(before("time_s")[:, :, 0]),
     }
-    in_force = before("command_in_force_mps2")
     for i in range(recording.task.scenario.vehicles):
-        columns[f"position_{i + 1}_m"] = each(recording.positions_m[:, :, i])
-        columns[f"speed_{i + 1}_mps"] = each(recording.speeds_mps[:, :, i])
-        columns[f"command_in_force_{i + 1}_mps2"] = each(in_force[:, :, i])
-    chosen, terms = recording.told("chosen_command_mps2")[1:], recording.terms()
-    reward = np.stack([step.reward for step in recording.steps])
-    for c, i in enumerate(recording.task.scenario.learners):
-        for f, feature in enumerate(recording.task.observation.features):
-            columns[f"observation_{i + 1}.{feature.name}"] = each(recording.observations[:, :, c, f])
-        columns[f"action_{i + 1}"] = each(recording.actions[:, :, c])
-        columns[f"chosen_command_{i + 1}_mps2"] = each(chosen[:, :, i])
-        columns[f"reward_{i + 1}"] = each(reward[:, :, i])
-        columns |= {f"reward_{name}_{i + 1}": each(term[1:, :, c]) for name, term in terms.items()}
-    columns["cost"] = each(np.stack([told.cost for told in after]))
-    columns["terminated"] = each(np.stack([step.terminated for step in recording.steps]))
-    columns["truncated"] = each(np.stack([step.truncated for step in recording.steps]))
-    columns["first_impact_harm"] = whole(recording.ledger.world_harm("first"))
-    columns["total_harm"] = whole(recording.ledger.world_harm("total"))
-    return columns
+        columns |= {
+            f"position_{i + 1}_m": each(recording.positions_m[:, :, i]),
+            f"speed_{i + 1}_mps": each(recording.speeds_mps[:, :, i]),
+            f"command_in_force_{i + 1}_mps2": each(in_force[:, :, i]),
+        }
+    for c, i in enumerate(recording.learners):
+        seen = {feature.name: f for f, feature in enumerate(recording.task.observation.features)}
+        columns |= {
+            **{f"observation_{i + 1}.{name}": each(recording.observations[:, :, c, f]) for name, f in seen.items()},
+            f"action_{i + 1}": each(recording.actions[:, :, c]),
+            f"chosen_command_{i + 1}_mps2": each(chosen[:, :, i]),
+            f"reward_{i + 1}": each(stacked["reward"][:, :, i]),
+            **{f"reward_{name}_{i + 1}": each(term[1:, :, c]) for name, term in terms.items()},
+        }
+    return columns | {
+        "cost": each(np.stack([told.cost for told in recording.reports[1:]])),
+        "terminated": each(stacked["terminated"]),
+        "truncated": each(stacked["truncated"]),
+        "first_impact_harm": whole(recording.ledger.world_harm("first")),
+        "total_harm": whole(recording.ledger.world_harm("total")),
+    }
 
 
 # Episodes of one learner as a dataset of Minari, which replays to the recorded bits in the environment it recovers.
@@ -992,17 +1003,14 @@ def _episodes(recording: Recording) -> Iterator[dict[str, Any]]:
     """The fields of an ``EpisodeBuffer``, world by world."""
     vehicle, seed = recording.learners[0], recording.task.seed
     infos = _infos(recording, vehicle)
-    reward = np.stack([step.reward[:, vehicle] for step in recording.steps])
-    terminated, truncated = (
-        np.stack([getattr(step, name) for step in recording.steps]) for name in ("terminated", "truncated")
-    )
+    reward, terminated, truncated = (np.stack([getattr(step, name) for step in recording.steps]) for name in _OF_STEPS)
     for k, (world, end) in enumerate(zip(recording.index.tolist(), recording.decisions.tolist(), strict=True)):
         yield {
             "seed": seed,
             "options": {"listed_world": {"seed": seed, "number": world}},
             "observations": recording.observations[: end + 1, k, 0],
             "actions": recording.actions[:end, k],
-            "rewards": reward[:end, k],
+            "rewards": reward[:end, k, vehicle],
             "terminations": terminated[:end, k],
             "truncations": truncated[:end, k],
             "infos": {name: values[: end + 1, k] for name, values in infos.items()},
@@ -1011,17 +1019,19 @@ def _episodes(recording: Recording) -> Iterator[dict[str, Any]]:
 
 def _infos(recording: Recording, vehicle: int) -> dict[str, NDArray[Any]]:
     """The infos of the environment, [T + 1, n, ...]."""
-    infos: dict[str, NDArray[Any]] = {name: recording.told(name)[:, :, vehicle] for name in COLUMNS}
-    infos["collided"] = infos["collided"] == 1.0
-    infos["chosen_action"] = infos["chosen_action"].astype(np.float32)[:, :, np.newaxis]
-    infos["cost"] = np.stack([told.cost for told in recording.reports])
-    infos["world_seed"] = np.full(infos["cost"].shape, recording.task.seed)
-    infos["world"] = np.stack([told.world for told in recording.reports])
-    infos |= {f"reward_{name}": term[:, :, 0] for name, term in recording.terms().items()}
-    news = [told.known_from_s[:, vehicle] for told in recording.reports if told.known_from_s is not None]
-    if news:
-        infos["known_from_s"] = np.stack(news)
-    return infos
+    told = {name: recording.told(name)[:, :, vehicle] for name in COLUMNS}
+    cost = np.stack([each.cost for each in recording.reports])
+    news = [each.known_from_s[:, vehicle] for each in recording.reports if each.known_from_s is not None]
+    return {
+        **told,
+        "collided": told["collided"] == 1.0,
+        "chosen_action": told["chosen_action"].astype(np.float32)[:, :, np.newaxis],
+        "cost": cost,
+        "world_seed": np.full(cost.shape, recording.task.seed),
+        "world": np.stack([each.world for each in recording.reports]),
+        **{f"reward_{name}": term[:, :, 0] for name, term in recording.terms().items()},
+        **({"known_from_s": np.stack(news)} if news else {}),
+    }
 
 
 BATCH = 500  # worlds recorded together: bounds memory, changes no episode

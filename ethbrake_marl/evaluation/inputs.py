@@ -236,7 +236,6 @@ def states_of(worlds: Worlds, scenario: Scenario) -> list[dict[str, float]]:
     return [{name: float(values[k]) for name, values in columns.items()} for k in range(worlds.n)]
 
 
-PROGRESS_EVERY = 2_500  # worlds between two signs of life
 TRIED_CANDIDATES = 16  # of a script that searches, when a scenario is only checked
 
 LADDER = (  # from no decision at all up to the best that is known
@@ -252,47 +251,43 @@ LADDER = (  # from no decision at all up to the best that is known
 _LADDER_SPEC = "ladder"
 
 
-def load_runnable(name_or_path: str, settings: Sequence[Override] = ()) -> Scenario:
+def load_runnable(
+    name_or_path: str,
+    settings: Sequence[Override] = (),
+    *,
+    vehicle: str | None = None,
+    drives: Literal["nobody", "one", "some"] = "nobody",
+) -> Scenario:
     """Load a scenario as ``load_scenario`` does, and try its scripts, which the file's own check cannot know.
 
-    ``settings`` are put in the place of what the file says.
+    ``settings`` are put in the place of what the file says. ``vehicle`` alone is to be driven; by default all learners
+    that there are. ``drives``: it must be one, or some, that are driven.
 
-    Raises ``InvalidInput`` naming the file, line, role and script that no agent of that name and argument can play.
+    Raises ``InvalidInput`` naming the file, line, role and script that no agent of that name and argument can play, and
+    when there is no such vehicle, or no learner, or several and nothing says which one is driven.
     """
     scenario = load_scenario(name_or_path)
     if settings:
         content = {**scenario.model_dump(mode="json", exclude_none=True), **scenario.declared()}
         scenario = scenario.replace(**Override.put(content, settings))
     worlds = scenario.replace(early_impacts="keep").sample(1, DEFAULT.LIST_SEED).worlds
-    for vehicle, script in scenario.scripts.items():
+    for i, script in scenario.scripts.items():
         try:
             driver = make_agent(script, horizon_s=scenario.horizon_s, most_candidates=TRIED_CANDIDATES)
-            agent = Team.of(driver, [vehicle]).drivers[vehicle]
-            ask_script(agent, worlds, begin_script(agent, worlds, vehicle, {}), vehicle)
+            agent = Team.of(driver, [i]).drivers[i]
+            ask_script(agent, worlds, begin_script(agent, worlds, i, {}), i)
         except InvalidInput as error:
-            role = scenario.vehicle_names[vehicle]
+            role = scenario.vehicle_names[i]
             where = f"scenario {name_or_path!r}"
             if Path(name_or_path).is_file():
                 where = read_yaml(name_or_path).where(("roles", role))
             raise InvalidInput(f"{where}: roles.{role} = {script}: {error}") from None
-    return scenario
-
-
-def load_driven(
-    name_or_path: str, vehicle: str | None, settings: Sequence[Override] = (), *, alone: bool = True
-) -> Scenario:
-    """A runnable scenario whose learners are to be driven: ``vehicle`` alone, by default all learners there are.
-
-    ``alone``: it must be one. Raises ``InvalidInput`` when there is no such vehicle, or no learner, or several and
-    nothing says which one is driven.
-    """
-    scenario = load_runnable(name_or_path, settings)
     if vehicle is not None:
         return scenario.with_learners([vehicle])
     learners = [scenario.vehicle_names[i] for i in scenario.learners]
-    if alone:
+    if drives == "one":
         check_one_learner(scenario.name, learners, "say which vehicle is driven, for instance --vehicle vehicle_2")
-    elif not learners:
+    elif drives == "some" and not learners:
         raise InvalidInput(
             f"scenario {scenario.name!r} has no learner to drive; give the scenario that the agents were trained for"
             " (--scenario), or say which vehicle is driven, for instance --vehicle vehicle_2"

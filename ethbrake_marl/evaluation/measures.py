@@ -57,6 +57,7 @@ _SHOWN_AGENTS = 5  # by name, in ``repr``
 _NAMED = 10  # worlds left out that are named one by one; all stand in the JSON
 COLUMN = "metric_"  # before the name of a registered measure, in JSON and in files with every world
 Columns = dict[str, list[Any]]  # of one row per world
+Values = NDArray[Any]  # [n]
 
 # Columns of files with every world that hold texts, but for the types of vehicles.
 UNSTATED = Knowledge((Source.UNSTATED,))
@@ -66,6 +67,7 @@ _ALWAYS_TOLD = (
     "speeds_mps",
     "obstacle_gap_m",
 )  # quantities of those files that may be the same in all worlds
+_COLUMNS = ("at_rest", "predicted_harm", "chosen_policy", "shoved_m", "sampled_harm")  # of an outcome, [n]
 _LIBRARIES = ("pandas", "polars", "columns")  # of a frame, in the order of preference
 
 
@@ -90,7 +92,7 @@ class Outcome:
     knows: Knowledge = UNSTATED  # what the agent says it knows of the line
     shoved_m: Floats | None = None  # [n] how far Vehicle 1 ends beyond where it would by itself
     sampled_harm: Floats | None = None  # [n] the paper's sum over samples of the same commands
-    policies: Mapping[int, str] = field(default_factory=dict)  # vehicle (0 = front) -> SHA-256 of its policy's manifest
+    policies: Mapping[str, str] = field(default_factory=dict)  # vehicle's name -> SHA-256 of its policy's manifest
     metrics: Mapping[str, Floats] = field(default_factory=dict)  # registered measures by column, [n]
 
     def __repr__(self) -> str:
@@ -101,17 +103,21 @@ class Outcome:
 
     def take(self, rows: Ints | Bools) -> Outcome:
         """That of some of the worlds."""
-        names = ("predicted_harm", "chosen_policy", "shoved_m", "sampled_harm")
-        columns: dict[str, Any] = {name: getattr(self, name) for name in names}
-        columns = {name: None if column is None else column[rows] for name, column in columns.items()}
+        found = {name: getattr(self, name) for name in _COLUMNS}
+        columns: dict[str, Any] = {name: None if column is None else column[rows] for name, column in found.items()}
         metrics = {name: column[rows] for name, column in self.metrics.items()}
-        ledger, final = self.ledger.take(rows), self.final.take(rows)
-        return replace(self, ledger=ledger, final=final, at_rest=self.at_rest[rows], metrics=metrics, **columns)
+        return replace(self, ledger=self.ledger.take(rows), final=self.final.take(rows), metrics=metrics, **columns)
 
-    @property
-    def named_policies(self) -> dict[str, str]:
-        """``policies`` by the vehicles' names."""
-        return {f"vehicle_{i + 1}": sha for i, sha in self.policies.items()}
+    @classmethod
+    def join(cls, parts: Sequence[Outcome]) -> Outcome:
+        """One from those of consecutive worlds."""
+        first = parts[0]
+        given = [name for name in _COLUMNS if getattr(first, name) is not None]
+        columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in given}
+        ledger = Ledger(*(np.concatenate([getattr(part.ledger, f.name) for part in parts]) for f in fields(Ledger)))
+        final = Worlds.concatenate([part.final for part in parts])
+        metrics = {name: np.concatenate([part.metrics[name] for part in parts]) for name in first.metrics}
+        return replace(first, ledger=ledger, final=final, metrics=metrics, **columns)
 
     @property
     def collided(self) -> Bools:
@@ -158,10 +164,16 @@ class Outcome:
                 told[f"{objective}_{harm_count}"] = values
         return {f"{name}_{i + 1}": each[:, i] for name, each in told.items() for i in range(each.shape[1])}
 
-    def columns(self) -> Columns:
+    def columns(self) -> dict[str, Values | None]:
         """What happened in each world, by the names of ``--per-world``; None where the agent says nothing."""
-        final = self.final
-        found: dict[str, Any] = {
+        final, obstacle = self.final, {}
+        if np.isfinite(final.obstacle_gap_m).all():  # of the harm above, what Vehicle 1's impacts with the obstacle did
+            obstacle = {
+                "obstacle_first_impact_harm": self.ledger.obstacle_harm("first"),
+                "obstacle_total_harm": self.ledger.obstacle_harm("total"),
+                "final_obstacle_gap_m": final.obstacle_gap_m,
+            }
+        return {
             "collided": self.collided + 0,
             "impacts": self.impacts,
             **self.borne(),
@@ -169,19 +181,15 @@ class Outcome:
             "total_harm": self.total_harm,
             "sampled_harm": self.sampled_harm,
             "vehicle_1_shoved_m": self.shoved_m,
+            **obstacle,
+            **{f"final_gap_{p + 1}_m": final.gaps_m[:, p] for p in range(final.N - 1)},
+            **{f"final_speed_{i + 1}_mps": final.speeds_mps[:, i] for i in range(final.N)},
+            "end_s": final.time_s,
+            "ended": self.ended,
+            "predicted_harm": self.predicted_harm,
+            "chosen_policy": None if self.chosen_policy is None else self.chosen_policy + 0,
+            **{COLUMN + name: column + 0 for name, column in self.metrics.items()},  # truths as 0 and 1
         }
-        if np.isfinite(final.obstacle_gap_m).all():  # of the harm above, what Vehicle 1's impacts with the obstacle did
-            found["obstacle_first_impact_harm"] = self.ledger.obstacle_harm("first")
-            found["obstacle_total_harm"] = self.ledger.obstacle_harm("total")
-            found["final_obstacle_gap_m"] = final.obstacle_gap_m
-        found |= {f"final_gap_{p + 1}_m": final.gaps_m[:, p] for p in range(final.N - 1)}
-        found |= {f"final_speed_{i + 1}_mps": final.speeds_mps[:, i] for i in range(final.N)}
-        chosen = None if self.chosen_policy is None else self.chosen_policy + 0
-        found |= {"end_s": final.time_s, "ended": self.ended}
-        found |= {"predicted_harm": self.predicted_harm, "chosen_policy": chosen}
-        found |= {COLUMN + name: column + 0 for name, column in self.metrics.items()}  # truths as 0 and 1
-        nothing = [None] * len(self.collided)
-        return {name: nothing if column is None else column.tolist() for name, column in found.items()}
 
 
 class LeftOut(NamedTuple):
@@ -226,9 +234,7 @@ class Evaluation:
     seed: int | None  # of the list; None for worlds that were given
     outcomes: dict[str, Outcome]  # by the agent's name
     left_out: tuple[LeftOut, ...] = ()  # worlds of the list that are in none of the arrays, the same for all agents
-    kinds: Mapping[str, NDArray[np.str_]] = field(
-        default_factory=dict
-    )  # ``scenario`` of a mixture, ``vehicle_2_type``, ...: [n]
+    kinds: Mapping[str, NDArray[np.str_]] = field(default_factory=dict)  # ``scenario``, ``vehicle_2_type``: each [n]
 
     def __repr__(self) -> str:
         drivers = [f"{agent!r:.42}" for agent in list(self.outcomes)[:_SHOWN_AGENTS]]
@@ -314,9 +320,8 @@ class Evaluation:
     @property
     def hidden(self) -> Bools:
         """Worlds in which the channel hides something of the line from a driven vehicle, [n]; see ``v2x``."""
-        hidden = np.zeros(self.worlds.n, np.bool_)
-        for vehicle in self.vehicles:
-            hidden |= self.worlds.vehicles.hide_from(vehicle) | Messages.of(self.worlds).periodic
+        from_each = [self.worlds.vehicles.hide_from(i) | Messages.of(self.worlds).periodic for i in self.vehicles]
+        hidden: Bools = np.logical_or.reduce([np.zeros(self.worlds.n, np.bool_), *from_each])
         return hidden
 
     @cached_property
@@ -355,17 +360,19 @@ class Evaluation:
             values = rule.of(self.worlds)
             if not limits or key in _ALWAYS_TOLD or np.ptp(values, axis=0).any():
                 initial |= {rule.column_of(i): values[:, i].tolist() for i in range(values.shape[1])}
-        hidden: Columns = {"hidden": self.hidden.astype(int).tolist()}
         found: Columns = {}
         for agent, outcome in self.outcomes.items():
-            columns: Columns = {"agent": [agent] * n, **initial, **outcome.columns()}
-            if regrets is not None:
-                columns |= regrets.columns(outcome)
-            elif limits:
-                columns |= {name: [None] * n for name in Regrets.COLUMNS}
-            told = outcome.borne(objectives)
-            columns |= {name: column.tolist() for name, column in told.items() if name not in columns}
-            columns |= {"knows": [outcome.knows.text] * n, **hidden}
+            told = outcome.columns()
+            for name, of in KNOWN_OF_WORLDS.items() if limits else ():
+                told[name] = None if regrets is None else of(regrets, outcome)
+            told |= {name: column for name, column in outcome.borne(objectives).items() if name not in told}
+            columns: Columns = {
+                "agent": [agent] * n,
+                **initial,
+                **{name: [None] * n if column is None else column.tolist() for name, column in told.items()},
+                "knows": [outcome.knows.text] * n,
+                "hidden": self.hidden.astype(int).tolist(),
+            }
             for left in self.left_out if limits else ():
                 told_of = {"agent": agent, "world": left.world, "ended": f"left out: {left.agent}: {left.reason}"}
                 columns = {name: [*values, told_of.get(name)] for name, values in columns.items()}
@@ -396,25 +403,26 @@ class Evaluation:
             raise InvalidInput(f"to_frame: {chosen} is not installed: {sys.executable} -m pip install {chosen}")
         return import_module(chosen).DataFrame(self.arrays())
 
-    def rescore(self, declared: Sequence[Declared] | None = None) -> list[Rescored]:
+    def rescore(self, declared: Sequence[Declared] | None = None) -> Rescores:
         """Every agent under every objective and both counts, in that order."""
-        return [
-            Rescored(agent, objective, harm_count, tuple(mean(column) for column in values.T))
-            for agent, outcome in self.outcomes.items()
-            for harm_count in HARM_COUNTS
-            for objective, values in scored(outcome.ledger, harm_count, declared).items()
-        ]
+        return Rescores(
+            [
+                Rescored(agent, objective, harm_count, tuple(mean(column) for column in values.T))
+                for agent, outcome in self.outcomes.items()
+                for harm_count in HARM_COUNTS
+                for objective, values in scored(outcome.ledger, harm_count, declared).items()
+            ]
+        )
 
     def _repr_html_(self) -> str:
         """What each agent did, for a notebook."""
-        harms = {"First-impact harm": "first_impact_harm", "Total harm": "total_harm"}
-        rows = []
-        for agent, outcome in self.outcomes.items():
-            collided = rate(int(outcome.collided.sum()), self.worlds.n)
-            means = [mean(getattr(outcome, name)).in_words() for name in harms.values()]
-            rows.append((agent, collided.in_words(digits=1, scale=100.0, unit=" %"), *means))
+        share = Column("Collisions", digits=1, scale=100.0, unit=" %")
+        rows = [
+            (agent, rate(int(each.collided.sum()), self.worlds.n), mean(each.first_impact_harm), mean(each.total_harm))
+            for agent, each in self.outcomes.items()
+        ]
         note = "Means per world in m²/s², with their 95 % intervals. eb.summarise tells more."
-        return Sheet(repr(self), ("Agent", "Collisions", *harms), rows, note).html()
+        return Sheet(repr(self), ("Agent", share, Column("First-impact harm"), Column("Total harm")), rows, note).html()
 
     def complete(self) -> Evaluation:
         """The evaluation itself, for who needs every world; raises ``PhysicsError`` if some were left out."""
@@ -634,26 +642,19 @@ class Regrets:
             return None
         return Between.of(~self.avoidable, self.limits.proof.impact, self.first_impact_harm, self.total_harm)
 
-    COLUMNS = (
-        "avoidable", "unavoidable_reason", "best_known_first_impact_harm", "best_known_total_harm", "best_known_source",
-        "impact_proven", "proven_harm", "regret_first_impact_harm", "regret_total_harm",
-    )  # fmt: skip
 
-    def columns(self, outcome: Outcome) -> Columns:
-        """What was avoidable and the best known in each world, by the names of ``--per-world``."""
-        n, proof = len(outcome.collided), self.limits.proof
-        columns = (
-            np.full(n, None) if proof.avoidable is None else proof.avoidable + 0,
-            np.full(n, None) if proof.reason is None else proof.reason,
-            self.first_impact_harm,
-            self.total_harm,
-            self.source,
-            proof.impact + 0,
-            proof.harm,
-            self.regret(outcome, "first"),
-            self.regret(outcome, "total"),
-        )
-        return {name: column.tolist() for name, column in zip(self.COLUMNS, columns, strict=True)}
+# What was avoidable and the best known in each world, by the names of ``--per-world``.
+KNOWN_OF_WORLDS: dict[str, Callable[[Regrets, Outcome], Values | None]] = {
+    "avoidable": lambda r, _: None if r.avoidable is None else r.avoidable + 0,
+    "unavoidable_reason": lambda r, _: r.limits.proof.reason,
+    "best_known_first_impact_harm": lambda r, _: r.first_impact_harm,
+    "best_known_total_harm": lambda r, _: r.total_harm,
+    "best_known_source": lambda r, _: r.source,
+    "impact_proven": lambda r, _: r.limits.proof.impact + 0,
+    "proven_harm": lambda r, _: r.limits.proof.harm,
+    "regret_first_impact_harm": lambda r, o: r.regret(o, "first"),
+    "regret_total_harm": lambda r, o: r.regret(o, "total"),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -693,7 +694,6 @@ class Between:
 
 BASELINE = "full_brake"
 FAR_M = 5.0  # Vehicle 1 counts as shoved far beyond this
-Values = NDArray[Any]  # [n]
 
 
 @dataclass(frozen=True, slots=True)
@@ -967,14 +967,18 @@ class Tally:
             raise InvalidInput(f"is no tally of a shard: {error!r}") from None
         return tally
 
-    def rescore(self, objectives: Sequence[str], vehicles: int) -> list[Rescored]:
+    def rescore(self, objectives: Sequence[str], vehicles: int) -> Rescores:
         """Every agent under these objectives and both counts, as ``Evaluation.rescore``."""
-        return [
-            Rescored(name, each, count, tuple(own.moments[f"{each}_{count}_{i + 1}"].estimate for i in range(vehicles)))
-            for name, own in self.agents.items()
-            for count in HARM_COUNTS
-            for each in objectives
-        ]
+        return Rescores(
+            [
+                Rescored(
+                    name, each, count, tuple(own.moments[f"{each}_{count}_{i + 1}"].estimate for i in range(vehicles))
+                )
+                for name, own in self.agents.items()
+                for count in HARM_COUNTS
+                for each in objectives
+            ]
+        )
 
 
 def _estimate_all(
@@ -1208,56 +1212,53 @@ def proven_of_table(worlds: Worlds, task: Task, table: BestHarmTable) -> dict[st
     return leaving_out_failed(of, np.arange(worlds.n))[0]
 
 
-def shipped_bounds(tables: Iterable[BestHarmTable] | None = None) -> list[dict[str, Any]]:
-    """The least harm known, the proven one, and the gap of every shipped table, as plain data, by name of its file.
+def shipped_bounds(tables: Iterable[BestHarmTable] | None = None) -> tuple[list[dict[str, Any]], Sheet]:
+    """The least harm known, the proven one, and the gap of every shipped table: plain data, and means as a sheet.
 
     A header names a shipped scenario and a list of it, of which every world is compared; raises ``InvalidInput`` if
     the table does not hold them. A gap is best known minus proven harm, as a share of the best known.
     """
-    found = []
-    for table in shipped_tables() if tables is None else tables:
-        header = table.header
-        scenario = load_scenario(header["scenario"])
-        names, seed, episodes = tuple(header["vehicles"]), int(header["list_seed"]), int(header["episodes"])
-        task = Task(scenario, tuple(scenario.vehicle_names.index(name) for name in names))
-        sample = scenario.sample(episodes, seed)
-        worlds = sample.worlds
-        table.check_holds_any(task_problem(worlds, task).identity)
-        why = unproven_because(worlds, task)
-        proven = None if why is not None else proven_of_table(worlds, task, table)
-        known = {c: float(table.best[c].harm.mean()) if c in table.best else None for c in HARM_COUNTS}
-        told = result_identity("best-harm", scenario, sample)
-        told |= {"scenario": scenario.name, "vehicles": names, "list_seed": seed, "worlds": len(table.identity)}
-        told |= {f"best_known_{harm_count}": best for harm_count, best in known.items()}
-        told |= {"proven": proven, "nothing_proven_because": why}
-        for harm_count, best in known.items():
-            gap = None
-            if proven is not None and best is not None:
-                gap = 1.0 - proven["proven_harm"] / best if best > 0.0 else 0.0
-            told[f"gap_{harm_count}"] = gap
-        found.append(told)
-    return found
-
-
-def shipped_sheet(found: Sequence[Mapping[str, Any]]) -> Sheet:
-    """The table of all of them; harms are means over the worlds, m2/s2."""
     harm, share = partial(Column, digits=3, sign="-"), partial(Column, digits=1, scale=100.0, unit=" %", sign="-")
     columns = (
         "list", Column("worlds"), harm("proven"), harm("best known, first"), share("gap"), harm("best known, total"),
         share("gap"), share("contact proven"), share("impact proven"), share("between"),
         harm("best known there, first"), share("next to none there"),
     )  # fmt: skip
-    rows = []
-    for one in found:
-        proven = one["proven"] or {}
-        inside = proven.get("between") or {}
-        why = f": {one['nothing_proven_because']}" if one["nothing_proven_because"] else ""
-        row: list[Cell] = [f"{one['scenario']} (seed {one['list_seed']}){why}", f"{one['worlds']:,}"]
-        row += [proven.get("proven_harm")]
-        row += [one[name] for name in ("best_known_first", "gap_first", "best_known_total", "gap_total")]
-        row += [proven.get("contact_proven_rate"), proven.get("impact_proven_rate")]
-        rows.append([*row, *(inside.get(name) for name in ("rate", "mean_first", "harmless_rate"))])
-    return Sheet("", columns, rows)
+    found, rows = [], []
+    for table in shipped_tables() if tables is None else tables:
+        header = table.header
+        scenario = load_scenario(header["scenario"])
+        names, seed = tuple(header["vehicles"]), int(header["list_seed"])
+        task = Task(scenario, tuple(scenario.vehicle_names.index(name) for name in names))
+        sample = scenario.sample(int(header["episodes"]), seed)
+        table.check_holds_any(task_problem(sample.worlds, task).identity)
+        why = unproven_because(sample.worlds, task)
+        proven = None if why is not None else proven_of_table(sample.worlds, task, table)
+        known = {c: float(table.best[c].harm.mean()) if c in table.best else None for c in HARM_COUNTS}
+        gaps: dict[str, float | None] = dict.fromkeys(known)
+        for harm_count, best in known.items():
+            if proven is not None and best is not None:
+                gaps[harm_count] = 1.0 - proven["proven_harm"] / best if best > 0.0 else 0.0
+        found.append({
+            **result_identity("best-harm", scenario, sample),
+            "scenario": scenario.name,
+            "vehicles": names,
+            "list_seed": seed,
+            "worlds": len(table.identity),
+            **{f"best_known_{harm_count}": best for harm_count, best in known.items()},
+            "proven": proven,
+            "nothing_proven_because": why,
+            **{f"gap_{harm_count}": gap for harm_count, gap in gaps.items()},
+        })  # fmt: skip
+        told = proven or {}
+        inside = told.get("between") or {}
+        rows.append((
+            f"{scenario.name} (seed {seed}){f': {why}' if why else ''}", f"{len(table.identity):,}",
+            told.get("proven_harm"), known["first"], gaps["first"], known["total"], gaps["total"],
+            told.get("contact_proven_rate"), told.get("impact_proven_rate"),
+            inside.get("rate"), inside.get("mean_first"), inside.get("harmless_rate"),
+        ))  # fmt: skip
+    return found, Sheet("", columns, rows)
 
 
 @dataclass(frozen=True, slots=True)
@@ -1274,10 +1275,13 @@ class Rescored:
         each = Estimate.side_by_side({f"vehicle_{i + 1}": estimate for i, estimate in enumerate(self.each)})
         return {"objective": self.objective, "harm_count": self.harm_count, **each}
 
-    @staticmethod
-    def sheet(rows: Sequence[Rescored], harm_count: HarmCount) -> Sheet:
+
+class Rescores(list[Rescored]):
+    """Agents under objectives and counts."""
+
+    def sheet(self, harm_count: HarmCount) -> Sheet:
         """The means under one count: one line per agent and objective, one column per vehicle."""
-        shown = [row for row in rows if row.harm_count == harm_count]
+        shown = [row for row in self if row.harm_count == harm_count]
         vehicles = range(len(shown[0].each) if shown else 0)
         columns = [Column(f"Vehicle {i + 1}", interval="hidden") for i in vehicles]
         names = ["" if k and shown[k - 1].agent == row.agent else row.agent for k, row in enumerate(shown)]
@@ -1303,6 +1307,10 @@ _ALWAYS_SHOWN = ("collision_rate", "first_impact_harm", "total_harm", "sampled_h
 _NARROW = (  # in a narrow terminal too, where there is no regret to show, and where there is
     ("harm_decrease_first", "harm_decrease_total"),
     ("mean_regret_first", "realised_share_first"),
+)
+_IN_NOTEBOOKS = (
+    *("Agent", "Knows", "collision_rate", "first_impact_harm", "total_harm"),
+    *("mean_regret_first", "harm_decrease_first", "realised_share_first"),
 )
 _BELOW = ("collision_rate", "first_impact_harm", "total_harm")  # a terminal shows their intervals; JSON has all
 
@@ -1415,17 +1423,12 @@ class SummaryTable(list[SummaryRow]):
     """
 
     def _repr_html_(self) -> str:
-        share = partial(Column, digits=1, scale=100.0, unit=" %")
-        columns = (
-            "Agent", "Knows", share("Collisions"), Column("First-impact harm"), Column("Total harm"),
-            Column("Regret, first"), share("Decrease, first"), share("Realised share, first"),
-        )  # fmt: skip
-        names = ("collision_rate", "first_impact_harm", "total_harm", "mean_regret_first", "harm_decrease_first")
-        rows = [(row.agent, row.knows.text, *(row[name] for name in (*names, "realised_share_first"))) for row in self]
         note = "Harm: means per world in m²/s². In brackets: 95 % intervals. Decrease: of full braking's harm."
         note += f" WARNING: {self[0].warning}." if self and self[0].warning else ""
         worlds = f"{self[0].parameters['scenario']}, {count_of(self[0].episodes, 'world')}" if self else "no agent"
-        return Sheet(worlds, columns, rows, note).html()
+        sheet = self.sheet()
+        ours = replace(sheet, title=worlds, rows=sheet.rows[: len(self)], note=note)
+        return ours.only(k for k, name in enumerate(sheet.names) if name in _IN_NOTEBOOKS).html()
 
     @classmethod
     def of_tallies(
@@ -1495,34 +1498,21 @@ class SummaryTable(list[SummaryRow]):
             bound = row.known_best_share is not None and row.known_best_share < 1.0
             cells["mean_regret_first"] = Shown(f"≥ {value}" if bound else value, interval)
             lines.append((row.agent, SEES_THROUGH * row.sees_through + row.knows.text, *cells.values()))
-        for name, paper in self._papers().items():
-            lines += [
-                f"paper, {name}",
-                *((agent, None, *(cells.get(c.name) for c in columns)) for agent, cells in paper),
-            ]
-        return Sheet("", ["Agent", "Knows", *columns], lines)
-
-    def _papers(self) -> dict[str, list[tuple[str, dict[str, str]]]]:
-        """The paper's rows that belong beside these, by table, with the digits that it prints."""
-        found: dict[str, list[tuple[str, dict[str, str]]]] = {}
-        for row in PAPER_ROWS if self and self[0].beside_paper else ():
-            cells = {
-                "collision_rate": f"{100 * row.collision_rate:.4g} %",
-                "first_impact_harm": f"{row.average_harm:.6g}",
+        for paper in PAPER_ROWS if self and self[0].beside_paper else ():
+            printed = {
+                "collision_rate": f"{100 * paper.collision_rate:.4g} %",
+                "first_impact_harm": f"{paper.average_harm:.6g}",
             }
-            if row.harm_decrease is not None:
-                cells["harm_decrease_first"] = f"{100 * row.harm_decrease:.4g} %"
-            found.setdefault(row.table, []).append((row.agent, cells))
-        return found
-
-    def paper_lines(self) -> list[str]:
-        """The conditions of the paper's rows beside these, by table; the last is what must be known of them."""
-        found = [f"{name}: {PAPER_PARAMETERS[name]}." for name in self._papers()]
-        return [*found, PAPER_NOTE] if found else []
+            if paper.harm_decrease is not None:
+                printed["harm_decrease_first"] = f"{100 * paper.harm_decrease:.4g} %"
+            section = f"paper, {paper.table}"
+            lines += [] if section in lines else [section]
+            lines.append((paper.agent, None, *(printed.get(column.name) for column in columns)))
+        return Sheet("", ["Agent", "Knows", *columns], lines)
 
     def terminal(self) -> Sheet:
         """The table for a terminal of 80 columns or more: ours, then the paper's rows, then the conditions of each."""
-        narrow = (*_ALWAYS_SHOWN, *_NARROW[bool(self.limit_lines())])
+        narrow = (*_ALWAYS_SHOWN, *_NARROW[bool(self.limit_line())])
         columns = [
             replace(each, wide=each.name not in narrow, interval="below" if each.name in _BELOW else "hidden")
             for each in (measure.column() for measure in measures() if measure.heading)
@@ -1547,43 +1537,45 @@ class SummaryTable(list[SummaryRow]):
     def _conditions(self) -> str:
         if not self:
             return ""
-        texts = [
+        ours = (
             f"Ours: {self[0].parameters.line}. Harms are means per world in m²/s²; in brackets or"
             " below a value: its 95 % interval; decreases are relative to full braking."
-        ]
-        texts += self.left_out_lines() + self.warning_lines() + self.limit_lines() + self.knowledge_lines()
-        *paper, note = self.paper_lines() or [""]
-        return "\n\n".join([*texts, *(f"Paper, {line}" for line in paper), *([note] if note else [])])
+        )
+        return "\n\n".join([ours, *(text for _, text in self.notes())])
 
-    def left_out_lines(self) -> list[str]:
-        """Which worlds no row counts, as a sentence; none where every world counts."""
-        left_out = self[0].left_out if self else ()
-        if not left_out:
-            return []
-        whole = self[0].episodes + len(left_out)
-        return [LeftOut.line([str(left) for left in left_out], whole)]
+    def notes(self) -> list[tuple[str, str]]:
+        """What must be told beside the table: ``quiet`` or ``note`` (it must not be overlooked), and the sentences.
 
-    def warning_lines(self) -> list[str]:
-        """That a table of best known harm lacks some of these worlds, and where the horizon cut a motion off.
-
-        None where all is well.
+        Which worlds no row counts, that a table of best known harm lacks some of these worlds, where the horizon cut a
+        motion off, the limits, who knows what, and the conditions of the paper's rows.
         """
-        lines = [f"WARNING: {self[0].warning}."] if self and self[0].warning else []
-        moving = [f"{row.agent} {row.horizon_ends:,}" for row in self if row.horizon_ends]
-        if moving:
-            lines.append(
-                f"At the horizon ({self[0].parameters['horizon_s']:g} s) something still moved, and what came after"
-                f" counts nowhere; worlds, of {self[0].episodes:,}: {', '.join(moving)}."
-            )
-        return lines
+        if not self:
+            return []
+        row = self[0]
+        left_out = LeftOut.line([str(left) for left in row.left_out], row.episodes + len(row.left_out))
+        moving = ", ".join(f"{each.agent} {each.horizon_ends:,}" for each in self if each.horizon_ends)
+        cut_off = (
+            f"At the horizon ({row.parameters['horizon_s']:g} s) something still moved, and what came after"
+            f" counts nowhere; worlds, of {row.episodes:,}: {moving}."
+        )
+        paper = [("quiet", f"Paper, {name}: {told}.") for name, told in PAPER_PARAMETERS.items()]
+        told = [
+            ("note", left_out if row.left_out else ""),
+            ("note", f"WARNING: {row.warning}." if row.warning else ""),
+            ("note", cut_off if moving else ""),
+            ("quiet", self.limit_line()),
+            ("note", self._knowledge_line()),
+            *([*paper, ("note", PAPER_NOTE)] if row.beside_paper else []),
+        ]
+        return [(kind, text) for kind, text in told if text]
 
-    def limit_lines(self) -> list[str]:
-        """What nobody could avoid here and the best known harm, as sentences; none where nothing is proven."""
+    def limit_line(self) -> str:
+        """What nobody could avoid here and the best known harm, as sentences; empty where nothing is proven."""
         first, total = (
             (self[0][f"best_known_{name}_harm"] for name in ("first_impact", "total")) if self else (None, None)
         )
         if first is None or total is None:
-            return []
+            return ""
         row = self[0]
         driven = row.parameters.get("controlled_vehicle")
         command = f"command of {str(driven).replace('vehicle_', 'Vehicle ')}" if driven else "joint command"
@@ -1613,21 +1605,21 @@ class SummaryTable(list[SummaryRow]):
         below = [
             f"{each.agent} in {count_of(each.below_best_known, 'world')}" for each in self if each.below_best_known
         ]
-        return [text + (f" Below what was known: {', '.join(below)}." if below else "")]
+        return text + (f" Below what was known: {', '.join(below)}." if below else "")
 
-    def identity_lines(self) -> list[str]:
-        """By which hashes this result is recognised, as a sentence; none without rows."""
+    def identity_line(self) -> str:
+        """By which hashes this result is recognised, as a sentence; empty without rows."""
         if not self:
-            return []
+            return ""
         policies = [f"{row.agent} ({', '.join(row.policy_sha256.values())})" for row in self if row.policy_sha256]
         text = f"SHA-256 of the worlds {self[0].worlds_sha256}, of the scenario {self[0].scenario_sha256}"
-        return [f"{text}{', of policies: ' + '; '.join(policies) if policies else ''}."]
+        return f"{text}{', of policies: ' + '; '.join(policies) if policies else ''}."
 
-    def knowledge_lines(self) -> list[str]:
-        """Who sees through the channel, and who does not say, as sentences; none where the channel hides nothing."""
-        hidden = self[0].hidden_share if self else 0.0
+    def _knowledge_line(self) -> str:
+        """Who sees through the channel, and who does not say, as sentences; empty where the channel hides nothing."""
+        hidden = self[0].hidden_share
         if not hidden:
-            return []
+            return ""
         text = (
             f"In {100 * hidden:.1f} % of these worlds the channel hides something of the line from a driven vehicle at"
             " its first decision: news that has not arrived, or how late another vehicle will react."
@@ -1639,7 +1631,7 @@ class SummaryTable(list[SummaryRow]):
                 " compare with, and nothing that a vehicle on this channel could do."
             )
         silent = ", ".join(row.agent for row in self if Source.UNSTATED in row.knows)
-        return [text + (f" Not stated what it knows: {silent}." if silent else "")]
+        return text + (f" Not stated what it knows: {silent}." if silent else "")
 
 
 def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTable:
@@ -1650,7 +1642,7 @@ def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTab
         evaluation.conditions,
         evaluation.task,
         {name: outcome.knows for name, outcome in evaluation.outcomes.items()},
-        {name: outcome.named_policies for name, outcome in evaluation.outcomes.items()},
+        {name: outcome.policies for name, outcome in evaluation.outcomes.items()},
         baseline=baseline,
         between=None if regrets is None else regrets.between,
         warning=limits.warning if isinstance(limits, Limits) else "",

@@ -7,10 +7,9 @@ import hashlib
 import io
 import json
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from itertools import pairwise
 from operator import add
@@ -22,14 +21,12 @@ import numpy as np
 from ethbrake_marl.agents import Driver, Knowledge, Team
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import (
-    AlreadyExists,
     EthBrakeError,
     InvalidInput,
     PhysicsError,
     check_whole_number,
     count_of,
     naming_extras,
-    need,
     unknown_name,
 )
 from ethbrake_marl.evaluation.inputs import (
@@ -49,10 +46,10 @@ from ethbrake_marl.evaluation.measures import (
     SummaryTable,
     Tally,
 )
-from ethbrake_marl.evaluation.rollout import evaluate_block
+from ethbrake_marl.evaluation.rollout import evaluate_list
 from ethbrake_marl.evaluation.statistics import paired_difference, unpaired_difference
 from ethbrake_marl.files.sheet import Estimate, parquet_file
-from ethbrake_marl.files.store import check_writable, parse_strict_json, read_plain, write_file
+from ethbrake_marl.files.store import check_target, parse_strict_json, read_plain, write_output
 from ethbrake_marl.harm import Declared
 from ethbrake_marl.limits import Unproven, known_limits
 from ethbrake_marl.physics import Floats
@@ -62,39 +59,6 @@ from ethbrake_marl.shield import parse_uncertainty
 # One row per agent and world: its columns, and its file, written whole and never over another by accident.
 
 
-def check_target(path: str | Path, *, force: bool = False) -> Path:
-    """Refuse a file that exists (``AlreadyExists``, unless ``force``) or cannot be written (``InvalidInput``).
-
-    Even ``force`` replaces plain files only: no folder, device, pipe or symbolic link. Call it before long work whose
-    result goes there.
-    """
-    target = Path(path)
-    try:
-        if target.is_symlink():
-            raise InvalidInput(f"{target}: is a symbolic link; give the file it points to")
-        if target.is_dir():
-            raise InvalidInput(f"{target}: is a folder; give the name of a file")
-        if target.exists() and not target.is_file():
-            raise InvalidInput(f"{target}: is a device or a pipe, not a plain file; give another name")
-        if not target.parent.is_dir():
-            raise InvalidInput(f"{target}: there is no folder {target.parent}; make it first")
-        if os.path.lexists(target) and not force:
-            raise AlreadyExists(f"{target}: is there already; give another name or use force (--force)")
-        check_writable(target.parent)
-    except (InvalidInput, AlreadyExists):
-        raise
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InvalidInput(f"{target!s:.200}: cannot be written ({reason})") from None
-    return target
-
-
-def write_output(path: str | Path, data: bytes, *, force: bool = False) -> None:
-    """Write ``data`` in one step; raises as ``check_target``."""
-    write_file(check_target(path, force=force), data)
-
-
-PER_WORLD = "per_world.csv"  # its name in the folder of a run
 CSV, PARQUET = ".csv", ".parquet"
 HARMS = ("first_impact_harm", "total_harm")
 _HARMS = ("agent", "world", *HARMS)
@@ -107,10 +71,12 @@ def write_per_world(
 
     docs/evaluation.md lists the columns; ``objectives`` adds theirs. A world that was left out has a row with nothing
     but its number and, in ``ended``, why. The file appears whole or not at all. Raises ``AlreadyExists`` unless
-    ``force``, ``InvalidInput`` without a folder, and as ``check_per_world``.
+    ``force``, ``InvalidInput`` without a folder or for another ending, ``MissingExtra`` without pyarrow for Parquet.
     """
-    check_per_world(path)
-    if Path(path).suffix.lower() == PARQUET:
+    ending = Path(path).suffix.lower()
+    if ending not in (CSV, PARQUET):
+        raise InvalidInput(f"{path}: must end in {CSV} or {PARQUET}")
+    if ending == PARQUET:
         with naming_extras():
             import pyarrow
         columns = evaluation.arrays(objectives)
@@ -123,18 +89,6 @@ def write_per_world(
     writer.writerow(told)
     writer.writerows(zip(*told.values(), strict=True))
     write_output(path, text.getvalue().encode(), force=force)
-
-
-def check_per_world(path: str | Path) -> None:
-    """Refuse a file that ``write_per_world`` cannot write, before work whose result goes there.
-
-    Raises ``InvalidInput`` for another ending than .csv or .parquet, ``MissingExtra`` without pyarrow for Parquet.
-    """
-    ending = Path(path).suffix.lower()
-    if ending not in (CSV, PARQUET):
-        raise InvalidInput(f"{path}: must end in {CSV} or {PARQUET}")
-    if ending == PARQUET:
-        need("pyarrow")
 
 
 def read_harms(path: Path, data: bytes) -> dict[str, dict[int, tuple[float, ...]]]:
@@ -482,6 +436,12 @@ class Question:
     harm_count: HarmCount = "first"
     uncertainty: str | None = None
     objectives: tuple[str, ...] = ()
+    # what ``ask`` looks up
+    identity: Mapping[str, Any] = field(default_factory=dict)  # plain data: all that the answer depends on
+    knows: Mapping[str, Knowledge] = field(default_factory=dict)  # by agent
+    policies: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # by agent: vehicle -> its policy's SHA-256
+    limits: bool = False  # the best known harm of its worlds is looked up
+    because: str | None = None  # why nothing is proven for its worlds; None where something is
 
     def __post_init__(self) -> None:
         check_whole_number("episodes", self.episodes, 1, MOST_EPISODES)
@@ -505,10 +465,11 @@ class Question:
         ends = [min(leaves * k // shards * LEAF, self.episodes) for k in range(shards + 1)]
         return list(pairwise(ends))
 
-    def ask(self) -> Asked:
-        """Look up what it is about: hashes of scenario, policies and user files, versions, and what is proven.
+    def ask(self) -> Question:
+        """The same with what it is about, looked up once and told to every process.
 
-        Raises what ``lineup`` raises.
+        That are hashes of scenario, policies and user files, versions, and what is proven. Raises what ``lineup``
+        raises.
         """
         lineup, scenario = self.lineup(), self.scenario
         teams = {name: Team.of(agent, scenario.learners) for name, agent in lineup.items()}
@@ -536,19 +497,8 @@ class Question:
             "versions": result_versions(),
         }
         limits = all(not isinstance(each, Unproven) and bool(each.known.all()) for each in found)
-        return Asked(self, identity, knows, policies, limits, because)
-
-
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """A question with everything that its answer depends on, looked up once and told to every process."""
-
-    question: Question
-    identity: Mapping[str, Any]  # plain data
-    knows: Mapping[str, Knowledge]  # by agent
-    policies: Mapping[str, Mapping[str, str]]  # by agent: vehicle's name -> SHA-256 of its policy
-    limits: bool  # the best known harm of its worlds is looked up
-    because: str | None  # why nothing is proven for its worlds; None where something is
+        told = {"identity": identity, "knows": knows, "policies": policies, "limits": limits, "because": because}
+        return replace(self, **told)  # type: ignore[arg-type]
 
     @property
     def sha256(self) -> str:
@@ -567,32 +517,32 @@ class Asked:
         Raises ``InvalidInput`` for a policy that is not the one that was asked about, and what driving raises.
 
         """
-        if first % LEAF or block % LEAF or not (end % LEAF == 0 or end == self.question.episodes) or not first < end:
+        if first % LEAF or block % LEAF or not (end % LEAF == 0 or end == self.episodes) or not first < end:
             raise InvalidInput(
                 f"shard from {first} to {end} in blocks of {block}: must be whole leaves of {LEAF:,} worlds"
             )
         lineup, starts = self._lineup(), range(first, end, block)
-        with nullcontext(None) if rows is None else rows_file(rows, self.question.objectives) as write:
+        with nullcontext(None) if rows is None else rows_file(rows, self.objectives) as write:
             return reduce(add, (_answer_block(self, lineup, k, min(k + block, end), write) for k in starts), Tally())
 
     def _lineup(self) -> Mapping[str, Driver]:
         """The agents in this process, once."""
         if self.sha256 not in _LINEUPS:
-            here = self.question.ask()
+            here = self.ask()
             if here.sha256 != self.sha256:
                 changed = sorted(key for key in self.identity if here.identity.get(key) != self.identity[key])
                 raise InvalidInput(f"shards: {', '.join(changed)} changed since the evaluation began; begin it again")
-            _LINEUPS[self.sha256] = self.question.lineup()
+            _LINEUPS[self.sha256] = self.lineup()
         return _LINEUPS[self.sha256]
 
     def summarise(self, tally: Tally) -> SummaryTable:
         """One row per agent, as ``summarise``; rates with exact intervals. ``PhysicsError`` if no world is left."""
         if not tally.worlds:
             raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in tally.left_out})
-        task, told = self.question.task, Conditions.of_ranges(tally.ranges)
+        task, told = self.task, Conditions.of_ranges(tally.ranges)
         return SummaryTable.of_tallies(
             {name: tally.agents[name].knowing(tally.worlds) for name in self.identity["agents"]},
-            Conditions.of_test(task, self.question.seed, tally.worlds, self.because, told),
+            Conditions.of_test(task, self.seed, tally.worlds, self.because, told),
             task,
             self.knows,
             self.policies,
@@ -606,9 +556,9 @@ class Asked:
 
     def to_json(self, tally: Tally, rows: Sequence[SummaryRow]) -> list[dict[str, Any]]:
         """What a results file holds: one object per agent, each vehicle's harm and the kind of intervals in it."""
-        question, vehicles = self.question, self.question.scenario.vehicles
-        settings = {"harm_count": question.harm_count, "uncertainty": question.uncertainty}
-        found = results_to_json(rows, told=tally.rescore(question.objectives, vehicles), settings=settings)
+        vehicles = self.scenario.vehicles
+        settings = {"harm_count": self.harm_count, "uncertainty": self.uncertainty}
+        found = results_to_json(rows, told=tally.rescore(self.objectives, vehicles), settings=settings)
         names = [f"{name}_{i + 1}" for name in HARMS for i in range(vehicles)]
         told = {"kind": "evaluate-shards", "intervals": INTERVALS}
         return [
@@ -627,12 +577,11 @@ _LINEUPS: dict[str, Mapping[str, Driver]] = {}  # of this process; an evaluation
 
 
 def _answer_block(
-    asked: Asked, lineup: Mapping[str, Driver], first: int, end: int, write: Callable[[Evaluation], None] | None
+    question: Question, lineup: Mapping[str, Driver], first: int, end: int, write: Callable[[Evaluation], None] | None
 ) -> Tally:
     """The statistics of worlds that are advanced together."""
-    question = asked.question
     sample = question.scenario.sample(end - first, question.seed, first=first)
-    evaluation, left_out = evaluate_block(sample, lineup, scenario=question.scenario, seed=question.seed)
+    evaluation, left_out = evaluate_list(sample, lineup, question.scenario, question.seed)
     if evaluation is None:
         return Tally(left_out=left_out)
     if write is not None:
@@ -644,7 +593,7 @@ def _answer_block(
     }
     leaves = [np.flatnonzero(index // LEAF == number) for number in np.unique(index // LEAF)]
     hashes = sum(int(worlds_sha256(worlds.take(leaf), index[leaf]), 16) for leaf in leaves)
-    agents = evaluation.tally(limits=asked.limits, objectives=question.objectives)
+    agents = evaluation.tally(limits=question.limits, objectives=question.objectives)
     return Tally(worlds.n, int(evaluation.hidden.sum()), hashes, ranges, left_out, agents)
 
 

@@ -6,8 +6,9 @@ Counting "the first episodes that finish" instead would over-count short ones, a
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields
-from typing import Any, NamedTuple
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +23,8 @@ from ethbrake_marl.errors import (
     check_whole_number,
     unknown_name,
 )
-from ethbrake_marl.evaluation.inputs import policy_sha256
+from ethbrake_marl.evaluation.inputs import policies_of
 from ethbrake_marl.evaluation.measures import REGISTERED, Evaluation, LeftOut, Outcome, Tape
-from ethbrake_marl.harm import Ledger
 from ethbrake_marl.physics import Decisions, Floats, Ints, Worlds, advance, advance_sampled, leaving_out_failed, move_on
 from ethbrake_marl.scenario import Sample, Scenario, ScriptSpec, Task
 
@@ -123,6 +123,7 @@ class SampledHarm:
 
 
 CHUNK = 10_000  # worlds advanced together: bounds memory, changes no result
+_TOLD_CHUNK = 2_500  # the same where somebody waits for a sign of life
 
 OnWorlds = Callable[[str, int], None]  # agent, worlds done so far
 
@@ -134,7 +135,7 @@ def evaluate(
     scenario: Scenario,
     vehicle: int | str | None = None,
     seed: int | None = None,
-    chunk: int = CHUNK,
+    chunk: int | None = None,
     on_progress: OnWorlds | None = None,
     aftermath: bool = True,
 ) -> Evaluation:
@@ -150,7 +151,7 @@ def evaluate(
         scenario: of the worlds.
         vehicle: the one that is driven, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
         seed: of the list; noted, not used.
-        chunk: worlds advanced together.
+        chunk: worlds advanced together; None: 10,000, or 2,500 with ``on_progress``.
         on_progress: is called with an agent's name and its worlds done so far.
         aftermath: look how far Vehicle 1 is shoved, what the paper's sum over samples is, and what registered harm
             metrics are; costs time.
@@ -162,56 +163,53 @@ def evaluate(
     _check_request(worlds, agents, scenario, chunk)
     sample = worlds if isinstance(worlds, Sample) else Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0)
     check_alert(sample.worlds, sample.worlds.n, scenario.vehicles)
-    driven = driven_vehicles(scenario, vehicle, agents)
-    whole = _drive_all(sample, agents, scenario, driven, seed, chunk, on_progress, aftermath)
-    return whole.evaluation(scenario, driven, seed)
+    whole, left_out = evaluate_list(sample, agents, scenario, seed, vehicle, chunk, on_progress, aftermath)
+    if whole is None:
+        raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in left_out})
+    return whole
 
 
-def evaluate_block(
-    sample: Sample, agents: Mapping[str, Driver], *, scenario: Scenario, seed: int
-) -> tuple[Evaluation | None, tuple[LeftOut, ...]]:
-    """``evaluate`` a part of a list at once, and which of its worlds were left out; None where that is all of them.
-
-    Args:
-        sample: the part, which is advanced together.
-        agents: as for ``evaluate``; they drive the scenario's learners.
-        scenario: of the list.
-        seed: of the list.
-
-    """
-    driven = driven_vehicles(scenario, None, agents)
-    whole = _drive_all(sample, agents, scenario, driven, seed, sample.worlds.n, None, True)
-    if len(whole.left_out) == sample.worlds.n:
-        return None, whole.left_out
-    return whole.evaluation(scenario, driven, seed), whole.left_out
-
-
-def _drive_all(
+def evaluate_list(
     sample: Sample,
     agents: Mapping[str, Driver],
     scenario: Scenario,
-    driven: tuple[int, ...],
     seed: int | None,
-    chunk: int,
-    on_progress: OnWorlds | None,
-    aftermath: bool,
-) -> _Whole:
-    """Let each agent drive every world, and note in which of them one of them fails."""
-    parts: dict[str, list[_Part]] = {name: [] for name in agents}
-    lost: dict[int, LeftOut] = {}
+    vehicle: int | str | None = None,
+    chunk: int | None = None,
+    on_progress: OnWorlds | None = None,
+    aftermath: bool = True,
+) -> tuple[Evaluation | None, tuple[LeftOut, ...]]:
+    """``evaluate`` worlds at the alert, and which of them were left out; None where that is all of them."""
+    n, driven = sample.worlds.n, driven_vehicles(scenario, vehicle, agents)
+    chunk = chunk or (CHUNK if on_progress is None else _TOLD_CHUNK)
     others = [script.name for script in script_agents(scenario, except_for=driven).values()]
+    parts: dict[str, list[tuple[Outcome, Ints]]] = {name: [] for name in agents}
+    lost: dict[int, LeftOut] = {}
     for name, agent in agents.items():
-        chunk_of = _Chunk(sample.worlds, agent, driven, scenario, aftermath)
-        for first in range(0, sample.worlds.n, chunk):
-            rows = np.arange(first, min(first + chunk, sample.worlds.n))
+        roll_out = partial(_roll_out, sample.worlds, agent, driven, scenario, aftermath)
+        for first in range(0, n, chunk):
+            end = min(first + chunk, n)
             with AgentFailed.naming(name, others):
-                outcome, kept, failed = leaving_out_failed(chunk_of.roll_out, rows)
+                outcome, rows, failed = leaving_out_failed(roll_out, np.arange(first, end))
             lost = {row: LeftOut(int(sample.index[row]), seed, name, why) for row, why in failed.items()} | lost
             if outcome is not None:
-                parts[name].append(_Part(outcome, kept))
+                parts[name].append((outcome, rows))
             if on_progress is not None:
-                on_progress(name, int(rows[-1]) + 1)
-    return _Whole(sample, parts, tuple(lost[row] for row in sorted(lost)), np.array(sorted(lost), np.int64))
+                on_progress(name, end)
+    left_out = tuple(lost[row] for row in sorted(lost))
+    if len(lost) == n:
+        return None, left_out
+    outcomes = {name: Outcome.join([outcome for outcome, _ in found]) for name, found in parts.items()}
+    whole = Evaluation(scenario, driven, sample.worlds, sample.index, seed, outcomes, kinds=sample.kinds)
+    if lost:
+        good = np.setdiff1d(np.arange(n), list(lost))
+        for name, found in parts.items():
+            outcomes[name] = outcomes[name].take(np.isin(np.concatenate([rows for _, rows in found]), good))
+        kinds = {name: column[good] for name, column in sample.kinds.items()}
+        whole = replace(
+            whole, worlds=sample.worlds.take(good), index=sample.index[good], kinds=kinds, left_out=left_out
+        )
+    return whole, left_out
 
 
 def _check_request(worlds: object, agents: object, scenario: object, chunk: object) -> None:
@@ -231,7 +229,8 @@ def _check_request(worlds: object, agents: object, scenario: object, chunk: obje
     for name, agent in agents.items():
         check_agent(agent, f"evaluate: agent {name!r}", alone=False)
         Knowledge.of(agent)  # refuses what is no statement
-    check_whole_number("evaluate: chunk", chunk, 1)
+    if chunk is not None:
+        check_whole_number("evaluate: chunk", chunk, 1)
 
 
 def driven_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mapping[str, Driver]) -> tuple[int, ...]:
@@ -262,56 +261,11 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
     return int(vehicle)
 
 
-class _Part(NamedTuple):
-    """What an agent achieved in some rows of the list."""
-
-    outcome: Outcome
-    rows: Ints
-
-    def among(self, good: Ints) -> Outcome:
-        """In those that are among these rows."""
-        kept = np.isin(self.rows, good)
-        return self.outcome if kept.all() else self.outcome.take(kept)
-
-
-class _Whole(NamedTuple):
-    """What all agents achieved in the whole list, and the rows where one of them failed."""
-
-    sample: Sample
-    parts: Mapping[str, list[_Part]]
-    left_out: tuple[LeftOut, ...]
-    lost: Ints
-
-    def evaluation(self, scenario: Scenario, driven: tuple[int, ...], seed: int | None) -> Evaluation:
-        """All outcomes over the same worlds; raises ``PhysicsError`` if there is none."""
-        worlds, index = self.sample.worlds, self.sample.index
-        good = np.setdiff1d(np.arange(worlds.n), self.lost)
-        if self.left_out and not good.size:
-            raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
-        outcomes = {name: _join([part.among(good) for part in parts]) for name, parts in self.parts.items()}
-        kinds = self.sample.kinds
-        if self.left_out:
-            worlds, index = worlds.take(good), index[good]
-            kinds = {name: column[good] for name, column in kinds.items()}
-        return Evaluation(scenario, driven, worlds, index, seed, outcomes, self.left_out, kinds)
-
-
-class _Chunk(NamedTuple):
-    """What drives in some worlds of a list."""
-
-    worlds: Worlds
-    agent: Driver
-    driven: tuple[int, ...]
-    scenario: Scenario
-    aftermath: bool
-
-    def roll_out(self, rows: Ints) -> Outcome:
-        """The outcome in these worlds alone, of a fresh team."""
-        return _roll_out(self.worlds.take(rows), Team.of(self.agent, self.driven), self.scenario, self.aftermath)
-
-
-def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -> Outcome:
-    """Outcome of a fresh team; what an agent says about a world counts where it drives alone."""
+def _roll_out(
+    whole: Worlds, agent: Driver, driven: tuple[int, ...], scenario: Scenario, aftermath: bool, rows: Ints
+) -> Outcome:
+    """Outcome of a fresh team in these worlds; what an agent says about a world counts where it drives alone."""
+    worlds, team = whole.take(rows), Team.of(agent, driven)
     task = Task(scenario, tuple(team.drivers))
     shoved = ShovedFront.of(worlds, task) if aftermath else None
     sampled = SampledHarm.of(worlds, task) if aftermath else None
@@ -330,7 +284,7 @@ def _roll_out(worlds: Worlds, team: Team, scenario: Scenario, aftermath: bool) -
         Knowledge.of(team),
         None if shoved is None else shoved.metres,
         None if sampled is None else sampled.finish(),
-        {vehicle: sha for vehicle, agent in team.drivers.items() if (sha := policy_sha256(agent)) is not None},
+        policies_of(team.drivers),
         {} if impacts is None else impacts.measured(),
     )
 
@@ -347,25 +301,3 @@ def _read_column(team: Team, memory: Any, what: str, n: int) -> NDArray[np.gener
             " needed"
         )
     return column
-
-
-def _join(parts: list[Outcome]) -> Outcome:
-    """One outcome from those of consecutive chunks."""
-    ledger = Ledger(*(np.concatenate([getattr(part.ledger, f.name) for part in parts]) for f in fields(Ledger)))
-
-    def column(name: str) -> NDArray[Any] | None:
-        found = [getattr(part, name) for part in parts]
-        return None if found[0] is None else np.concatenate(found)
-
-    return Outcome(
-        ledger,
-        Worlds.concatenate([part.final for part in parts]),
-        np.concatenate([part.at_rest for part in parts]),
-        column("predicted_harm"),
-        column("chosen_policy"),
-        parts[0].knows,
-        column("shoved_m"),
-        column("sampled_harm"),
-        parts[0].policies,
-        {name: np.concatenate([part.metrics[name] for part in parts]) for name in parts[0].metrics},
-    )

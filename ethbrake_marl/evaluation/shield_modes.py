@@ -88,12 +88,11 @@ class ShieldModes(list[ModeRow]):
         return [about | row.to_json() for row in self]
 
     def sheets(self) -> list[Sheet]:
-        """The rows for a terminal, below the name of each agent; of teams also what each vehicle bears."""
+        """The rows as tables, below the name of each agent; of teams also what each vehicle bears."""
         share, teams = partial(Column, digits=1, scale=100.0, unit=" %"), self.of_teams
-        columns = [Column("agent, mode", text=True), Column("harm", interval="hidden")]
-        columns += [Column("minus no shield" if teams else "minus episode mode", sign="+")]
-        columns += [Column("bound", interval="hidden")] if teams else []
-        columns += [share("replaced"), *map(share, VERDICTS), Column("above")]
+        head = [Column("agent, mode", text=True), Column("harm", interval="hidden")]
+        head += [Column("minus no shield" if teams else "minus episode mode", sign="+")]
+        head += [Column("bound", interval="hidden")] if teams else []
         lines: list[Row] = []
         for row in self:
             lines += [(row.agent,)] if row.mode == "none" else []
@@ -101,15 +100,12 @@ class ShieldModes(list[ModeRow]):
             shares = row.verdicts or (None,) * len(VERDICTS)
             lines.append((f"  {row.mode}", row.harm, *compared, row.replaced, *shares, row.above_bound))
         title = "Mean harm per world (m²/s²), difference with 95 % interval"
-        found = [Sheet(title, columns, lines, gap=2)]
+        found = [Sheet(title, [*head, share("replaced"), *map(share, VERDICTS), Column("above")], lines, gap=2)]
         if teams:
-            columns = [Column("agent, mode, vehicle", text=True), share("replaced"), Column("bears")]
-            columns += [Column("under the baseline plan"), share("worlds with more")]
-            lines = []
-            for row in self:
-                lines += [(f"{row.agent}, {row.mode}",)] if row.vehicles else []
-                lines += [(f"  {each.vehicle}", *each[1:]) for each in row.vehicles]
-            found.append(Sheet("What each vehicle bears, mean per world (m²/s²)", columns, lines, gap=2))
+            head = [Column("agent, mode, vehicle", text=True), share("replaced"), Column("bears")]
+            head += [Column("under the baseline plan"), share("worlds with more")]
+            bears = [(f"{row.agent}, {row.mode}, {each.vehicle}", *each[1:]) for row in self for each in row.vehicles]
+            found.append(Sheet("What each vehicle bears, mean per world (m²/s²)", head, bears, gap=2))
         return found
 
 

@@ -9,7 +9,7 @@ of whole numbers: the order of the worlds changes no bit of them.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -327,33 +327,22 @@ def interquartile_mean(tasks: Sequence[ArrayLike], *, resamples: int = RESAMPLES
 
 
 def mean_over_seeds(values: ArrayLike, baseline: ArrayLike | None = None, *, seed: int = 0) -> Estimate:
-    """Mean of ``values``, or of ``values - baseline`` on the same worlds, [seeds, worlds] each.
+    """Mean of ``values``, or of ``values - baseline`` on the same worlds, [seeds, worlds] each; of truths their share.
 
     Numbers of seeds may differ. The bootstrap interval draws the seeds of either side and the worlds, which both sides
     share, anew: an interval of differences that leaves out 0 holds for other seeds *and* other worlds. None with a
-    single world. Raises ``InvalidInput`` for arrays that cannot be paired or are not finite.
+    single world. That is no interval of truths that hold nearly always or never: draws of such worlds are all alike. So
+    theirs reaches at least as far as Wilson's of the share over the worlds. Raises ``InvalidInput`` for arrays that
+    cannot be paired or are not finite.
     """
-    given = np.atleast_2d(np.asarray(values, np.float64))
-    first, second = _pair_sides(
-        "mean_over_seeds", given, np.zeros((1, given.shape[-1])) if baseline is None else baseline
-    )
-    value = float((first.mean(axis=0) - second.mean(axis=0)).mean())
-    if first.shape[1] < 2:
-        return Estimate(value, None)
-    means = _resample_means((first, second), _RESAMPLES, seed)
-    return _with_percentiles(value, means[:, 0] - means[:, 1])
-
-
-def rate_over_seeds(happened: ArrayLike, *, seed: int = 0) -> Estimate:
-    """Share of the episodes [seeds, worlds] in which something happened, with an interval as in ``mean_over_seeds``.
-
-    That is no interval where it happened nearly always or never: draws of such worlds are all alike. So it reaches at
-    least as far as Wilson's of the share over the worlds.
-    """
-    given = np.atleast_2d(np.asarray(happened, np.float64))
-    found, worlds = mean_over_seeds(given, seed=seed), given.shape[1]
-    share = min(found.value, 1.0)  # a mean of ones may be rounded up
-    low, high = wilson(share, worlds)
+    given = np.atleast_2d(np.asarray(values))
+    sides = _pair_sides("mean_over_seeds", given, np.zeros((1, given.shape[-1])) if baseline is None else baseline)
+    value = float((sides[0].mean(axis=0) - sides[1].mean(axis=0)).mean())
+    found = _resampled(value, sides, lambda means: means[:, 0] - means[:, 1], seed)
+    if given.dtype != np.bool_:
+        return found
+    share = min(value, 1.0)  # a mean of ones may be rounded up
+    low, high = wilson(share, given.shape[1])
     ends = found.interval or (low, high)
     return Estimate(share, (max(min(low, ends[0]), 0.0), min(max(high, ends[1]), 1.0)))
 
@@ -368,12 +357,13 @@ def share_over_seeds(values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, se
     reached, high, low = (float(side.mean(axis=0).mean()) for side in sides)
     if not high > low:
         return None
-    share = (high - reached) / (high - low)
-    if sides[0].shape[1] < 2:
-        return Estimate(share, None)
-    means = _resample_means(sides, _RESAMPLES, seed)
-    means = means[means[:, 1] > means[:, 2]]
-    return _with_percentiles(share, (means[:, 1] - means[:, 0]) / (means[:, 1] - means[:, 2]))
+
+    def shares(means: Floats) -> Floats:
+        means = means[means[:, 1] > means[:, 2]]
+        share: Floats = (means[:, 1] - means[:, 0]) / (means[:, 1] - means[:, 2])
+        return share
+
+    return _resampled((high - reached) / (high - low), sides, shares, seed)
 
 
 def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
@@ -385,6 +375,15 @@ def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
     if not all(np.isfinite(side).all() for side in arrays):
         raise InvalidInput(f"{who}: every harm must be finite")
     return arrays
+
+
+def _resampled(value: float, sides: Sequence[Floats], of: Callable[[Floats], Floats], seed: int) -> Estimate:
+    """``value`` with the percentiles of what it is in means drawn anew; no interval with a single world."""
+    if sides[0].shape[1] < 2:
+        return Estimate(value, None)
+    tail = 50.0 * (1.0 - CONFIDENCE)
+    low, high = np.percentile(of(_resample_means(sides, _RESAMPLES, seed)), [tail, 100.0 - tail])
+    return Estimate(value, (float(low), float(high)))
 
 
 def _resample_means(sides: Sequence[Floats], resamples: int, seed: int) -> Floats:
@@ -404,9 +403,3 @@ def _resample_means(sides: Sequence[Floats], resamples: int, seed: int) -> Float
             means[:, column] = np.take_along_axis(of_seeds, seeds, axis=1).mean(axis=1)
         parts.append(means)
     return np.concatenate(parts)
-
-
-def _with_percentiles(value: float, resampled: Floats) -> Estimate:
-    tail = 50.0 * (1.0 - CONFIDENCE)
-    low, high = np.percentile(resampled, [tail, 100.0 - tail])
-    return Estimate(value, (float(low), float(high)))

@@ -32,15 +32,7 @@ class Plugin:
     sha256: str  # of the file, or of the file of the entry point's module
 
 
-@dataclass(frozen=True, slots=True)
-class _RunFile:
-    """A Python file that was run in this process."""
-
-    sha256: str
-    module: ModuleType
-
-
-_RUN: dict[Path, _RunFile] = {}
+_RUN: dict[Path, tuple[str, ModuleType]] = {}  # files of this process, with their SHA-256
 _BEING_RUN: set[Path] = set()
 _READ: dict[str, set[str]] = {}
 _LOADED: dict[str, Plugin] = {}  # by file, or by the entry point's name
@@ -62,8 +54,8 @@ def load_plugin(source: str | os.PathLike[str]) -> None:
     path = Path(named)
     if path.suffix != ".py":
         raise InvalidInput(f"plug-in {named!r}: must be a Python file (.py), or the name of an installed plug-in")
-    run = _run_file(path, f"plug-in {named!r}")
-    _LOADED.setdefault(str(path.resolve()), Plugin(path.name, named, run.sha256))
+    sha256, _ = _run_file(path, f"plug-in {named!r}")
+    _LOADED.setdefault(str(path.resolve()), Plugin(path.name, named, sha256))
 
 
 def load_function(path: str, function: str) -> Any:
@@ -71,7 +63,7 @@ def load_function(path: str, function: str) -> Any:
 
     Raises ``InvalidInput`` as ``load_plugin``, and if there is no such function.
     """
-    found = getattr(_run_file(Path(path), f"file {path!r}").module, function, None)
+    found = getattr(_run_file(Path(path), f"file {path!r}")[1], function, None)
     if not callable(found):
         raise InvalidInput(f"file {path!r}: has no function {function}; it is what makes the agent")
     return found
@@ -95,11 +87,11 @@ def files_run() -> dict[str, str]:
     Of all of that name, where there are several.
     """
     found = {name: set(several) for name, several in _READ.items()}
-    for path, file in _RUN.items():
-        found.setdefault(path.name, set()).add(file.sha256)
+    for path, (sha256, _) in _RUN.items():
+        found.setdefault(path.name, set()).add(sha256)
     for plugin in loaded_plugins():
         found.setdefault(plugin.name, set()).add(plugin.sha256)
-    return {name: ", ".join(sorted(sha256)) for name, sha256 in found.items()}
+    return {name: ", ".join(sorted(several)) for name, several in found.items()}
 
 
 def noted_plugins() -> list[dict[str, str]]:
@@ -152,18 +144,17 @@ def _read_noted(noted: object, where: str) -> list[Plugin]:
     return found
 
 
-def _run_file(path: Path, what: str) -> _RunFile:
-    """The module of a file; run now unless it was run before."""
+def _run_file(path: Path, what: str) -> tuple[str, ModuleType]:
+    """SHA-256 and module of a file; run now unless it was run before."""
     if not path.is_file():
         raise InvalidInput(f"{what}: {'is not a plain file' if path.exists() else 'there is no such file'}")
     content = read_plain(path, _LIMIT_BYTES)
     sha256, resolved = hashlib.sha256(content).hexdigest(), path.resolve()
-    before = _RUN.get(resolved)
-    if before is None:
-        before = _RUN[resolved] = _RunFile(sha256, _run(content, resolved, sha256, what))
-    if before.sha256 != sha256:
+    if resolved not in _RUN:
+        _RUN[resolved] = sha256, _run(content, resolved, sha256, what)
+    if _RUN[resolved][0] != sha256:
         raise InvalidInput(f"{what}: was changed since it was loaded; begin a new process")
-    return before
+    return _RUN[resolved]
 
 
 def _run(content: bytes, path: Path, sha256: str, what: str) -> ModuleType:

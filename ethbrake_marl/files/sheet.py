@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 
 DASH = "–"  # for what does not exist
+_AFTER_SIGN = re.compile(r"(?<=[:+@,/])(?=.)")
 WIDE = 120  # characters of a terminal that show every column
 
 
@@ -219,18 +221,31 @@ class Sheet:
         return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
     def html(self) -> str:
-        """For a notebook: the title above, the note below, everything as text; the first cell is its row's heading."""
-        lines = ["<table>"]
+        """For a notebook or a page: the title above, the note below, intervals in brackets behind their values.
+
+        Everything is text but what says by ``__html__`` that it is none. The first cell of a row is its heading. The
+        text of a column after it may be broken into lines if the column is one of texts.
+        """
+        columns, label = self._columns(), self.title or f"Table: {self.headings[0]}"
+        kinds = [' class="words"' if k and self.rows and column.text else "" for k, column in enumerate(columns)]
+        heads = zip(kinds, self.headings, strict=True)
+        lines = [f'<div class="wide" tabindex="0" role="region" aria-label="{_html(label)}"><table>']
         lines += [f"<caption>{_html(self.title)}</caption>"] if self.title else []
-        lines += ["<thead><tr>", *(f'<th scope="col">{_html(each)}</th>' for each in self.headings), "</tr></thead>"]
-        lines += ["<tbody>"]
+        lines += ["<thead><tr>", *(f'<th scope="col"{kind}>{_html(each)}</th>' for kind, each in heads)]
+        lines += ["</tr></thead>", "<tbody>"]
         for row in self.shown():
             if isinstance(row, str):
-                lines.append(f'<tr><th scope="rowgroup" colspan="{len(self.columns)}">{_html(row)}</th></tr>')
+                lines.append(f'<tr class="block"><th colspan="{len(columns)}" scope="rowgroup">{_html(row)}</th></tr>')
                 continue
-            first, *rest = (_html(shown.in_words) for shown in row)
-            lines += [f'<tr><th scope="row">{first}</th>', *(f"<td>{cell}</td>" for cell in rest), "</tr>"]
-        lines += ["</tbody>", "</table>"]
+            name = row[0].in_words  # a long one such as e_v2x_bm:pairwise is broken after a sign before inside a word
+            if not hasattr(row[0].value, "__html__"):
+                name = "<wbr>".join(map(_html, _AFTER_SIGN.split(name)))
+            lines.append(f'<tr><th scope="row">{name}</th>')
+            for kind, (value, interval) in zip(kinds[1:], row[1:], strict=True):
+                below = f' <span class="interval">[{_html(interval)}]</span>' if interval else ""
+                lines.append(f"<td{kind}>{_html(value)}{below}</td>")
+            lines.append("</tr>")
+        lines += ["</tbody>", "</table></div>"]
         lines += [f"<p>{_html(self.note)}</p>"] if self.note else []
         return "\n".join(lines)
 
@@ -306,5 +321,7 @@ def parquet_file(
                 writer.close()
 
 
-def _html(value: str) -> str:
-    return escape(plain_text(value, keep="\u00a0"))
+def _html(value: object) -> str:
+    """A value as text of a page: no control or direction character, whoever wrote it."""
+    known: Callable[[], str] | None = getattr(value, "__html__", None)
+    return escape(plain_text(str(value), keep="\u00a0")) if known is None else known()

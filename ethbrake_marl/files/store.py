@@ -53,6 +53,38 @@ def check_writable(folder: Path) -> None:
     Path(name).unlink()
 
 
+def check_target(path: str | Path, *, force: bool = False) -> Path:
+    """Refuse a file that exists (``AlreadyExists``, unless ``force``) or cannot be written (``InvalidInput``).
+
+    Even ``force`` replaces plain files only: no folder, device, pipe or symbolic link. Call it before long work whose
+    result goes there.
+    """
+    target = Path(path)
+    try:
+        if target.is_symlink():
+            raise InvalidInput(f"{target}: is a symbolic link; give the file it points to")
+        if target.is_dir():
+            raise InvalidInput(f"{target}: is a folder; give the name of a file")
+        if target.exists() and not target.is_file():
+            raise InvalidInput(f"{target}: is a device or a pipe, not a plain file; give another name")
+        if not target.parent.is_dir():
+            raise InvalidInput(f"{target}: there is no folder {target.parent}; make it first")
+        if os.path.lexists(target) and not force:
+            raise AlreadyExists(f"{target}: is there already; give another name or use force (--force)")
+        check_writable(target.parent)
+    except (InvalidInput, AlreadyExists):
+        raise
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InvalidInput(f"{target!s:.200}: cannot be written ({reason})") from None
+    return target
+
+
+def write_output(path: str | Path, data: bytes, *, force: bool = False) -> None:
+    """Write ``data`` in one step; raises as ``check_target``."""
+    write_file(check_target(path, force=force), data)
+
+
 @contextmanager
 def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """Give a temporary folder beside ``path`` that takes its name when the block ends well, and vanishes otherwise.

@@ -59,13 +59,12 @@ def _flow(value: Any) -> str:
 
 
 def _number(value: int | float) -> str:
-    if value != value:
-        return ".nan"
-    if value in (float("inf"), float("-inf")):
-        return ".inf" if value > 0 else "-.inf"
     if isinstance(value, int):
         return str(int(value)) if abs(value) < 2**63 else f"{str(value)[:24]}..."
-    return str(int(value)) if abs(value) < 1e15 and value == int(value) else repr(float(value))
+    if abs(value) < 1e15 and value == int(value):
+        return str(int(value))
+    text = repr(float(value))
+    return {"nan": ".nan", "inf": ".inf", "-inf": "-.inf"}.get(text, text)
 
 
 SIZE_LIMIT = 64 * 1024  # bytes

@@ -6,7 +6,6 @@ The server needs the extra ``explore``.
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import re
 import secrets
@@ -15,7 +14,7 @@ import time
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from http import HTTPStatus
 from pathlib import Path
 from threading import Lock, Thread
@@ -23,8 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ethbrake_marl.agents import Driver, Source, Team, optimise_coupled
-from ethbrake_marl.defaults import HarmCount
+from ethbrake_marl.agents import Agent, Source, optimise_coupled
 from ethbrake_marl.errors import (
     AlreadyExists,
     EthBrakeError,
@@ -113,13 +111,10 @@ def read_state(given: object, scenario: Scenario) -> Worlds:
     for key, rule in known.items():
         if key not in given:
             raise InvalidInput(f"world: {key} is missing; every quantity must be given")
-        if rule.per == "world":
-            read_number(given[key], f"world: {key}")
-            continue
-        if not isinstance(given[key], list):
+        if rule.per != "world" and not isinstance(given[key], list):
             raise InvalidInput(f"world: {key}: must be a list of {rule.count(scenario.vehicles)} numbers")
-        for i, each in enumerate(given[key]):
-            read_number(each, f"world: {key}[{i}]")
+        for i, each in enumerate(given[key] if rule.per != "world" else [given[key]]):
+            read_number(each, f"world: {key}[{i}]" if rule.per != "world" else f"world: {key}")
     return scenario.worlds_from_state(given)
 
 
@@ -135,8 +130,9 @@ def read_number(value: object, what: str) -> float:
 MOST_COMMANDS = 2_000
 
 
-def decision_grid(world: Worlds, scenario: Scenario, vehicle: int) -> dict[str, Any]:
-    """Where the commands of a profile of a vehicle fall in one world (n = 1), and which are possible."""
+def decision_grid(world: Worlds, task: Task) -> dict[str, Any]:
+    """Where the commands of a profile of the driven vehicle fall in one world (n = 1), and which are possible."""
+    scenario, vehicle = task.scenario, task.vehicle
     first = world.first_decision_s([vehicle])
     steps = Decisions(first, scenario.time_step_s).before(scenario.horizon_s)
     v = world.vehicles
@@ -188,53 +184,38 @@ _REASONS = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Explored:
-    """A scenario with one driven vehicle, and who drives it.
+    """One driven vehicle of a scenario, and who drives it; the task's harm is what agents and the search minimise.
 
-    Raises ``InvalidInput`` for a scenario without exactly one learner, a team, or more than ``MOST_AGENTS`` agents.
+    Raises ``InvalidInput`` for a task of several vehicles, or more than ``MOST_AGENTS`` agents.
     """
 
-    scenario: Scenario
-    lineup: Mapping[str, Driver]
-    harm_count: HarmCount = "first"  # that agents and the search minimise
+    task: Task
+    lineup: Mapping[str, Agent]
 
     def __post_init__(self) -> None:
-        """Look whether all of it can be explored."""
-        if len(self.scenario.learners) != 1:
-            raise InvalidInput(f"explore: {len(self.scenario.learners)} vehicles are driven; it takes exactly one")
+        if len(self.task.vehicles) != 1:
+            raise InvalidInput(f"explore: {len(self.task.vehicles)} vehicles are driven; it takes exactly one")
         if not 1 <= len(self.lineup) <= MOST_AGENTS:
             raise InvalidInput(f"explore: {len(self.lineup)} agents; at least 1 and at most {MOST_AGENTS}")
-        for name, agent in self.lineup.items():
-            if isinstance(agent, Team):
-                raise InvalidInput(f"agent {name!r}: is a team, one agent is needed here: ppo@RUN/policy/vehicle_2")
-
-    @property
-    def vehicle(self) -> int:
-        """The driven vehicle, from 0."""
-        return self.scenario.learners[0]
-
-    @cached_property
-    def task(self) -> Task:
-        """What agents are asked."""
-        return Task(self.scenario, (self.vehicle,), self.harm_count)
 
     def answer(self, world: Worlds, profile: Floats) -> dict[str, Any]:
         """Every agent and the profile ``by hand`` in one world (n = 1), and what is known of it, as plain data."""
-        drivers: dict[str, Driver] = {**self.lineup, "by hand": HandDriven(profile, self.scenario.time_step_s)}
+        drivers = {**self.lineup, "by hand": HandDriven(profile, self.task.scenario.time_step_s)}
         motions = {name: self.follow(world, driver) for name, driver in drivers.items()}
-        episodes = [Played.episode(motion, (self.vehicle,)) for motion in motions.values()]
+        episodes = [Played.episode(motion, self.task.vehicles) for motion in motions.values()]
         return {
             "world": {"conditions": Conditions.of(world).quantities, "episodes": episodes},
             "outcomes": [outcome(name, motion) for name, motion in motions.items()],
             "verdict": self.verdict(world),
             "constant": self.best_constant(world),
-            "grid": decision_grid(world, self.scenario, self.vehicle),
+            "grid": decision_grid(world, self.task),
         }
 
-    def follow(self, world: Worlds, agent: Driver) -> EpisodeMotion:
+    def follow(self, world: Worlds, agent: Agent) -> EpisodeMotion:
         """The episode of one agent in one world."""
-        return follow_episodes(world, agent, self.scenario)[0]
+        return follow_episodes(world, agent, self.task.scenario)[0]
 
     def verdict(self, world: Worlds) -> dict[str, Any]:
         """Whether contact can be avoided, and the harm that no command undercuts (m2/s2), where that is proven."""
@@ -254,8 +235,9 @@ class Explored:
         except InvalidInput as error:
             return {"why": shown(error)}
         best = optimise_coupled(
-            world, self.vehicle, harm_count=self.harm_count, horizon_s=self.scenario.horizon_s, others_mps2=others
-        )
+            world, self.task.vehicle, harm_count=self.task.harm_count, horizon_s=self.task.scenario.horizon_s,
+            others_mps2=others,
+        )  # fmt: skip
         return {
             "deceleration_mps2": float(best.deceleration_mps2[0]),
             "first": float(best.first_impact_harm[0]),
@@ -264,10 +246,8 @@ class Explored:
 
     def commands_of(self, world: Worlds, agent: str) -> list[float]:
         """What an agent of the line-up commands in each decision (m/s2), to begin a profile from."""
-        steps = decision_grid(world, self.scenario, self.vehicle)["steps"]
-        driver = self.lineup[agent]
-        assert not isinstance(driver, Team)  # refused at the beginning
-        return _step_by_step(driven_profiles(driver, world, self.task, np.array([steps])))
+        steps = decision_grid(world, self.task)["steps"]
+        return _step_by_step(driven_profiles(self.lineup[agent], world, self.task, np.array([steps])))
 
     def search(self, world: Worlds, profile: Floats, seconds: float, stop: Callable[[], bool]) -> dict[str, Any]:
         """The best profile that a search of so many seconds finds; ``stop`` ends it early.
@@ -276,25 +256,24 @@ class Explored:
         the profile driven again by the engine.
         """
         begin = time.monotonic()
+        scenario, harm_count = self.task.scenario, self.task.harm_count
         problem = task_problem(world, self.task)
         constant = np.full((1, 1, 1), -self.best_constant(world)["deceleration_mps2"])
         given = problem.constant(np.concatenate([constant, problem.even_grid(CONSTANTS)], axis=1))
         used = 0
-        while True:
+        while used == 0 or not (time.monotonic() - begin >= seconds or stop()):
             given, _ = problem.search(given, budget=SLICE, seed=used // SLICE)
             used += SLICE
-            if time.monotonic() - begin >= seconds or stop():
-                break
         commands = _step_by_step(given)
-        both = [HandDriven(np.array(each), self.scenario.time_step_s) for each in (commands, profile.tolist())]
+        both = [HandDriven(np.array(each), scenario.time_step_s) for each in (commands, profile.tolist())]
         motions = [self.follow(world, each) for each in both]
-        which = int(np.argmin([motion.ledger.world_harm(self.harm_count)[0] for motion in motions]))
+        which = int(np.argmin([motion.ledger.world_harm(harm_count)[0] for motion in motions]))
         best = outcome("best known", motions[which])
         return best | {
             "commands": commands if which == 0 else profile.tolist(),
             "candidates": used,
             "by_hand": which == 1,
-            "episode": Played.episode(motions[which], (self.vehicle,)),
+            "episode": Played.episode(motions[which], self.task.vehicles),
         }
 
 
@@ -363,13 +342,8 @@ class Guard:
             await send(message)
 
         why = self._refusal(scope)
-        if not why:
-            await self._app(scope, receive, send_guarded)
-            return
-        body = json.dumps({"error": why}).encode()
-        told = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
-        await send_guarded({"type": "http.response.start", "status": 403, "headers": told})
-        await send_guarded({"type": "http.response.body", "body": body})
+        answer: Any = _reply({"error": why}, HTTPStatus.FORBIDDEN) if why else self._app
+        await answer(scope, receive, send_guarded)
 
     def _refusal(self, scope: Scope) -> str:
         """Why a request is not answered; empty for one that is."""
@@ -524,8 +498,8 @@ def explorer_page(explored: Explored, state: State, *, world: int, seed: int) ->
         seed: of the list.
 
     """
-    scenario, agents = explored.scenario, list(explored.lineup)
-    vehicle, drivers = f"Vehicle {explored.vehicle + 1}", list(explored.lineup.values())
+    task, agents, drivers = explored.task, list(explored.lineup), list(explored.lineup.values())
+    scenario, vehicle = task.scenario, f"Vehicle {task.vehicle + 1}"
     learned = [k for k, each in enumerate(drivers) if isinstance(getattr(each, "policy", None), Policy)]
     content = {
         "groups": slider_groups(scenario, state),
@@ -535,15 +509,15 @@ def explorer_page(explored: Explored, state: State, *, world: int, seed: int) ->
         "named": agents,  # as the server knows them
         "rival": [*learned, len(agents) - 1][0],  # whom to beat: the first agent that learned, else the last one
         "worst": agents.index("full_brake") if "full_brake" in agents else 0,
-        "driven": [explored.vehicle],
+        "driven": list(task.vehicles),
         "vehicles": scenario.vehicles,
-        "harm_count": explored.harm_count,
+        "harm_count": task.harm_count,
     }
     shielded = any(isinstance(agent, HybridAgent | ShieldedDriver) for agent in drivers)
     part = partial(Part.template, "explorer.html.j2")
     sections = [
         Section("The emergency", [part(part="sliders", seed=seed)]),
-        Section("What came of it", [part(part="outcome", harm_count=explored.harm_count)]),
+        Section("What came of it", [part(part="outcome", harm_count=task.harm_count)]),
         Section("Drive it yourself", [part(part="profile", vehicle=vehicle)]),
         Section("Watch it", [Part.live_player(scenario.vehicles, shielded=shielded)]),
         Section("Keep it", [part(part="keep"), Part.data("explorer_data", content, **_PAGE)]),
@@ -583,7 +557,7 @@ def explorer_app(
 
     answers = _Answers(explored, folder, seed)
     first = answers.world_of_list(world)
-    read_state(Conditions.of(first), explored.scenario)  # refuses scenarios whose channel is drawn
+    read_state(Conditions.of(first), explored.task.scenario)  # refuses scenarios whose channel is drawn
     page = explorer_page(explored, Conditions.of(first), world=world, seed=seed)
     policy = {"content-security-policy": f"{page.policy}; frame-ancestors 'none'"}
 
@@ -596,9 +570,8 @@ def explorer_app(
 
     if warm_up:
         answers.warm_up(first)
-    routes = [Route("/{token}/", show_page, methods=["GET"])]
-    for name in answers.questions:
-        routes.append(Route(f"/{{token}}/{name}", partial(answers.reply_to, name), methods=["POST"]))
+    asked = [Route(f"/{{token}}/{n}", partial(answers.reply_to, n), methods=["POST"]) for n in answers.questions]
+    routes = [Route("/{token}/", show_page, methods=["GET"]), *asked]
     app = Starlette(routes=routes, exception_handlers={HTTPException: refuse})
     app.router.redirect_slashes = False
     return Guard(app, token, port)
@@ -631,7 +604,7 @@ class _Answers:
             if missing := [key for key in keys if key not in asked]:
                 raise InvalidInput(f"{missing[0]} is missing")
             if "world" in asked:
-                asked["world"] = read_state(asked["world"], self._explored.scenario)
+                asked["world"] = read_state(asked["world"], self._explored.task.scenario)
             if "profile" in asked:
                 asked["profile"] = read_profile(asked["profile"])
             return _reply(await answer(**asked))
@@ -643,7 +616,7 @@ class _Answers:
 
     def world_of_list(self, number: int) -> Worlds:
         """One world (n = 1) of the scenario's list."""
-        return self._explored.scenario.sample(1, self._seed, first=number).worlds
+        return self._explored.task.scenario.sample(1, self._seed, first=number).worlds
 
     def warm_up(self, world: Worlds) -> None:
         """Begin with the first world, before anybody asks."""
@@ -676,7 +649,7 @@ class _Answers:
 
     async def save(self, world: Worlds, name: object, kind: object) -> Any:
         """The state as a new file."""
-        scenario = self._explored.scenario
+        scenario = self._explored.task.scenario
         return {"file": await asyncio.to_thread(save_state, self._folder, name, kind, world, scenario)}
 
 

@@ -21,12 +21,12 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from ethbrake_marl.agents import Driver, Team
+from ethbrake_marl.agents import Driver
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.envs import BODY_M
 from ethbrake_marl.errors import InvalidInput, plain_text
-from ethbrake_marl.evaluation import Conditions, EpisodeMotion, Passport, follow_episodes, policies_of
-from ethbrake_marl.files.sheet import Column, Sheet
+from ethbrake_marl.evaluation import Conditions, EpisodeMotion, Passport, follow_episodes
+from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario
 
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from ethbrake_marl.figures import Figure
 
 _STAY = "\u00a0"  # a blank at which no line is broken
-_AFTER_SIGN = re.compile(r"(?<=[:+@,/])(?=.)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,38 +85,8 @@ class Part:
 
     @classmethod
     def table(cls, sheet: Sheet) -> Part:
-        """A table that scrolls by itself where it is wider than the page, intervals below their values.
-
-        The first cell of a row is its heading. The text of a column after it may be broken into lines if the column is
-        one of texts. A cell may be a ``Shown`` of Markup.
-        """
-        caption, headings = sheet.title, sheet.headings
-        wordy = [not isinstance(column, Column) or column.text for column in sheet.columns]
-        kinds = [Markup(' class="words"') if k and sheet.rows and words else Markup() for k, words in enumerate(wordy)]
-        lines = [Markup('<div class="wide" tabindex="0" role="region" aria-label="{}"><table>').format(
-            shown(caption or f"Table: {headings[0]}")
-        )]  # fmt: skip
-        lines += [Markup("<caption>{}</caption>").format(shown(caption))] if caption else []
-        head = [
-            Markup('<th scope="col"{}>{}</th>').format(kind, shown(text))
-            for kind, text in zip(kinds, headings, strict=True)
-        ]
-        lines += [Markup("<thead><tr>{}</tr></thead>").format(Markup("").join(head)), Markup("<tbody>")]
-        for row in sheet.shown():
-            if isinstance(row, str):
-                section = Markup('<tr class="block"><th colspan="{}" scope="rowgroup">{}</th></tr>')
-                lines.append(section.format(len(headings), shown(row)))
-                continue
-            name = row[0].value  # a long one such as e_v2x_bm:pairwise is broken after a sign before inside a word
-            if not isinstance(name, Markup):
-                name = Markup("<wbr>").join(_AFTER_SIGN.split(shown(name)))
-            cells = [Markup('<th scope="row">{}</th>').format(name)]
-            for kind, (value, below) in zip(kinds[1:], row[1:], strict=True):
-                under = Markup('<span class="interval">{}</span>').format(shown(below)) if below else Markup()
-                cells.append(Markup("<td{}>{}{}</td>").format(kind, _text(value), under))
-            lines.append(Markup("<tr>{}</tr>").format(Markup("").join(cells)))
-        lines.append(Markup("</tbody></table></div>\n"))
-        return cls(Markup("\n").join(lines))
+        """A table that scrolls by itself where it is wider than the page; a cell may be a ``Shown`` of Markup."""
+        return cls(Markup(sheet.html() + "\n"))
 
     @classmethod
     def drawing(
@@ -378,12 +347,8 @@ class Played:
             harm_count: that the agent minimised.
 
         """
-        drivers = Team.of(agent, scenario.learners).drivers
-        policies = policies_of(drivers)
         for one, motion in zip(played, follow_episodes(worlds, agent, scenario), strict=True):
-            passport = Passport.of(
-                motion, scenario, spelling, seed=seed, number=one.number, harm_count=harm_count, policies=policies
-            )
+            passport = Passport.of(motion, scenario, spelling, seed=seed, number=one.number, harm_count=harm_count)
             one.motions[name] = motion
             one.passports[name] = str(passport)
 

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
+from numpy.typing import NDArray
 
 from ethbrake_marl.agents import Driver
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation import (
-    BASELINE,
     Conditions,
     Evaluation,
     ShieldModes,
@@ -22,15 +23,14 @@ from ethbrake_marl.evaluation import (
     compare_modes,
     mean,
     rate,
-    write_output,
 )
 from ethbrake_marl.figures import harm_by_agent, harm_in_parts, regret_distribution
-from ethbrake_marl.files.sheet import DASH, Column, Estimate, Sheet, Shown
+from ethbrake_marl.files.sheet import Column, Sheet, Shown
+from ethbrake_marl.files.store import write_output
 from ethbrake_marl.limits import Unproven
 from ethbrake_marl.pages.page import Page, Part, Played, Section
 from ethbrake_marl.physics import Bools, Floats, Ints
 from ethbrake_marl.scenario import Task
-from ethbrake_marl.shield import VERDICTS
 
 # The worlds that a report shows: the worst, the typical, and some drawn at random; and every agent in each.
 
@@ -38,6 +38,7 @@ MOST_WORLDS = 50
 WORST = 10
 _EACH = 5  # of the other kinds
 _RANDOM_SEED = 0
+_BASELINE = "full_brake"
 
 
 def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS) -> dict[int, Played]:
@@ -57,10 +58,10 @@ def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS)
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
     if avoidable is not None:
         add(f"Avoidable, and {focus} collided", _largest(total, outcome.collided & avoidable), _EACH)
-    if BASELINE in evaluation.outcomes and focus != BASELINE:
-        saved = evaluation.outcome(BASELINE).total_harm - total
-        add(f"Where {focus} saved most against {BASELINE}", _largest(saved, saved > 0.0), _EACH)
-        add(f"Where {focus} did more harm than {BASELINE}", _largest(-saved, saved < 0.0), _EACH)
+    if _BASELINE in evaluation.outcomes and focus != _BASELINE:
+        saved = evaluation.outcome(_BASELINE).total_harm - total
+        add(f"Where {focus} saved most against {_BASELINE}", _largest(saved, saved > 0.0), _EACH)
+        add(f"Where {focus} did more harm than {_BASELINE}", _largest(-saved, saved < 0.0), _EACH)
     order = np.argsort(total, kind="stable")
     add(f"Typical of {focus}", [order[int(q * (len(order) - 1))] for q in (0.5, 0.6, 0.7, 0.8, 0.9)], _EACH)
     add("Drawn at random", np.random.default_rng(_RANDOM_SEED).permutation(len(total))[: 2 * most], most)
@@ -88,23 +89,26 @@ def worst_section(evaluation: Evaluation, focus: str, watched: Sequence[int]) ->
     """The ten worlds in which an agent did worst; those that the page plays have a button."""
     regrets, outcome = evaluation.regrets, evaluation.outcome(focus)
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
-    known = [] if regrets is None else ["Best known, first", "Best known, total"]
-    known += [] if avoidable is None else ["Contact"]
-    head = ["World", "First-impact harm", "Total harm", *known, "Impacts"]
-    columns = [outcome.first_impact_harm, outcome.total_harm]
-    columns += [] if regrets is None else [regrets.best(count) for count in HARM_COUNTS]
+    columns: dict[str, NDArray[Any] | None] = {
+        "First-impact harm": outcome.first_impact_harm,
+        "Total harm": outcome.total_harm,
+        "Best known, first": None if regrets is None else regrets.first_impact_harm,
+        "Best known, total": None if regrets is None else regrets.total_harm,
+        "Contact": None if avoidable is None else np.where(avoidable, "avoidable", "unavoidable"),
+        "Impacts": outcome.impacts,
+    }
+    told = {name: column.tolist() for name, column in columns.items() if column is not None}
     rows = []
     for k in worst_rows(evaluation, focus).tolist():
         number = int(evaluation.index[k])
         button = Markup('{} <button type="button" data-watch="{}">Watch</button>').format(number, number)
-        contact = [] if avoidable is None else ["avoidable" if avoidable[k] else "unavoidable"]
-        harms = (f"{column[k]:.2f}" for column in columns)
-        rows.append([Shown(button) if number in watched else number, *harms, *contact, int(outcome.impacts[k])])
-    why = "as nothing is proven of these worlds" if regrets is None else "above the best known"
-    told = f"Of {focus}, by total harm{',' * (regrets is None)} {why}. Harm in m²/s²."
-    if not rows:
-        return Section("Worst ten worlds", [f"{focus} did no harm above the best known in any of these worlds."])
-    return Section("Worst ten worlds", [told, Part.table(Sheet(f"Worlds of {focus}", list(map(Column, head)), rows))])
+        rows.append([Shown(button) if number in watched else number, *(column[k] for column in told.values())])
+    why = ", as nothing is proven of these worlds" if regrets is None else " above the best known"
+    body: list[str | Part] = [f"{focus} did no harm above the best known in any of these worlds."]
+    if rows:
+        table = Part.table(Sheet(f"Worlds of {focus}", list(map(Column, ("World", *told))), rows))
+        body = [f"Of {focus}, by total harm{why}. Harm in m²/s².", table]
+    return Section("Worst ten worlds", body)
 
 
 def avoidable_section(evaluation: Evaluation) -> Section:
@@ -112,11 +116,11 @@ def avoidable_section(evaluation: Evaluation) -> Section:
     regrets = evaluation.regrets
     body: list[str | Part] = []
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
-    if regrets is None or avoidable is None:
+    if isinstance(evaluation.limits, Unproven):
         told = "Nothing is proven of these worlds, so what was avoidable is not told apart."
-        if regrets is not None:
-            told = "Where contact can be avoided is not decided for these vehicles, so that is not told apart."
-        body.append(f"{told} Reason: {evaluation.limits.because}." if isinstance(evaluation.limits, Unproven) else told)
+        body.append(f"{told} Reason: {evaluation.limits.because}.")
+    elif regrets is None or avoidable is None:
+        body.append("Where contact can be avoided is not decided for these vehicles, so that is not told apart.")
     else:
         share = rate(int(avoidable.sum()), len(avoidable)).in_words(digits=1, scale=100.0, unit=" %")
         body.append(
@@ -124,16 +128,18 @@ def avoidable_section(evaluation: Evaluation) -> Section:
         )
         for where, among in (("Contact avoidable", avoidable), ("Contact unavoidable", ~avoidable)):
             if among.any():
-                rows = []
-                for agent, each in evaluation.outcomes.items():
-                    harms = [each.ledger.world_harm(count) for count in HARM_COUNTS]
-                    means = [
-                        mean(values[among]) for values in (*harms, *(regrets.regret(each, c) for c in HARM_COUNTS))
-                    ]
-                    collided = rate(int((each.collided & among).sum()), int(among.sum()))
-                    rows.append([agent, _cell(collided, 100.0, 1, " %"), *map(_cell, means)])
-                caption = f"{where}: {count_of(int(among.sum()), 'world')}"
-                body.append(Part.table(Sheet(caption, list(map(Column, _SPLIT)), rows)))
+                part = evaluation.take(among)
+                caption = f"{where}: {count_of(part.worlds.n, 'world')}"
+                rows = [
+                    (
+                        agent,
+                        rate(int(each.collided.sum()), part.worlds.n),
+                        *(mean(each.world_harm(count)) for count in HARM_COUNTS),
+                        *(mean(regrets.regret(evaluation.outcomes[agent], count)[among]) for count in HARM_COUNTS),
+                    )
+                    for agent, each in part.outcomes.items()
+                ]
+                body.append(Part.table(Sheet(caption, _SPLIT, rows)))
         about = "Mean harm per world as the least that is known, and what each agent did above it."
         body.append(Part.drawing(harm_in_parts(evaluation), "What the harm is made of", about))
     title, words = "Harm world by world", "For each harm x, the share of the worlds in which an agent did more."
@@ -144,49 +150,25 @@ def avoidable_section(evaluation: Evaluation) -> Section:
     return Section("What was avoidable", body)
 
 
-_SPLIT = ("Agent", "Collided", "First-impact harm", "Total harm", "Regret, first-impact", "Regret, total")
+_SPLIT: tuple[Column | str, ...] = (
+    "Agent", Column("Collided", digits=1, scale=100.0, unit=" %"),
+    *map(Column, ("First-impact harm", "Total harm", "Regret, first-impact", "Regret, total")),
+)  # fmt: skip
 
 
 def shield_section(rows: ShieldModes, conditions: str) -> Section:
     """The modes of the shield on the same worlds, and what each intervention of step mode was good for."""
-    teams = rows.of_teams
-    head = ["Agent, mode", "Harm", "Minus no shield" if teams else "Minus episode mode", "Decisions replaced"]
-    head += [*VERDICTS, "Worlds above the bound"]
-    lines = []
-    for row in rows:
-        shares = map(_share, (row.replaced, *(row.verdicts or [None] * len(VERDICTS))))
-        above = DASH if row.above_bound is None else row.above_bound
-        against = row.against_none if teams else row.against_episode
-        told_against = DASH if against is None else _cell(against)
-        lines.append([f"{row.agent}, {row.mode}", _cell(row.harm), told_against, *shares, above])
+    if not rows:
+        return Section("Shield", ())
     told = (
         "Each agent alone and behind every mode of the shield. Each decision that step mode replaced was simulated"
         " again without it: needed (harm would have been higher), harmless (the same), costly (lower)."
     )
-    body: list[str | Part] = [told, Part.table(Sheet("Modes of the shield", list(map(Column, head)), lines))]
-    if teams:
-        head = ["Agent, mode, vehicle", "Decisions replaced", "Bears", "Under the baseline plan", "Worlds with more"]
-        lines = [
-            [f"{row.agent}, {row.mode}, {each.vehicle}", _share(each.replaced), f"{each.harm:.2f}",
-             f"{each.baseline:.2f}", _share(each.above_baseline)]
-            for row in rows
-            for each in row.vehicles
-        ]  # fmt: skip
-        body.append(Part.table(Sheet("What each vehicle bears", list(map(Column, head)), lines)))
-    body.append(Part.paragraph(conditions, "quiet"))
+    body: list[str | Part] = [told, *map(Part.table, rows.sheets()), Part.paragraph(conditions, "quiet")]
     if left_out := rows[0].left_out:
         told_of = count_of(len(left_out), "world")
         body.append(Part.paragraph(f"Left out: {told_of}, which the physics could not advance.", "note"))
     return Section("Shield", body)
-
-
-def _share(share: float | None) -> str:
-    return DASH if share is None else f"{100.0 * share:.1f} %"
-
-
-def _cell(estimate: Estimate, scale: float = 1.0, digits: int = 2, unit: str = "") -> Shown:
-    value, *ends = (f"{scale * each:.{digits}f}" for each in (estimate.value, *(estimate.interval or ())))
-    return Shown(f"{value}{unit}".replace("-", "−"), ", ".join(ends).replace("-", "−"))
 
 
 _OTHERS = ("sampled_harm", "vehicle_1_shoved_m", "vehicle_1_shoved_far_rate", "predicted_harm")
@@ -198,7 +180,7 @@ class Report:
 
     title: str
     rows: Sequence[SummaryRow]
-    evaluation: Evaluation | None = None  # that the rows sum up
+    evaluation: Evaluation  # that the rows sum up
     played: Sequence[Played] = ()  # episodes to watch
     shield: Section | None = None  # what is behind a shield
     focus: str = ""  # the agent whose worst worlds are shown
@@ -229,7 +211,6 @@ class Report:
 
         """
         evaluation = self.evaluation
-        assert evaluation is not None
         learned = [row.agent for row in self.rows if row.policy_sha256]
         focus = self.focus or [*[row.agent for row in self.rows][-1:], *learned][-1]
         chosen = choose_shown(evaluation, focus)
@@ -246,79 +227,63 @@ class Report:
         modes = compare_modes(agents, some, Task(evaluation.scenario, evaluation.vehicles, harm_count), behind=True)
         line = Conditions({**evaluation.conditions, "count": some.n}).line
         count = "First-impact" if harm_count == "first" else "Total"
-        shield = shield_section(modes, f"{count} harm, which the shield bounds, in m²/s². {line}.") if modes else None
+        shield = shield_section(modes, f"{count} harm, which the shield bounds, in m²/s². {line}.")
         return replace(self, played=played, shield=shield, focus=focus)
 
     @property
     def html(self) -> str:
         """The page; it loads nothing from anywhere."""
-        sections = [self._results(), *self._episodes()]
-        if self.evaluation is not None:
-            if self.focus:
-                sections.append(worst_section(self.evaluation, self.focus, [one.number for one in self.played]))
-            sections.append(avoidable_section(self.evaluation))
-        sections += [self.shield] if self.shield is not None else []
-        sections += [Section("Figures", self.figures)] if self.figures else []
+        sections: list[Section | None] = [self._results(), self._episodes()]
+        if self.focus:
+            sections.append(worst_section(self.evaluation, self.focus, [one.number for one in self.played]))
+        sections += [avoidable_section(self.evaluation), self.shield, Section("Figures", self.figures)]
         all_rows = SummaryTable(self.rows)
-        sheet, nowhere = all_rows.sheet(), set(_empty(self.rows))
+        sheet, nowhere = all_rows.sheet(), set(_empty(all_rows))
         for title, about, told_rows in self.tests:
             rows = SummaryTable(told_rows)
-            body: list[str | Part] = [about, _table(rows.sheet(), title, {"Knows"})]
-            if empty := _empty(rows):
-                told = f"Columns without a value in any row are left out: {'; '.join(empty)}."
-                body.append(Part.paragraph(told, "quiet"))
-            if rows:
-                lines = [f"{rows[0].parameters.line}.", *rows.limit_lines(), *rows.identity_lines()]
-                body += [Part.paragraph(text, "note") for text in rows.warning_lines()]
-                body += [Part.paragraph(text, "quiet") for text in lines]
-            sections.append(Section(title, body))
-            nowhere.intersection_update(empty)
+            told = [_table(rows.sheet(), title, {"Knows"}), *_told(rows), Part.paragraph(rows.identity_line(), "quiet")]
+            sections.append(Section(title, [about, *told]))
+            nowhere.intersection_update(_empty(rows))
         ours = replace(sheet, rows=sheet.rows[: len(self.rows)])
         others = _table(ours, "In the same worlds", set(sheet.names) - {"Knows", *_OTHERS})
-        meanings = {}
-        for name, meaning in all_rows.meanings().items():
-            about_it = {column for column in sheet.headings[2:] if column.startswith(name)}
-            if not about_it or about_it - nowhere:
-                meanings[name] = meaning
-        sections.append(Section("Other measures", [others]))
-        sections.append(Section("How to read the tables", [Part.facts(meanings)]))
-        if self.settings:
-            sections.append(Section("Settings and seeds", [Part.facts(self.settings)]))
+        unseen = tuple(name for name in sheet.headings[2:] if name in nowhere)
+        seen = tuple(name for name in sheet.headings[2:] if name not in nowhere)
+        meanings = {
+            name: meaning
+            for name, meaning in all_rows.meanings().items()
+            if any(each.startswith(name) for each in seen) or not any(each.startswith(name) for each in unseen)
+        }
         versions = [Part.facts(self.versions)] if self.versions else []
-        versions += [Part.paragraph(text, "quiet") for text in all_rows.identity_lines()]
-        sections += [Section("Versions", versions)] if versions else []
-        return Page(self.title, sections, lead=self.summary).html
+        versions += [Part.paragraph(all_rows.identity_line(), "quiet")] if all_rows else []
+        sections += [
+            Section("Other measures", [others]),
+            Section("How to read the tables", [Part.facts(meanings)]),
+            Section("Settings and seeds", [Part.facts(self.settings)] if self.settings else ()),
+            Section("Versions", versions),
+        ]
+        shown = [section for section in sections if section is not None and section.body]
+        return Page(self.title, shown, lead=self.summary).html
 
     def write(self, path: str | Path, *, force: bool = False) -> None:
         """Write the page; raises ``AlreadyExists`` unless ``force``, ``InvalidInput`` without a folder."""
         write_output(path, self.html.encode("utf-8"), force=force)
 
     def _results(self) -> Section:
-        rows, quiet = SummaryTable(self.rows), []
+        rows = SummaryTable(self.rows)
         body: list[str | Part] = []
         if rows:
             about = "Mean per world of the squared closing speed of impacts: each pair's first one, and every one."
             body.append(Part.drawing(harm_by_agent(rows), "Harm of each agent", about))
-            quiet.append(f"{rows[0].parameters.line}. Harm in m²/s².")
-        body.append(_table(rows.sheet(), "Means with 95 % intervals", {"Knows", *_OTHERS}))
-        if empty := _empty(rows):
-            limits = self.evaluation.limits if self.evaluation is not None else None
-            because = f" Nothing is proven of these worlds: {limits.because}." if isinstance(limits, Unproven) else ""
-            quiet.append(f"Columns without a value in any row are left out: {'; '.join(empty)}.{because}")
-        body += [Part.paragraph(text, "quiet") for text in quiet]
-        body += [Part.paragraph(text, "note") for text in (*rows.left_out_lines(), *rows.warning_lines())]
-        body += [Part.paragraph(f"The limit: {text}", "quiet") for text in rows.limit_lines()]
-        body += [Part.paragraph(f"Who knows what: {text}", "note") for text in rows.knowledge_lines()]
-        *paper, note = rows.paper_lines() or [""]
-        body += [Part.paragraph(f"The paper's {line}", "quiet") for line in paper]
-        body += [Part.paragraph(note, "note")] if note else []
-        return Section("Results", body)
+        limits = self.evaluation.limits
+        because = f" Nothing is proven of these worlds: {limits.because}." if isinstance(limits, Unproven) else ""
+        table = _table(rows.sheet(), "Means with 95 % intervals", {"Knows", *_OTHERS})
+        return Section("Results", [*body, table, *_told(rows, because)])
 
-    def _episodes(self) -> list[Section]:
+    def _episodes(self) -> Section:
         """The episodes to watch; which agents drove otherwise when they drove once more, and where episodes end."""
         evaluation, played = self.evaluation, self.played
-        if not played or evaluation is None:
-            return []
+        if not played:
+            return Section("Episodes", ())
         rows = {int(number): row for row, number in enumerate(evaluation.index)}
         unrepeated: dict[str, int] = {}
         for world in played:
@@ -333,22 +298,29 @@ class Report:
             if count
         ]
         moving = sum(not all(motion.at_rest for motion in world.motions.values()) for world in played)
-        until = "from the alert to rest"
-        if moving:
-            until += (
-                f", or to the horizon of {evaluation.scenario.horizon_s:g} s: in {count_of(moving, 'world')} the line"
-                " of some agent was not at rest then, and the player says whose"
-            )
+        until = (
+            f"from the alert to rest, or to the horizon of {evaluation.scenario.horizon_s:g} s: in"
+            f" {count_of(moving, 'world')} the line of some agent was not at rest then, and the player says whose"
+        )
+        until = until if moving else "from the alert to rest"
         shown, every = len(played), evaluation.worlds.n
         told = f"{shown} of the {every:,} worlds" if shown < every else f"All {shown} worlds"
         player = Part.player(played, evaluation.vehicles, focus=self.focus)
         body: list[str | Part] = [f"{told}, {until}.", *(Part.paragraph(text, "note") for text in notes), player]
-        return [Section("Episodes", body)]
+        return Section("Episodes", body)
 
 
-def _empty(rows: Sequence[SummaryRow]) -> list[str]:
+def _told(rows: SummaryTable, because: str = "") -> list[Part]:
+    """What stands below the table of these rows; ``because``: why columns of it may be empty."""
+    told = [("quiet", f"{row.parameters.line}. Harm in m²/s².") for row in rows[:1]]
+    if empty := _empty(rows):
+        told.append(("quiet", f"Columns without a value in any row are left out: {'; '.join(empty)}.{because}"))
+    return [Part.paragraph(text, kind) for kind, text in (*told, *rows.notes())]
+
+
+def _empty(rows: SummaryTable) -> list[str]:
     """Columns of the table of these rows in which no line has a value."""
-    sheet = SummaryTable(rows).sheet()
+    sheet = rows.sheet()
     filled = sheet.filled()
     return [name for k, name in enumerate(sheet.headings) if k not in filled]
 

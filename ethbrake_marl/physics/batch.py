@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import pairwise
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -261,75 +261,59 @@ class Packed(NamedTuple):
         return first, total, count.astype(np.int64), *of_obstacle
 
 
-# Advancing worlds that are packed into rows.
+# Advancing worlds.
 
 
 @compiled
-def advance_row(
-    state: Floats, params: Floats, column: Columns, command: Floats, until: float, post: float, table: Floats,
-    world: int, rows: Floats, recorded: int,
-) -> tuple[int, int]:  # fmt: skip
-    """Take one world, a row of state and one of parameters, to ``until`` in place, and add its harm.
-
-    ``table`` has a column for each vehicle, or one more in front of them: the world's obstacle, or where it has none a
-    post that is ``post`` (m) ahead of Vehicle 1. Gives what ``advance_table`` gives; a world in which a check fails
-    stays where it was.
-    """
-    N, time = column.vehicles, state[column.time]
-    speed, in_force, gap, harm, obstacle = column.speed, column.command, column.gap, column.harm, column.obstacle
-    P, latency, at = N - 1, column.latency, table.shape[1] - N
-    with_obstacle = state.shape[0] > obstacle and state[obstacle] < math.inf
-    if at == 1:
-        place_obstacle(table, state[obstacle] if with_obstacle else post, state[obstacle + 1] if with_obstacle else 0.0)
-        table[ROW.SPEED, 0] = 0.0
-    for i in range(N):
-        table[ROW.COMMAND, at + i] = command[i]
-        table[ROW.SPEED, at + i] = state[speed + i]
-        table[ROW.MASS, at + i] = params[column.mass + i]
-        table[ROW.LIMIT, at + i] = params[column.limit + i]
-        table[ROW.ONSET, at + i] = onset_s(params[latency + i], time)
-    for p in range(P):
-        table[ROW.GAP, at + p] = state[gap + p]
-        table[ROW.HIT, at + p] = state[gap + P + p]
-    recorded, status = advance_table(table, params[column.restitution], until - time, time, world, rows, recorded)
-    if status != FLAG.DONE:
-        return recorded, status
-    state[column.time] = until
-    for i in range(N):
-        state[speed + i] = table[ROW.SPEED, at + i]
-        state[in_force + i] = command_in_force(command[i], params[latency + i], until)
-    for p in range(P):
-        state[gap + p] = table[ROW.GAP, at + p]
-        state[gap + P + p] = table[ROW.HIT, at + p]
-        state[harm + p] += table[ROW.FIRST_HARM, at + p]
-        state[harm + P + p] += table[ROW.TOTAL_HARM, at + p]
-        state[harm + 2 * P + p] += table[ROW.COUNT, at + p]
-    if with_obstacle:
-        state[obstacle] = table[ROW.GAP, 0]
-        state[obstacle + 1] = table[ROW.HIT, 0]
-        state[obstacle + 2] += table[ROW.FIRST_HARM, 0]
-        state[obstacle + 3] += table[ROW.TOTAL_HARM, 0]
-        state[obstacle + 4] += table[ROW.COUNT, 0]
-    return recorded, status
-
-
-@compiled
-def advance_rows(
-    state: Floats, params: Floats, command: Floats, until: Floats, failed: Ints, rows: Floats
+def advance_worlds(
+    gaps: Floats, speeds: Floats, time: Floats, hit: Bools, in_force: Floats, ahead: Floats, ahead_hit: Bools,
+    first_harm: Floats, total_harm: Floats, count: Ints, ahead_first: Floats, ahead_total: Floats, ahead_count: Ints,
+    command: Floats, until: Floats, latency: Floats, mass: Floats, limit: Floats, restitution: Floats, failed: Ints,
+    at: int, rows: Floats,
 ) -> int:  # fmt: skip
-    """Advance every world to its ``until`` [n] under ``command`` [n, N], in place.
+    """Advance every world to its ``until``, in place (the first seven arrays), and fill its harm (the next six).
 
+    ``at`` is 1 where some world has an obstacle ``ahead``, else 0: vehicle i stands in column at + i of the table.
     ``rows`` [capacity, LISTED.WIDTH] receives the impacts that fit; gives their whole number. A world in which a check
     fails is marked with its status in ``failed`` [n] (else DONE) and stays where it was; the others go on.
     """
-    column = columns(state)
-    at = 1 if state.shape[1] > column.obstacle else 0
-    table = np.zeros((ROW.OF_SEGMENT, column.vehicles + at))
+    n, vehicles = speeds.shape
+    table = np.zeros((ROW.OF_SEGMENT, at + vehicles))
     recorded = 0
-    for k in range(state.shape[0]):
-        recorded, failed[k] = advance_row(
-            state[k], params[k], column, command[k], until[k], BOUND.FAR_AWAY_M, table, k, rows, recorded
-        )
+    for k in range(n):
+        if at == 1:
+            place_obstacle(table, min(ahead[k], BOUND.FAR_AWAY_M), 1.0 if ahead_hit[k] else 0.0)
+            table[ROW.SPEED, 0] = 0.0
+        for i in range(vehicles):
+            table[ROW.COMMAND, at + i] = command[k, i]
+            table[ROW.SPEED, at + i] = speeds[k, i]
+            table[ROW.MASS, at + i] = mass[k, i]
+            table[ROW.LIMIT, at + i] = limit[k, i]
+            table[ROW.ONSET, at + i] = onset_s(latency[k, i], time[k])
+            in_force[k, i] = command_in_force(command[k, i], latency[k, i], until[k])
+        for p in range(vehicles - 1):
+            table[ROW.GAP, at + p] = gaps[k, p]
+            table[ROW.HIT, at + p] = 1.0 if hit[k, p] else 0.0
+        duration = until[k] - time[k]
+        recorded, status = advance_table(table, restitution[k], duration, time[k], k, rows, recorded)
+        failed[k] = status
+        if status != FLAG.DONE:
+            continue
+        time[k] = until[k]
+        for i in range(vehicles):
+            speeds[k, i] = table[ROW.SPEED, at + i]
+        for p in range(vehicles - 1):
+            gaps[k, p] = table[ROW.GAP, at + p]
+            hit[k, p] = table[ROW.HIT, at + p] == 1.0
+            first_harm[k, p] = table[ROW.FIRST_HARM, at + p]
+            total_harm[k, p] = table[ROW.TOTAL_HARM, at + p]
+            count[k, p] = int(table[ROW.COUNT, at + p])
+        if at == 1 and ahead[k] < math.inf:
+            ahead[k] = table[ROW.GAP, 0]
+            ahead_hit[k] = table[ROW.HIT, 0] == 1.0
+            ahead_first[k] = table[ROW.FIRST_HARM, 0]
+            ahead_total[k] = table[ROW.TOTAL_HARM, 0]
+            ahead_count[k] = int(table[ROW.COUNT, 0])
     return recorded
 
 
@@ -361,28 +345,36 @@ def advance(
     end = until_s if duration_s is None else worlds.time_s + _shaped("duration_s", duration_s, (worlds.n,))
     until = _shaped("until_s", end, (worlds.n,))
     _refuse_bad(worlds, command, until, (until >= worlds.time_s) & (until < math.inf))
-    before, failed = Packed.of(worlds), np.empty(worlds.n, np.int64)
-    capacity = 4 * worlds.n + 64 if record else 0
+    v, shape = worlds.vehicles, worlds.gaps_m.shape
+    at, capacity = int(worlds.obstacle_ahead.any()), 4 * worlds.n + 64 if record else 0
     while True:
-        after = before._replace(state=before.state.copy())
-        arrays = (*after, command, until, failed)
-        parts = by_parts(partial(_advance_part, arrays, capacity), worlds.n, threads)
+        after = Worlds(
+            v, worlds.gaps_m.copy(), worlds.speeds_mps.copy(), worlds.time_s.copy(), worlds.pair_hit.copy(),
+            np.empty(worlds.speeds_mps.shape), worlds.obstacle_gap_m.copy(), worlds.obstacle_hit.copy(),
+            worlds.messages.copy(),
+        )  # fmt: skip
+        harm = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64), *Impacts.no_obstacle(worlds.n)
+        failed = np.empty(worlds.n, np.int64)
+        arrays = (
+            after.gaps_m, after.speeds_mps, after.time_s, after.pair_hit, after.command_mps2, after.obstacle_gap_m,
+            after.obstacle_hit, *harm, command, until, v.latency_s, v.mass_t, v.speed_limit_mps, v.restitution, failed,
+        )  # fmt: skip
+        parts = by_parts(partial(_advance_part, arrays, at, capacity), worlds.n, threads)
         most = max(recorded for _, recorded, _ in parts)
         if most <= capacity or not record:
             break
         capacity = most
     if (failed != FLAG.DONE).any():
         raise FLAG.failure(failed, worlds.time_s, until)
-    return after.worlds(worlds.vehicles), Impacts(
-        *after.ledger(), _impact_rows(parts, int(after.has_obstacle)) if record else None
-    )
+    return after, Impacts(*harm, _impact_rows(parts, at) if record else None)
 
 
-def _advance_part(arrays: tuple[NDArray[Any], ...], capacity: int, part: slice) -> tuple[Floats, int, int]:
+def _advance_part(arrays: tuple[NDArray[Any], ...], at: int, capacity: int, part: slice) -> tuple[Floats, int, int]:
     """Advance the worlds of ``part`` in place: the impacts that fit, the number of all, and the part's first world."""
-    rows = np.empty((capacity, LISTED.WIDTH))
-    state, params, command, until, failed = (array[part] for array in arrays)
-    return rows, advance_rows(state, params, command, until, failed, rows), part.start
+    rows, kernel = np.empty((capacity, LISTED.WIDTH)), cast("Any", advance_worlds)
+    whole = part.stop - part.start == len(arrays[0])
+    mine = arrays if whole else [array[part] for array in arrays]
+    return rows, kernel(*mine, at, rows), part.start
 
 
 def _shaped(name: str, value: ArrayLike | None, shape: tuple[int, ...]) -> Floats:
@@ -397,10 +389,9 @@ def _refuse_bad(worlds: Worlds, command: Floats, until: Floats, in_time: Bools) 
     """Refuse the first world whose end is not ``in_time`` [n], or with a command beyond a vehicle's capacity."""
     low, high = -worlds.vehicles.braking_capacity_mps2, worlds.vehicles.driving_capacity_mps2
     in_range = (command >= low) & (command <= high)
-    good = in_time & in_range.all(axis=1)
-    if good.all():
+    if in_time.all() and in_range.all():
         return
-    k = int(np.argmin(good))
+    k = int(np.argmin(in_time & in_range.all(axis=1)))
     if not in_time[k]:
         raise InvalidInput(f"advance: world {k} is at {worlds.time_s[k]:g} s and cannot be advanced to {until[k]:g} s")
     i = int(np.argmin(in_range[k]))
@@ -619,9 +610,9 @@ def _samples(worlds: Worlds, until: Floats, step_s: float) -> tuple[Ints, Ints]:
             f"advance_sampled: world {k} is at {worlds.time_s[k]:g} s, between two of its samples"
             f" {start[k]:g} s + n * {step_s:g} s; begin at a sample or before the first"
         )
-    good = ~before | (worlds.speeds_mps >= 0.0).all(axis=1)
+    good = ~before[:, np.newaxis] | (worlds.speeds_mps >= 0.0)
     if not good.all():
-        k = int(np.argmin(good))
+        k = int(np.argmin(good.all(axis=1)))
         raise InvalidInput(
             f"advance_sampled: world {k} has a negative speed at {worlds.time_s[k]:g} s, before its first sample at"
             f" {start[k]:g} s; the map knows no impacts before that"

@@ -24,9 +24,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.physics.batch import Columns, advance_row, columns
+from ethbrake_marl.physics.batch import Columns, columns
 from ethbrake_marl.physics.compiling import compiled
-from ethbrake_marl.physics.kernel import FLAG, LISTED, ROW, command_in_force, solo_motion
+from ethbrake_marl.physics.kernel import (
+    FLAG,
+    LISTED,
+    ROW,
+    advance_table,
+    command_in_force,
+    onset_s,
+    place_obstacle,
+    solo_motion,
+)
 from ethbrake_marl.physics.worlds import Bools, Floats, Worlds
 
 
@@ -242,14 +251,36 @@ def _move(
     state: Floats, params: Floats, column: Columns, wanted: Floats, end: float, table: Floats, no_rows: Floats
 ) -> bool:
     """One world moved to ``end``, its places included; False, and nothing moved, where the kernel cannot."""
-    N, gap, obstacle = column.vehicles, column.gap, column.obstacle
-    ahead = state[obstacle] if state.shape[0] > obstacle and state[obstacle] < math.inf else POST_M
-    if advance_row(state, params, column, wanted, end, POST_M, table, 0, no_rows, 0)[1] != FLAG.DONE:
+    N, time = column.vehicles, state[column.time]
+    speed, command, gap, obstacle = column.speed, column.command, column.gap, column.obstacle
+    with_obstacle = state.shape[0] > obstacle and state[obstacle] < math.inf
+    ahead = state[obstacle] if with_obstacle else POST_M
+    place_obstacle(table, ahead, state[obstacle + 1] if with_obstacle else 0.0)
+    latency = column.latency
+    for i in range(N):
+        table[ROW.SPEED, i + 1] = state[speed + i]
+        table[ROW.COMMAND, i + 1] = wanted[i]
+        table[ROW.MASS, i + 1] = params[column.mass + i]
+        table[ROW.LIMIT, i + 1] = params[column.limit + i]
+        table[ROW.ONSET, i + 1] = onset_s(params[latency + i], time)
+    for p in range(N - 1):
+        table[ROW.GAP, p + 1] = state[gap + p]
+        table[ROW.HIT, p + 1] = state[gap + N - 1 + p]
+    if advance_table(table, params[column.restitution], end - time, time, 0, no_rows, 0)[1] != FLAG.DONE:
         return False
     place = column.messages + place_at(N)
     params[place] += ahead - table[ROW.GAP, 0]
+    state[column.time] = end
+    for i in range(N):
+        state[speed + i] = table[ROW.SPEED, i + 1]
+        state[command + i] = command_in_force(wanted[i], params[latency + i], end)
     for p in range(N - 1):
-        params[place + p + 1] = params[place + p] - state[gap + p]
+        state[gap + p] = table[ROW.GAP, p + 1]
+        state[gap + N - 1 + p] = table[ROW.HIT, p + 1]
+        params[place + p + 1] = params[place + p] - table[ROW.GAP, p + 1]
+    if with_obstacle:
+        state[obstacle] = table[ROW.GAP, 0]
+        state[obstacle + 1] = table[ROW.HIT, 0]
     return True
 
 

@@ -149,28 +149,35 @@ class Worlds:
         """Number of vehicles in each line."""
         return int(self.speeds_mps.shape[1])
 
+    def _each(self, change: Callable[..., NDArray[Any]], *others: Worlds) -> Worlds:
+        """``change`` of each column of these worlds and of the others, which picks or joins rows."""
+        parts = (self, *others)
+        columns = (change(*(getattr(w, name) for w in parts)) for name in _OF_WORLDS)
+        return Worlds(_combined(change, *(w.vehicles for w in parts)), *columns)
+
     def take(self, rows: ArrayLike) -> Worlds:
         """Select worlds by index or mask (always a copy)."""
         index = np.asarray(rows)
-        return Worlds(
-            self.vehicles.take(index), *(np.ascontiguousarray(getattr(self, f.name)[index]) for f in fields(self)[1:])
-        )
+        return self._each(lambda column: np.ascontiguousarray(column[index]))
 
     @staticmethod
     def concatenate(parts: Sequence[Worlds]) -> Worlds:
         """Join worlds with the same number of vehicles into one batch."""
-        vehicles = _combined(lambda *columns: np.concatenate(columns), *(w.vehicles for w in parts))
-        return Worlds(vehicles, *(np.concatenate([getattr(w, name) for w in parts]) for name in _OF_WORLDS))
+        return parts[0]._each(lambda *columns: np.concatenate(columns), *parts[1:])
 
     def assign(self, rows: Ints, fresh: Worlds) -> Worlds:
         """The batch with ``rows`` replaced by the len(rows) worlds of ``fresh``; nothing is changed in place."""
-        vehicles = _combined(lambda whole, part: _assigned(whole, rows, part), self.vehicles, fresh.vehicles)
-        return Worlds(vehicles, *(_assigned(getattr(self, name), rows, getattr(fresh, name)) for name in _OF_WORLDS))
+
+        def assigned(whole: NDArray[Any], part: NDArray[Any]) -> NDArray[Any]:
+            copy = whole.copy()
+            copy[rows] = part
+            return copy
+
+        return self._each(assigned, fresh)
 
     def read_only(self) -> Worlds:
         """The same worlds as arrays that cannot be written to; these stay as they are."""
-        vehicles = _combined(unwritable, self.vehicles)
-        return Worlds(vehicles, *(unwritable(getattr(self, name)) for name in _OF_WORLDS))
+        return self._each(_unwritable)
 
     def first_decision_s(self, deciders: Sequence[int]) -> Floats:
         """Time of the first decision, [n] s: the least latency of the ``deciders``, or the worlds' time if it is later.
@@ -235,6 +242,13 @@ class Worlds:
 _OF_WORLDS = tuple(f.name for f in fields(Worlds))[1:]
 
 
+def _unwritable(array: NDArray[Any]) -> NDArray[Any]:
+    """The same array, which cannot be written to; the one given can."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
 def _span(values: Floats) -> str:
     """The least and the largest of the values, or the one that all have; ``none`` where there are none."""
     if not values.size:
@@ -250,19 +264,6 @@ def _combined(change: Callable[..., NDArray[Any]], *parts: Vehicles) -> Vehicles
         change(*(getattr(part, name) for part in parts)) for name in (_WITHOUT_NEWS if at_once else _OF_VEHICLES)
     ]
     return Vehicles.at_once(*columns) if at_once else Vehicles(*columns)
-
-
-def unwritable(array: NDArray[Any]) -> NDArray[Any]:
-    """The same array, which cannot be written to; the one given can."""
-    view = array.view()
-    view.flags.writeable = False
-    return view
-
-
-def _assigned(whole: NDArray[Any], rows: Ints, part: NDArray[Any]) -> NDArray[Any]:
-    copy = whole.copy()
-    copy[rows] = part
-    return copy
 
 
 def make_worlds(

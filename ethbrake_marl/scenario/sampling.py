@@ -975,7 +975,7 @@ class ScenarioFields(FileModel):
         if self.mixture is None:
             return _draw_numbers(self, np.arange(first, first + n, dtype=np.int64), int(seed), channel)
         cumulative = np.cumsum([member.weight for member in self.mixture])
-        u = uniform_numbers(int(seed), channel, 0, first, n, MIXTURE_WIDTH, of=MIXTURE)[:, 0]
+        u = uniform_numbers(int(seed), channel, 0, first, n, OF_WORLD, of=MIXTURE)[:, 0]
         chosen = np.searchsorted(cumulative / cumulative[-1], u, side="right")
         typed = any(member.vehicle_types is not None for member in self.members)
         parts = []
@@ -998,14 +998,14 @@ class ScenarioFields(FileModel):
             typed = line.draw(u.reshape(len(u), self.vehicles, PER_TYPE))
         drawn = drawn_quantities(self, numbers(BLOCK * self.vehicles, ()), typed)
         obstacle_gap_m = obstacle_gap(
-            self, drawn, lambda key: values(self.quantities(key)[0], numbers(OBSTACLE_WIDTH, OBSTACLE)[:, 0])
+            self, drawn, lambda key: values(self.quantities(key)[0], numbers(OF_WORLD, OBSTACLE)[:, 0])
         )
         restitution, gaps, speeds = drawn.pop("restitution")[:, 0], drawn.pop("gaps_m"), drawn.pop("speeds_mps")
         worlds = make_worlds(gaps, speeds, restitution=restitution, obstacle_gap_m=obstacle_gap_m, **drawn)
         if self.v2x.by_link:
             u = numbers(self.v2x.width(self.vehicles), V2X_NEWS)
             periodic = self.v2x.channel.persistence == "periodic"
-            key = numbers(KEY_WIDTH, LATER_LOSSES)[:, 0] if periodic else np.zeros(len(u))
+            key = numbers(OF_WORLD, LATER_LOSSES)[:, 0] if periodic else np.zeros(len(u))
             worlds = self.v2x.with_channel(worlds, u, key, self.time_step_s)
         return Sample(worlds, index, 0, None if typed is None or line is None else np.array(line.names)[typed[0]])
 
@@ -1172,12 +1172,10 @@ Channel = Literal["list", "training"]
 CHANNELS: dict[str, int] = {"list": 0, "training": 1}
 V2X_NEWS = (1,)  # the stream of the links' delays and losses
 OBSTACLE = (2,)  # the stream of the obstacle's distance
-OBSTACLE_WIDTH = 4  # its numbers per world, of which the first is used
 TYPES = (3,)  # the stream of the vehicles' types and loads
 MIXTURE = (4,)  # the stream of what each world of a mixture is drawn from
-MIXTURE_WIDTH = 4  # its numbers per world, of which the first is used
 LATER_LOSSES = (5,)  # the stream of a world's key, from which its later messages are lost or not
-KEY_WIDTH = 4  # its numbers per world, of which the first is used
+OF_WORLD = 4  # numbers per world of the streams of obstacle, mixture and later losses; the first is used
 PER_TYPE = 4  # its numbers per vehicle: type, load, and two that are free; one Philox counter
 MOST_ATTEMPTS = 1000  # draws of one world before its scenario is declared unusable
 _PATIENCE = 10  # attempts of a whole list before one world is tried to its end
@@ -1450,7 +1448,7 @@ class Ranges:
         A scenario that rejects early impacts does not accept worlds that have one.
         """
         n, vehicles = len(points), self.scenario.vehicles
-        widths = {(): BLOCK * vehicles, TYPES: PER_TYPE * vehicles, OBSTACLE: OBSTACLE_WIDTH}
+        widths = {(): BLOCK * vehicles, TYPES: PER_TYPE * vehicles, OBSTACLE: OF_WORLD}
         streams = {of: np.full((n, width), _UNUSED) for of, width in widths.items()}
         for (of, column), u in zip(self.places, points.T, strict=True):
             streams[of][:, column] = u
@@ -1486,9 +1484,8 @@ def _of_types(scenario: ScenarioFields) -> dict[str, Place]:
     if scenario.types_of_line is None:
         return {}
     places: dict[str, Place] = {}
-    keys = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "latency_s", "speed_limit_mps")
     for i, vehicle in enumerate(scenario.vehicle_names):
-        possible = [scenario.possible_quantities(key)[i] for key in keys]
+        possible = [scenario.possible_quantities(key)[i] for key in QUANTITY.of_a_type]
         if any(len(each) > 1 for each in possible):
             places[f"{vehicle} type"] = (TYPES, PER_TYPE * i)
         if any(isinstance(entry, WithLoad) for each in possible for entry in each.values()):

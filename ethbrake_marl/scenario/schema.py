@@ -25,6 +25,7 @@ from ethbrake_marl.files.yaml import (
     flow_text,
     read_yaml,
     refuse,
+    require,
     schema_lines,
     suggestion,
 )
@@ -50,22 +51,23 @@ MOST_SAMPLES = 1_000  # that a message may be older than the newest one
 
 def check_whole(scenario: ScenarioFields) -> None:
     """Fields that limit each other: quantities declared twice, time step, horizon, latency, speeds, gaps, scripts."""
-    if "speed_deviations_mps" in scenario.model_fields_set and scenario.line_speed_mps is None:
-        right = "needs line_speed_mps, the speed that it is added to"
-        refuse(("speed_deviations_mps",), scenario.speed_deviations_mps, right)
+    alone = "speed_deviations_mps" in scenario.model_fields_set and scenario.line_speed_mps is None
+    right = "needs line_speed_mps, the speed that it is added to"
+    require(not alone, ("speed_deviations_mps",), scenario.speed_deviations_mps, right)
     for usual, other in QUANTITY.alternatives.items():
         given = [key for key in (usual, other) if getattr(scenario, key) is not None]
         if not given and usual not in QUANTITY.optional:
             raise PydanticCustomError("missing", "missing", {"at": (usual,)})
-        if len(given) == 2:
-            refuse((other,), getattr(scenario, other), f"give either {usual} or {other}, not both")
-    if not scenario.time_step_s <= scenario.horizon_s:
-        refuse(("time_step_s",), scenario.time_step_s, f"must not be above horizon_s ({scenario.horizon_s:g} s)")
+        right = f"give either {usual} or {other}, not both"
+        require(len(given) < 2, (other,), getattr(scenario, other), right)
+    horizon = f"horizon_s ({scenario.horizon_s:g} s)"
+    in_time = scenario.time_step_s <= scenario.horizon_s
+    require(in_time, ("time_step_s",), scenario.time_step_s, f"must not be above {horizon}")
     for i, latencies in enumerate(scenario.possible_quantities("latency_s")):
         for kind, latency in latencies.items():
-            if not support(latency)[1] < scenario.horizon_s:
-                right = f"must be below horizon_s ({scenario.horizon_s:g} s), or the vehicle can never act"
-                refuse(_path(scenario, "latency_s", i, kind), latency, right)
+            right = f"must be below {horizon}, or the vehicle can never act"
+            acts = support(latency)[1] < scenario.horizon_s
+            require(acts, _path(scenario, "latency_s", i, kind), latency, right)
     _check_reactions(scenario)
     _check_speeds(scenario)
     _check_derived(scenario)
@@ -75,17 +77,15 @@ def check_whole(scenario: ScenarioFields) -> None:
 def _check_reactions(scenario: ScenarioFields) -> None:
     """However late the news is, every vehicle may act before the horizon."""
     own = np.array([latest for _, latest in scenario.supports("latency_s")])
-    latest = scenario.v2x.latest_reaction_s(own)
-    if not (latest < scenario.horizon_s).all():
-        i = int(np.argmin(latest < scenario.horizon_s))
+    for i, latest in enumerate(scenario.v2x.latest_reaction_s(own)):
         right = (
-            f"vehicle_{i + 1} may have no news until {latest[i]:g} s; it must be below horizon_s"
+            f"vehicle_{i + 1} may have no news until {latest:g} s; it must be below horizon_s"
             f" ({scenario.horizon_s:g} s), which may be raised"
         )
-        refuse(("v2x",), scenario.v2x, right)
-    if not (samples := scenario.v2x.channel.samples(scenario.time_step_s)) <= MOST_SAMPLES:
-        right = f"a message is on its way for {samples - 3} time steps; at most {MOST_SAMPLES - 3} are possible"
-        refuse(("v2x",), scenario.v2x, right)
+        require(bool(latest < scenario.horizon_s), ("v2x",), scenario.v2x, right)
+    samples = scenario.v2x.channel.samples(scenario.time_step_s)
+    right = f"a message is on its way for {samples - 3} time steps; at most {MOST_SAMPLES - 3} are possible"
+    require(samples <= MOST_SAMPLES, ("v2x",), scenario.v2x, right)
 
 
 def _check_speeds(scenario: ScenarioFields) -> None:
@@ -100,22 +100,22 @@ def _check_speeds(scenario: ScenarioFields) -> None:
             refuse(_path(scenario, "speeds_mps", i), speed, f"must not be above {limit}")
         drives = f"vehicle_{i + 1} drives {low:g}" + ("" if low == high else f" to {high:g}")
         deviates = "with speed_deviations_mps " if "speed_deviations_mps" in scenario.model_fields_set else ""
-        right = f"{deviates}{drives} m/s; must be 0 to {limit}"
-        refuse(("line_speed_mps",), scenario.line_speed_mps, right)
+        refuse(("line_speed_mps",), scenario.line_speed_mps, f"{deviates}{drives} m/s; must be 0 to {limit}")
 
 
 def _check_derived(scenario: ScenarioFields) -> None:
     """Gaps that follow from time gaps, and an obstacle's distance that follows from its margin, are in range."""
     largest = QUANTITY.usual["gaps_m"].high
     for pair, (_, high) in enumerate(scenario.bounds("gaps_m") if scenario.time_gaps_s is not None else ()):
-        if not high <= largest:
-            right = f"is up to {high:g} m at the speed of vehicle_{pair + 2}; a gap must not be above {largest:g} m"
-            refuse(_path(scenario, "time_gaps_s", pair), scenario.quantities("time_gaps_s")[pair], right)
+        right = f"is up to {high:g} m at the speed of vehicle_{pair + 2}; a gap must not be above {largest:g} m"
+        require(high <= largest, _path(scenario, "time_gaps_s", pair), scenario.quantities("time_gaps_s")[pair], right)
     largest = QUANTITY.optional["obstacle_gap_m"].high
-    if scenario.obstacle_margin_m is not None and not scenario.farthest_obstacle_m <= largest:
-        farthest = f"puts the obstacle up to {scenario.farthest_obstacle_m:g} m ahead of vehicle_1"
-        right = f"{farthest}; that distance must not be above {largest:g} m"
-        refuse(("obstacle_margin_m",), scenario.obstacle_margin_m, right)
+    if scenario.obstacle_margin_m is not None:
+        farthest = scenario.farthest_obstacle_m
+        right = (
+            f"puts the obstacle up to {farthest:g} m ahead of vehicle_1; that distance must not be above {largest:g} m"
+        )
+        require(farthest <= largest, ("obstacle_margin_m",), scenario.obstacle_margin_m, right)
 
 
 def _check_scripts(scenario: ScenarioFields) -> None:
@@ -124,20 +124,16 @@ def _check_scripts(scenario: ScenarioFields) -> None:
         deceleration = ScriptSpec.parse(script).deceleration_mps2 or 0.0
         field = "braking_capacity_mps2" if deceleration > 0.0 else "driving_capacity_mps2"
         capacity = scenario.supports(field)[i][0]
-        if not abs(deceleration) <= capacity:
-            refuse(("roles", f"vehicle_{i + 1}"), script, f"is above this vehicle's {field}, {capacity:g} m/s2")
-    if 0 in scenario.learners and not scenario.has_obstacle:
-        right = (
-            "has nothing to lose without an obstacle ahead; give obstacle_gap_m too, for instance obstacle_gap_m: 42"
-        )
-        refuse(("roles", "vehicle_1"), LEARNER, right)
+        right = f"is above this vehicle's {field}, {capacity:g} m/s2"
+        require(abs(deceleration) <= capacity, ("roles", f"vehicle_{i + 1}"), script, right)
+    right = "has nothing to lose without an obstacle ahead; give obstacle_gap_m too, for instance obstacle_gap_m: 42"
+    require(0 not in scenario.learners or scenario.has_obstacle, ("roles", "vehicle_1"), LEARNER, right)
     for i, script in scenario.scripts.items() if scenario.early_impacts == "reject" and scenario.learners else ():
         spec = ScriptSpec.parse(script)
-        if not spec.is_state_free():
-            close = get_close_matches(spec.name, STATE_FREE, n=1)
-            hint = f"; did you mean {close[0]}?" if close else ""
-            right = f"with early_impacts: reject a script must be full_brake, coast or constant:a{hint}"
-            refuse(("roles", f"vehicle_{i + 1}"), script, right)
+        close = get_close_matches(spec.name, STATE_FREE, n=1)
+        hint = f"; did you mean {close[0]}?" if close else ""
+        right = f"with early_impacts: reject a script must be full_brake, coast or constant:a{hint}"
+        require(spec.is_state_free(), ("roles", f"vehicle_{i + 1}"), script, right)
 
 
 def _path(scenario: ScenarioFields, field: str, index: int, kind: int = 0) -> YamlPath:

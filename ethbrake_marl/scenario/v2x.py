@@ -35,7 +35,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.files.yaml import Document, FileModel, Wording, refuse
+from ethbrake_marl.files.yaml import Document, FileModel, Wording, require
 from ethbrake_marl.physics import Floats, Ints, Messages, Vehicles, Worlds
 
 PER_LINK = 4  # uniform numbers of one link: wait, burst, loss, hop; one Philox counter
@@ -91,9 +91,8 @@ _OF_MESSAGES = ("message_period_s", "loss_begins", "loss_ends", "radio_s", "proc
 
 
 def _known_preset(name: str) -> str:
-    if name not in CHANNELS:
-        *names, last = CHANNELS
-        refuse((), name, f"must be {', '.join(names)} or {last}")
+    *names, last = CHANNELS
+    require(name in CHANNELS, (), name, f"must be {', '.join(names)} or {last}")
     return name
 
 
@@ -126,9 +125,8 @@ class V2X(FileModel):
     @model_validator(mode="before")
     @classmethod
     def _by_name(cls, value: Any) -> Any:
-        if not isinstance(value, str | dict | V2X):
-            right = f"must be a preset ({', '.join(CHANNELS)}), or a mapping such as {{preset: nominal, lost: 0.1}}"
-            refuse((), value, right)
+        right = f"must be a preset ({', '.join(CHANNELS)}), or a mapping such as {{preset: nominal, lost: 0.1}}"
+        require(isinstance(value, str | dict | V2X), (), value, right)
         return {"preset": value} if isinstance(value, str) else value
 
     @model_validator(mode="after")
@@ -136,7 +134,7 @@ class V2X(FileModel):
         channel = self.channel
         sent = channel.hears != "none" and channel.timing != "latency"
         right = "nobody sends messages one by one here; give a preset that generates them, such as nominal"
-        _require(channel.persistence == "first" or sent, "persistence", self, right)
+        self._require(channel.persistence == "first" or sent, "persistence", right)
         if channel.hears == "none":
             self._leave_out(("link_latency_s", "lost", *_OF_MESSAGES), "hears none has no messages")
         elif channel.timing == "fixed":
@@ -148,20 +146,24 @@ class V2X(FileModel):
         if channel.senses == "none":
             self._leave_out(("sensing_s",), "senses none has nobody in sight")
         low, high = channel.sensing_s
-        _require(low <= high, "sensing_s", self, "low must not be above high")
+        self._require(low <= high, "sensing_s", "low must not be above high")
         silent = channel.timing == "messages" or channel.hears == "none" or channel.lost > 0.0
-        needs_sight = silent and (channel.timing != "latency")
+        blind = channel.senses == "none" and silent and channel.timing != "latency"
         right = (
             "without sight of the vehicle ahead, one that hears nothing would never react; use senses: both or front"
         )
-        at = "senses" if self.senses is not None else "lost"  # one that is given: only preset paper itself sees nobody
-        _require(channel.senses != "none" or not needs_sight, at, self, right)
+        # one that is given: only preset paper itself sees nobody
+        self._require(not blind, "senses" if self.senses is not None else "lost", right)
         return self
 
     def _leave_out(self, names: tuple[str, ...], why: str) -> None:
         """Refuse the first of these keys that is given: it would do nothing."""
         for name in names:
-            _require(getattr(self, name) is None, name, self, f"{why}; leave it out")
+            self._require(getattr(self, name) is None, name, f"{why}; leave it out")
+
+    def _require(self, holds: bool, name: str, right: str) -> None:
+        value = getattr(self, name)
+        require(holds, (name,), getattr(self.channel, name) if value is None else value, right)
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
@@ -229,15 +231,12 @@ class V2X(FileModel):
         channel, links = self.channel, u.reshape(n, N, N, PER_LINK)
         low, high = channel.sensing_s
         hop = low + (high - low) * links[..., 3]
-        heard = np.full((n, N, N), -np.inf) if channel.timing == "latency" else link_delays(channel, links)
-        if channel.timing == "latency":
-            heard[links[..., 2] < channel.lost] = np.inf
+        heard = link_delays(channel, links)
         receiver, sender = np.indices((N, N))
-        heard[:, (sender >= receiver) if channel.hears == "front" else np.full((N, N), channel.hears == "none")] = (
-            np.inf
-        )
+        unheard = {"all": sender < 0, "front": sender >= receiver, "none": sender >= 0}
+        heard[:, unheard[channel.hears]] = np.inf
         ahead = sender == receiver - 1
-        in_sight = {"both": ahead | (sender == receiver + 1), "front": ahead, "none": np.zeros((N, N), np.bool_)}
+        in_sight = {"both": ahead | (sender == receiver + 1), "front": ahead, "none": sender < 0}
         return heard, np.where(in_sight[channel.senses], hop, np.inf)
 
     def with_channel(self, worlds: Worlds, u: Floats, key: Floats, time_step_s: float) -> Worlds:
@@ -274,13 +273,6 @@ class V2X(FileModel):
         return self.with_channel(worlds, np.zeros((n, self.width(N))), np.zeros(n), time_step_s)
 
 
-def _require(holds: bool, name: str, v2x: V2X, right: str) -> None:
-    """Refuse the value of ``name`` unless ``holds``; ``right`` says what would do."""
-    if not holds:
-        value = getattr(v2x, name)
-        refuse((name,), v2x.channel._asdict()[name] if value is None else value, right)
-
-
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
     """Message periods k lost to a burst, in the shape of the uniform numbers ``u`` in [0, 1).
 
@@ -298,12 +290,14 @@ def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
 
 
 def link_delays(channel: Channel, u: Floats) -> Floats:
-    """The delay tau (s) of each link from its uniform numbers ``u`` [..., PER_LINK]; infinite where nothing arrives."""
-    delay = np.full(u.shape[:-1], channel.link_latency_s)
+    """The delay tau (s) of each link from its uniform numbers ``u`` [..., PER_LINK]; infinite where nothing arrives.
+
+    Where the receiver's own latency is all that counts, minus infinity.
+    """
+    delay = np.full(u.shape[:-1], -np.inf if channel.timing == "latency" else channel.link_latency_s)
     if channel.timing == "messages":
-        after_sending = channel.radio_s + channel.processing_s + channel.actuation_s
         periods = burst_periods(u[..., 1], channel.loss_begins, channel.loss_ends)
-        delay = (u[..., 0] + periods) * channel.message_period_s + after_sending
+        delay = (u[..., 0] + periods) * channel.message_period_s + channel.delay_s
     delay[u[..., 2] < channel.lost] = np.inf
     return delay
 

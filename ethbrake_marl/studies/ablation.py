@@ -18,19 +18,17 @@ from ethbrake_marl.agents import Agent, Driver, LearnedAgent, Team, make_agent
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, count_of
 from ethbrake_marl.evaluation import (
-    PROGRESS_EVERY,
     evaluate,
     interquartile_mean,
     load_runnable,
     mean_over_seeds,
     policy_sha256,
-    rate_over_seeds,
     result_identity,
     share_over_seeds,
-    write_output,
 )
 from ethbrake_marl.figures import Figure, ablation_figures, write_picture
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
+from ethbrake_marl.files.store import write_output
 from ethbrake_marl.files.yaml import Override
 from ethbrake_marl.learning import (
     WORDS,
@@ -260,7 +258,7 @@ class Plan:
             number, broken = chunks_left(level.scenario, part, budget=self.budget, chunks=self.optimum_folder(level))
             damaged += broken
             if number:
-                worlds = part.worlds.take(np.arange(min(_TIMED_WORLDS, part.worlds.n)))
+                worlds = part.worlds.take(np.arange(min(4, part.worlds.n)))
                 searching = partial(best_harm, level.scenario, budget=self.budget, threads=1)
                 search_s += number * Timed.each_s(worlds, searching)
         speed = f" at {decisions.total() / training_s:,.0f}/s" if training_s > 0.0 else ""
@@ -271,9 +269,6 @@ class Plan:
             f" together about {told(whole_s)} of one core"
         )
         return "\n".join([line, *(f"{file}: is damaged; its worlds are searched again" for file in damaged)])
-
-
-_TIMED_WORLDS = 4  # of the search
 
 
 def with_scheme(recipe: TrainingRecipe, scheme: str | None) -> TrainingRecipe:
@@ -490,7 +485,7 @@ def _drive(scenario: Scenario, sample: Sample, drivers: Sequence[Driver], tell: 
     """Harms of several drivers of one level on the same worlds."""
     outcomes = []
     for driver in drivers:
-        result = evaluate(sample, {driver.name: driver}, scenario=scenario, chunk=PROGRESS_EVERY).complete()
+        result = evaluate(sample, {driver.name: driver}, scenario=scenario).complete()
         outcomes.append(result.outcome(driver.name))
         tell(Progress(f"driving {driver.name}", sample.worlds.n, sample.worlds.n))
     ledgers = [outcome.ledger for outcome in outcomes]
@@ -498,7 +493,7 @@ def _drive(scenario: Scenario, sample: Sample, drivers: Sequence[Driver], tell: 
         {harm_count: np.stack([each.world_harm(harm_count) for each in ledgers]) for harm_count in HARM_COUNTS},
         {harm_count: np.stack([each.vehicle_harm(harm_count) for each in ledgers]) for harm_count in HARM_COUNTS},
         np.stack([outcome.collided for outcome in outcomes]),
-        tuple(outcome.named_policies for outcome in outcomes),
+        tuple(dict(outcome.policies) for outcome in outcomes),
     )
 
 
@@ -638,7 +633,7 @@ class LineQuestion:
             "decrease": share_over_seeds(own, worst, np.zeros_like(worst)),
             "best_known": best_known,  # in the worlds that were searched
             "share": share,  # of the joint optimum's reduction, there
-            "worse_off": rate_over_seeds((reached.vehicle[count] > braking.vehicle[count] + TOLERANCE).any(axis=2)),
+            "worse_off": mean_over_seeds((reached.vehicle[count] > braking.vehicle[count] + TOLERANCE).any(axis=2)),
         }
         return {
             **result_identity("generalise", scenario, sample),
@@ -680,10 +675,8 @@ class LineQuestion:
 def lengthen(scenario: Scenario, vehicles: int) -> Scenario:
     """The scenario with a line of ``vehicles``: shorter ones lose the rear, vehicle i > N is like vehicle i - 2.
 
-    All followers learn; Vehicle 1 keeps its role. Raises ``InvalidInput`` for fewer than 2 vehicles.
+    All followers learn; Vehicle 1 keeps its role.
     """
-    if not vehicles >= 2:
-        raise InvalidInput(f"line of {vehicles} vehicles: at least 2 are needed")
     given = scenario.model_dump(mode="json", exclude_unset=True)
     changes: dict[str, Any] = {"vehicles": vehicles, "name": f"{scenario.name}-n{vehicles}"}
     for key in (*QUANTITY.declared, "objective", "types"):
@@ -757,7 +750,7 @@ def _level(one: Measured, searched: int) -> Json:
         "learners": [scenario.vehicle_names[i] for i in scenario.learners],
         "seeds": len(one.reached.collided),
         "worlds": one.reached.collided.shape[1],
-        "collision_rate": rate_over_seeds(one.reached.collided).to_json(),
+        "collision_rate": mean_over_seeds(one.reached.collided).to_json(),
     }
     for harm_count in HARM_COUNTS:
         reached, braking = one.reached.world[harm_count], one.full_brake.world[harm_count]
@@ -794,10 +787,10 @@ def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: 
         "above_bound": int((shielded.harm > shielded.bound).sum()),
         "replaced": float(shielded.replaced.sum() / actions.sum()),
         "replaced_vehicles": (shielded.replaced.sum(axis=(0, 1)) / shielded.decisions.sum()).tolist(),
-        "stepped_in": rate_over_seeds((shielded.replaced > 0).any(axis=2)).to_json(),
+        "stepped_in": mean_over_seeds((shielded.replaced > 0).any(axis=2)).to_json(),
         "vehicles": [mean_over_seeds(column).to_json() for column in np.moveaxis(after - before, 2, 0)],
-        "worse_off": rate_over_seeds((after > before + TOLERANCE).any(axis=2)).to_json(),
-        "above_baseline": rate_over_seeds((after > shielded.baseline + TOLERANCE).any(axis=2)).to_json(),
+        "worse_off": mean_over_seeds((after > before + TOLERANCE).any(axis=2)).to_json(),
+        "above_baseline": mean_over_seeds((after > shielded.baseline + TOLERANCE).any(axis=2)).to_json(),
         "moving": int(shielded.moving.sum()),
         "searched": {"harm": mean_over_seeds(shielded.harm[:, :searched]).to_json()},
     }
@@ -814,7 +807,7 @@ def _change(before: Measured, after: Measured, algorithm: str) -> Json:
         found[harm_count] = {
             "difference": mean_over_seeds(after.reached.world[harm_count], before.reached.world[harm_count]).to_json(),
             "vehicles": [mean_over_seeds(new, old).to_json() for new, old in pairs],
-            "worse_off": rate_over_seeds(worse.any(axis=2)).to_json(),
+            "worse_off": mean_over_seeds(worse.any(axis=2)).to_json(),
             "worse_off_vehicles": [float(share) for share in worse.mean(axis=(0, 1))],
         }
     return found

@@ -22,7 +22,6 @@ from ethbrake_marl.agents import Driver, Team
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import InvalidInput, OnProgress, PhysicsError, Progress, one_line, unknown_name
 from ethbrake_marl.evaluation import (
-    PROGRESS_EVERY,
     check_agents,
     content_sha256,
     driving_policy,
@@ -33,10 +32,9 @@ from ethbrake_marl.evaluation import (
     relative_decrease,
     result_versions,
     worlds_sha256,
-    write_output,
 )
 from ethbrake_marl.files.sheet import DASH, Column, Estimate, Sheet
-from ethbrake_marl.files.store import read_plain
+from ethbrake_marl.files.store import read_plain, write_output
 from ethbrake_marl.files.yaml import FileModel, read_json_model
 from ethbrake_marl.limits import BestHarmTable, task_problem
 from ethbrake_marl.physics import Floats
@@ -281,7 +279,6 @@ def mean_of_lists(shares: Sequence[Estimate]) -> Estimate:
 
 
 REFERENCE = "full_brake"
-_SAME_HARM = 1e-6  # of means (m2/s2), relative or absolute: what another machine may round otherwise
 Count = Annotated[int, Field(ge=0)]
 
 
@@ -407,7 +404,6 @@ def _drive_list(
             {**make_lineup([REFERENCE], each.scenario), **lineup},
             scenario=each.scenario,
             seed=content.seed,
-            chunk=PROGRESS_EVERY,
             on_progress=tell,
             aftermath=False,
         ).complete()
@@ -419,7 +415,7 @@ def _drive_list(
         ("full braking", float(full.mean()), content.full_brake_harm),
         ("the best known", float(best.mean()), content.best_known_harm),
     ):
-        if not abs(found - frozen) <= _SAME_HARM * max(1.0, frozen):
+        if not abs(found - frozen) <= 1e-6 * max(1.0, frozen):  # what another machine may round otherwise
             raise InvalidInput(
                 f"list {each.name}: the harm of {what} is {found:.9g} m2/s2 here, {frozen:.9g} in the suite: this"
                 " version has another physics"
@@ -427,7 +423,7 @@ def _drive_list(
     return ListResult(
         worlds=content.worlds,
         worlds_sha256=content.worlds_sha256,
-        policies=outcome.named_policies,
+        policies=dict(outcome.policies),
         policy_seeds=seeds,
         knows=outcome.knows.text,
         realised_share=realised_share(harm, full, best),

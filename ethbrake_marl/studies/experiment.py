@@ -17,27 +17,23 @@ import numpy as np
 
 from ethbrake_marl.agents import Agent, LearnedAgent
 from ethbrake_marl.defaults import DEFAULT
-from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, count_of
+from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, check_one_learner, count_of
 from ethbrake_marl.evaluation import (
-    BASELINE,
-    PER_WORLD,
-    PROGRESS_EVERY,
     TESTS,
     Evaluation,
     SummaryRow,
     SummaryTable,
-    controlled_vehicle,
     evaluate,
     make_agents,
     other_tests,
     record_episode,
     results_to_json,
     summarise,
-    write_output,
     write_per_world,
 )
 from ethbrake_marl.figures import harm_against_total_gap, learning_curve, trajectories, write_picture
 from ethbrake_marl.files.sheet import csv_text
+from ethbrake_marl.files.store import write_output
 from ethbrake_marl.learning import (
     RunDirectory,
     RunStatus,
@@ -57,8 +53,6 @@ from ethbrake_marl.shield import HybridAgent
 # The results of an experiment beside its policy: CSV and JSON, every world, three figures and one page.
 
 BESIDE = ("full_brake", "e_v2x_bm")  # beside the policy: in its figures, and on the other two of the three tests
-BESIDE_EPISODES = 2_000  # at most so many worlds of each of these tests
-BASELINES = (*BESIDE, "e_v2x_bm:pairwise")
 RUNS = Path("runs")
 
 
@@ -128,7 +122,7 @@ def learned_name(evaluation: Evaluation) -> str:
 
 def telling_world(evaluation: Evaluation) -> int:
     """Row of the world to draw: median saving of the policy among the worlds where full braking harms, else row 0."""
-    before = evaluation.outcome(BASELINE).first_impact_harm
+    before = evaluation.outcome(BESIDE[0]).first_impact_harm
     rows = np.flatnonzero(before > 0.0)
     if not len(rows):
         return 0
@@ -149,6 +143,7 @@ class ExperimentResult:
     steps: int
     rows: SummaryTable
     report: Path
+    per_world: Path
     beside: Mapping[str, SummaryTable] = field(default_factory=dict)  # by test: the other two of the three tests
 
 
@@ -204,7 +199,8 @@ def run_experiment(
     """
     started = time.monotonic()
     tell = on_progress or (lambda progress: None)
-    vehicle = controlled_vehicle(scenario, None)
+    names = [scenario.vehicle_names[i] for i in scenario.learners]
+    check_one_learner(scenario.name, names, "say which vehicle the agents drive")
     sample = scenario.sample(episodes, list_seed)
     trained = train(
         recipe,
@@ -230,9 +226,7 @@ def run_experiment(
             sample,
             agents,
             scenario=scenario,
-            vehicle=vehicle,
             seed=list_seed,
-            chunk=PROGRESS_EVERY,
             on_progress=lambda name, done: tell(Progress(name, done, total)),
         )
         others, done = other_tests(scenario), count()
@@ -245,12 +239,12 @@ def run_experiment(
         rows = summarise(evaluation)
         beside: dict[str, SummaryTable] = {}
         for other in others:  # the policy was trained on ``scenario`` alone
-            part = other.sample(min(episodes, BESIDE_EPISODES), list_seed)
+            part = other.sample(min(episodes, 2_000), list_seed)
             begin(f"the same policy on {other.name}: {count_of(part.worlds.n, 'world')}")
             driven = evaluate(part, _agents(trained.policy, other, BESIDE), scenario=other, seed=list_seed)
             beside[other.name] = summarise(driven)
         begin("results and figures")
-        per_world = run.path / PER_WORLD
+        per_world = run.path / "per_world.csv"
         write_per_world(per_world, evaluation, force=True)
         write_results(run.path, "results", rows, per_world)
         if beside:
@@ -258,10 +252,12 @@ def run_experiment(
         wall_s = time.monotonic() - started
         report = _show(run, evaluation, rows, beside, trained, agents, begin, wall_s=wall_s)
         begin("")
-    return ExperimentResult(run.path, trained.status, trained.steps, rows, report, beside)
+    return ExperimentResult(run.path, trained.status, trained.steps, rows, report, per_world, beside)
 
 
-def _agents(policy: Policy, scenario: Scenario, baselines: Sequence[str] = BASELINES) -> dict[str, Agent]:
+def _agents(
+    policy: Policy, scenario: Scenario, baselines: Sequence[str] = (*BESIDE, "e_v2x_bm:pairwise")
+) -> dict[str, Agent]:
     """The baselines, the policy alone (``ppo`` or ``sac``), and the policy behind its shield (``hybrid``)."""
     name = policy.manifest.algorithm
     learned: dict[str, Agent] = {

@@ -37,7 +37,7 @@ from ethbrake_marl.errors import (
     naming_extras,
     one_line,
 )
-from ethbrake_marl.evaluation import BLOCK, Asked, Tally, evaluate
+from ethbrake_marl.evaluation import Question, Tally, evaluate
 from ethbrake_marl.files.plugins import Plugin, load_the_same, loaded_plugins
 from ethbrake_marl.files.store import (
     check_writable,
@@ -384,7 +384,6 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any], inside: str 
 
 # Trainings as jobs: one that is finished is kept, one that is begun goes on; what it costs.
 
-_UPDATES = 4  # of the training that is timed; the first one does not count
 TIMED_DRIVES = 50  # worlds that the timed policy drives
 
 
@@ -451,7 +450,7 @@ class TrainingJob:
         with tempfile.TemporaryDirectory(prefix="ethbrake-") as folder:
             path = Path(folder) / "timed"
             train(short, scenario, path, steps=1)  # compiles and warms up
-            train(short, scenario, path, steps=_UPDATES * self.per_update, force=True, on_progress=told.append)
+            train(short, scenario, path, steps=4 * self.per_update, force=True, on_progress=told.append)
             updates = [one for one in told if one.updates >= 1]
             last = updates[-1]
             first = updates[0] if updates[0].done < last.done else Progress("begun", 0, 0)
@@ -634,8 +633,6 @@ def _end_with(parent: BaseProcess) -> None:
 # A Ray cluster, or a Ray of this machine alone that nobody else can reach.
 
 _LOCAL = "local"
-_LOOK_S = 10.0  # between two looks at how large the cluster is
-_AHEAD = 2  # jobs per core that Ray holds: one runs, one waits
 
 
 class RayWorkers:
@@ -667,9 +664,9 @@ class RayWorkers:
 
     def room(self) -> int:
         """So many that no core has to wait for us, however many join the cluster or leave it."""
-        if time.monotonic() - self._looked > _LOOK_S:
+        if time.monotonic() - self._looked > 10.0:
             self._cores, self._looked = int(self._ray.cluster_resources().get("CPU", 0)), time.monotonic()
-        most = _AHEAD * self._cores if self._most is None else self._most
+        most = 2 * self._cores if self._most is None else self._most  # on each core one runs, one waits
         return most - len(self._running)
 
     def begin(self, number: int, call: bytes) -> None:
@@ -748,14 +745,14 @@ def open_workers(ray: str | None, jobs: int | None) -> Workers:
 
 
 def evaluate_shards(
-    asked: Asked,
+    asked: Question,
     *,
     shards: int,
     jobs: int = 1,
     workers: Workers | None = None,
     folder: Path | None = None,
     with_rows: bool = False,
-    block: int = BLOCK,
+    block: int = 4_000,
     tell: OnProgress | None = None,
 ) -> Tally:
     """The merged tally of all worlds of a list; the same bits whatever ``shards``, ``jobs`` and ``block`` are.
@@ -770,11 +767,11 @@ def evaluate_shards(
         block: worlds advanced together, a multiple of 1,000.
         tell: is told the worlds done so far.
 
-    Raises what ``Asked.answer`` and ``JobFolder.work`` raise, ``WorkerLost`` where a shard was lost again and again.
+    Raises what ``Question.answer`` and ``JobFolder.work`` raise, ``WorkerLost`` where a shard was lost again and again.
 
     """
     run, note = run_jobs, ""
-    bounds = {f"{first:013d}-{end:013d}": (first, end) for first, end in asked.question.bounds(shards)}
+    bounds = {f"{first:013d}-{end:013d}": (first, end) for first, end in asked.bounds(shards)}
     files = {} if folder is None else {name: folder.absolute() / f"worlds-{name}.parquet" for name in bounds}
     done: dict[str, Any] = {}
     with ExitStack() as stack:
@@ -799,7 +796,7 @@ def evaluate_shards(
 
         def say(note: str = "") -> None:
             if tell is not None:
-                tell(Progress("worlds", worlds, asked.question.episodes, note=note))
+                tell(Progress("worlds", worlds, asked.episodes, note=note))
 
         def take(job: Job, found: dict[str, Any]) -> None:
             nonlocal whole, worlds
@@ -818,7 +815,7 @@ def evaluate_shards(
         return whole
 
 
-def _answer(asked: Asked, first: int, end: int, rows: Path | None, block: int) -> dict[str, Any]:
+def _answer(asked: Question, first: int, end: int, rows: Path | None, block: int) -> dict[str, Any]:
     tally = asked.answer(first, end, rows, block)
     size = None if rows is None else rows.stat().st_size
     return {"first": first, "end": end, "rows_bytes": size, "tally": tally.to_json()}

@@ -29,11 +29,9 @@ from ethbrake_marl.agents import Agent, LearnedAgent
 from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, count_of, plain_text, unknown_name
 from ethbrake_marl.evaluation import (
     PAPER_ROWS,
-    PROGRESS_EVERY,
     EpisodeRecord,
     Evaluation,
     PaperRow,
-    check_target,
     evaluate,
     interquartile_mean,
     make_agents,
@@ -43,7 +41,6 @@ from ethbrake_marl.evaluation import (
     record_episode,
     relative_decrease,
     unpaired_difference,
-    write_output,
 )
 from ethbrake_marl.figures import (
     Figure,
@@ -57,7 +54,7 @@ from ethbrake_marl.figures import (
     write_picture,
 )
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown, csv_text as csv_of
-from ethbrake_marl.files.store import read_plain, write_file
+from ethbrake_marl.files.store import check_target, read_plain, write_file, write_output
 from ethbrake_marl.learning import RunDirectory, TrainingRecipe, load_recipe, read_object
 from ethbrake_marl.limits import Unproven
 from ethbrake_marl.pages.page import Page, Part, Played, Section, anchors, shown
@@ -84,8 +81,6 @@ HOW_JUDGED = (
     f" {100.0 * WIDE:g} %, and cannot agree where a bound that holds for every strategy excludes it. Statements are"
     " those of the paper's text; its figures hold no printed numbers."
 )
-_MOST_NAMED = 2
-_PLURAL = {"agrees": "agree", "differs": "differ"}
 _WRITTEN = ConfigDict(strict=True, extra="forbid")  # what a file holds, and nothing else
 
 
@@ -187,7 +182,7 @@ class Less:
 def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False, show: Column = HARM) -> Verdict:
     """Whether every comparison of a statement comes out below 0, or at most 0, by its interval."""
     compared, ties = [part for part in parts if not part.neither], [part.where for part in parts if part.neither]
-    places = ", ".join(ties) if len(ties) <= _MOST_NAMED else f"{len(ties)} more"
+    places = ", ".join(ties) if len(ties) <= 2 else f"{len(ties)} more"
     if not compared:
         return Verdict(what, "agrees", f"nothing to undercut: both are 0 in {places}")
     highest = [part.difference.ends[1] for part in compared]
@@ -220,7 +215,8 @@ def summarise_verdicts(verdicts: Sequence[Verdict]) -> Verdict:
     if not verdicts:
         return Verdict("all", "not run", "nothing was compared")
     counted = {outcome: sum(each.outcome == outcome for each in verdicts) for outcome in get_args(Judgement)}
-    told = [f"{n} {_PLURAL.get(outcome, outcome) if n > 1 else outcome}" for outcome, n in counted.items() if n]
+    plural = {"agrees": "agree", "differs": "differ"}
+    told = [f"{n} {plural.get(outcome, outcome) if n > 1 else outcome}" for outcome, n in counted.items() if n]
     first = next(each for outcome in counted for each in verdicts if each.outcome == outcome)
     lead = "" if len(verdicts) == 1 else f"of {len(verdicts)} comparisons {', '.join(told)}; "
     return Verdict("all", first.outcome, f"{lead}{first.what}: {first.because}")
@@ -577,8 +573,7 @@ class Reading:
         return found.replace(latency_s=[first, self.acts_s, *others])
 
 
-AS_STATED = Reading("as stated")
-READINGS = (AS_STATED, Reading("Vehicle 2 acts at 0.2 s", 0.2))
+READINGS = (Reading("as stated"), Reading("Vehicle 2 acts at 0.2 s", 0.2))
 
 
 def lineup(scenario: Scenario, *specs: str) -> dict[str, Agent]:
@@ -593,7 +588,6 @@ def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, s
         agents,
         scenario=scenario,
         seed=LIST_SEED,
-        chunk=PROGRESS_EVERY,
         aftermath=False,
         on_progress=lambda name, done: settings.tell(Progress(scenario.name, done, episodes)),
     )
@@ -617,7 +611,6 @@ def harms(evaluation: Evaluation) -> dict[str, Floats]:
 
 STOPPED, OPEN = "stopped", "open"
 CURVES = {delay: (delay, f"{delay}-ppo-paper", f"{delay}-sac-paper") for delay in ("low", "high")}  # -> groups
-_SEEDS = 3
 _HARM = "eval/first_impact_harm"  # column of a training's table
 _STATED_STATE = (  # positions and speeds of all, and the others' actions: no more is in the paper's state
     "own.speed", "own.acceleration", "front_1.gap", "front_1.closing_speed", "front_1.acceleration", "rear_1.gap",
@@ -652,8 +645,6 @@ class TrainedRecipe:
 
 
 PPO_PAPER = TrainedRecipe("ppo-paper", 100_000, 1, 5_000)
-_OURS = (TrainedRecipe("ppo", 400_000, 4, 16_000), TrainedRecipe("sac", 60_000, 30, 3_000))
-_SAC_PAPER = TrainedRecipe("sac-paper", 20_000, 1_000, 170)
 _EARLY = TrainedRecipe("ppo", 100_000, 4, 16_000)  # a fifteenth of the recipe's own number
 
 
@@ -680,16 +671,16 @@ def groups() -> dict[str, Group]:
 
     def curves(suffix: str, *recipes: TrainedRecipe) -> list[Group]:
         trained = {each.recipe: (each, each.load(each.recipe)) for each in recipes}
-        return [Group(f"{delay}{suffix}", f"paper-delay-{delay}", trained, _SEEDS) for delay in CURVES]
+        return [Group(f"{delay}{suffix}", f"paper-delay-{delay}", trained, 3) for delay in CURVES]
 
     found = [
         Group(STOPPED, "paper-random", {"ppo-stopped": (_EARLY, _EARLY.load("ppo-stopped"))}, 1),
-        *curves("", *_OURS),
+        *curves("", TrainedRecipe("ppo", 400_000, 4, 16_000), TrainedRecipe("sac", 60_000, 30, 3_000)),
         *curves("-ppo-paper", PPO_PAPER),
         Group(
             OPEN, "paper-random", {name: (PPO_PAPER, PPO_PAPER.load(name, **own)) for name, own in variants.items()}, 2
         ),
-        *curves("-sac-paper", _SAC_PAPER),
+        *curves("-sac-paper", TrainedRecipe("sac-paper", 20_000, 1_000, 170)),
     ]
     return {group.name: group for group in found}
 
@@ -721,7 +712,6 @@ def hybrid(policy: Policy, scenario: Scenario, bound: Bound) -> Agent:
 # The paper's learning curves at high and low delay (``fig:ppo_sac_high_latency``, ``fig:ppo_sac_low_latency``).
 
 HIGH, LOW = "high", "low"
-_WORLDS = 2_000
 _PAIRS = {  # stem of the figure -> recipes, and what is about them
     "ours": ("ppo", "sac", "our recipes", "our recipes"),
     "paper": (
@@ -735,7 +725,7 @@ _NUMBER, _DECISIONS = Column("Final return", digits=3), Column("Decisions", digi
 
 def _shipped_ends(settings: Reproduction) -> Made:
     """What finished policies reach at both delays, in both readings of when Vehicle 2 acts."""
-    episodes = min(_WORLDS, settings.episodes)
+    episodes = min(2_000, settings.episodes)
     verdicts, rows, data = [], [], []
     for reading in READINGS:
         scenarios = {delay: reading.scenario(f"paper-delay-{delay}") for delay in (LOW, HIGH)}
@@ -1283,10 +1273,6 @@ def _beside_printed(
 
 _RANDOM, _HYBRID_WORLDS, _RANDOM_WORLDS, _KINDS = "paper-random", 5_000, 10_000, ("SAC", "PPO")
 _ALONE, _REALISED, _AS_PRINTED = "policy alone", "hybrid, realised H*", "hybrid, predicted H*"
-_UNCONVERGED = (
-    "The paper does not describe its policy that has not converged. The rows of Standalone DRL and Hybrid are of ours:"
-    " whether they agree depends on when a training is stopped."
-)
 
 
 def _drive_hybrid(name: str, settings: Reproduction, reading: Reading) -> Evaluation:
@@ -1355,7 +1341,11 @@ def reproduce_hybrid_table(settings: Reproduction) -> Made:
         list_parameter(episodes, "5,000, text to Table:hybrid" if episodes == _HYBRID_WORLDS else ""),
     ]
     arithmetic = [selection_verdict(*(printed[agent] for agent in ours))]
-    return _beside_printed("hybrid-table", list(printed.values()), besides, arithmetic, parameters, [_UNCONVERGED])
+    note = (
+        "The paper does not describe its policy that has not converged. The rows of Standalone DRL and Hybrid are of"
+        " ours: whether they agree depends on when a training is stopped."
+    )
+    return _beside_printed("hybrid-table", list(printed.values()), besides, arithmetic, parameters, [note])
 
 
 def reproduce_random_table(settings: Reproduction) -> Made:
@@ -1463,7 +1453,6 @@ GAPS = (
 )  # fmt: skip
 
 
-_GAP_WORLDS = 2_000
 _SPECS = (FULL_BRAKE, PAIRWISE, COUPLED, PPO)
 _SHOWN = tuple(NAMES[spec] for spec in _SPECS)
 
@@ -1486,7 +1475,7 @@ class Headline:
 
 def reproduce_gaps(settings: Reproduction) -> Made:
     """The sensitivity table: every quantity, our default, alternatives, and how far the headline moves."""
-    episodes, scenario = min(_GAP_WORLDS, settings.episodes), load_scenario(_RANDOM)
+    episodes, scenario = min(2_000, settings.episodes), load_scenario(_RANDOM)
     base = _measure(scenario, Alternative("default"), episodes)
     measured = [gap for gap in GAPS if gap.alternatives]
     found: dict[tuple[Gap, Alternative], Headline] = {}
@@ -1588,12 +1577,7 @@ def _measure(scenario: Scenario, alternative: Alternative, episodes: int) -> Hea
         agents[NAMES[PPO]] = hybrid(load_shipped("ppo"), own, alternative.bound)
     seed = LIST_SEED if alternative.seed is None else alternative.seed
     evaluation = evaluate(
-        own.sample(episodes, seed),
-        agents,
-        scenario=own,
-        seed=seed,
-        chunk=PROGRESS_EVERY,
-        aftermath=alternative.harm == "sampled",
+        own.sample(episodes, seed), agents, scenario=own, seed=seed, aftermath=alternative.harm == "sampled"
     )
     harm = {}
     for name, outcome in evaluation.outcomes.items():
@@ -1610,7 +1594,6 @@ def _measure(scenario: Scenario, alternative: Alternative, episodes: int) -> Hea
 _AGENTS = (PPO, SAC, COUPLED, FULL_BRAKE)
 _POLICIES = (NAMES[PPO], NAMES[SAC])
 _SCENARIOS = (1, 2)
-_GRID_S = 0.02
 _CELLS = [(reading, number) for reading in READINGS for number in _SCENARIOS]
 
 Records = dict[tuple[Reading, int, str], EpisodeRecord]  # reading, scenario, strategy
@@ -1736,7 +1719,7 @@ def _parameters() -> list[Parameter]:
 def _both(records: Records, reading: Reading, number: int, what: str, column: int) -> tuple[Floats, Floats]:
     """A column of PPO's and SAC's record at equal times until the later one ends; beyond its end it stays."""
     pair = [records[reading, number, name] for name in _POLICIES]
-    times = np.arange(0.0, float(max(record.time_s[-1] for record in pair)), _GRID_S)
+    times = np.arange(0.0, float(max(record.time_s[-1] for record in pair)), 0.02)
     one, other = (np.interp(times, each.time_s, getattr(each, what)[:, column]) for each in pair)
     return one, other
 
@@ -1915,7 +1898,6 @@ def checked_result(content: Mapping[str, Any], where: Path | str, name: str) -> 
 _TITLE = "The paper, made again"
 _PAPER = "How to Brake? Ethical Emergency Braking with Deep Reinforcement Learning"
 _LEAD = f" of {_PAPER}, with the paper's numbers and statements. {HOW_JUDGED}"
-_LOAD = r", load [0-9.]+"  # of the machine, which differs from item to item
 _NUMERAL = re.compile(r"[-+−]?\d[\d,.]*( ?%)?|–|")
 
 
@@ -1930,7 +1912,8 @@ def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
     names = [] if every else [result.name for result in results]
     mode = "--full" if any(result.mode == "full" for result in results) else "--quick"
     command = ["ethbrake reproduce", *names, mode, *(["--episodes", str(most)] if fewer else [])]
-    machines = (f"{each.made_utc[:10]}, {re.sub(_LOAD, '', each.machine)}" for each in results)
+    unloaded = [re.sub(r", load [0-9.]+", "", each.machine) for each in results]  # the load differs item by item
+    machines = (f"{each.made_utc[:10]}, {machine}" for each, machine in zip(results, unloaded, strict=True))
     seconds = sum(each.processor_s for each in results)
     return (
         f"Every figure and table{_LEAD}" if every else f"{len(results)} of the {len(ITEMS)} items{_LEAD}",
@@ -2002,9 +1985,6 @@ def _outcome(word: str) -> Markup:
 
 
 FIGURES, PREFIX = "figures", "reproduction-"  # of the figures beside docs/reproduction.md
-_WIDTH = 99  # characters of a line
-_LONG_TABLE = 12  # rows
-_PLACES = "--output runs/reproduction --docs docs/reproduction.md"
 
 
 def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
@@ -2031,7 +2011,7 @@ def docs_page(results: Sequence[Result]) -> str:
         f"# {_TITLE}",
         "What comes out where the paper's experiments are made again, and where it cannot?",
         _wrapped(lead),
-        _wrapped(f"Made by `{command} {_PLACES}` ({_escaped(made)})."),
+        _wrapped(f"Made by `{command} --output runs/reproduction --docs docs/reproduction.md` ({_escaped(made)})."),
         _wrapped(
             "The page, its figures and `reproduction.json`, which holds the same as data, are written by that command"
             " and not by hand; `ethbrake reproduce` makes them again without training. [The paper, line by line]"
@@ -2061,7 +2041,7 @@ def docs_page(results: Sequence[Result]) -> str:
         ]
         for title, head, rows, note in tables:
             lines = _table([*map(_escaped, head)], [[*map(_escaped, row)] for row in rows])
-            if len(rows) > _LONG_TABLE:
+            if len(rows) > 12:
                 lines = f"<details>\n<summary>{len(rows)} rows</summary>\n\n{lines}\n\n</details>"
             blocks += [f"### {_escaped(title)}", lines, *([_wrapped(_escaped(note))] if note else [])]
     return "\n\n".join(blocks) + "\n"
@@ -2074,7 +2054,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def _wrapped(text: str) -> str:
     """A paragraph in lines of the pages' width; no line of it begins a list or a heading."""
-    lines = textwrap.wrap(text, _WIDTH, break_long_words=False, break_on_hyphens=False)
+    lines = textwrap.wrap(text, 99, break_long_words=False, break_on_hyphens=False)
     return "\n".join(re.sub(r"^(?=[-+#>] )", r"\\", line) for line in lines)
 
 

@@ -242,10 +242,8 @@ def _start_seconds(effort: Effort) -> Floats:
     return np.sort(found[1:])
 
 
-_OPTIMUM = "one optimum per world"
 _BRAKING = "first decision to rest in steps of 0.1 s; Vehicle 2 brakes with {:.0%} of its capacity, all others fully"
 _DRIVING = "Vehicle 2 brakes with 75% of its capacity; new episodes as old ones end"
-_FRESH = "a fresh interpreter: import, parallel_env, reset, step; kernels compiled before"
 
 
 def _rate_of(
@@ -266,12 +264,19 @@ BENCHMARKS: tuple[Benchmark, ...] = (
     _rate_of("engine step", _DRIVING, stepping, 4096, 8e6),
     _rate_of("Stable-Baselines3 VecEnv", _DRIVING, vec_env, 512, 4e6),
     _rate_of("PettingZoo parallel", "whole episodes, resets included", parallel, 1, 80e3),
-    Benchmark("import and first step", _FRESH, "s", 1, 2.0, _start_seconds),
+    Benchmark(
+        "import and first step",
+        "a fresh interpreter: import, parallel_env, reset, step; kernels compiled before",
+        "s",
+        1,
+        2.0,
+        _start_seconds,
+    ),
     _rate_of("sampling", "a list of worlds, refused draws included", _sampling, 10_000, unit="worlds/s"),
     _rate_of(
         "E-V2X-BM pairwise", "one optimum per world", partial(_optimise, optimise_pairwise), 10_000, unit="worlds/s"
     ),
-    _rate_of("E-V2X-BM coupled", _OPTIMUM, partial(_optimise, optimise_coupled), 1000, unit="worlds/s"),
+    _rate_of("E-V2X-BM coupled", "one optimum per world", partial(_optimise, optimise_coupled), 1000, unit="worlds/s"),
     _rate_of("forecast", "16 constant commands per world, to the horizon", _forecast, 1000, unit="runs/s"),
 )
 

@@ -134,7 +134,6 @@ RESULTS = (
     *(f"last_{name}" for name in _MEASURED),  # of the last one
     "policy_sha256",  # of the kept policy's manifest, of several vehicle_i=... each
 )
-_FREE_S = 60.0  # a worker that has lost its driver may hold the folder for a moment
 
 
 def reach_results(job: TrainingJob, log: Path, stop_at: StopAt | None = None) -> list[str] | None:
@@ -152,7 +151,7 @@ def reach_results(job: TrainingJob, log: Path, stop_at: StopAt | None = None) ->
     with _printing_to(log):
         run = RunDirectory(job.folder)
         if run.status.is_file():
-            run.wait_for_others(_FREE_S)
+            run.wait_for_others(60.0)  # a worker that has lost its driver may hold the folder for a moment
             run.check_same(job.training)
             bundles = [job.folder / place for place in job.training.drivers.values()]
             if run.is_finished and not all(map(Policy.stands_in, bundles)):
@@ -723,7 +722,6 @@ _NOT_SEARCHED = {  # key -> why; what is inside it, too
     "checkpoint_every_updates": "it changes no result",
     "reward.harm_count": "it says which harm is least; give it in set",
 }
-_NOT_SET = ("seed", "evaluation")
 _TRIED = 200  # points of the space that are checked before anything starts
 # inside the tuning's folder; no time and no place stands in the table: with one worker it is the same, byte for byte,
 # however often it was stopped
@@ -760,7 +758,7 @@ class TuningPlan:
                 _check_searched(key, recipe, file)
         for key in file.settings:
             with at(("set", key)):
-                if key.removeprefix("recipe.").partition(".")[0] in _NOT_SET:
+                if key.removeprefix("recipe.").partition(".")[0] in ("seed", "evaluation"):
                     raise InvalidInput(f"set.{key}: is no setting here; give seed and measure beside it")
         asked = file.scenario, file.recipe, _texts_of(file.settings)
         try:
@@ -1003,7 +1001,6 @@ _STATES: dict[str, State] = {
     "FAIL": "failed",
 }
 _HASH, _RESULTS, _REASON = "hash", "results", "reason"  # what we note of a trial in the storage
-_DIGITS = 32  # of a study's name
 
 
 @dataclass(frozen=True, slots=True)
@@ -1041,7 +1038,7 @@ class TuningStudy:
             backend = optuna.storages.journal.JournalFileBackend(str(journal))
             self._study = optuna.create_study(
                 storage=optuna.storages.JournalStorage(backend),
-                study_name=f"ethbrake-{identity[:_DIGITS]}",
+                study_name=f"ethbrake-{identity[:32]}",
                 pruner=pruner,
                 direction="minimize",
                 load_if_exists=True,

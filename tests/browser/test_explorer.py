@@ -15,9 +15,9 @@ import pytest
 
 from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.evaluation import Evaluation, evaluate
-from ethbrake_marl.evaluation.inputs import make_lineup
+from ethbrake_marl.evaluation.inputs import make_agents, make_lineup
 from ethbrake_marl.physics import Worlds
-from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.scenario import Scenario, Task, load_scenario
 
 pytestmark = pytest.mark.slow  # what the server answers is tried without a browser, too
 
@@ -240,7 +240,7 @@ def test_profile__is_drawn_by_hand_and_beats_the_policy(open_explorer: Open, sce
     from ethbrake_marl.pages.explorer import Explored, HandDriven, outcome, read_profile
 
     world = scenario.sample(1, DEFAULT.LIST_SEED, first=1).worlds
-    explored = Explored(scenario, make_lineup(["full_brake"], scenario))
+    explored = Explored(Task(scenario, scenario.learners), make_agents(["full_brake"], scenario))
     expected = outcome("by hand", explored.follow(world, HandDriven(read_profile(commands), scenario.time_step_s)))
     assert drawn == (expected["impacts"], expected["first"], expected["total"])
 

@@ -134,7 +134,7 @@ def test_evaluate_report__its_passports_can_be_replayed(ethbrake, tmp_path):
     assert len(passports) == len(set(passports)) == 24
     for passport in (passports[0], passports[-1]):
         assert "bit for bit" in ethbrake("watch", "replay", passport).out
-    assert "Modes of the shield" in text
+    assert "minus episode mode" in text
     refused = ethbrake("evaluate", "--episodes", "1", "--report", page)
     assert refused.status == 2 and "--force" in refused.err
     assert ethbrake("evaluate", "--episodes", "1", "--report", tmp_path / "report.pdf").status == 2

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.evaluation import measures
-from ethbrake_marl.evaluation.measures import Between, proven_of_table, shipped_bounds, shipped_sheet
+from ethbrake_marl.evaluation.measures import Between, proven_of_table, shipped_bounds
 from ethbrake_marl.limits.limits import BestHarmTable, shipped_tables
 from ethbrake_marl.scenario import Task, load_scenario
 
@@ -31,7 +31,7 @@ def test_between__by_hand() -> None:
 
 
 def test_shipped__stress_wide_has_a_loose_proof_and_says_so() -> None:
-    (found,) = shipped_bounds([shipped("stress-wide")])
+    (found,), sheet = shipped_bounds([shipped("stress-wide")])
     assert (found["worlds"], found["list_seed"]) == (5000, 7)
     assert found["gap_first"] == pytest.approx(0.057, abs=5e-4)
     assert found["gap_total"] == pytest.approx(0.122, abs=5e-4)
@@ -40,22 +40,22 @@ def test_shipped__stress_wide_has_a_loose_proof_and_says_so() -> None:
     assert proven["contact_proven_rate"] - proven["impact_proven_rate"] == pytest.approx(inside["rate"])
     assert inside["mean_first"] > 0.9  # nobody leans there
     assert inside["harmless_rate"] < 0.55
-    (_, _, line) = shipped_sheet([found]).markdown().splitlines()
+    (_, _, line) = sheet.markdown().splitlines()
     assert "| 5.7 % |" in line and "| 12.2 % |" in line
     assert json.loads(json.dumps(found))["proven"]["between"]["rate"] == inside["rate"]
 
 
 def test_shipped__in_the_papers_lists_leaning_explains_what_is_between() -> None:
-    (found,) = shipped_bounds([shipped("paper-delay-low")])
+    (found,), _ = shipped_bounds([shipped("paper-delay-low")])
     assert found["proven"]["between"]["mean_first"] < 0.03
 
 
 def test_shipped__every_table_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     few = [replace_header(table, episodes=20) for table in shipped_tables()]
     monkeypatch.setattr(measures, "shipped_tables", lambda: few)
-    found = shipped_bounds()
+    found, sheet = shipped_bounds()
     assert [one["scenario"] for one in found] == [table.header["scenario"] for table in shipped_tables()]
-    assert len(shipped_sheet(found).markdown().splitlines()) == 2 + len(found)
+    assert len(sheet.markdown().splitlines()) == 2 + len(found)
 
 
 def replace_header(table: BestHarmTable, **changes: object) -> BestHarmTable:
@@ -65,9 +65,9 @@ def replace_header(table: BestHarmTable, **changes: object) -> BestHarmTable:
 def test_shipped__where_nothing_is_proven_the_reason_stands_there(monkeypatch: pytest.MonkeyPatch) -> None:
     table = replace_header(shipped("paper-delay-low"), episodes=5)
     monkeypatch.setattr(measures, "unproven_because", lambda *_: "an obstacle stands ahead of vehicle_1")
-    (found,) = shipped_bounds([table])
+    (found,), sheet = shipped_bounds([table])
     assert found["proven"] is None and found["gap_first"] is None
-    assert "an obstacle stands ahead" in shipped_sheet([found]).markdown().splitlines()[2]
+    assert "an obstacle stands ahead" in sheet.markdown().splitlines()[2]
 
 
 def test_proven__of_a_table_leaves_out_what_cannot_be_advanced() -> None:

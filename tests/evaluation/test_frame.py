@@ -14,7 +14,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput, MissingExtra, UnknownName
-from ethbrake_marl.evaluation.results import check_per_world, read_harms, write_per_world
+from ethbrake_marl.evaluation.results import read_harms, write_per_world
 
 SCENARIO = eb.load_scenario("paper-random")
 
@@ -66,11 +66,13 @@ def test_frame__of_the_library_itself_has_a_row_per_agent_and_world(evaluation: 
     )
 
 
-def test_parquet__without_pyarrow_names_the_extra(evaluation: eb.Evaluation, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parquet__without_pyarrow_names_the_extra(
+    evaluation: eb.Evaluation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MissingExtra, match=r"pyarrow, which is not installed: .*pip install 'ethbrake-marl\[data\]'"):
-        check_per_world("worlds.parquet")
-    check_per_world("worlds.csv")
+        write_per_world(tmp_path / "worlds.parquet", evaluation)
+    write_per_world(tmp_path / "worlds.csv", evaluation)
 
 
 def test_parquet__holds_what_the_csv_file_holds(evaluation: eb.Evaluation, tmp_path: Path) -> None:

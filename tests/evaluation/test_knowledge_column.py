@@ -56,13 +56,13 @@ def terminal(result: Evaluation) -> str:
 
 def told(result: Evaluation) -> tuple[str, ...]:
     """Everything that is written about a result for people."""
-    return terminal(result), summarise(result).markdown(), Report("Mine", summarise(result)).html
+    return terminal(result), summarise(result).markdown(), Report("Mine", summarise(result), result).html
 
 
 def test_knowledge__is_a_column_of_every_table(clear: Evaluation) -> None:
     rows = summarise(clear)
     assert [row.to_json()["knows"] for row in rows] == [*KNOWN, "not stated"]
-    for text in (rows.markdown(), Report("Mine", rows).html, terminal(clear)):
+    for text in (rows.markdown(), Report("Mine", rows, clear).html, terminal(clear)):
         for spec, known in (*zip(SPECS, KNOWN, strict=True), ("mine", "not stated")):
             assert spec in text and known in text
     lines = rows.markdown().splitlines()
@@ -96,7 +96,7 @@ def test_knowledge__where_nothing_is_hidden_nobody_is_marked(v2x: object) -> Non
 
 
 def hidden_words(result: Evaluation) -> list[str]:
-    page = Report("Mine", summarise(result)).html.partition(">How to read the tables</h2>")[0]
+    page = Report("Mine", summarise(result), result).html.partition(">How to read the tables</h2>")[0]
     texts = (terminal(result), summarise(result).markdown(), page)
     return [word for text in texts for word in ("†", "hides", "Not stated") if word in text]
 

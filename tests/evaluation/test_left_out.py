@@ -85,7 +85,7 @@ def test_table_json_and_report__say_how_many_and_which(found: Evaluation) -> Non
     assert all(row["episodes"] == 9 for row in told)
     assert all([left["world"] for left in row["left_out"]] == [3, 7, 10] for row in told)
     assert told[0]["left_out"][2] == {"world": 10, "seed": SEED, "agent": "failing", "reason": "planted"}
-    for text in (rows.markdown(), Report("title", rows).html):
+    for text in (rows.markdown(), Report("title", rows, found).html):
         assert "LEFT OUT for every agent: 3 of 12 worlds" in text
         assert "world 10 of seed 7 (failing: planted)" in text
     well = summarise(replace(found, left_out=()))

@@ -10,9 +10,9 @@ import pytest
 
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.evaluation import Evaluation, check_target, evaluate, write_per_world
-from ethbrake_marl.evaluation.measures import Regrets
-from ethbrake_marl.evaluation.results import write_output
+from ethbrake_marl.evaluation import Evaluation, evaluate, write_per_world
+from ethbrake_marl.evaluation.measures import KNOWN_OF_WORLDS
+from ethbrake_marl.files.store import check_target, write_output
 from ethbrake_marl.scenario import Scenario
 
 
@@ -58,7 +58,7 @@ def test_per_world__every_number_reads_back_as_the_same_bits(tmp_path: Path, eva
     for name, values in expected.items():
         np.testing.assert_array_equal(column(rows, name), values.astype(float), err_msg=name)
     assert {row["ended"] for row in rows} == {"at_rest"}
-    assert set(rows[0]) == {"agent", "knows", "world", "hidden", "ended", *expected, *Regrets.COLUMNS}
+    assert set(rows[0]) == {"agent", "knows", "world", "hidden", "ended", *expected, *KNOWN_OF_WORLDS}
 
 
 def test_per_world__the_initial_columns_make_the_same_worlds_again(tmp_path: Path, evaluation: Evaluation) -> None:

@@ -67,5 +67,6 @@ def test_html__escapes_hostile_names(evaluation: eb.Evaluation) -> None:
 def test_html__shows_every_agent_with_its_figures(evaluation: eb.Evaluation) -> None:
     harm = eb.summarise(evaluation)[0].total_harm
     for html in (evaluation._repr_html_(), eb.summarise(evaluation)._repr_html_()):
-        assert f"<td>{harm.value:.2f} [{harm.interval[0]:.2f}, {harm.interval[1]:.2f}]</td>" in html
+        interval = f'<span class="interval">[{harm.interval[0]:.2f}, {harm.interval[1]:.2f}]</span>'
+        assert f"<td>{harm.value:.2f} {interval}</td>" in html
         assert html.count("<tr>") == 3

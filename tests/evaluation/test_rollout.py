@@ -181,7 +181,7 @@ def test_evaluate__an_agent_that_predicts_for_other_worlds_is_refused(paper_rand
             return np.zeros(3), memory
 
     for shape, told in (
-        ((3, 2), r"'confused': predicted_harm has shape \(3, 2\)"),
+        ((3, 2), r"'confused': predicted_harm is float64 of shape \(3, 2\)"),
         ((2,), r"'confused' of vehicle_2: .*shape \(2,\)"),
     ):
         with pytest.raises(InvalidInput, match=told):

@@ -5,13 +5,7 @@ import pytest
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import statistics
-from ethbrake_marl.evaluation.statistics import (
-    interquartile_mean,
-    mean_over_seeds,
-    rate,
-    rate_over_seeds,
-    share_over_seeds,
-)
+from ethbrake_marl.evaluation.statistics import interquartile_mean, mean_over_seeds, rate, share_over_seeds
 
 
 @pytest.mark.parametrize(
@@ -123,10 +117,10 @@ def test_mean_over_seeds__is_the_mean_with_the_spread_between_seeds() -> None:
 
 
 def test_rate_over_seeds__is_no_certainty_where_all_worlds_were_alike() -> None:
-    assert rate_over_seeds(np.ones((2, 20), np.bool_)).interval == rate(20, 20).interval
-    assert rate_over_seeds(np.zeros((1, 20), np.bool_)).interval == rate(0, 20).interval
-    assert rate_over_seeds(np.ones((1, 1), np.bool_)).interval == rate(1, 1).interval
+    assert mean_over_seeds(np.ones((2, 20), np.bool_)).interval == rate(20, 20).interval
+    assert mean_over_seeds(np.zeros((1, 20), np.bool_)).interval == rate(0, 20).interval
+    assert mean_over_seeds(np.ones((1, 1), np.bool_)).interval == rate(1, 1).interval
     happened = np.zeros((4, 50), np.bool_)
     happened[0] = True  # one seed always, three never
-    low, high = rate_over_seeds(happened).interval or (0.0, 0.0)
+    low, high = mean_over_seeds(happened).interval or (0.0, 0.0)
     assert low == 0.0 and high > 0.7

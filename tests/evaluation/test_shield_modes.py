@@ -139,14 +139,14 @@ def test_team__an_intervention_is_simulated_again_without_it_for_the_whole_team(
 
 def test_team__tables_and_figure_show_bound_and_shares(team_rows: ShieldModes) -> None:
     modes, shares = team_rows.sheets()
-    assert (len(modes.rows), len(shares.rows)) == (10, 6 * 4)
+    assert (len(modes.rows), len(shares.rows)) == (10, 6 * 3)
     assert modes.headings[2:4] == ["minus no shield", "bound"]
     axes = shield_modes_figure(team_rows).axes[0]
     assert len(axes.containers) == 6 and "without a shield" in axes.get_xlabel()
     told = team_rows[1].to_json()
     assert told["vehicles"][0] == {**told["vehicles"][0], "vehicle": "vehicle_1", "replaced": None}
     text = Page(page.Page("Shield", [shield_section(team_rows, "30 worlds")]).html).text
-    assert "Minus no shield" in text and "coast, step-cap, vehicle_3" in text.replace("\u200b", "")
+    assert "minus no shield" in text and "coast, step-cap, vehicle_3" in text.replace("\u200b", "")
 
 
 def test_team__what_is_behind_a_shield_is_compared_without_it() -> None:

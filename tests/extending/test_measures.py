@@ -74,9 +74,9 @@ def test_measure_of_each_vehicle__stands_in_rows_frame_markdown_and_report() -> 
     assert told["metrics"]["injury_3"] == "injury, vehicle 3 (1)"
     frame = found.to_frame("columns")
     assert frame["metric_squared"] == pytest.approx(frame["total_harm"])
-    for text in (rows.markdown(), Report("mine", rows).html):
+    for text in (rows.markdown(), Report("mine", rows, found).html):
         assert "squared (m2/s2)" in text and "injury, vehicle 2 (1)" in text
-    assert "Squared closing speed of every impact." in Report("mine", rows).html
+    assert "Squared closing speed of every impact." in Report("mine", rows, found).html
 
 
 def test_change_of_speed__is_the_largest_of_each_vehicle_and_0_without_an_impact() -> None:

@@ -55,7 +55,7 @@ def test_sheet__in_a_notebook() -> None:
     page = SHEET.html()
     assert "<caption>Two agents</caption>" in page
     assert page.endswith("<p>In m²/s².</p>")
-    assert '<tr><th scope="rowgroup" colspan="3">paper, &lt;test&gt;</th></tr>' in page
+    assert '<tr class="block"><th colspan="3" scope="rowgroup">paper, &lt;test&gt;</th></tr>' in page
     assert '<th scope="row">Non-E</th>\n<td>–</td>' in page
 
 

@@ -44,7 +44,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     watch(limits, "lower_bound", "bound")
     watch(limits, "best_known", "best known")
     watch(measures, "known_limits", "limits")
-    watch(rollout._Whole, "evaluation", "evaluation")
+    watch(rollout, "evaluate_list", "evaluation")
     return found
 
 
@@ -138,7 +138,7 @@ def test_evaluation__of_a_team_tells_the_proven_harm_where_contact_is_not_decide
         told["proven_harm"] is not None and 0 < told["proven_harm"].value < told["best_known_first_impact_harm"].value
     )
     assert told["impact_proven_rate"] is not None and told.known_best_share == 0.0
-    [text] = rows.limit_lines()
+    text = rows.limit_line()
     assert "no joint command avoids an impact (proven)" in text and "avoids contact" not in text
     write_per_world(tmp_path / "out.csv", found)
     header, first = (tmp_path / "out.csv").read_text().splitlines()[:2]

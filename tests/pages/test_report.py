@@ -228,7 +228,7 @@ ALLOWED = set(
 
 def test_report__of_another_scenario_leaves_the_papers_rows_out(pair: Scenario) -> None:
     result = evaluate(pair.sample(2, 0), {"full_brake": make_agent("full_brake")}, scenario=pair)
-    text = Page(Report(title="Pair", rows=summarise(result)).html).text
+    text = Page(Report(title="Pair", rows=summarise(result), evaluation=result).html).text
     assert "9.00" in text
     assert "as printed" not in text
     assert "5.6202" not in text
@@ -254,13 +254,14 @@ def test_report__says_where_the_horizon_cut_episodes_off(pair: Scenario, html: s
 
 @pytest.mark.usefixtures("undrawn")
 def test_write_report__overwrites_only_by_force(tmp_path: Path, pair: Scenario) -> None:
-    rows = summarise(evaluate(pair.sample(2, 0), {"coast": make_agent("coast")}, scenario=pair))
+    found = evaluate(pair.sample(2, 0), {"coast": make_agent("coast")}, scenario=pair)
+    rows = summarise(found)
     path = tmp_path / "report.html"
-    Report("Mine", rows).write(path)
-    assert path.read_text("utf-8") == Report("Mine", rows).html
+    Report("Mine", rows, found).write(path)
+    assert path.read_text("utf-8") == Report("Mine", rows, found).html
     with pytest.raises(AlreadyExists):
-        Report("Mine", rows).write(path)
-    Report(title="Other", rows=[]).write(path, force=True)
+        Report("Mine", rows, found).write(path)
+    Report(title="Other", rows=[], evaluation=found).write(path, force=True)
     assert "<h1>Other</h1>" in path.read_text("utf-8")
 
 

@@ -220,7 +220,10 @@ BUGS: dict[str, Bug] = {
         REGRET, "own.count(KNOWN) != worlds", "own.count(KNOWN) == 0", OF_TABLES
     ),
     "an agent's prediction of the first chunk told for all": Bug(
-        ROLLOUT, "else np.concatenate(found)", "else np.resize(found[0], len(ledger.mass_t))", OF_TABLES
+        TABLE,
+        "np.concatenate([getattr(part, name) for part in parts]) for name in given",
+        "np.resize(getattr(first, name), sum(len(part.at_rest) for part in parts)) for name in given",
+        OF_TABLES,
     ),
     # ------------------------------------------------------------ types and mixtures
     "types drawn from the numbers of the quantities": Bug(

@@ -12,7 +12,7 @@ import pytest
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation.measures import Tally
-from ethbrake_marl.evaluation.results import Asked, Question
+from ethbrake_marl.evaluation.results import Question
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.studies.jobs import LocalWorkers, evaluate_shards
 
@@ -20,12 +20,12 @@ N = 4_500
 
 
 @pytest.fixture(scope="module")
-def asked(paper_random: Scenario) -> Asked:
+def asked(paper_random: Scenario) -> Question:
     return Question(paper_random, ("full_brake", "coast"), N, 11).ask()
 
 
 @pytest.fixture(scope="module")
-def tally(asked: Asked) -> Tally:
+def tally(asked: Question) -> Tally:
     return evaluate_shards(asked, shards=1)
 
 
@@ -33,13 +33,13 @@ def tally(asked: Asked) -> Tally:
 def driven(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     """The ranges of worlds that are driven from now on."""
     found: list[tuple[int, int]] = []
-    answer = Asked.answer
+    answer = Question.answer
 
     def noted(asked, first, end, *more):
         found.append((first, end))
         return answer(asked, first, end, *more)
 
-    monkeypatch.setattr(Asked, "answer", noted)
+    monkeypatch.setattr(Question, "answer", noted)
     return found
 
 
@@ -49,7 +49,7 @@ def finished(folder: Path) -> int:
     return journal.read_text().count('"status": "finished"') if journal.exists() else 0
 
 
-def interrupted(asked: Asked, folder: Path, after: int, shards: int, **more) -> None:
+def interrupted(asked: Question, folder: Path, after: int, shards: int, **more) -> None:
     """Let an evaluation be killed when so many shards are finished."""
 
     def tell(progress) -> None:

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import pytest
 
 from ethbrake_marl.defaults import DEFAULT
-from ethbrake_marl.evaluation.inputs import make_lineup
+from ethbrake_marl.evaluation.inputs import make_agents
 from ethbrake_marl.evaluation.measures import Conditions
 from ethbrake_marl.pages.explorer import Explored
-from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.scenario import Scenario, Task, load_scenario
 
 TOKEN, PORT = "the-token-of-this-test", 4711
 HOST = f"127.0.0.1:{PORT}"
@@ -105,7 +105,7 @@ def scenario() -> Scenario:
 
 @pytest.fixture(scope="package")
 def explored(scenario: Scenario) -> Explored:
-    return Explored(scenario, make_lineup(AGENTS, scenario))
+    return Explored(Task(scenario, scenario.learners), make_agents(AGENTS, scenario))
 
 
 @pytest.fixture

@@ -13,11 +13,11 @@ from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
 from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.inputs import make_lineup
+from ethbrake_marl.evaluation.inputs import make_agents, make_lineup
 from ethbrake_marl.evaluation.measures import Conditions
 from ethbrake_marl.limits.limits import Proof, prove
 from ethbrake_marl.pages.explorer import Explored, explorer_page, read_state, save_state
-from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from tests.pages.explorer.conftest import AGENTS, Client
 
 
@@ -33,7 +33,7 @@ def test_answer__is_the_evaluation_of_that_world(client: Client, scenario: Scena
         harms = float(outcome.first_impact_harm[0]), float(outcome.total_harm[0])
         assert (told["impacts"], told["first"], told["total"]) == (int(outcome.impacts[0]), *harms)
     assert (hand["agent"], hand["first"]) == ("by hand", others[0]["first"])  # beyond its capacity: full braking
-    proof = prove(worlds, Explored(scenario, make_lineup(AGENTS, scenario)).task)
+    proof = prove(worlds, Task(scenario, scenario.learners))
     assert isinstance(proof, Proof) and proof.harm is not None
     verdict = reply.json["verdict"]
     assert (verdict["avoidable"], verdict["proven_harm"]) == (bool(proof.avoidable[0]), float(proof.harm[0]))
@@ -65,7 +65,7 @@ def test_search__is_never_worse_than_h_star(
 
 
 def test_search__takes_the_profile_by_hand_where_that_is_better(explored: Explored, state: dict[str, Any]) -> None:
-    world = read_state(state, explored.scenario)
+    world = read_state(state, explored.task.scenario)
     good = explored.search(world, np.array([0.0]), 1.0, lambda: False)
     folded = explored.search(world, np.array(good["commands"]), 0.0, lambda: True)
     assert folded["first"] <= good["first"]
@@ -144,17 +144,19 @@ def test_save_state__refuses_what_is_there(folder: Path, scenario: Scenario, sta
 
 def test_explored__says_what_it_cannot_show(scenario: Scenario) -> None:
     with pytest.raises(InvalidInput, match="2 vehicles are driven; it takes exactly one"):
-        Explored(scenario.with_learners([1, 2]), make_lineup(["full_brake"], scenario))
+        Explored(Task(scenario, (1, 2)), make_agents(["full_brake"], scenario))
     nine = [f"constant:{k / 10}" for k in range(1, 10)]
     with pytest.raises(InvalidInput, match="9 agents; at least 1 and at most 8"):
-        Explored(scenario, make_lineup(nine, scenario))
+        Explored(Task(scenario, scenario.learners), make_agents(nine, scenario))
 
 
 def test_page__shows_hostile_names_as_text(scenario: Scenario, state: dict[str, Any]) -> None:
     hostile = "</script><img src=x onerror=alert(1)>\u202e"
-    lineup = make_lineup(["full_brake"], scenario)
+    lineup = make_agents(["full_brake"], scenario)
     changed = scenario.replace(title=hostile)
-    text = explorer_page(Explored(changed, {hostile: lineup["full_brake"]}), state, world=0, seed=7).html
+    text = explorer_page(
+        Explored(Task(changed, changed.learners), {hostile: lineup["full_brake"]}), state, world=0, seed=7
+    ).html
     assert "<img" not in text and "\u202e" not in text
     content = json.loads(text.partition('id="explorer_data">')[2].partition("</script>")[0])
     assert content["named"] == [hostile] and all(name.isprintable() for name in content["agents"])

@@ -71,15 +71,15 @@ BUGS: dict[str, tuple[Patch, ...]] = {
     "late latency: counted from the segment's start": (
         Patch(
             ADVANCE,
-            "table[ROW.ONSET, at + i] = onset_s(params[latency + i], time)",
-            "table[ROW.ONSET, at + i] = params[latency + i]",
+            "table[ROW.ONSET, at + i] = onset_s(latency[k, i], time[k])",
+            "table[ROW.ONSET, at + i] = latency[k, i]",
         ),
     ),
     "latency rounded up to the end of the step": (
         Patch(
             ADVANCE,
-            "table[ROW.ONSET, at + i] = onset_s(params[latency + i], time)",
-            "table[ROW.ONSET, at + i] = params[latency + i] - time if params[latency + i] <= time else until - time",
+            "table[ROW.ONSET, at + i] = onset_s(latency[k, i], time[k])",
+            "table[ROW.ONSET, at + i] = latency[k, i] - time[k] if latency[k, i] <= time[k] else until[k] - time[k]",
         ),
     ),
     "every impact counted as a first one": (
@@ -122,18 +122,10 @@ BUGS: dict[str, tuple[Patch, ...]] = {
         ),
     ),
     "restitution e used as 1 - e": (
-        Patch(
-            ADVANCE,
-            "advance_table(table, params[column.restitution],",
-            "advance_table(table, 1.0 - params[column.restitution],",
-        ),
+        Patch(ADVANCE, "advance_table(table, restitution[k],", "advance_table(table, 1.0 - restitution[k],"),
     ),
     "restitution with the wrong sign": (
-        Patch(
-            ADVANCE,
-            "advance_table(table, params[column.restitution],",
-            "advance_table(table, -params[column.restitution],",
-        ),
+        Patch(ADVANCE, "advance_table(table, restitution[k],", "advance_table(table, -restitution[k],"),
     ),
     "simultaneous impacts resolved pair after pair": (
         Patch(

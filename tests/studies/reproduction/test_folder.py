@@ -59,7 +59,7 @@ def test_page__tells_everything_that_a_result_holds(settings: Reproduction) -> N
     (result,), _ = settings.make([planted("gaps", lambda s: told)])
     page = Page((settings.folder / "index.html").read_text("utf-8"))
     assert page.open == []
-    for text in ("A table", "PPO 1.50 1.25, 1.75", "Of 24 worlds.", "What it is.", "label", "Comparisons: 1"):
+    for text in ("A table", "PPO 1.50 [1.25, 1.75]", "Of 24 worlds.", "What it is.", "label", "Comparisons: 1"):
         assert text in page.text
     assert result.verdict.because in page.text and "stated in the paper (told)" in page.text
     links = [attributes["href"] for tag, attributes in page.tags if tag == "a"]
