@@ -130,7 +130,7 @@ BUGS: dict[str, Bug] = {
     "bursts one period short": Bug(
         V2X, "len(rising) - np.searchsorted(", "np.maximum(len(rising) - 1, 0) - np.searchsorted(", OF_V2X
     ),
-    "front hears those behind": Bug(V2X, "(sender >= receiver)", "(sender <= receiver)", OF_V2X),
+    "front hears those behind": Bug(V2X, "sender >= receiver,", "sender <= receiver,", OF_V2X),
     "the sight of the vehicle ahead before it brakes": Bug(
         V2X, "latency[:, i - 1] + seen[:, i, i - 1]", "seen[:, i, i - 1]", OF_V2X
     ),
@@ -144,10 +144,7 @@ BUGS: dict[str, Bug] = {
         OF_V2X,
     ),
     "time to act left out of the delay of a message": Bug(
-        V2X,
-        "channel.radio_s + channel.processing_s + channel.actuation_s",
-        "channel.radio_s + channel.processing_s",
-        OF_V2X,
+        V2X, "self.radio_s + self.processing_s + self.actuation_s", "self.radio_s + self.processing_s", OF_V2X
     ),
     "all links of a world share one draw": Bug(
         V2X, "u.reshape(n, N, N, PER_LINK)", "np.broadcast_to(u[:, None, None, :PER_LINK], (n, N, N, PER_LINK))", OF_V2X
@@ -227,7 +224,7 @@ BUGS: dict[str, Bug] = {
     ),
     # ------------------------------------------------------------ types and mixtures
     "types drawn from the numbers of the quantities": Bug(
-        SAMPLING, "numbers(PER_TYPE * scenario.vehicles, TYPES)", "numbers(PER_TYPE * scenario.vehicles)", OF_SCENARIOS
+        SAMPLING, "numbers(PER_TYPE * self.vehicles, TYPES)", "numbers(PER_TYPE * self.vehicles, ())", OF_SCENARIOS
     ),
     "each quantity with a load of its own": Bug(
         SAMPLING, "entry.value(typed[1][rows, i])", "entry.value(u[rows, rule.place(i)])", OF_SCENARIOS
@@ -236,7 +233,7 @@ BUGS: dict[str, Bug] = {
         MIXTURE, "first + np.flatnonzero(chosen == k)", "first + np.arange(int((chosen == k).sum()))", OF_SCENARIOS
     ),
     "the weights of a mixture ignored": Bug(
-        MIXTURE, "[member.weight for member in scenario.mixture]", "[1.0 for _ in scenario.mixture]", OF_SCENARIOS
+        MIXTURE, "[member.weight for member in self.mixture]", "[1.0 for _ in self.mixture]", OF_SCENARIOS
     ),
     # ------------------------------------------------------------ learning
     "the best policy judged by the other count": Bug(
