@@ -25,7 +25,17 @@ from ethbrake_marl.errors import (
 )
 from ethbrake_marl.evaluation.inputs import policies_of
 from ethbrake_marl.evaluation.measures import REGISTERED, Evaluation, LeftOut, Outcome, Tape
-from ethbrake_marl.physics import Decisions, Floats, Ints, Worlds, advance, leaving_out_failed, move_on, sample_on
+from ethbrake_marl.physics import (
+    Decisions,
+    Floats,
+    Ints,
+    Worlds,
+    advance,
+    leaving_out_failed,
+    move_on,
+    sample_on,
+    sum_rows,
+)
 from ethbrake_marl.scenario import Sample, Scenario, ScriptSpec, Task
 
 # The aftermath of a line: where Vehicle 1 ends, and how much of that others pushed it.
@@ -113,7 +123,7 @@ class SampledHarm:
         next_s = np.minimum(Decisions(self._start_s, self._step_s).at(self._samples), self._horizon_s)
         until_s = np.maximum(next_s, self._worlds.time_s)
         self._worlds, impacts = sample_on(self._worlds, self._command, until_s, self._step_s)
-        self._harm += impacts.total_harm.sum(axis=1)
+        self._harm += sum_rows(impacts.total_harm)
 
     def finish(self) -> Floats:
         """Go on to the horizon; gives the sum of each world, [n] m2/s2."""

@@ -78,4 +78,5 @@ from ethbrake_marl.physics.worlds import (
     Vehicles as Vehicles,
     Worlds as Worlds,
     make_worlds as make_worlds,
+    sum_rows as sum_rows,
 )
