@@ -1,4 +1,4 @@
-"""Who drives: what an agent is and what it knows, agents by name, and the loop that lets them drive episodes.
+"""Agents: what one is and what it knows, the list of them by name, and the loop that lets them drive episodes.
 
 An entry of the list of names tells the function that makes the agent, and is loaded when it is first used: so policies,
 searches and shields, which stand above this folder, are in the same list without being imported here.
