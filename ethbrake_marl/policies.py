@@ -16,6 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
+from itertools import chain
 from operator import not_
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
@@ -101,44 +102,41 @@ class NetworkSpec(FileModel):
 
     @property
     def tensors(self) -> tuple[TensorRow, ...]:
-        """Every tensor, all float32; weights are [outputs, inputs] as in ``y = W x + b``."""
-        inputs, hidden = self.observation_size, self.policy_hidden
-        rows: list[TensorRow] = []
+        """Every tensor, all float32; weights are [outputs, inputs] as in ``y = W x + b``.
+
+        The training library counts activations too, so the index of its layers is twice ours.
+        """
+
+        def layer(name: str, sb3_name: str, inputs: int, outputs: int) -> list[TensorRow]:
+            return [
+                TensorRow(f"{name}.weight", (outputs, inputs), f"{sb3_name}.weight"),
+                TensorRow(f"{name}.bias", (outputs,), f"{sb3_name}.bias"),
+            ]
+
+        def network(name: str, sb3_name: str, hidden: tuple[int, ...], sb3_head: str, outputs: int) -> list[TensorRow]:
+            sizes = [self.observation_size, *hidden]
+            layers = [layer(f"{name}.{k}", f"{sb3_name}.{2 * k}", sizes[k], sizes[k + 1]) for k in range(len(hidden))]
+            return [*chain(*layers), *layer(f"{name}.output", sb3_head, sizes[-1], outputs)]
+
+        hidden, actions = self.policy_hidden, self.action_size
         if self.networks > 1:
-            for m, name in enumerate(self.actors):
-                rows += _network(
-                    name, f"members.{m}.mlp_extractor.policy_net", inputs, hidden, f"members.{m}.action_net",
-                    self.action_size,
-                )  # fmt: skip
-            gate, head = self.gate_hidden, f"gate.average.{2 * len(self.gate_hidden)}"
-            return (*rows, *_network("gate", "gate.average", inputs, gate, head, self.networks))
+            gate = network(
+                "gate", "gate.average", self.gate_hidden, f"gate.average.{2 * len(self.gate_hidden)}", self.networks
+            )
+            actors = [
+                network(name, f"members.{m}.mlp_extractor.policy_net", hidden, f"members.{m}.action_net", actions)
+                for m, name in enumerate(self.actors)
+            ]
+            return (*chain(*actors), *gate)
         if self.output == "clip":
-            rows += _network("policy", "mlp_extractor.policy_net", inputs, hidden, "action_net", self.action_size)
-            rows += [TensorRow("policy.log_std", (self.action_size,), "log_std")]
+            rows = network("policy", "mlp_extractor.policy_net", hidden, "action_net", actions)
+            rows.append(TensorRow("policy.log_std", (actions,), "log_std"))
         else:
-            rows += _network("policy", "actor.latent_pi", inputs, hidden, "actor.mu", self.action_size)
-            rows += _layer("policy.log_std", "actor.log_std", hidden[-1], self.action_size)
+            rows = network("policy", "actor.latent_pi", hidden, "actor.mu", actions)
+            rows += layer("policy.log_std", "actor.log_std", hidden[-1], actions)
         if self.value_hidden:
-            rows += _network("value", "mlp_extractor.value_net", inputs, self.value_hidden, "value_net", 1)
+            rows += network("value", "mlp_extractor.value_net", self.value_hidden, "value_net", 1)
         return tuple(rows)
-
-
-def _network(
-    name: str, sb3_name: str, inputs: int, hidden: tuple[int, ...], sb3_head: str, outputs: int
-) -> list[TensorRow]:
-    """Hidden layers and the last one; the training library counts activations too, so its index is twice ours."""
-    rows: list[TensorRow] = []
-    for k, width in enumerate(hidden):
-        rows += _layer(f"{name}.{k}", f"{sb3_name}.{2 * k}", inputs, width)
-        inputs = width
-    return rows + _layer(f"{name}.output", sb3_head, inputs, outputs)
-
-
-def _layer(name: str, sb3_name: str, inputs: int, outputs: int) -> list[TensorRow]:
-    return [
-        TensorRow(f"{name}.weight", (outputs, inputs), f"{sb3_name}.weight"),
-        TensorRow(f"{name}.bias", (outputs,), f"{sb3_name}.bias"),
-    ]
 
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -331,17 +329,16 @@ class Actor:
 
     def _forward(self, layers: Layers, x: Float32s) -> Float32s:
         """[F, rows] -> [outputs, rows] of one network."""
-        for weight, bias in layers[:-1]:
+        for number, (weight, bias) in enumerate(layers, start=1):
             y = np.empty((weight.shape[0], x.shape[1]), dtype=np.float32)
             dense(weight, bias, x, y)
+            if number == len(layers):
+                break
             if self.spec.activation == "relu":
                 x = np.maximum(y, np.float32(0.0))
             else:
                 squash(y)
                 x = y
-        weight, bias = layers[-1]
-        y = np.empty((weight.shape[0], x.shape[1]), dtype=np.float32)
-        dense(weight, bias, x, y)
         return y
 
     def _check(self, observation: Float32s) -> Float32s:
@@ -443,6 +440,34 @@ class Policy:
         """The policy that drives each of its learners."""
         return dict.fromkeys(self.manifest.learners, self)
 
+    @classmethod
+    def make(
+        cls, tensors: Mapping[str, Float32s], *, observation: ObservationSpec | ObservationSchema, **manifest: Any
+    ) -> Self:
+        """A policy from ``tensors`` and the fields of ``Manifest`` (all but hashes and format, which follow).
+
+        ``versions`` are the installed ones where they are not given. Raises ``InvalidInput`` naming the tensor or field
+        that does not fit.
+        """
+        data = _serialise(tensors)
+        seen = observation if isinstance(observation, ObservationSchema) else ObservationSchema.of(observation)
+        given = {"versions": installed_versions(), **manifest, "format_version": manifest["network"].format_version}
+        try:
+            weights = hashlib.sha256(data).hexdigest()
+            draft = Manifest(**given, observation=seen, weights_sha256=weights, manifest_sha256="0" * 64)
+            own = content_sha256(draft.model_dump(mode="json"))
+            checked = draft.model_copy(update={"manifest_sha256": own})
+            return cls(checked, _tensors(data, checked))
+        except ValidationError as error:
+            raise InvalidInput(f"policy: {first_mistake(error)}") from None
+        except ValueError as error:
+            raise InvalidInput(f"policy: {error}") from None
+
+    @staticmethod
+    def stands_in(folder: Path) -> bool:
+        """Whether the files of a bundle stand in ``folder``; they are not read."""
+        return all((folder / name).is_file() for name in (MANIFEST, WEIGHTS))
+
     def save(self, folder: Path, *, replace: bool = False) -> None:
         """Write it as the new folder ``folder``, completely or not at all; raises ``AlreadyExists``.
 
@@ -452,33 +477,76 @@ class Policy:
             write_file(partial / WEIGHTS, _serialise(self.tensors))
             write_file(partial / MANIFEST, self.manifest.model_dump_json(indent=2).encode() + b"\n")
 
+    def to_onnx(self) -> bytes:
+        """The ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
 
-def make_policy(
-    tensors: Mapping[str, Float32s], *, observation: ObservationSpec | ObservationSchema, **manifest: Any
-) -> Policy:
-    """Build a policy from ``tensors`` and the fields of ``Manifest`` (all but hashes and format, which follow).
+        The acceleration is the action times the own braking (below 0) or driving capacity (above 0), which the
+        observation holds. Products are summed in another order than in our forward pass: results agree within rounding,
+        not to the bit. Raises ``MissingExtra`` where the package onnx is not installed.
+        """
+        with naming_extras():
+            import onnx  # only here: an extra
+        helper, float32, manifest, spec = onnx.helper, onnx.TensorProto.FLOAT, self.manifest, self.manifest.network
+        nodes: list[Any] = []
+        constants: list[Any] = []
 
-    ``versions`` are the installed ones where they are not given. Raises ``InvalidInput`` naming the tensor or field
-    that does not fit.
-    """
-    data = _serialise(tensors)
-    seen = observation if isinstance(observation, ObservationSchema) else ObservationSchema.of(observation)
-    given = {"versions": installed_versions(), **manifest, "format_version": manifest["network"].format_version}
-    try:
-        weights = hashlib.sha256(data).hexdigest()
-        draft = Manifest(**given, observation=seen, weights_sha256=weights, manifest_sha256="0" * 64)
-        own = content_sha256(draft.model_dump(mode="json"))
-        checked = draft.model_copy(update={"manifest_sha256": own})
-        return Policy(checked, _tensors(data, checked))
-    except ValidationError as error:
-        raise InvalidInput(f"policy: {first_mistake(error)}") from None
-    except ValueError as error:
-        raise InvalidInput(f"policy: {error}") from None
+        def constant(name: str, array: NDArray[Any]) -> str:
+            constants.append(onnx.numpy_helper.from_array(np.ascontiguousarray(array), name))
+            return name
 
+        def node(operator: str, inputs: list[str], *, output: str = "", **attributes: Any) -> str:
+            name = output or f"{operator.lower()}_{len(nodes)}"
+            nodes.append(helper.make_node(operator, inputs, [name], **attributes))
+            return name
 
-def has_bundle(folder: Path) -> bool:
-    """Whether the files of a bundle stand in ``folder``; they are not read."""
-    return all((folder / name).is_file() for name in (MANIFEST, WEIGHTS))
+        def network(name: str, hidden: int) -> str:
+            """One network of the policy, from the observation on."""
+            x = "observation"
+            for layer in [*(f"{name}.{k}" for k in range(hidden)), f"{name}.output"]:
+                weight, bias = (
+                    constant(f"{layer}.{part}", self.tensors[f"{layer}.{part}"]) for part in ("weight", "bias")
+                )
+                x = node("Gemm", [x, weight, bias], transB=1)
+                if not layer.endswith("output"):
+                    x = node("Relu" if spec.activation == "relu" else "Tanh", [x])
+            return x
+
+        outputs = [network(name, len(spec.policy_hidden)) for name in spec.actors]
+        x = outputs[0]
+        if len(outputs) > 1:  # the one that the gate chooses
+            chosen = node("ArgMax", [network("gate", len(spec.gate_hidden))], axis=1, keepdims=1)
+            x = node("GatherElements", [node("Concat", outputs, axis=1), chosen], axis=1)
+        if spec.output == "tanh":
+            action = node("Tanh", [x], output="action")
+        else:
+            bounds = [constant(name, np.array(at, np.float32)) for name, at in (("lowest", -1.0), ("highest", 1.0))]
+            action = node("Clip", [x, *bounds], output="action")
+        capacities = []  # in m/s2, [n, 1]
+        features = [f.name for f in self.observation.features]
+        for name in ("own.braking_capacity", "own.driving_capacity"):
+            column = features.index(name)
+            index = constant(f"{name}.column", np.array([column], np.int64))
+            unit = constant(f"{name}.scale", np.array([self.observation.features[column].scale], np.float32))
+            capacities.append(node("Mul", [node("Gather", ["observation", index], axis=1), unit]))
+        zero = constant("zero", np.zeros(1, np.float32))
+        below = node("Mul", [node("Min", [action, zero]), capacities[0]])
+        above = node("Mul", [node("Max", [action, zero]), capacities[1]])
+        node("Add", [below, above], output="acceleration_mps2")
+
+        given = [helper.make_tensor_value_info("observation", float32, ["n", spec.observation_size])]
+        found = [helper.make_tensor_value_info(name, float32, ["n", 1]) for name in ("action", "acceleration_mps2")]
+        graph = helper.make_graph(nodes, "policy", given, found, constants)
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], producer_name="ethbrake-marl")
+        model.ir_version = 8  # old enough for every runtime since 2022
+        told = {
+            "algorithm": manifest.algorithm,
+            "manifest_sha256": manifest.manifest_sha256,
+            "features": ",".join(manifest.observation.features),
+        }
+        helper.set_model_props(model, told)
+        onnx.checker.check_model(model)
+        data: bytes = model.SerializeToString()
+        return data
 
 
 def load_policy(path: str | os.PathLike[str]) -> Policy:
@@ -691,81 +759,3 @@ def load_named_policy(
     if slash:
         return load_shipped(name)
     return load_shipped(shipped_name(kind, None if scenario is None else scenario.name, harm_count))
-
-
-# A policy as an ONNX model: observation in, acceleration out. Needs the extra ``export``.
-
-OPSET = 17
-IR_VERSION = 8  # old enough for every runtime since 2022
-
-
-def onnx_model(policy: Policy) -> bytes:
-    """The serialised model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
-
-    The acceleration is the action times the own braking (below 0) or driving capacity (above 0), which the observation
-    holds. Products are summed in another order than in our forward pass: results agree within rounding, not to the
-    bit. Raises ``MissingExtra`` where the package onnx is not installed.
-    """
-    with naming_extras():
-        import onnx  # only here: an extra
-    helper, float32, manifest, spec = onnx.helper, onnx.TensorProto.FLOAT, policy.manifest, policy.manifest.network
-    nodes: list[Any] = []
-    constants: list[Any] = []
-
-    def constant(name: str, array: NDArray[Any]) -> str:
-        constants.append(onnx.numpy_helper.from_array(np.ascontiguousarray(array), name))
-        return name
-
-    def node(operator: str, inputs: list[str], *, output: str = "", **attributes: Any) -> str:
-        name = output or f"{operator.lower()}_{len(nodes)}"
-        nodes.append(helper.make_node(operator, inputs, [name], **attributes))
-        return name
-
-    def network(name: str, hidden: int) -> str:
-        """One network of the policy, from the observation on."""
-        x = "observation"
-        for layer in [*(f"{name}.{k}" for k in range(hidden)), f"{name}.output"]:
-            weight, bias = (
-                constant(f"{layer}.{part}", policy.tensors[f"{layer}.{part}"]) for part in ("weight", "bias")
-            )
-            x = node("Gemm", [x, weight, bias], transB=1)
-            if not layer.endswith("output"):
-                x = node("Relu" if spec.activation == "relu" else "Tanh", [x])
-        return x
-
-    outputs = [network(name, len(spec.policy_hidden)) for name in spec.actors]
-    x = outputs[0]
-    if len(outputs) > 1:  # the one that the gate chooses
-        chosen = node("ArgMax", [network("gate", len(spec.gate_hidden))], axis=1, keepdims=1)
-        x = node("GatherElements", [node("Concat", outputs, axis=1), chosen], axis=1)
-    if spec.output == "tanh":
-        action = node("Tanh", [x], output="action")
-    else:
-        bounds = [constant(name, np.array(at, np.float32)) for name, at in (("lowest", -1.0), ("highest", 1.0))]
-        action = node("Clip", [x, *bounds], output="action")
-    capacities = []  # in m/s2, [n, 1]
-    features = [f.name for f in policy.observation.features]
-    for name in ("own.braking_capacity", "own.driving_capacity"):
-        column = features.index(name)
-        index = constant(f"{name}.column", np.array([column], np.int64))
-        unit = constant(f"{name}.scale", np.array([policy.observation.features[column].scale], np.float32))
-        capacities.append(node("Mul", [node("Gather", ["observation", index], axis=1), unit]))
-    zero = constant("zero", np.zeros(1, np.float32))
-    below = node("Mul", [node("Min", [action, zero]), capacities[0]])
-    above = node("Mul", [node("Max", [action, zero]), capacities[1]])
-    node("Add", [below, above], output="acceleration_mps2")
-
-    given = [helper.make_tensor_value_info("observation", float32, ["n", spec.observation_size])]
-    found = [helper.make_tensor_value_info(name, float32, ["n", 1]) for name in ("action", "acceleration_mps2")]
-    graph = helper.make_graph(nodes, "policy", given, found, constants)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="ethbrake-marl")
-    model.ir_version = IR_VERSION
-    told = {
-        "algorithm": manifest.algorithm,
-        "manifest_sha256": manifest.manifest_sha256,
-        "features": ",".join(manifest.observation.features),
-    }
-    helper.set_model_props(model, told)
-    onnx.checker.check_model(model)
-    data: bytes = model.SerializeToString()
-    return data

@@ -14,7 +14,7 @@ from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.observations import FORECAST_S, GROUPS, ObservationSpec, choose_observation, observe
 from ethbrake_marl.physics import advance, make_worlds
-from ethbrake_marl.policies import NetworkSpec, make_policy
+from ethbrake_marl.policies import NetworkSpec, Policy
 from ethbrake_marl.scenario import observation_for
 
 SCENARIO = eb.load_scenario("paper-random")
@@ -189,7 +189,7 @@ def contact_policy(scenario, group="contact"):
         "policy.output.bias": (1,), "policy.log_std": (1,),
     }  # fmt: skip
     tensors = {name: draw.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
-    return make_policy(
+    return Policy.make(
         tensors, algorithm="counterfactual", network=network, observation=spec,
         learners=("vehicle_2",), scenario=scenario, reward={}, seeds={}, steps=0,
     )  # fmt: skip

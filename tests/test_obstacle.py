@@ -11,8 +11,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.registry import drive, make_agent
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.episodes import record_episode

@@ -43,7 +43,7 @@ REMAINS = {
     ("figures.py", "**"): SQUARES,
     ("learning/algorithms.py", "**"): TRAINED,
     ("learning/algorithms.py", "np.exp"): TRAINED,
-    ("learning/recipe.py", "math.cos"): TRAINED,
+    ("learning/training.py", "math.cos"): TRAINED,
     ("pages/page.py", "**"): SQUARES,
     ("studies/falsification.py", "**"): SEARCHED,
     ("studies/falsification.py", "rng.standard_normal"): SEARCHED,

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
-from ethbrake_marl.learning.recipe import PpoRecipe, load_recipe
-from ethbrake_marl.learning.training import RunDirectory, resolve
-from ethbrake_marl.policies import NetworkSpec, Policy, make_policy
+from ethbrake_marl.learning.training import PpoRecipe, RunDirectory, Training, load_recipe
+from ethbrake_marl.policies import NetworkSpec, Policy
 from ethbrake_marl.scenario import observation_for
 
 
@@ -46,7 +45,7 @@ def train_mappo(recipe: PpoRecipe, scenario: eb.Scenario, directory: Path) -> Po
     recipe = recipe.replace(scheme="centralised")
     if recipe.observation is not None:
         scenario = scenario.replace(observation=list(recipe.observation))
-    team = resolve(recipe, scenario).team()
+    team = Training.of(recipe, scenario).team()
     content = {"recipe": recipe.model_dump(mode="json"), "scenario": scenario.model_dump(mode="json")}
     run = RunDirectory(directory).create({**content, "library": "benchmarl"}, team=team)
     with own_random_state(), tempfile.TemporaryDirectory() as scratch:
@@ -105,7 +104,7 @@ def policy_of(experiment: Any, recipe: PpoRecipe, scenario: eb.Scenario) -> Poli
         activation=recipe.network.activation,
         output="tanh",
     )
-    return make_policy(
+    return Policy.make(
         tensors_of(actor, len(recipe.network.policy)),
         algorithm="ppo",
         network=network,

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.files.store import new_folder
-from ethbrake_marl.policies import NetworkSpec, Policy, make_policy
+from ethbrake_marl.policies import NetworkSpec, Policy
 
 HIDDEN = (128, 128)
 EPOCHS, BATCH, LEARNING_RATE = 20, 512, 1e-3
@@ -84,7 +84,7 @@ def as_policy(network: nn.Sequential, told: dict[str, Any], seed: int) -> Policy
     for name, layer in zip(names, linear, strict=True):
         tensors[f"{name}.weight"] = layer.weight.detach().numpy()
         tensors[f"{name}.bias"] = layer.bias.detach().numpy()
-    return make_policy(
+    return Policy.make(
         tensors,
         algorithm="clone",
         network=NetworkSpec(

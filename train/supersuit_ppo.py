@@ -24,8 +24,8 @@ import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.files.store import new_folder
 from ethbrake_marl.learning.algorithms import tensors_of
-from ethbrake_marl.learning.training import resolve
-from ethbrake_marl.policies import NetworkSpec, Policy, make_policy
+from ethbrake_marl.learning.training import Training
+from ethbrake_marl.policies import NetworkSpec, Policy
 from ethbrake_marl.rewards import reward_params
 
 # 1. What to train: the same settings as train/ppo.yaml, in smaller networks.
@@ -129,7 +129,7 @@ def train(scenario: eb.Scenario, steps: int, seed: int, output: Path) -> None:
 
     Refuses at once what cannot be: steps, a seed, a scenario in which nobody learns, an `output` that is there.
     """
-    resolve("ppo", scenario, total_steps=steps, seed=seed)
+    Training.of("ppo", scenario, total_steps=steps, seed=seed)
     with new_folder(output) as folder:
         learn(scenario, steps, seed).save(folder / "policy")
 
@@ -161,7 +161,7 @@ def learn(scenario: eb.Scenario, steps: int, seed: int) -> Policy:
         activation="relu",
         output="clip",
     )
-    return make_policy(
+    return Policy.make(
         tensors_of(model.policy, network),
         algorithm="ppo",
         network=network,

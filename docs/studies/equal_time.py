@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Driver, knowledge_text
+from ethbrake_marl.agents.registry import Driver
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.evaluation.measures import Outcome
@@ -58,7 +58,7 @@ def rows_of(driven: Mapping[str, tuple[float, Outcome]], against: str) -> list[S
         low, high = found.interval or (found.value, found.value)
         difference = "" if name == against else f"{found.value:+.3f} [{low:+.3f}, {high:+.3f}]"
         means = [f"{each.mean():.3f}" for each in (harm, outcome.total_harm)]
-        rows.append([f"`{name}`", knowledge_text(outcome.knows), f"{spent_ms:.2f}", *means, difference])
+        rows.append([f"`{name}`", outcome.knows.text, f"{spent_ms:.2f}", *means, difference])
     return rows
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
-from ethbrake_marl.agents.registry import make_single_agent
+from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine import ask_script, begin_script
 from ethbrake_marl.evaluation.inputs import result_versions, scenario_sha256, worlds_sha256
 from ethbrake_marl.figures import GREY, add_caption, new_figure, series_style, style_axes, write_picture
@@ -78,7 +78,7 @@ def chain_impacts(worlds: Worlds, rows: ImpactRows) -> Bools:
 def convergence(worlds: Worlds, agent: str, until_s: float = 8.0, steps_s: Sequence[float] = STEPS_S) -> Convergence:
     """Exact and sampled harm of ``worlds`` (at the alert) up to ``until_s``, for every step."""
     command = -worlds.vehicles.braking_capacity_mps2
-    driver = make_single_agent(agent)
+    driver = make_agent(agent)
     command[:, VEHICLE], _ = ask_script(driver, worlds, begin_script(driver, worlds, VEHICLE, {}), VEHICLE)
     _, exact = advance(worlds, command, until_s=until_s, record=True)
     assert exact.rows is not None

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from ethbrake_marl.policies import Manifest, Policy, load_policy, make_policy
+from ethbrake_marl.policies import Manifest, Policy, load_policy
 
 
 def actor_only(policy: Policy) -> Policy:
@@ -17,7 +17,7 @@ def actor_only(policy: Policy) -> Policy:
     fields = {name: getattr(policy.manifest, name) for name in Manifest.model_fields}
     del fields["weights_sha256"], fields["manifest_sha256"]
     tensors = {row.name: policy.tensors[row.name] for row in network.tensors}
-    return make_policy(tensors, **{**fields, "network": network})
+    return Policy.make(tensors, **{**fields, "network": network})
 
 
 if __name__ == "__main__":

@@ -16,8 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Agent, AgentAround, Knowledge, Source, fixed_commands
-from ethbrake_marl.agents.rollout import script_agents
+from ethbrake_marl.agents.registry import Agent, AgentAround, Knowledge, Source, fixed_commands, script_agents
 from ethbrake_marl.engine import Memory, Script, ask_script, begin_script, renew_memory
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Bools, Floats, Messages, Vehicles, Worlds, move_on
@@ -45,34 +44,41 @@ class Told(NamedTuple):
         reacts: Bools = self.known & (self.command_mps2 != 0.0)
         return reacts
 
+    @classmethod
+    def to(cls, worlds: Worlds, vehicle: int) -> Told:
+        """What has reached ``vehicle``."""
+        n, N = worlds.speeds_mps.shape
+        known = worlds.vehicles.known_from_s[:, vehicle] <= worlds.time_s[:, np.newaxis]
+        known[:, vehicle] = True
+        place = _places_of(worlds, vehicle)
+        hit = np.zeros((n, N - 1), np.bool_)
+        at_s = np.repeat(worlds.time_s[:, np.newaxis], N, axis=1)
+        told = cls(
+            known, at_s, place, worlds.speeds_mps.copy(), worlds.command_mps2.copy(),
+            worlds.obstacle_gap_m + place[:, 0], worlds.obstacle_hit.copy(), hit,
+        )  # fmt: skip
+        if (periodic := Messages.of(worlds).periodic).any():
+            told._hear_messages(worlds, vehicle, periodic)
+        for pair, other in ((vehicle - 1, vehicle - 1), (vehicle, vehicle + 1)):
+            if 0 <= pair < N - 1:
+                hit[:, pair] = worlds.pair_hit[:, pair] & known[:, other]
+        unheard = ~known[:, 0]
+        told.obstacle_m[unheard], told.obstacle_hit[unheard] = np.inf, False
+        return told
 
-class Foretold(NamedTuple):
-    """How worlds were expected to be by now, and of which vehicles that tells more than was told of them."""
-
-    worlds: Worlds
-    keeps: Bools  # [n, N]
-
-
-def told_to(worlds: Worlds, vehicle: int) -> Told:
-    """What has reached ``vehicle`` of the others."""
-    n, N = worlds.speeds_mps.shape
-    known = worlds.vehicles.known_from_s[:, vehicle] <= worlds.time_s[:, np.newaxis]
-    known[:, vehicle] = True
-    place = _places_of(worlds, vehicle)
-    hit = np.zeros((n, N - 1), np.bool_)
-    at_s = np.repeat(worlds.time_s[:, np.newaxis], N, axis=1)
-    told = Told(
-        known, at_s, place, worlds.speeds_mps.copy(), worlds.command_mps2.copy(),
-        worlds.obstacle_gap_m + place[:, 0], worlds.obstacle_hit.copy(), hit,
-    )  # fmt: skip
-    if (periodic := Messages.of(worlds).periodic).any():
-        told = _told_by_messages(worlds, vehicle, told, periodic)
-    for pair, other in ((vehicle - 1, vehicle - 1), (vehicle, vehicle + 1)):
-        if 0 <= pair < N - 1:
-            hit[:, pair] = worlds.pair_hit[:, pair] & told.known[:, other]
-    unheard = ~told.known[:, 0]
-    told.obstacle_m[unheard], told.obstacle_hit[unheard] = np.inf, False
-    return told
+    def _hear_messages(self, worlds: Worlds, vehicle: int, periodic: Bools) -> None:
+        """What is known is as old as the newest message, or the present of who is in sight."""
+        newest = Messages.of(worlds).newest_told(vehicle)
+        other = periodic[:, np.newaxis] & (np.arange(worlds.N) != vehicle)
+        stale = other & (newest.at_s < worlds.time_s[:, np.newaxis])
+        self.place_m[stale] = (newest.place_m - newest.own_place_m[:, np.newaxis])[stale]
+        self.speed_mps[stale] = newest.speed_mps[stale]
+        self.command_mps2[stale] = newest.command_mps2[stale]
+        self.at_s[stale] = newest.at_s[stale]
+        if vehicle > 0:
+            self.obstacle_m[periodic] = (newest.obstacle_place_m - newest.own_place_m)[periodic]
+            self.obstacle_hit[periodic] = newest.obstacle_hit[periodic, 0] == 1.0
+        self.known[:] &= ~other | (newest.at_s >= 0.0)
 
 
 def _places_of(worlds: Worlds, vehicle: int) -> Floats:
@@ -85,29 +91,53 @@ def _places_of(worlds: Worlds, vehicle: int) -> Floats:
     return place
 
 
-def _told_by_messages(worlds: Worlds, vehicle: int, told: Told, periodic: Bools) -> Told:
-    """The same where what is known is as old as the newest message, or the present of who is in sight."""
-    newest = Messages.of(worlds).newest_told(vehicle)
-    other = periodic[:, np.newaxis] & (np.arange(worlds.N) != vehicle)
-    stale = other & (newest.at_s < worlds.time_s[:, np.newaxis])
-    told.place_m[stale] = (newest.place_m - newest.own_place_m[:, np.newaxis])[stale]
-    told.speed_mps[stale] = newest.speed_mps[stale]
-    told.command_mps2[stale] = newest.command_mps2[stale]
-    told.at_s[stale] = newest.at_s[stale]
-    if vehicle > 0:
-        told.obstacle_m[periodic] = (newest.obstacle_place_m - newest.own_place_m)[periodic]
-        told.obstacle_hit[periodic] = newest.obstacle_hit[periodic, 0] == 1.0
-    return told._replace(known=told.known & (~other | (newest.at_s >= 0.0)))
-
-
 @dataclass(frozen=True, slots=True)
 class Ranges:
-    """What a scenario declares of a vehicle that is not known: the middle, the least and the largest, each [N]."""
+    """What a scenario declares of who is not known to ``vehicle``: the middle, the least and the largest, each [N].
 
+    ``place`` is ahead of where it was at the alert (m), ``latency_s`` the own part of a latency, ``news_s`` the time at
+    which a vehicle has heard of the emergency, before which it does not react; 0 without a channel.
+    """
+
+    vehicle: int
+    others: Mapping[int, Script]  # the scripts that the others are known to follow; without one they brake fully
     middle: Mapping[str, Floats]
     low: Mapping[str, Floats]
     high: Mapping[str, Floats]
     obstacle_gap_m: float  # infinite: there is none
+
+    @classmethod
+    def of(cls, scenario: Scenario, vehicle: int, others: Mapping[int, Script] | None = None) -> Ranges:
+        """Those of a scenario as ``vehicle`` needs them; ``others`` of None: the scenario's scripts.
+
+        Raises ``InvalidInput`` for a mixture, which does not say what a vehicle is.
+        """
+        if scenario.members:
+            names = ", ".join(member.name for member in scenario.members)
+            raise InvalidInput(
+                f"scenario {scenario.name!r}: is a mixture, and a vehicle that is not known could be of any of {names};"
+                " believed agents need one of these"
+            )
+        world = scenario.sample_by(lambda width, of: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
+        low, high = ({key: np.array(scenario.bounds(key)).T[k] for key in ("gaps_m", *OF_OTHERS[1:5])} for k in (0, 1))
+        named = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "speed_limit_mps")
+        one, N = np.ones((1, scenario.vehicles)), scenario.vehicles
+        heard = Vehicles.at_once(one, one, np.zeros((1, N)), one, one, np.zeros(1))  # no latency but that of the news
+        if scenario.v2x.by_link:
+            heard = scenario.v2x.with_news(heard, np.full((1, scenario.v2x.width(N)), 0.5))
+        middle = {
+            "place": _places(world.gaps_m[0], world.gaps_m[0], vehicle),
+            "speeds_mps": world.speeds_mps[0],
+            **{key: getattr(world.vehicles, key)[0] for key in named},
+            "latency_s": world.vehicles.own_latency_s[0],
+            "news_s": heard.latency_s[0],
+        }
+        low["place"] = _places(low["gaps_m"], high["gaps_m"], vehicle)
+        high["place"] = _places(high["gaps_m"], low["gaps_m"], vehicle)
+        low["news_s"] = np.zeros(scenario.vehicles)
+        high["news_s"] = scenario.v2x.latest_reaction_s(low["news_s"])
+        others = script_agents(scenario, except_for=vehicle) if others is None else others
+        return cls(vehicle, others, middle, low, high, float(world.obstacle_gap_m[0]))
 
     def at(self, share: Mapping[tuple[str, int], float] | None, key: str) -> Floats:
         """A quantity of every vehicle [N]: its middle, or where ``share`` says, 0 the least value and 1 the largest."""
@@ -117,127 +147,81 @@ class Ranges:
                 value[j] = self.low[key][j] + part * (self.high[key][j] - self.low[key][j])
         return value
 
-    def uncertain(self, vehicle: int) -> tuple[tuple[str, int], ...]:
+    @property
+    def uncertain(self) -> tuple[tuple[str, int], ...]:
         """The numbers that are not fixed by the scenario: quantity and vehicle."""
-        others = [j for j in range(len(self.middle["place"])) if j != vehicle]
+        others = [j for j in range(len(self.middle["place"])) if j != self.vehicle]
         return tuple((key, j) for j in others for key in OF_OTHERS if self.low[key][j] < self.high[key][j])
 
+    def believe(
+        self,
+        worlds: Worlds,
+        way_m: Floats,
+        share: Mapping[tuple[str, int], float] | None = None,
+        foretold: tuple[Worlds, Bools] | None = None,
+    ) -> Worlds:
+        """The worlds as the vehicle believes them to be now, at their time.
 
-def ranges_of(scenario: Scenario, vehicle: int) -> Ranges:
-    """The ranges of a scenario as ``vehicle`` needs them.
+        Args:
+            worlds: as they are; of them only what the vehicle received is read.
+            way_m: [n] the vehicle's own way since the alert, m.
+            share: where in its range each uncertain number lies, 0 to 1; None: in the middle.
+            foretold: how these worlds were expected to be by now, with the impacts on the way, and of whom [n, N] that
+                tells better than a message from before.
 
-    ``place`` is ahead of where it was at the alert (m), ``latency_s`` the own part of a latency, ``news_s`` the time at
-    which a vehicle has heard of the emergency, before which it does not react; 0 without a channel.
-
-    Raises ``InvalidInput`` for a mixture, which does not say what a vehicle is.
-    """
-    if scenario.members:
-        names = ", ".join(member.name for member in scenario.members)
-        raise InvalidInput(
-            f"scenario {scenario.name!r}: is a mixture, and a vehicle that is not known could be of any of {names};"
-            " believed agents need one of these"
+        """
+        vehicle, (n, N) = self.vehicle, worlds.speeds_mps.shape
+        told, own, v = Told.to(worlds, vehicle), np.arange(N) == vehicle, worlds.vehicles
+        given = {"mass_t": v.mass_t, "braking_capacity_mps2": v.braking_capacity_mps2,
+                 "driving_capacity_mps2": v.driving_capacity_mps2, "speed_limit_mps": v.speed_limit_mps}  # fmt: skip
+        of = {key: np.where(told.known, values, self.at(share, key)) for key, values in given.items()}
+        at_s = np.where(told.known, told.at_s, 0.0)
+        own_part = np.where(told.known, v.own_latency_s, self.at(share, "latency_s"))
+        latency = np.where(told.reacts, at_s, np.maximum(np.maximum(own_part, self.at(share, "news_s")), at_s))
+        past = v.latency_s[:, vehicle] <= worlds.time_s
+        latency[:, vehicle] = np.where(
+            past, v.latency_s[:, vehicle], np.maximum(v.own_latency_s[:, vehicle], worlds.time_s)
         )
-    world = scenario.sample_by(lambda width, of: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
-    bounds = {key: np.array(scenario.bounds(key)).T for key in ("gaps_m", *OF_OTHERS[1:5])}
-    named = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "speed_limit_mps")
-    middle = {
-        "place": _places(world.gaps_m[0], world.gaps_m[0], vehicle),
-        "speeds_mps": world.speeds_mps[0],
-        **{key: getattr(world.vehicles, key)[0] for key in named},
-        "latency_s": world.vehicles.own_latency_s[0],
-        "news_s": _middle_news(scenario),
-    }
-    low, high = ({key: values[side] for key, values in bounds.items()} for side in (0, 1))
-    low["place"] = _places(low["gaps_m"], high["gaps_m"], vehicle)
-    high["place"] = _places(high["gaps_m"], low["gaps_m"], vehicle)
-    low["news_s"] = np.zeros(scenario.vehicles)
-    high["news_s"] = scenario.v2x.latest_reaction_s(low["news_s"])
-    return Ranges(middle, low, high, float(world.obstacle_gap_m[0]))
-
-
-def _middle_news(scenario: Scenario) -> Floats:
-    """When each vehicle has heard of the emergency where every number of the channel is in the middle, [N] s."""
-    one, N = np.ones((1, scenario.vehicles)), scenario.vehicles
-    vehicles = Vehicles.at_once(one, one, np.zeros((1, N)), one, one, np.zeros(1))
-    if scenario.v2x.by_link:
-        vehicles = scenario.v2x.with_news(vehicles, np.full((1, scenario.v2x.width(N)), 0.5))
-    news: Floats = vehicles.latency_s[0]
-    return news
+        vehicles = Vehicles.at_once(
+            of["braking_capacity_mps2"], of["driving_capacity_mps2"], latency, of["mass_t"], of["speed_limit_mps"],
+            v.restitution,
+        )  # fmt: skip
+        place = np.where(told.known, told.place_m, self.at(share, "place") - way_m[:, np.newaxis])
+        speed = np.maximum(np.where(told.known, told.speed_mps, self.at(share, "speeds_mps")), 0.0)
+        usual_gaps = np.repeat(-np.diff(self.middle["place"])[np.newaxis], n, axis=0)
+        line = replace(
+            worlds, vehicles=vehicles, speeds_mps=np.minimum(speed, of["speed_limit_mps"]), pair_hit=told.hit,
+            command_mps2=np.zeros((n, N)), gaps_m=usual_gaps, messages=np.zeros((n, 0)), obstacle_hit=told.obstacle_hit,
+        )  # fmt: skip
+        command = fixed_commands(self.others, line, "believed", vehicle=vehicle)
+        speed, way = move_on(
+            line.speeds_mps, command, latency - at_s, of["speed_limit_mps"], worlds.time_s[:, None] - at_s
+        )
+        speed[:, vehicle], way[:, vehicle] = line.speeds_mps[:, vehicle], 0.0
+        place, hit = place + way, told.hit
+        if foretold is not None:
+            (expected, keeps), hit = foretold, hit | foretold[0].pair_hit
+            place = np.where(keeps, _places_of(expected, vehicle), place)
+            speed = np.where(keeps, np.maximum(expected.speeds_mps, 0.0), speed)
+        place = _in_order(place, told.known, vehicle)
+        gaps = np.maximum(place[:, :-1] - place[:, 1:], 0.0)
+        usual_obstacle = self.obstacle_gap_m + self.middle["place"][0] - way_m
+        obstacle = np.where(np.isfinite(told.obstacle_m), told.obstacle_m, usual_obstacle)
+        command[:, own] = worlds.command_mps2[:, own]
+        return replace(
+            line,
+            pair_hit=hit,
+            speeds_mps=speed,
+            gaps_m=np.where(gaps < TOUCHING_M, 0.0, gaps),
+            command_mps2=np.where((latency <= worlds.time_s[:, np.newaxis]), command, 0.0),
+            obstacle_gap_m=np.maximum(obstacle - place[:, 0], 0.0),
+        )
 
 
 def _places(ahead_m: Floats, behind_m: Floats, vehicle: int) -> Floats:
     """Where all vehicles are ahead of one [N], by the gaps [P] in front of it and behind it."""
     front = np.cumsum(ahead_m[:vehicle][::-1])[::-1]
     return np.concatenate([front, [0.0], -np.cumsum(behind_m[vehicle:])])
-
-
-def believed_worlds(
-    worlds: Worlds,
-    vehicle: int,
-    ranges: Ranges,
-    others: Mapping[int, Script],
-    way_m: Floats,
-    *,
-    share: Mapping[tuple[str, int], float] | None = None,
-    foretold: Foretold | None = None,
-) -> Worlds:
-    """The worlds as ``vehicle`` believes them to be now, at their time.
-
-    Args:
-        worlds: as they are; of them only what ``vehicle`` received is read.
-        vehicle: index from 0.
-        ranges: of the scenario, for this vehicle.
-        others: scripts that the other vehicles are known to follow; without one they brake fully.
-        way_m: [n] the vehicle's own way since the alert, m.
-        share: where in its range each uncertain number lies, 0 to 1; None: in the middle.
-        foretold: how these worlds were expected to be by now, with the impacts on the way, and whose state that tells
-            better than a message from before.
-
-    """
-    n, N = worlds.speeds_mps.shape
-    told, own, v = told_to(worlds, vehicle), np.arange(N) == vehicle, worlds.vehicles
-    given = {"mass_t": v.mass_t, "braking_capacity_mps2": v.braking_capacity_mps2,
-             "driving_capacity_mps2": v.driving_capacity_mps2, "speed_limit_mps": v.speed_limit_mps}  # fmt: skip
-    of = {key: np.where(told.known, values, ranges.at(share, key)) for key, values in given.items()}
-    at_s = np.where(told.known, told.at_s, 0.0)
-    own_part = np.where(told.known, v.own_latency_s, ranges.at(share, "latency_s"))
-    latency = np.where(told.reacts, at_s, np.maximum(np.maximum(own_part, ranges.at(share, "news_s")), at_s))
-    past = v.latency_s[:, vehicle] <= worlds.time_s
-    latency[:, vehicle] = np.where(
-        past, v.latency_s[:, vehicle], np.maximum(v.own_latency_s[:, vehicle], worlds.time_s)
-    )
-    vehicles = Vehicles.at_once(
-        of["braking_capacity_mps2"], of["driving_capacity_mps2"], latency, of["mass_t"], of["speed_limit_mps"],
-        v.restitution,
-    )  # fmt: skip
-    place = np.where(told.known, told.place_m, ranges.at(share, "place") - way_m[:, np.newaxis])
-    speed = np.maximum(np.where(told.known, told.speed_mps, ranges.at(share, "speeds_mps")), 0.0)
-    usual_gaps = np.repeat(-np.diff(ranges.middle["place"])[np.newaxis], n, axis=0)
-    line = replace(
-        worlds, vehicles=vehicles, speeds_mps=np.minimum(speed, of["speed_limit_mps"]), pair_hit=told.hit,
-        command_mps2=np.zeros((n, N)), gaps_m=usual_gaps, messages=np.zeros((n, 0)), obstacle_hit=told.obstacle_hit,
-    )  # fmt: skip
-    command = fixed_commands(others, line, "believed", vehicle=vehicle)
-    speed, way = move_on(line.speeds_mps, command, latency - at_s, of["speed_limit_mps"], worlds.time_s[:, None] - at_s)
-    speed[:, vehicle], way[:, vehicle] = line.speeds_mps[:, vehicle], 0.0
-    place, hit = place + way, told.hit
-    if foretold is not None:
-        expected, keeps, hit = foretold.worlds, foretold.keeps, hit | foretold.worlds.pair_hit
-        place = np.where(keeps, _places_of(expected, vehicle), place)
-        speed = np.where(keeps, np.maximum(expected.speeds_mps, 0.0), speed)
-    place = _in_order(place, told.known, vehicle)
-    gaps = np.maximum(place[:, :-1] - place[:, 1:], 0.0)
-    usual_obstacle = ranges.obstacle_gap_m + ranges.middle["place"][0] - way_m
-    obstacle = np.where(np.isfinite(told.obstacle_m), told.obstacle_m, usual_obstacle)
-    command[:, own] = worlds.command_mps2[:, own]
-    return replace(
-        line,
-        pair_hit=hit,
-        speeds_mps=speed,
-        gaps_m=np.where(gaps < TOUCHING_M, 0.0, gaps),
-        command_mps2=np.where((latency <= worlds.time_s[:, np.newaxis]), command, 0.0),
-        obstacle_gap_m=np.maximum(obstacle - place[:, 0], 0.0),
-    )
 
 
 def _in_order(place: Floats, known: Bools, vehicle: int) -> Floats:
@@ -258,17 +242,6 @@ def _in_order(place: Floats, known: Bools, vehicle: int) -> Floats:
 
 
 # Agents that decide on what was really received: any agent that reads the line, shown a believed world instead.
-
-SUFFIX = "believed"
-
-
-def split_believed(argument: str | None) -> tuple[str | None, bool]:
-    """The argument of an agent without ``believed`` at its end, and whether it was there."""
-    if argument == SUFFIX:
-        return None, True
-    if argument is not None and argument.endswith(f":{SUFFIX}"):
-        return argument.removesuffix(f":{SUFFIX}"), True
-    return argument, False
 
 
 class Odometer(NamedTuple):
@@ -302,17 +275,15 @@ class Believing(AgentAround):
     ``InvalidInput`` for a mixture.
     """
 
-    def __init__(self, policy: Agent, scenario: Scenario, *, name: str | None = None, shows: bool = False) -> None:
-        super().__init__(policy, f"{policy.name}:{SUFFIX}" if name is None else name)
-        self.scenario = scenario
-        self._shows = shows
-        self._of_line: dict[int, tuple[Ranges, dict[int, Agent]]] = {}  # by own vehicle
-        ranges_of(scenario, 0)  # refuses a mixture at once
+    def __init__(self, policy: Agent, scenario: Scenario, *, shows: bool = False) -> None:
+        super().__init__(policy, f"{policy.name}:believed")
+        self.scenario, self._shows = scenario, shows
+        self._ranges = {0: Ranges.of(scenario, 0)}  # by own vehicle; refuses a mixture at once
 
     @property
     def knows(self) -> Knowledge:
         """What it received, and the model of the line filled in from the scenario."""
-        return (Source.BELIEFS,)
+        return Knowledge((Source.BELIEFS,))
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         """Where these episodes start; nothing has been received yet, so the policy has not begun."""
@@ -330,7 +301,8 @@ class Believing(AgentAround):
         rows = np.flatnonzero((heard != memory["heard"]).any(axis=1))
         if rows.size:
             believed = self._believe(worlds.take(rows), vehicle, way.way_m[rows])
-            begun = begin_script(self.policy, self._shown_at_first(believed), vehicle, self._line(vehicle)[1])
+            others = self._ranges[vehicle].others
+            begun = begin_script(self.policy, self._shown_at_first(believed), vehicle, others)
             policy = begun if policy is None else renew_memory(policy, rows, begun)  # first of all in every row
             if isinstance(policy, Mapping) and "predicted_harm" in policy:
                 predicted = np.where(np.isnan(memory["heard"][:, 0]), policy["predicted_harm"], predicted)
@@ -343,16 +315,11 @@ class Believing(AgentAround):
 
     def _heard(self, worlds: Worlds, vehicle: int) -> Floats:
         """What the policy begins anew for when it changes, [n, 2 N]: who is known, and who reacts."""
-        told = told_to(worlds, vehicle)
+        told = Told.to(worlds, vehicle)
         unforetold = told.reacts & self.scenario.v2x.by_link  # without a channel the own latencies tell
         return np.concatenate([told.known, unforetold], axis=1).astype(np.float64)
 
     def _believe(self, worlds: Worlds, vehicle: int, way_m: Floats) -> Worlds:
-        return believed_worlds(worlds, vehicle, *self._line(vehicle), way_m)
-
-    def _line(self, vehicle: int) -> tuple[Ranges, dict[int, Agent]]:
-        """What the scenario says of the line around one vehicle, and who drives the others."""
-        if vehicle not in self._of_line:
-            others = script_agents(self.scenario, except_for=vehicle)
-            self._of_line[vehicle] = ranges_of(self.scenario, vehicle), others
-        return self._of_line[vehicle]
+        if vehicle not in self._ranges:
+            self._ranges[vehicle] = Ranges.of(self.scenario, vehicle)
+        return self._ranges[vehicle].believe(worlds, way_m)

@@ -29,9 +29,8 @@ from typing import Literal, NamedTuple, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ethbrake_marl.agents.believed import Believing, split_believed
-from ethbrake_marl.agents.protocol import Agent, Source, fixed_commands
-from ethbrake_marl.agents.registry import AgentSettings
+from ethbrake_marl.agents.believed import Believing
+from ethbrake_marl.agents.registry import Agent, AgentSettings, Source, fixed_commands
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.engine import Memory, Script, is_state_free
 from ethbrake_marl.errors import InvalidInput, renumbered
@@ -58,6 +57,7 @@ from ethbrake_marl.physics import (
     to_next_event,
     to_next_impact,
 )
+from ethbrake_marl.scenario import ScriptSpec
 
 TOUCH_SQUARED = (
     BOUND.TOUCH_SPEED_MPS * BOUND.TOUCH_SPEED_MPS
@@ -283,6 +283,7 @@ class PairwiseOptimum(NamedTuple):
     harm: Floats  # predicted H* (m2/s2)
     spares_front_mps2: Floats  # smallest deceleration that avoids the front vehicle; inf if none
     spares_rear_mps2: Floats  # largest deceleration that avoids the rear vehicle; inf if all do, -inf if none
+    breakpoints_mps2: Floats  # [n, 6] every deceleration at which the harm may have its minimum, unordered
 
 
 @compiled
@@ -363,24 +364,18 @@ def minimise_over(
 
 
 @compiled
-def optimise_worlds(gaps: Floats, speeds: Floats, capacity: Floats, onset: Floats, i: int, out: Floats) -> None:
-    """Optimum of every world into ``out`` [4, n]: a*, H*, and the two thresholds."""
-    at = np.empty(CANDIDATES)
+def optimise_worlds(
+    gaps: Floats, speeds: Floats, capacity: Floats, onset: Floats, i: int, at: Floats, out: Floats
+) -> None:
+    """Candidates of every world into ``at`` [n, 6], its optimum into ``out`` [4, n]: a*, H*, and the two thresholds."""
     for k in range(gaps.shape[0]):
-        low, high = find_breakpoints(at, i, gaps[k], speeds[k], capacity[k], onset[k])
+        low, high = find_breakpoints(at[k], i, gaps[k], speeds[k], capacity[k], onset[k])
         top = min(high, capacity[k, i])
         if low <= top:
             out[0, k], out[1, k] = 0.5 * (low + top), 0.0
         else:
-            out[0, k], out[1, k] = minimise_over(at, i, gaps[k], speeds[k], capacity[k], onset[k])
+            out[0, k], out[1, k] = minimise_over(at[k], i, gaps[k], speeds[k], capacity[k], onset[k])
         out[2, k], out[3, k] = low, high
-
-
-@compiled
-def breakpoints_of_worlds(gaps: Floats, speeds: Floats, capacity: Floats, onset: Floats, i: int, out: Floats) -> None:
-    """Candidates of every world into ``out`` [n, 6]."""
-    for k in range(gaps.shape[0]):
-        find_breakpoints(out[k], i, gaps[k], speeds[k], capacity[k], onset[k])
 
 
 @compiled
@@ -404,23 +399,11 @@ def optimise_pairwise(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
 
     Raises ``InvalidInput`` if ``vehicle`` is not in the line or a vehicle moves backward.
     """
-    onset = _onset_s(worlds, vehicle)
-    out = np.empty((4, worlds.n))
-    capacity = worlds.vehicles.braking_capacity_mps2
-    optimise_worlds(worlds.gaps_m, worlds.speeds_mps, capacity, onset, vehicle, out)
-    return PairwiseOptimum(out[0].copy(), out[1].copy(), out[2].copy(), out[3].copy())
-
-
-def pairwise_breakpoints(worlds: Worlds, vehicle: int) -> Floats:
-    """Every deceleration at which the predicted harm of ``vehicle`` may have its minimum, [n, 6], unordered. [m/s2]
-
-    Raises ``InvalidInput`` as ``optimise_pairwise`` does.
-    """
-    onset = _onset_s(worlds, vehicle)
-    out = np.empty((worlds.n, CANDIDATES))
-    capacity = worlds.vehicles.braking_capacity_mps2
-    breakpoints_of_worlds(worlds.gaps_m, worlds.speeds_mps, capacity, onset, vehicle, out)
-    return out
+    onset, capacity = _onset_s(worlds, vehicle), worlds.vehicles.braking_capacity_mps2
+    at, out = np.empty((worlds.n, CANDIDATES)), np.empty((4, worlds.n))
+    optimise_worlds(worlds.gaps_m, worlds.speeds_mps, capacity, onset, vehicle, at, out)
+    deceleration, harm, front, rear = out
+    return PairwiseOptimum(deceleration, harm, front, rear, at)
 
 
 def pairwise_harm(worlds: Worlds, deceleration_mps2: ArrayLike) -> Floats:
@@ -447,11 +430,6 @@ def _onset_s(worlds: Worlds, vehicle: int) -> Floats:
     if not np.all(worlds.speeds_mps >= 0.0):
         k, i = (int(x) for x in np.argwhere(~(worlds.speeds_mps >= 0.0))[0])
         raise InvalidInput(f"speeds_mps[{k}, {i}] = {worlds.speeds_mps[k, i]:g}: the closed form needs speeds >= 0")
-    return onset_after_s(worlds)
-
-
-def onset_after_s(worlds: Worlds) -> Floats:
-    """Time from now until each vehicle may brake, [n, N]."""
     onset: Floats = np.maximum(worlds.vehicles.latency_s - worlds.time_s[:, None], 0.0)
     return onset
 
@@ -1104,7 +1082,11 @@ def optimise_coupled(
     check_harm_count(harm_count)
     capacity = worlds.vehicles.braking_capacity_mps2
     command = -capacity if others_mps2 is None else np.array(others_mps2, dtype=np.float64)
-    told = _braking_as_told(worlds, vehicle, command)
+    # The closed form lets the others brake with all their capacity: it is what they are told. Who is told to coast or
+    # to drive keeps the capacity: the closed form cannot say what that one does.
+    braking = np.where(command < 0.0, -command, capacity)
+    braking[:, vehicle] = capacity[:, vehicle]
+    told = replace(worlds, vehicles=replace(worlds.vehicles, braking_capacity_mps2=braking))
     best = optimise_pairwise(told, vehicle).deceleration_mps2
     command[:, vehicle] = -best
     _, impacts = advance(worlds, command, until_s=horizon_s)
@@ -1119,16 +1101,6 @@ def optimise_coupled(
     return CoupledOptimum(best, first if harm_count == "first" else total, first, total)
 
 
-def _braking_as_told(worlds: Worlds, vehicle: int, command: Floats) -> Worlds:
-    """The worlds for the closed form, which lets the others brake with all their capacity: it is what they are told.
-
-    Who is told to coast or to drive keeps the capacity: the closed form cannot say what that one does.
-    """
-    capacity = np.where(command < 0.0, -command, worlds.vehicles.braking_capacity_mps2)
-    capacity[:, vehicle] = worlds.vehicles.braking_capacity_mps2[:, vehicle]
-    return replace(worlds, vehicles=replace(worlds.vehicles, braking_capacity_mps2=capacity))
-
-
 def _minimise(
     worlds: Worlds, told: Worlds, command: Floats, vehicle: int, rows: Ints, harm_count: HarmCount, horizon_s: float
 ) -> Floats:
@@ -1136,8 +1108,8 @@ def _minimise(
     v = worlds.vehicles
     lines = (
         worlds.gaps_m, worlds.speeds_mps, worlds.time_s, worlds.pair_hit, worlds.obstacle_gap_m, worlds.obstacle_hit,
-        command, told.vehicles.braking_capacity_mps2, onset_after_s(worlds), v.latency_s, v.mass_t, v.speed_limit_mps,
-        v.restitution,
+        command, told.vehicles.braking_capacity_mps2, _onset_s(worlds, vehicle), v.latency_s, v.mass_t,
+        v.speed_limit_mps, v.restitution,
     )  # fmt: skip
     question = hashlib.sha256(repr((vehicle, harm_count, horizon_s, worlds.speeds_mps.shape)).encode())
     for column in (rows, *lines):
@@ -1204,9 +1176,7 @@ class EV2XBM:
         check_harm_count(harm_count)
         self.name = "e_v2x_bm" if mode == "coupled" else "e_v2x_bm:pairwise"
         self.knows = Source.MODEL if mode == "coupled" else Source.STATE
-        self._mode = mode
-        self._harm_count = harm_count
-        self._horizon_s = horizon_s
+        self._mode, self._harm_count, self._horizon_s = mode, harm_count, horizon_s
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         """Choose a* from the worlds at the alert."""
@@ -1219,12 +1189,11 @@ class EV2XBM:
             chooses_first = isinstance(script, EV2XBM) and (script._mode == "pairwise" or vehicle not in scripts)
             return is_state_free(script) or chooses_first
 
-        advice = (
-            f" before vehicle_{vehicle + 1} chooses; take e_v2x_bm:pairwise, which needs nobody's command, for one of"
-            " the two"
-        )
-        who = f"agent {self.name!r}"
-        others = fixed_commands(scripts, alert, who, vehicle=vehicle, is_fixed=is_fixed, advice=advice)
+        others = fixed_commands(
+            scripts, alert, f"agent {self.name!r}", vehicle=vehicle, is_fixed=is_fixed,
+            advice=f" before vehicle_{vehicle + 1} chooses; take e_v2x_bm:pairwise, which needs nobody's command, for"
+            " one of the two",
+        )  # fmt: skip
         coupled = optimise_coupled(
             alert, vehicle, harm_count=self._harm_count, horizon_s=self._horizon_s, others_mps2=others
         )
@@ -1237,10 +1206,86 @@ class EV2XBM:
 
 def make_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
     """``e_v2x_bm``, the same as ``e_v2x_bm:coupled``, or ``e_v2x_bm:pairwise``; ``:believed`` behind: believing."""
-    mode, believes = split_believed(argument)
-    if mode not in (None, "coupled", "pairwise"):
+    if argument not in (None, "coupled", "pairwise"):
         raise InvalidInput(f"agent {settings.spec!r}: the argument must be 'coupled' or 'pairwise', then 'believed'")
-    agent = EV2XBM(
-        "pairwise" if mode == "pairwise" else "coupled", harm_count=settings.harm_count, horizon_s=settings.horizon_s
-    )
-    return Believing(agent, settings.needed_scenario()) if believes else agent
+    mode: Mode = "pairwise" if argument == "pairwise" else "coupled"
+    agent = EV2XBM(mode, harm_count=settings.harm_count, horizon_s=settings.horizon_s)
+    return Believing(agent, settings.needed_scenario()) if settings.believes else agent
+
+
+# Scripts: full braking, coasting, a constant, and two baselines that know only the vehicle in front.
+
+
+class StateFree:
+    """``full_brake``, ``coast`` or ``constant:a`` (deceleration in m/s2): the same command whatever happens.
+
+    ``full_brake`` of every vehicle is the paper's non-ethical strategy. Raises ``InvalidInput`` for any other script
+    and for a constant beyond the vehicle's capacity.
+    """
+
+    state_free = True
+    knows = Source.SENSORS
+
+    def __init__(self, spec: str) -> None:
+        if not ScriptSpec.parse(spec).is_state_free():
+            raise InvalidInput(f"agent {spec!r}: must be full_brake, coast or constant:a")
+        self.name = spec
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """The constant command, [n] m/s2."""
+        vehicles = worlds.vehicles
+        command = ScriptSpec.parse(self.name).command(
+            vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
+        )
+        assert command is not None
+        return command
+
+
+class CopyLeader:
+    """Brake exactly as hard as the vehicle in front can, as far as the own brakes allow.
+
+    ``a = min(a_front, a_own)``. Needs one number from the front vehicle. Raises ``InvalidInput`` for the first vehicle.
+    """
+
+    name = "copy_leader"
+    state_free = True
+    knows = Source.STATE
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """``-min(a_front, a_own)``, [n] m/s2."""
+        _check_has_front(self.name, vehicle)
+        capacity = worlds.vehicles.braking_capacity_mps2
+        return -np.minimum(capacity[:, vehicle - 1], capacity[:, vehicle])
+
+
+class GentlestFront:
+    """The smallest constant deceleration that spares the vehicle in front; full braking if none does.
+
+    From the pairwise closed form; it needs nothing from the vehicle behind, and collides in the very worlds in which
+    E-V2X-BM does: what it lacks is the choice between two harms. Raises ``InvalidInput`` for the first vehicle.
+    """
+
+    name = "gentlest_front"
+    state_free = True  # once the episode has begun
+    knows = Source.STATE
+
+    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Floats:
+        """The command of these episodes."""
+        _check_has_front(self.name, vehicle)
+        least = optimise_pairwise(alert, vehicle).spares_front_mps2
+        return -np.minimum(least, alert.vehicles.braking_capacity_mps2[:, vehicle])
+
+    def act(self, worlds: Worlds, memory: Floats, vehicle: int) -> tuple[Floats, Floats]:
+        """That command, [n] m/s2."""
+        return memory, memory
+
+
+def make_script(argument: str | None, settings: AgentSettings) -> Agent:
+    """The script of that name."""
+    others: dict[str, type[CopyLeader | GentlestFront]] = {"copy_leader": CopyLeader, "gentlest_front": GentlestFront}
+    return others[settings.spec]() if settings.spec in others else StateFree(settings.spec)
+
+
+def _check_has_front(name: str, vehicle: int) -> None:
+    if vehicle < 1:
+        raise InvalidInput(f"agent {name!r}: vehicle_{vehicle + 1} has no vehicle in front of it")

@@ -17,7 +17,7 @@ from gymnasium.wrappers import NormalizeObservation, RescaleObservation
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import LARGEST, action_to_command
-from ethbrake_marl.agents.protocol import Source
+from ethbrake_marl.agents.registry import Source
 from ethbrake_marl.engine import Memory, Script, checked_memory, map_memory, take_memory
 from ethbrake_marl.errors import AgentFailed, InvalidInput, describe_error, naming_extras
 from ethbrake_marl.observations import Observation, Observations, ObservationSpec, choose_observation, observe
@@ -126,13 +126,11 @@ def training_environment(model: Any, name: str) -> Any:
 
 def _statistics(model: Any) -> Any:
     """Stable-Baselines3's ``VecNormalize`` that the model is trained under, as it counts now; None without one."""
-    find = getattr(model, "get_vec_normalize_env", None)
-    return None if find is None else find()
+    return getattr(model, "get_vec_normalize_env", lambda: None)()
 
 
 def _ask_onnx(session: Any) -> Infer:
-    given = session.get_inputs()[0].name
-    names = [output.name for output in session.get_outputs()]
+    given, names = session.get_inputs()[0].name, [output.name for output in session.get_outputs()]
     wanted = "action" if "action" in names else names[0]
     return lambda seen, _: (session.run([wanted], {given: seen})[0], None)
 
@@ -242,7 +240,8 @@ def policy_agent(
     5
 
     """
-    named = name or _name_of(policy)
+    of_file = isinstance(policy, str | os.PathLike)
+    named = name or (Path(policy).stem if of_file else str(getattr(policy, "__name__", type(policy).__name__)))
     trained = training_environment(policy, named)
     spec = _observation_of(policy, scenario, observation, trained)
     if appended is None and (appended := getattr(trained, "appended", None)) is not None:
@@ -285,13 +284,6 @@ def _observation_of(policy: Any, scenario: Scenario | None, given: Observation |
     return own if isinstance(own, ObservationSpec) else ObservationSpec()
 
 
-def _name_of(policy: Any) -> str:
-    """Of the file, the function or the class."""
-    if isinstance(policy, str | os.PathLike):
-        return Path(policy).stem
-    return str(getattr(policy, "__name__", type(policy).__name__))
-
-
 class PolicyAgent:
     """Drives one vehicle by a policy of any library; made by ``policy_agent``."""
 
@@ -311,13 +303,17 @@ class PolicyAgent:
         self.weights_sha256 = weights_sha256  # of the policy as it is now; None where nobody can find its weights
         self.observation = observation
         self._infer, self._initial_state, self._clip = infer, initial_state, clip
-        self.remembers = initial_state is not None
         self._more = more  # what stands behind the own observation
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         """No decision was made yet; the policy's own state is the initial one."""
-        state = None if self._initial_state is None else self._begun(alert.n)
-        return {"steps": np.zeros(alert.n, np.int64), "state": state}
+        n, state = alert.n, None
+        try:
+            if self._initial_state is not None:
+                state = take_memory(checked_memory(self._initial_state(n), n), np.arange(n))
+        except Exception as error:
+            raise AgentFailed(self.name, None, f"initial_state({n}): {describe_error(error)}") from error
+        return {"steps": np.zeros(n, np.int64), "state": state}
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
         """Wanted signed acceleration [n], m/s2.
@@ -333,19 +329,14 @@ class PolicyAgent:
         values = self._checked(action, seen, worlds, steps)
         return action_to_command(values, worlds.vehicles, vehicle), {"steps": steps + 1, "state": state}
 
-    def _begun(self, n: int) -> State:
-        assert self._initial_state is not None
-        try:
-            return take_memory(checked_memory(self._initial_state(n), n), np.arange(n))
-        except Exception as error:
-            raise AgentFailed(self.name, None, f"initial_state({n}): {describe_error(error)}") from error
-
     def _ask(self, seen: Observations, state: State, worlds: Worlds, steps: Ints) -> tuple[NDArray[Any], State]:
         try:
             return self._answer(seen, state, np.arange(worlds.n))
         except Exception as error:
             k = self._find_failing(seen, state)
-            where = _steps_text(steps) if k is None else _moment_text(k, worlds, steps)
+            first, last = steps.min(initial=10**9) + 1, steps.max(initial=0) + 1  # of all running episodes
+            where = f"step {first}" if first >= last else f"steps {first} to {last}"
+            where = where if k is None else _moment_text(k, worlds, steps)
             reason = f"{where}: observations of shape {seen.shape}: {describe_error(error)}"
             raise AgentFailed(self.name, k, reason) from error
 
@@ -394,12 +385,6 @@ class PolicyAgent:
 
     def _refusal(self, k: int, worlds: Worlds, steps: Ints, reason: str) -> AgentFailed:
         return AgentFailed(self.name, k, f"{_moment_text(k, worlds, steps)}: {reason}")
-
-
-def _steps_text(steps: Ints) -> str:
-    """The step, of all running episodes, at which nobody knows whose it was."""
-    first, last = steps.min(initial=10**9) + 1, steps.max(initial=0) + 1
-    return f"step {first}" if first >= last else f"steps {first} to {last}"
 
 
 def _moment_text(k: int, worlds: Worlds, steps: Ints) -> str:

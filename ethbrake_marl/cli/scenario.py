@@ -49,14 +49,14 @@ def scenario_show(out: Out, scenario: NameArgument) -> None:
 @scenario_group.add("validate", "scenario validate my-scenario.yaml", json=True)
 def scenario_validate(out: Out, path: NameArgument) -> None:
     """Check a scenario: one line, OK or what is wrong; then what may not be meant."""
-    from ethbrake_marl.agents import Team, drive, make_single_agent
+    from ethbrake_marl.agents import Team, drive, make_agent
 
     scenario = evaluation.load_runnable(path)
     sample = scenario.sample(CHECKED_DRAWS, DEFAULT.LIST_SEED)
     names = [scenario.vehicle_names[i] for i in scenario.learners]
     free = {i for i, script in scenario.scripts.items() if scenarios.ScriptSpec.parse(script).is_state_free()}
     deciding = [i for i in range(scenario.vehicles) if i not in free]
-    braking = Team.copies(make_single_agent("full_brake"), deciding)
+    braking = Team.of(make_agent("full_brake"), deciding)
     moving = int((~drive(sample.worlds, braking, scenario).at_rest).sum())
     late = int((sample.worlds.vehicles.latency_s[:, 0] > 0.0).sum())
     told = {"name": scenario.name, "vehicles": scenario.vehicles, "learners": names, "worlds": CHECKED_DRAWS}
@@ -126,7 +126,7 @@ recipe_group = app.group(
 @recipe_group.add("list", "recipe list", json=True)
 def recipe_list(out: Out) -> None:
     """List the shipped recipes: name, algorithm and title."""
-    found = {name: (learning.load_recipe(name), path) for name, path in learning.shipped_recipes().items()}
+    found = {name: (learning.load_recipe(name), path) for name, path in learning.TrainingRecipe.shipped().items()}
     width = max(map(len, found))
     out.result(
         [
@@ -141,7 +141,7 @@ def recipe_list(out: Out) -> None:
 def recipe_show(out: Out, recipe: NameArgument) -> None:
     """Print the YAML of a recipe that is in order."""
     learning.load_recipe(recipe)
-    _show_file(out, learning.recipe_path(recipe))
+    _show_file(out, learning.TrainingRecipe.file(recipe))
 
 
 @recipe_group.add("validate", "recipe validate my-recipe.yaml")
@@ -158,7 +158,7 @@ def recipe_validate(out: Out, path: NameArgument) -> None:
 @recipe_group.add("new", "recipe new my-recipe --based-on sac", force=True)
 def recipe_new(out: Out, name: NewNameArgument, based_on: BasedOnOption = "ppo", output: FolderOption = Path()) -> None:
     """Write a commented NAME.yaml with every key."""
-    _write_new(out, "recipe", output / f"{name}.yaml", learning.new_recipe_text(name, based_on))
+    _write_new(out, "recipe", output / f"{name}.yaml", learning.load_recipe(based_on).new_text(name))
 
 
 @recipe_group.add("schema", "recipe schema > recipe.schema.json")
@@ -167,7 +167,7 @@ def recipe_schema(out: Out) -> None:
 
     For editors that complete and check YAML.
     """
-    out.print_json(learning.recipe_json_schema())
+    out.print_json(learning.TrainingRecipe.json_schema())
 
 
 def _show_file(out: Out, path: Path) -> None:
@@ -192,13 +192,13 @@ def agent_list(out: Out) -> None:
 
     What begins with + goes behind any agent, for instance full_brake+step: +refined first, then one shield.
     """
-    from ethbrake_marl.agents import agent_entries, knowledge_text, sees_through
+    from ethbrake_marl.agents import Knowledge, agent_entries
 
     told, rows = [], []
     for entry in agent_entries():
-        omniscient, added = sees_through(entry.knows), "also " if entry.form.startswith("+") else ""
-        told.append({"agent": entry.form, "about": entry.about, "knows": list(entry.knows), "omniscient": omniscient})
-        rows.append((entry.form, entry.about, f"{added}{knowledge_text(entry.knows)}{' †' if omniscient else ''}"))
+        knows, added = Knowledge.of(entry), "also " if entry.form.startswith("+") else ""
+        told.append({"agent": entry.form, "about": entry.about, "knows": list(knows), "omniscient": knows.sees_through})
+        rows.append((entry.form, entry.about, f"{added}{knows.text}{' †' if knows.sees_through else ''}"))
     out.result(
         told,
         Sheet("", ("Agent", "Drives by", "Knows"), rows, gap=2),
@@ -217,7 +217,7 @@ def agent_export(
 
     Needs the package onnx, which the extra `export` brings.
     """
-    from ethbrake_marl.policies import load_named_policy, onnx_model
+    from ethbrake_marl.policies import load_named_policy
 
     out.check(onnx)
-    out.write(onnx, onnx_model(load_named_policy(policy)), what="written")
+    out.write(onnx, load_named_policy(policy).to_onnx(), what="written")

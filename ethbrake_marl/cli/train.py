@@ -120,7 +120,7 @@ def start_command(
     chosen, plan = evaluation.load_runnable(scenario, given.scenario), given.change(plan, out.note)
     if scheme is not None:
         plan = plan.replace(scheme=scheme)
-    begun = [learning.resolve(plan, chosen).who_drives()]
+    begun = [learning.Training.of(plan, chosen).who_drives()]
 
     def tell(progress: Progress) -> None:
         if begun:  # all input is known to be good

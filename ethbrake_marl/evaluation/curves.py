@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents import Agent, optimise_coupled, optimise_pairwise, pairwise_breakpoints, pairwise_harm
+from ethbrake_marl.agents import Agent, optimise_coupled, optimise_pairwise, pairwise_harm
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.measures import Evaluation, Outcome
@@ -192,8 +192,9 @@ def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> De
         raise InvalidInput(f"deceleration curve: points = {points}; at least 2 are needed")
     scenario, vehicle = task.scenario, task.vehicle
     capacity = float(world.vehicles.braking_capacity_mps2[0, vehicle])
-    chosen = optimise_pairwise(world, vehicle).deceleration_mps2
-    special = np.append(pairwise_breakpoints(world, vehicle)[0], chosen)
+    pairwise = optimise_pairwise(world, vehicle)
+    chosen = pairwise.deceleration_mps2
+    special = np.append(pairwise.breakpoints_mps2[0], chosen)
     at = np.union1d(np.linspace(0.0, capacity, points), special)
     others = scripted_commands(world, task)
     first, total = forecast(world, others, vehicle, -at[None, :], scenario.horizon_s)

@@ -25,18 +25,7 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import command_to_action
-from ethbrake_marl.agents import (
-    Agent,
-    Driver,
-    Episodes,
-    Team,
-    drive,
-    episode_engine,
-    parse_spec,
-    play,
-    script_agents,
-    team_of,
-)
+from ethbrake_marl.agents import Agent, Driver, Episodes, Team, drive, episode_engine, parse_spec, script_agents
 from ethbrake_marl.defaults import DEFAULT, HARM_COUNTS, DatasetFormat, HarmCount
 from ethbrake_marl.engine import Engine, Step
 from ethbrake_marl.envs import COLUMNS, Frame, Report, Scene, Trace, action_box, animate_films, feature_box, report
@@ -114,10 +103,10 @@ def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[E
     Raises ``PhysicsError`` naming the worlds that could not be advanced.
 
     """
-    team = team_of(agent, scenario.learners)
+    team = Team.of(agent, scenario.learners)
     engine = episode_engine(worlds, team, scenario)
     follower = _Follower(worlds, team, engine)
-    episodes = play(engine, worlds, [follower])
+    episodes = Episodes.of(engine, worlds, [follower])
     return follower.motions(episodes)
 
 
@@ -336,7 +325,7 @@ def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float 
     """
     if world.n != 1:
         raise InvalidInput(f"film_scenes: {count_of(world.n, 'world')} given; exactly 1 is needed: worlds.take([0])")
-    engine = episode_engine(world, team_of(agent, scenario.learners), scenario)
+    engine = episode_engine(world, Team.of(agent, scenario.learners), scenario)
     trace = Trace(engine, whole=True, alert=world)
     while not engine.ended.all():
         engine.step({})
@@ -769,7 +758,7 @@ def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Re
     Raises ``PhysicsError`` naming worlds that could not be advanced, and what ``episode_engine`` raises.
     """
     scenario, learners = task.scenario, task.scenario.learners
-    engine = episode_engine(sample.worlds, team_of(driver, learners), scenario)
+    engine = episode_engine(sample.worlds, Team.of(driver, learners), scenario)
     asked = []
     while not engine.ended.all():
         engine.step({})
@@ -1162,7 +1151,7 @@ def check_dataset(
 def tell(task: Task, agents: Mapping[str, Driver], episodes: int) -> dict[str, Any]:
     """What is recorded, as plain data: the metadata of every dataset."""
     scenario = task.scenario
-    teams = {name: team_of(driver, scenario.learners).drivers for name, driver in agents.items()}
+    teams = {name: Team.of(driver, scenario.learners).drivers for name, driver in agents.items()}
     return {
         "scenario": scenario.declared(),
         "scenario_sha256": scenario_sha256(scenario),

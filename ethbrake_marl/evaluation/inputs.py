@@ -24,10 +24,8 @@ from ethbrake_marl.agents import (
     Team,
     episode_engine,
     make_agent,
-    make_single_agent,
     parse_spec,
     script_agents,
-    team_of,
 )
 from ethbrake_marl.defaults import DEFAULT, HarmCount
 from ethbrake_marl.engine import ask_script, begin_script
@@ -275,7 +273,8 @@ def load_runnable(
     worlds = scenario.replace(early_impacts="keep").sample(1, DEFAULT.LIST_SEED).worlds
     for i, script in scenario.scripts.items():
         try:
-            agent = make_single_agent(script, horizon_s=scenario.horizon_s, most_candidates=TRIED_CANDIDATES)
+            driver = make_agent(script, horizon_s=scenario.horizon_s, most_candidates=TRIED_CANDIDATES)
+            agent = Team.of(driver, [i]).drivers[i]
             ask_script(agent, worlds, begin_script(agent, worlds, i, {}), i)
         except InvalidInput as error:
             role = scenario.vehicle_names[i]
@@ -302,7 +301,7 @@ def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenari
     Scripts that need no state are tried on all worlds, which takes no time; all others on the first.
     """
     for name, agent in agents.items():
-        team = team_of(agent, scenario.learners)
+        team = Team.of(agent, scenario.learners)
         scripts = script_agents(scenario, except_for=team.drivers)
         if team.shield is not None:
             with AgentFailed.naming(name, [script.name for script in scripts.values()]):

@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents import Knowledge, Source, knowledge_text, sees_through
+from ethbrake_marl.agents import Knowledge, Source
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import (
     AlreadyExists,
@@ -60,6 +60,7 @@ Columns = dict[str, list[Any]]  # of one row per world
 Values = NDArray[Any]  # [n]
 
 # Columns of files with every world that hold texts, but for the types of vehicles.
+UNSTATED = Knowledge((Source.UNSTATED,))
 _TEXT_COLUMNS = {"agent", "scenario", "unavoidable_reason", "best_known_source", "ended", "knows"}
 _ALWAYS_TOLD = (
     "gaps_m",
@@ -88,7 +89,7 @@ class Outcome:
     at_rest: Bools  # [n] the line came to rest; else the horizon cut the episode off
     predicted_harm: Floats | None  # [n] what the agent expected at the alert, if it predicts and drives alone
     chosen_policy: Bools | None  # [n] a hybrid drove by its policy; else by its backup
-    knows: Knowledge = (Source.UNSTATED,)  # what the agent says it knows of the line
+    knows: Knowledge = UNSTATED  # what the agent says it knows of the line
     shoved_m: Floats | None = None  # [n] how far Vehicle 1 ends beyond where it would by itself
     sampled_harm: Floats | None = None  # [n] the paper's sum over samples of the same commands
     policies: Mapping[str, str] = field(default_factory=dict)  # vehicle's name -> SHA-256 of its policy's manifest
@@ -369,7 +370,7 @@ class Evaluation:
                 "agent": [agent] * n,
                 **initial,
                 **{name: [None] * n if column is None else column.tolist() for name, column in told.items()},
-                "knows": [knowledge_text(outcome.knows)] * n,
+                "knows": [outcome.knows.text] * n,
                 "hidden": self.hidden.astype(int).tolist(),
             }
             for left in self.left_out if limits else ():
@@ -1342,7 +1343,7 @@ class SummaryRow:
     warning: str = ""  # a table of best known harm holds some of the worlds, and not the others
     left_out: tuple[LeftOut, ...] = ()  # worlds of the list that no row counts: they could not be advanced
     beside_paper: bool = False  # these are results of the test that the paper's rows are about
-    knows: Knowledge = (Source.UNSTATED,)  # what the agent says it knows of the line
+    knows: Knowledge = UNSTATED  # what the agent says it knows of the line
     hidden_share: float = 0.0  # worlds in which the channel hides something from a driven vehicle, whoever drives
     worlds_sha256: str = ""  # of the list; results on the same worlds have the same
     scenario_sha256: str = ""  # of all that shapes an episode
@@ -1376,7 +1377,7 @@ class SummaryRow:
     @property
     def sees_through(self) -> bool:
         """Whether the channel hides something here that this agent reads all the same."""
-        return self.hidden_share > 0.0 and sees_through(self.knows)
+        return self.hidden_share > 0.0 and self.knows.sees_through
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON; what does not exist is null, intervals are ``[low, high]``."""
@@ -1386,7 +1387,7 @@ class SummaryRow:
         return {
             "kind": "evaluate",
             "agent": self.agent,
-            "knows": knowledge_text(self.knows),
+            "knows": self.knows.text,
             "sees_through_channel": self.sees_through,
             "hidden_share": self.hidden_share,
             "episodes": self.episodes,
@@ -1496,7 +1497,7 @@ class SummaryTable(list[SummaryRow]):
             value, interval = Column("", sign="-").show(row["mean_regret_first"])
             bound = row.known_best_share is not None and row.known_best_share < 1.0
             cells["mean_regret_first"] = Shown(f"≥ {value}" if bound else value, interval)
-            lines.append((row.agent, SEES_THROUGH * row.sees_through + knowledge_text(row.knows), *cells.values()))
+            lines.append((row.agent, SEES_THROUGH * row.sees_through + row.knows.text, *cells.values()))
         for paper in PAPER_ROWS if self and self[0].beside_paper else ():
             printed = {
                 "collision_rate": f"{100 * paper.collision_rate:.4g} %",

@@ -18,7 +18,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ethbrake_marl.agents import Driver, Knowledge, knowledge_of, knowledge_text, team_of
+from ethbrake_marl.agents import Driver, Knowledge, Team
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import (
     EthBrakeError,
@@ -472,8 +472,8 @@ class Question:
         raises.
         """
         lineup, scenario = self.lineup(), self.scenario
-        teams = {name: team_of(agent, scenario.learners) for name, agent in lineup.items()}
-        knows = {name: knowledge_of(team) for name, team in teams.items()}
+        teams = {name: Team.of(agent, scenario.learners) for name, agent in lineup.items()}
+        knows = {name: Knowledge.of(team) for name, team in teams.items()}
         policies = {name: policies_of(team.drivers) for name, team in teams.items()}
         ends = sorted({0, max(self.episodes - _TRIED, 0)})
         found = [
@@ -489,7 +489,7 @@ class Question:
             "episodes": self.episodes,
             "agents": list(lineup),
             "policy_sha256": policies,
-            "knows": {name: knowledge_text(each) for name, each in knows.items()},
+            "knows": {name: each.text for name, each in knows.items()},
             "harm_count": self.harm_count,
             "uncertainty": self.uncertainty,
             "objectives": list(self.objectives),

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents import Driver, Shielding, Team, check_agent, drive, knowledge_of, script_agents, team_of
+from ethbrake_marl.agents import Driver, Knowledge, Team, check_agent, drive, script_agents
 from ethbrake_marl.engine import check_alert, is_state_free
 from ethbrake_marl.errors import (
     AgentFailed,
@@ -25,7 +25,17 @@ from ethbrake_marl.errors import (
 )
 from ethbrake_marl.evaluation.inputs import policies_of
 from ethbrake_marl.evaluation.measures import REGISTERED, Evaluation, LeftOut, Outcome, Tape
-from ethbrake_marl.physics import Decisions, Floats, Ints, Worlds, advance, advance_sampled, leaving_out_failed, move_on
+from ethbrake_marl.physics import (
+    Decisions,
+    Floats,
+    Ints,
+    Worlds,
+    advance,
+    leaving_out_failed,
+    move_on,
+    sample_on,
+    sum_rows,
+)
 from ethbrake_marl.scenario import Sample, Scenario, ScriptSpec, Task
 
 # The aftermath of a line: where Vehicle 1 ends, and how much of that others pushed it.
@@ -112,8 +122,8 @@ class SampledHarm:
         self._samples += 1
         next_s = np.minimum(Decisions(self._start_s, self._step_s).at(self._samples), self._horizon_s)
         until_s = np.maximum(next_s, self._worlds.time_s)
-        self._worlds, impacts = advance_sampled(self._worlds, self._command, until_s=until_s, step_s=self._step_s)
-        self._harm += impacts.total_harm.sum(axis=1)
+        self._worlds, impacts = sample_on(self._worlds, self._command, until_s, self._step_s)
+        self._harm += sum_rows(impacts.total_harm)
 
     def finish(self) -> Floats:
         """Go on to the horizon; gives the sum of each world, [n] m2/s2."""
@@ -227,9 +237,8 @@ def _check_request(worlds: object, agents: object, scenario: object, chunk: obje
     if not agents:
         raise InvalidInput("evaluate: no agents given; at least one is needed, for instance full_brake")
     for name, agent in agents.items():
-        if not isinstance(agent, Team | Shielding):
-            check_agent(agent, f"evaluate: agent {name!r}")
-        knowledge_of(agent)  # refuses what is no statement
+        check_agent(agent, f"evaluate: agent {name!r}", alone=False)
+        Knowledge.of(agent)  # refuses what is no statement
     if chunk is not None:
         check_whole_number("evaluate: chunk", chunk, 1)
 
@@ -266,7 +275,7 @@ def _roll_out(
     whole: Worlds, agent: Driver, driven: tuple[int, ...], scenario: Scenario, aftermath: bool, rows: Ints
 ) -> Outcome:
     """Outcome of a fresh team in these worlds; what an agent says about a world counts where it drives alone."""
-    worlds, team = whole.take(rows), team_of(agent, driven)
+    worlds, team = whole.take(rows), Team.of(agent, driven)
     task = Task(scenario, tuple(team.drivers))
     shoved = ShovedFront.of(worlds, task) if aftermath else None
     sampled = SampledHarm.of(worlds, task) if aftermath else None
@@ -282,7 +291,7 @@ def _roll_out(
         episodes.at_rest,
         None if predicted is None else predicted.astype(np.float64),
         None if chosen is None else chosen.astype(np.bool_),
-        knowledge_of(team),
+        Knowledge.of(team),
         None if shoved is None else shoved.metres,
         None if sampled is None else sampled.finish(),
         policies_of(team.drivers),

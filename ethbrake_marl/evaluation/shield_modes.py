@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents import Agent, Driver, Team, drive, team_of
+from ethbrake_marl.agents import Agent, Driver, Team, drive
 from ethbrake_marl.errors import renumbered
 from ethbrake_marl.evaluation.inputs import policies_of, result_identity
 from ethbrake_marl.evaluation.rollout import OnWorlds
@@ -177,7 +177,7 @@ def _compare(agents: Mapping[str, Driver], worlds: Worlds, task: Task, on_progre
 def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[Mode, _Part]:
     """Each mode in one chunk."""
     several, found = len(task.vehicles) > 1, {}
-    alone: dict[Mode, Team] = {"none": team_of(agent, task.vehicles)}
+    alone: dict[Mode, Team] = {"none": Team.of(agent, task.vehicles)}
     if not several:
         assert isinstance(agent, Agent)
         hybrid = HybridAgent(agent, task.scenario, harm_count=task.harm_count)

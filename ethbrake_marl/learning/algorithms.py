@@ -37,15 +37,16 @@ from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.engine import Engine, Moment
 from ethbrake_marl.envs import EthBrakeVecEnv
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
-from ethbrake_marl.learning.recipe import (
+from ethbrake_marl.learning.training import (
+    Algorithm,
     CounterfactualRecipe,
     ModesPlan,
     NetworkShape,
     PpoRecipe,
     SacRecipe,
     SquashedShape,
+    Training,
 )
-from ethbrake_marl.learning.training import Algorithm, Training
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats, Ints, Packed, Worlds, columns, compiled
 from ethbrake_marl.policies import Activation, Float32s, NetworkSpec, Policy, load_named_policy
@@ -526,9 +527,6 @@ def follow(average: Iterable[Tensor], learning: nn.Module, keep: float) -> None:
         mean.lerp_(learns, 1.0 - keep)
 
 
-LOG_NOISE = -3.0  # of the bundle: the actor itself never explores
-
-
 class _Deterministic(BasePolicy):
     """A policy whose actions are its ``means``, cut at -1 and 1."""
 
@@ -569,7 +567,8 @@ class AveragedActor(_Deterministic):
                 nn.init.zeros_(layer.bias)
         nn.init.orthogonal_(self.action_net.weight, 0.01)
         nn.init.constant_(self.action_net.bias, shape.initial_action or 0.0)
-        self.log_std = nn.Parameter(torch.full((1,), LOG_NOISE), requires_grad=False)
+        # of the bundle: the actor itself never explores
+        self.log_std = nn.Parameter(torch.full((1,), -3.0), requires_grad=False)
         last = nn.Linear(hidden[-1], 1)
         self.learning = nn.Sequential(*create_mlp(inputs, -1, hidden, activation), last)
         self.average = [*self.mlp_extractor.parameters(), *self.action_net.parameters()]
@@ -750,7 +749,6 @@ def trusted_targets(tried: Tried, radius: float, anchor: float) -> tuple[Float32
 # with unequal chances, and each counts the less, the likelier it was drawn: what is learned is the same on average.
 
 WIDTH = 64  # of its hidden layer
-HIGHEST = 20.0  # logarithm of what it expects at most
 
 
 class Scout(nn.Module):
@@ -765,8 +763,8 @@ class Scout(nn.Module):
         nn.init.zeros_(last.bias)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """The logarithm of what is to be expected [rows] of observations [rows, F]."""
-        found: Tensor = self.layers(observation)[:, 0].clamp(max=HIGHEST)
+        """The logarithm of what is to be expected [rows] of observations [rows, F]; at most 20."""
+        found: Tensor = self.layers(observation)[:, 0].clamp(max=20.0)
         return found
 
     def expect(self, observation: Float32s) -> Floats:
@@ -970,11 +968,6 @@ def own_worlds(engine: Engine, plan: ModesPlan, found: Explored, act: Act, gamma
     return found.start.take(rows)
 
 
-OTHER_COUNT: dict[HarmCount, HarmCount] = {"first": "total", "total": "first"}
-SAME_COST = 1e-9
-SAME_ACTION = 1e-2
-
-
 class NoOtherMode(EthBrakeError, ValueError):
     """No template does better than the networks so far: there is no other mode to be learned."""
 
@@ -1104,11 +1097,12 @@ class ModesModel(CounterfactualModel):
         engine, members = self.engine, [actor.act for actor in self.policy.actors]
         observed = seen.reshape(-1, seen.shape[2])
         actions = np.stack([act(observed) for act in members])
-        differ = (np.ptp(actions, axis=0) > SAME_ACTION) & moving_rows(moments)
+        differ = (np.ptp(actions, axis=0) > 1e-2) & moving_rows(moments)
         count, scout = self.plan.gate_states, self.policy.gate.scout
         expect = None if scout is None else scout.expect
         rows, importance = choose_rows(observed, np.flatnonzero(differ), count, self.recipe.focus, expect)
-        other, then = OTHER_COUNT[engine.reward.harm_count], moments.take(rows)
+        other: HarmCount = "total" if engine.reward.harm_count == "first" else "first"
+        then = moments.take(rows)
         costs = np.empty((len(rows), len(members)))
         for number, act in enumerate(members):
             gained, harm = drive_from(engine, then, act, self.recipe.gamma, other)
@@ -1122,7 +1116,7 @@ class ModesModel(CounterfactualModel):
         gate = self.policy.gate
         self._update_learning_rate(gate.optimizer)
         more = (costs - costs.min(axis=1, keepdims=True)).astype(np.float32)
-        rows = np.flatnonzero(more.max(axis=1) > SAME_COST)
+        rows = np.flatnonzero(more.max(axis=1) > 1e-9)
         gate.remember(seen[rows], more[rows] * importance[rows, np.newaxis])
         if gate.scout is not None:
             arrays = [torch.from_numpy(array) for array in (seen, more.max(axis=1), importance)]

@@ -56,17 +56,17 @@ from ethbrake_marl.files.store import (
 from ethbrake_marl.files.yaml import FileModel, read_json_model
 from ethbrake_marl.harm import objective_harm
 from ethbrake_marl.learning.algorithms import tensors_of
-from ethbrake_marl.learning.recipe import Scheme, TrainingRecipe
 from ethbrake_marl.learning.training import (
     Algorithm,
     RunDirectory,
     RunStatus,
+    Scheme,
     Training,
+    TrainingRecipe,
     read_object,
-    resolve,
     stop_on_signal,
 )
-from ethbrake_marl.policies import Policy, PolicyTeam, Sha256, Trained, installed_versions, make_policy, read_trained
+from ethbrake_marl.policies import Policy, PolicyTeam, Sha256, Trained, installed_versions, read_trained
 from ethbrake_marl.scenario import Appended, Scenario
 
 Model = BaseAlgorithm  # of Stable-Baselines3
@@ -166,8 +166,8 @@ def measure_on_list(training: Training) -> Evaluate:
         if objectives:
             harm = objective_harm(outcome.ledger, recipe.reward.harm_count, objectives)
             each = {names[i]: mean(harm[:, i]).value for i in scenario.learners}
-            metrics[OBJECTIVE] = sum(each.values()) / len(each)
-            metrics |= {f"{OBJECTIVE}_{name}": value for name, value in each.items()}
+            metrics[RunDirectory.OBJECTIVE] = sum(each.values()) / len(each)
+            metrics |= {f"{RunDirectory.OBJECTIVE}_{name}": value for name, value in each.items()}
         return metrics
 
     return measure
@@ -218,7 +218,7 @@ def train(
 
     """
     changes = {"scheme": scheme, "turns": turns, "seed": seed, "total_steps": steps}
-    training = resolve(recipe, scenario, **{name: value for name, value in changes.items() if value is not None})
+    training = Training.of(recipe, scenario, **{name: value for name, value in changes.items() if value is not None})
     run = RunDirectory(Path(directory))
     begin = partial(run.create, training.config(settings), team=training.team(), force=force)
     return _run(run, begin, training, _Wishes(measure, stop_when_lost, stop_at, Progress.listener(on_progress)))
@@ -305,9 +305,8 @@ def _run(
 def _newest(run: RunDirectory, training: str, other_versions: bool) -> tuple[TrainingState | None, list[str]]:
     """The newest whole checkpoint, if there is one, and what was wrong with newer ones."""
     remove_unfinished(run.path)
-    if not run.checkpoints.is_dir():
-        return None, []
-    remove_unfinished(run.checkpoints)
+    if run.checkpoints.is_dir():
+        remove_unfinished(run.checkpoints)
     state, damaged = newest_usable(run.checkpoints)
     if state is None:
         return None, damaged
@@ -590,7 +589,7 @@ def trained_policies(training: Training, algorithm: Algorithm, model: Model) -> 
     names, actors = tuple(training.drivers), algorithm.actors(model)
     apart = training.scheme == "independent"
     policies = [
-        make_policy(
+        Policy.make(
             tensors_of(actor, network),
             algorithm=recipe.algorithm,
             network=network,
@@ -614,8 +613,6 @@ EPISODE_COLUMNS = {
     "rollout/total_harm": "world_total_harm",
     "rollout/collision_rate": "collided",
 }
-HARM_METRIC: dict[HarmCount, str] = {"first": "first_impact_harm", "total": "total_harm"}
-OBJECTIVE = "objective"  # mean over the learners of their objectives' harm, where one is another than total
 RETURN = "episode_return"
 AT_HORIZON = "horizon_rate"  # share of the fixed list's episodes in which something still moves at the horizon
 
@@ -662,7 +659,7 @@ class Course:
         """Take in an evaluation of ``policy``; gives the alarm, if this one raises it."""
         extra = {} if episode_return is None else {RETURN: episode_return}
         self.evaluations.append({"steps": self.steps, "updates": self.updates, **metrics, **extra})
-        name = chosen_by(self.evaluations, self.harm_count)
+        name = RunDirectory.chosen_by(self.evaluations, self.harm_count)
         if name in metrics and metrics[name] < self.best_harm:
             self.best, self.best_harm = policy, metrics[name]
         self.lost = lost_training(self.evaluations, name)
@@ -686,12 +683,6 @@ class Course:
         self.alarms = list(content["alarms"])
         self.best_harm = math.inf if content["best_harm"] is None else float(content["best_harm"])
         self.wall_before_s = float(content["wall_s"])
-
-
-def chosen_by(evaluations: Sequence[Mapping[str, Any]], harm_count: HarmCount, prefix: str = "") -> str:
-    """Name of what the best policy has least of: the objective, or the line's harm where an evaluation tells none."""
-    found = evaluations and all(entry.get(prefix + OBJECTIVE) not in (None, "") for entry in evaluations)
-    return prefix + (OBJECTIVE if found else HARM_METRIC[harm_count])
 
 
 def misleading_return(evaluations: Sequence[Mapping[str, float]], harm: str) -> str | None:
@@ -995,7 +986,6 @@ _NUMBERS, _ARRAYS, _TABLE, _POLICY, _BEST, _MEMORY = (
     "best",
     "replay",
 )
-_LISTING_LIMIT_BYTES = 1 << 20
 _HELD_LIMITS_BYTES = {_NUMBERS: 256 << 20, _ARRAYS: 1 << 30, _TABLE: 256 << 20}  # of what is read as a whole
 _SIZE_LIMIT_BYTES = 1 << 36  # of any other file: a replay memory of ten million decisions
 _DTYPES = {"BOOL", "F32", "F64", "I32", "I64", "U8", "U32", "U64"}
@@ -1113,9 +1103,9 @@ def newest_usable(folder: Path) -> tuple[TrainingState | None, list[str]]:
 
 def _check_files(folder: Path) -> tuple[Listing, dict[str, bytes]]:
     """The listing, and the content of the files beside it; every file is there, and is what the listing says."""
-    path = folder / LISTING
+    path, read = folder / LISTING, partial(read_plain, refusal=CorruptBundle, follow_links=False)
     try:
-        data = _read(path, _LISTING_LIMIT_BYTES)
+        data = read(path, 1 << 20)
         content = parse_strict_json(data)
         version = content.get("format_version") if isinstance(content, dict) else None
         if type(version) is int and version != FORMAT_VERSION:
@@ -1137,7 +1127,7 @@ def _check_files(folder: Path) -> tuple[Listing, dict[str, bytes]]:
     held = {}
     for name, entry in files.items():
         if name in _HELD_LIMITS_BYTES:
-            held[name] = _read(found[name], _HELD_LIMITS_BYTES[name])
+            held[name] = read(found[name], _HELD_LIMITS_BYTES[name])
             digest, size = hashlib.sha256(held[name]), len(held[name])
         else:
             with open_plain(found[name], _SIZE_LIMIT_BYTES, refusal=CorruptBundle, follow_links=False) as stream:
@@ -1145,10 +1135,6 @@ def _check_files(folder: Path) -> tuple[Listing, dict[str, bytes]]:
         if (size, digest.hexdigest()) != (entry.bytes, entry.sha256):
             raise CorruptBundle(f"{found[name]}: is not the file that was written (size or SHA-256 differ)")
     return listing, held
-
-
-def _read(path: Path, limit_bytes: int) -> bytes:
-    return read_plain(path, limit_bytes, refusal=CorruptBundle, follow_links=False)
 
 
 def _is_folder(path: Path) -> bool:

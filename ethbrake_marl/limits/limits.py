@@ -26,8 +26,6 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ethbrake_marl.agents import (
-    MOST_CANDIDATES,
-    PROFILE_BUDGET,
     Agent,
     AgentSettings,
     BestHarm,
@@ -41,7 +39,7 @@ from ethbrake_marl.defaults import DEFAULT, HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError, check_one_learner
 from ethbrake_marl.files.arrays import ArrayArchive, ArrayRow
 from ethbrake_marl.files.store import parse_strict_json, read_plain, write_file
-from ethbrake_marl.files.yaml import first_mistake, parse_numeral
+from ethbrake_marl.files.yaml import first_mistake
 from ethbrake_marl.limits.lower_bound import avoidability, extreme_profiles, lower_bound, onset_states, team_bound
 from ethbrake_marl.physics import (
     CLOCK,
@@ -599,17 +597,7 @@ def shipped_profiles(problem: ProfileProblem, harm_count: HarmCount) -> tuple[Pr
 
 def make_best_harm(argument: str | None, settings: AgentSettings) -> Agent:
     """``best_harm[:candidates]``: the shipped profile, or a search with so many candidates where there is none."""
-    number = PROFILE_BUDGET if argument is None else parse_numeral(argument)
-    if number is None or (argument is not None and not argument.isdecimal()) or not 1 <= number <= MOST_CANDIDATES:
-        raise InvalidInput(
-            f"agent 'best_harm:{argument}': the argument must be a number of candidates, for instance {PROFILE_BUDGET},"
-            f" at most {MOST_CANDIDATES:,}"
-        )
-    budget = int(number) if settings.most_candidates is None else min(int(number), settings.most_candidates)
-    return BestHarm(
-        shipped_profiles, harm_count=settings.harm_count, horizon_s=settings.horizon_s, budget=budget,
-        time_step_s=settings.time_step_s,
-    )  # fmt: skip
+    return BestHarm.make(argument, settings, shipped_profiles)
 
 
 _VEHICLES, _DRIVEN = 3, 1

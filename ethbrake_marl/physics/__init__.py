@@ -10,6 +10,7 @@ from ethbrake_marl.physics.batch import (
     columns as columns,
     leaving_out_failed as leaving_out_failed,
     measured_without_failed as measured_without_failed,
+    sample_on as sample_on,
 )
 from ethbrake_marl.physics.compiling import (
     PER_LN2 as PER_LN2,
@@ -77,4 +78,5 @@ from ethbrake_marl.physics.worlds import (
     Vehicles as Vehicles,
     Worlds as Worlds,
     make_worlds as make_worlds,
+    sum_rows as sum_rows,
 )

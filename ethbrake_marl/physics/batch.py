@@ -268,23 +268,29 @@ class Packed(NamedTuple):
 def advance_worlds(
     gaps: Floats, speeds: Floats, time: Floats, hit: Bools, in_force: Floats, ahead: Floats, ahead_hit: Bools,
     first_harm: Floats, total_harm: Floats, count: Ints, ahead_first: Floats, ahead_total: Floats, ahead_count: Ints,
-    command: Floats, until: Floats, latency: Floats, mass: Floats, limit: Floats, restitution: Floats, failed: Ints,
-    at: int, rows: Floats,
-) -> int:  # fmt: skip
+    command: Floats, until: Floats, braking: Floats, driving: Floats, latency: Floats, mass: Floats, limit: Floats,
+    restitution: Floats, failed: Ints, at: int, rows: Floats,
+) -> tuple[int, bool]:  # fmt: skip
     """Advance every world to its ``until``, in place (the first seven arrays), and fill its harm (the next six).
 
     ``at`` is 1 where some world has an obstacle ``ahead``, else 0: vehicle i stands in column at + i of the table.
-    ``rows`` [capacity, LISTED.WIDTH] receives the impacts that fit; gives their whole number. A world in which a check
-    fails is marked with its status in ``failed`` [n] (else DONE) and stays where it was; the others go on.
+    ``rows`` [capacity, LISTED.WIDTH] receives the impacts that fit. Gives their whole number, and False where a world's
+    end or command is refused. A world in which a check fails is marked with its status in ``failed`` [n] (else DONE)
+    and stays where it was; the others go on.
     """
     n, vehicles = speeds.shape
     table = np.zeros((ROW.OF_SEGMENT, at + vehicles))
     recorded = 0
     for k in range(n):
+        duration = until[k] - time[k]
+        if not 0.0 <= duration < math.inf:
+            return recorded, False
         if at == 1:
             place_obstacle(table, min(ahead[k], BOUND.FAR_AWAY_M), 1.0 if ahead_hit[k] else 0.0)
             table[ROW.SPEED, 0] = 0.0
         for i in range(vehicles):
+            if not -braking[k, i] <= command[k, i] <= driving[k, i]:
+                return recorded, False
             table[ROW.COMMAND, at + i] = command[k, i]
             table[ROW.SPEED, at + i] = speeds[k, i]
             table[ROW.MASS, at + i] = mass[k, i]
@@ -294,7 +300,6 @@ def advance_worlds(
         for p in range(vehicles - 1):
             table[ROW.GAP, at + p] = gaps[k, p]
             table[ROW.HIT, at + p] = 1.0 if hit[k, p] else 0.0
-        duration = until[k] - time[k]
         recorded, status = advance_table(table, restitution[k], duration, time[k], k, rows, recorded)
         failed[k] = status
         if status != FLAG.DONE:
@@ -314,7 +319,7 @@ def advance_worlds(
             ahead_first[k] = table[ROW.FIRST_HARM, 0]
             ahead_total[k] = table[ROW.TOTAL_HARM, 0]
             ahead_count[k] = int(table[ROW.COUNT, 0])
-    return recorded
+    return recorded, True
 
 
 def advance(
@@ -344,7 +349,6 @@ def advance(
         raise InvalidInput("advance: give either duration_s or until_s")
     end = until_s if duration_s is None else worlds.time_s + _shaped("duration_s", duration_s, (worlds.n,))
     until = _shaped("until_s", end, (worlds.n,))
-    _refuse_bad(worlds, command, until, (until >= worlds.time_s) & (until < math.inf))
     v, shape = worlds.vehicles, worlds.gaps_m.shape
     at, capacity = int(worlds.obstacle_ahead.any()), 4 * worlds.n + 64 if record else 0
     while True:
@@ -357,11 +361,17 @@ def advance(
         failed = np.empty(worlds.n, np.int64)
         arrays = (
             after.gaps_m, after.speeds_mps, after.time_s, after.pair_hit, after.command_mps2, after.obstacle_gap_m,
-            after.obstacle_hit, *harm, command, until, v.latency_s, v.mass_t, v.speed_limit_mps, v.restitution, failed,
+            after.obstacle_hit, *harm, command, until, v.braking_capacity_mps2, v.driving_capacity_mps2, v.latency_s,
+            v.mass_t, v.speed_limit_mps, v.restitution, failed,
         )  # fmt: skip
         parts = by_parts(partial(_advance_part, arrays, at, capacity), worlds.n, threads)
-        most = max(recorded for _, recorded, _ in parts)
-        if most <= capacity or not record:
+        for part in parts:
+            if not part.good:
+                _refuse_bad(worlds, command, until, (until >= worlds.time_s) & (until < math.inf))
+        if not record:
+            break
+        most = max(part.recorded for part in parts)
+        if most <= capacity:
             break
         capacity = most
     if (failed != FLAG.DONE).any():
@@ -369,16 +379,27 @@ def advance(
     return after, Impacts(*harm, _impact_rows(parts, at) if record else None)
 
 
-def _advance_part(arrays: tuple[NDArray[Any], ...], at: int, capacity: int, part: slice) -> tuple[Floats, int, int]:
-    """Advance the worlds of ``part`` in place: the impacts that fit, the number of all, and the part's first world."""
+class _Part(NamedTuple):
+    """How the kernel fared on a part of the worlds."""
+
+    first: int  # world of the whole batch with which the part begins
+    rows: Floats  # the impacts that fit; worlds are counted from ``first``
+    recorded: int  # all impacts
+    good: bool  # no end and no command was refused
+
+
+def _advance_part(arrays: tuple[NDArray[Any], ...], at: int, capacity: int, part: slice) -> _Part:
+    """Advance the worlds of ``part`` in place."""
     rows, kernel = np.empty((capacity, LISTED.WIDTH)), cast("Any", advance_worlds)
     whole = part.stop - part.start == len(arrays[0])
     mine = arrays if whole else [array[part] for array in arrays]
-    return rows, kernel(*mine, at, rows), part.start
+    return _Part(part.start, rows, *kernel(*mine, at, rows))
 
 
 def _shaped(name: str, value: ArrayLike | None, shape: tuple[int, ...]) -> Floats:
     given = np.asarray(value, np.float64)
+    if given.shape == shape:
+        return np.ascontiguousarray(given)
     try:
         return np.array(np.broadcast_to(given, shape), order="C")
     except ValueError:
@@ -398,10 +419,10 @@ def _refuse_bad(worlds: Worlds, command: Floats, until: Floats, in_time: Bools) 
     raise InvalidInput(f"command_mps2[{k}, {i}] = {command[k, i]:g}: must be in [{low[k, i]:g}, {high[k, i]:g}] m/s2")
 
 
-def _impact_rows(parts: list[tuple[Floats, int, int]], ahead: int) -> ImpactRows:
+def _impact_rows(parts: list[_Part], ahead: int) -> ImpactRows:
     """The impacts of all parts; ``ahead`` columns of their tables stand before that of Vehicle 1."""
-    rows = np.concatenate([listed[:recorded] for listed, recorded, _ in parts])
-    first = np.repeat([start for _, _, start in parts], [recorded for _, recorded, _ in parts])
+    rows = np.concatenate([part.rows[: part.recorded] for part in parts])
+    first = np.repeat([part.first for part in parts], [part.recorded for part in parts])
     return ImpactRows(
         first + rows[:, LISTED.WORLD].astype(np.int64),
         rows[:, LISTED.PAIR].astype(np.int64) - ahead,
@@ -562,7 +583,6 @@ def advance_sampled(
     Raises ``InvalidInput`` for a command beyond a vehicle's capacity, an end before a world's time, a step below
     1e-6 s, a world whose time is between two samples, negative speeds before the first sample, or an obstacle ahead.
     """
-    vehicles = worlds.vehicles
     if worlds.obstacle_ahead.any():
         k = int(np.argmax(worlds.obstacle_ahead))
         raise InvalidInput(
@@ -572,7 +592,17 @@ def advance_sampled(
     command = _shaped("command_mps2", command_mps2, worlds.speeds_mps.shape)
     until = _shaped("until_s", until_s, (worlds.n,))
     _refuse_bad(worlds, command, until, np.ones(worlds.n, np.bool_))
-    first, last = _samples(worlds, until, step_s)
+    _refuse_unsampled(worlds, until, step_s)
+    return sample_on(worlds, command, until, step_s)
+
+
+def sample_on(worlds: Worlds, command: Floats, until: Floats, step_s: float) -> tuple[Worlds, Impacts]:
+    """``advance_sampled`` of what it would accept: nothing is checked."""
+    vehicles = worlds.vehicles
+    start = vehicles.latency_s[:, 1]
+    position, end = (worlds.time_s - start) / step_s, (until - start) / step_s  # times on the grid may be rounded
+    first = np.where(position < -_ON_SAMPLE, -1.0, np.rint(position)).astype(np.int64)
+    last = np.where(end < -_ON_SAMPLE, -1.0, np.ceil(end - _ON_SAMPLE)).astype(np.int64)
     gaps, speeds, time, hit = (
         worlds.gaps_m.copy(), worlds.speeds_mps.copy(), worlds.time_s.copy(), worlds.pair_hit.copy()
     )  # fmt: skip
@@ -589,8 +619,8 @@ def advance_sampled(
     return after, Impacts(first_harm, total_harm, count, *Impacts.no_obstacle(worlds.n))
 
 
-def _samples(worlds: Worlds, until: Floats, step_s: float) -> tuple[Ints, Ints]:
-    """First and last sample of every world, [n] each; -1 stands for a time before sample 0."""
+def _refuse_unsampled(worlds: Worlds, until: Floats, step_s: float) -> None:
+    """Refuse a step, an end or a state that the map does not know."""
     if not (SHORTEST_STEP_S <= step_s < math.inf):
         raise InvalidInput(f"step_s = {step_s:g}: must be finite and at least {SHORTEST_STEP_S:g} s")
     good = (until >= worlds.time_s) & (until <= worlds.time_s + MOST_STEPS * step_s)
@@ -617,7 +647,3 @@ def _samples(worlds: Worlds, until: Floats, step_s: float) -> tuple[Ints, Ints]:
             f"advance_sampled: world {k} has a negative speed at {worlds.time_s[k]:g} s, before its first sample at"
             f" {start[k]:g} s; the map knows no impacts before that"
         )
-    end = (until - start) / step_s  # times on the grid may be rounded
-    first = np.where(before, -1.0, np.rint(position))
-    last = np.where(end < -_ON_SAMPLE, -1.0, np.ceil(end - _ON_SAMPLE))
-    return first.astype(np.int64), last.astype(np.int64)

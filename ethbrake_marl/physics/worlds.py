@@ -234,7 +234,7 @@ class Worlds:
         """
         vehicles = self.vehicles
         driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]
-        energy = (vehicles.mass_t * (self.speeds_mps * self.speeds_mps / 2.0 + driving)).sum(axis=1)
+        energy = sum_rows(vehicles.mass_t * (self.speeds_mps * self.speeds_mps / 2.0 + driving))
         farthest = 1.01 * duration_s * np.sqrt(2.0 * energy / vehicles.mass_t[:, 0])
         return replace(self, obstacle_gap_m=np.where(self.obstacle_ahead, self.obstacle_gap_m, farthest + 1.0))
 
@@ -264,6 +264,17 @@ def _combined(change: Callable[..., NDArray[Any]], *parts: Vehicles) -> Vehicles
         change(*(getattr(part, name) for part in parts)) for name in (_WITHOUT_NEWS if at_once else _OF_VEHICLES)
     ]
     return Vehicles.at_once(*columns) if at_once else Vehicles(*columns)
+
+
+def sum_rows(values: Floats) -> Floats:
+    """``values.sum(axis=1)`` to the same bits; faster where a row is short, which NumPy adds up entry by entry."""
+    if not 0 < values.shape[1] < 8:
+        total: Floats = values.sum(axis=1)
+        return total
+    total = values[:, 0].copy()
+    for column in values.T[1:]:
+        total += column
+    return total
 
 
 def make_worlds(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import action_to_command
-from ethbrake_marl.agents import Agent, AgentAround, Driver, Team, drive, team_of
+from ethbrake_marl.agents import Agent, AgentAround, Driver, Team, drive
 from ethbrake_marl.engine import Memory, Script
 from ethbrake_marl.errors import InvalidInput, count_of, renumbered
 from ethbrake_marl.physics import Bools, Decisions, Floats, Ints, LeftOutRows, Worlds, measured_without_failed
@@ -74,7 +74,7 @@ def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: In
     actions = plan.reshape(*plan.shape[:2], len(shield.vehicles))
     again = {
         i: _Released(agent, actions[:, :, c], step, shield.vehicles, scenario.time_step_s)
-        for c, (i, agent) in enumerate(team_of(policy, shield.vehicles).drivers.items())
+        for c, (i, agent) in enumerate(Team.of(policy, shield.vehicles).drivers.items())
     }
     with renumbered(world):
         return drive(worlds.take(world), Team(again, "released"), scenario).ledger.world_harm(shield.harm_count)

@@ -40,10 +40,7 @@ from ethbrake_marl.agents import (
     Source,
     Team,
     check_agent,
-    combine,
     drive,
-    split_believed,
-    team_of,
 )
 from ethbrake_marl.defaults import DEFAULT, HarmCount
 from ethbrake_marl.engine import (
@@ -746,8 +743,7 @@ class ShieldedDriver:
         self.options = ShieldOptions(**options)
         if self.options.mode == "episode":
             raise InvalidInput("shield: mode = 'episode': HybridAgent is that of mode episode")
-        if not isinstance(policy, Team):
-            check_agent(policy, str(self.options.mode))
+        check_agent(policy, str(self.options.mode), alone=not isinstance(policy, Team))
         check_scenario(scenario, str(self.options.mode))
         if not (told is None or isinstance(told, Worlds)):
             raise InvalidInput(f"step: told = {told!r}: must be worlds at the alert, or None")
@@ -774,11 +770,11 @@ class ShieldedDriver:
     @property
     def knows(self) -> Knowledge:
         """What the policy knows, and what the shield adds."""
-        return combine(self.policy, also=self.adds)
+        return Knowledge.of(self.policy, also=self.adds)
 
     def on(self, vehicles: Collection[int]) -> Team:
         """The team that drives these vehicles behind one shield, each by its own copy."""
-        return Team(team_of(self.policy, vehicles).drivers, self.name, shield=self)
+        return Team(Team.of(self.policy, vehicles).drivers, self.name, shield=self)
 
     def guard(self, engine: Engine, policies: Mapping[int, Agent]) -> Guard:
         """What stands in the engine in which they drive."""
@@ -841,9 +837,9 @@ class Shielded(NamedTuple):
 def put_shield(driver: Driver, task: Task, **settings: Any) -> Team:
     """A copy of the ``driver`` behind one step shield, on the task's vehicles; settings as of ``ShieldedDriver``."""
     if isinstance(driver, Team) and len(task.vehicles) == 1:
-        driver = team_of(driver, task.vehicles).drivers[task.vehicle]
+        driver = Team.of(driver, task.vehicles).drivers[task.vehicle]
     elif isinstance(driver, Agent) and len(task.vehicles) > 1:
-        driver = Team.copies(driver, task.vehicles)
+        driver = Team.of(driver, task.vehicles)
     return ShieldedDriver(driver, task.scenario, harm_count=task.harm_count, **settings).on(task.vehicles)
 
 
@@ -858,7 +854,7 @@ class BelievingHybrid(Believing):
     @property
     def knows(self) -> Knowledge:
         """What the policy knows, which drives by what it observes, and what the comparison adds."""
-        return combine(self.policy.policy, also=Source.BELIEFS)
+        return Knowledge.of(self.policy.policy, also=Source.BELIEFS)
 
     def _shown_at_first(self, believed: Worlds) -> Worlds:
         """The comparison is a rollout, which begins at t = 0 without impacts: the same line, its clock put back."""
@@ -875,23 +871,22 @@ class BelievingHybrid(Believing):
 
 def shield_episodes(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
     """``+episode`` or ``+episode:pairwise`` around an agent, with ``:believed`` behind on what was received."""
-    pairwise, believes = split_believed(argument)
-    bound: Bound = "coupled" if pairwise is None else "pairwise"
+    bound: Bound = "coupled" if argument is None else "pairwise"
     scenario = settings.needed_scenario()
     hybrid = HybridAgent(policy, scenario, bound=bound, harm_count=settings.harm_count)
-    if believes and isinstance(policy, Believing):
+    if settings.believes and isinstance(policy, Believing):
         raise InvalidInput(f"agent {settings.spec!r}: {policy.name} decides on what was received itself; take +step")
-    return BelievingHybrid(hybrid, scenario) if believes else hybrid
+    return BelievingHybrid(hybrid, scenario) if settings.believes else hybrid
 
 
 def shield_steps(policy: Driver, argument: str | None, settings: AgentSettings) -> Driver:
     """``+step`` around an agent or a team, where several vehicles learn around a copy for each; ``+step:believed``."""
-    scenario, believes = settings.needed_scenario(), split_believed(argument)[1]
+    scenario, believes = settings.needed_scenario(), settings.believes
     several = isinstance(policy, Team) or len(scenario.learners) > 1
     if several and believes:
         raise InvalidInput(f"agent {settings.spec!r}: :believed shields one learner, not several; take +step")
     if several and isinstance(policy, Agent):
-        policy = Team.copies(policy, scenario.learners)
+        policy = Team.of(policy, scenario.learners)
     shielded = ShieldedDriver(policy, scenario, mode="step", harm_count=settings.harm_count, believed=believes)
     return shielded.on(policy.drivers) if isinstance(policy, Team) else shielded
 
@@ -901,11 +896,9 @@ def shield_steps_robustly(policy: Agent, argument: str | None, settings: AgentSe
 
     With ``:believed`` behind, against all that was not received, without one.
     """
-    scenario, where, (certainty, believes) = (
-        settings.needed_scenario(), f"agent {settings.spec!r}", split_believed(argument),
-    )  # fmt: skip
+    where = f"agent {settings.spec!r}"
     return ShieldedDriver(
-        policy, scenario, mode="robust", harm_count=settings.harm_count, believed=believes, where=where,
-        robust=checked_robust(certainty or CORNERS, where),
-        uncertainty=None if believes else mode_uncertainty("robust", settings.uncertainty, where),
+        policy, settings.needed_scenario(), mode="robust", harm_count=settings.harm_count, believed=settings.believes,
+        where=where, robust=checked_robust(argument or CORNERS, where),
+        uncertainty=None if settings.believes else mode_uncertainty("robust", settings.uncertainty, where),
     )  # fmt: skip

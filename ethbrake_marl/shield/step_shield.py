@@ -45,20 +45,16 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.actions import action_to_command, command_of, command_to_action
 from ethbrake_marl.agents import (
-    SUFFIX,
     Agent,
     AgentAround,
-    Foretold,
     Odometer,
+    Ranges,
     Team,
     Told,
-    believed_worlds,
     episode_engine,
     fixed_commands,
     optimise_coupled,
-    ranges_of,
     script_agents,
-    told_to,
     write_down,
 )
 from ethbrake_marl.defaults import HarmCount
@@ -1395,7 +1391,7 @@ class BelievedShield:
         others: Mapping[int, Script] | None = None,
     ) -> None:
         self.scenario, self.vehicle = scenario, vehicle
-        self.robust = None if robust is None else checked_robust(robust, SUFFIX)
+        self.robust = None if robust is None else checked_robust(robust, "believed")
         self.predicted_harm: Floats = np.zeros(0)
         self.interventions: Ints = np.zeros(0, np.int64)  # [n] so far in the running episodes
         self.decision: Decision | None = None  # the last one
@@ -1407,11 +1403,11 @@ class BelievedShield:
         self._wanted: Floats = np.zeros(0)  # [n] actions
         self._totals: Floats = np.zeros((0, 0, 0))  # [n, M, pairs] foretold total harm at the last decision (m2/s2)
         self._impact_s: Floats = np.zeros((0, 0))  # [n, N] last time at which an impact of this vehicle was foretold
-        self._ranges = ranges_of(scenario, vehicle)
-        numbers = len(self._ranges.uncertain(vehicle))
+        self._ranges = Ranges.of(scenario, vehicle, self._others)
+        numbers = len(self._ranges.uncertain)
         if self.robust is not None and 2**numbers > MOST_CORNERS:
             raise InvalidInput(
-                f"robust:{SUFFIX}: scenario {scenario.name!r} leaves {numbers} numbers of the other vehicles open,"
+                f"robust:believed: scenario {scenario.name!r} leaves {numbers} numbers of the other vehicles open,"
                 f" which make {2**numbers} corners; at most {MOST_CORNERS} can be certified"
             )
         self.shield = self._make()
@@ -1471,7 +1467,7 @@ class BelievedShield:
         shield, vehicle = self.shield, self.vehicle
         if worlds.n > len(self._heard):
             raise InvalidInput(
-                f"shield: {SUFFIX}: act on {count_of(worlds.n, 'world')}, but begin was not called for each"
+                f"shield: believed: act on {count_of(worlds.n, 'world')}, but begin was not called for each"
             )
         self._odometer = odometer = Odometer(*self._odometer).look(worlds, vehicle)
         past = worlds.vehicles.latency_s[:, vehicle] <= worlds.time_s
@@ -1491,7 +1487,7 @@ class BelievedShield:
     def _begin_anew(self, worlds: Worlds, believed: Worlds, way_m: Floats, due: Bools) -> None:
         """Let the shield begin where it has not, or where what was heard was not foretold."""
         shield, vehicle = self.shield, self.vehicle
-        told = told_to(worlds, vehicle)
+        told = Told.to(worlds, vehicle)
         heard = np.concatenate([told.known, told.reacts], axis=1).astype(np.float64)
         fresh, begun = np.isnan(self._heard[:, 0]), shield.running is not None
         keeps, anew = np.zeros_like(told.known), fresh
@@ -1527,7 +1523,7 @@ class BelievedShield:
                 assert before.running is not None
                 expected = worlds_at(believed, before.running.states[rows * before.running.members + m])
                 known = keeps.any(axis=1, keepdims=True)
-                foretold = Foretold(replace(expected, pair_hit=expected.pair_hit & known), keeps)
+                foretold = (replace(expected, pair_hit=expected.pair_hit & known), keeps)
             parts.append(self._believe(worlds, way_m, share, foretold))
         self.shield.begin(parts[0], rows, possible=Uncertainty.interleaved(parts))
 
@@ -1574,7 +1570,7 @@ class BelievedShield:
         return wrong
 
     def _corners(self) -> list[dict[tuple[str, int], float]]:
-        uncertain = self._ranges.uncertain(self.vehicle)
+        uncertain = self._ranges.uncertain
         shares = [] if self.robust is None else product((0.0, 1.0), repeat=len(uncertain))
         return [dict(zip(uncertain, each, strict=True)) for each in shares]
 
@@ -1583,6 +1579,6 @@ class BelievedShield:
         worlds: Worlds,
         way_m: Floats,
         share: dict[tuple[str, int], float] | None,
-        foretold: Foretold | None = None,
+        foretold: tuple[Worlds, Bools] | None = None,
     ) -> Worlds:
-        return believed_worlds(worlds, self.vehicle, self._ranges, self._others, way_m, share=share, foretold=foretold)
+        return self._ranges.believe(worlds, way_m, share, foretold)

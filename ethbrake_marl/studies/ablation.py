@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ethbrake_marl.agents import Agent, Driver, LearnedAgent, Team, make_single_agent
+from ethbrake_marl.agents import Agent, Driver, LearnedAgent, Team, make_agent
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, count_of
 from ethbrake_marl.evaluation import (
@@ -31,15 +31,13 @@ from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.files.yaml import Override
 from ethbrake_marl.learning import (
-    HARM_METRIC,
     WORDS,
     RunDirectory,
+    Training,
     TrainingRecipe,
     load_recipe,
-    load_team,
     read_object,
     read_settings,
-    resolve,
 )
 from ethbrake_marl.limits import BestHarmTable, best_harm, chunks_left, search_list, task_problem
 from ethbrake_marl.pages.page import Page, Part, Played, Section
@@ -189,7 +187,7 @@ class Plan:
             changes |= dict.fromkeys({"scheme", "turns"} & type(recipe).model_fields.keys())
         name = recipe.name if learners == 1 else _algorithm(recipe)
         folder = self.folder / "trainings" / f"{level.name}-{name}-seed{seed}"
-        return TrainingJob(resolve(recipe.replace(**changes), level.scenario), folder, self.noted)
+        return TrainingJob(Training.of(recipe.replace(**changes), level.scenario), folder, self.noted)
 
     def settings(self) -> dict[str, Any]:
         """Everything that shapes the results, as plain data."""
@@ -234,7 +232,7 @@ class Plan:
         for level, algorithm, training, steps in left:
             decisions[level.name, algorithm] += steps
             if not steps:
-                load_team(training.folder, level.scenario)
+                RunDirectory(training.folder).load_team(level.scenario)
         lists = common_worlds(self.levels, self.episodes, self.list_seed)
         samples = {level.name: sample for level, sample in zip(self.levels, lists, strict=True)}
         kinds = {(level.name, algorithm): training for level, algorithm, training, _ in left}
@@ -246,7 +244,7 @@ class Plan:
         for level in self.levels if self.shield else ():  # learners that brake fully are replaced most often
             if level.scenario.learners:
                 task, often = Task(level.scenario, level.scenario.learners), self.seeds * len(self.recipes)
-                shielded = partial(Shielded.driven, make_single_agent("full_brake"), task=task)
+                shielded = partial(Shielded.driven, make_agent("full_brake"), task=task)
                 world_s = Timed.each_s(samples[level.name].worlds, shielded)
                 driving_s += self.episodes * often * len(HARM_COUNTS) * world_s
         search_s, damaged = 0.0, []
@@ -440,7 +438,7 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
     say = tell or (lambda progress: None)
     teams: dict[tuple[str, str], list[Team]] = {}
     for level, algorithm, training in plan.trainings():
-        team = load_team(training.folder, level.scenario, training.folder.name)
+        team = RunDirectory(training.folder).load_team(level.scenario, training.folder.name)
         teams.setdefault((level.name, algorithm), []).append(team)
     samples = common_worlds(plan.levels, plan.episodes, plan.list_seed)
     tables = search_all(plan, samples, jobs, say)
@@ -532,7 +530,7 @@ def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
             for recipe in plan.recipes:
                 folder = plan.training(level, recipe, 0).folder
                 name = level.name if len(plan.recipes) == 1 else f"{level.name}, {_algorithm(recipe)}"
-                drivers[name] = load_team(folder, level.scenario, name), f"{recipe.algorithm}@{folder}"
+                drivers[name] = RunDirectory(folder).load_team(level.scenario, name), f"{recipe.algorithm}@{folder}"
         for name, (team, spelling) in drivers.items():
             Played.drive(played, worlds, name, team, level.scenario, spelling, seed=plan.list_seed)
             driven[name] = level.scenario.learners
@@ -607,7 +605,7 @@ class LineQuestion:
 
     def _drive_line(self, scenario: Scenario, sample: Sample, agents: Sequence[Agent], tell: OnProgress | None) -> Json:
         count, say = self.harm_count, tell or (lambda progress: None)
-        braking = _drive(scenario, sample, [make_single_agent("full_brake")], say)
+        braking = _drive(scenario, sample, [make_agent("full_brake")], say)
         reached = _drive(scenario, sample, agents, say)
         worst, own = braking.world[count], reached.world[count]
         best_known, share = None, None
@@ -831,7 +829,7 @@ def _seed_row(one: Measured, seed: int, searched: int) -> Json:
     vehicles: Json = {}
     shield: Json = {}
     for harm_count in HARM_COUNTS:
-        name = HARM_METRIC[harm_count]
+        name = RunDirectory.HARM[harm_count]
         reached, braking = one.reached.world[harm_count][seed], one.full_brake.world[harm_count]
         about |= {
             name: float(reached.mean()),

@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import numpy as np
 from pydantic import Field, JsonValue
 
-from ethbrake_marl.agents import Driver, knowledge_text, team_of
+from ethbrake_marl.agents import Driver, Team
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import InvalidInput, OnProgress, PhysicsError, Progress, one_line, unknown_name
 from ethbrake_marl.evaluation import (
@@ -366,7 +366,7 @@ def read_entry(path: Path) -> Entry:
 def policy_seeds(driver: Driver, each: SuiteList) -> dict[str, dict[str, int]]:
     """Vehicle -> what the manifest of its policy says of seeds; only vehicles whose policy has a manifest."""
     found = {}
-    for vehicle, agent in team_of(driver, each.scenario.learners).drivers.items():
+    for vehicle, agent in Team.of(driver, each.scenario.learners).drivers.items():
         policy = driving_policy(agent)
         if isinstance(policy, Policy):
             found[each.scenario.vehicle_names[vehicle]] = dict(policy.manifest.seeds)
@@ -417,7 +417,7 @@ def _drive_list(
         worlds_sha256=content.worlds_sha256,
         policies=dict(outcome.policies),
         policy_seeds=seeds,
-        knows=knowledge_text(outcome.knows),
+        knows=outcome.knows.text,
         realised_share=realised_share(harm, full, best),
         worst_decile_regret=worst_mean(harm - best),
         first_impact_harm=mean(outcome.first_impact_harm),

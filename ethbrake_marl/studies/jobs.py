@@ -47,7 +47,7 @@ from ethbrake_marl.files.store import (
     remove_unfinished,
     write_file,
 )
-from ethbrake_marl.learning import RunDirectory, Training, load_team, read_object, stop_on_signal
+from ethbrake_marl.learning import RunDirectory, Training, read_object, stop_on_signal
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Sample
 
@@ -458,7 +458,7 @@ class TrainingJob:
 
     def world_seconds(self, sample: Sample) -> float:
         """Seconds per world that its team drives."""
-        team = {"team": load_team(self.folder, self.training.scenario)}
+        team = {"team": RunDirectory(self.folder).load_team(self.training.scenario)}
         drive = partial(evaluate, agents=team, scenario=self.training.scenario, aftermath=False)
         return Timed.each_s(sample.worlds, drive)
 

@@ -14,7 +14,7 @@ from ethbrake_marl.evaluation import interquartile_mean, result_identity, worlds
 from ethbrake_marl.figures import SeedCurve, seed_curves, write_picture
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import write_output
-from ethbrake_marl.learning import HARM_METRIC, RETURN, RunDirectory, TrainingRecipe, load_recipe, resolve
+from ethbrake_marl.learning import RunDirectory, Training, TrainingRecipe, load_recipe
 from ethbrake_marl.policies import load_policy
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.studies.jobs import JobFolder, TrainingJob
@@ -57,7 +57,9 @@ class LearningCurves(NamedTuple):
         """
         trainings = [
             TrainingJob(
-                resolve(recipe, self.scenario, seed=seed, total_steps=recipe.total_steps if steps is None else steps),
+                Training.of(
+                    recipe, self.scenario, seed=seed, total_steps=recipe.total_steps if steps is None else steps
+                ),
                 self._run(recipe, seed),
                 tuple(settings),
             )
@@ -82,7 +84,7 @@ class LearningCurves(NamedTuple):
             "recipes": {},
         }
         for recipe, seeds in self.plan:
-            values = curves[HARM_METRIC[recipe.reward.harm_count]][recipe.name].values
+            values = curves[RunDirectory.HARM[recipe.reward.harm_count]][recipe.name].values
             fixed = scenario.sample(recipe.evaluation.worlds, recipe.evaluation.seed)
             lists.add((recipe.evaluation.worlds, recipe.evaluation.seed))
             reached = {}
@@ -120,12 +122,12 @@ class LearningCurves(NamedTuple):
     def _curves(self) -> dict[str, dict[str, SeedCurve]]:
         """What the trainings reached, by metric and recipe; without what no episode told."""
         counts = {recipe.reward.harm_count for recipe, _ in self.plan}
-        metrics = [HARM_METRIC[count] for count in HARM_COUNTS if count in counts]
+        metrics = [RunDirectory.HARM[count] for count in HARM_COUNTS if count in counts]
         curves: dict[str, dict[str, SeedCurve]] = {metric: {} for metric in (*metrics, _RETURNED)}
         for recipe, seeds in self.plan:
             runs = [RunDirectory(self._run(recipe, seed)) for seed in range(seeds)]
             for metric in curves:
-                values = [run.column(RETURN if metric == _RETURNED else f"eval/{metric}") for run in runs]
+                values = [run.column(RunDirectory.RETURN if metric == _RETURNED else f"eval/{metric}") for run in runs]
                 if metric != _RETURNED or all(values):  # no episode may have ended in a very short training
                     curves[metric][recipe.name] = SeedCurve.of(values)
         return {metric: lines for metric, lines in curves.items() if lines}

@@ -55,7 +55,7 @@ from ethbrake_marl.figures import (
 )
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown, csv_text as csv_of
 from ethbrake_marl.files.store import check_target, read_plain, write_file, write_output
-from ethbrake_marl.learning import RETURN, RunDirectory, TrainingRecipe, load_recipe, read_object
+from ethbrake_marl.learning import RunDirectory, TrainingRecipe, load_recipe, read_object
 from ethbrake_marl.limits import Unproven
 from ethbrake_marl.pages.page import Page, Part, Played, Section, anchors, shown
 from ethbrake_marl.physics import Bools, Floats
@@ -794,7 +794,10 @@ def reproduce_curves(delay: str, settings: Reproduction) -> Made:
     courses = {
         each: {
             name.partition("/")[2]: Course(
-                *(SeedCurve.of([RunDirectory(path).column(what) for path in paths]) for what in (RETURN, _HARM))
+                *(
+                    SeedCurve.of([RunDirectory(path).column(what) for path in paths])
+                    for what in (RunDirectory.RETURN, _HARM)
+                )
             )
             for name, paths in settings.trained(CURVES[each]).items()
         }

@@ -56,19 +56,8 @@ from ethbrake_marl.files.yaml import (
     read_model,
     read_yaml,
 )
-from ethbrake_marl.learning import (
-    HARM_METRIC,
-    OBJECTIVE,
-    RunDirectory,
-    StopAt,
-    Training,
-    TrainingRecipe,
-    chosen_by,
-    load_recipe,
-    read_settings,
-    resolve,
-)
-from ethbrake_marl.policies import Policy, has_bundle, installed_versions, read_trained
+from ethbrake_marl.learning import RunDirectory, StopAt, Training, TrainingRecipe, load_recipe, read_settings
+from ethbrake_marl.policies import Policy, installed_versions, read_trained
 from ethbrake_marl.scenario import Scenario, check_file_name, load_scenario
 from ethbrake_marl.studies.jobs import Attempt, Job, JobFolder, Timed, TrainingJob, Workers
 
@@ -141,7 +130,7 @@ RESULTS = (
     "steps",  # decisions of learners in whole updates
     "policy_steps",  # decisions after which the kept policy was taken: the best one on the recipe's list
     *_MEASURED,  # of the kept policy on that list
-    OBJECTIVE,  # likewise, where a learner has another objective than total
+    RunDirectory.OBJECTIVE,  # likewise, where a learner has another objective than total
     *(f"last_{name}" for name in _MEASURED),  # of the last one
     "policy_sha256",  # of the kept policy's manifest, of several vehicle_i=... each
 )
@@ -164,7 +153,9 @@ def reach_results(job: TrainingJob, log: Path, stop_at: StopAt | None = None) ->
         if run.status.is_file():
             run.wait_for_others(60.0)  # a worker that has lost its driver may hold the folder for a moment
             run.check_same(job.training)
-            if run.is_finished and not all(has_bundle(run.path / place) for place in job.training.drivers.values()):
+            if run.is_finished and not all(
+                Policy.stands_in(job.folder / place) for place in job.training.drivers.values()
+            ):
                 remove_folder(job.folder)  # a finished run has no checkpoint: it is trained anew
         try:
             finished = job.finish(stop_at=stop_at)
@@ -181,7 +172,7 @@ def _read_results(job: TrainingJob) -> list[str]:
     table = [row for row in run.rows() if row.get(f"eval/{_MEASURED[0]}")]
     if not table:
         raise InvalidInput(f"{run.progress}: holds no evaluation; delete its folder to train anew")
-    harm = chosen_by(table, job.training.recipe.reward.harm_count, "eval/")
+    harm = RunDirectory.chosen_by(table, job.training.recipe.reward.harm_count, "eval/")
     kept, last = min(table, key=lambda row: float(row[harm])), table[-1]
     trained = read_trained(run.policy)
     if isinstance(trained, Policy):
@@ -189,7 +180,7 @@ def _read_results(job: TrainingJob) -> list[str]:
     else:
         sha256 = " ".join(f"{name}={policy.manifest.manifest_sha256}" for name, policy in trained.drivers.items())
     measured, later = ([row[f"eval/{name}"] for name in _MEASURED] for row in (kept, last))
-    return [last["steps"], kept["steps"], *measured, kept.get(f"eval/{OBJECTIVE}", ""), *later, sha256]
+    return [last["steps"], kept["steps"], *measured, kept.get(f"eval/{RunDirectory.OBJECTIVE}", ""), *later, sha256]
 
 
 @contextmanager
@@ -408,7 +399,7 @@ class SweepPlan:
             if kind not in firsts:
                 try:
                     scenario, recipe = _load_parts(*kind)
-                    first = resolve(recipe, scenario, seed=asked.seed)
+                    first = Training.of(recipe, scenario, seed=asked.seed)
                 except InvalidInput as error:
                     raise type(error)(f"{file.where(asked, _refused_part(*kind))}: {asked}: {error}") from None
                 firsts[kind] = first, first.content()
@@ -426,7 +417,7 @@ class SweepPlan:
 
     def training(self, row: Row) -> Training:
         """What is to be trained."""
-        return resolve(row.first.recipe, row.first.scenario, seed=row.asked.seed)
+        return Training.of(row.first.recipe, row.first.scenario, seed=row.asked.seed)
 
     def job(self, row: Row, folder: Path, log: Path) -> Job:
         """What trains the job of a row in the folder of a sweep."""
@@ -450,7 +441,7 @@ class SweepPlan:
                 run, values = RunDirectory(path / RUNS / row.name), found[row.name]
                 hashes = values[RESULTS.index("policy_sha256")].split()
                 named = [text.rpartition("=")[0] for text in hashes]  # vehicle_i of several, of one policy nothing
-                if run.status.is_file() and all(has_bundle(run.policy / name) for name in named):
+                if run.status.is_file() and all(Policy.stands_in(run.policy / name) for name in named):
                     results[row.name] = values
         return results, damaged
 
@@ -781,7 +772,7 @@ class TuningPlan:
                 raise
         recipe = recipe.replace(seed=file.seed)
         with at(("scenario",)):
-            content = resolve(recipe, scenario).content()
+            content = Training.of(recipe, scenario).content()
         told = {
             "training": content,
             **file.model_dump(mode="json", include={"search", "measure", "prune", "sampler"}),
@@ -812,7 +803,7 @@ class TuningPlan:
         asked = self.file.measure
         every = -(-self.updates(recipe) // asked.times)
         listed = {"every_updates": every, "worlds": asked.worlds, "seed": asked.seed}
-        return resolve(recipe.replace(evaluation=listed), self.scenario)
+        return Training.of(recipe.replace(evaluation=listed), self.scenario)
 
     def updates(self, recipe: TrainingRecipe) -> int:
         """Updates of a whole training."""
@@ -924,7 +915,8 @@ class TuningPlan:
                     say(f"trial {number}: {attempt.reason}; {kept.log(attempt.job.name)}")
                     return
                 results = dict(zip(RESULTS, end["results"], strict=True))
-                harm = float(results[OBJECTIVE] or results[HARM_METRIC[self.recipe.reward.harm_count]])
+                chosen = RunDirectory.HARM[self.recipe.reward.harm_count]
+                harm = float(results[RunDirectory.OBJECTIVE] or results[chosen])
                 study.end(number, "pruned" if end["pruned"] else "finished", end["results"], harm)
                 best = study.best()
                 is_best = best is not None and best.number == number
@@ -1151,12 +1143,12 @@ def do_trial(plan: TuningPlan, path: Path, number: int, log: Path) -> dict[str, 
     noted = _texts_of({**plan.file.settings, **known[number].values})
     job = TrainingJob(training, path / TRIALS / f"{number:04d}", noted)
     times, updates, pruned = plan.file.measure.times, plan.updates(training.recipe), False
-    harm = HARM_METRIC[training.recipe.reward.harm_count]
+    harm = RunDirectory.HARM[training.recipe.reward.harm_count]
 
     def judge(evaluation: Mapping[str, float]) -> str | None:
         nonlocal pruned
         step = int(times * evaluation["updates"]) // updates
-        study.report(number, step, evaluation.get(OBJECTIVE, evaluation[harm]))
+        study.report(number, step, evaluation.get(RunDirectory.OBJECTIVE, evaluation[harm]))
         pruned = bool(step < times and study.running(number).should_prune())
         return PRUNED if pruned else None
 

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ethbrake_marl.actions import action_to_command, command_to_action
-from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.agents.rollout import script_agents
+from ethbrake_marl.agents.registry import Agent, script_agents
 from ethbrake_marl.engine import Engine, Memory, Script, ask_script, begin_script
 from ethbrake_marl.physics import Bools, Floats, Packed, Worlds
 from ethbrake_marl.physics.messages import CHANNEL, LINK, Messages, link_at, place_at, ring_at

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from ethbrake_marl.agents.protocol import AgentAround, Source, knowledge_of
-from ethbrake_marl.agents.refined import Refined
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.planner import Refined
+from ethbrake_marl.agents.registry import AgentAround, Knowledge, Source, drive, make_agent
 from ethbrake_marl.scenario import load_scenario
 from tests.fixtures.asked import Asked
 
@@ -18,7 +16,7 @@ def test_around__drives_knows_and_is_called_as_the_agent_inside():
         Asked(agent).begin(worlds, 1) for agent in (make_agent("e_v2x_bm"), AgentAround(make_agent("e_v2x_bm")))
     )
     assert around.act(worlds, 1).tolist() == alone.act(worlds, 1).tolist()
-    assert (around.name, knowledge_of(around.agent)) == ("e_v2x_bm", (Source.MODEL,))
+    assert (around.name, Knowledge.of(around.agent)) == ("e_v2x_bm", (Source.MODEL,))
 
 
 def test_refined__a_planner_is_told_the_others_scripts_while_it_searches():

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.believed import Odometer, believed_worlds, ranges_of, told_to
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive, script_agents
+from ethbrake_marl.agents.believed import Odometer, Ranges, Told
+from ethbrake_marl.agents.registry import drive, make_agent, script_agents
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Worlds
@@ -26,8 +25,7 @@ def engine_of(scenario: Scenario, n: int = 40, vehicle: int = 1, seed: int = 7) 
 def believed(engine: Engine, vehicle: int = 1, odometer: Odometer | None = None) -> Worlds:
     worlds, scenario = engine.worlds, engine.scenario
     way = worlds.speeds_mps[:, vehicle] * worlds.time_s if odometer is None else odometer.way_m
-    scripts = script_agents(scenario, except_for=vehicle)
-    return believed_worlds(worlds, vehicle, ranges_of(scenario, vehicle), scripts, way)
+    return Ranges.of(scenario, vehicle).believe(worlds, way)
 
 
 def test_believed__is_the_world_where_everything_is_known() -> None:
@@ -72,7 +70,7 @@ def test_believed__an_old_message_is_moved_on_by_the_script_to_the_truth() -> No
     engine = engine_of(BASE.replace(v2x=channel))
     odometer = Odometer.begun(engine.scenario.sample(40, 7).worlds, 1)
     for _ in range(12):
-        now, told = engine.worlds, told_to(engine.worlds, 1)
+        now, told = engine.worlds, Told.to(engine.worlds, 1)
         assert told.known.all() and (told.at_s[:, [0, 2]] < now.time_s[:, np.newaxis] - 0.19).all()
         odometer = odometer.look(now, 1)
         taken = believed(engine, odometer=odometer)
@@ -118,7 +116,7 @@ def test_believing__knows_of_the_obstacle_what_it_was_told(v2x: object) -> None:
     engine = engine_of(scenario)
     for _ in range(15):
         engine.step(np.full((40, 1), -0.9))
-    told, now = told_to(engine.worlds, 1), engine.worlds
+    told, now = Told.to(engine.worlds, 1), engine.worlds
     heard = told.known[:, 0]
     assert heard.sum() > 20
     np.testing.assert_allclose(told.obstacle_m[heard], (now.obstacle_gap_m + now.gaps_m[:, 0])[heard], atol=1e-9)

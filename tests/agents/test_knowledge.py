@@ -9,10 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents import believed, make_agent
-from ethbrake_marl.agents.believed import told_to
-from ethbrake_marl.agents.protocol import Agent, Source, Team, combine, knowledge_of, knowledge_text, sees_through
-from ethbrake_marl.agents.registry import agent_entries, find_entry, parse_spec
+from ethbrake_marl.agents import make_agent
+from ethbrake_marl.agents.believed import Told
+from ethbrake_marl.agents.registry import Agent, Knowledge, Source, Team, agent_entries, find_entry, parse_spec
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.physics import Messages
@@ -70,7 +69,7 @@ HONEST, SEEING = (  # what bounds a box takes minutes to compile
     [
         pytest.param(spec, marks=pytest.mark.slow if "interior" in spec else ())
         for spec, knows in STATED.items()
-        if sees_through(knows) == seeing
+        if Knowledge(knows).sees_through == seeing
     ]
     for seeing in (False, True)
 )
@@ -145,29 +144,29 @@ def test_knowledge__an_agent_that_nobody_wrote_down_is_found(form, monkeypatch):
 @pytest.mark.parametrize("spec", STATED)
 def test_knowledge__every_agent_states_it(spec):
     knows = STATED[spec]
-    assert knowledge_of(agent_of(spec)) == knows
+    assert Knowledge.of(agent_of(spec)) == knows
     if "+" not in spec and spec != "e_v2x_bm:pairwise" and not spec.endswith(":believed"):
-        assert find_entry(parse_spec(spec)).knows == knows, "`ethbrake agent list` says something else"
+        assert Knowledge.of(find_entry(parse_spec(spec))) == knows, "`ethbrake agent list` says something else"
 
 
 def test_knowledge__a_wrapper_adds_the_model_to_what_its_policy_knows():
     for shield in ("episode", "step"):
-        assert knowledge_of(agent_of(f"ppo@shipped/ppo+{shield}")) == (MESSAGES, MODEL)
-    assert combine(Silent(), also=MODEL) == (MODEL, Source.UNSTATED)
+        assert Knowledge.of(agent_of(f"ppo@shipped/ppo+{shield}")) == (MESSAGES, MODEL)
+    assert Knowledge.of(Silent(), also=MODEL) == (MODEL, Source.UNSTATED)
 
 
 def test_knowledge__a_team_knows_what_its_drivers_know():
-    assert knowledge_of(Team({1: agent_of("ppo@shipped/ppo"), 2: agent_of("full_brake")}, "both")) == (
+    assert Knowledge.of(Team({1: agent_of("ppo@shipped/ppo"), 2: agent_of("full_brake")}, "both")) == (
         SENSORS,
         MESSAGES,
     )
-    assert knowledge_text(knowledge_of(Team({}, "scripts"))) == "–"
+    assert Knowledge.of(Team({}, "scripts")).text == "–"
 
 
 def test_knowledge__an_agent_of_the_users_own_is_not_stated():
-    assert knowledge_text(knowledge_of(Silent())) == "not stated"
-    assert not sees_through(knowledge_of(Silent()))
-    assert knowledge_of(Leaking()) == (MESSAGES,)
+    assert Knowledge.of(Silent()).text == "not stated"
+    assert not Knowledge.of(Silent()).sees_through
+    assert Knowledge.of(Leaking()) == (MESSAGES,)
 
 
 @pytest.mark.parametrize("knows", ["everything", 3, ("messages", "gossip"), [["messages"]]])
@@ -175,7 +174,7 @@ def test_knowledge__another_word_is_refused(knows):
     agent = Silent()
     agent.knows = knows
     with pytest.raises(InvalidInput, match=r"agent 'silent': knows = .*'messages', 'believed model', 'true state'"):
-        knowledge_of(agent)
+        Knowledge.of(agent)
 
 
 @pytest.mark.parametrize(
@@ -216,7 +215,7 @@ def test_messages__contact_features_tell_nothing_that_was_not_received(channel, 
     scenario = BLOCKED.replace(v2x=channel)
     contact_policy(scenario.model_dump(mode="json")).save(tmp_path / "policy")
     agent = agent_of(f"counterfactual@{tmp_path}", scenario)
-    assert knowledge_of(agent) == (MESSAGES,)
+    assert Knowledge.of(agent) == (MESSAGES,)
     assert changed_decisions(agent, scenario) == 0
 
 
@@ -249,14 +248,16 @@ def test_changed_decisions__lets_other_learners_brake_fully():
 @pytest.mark.parametrize("spec", ["e_v2x_bm:believed", "coast+step:believed", "ppo@shipped/ppo+episode:believed"])
 @pytest.mark.parametrize("leak", ["known", "speed_mps"])
 def test_believed_model__a_planted_leak_is_found(spec, leak, monkeypatch):
+    honest = Told.to
+
     def leaking(worlds, vehicle):
-        told = told_to(worlds, vehicle)
+        told = honest(worlds, vehicle)
         if leak == "known":
             return told._replace(known=np.ones_like(told.known))
         return told._replace(speed_mps=worlds.speeds_mps.copy())
 
     scenario = BLOCKED.replace(v2x={"preset": "blocked", "persistence": "periodic"})
-    monkeypatch.setattr(believed, "told_to", leaking)
+    monkeypatch.setattr(Told, "to", leaking)
     assert changed_decisions(agent_of(spec, scenario), scenario, n=100) > 0
 
 

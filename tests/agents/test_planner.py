@@ -5,7 +5,7 @@ import pytest
 
 from ethbrake_marl.agents import make_agent, optimise_coupled
 from ethbrake_marl.agents.planner import Planner
-from ethbrake_marl.agents.rollout import drive, script_agents
+from ethbrake_marl.agents.registry import drive, script_agents
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Worlds
@@ -76,4 +76,4 @@ def test_search__decides_when_its_scenario_does(spec, time_step_s):
     episodes = drive(scenario.sample(20, 7).worlds, agent, scenario, 1)
     assert (episodes.ledger.world_harm("first") <= episodes.memories[1]["predicted_harm"] + 1e-9).all()
     role = scenario.replace(early_impacts="keep", roles={"vehicle_2": spec, "vehicle_3": "learner"})
-    assert script_agents(role)[1]._time_step_s == time_step_s
+    assert script_agents(role)[1]._outlook.time_step_s == time_step_s

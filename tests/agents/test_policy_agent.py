@@ -9,10 +9,9 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents import registry
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.registry import drive
 from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.evaluation.inputs import policy_sha256
-from ethbrake_marl.policies import onnx_model
 from ethbrake_marl.shield.guard import ShieldedDriver
 from tests.fixtures.asked import Asked
 
@@ -155,7 +154,7 @@ def test_onnx__path_and_session_drive_as_the_policy_does(tmp_path: Path):
     pytest.importorskip("onnx")
     policy = eb.load_shipped("ppo")
     path = tmp_path / "shipped.onnx"
-    path.write_bytes(onnx_model(policy))
+    path.write_bytes(policy.to_onnx())
     expected = harms(eb.LearnedAgent(policy))
     session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     for given in (path, session):
@@ -300,7 +299,7 @@ def test_model_trained_on_rows_with_something_appended__drives_as_there(appended
         eb.policy_agent(model.policy, appended=appended)
     told = {"scenario": scenario, "appended": appended}  # a model that has its environment needs none of it
     agents = {1: eb.policy_agent(model.policy, **told), 2: eb.policy_agent(model)}
-    assert agents[1].knows == (eb.agents.protocol.Source.STATE if appended == "state" else "messages")
+    assert agents[1].knows == (eb.agents.registry.Source.STATE if appended == "state" else "messages")
     team = drive(scenario.sample(4, 3, channel="training").worlds, eb.Team(agents, "theirs"), scenario)
     rows.seed(3)  # the model has set its own
     seen, over, harm = rows.reset(), np.zeros(4, bool), np.full(4, np.nan)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents import refined
-from ethbrake_marl.agents.refined import HOLDS, SIZES, Refined, changes, deviate
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents import planner as refined
+from ethbrake_marl.agents.planner import HOLDS, SIZES, Refined, changes, deviate
+from ethbrake_marl.agents.registry import drive, make_agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.scenario import load_scenario

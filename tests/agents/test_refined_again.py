@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.registry import Team, drive
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.scenario import load_scenario
 

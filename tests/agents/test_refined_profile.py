@@ -7,8 +7,8 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl import search
-from ethbrake_marl.agents.refined import RefinedProfile
-from ethbrake_marl.agents.rollout import drive, record_commands
+from ethbrake_marl.agents.planner import RefinedProfile
+from ethbrake_marl.agents.registry import drive, record_commands
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.search import profile_problem

@@ -9,7 +9,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents import registry
-from ethbrake_marl.agents.refined import Refined
+from ethbrake_marl.agents.planner import Refined
 from ethbrake_marl.agents.registry import AgentSpec, make_agent, parse_spec
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput, UnknownName
@@ -97,7 +97,7 @@ def test_agent__names_of_earlier_versions_are_unknown(spec):
 OWN_FILE = """
 import numpy as np
 import ethbrake_marl as eb
-from ethbrake_marl.agents.protocol import Source
+from ethbrake_marl.agents.registry import Source
 
 
 class HalfBrake:

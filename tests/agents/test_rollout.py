@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents import registry
-from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import make_agent, register_agent
-from ethbrake_marl.agents.rollout import drive, script_agents
+from ethbrake_marl.agents.registry import Team, drive, make_agent, register_agent, script_agents
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import InvalidInput

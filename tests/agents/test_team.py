@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.policy import LearnedAgent
-from ethbrake_marl.agents.protocol import Team, team_of
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.registry import Team, drive, make_agent
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate, summarise
@@ -95,7 +93,7 @@ def test_evaluate__what_several_predict_is_nobodys_prediction():
 
 def test_e_v2x_bm__takes_the_other_learners_to_brake_fully():
     worlds = PAIR.sample(30, 7).worlds
-    team = Team.copies(make_agent("e_v2x_bm"), (1, 2))
+    team = Team.of(make_agent("e_v2x_bm"), (1, 2))
     both = drive(worlds, team, PAIR).memories[1]
     alone = drive(worlds, make_agent("e_v2x_bm"), PAIR.with_learners(["vehicle_2"]), 1).memories[1]
     assert both["deceleration_mps2"].tolist() == alone["deceleration_mps2"].tolist()
@@ -135,4 +133,4 @@ def test_team__bad_input_is_refused():
     with pytest.raises(InvalidInput, match="vehicle_2 is driven by 'coast', which is no agent"):
         Team({1: "coast"}, "t")
     with pytest.raises(InvalidInput, match="team 't' drives vehicle_2; the vehicles to drive are vehicle_2, vehicle_3"):
-        team_of(Team({1: brake}, "t"), (1, 2))
+        Team.of(Team({1: brake}, "t"), (1, 2))

@@ -20,8 +20,8 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.results import write_per_world
-from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.runs import train
+from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.scenario import load_scenario
 
 SCENARIO = "paper-random"

@@ -22,9 +22,8 @@ from stable_baselines3 import PPO
 from ethbrake_marl.agents.policy import policy_agent
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.evaluation import evaluate, summarise
-from ethbrake_marl.learning.recipe import load_recipe, read_settings
 from ethbrake_marl.learning.runs import measure_on_list, train
-from ethbrake_marl.learning.training import Training
+from ethbrake_marl.learning.training import Training, load_recipe, read_settings
 from ethbrake_marl.scenario import Scenario, load_scenario
 
 OWN_LOOP = "sb3"

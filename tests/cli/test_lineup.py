@@ -8,7 +8,7 @@ import pytest
 from ethbrake_marl.agents.registry import agent_names
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import LADDER, check_agents, choose_worlds, make_lineup
-from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import HybridAgent
 from ethbrake_marl.studies.experiment import run_folder

@@ -230,15 +230,14 @@ def test_changed_file__is_refused_in_the_same_process(ethbrake, parts):
 
 @pytest.mark.slow
 def test_worker_processes__load_the_plugins_of_their_parent(tmp_path, parts, monkeypatch):
-    from ethbrake_marl.learning.recipe import load_recipe
-    from ethbrake_marl.learning.training import resolve
+    from ethbrake_marl.learning.training import Training, load_recipe
     from ethbrake_marl.scenario import load_scenario
 
     monkeypatch.setenv("PYTHONPATH", os.getcwd())
     plugins.load_plugin(parts)
     recipe = load_recipe(str(write_recipe(tmp_path, reward={"harm": 1.0, "calm": 0.01})))
     scenario, kept = load_scenario("paper-random"), JobFolder(tmp_path / "trainings", "trainings")
-    wanted = [TrainingJob(resolve(recipe, scenario, seed=seed), tmp_path / f"seed{seed}") for seed in (0, 1)]
+    wanted = [TrainingJob(Training.of(recipe, scenario, seed=seed), tmp_path / f"seed{seed}") for seed in (0, 1)]
     with kept.work():
         assert kept.train(wanted, 2)
     for training in wanted:

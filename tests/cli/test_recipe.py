@@ -12,32 +12,32 @@ import pytest
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.evaluation.inputs import load_runnable
 from ethbrake_marl.files.yaml import Override
-from ethbrake_marl.learning.recipe import load_recipe, new_recipe_text, read_settings, shipped_recipes
+from ethbrake_marl.learning.training import TrainingRecipe, load_recipe, read_settings
 
 Run = Callable[..., Any]
 
 
 def test_list__has_every_shipped_recipe(ethbrake: Run) -> None:
     answer = ethbrake("recipe", "list")
-    assert answer.status == 0 and [line.split()[0] for line in answer.out.splitlines()] == [*shipped_recipes()]
+    assert answer.status == 0 and [line.split()[0] for line in answer.out.splitlines()] == [*TrainingRecipe.shipped()]
     told = json.loads(ethbrake("recipe", "list", "--json").out)
     assert {row["name"]: row["algorithm"] for row in told}["sac"] == "sac"
 
 
 def test_show_and_validate__read_the_file(ethbrake: Run, tmp_path: Path) -> None:
-    assert ethbrake("recipe", "show", "ppo").out == shipped_recipes()["ppo"].read_text()
+    assert ethbrake("recipe", "show", "ppo").out == TrainingRecipe.shipped()["ppo"].read_text()
     answer = ethbrake("recipe", "validate", "ppo")
     assert answer.status == 0 and answer.out.startswith("OK  ppo: ppo, 1,500,000 steps, seed 0, ")
     wrong = tmp_path / "wrong.yaml"
-    wrong.write_text(shipped_recipes()["ppo"].read_text().replace("gamma: 0.995", "gamma: 2"))
+    wrong.write_text(TrainingRecipe.shipped()["ppo"].read_text().replace("gamma: 0.995", "gamma: 2"))
     refused = ethbrake("recipe", "validate", wrong)
     assert refused.status == 2 and "wrong.yaml, line " in refused.err and "gamma = 2" in refused.err
     assert "did you mean 'ppo'" in ethbrake("recipe", "validate", "ppoo").err
 
 
-@pytest.mark.parametrize("based_on", sorted(shipped_recipes()))
+@pytest.mark.parametrize("based_on", sorted(TrainingRecipe.shipped()))
 def test_new__has_every_key_with_a_comment_and_the_same_values(based_on: str, tmp_path: Path) -> None:
-    text = new_recipe_text("mine", based_on)
+    text = load_recipe(based_on).new_text("mine")
     (tmp_path / "mine.yaml").write_text(text)
     made, base = load_recipe(tmp_path / "mine.yaml"), load_recipe(based_on)
     words = {"name", "title", "description", "source"}

@@ -8,8 +8,7 @@ from dataclasses import replace
 import pytest
 
 from ethbrake_marl.agents import registry
-from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import Entry, make_agent
+from ethbrake_marl.agents.registry import Entry, Team, make_agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.scenario import Scenario, load_scenario
@@ -102,7 +101,7 @@ def test_shield__a_shielded_team_and_a_vehicle_that_is_no_learner_are_refused(et
 
 
 def test_evaluate__a_team_goes_behind_the_step_shield_and_no_other(monkeypatch):
-    scenario, team = load_scenario("cooperation-3-pair"), Team.copies(make_agent("coast"), [1, 2])
+    scenario, team = load_scenario("cooperation-3-pair"), Team.of(make_agent("coast"), [1, 2])
     monkeypatch.setitem(registry._ENTRIES, "team", Entry("team@RUN", "", (), lambda argument, settings: team))
     assert list(make_lineup(["team@run"], scenario)) == ["team@run"]
     with pytest.raises(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.registry import drive
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.physics import Bools, Floats, Worlds
 from ethbrake_marl.scenario import load_scenario

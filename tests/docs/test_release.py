@@ -14,7 +14,7 @@ import yaml
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.learning.recipe import new_recipe_text, recipe_json_schema, shipped_recipes
+from ethbrake_marl.learning.training import TrainingRecipe, load_recipe
 from ethbrake_marl.scenario import list_scenarios, new_scenario_text, scenario_json_schema
 from tests.docs.site import DOCS
 
@@ -35,7 +35,7 @@ def test_version__is_the_same_wherever_it_stands() -> None:
     ("file", "schema", "text"),
     [
         ("scenarios/scenario.schema.json", scenario_json_schema, new_scenario_text),
-        ("train/recipe.schema.json", recipe_json_schema, new_recipe_text),
+        ("train/recipe.schema.json", TrainingRecipe.json_schema, lambda name: load_recipe("ppo").new_text(name)),
     ],
 )
 def test_schema__that_ships_is_the_one_that_the_command_prints(
@@ -56,7 +56,9 @@ def test_schema__of_sweeps_and_tunings_is_printed_by_the_command_and_named_by_th
 
 
 def test_schemas__are_no_scenario_and_no_recipe() -> None:
-    assert all(path.suffix == ".yaml" for path in (*shipped_recipes().values(), *(e.path for e in list_scenarios())))
+    assert all(
+        path.suffix == ".yaml" for path in (*TrainingRecipe.shipped().values(), *(e.path for e in list_scenarios()))
+    )
 
 
 @pytest.mark.parametrize("name", GUIDES)

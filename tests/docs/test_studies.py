@@ -9,8 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.registry import drive, make_agent
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.figures import picture_bytes
 from ethbrake_marl.limits.limits import best_known

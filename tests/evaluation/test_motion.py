@@ -3,9 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.registry import Team, drive, make_agent
 from ethbrake_marl.evaluation import Evaluation, record_episode
 from ethbrake_marl.evaluation.episodes import EpisodeMotion, follow_episodes, state_at
 from ethbrake_marl.physics import Floats
@@ -64,7 +62,7 @@ def test_motion__tells_where_a_shield_stepped_in(paper_random: Scenario) -> None
 def test_motion__tells_where_the_shield_of_a_team_stepped_in_as_its_log_does() -> None:
     scenario = load_scenario("cooperation-3-pair")
     worlds = scenario.sample(6, 7).worlds
-    team = ShieldedDriver(Team.copies(make_agent("constant:3"), (1, 2)), scenario, logging=True).on((1, 2))
+    team = ShieldedDriver(Team.of(make_agent("constant:3"), (1, 2)), scenario, logging=True).on((1, 2))
     log = drive(worlds, team, scenario).guarded.shield.log
     motions = follow_episodes(worlds, make_agent("constant:3+step", scenario=scenario), scenario)
     for k, motion in enumerate(motions):

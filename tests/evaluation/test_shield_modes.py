@@ -7,9 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.registry import Team, drive, make_agent
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.evaluation.shield_modes import ShieldModes, compare_modes
 from ethbrake_marl.evaluation.statistics import mean, paired_difference
@@ -106,9 +104,9 @@ def team_rows() -> ShieldModes:
 def test_team__rows_are_what_driving_behind_each_shield_gives(team_rows: ShieldModes) -> None:
     worlds = PAIR.sample(30, 3).worlds
     assert [row.mode for row in team_rows] == ["none", "step", "step-alert", "step-cap"] * 2
-    alone = drive(worlds, Team.copies(make_agent("coast"), (1, 2)), PAIR).ledger.world_harm("total")
+    alone = drive(worlds, Team.of(make_agent("coast"), (1, 2)), PAIR).ledger.world_harm("total")
     for row, cap in ((team_rows[5], None), (team_rows[7], "baseline")):
-        coasting = Team.copies(make_agent("coast"), (1, 2))
+        coasting = Team.of(make_agent("coast"), (1, 2))
         team = ShieldedDriver(coasting, PAIR, harm_count="total", cap=cap, logging=True).on((1, 2))
         episodes = drive(worlds, team, PAIR)
         ledger, shield = episodes.ledger, episodes.guarded.shield
@@ -128,12 +126,12 @@ def test_team__rows_are_what_driving_behind_each_shield_gives(team_rows: ShieldM
 
 def test_team__an_intervention_is_simulated_again_without_it_for_the_whole_team() -> None:
     worlds = PAIR.sample(40, 3).worlds
-    coasting = Team.copies(make_agent("coast"), (1, 2))
+    coasting = Team.of(make_agent("coast"), (1, 2))
     episodes = drive(worlds, ShieldedDriver(coasting, PAIR, logging=True).on((1, 2)), PAIR)
     harm = episodes.ledger.world_harm("first")
     found = review(episodes.guarded.shield, coasting, worlds)
     assert found.realised.tolist() == harm[found.world].tolist() and set(found.vehicle) == {1, 2}
-    alone = drive(worlds, Team.copies(make_agent("coast"), (1, 2)), PAIR).ledger.world_harm("first")
+    alone = drive(worlds, Team.of(make_agent("coast"), (1, 2)), PAIR).ledger.world_harm("first")
     first = {world: k for k, world in reversed(list(enumerate(found.world.tolist())))}
     assert all(found.without[k] == alone[world] for world, k in first.items()) and len(first) > 20
     assert found.share("needed") > 0.5

@@ -11,7 +11,7 @@ from ethbrake_marl import harm, observations, rewards as terms
 from ethbrake_marl.agents import registry as agents
 from ethbrake_marl.evaluation import measures
 from ethbrake_marl.files import plugins
-from ethbrake_marl.learning import recipe as algorithms
+from ethbrake_marl.learning import training as algorithms
 from ethbrake_marl.scenario import schema, v2x
 
 TABLES = (

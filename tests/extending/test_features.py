@@ -17,8 +17,8 @@ import yaml
 import ethbrake_marl as eb
 from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, Progress, UnknownName
-from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.runs import resume, train
+from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.observations import FEATURES, observe
 from ethbrake_marl.policies import load_policy
 from ethbrake_marl.scenario import scenario_json_schema

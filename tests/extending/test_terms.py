@@ -14,8 +14,8 @@ import yaml
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
-from ethbrake_marl.learning.recipe import load_recipe, recipe_json_schema
 from ethbrake_marl.learning.runs import train
+from ethbrake_marl.learning.training import TrainingRecipe, load_recipe
 from ethbrake_marl.policies import load_policy
 from ethbrake_marl.rewards import TERMS, StepOutcome, reward_params
 from tests.learning.tiny import TINY_PPO
@@ -99,7 +99,7 @@ def test_term__stands_in_the_infos_of_every_interface(mine: Any) -> None:
 
 
 def test_term__has_its_place_in_the_schema_of_recipes(mine: Any) -> None:
-    weights = recipe_json_schema()["$defs"]["RewardParams"]["properties"]
+    weights = TrainingRecipe.json_schema()["$defs"]["RewardParams"]["properties"]
     assert weights["calm"]["minimum"] == weights["harm"]["minimum"] == 0
 
 

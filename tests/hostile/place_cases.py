@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.limits.limits import BestHarmTable
 from ethbrake_marl.policies import load_policy, shipped_policies
 from ethbrake_marl.scenario import load_scenario

@@ -12,8 +12,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.runs import train
+from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.scenario import load_scenario
 
 RUN = "run"

@@ -6,7 +6,7 @@ import random
 from collections.abc import Iterator
 from pathlib import Path
 
-from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.scenario import load_scenario
 from tests.hostile.case import Case, damaged, write
 from tests.hostile.recipe_parts import RECIPE_PARTS

@@ -17,11 +17,17 @@ import yaml
 import ethbrake_marl as eb
 from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.errors import InvalidInput, Progress
-from ethbrake_marl.learning import recipe as registry
+from ethbrake_marl.learning import training as registry
 from ethbrake_marl.learning.algorithms import Ppo
-from ethbrake_marl.learning.recipe import PpoRecipe, TrainingRecipe, algorithm_names, load_recipe, register_algorithm
 from ethbrake_marl.learning.runs import resume, train
-from ethbrake_marl.learning.training import load_team
+from ethbrake_marl.learning.training import (
+    PpoRecipe,
+    RunDirectory,
+    TrainingRecipe,
+    algorithm_names,
+    load_recipe,
+    register_algorithm,
+)
 from ethbrake_marl.policies import load_policy
 from tests.learning.tiny import TINY_PPO
 
@@ -80,7 +86,7 @@ def test_own_algorithm__trains_resumes_bit_for_bit_and_is_evaluated(tmp_path: Pa
 
     policy = load_policy(tmp_path / "run")
     assert policy.manifest.algorithm == "a2c"
-    agents = {"mine": LearnedAgent(policy, "mine"), "team": load_team(tmp_path / "run", SCENARIO)}
+    agents = {"mine": LearnedAgent(policy, "mine"), "team": RunDirectory(tmp_path / "run").load_team(SCENARIO)}
     found = eb.evaluate(SCENARIO.sample(10, 7), agents, scenario=SCENARIO)
     harms = [found.outcome(name).first_impact_harm.mean() for name in agents]
     assert harms[0] == harms[1] == pytest.approx(min(e["first_impact_harm"] for e in result.evaluations))

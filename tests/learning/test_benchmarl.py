@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.learning.recipe import load_recipe
-from ethbrake_marl.learning.training import load_team
+from ethbrake_marl.learning.training import RunDirectory, load_recipe
 from tests.docs.site import load
 
 pytest.importorskip("benchmarl", reason="needs the extra marl")
@@ -78,7 +77,7 @@ def test_policy_of__acts_as_benchmarls_own_policy_does(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_mappo__learns_to_beat_full_braking(tmp_path: Path) -> None:
     SCRIPT.train_mappo(load_recipe("cooperation-ppo").replace(total_steps=300_000), PAIR, tmp_path / "run")
-    agents = {"full_brake": eb.make_agent("full_brake"), "team": load_team(tmp_path / "run", PAIR)}
+    agents = {"full_brake": eb.make_agent("full_brake"), "team": RunDirectory(tmp_path / "run").load_team(PAIR)}
     result = eb.evaluate(PAIR.sample(1000, 7), agents, scenario=PAIR)
     harm = {name: result.outcome(name).first_impact_harm.mean() for name in agents}
     assert harm["team"] < 0.9 * harm["full_brake"]

@@ -14,9 +14,8 @@ import torch
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput, Progress
 from ethbrake_marl.learning.algorithms import Adam, CounterfactualModel, Tried, trusted_targets, widened
-from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.runs import TrainingDiverged, resume, train
-from ethbrake_marl.learning.training import resolve
+from ethbrake_marl.learning.training import Training, load_recipe
 from ethbrake_marl.policies import load_policy
 
 SCENARIO = eb.load_scenario("paper-random")
@@ -91,15 +90,15 @@ def _small(**changes: Any) -> dict[str, Any]:
 def test_widened__puts_every_feature_where_it_is_observed_now() -> None:
     shipped = eb.load_shipped("ppo")
     names = list(shipped.manifest.observation.features)
-    turned = resolve(SHIPPED.replace(observation=["contact.brake_total_harm", *reversed(names)]), SCENARIO)
+    turned = Training.of(SHIPPED.replace(observation=["contact.brake_total_harm", *reversed(names)]), SCENARIO)
     first = widened(shipped, turned)["policy.0.weight"]
     assert (first[:, 0] == 0.0).all()
     assert (first[:, 1:] == shipped.tensors["policy.0.weight"][:, ::-1]).all()
     assert "value.0.weight" not in widened(shipped, turned)
     with pytest.raises(InvalidInput, match=r"observation: lacks rear_1.known, .* which the policy"):
-        widened(shipped, resolve(SHIPPED.replace(observation=["own", "front_1", "contact"]), SCENARIO))
+        widened(shipped, Training.of(SHIPPED.replace(observation=["own", "front_1", "contact"]), SCENARIO))
     with pytest.raises(InvalidInput, match=r"policy_hidden is \(64, 64\), but \(128, 128\) in the policy"):
-        widened(shipped, resolve(SHIPPED.replace(network={"policy": [64, 64]}), SCENARIO))
+        widened(shipped, Training.of(SHIPPED.replace(network={"policy": [64, 64]}), SCENARIO))
 
 
 def test_training__stops_and_resumes_bit_for_bit(tmp_path: Path) -> None:

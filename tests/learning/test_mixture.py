@@ -16,7 +16,7 @@ from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning import runs as train_module
 from ethbrake_marl.learning.runs import resume, train
-from ethbrake_marl.learning.training import RunDirectory, resolve
+from ethbrake_marl.learning.training import RunDirectory, Training
 from ethbrake_marl.scenario import load_scenario
 from tests.learning.tiny import TINY_PPO
 
@@ -62,9 +62,9 @@ def test_training__goes_on_to_the_same_bits(tmp_path: Path, monkeypatch: pytest.
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     kept = RunDirectory(tmp_path / "run").training(config)  # from its own file alone
     assert kept.scenario == MIXTURE
-    RunDirectory(tmp_path / "run").check_same(resolve(RECIPE, MIXTURE))
+    RunDirectory(tmp_path / "run").check_same(Training.of(RECIPE, MIXTURE))
     with pytest.raises(InvalidInput, match="holds another training"):
-        RunDirectory(tmp_path / "run").check_same(resolve(RECIPE, load_scenario("realistic-truck")))
+        RunDirectory(tmp_path / "run").check_same(Training.of(RECIPE, load_scenario("realistic-truck")))
 
     policy = eb.load_policy(tmp_path / "run")
     agents = {"mine": eb.LearnedAgent(policy), "full_brake": eb.make_agent("full_brake")}

@@ -24,9 +24,8 @@ from ethbrake_marl.learning.algorithms import (
     stages_of,
     visit,
 )
-from ethbrake_marl.learning.recipe import ModesPlan, load_recipe
 from ethbrake_marl.learning.runs import TrainResult, make_environment, make_model, resume, train
-from ethbrake_marl.learning.training import resolve
+from ethbrake_marl.learning.training import ModesPlan, Training, load_recipe
 from ethbrake_marl.policies import load_policy
 from ethbrake_marl.search import profile_problem
 
@@ -64,7 +63,7 @@ TINY = SHIPPED.replace(
 
 def _model(**changes: Any) -> tuple[ModesModel, Any]:
     """A model of the tiny recipe, and the engine of its environment."""
-    training = resolve(TINY.replace(**changes), SCENARIO)
+    training = Training.of(TINY.replace(**changes), SCENARIO)
     with closing(make_environment(training)) as environment:
         environment.reset()
         model = make_model(training.recipe.make_algorithm(), training, environment)

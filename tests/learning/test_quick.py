@@ -10,8 +10,8 @@ import pytest
 from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.cli.train import run_command
 from ethbrake_marl.evaluation import evaluate, summarise
-from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.runs import train
+from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.scenario import load_scenario
 
 GOAL = 1.10  # harm of the policy, in the least harm known

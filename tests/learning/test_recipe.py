@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.learning.recipe import LearningRate, SacRecipe, TrainingRecipe, load_recipe, shipped_recipes
+from ethbrake_marl.learning.training import LearningRate, SacRecipe, TrainingRecipe, load_recipe
 from ethbrake_marl.policies import NetworkSpec
 
 GOOD = """\
@@ -89,19 +89,19 @@ def test_sac_recipe__refuses_bad_input(change: dict[str, object], message: str) 
 
 
 def test_recipe__comes_back_from_its_json() -> None:
-    for name in shipped_recipes():
+    for name in TrainingRecipe.shipped():
         recipe = load_recipe(name)
         assert TrainingRecipe.of(recipe.model_dump(mode="json")) == recipe
 
 
 def test_shipped_recipes__are_found_by_name() -> None:
-    assert {"ppo", "ppo-paper"} <= shipped_recipes().keys()
+    assert {"ppo", "ppo-paper"} <= TrainingRecipe.shipped().keys()
     with pytest.raises(UnknownName, match="unknown recipe 'ppo-papre'; did you mean 'ppo-paper'"):
         load_recipe("ppo-papre")
 
 
 def test_shipped_recipes__of_ppo_expect_nothing_beyond_the_horizon() -> None:
-    recipes = [load_recipe(name) for name in shipped_recipes()]
+    recipes = [load_recipe(name) for name in TrainingRecipe.shipped()]
     without = [each.name for each in recipes if each.algorithm == "ppo" and not each.horizon_is_end]
     assert without == ["ppo-paper"]  # whose values are the paper's
 

@@ -9,37 +9,31 @@ from jsonschema import Draft202012Validator
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import parse_yaml, read_yaml
-from ethbrake_marl.learning.recipe import (
-    algorithm_names,
-    load_recipe,
-    new_recipe_text,
-    recipe_json_schema,
-    shipped_recipes,
-)
+from ethbrake_marl.learning.training import TrainingRecipe, algorithm_names, load_recipe
 
 
 def _marked(content: Any) -> set[str]:
     """The places where an editor marks a mistake; empty: the whole file."""
-    found = Draft202012Validator(recipe_json_schema()).iter_errors(content)
+    found = Draft202012Validator(TrainingRecipe.json_schema()).iter_errors(content)
     return {".".join(map(str, error.absolute_path)) for error in found}
 
 
 def test_schema__is_one() -> None:
-    Draft202012Validator.check_schema(recipe_json_schema())
+    Draft202012Validator.check_schema(TrainingRecipe.json_schema())
 
 
 @pytest.mark.parametrize("algorithm", algorithm_names())
 def test_schema__says_what_every_key_of_an_algorithm_means(algorithm: str) -> None:
     recipe = type(load_recipe(algorithm))
-    properties = recipe_json_schema()["$defs"][recipe.__name__]["properties"]
+    properties = TrainingRecipe.json_schema()["$defs"][recipe.__name__]["properties"]
     assert set(properties) == set(recipe.model_fields)
     assert [key for key, value in properties.items() if not value.get("description")] == []
 
 
-@pytest.mark.parametrize("name", sorted(shipped_recipes()))
+@pytest.mark.parametrize("name", sorted(TrainingRecipe.shipped()))
 def test_schema__lets_shipped_and_new_recipes_pass(name: str) -> None:
-    assert _marked(read_yaml(shipped_recipes()[name]).content) == set()
-    assert _marked(parse_yaml(new_recipe_text("mine", name), "mine.yaml").content) == set()
+    assert _marked(read_yaml(TrainingRecipe.shipped()[name]).content) == set()
+    assert _marked(parse_yaml(load_recipe(name).new_text("mine"), "mine.yaml").content) == set()
 
 
 @pytest.mark.parametrize(
@@ -61,13 +55,13 @@ def test_schema__lets_shipped_and_new_recipes_pass(name: str) -> None:
     ],
 )
 def test_schema__marks_what_the_reader_refuses(change: dict[str, Any], place: str) -> None:
-    good = read_yaml(shipped_recipes()["ppo"]).content
+    good = read_yaml(TrainingRecipe.shipped()["ppo"]).content
     assert _marked({**good, **change}) == {place}
     with pytest.raises(InvalidInput):
         load_recipe("ppo").replace(**change)
 
 
 def test_schema__asks_for_what_is_missing() -> None:
-    good = read_yaml(shipped_recipes()["ppo"]).content
+    good = read_yaml(TrainingRecipe.shipped()["ppo"]).content
     assert _marked({key: value for key, value in good.items() if key != "gamma"}) == {""}
     assert _marked({key: value for key, value in good.items() if key != "algorithm"}) == {""}

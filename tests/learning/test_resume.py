@@ -19,9 +19,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning import runs as train_module
-from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.runs import TrainResult, resume, train
-from ethbrake_marl.learning.training import RunDirectory, Training
+from ethbrake_marl.learning.training import RunDirectory, Training, load_recipe
 from ethbrake_marl.policies import Policy, load_policy
 from ethbrake_marl.scenario import load_scenario
 from tests.learning.tiny import TINY_PPO

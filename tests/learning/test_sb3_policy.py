@@ -8,7 +8,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.sac.policies import SACPolicy
 
 from ethbrake_marl.learning.algorithms import ppo_arguments, sac_arguments, tensors_of
-from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.policies import Actor, NetworkSpec
 
 SHAPE = load_recipe("ppo-paper").network

@@ -12,8 +12,8 @@ import torch
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput, Progress
 from ethbrake_marl.learning.algorithms import Scout, choose_rows, draw_rows
-from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.runs import resume, train
+from ethbrake_marl.learning.training import load_recipe
 
 SCENARIO = eb.load_scenario("paper-random")
 TINY = load_recipe("modes").replace(

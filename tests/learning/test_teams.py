@@ -20,9 +20,8 @@ import ethbrake_marl as eb
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, UnknownName
 from ethbrake_marl.learning import runs as train_module
-from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.learning.runs import make_model, resume, train
-from ethbrake_marl.learning.training import RunDirectory, load_team, resolve
+from ethbrake_marl.learning.training import RunDirectory, Training, TrainingRecipe, load_recipe
 from ethbrake_marl.policies import PolicyTeam, load_policy
 from tests.learning.tiny import TINY_PPO
 
@@ -68,7 +67,7 @@ def test_train__leaves_a_folder_that_drives_by_itself(scheme: Any, tmp_path: Pat
 
     moved = tmp_path / "elsewhere"
     shutil.move(tmp_path / "run", moved)
-    team = load_team(moved, PAIR)
+    team = RunDirectory(moved).load_team(PAIR)
     assert sorted(team.drivers) == [1, 2]
     worlds = PAIR.sample(10, 7)
     harm = eb.evaluate(worlds, {"team": team}, scenario=PAIR).outcome("team").first_impact_harm.mean()
@@ -129,7 +128,7 @@ def test_independent__nobody_learns_from_anothers_reward(tmp_path: Path, monkeyp
 def test_independent__a_row_that_is_cut_off_gets_the_value_of_its_own_learner() -> None:
     recipe = TINY.replace(scheme="independent")
     environment = make_sb3_vec_env(PAIR, 8, appended="number", reward=recipe.reward)
-    policy: Any = make_model(recipe.make_algorithm(), resolve(recipe, PAIR), environment).policy
+    policy: Any = make_model(recipe.make_algorithm(), Training.of(recipe, PAIR), environment).policy
     seen = environment.reset()
     assert seen.shape == (16, environment.engine.observation.size + 1)
     assert seen[:, -1].tolist() == [0.0, 1.0] * 8
@@ -145,7 +144,7 @@ def test_independent__a_row_that_is_cut_off_gets_the_value_of_its_own_learner() 
 def test_centralised__the_critic_sees_the_line_and_the_actor_does_not() -> None:
     recipe = TINY.replace(scheme="centralised")
     environment = make_sb3_vec_env(PAIR, 8, appended="state", reward=recipe.reward)
-    policy: Any = make_model(recipe.make_algorithm(), resolve(recipe, PAIR), environment).policy
+    policy: Any = make_model(recipe.make_algorithm(), Training.of(recipe, PAIR), environment).policy
     own = environment.engine.observation.size
     seen = policy.obs_to_tensor(environment.reset())[0]
     elsewhere = seen.clone()
@@ -255,11 +254,11 @@ def test_scheme__that_does_not_fit_is_refused_before_anything_is_made(tmp_path: 
 
 
 def test_scheme__of_a_recipe_and_who_drives_what() -> None:
-    assert resolve(TINY, ALONE).scheme == "single" and resolve(TINY, PAIR).scheme == "shared"
-    assert resolve(TINY, PAIR, scheme="centralised").scheme == "centralised"
-    assert resolve(TINY, PAIR).who_drives() == "scheme shared: policy drives vehicle_2, vehicle_3"
+    assert Training.of(TINY, ALONE).scheme == "single" and Training.of(TINY, PAIR).scheme == "shared"
+    assert Training.of(TINY, PAIR, scheme="centralised").scheme == "centralised"
+    assert Training.of(TINY, PAIR).who_drives() == "scheme shared: policy drives vehicle_2, vehicle_3"
     told = "scheme independent: policy/vehicle_2 drives vehicle_2; policy/vehicle_3 drives vehicle_3"
-    assert resolve(TINY, PAIR, scheme="independent").who_drives() == told
+    assert Training.of(TINY, PAIR, scheme="independent").who_drives() == told
 
 
 def test_train__takes_names_as_the_interfaces_do(tmp_path: Path) -> None:
@@ -268,7 +267,7 @@ def test_train__takes_names_as_the_interfaces_do(tmp_path: Path) -> None:
     train(recipe, "cooperation-3-pair", tmp_path / "named", steps=1)
     train(TINY, PAIR, tmp_path / "loaded", steps=1)
     assert _weights(tmp_path / "named" / "policy-last") == _weights(tmp_path / "loaded" / "policy-last")
-    assert sorted(load_team(tmp_path / "named", "cooperation-3-pair").drivers) == [1, 2]
+    assert sorted(RunDirectory(tmp_path / "named").load_team("cooperation-3-pair").drivers) == [1, 2]
     with pytest.raises(UnknownName, match="unknown recipe 'cooperatin'; did you mean 'cooperation'"):
         train("cooperatin", PAIR, tmp_path / "no")
     with pytest.raises(UnknownName, match="unknown scenario"):
@@ -283,19 +282,19 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_load_team__drives_the_learners_that_the_scenario_has(trained: Path) -> None:
-    assert sorted(load_team(trained, PAIR.with_learners(["vehicle_3"])).drivers) == [2]
+    assert sorted(RunDirectory(trained).load_team(PAIR.with_learners(["vehicle_3"])).drivers) == [2]
     four = PAIR.replace(
         vehicles=4, braking_capacity_mps2=6, driving_capacity_mps2=6, mass_t=5, latency_s=0.5, roles={
             "vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "learner", "vehicle_4": "full_brake"}
     )  # fmt: skip
     with pytest.raises(InvalidInput, match=r"a line of 3 vehicles, scenario 'cooperation-3-pair' has 4"):
-        load_team(trained, four)
+        RunDirectory(trained).load_team(four)
     with pytest.raises(InvalidInput, match=r"drives vehicle_2, vehicle_3; scenario .* has nobody to drive"):
-        load_team(trained, PAIR.with_learners([]))
+        RunDirectory(trained).load_team(PAIR.with_learners([]))
     with pytest.raises(InvalidInput, match=r"has a policy of its own; name one, for instance .*vehicle_2"):
         load_policy(trained)
     with pytest.raises(InvalidInput, match="holds no team"):
-        load_team(trained / "policy", PAIR)
+        RunDirectory(trained / "policy").load_team(PAIR)
     with pytest.raises(InvalidInput, match=r"has finished; .* --scenario cooperation-3-pair --agents team@.*/run$"):
         resume(trained)
 
@@ -334,7 +333,7 @@ def test_load_team__a_damaged_folder_is_refused(
     shutil.copytree(trained, tmp_path / "run")
     damage(tmp_path / "run" / "team.json")
     with pytest.raises(CorruptBundle, match=message):
-        load_team(tmp_path / "run", PAIR)
+        RunDirectory(tmp_path / "run").load_team(PAIR)
 
 
 def test_resume__of_another_library_is_refused(trained: Path, tmp_path: Path) -> None:
@@ -347,8 +346,9 @@ def test_resume__of_another_library_is_refused(trained: Path, tmp_path: Path) ->
 
 def test_load_team__needs_no_torch(trained: Path) -> None:
     program = (
-        "import sys, ethbrake_marl as eb; from ethbrake_marl.learning.training import load_team;"
-        f"load_team({str(trained)!r}, eb.load_scenario('cooperation-3-pair')); sys.exit('torch' in sys.modules)"
+        "import sys, ethbrake_marl as eb; from ethbrake_marl.learning.training import RunDirectory;"
+        f"from pathlib import Path; run = RunDirectory(Path({str(trained)!r}));"
+        "run.load_team(eb.load_scenario('cooperation-3-pair')); sys.exit('torch' in sys.modules)"
     )
     root = Path(__file__).resolve().parents[2]
     assert subprocess.run([sys.executable, "-c", program], cwd=root, check=False).returncode == 0
@@ -358,7 +358,7 @@ def test_load_team__needs_no_torch(trained: Path) -> None:
 def test_cooperation__two_learners_avoid_what_can_be_avoided(tmp_path: Path) -> None:
     """Contact cannot be avoided in 65 % of these worlds; PPO's pairs collided in every one (docs/cooperation.md)."""
     train("cooperation", PAIR, tmp_path / "run", steps=800_000)
-    result = eb.evaluate(PAIR.sample(1000, 7), {"team": load_team(tmp_path / "run", PAIR)}, scenario=PAIR)
+    result = eb.evaluate(PAIR.sample(1000, 7), {"team": RunDirectory(tmp_path / "run").load_team(PAIR)}, scenario=PAIR)
     assert result.outcome("team").collided.mean() < 0.70
     assert result.outcome("team").first_impact_harm.mean() < 7.2
 
@@ -375,7 +375,7 @@ LEARNS = load_recipe("cooperation-ppo").replace(
 @pytest.mark.parametrize("scheme", ["shared", "independent", "centralised"])
 def test_scheme__learns_to_beat_full_braking(scheme: Any, tmp_path: Path) -> None:
     train(LEARNS, PAIR, tmp_path / "run", scheme=scheme)
-    agents = {"full_brake": eb.make_agent("full_brake"), "team": load_team(tmp_path / "run", PAIR)}
+    agents = {"full_brake": eb.make_agent("full_brake"), "team": RunDirectory(tmp_path / "run").load_team(PAIR)}
     result = eb.evaluate(PAIR.sample(1000, 7), agents, scenario=PAIR)
     harm = {name: result.outcome(name).first_impact_harm.mean() for name in agents}
     assert harm["team"] < 0.9 * harm["full_brake"]

@@ -20,8 +20,8 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput, Progress
 from ethbrake_marl.evaluation import evaluate, measures as outcome_module, summarise
 from ethbrake_marl.harm import objective_harm, objectives_of
 from ethbrake_marl.learning import runs as train_module
-from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe, shipped_recipes
 from ethbrake_marl.learning.runs import TrainingDiverged
+from ethbrake_marl.learning.training import TrainingRecipe, load_recipe
 from ethbrake_marl.policies import Policy, load_policy
 from ethbrake_marl.scenario import load_scenario
 from tests.learning.tiny import TINY_PPO
@@ -337,7 +337,10 @@ OF_THEIR_KIND = ("cooperation", "cooperation-ppo", "modes", "ppo-paper", "sac-pa
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=() if name in OF_THEIR_KIND else pytest.mark.slow) for name in sorted(shipped_recipes())],
+    [
+        pytest.param(name, marks=() if name in OF_THEIR_KIND else pytest.mark.slow)
+        for name in sorted(TrainingRecipe.shipped())
+    ],
 )
 def test_shipped_recipe__trains_for_one_update(name: str, tmp_path: Path) -> None:
     recipe = load_recipe(name)

@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.training import RunDirectory, resolve
+from ethbrake_marl.learning.training import RunDirectory, Training
 from ethbrake_marl.scenario import Scenario, load_scenario
 from tests.learning.tiny import TINY_PPO
 
 SCENARIO = load_scenario("paper-random")
-TRAINING = resolve(TINY_PPO, SCENARIO)
+TRAINING = Training.of(TINY_PPO, SCENARIO)
 
 
 def folder_of(path: Path, recipe: dict[str, Any], scenario: dict[str, Any]) -> Path:
@@ -32,7 +32,7 @@ def test_same__words_and_defaults_that_are_spelt_out_change_no_training(tmp_path
     words = {"title": "Another", "description": "More.", "source": "Elsewhere."}
     RunDirectory(written(tmp_path / "words", **words)).check_same(TRAINING)
     RunDirectory(written(tmp_path / "defaults", v2x={"preset": "paper"}, speed_limit_mps=40)).check_same(TRAINING)
-    assert resolve(TINY_PPO.replace(**words), SCENARIO.replace(**words)).identity == TRAINING.identity
+    assert Training.of(TINY_PPO.replace(**words), SCENARIO.replace(**words)).identity == TRAINING.identity
 
 
 def test_same__everything_else_does_and_is_named(tmp_path: Path) -> None:
@@ -46,8 +46,8 @@ def test_same__everything_else_does_and_is_named(tmp_path: Path) -> None:
     ]
     for recipe, scenario, named in other:
         with pytest.raises(InvalidInput, match=rf"run: holds another training \(here other: {named}\); give another"):
-            RunDirectory(folder).check_same(resolve(recipe, scenario))
-        assert resolve(recipe, scenario).identity != TRAINING.identity
+            RunDirectory(folder).check_same(Training.of(recipe, scenario))
+        assert Training.of(recipe, scenario).identity != TRAINING.identity
 
 
 def test_same__another_library_trains_other_policies(tmp_path: Path) -> None:

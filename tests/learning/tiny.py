@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.learning.training import load_recipe
 
 TINY_PPO = load_recipe("ppo").replace(
     n_envs=8,

@@ -8,7 +8,7 @@ import pytest
 
 from ethbrake_marl.agents import make_agent, optimise_coupled
 from ethbrake_marl.agents.planner import BestHarm
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.registry import drive
 from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
 from ethbrake_marl.evaluation.measures import TESTS

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl import engine as engine_step, search as search_kernel
-from ethbrake_marl.agents.protocol import fixed_commands
-from ethbrake_marl.agents.rollout import drive, script_agents
+from ethbrake_marl.agents.registry import drive, fixed_commands, script_agents
 from ethbrake_marl.physics import kernel, kernel as episode
 from ethbrake_marl.physics.kernel import Decisions
 from ethbrake_marl.scenario import load_scenario

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.policies import Actor, NetworkSpec, dense, squash
 
 Tensors = Callable[[NetworkSpec], dict[str, np.ndarray]]

@@ -10,7 +10,7 @@ import onnxruntime
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.policies import NetworkSpec, Policy, load_policy, make_policy, onnx_model
+from ethbrake_marl.policies import NetworkSpec, Policy, load_policy
 
 SCENARIO = eb.load_scenario("paper-random")
 
@@ -27,7 +27,7 @@ def _alone(mixture: Policy, number: int) -> Policy:
     fields = {name: getattr(mixture.manifest, name) for name in type(mixture.manifest).model_fields}
     del fields["weights_sha256"], fields["manifest_sha256"]
     log_std = np.zeros(1, np.float32)
-    return make_policy({**tensors, "policy.log_std": log_std}, **{**fields, "network": NetworkSpec(**network)})
+    return Policy.make({**tensors, "policy.log_std": log_std}, **{**fields, "network": NetworkSpec(**network)})
 
 
 def test_mixture__acts_as_the_network_that_the_gate_chooses(mixture: Policy) -> None:
@@ -56,7 +56,7 @@ def test_mixture__the_first_of_equal_scores_acts(mixture: Policy) -> None:
         tensors[name] = np.zeros_like(tensors[name])
     fields = {name: getattr(mixture.manifest, name) for name in type(mixture.manifest).model_fields}
     del fields["weights_sha256"], fields["manifest_sha256"]
-    assert (make_policy(tensors, **fields)._actor.choose(np.ascontiguousarray(_seen(50).T)) == 0).all()
+    assert (Policy.make(tensors, **fields)._actor.choose(np.ascontiguousarray(_seen(50).T)) == 0).all()
 
 
 def test_mixture__as_a_bundle(mixture: Policy, tmp_path: Path) -> None:
@@ -90,7 +90,7 @@ def test_mixture__drives_alone_shielded_and_refined(around: str, mixture: Policy
 
 
 def test_mixture__as_onnx(mixture: Policy) -> None:
-    session = onnxruntime.InferenceSession(onnx_model(mixture), providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(mixture.to_onnx(), providers=["CPUExecutionProvider"])
     seen = _seen(2000)
     (action,) = session.run(["action"], {"observation": seen})
     np.testing.assert_allclose(action, mixture(seen), rtol=0.0, atol=1e-5)

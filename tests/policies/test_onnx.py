@@ -10,7 +10,7 @@ from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.errors import MissingExtra
 from ethbrake_marl.observations import observe
 from ethbrake_marl.physics import advance
-from ethbrake_marl.policies import NetworkSpec, Policy, make_policy, onnx_model
+from ethbrake_marl.policies import NetworkSpec, Policy
 from ethbrake_marl.scenario import load_scenario
 
 STATES = 10_000
@@ -30,7 +30,7 @@ def _policy_like(policy: Policy, output: str, activation: str) -> Policy:
     tensors["policy.output.weight"] *= 3.0  # so that some actions reach the bounds
     fields = {name: getattr(policy.manifest, name) for name in type(policy.manifest).model_fields}
     del fields["weights_sha256"], fields["manifest_sha256"]
-    return make_policy(tensors, **{**fields, "network": spec, "algorithm": "sac" if output == "tanh" else "ppo"})
+    return Policy.make(tensors, **{**fields, "network": spec, "algorithm": "sac" if output == "tanh" else "ppo"})
 
 
 @pytest.mark.parametrize(("output", "activation"), [("clip", "relu"), ("tanh", "relu"), ("clip", "tanh")])
@@ -38,7 +38,7 @@ def test_onnx_model__asks_for_the_same_acceleration_in_10_000_states(
     output: str, activation: str, policy: Policy
 ) -> None:
     ours = _policy_like(policy, output, activation)
-    session = onnxruntime.InferenceSession(onnx_model(ours), providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(ours.to_onnx(), providers=["CPUExecutionProvider"])
 
     worlds = load_scenario("paper-random").replace(driving_capacity_mps2={"uniform": [1, 3]}).sample(STATES, 5).worlds
     rng = np.random.default_rng(0)
@@ -56,4 +56,4 @@ def test_onnx_model__asks_for_the_same_acceleration_in_10_000_states(
 def test_onnx_model__says_what_to_install(policy: Policy, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(MissingExtra, match=r"-m pip install 'ethbrake-marl\[export\]'$"):
-        onnx_model(policy)
+        policy.to_onnx()

@@ -18,7 +18,7 @@ import safetensors.numpy
 
 from ethbrake_marl import policies as bundle
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput
-from ethbrake_marl.policies import Policy, content_sha256, load_policy, make_policy
+from ethbrake_marl.policies import Policy, content_sha256, load_policy
 from tests.docs.site import load
 
 Spoil = Callable[[Path], None]
@@ -348,7 +348,7 @@ def test_load_policy__refuses_a_linked_folder(policy: Policy, tmp_path: Path) ->
 _WATCHED_LOADS = """
 import json, sys
 from ethbrake_marl.errors import CorruptBundle
-from ethbrake_marl.policies import load_policy
+from ethbrake_marl.policies import (load_policy)
 
 root, names = sys.argv[1], json.loads(sys.argv[2])
 load_policy(f"{root}/good")
@@ -448,6 +448,6 @@ def test_make_policy__refuses_what_it_could_not_load(policy: Policy) -> None:
     fields = {name: getattr(policy.manifest, name) for name in type(policy.manifest).model_fields}
     del fields["weights_sha256"], fields["manifest_sha256"]
     with pytest.raises(InvalidInput, match=r"policy: steps: must be greater"):
-        make_policy(policy.tensors, **{**fields, "steps": -1})
+        Policy.make(policy.tensors, **{**fields, "steps": -1})
     with pytest.raises(InvalidInput, match=r"policy: tensor 'policy.0.bias' holds a number that is not finite"):
-        make_policy({**policy.tensors, "policy.0.bias": np.full(13, np.nan, np.float32)}, **fields)
+        Policy.make({**policy.tensors, "policy.0.bias": np.full(13, np.nan, np.float32)}, **fields)

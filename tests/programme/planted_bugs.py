@@ -49,7 +49,7 @@ COURSE, LOOP, EVENTS, KEPT, INDEPENDENT, RECIPE = (
     "ethbrake_marl/learning/runs.py",
     "ethbrake_marl/learning/training.py",
     "ethbrake_marl/learning/algorithms.py",
-    "ethbrake_marl/learning/recipe.py",
+    "ethbrake_marl/learning/training.py",
 )
 
 
@@ -238,8 +238,8 @@ BUGS: dict[str, Bug] = {
     # ------------------------------------------------------------ learning
     "the best policy judged by the other count": Bug(
         COURSE,
-        "name = chosen_by(self.evaluations, self.harm_count)",
-        'name = chosen_by(self.evaluations, "first")',
+        "name = RunDirectory.chosen_by(self.evaluations, self.harm_count)",
+        'name = RunDirectory.chosen_by(self.evaluations, "first")',
         OF_LEARNING,
     ),
     "no alarm where the harm rises with the return": Bug(

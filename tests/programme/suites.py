@@ -217,11 +217,6 @@ LEARNING = Suite(
             "tests/learning/test_resume.py",
             "tests/learning/test_sb3_policy.py",
         ),
-        "learning/recipe.py": (
-            "tests/learning/test_recipe.py",
-            "tests/learning/test_algorithms.py",
-            "tests/learning/test_teams.py",
-        ),
         "policies.py": (
             "tests/policies/test_policy.py",
             "tests/learning/test_teams.py",
@@ -234,6 +229,8 @@ LEARNING = Suite(
             "tests/learning/test_run_files.py",
         ),
         "learning/training.py": (
+            "tests/learning/test_recipe.py",
+            "tests/learning/test_algorithms.py",
             "tests/learning/test_training.py",
             "tests/learning/test_teams.py",
             "tests/learning/test_run_files.py",

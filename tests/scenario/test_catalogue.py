@@ -9,7 +9,7 @@ from jsonschema import Draft202012Validator
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.files.yaml import flow_text, read_yaml
-from ethbrake_marl.learning.recipe import shipped_recipes
+from ethbrake_marl.learning.training import TrainingRecipe
 from ethbrake_marl.scenario import (
     Scenario,
     list_scenarios,
@@ -240,11 +240,11 @@ def test_folder__of_an_installed_package_is_inside_it(tmp_path: Path, monkeypatc
 def test_folder__of_recipes_follows_the_same_rule(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(shipped_files, "_PACKAGE", tmp_path / "ethbrake_marl")
     with pytest.raises(InvalidInput, match=r"the shipped recipes are missing: .*reinstall"):
-        shipped_recipes()
+        TrainingRecipe.shipped()
     installed = tmp_path / "ethbrake_marl" / "_data" / "train"
     installed.mkdir(parents=True)
     (installed / "mine.yaml").touch()
-    assert shipped_recipes() == {"mine": installed / "mine.yaml"}
+    assert TrainingRecipe.shipped() == {"mine": installed / "mine.yaml"}
 
 
 def test_new__says_that_a_latency_must_be_below_the_horizon():

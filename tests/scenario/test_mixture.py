@@ -14,7 +14,7 @@ from scipy import stats
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import scenario_sha256, worlds_sha256
-from ethbrake_marl.learning.training import resolve
+from ethbrake_marl.learning.training import Training
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario, load_scenario
 
@@ -105,7 +105,7 @@ def test_scenario__copies_and_is_told_by_its_hash():
         assert [member.name for member in each.members] == list(MEMBERS)
         assert scenario_sha256(each) == scenario_sha256(DELAYS)
     assert scenario_sha256(DELAYS.replace(mass_t=3)) != scenario_sha256(DELAYS)
-    assert resolve("ppo", DELAYS).identity != resolve("ppo", DELAYS.replace(mass_t=3)).identity
+    assert Training.of("ppo", DELAYS).identity != Training.of("ppo", DELAYS.replace(mass_t=3)).identity
 
 
 def test_file__may_name_a_file_beside_it(tmp_path: Path):

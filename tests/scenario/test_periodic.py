@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.rollout import script_agents
+from ethbrake_marl.agents.registry import script_agents
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.interfaces import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env

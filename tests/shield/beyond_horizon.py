@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.registry import drive, make_agent
 from ethbrake_marl.physics import advance
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import ShieldedDriver

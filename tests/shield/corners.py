@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.registry import drive
 from ethbrake_marl.physics import Floats, Worlds
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.shield import ShieldedDriver

@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import fixed_commands
-from ethbrake_marl.agents.rollout import script_agents
+from ethbrake_marl.agents.registry import fixed_commands, script_agents
 from ethbrake_marl.physics import Worlds, advance
 from ethbrake_marl.shield.enclosure import (
     CLOSING,

@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.registry import drive
 from ethbrake_marl.envs.interfaces import EthBrakeVectorEnv, parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.shield import HybridShield, ShieldedDriver, ShieldedEnv, ShieldedVectorEnv, shielded_aec

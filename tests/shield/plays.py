@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pettingzoo.utils import BaseParallelWrapper
 
-from ethbrake_marl.agents.rollout import episode_engine
+from ethbrake_marl.agents.registry import episode_engine
 from ethbrake_marl.envs.interfaces import EthBrakeParallelEnv, EthBrakeVectorEnv, parallel_env
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.shield import HybridShield, ShieldedDriver, ShieldedEnv, ShieldedVectorEnv, shielded_aec

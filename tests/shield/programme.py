@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.rollout import episode_engine
+from ethbrake_marl.agents.registry import episode_engine
 from ethbrake_marl.evaluation.inputs import make_agents
 from ethbrake_marl.files.store import write_file
 from ethbrake_marl.scenario import load_scenario

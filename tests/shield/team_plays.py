@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.rollout import episode_engine
+from ethbrake_marl.agents.registry import Team, episode_engine
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import HybridShield, ShieldedDriver
 from tests.shield.plays import Aec, Evaluation, Failing, Failure, Parallel, Play, Sb3

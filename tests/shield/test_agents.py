@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from pettingzoo.test import parallel_api_test
 
-from ethbrake_marl.agents.refined import Refined
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.planner import Refined
+from ethbrake_marl.agents.registry import drive, make_agent
 from ethbrake_marl.envs.interfaces import parallel_env
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.scenario import load_scenario

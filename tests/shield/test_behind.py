@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.registry import Team, drive, make_agent
 from ethbrake_marl.scenario import Task, load_scenario
 from ethbrake_marl.shield import ShieldedDriver, guard as behind_module
 from ethbrake_marl.shield.guard import Shielded, put_shield
@@ -16,7 +14,7 @@ PAIR, PAPER = (load_scenario(name) for name in ("cooperation-3-pair", "paper-ran
 
 def test_drive_chunks__is_what_the_shielded_team_does_whatever_the_chunk(monkeypatch):
     worlds, task = PAIR.sample(12, 7).worlds, Task(PAIR, (1, 2), "total")
-    team = ShieldedDriver(Team.copies(make_agent("coast"), (1, 2)), PAIR, harm_count="total", logging=True)
+    team = ShieldedDriver(Team.of(make_agent("coast"), (1, 2)), PAIR, harm_count="total", logging=True)
     episodes = drive(worlds, team.on((1, 2)), PAIR)
     ledger, shield = episodes.ledger, episodes.guarded.shield
     whole = Shielded.driven(make_agent("coast"), worlds, task)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.registry import drive, make_agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.physics import Floats

@@ -10,8 +10,7 @@ import pytest
 from pettingzoo.test import parallel_api_test
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.registry import drive, make_agent
 from ethbrake_marl.envs.interfaces import EthBrakeEnv, EthBrakeVectorEnv, parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput

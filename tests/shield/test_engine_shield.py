@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from gymnasium.wrappers import Autoreset
 
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive, episode_engine
+from ethbrake_marl.agents.registry import drive, episode_engine, make_agent
 from ethbrake_marl.engine import STEP, Engine
 from ethbrake_marl.envs.interfaces import EthBrakeVectorEnv, parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.protocol import fixed_commands
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive, script_agents
+from ethbrake_marl.agents.registry import drive, fixed_commands, make_agent, script_agents
 from ethbrake_marl.envs.interfaces import parallel_env
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.physics.kernel import Decisions

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from pettingzoo.utils import BaseParallelWrapper
 
-from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.registry import Team, drive, make_agent
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.interfaces import parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
@@ -282,7 +280,7 @@ def test_parallel__a_team_proposes_where_nobody_does_and_one_may_be_left_out():
     env.reset(seed=1)
     *_, infos = env.step({"vehicle_3": [0.5]})
     assert [infos[agent]["shield"]["proposed_action"] for agent in env.shielded] == [-1.0, 0.5]
-    for policy in (make_agent("full_brake"), Team.copies(make_agent("full_brake"), (1, 2))):
+    for policy in (make_agent("full_brake"), Team.of(make_agent("full_brake"), (1, 2))):
         alike = HybridShield(parallel_env("cooperation-3-pair"), policy, mode="step")
         alike.reset(seed=1)
         *_, infos = alike.step({})
@@ -364,7 +362,7 @@ def test_evaluation__a_team_behind_the_shield_keeps_its_bound_and_is_never_worse
 
 
 def test_evaluation__members_ask_once_and_the_engine_is_followed_to_the_end():
-    team = ShieldedDriver(Team.copies(make_agent("coast"), (1, 2)), PAIR, logging=True).on((1, 2))
+    team = ShieldedDriver(Team.of(make_agent("coast"), (1, 2)), PAIR, logging=True).on((1, 2))
     worlds = PAIR.sample(20, 9).worlds
     episodes = drive(worlds, team, PAIR)
     harm, shield = episodes.ledger, episodes.guarded.shield

@@ -8,8 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.registry import drive, make_agent
 from ethbrake_marl.envs.interfaces import parallel_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import Scenario

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.registry import drive, make_agent
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.figures import robustness_figure
 from ethbrake_marl.scenario import load_scenario

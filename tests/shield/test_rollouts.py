@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ethbrake_marl.agents.planner import Refined
 from ethbrake_marl.agents.policy import LearnedAgent
-from ethbrake_marl.agents.refined import Refined
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.registry import drive, make_agent
 from ethbrake_marl.envs.interfaces import parallel_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import ObservationSpec

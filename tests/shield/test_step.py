@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.agents.rollout import drive
+from ethbrake_marl.agents.registry import drive, make_agent
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.figures import operating_figure
 from ethbrake_marl.scenario import load_scenario

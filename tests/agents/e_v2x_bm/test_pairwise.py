@@ -14,7 +14,6 @@ from ethbrake_marl.agents.e_v2x_bm import (
     least_to_spare_front,
     most_to_spare_rear,
     optimise_pairwise,
-    pairwise_breakpoints,
     pairwise_harm,
 )
 from ethbrake_marl.errors import InvalidInput
@@ -195,7 +194,7 @@ def test_optimum__takes_the_middle_of_a_flat_minimum():
 
 def test_breakpoints__are_finite_and_inside_the_capacity():
     worlds = wide_worlds(500, 3, seed=17, exact_zeros=True)
-    at = pairwise_breakpoints(worlds, 1)
+    at = optimise_pairwise(worlds, 1).breakpoints_mps2
     assert at.shape == (500, CANDIDATES)
     assert np.all((at >= 0) & (at <= worlds.vehicles.braking_capacity_mps2[:, 1:2]))
 

@@ -18,8 +18,8 @@ import time
 from multiprocessing.context import ForkProcess
 from pathlib import Path
 
-from ethbrake_marl.learning.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.learning.runs import newest_usable, resume, train
+from ethbrake_marl.learning.training import TrainingRecipe, load_recipe
 from ethbrake_marl.scenario import load_scenario
 
 SOON_S = 300.0

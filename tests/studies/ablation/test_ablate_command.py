@@ -16,7 +16,7 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.episodes import Passport
 from ethbrake_marl.learning import runs as learning_train
-from ethbrake_marl.learning.recipe import Scheme, TrainingRecipe, load_recipe
+from ethbrake_marl.learning.training import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.studies.ablation import Plan, read_levels, with_scheme
 from ethbrake_marl.studies.jobs import TrainingJob
 from tests.fixtures.pictures import draw_nothing

@@ -9,7 +9,7 @@ from typing import get_args
 import pytest
 
 from ethbrake_marl.harm import KINDS, scored
-from ethbrake_marl.learning.recipe import Scheme
+from ethbrake_marl.learning.training import Scheme
 from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario, parse_yaml
 from ethbrake_marl.scenario.v2x import CHANNELS, PRESETS, V2X
 

@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.registry import Team, make_agent
 from ethbrake_marl.errors import Progress
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.limits.limits import best_harm, chunks_left
 from ethbrake_marl.scenario import Sample, load_scenario
 from ethbrake_marl.studies.ablation import (
@@ -34,7 +33,7 @@ NAMES = ("cooperation-1-front", "cooperation-2-paper", "cooperation-3-pair", "co
 def answer(level: Level, budget: int, agent: str = "full_brake") -> LevelOptimum:
     worlds = level.scenario.sample(WORLDS, 7).worlds
     table = best_harm(level.scenario, worlds, budget=budget, threads=1)
-    return LevelOptimum(level, worlds, table, (Team.copies(make_agent(agent), level.scenario.learners),))
+    return LevelOptimum(level, worlds, table, (Team.of(make_agent(agent), level.scenario.learners),))
 
 
 @pytest.fixture(scope="module")

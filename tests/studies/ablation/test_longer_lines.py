@@ -15,7 +15,7 @@ from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.policies import Manifest, load_policy, make_policy
+from ethbrake_marl.policies import Manifest, Policy, load_policy
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies import ablation
 from ethbrake_marl.studies.ablation import LineQuestion, lengthen
@@ -141,7 +141,7 @@ def changed(run: Path, folder: Path, scenario: Mapping[str, object] = {}, recipe
     fields = {name: getattr(policy.manifest, name) for name in Manifest.model_fields}
     del fields["weights_sha256"], fields["manifest_sha256"]
     tensors = {name: tensor + np.float32(0.01) for name, tensor in policy.tensors.items()}
-    other = make_policy(tensors, **{**fields, "scenario": {**policy.manifest.scenario, **scenario}})
+    other = Policy.make(tensors, **{**fields, "scenario": {**policy.manifest.scenario, **scenario}})
     other.save(folder / "policy", replace=True)
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps(config | {"recipe": {**config["recipe"], **recipe}}))

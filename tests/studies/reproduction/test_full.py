@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.figures import SeedCurve
-from ethbrake_marl.learning.recipe import load_recipe
+from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.studies import reproduction
 from ethbrake_marl.studies.reproduction import ITEMS, Course, Group, Reproduction, TrainedRecipe
 from tests.learning.tiny import TINY_PPO

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.learning.training import resolve
+from ethbrake_marl.learning.training import Training
 from ethbrake_marl.studies.sweep import SweepPlan
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
@@ -36,7 +36,7 @@ def test_rows__have_the_hash_that_their_trainings_have(write_sweep):
     for row in plan.rows:
         training = plan.training(row)
         assert training.identity == row.identity and training.recipe.seed == row.asked.seed
-        assert resolve(training.recipe, training.scenario).identity == row.identity
+        assert Training.of(training.recipe, training.scenario).identity == row.identity
     assert plan.training(plan.rows[2]).recipe.network.policy == (8, 8)
 
 

@@ -16,8 +16,8 @@ import pytest
 import yaml
 
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.runs import train
+from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.policies import load_policy
 from ethbrake_marl.studies import jobs
 from tests.studies.jobs.inside import Inside

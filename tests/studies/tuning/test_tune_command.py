@@ -15,8 +15,8 @@ import pytest
 import yaml
 
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.learning.recipe import load_recipe
 from ethbrake_marl.learning.runs import train
+from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.studies.sweep import TuningPlan
 from tests.studies.sweep.disturbing import PROGRAM
 from tests.studies.tuning.conftest import TRIALS

@@ -8,7 +8,7 @@ import pytest
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.recipe import shipped_recipes
+from ethbrake_marl.learning.training import TrainingRecipe
 from ethbrake_marl.studies.sweep import TuningPlan
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
@@ -168,7 +168,7 @@ def test_identity__is_that_of_all_that_changes_a_trial(write_tuning):
 @pytest.mark.parametrize("name", ["tuning-quick", "tuning-ppo"])
 def test_shipped_spaces__are_in_order_and_hold_their_recipe(name):
     plan = TuningPlan.read(DOCS / f"{name}.yaml")
-    assert plan.own_values() is not None and plan.file.recipe in shipped_recipes()
+    assert plan.own_values() is not None and plan.file.recipe in TrainingRecipe.shipped()
     assert (DOCS / f"{name}.yaml").read_text("utf-8") in (DOCS / "tuning.md").read_text(
         "utf-8"
     ) or name != "tuning-quick"
