@@ -16,7 +16,7 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation.inputs import make_lineup, worlds_sha256
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.files.store import write_file
-from ethbrake_marl.limits.limits import BestHarmTable, table_bytes, world_identity
+from ethbrake_marl.limits.limits import BestHarmTable, table_bytes, task_problem
 from ethbrake_marl.scenario import Scenario, Task
 from ethbrake_marl.studies.benchmark import CONTENT, REFERENCE, ListContent, Suite, SuiteContent, load_suite
 
@@ -62,7 +62,7 @@ def _freeze(new: NewList) -> tuple[ListContent, bytes]:
     """What the suite's file says of a list, and its table as bytes."""
     scenario, sample = new.scenario, new.scenario.sample(new.worlds, new.seed)
     task = Task(scenario, scenario.learners, new.harm_count)
-    best = new.table.harm(world_identity(sample.worlds, task), new.harm_count)
+    best = new.table.harm(task_problem(sample.worlds, task).identity, new.harm_count)
     full = evaluate(sample, make_lineup([REFERENCE], scenario), scenario=scenario, aftermath=False).complete()
     full_harm = float(full.outcome(REFERENCE).world_harm(new.harm_count).mean())
     if not best.mean() < full_harm:
