@@ -16,8 +16,7 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation.inputs import make_lineup, worlds_sha256
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.files.store import write_file
-from ethbrake_marl.limits import task_problem
-from ethbrake_marl.limits.limits import BestHarmTable, table_bytes
+from ethbrake_marl.limits.limits import BestHarmTable, table_bytes, task_problem
 from ethbrake_marl.scenario import Scenario, Task
 from ethbrake_marl.studies.benchmark import CONTENT, REFERENCE, ListContent, Suite, SuiteContent, load_suite
 
