@@ -446,6 +446,8 @@ def ablate_command(
         episodes=episodes, list_seed=list_seed, search_episodes=search_episodes, budget=budget, shield=shield,
         folder=output,
     )  # fmt: skip
+    if not cost:
+        plan.job_folder().check()
     out.note(plan.cost())
     if cost:
         return

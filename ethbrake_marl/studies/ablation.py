@@ -308,7 +308,7 @@ def plan_ablation(
         )
     if not any(level.scenario.learners for level in plan.levels):
         raise InvalidInput("levels: nobody learns in any of them; give at least one with a learner")
-    plan.job_folder().check()
+    JobFolder(plan.folder, "an ablation").check()
     common_worlds(plan.levels, 5, plan.list_seed)
     list(plan.trainings())  # one that cannot be is refused
     return plan
