@@ -1,4 +1,4 @@
-"""What the vehicles of a scenario observe, and the rows that learners are given: full state or place behind it."""
+"""Observations of a scenario: what its vehicles observe, and the rows of learners, full state or place behind it."""
 
 from __future__ import annotations
 

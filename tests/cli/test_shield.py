@@ -113,7 +113,7 @@ def test_evaluate__a_team_goes_behind_the_step_shield_and_no_other(monkeypatch):
 
 def test_horizon__what_still_moves_then_is_told_by_both_commands(ethbrake, tmp_path):
     short = tmp_path / "short.yaml"
-    long = (shipped_folder("scenarios", "scenarios") / "paper" / "paper-random.yaml").read_text("utf-8")
+    long = (shipped_folder() / "paper" / "paper-random.yaml").read_text("utf-8")
     short.write_text(long.replace("horizon_s: 8", "horizon_s: 3").replace("name: paper-random", "name: short"), "utf-8")
     note = "note: bounds of the shield end at the horizon (3 s) and say nothing of what comes after; worlds, of 20,"
     told = ethbrake("shield", "--agents", "full_brake", "--episodes", "20", "--scenario", str(short), "--json")
