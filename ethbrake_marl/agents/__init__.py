@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         episode_engine as episode_engine,
         fixed_commands as fixed_commands,
         make_agent as make_agent,
+        make_single_agent as make_single_agent,
         parse_spec as parse_spec,
         record_commands as record_commands,
         register_agent as register_agent,

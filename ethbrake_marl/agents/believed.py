@@ -278,7 +278,8 @@ class Believing(AgentAround):
     def __init__(self, policy: Agent, scenario: Scenario, *, shows: bool = False) -> None:
         super().__init__(policy, f"{policy.name}:believed")
         self.scenario, self._shows = scenario, shows
-        self._ranges = {0: Ranges.of(scenario, 0)}  # by own vehicle; refuses a mixture at once
+        self._ranges: dict[int, Ranges] = {}  # by own vehicle
+        Ranges.of(scenario, 0, {})  # refuses a mixture at once
 
     @property
     def knows(self) -> Knowledge:

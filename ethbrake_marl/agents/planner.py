@@ -215,6 +215,8 @@ class BestHarm:
         budget: int = PROFILE_BUDGET,
         time_step_s: float = TIME_STEP_S,
     ) -> None:
+        if not budget >= 1:
+            raise InvalidInput(f"best_harm: budget = {budget}; at least 1 candidate is needed")
         check_harm_count(harm_count)
         self._recall, self._budget = recall, budget
         self._outlook = _Outlook(harm_count, horizon_s, time_step_s)
@@ -230,7 +232,7 @@ class BestHarm:
             )
         return cls(
             recall, harm_count=settings.harm_count, horizon_s=settings.horizon_s, time_step_s=settings.time_step_s,
-            budget=min(budget[0], settings.most_candidates or budget[0]),
+            budget=budget[0] if settings.most_candidates is None else min(budget[0], settings.most_candidates),
         )  # fmt: skip
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:

@@ -540,6 +540,14 @@ def make_agent(
     return driver
 
 
+def make_single_agent(spec: str, **settings: Any) -> Agent:
+    """``make_agent`` for who drives one vehicle; raises ``InvalidInput`` for a team too."""
+    agent = make_agent(spec, **settings)
+    if not isinstance(agent, Agent):
+        raise InvalidInput(f"agent {spec!r}: is a team, one agent is needed here: ppo@RUN/policy/vehicle_2")
+    return agent
+
+
 def find_entry(written: AgentSpec) -> Entry:
     """The registry's entry of an agent.
 
@@ -679,11 +687,11 @@ def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | Non
     """Agents for the scenario's scripts, by vehicle."""
     left_out = (except_for,) if isinstance(except_for, int) else except_for or ()
     made = {
-        i: make_agent(spec, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s)
+        i: make_single_agent(spec, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s)
         for i, spec in scenario.scripts.items()
         if i not in left_out
     }
-    return {i: Team.of(driver, [i]).drivers[i] for i, driver in made.items()}
+    return made
 
 
 def episode_engine(worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None) -> Engine:

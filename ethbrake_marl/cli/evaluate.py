@@ -401,6 +401,7 @@ def record_command(
 ) -> None:
     """Agents in one world of the list, in real time: the road to scale, commands, impacts, harm."""
     out.check(output)
+    evaluation.check_film(output.suffix.lower())
     chosen = _asked_task(scenario, vehicle, None).scenario
     lineup = _make_drivers(agents, chosen, uncertainty=uncertainty)
     worlds = chosen.sample(1, seed, first=world).worlds
@@ -434,6 +435,8 @@ def replay_command(
     """
     named = evaluation.Passport.parse(passport)
     out.check(output)
+    if output is not None and output.suffix.lower() not in PAGES:
+        evaluation.check_film(output.suffix.lower())
     found = named.replay(
         scenario=scenario,
         settings=learning.read_settings(settings).scenario,
@@ -529,6 +532,7 @@ def dataset_command(
     replay to the same bits. The reward counts the harm of --harm-count, too.
     """
     chosen = _asked_task(scenario, vehicle, settings, harm_count).scenario
+    evaluation.check_dataset(output, chosen, format, force=out.force)
     lineup = _make_drivers(agents, chosen, harm_count, uncertainty)
     evaluation.check_agents(lineup, chosen.sample(1, seed).worlds, chosen)
     summary = evaluation.write_dataset(

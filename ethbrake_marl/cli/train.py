@@ -281,6 +281,8 @@ def sweep_command(
     from ethbrake_marl.studies.jobs import open_workers
     from ethbrake_marl.studies.sweep import SweepPlan
 
+    if ray is not None:
+        need("ray")
     plan = SweepPlan.read(file)
     plan.folder(output).check()
     if dry_run:
@@ -333,6 +335,8 @@ def tune_command(
     from ethbrake_marl.studies.jobs import open_workers
     from ethbrake_marl.studies.sweep import TuningPlan
 
+    if ray is not None:
+        need("ray")
     plan = TuningPlan.read(file)
     plan.folder(output).check()
     if export is not None:  # raise now what would be raised at the end

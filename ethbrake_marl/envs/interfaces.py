@@ -405,7 +405,8 @@ class Begun:
         and are ignored. Returns the seed that was used. Raises ``InvalidInput``, with nothing changed, for a seed that
         is not a whole number >= 0, a bad initial state or listed world, or both of them.
         """
-        used = None if seed is None and self._started else chosen_seed(seed)
+        goes_on = self._started or getattr(self, "_np_random_seed", None) is not None  # Gymnasium's own stream was used
+        used = None if seed is None and goes_on else chosen_seed(seed)
         if not (options is None or isinstance(options, Mapping)):
             raise InvalidInput(
                 f"reset: options = {options!r}: must be None or a mapping, for instance {{'{INITIAL_STATE}': ...}}"

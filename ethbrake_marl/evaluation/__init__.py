@@ -15,6 +15,8 @@ if TYPE_CHECKING:
         EpisodeMotion as EpisodeMotion,
         EpisodeRecord as EpisodeRecord,
         Passport as Passport,
+        check_dataset as check_dataset,
+        check_film as check_film,
         film as film,
         follow_episodes as follow_episodes,
         record_episode as record_episode,

@@ -24,6 +24,7 @@ from ethbrake_marl.agents import (
     Team,
     episode_engine,
     make_agent,
+    make_single_agent,
     parse_spec,
     script_agents,
 )
@@ -273,8 +274,7 @@ def load_runnable(
     worlds = scenario.replace(early_impacts="keep").sample(1, DEFAULT.LIST_SEED).worlds
     for i, script in scenario.scripts.items():
         try:
-            driver = make_agent(script, horizon_s=scenario.horizon_s, most_candidates=TRIED_CANDIDATES)
-            agent = Team.of(driver, [i]).drivers[i]
+            agent = make_single_agent(script, horizon_s=scenario.horizon_s, most_candidates=TRIED_CANDIDATES)
             ask_script(agent, worlds, begin_script(agent, worlds, i, {}), i)
         except InvalidInput as error:
             role = scenario.vehicle_names[i]

@@ -528,6 +528,8 @@ class Question:
     def _lineup(self) -> Mapping[str, Driver]:
         """The agents in this process, once."""
         if self.sha256 not in _LINEUPS:
+            if not self.identity:
+                raise InvalidInput("question: it was not asked yet; answer what ask() gives")
             here = self.ask()
             if here.sha256 != self.sha256:
                 changed = sorted(key for key in self.identity if here.identity.get(key) != self.identity[key])

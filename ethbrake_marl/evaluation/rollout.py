@@ -172,6 +172,8 @@ def evaluate(
     """
     _check_request(worlds, agents, scenario, chunk)
     sample = worlds if isinstance(worlds, Sample) else Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0)
+    if not sample.worlds.n:
+        raise InvalidInput("evaluate: worlds: there are none; at least one is needed")
     check_alert(sample.worlds, sample.worlds.n, scenario.vehicles)
     whole, left_out = evaluate_list(sample, agents, scenario, seed, vehicle, chunk, on_progress, aftermath)
     if whole is None:

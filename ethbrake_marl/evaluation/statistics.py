@@ -327,19 +327,19 @@ def interquartile_mean(tasks: Sequence[ArrayLike], *, resamples: int = RESAMPLES
 
 
 def mean_over_seeds(values: ArrayLike, baseline: ArrayLike | None = None, *, seed: int = 0) -> Estimate:
-    """Mean of ``values``, or of ``values - baseline`` on the same worlds, [seeds, worlds] each; of truths their share.
+    """Mean of ``values``, or of ``values - baseline`` on the same worlds, [seeds, worlds] each.
 
     Numbers of seeds may differ. The bootstrap interval draws the seeds of either side and the worlds, which both sides
     share, anew: an interval of differences that leaves out 0 holds for other seeds *and* other worlds. None with a
     single world. That is no interval of truths that hold nearly always or never: draws of such worlds are all alike. So
-    theirs reaches at least as far as Wilson's of the share over the worlds. Raises ``InvalidInput`` for arrays that
-    cannot be paired or are not finite.
+    that of truths without a baseline reaches at least as far as Wilson's of their share over the worlds. Raises
+    ``InvalidInput`` for arrays that cannot be paired or are not finite.
     """
     given = np.atleast_2d(np.asarray(values))
     sides = _pair_sides("mean_over_seeds", given, np.zeros((1, given.shape[-1])) if baseline is None else baseline)
     value = float((sides[0].mean(axis=0) - sides[1].mean(axis=0)).mean())
     found = _resampled(value, sides, lambda means: means[:, 0] - means[:, 1], seed)
-    if given.dtype != np.bool_:
+    if given.dtype != np.bool_ or baseline is not None:
         return found
     share = min(value, 1.0)  # a mean of ones may be rounded up
     low, high = wilson(share, given.shape[1])

@@ -758,9 +758,11 @@ class ShieldedDriver:
         self._guard: dict[str, Any] = {} if self.options.believed else {"later_rollouts": later_rollouts, "told": told}
         robust = "" if self.options.robust == CORNERS else f":{self.options.robust}"
         self.name = f"{policy.name}+{self.options.mode}{robust}{':believed' if self.options.believed else ''}"
-        make = self.options.believed_shield if self.options.believed else self.options.step_shield
-        if self.options.believed or not isinstance(policy, Team):
-            make(scenario, scenario.learners[0] if len(scenario.learners) == 1 else 0)  # refuses bad settings at once
+        one = scenario.learners[0] if len(scenario.learners) == 1 else None
+        if self.options.believed:  # refuses bad settings at once; without one learner nobody knows whose scripts count
+            self.options.believed_shield(scenario, one or 0, {} if one is None else None)
+        elif not isinstance(policy, Team):
+            self.options.step_shield(scenario, one or 0)
 
     @property
     def adds(self) -> Source:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ethbrake_marl.agents import Agent, Driver, LearnedAgent, Team, make_agent
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
-from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, count_of
+from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, check_whole_number, count_of
 from ethbrake_marl.evaluation import (
     evaluate,
     interquartile_mean,
@@ -297,6 +297,8 @@ def plan_ablation(
         noted=changed.texts,
         **{**(_QUICK if quick else _FULL), **{name: value for name, value in given.items() if value is not None}},
     )
+    for name in ("seeds", "steps_per_learner", "episodes", "search_episodes", "budget"):
+        check_whole_number(name, getattr(plan, name), 1)
     called = [recipe.name for recipe in loaded]
     if len(set(called)) < len(called):
         raise InvalidInput(f"recipes {', '.join(called)}: give at least one, each with a name of its own")

@@ -1269,9 +1269,14 @@ _RANDOM, _HYBRID_WORLDS, _RANDOM_WORLDS, _KINDS = "paper-random", 5_000, 10_000,
 _ALONE, _REALISED, _AS_PRINTED = "policy alone", "hybrid, realised H*", "hybrid, predicted H*"
 
 
-@lru_cache(maxsize=2 * len(READINGS))  # figure and table share what they drive
 def _drive_hybrid(name: str, settings: Reproduction, reading: Reading) -> Evaluation:
     """The strategies on the worlds of a scenario."""
+    return _driven_hybrid(name, settings, reading, unconverged_policy(settings)[1])
+
+
+@lru_cache(maxsize=2 * len(READINGS))  # figure and table share what they drive
+def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: str) -> Evaluation:
+    """... with the policy that is told ``about``: a training that has ended since takes the place of a shipped one."""
     scenario, (policy, _) = reading.scenario(name), unconverged_policy(settings)
     agents: dict[str, Agent] = {
         **lineup(scenario, PAIRWISE, COUPLED),

@@ -77,3 +77,9 @@ def test_search__decides_when_its_scenario_does(spec, time_step_s):
     assert (episodes.ledger.world_harm("first") <= episodes.memories[1]["predicted_harm"] + 1e-9).all()
     role = scenario.replace(early_impacts="keep", roles={"vehicle_2": spec, "vehicle_3": "learner"})
     assert script_agents(role)[1]._outlook.time_step_s == time_step_s
+
+
+@pytest.mark.parametrize("most", [0, -1])
+def test_best_harm__without_a_candidate_is_refused(most: int) -> None:
+    with pytest.raises(InvalidInput, match=f"best_harm: budget = {most}; at least 1 candidate is needed"):
+        make_agent("best_harm", most_candidates=most)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.policy import LearnedAgent
-from ethbrake_marl.agents.registry import Team, drive, make_agent
+from ethbrake_marl.agents.registry import Team, drive, make_agent, script_agents
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate, summarise
@@ -134,3 +134,12 @@ def test_team__bad_input_is_refused():
         Team({1: "coast"}, "t")
     with pytest.raises(InvalidInput, match="team 't' drives vehicle_2; the vehicles to drive are vehicle_2, vehicle_3"):
         Team.of(Team({1: brake}, "t"), (1, 2))
+
+
+def test_team__as_a_script_is_refused_with_what_to_write(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = PAIR.with_learners(["vehicle_2"])
+    scripted = scenario.replace(roles=dict.fromkeys(("vehicle_1", "vehicle_3"), "coast") | {"vehicle_2": "learner"})
+    brake = make_agent("full_brake")
+    monkeypatch.setattr("ethbrake_marl.agents.registry.make_agent", lambda *_, **__: Team({2: brake}, "t"))
+    with pytest.raises(InvalidInput, match="agent 'coast': is a team, one agent is needed here"):
+        script_agents(scripted)

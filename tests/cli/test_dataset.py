@@ -64,6 +64,7 @@ def test_dataset__without_the_extra_says_the_line_that_installs_it(
             "a dataset of Minari is one learner's: --vehicle NAME",
         ),
         (("--output", "a.parquet", "--agents", "ful_brake"), "did you mean 'full_brake'?"),
+        (("--output", "brakes", "--agents", "ful_brake"), "a dataset of Minari is a folder called NAME-vNUMBER"),
     ],
 )
 def test_dataset__what_cannot_be_is_refused_in_one_line(

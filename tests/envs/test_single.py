@@ -72,6 +72,14 @@ def test_seed__of_an_unseeded_environment_can_be_read_and_repeated() -> None:
     assert np.array_equal(EthBrakeEnv().reset(seed=env.np_random_seed)[0], start)
 
 
+def test_seed__of_a_stream_that_the_user_set_goes_on() -> None:
+    env = EthBrakeEnv()
+    env.np_random = np.random.default_rng(7)
+    info = env.reset()[1]
+    assert (info["world_seed"], info["world"]) == (0, 1)
+    assert env.np_random.integers(10**6) == 944_904
+
+
 def test_settings__reach_the_engine() -> None:
     params = RewardParams(harm=2.0)
     spec = ObservationSpec(front=2, rear=0)

@@ -202,6 +202,12 @@ def test_evaluate__takes_the_vehicle_by_name(paper_random: Scenario) -> None:
         evaluate(worlds, agents, scenario=paper_random, vehicle="vehicle_9")
 
 
+def test_evaluate__of_no_worlds_is_refused(paper_random: Scenario) -> None:
+    nothing = paper_random.sample(1, 1).worlds.take(np.arange(0))
+    with pytest.raises(InvalidInput, match="worlds: there are none"):
+        evaluate(nothing, {"coast": make_agent("coast")}, scenario=paper_random)
+
+
 def test_evaluate__refuses_worlds_that_are_not_at_the_alert(paper_random: Scenario) -> None:
     worlds = paper_random.sample(3, 0).worlds
     later, _ = advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=0.1)

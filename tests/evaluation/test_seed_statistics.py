@@ -124,3 +124,8 @@ def test_rate_over_seeds__is_no_certainty_where_all_worlds_were_alike() -> None:
     happened[0] = True  # one seed always, three never
     low, high = mean_over_seeds(happened).interval or (0.0, 0.0)
     assert low == 0.0 and high > 0.7
+
+
+def test_mean_over_seeds__of_truths_against_a_baseline_is_a_difference() -> None:
+    found = mean_over_seeds(np.array([[True, False, False, True]]), np.array([[True] * 4]))
+    assert found.value == -0.5 and found.interval is not None and found.interval[0] < -0.5 < found.interval[1] <= 0.0

@@ -147,6 +147,18 @@ def test_believed__what_cannot_be_is_refused(spec: str, words: str) -> None:
         make_agent(spec, scenario=BASE)
 
 
+@pytest.mark.parametrize("spec", ["coast+robust:interior:believed", "coast+step:believed", "e_v2x_bm:believed"])
+@pytest.mark.parametrize("script", ["copy_leader", "e_v2x_bm"])
+def test_believed__the_script_of_the_driven_vehicle_itself_does_not_count(spec: str, script: str) -> None:
+    scripted = BASE.replace(roles={"vehicle_1": "full_brake", "vehicle_2": script, "vehicle_3": "full_brake"})
+    worlds = scripted.sample(3, 1).worlds
+    harms = [
+        drive(worlds, make_agent(spec, scenario=scenario), scenario, 1).ledger.world_harm("total")
+        for scenario in (BASE, scripted)
+    ]
+    np.testing.assert_array_equal(*harms)
+
+
 def test_interior__what_it_cannot_certify_is_refused_when_the_agent_is_made() -> None:
     with pytest.raises(InvalidInput, match="robust interior: total harm"):
         make_agent("coast+robust:interior:believed", scenario=BASE, harm_count="total")

@@ -17,7 +17,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.episodes import Passport
 from ethbrake_marl.learning import runs as learning_train
 from ethbrake_marl.learning.training import Scheme, TrainingRecipe, load_recipe
-from ethbrake_marl.studies.ablation import Plan, read_levels, with_scheme
+from ethbrake_marl.studies.ablation import Plan, plan_ablation, read_levels, with_scheme
 from ethbrake_marl.studies.jobs import TrainingJob
 from tests.fixtures.pictures import draw_nothing
 
@@ -301,3 +301,9 @@ def _wait_for(happened, process) -> None:
     while not happened():
         assert process.poll() is None and time.monotonic() < end
         time.sleep(0.1)
+
+
+@pytest.mark.parametrize("name", ["seeds", "steps_per_learner", "episodes", "search_episodes", "budget"])
+def test_plan__of_no_seeds_or_worlds_is_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match=f"{name} = 0: must be a whole number, at least 1"):
+        plan_ablation(None, "cooperation", None, None, quick=True, list_seed=7, folder=tmp_path / "a", **{name: 0})

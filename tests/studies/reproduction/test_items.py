@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 
 from ethbrake_marl.errors import InvalidInput, UnknownName
+from ethbrake_marl.policies import load_shipped
+from ethbrake_marl.studies import reproduction
 from ethbrake_marl.studies.reproduction import GAPS, ITEMS, Item, Made, Reproduction, summarise_verdicts
 
 PAPER = Path(__file__).resolve().parents[3] / "docs" / "paper.md"
@@ -73,3 +75,12 @@ def test_register__every_gap_says_what_the_paper_says_and_what_is_measured() -> 
     for gap in GAPS:
         assert gap.paper and gap.ours
         assert bool(gap.alternatives) != gap.otherwise.startswith(("trained by --full: ", "not measured: ")), gap.name
+
+
+def test_hybrid__is_driven_anew_once_its_policy_was_trained(
+    settings: Reproduction, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = reproduction._drive_hybrid("paper-random", settings, reproduction.READINGS[0])
+    assert reproduction._drive_hybrid("paper-random", settings, reproduction.READINGS[0]) is first
+    monkeypatch.setattr(reproduction, "unconverged_policy", lambda _: (load_shipped("ppo"), "trained since"))
+    assert reproduction._drive_hybrid("paper-random", settings, reproduction.READINGS[0]) is not first

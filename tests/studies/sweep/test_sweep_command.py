@@ -16,6 +16,7 @@ import pytest
 import yaml
 
 from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning.runs import train
 from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.policies import load_policy
@@ -217,3 +218,16 @@ def disturb(command: list[str], folder: Path) -> None:
 def ends(folder: Path) -> Counter[str]:
     """How often each job was finished."""
     return Counter(one["job"] for one in journal(folder) if one["status"] == "finished")
+
+
+@pytest.mark.parametrize("command", ["sweep", "tune"])
+def test_ray__that_is_missing_is_told_before_anything_is_planned(
+    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def need(package: str) -> None:
+        raise InvalidInput(f"needs the package {package}")
+
+    monkeypatch.setattr("ethbrake_marl.cli.train.need", need)
+    arguments = ["study", command, "no.yaml", "--output", "no", "--ray", "local", "--dry-run"]
+    assert run_command(arguments) == 2
+    assert "needs the package ray" in capsys.readouterr().err
