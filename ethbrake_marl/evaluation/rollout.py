@@ -40,7 +40,7 @@ from ethbrake_marl.scenario import Sample, Scenario, ScriptSpec, Task
 
 # The aftermath of a line: where Vehicle 1 ends, and how much of that others pushed it.
 #
-# Worlds know gaps and speeds, no places: a post ahead (``with_obstacle``) makes the way of Vehicle 1 one more gap.
+# Worlds know gaps and speeds, no places: a post ahead (``with_post_ahead``) makes the way of Vehicle 1 one more gap.
 
 
 class ShovedFront:
