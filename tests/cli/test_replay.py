@@ -138,3 +138,8 @@ def test_evaluate_report__its_passports_can_be_replayed(ethbrake, tmp_path):
     refused = ethbrake("evaluate", "--episodes", "1", "--report", page)
     assert refused.status == 2 and "--force" in refused.err
     assert ethbrake("evaluate", "--episodes", "1", "--report", tmp_path / "report.pdf").status == 2
+
+
+def test_film__of_another_ending_is_refused_before_anybody_is_asked_for(ethbrake, tmp_path):
+    answer = ethbrake("watch", "record", "--agents", "nobody", "--output", str(tmp_path / "x.txt"))
+    assert answer.status == 2 and "films are written as" in answer.err and "nobody" not in answer.err
