@@ -92,7 +92,7 @@ class SampledHarm:
     """
 
     def __init__(self, worlds: Worlds, scenario: Scenario) -> None:
-        self._worlds = worlds
+        self._worlds = worlds.copy()
         self._command = np.zeros(worlds.speeds_mps.shape)
         self._harm = np.zeros(worlds.n)
         self._start_s = worlds.first_decision_s([VEHICLE_2])
@@ -122,7 +122,7 @@ class SampledHarm:
         self._samples += 1
         next_s = np.minimum(Decisions(self._start_s, self._step_s).at(self._samples), self._horizon_s)
         until_s = np.maximum(next_s, self._worlds.time_s)
-        self._worlds, impacts = sample_on(self._worlds, self._command, until_s, self._step_s)
+        impacts = sample_on(self._worlds, self._command, until_s, self._step_s)
         self._harm += sum_rows(impacts.total_harm)
 
     def finish(self) -> Floats:

@@ -352,11 +352,7 @@ def advance(
     v, shape = worlds.vehicles, worlds.gaps_m.shape
     at, capacity = int(worlds.obstacle_ahead.any()), 4 * worlds.n + 64 if record else 0
     while True:
-        after = Worlds(
-            v, worlds.gaps_m.copy(), worlds.speeds_mps.copy(), worlds.time_s.copy(), worlds.pair_hit.copy(),
-            np.empty(worlds.speeds_mps.shape), worlds.obstacle_gap_m.copy(), worlds.obstacle_hit.copy(),
-            worlds.messages.copy(),
-        )  # fmt: skip
+        after = worlds.copy()
         harm = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64), *Impacts.no_obstacle(worlds.n)
         failed = np.empty(worlds.n, np.int64)
         arrays = (
@@ -593,30 +589,27 @@ def advance_sampled(
     until = _shaped("until_s", until_s, (worlds.n,))
     _refuse_bad(worlds, command, until, np.ones(worlds.n, np.bool_))
     _refuse_unsampled(worlds, until, step_s)
-    return sample_on(worlds, command, until, step_s)
+    after = worlds.copy()
+    impacts = sample_on(after, command, until, step_s)
+    acting = worlds.vehicles.latency_s <= after.time_s[:, np.newaxis] + _ON_SAMPLE * step_s
+    after.command_mps2[...] = np.where(acting, command, 0.0)
+    return after, impacts
 
 
-def sample_on(worlds: Worlds, command: Floats, until: Floats, step_s: float) -> tuple[Worlds, Impacts]:
-    """``advance_sampled`` of what it would accept: nothing is checked."""
+def sample_on(worlds: Worlds, command: Floats, until: Floats, step_s: float) -> Impacts:
+    """``advance_sampled`` of what it would accept, in place; it checks nothing, and leaves ``command_mps2`` alone."""
     vehicles = worlds.vehicles
     start = vehicles.latency_s[:, 1]
     position, end = (worlds.time_s - start) / step_s, (until - start) / step_s  # times on the grid may be rounded
     first = np.where(position < -_ON_SAMPLE, -1.0, np.rint(position)).astype(np.int64)
     last = np.where(end < -_ON_SAMPLE, -1.0, np.ceil(end - _ON_SAMPLE)).astype(np.int64)
-    gaps, speeds, time, hit = (
-        worlds.gaps_m.copy(), worlds.speeds_mps.copy(), worlds.time_s.copy(), worlds.pair_hit.copy()
-    )  # fmt: skip
+    gaps, time = worlds.gaps_m, worlds.time_s
     first_harm, total_harm, count = np.zeros(gaps.shape), np.zeros(gaps.shape), np.zeros(gaps.shape, np.int64)
     sample_worlds(
-        gaps, speeds, time, hit, command, until, float(step_s), first, last, vehicles.latency_s, vehicles.mass_t,
-        vehicles.speed_limit_mps, vehicles.restitution, first_harm, total_harm, count,
+        gaps, worlds.speeds_mps, time, worlds.pair_hit, command, until, float(step_s), first, last, vehicles.latency_s,
+        vehicles.mass_t, vehicles.speed_limit_mps, vehicles.restitution, first_harm, total_harm, count,
     )  # fmt: skip
-    in_force = np.where(vehicles.latency_s <= time[:, None] + _ON_SAMPLE * step_s, command, 0.0)
-    after = Worlds(
-        vehicles, gaps, speeds, time, hit, in_force, worlds.obstacle_gap_m.copy(), worlds.obstacle_hit.copy(),
-        worlds.messages.copy(),
-    )  # fmt: skip
-    return after, Impacts(first_harm, total_harm, count, *Impacts.no_obstacle(worlds.n))
+    return Impacts(first_harm, total_harm, count, *Impacts.no_obstacle(worlds.n))
 
 
 def _refuse_unsampled(worlds: Worlds, until: Floats, step_s: float) -> None:

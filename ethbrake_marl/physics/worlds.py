@@ -155,6 +155,10 @@ class Worlds:
         columns = (change(*(getattr(w, name) for w in parts)) for name in _OF_WORLDS)
         return Worlds(_combined(change, *(w.vehicles for w in parts)), *columns)
 
+    def copy(self) -> Worlds:
+        """The same worlds in memory of their own, but for ``vehicles``, which do not change."""
+        return Worlds(self.vehicles, *(getattr(self, name).copy() for name in _OF_WORLDS))
+
     def take(self, rows: ArrayLike) -> Worlds:
         """Select worlds by index or mask (always a copy)."""
         index = np.asarray(rows)

@@ -1,11 +1,9 @@
-"""What ``ethbrake doctor speed`` measures, and that no figure is far below what this code can do."""
+"""What ``ethbrake doctor speed`` measures. No speed is asserted: a figure is one machine's, on one day."""
 
 from __future__ import annotations
 
 import math
-import sys
 import time
-from collections.abc import Callable
 
 import numba
 import numpy as np
@@ -27,8 +25,6 @@ from ethbrake_marl.studies.speed import (
 )
 
 SHORT = Effort(1, 1e-6)
-
-compiled_only = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="compilation is switched off")
 
 
 def speeds_of(name: str, effort: Effort) -> list[Speed]:
@@ -89,10 +85,9 @@ def test_calibration__brakes_by_half_a_metre_per_second_and_starts_again() -> No
 
 
 def test_benchmarks__each_measures_something() -> None:
-    slow = ("Stable-Baselines3 VecEnv", "import and first step")  # measured below
     for each in BENCHMARKS:
         assert each.workload and each.worlds >= 1
-        if each.name not in slow:
+        if each.name != "import and first step":  # measured below
             speed = each.measure(SHORT)
             assert 0.0 < speed.lowest == speed.value == speed.highest
 
@@ -109,43 +104,3 @@ def test_machine__is_named_in_words() -> None:
     words = str(machine)
     assert machine.processor in words and f"{machine.cores_usable} of {machine.cores} cores" in words
     assert f"numba {numba.__version__}" in words and machine.processor
-
-
-def watched() -> bool:
-    """Whether a tracer, profiler or monitor runs beside the code (coverage, a debugger): it slows down Python alone."""
-    monitoring = getattr(sys, "monitoring", None)  # from Python 3.12 on
-    tools = [] if monitoring is None else [monitoring.get_tool(number) for number in range(6)]
-    return sys.gettrace() is not None or sys.getprofile() is not None or any(tools)
-
-
-@pytest.mark.parametrize("switch", [sys.settrace, sys.setprofile])
-def test_watched__sees_a_tracer_and_a_profiler(switch: Callable[[object], None]) -> None:
-    before = {sys.settrace: sys.gettrace, sys.setprofile: sys.getprofile}[switch]()
-    try:
-        switch(lambda *event: None)
-        seen = watched()
-    finally:
-        switch(before)
-    assert seen
-
-
-@compiled_only
-@pytest.mark.parametrize(
-    ("name", "least"),
-    [  # half or less of what each was, on a machine with eight busy programs for two cores: a third of that is too slow
-        ("advance and ledger, 75%", 0.016),
-        ("advance and ledger, 100%", 0.016),
-        ("engine step", 0.008),
-        ("Stable-Baselines3 VecEnv", 0.004),
-        ("PettingZoo parallel", 9e-5),
-    ],
-)
-def test_speed__is_not_far_below_the_calibration(name: str, least: float) -> None:
-    if watched():
-        pytest.skip("a tracer slows down Python and not the compiled calibration")
-    effort = Effort(3, 0.03)
-    (calibration,) = speeds_of("calibration", effort)
-    speeds = speeds_of(name, effort)
-    assert speeds
-    for speed in speeds:
-        assert speed.highest / calibration.value > least
