@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.physics import advance, make_worlds
-from tests.physics.measures import momentum_eps
-from tests.physics.nearly_joined import nearly_joined, thrown_lines
+from tests.physics.random_worlds import momentum_eps, nearly_joined, thrown_lines
 from tests.reference.tolerances import MOMENTUM_EPS
 
 

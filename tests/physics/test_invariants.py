@@ -9,9 +9,15 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from ethbrake_marl.physics import Worlds, advance, make_worlds
-from tests.physics.measures import energy_rise_eps, momentum_eps, restitution_eps, rounds
-from tests.physics.random_worlds import driving_lines, touching_lines
-from tests.physics.watched import Watched
+from tests.physics.random_worlds import (
+    Watched,
+    driving_lines,
+    energy_rise_eps,
+    momentum_eps,
+    restitution_eps,
+    rounds,
+    touching_lines,
+)
 from tests.reference.tolerances import ENERGY_EPS, EPS, GAP_M, MOMENTUM_EPS, RESTITUTION_EPS, SMALLEST
 
 SPEED = st.just(0.0) | st.floats(SMALLEST, 40.0)

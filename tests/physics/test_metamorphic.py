@@ -9,8 +9,16 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.physics import Impacts, Worlds, advance, make_worlds
-from tests.physics.random_worlds import Batch, driving_lines
-from tests.physics.runs import HARMS, HORIZON_S, last_digit_errors, once, split_errors, state_bytes
+from tests.physics.random_worlds import (
+    HARMS,
+    HORIZON_S,
+    Batch,
+    driving_lines,
+    last_digit_errors,
+    once,
+    split_errors,
+    state_bytes,
+)
 from tests.reference.tolerances import SPLIT, SPLIT_CASCADE
 
 # ---------------------------------------------------------------- cutting a segment

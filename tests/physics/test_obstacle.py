@@ -12,8 +12,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.harm import empty_ledger
 from ethbrake_marl.physics import Worlds, advance, advance_sampled, forecast, make_worlds
 from tests.physics.exact_simulator import line_of, simulate
-from tests.physics.random_worlds import Batch, Draws, driving_lines, touching_lines
-from tests.physics.runs import HARMS, HORIZON_S, state_bytes
+from tests.physics.random_worlds import HARMS, HORIZON_S, Batch, Draws, driving_lines, state_bytes, touching_lines
 from tests.reference.tolerances import CLUSTER_EPS, ENERGY_EPS, EPS, SPLIT
 
 
