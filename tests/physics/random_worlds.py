@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,15 @@ from ethbrake_marl.physics.kernel import BOUND
 from tests.reference.tolerances import ENERGY_EPS, EPS, FEW_IMPACTS
 
 CAPACITY_MPS2 = 8.0
+
+
+def line(gaps_m: Any, speeds_mps: Any, **settings: Any) -> Worlds:
+    """Vehicles of 1 t that act at once and do not bounce, unless the settings say otherwise."""
+    usual = {
+        "braking_capacity_mps2": 16.0, "driving_capacity_mps2": 16.0, "latency_s": 0.0, "mass_t": 1.0,
+        "restitution": 0.0, "speed_limit_mps": 64.0,
+    }  # fmt: skip
+    return make_worlds(gaps_m, speeds_mps, **{**usual, **settings})
 
 
 class Batch(NamedTuple):
@@ -60,6 +69,13 @@ def driving_lines(key: int, n: int, N: int, *, drive: bool = True) -> Batch:
     )
     command = draws.uniform(-CAPACITY_MPS2, 4.0 if drive else 0.0, (n, N)) * draws.choice([1.0] * 7 + [0.0], (n, N))
     return Batch(worlds, command)
+
+
+def place_ahead(batch: Batch, key: int, low: float = 0.2, high: float = 40.0) -> Batch:
+    """The same lines with an obstacle ahead, touching in a tenth of them."""
+    draws = Draws(key)
+    gap = draws.uniform(low, high, (batch.worlds.n,)) * draws.choice([1.0] * 9 + [0.0], (batch.worlds.n,))
+    return Batch(replace(batch.worlds, obstacle_gap_m=gap), batch.command)
 
 
 def touching_lines(key: int, n: int, N: int, *, heaviest_ratio: float = 1.0) -> Batch:

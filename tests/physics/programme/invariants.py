@@ -18,7 +18,7 @@ from tests.physics.random_worlds import (
     rounds,
     touching_lines,
 )
-from tests.physics.test_manufactured import at_once, in_steps
+from tests.physics.test_oracles import at_once, in_steps
 from tests.reference.tolerances import ENERGY_EPS, GAP_M, MOMENTUM_EPS, RESTITUTION_EPS
 
 # ---------------------------------------------------------------- manufactured worlds
