@@ -20,7 +20,7 @@ INSTALL := sh .ci/install $(VENV)
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs shield-bugs mutation bench-peers test-libraries test-bounds test-machines proofs test-cluster docs dist kernels benchmark audit figures
+.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs mutation bench-peers test-libraries test-bounds test-machines proofs test-cluster docs dist kernels benchmark audit figures
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
@@ -40,12 +40,11 @@ help:
 	@echo "make test-libraries   train with other people's libraries, each in its own environment below .venvs/, and print the matrix"
 	@echo "make proofs           statements about the code that a solver proves, one line each"
 	@echo "make test-cluster     a sweep on a Ray cluster of two nodes on this machine, whose workers are killed at random, its driver once"
-	@echo "make shield-bugs      plant 36 bugs in copies of the shield; each must turn a test red"
 	@echo "make test-bounds      the tests at the lowest versions that pyproject.toml allows, and at the newest"
 	@echo "make test-machines    recorded results again, as on nine older processors: the same bits"
 	@echo "make test-order       the suite ten times in random orders and in parallel: no failure"
-	@echo "make planted-bugs     plant 27 bugs in copies of the physics, 44 in the rest; each must turn a test red"
-	@echo "make mutation [ARGS=] mutation testing of the physics (ARGS='--modules rewards,v2x --sample 40': of others)"
+	@echo "make planted-bugs     plant 146 bugs, each in a copy of the code; each must turn a test red"
+	@echo "make mutation [ARGS=] 40 small random changes of each folder: how many turn a test red (ARGS='--folders shield')"
 	@echo "make bench-peers      speed beside other simulators, in an environment of their own: $(PEERS)"
 	@echo "make benchmark        drive suite v2 with the agents of docs/benchmark.md and make its tables (ARGS: some agents)"
 	@echo "make venv             the environment alone: $(VENV)"
@@ -191,18 +190,13 @@ test-cluster: $(STAMP)
 	@$(INSTALL) -e ".[cluster]"
 	@$(BIN)/python -m tests.studies.sweep.cluster $(ARGS)
 
-shield-bugs: $(STAMP)
-	@echo "== planted shield bugs"
-	@$(BIN)/python -m tests.shield.planted_bugs $(ARGS)
-
 planted-bugs: $(STAMP)
 	@echo "== planted bugs"
-	@$(BIN)/python -m tests.physics.programme.planted_bugs $(ARGS)
-	@$(BIN)/python -m tests.programme.planted_bugs $(ARGS)
+	@$(BIN)/python -m tests.programmes.faults bugs $(ARGS)
 
 mutation: $(STAMP)
 	@echo "== mutation testing"
-	@$(BIN)/python -m tests.physics.programme.mutation $(ARGS)
+	@$(BIN)/python -m tests.programmes.faults mutants $(ARGS)
 
 bench-peers: $(STAMP)
 	@$(BIN)/python -m tests.benchmarks.peers --environment $(PEERS) --torch-index "$(TORCH_INDEX)" $(ARGS)

@@ -197,8 +197,6 @@ TABLES: dict[str, How] = {
     "| no. | label | the paper": _by(BY_HAND),
     "| version | what it is": _by(BY_HAND),
     "| key | range | meaning": _by(BY_HAND),
-    "| Python | versions": _by(SEARCH, "make test-bounds"),
-    "| bug | the first test": _by(SEARCH, "make planted-bugs"),
 }
 
 PICTURES: dict[str, How] = {

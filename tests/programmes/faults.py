@@ -1,0 +1,463 @@
+"""Faults that some test must notice: small changes of the code drawn at random in every folder, and planted bugs.
+
+    make mutation ARGS="--folders physics,shield --sample 40 --seed 0"
+    make planted-bugs ARGS="--only WORD"
+
+A *mutant* changes one node of the syntax tree: an operator of arithmetic or comparison, a constant, a sign, a condition
+negated, a statement removed, min and max swapped. The *planted bugs* are those of ``bugs.yaml``: errors that people
+make in such code. A fault is written into a copy of the repository, never into the working tree. There the tests run
+that call the changed function (``calls.py``), the likely and quick ones first, until one fails. What is compiled is
+tried without compilation before. A fault is found by a failed test, or where the tests do not end.
+
+The table counts found and tried by folder. ``--journal`` notes each verdict, and takes those noted before as they are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import copy
+import hashlib
+import importlib
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import yaml
+
+from tests.programmes.calls import PACKAGE, ROOT, Callers, Function, record
+
+BUGS = Path(__file__).with_name("bugs.yaml")
+COPIES = ROOT / ".pytest_cache" / "copies"
+PARTS = ("ethbrake_marl", "tests", "scenarios", "train", "docs", "README.md", "pyproject.toml", "Makefile")
+PRELOADED = (
+    "hypothesis", "numba", "numpy", "pytest", "torch", "stable_baselines3", "scipy.stats", "scipy.optimize", "pydantic",
+    "matplotlib.pyplot", "gymnasium", "pettingzoo", "yaml", "rich", "typer", "tensorboard.compat.proto.event_pb2",
+)  # fmt: skip
+OPTIONS = ("-x", "-q", "-m", "not long", "-p", "no:cacheprovider", "-p", "no:randomly", "--rootdir=.")
+
+BUDGET_S = 40.0  # processor time of the tests that are tried, as they take without a fault
+MOST_FILES = 30
+EACH_S = 2.0  # of a test without compilation: what takes longer is left to the compiled run
+INTERPRETED_S = 40.0  # of all of them
+COMPILING_S = 240.0  # beyond the budget: to compile what was changed, and to be slower than usual
+MOST_MEMORY_BYTES = 10 * 2**30
+
+
+# ---------------------------------------------------------------- faults
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A change of the package: the new texts of its files."""
+
+    name: str
+    file: str  # below the package; the first one that changes
+    line: int
+    texts: tuple[tuple[str, str], ...]  # file below the package, its text
+    words: tuple[str, ...] = ()  # names that a change outside of all functions gives a value
+
+    @property
+    def folder(self) -> str:
+        """Of the file; the package itself for its modules."""
+        return self.file.partition("/")[0] if "/" in self.file else "ethbrake_marl"
+
+    @property
+    def digest(self) -> str:
+        """Of what it changes."""
+        return hashlib.sha256(repr(self.texts).encode()).hexdigest()[:20]
+
+
+ARITHMETIC: dict[type[ast.operator], type[ast.operator]] = {
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult, ast.Mod: ast.Mult,
+    ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd, ast.Pow: ast.Mult,
+}  # fmt: skip
+BOUNDARY: dict[type[ast.cmpop], type[ast.cmpop]] = {
+    ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In,
+}  # fmt: skip
+SWAPPED = {"min": "max", "max": "min", "np.maximum": "np.minimum", "np.minimum": "np.maximum"}
+REMOVABLE = (ast.Assign, ast.AugAssign, ast.Expr, ast.Continue, ast.Break, ast.Raise)
+NOT_CODE = ("annotation", "returns", "decorator_list", "bases", "type_params")
+
+
+class Change(NamedTuple):
+    """A node of a syntax tree that is written anew."""
+
+    node: Any
+    what: str
+    new: ast.AST | None  # None: a statement is removed
+    words: tuple[str, ...]  # names that the statement around it gives a value
+
+
+def mutant(file: Path, change: Change) -> Fault:
+    """A file with a change; no line of it moves."""
+    node, what, new, words = change
+    text, place = file.read_text("utf-8"), file.relative_to(PACKAGE).as_posix()
+    lines = text.splitlines(keepends=True)
+
+    def offset(line: int, column: int) -> int:
+        return sum(map(len, lines[: line - 1])) + len(lines[line - 1].encode()[:column].decode())
+
+    begin, end = offset(node.lineno, node.col_offset), offset(node.end_lineno, node.end_col_offset)
+    old, written = text[begin:end], "pass" if new is None else ast.unparse(new)
+    if isinstance(new, ast.expr):
+        written = f"({written})"
+    written += "\n" * (old.count("\n") - written.count("\n"))
+    name = f"{place}:{node.lineno}: {what} in `{' '.join(old.split())[:60]}`"
+    return Fault(name, place, node.lineno, ((place, text[:begin] + written + text[end:]),), words)
+
+
+def changes(node: ast.AST, words: tuple[str, ...] = ()) -> Iterator[Change]:
+    """The changes of a node and of all below it: no imports, annotations, decorators, docstrings, messages."""
+    if isinstance(node, ast.Assign | ast.AnnAssign):
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+        words = tuple(n.id for target in targets for n in ast.walk(target) if isinstance(n, ast.Name))
+    if isinstance(node, ast.expr):
+        for what, new in _of_expression(node):
+            yield Change(node, what, new, words)
+    if isinstance(node, ast.AugAssign) and type(node.op) in ARITHMETIC:
+        statement = copy.copy(node)
+        statement.op = ARITHMETIC[type(node.op)]()
+        yield Change(node, "operator", statement, words)
+    if isinstance(node, ast.If | ast.While | ast.IfExp):
+        yield Change(node.test, "condition negated", ast.UnaryOp(ast.Not(), node.test), words)
+    for name, value in ast.iter_fields(node):
+        for child in value if isinstance(value, list) else [value]:
+            if not isinstance(child, ast.AST) or name in NOT_CODE or _is_text(child):
+                continue
+            if isinstance(child, ast.Import | ast.ImportFrom | ast.JoinedStr | ast.arg):
+                continue
+            if name in ("body", "orelse") and isinstance(child, REMOVABLE):
+                yield Change(child, "removed", None, words)
+            yield from changes(child, words)
+
+
+def _is_text(node: ast.AST) -> bool:
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+
+
+def _of_expression(node: ast.expr) -> Iterator[tuple[str, ast.expr]]:
+    new: Any = copy.copy(node)
+    if isinstance(node, ast.BinOp) and type(node.op) in ARITHMETIC:
+        new.op = ARITHMETIC[type(node.op)]()
+        yield f"{type(node.op).__name__} -> {type(new.op).__name__}", new
+    elif isinstance(node, ast.Compare):
+        for k, op in enumerate(node.ops):
+            new = copy.copy(node)
+            new.ops = [*node.ops[:k], BOUNDARY[type(op)](), *node.ops[k + 1 :]]
+            yield f"{type(op).__name__} -> {type(new.ops[k]).__name__}", new
+    elif isinstance(node, ast.BoolOp):
+        new.op = ast.Or() if isinstance(node.op, ast.And) else ast.And()
+        yield "and <-> or", new
+    elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
+        yield "sign dropped", node.operand
+    elif isinstance(node, ast.Call) and (other := SWAPPED.get(ast.unparse(node.func))):
+        new.func = ast.parse(other, mode="eval").body
+        yield f"-> {other}", new
+    elif isinstance(node, ast.Constant) and isinstance(node.value, bool | int | float):
+        if isinstance(node.value, bool):
+            new.value = not node.value
+        else:
+            new.value = node.value + 1 if isinstance(node.value, int) or node.value == 0 else node.value * 2
+        yield f"{node.value!r} -> {new.value!r}", new
+
+
+def sample_of(folder: str, count: int, seed: int) -> list[Fault]:
+    """Mutants of a folder, drawn at random: a smaller sample is part of a larger one."""
+    files = sorted(PACKAGE.glob("*.py") if folder == PACKAGE.name else (PACKAGE / folder).rglob("*.py"))
+    every = [(file, change) for file in files for change in changes(ast.parse(file.read_text("utf-8")))]
+    random.Random(seed).shuffle(every)
+    return [mutant(file, change) for file, change in every[:count]]
+
+
+def planted() -> tuple[list[Fault], list[str]]:
+    """The planted bugs, and what does not fit the code."""
+    bugs, misfits = [], []
+    for name, patches in yaml.safe_load(BUGS.read_text("utf-8")).items():
+        texts: dict[str, str] = {}
+        for place, old, new in patches:
+            text = texts.get(place) or (PACKAGE / place).read_text("utf-8")
+            if text.count(old) != 1:
+                misfits.append(f"{name}: {place} holds {old!r} {text.count(old)} times, not once")
+            texts[place] = text.replace(old, new)
+        place, old, _ = patches[0]
+        text = (PACKAGE / place).read_text("utf-8")
+        at = text.find(old) + next((k for k, (a, b) in enumerate(zip(old, patches[0][2], strict=False)) if a != b), 0)
+        bugs.append(Fault(name, place, text[:at].count("\n") + 1, tuple(texts.items())))
+    return bugs, misfits
+
+
+def folders() -> list[str]:
+    """The folders of the package that hold code, and the package for its own modules."""
+    return [PACKAGE.name, *sorted(file.parent.name for file in PACKAGE.glob("*/__init__.py"))]
+
+
+# ---------------------------------------------------------------- one copy of the repository
+
+
+class Told:
+    """In the child, for pytest: which tests run in which order, and what failed first."""
+
+    def __init__(self, tests: list[str], each_s: float | None, pipe: int) -> None:
+        self.places = {test: k for k, test in enumerate(tests)}
+        self.each_s, self.pipe = each_s, pipe
+
+    def pytest_collection_modifyitems(self, items: list[Any]) -> None:
+        """The chosen ones alone; what has another name because of the fault, last."""
+        items[:] = sorted(
+            (i for i in items if i.nodeid in self.places), key=lambda i: self.places[i.nodeid]
+        )  # stable: in the order of the files
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self) -> Iterator[Any]:
+        """Ends a test that takes too long without compilation, as if it had been skipped."""
+        if self.each_s is not None:
+            signal.setitimer(signal.ITIMER_PROF, self.each_s)
+        try:
+            return (yield)
+        finally:
+            signal.setitimer(signal.ITIMER_PROF, 0.0)
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        """The first failure."""
+        if report.failed:
+            os.write(self.pipe, f"{report.nodeid}\n".encode())
+
+    def pytest_collectreport(self, report: Any) -> None:
+        """A file of tests that cannot even be read."""
+        if report.failed:
+            os.write(self.pipe, f"{report.nodeid}\n".encode())
+
+
+def _too_slow(*_: object) -> None:
+    pytest.skip("too slow without compilation")
+
+
+class Copy:
+    """A copy of the repository with kernels of its own, in which faults are tried one after another."""
+
+    def __init__(self, number: int, jobs: int) -> None:
+        self.folder = COPIES / str(number)
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self.folder.mkdir(parents=True)
+        skipped = shutil.ignore_patterns("__pycache__", ".venv", "runs", ".git", "*.pyc")
+        for name in PARTS:
+            if (ROOT / name).is_dir():
+                shutil.copytree(ROOT / name, self.folder / name, ignore=skipped)
+            elif (ROOT / name).exists():
+                shutil.copy2(ROOT / name, self.folder / name)
+        self.tests = Callers(record(jobs))
+        self.red_anyway: dict[bool, set[str]] = {True: set(), False: set()}  # compiled or not -> tests
+        self.green: dict[bool, set[str]] = {True: set(), False: set()}  # those known to pass without a fault
+        self.digests: dict[str, str] = {}
+        self.digests = json.loads(self.ask(_digests))
+
+    @contextmanager
+    def changed(self, fault: Fault) -> Iterator[None]:
+        """While it lasts the copy has the fault."""
+        kernels = COPIES / f"{self.folder.name}-kernels" / PACKAGE.name
+        before = set(kernels.rglob("*")) if kernels.is_dir() else set()
+        try:
+            for file, text in fault.texts:
+                (self.folder / PACKAGE.name / file).write_text(text, "utf-8")
+            yield
+        finally:
+            for file, _ in fault.texts:
+                shutil.copy2(PACKAGE / file, self.folder / PACKAGE.name / file)
+            for other in set(kernels.rglob("*")) - before if self.function(fault).compiled else ():
+                other.unlink(missing_ok=True)
+
+    def function(self, fault: Fault) -> Function:
+        """Where a fault is."""
+        return self.tests.at(PACKAGE / fault.file, fault.line)
+
+    def ask(self, what: Any, *given: Any, cpu_s: float = COMPILING_S) -> str:
+        """What a function writes to its pipe in a forked process of this folder; its end, where it wrote nothing."""
+        ends, begins = os.pipe()
+        child = os.fork()
+        if child == 0:
+            code = 1
+            try:
+                os.close(ends)
+                self._settle(cpu_s)
+                what(self, begins, *given)
+                code = 0
+            finally:
+                os._exit(code)
+        os.close(begins)
+        with os.fdopen(ends, "rb") as pipe:
+            answer = pipe.read().decode()
+        _, status, _ = os.wait4(child, 0)
+        ended = os.waitstatus_to_exitcode(status)
+        return answer or ("" if ended == 0 else "(no end)" if ended < 0 else f"(exit status {ended})")
+
+    def _settle(self, cpu_s: float) -> None:
+        """In the child: silence, limits, this folder."""
+        limit = round(cpu_s)
+        resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY_BYTES, MOST_MEMORY_BYTES))
+        resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 5))
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.alarm(20 * limit)
+        signal.signal(signal.SIGPROF, _too_slow)
+        kernels = COPIES / f"{self.folder.name}-kernels"
+        os.environ |= {"NUMBA_CACHE_DIR": str(kernels), "PYTHONPATH": str(self.folder)}
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, 1)
+        os.dup2(null, 2)
+        os.chdir(self.folder)
+        sys.dont_write_bytecode = True
+        sys.path.insert(0, str(self.folder))
+        for name in [name for name in sys.modules if name.split(".")[0] in ("tests", PACKAGE.name)]:
+            del sys.modules[name]  # those of the working tree
+
+    def first_red(self, tests: list[str], *, compiled: bool, own_kernels: bool = False) -> str:
+        """The first of these tests that fails as the copy is now; empty where none does."""
+        tests = [test for test in tests if test not in self.red_anyway[compiled]]
+        if not tests:
+            return ""
+        limit = COMPILING_S + 3.0 * BUDGET_S if compiled else INTERPRETED_S
+        red = self.ask(_run, tests, compiled, own_kernels, cpu_s=limit).partition("\n")[0]
+        return "" if not compiled and red == "(no end)" else red
+
+    def verdict(self, fault: Fault) -> str:
+        """The first test that notices a fault; empty where none does."""
+        function = self.function(fault)
+        tests = self.tests.ordered(function, fault.words, BUDGET_S, MOST_FILES)
+        for compiled in (False, True) if function.compiled else (True,):
+            while True:
+                with self.changed(fault):
+                    red = self.first_red(tests, compiled=compiled, own_kernels=function.compiled)
+                if not red or red.startswith("(") or red in self.green[compiled]:
+                    break
+                again = [test for test in tests if test.startswith(red)][:1]
+                if not self.first_red(again, compiled=compiled):
+                    self.green[compiled].add(red)
+                    break
+                self.red_anyway[compiled] |= {red, *again}  # it fails without the fault, too
+            if red:
+                return red
+        return ""
+
+
+def _digests(self: Copy, pipe: int) -> None:
+    """In a child: what kernels of each file are named by, as long as no kernel changes."""
+    from ethbrake_marl.physics.compiling import digest_of_sources
+
+    found = {str(file): digest_of_sources(file) for file in sorted((self.folder / PACKAGE.name).rglob("*.py"))}
+    os.write(pipe, json.dumps(found).encode())
+
+
+def _run(self: Copy, pipe: int, tests: list[str], compiled: bool, own_kernels: bool) -> None:
+    """In a child: some tests, until one fails, which is written to the pipe."""
+    import numba
+
+    numba.config.DISABLE_JIT = not compiled
+    os.environ["NUMBA_DISABLE_JIT"] = str(int(not compiled))
+    if compiled and not own_kernels:
+        from ethbrake_marl.physics import compiling
+
+        compiling.digest_of_sources = cache(lambda source: self.digests.get(str(source), ""))
+    plugin = Told(tests, None if compiled else EACH_S, pipe)
+    files = list(dict.fromkeys(test.partition("::")[0] for test in tests))
+    pytest.main([*OPTIONS, *files], plugins=[plugin])
+
+
+# ---------------------------------------------------------------- all of them
+
+
+_COPIES: list[Copy] = []  # that of this process
+
+
+def make_copy(numbers: Any, jobs: int) -> None:
+    """The copy of a process that tries faults."""
+    _COPIES.append(Copy(numbers.get(), jobs))
+
+
+def try_fault(fault: Fault) -> tuple[str, float]:
+    """The verdict on one fault in the copy of this process, and the processor time that it took."""
+    begun = _used()
+    return _COPIES[0].verdict(fault), _used() - begun
+
+
+def _used() -> float:
+    return sum(resource.getrusage(who).ru_utime for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+
+
+def preload() -> None:
+    """Load what every process needs once, before forking; nothing of the package itself."""
+    os.environ |= {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
+    sys.path[:] = [p for p in sys.path if Path(p or ".").resolve() != ROOT]
+    for name in PRELOADED:
+        importlib.import_module(name)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Try the faults, and print which test finds each."""
+    parser = argparse.ArgumentParser(prog="faults", description=__doc__.splitlines()[0])
+    parser.add_argument("what", choices=("mutants", "bugs"))
+    parser.add_argument("--folders", default=",".join(folders()), help="comma list; default: all")
+    parser.add_argument("--sample", type=int, default=40, help="mutants of each folder")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", default="", help="faults whose name contains this")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--journal", type=Path, help="verdicts are noted here, and taken from here")
+    given = parser.parse_args(arguments)
+    wanted = given.folders.split(",")
+    if given.what == "bugs":
+        faults, misfits = planted()
+        for wrong in misfits:
+            print(f"ERROR  {wrong}")
+        if misfits:
+            return 1
+    else:
+        faults = [fault for folder in wanted for fault in sample_of(folder, given.sample, given.seed)]
+    faults = [fault for fault in faults if given.only in fault.name and fault.folder in wanted]
+    journal = given.journal
+    lines = journal.read_text("utf-8").splitlines() if journal is not None and journal.exists() else []
+    verdicts = {line["digest"]: line["red"] for line in map(json.loads, lines)}
+    fresh = [fault for fault in faults if fault.digest not in verdicts]
+    print(f"{len(faults)} faults, {len(faults) - len(fresh)} of them from the journal", flush=True)
+    record(given.jobs)
+    preload()
+    begun = time.monotonic()
+    context = get_context("fork")
+    numbers = context.SimpleQueue()
+    for number in range(given.jobs):
+        numbers.put(number)
+    with ProcessPoolExecutor(given.jobs, context, make_copy, (numbers, given.jobs)) as pool:
+        futures = {pool.submit(try_fault, fault): fault for fault in fresh}
+        for future in as_completed(futures):
+            fault, (red, cpu_s) = futures[future], future.result()
+            verdicts[fault.digest] = red
+            print(f"{'found' if red else 'LIVES'}  {cpu_s:5.0f} s  {fault.name:70s}  {red}", flush=True)
+            if journal is not None:
+                note = {"digest": fault.digest, "name": fault.name, "red": red, "cpu_s": round(cpu_s, 1)}
+                with journal.open("a", encoding="utf-8") as out:
+                    out.write(json.dumps(note) + "\n")
+    tried = Counter(fault.folder for fault in faults)
+    found = Counter(fault.folder for fault in faults if verdicts[fault.digest])
+    for folder in sorted(tried):
+        print(f"{folder:16s} {found[folder]:4d} of {tried[folder]}")
+    missed = len(faults) - found.total()
+    print(f"faults: {found.total()} of {len(faults)} found, {(time.monotonic() - begun) / 60.0:.1f} min")
+    return int(given.what == "bugs" and missed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
