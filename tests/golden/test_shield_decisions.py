@@ -9,7 +9,7 @@ import pytest
 
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import StepShield, parse_uncertainty
-from tests.shield.lines import line
+from tests.shield.attacks import line
 
 GOLDEN = {
     "paper": "e588aa78dd473755",
