@@ -192,7 +192,7 @@ TABLES: dict[str, How] = {
     "| key | default | unit, range": _by(SUITE, "tests/scenario/test_catalogue.py"),
     "| name | gaps | speeds": EXACT,
     "| name | speeds | gaps": EXACT,
-    "| licence | packages": _by(SUITE, "tests/programme/test_audit.py"),
+    "| licence | packages": _by(SUITE, "tests/programmes/test_programmes.py"),
     "| no. | label | the paper": _by(BY_HAND),
     "| version | what it is": _by(BY_HAND),
     "| key | range | meaning": _by(BY_HAND),
