@@ -15,7 +15,7 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput, MissingExtra
 from ethbrake_marl.evaluation import episodes
 from ethbrake_marl.evaluation.episodes import film_bytes, film_scenes
-from tests.envs.lines import CRASH
+from tests.contract.interfaces import CRASH
 
 SVG = "{http://www.w3.org/2000/svg}"
 README = Path(__file__).resolve().parents[2] / "README.md"
