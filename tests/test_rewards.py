@@ -16,7 +16,7 @@ from ethbrake_marl.errors import InvalidInput, UnknownName, WithoutEffect
 from ethbrake_marl.physics import advance, forecast, make_worlds
 from ethbrake_marl.rewards import REWARDS, RewardParams, StepOutcome, reward_params
 from ethbrake_marl.scenario import load_scenario
-from tests.envs.lines import CRASH, REST
+from tests.contract.interfaces import CRASH, REST
 
 
 def sigmoid(x: float) -> float:
