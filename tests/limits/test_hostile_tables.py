@@ -12,8 +12,7 @@ import pytest
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.limits.limits import BestHarmTable, search_list
 from ethbrake_marl.scenario import load_scenario
-from tests.hostile.archives import bomb, good, good_bytes, packed
-from tests.hostile.table_cases import CERTAIN, ONLY_A_PROBLEM_KNOWS
+from tests.programmes.archives import CERTAIN, ONLY_A_PROBLEM_KNOWS, bomb, good, good_bytes, packed
 
 READ = [category for category in CERTAIN if category not in ONLY_A_PROBLEM_KNOWS]
 

@@ -22,7 +22,8 @@ from typing import Any, NamedTuple
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.programmes import ROOT
+
 PACKAGE = ROOT / "ethbrake_marl"
 KEPT = ROOT / ".pytest_cache" / "calls"
 

@@ -1,4 +1,4 @@
-"""Faults that some test must notice: small changes of the code drawn at random in every folder, and planted bugs.
+"""Faults that some test must notice: small random changes of the code in every folder, and planted bugs.
 
     make mutation ARGS="--folders physics,shield --sample 40 --seed 0"
     make planted-bugs ARGS="--only WORD"
@@ -9,7 +9,7 @@ make in such code. A fault is written into a copy of the repository, never into 
 that call the changed function (``calls.py``), the likely and quick ones first, until one fails. What is compiled is
 tried without compilation before. A fault is found by a failed test, or where the tests do not end.
 
-The table counts found and tried by folder. ``--journal`` notes each verdict, and takes those noted before as they are.
+``--journal`` notes each verdict, and takes those noted before as they are.
 """
 
 from __future__ import annotations
@@ -26,13 +26,11 @@ import resource
 import shutil
 import signal
 import sys
-import time
-from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,7 +38,8 @@ from typing import Any, NamedTuple
 import pytest
 import yaml
 
-from tests.programmes.calls import PACKAGE, ROOT, Callers, Function, record
+from tests.programmes import ROOT, Cases, Told
+from tests.programmes.calls import PACKAGE, Callers, Function, record
 
 BUGS = Path(__file__).with_name("bugs.yaml")
 COPIES = ROOT / ".pytest_cache" / "copies"
@@ -389,14 +388,9 @@ def make_copy(numbers: Any, jobs: int) -> None:
     _COPIES.append(Copy(numbers.get(), jobs))
 
 
-def try_fault(fault: Fault) -> tuple[str, float]:
-    """The verdict on one fault in the copy of this process, and the processor time that it took."""
-    begun = _used()
-    return _COPIES[0].verdict(fault), _used() - begun
-
-
-def _used() -> float:
-    return sum(resource.getrusage(who).ru_utime for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+def try_fault(fault: Fault) -> str:
+    """The verdict on one fault, in the copy of this process."""
+    return _COPIES[0].verdict(fault)
 
 
 def preload() -> None:
@@ -407,57 +401,60 @@ def preload() -> None:
         importlib.import_module(name)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Try the faults, and print which test finds each."""
-    parser = argparse.ArgumentParser(prog="faults", description=__doc__.splitlines()[0])
+def options(parser: argparse.ArgumentParser) -> None:
+    """What the command line may say."""
     parser.add_argument("what", choices=("mutants", "bugs"))
     parser.add_argument("--folders", default=",".join(folders()), help="comma list; default: all")
     parser.add_argument("--sample", type=int, default=40, help="mutants of each folder")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="", help="faults whose name contains this")
-    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--seed", type=int, default=0, help="of the sample")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--journal", type=Path, help="verdicts are noted here, and taken from here")
-    given = parser.parse_args(arguments)
+
+
+def cases(given: argparse.Namespace) -> Cases:
+    """Each fault, and by which test it is found; then the table of folders."""
     wanted = given.folders.split(",")
-    if given.what == "bugs":
-        faults, misfits = planted()
-        for wrong in misfits:
-            print(f"ERROR  {wrong}")
-        if misfits:
-            return 1
-    else:
-        faults = [fault for folder in wanted for fault in sample_of(folder, given.sample, given.seed)]
+    faults, misfits = planted()
+    if given.what == "mutants":
+        faults, misfits = [fault for folder in wanted for fault in sample_of(folder, given.sample, given.seed)], []
+    for wrong in misfits:
+        yield wrong, partial(Told, False, "does not fit the code")
     faults = [fault for fault in faults if given.only in fault.name and fault.folder in wanted]
-    journal = given.journal
-    lines = journal.read_text("utf-8").splitlines() if journal is not None and journal.exists() else []
-    verdicts = {line["digest"]: line["red"] for line in map(json.loads, lines)}
-    fresh = [fault for fault in faults if fault.digest not in verdicts]
-    print(f"{len(faults)} faults, {len(faults) - len(fresh)} of them from the journal", flush=True)
-    record(given.jobs)
-    preload()
-    begun = time.monotonic()
+    known = verdicts_of(given.journal)
+    fresh = [] if given.list or misfits else [fault for fault in faults if fault.digest not in known]
+    if fresh:
+        record(given.jobs)
+        preload()
     context = get_context("fork")
     numbers = context.SimpleQueue()
     for number in range(given.jobs):
         numbers.put(number)
     with ProcessPoolExecutor(given.jobs, context, make_copy, (numbers, given.jobs)) as pool:
-        futures = {pool.submit(try_fault, fault): fault for fault in fresh}
-        for future in as_completed(futures):
-            fault, (red, cpu_s) = futures[future], future.result()
-            verdicts[fault.digest] = red
-            print(f"{'found' if red else 'LIVES'}  {cpu_s:5.0f} s  {fault.name:70s}  {red}", flush=True)
-            if journal is not None:
-                note = {"digest": fault.digest, "name": fault.name, "red": red, "cpu_s": round(cpu_s, 1)}
-                with journal.open("a", encoding="utf-8") as out:
-                    out.write(json.dumps(note) + "\n")
-    tried = Counter(fault.folder for fault in faults)
-    found = Counter(fault.folder for fault in faults if verdicts[fault.digest])
-    for folder in sorted(tried):
-        print(f"{folder:16s} {found[folder]:4d} of {tried[folder]}")
-    missed = len(faults) - found.total()
-    print(f"faults: {found.total()} of {len(faults)} found, {(time.monotonic() - begun) / 60.0:.1f} min")
-    return int(given.what == "bugs" and missed > 0)
+        tried = {fault.digest: pool.submit(try_fault, fault) for fault in fresh}
+
+        def told(fault: Fault) -> Told:
+            red = known.get(fault.digest)
+            if red is None:
+                red = known[fault.digest] = tried[fault.digest].result()
+                note(given.journal, fault, red)
+            return Told(True, red) if red else Told(False if given.what == "bugs" else None, "no test notices it")
+
+        for fault in faults:
+            yield fault.name, partial(told, fault)
+    for folder in folders():
+        here = [fault for fault in faults if fault.folder == folder and fault.digest in known]
+        if here:
+            print(f"{folder:16} {sum(known[fault.digest] != '' for fault in here):4d} of {len(here)} found")
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def verdicts_of(journal: Path | None) -> dict[str, str]:
+    """Digest of a fault -> the test that found it, as noted before."""
+    lines = journal.read_text("utf-8").splitlines() if journal is not None and journal.exists() else []
+    return {line["digest"]: line["red"] for line in map(json.loads, lines)}
+
+
+def note(journal: Path | None, fault: Fault, red: str) -> None:
+    """Keep a verdict."""
+    if journal is not None:
+        with journal.open("a", encoding="utf-8") as out:
+            out.write(json.dumps({"digest": fault.digest, "name": fault.name, "red": red}) + "\n")

@@ -13,8 +13,7 @@ from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.shield import ShieldedDriver, enclosure
 from ethbrake_marl.shield.enclosure import Boxes, boxes_of
 from ethbrake_marl.shield.step_shield import BelievedShield
-from tests.shield import corners
-from tests.shield.corners import ABOVE, INSIDE, LISTS, NEVER_HEARD, WAYS, Hostile, shielded
+from tests.shield.attacks import ABOVE, INSIDE, LISTS, NEVER_HEARD, WAYS, Hostile, shielded
 
 BASE = load_scenario("cooperation-2-paper").replace(early_impacts="keep")
 PERIODIC = BASE.replace(v2x={"preset": "blocked", "persistence": "periodic"})
@@ -61,14 +60,6 @@ def test_interior__a_box_that_is_the_middle_alone_is_found(monkeypatch: pytest.M
     monkeypatch.setattr(BelievedShield, "_corners", lambda self: [{}])
     harm, bound, _ = shielded("coast", INSIDE["never heard"], 12, 7, robust="interior")
     assert (harm > bound + 1.0).any()
-
-
-@pytest.mark.slow
-def test_gate__of_the_ranges_is_red_where_a_world_is_above(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(corners, "INSIDE", {"heard late": INSIDE["heard late"]})
-    assert corners.ranges_gate(6, 7)
-    monkeypatch.setattr(corners, "shielded", lambda *given, **more: (np.ones(1), np.zeros(1), 1))
-    assert not corners.ranges_gate(6, 7)
 
 
 def test_step__in_the_middle_promises_nothing_of_the_corners() -> None:

@@ -12,7 +12,7 @@ from ethbrake_marl.physics import make_worlds
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield.step_shield import CONSTANTS, REASONS, Backup, begin_running, certify, plan_harm
-from tests.shield.lines import line
+from tests.shield.attacks import line
 
 STEPS = 81
 

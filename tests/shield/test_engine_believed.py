@@ -17,7 +17,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
-from tests.shield.corners import ABOVE, HEARD_LATE, LISTS, NEVER_HEARD
+from tests.shield.attacks import ABOVE, HEARD_LATE, LISTS, NEVER_HEARD
 from tests.shield.test_interfaces import KEYS
 
 PERIODIC = load_scenario("cooperation-2-paper").replace(v2x={"preset": "blocked", "persistence": "periodic"})

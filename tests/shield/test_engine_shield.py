@@ -28,7 +28,7 @@ from ethbrake_marl.shield import (
     parse_uncertainty,
 )
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
-from tests.shield.beyond_horizon import above_later
+from tests.shield.attacks import above_later
 
 PAPER = load_scenario("paper-random")
 DRIVE = np.array([1.0])

@@ -9,10 +9,9 @@ from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
-from tests.shield.interference import PLAYS, WRAPPERS, disturbed, wrapped
+from tests.shield.plays import INSIDE, PLAYS, WRAPPERS, disturbed, played, wrapped
 
 BATCHED = ("vector", "vector, next step", "sb3", "team, sb3")
-INSIDE = [name for name in PLAYS if "evaluation" not in name]  # the engine itself asks that one: nothing is in between
 
 
 @pytest.mark.parametrize("name", PLAYS)
@@ -20,6 +19,12 @@ def test_disturbed__calls_that_fail_or_are_interrupted_change_nothing_and_no_epi
     found = disturbed(name, 8 if name in BATCHED or "evaluation" in name else 5, seed=3)
     assert found.refused > 5 and found.interrupted > 3
     assert (found.above, found.broken) == (0, 0)
+
+
+@pytest.mark.parametrize("name", PLAYS)
+def test_played__through_every_interface_no_episode_gets_above_its_bound(name):
+    found = played(name, 24, seed=5)
+    assert found.episodes >= 24 and (found.above, found.broken) == (0, 0)
 
 
 @pytest.mark.parametrize("wrapper", WRAPPERS)

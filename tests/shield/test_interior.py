@@ -14,8 +14,8 @@ from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield import HybridShield, ShieldedDriver, ShieldOptions, StepShield, enclosure, parse_uncertainty
 from ethbrake_marl.shield.enclosure import Known, boxes_of, cell_of, wait
 from ethbrake_marl.shield.step_shield import begin_running, plan_harm
+from tests.shield.attacks import line
 from tests.shield.enclosed import outside
-from tests.shield.lines import line
 from tests.shield.test_certify import STEPS, two
 
 # What bounds a box takes two minutes to compile; the tests in other files that need it are slow, too.

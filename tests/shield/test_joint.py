@@ -25,7 +25,7 @@ from ethbrake_marl.shield.step_shield import (
     joint_constants,
     plan_harm,
 )
-from tests.shield.joint_attack import ADVERSARIES, joint_attack, scenario_of
+from tests.shield.attacks import TEAM_ADVERSARIES, TEAMS, attack
 
 STEPS = 81
 COAST = make_agent("coast")
@@ -135,15 +135,15 @@ def test_caps__reject_what_only_moves_harm_to_another():
 )
 @pytest.mark.parametrize("harm_count", ["first", "total"])
 def test_engine__realises_the_last_bound_to_the_bit_and_the_bound_never_rises(level, N, harm_count):
-    scenario = scenario_of(level, N)
+    scenario = load_scenario(TEAMS[level, N])
     cap = "baseline" if harm_count == "first" else None
     worlds = scenario.sample(8, 5).worlds
-    for k, (name, adversary) in enumerate(ADVERSARIES.items()):
+    for k, (name, adversary) in enumerate(TEAM_ADVERSARIES.items()):
         for hostile in ("all", "one") if level > 3 or N > 3 else ("one" if k % 2 else "all",):
-            found = joint_attack(scenario, worlds, adversary, hostile=hostile, harm_count=harm_count, cap=cap, seed=1)
+            found = attack(scenario, worlds, adversary, hostile=hostile, harm_count=harm_count, cap=cap, seed=1)
             assert found.realised.tolist() == found.last_bound.tolist(), name
             assert (found.realised <= found.bound).all() and found.rises == 0 and found.over_cap == 0
-            assert found.accepted > 0 or name == "full_drive"
+            assert found.accepted.sum() > 0 or name == "full_drive"
 
 
 def test_one_vehicle_in_a_list__is_the_single_shield_bit_for_bit():
@@ -232,7 +232,7 @@ def test_policies__of_other_vehicles_are_refused():
 
 
 def test_surprise__of_one_world_hands_the_whole_team_to_the_fallback():
-    scenario = scenario_of(4, 3)
+    scenario = load_scenario(TEAMS[4, 3])
     worlds = scenario.sample(3, 1).worlds
     shield = StepShield(scenario, scenario.learners)
     shield.begin(worlds, np.arange(3))

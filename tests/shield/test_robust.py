@@ -15,7 +15,7 @@ from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield import HybridShield, ShieldedDriver, ShieldedEnv, StepShield, parse_uncertainty
 from ethbrake_marl.shield.step_shield import REASONS, Backup, begin_running, certify, plan_harm
-from tests.shield.lines import line
+from tests.shield.attacks import line
 from tests.shield.test_certify import STEPS, two
 
 ALL = {

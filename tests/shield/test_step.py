@@ -15,7 +15,7 @@ from ethbrake_marl.shield import HybridAgent, ShieldedDriver, StepShield, parse_
 from ethbrake_marl.shield.evidence import operating_curves, review
 from ethbrake_marl.shield.step_shield import REASONS
 from tests.failing_worlds import plant, without
-from tests.shield.lines import ADVERSARIES, attack, line
+from tests.shield.attacks import ADVERSARIES, attack, line
 
 pytestmark = pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.MovingAtHorizon")
 

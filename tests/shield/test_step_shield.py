@@ -8,7 +8,7 @@ import pytest
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield import StepShield
 from ethbrake_marl.shield.step_shield import REASONS
-from tests.shield.lines import attack, extremes, random_actions
+from tests.shield.attacks import attack, extremes, random_actions
 
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # uncompiled, a division by 0 warns
 
