@@ -210,7 +210,7 @@ def folders() -> list[str]:
 # ---------------------------------------------------------------- one copy of the repository
 
 
-class Told:
+class Listener:
     """In the child, for pytest: which tests run in which order, and what failed first."""
 
     def __init__(self, tests: list[str], each_s: float | None, pipe: int) -> None:
@@ -372,7 +372,7 @@ def _run(self: Copy, pipe: int, tests: list[str], compiled: bool, own_kernels: b
         from ethbrake_marl.physics import compiling
 
         compiling.digest_of_sources = cache(lambda source: self.digests.get(str(source), ""))
-    plugin = Told(tests, None if compiled else EACH_S, pipe)
+    plugin = Listener(tests, None if compiled else EACH_S, pipe)
     files = list(dict.fromkeys(test.partition("::")[0] for test in tests))
     pytest.main([*OPTIONS, *files], plugins=[plugin])
 
