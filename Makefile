@@ -208,7 +208,7 @@ bench-peers: $(STAMP)
 	@$(BIN)/python -m tests.benchmarks.peers --environment $(PEERS) --torch-index "$(TORCH_INDEX)" $(ARGS)
 
 benchmark: $(STAMP)
-	@$(BIN)/python -m tests.studies.benchmark.rows $(ARGS)
+	@$(BIN)/python -m tests.studies.benchmark_rows $(ARGS)
 
 clean:
 	rm -rf $(VENV) $(PEERS) .venvs .pytest_cache .ruff_cache .mypy_cache .hypothesis build dist docs/_build

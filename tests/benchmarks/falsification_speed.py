@@ -20,7 +20,7 @@ from ethbrake_marl.studies.falsification import Measure
 from tests.programme.copies import KERNELS, working_copy
 from tests.programme.planting import plant
 from tests.shield.planted_bugs import BUGS
-from tests.studies.falsification.holed import Holed
+from tests.studies.test_falsification import Holed
 
 BUDGET = 6_000
 LEAK_BUDGET = 1_024

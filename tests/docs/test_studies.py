@@ -21,9 +21,17 @@ from tests.docs.site import DOCS, load
 sampling, price, equal_time, scaling = (
     load(f"../studies/{name}") for name in ("sampling", "price", "equal_time", "scaling")
 )
+
+
 PAPER = load_scenario("paper-random")
+
+
 BASE = load_scenario("cooperation-2-paper")
+
+
 SHORT = Effort(1, 1e-6)
+
+
 PNG = b"\x89PNG"
 
 
@@ -167,3 +175,25 @@ def test_scaling__draws_batches_left_and_single_worlds_right() -> None:
     assert right.get_lines()[0].get_ydata() == pytest.approx([20.0, 40.0])
     assert "ns per vehicle-step" in str(by_worlds[0])
     assert [text.get_text() for text in right.get_legend().get_texts()] == [scaling.APART, "proportional"]
+
+
+drawings = load("../drawings")
+
+
+@pytest.mark.parametrize("name", drawings.DRAWINGS)
+def test_drawing__is_the_one_that_is_shown(name: str) -> None:
+    assert f"](figures/model-{name}.svg)" in (DOCS / "model.md").read_text("utf-8").replace("\n", " ")
+    made = picture_bytes(drawings.DRAWINGS[name](), "made.svg")
+    assert made == (DOCS / "figures" / f"model-{name}.svg").read_bytes()
+
+
+def test_phases__follow_latency_speed_and_command() -> None:
+    time, speed = np.arange(6.0), np.array([5.0, 5.0, 5.0, 4.0, 0.0, 0.0])
+    command = np.array([0.0, 0.0, 2.0, -1.0, -1.0, -1.0])
+    assert list(drawings.phases(time, speed, command, 1.0)) == [
+        (0.0, 1.0, "waits for its news"),
+        (1.0, 2.0, "coasts"),
+        (2.0, 3.0, "drives"),
+        (3.0, 4.0, "brakes"),
+        (4.0, 5.0, "stands"),
+    ]
