@@ -669,7 +669,7 @@ def test_generalise__runs_that_are_not_seeds_of_one_training_are_refused(run: Pa
     other = changed(run, tmp_path / "scenario", scenario={"name": "mine"})
     refused(f"runs {run} and {other}: differ in scenario; give seeds of one training", run, other)
     refused("differ in recipe", run, changed(run, tmp_path / "recipe", recipe={"gamma": 0.5}))
-    refused("vehicle_1 learns there, and none of the runs trained it", run, scenario="cooperation-4-all")
+    refused("give one whose Vehicle 1 follows a script", run, scenario="cooperation-4-all")
     seed = changed(run, tmp_path / "seed", recipe={"seed": 1})
     assert generalise(run, seed) == 0 and "2 policies" in capsys.readouterr().out
     team = {"vehicle_2": "policy/vehicle_2", "vehicle_3": "policy/vehicle_3"}

@@ -157,6 +157,7 @@ def paths(folder: Path) -> list[Path]:
 
 def test_commands__write_and_print_entries_and_the_leaderboard(suites, entries, tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.setattr("ethbrake_marl.studies.benchmark.SUITES", suites)
+    monkeypatch.setenv("COLUMNS", "100")
     monkeypatch.chdir(tmp_path)
 
     def told(*words: str) -> tuple[str, str]:

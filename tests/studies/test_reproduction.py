@@ -116,9 +116,9 @@ def test_compare_number__says_why_and_names_the_nearest_other_reading() -> None:
         compare_number("collisions", 0.5974, MANY, show=PERCENT, least=("worlds that no command saves", LEAST[1])),
     ]
     assert [each.because for each in told] == [
-        "ours 24.20 [23.90, 24.50], printed 33.6 (-28.0 %); nearest: at 0.2 s, 33.40 [33.10, 33.70], which agrees",
-        "ours 24.20 [23.90, 24.50], printed 33.6 (-28.0 %); no other reading here comes nearer",
-        "ours 10.00 [8.00, 12.00], printed 11.4 (-12.3 %): too few worlds to tell",
+        "ours 24.20 [23.90, 24.50], printed 33.600 (-28.0 %); nearest: at 0.2 s, 33.40 [33.10, 33.70], which agrees",
+        "ours 24.20 [23.90, 24.50], printed 33.600 (-28.0 %); no other reading here comes nearer",
+        "ours 10.00 [8.00, 12.00], printed 11.400: too few worlds to tell",
         "worlds that no command saves: at least 62.6 % [61.6, 63.5], whoever drives;"
         " ours 65.0 % [64.1, 65.9], printed 59.74 %",
     ]
