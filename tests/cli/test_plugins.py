@@ -20,7 +20,7 @@ from ethbrake_marl.learning.training import Training, load_recipe
 from ethbrake_marl.scenario import load_scenario, new_scenario_text
 from ethbrake_marl.studies.jobs import JobFolder, TrainingJob
 from tests.cli.conftest import TINY_RECIPE, check_refused
-from tests.extending.conftest import restore, tables
+from tests.fixtures.registered import restore, tables
 
 PLUGIN = '''
 import numpy as np

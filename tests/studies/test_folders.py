@@ -51,7 +51,7 @@ def study(request: pytest.FixtureRequest, tmp_path: Path) -> Study:
     if name == "ablation":
         line, told = (
             ("study", "ablate", "--recipes", get("tiny_total"), *ABLATE),
-            "(budget 50, here 60; seeds 2, here 3)",
+            "(seeds 2, here 3; budget 50, here 60)",
         )
         return Study(line, get("finished_ablation"), ("--budget", "60", "--seeds", "3"), told, "settings.json")
     if name == "tuning":
