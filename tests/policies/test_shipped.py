@@ -1,3 +1,5 @@
+"""Policies that ship: found by name, scenario and count, and as good as their pages say."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -6,10 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
 from ethbrake_marl import policies as bundle
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
-from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.evaluation.measures import TESTS
@@ -30,59 +30,32 @@ def folder(policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
     return tmp_path
 
 
-def test_shipped_name__is_by_kind_scenario_and_count(folder: Path) -> None:
-    assert shipped_name("ppo", "paper-random", "first") == "ppo"
-    assert shipped_name("ppo", "paper-random", "total") == "ppo-total"
-    assert shipped_name("ppo", "paper-distance", "total") == "ppo-paper-distance"  # better than none
-    assert shipped_name("universal", "paper-delay-low", "first") == "universal"
-    assert shipped_name("ppo", None, "total") == "ppo-total"
-    assert shipped_name("policy", "paper-random", "total") == "ppo-total"
-    assert shipped_name("policy", "paper-delay-low", "first") == "universal"
-
-
-@pytest.mark.parametrize(("kind", "scenario"), [("sac", "paper-random"), ("ppo", "paper-delay-low"), ("sac", None)])
-def test_shipped_name__lists_what_ships_when_there_is_none(kind: str, scenario: str | None, folder: Path) -> None:
-    listed = "ppo, ppo-paper-distance, ppo-total, universal"
-    with pytest.raises(InvalidInput, match=f"shipped policy {kind}.*: there is none; shipped are: {listed}"):
-        shipped_name(kind, scenario, "first")
-
-
-def test_load_named_policy__by_its_own_name(folder: Path) -> None:
-    assert load_named_policy("shipped/universal").manifest.steps == 1024
-    with pytest.raises(UnknownName, match="unknown shipped policy 'universel'; did you mean 'universal'"):
-        load_named_policy("shipped/universel")
-
-
-def test_lineup__takes_what_ships(folder: Path, policy: Policy) -> None:
-    worlds = SCENARIO.sample(5, 1).worlds
-    specs = ["ppo@shipped", "universal@shipped", "ppo@shipped+episode", "ppo@shipped/ppo-paper-distance"]
-    lineup = make_lineup(specs, SCENARIO)
-    assert list(lineup) == specs
-    assert isinstance(lineup["ppo@shipped+episode"], HybridAgent)
-    assert lineup["universal@shipped"].name == "universal@shipped"
-    alone = lineup["ppo@shipped"].act(worlds, 1)
-    assert np.array_equal(alone, eb.make_agent("universal@shipped").act(worlds, 1))
-
-
-def test_team__is_what_ships_for_the_scenario(folder: Path) -> None:
-    pair = SCENARIO.with_learners(["vehicle_2", "vehicle_3"])
-    worlds = pair.sample(5, 1).worlds
-    team, policy = (eb.make_agent(f"{name}@shipped", scenario=pair) for name in ("team", "policy"))
-    assert team.name == "team@shipped" and np.array_equal(team.act(worlds, 2), policy.act(worlds, 2))
-
-
 @pytest.mark.parametrize(
-    ("spec", "message"),
+    ("kind", "scenario", "harm_count", "name"),
     [
-        ("universal@runs/x", "must be universal@shipped"),
-        ("sac@shipped/universal", "that policy was trained by PPO: ppo@shipped/universal"),
-        ("ppo@", "a path is needed after '@'"),
-        ("sac", "a policy is needed: sac@PATH, where PATH is a run or a policy bundle"),
+        ("ppo", "paper-random", "first", "ppo"),
+        ("ppo", "paper-random", "total", "ppo-total"),
+        ("ppo", "paper-distance", "total", "ppo-paper-distance"),  # better than none
+        ("universal", "paper-delay-low", "first", "universal"),
+        ("ppo", None, "total", "ppo-total"),
+        ("policy", "paper-random", "total", "ppo-total"),
+        ("policy", "paper-delay-low", "first", "universal"),
     ],
 )
-def test_lineup__says_what_a_policy_is_called(spec: str, message: str, folder: Path) -> None:
-    with pytest.raises(InvalidInput, match=message):
-        make_lineup([spec], SCENARIO)
+def test_shipped_name__is_by_kind_scenario_and_count(
+    kind: str, scenario: str | None, harm_count: HarmCount, name: str, folder: Path
+) -> None:
+    assert shipped_name(kind, scenario, harm_count) == name
+
+
+def test_lineup__takes_what_ships(folder: Path) -> None:
+    specs = ["ppo@shipped", "universal@shipped", "policy@shipped", "team@shipped", "ppo@shipped+episode"]
+    lineup = make_lineup([*specs, "ppo@shipped/ppo-paper-distance"], SCENARIO)
+    assert [each.name for each in lineup.values()] == list(lineup)
+    assert isinstance(lineup["ppo@shipped+episode"], HybridAgent)
+    worlds = SCENARIO.sample(5, 1).worlds
+    acts = [lineup[spec].act(worlds, 1).tolist() for spec in specs[:4]]
+    assert acts == [acts[0]] * 4  # four copies of one policy ship here
 
 
 def test_shipped_policies__each_that_ships_is_small_and_has_a_card() -> None:
@@ -149,12 +122,6 @@ def test_policy_shipped__drives_all_learners_of_a_level_of_cooperation(
     assert policy.first_impact_harm.mean() <= share_of_full_braking * braking.first_impact_harm.mean()
     assert policy.collided.mean() <= collisions
     assert np.array_equal(policy.first_impact_harm, team.first_impact_harm)
-
-
-def test_policy__whatever_trained_it(folder: Path, policy: Policy) -> None:
-    assert make_lineup(["policy@shipped/ppo"], SCENARIO)["policy@shipped/ppo"].name == "policy@shipped/ppo"
-    with pytest.raises(InvalidInput, match="policy@PATH, where PATH is a run or a policy bundle"):
-        make_lineup(["policy"], SCENARIO)
 
 
 @pytest.mark.parametrize("harm_count", HARM_COUNTS)
