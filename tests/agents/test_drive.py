@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents import registry
-from ethbrake_marl.agents.policy import LearnedAgent
+from ethbrake_marl.agents.policy import LearnedAgent, policy_agent
 from ethbrake_marl.agents.registry import Team, drive, make_agent, register_agent, script_agents
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation import evaluate, summarise
+from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.episodes import Task, film_scenes, follow_episodes, record_episode, record_episodes
 from ethbrake_marl.evaluation.inputs import worlds_sha256
-from ethbrake_marl.observations import ObservationSpec, observe
 from ethbrake_marl.physics import Floats, Worlds, advance
+from ethbrake_marl.policies import Policy
 from ethbrake_marl.rewards import RewardParams
 from ethbrake_marl.scenario import load_scenario, observation_for
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver
@@ -32,19 +32,17 @@ def with_role(role, vehicle="vehicle_3"):
     return PAPER.replace(roles={**PAPER.roles, vehicle: role}, early_impacts="keep")
 
 
+@pytest.mark.parametrize("spec", ["e_v2x_bm", "e_v2x_bm+episode"])
 @pytest.mark.parametrize("role", ["constant:3", "coast", "copy_leader", "gentlest_front", "e_v2x_bm"])
-def test_e_v2x_bm__predicts_and_beats_constants_whatever_script_the_others_follow(role):
+def test_e_v2x_bm__predicts_and_beats_constants_whatever_script_the_others_follow(spec, role):
     scenario = with_role(role)
     worlds = scenario.sample(60, 7).worlds
-    agent = make_agent("e_v2x_bm")
-    episodes = drive(worlds, agent, scenario, 1)
+    episodes = drive(worlds, make_agent(spec, scenario=scenario), scenario, 1)
     realised = episodes.ledger.world_harm("first")
     np.testing.assert_allclose(realised, episodes.memories[1]["predicted_harm"], atol=1e-6)
     for deceleration in np.linspace(0.0, 7.0, 15):
-        assert (
-            realised
-            <= drive(worlds, make_agent(f"constant:{deceleration}"), scenario, 1).ledger.world_harm("first") + 1e-6
-        ).all()
+        constant = drive(worlds, make_agent(f"constant:{deceleration}"), scenario, 1)
+        assert (realised <= constant.ledger.world_harm("first") + 1e-6).all()
 
 
 def test_e_v2x_bm__knows_who_drives_in_the_engines_of_all_interfaces():
@@ -67,17 +65,6 @@ def test_drive__a_scripted_vehicle_that_is_driven_follows_its_script_in_nobodys_
     assert found[0].tolist() == found[1].tolist()
 
 
-def test_hybrid__its_parts_know_the_others_too():
-    scenario = with_role("constant:3")
-    worlds = scenario.sample(30, 7).worlds
-    hybrid = HybridAgent(make_agent("e_v2x_bm", harm_count="total"), scenario)
-    episodes = drive(worlds, hybrid, scenario, 1)
-    memory = episodes.memories[1]
-    assert episodes.ledger.world_harm("first").tolist() == memory["predicted_harm"].tolist()
-    best = drive(worlds, make_agent("e_v2x_bm"), scenario, 1).ledger.world_harm("first")
-    np.testing.assert_allclose(memory["bound_harm"], best, atol=1e-9)
-
-
 @pytest.mark.parametrize("script", ["copy_leader", "gentlest_front"])
 def test_scripts__fixed_at_the_alert_are_asked_once_to_the_same_motion(script):
     fixed, remembering = make_agent(script), make_agent(script)
@@ -88,25 +75,17 @@ def test_scripts__fixed_at_the_alert_are_asked_once_to_the_same_motion(script):
     assert one.ledger.total_harm.tolist() == other.ledger.total_harm.tolist()
 
 
-class Looking:
-    """Brakes half, and keeps what a learner with the usual observation would have seen."""
-
-    name = "looking"
-
-    def __init__(self):
-        self.seen = []
-
-    def act(self, worlds, vehicle):
-        self.seen.append(observe(worlds, vehicle, observation_for(PAPER)))
-        return np.full(worlds.n, -3.5)
-
-
 def test_drive__an_agent_sees_what_a_learner_sees_from_the_first_decision_on():
-    worlds, agent = PAPER.sample(20, 7).worlds, Looking()
-    drive(worlds, agent, PAPER, 1)
+    worlds, seen = PAPER.sample(20, 7).worlds, []
+
+    def half(observation):
+        seen.append(observation.tobytes())
+        return np.full((len(observation), 1), -0.5, np.float32)
+
+    drive(worlds, policy_agent(half, scenario=PAPER), PAPER, 1)
     engine = Engine(PAPER, 20, learners=(1,), scripts=script_agents(PAPER, except_for=1), worlds=worlds)
-    for seen in agent.seen[:3]:
-        assert engine.observe(1).tobytes() == seen.tobytes()
+    for each in seen[:3]:
+        assert engine.observe(1).tobytes() == each
         engine.step(np.full((20, 1), -0.5))
 
 
@@ -183,21 +162,6 @@ def test_record__motion_and_dataset_follow_scripts_that_decide_within_a_step(swi
         assert scene.front_m[0] == pytest.approx(last[0], abs=1e-6)
 
 
-class SoftPolicy:
-    """Brakes softer, the larger the gap ahead; its output is float32, as a network's is."""
-
-    observation = ObservationSpec()
-
-    def __call__(self, observation):
-        names = [feature.name for feature in self.observation.features]
-        gap = observation[:, names.index("front_1.gap")]
-        return (np.float32(-1.0) / (np.float32(1.0) + gap))[:, np.newaxis]
-
-
-def harm(result, name):
-    return result.outcome(name).total_harm
-
-
 def test_team__of_one_drives_as_the_agent_alone():
     sample, agent = PAPER.sample(40, 7), make_agent("e_v2x_bm")
     result = evaluate(sample, {"alone": agent, "team": Team({1: agent}, "team")}, scenario=PAPER)
@@ -209,19 +173,29 @@ def test_team__of_one_drives_as_the_agent_alone():
     assert result.vehicle == named.vehicle == 1
 
 
-def test_evaluate__an_agent_alone_drives_every_learner():
+def test_evaluate__an_agent_alone_drives_every_learner_and_a_team_of_nobody_none():
     brake, gentle = make_agent("full_brake"), make_agent("constant:4")
     agents = {"alone": brake, "by_hand": Team({1: brake, 2: brake}, "t"), "unlike": Team({1: gentle, 2: brake}, "u")}
-    result = evaluate(PAIR.sample(60, 7), agents, scenario=PAIR)
-    paper = evaluate(PAPER.sample(60, 7), {"alone": brake, "unlike": gentle}, scenario=PAPER)
-    for name in ("alone", "unlike"):
-        np.testing.assert_allclose(harm(result, name), harm(paper, name), rtol=1e-12)
-    assert harm(result, "alone").tolist() == harm(result, "by_hand").tolist()
-    assert result.vehicles == (1, 2)
+    level = load_scenario("cooperation-0-sensors")
+    scripted = {"scripts": Team({}, "scripts")}
+    found, paper, nobody, driven = (
+        evaluate(scenario.sample(60, 7), drivers, scenario=scenario, vehicle=vehicle)
+        for scenario, drivers, vehicle in (
+            (PAIR, agents, None),
+            (PAPER, {"alone": brake, "unlike": gentle}, None),
+            (level, scripted, None),
+            (level, {"scripts": brake}, 1),
+        )
+    )
+    for other, result, name in ((paper, found, "alone"), (paper, found, "unlike"), (driven, nobody, "scripts")):
+        harms = [each.outcome(name).total_harm for each in (result, other)]
+        np.testing.assert_allclose(*harms, rtol=1e-12)
+    assert found.outcome("alone").total_harm.tolist() == found.outcome("by_hand").total_harm.tolist()
+    assert found.vehicles == (1, 2)
 
 
-def test_evaluate__several_learners_do_what_they_do_in_training():
-    worlds, policy = PAIR.sample(50, 3).worlds, SoftPolicy()
+def test_evaluate__several_learners_do_what_they_do_in_training(policy: Policy) -> None:
+    worlds = PAIR.sample(50, 3).worlds
     engine = Engine(PAIR, 50, learners=(1, 2), scripts={0: make_agent("full_brake")}, worlds=worlds)
     while not engine.ended.all():
         engine.step({i: policy(engine.observe(i))[:, 0].astype(np.float64) for i in (1, 2)})
@@ -253,24 +227,6 @@ def test_e_v2x_bm__takes_the_other_learners_to_brake_fully():
     assert both["deceleration_mps2"].tolist() == alone["deceleration_mps2"].tolist()
 
 
-def test_evaluate__nobody_is_driven_by_a_team_of_nobody():
-    level = load_scenario("cooperation-0-sensors")
-    result = evaluate(level.sample(20, 7), {"scripts": Team({}, "scripts")}, scenario=level)
-    driven = evaluate(level.sample(20, 7), {"b": make_agent("full_brake")}, scenario=level, vehicle=1)
-    np.testing.assert_allclose(harm(result, "scripts"), harm(driven, "b"), rtol=1e-12)
-
-
-def test_summarise__with_several_driven_vehicles_tells_the_proven_harm():
-    (row,) = summarise(evaluate(PAIR.sample(5, 7), {"b": make_agent("full_brake")}, scenario=PAIR, seed=7))
-    found = row.to_json()
-    assert 0 < found["proven_harm"] <= found["best_known_first_impact_harm"]
-    assert found["known_best_share"] < 1  # no table of teams ships: the best known is that of the agents
-    assert found["parameters"]["controlled_vehicles"] == ["vehicle_2", "vehicle_3"]
-    assert "controlled_vehicle" not in found["parameters"]
-    assert found["parameters"]["scripts"] == {"vehicle_1": "full_brake"}
-    assert found["parameters"]["no_limits_because"] is None
-
-
 class _Writes:
     """Writes into what it is given, when an episode begins or at each decision."""
 
@@ -296,6 +252,7 @@ class _Writes:
         return -worlds.vehicles.braking_capacity_mps2[:, vehicle], memory
 
 
+KEPT = ("name", "plan")  # an attribute that there is, and a new one
 WRAPPED = {
     "alone": lambda agent: agent,
     "episode": lambda agent: HybridAgent(agent, PAPER),
@@ -305,24 +262,29 @@ WRAPPED = {
 
 @pytest.mark.parametrize("around", WRAPPED)
 @pytest.mark.parametrize("state_free", [True, False])
-@pytest.mark.parametrize("when", ["begin", "act", "vehicles"])
-def test_agent_that_writes_into_worlds__is_refused_by_name(around: str, when: str, state_free: bool) -> None:
+@pytest.mark.parametrize(
+    ("when", "told"),
+    [
+        *((when, r"(begin|act) on .*read-only") for when in ("begin", "act", "vehicles")),
+        *(
+            (name, rf"keeps something in its attribute '{name}'; one that remembers has begin\(alert, ")
+            for name in KEPT
+        ),
+    ],
+)
+def test_agent_that_writes_into_worlds_or_itself__is_refused_by_name(
+    around: str, when: str, told: str, state_free: bool
+) -> None:
     sample = PAPER.sample(20, 3)
     before = worlds_sha256(sample.worlds, sample.index)
-    agent = WRAPPED[around](_Writes(when, state_free=state_free))
-    with pytest.raises(InvalidInput, match=r"agent 'kmh' of vehicle_2: (begin|act) on .*read-only"):
-        evaluate(sample, {"full_brake": make_agent("full_brake"), "kmh": agent}, scenario=PAPER)
-    assert worlds_sha256(sample.worlds, sample.index) == before
-
-
-@pytest.mark.parametrize("around", WRAPPED)
-@pytest.mark.parametrize("state_free", [True, False])
-@pytest.mark.parametrize("when", ["name", "plan"])  # an attribute that there is, and a new one
-def test_agent_that_keeps_something_in_itself__is_refused_by_name(around: str, state_free: bool, when: str) -> None:
-    agent = WRAPPED[around](_Writes(when, state_free=state_free))
-    told = rf"of vehicle_2: keeps something in its attribute '{when}'; one that remembers has begin\(alert, "
-    with pytest.raises(InvalidInput, match=told):
-        evaluate(PAPER.sample(3, 3), {"kmh": agent}, scenario=PAPER)
+    agents = {"full_brake": make_agent("full_brake"), "kmh": WRAPPED[around](_Writes(when, state_free=state_free))}
+    with pytest.raises(InvalidInput, match=rf"agent '(kmh|other)' of vehicle_2: {told}"):
+        evaluate(sample, agents, scenario=PAPER)
+    assert worlds_sha256(sample.worlds, sample.index) == before and sample.worlds.gaps_m.flags.writeable
+    agents["kmh"] = _Writes("memory", state_free=False)  # which is its own
+    found = evaluate(sample, agents, scenario=PAPER)
+    full, kmh = (found.outcome(name).ledger.world_harm("first") for name in agents)
+    assert np.array_equal(full, kmh)
 
 
 @pytest.mark.parametrize(
@@ -349,21 +311,3 @@ def test_memory_of_another_form__is_refused_by_name(begun: Any, kept: Any, told:
 
     with pytest.raises(InvalidInput, match=f"agent 'mine' of vehicle_2.*{told}"):
         evaluate(PAPER.sample(3, 3), {"mine": Remembers()}, scenario=PAPER)
-
-
-def test_agent_that_writes_into_its_memory__writes_into_its_own() -> None:
-    sample = PAPER.sample(20, 3)
-    agents = {"full_brake": make_agent("full_brake"), "kmh": _Writes("memory", state_free=False)}
-    result = evaluate(sample, agents, scenario=PAPER)
-    full, kmh = (result.outcomes[name].ledger.world_harm("first") for name in agents)
-    assert np.array_equal(full, kmh)
-
-
-def test_read_only__same_values_and_the_given_ones_stay_writable() -> None:
-    worlds = PAPER.sample(5, 3).worlds
-    seen = worlds.read_only()
-    assert worlds_sha256(seen, np.arange(5)) == worlds_sha256(worlds, np.arange(5))
-    assert worlds.gaps_m.flags.writeable and not seen.gaps_m.flags.writeable
-    assert np.shares_memory(worlds.gaps_m, seen.gaps_m)
-    with pytest.raises(ValueError, match="read-only"):
-        seen.vehicles.latency_s[0] = 0.0

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import gymnasium
 import numpy as np
+import onnxruntime
 import pytest
+import stable_baselines3 as stable
+import torch
 
 import ethbrake_marl as eb
 from ethbrake_marl.actions import action_to_command
@@ -50,11 +54,8 @@ def brake(observation):
 
 @pytest.fixture(scope="module")
 def model():
-    stable = pytest.importorskip("stable_baselines3")
-    model = stable.PPO(
-        "MlpPolicy", eb.make_sb3_vec_env("paper-random", 4), n_steps=8, batch_size=16, n_epochs=1, seed=1
-    )
-    return model.learn(64)
+    rows = eb.make_sb3_vec_env("paper-random", 4)
+    return stable.PPO("MlpPolicy", rows, n_steps=8, batch_size=16, n_epochs=1, seed=1).learn(64)
 
 
 def test_function__drives_as_it_says_and_is_named_after_itself():
@@ -64,22 +65,19 @@ def test_function__drives_as_it_says_and_is_named_after_itself():
     assert Asked(agent).begin(WORLDS, 1).act(WORLDS, 1).tolist() == half.tolist()
 
 
-def test_trained_model__drives_as_in_its_own_librarys_rollout(model):
+@pytest.mark.parametrize("seed", [3, 4, 9])
+def test_trained_model__drives_as_in_its_own_librarys_rollout(model, seed):
+    env = eb.EthBrakeEnv()
+    (observation, _), over, reward = env.reset(seed=seed), False, 0.0
+    while not over:
+        observation, more, terminated, truncated, _ = env.step(model.predict(observation, deterministic=True)[0])
+        reward, over = reward + more, terminated or truncated
+    worlds = SCENARIO.sample(1, seed, channel="training").worlds
     agent = eb.policy_agent(model, name="sb3", scenario=SCENARIO)
-    for seed in (3, 4, 9):
-        env = eb.EthBrakeEnv()
-        observation, _ = env.reset(seed=seed)
-        over, reward = False, 0.0
-        while not over:
-            action, _ = model.predict(observation, deterministic=True)
-            observation, more, terminated, truncated, _ = env.step(action)
-            reward, over = reward + more, terminated or truncated
-        worlds = SCENARIO.sample(1, seed, channel="training").worlds
-        assert harms(agent, worlds)[0] == pytest.approx(-reward, rel=1e-5, abs=1e-5)
+    assert harms(agent, worlds)[0] == pytest.approx(-reward, rel=1e-5, abs=1e-5)
 
 
 def test_policy_of_another_library__is_known_by_its_weights():
-    torch = pytest.importorskip("torch")
     module = torch.nn.Linear(27, 1)
     agent = eb.policy_agent(module)
     before = policy_sha256(agent)
@@ -105,26 +103,17 @@ def test_agent_that_fails_once__is_told_with_its_step():
         eb.evaluate(SCENARIO.sample(4, 1), {"tired": eb.policy_agent(tired)}, scenario=SCENARIO)
 
 
-def test_torch_module__drives_without_gradients_and_is_shared():
-    torch = pytest.importorskip("torch")
+def test_torch_module__drives_without_gradients():
     module = torch.nn.Sequential(torch.nn.Linear(27, 1), torch.nn.Tanh())
-    agent = eb.policy_agent(module, name="torch")
-
-    def by_hand(observation):
-        return module(torch.from_numpy(observation)).detach().numpy()
-
-    assert harms(agent).tolist() == harms(eb.policy_agent(by_hand)).tolist()
+    by_hand = eb.policy_agent(lambda seen: module(torch.from_numpy(seen)).detach().numpy())
+    assert harms(eb.policy_agent(module, name="torch")).tolist() == harms(by_hand).tolist()
 
 
 def test_onnx__path_and_session_drive_as_the_policy_does(tmp_path: Path):
-    runtime = pytest.importorskip("onnxruntime")
-    pytest.importorskip("onnx")
-    policy = eb.load_shipped("ppo")
-    path = tmp_path / "shipped.onnx"
+    policy, path = eb.load_shipped("ppo"), tmp_path / "shipped.onnx"
     path.write_bytes(policy.to_onnx())
     expected = harms(eb.LearnedAgent(policy))
-    session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    for given in (path, session):
+    for given in (path, onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])):
         assert harms(eb.policy_agent(given)) == pytest.approx(expected, rel=1e-5, abs=1e-5)
     assert eb.policy_agent(path).name == "shipped"
     assert harms(eb.policy_agent(policy)).tolist() == expected.tolist()
@@ -139,9 +128,21 @@ def no_memory(n):
     return {"steps": np.zeros((n, 1), np.float32)}
 
 
-def test_memory__belongs_to_each_episode_and_goes_with_its_world():
-    agent = Asked(eb.policy_agent(ramp, initial_state=no_memory))
-    capacity = WORLDS.vehicles.braking_capacity_mps2[:, 1]
+class Recurrent:
+    """A model with the interface of sb3-contrib's recurrent ones, which brakes harder with every step."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        kept = np.zeros((1, len(observation), 1), np.float32) if state is None else state[0]
+        begun = np.zeros(len(observation), bool) if episode_start is None else np.asarray(episode_start)
+        steps = np.where(begun[None, :, None], np.float32(0.0), kept)
+        return -np.minimum(steps[0], 10.0) / 10.0, (steps + np.float32(1.0),)
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: eb.policy_agent(ramp, initial_state=no_memory), lambda: eb.policy_agent(Recurrent())]
+)
+def test_memory__belongs_to_each_episode_and_goes_with_its_world(make):
+    agent, capacity = Asked(make()), WORLDS.vehicles.braking_capacity_mps2[:, 1]
     agent.begin(WORLDS, 1, np.arange(12))
     for _ in range(3):
         agent.act(WORLDS, 1)
@@ -150,6 +151,7 @@ def test_memory__belongs_to_each_episode_and_goes_with_its_world():
     share = np.where(np.arange(12) == 4, 0.0, 0.3)
     assert agent.act(WORLDS, 1) == pytest.approx(-share * capacity)
     assert part.act(WORLDS.take([3, 4]), 1) == pytest.approx([-0.3 * capacity[3], 0.0])  # left as it was
+    assert harms(make()).tolist() == harms(eb.policy_agent(ramp, initial_state=no_memory)).tolist()
 
 
 @pytest.mark.parametrize("around", AROUND)
@@ -164,31 +166,6 @@ def test_policy__behind_every_shield_keeps_the_bound(kind, model, around):
         assert (harm[found.chosen_policy] == harms(own)[found.chosen_policy]).all() and found.chosen_policy.any()
 
 
-class Recurrent:
-    """A model with the interface of sb3-contrib's recurrent ones, which brakes harder with every step."""
-
-    def predict(self, observation, state=None, episode_start=None, deterministic=False):
-        if state is None:
-            state = (np.zeros((1, len(observation), 1), np.float32),)
-        steps = np.where(np.asarray(episode_start)[None, :, None], 0.0, state[0]) if episode_start is not None else 0.0
-        steps = steps + np.zeros((1, len(observation), 1), np.float32)
-        return -np.minimum(steps[0], 10.0) / 10.0, (steps + 1.0,)
-
-
-def test_recurrent_model__keeps_its_state_world_by_world():
-    agent, same = Asked(eb.policy_agent(Recurrent())), Asked(eb.policy_agent(ramp, initial_state=no_memory))
-    for each in (agent, same):
-        each.begin(WORLDS, 1, np.arange(12))
-    for step in range(5):
-        assert agent.act(WORLDS, 1).tolist() == same.act(WORLDS, 1).tolist()
-        if step == 2:
-            for each in (agent, same):
-                each.begin(WORLDS.take([4, 7]), 1, np.array([4, 7]))
-    rows = np.array([7, 3])
-    assert agent.take(rows).act(WORLDS.take(rows), 1).tolist() == same.take(rows).act(WORLDS.take(rows), 1).tolist()
-    assert harms(agent.agent).tolist() == harms(same.agent).tolist()
-
-
 def test_recurrent_model__whose_state_has_no_axis_of_worlds_is_refused():
     class Shared(Recurrent):
         def predict(self, observation, **asked):
@@ -199,7 +176,6 @@ def test_recurrent_model__whose_state_has_no_axis_of_worlds_is_refused():
 
 
 def test_model_trained_under_vec_normalize__drives_by_what_was_counted():
-    stable = pytest.importorskip("stable_baselines3")
     normalised = stable.common.vec_env.VecNormalize(eb.make_sb3_vec_env("paper-random", 4), clip_obs=2.0)
     model = stable.PPO("MlpPolicy", normalised, n_steps=64, batch_size=256, n_epochs=1, seed=1).learn(256)
 
@@ -217,14 +193,12 @@ def test_model_trained_under_vec_normalize__drives_by_what_was_counted():
 
 
 def test_model_of_actions_that_mean_something_else__is_refused():
-    stable, gymnasium = pytest.importorskip("stable_baselines3"), pytest.importorskip("gymnasium")
-    model = stable.PPO("MlpPolicy", gymnasium.wrappers.RescaleAction(eb.EthBrakeEnv(), np.float32(0), np.float32(1)))
+    rescaled = gymnasium.wrappers.RescaleAction(eb.EthBrakeEnv(), np.float32(0), np.float32(1))
     with pytest.raises(InvalidInput, match=r"gives actions in Box\(0.0, 1.0, .*here they mean \[-1, 1\]"):
-        eb.policy_agent(model)
+        eb.policy_agent(stable.PPO("MlpPolicy", rescaled))
 
 
 def test_model_that_has_its_environment__observes_what_it_was_trained_on(model):
-    stable, wrappers = pytest.importorskip("stable_baselines3"), pytest.importorskip("gymnasium").wrappers
     other = eb.ObservationSpec(front=2, rear=0)  # as many features as the usual ones
     assert other.size == eb.ObservationSpec().size
     settings = {"env_kwargs": {"observation": other}}
@@ -237,14 +211,13 @@ def test_model_that_has_its_environment__observes_what_it_was_trained_on(model):
         for settings in ({"scenario": SCENARIO}, {"observation": eb.ObservationSpec()}):
             with pytest.raises(InvalidInput, match=r"trained on other features than ObservationSpec\(front=1, rear=1"):
                 eb.policy_agent(theirs, **settings)
-    rows = stable.common.env_util.make_vec_env("EthBrake-v0", wrapper_class=wrappers.NormalizeObservation)
+    rows = stable.common.env_util.make_vec_env("EthBrake-v0", wrapper_class=gymnasium.wrappers.NormalizeObservation)
     with pytest.raises(InvalidInput, match="trained under NormalizeObservation, which this agent knows nothing of"):
         eb.policy_agent(stable.PPO("MlpPolicy", rows, n_steps=8, batch_size=8))
 
 
 @pytest.mark.parametrize(("layer", "setting"), [("Dropout", 0.5), ("BatchNorm1d", 4)])
 def test_torch_module__that_draws_or_mixes_worlds_must_be_in_evaluation_mode(layer, setting):
-    torch = pytest.importorskip("torch")
     module = torch.nn.Sequential(
         torch.nn.Linear(27, 4), getattr(torch.nn, layer)(setting), torch.nn.Linear(4, 1), torch.nn.Tanh()
     )
@@ -256,7 +229,6 @@ def test_torch_module__that_draws_or_mixes_worlds_must_be_in_evaluation_mode(lay
 
 @pytest.mark.parametrize("appended", ["number", "state"])
 def test_model_trained_on_rows_with_something_appended__drives_as_there(appended):
-    stable = pytest.importorskip("stable_baselines3")
     scenario = eb.load_scenario("cooperation-3-pair")
     rows = eb.make_sb3_vec_env(scenario, 4, seed=3, appended=appended)
     model = stable.PPO("MlpPolicy", rows, n_steps=8, batch_size=16, n_epochs=1, seed=1)

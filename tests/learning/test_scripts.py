@@ -18,8 +18,13 @@ from tests.docs.site import load
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning", "ignore::FutureWarning")
 
+
 TRAIN = Path(__file__).resolve().parents[2] / "train"
+
+
 PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
+
+
 RECIPE = load_recipe("cooperation-ppo").replace(
     n_envs=16, n_steps=16, batch_size=128, network={"policy": [16, 16], "value": [16, 16]}
 )
@@ -146,8 +151,10 @@ def test_tasks__are_in_benchmarls_own_registry_and_make_the_same_worlds() -> Non
 
 
 @pytest.fixture
-def supersuit() -> ModuleType:
-    return load("../../train/supersuit_ppo")
+def supersuit(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    module = load("../../train/supersuit_ppo")
+    monkeypatch.delitem(sys.modules, module.__name__)  # so that its functions are pickled as a script's are
+    return module
 
 
 def test_supersuit__worlds_are_seeded_and_no_two_copies_are_alike(supersuit: ModuleType) -> None:

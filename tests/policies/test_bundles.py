@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import pickle
-import socket
 import stat
 import subprocess
 import sys
@@ -18,7 +17,6 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from ethbrake_marl import policies as bundle
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput
 from ethbrake_marl.policies import Policy, content_sha256, load_policy
 from tests.docs.site import load
@@ -37,11 +35,8 @@ def _edit(*, rehash: bool = True, **changes: Any) -> Spoil:
     def spoil(folder: Path) -> None:
         manifest = json.loads((folder / "manifest.json").read_bytes())
         for key, value in changes.items():
-            *outer, last = key.split("__")
-            target = manifest
-            for name in outer:
-                target = target[name]
-            target[last] = value
+            outer, _, inner = key.rpartition("__")
+            (manifest[outer] if outer else manifest)[inner] = value
         if rehash:
             manifest["manifest_sha256"] = content_sha256(manifest)
         (folder / "manifest.json").write_text(json.dumps(manifest))
@@ -114,17 +109,6 @@ def _folder_instead(folder: Path) -> None:
     (folder / "weights.safetensors").mkdir()
 
 
-def _socket(folder: Path) -> None:
-    (folder / "weights.safetensors").unlink()
-    here = os.getcwd()
-    os.chdir(folder)  # the name of a socket has a short longest length
-    try:
-        with socket.socket(socket.AF_UNIX) as listening:
-            listening.bind("weights.safetensors")
-    finally:
-        os.chdir(here)
-
-
 def _endless_device(folder: Path) -> None:
     """A file that never ends: a device where that may be made, else a huge file without blocks."""
     path = folder / "weights.safetensors"
@@ -142,11 +126,6 @@ def _first_tensor(**changes: Any) -> Spoil:
 
 def _raw_header(text: bytes) -> Spoil:
     return _weights(lambda data: len(text).to_bytes(8, "little") + text + data[-400:])
-
-
-def _not_finite(tensors: dict[str, np.ndarray], number: float) -> dict[str, np.ndarray]:
-    tensors["value.0.bias"][2] = number
-    return tensors
 
 
 SPOILED: dict[str, tuple[Spoil, str]] = {
@@ -230,7 +209,6 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
         lambda f: _replace(f / "weights.safetensors", lambda d: d[:-3] + bytes([d[-3] ^ 1]) + d[-2:]),
         r"weights.safetensors: SHA-256 is [0-9a-f]{64}, the manifest says",
     ),
-    "socket": (_socket, r"weights.safetensors: (is not a plain file|cannot be read)"),
     "endless_device": (_endless_device, r"weights.safetensors: (is not a plain file|larger than)"),
     "sparse_giant": (lambda f: os.truncate(f / "weights.safetensors", 1 << 40), r"weights.safetensors: larger than"),
     "other_case": (lambda f: (f / "manifest.json").rename(f / "Manifest.json"), r"manifest.json: is missing"),
@@ -268,7 +246,10 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "deep_header": (_raw_header(b"[" * 200_000), r"weights.safetensors: nested too deeply"),
     "key_twice_in_header": (_raw_header(b'{"a": {}, "a": {}}'), r"weights.safetensors: key 'a' stands twice"),
     "empty_header": (_raw_header(b"{}"), r"tensor 'policy.0.bias' is missing"),
-    "minus_infinite_weight": (_tensors(lambda t: _not_finite(t, -np.inf)), r"tensor 'value.0.bias' holds a number"),
+    "minus_infinite_weight": (
+        _tensors(lambda t: {**t, "value.0.bias": t["value.0.bias"] - np.float32(np.inf)}),
+        r"tensor 'value.0.bias' holds a number",
+    ),
     "empty_weights": (_weights(lambda _: b""), r"weights.safetensors: not a safetensors file"),
     "pickle": (_weights(lambda _: pickle.dumps(_Payload())), r"weights.safetensors: not a safetensors file"),
     "zip": (_weights(lambda _: b"PK\x03\x04" + b"\0" * 4000), r"weights.safetensors: not a safetensors file"),
@@ -301,8 +282,14 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
         _tensors(lambda t: {**t, "policy.0.bias": np.zeros(13, "f8")}),
         r"tensor 'policy.0.bias' is F64 \[13\], should be F32 \[13\]",
     ),
-    "nan_weight": (_tensors(lambda t: _not_finite(t, np.nan)), r"tensor 'value.0.bias' holds a number that is not"),
-    "infinite_weight": (_tensors(lambda t: _not_finite(t, np.inf)), r"tensor 'value.0.bias' holds a number that is"),
+    "nan_weight": (
+        _tensors(lambda t: {**t, "value.0.bias": np.append(t["value.0.bias"][1:], np.float32(np.nan))}),
+        r"tensor 'value.0.bias' holds a number that is not",
+    ),
+    "infinite_weight": (
+        _tensors(lambda t: {**t, "value.0.bias": t["value.0.bias"] + np.float32(np.inf)}),
+        r"tensor 'value.0.bias' holds a number that is",
+    ),
 }
 
 
@@ -332,18 +319,19 @@ def test_load_policy__refuses_a_damaged_bundle(name: str, policy: Policy, tmp_pa
     assert "\n" not in str(caught.value)
 
 
-def test_load_policy__refuses_a_linked_folder(policy: Policy, tmp_path: Path) -> None:
+@pytest.mark.parametrize("given", ["run", "run/policy"])
+def test_load_policy__refuses_a_linked_folder(given: str, policy: Policy, tmp_path: Path) -> None:
     policy.save(tmp_path / "elsewhere")
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "policy").symlink_to(tmp_path / "elsewhere")
-    for path in (tmp_path / "run", tmp_path / "run" / "policy"):
-        with pytest.raises(CorruptBundle, match="policy: is a symbolic link"):
-            load_policy(path)
+    with pytest.raises(CorruptBundle, match="policy: is a symbolic link"):
+        load_policy(tmp_path / given)
 
 
 _WATCHED_LOADS = """
 import json, sys
 from ethbrake_marl.errors import CorruptBundle
+from ethbrake_marl.learning.training import RunDirectory  # which needs no torch either
 from ethbrake_marl.policies import (load_policy)
 
 root, names = sys.argv[1], json.loads(sys.argv[2])
@@ -405,25 +393,6 @@ def test_save__does_not_replace(policy: Policy, tmp_path: Path) -> None:
     with pytest.raises(AlreadyExists, match="policy: is there already"):
         policy.save(tmp_path / "policy")
     assert list(tmp_path.rglob("*")) == [tmp_path / "policy"]
-
-
-@pytest.mark.parametrize("failing_call", [1, 2])
-def test_save__leaves_nothing_when_it_fails(
-    failing_call: int, policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls: list[Path] = []
-    write = bundle.write_file
-
-    def full_disk(path: Path, data: bytes) -> None:
-        calls.append(path)
-        if len(calls) == failing_call:
-            raise OSError(28, "No space left on device")
-        write(path, data)
-
-    monkeypatch.setattr(bundle, "write_file", full_disk)
-    with pytest.raises(OSError, match="No space left"):
-        policy.save(tmp_path / "policy")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_make_policy__refuses_what_it_could_not_load(policy: Policy) -> None:
