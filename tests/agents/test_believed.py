@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.believed import Odometer, Ranges, Told
-from ethbrake_marl.agents.registry import drive, make_agent, script_agents
+import ethbrake_marl as eb
+from ethbrake_marl.agents import Odometer, Ranges, Told, drive, make_agent, script_agents
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.physics import Worlds
-from ethbrake_marl.scenario import Scenario, load_scenario
 
-BASE = load_scenario("cooperation-2-paper").replace(early_impacts="keep")
+BASE = eb.load_scenario("cooperation-2-paper").replace(early_impacts="keep")
 
 
 DEAF = {"preset": "paper", "hears": "front"}
@@ -20,7 +19,7 @@ DEAF = {"preset": "paper", "hears": "front"}
 PERIODIC = {"preset": "blocked", "persistence": "periodic"}
 
 
-def engine_of(scenario: Scenario, n: int = 40, vehicle: int = 1, seed: int = 7) -> Engine:
+def engine_of(scenario: eb.Scenario, n: int = 40, vehicle: int = 1, seed: int = 7) -> Engine:
     scripts = script_agents(scenario, except_for=vehicle)
     return Engine(scenario, n, learners=[vehicle], scripts=scripts, worlds=scenario.sample(n, seed).worlds)
 
@@ -107,7 +106,7 @@ def test_odometer__is_exact_without_impacts() -> None:
     [*((3, v2x) for v2x in (DEAF, PERIODIC, "blocked", "sensors-only")), (2, PERIODIC), (5, PERIODIC), (5, "blocked")],
 )
 def test_believing__drives_every_line_and_no_world_depends_on_the_batch(vehicles: int, v2x: object) -> None:
-    scenario = load_scenario("paper-random").replace(
+    scenario = eb.load_scenario("paper-random").replace(
         vehicles=vehicles, braking_capacity_mps2=6.0, driving_capacity_mps2=6.0, mass_t=5.0, latency_s=0.1, v2x=v2x,
         roles={"vehicle_2": "learner"}, horizon_s=12.0,
     )  # fmt: skip
@@ -121,7 +120,7 @@ def test_believing__drives_every_line_and_no_world_depends_on_the_batch(vehicles
 
 @pytest.mark.parametrize("v2x", ["paper", PERIODIC])
 def test_believing__knows_of_the_obstacle_what_it_was_told(v2x: object) -> None:
-    scenario = load_scenario("cooperation-4-all").replace(early_impacts="keep", v2x=v2x).with_learners(["vehicle_2"])
+    scenario = eb.load_scenario("cooperation-4-all").replace(early_impacts="keep", v2x=v2x).with_learners(["vehicle_2"])
     engine = engine_of(scenario)
     for _ in range(15):
         engine.step(np.full((40, 1), -0.9))

@@ -7,25 +7,29 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents import registry
-from ethbrake_marl.agents.policy import LearnedAgent, policy_agent
-from ethbrake_marl.agents.registry import Team, drive, make_agent, register_agent, script_agents
+import ethbrake_marl as eb
+from ethbrake_marl.agents import (
+    LearnedAgent,
+    Team,
+    drive,
+    make_agent,
+    policy_agent,
+    register_agent,
+    registry,
+    script_agents,
+)
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.episodes import Task, film_scenes, follow_episodes, record_episode, record_episodes
-from ethbrake_marl.evaluation.inputs import worlds_sha256
+from ethbrake_marl.evaluation import evaluate, follow_episodes, record_episode, worlds_sha256
+from ethbrake_marl.evaluation.episodes import Task, film_scenes, record_episodes
 from ethbrake_marl.physics import Floats, Worlds, advance
-from ethbrake_marl.policies import Policy
-from ethbrake_marl.rewards import RewardParams
-from ethbrake_marl.scenario import load_scenario, observation_for
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver
 
-PAPER = load_scenario("paper-random")
+PAPER = eb.load_scenario("paper-random")
 
 
-PAIR = load_scenario("cooperation-3-pair")
+PAIR = eb.load_scenario("cooperation-3-pair")
 
 
 def with_role(role, vehicle="vehicle_3"):
@@ -147,7 +151,7 @@ def test_record__motion_and_dataset_follow_scripts_that_decide_within_a_step(swi
     agent = make_agent("constant:3")
     outcome = evaluate(sample, {"it": agent}, scenario=swinging).outcome("it")
     motions = follow_episodes(sample.worlds, agent, swinging)
-    task = Task(swinging, 7, RewardParams(), observation_for(swinging))
+    task = Task(swinging, 7, eb.RewardParams(), eb.observation_for(swinging))
     recording = record_episodes(sample, agent, "it", task)
     assert outcome.sampled_harm is None  # its samples are the decisions of Vehicle 2 alone
     for k, motion in enumerate(motions):
@@ -176,7 +180,7 @@ def test_team__of_one_drives_as_the_agent_alone():
 def test_evaluate__an_agent_alone_drives_every_learner_and_a_team_of_nobody_none():
     brake, gentle = make_agent("full_brake"), make_agent("constant:4")
     agents = {"alone": brake, "by_hand": Team({1: brake, 2: brake}, "t"), "unlike": Team({1: gentle, 2: brake}, "u")}
-    level = load_scenario("cooperation-0-sensors")
+    level = eb.load_scenario("cooperation-0-sensors")
     scripted = {"scripts": Team({}, "scripts")}
     found, paper, nobody, driven = (
         evaluate(scenario.sample(60, 7), drivers, scenario=scenario, vehicle=vehicle)
@@ -194,7 +198,7 @@ def test_evaluate__an_agent_alone_drives_every_learner_and_a_team_of_nobody_none
     assert found.vehicles == (1, 2)
 
 
-def test_evaluate__several_learners_do_what_they_do_in_training(policy: Policy) -> None:
+def test_evaluate__several_learners_do_what_they_do_in_training(policy: eb.Policy) -> None:
     worlds = PAIR.sample(50, 3).worlds
     engine = Engine(PAIR, 50, learners=(1, 2), scripts={0: make_agent("full_brake")}, worlds=worlds)
     while not engine.ended.all():

@@ -10,33 +10,32 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import ethbrake_marl as eb
 from ethbrake_marl.actions import action_to_command, command_to_action
-from ethbrake_marl.agents import make_agent
-from ethbrake_marl.agents.believed import Told
-from ethbrake_marl.agents.registry import (
+from ethbrake_marl.agents import (
     Agent,
     Knowledge,
     Source,
     Team,
+    Told,
     agent_entries,
-    find_entry,
+    make_agent,
     parse_spec,
     script_agents,
 )
+from ethbrake_marl.agents.registry import find_entry
 from ethbrake_marl.engine import Engine, Memory, Script, ask_script, begin_script
-from ethbrake_marl.evaluation.inputs import make_lineup
+from ethbrake_marl.evaluation import make_lineup
 from ethbrake_marl.physics import Bools, Floats, Packed, Worlds
 from ethbrake_marl.physics.messages import CHANNEL, LINK, Messages, link_at, place_at, ring_at
-from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.scenario.v2x import PRESETS
-from ethbrake_marl.shield import ShieldedDriver
+from ethbrake_marl.shield import ShieldedDriver, parse_uncertainty
 from ethbrake_marl.shield.step_shield import Proposer, proposed_action, seen_columns
-from ethbrake_marl.shield.uncertainty import parse_uncertainty
 from tests.test_contact_features import contact_policy
 
 
 def changed_decisions(
-    agent: Agent, scenario: Scenario, *, vehicle: int | None = None, n: int = 100, decisions: int = 8, seed: int = 11
+    agent: Agent, scenario: eb.Scenario, *, vehicle: int | None = None, n: int = 100, decisions: int = 8, seed: int = 11
 ) -> int:
     """How many decisions change when all is altered that has not reached the vehicle by then: 0 for an honest agent.
 
@@ -178,10 +177,10 @@ def _alter_messages(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> F
     return columns
 
 
-PAPER = load_scenario("paper-random")
+PAPER = eb.load_scenario("paper-random")
 
 
-BLOCKED = load_scenario("cooperation-2-blocked")
+BLOCKED = eb.load_scenario("cooperation-2-blocked")
 
 
 SENSORS, MESSAGES, BELIEFS, STATE, MODEL = (
@@ -273,7 +272,7 @@ class Leaking(Silent):
         return -0.1 * worlds.speeds_mps[:, vehicle + 1]
 
 
-def agent_of(spec: str, scenario: Scenario = PAPER) -> Agent:
+def agent_of(spec: str, scenario: eb.Scenario = PAPER) -> Agent:
     uncertainty = parse_uncertainty("gaps_m=0.5") if parse_spec(spec).shield in ("robust", "robust:interior") else None
     return make_lineup([spec], scenario, uncertainty=uncertainty)[spec]
 
@@ -351,7 +350,7 @@ def test_own_sensors_and_messages__what_was_not_received_changes_no_action(spec,
     "spec", ["ppo@shipped/ppo-paper-random-obstacle", "e_v2x_bm:believed", "coast+robust:believed"]
 )
 def test_own_sensors_and_messages__nor_where_an_obstacle_is_that_was_not_received(spec, channel):
-    scenario = load_scenario("cooperation-4-all").with_learners(["vehicle_2"]).replace(v2x=channel)
+    scenario = eb.load_scenario("cooperation-4-all").with_learners(["vehicle_2"]).replace(v2x=channel)
     assert changed_decisions(agent_of(spec, scenario), scenario, n=5 if "robust" in spec else 20) == 0
     assert changed_decisions(agent_of("gentlest_front", scenario), scenario, n=20) > 0
 
@@ -387,7 +386,7 @@ def test_changed_decisions__finds_who_reads_what_others_heard_or_what_will_never
 
 
 def test_changed_decisions__lets_other_learners_brake_fully():
-    pair = load_scenario("cooperation-3-pair").replace(v2x="blocked")
+    pair = eb.load_scenario("cooperation-3-pair").replace(v2x="blocked")
     assert [changed_decisions(make_agent("full_brake"), pair, vehicle=i) for i in (1, 2)] == [0, 0]
 
 

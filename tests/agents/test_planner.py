@@ -7,25 +7,26 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl import search
-from ethbrake_marl.agents import optimise_coupled, planner as refined
-from ethbrake_marl.agents.planner import HOLDS, SIZES, Planner, Refined, RefinedProfile, changes, deviate
-from ethbrake_marl.agents.registry import (
+from ethbrake_marl.agents import (
     AgentAround,
     Knowledge,
+    Refined,
     Source,
     Team,
     drive,
     make_agent,
+    optimise_coupled,
+    planner as refined,
     record_commands,
     script_agents,
 )
+from ethbrake_marl.agents.planner import HOLDS, SIZES, Planner, RefinedProfile, changes, deviate
 from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import PhysicsError
-from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.search import profile_problem
 from tests.fixtures.asked import Asked
 
-SCENARIO = load_scenario("paper-random")
+SCENARIO = eb.load_scenario("paper-random")
 WORLDS = SCENARIO.sample(80, 3).worlds
 
 
@@ -130,7 +131,7 @@ def test_search__new_episodes_change_their_rows_only_and_take_goes_on_in_some(se
     ],
 )
 def test_search__of_any_line_obstacle_and_step_keeps_what_it_predicted(spec, name, vehicle, changes):
-    scenario = load_scenario(name).replace(**changes)
+    scenario = eb.load_scenario(name).replace(**changes)
     scenario = scenario.with_learners([scenario.vehicle_names[vehicle]])
     worlds = scenario.sample(20, 4).worlds
     episodes = drive(worlds, agent_of(spec, scenario, "total"), scenario, vehicle)

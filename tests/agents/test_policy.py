@@ -13,15 +13,12 @@ import torch
 
 import ethbrake_marl as eb
 from ethbrake_marl.actions import action_to_command
-from ethbrake_marl.agents import registry
-from ethbrake_marl.agents.policy import LearnedAgent
-from ethbrake_marl.agents.registry import drive
+from ethbrake_marl.agents import LearnedAgent, drive, registry
 from ethbrake_marl.errors import AgentFailed, InvalidInput
-from ethbrake_marl.evaluation.inputs import policy_sha256
+from ethbrake_marl.evaluation import policy_sha256
 from ethbrake_marl.observations import ObservationSpec, observe
 from ethbrake_marl.physics import make_worlds
-from ethbrake_marl.policies import Policy
-from ethbrake_marl.shield.guard import ShieldedDriver
+from ethbrake_marl.shield import ShieldedDriver
 from tests.fixtures.asked import Asked
 
 SCENARIO = eb.load_scenario("paper-random")
@@ -326,7 +323,7 @@ def test_file__makes_an_agent_alone_and_behind_every_shield(tmp_path: Path, arou
     assert harms(eb.make_agent(f"{file}:make_agent")).tolist() == harms(eb.policy_agent(brake)).tolist()
 
 
-def test_bundle__acts_in_fractions_of_the_own_capacity(policy: Policy) -> None:
+def test_bundle__acts_in_fractions_of_the_own_capacity(policy: eb.Policy) -> None:
     class Fixed:
         observation = ObservationSpec()
 

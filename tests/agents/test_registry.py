@@ -8,12 +8,20 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import agent_names, make_agent, optimise_coupled, optimise_pairwise, register_agent, registry
-from ethbrake_marl.agents.planner import Refined
-from ethbrake_marl.agents.registry import AgentSpec, agent_entries, parse_spec
+from ethbrake_marl.agents import (
+    Refined,
+    agent_entries,
+    agent_names,
+    make_agent,
+    optimise_coupled,
+    optimise_pairwise,
+    parse_spec,
+    register_agent,
+    registry,
+)
+from ethbrake_marl.agents.registry import AgentSpec
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver
 from tests.fixtures.asked import Asked
@@ -79,7 +87,7 @@ def test_spec__is_taken_apart_and_written_again(spec, parts):
 def test_shields__go_around_any_agent_and_hold(spec, kind):
     agents = {spec: make_agent(spec, scenario=SCENARIO, harm_count="total", uncertainty="gaps_m=0.2")}
     assert isinstance(agents[spec], kind)
-    outcome = evaluate(SCENARIO.sample(3, 5), agents, scenario=SCENARIO).outcome(spec)
+    outcome = eb.evaluate(SCENARIO.sample(3, 5), agents, scenario=SCENARIO).outcome(spec)
     assert (outcome.total_harm <= outcome.predicted_harm + 1e-9).all()
 
 

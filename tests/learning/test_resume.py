@@ -20,12 +20,10 @@ import pytest
 import safetensors.numpy
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import ethbrake_marl as eb
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, Progress
-from ethbrake_marl.learning import runs
-from ethbrake_marl.learning.runs import TrainResult, resume, train
-from ethbrake_marl.learning.training import Training
+from ethbrake_marl.learning import Training, TrainResult, resume, runs, train
 from ethbrake_marl.policies import Trained, load_policy
-from ethbrake_marl.scenario import load_scenario
 from tests.hostile.run_cases import CHANGES
 from tests.hostile.stopped_runs import listed_anew, newest
 from tests.learning.tiny import (
@@ -42,8 +40,8 @@ from tests.learning.tiny import (
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
-PAPER, PAIR = load_scenario("paper-random"), load_scenario("cooperation-3-pair")
-MIXTURE = load_scenario(
+PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
+MIXTURE = eb.load_scenario(
     {"name": "both", "mixture": [{"scenario": "realistic-mixed"}, {"scenario": "realistic-truck", "weight": 2}]}
 )
 REMEMBERING = PAPER.replace(

@@ -19,12 +19,12 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
-from ethbrake_marl.agents.policy import LearnedAgent
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, Progress
+import ethbrake_marl as eb
+from ethbrake_marl.errors import AlreadyExists, Progress
 from ethbrake_marl.evaluation import evaluate, measures as outcomes, summarise
-from ethbrake_marl.files.store import hold_lock, new_folder, write_file
+from ethbrake_marl.files.store import new_folder, write_file
 from ethbrake_marl.harm import objective_harm, objectives_of
-from ethbrake_marl.learning import runs
+from ethbrake_marl.learning import Training, TrainingRecipe, load_recipe, resume, runs
 from ethbrake_marl.learning.runs import (
     Course,
     EventFile,
@@ -34,17 +34,14 @@ from ethbrake_marl.learning.runs import (
     event_sizes,
     lost_training,
     misleading_return,
-    resume,
 )
-from ethbrake_marl.learning.training import Training, TrainingRecipe, load_recipe
 from ethbrake_marl.policies import Policy, load_policy, read_trained
-from ethbrake_marl.scenario import load_scenario
 from tests.learning.tiny import TINY_PPO, TINY_SAC, Answer, ctrl_c_in, files_of, watch_steps
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of those who read event files
 
 
-SCENARIO = load_scenario("paper-random")
+SCENARIO = eb.load_scenario("paper-random")
 
 
 UPDATE = 8 * 16  # decisions
@@ -177,7 +174,7 @@ def test_train__measures_what_an_evaluation_of_the_kept_policy_tells_and_proves_
     result = runs.train(TINY, SCENARIO, tmp_path / "run", steps=UPDATE, on_progress=None)
     assert asked == []
     worlds = result.training.scenario.sample(TINY.evaluation.worlds, TINY.evaluation.seed)
-    agents = {"policy": LearnedAgent(result.last_policy, "policy")}
+    agents = {"policy": eb.LearnedAgent(result.last_policy, "policy")}
     (row,) = summarise(evaluate(worlds, agents, scenario=result.training.scenario))
     assert asked == ["limits"]
     names = ("first_impact_harm", "total_harm", "collision_rate")
@@ -209,7 +206,7 @@ def test_train__numbers_that_are_not_finite_stop_it_and_keep_the_last_good_polic
         return answer
 
     watch_steps(monkeypatch, spoil)
-    scenario = load_scenario("cooperation-3-pair") if scheme else SCENARIO
+    scenario = eb.load_scenario("cooperation-3-pair") if scheme else SCENARIO
     with pytest.raises(TrainingDiverged, match=message):
         train(recipe, scenario, tmp_path / "run", steps=max(2 * UPDATE, recipe.total_steps), scheme=scheme)
     assert status_of(tmp_path / "run")["status"] == "failed"
@@ -277,7 +274,7 @@ def test_train__keeps_and_tells_what_the_learners_objectives_make_of_the_harm(tm
     best = min(result.evaluations, key=lambda each: each["objective"])
     kept = load_policy(tmp_path / "run" / "policy")
     assert len(rows) == len(result.evaluations) > 3 and kept.manifest.steps == best["steps"]
-    found = evaluate(scenario.sample(10, 7).worlds, {"kept": LearnedAgent(kept)}, scenario=scenario)
+    found = evaluate(scenario.sample(10, 7).worlds, {"kept": eb.LearnedAgent(kept)}, scenario=scenario)
     harm = objective_harm(found.outcome("kept").ledger, "first", objectives_of(objectives, 3)).mean(axis=0)
     assert (best["objective_vehicle_2"], best["objective_vehicle_3"]) == (
         pytest.approx(harm[1]),
@@ -294,7 +291,7 @@ GOAL = 1.10  # harm of the policy, in the least harm known
 @pytest.mark.parametrize("seed", range(3))
 def test_quick__ends_near_the_best_known_for_every_seed(seed: int, tmp_path: Path) -> None:
     result = runs.train("quick", "paper-random", tmp_path / "run", seed=seed, on_progress=None)
-    agents = {"last": LearnedAgent(result.last_policy), "kept": LearnedAgent(result.policy)}
+    agents = {"last": eb.LearnedAgent(result.last_policy), "kept": eb.LearnedAgent(result.policy)}
     for row in summarise(evaluate(SCENARIO.sample(10_000, seed=7), agents, scenario=SCENARIO, aftermath=False)):
         assert row.first_impact_harm.value <= GOAL * row["best_known_first_impact_harm"].value
     assert result.alarms == ()
@@ -451,20 +448,6 @@ def test_new_folder__is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(AlreadyExists, match="taken: is there already"), new_folder(tmp_path / "a" / "taken"):
         (tmp_path / "a" / "taken").mkdir()  # meanwhile, by somebody else
     assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*")) == ["a", "a/good", "a/good/x", "a/taken"]
-
-
-def test_hold_lock__is_for_one_and_free_afterwards(tmp_path: Path) -> None:
-    for _ in range(2):
-        with (
-            hold_lock(tmp_path / "some.lock", "somebody works here"),
-            pytest.raises(InvalidInput, match=f"^{tmp_path}: somebody works here$"),
-            hold_lock(tmp_path / "some.lock", "somebody works here"),
-        ):
-            pass
-    (tmp_path / "folder.lock").mkdir()
-    told = r"folder\.lock: cannot be used as a lock .*; delete it"
-    with pytest.raises(InvalidInput, match=told), hold_lock(tmp_path / "folder.lock", ""):
-        pass
 
 
 def test_progress_table__columns_are_sorted_and_later_ones_are_filled_in(tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ import torch
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning.training import load_recipe
 from tests.docs.site import load
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning", "ignore::FutureWarning")
@@ -25,7 +24,7 @@ TRAIN = Path(__file__).resolve().parents[2] / "train"
 PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
 
 
-RECIPE = load_recipe("cooperation-ppo").replace(
+RECIPE = eb.load_recipe("cooperation-ppo").replace(
     n_envs=16, n_steps=16, batch_size=128, network={"policy": [16, 16], "value": [16, 16]}
 )
 
@@ -127,7 +126,7 @@ def test_mappo__leaves_a_policy_that_acts_as_benchmarls_own_does(mappo: ModuleTy
 
 @pytest.mark.long
 def test_mappo__learns_to_beat_full_braking(mappo: ModuleType, tmp_path: Path) -> None:
-    mappo.train_mappo(load_recipe("cooperation-ppo").replace(total_steps=300_000), PAIR, tmp_path / "run")
+    mappo.train_mappo(eb.load_recipe("cooperation-ppo").replace(total_steps=300_000), PAIR, tmp_path / "run")
     assert harm_beside_full_braking(tmp_path / "run") < 0.9
 
 

@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import make_single_agent
-from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
+from ethbrake_marl.agents import make_single_agent
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
-from ethbrake_marl.learning.runs import make_model, train
-from ethbrake_marl.learning.training import RunDirectory, Training, TrainingRecipe, load_recipe
+from ethbrake_marl.learning import RunDirectory, Training, TrainingRecipe, load_recipe, train
+from ethbrake_marl.learning.runs import make_model
 from ethbrake_marl.policies import PolicyTeam, load_policy
 from tests.learning.tiny import TINY_PPO, Answer, files_of, watch_steps
 
@@ -100,10 +99,10 @@ def test_independent__nobody_learns_from_anothers_reward(tmp_path: Path, monkeyp
     assert [plain[name] == spoiled[name] for name in NAMES] == [True, False]
 
 
-def model_of(scheme: str, appended: Any) -> tuple[Any, EthBrakeVecEnv]:
+def model_of(scheme: str, appended: Any) -> tuple[Any, eb.EthBrakeVecEnv]:
     """The policy in training, and its environment."""
     recipe = TINY.replace(scheme=scheme)
-    environment = make_sb3_vec_env(PAIR, 8, appended=appended, reward=recipe.reward)
+    environment = eb.make_sb3_vec_env(PAIR, 8, appended=appended, reward=recipe.reward)
     return make_model(recipe.make_algorithm(), Training.of(recipe, PAIR), environment).policy, environment
 
 

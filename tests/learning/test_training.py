@@ -9,18 +9,12 @@ from typing import Any
 import pytest
 from jsonschema import Draft202012Validator
 
+import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import parse_yaml, read_yaml
-from ethbrake_marl.learning.training import (
-    LearningRate,
-    RunDirectory,
-    Training,
-    TrainingRecipe,
-    algorithm_names,
-    load_recipe,
-)
+from ethbrake_marl.learning import RunDirectory, Training, TrainingRecipe, algorithm_names, load_recipe
+from ethbrake_marl.learning.training import LearningRate
 from ethbrake_marl.policies import NetworkSpec
-from ethbrake_marl.scenario import load_scenario
 from tests.learning.tiny import TINY_COUNTERFACTUAL, TINY_PPO
 
 SHIPPED = TrainingRecipe.shipped()
@@ -117,7 +111,7 @@ def test_schema__asks_for_what_is_missing(missing: str) -> None:
     assert marked({key: value for key, value in good.items() if key != missing}) == {""}
 
 
-SCENARIO = load_scenario("paper-random")
+SCENARIO = eb.load_scenario("paper-random")
 TRAINING = Training.of(TINY_PPO, SCENARIO)
 WORDS = {"title": "Another", "description": "More.", "source": "Elsewhere."}
 

@@ -14,9 +14,6 @@ import torch
 from torch import nn
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.policy import LearnedAgent
-from ethbrake_marl.errors import MissingExtra
-from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.observations import observe
 from ethbrake_marl.physics import advance
 from ethbrake_marl.policies import Actor, NetworkSpec, Policy, dense, squash
@@ -27,7 +24,7 @@ def _observations(n: int, size: int) -> np.ndarray:
 
 
 def test_tensors__of_the_papers_network_has_the_tables_tensors() -> None:
-    shapes = {row.name: row.shape for row in load_recipe("ppo-paper").network_spec(27).tensors}
+    shapes = {row.name: row.shape for row in eb.load_recipe("ppo-paper").network_spec(27).tensors}
     assert shapes == {
         "policy.0.weight": (256, 27),
         "policy.0.bias": (256,),
@@ -101,7 +98,7 @@ def test_actor__action_is_bitwise_independent_of_the_batch_around_it(
 
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
 def test_actor__agrees_with_torch(activation: str, random_tensors: RandomTensors) -> None:
-    spec = load_recipe("ppo-paper").network_spec(27).model_copy(update={"activation": activation})
+    spec = eb.load_recipe("ppo-paper").network_spec(27).model_copy(update={"activation": activation})
     tensors, seen = random_tensors(spec), _observations(1000, 27)
     x, function = torch.from_numpy(seen), nn.functional.relu if activation == "relu" else torch.tanh
     for name in ("policy.0", "policy.1", "policy.output"):
@@ -180,7 +177,7 @@ def test_onnx__asks_for_the_same_acceleration_in_10_000_states(
     rng = np.random.default_rng(0)
     command = -rng.uniform(0.0, 1.0, worlds.speeds_mps.shape) * worlds.vehicles.braking_capacity_mps2
     worlds, _ = advance(worlds, command, until_s=rng.uniform(0.0, 6.0, worlds.n))
-    seen, expected = observe(worlds, 1, ours.observation), LearnedAgent(ours).act(worlds, 1)
+    seen, expected = observe(worlds, 1, ours.observation), eb.LearnedAgent(ours).act(worlds, 1)
     action, acceleration = onnx_of(ours).run(["action", "acceleration_mps2"], {"observation": seen})
     assert np.ptp(expected) > 4.0 and (expected > 0.5).any()
     np.testing.assert_allclose(action, ours(seen), rtol=0.0, atol=1e-5)
@@ -192,5 +189,5 @@ def test_onnx__of_several_networks_and_without_the_package(mixture: Policy, monk
     (action,) = onnx_of(mixture).run(["action"], {"observation": seen})
     np.testing.assert_allclose(action, mixture(seen), rtol=0.0, atol=1e-5)
     monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(MissingExtra, match=r"-m pip install 'ethbrake-marl\[export\]'$"):
+    with pytest.raises(eb.MissingExtra, match=r"-m pip install 'ethbrake-marl\[export\]'$"):
         mixture.to_onnx()
