@@ -11,11 +11,7 @@ from ethbrake_marl.engine import Engine
 from ethbrake_marl.physics import Worlds
 
 BASE = eb.load_scenario("cooperation-2-paper").replace(early_impacts="keep")
-
-
 DEAF = {"preset": "paper", "hears": "front"}
-
-
 PERIODIC = {"preset": "blocked", "persistence": "periodic"}
 
 

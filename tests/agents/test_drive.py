@@ -27,8 +27,6 @@ from ethbrake_marl.physics import Floats, Worlds, advance
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver
 
 PAPER = eb.load_scenario("paper-random")
-
-
 PAIR = eb.load_scenario("cooperation-3-pair")
 
 

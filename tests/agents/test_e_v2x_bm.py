@@ -13,14 +13,12 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents import e_v2x_bm, optimise_coupled, optimise_pairwise, pairwise_harm
 from ethbrake_marl.agents.e_v2x_bm import (
-    MINIMA,
     CoupledOptimum,
     Line,
     Samples,
     bound_cells,
     choose,
     closing_speed_squared,
-    find_minima,
     least_to_spare_front,
     make_line,
     most_to_spare_rear,
@@ -194,20 +192,6 @@ def test_choose__order_of_preference(harm, other, expected):
     assert choose(found, 5, np.empty(5)) == expected
     back = Samples(*(column[::-1].copy() for column in found))
     assert choose(back, 5, np.empty(5)) == expected
-
-
-@pytest.mark.parametrize(
-    ("harm", "places", "minima"),
-    [
-        ([5, 2, 3, 6, 1, 7], [4, 1, 0, 2, 3, 5], 2),  # by depth; no third minimum: nothing to narrow
-        ([9, 7, 9, 3, 9, 6, 9, 1, 9, 5, 9, 2, 9, 4, 9], [7, 11, 3, 13, 9, 5], 6),  # the six lowest
-    ],
-)
-def test_find_minima__are_in_order_of_depth(harm, places, minima):
-    depth, found = np.empty(len(harm)), np.empty(MINIMA, np.int64)
-    find_minima(samples(range(len(harm)), harm), len(harm), depth, found)
-    assert found.tolist() == places
-    assert np.isfinite(depth[found]).tolist() == [k < minima for k in range(6)]
 
 
 @pytest.mark.parametrize(

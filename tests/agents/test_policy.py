@@ -22,11 +22,7 @@ from ethbrake_marl.shield import ShieldedDriver
 from tests.fixtures.asked import Asked
 
 SCENARIO = eb.load_scenario("paper-random")
-
-
 WORLDS = SCENARIO.sample(12, 7).worlds
-
-
 AROUND = ("+refined", "+episode", "+episode:pairwise", "+step", "+refined+step")
 
 

@@ -64,8 +64,6 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "learning.md").read_text("utf-8")
-
-
 SCENARIO = eb.load_scenario("paper-random")
 
 
@@ -180,8 +178,6 @@ def test_tensors_of__hold_every_weight_once_and_give_sb3s_deterministic_action(
 
 
 SHIPPED = load_recipe("counterfactual")
-
-
 STILL = {"learning_rate": {"start": 1e-12, "end": 1e-12}, "total_steps": 1}
 
 
@@ -248,11 +244,7 @@ def test_widened__puts_every_feature_where_it_is_observed_now() -> None:
 
 
 OWN = {"reward": {"harm": 1.0, "harm_count": "total", "objective": "own", "terminal": 0.5}}
-
-
 CONTACT = OWN | {"observation": ["own", "front_1", "rear_1", "contact"]}
-
-
 SCRIPTED = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "e_v2x_bm:pairwise"}
 
 
@@ -277,14 +269,8 @@ FROM_SCRATCH = {
     "n_envs": 64, "batch_size": 64, "averaging": 0.9, "network": {"policy": [32]},
     "learning_rate": {"start": 3e-3, "end": 3e-3}, "evaluation": {"every_updates": 1000, "worlds": 300, "seed": 7},
 }  # fmt: skip
-
-
 SHARES = {"alone": 0.0, "further": 0.25, "gate": 0.5, "together": 0.25}
-
-
 MANY_TRIED = {"n_steps": 8, "counterfactuals": 256, "total_steps": 30 * 512}
-
-
 GATED = {
     "total_steps": 16 * 256,
     "modes": MODES | {"worlds": 400, "imitation_epochs": 20, "gate_states": 512, "shares": SHARES},

@@ -23,7 +23,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import ethbrake_marl as eb
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, Progress
 from ethbrake_marl.learning import Training, TrainResult, resume, runs, train
-from ethbrake_marl.policies import Trained, load_policy
+from ethbrake_marl.policies import Trained
 from tests.hostile.run_cases import CHANGES
 from tests.hostile.stopped_runs import listed_anew, newest
 from tests.learning.tiny import (
@@ -39,7 +39,6 @@ from tests.learning.tiny import (
 )
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
-
 PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
 MIXTURE = eb.load_scenario(
     {"name": "both", "mixture": [{"scenario": "realistic-mixed"}, {"scenario": "realistic-truck", "weight": 2}]}
@@ -195,16 +194,6 @@ def test_resume__after_a_failure_and_another_stop_it_ends_as_if_nothing_had_happ
     (run / "team.json").write_text("{}")  # follows from the configuration, and is written anew
     resume(run, measure=measure)
     assert_same(run, whole("turns")[0])
-
-
-def test_train__keeps_the_policy_of_least_harm_and_the_last_one(whole: Whole) -> None:
-    folder, result = whole("ppo")
-    harms = [entry["first_impact_harm"] for entry in result.evaluations]
-    best = result.evaluations[int(np.argmin(harms))]
-    assert harms[-1] > min(harms)  # else the two were one
-    assert load_policy(folder).manifest.steps == best["steps"] == result.policy.manifest.steps
-    assert load_policy(folder / "policy-last").manifest.steps == result.steps == result.last_policy.manifest.steps
-    assert measure(result.training)(load_policy(folder))["first_impact_harm"] == min(harms)
 
 
 KILLED = """

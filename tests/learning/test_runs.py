@@ -39,20 +39,10 @@ from ethbrake_marl.policies import Policy, load_policy, read_trained
 from tests.learning.tiny import TINY_PPO, TINY_SAC, Answer, ctrl_c_in, files_of, watch_steps
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of those who read event files
-
-
 SCENARIO = eb.load_scenario("paper-random")
-
-
 UPDATE = 8 * 16  # decisions
-
-
 EVERY_SECOND = {"every_updates": 2, "worlds": 10, "seed": 7}
-
-
 TINY = TINY_PPO.replace(total_steps=3 * UPDATE, evaluation=EVERY_SECOND)
-
-
 train = partial(runs.train, measure=None)
 
 
@@ -368,14 +358,10 @@ def test_lost_training__is_harm_that_came_back_and_stays(
 # As measured every 163,840 decisions (2026-11-21): recipe ppo with contact features and ``horizon_is_end: false``, and
 # recipe ppo for twice its decisions, whose episodes the horizon cuts off more and more often at the same harm.
 COLLAPSED = [91.91, 10.28, 11.56, 12.02, 14.74, 18.90, 25.70, 37.11, 47.96, 70.85]
-
-
 STAYED = [
     91.54, 11.13, 8.73, 7.71, 8.81, 8.77, 8.78, 7.19, 6.97, 6.86, 7.63, 7.01, 7.09, 7.01,
     7.26, 7.09, 7.43, 6.81, 7.17, 7.12,
 ]  # fmt: skip
-
-
 CUT_OFF = [0.19, 0.29, *[0.65] * 18]
 
 
@@ -385,15 +371,6 @@ CUT_OFF = [0.19, 0.29, *[0.65] * 18]
 def test_lost_training__in_two_real_trainings(harms: list[float], at_horizon: list[float], alarms: list[int]) -> None:
     entries = told_of(total_harm=harms, horizon_rate=at_horizon)
     assert [k for k in range(len(harms) + 1) if lost_training(entries[:k], "total_harm") is not None] == alarms
-
-
-def test_course__says_that_it_is_lost_until_it_is_found_again(policy) -> None:
-    course, told = Course("total"), []
-    for harm in (90.0, 7.0, 60.0, 60.0, 60.0, 7.5):
-        told.append(course.add_evaluation(policy, {"total_harm": harm}, None))
-        assert (course.lost is None) == (told[-1] is None)
-    assert [each is not None for each in told] == [False, False, False, True, True, False]
-    assert course.alarms == told[3:5]
 
 
 def test_course__the_best_is_judged_by_the_count_of_the_reward_and_comes_back_from_json(policy) -> None:

@@ -16,14 +16,8 @@ from ethbrake_marl.errors import InvalidInput
 from tests.docs.site import load
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning", "ignore::FutureWarning")
-
-
 TRAIN = Path(__file__).resolve().parents[2] / "train"
-
-
 PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
-
-
 RECIPE = eb.load_recipe("cooperation-ppo").replace(
     n_envs=16, n_steps=16, batch_size=128, network={"policy": [16, 16], "value": [16, 16]}
 )
@@ -128,25 +122,6 @@ def test_mappo__leaves_a_policy_that_acts_as_benchmarls_own_does(mappo: ModuleTy
 def test_mappo__learns_to_beat_full_braking(mappo: ModuleType, tmp_path: Path) -> None:
     mappo.train_mappo(eb.load_recipe("cooperation-ppo").replace(total_steps=300_000), PAIR, tmp_path / "run")
     assert harm_beside_full_braking(tmp_path / "run") < 0.9
-
-
-@pytest.mark.usefixtures("mappo")
-def test_tasks__are_in_benchmarls_own_registry_and_make_the_same_worlds() -> None:
-    from benchmarl.environments import task_config_registry
-
-    from ethbrake_marl.learning.benchmarl_tasks import EthBrakeTask, register_tasks
-
-    register_tasks()
-    names = {name for name in task_config_registry if name.startswith("ethbrake/")}
-    assert "ethbrake/cooperation_3_pair" in names and len(names) == len(list(EthBrakeTask))
-    settings = {"scenario": PAIR.declared(), "reward": {"harm": 1.0}, "horizon_is_end": True}
-    tasks = (
-        EthBrakeTask.COOPERATION_3_PAIR.get_from_yaml(),
-        task_config_registry["ethbrake/cooperation_3_pair"].get_task(settings),
-    )
-    seen = [task.get_env_fun(3, True, 5, "cpu")().reset()["learners", "observation"] for task in tasks]
-    np.testing.assert_array_equal(*(part.numpy() for part in seen))
-    assert [task.group_map(None) for task in tasks] == [{"learners": ["vehicle_2", "vehicle_3"]}] * 2
 
 
 @pytest.fixture

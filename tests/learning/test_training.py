@@ -18,21 +18,29 @@ from ethbrake_marl.policies import NetworkSpec
 from tests.learning.tiny import TINY_COUNTERFACTUAL, TINY_PPO
 
 SHIPPED = TrainingRecipe.shipped()
+PAPERS = {
+    "ppo-paper": {
+        "gamma": 0.99, "n_steps": 2048, "n_epochs": 4, "batch_size": 512, "clip_range": 0.15, "gae_lambda": 0.95,
+        "vf_coef": 0.5, "ent_coef": 0.005, "target_kl": 0.15, "max_grad_norm": 0.3,
+    },
+    "sac-paper": {
+        "batch_size": 256, "buffer_size": 10**6, "learning_starts": 10**4, "tau": 0.02, "gamma": 0.99,
+        "steps_per_update": 1, "gradient_steps": 1, "ent_coef": "auto", "target_update_interval": 1, "n_envs": 1,
+        "update_ratio": 1.0,
+    },
+}  # fmt: skip
+NETWORKS = {
+    "ppo-paper": {"value_hidden": (256, 256, 128), "output": "clip"},
+    "sac-paper": {"value_hidden": (), "output": "tanh"},
+}
 
 
-def test_recipe__of_the_paper_has_its_network_and_tables() -> None:
-    r = load_recipe("ppo-paper")
-    assert r.network_spec(27) == NetworkSpec(
-        observation_size=27, action_size=1, policy_hidden=(256, 256), value_hidden=(256, 256, 128),
-        activation="relu", output="clip",
-    )  # fmt: skip
-    assert (r.gamma, r.n_steps, r.n_epochs, r.batch_size, r.clip_range) == (0.99, 2048, 4, 512, 0.15)
-    assert (r.gae_lambda, r.vf_coef, r.ent_coef, r.target_kl, r.max_grad_norm) == (0.95, 0.5, 0.005, 0.15, 0.3)
-    r = load_recipe("sac-paper")
-    assert (r.batch_size, r.buffer_size, r.learning_starts, r.tau, r.gamma) == (256, 10**6, 10**4, 0.02, 0.99)
-    assert (r.steps_per_update, r.gradient_steps, r.ent_coef, r.target_update_interval) == (1, 1, "auto", 1)
-    assert (r.network.policy, r.network.value, r.network.activation) == ((256, 256), (256, 256), "relu")
-    assert (r.n_envs, r.update_ratio) == (1, 1.0)
+@pytest.mark.parametrize("name", PAPERS)
+def test_recipe__of_the_paper_has_its_network_and_table(name: str) -> None:
+    recipe = load_recipe(name)
+    assert {key: getattr(recipe, key) for key in PAPERS[name]} == PAPERS[name]
+    shape = {"observation_size": 27, "action_size": 1, "policy_hidden": (256, 256), "activation": "relu"}
+    assert recipe.network_spec(27) == NetworkSpec(**shape, **NETWORKS[name])
 
 
 @pytest.mark.parametrize("name", sorted(SHIPPED))

@@ -63,7 +63,6 @@ MODES = {
     "shares": {"alone": 0.25, "further": 0.25, "gate": 0.25, "together": 0.25},
 }
 TINY_MODES = TINY_COUNTERFACTUAL.replace(modes=MODES)
-
 Answer = tuple[Any, ...]
 
 

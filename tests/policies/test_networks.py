@@ -119,8 +119,6 @@ def test_squash__is_the_rounded_hyperbolic_tangent() -> None:
 
 
 RandomTensors = Callable[[NetworkSpec], dict[str, np.ndarray]]
-
-
 SCENARIO = eb.load_scenario("paper-random")
 
 
