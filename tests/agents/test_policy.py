@@ -51,13 +51,6 @@ def model():
     return stable.PPO("MlpPolicy", rows, n_steps=8, batch_size=16, n_epochs=1, seed=1).learn(64)
 
 
-def test_function__drives_as_it_says_and_is_named_after_itself():
-    agent = eb.policy_agent(brake)
-    assert agent.name == "brake" and isinstance(agent, eb.Agent)
-    half = -0.5 * WORLDS.vehicles.braking_capacity_mps2[:, 1]
-    assert Asked(agent).begin(WORLDS, 1).act(WORLDS, 1).tolist() == half.tolist()
-
-
 @pytest.mark.parametrize("seed", [3, 4, 9])
 def test_trained_model__drives_as_in_its_own_librarys_rollout(model, seed):
     env = eb.EthBrakeEnv()

@@ -35,10 +35,10 @@ NETWORKS = {
 }
 
 
-@pytest.mark.parametrize("name", PAPERS)
-def test_recipe__of_the_paper_has_its_network_and_table(name: str) -> None:
+@pytest.mark.parametrize(("name", "value"), [("ppo-paper", (256, 256, 128)), ("sac-paper", (256, 256))])
+def test_recipe__of_the_paper_has_its_network_and_table(name: str, value: tuple[int, ...]) -> None:
     recipe = load_recipe(name)
-    assert {key: getattr(recipe, key) for key in PAPERS[name]} == PAPERS[name]
+    assert {key: getattr(recipe, key) for key in PAPERS[name]} == PAPERS[name] and recipe.network.value == value
     shape = {"observation_size": 27, "action_size": 1, "policy_hidden": (256, 256), "activation": "relu"}
     assert recipe.network_spec(27) == NetworkSpec(**shape, **NETWORKS[name])
 
