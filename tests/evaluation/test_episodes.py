@@ -31,7 +31,7 @@ from ethbrake_marl.evaluation.episodes import (
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.shield import ShieldedDriver
-from tests.envs.lines import CRASH
+from tests.contract.interfaces import CRASH
 from tests.pages.hostile import HOSTILE
 
 IMPACT_S = 0.5 + 0.25 / 3.0  # see PAIR
