@@ -8,16 +8,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import (
-    LearnedAgent,
-    Team,
-    drive,
-    make_agent,
-    policy_agent,
-    register_agent,
-    registry,
-    script_agents,
-)
+from ethbrake_marl.agents import LearnedAgent, Team, drive, make_agent, policy_agent, register_agent, script_agents
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import InvalidInput
@@ -116,9 +107,8 @@ class Swinging:
 
 
 @pytest.fixture
-def swinging(monkeypatch):
+def swinging():
     """Lines whose first and last vehicle follow a script that decides within the steps of Vehicle 2."""
-    monkeypatch.setattr(registry, "_ENTRIES", dict(registry._ENTRIES))
     register_agent("swinging", lambda argument, settings: Swinging())
     roles = {"vehicle_1": "swinging", "vehicle_2": "learner", "vehicle_3": "swinging"}
     latency = [0.04, 0.5, {"uniform": [0.2, 0.9]}]

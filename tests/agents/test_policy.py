@@ -13,7 +13,7 @@ import torch
 
 import ethbrake_marl as eb
 from ethbrake_marl.actions import action_to_command
-from ethbrake_marl.agents import LearnedAgent, drive, registry
+from ethbrake_marl.agents import LearnedAgent, drive
 from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.evaluation import policy_sha256
 from ethbrake_marl.observations import ObservationSpec, observe
@@ -28,11 +28,6 @@ AROUND = ("+refined", "+episode", "+episode:pairwise", "+step", "+refined+step")
 
 def harms(agent, worlds=WORLDS):
     return drive(worlds, agent, SCENARIO, 1).ledger.world_harm("first")
-
-
-@pytest.fixture(autouse=True)
-def own_names(monkeypatch):
-    monkeypatch.setattr(registry, "_ENTRIES", dict(registry._ENTRIES))
 
 
 def shielded(agent, around):

@@ -17,7 +17,6 @@ from ethbrake_marl.agents import (
     optimise_pairwise,
     parse_spec,
     register_agent,
-    registry,
 )
 from ethbrake_marl.agents.registry import AgentSpec
 from ethbrake_marl.cli.app import run_command
@@ -28,12 +27,6 @@ from tests.fixtures.asked import Asked
 
 SCENARIO = eb.load_scenario("paper-random")
 ALL = ["full_brake", "coast", "constant:3.5", "copy_leader", "gentlest_front", "e_v2x_bm", "e_v2x_bm:pairwise"]
-
-
-@pytest.fixture(autouse=True)
-def own_names(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a test registers is forgotten afterwards."""
-    monkeypatch.setattr(registry, "_ENTRIES", dict(registry._ENTRIES))
 
 
 def random_worlds(n: int, seed: int = 31, *, capacity: tuple[float, float, float] = (6, 7, 6)) -> Worlds:

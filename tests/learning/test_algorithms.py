@@ -22,7 +22,7 @@ from stable_baselines3.sac.policies import SACPolicy
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning import Training, TrainingRecipe, load_recipe, resume, train, training as registry
+from ethbrake_marl.learning import Training, TrainingRecipe, load_recipe, resume, train
 from ethbrake_marl.learning.algorithms import (
     Adam,
     CounterfactualModel,
@@ -54,8 +54,7 @@ from tests.learning.tiny import MODES, TINY_COUNTERFACTUAL, TINY_MODES, TINY_PPO
 
 @pytest.fixture
 def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """The page's file, imported; what it registers is forgotten afterwards."""
-    monkeypatch.setattr(registry, "_ALGORITHMS", dict(registry._ALGORITHMS))
+    """The algorithm of the page's file, imported."""
     (source,) = (block for block in re.findall("```python\n(.*?)```", PAGE, re.DOTALL) if "register_algorithm" in block)
     (tmp_path / "my_algorithm.py").write_text(source)
     monkeypatch.syspath_prepend(tmp_path)
