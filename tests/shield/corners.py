@@ -69,34 +69,17 @@ def shielded(
     return episodes.ledger.world_harm("first"), shield.predicted_harm, int(shield.interventions.sum())
 
 
-def ranges_gate(worlds: int, seed: int) -> bool:
-    """Wherever in the ranges the world is, no harm is above the first bound of ``+robust:interior:believed``."""
-    good, each = True, max(1, worlds // (len(INSIDE) * len(WAYS)))
-    for name, scenario in INSIDE.items():
+def gate(lists: dict[str, Scenario], robust: str, worlds: int, seed: int) -> bool:
+    """In no world of these lists is harm above the first bound of ``+robust:believed``, whatever is proposed."""
+    good, each = True, max(1, worlds // (len(lists) * len(WAYS)))
+    for name, scenario in lists.items():
         for way in WAYS:
-            harm, bound, replaced = shielded(way, scenario, each, seed, robust="interior")
+            harm, bound, replaced = shielded(way, scenario, each, seed, robust=robust)
             above, kept = int((harm > bound + ABOVE).sum()), np.isfinite(bound)
             good = good and above == 0 and replaced > 0
             print(
-                f"  inside, {name:12s} {way:7s} {each:7,} worlds {replaced:9,} replaced  above the bound: {above},"
+                f"  {robust}, {name:12s} {way:7s} {each:7,} worlds {replaced:9,} replaced  above the bound: {above},"
                 f" without one: {int((~kept).sum())}; harm {harm.mean():.1f}, bound {bound[kept].mean():.1f}",
-                flush=True,
-            )
-    return good
-
-
-def corners_gate(worlds: int, seed: int) -> bool:
-    """Where the world is a corner of what is not known, no harm is above the first bound, whatever is proposed."""
-    good, each = True, max(1, worlds // (len(LISTS) * len(WAYS)))
-    for name, scenario in LISTS.items():
-        for way in WAYS:
-            harm, bound, replaced = shielded(way, scenario, each, seed)
-            above = int((harm > bound + ABOVE).sum())
-            good = good and above == 0 and replaced > 0
-            excess = float(np.maximum(harm - bound, 0.0).max())
-            print(
-                f"  {name:12s} {way:7s} {each:7,} worlds {replaced:9,} replaced  above the bound: {above}, largest"
-                f" excess {excess:.2g}",
                 flush=True,
             )
     return good

@@ -3,10 +3,10 @@
 Six gates, one line each, exit status 1 if one fails:
 
 bound   random worlds against every adversary of ``tests.shield.lines``, both counts, N = 3 and 5, e from 0 to 0.3
-joint   teams of hostile learners at cooperation levels 3 and 4, N = 3 and 5 (``tests.shield.joint_attack``)
+joint   teams of hostile learners at cooperation levels 3 and 4, N = 3 and 5 (``tests.shield.lines``)
 interfaces   worlds through every wrapped interface (``tests.shield.interface_attack``)
 interference  refused calls, exceptions and interrupts at random lines on every interface, and wrappers in between
-search  restarts of a search against the shield, and against twelve leaks of it (``tests.shield.search``)
+search  restarts of a search against the shield, and against twelve leaks of it (``tests.shield.lines``)
 believed  worlds that are corners of what was not received (``tests.shield.corners``)
 inside  worlds drawn from the inside of intervals, behind robust mode (``tests.shield.inside``)
 speed   decisions per second in a batch, and the latency of one decision
@@ -39,20 +39,17 @@ from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import ShieldedDriver
 from ethbrake_marl.shield.step_shield import StepShield, certify
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
-from tests.shield.corners import corners_gate, ranges_gate
+from tests.shield.corners import INSIDE, LISTS, gate
 from tests.shield.inside import inside_gate
 from tests.shield.interface_attack import INTERFACES
 from tests.shield.interference import PLAYS, WRAPPERS, disturbed, wrapped
-from tests.shield.joint_attack import ADVERSARIES as JOINT_ADVERSARIES, joint_attack, scenario_of
-from tests.shield.lines import ADVERSARIES, attack, line
-from tests.shield.sabotage import LEAKS
-from tests.shield.search import search
+from tests.shield.lines import ADVERSARIES, LEAKS, TEAM_ADVERSARIES, attack, line, scenario_of, search
 
 ROOT = Path(__file__).resolve().parents[2]
 TOLERANCE = 1e-9  # m2/s2
 CHUNK = 2_000  # worlds
 CHUNKS = {3: 36, 5: 12}  # of each cell, for a million worlds: lines of five take five times as long
-SLOW_CHUNKS = {"worst_case": 5}  # of a search in every step
+SLOW_CHUNKS = {"most_harmful": 5}  # of a search in every step
 JOINT_CHUNKS = {
     (3, 3): 16,
     (4, 3): 4,
@@ -89,7 +86,7 @@ def joint_chunks(worlds: int) -> Iterator[tuple[str, dict[str, Any]]]:
     """Likewise for teams; 300,000 worlds are 624 chunks."""
     first = 0
     for level, N in JOINT_CHUNKS:
-        for count, hostile, name in product(("first", "total"), ("all", "one"), JOINT_ADVERSARIES):
+        for count, hostile, name in product(("first", "total"), ("all", "one"), TEAM_ADVERSARIES):
             chunks = max(1, round(JOINT_CHUNKS[level, N] * worlds / 300_000))
             for k in range(chunks):
                 size = min(JOINT_CHUNK[level, N], worlds)
@@ -106,11 +103,11 @@ def joint_chunk(
 ) -> dict[str, Any]:
     """One kind of hostile team in some worlds."""
     scenario = scenario_of(level, N)
-    found = joint_attack(
-        scenario, scenario.sample(worlds, seed, first=first).worlds, JOINT_ADVERSARIES[who], hostile=hostile,
+    found = attack(
+        scenario, scenario.sample(worlds, seed, first=first).worlds, TEAM_ADVERSARIES[who], hostile=hostile,
         harm_count=harm_count, cap=cap, seed=first,
     )  # fmt: skip
-    told = _outcome(found.realised, found.bound, found.decisions) | {"accepted": found.accepted}
+    told = _outcome(found.realised, found.bound, found.decisions) | {"accepted": int(found.accepted.sum())}
     other = int((found.realised != found.last_bound).sum()) + found.rises + found.over_cap
     return told | {"above": int((found.realised > found.bound).sum()) + other}
 
@@ -324,7 +321,10 @@ def main() -> int:
         "search": lambda: search_gate(given.restarts, given.seed),
         "interference": lambda: interference_gate(given.interfered, given.seed),
         "joint": lambda: run_chunks(list(joint_chunks(given.joint_worlds)), joint_chunk, given, code),
-        "believed": lambda: corners_gate(given.corner_worlds, given.seed) & ranges_gate(given.range_worlds, given.seed),
+        "believed": lambda: (
+            gate(LISTS, "corners", given.corner_worlds, given.seed)
+            & gate(INSIDE, "interior", given.range_worlds, given.seed)
+        ),
         "interfaces": lambda: run_chunks(list(interface_chunks(given.interface_worlds)), interface_chunk, given, code),
         "bound": lambda: run_chunks(list(bound_chunks(given.worlds)), attack_chunk, given, code),
     }

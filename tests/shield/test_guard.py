@@ -1,4 +1,4 @@
-"""What the engine does is what was certified, to the last step, and what fails changes nothing."""
+"""The guard in the engine: what it does is what was certified, to the last step, and what fails changes nothing."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from gymnasium.wrappers import Autoreset
 
+import ethbrake_marl as eb
+from ethbrake_marl.agents.planner import Refined
 from ethbrake_marl.agents.registry import drive, episode_engine, make_agent
 from ethbrake_marl.engine import STEP, Engine
 from ethbrake_marl.envs.interfaces import EthBrakeVectorEnv, parallel_env
@@ -19,18 +21,20 @@ from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import (
+    HybridAgent,
     HybridShield,
     MovingAtHorizon,
     ShieldedDriver,
     ShieldedEnv,
     ShieldedVectorEnv,
-    StepShield,
     parse_uncertainty,
 )
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
+from tests.fixtures.asked import Asked
 from tests.shield.beyond_horizon import above_later
 
 PAPER = load_scenario("paper-random")
+WORLDS = PAPER.sample(300, 3).worlds
 DRIVE = np.array([1.0])
 
 
@@ -53,14 +57,13 @@ def test_refused_call__one_at_the_first_decision_costs_nothing_later():
     env = HybridShield(parallel_env(), make_agent("e_v2x_bm"), mode="step")
     for seed in range(20):
         env.reset(seed=seed)
-        bound, plan = env.attached.shield.first_bound[0], env.attached.shield.backup.plan
+        shield, told = env.attached.shield, []
         with pytest.raises(InvalidInput, match="unknown agent 'vehicle_9'"):
             env.step({"vehicle_9": np.zeros(1)})
-        assert env.attached.shield.backup.plan is plan and env.attached.shield.running.steps.tolist() == [0]
+        assert env.attached.shield is shield and shield.running.steps.tolist() == [0]
         while env.agents:
-            *_, infos = env.step({"vehicle_2": DRIVE} if seed % 2 else {})
-            assert infos["vehicle_2"]["shield"]["trusted"]
-        assert env.unwrapped.engine.ledger.world_harm("first")[0] <= bound
+            told.append(env.step({"vehicle_2": DRIVE} if seed % 2 else {})[4]["vehicle_2"]["shield"]["trusted"])
+        assert all(told) and env.unwrapped.engine.ledger.world_harm("first")[0] <= shield.first_bound[0]
 
 
 class Cheating(Engine):
@@ -107,22 +110,30 @@ def test_step__what_is_not_certified_is_refused_and_the_worlds_stay_as_they_are(
     assert env.attached.shield is shield and not shield.distrusted.any()
 
 
-@pytest.mark.parametrize("what", [name for name in CHEATS if name != "a step"])
-@pytest.mark.parametrize("interface", ["single", "vector", "sb3"])
+LAST = [name for name in CHEATS if name != "a step"]
+
+
+@pytest.mark.parametrize("what", LAST)
+@pytest.mark.parametrize("interface", ["single", "vector", "sb3", "evaluation"])
 def test_last_step__is_compared_too_whatever_starts_the_next_episode(interface, what):
-    if interface == "single":
-        env, actions = shielded(), DRIVE
-    elif interface == "vector":
-        env, actions = ShieldedVectorEnv(EthBrakeVectorEnv(3, PAPER)), np.ones((3, 1))
-        env.reset(seed=0)
+    actions = np.ones((3, 1), np.float32)
+    if interface == "evaluation":
+        short = PAPER.replace(horizon_s=4.0)  # everything moves to the end
+        driver = ShieldedDriver(make_agent("full_brake"), short)
+        engine, step = episode_engine(short.sample(1, 0).worlds, driver, short, 1), None
     else:
-        env, actions = ShieldedVecEnv(make_sb3_vec_env(PAPER, 3)), np.ones((3, 1), np.float32)
+        env = {
+            "single": lambda: ShieldedEnv(gymnasium.make("EthBrake-v0").unwrapped),
+            "vector": lambda: ShieldedVectorEnv(EthBrakeVectorEnv(3, PAPER)),
+            "sb3": lambda: ShieldedVecEnv(make_sb3_vec_env(PAPER, 3)),
+        }[interface]()
         env.reset()
-    cheat(env.attached.engine, what, last_only=True)
+        engine, step = env.attached.engine, lambda: env.step(DRIVE if interface == "single" else actions)
+    cheat(engine, what, last_only=True)
     with pytest.raises(UncertifiedStep, match=CHEATS[what]):
         for _ in range(100):
-            env.step(actions)
-    assert env.attached.engine.steps.max() > 20
+            engine.step({}) if step is None else step()
+    assert engine.steps.max() > 20
 
 
 @pytest.mark.parametrize("group", [0, 1], ids=["first-impact harm", "total harm"])
@@ -227,24 +238,6 @@ def test_refused__reset_and_step_leave_the_shield_in_its_episode():
     assert [entry.step for entry in log] == sorted({entry.step for entry in log})
 
 
-def test_step_shield__a_copy_goes_on_apart_its_log_included():
-    shield = StepShield(PAPER, 1, logging=True)
-    shield.begin(PAPER.sample(2, 0).worlds, np.arange(2))
-    other = copy.copy(shield)
-    other.decide(np.ones(2))
-    assert (shield.running.steps.tolist(), other.running.steps.tolist()) == ([0, 0], [1, 1])
-    assert (len(shield.log), len(other.log)) == (0, 2)
-    shield.decide(np.full(2, 0.5))
-    assert [entry.proposed for entry in shield.log + other.log] == [0.5, 0.5, 1.0, 1.0]
-
-
-def test_snapshot__is_not_restored_under_a_shield():
-    env = ShieldedVecEnv(make_sb3_vec_env(PAPER, 2))
-    env.reset()
-    with pytest.raises(InvalidInput, match="a shield stands in this engine"):
-        env.env_method("restore", env.venv.snapshot())
-
-
 def test_threads__no_episode_gets_above_its_bound():
     env = ShieldedVectorEnv(EthBrakeVectorEnv(4, PAPER, autoreset_mode="NextStep"))
     env.reset(seed=0)
@@ -268,17 +261,6 @@ def test_threads__no_episode_gets_above_its_bound():
     shield, engine = env.attached.shield, env.attached.engine
     assert failures == [] and shield.running.steps.tolist() == engine.steps.tolist()
     assert (engine.ledger.world_harm("first") <= shield.first_bound).all()
-
-
-def test_evaluation__compares_the_last_step_too():
-    scenario = PAPER.replace(horizon_s=2.0)  # everything moves to the end
-    worlds = scenario.sample(1, 0).worlds
-    engine = episode_engine(worlds, ShieldedDriver(make_agent("full_brake"), scenario), scenario, 1)
-    cheat(engine, "speed", last_only=True)
-    with pytest.raises(UncertifiedStep, match=CHEATS["speed"]):
-        while not engine.ended.all():
-            engine.step({})
-    assert engine.steps[0] > 10 and not engine.guarded.shield.running.finished.any()
 
 
 class DrivesOff:
@@ -322,19 +304,73 @@ def test_horizon__what_still_moves_then_is_told_and_warned_of_once():
     assert info["shield"]["settles"] is True
 
 
-def test_horizon__settles_says_what_the_plan_comes_to_in_the_engine():
-    worlds = PAPER.sample(60, 5).worlds
-    scenario = PAPER.replace(horizon_s=4.2)
-    shield = StepShield(scenario, 1)
-    shield.begin(worlds, np.arange(60))
-    episodes = drive(worlds, ShieldedDriver(make_agent("e_v2x_bm"), scenario), scenario, 1)
-    rests = (episodes.final.speeds_mps == 0.0).all(axis=1)
-    assert rests.tolist() == shield.settles.tolist() and 0 < rests.sum() < 60
-
-
 def test_horizon__beyond_it_the_bound_says_nothing():
     now, later = above_later("coast", 200)
     assert now == 0.0 and later > 0.5
+
+
+# Mode episode: never worse than its baseline, in any world, and as predicted.
+
+
+def harm(agent, harm_count="first", worlds=WORLDS):
+    return drive(worlds, agent, PAPER, 1).ledger.world_harm(harm_count)
+
+
+class LateBrake:
+    """Coasts until 0.9 s, then brakes fully: no constant deceleration, so sometimes better than any."""
+
+    name = "late_brake"
+
+    def act(self, worlds, vehicle):
+        return np.where(worlds.time_s < 0.9, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle])
+
+
+def memory_of(agent):
+    return Asked(agent).begin(WORLDS, 1).memory
+
+
+@pytest.mark.parametrize("harm_count", ["first", "total"])
+def test_episode__is_never_worse_than_either_part(harm_count):
+    hybrid = HybridAgent(LateBrake(), PAPER, harm_count=harm_count)
+    realised, memory = harm(hybrid, harm_count), memory_of(hybrid)
+    alone, baseline = harm(LateBrake(), harm_count), harm(make_agent("e_v2x_bm", harm_count=harm_count), harm_count)
+    assert (realised <= np.minimum(alone, baseline)).all()
+    assert realised.tolist() == memory["predicted_harm"].tolist()
+    assert memory["chosen_policy"].tolist() == (alone <= baseline).tolist()
+    assert 0 < memory["chosen_policy"].sum() < WORLDS.n
+
+
+def test_episode__takes_a_refined_policy_at_its_word():
+    hybrid = HybridAgent(Refined(make_agent("constant:5"), PAPER, tries=6), PAPER)
+    realised, plain = harm(hybrid), harm(HybridAgent(make_agent("constant:5"), PAPER))
+    assert realised.tolist() == memory_of(hybrid)["predicted_harm"].tolist()
+    assert (realised <= plain).all() and (realised < plain).any()
+
+
+def test_episode__the_pairwise_bound_is_exceeded_in_the_same_physics():
+    hybrid = HybridAgent(make_agent("constant:0.5"), PAPER, bound="pairwise")
+    assert (harm(hybrid) > memory_of(hybrid)["bound_harm"] + 1.0).mean() > 0.3
+
+
+def test_episode__of_some_rows_leaves_the_others_alone():
+    hybrid = Asked(HybridAgent(make_agent("full_brake"), PAPER)).begin(WORLDS, 1)
+    expected = hybrid.bound_harm.copy()
+    hybrid.begin(WORLDS.take([7]), 1, np.array([2]))
+    expected[2] = expected[7]
+    assert hybrid.bound_harm.tolist() == expected.tolist()
+
+
+def test_episode__applies_the_certified_strategy_whatever_is_proposed():
+    shielded = HybridShield(parallel_env(), make_agent("full_brake"))
+    for seed in range(6):
+        shielded.reset(seed=seed)
+        while shielded.agents:
+            _, _, _, _, infos = shielded.step({"vehicle_2": np.array([1.0])})
+            told = infos["vehicle_2"]["shield"]
+            assert told["proposed_action"] == 1.0 and told["chosen_action"] <= 0.0
+            assert infos["vehicle_2"]["chosen_action"] == pytest.approx(told["chosen_action"], abs=1e-12)
+        realised = shielded.unwrapped.engine.ledger.world_harm("first")[0]
+        assert realised == pytest.approx(min(told["policy_harm"], told["bound_harm"]), abs=1e-9)
 
 
 class Counting:
@@ -351,7 +387,8 @@ class Counting:
 
 
 @pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.MovingAtHorizon")
-def test_episode_mode__a_refused_call_does_not_ask_the_policy_again():
+def test_episode__neither_a_prediction_nor_a_refused_call_asks_the_policy_again():
+    assert (HybridAgent(Counting(), PAPER).begin(WORLDS, 1, {})["policy"] == 0.0).all()
     harms = []
     for refused in (0, 3):
         env = HybridShield(parallel_env(), Counting())
@@ -366,3 +403,23 @@ def test_episode_mode__a_refused_call_does_not_ask_the_policy_again():
     env.reset(seed=4)
     *_, infos = env.unwrapped.step({"vehicle_2": np.zeros(1)})
     assert infos["vehicle_2"]["chosen_action"] == np.float32(env.attached.infos()[0]["chosen_action"]) < 0.0
+
+
+@pytest.mark.parametrize("believed", [False, True])
+def test_policy_with_a_memory__is_asked_once_per_decision_whoever_proposes(believed):
+    asked = []
+
+    def remembering(observation, state):
+        asked.append(float(state[0, 0]))
+        return -np.minimum(state, 10.0) / 10.0, state + 1.0
+
+    policy = eb.policy_agent(remembering, initial_state=lambda n: np.zeros((n, 1)))
+    env = HybridShield(parallel_env(), policy, mode="step", believed=believed)
+    env.reset(seed=7)
+    for actions in ({"vehicle_2": [-0.3]}, {}, {"vehicle_2": [-0.9]}, {"vehicle_2": [1.0]}):
+        env.step(actions)
+    assert env.attached.memory.policies[1]["steps"].tolist() == [4]
+    with pytest.raises(InvalidInput):
+        env.step({"vehicle_2": [-0.3], "vehicle_9": [0.0]})
+    env.step({})
+    assert env.attached.memory.policies[1]["steps"].tolist() == [5]
