@@ -1,14 +1,30 @@
-"""Random worlds from raw counter-based bits: the same doubles on any machine and with any version of numpy."""
+"""Random worlds from raw counter-based bits, whole runs of them, and the measured errors of what came out.
+
+The worlds are the same doubles on any machine and with any version of numpy.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import fields, replace
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.physics import Floats, Worlds, make_worlds
+from ethbrake_marl.physics import Bools, Floats, Impacts, Worlds, advance, make_worlds
+from ethbrake_marl.physics.kernel import BOUND
+from tests.reference.tolerances import ENERGY_EPS, EPS, FEW_IMPACTS
 
 CAPACITY_MPS2 = 8.0
+
+
+def line(gaps_m: Any, speeds_mps: Any, **settings: Any) -> Worlds:
+    """Vehicles of 1 t that act at once and do not bounce, unless the settings say otherwise."""
+    usual = {
+        "braking_capacity_mps2": 16.0, "driving_capacity_mps2": 16.0, "latency_s": 0.0, "mass_t": 1.0,
+        "restitution": 0.0, "speed_limit_mps": 64.0,
+    }  # fmt: skip
+    return make_worlds(gaps_m, speeds_mps, **{**usual, **settings})
 
 
 class Batch(NamedTuple):
@@ -55,6 +71,13 @@ def driving_lines(key: int, n: int, N: int, *, drive: bool = True) -> Batch:
     return Batch(worlds, command)
 
 
+def place_ahead(batch: Batch, key: int, low: float = 0.2, high: float = 40.0) -> Batch:
+    """The same lines with an obstacle ahead, touching in a tenth of them."""
+    draws = Draws(key)
+    gap = draws.uniform(low, high, (batch.worlds.n,)) * draws.choice([1.0] * 9 + [0.0], (batch.worlds.n,))
+    return Batch(replace(batch.worlds, obstacle_gap_m=gap), batch.command)
+
+
 def touching_lines(key: int, n: int, N: int, *, heaviest_ratio: float = 1.0) -> Batch:
     """Lines in which most pairs touch, at speeds of their own: many simultaneous impacts at t = 0."""
     draws = Draws(key)
@@ -70,3 +93,198 @@ def touching_lines(key: int, n: int, N: int, *, heaviest_ratio: float = 1.0) -> 
         restitution=draws.choice([0.0, 0.1, 0.5, 0.9, 1.0], (n,)),
     )
     return Batch(worlds, np.zeros((n, N)))
+
+
+# ---------------------------------------------------------------- where rounding rules
+
+MOST_ULPS = 3.0
+
+
+def nearly_joined(key: int, n: int, N: int, *, obstacle: bool = False) -> Worlds:
+    """Lines that touch throughout, at one speed but for a few units in the last place, masses from 0.05 to 100 t.
+
+    With an ``obstacle`` they touch that too, and only these units are left of their speeds.
+    """
+    draws = Draws(key)
+    speed = 2.0 ** draws.uniform(-10.0, 5.0, (n, 1))
+    ulps = np.rint(draws.uniform(-MOST_ULPS, MOST_ULPS, (n, N))) * np.spacing(speed)
+    worlds = make_worlds(
+        np.zeros((n, N - 1)),
+        speed + ulps,
+        braking_capacity_mps2=CAPACITY_MPS2,
+        driving_capacity_mps2=CAPACITY_MPS2,
+        latency_s=0.0,
+        mass_t=10.0 ** draws.uniform(-1.3, 2.0, (n, N)),
+        restitution=draws.choice([0.0, 0.1, 0.3, 1.0], (n,)),
+    )
+    return replace(worlds, speeds_mps=ulps, obstacle_gap_m=np.zeros(n)) if obstacle else worlds
+
+
+def thrown_lines(key: int, n: int, N: int) -> Batch:
+    """Lines of any masses and restitution, late leaders among them, against an obstacle 10 to 40 m ahead."""
+    draws = Draws(key)
+    capacity = draws.uniform(4.0, 9.0, (n, N))
+    worlds = make_worlds(
+        draws.uniform(1.0, 5.0, (n, N - 1)) * draws.choice([1.0] * 9 + [0.0], (n, N - 1)),
+        draws.uniform(15.0, 30.0, (n, N)),
+        braking_capacity_mps2=capacity,
+        driving_capacity_mps2=4.0,
+        latency_s=draws.uniform(0.0, 1.5, (n, N)),
+        mass_t=10.0 ** draws.uniform(-1.3, 2.0, (n, N)),
+        restitution=draws.choice([0.0, 0.1, 0.3, 0.6], (n,)),
+        obstacle_gap_m=draws.uniform(10.0, 40.0, (n,)),
+    )
+    command = np.maximum(draws.uniform(-12.0, 4.0, (n, N)), -capacity)
+    return Batch(worlds, command)
+
+
+# ---------------------------------------------------------------- whole runs, in one piece and in several
+
+HORIZON_S = 6.0
+HARMS = [f.name for f in fields(Impacts) if f.name != "rows"]
+
+
+def once(batch: Batch) -> tuple[Worlds, Impacts]:
+    """The whole run in one piece, with its list of impacts."""
+    return advance(batch.worlds, batch.command, until_s=HORIZON_S, record=True)
+
+
+def state_bytes(worlds: Worlds, impacts: Impacts) -> tuple[bytes, ...]:
+    """Every bit of a result."""
+    columns = [getattr(worlds, f.name) for f in fields(worlds)[1:]] + [getattr(impacts, name) for name in HARMS]
+    return tuple(column.tobytes() for column in columns)
+
+
+def relative_changes(mine: Worlds, theirs: Worlds, total_harm: Floats, other_harm: Floats) -> Floats:
+    """Largest change of a world's gaps, speeds and harm, relative to at least 100 m, 30 m/s, 900 m2/s2, [n]."""
+    worst = np.zeros(mine.n)
+    parts = ((mine.gaps_m, theirs.gaps_m, 100.0), (mine.speeds_mps, theirs.speeds_mps, 30.0))
+    for one, other, size in (*parts, (total_harm, other_harm, 900.0)):
+        scale = np.maximum(np.abs(other).max(axis=1), size)
+        worst = np.maximum(worst, np.abs(one - other).max(axis=1) / scale)
+    return worst
+
+
+class Split(NamedTuple):
+    """What cutting a run at random times changed; arrays [n]."""
+
+    error: Floats  # relative_changes
+    few: Bools  # at most FEW_IMPACTS impacts
+    other: Bools  # some pair has another number of impacts
+
+
+def split_errors(N: int, n: int, cuts: int, key: int) -> Split:
+    """Whole runs against the same runs cut at random times."""
+    batch = driving_lines(key, n, N)
+    whole, impacts = once(batch)
+    edges = np.sort(np.random.default_rng(cuts).uniform(0.0, HORIZON_S, (cuts, n)), axis=0)
+    edges[-1], world, total, count = HORIZON_S, batch.worlds, np.zeros(whole.gaps_m.shape), np.zeros(whole.gaps_m.shape)
+    for edge in edges:
+        world, part = advance(world, batch.command, until_s=edge)
+        total, count = total + part.total_harm, count + part.count
+    error = relative_changes(world, whole, total, impacts.total_harm)
+    return Split(error, _few(impacts), (count != impacts.count).any(axis=1))
+
+
+def last_digit_errors(N: int, n: int, key: int) -> Split:
+    """The same runs, uncut, against those whose initial gaps have another last digit: what doubles can know at all."""
+    batch = driving_lines(key, n, N)
+    whole, impacts = once(batch)
+    gaps = batch.worlds.gaps_m
+    moved = replace(batch.worlds, gaps_m=np.where(gaps > 0.0, np.nextafter(gaps, np.inf), gaps))
+    other, changed = once(Batch(moved, batch.command))
+    error = relative_changes(other, whole, changed.total_harm, impacts.total_harm)
+    return Split(error, _few(impacts), (changed.count != impacts.count).any(axis=1))
+
+
+def _few(impacts: Impacts) -> Bools:
+    few: Bools = impacts.count.sum(axis=1) <= FEW_IMPACTS
+    return few
+
+
+# ---------------------------------------------------------------- measured errors of an impact, in eps
+
+Wide = np.longdouble
+
+
+def rounds(impacts: Impacts) -> Floats:
+    """How many rounds of impacts each world had at one instant, at least 1, [n]."""
+    return np.maximum(impacts.count.max(axis=1), 1).astype(np.float64)
+
+
+def momentum_eps(before: Worlds, after: Worlds) -> Floats:
+    """Change of momentum in eps of ``sum m max(|v|, |v+|)``, [n]."""
+    mass = before.vehicles.mass_t.astype(Wide)
+    change = mass * (after.speeds_mps.astype(Wide) - before.speeds_mps)
+    scale = mass * np.maximum(np.abs(before.speeds_mps), np.abs(after.speeds_mps))
+    return np.asarray(np.abs(change.sum(axis=1)) / scale.sum(axis=1) / EPS, np.float64)
+
+
+def energy_rise_eps(before: Worlds, after: Worlds) -> Floats:
+    """Rise of kinetic energy (over ground) in eps of the energy before, [n]; negative where energy was lost."""
+    mass = before.vehicles.mass_t.astype(Wide)
+    was = (mass * before.speeds_mps.astype(Wide) ** 2).sum(axis=1)
+    now = (mass * after.speeds_mps.astype(Wide) ** 2).sum(axis=1)
+    return np.asarray((now - was) / np.where(was > 0, was, 1) / EPS, np.float64)
+
+
+def restitution_eps(before: Worlds, after: Worlds) -> Floats:
+    """Two vehicles: error of the speed at which they separate, in eps of the larger speed, for those that met, [k]."""
+    front, rear = before.speeds_mps[:, 0].astype(Wide), before.speeds_mps[:, 1].astype(Wide)
+    closing = rear - front
+    e = np.where(closing >= BOUND.PLASTIC_SPEED_MPS, before.vehicles.restitution, 0.0)
+    separation = after.speeds_mps[:, 0].astype(Wide) - after.speeds_mps[:, 1]
+    largest = np.maximum(np.abs(before.speeds_mps).max(axis=1), np.abs(after.speeds_mps).max(axis=1))
+    met = (closing > 0) & (before.gaps_m[:, 0] == 0.0)
+    return np.asarray((np.abs(separation - e * closing) / largest / EPS)[met], np.float64)
+
+
+# ---------------------------------------------------------------- a batch in many short steps
+
+STEADY_MPS = 1e-12  # a step is steady when the speed at its middle is this near to the mean of its ends
+
+
+class Watched:
+    """Random lines in steps of two halves.
+
+    ``worst``: largest difference, in steady steps without impacts, between a stored gap and the one that follows from
+    the speeds alone (by Simpson's rule, exact there, and never clipped at 0), or its depth below 0. [m]
+    """
+
+    def __init__(self, key: int, n: int, N: int, *, drive: bool, steps: int = 300, horizon_s: float = 6.0) -> None:
+        self.start, self.command = driving_lines(key, n, N, drive=drive)
+        self.states, self.impacts, self.worst, self.checked = [self.start], [], 0.0, 0
+        edges = np.linspace(0.0, horizon_s, 2 * steps + 1)
+        for a, b in zip(edges[1::2], edges[2::2], strict=True):
+            middle, first = advance(self.states[-1], self.command, until_s=a)
+            end, second = advance(middle, self.command, until_s=b)
+            self.impacts.append((first.count + second.count).sum(axis=1))
+            self._check_gaps(self.states[-1], middle, end)
+            self.states.append(end)
+
+    def _check_gaps(self, a: Worlds, b: Worlds, c: Worlds) -> None:
+        bend = np.abs(a.speeds_mps - 2.0 * b.speeds_mps + c.speeds_mps).max(axis=1)
+        steady: Bools = (bend < STEADY_MPS) & (self.impacts[-1] == 0)
+        opening = [w.speeds_mps[:, :-1] - w.speeds_mps[:, 1:] for w in (a, b, c)]
+        span = (c.time_s - a.time_s)[:, None]
+        unclipped = a.gaps_m + span * (opening[0] + 4.0 * opening[1] + opening[2]) / 6.0
+        self.worst = max(self.worst, float(np.abs(unclipped - c.gaps_m)[steady].max()), float(-unclipped[steady].min()))
+        self.checked += int(steady.sum())
+
+    def energy_rises(self) -> int:
+        """Steps in which the energy of a line that nobody drives rose: by more than ENERGY_EPS for each impact."""
+        steps = zip(pairwise(self.states), self.impacts, strict=True)
+        return sum(int((energy_rise_eps(a, b) > ENERGY_EPS * np.maximum(k, 1)).sum()) for (a, b), k in steps)
+
+    def unexplained_negative_speeds(self) -> int:
+        """Negative speeds that no bounce-back explains, or that brakes do not bring towards 0."""
+        found = 0
+        for (a, b), impacts in zip(pairwise(self.states), self.impacts, strict=True):
+            back = b.speeds_mps < 0.0
+            bounced = np.zeros(back.shape, bool)
+            bounced[:, :-1] |= b.pair_hit
+            bounced[:, 1:] |= b.pair_hit
+            bounced &= b.vehicles.restitution[:, None] > 0.0
+            sinking = (impacts == 0)[:, None] & (b.speeds_mps < a.speeds_mps - STEADY_MPS)
+            found += int((back & (~bounced | sinking)).sum())
+        return found

@@ -1,227 +1,376 @@
-"""The exact advance on cases that a person can compute by hand."""
+"""The exact advance: numbers by hand, where doubles end, threads, and forecasts by the same physics."""
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
-import re
-from dataclasses import replace
+import math
+from typing import Any
 
 import numba
 import numpy as np
 import pytest
 
-from ethbrake_marl.errors import InvalidInput, PhysicsError
-from ethbrake_marl.physics import Worlds, advance, kernel, make_worlds
+from ethbrake_marl.errors import PhysicsError
+from ethbrake_marl.physics import Impacts, Worlds, advance, compiling, forecast, kernel
 from ethbrake_marl.physics.compiling import by_parts
+from ethbrake_marl.scenario import load_scenario
+from tests.physics.random_worlds import Draws, driving_lines, line, place_ahead
+
+Events = list[tuple[float, int, float]]
 
 
-def line(gaps, speeds, *, mass=1.0, e=0.0, latency=0.0, limit=100.0, braking=10.0, driving=10.0) -> Worlds:
-    return make_worlds(
-        gaps,
-        speeds,
-        braking_capacity_mps2=braking,
-        driving_capacity_mps2=driving,
-        latency_s=latency,
-        mass_t=mass,
-        restitution=e,
-        speed_limit_mps=limit,
-    )
+def run(worlds: Worlds, command: Any, *until_s: float) -> tuple[Worlds, list[Impacts]]:
+    """Advance to each of these times."""
+    parts = []
+    for time in until_s:
+        worlds, impacts = advance(worlds, command, until_s=time, record=True)
+        parts.append(impacts)
+    return worlds, parts
 
 
-def test_free_motion__speed_and_gap_are_quadratic_in_time():
-    after, impacts = advance(line([10.0], [10.0, 8.0]), [-2.0, -1.0], 2.0)
-    assert after.speeds_mps.tolist() == [[6.0, 6.0]]
-    assert after.gaps_m.tolist() == [[12.0]]  # 10 - (-2) * 2 - 1 * 2
-    assert impacts.count.sum() == 0
-    assert after.time_s.tolist() == [2.0]
+def events(parts: list[Impacts]) -> Events:
+    """(time, pair, closing speed) of every impact."""
+    columns = [(part.rows.time_s, part.rows.pair, part.rows.closing_speed_mps) for part in parts]
+    return [(float(t), int(p), float(w)) for each in columns for t, p, w in zip(*each, strict=True)]
 
 
-def test_braking__stops_at_standstill_and_holds():
-    after, _ = advance(line([50.0], [4.0, 4.0]), [-2.0, -4.0], 10.0)
-    assert after.speeds_mps.tolist() == [[0.0, 0.0]]
-    assert after.gaps_m[0, 0] == 50.0 + 4.0 - 2.0
+# ---------------------------------------------------------------- by hand, in numbers that doubles hold
+
+# The line, its command, the end, (time, pair, closing speed) of each impact, and columns of the state at the end.
+# Pair -1 is Vehicle 1 and the obstacle.
+CASES: dict[str, tuple[Worlds, Any, float, Events, dict[str, Any]]] = {
+    "free motion is quadratic in time": (
+        line([10.0], [10.0, 8.0]), [-2.0, -1.0], 2.0, [], {"speeds_mps": [6.0, 6.0], "gaps_m": [12.0]},
+    ),
+    "a segment of no length changes nothing": (
+        line([6.0], [3.0, 8.0]), [-4.0, 4.0], 0.0, [],
+        {"speeds_mps": [3.0, 8.0], "gaps_m": [6.0], "command_mps2": [-4.0, 4.0]},
+    ),
+    "brakes end at standstill and hold": (  # 2 m and 4 m
+        line([50.0], [4.0, 4.0]), [-4.0, -2.0], 10.0, [], {"speeds_mps": [0.0, 0.0], "gaps_m": [48.0]},
+    ),
+    "a latency ends within the segment": (  # coasts 0.75 s, brakes 1 s
+        line([50.0], [8.0, 8.0], latency_s=[0.0, 0.75]), [-2.0, -4.0], 1.75, [],
+        {"speeds_mps": [4.5, 4.0], "gaps_m": [50.0 + 8.0 * 1.75 - 1.75**2 - 12.0]},
+    ),
+    "a latency that ends with the segment is in force after it": (
+        line([8.0], [4.0, 4.0], latency_s=[0.5, 0.75]), [-4.0, -4.0], 0.5, [],
+        {"speeds_mps": [4.0, 4.0], "command_mps2": [-4.0, 0.0]},
+    ),
+    "an onset at the moment of contact comes too late": (
+        line([6.0], [0.0, 8.0], latency_s=[0.0, 0.75]), [0.0, -16.0], 0.75, [(0.75, 0, 8.0)],
+        {"speeds_mps": [4.0, 4.0], "command_mps2": [0.0, -16.0]},
+    ),
+    "an onset releases the front vehicle": (  # joined at 4 m/s; from 0.5 s on the front drives away at 2
+        line([0.0], [4.0, 4.0], latency_s=[0.5, 0.0]), [2.0, 0.0], 1.5, [],
+        {"speeds_mps": [6.0, 4.0], "gaps_m": [1.0]},
+    ),
+    "an onset at standstill holds": (  # the rear stops at 1 s; the front, from 1 s on, brakes at rest
+        line([8.0], [0.0, 4.0], latency_s=[1.0, 0.0]), [-4.0, -4.0], 3.0, [],
+        {"speeds_mps": [0.0, 0.0], "gaps_m": [6.0]},
+    ),
+    "an impact exchanges speeds as in the paper": (  # v1+ = 3/4 * 1.5 * 8, v2+ = 8 - 1/4 * 1.5 * 8
+        line([6.0], [0.0, 8.0], mass_t=[1.0, 3.0], restitution=0.5), 0.0, 1.0, [(0.75, 0, 8.0)],
+        {"speeds_mps": [9.0, 5.0], "gaps_m": [1.0], "pair_hit": [True]},
+    ),
+    "a contact at the start happens at once": (
+        line([0.0], [0.0, 8.0]), 0.0, 0.0, [(0.0, 0, 8.0)], {"speeds_mps": [4.0, 4.0]},
+    ),
+    "standstill exactly at the bumper is a touch": (  # 8 m/s, braking at 4: 2 s and 8 m
+        line([8.0], [0.0, 8.0], restitution=0.5), [-4.0, -4.0], 4.0, [],
+        {"speeds_mps": [0.0, 0.0], "gaps_m": [0.0], "pair_hit": [False]},
+    ),
+    "standstill of both at the moment they touch": (  # 2 m and 4 m in 1 s
+        line([2.0], [4.0, 8.0], restitution=0.5), [-4.0, -8.0], 3.0, [], {"speeds_mps": [0.0, 0.0], "gaps_m": [0.0]},
+    ),
+    "equal speeds at the bumper are a touch": (  # w^2 = 2 q g
+        line([4.0], [10.0, 14.0]), [0.0, -2.0], 2.0, [], {"speeds_mps": [10.0, 10.0], "gaps_m": [0.0]},
+    ),
+    "standstill of the front vehicle when it is struck": (  # it stops after 1 s and 2 m; 8 m in that second
+        line([6.0], [4.0, 8.0]), [-4.0, 0.0], 1.0, [(1.0, 0, 8.0)], {"speeds_mps": [4.0, 4.0]},
+    ),
+    "thrown back, its brakes end the negative speed": (  # P = 2: front 3, rear -1, at rest after 0.5 s
+        line([0.0], [0.0, 8.0], mass_t=[3.0, 1.0], restitution=0.5), [0.0, -2.0], 2.0, [(0.0, 0, 8.0)],
+        {"speeds_mps": [3.0, 0.0], "gaps_m": [6.25]},
+    ),
+    "thrown back, it coasts on": (
+        line([0.0], [0.0, 8.0], mass_t=[3.0, 1.0], restitution=0.5), 0.0, 2.0, [(0.0, 0, 8.0)],
+        {"speeds_mps": [3.0, -1.0], "gaps_m": [8.0]},
+    ),
+    "thrown back, it drives forward again": (  # from -1 at +2: stands after 0.5 s
+        line([0.0], [0.0, 8.0], mass_t=[3.0, 1.0], restitution=0.5), [0.0, 2.0], 2.0, [(0.0, 0, 8.0)],
+        {"speeds_mps": [3.0, 3.0], "gaps_m": [4.0]},
+    ),
+    "a drive ends at the limit": (
+        line([50.0], [8.0, 0.0], speed_limit_mps=10.0), [2.0, 0.0], 3.0, [],
+        {"speeds_mps": [10.0, 0.0], "gaps_m": [79.0]},
+    ),
+    "the limit is reached at the moment of contact": (  # 4 to 8 m/s at 4 in 1 s, 6 m
+        line([6.0], [0.0, 4.0], speed_limit_mps=8.0), [0.0, 4.0], 1.0, [(1.0, 0, 8.0)], {"speeds_mps": [4.0, 4.0]},
+    ),
+    "the limit of the rear vehicle ends its push": (  # +2 each from 4 to 6 after 1 s
+        line([0.0], [4.0, 4.0], speed_limit_mps=[64.0, 6.0]), [0.0, 4.0], 3.0, [],
+        {"speeds_mps": [6.0, 6.0], "gaps_m": [0.0]},
+    ),
+    "a driver at its limit holds it against a braking front vehicle": (
+        line([0.0], [8.0, 8.0], speed_limit_mps=[64.0, 8.0]), [-2.0, 6.0], 2.0, [], {"speeds_mps": [8.0, 8.0]},
+    ),
+    "a driver at its limit gives all it has and no more": (  # (-10 + 6) / 2
+        line([0.0], [8.0, 8.0], speed_limit_mps=[64.0, 8.0]), [-10.0, 6.0], 2.0, [], {"speeds_mps": [4.0, 4.0]},
+    ),
+    "struck beyond its limit it coasts": (
+        line([0.0], [8.0, 16.0], speed_limit_mps=[8.0, 64.0]), [4.0, 0.0], 2.0, [(0.0, 0, 8.0)],
+        {"speeds_mps": [12.0, 12.0]},
+    ),
+    "pushed as hard as it holds it stands": (
+        line([0.0], [0.0, 0.0], mass_t=2.0), [-4.0, 4.0], 1.0, [], {"speeds_mps": [0.0, 0.0]},
+    ),
+    "pushed harder than it holds it moves": (  # (2 * 6 - 8) / 4
+        line([0.0], [0.0, 0.0], mass_t=2.0), [-4.0, 6.0], 1.0, [], {"speeds_mps": [1.0, 1.0]},
+    ),
+    "two braked members hold together": (  # 8 + 4 kN against 12
+        line([0.0, 0.0], [0.0] * 3, mass_t=[4.0, 1.0, 3.0]), [-2.0, -4.0, 4.0], 2.0, [], {"speeds_mps": [0.0] * 3},
+    ),
+    "two braked members give way together": (  # (24 - 12) / 8
+        line([0.0, 0.0], [0.0] * 3, mass_t=[4.0, 1.0, 3.0]), [-2.0, -4.0, 8.0], 2.0, [], {"speeds_mps": [3.0] * 3},
+    ),
+    "a moving block stops and then holds": (  # 2 t at -4 and 2 t at +2: block -1
+        line([0.0], [4.0, 4.0], mass_t=2.0), [-4.0, 2.0], 9.0, [], {"speeds_mps": [0.0, 0.0], "gaps_m": [0.0]},
+    ),
+    "a block shares by mass": (  # 1 t at -8 before 3 t at 0
+        line([0.0], [8.0, 8.0], mass_t=[1.0, 3.0]), [-8.0, 0.0], 1.0, [], {"speeds_mps": [6.0, 6.0]},
+    ),
+    "only the pressing part of a line is a block": (  # (-4 * 1 + 4 * 3) / 4
+        line([0.0, 0.0], [8.0] * 3, mass_t=[1.0, 1.0, 3.0]), [4.0, -4.0, 4.0], 1.0, [],
+        {"speeds_mps": [12.0, 10.0, 10.0], "gaps_m": [1.0, 0.0]},
+    ),
+    "two pairs apart from each other meet at one instant": (
+        line([6.0, 99.0, 6.0], [0.0, 8.0, 0.0, 8.0]), 0.0, 0.75, [(0.75, 0, 8.0), (0.75, 2, 8.0)],
+        {"speeds_mps": [4.0] * 4},
+    ),
+    "neighbouring pairs meet at one instant, in no order": (  # P = (4 + 8) / 4; v+ = 4.5 - 0.5 v
+        line([2.0, 6.0], [0.0, 2.0, 8.0], mass_t=[1.0, 2.0, 1.0], restitution=0.5), 0.0, 1.0,
+        [(1.0, 0, 2.0), (1.0, 1, 6.0)], {"speeds_mps": [4.5, 3.5, 0.5]},
+    ),
+    "the rear of three is struck: the law takes all three": (  # P = 9 / 3: v+ = 4.5 - 0.5 v
+        line([0.0, 0.0], [0.0, 0.0, 9.0], restitution=0.5), 0.0, 0.0, [(0.0, 1, 9.0)], {"speeds_mps": [4.5, 4.5, 0.0]},
+    ),
+    "a pair that opens is left out": (  # P = 6, 6, 4
+        line([0.0, 0.0], [4.0, 8.0, 4.0], restitution=0.5), 0.0, 0.0, [(0.0, 0, 4.0)], {"speeds_mps": [7.0, 5.0, 4.0]},
+    ),
+    "a second round at the same instant counts again": (  # P = 22 / 4: 8.25, 4.25, 4.75; then 2 and 3 at 0.5
+        line([0.0, 0.0], [0.0, 8.0, 7.0], mass_t=[1.0, 1.0, 2.0], restitution=0.5), 0.0, 0.0,
+        [(0.0, 0, 8.0), (0.0, 1, 0.5)], {"speeds_mps": [8.25, 4.75, 4.5]},
+    ),
+    "bounces without loss go on at a steady pace": (  # every flight lasts 2 * 8 / 4 s
+        line([0.0], [0.0, 8.0], mass_t=[2.0**60, 1.0], restitution=1.0), [-16.0, 4.0], 15.0,
+        [(0.0, 0, 8.0), (4.0, 0, 8.0), (8.0, 0, 8.0), (12.0, 0, 8.0)], {"speeds_mps": [0.0, 4.0]},
+    ),
+    "an obstacle throws back": (  # 10 m at 20 m/s; v+ = -0.5 * 20; 5 m away again
+        line([50.0], [20.0, 0.0], mass_t=[3.0, 1.0], restitution=0.5, obstacle_gap_m=10.0), 0.0, 1.0, [(0.5, -1, 20.0)],
+        {"speeds_mps": [-10.0, 0.0], "gaps_m": [55.0], "obstacle_gap_m": 5.0, "obstacle_hit": True},
+    ),
+    "an obstacle is struck again": (  # thrown back at 5, its motor turns it round
+        line([99.0], [10.0, 0.0], restitution=0.5, obstacle_gap_m=0.0), [4.0, 0.0], 3.0,
+        [(0.0, -1, 10.0), (2.5, -1, 5.0)], {"speeds_mps": [-0.5, 0.0]},
+    ),
+    "an obstacle takes 2 a g off the squared speed": (  # 400 - 12 * 28
+        line([99.0], [20.0, 0.0], restitution=0.0, obstacle_gap_m=28.0), [-6.0, 0.0], 8.0, [(2.0, -1, 8.0)],
+        {"speeds_mps": [0.0, 0.0], "obstacle_gap_m": 0.0},
+    ),
+    "an obstacle out of the way of the brakes is not met": (  # 33.33 m
+        line([99.0], [20.0, 0.0], obstacle_gap_m=33.5), [-6.0, 0.0], 8.0, [], {"obstacle_hit": False},
+    ),
+    "an obstacle below the plastic speed ends the motion": (
+        line([99.0], [0.04, 0.0], restitution=0.5, obstacle_gap_m=0.0), 0.0, 1.0, [(0.0, -1, 0.04)],
+        {"speeds_mps": [0.0, 0.0], "obstacle_hit": True},
+    ),
+    "an obstacle at the touch speed is not struck": (
+        line([99.0], [1e-5, 0.0], restitution=0.5, obstacle_gap_m=0.0), 0.0, 1.0, [],
+        {"speeds_mps": [0.0, 0.0], "obstacle_hit": False},
+    ),
+    "an obstacle and who leans on it stay when struck": (  # P of (0, 10) bounded by 0 is (0, 0): v+ = -e v-
+        line([0.0], [0.0, 10.0], mass_t=[1.0, 100.0], restitution=0.5, obstacle_gap_m=0.0), 0.0, 0.0, [(0.0, 0, 10.0)],
+        {"speeds_mps": [0.0, -5.0], "obstacle_hit": False},
+    ),
+    "an obstacle ends a plastic chain in one round": (
+        line([0.0, 0.0], [6.0, 8.0, 10.0], obstacle_gap_m=0.0), 0.0, 0.0,
+        [(0.0, -1, 6.0), (0.0, 0, 2.0), (0.0, 1, 2.0)], {"speeds_mps": [0.0] * 3},
+    ),
+    **{
+        f"an obstacle holds a line that presses with {command}": (
+            line([0.0, 0.0], [0.0] * 3, restitution=0.5, obstacle_gap_m=0.0), command, 5.0, [],
+            {"speeds_mps": [0.0] * 3, "gaps_m": [0.0] * 2, "obstacle_gap_m": 0.0, "obstacle_hit": False},
+        )
+        for command in ([6.0, 6.0, 6.0], [-6.0, 6.0, 6.0], [0.0, -6.0, 6.0], [0.0, 0.0, 6.0])
+    },
+}  # fmt: skip
 
 
-def test_latency__falls_inside_the_segment_exactly():
-    after, _ = advance(line([50.0], [8.0, 8.0], latency=[0.0, 0.75]), [-2.0, -4.0], 1.75)
-    assert after.speeds_mps[0, 1] == 4.0  # coasts 0.75 s, brakes 1 s
-    front, rear = 8.0 * 1.75 - 1.75**2, 8.0 * 0.75 + 8.0 - 2.0
-    assert after.gaps_m[0, 0] == pytest.approx(50.0 + front - rear, abs=1e-12)
+@pytest.mark.parametrize("cut", [False, True])
+@pytest.mark.parametrize("name", CASES)
+def test_advance__by_hand(name: str, cut: bool) -> None:
+    worlds, command, end, expected, state = CASES[name]
+    times = np.arange(0.25, end, 0.25).tolist() if cut else []
+    after, parts = run(worlds, command, *times, end)
+    assert events(parts) == expected
+    assert {name: getattr(after, name).tolist() for name in state} == {name: [value] for name, value in state.items()}
 
 
-def test_speed_limit__ends_the_drive():
-    after, _ = advance(line([50.0], [8.0, 0.0], limit=10.0), [2.0, 0.0], 3.0)
-    assert after.speeds_mps[0, 0] == 10.0
-    assert after.gaps_m[0, 0] == 50.0 + 9.0 + 20.0
+# ---------------------------------------------------------------- where doubles end
 
 
-def test_impact__follows_the_papers_velocity_exchange():
-    # 10 m at 10 m/s closing; masses 2 and 3; e = 0.5: v1+ = 3/5 * 1.5 * 10 = 9, v2+ = 10 - 2/5 * 1.5 * 10 = 4
-    after, impacts = advance(line([10.0], [0.0, 10.0], mass=[2.0, 3.0], e=0.5), [0.0, 0.0], 2.0, record=True)
-    assert after.speeds_mps[0] == pytest.approx([9.0, 4.0], abs=1e-14)
-    assert after.gaps_m[0, 0] == pytest.approx(5.0, abs=1e-13)
-    assert impacts.first_impact_harm.tolist() == impacts.total_harm.tolist() == [[100.0]]
-    rows = impacts.rows
-    assert rows.time_s.tolist() == [1.0] and rows.closing_speed_mps.tolist() == [10.0] and rows.first.tolist() == [True]
-    assert rows.front_speed_change_mps[0] == pytest.approx(9.0) and rows.rear_speed_change_mps[0] == pytest.approx(-6.0)
+def test_contact__one_double_before_the_end_of_a_segment_and_one_after() -> None:
+    worlds = line([6.0], [0.0, 8.0])
+    before, after = math.nextafter(0.75, 0.0), math.nextafter(0.75, 1.0)
+    counts = [[int(part.count[0, 0]) for part in run(worlds, 0.0, *times)[1]] for times in ([before], [after])]
+    assert counts == [[0], [1]]
+    assert [int(part.count[0, 0]) for part in run(worlds, 0.0, before, 0.75, 1.0)[1]] == [0, 1, 0]
 
 
-def test_impact__is_listed_only_on_demand_and_then_in_one_run(monkeypatch):
-    module, runs = importlib.import_module("ethbrake_marl.physics.batch"), []
-    monkeypatch.setattr(module, "by_parts", lambda *given: runs.append(given) or by_parts(*given))
-    worlds = line([10.0], [0.0, 10.0])
-    assert advance(worlds, 0.0, 2.0)[1].rows is None
-    assert advance(worlds, 0.0, 2.0, record=True)[1].rows is not None
-    assert len(runs) == 2  # the list was long enough at once
+@pytest.mark.parametrize(("onset", "end"), [(0.4, 1.45), (0.12, 1.3)])
+def test_end__that_an_event_reaches_is_the_end_itself(onset: float, end: float) -> None:
+    # 1 m/s over `end` metres; the onset cuts the way in two, whose doubles add up to a little less or more than `end`
+    assert onset + (end - onset) != end
+    assert events(run(line([end], [0.0, 1.0], latency_s=[0.0, onset]), 0.0, end)[1]) == [(end, 0, 1.0)]
 
 
-def test_impact__closing_speed_is_the_root_of_the_discriminant():
-    # g = 9, w = 3, b = 8: D = 9 + 144 = 153
-    _, impacts = advance(line([9.0], [5.0, 8.0]), [-8.0, 0.0], 0.625)
-    assert impacts.count.sum() == 0
-    _, impacts = advance(line([9.0], [20.0, 23.0]), [-8.0, 0.0], 2.0)
-    assert impacts.total_harm[0, 0] == pytest.approx(153.0, rel=1e-15)
+@pytest.mark.parametrize("limit", [5.6, 6.1, 6.6])
+def test_block__takes_the_limit_of_any_of_its_members_to_the_last_bit(limit: float) -> None:
+    # 6 t coasting, pushed by 1 t at +1: a block at +1/7, until its rear vehicle is at its limit; the doubles of
+    # speed + acceleration * time end a little beyond it
+    assert 1.0 + 1.0 / 7.0 * ((limit - 1.0) / (1.0 / 7.0)) > limit
+    after, _ = advance(line([0.0], [1.0, 1.0], mass_t=[6.0, 1.0], speed_limit_mps=[64.0, limit]), [0.0, 1.0], 60.0)
+    assert after.speeds_mps.tolist() == [[limit, limit]] and after.gaps_m.tolist() == [[0.0]]
 
 
-def test_impact__at_the_end_of_a_segment_belongs_to_that_segment():
-    worlds = line([10.0], [0.0, 10.0])
-    here, impacts = advance(worlds, [0.0, 0.0], 1.0)
-    assert impacts.count.tolist() == [[1]]
-    _, impacts = advance(here, [0.0, 0.0], 1.0)
-    assert impacts.count.tolist() == [[0]]
-
-
-def test_bounce_back__keeps_the_negative_speed_and_the_brakes_end_it():
-    # m_rear = 1 < e m_front = 0.5 * 4: v2+ = 10 - 4/5 * 1.5 * 10 = -2; braking at 4 stops it after 0.5 s, 0.5 m back
-    worlds = line([0.0], [0.0, 10.0], mass=[4.0, 1.0], e=0.5)
-    struck, impacts = advance(worlds, [0.0, -4.0], 0.0)
-    assert struck.speeds_mps[0] == pytest.approx([3.0, -2.0], abs=1e-14) and impacts.count.tolist() == [[1]]
-    after, _ = advance(struck, [0.0, -4.0], 1.0)
-    assert after.speeds_mps[0, 1] == 0.0
-    assert after.gaps_m[0, 0] == pytest.approx(3.5, abs=1e-13)
-
-
-def test_touch__is_no_impact_and_no_harm():
-    # w^2 = 2 q g: the rear vehicle just reaches the front one with no closing speed
-    after, impacts = advance(line([4.0], [10.0, 14.0]), [0.0, -2.0], 2.0)
-    assert impacts.count.sum() == 0 and impacts.total_harm.sum() == 0.0
-    assert after.gaps_m[0, 0] == 0.0 and after.speeds_mps.tolist() == [[10.0, 10.0]]
-
-
-@pytest.mark.parametrize(("push", "moves"), [(3.0, False), (5.0, True)])
-def test_holding_brake__moves_only_above_its_braking_force(push, moves):
-    worlds = line([0.0], [0.0, 0.0], mass=[2.0, 2.0])
-    after, impacts = advance(worlds, [-4.0, push], 2.0)
-    expected = (push - 4.0) / 2 * 2.0 if moves else 0.0  # (2 * push - 2 * 4) / 4 for 2 s
-    assert after.speeds_mps.tolist() == [[expected, expected]]
-    assert after.gaps_m.tolist() == [[0.0]] and impacts.count.sum() == 0
-
-
-def test_resting_contact__shares_the_common_deceleration_and_releases():
-    # joined at 5 m/s after a plastic impact; front brakes at 6, rear at 2: block -4 until rest
-    worlds = line([0.0], [0.0, 10.0])
-    after, _ = advance(worlds, [-6.0, -2.0], 1.0)
-    assert after.speeds_mps.tolist() == [[1.0, 1.0]] and after.gaps_m.tolist() == [[0.0]]
-    released, _ = advance(after, [0.0, -2.0], 0.25)
-    assert released.speeds_mps.tolist() == [[1.0, 0.5]] and released.gaps_m[0, 0] == 0.0625
-
-
-def test_cluster__three_touching_vehicles_share_by_the_order_free_law():
-    # rear strikes two that touch and stand: P pools all three, 9 * 1/3 = 3; e = 0.5: v+ = 4.5 - 0.5 v-
-    after, impacts = advance(line([0.0, 0.0], [0.0, 0.0, 9.0], e=0.5), [0.0, 0.0, 0.0], 0.0)
-    assert after.speeds_mps[0] == pytest.approx([4.5, 4.5, 0.0], abs=1e-14)
-    assert impacts.count.tolist() == [[0, 1]] and impacts.total_harm.tolist() == [[0.0, 81.0]]
-
-
-def test_bounces__end_in_resting_contact_and_each_is_counted():
-    # front stands and holds (heavy); rear is driven against it: bounces 8, 4, 2, 1, ... until below 0.05 m/s
-    worlds = line([0.0], [0.0, 8.0], mass=[1e15, 1.0], e=0.5)
-    after, impacts = advance(worlds, [-10.0, 4.0], 60.0)
-    speeds = [8.0 * 0.5**k for k in range(9)]  # the ninth, 0.03125, is plastic
-    assert impacts.count.tolist() == [[len(speeds)]]
-    assert impacts.total_harm[0, 0] == pytest.approx(sum(s * s for s in speeds), rel=1e-9)
-    assert impacts.first_impact_harm.tolist() == [[64.0]]
-    assert after.gaps_m.tolist() == [[0.0]] and after.speeds_mps[0, 1] == pytest.approx(0.0, abs=1e-12)
-
-
-def test_batch__a_world_has_the_same_bits_alone():
-    rng = np.random.default_rng(3)
-    worlds = make_worlds(
-        rng.uniform(1, 10, (200, 4)),
-        rng.uniform(5, 25, (200, 5)),
-        braking_capacity_mps2=7.0,
-        driving_capacity_mps2=7.0,
-        latency_s=rng.uniform(0, 1, (200, 5)),
-        mass_t=rng.uniform(1, 8, (200, 5)),
-        restitution=0.2,
-    )
-    command = rng.uniform(-7, 7, (200, 5))
-    whole, impacts = advance(worlds, command, 5.0)
-    assert impacts.count.sum() > 100
-    for k in (0, 57, 199):
-        alone, _ = advance(worlds.take([k]), command[k], 5.0)
-        assert alone.gaps_m.tobytes() == whole.gaps_m[k : k + 1].tobytes()
-        assert alone.speeds_mps.tobytes() == whole.speeds_mps[k : k + 1].tobytes()
-
-
-def test_split__two_half_segments_equal_one():
-    rng = np.random.default_rng(4)
-    worlds = make_worlds(
-        rng.uniform(1, 10, (500, 2)),
-        rng.uniform(5, 25, (500, 3)),
-        braking_capacity_mps2=7.0,
-        driving_capacity_mps2=7.0,
-        latency_s=0.5,
-        mass_t=[4.5, 5.5, 5.9],
-        restitution=0.1,
-    )
-    command = rng.uniform(-7, 0, (500, 3))
-    whole, once = advance(worlds, command, until_s=6.0)
-    half, first = advance(worlds, command, until_s=rng.uniform(0, 6, 500))
-    rest, second = advance(half, command, until_s=6.0)
-    np.testing.assert_allclose(rest.gaps_m, whole.gaps_m, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(first.total_harm + second.total_harm, once.total_harm, rtol=1e-12, atol=1e-10)
-    assert (first.count + second.count).tolist() == once.count.tolist()
+@pytest.mark.parametrize("gap", [-1.5e-9, -2e-9])  # beyond: `refusals/physics.txt`
+def test_overlap__at_an_event_is_rounding_up_to_1e_9_m(gap: float) -> None:
+    # vehicle 1 leaves vehicle 2 with 1e-9 m/s; vehicle 3 meets them after 1 s, when 1e-9 m of the overlap are gone
+    worlds = dataclasses.replace(line([0.0, 8.0], [1e-9, 0.0, 8.0]), gaps_m=np.array([[gap, 8.0]]))
+    after, impacts = advance(worlds, 0.0, 1.0)
+    assert impacts.count.tolist() == [[0, 1]] and (after.gaps_m == 0.0).all()
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("closing", "count", "apart"),
     [
-        (lambda w: advance(w, [-11.0, 0.0], 1.0), r"command_mps2\[0, 0\] = -11: must be in \[-10, 10\]"),
-        (lambda w: advance(w, [float("nan"), 0.0], 1.0), "nan"),
-        (lambda w: advance(w, [0.0, 0.0, 0.0], 1.0), "shape"),
-        (lambda w: advance(w, [0.0, 0.0], -1.0), "cannot be advanced"),
-        (lambda w: advance(w, [0.0, 0.0], until_s=float("inf")), "world 0 is at 0 s and cannot be advanced to inf s"),
-        (lambda w: advance(w, [0.0, 0.0]), "either"),
-        (lambda w: line([-1.0], [0.0, 0.0]), r"gaps_m\[0, 0\] = -1"),
-        (lambda w: line([1.0], [0.0, 0.0], mass=[1.0, -2.0]), r"mass_t\[0, 1\] = -2"),
-        (lambda w: line([1.0], [0.0, 200.0]), "speed_limit"),
-        (lambda w: line([1.0, 2.0], [0.0, 0.0]), "gaps_m"),
+        (0.5e-5, 0, 0.0),
+        (1e-5, 0, 0.0),
+        (math.nextafter(1e-5, 1.0), 1, 0.0),
+        (0.03125, 1, 0.0),
+        (0.05, 1, 0.025),
+        (0.0625, 1, 0.03125),
     ],
 )
-def test_bad_input__is_refused_with_its_place_and_range(call, message):
-    with pytest.raises(InvalidInput, match=message):
-        call(line([5.0], [1.0, 1.0]))
+def test_pair__touches_up_to_1e_5_and_joins_below_5_cm_per_s(closing: float, count: int, apart: float) -> None:
+    after, impacts = advance(line([0.0], [0.0, closing], restitution=0.5), 0.0, 0.0)
+    assert (impacts.count[0, 0], impacts.total_harm[0, 0], after.pair_hit[0, 0]) == (count, count * closing**2, count)
+    front, rear = after.speeds_mps[0]
+    assert front - rear == pytest.approx(apart, rel=1e-15) and front + rear == pytest.approx(closing, rel=1e-15)
 
 
-@pytest.mark.parametrize(("command", "message"), [([10.0, -11.0], "0, 1] = -11"), ([-10.0, 10.5], "0, 1] = 10.5")])
-def test_bad_command__is_named_also_behind_one_that_is_just_allowed(command, message):
-    with pytest.raises(InvalidInput, match=re.escape(message)):
-        advance(line([5.0], [1.0, 1.0]), command, 1.0)
+# ---------------------------------------------------------------- many impacts
 
 
-def test_overlap__that_no_advance_could_have_left_is_reported():
-    # pair 0 meets, so the world goes event by event; pair 1 overlaps by 1 m (a state of the sampled map) and separates
-    worlds = replace(line([1.0, 1.0], [0.0, 8.0, 4.0]), gaps_m=np.array([[1.0, -1.0]]))
-    with pytest.raises(PhysicsError, match=r"world 0: a contact was missed between 0 s and 2 s"):
-        advance(worlds, [0.0, 0.0, 0.0], 2.0)
+@pytest.mark.parametrize("e", [0.125, 0.25, 0.5, 0.75, 0.875])
+def test_bounces__end_after_the_sum_of_their_flights(e: float) -> None:
+    # rear presses with 4 on a holding wall: bounces 8, 8e, 8e^2, ... down to the first below 0.05, which is plastic
+    closing = [8.0]
+    while closing[-1] >= 0.05:
+        closing.append(closing[-1] * e)
+    flights = sum(2.0 * w / 4.0 for w in closing[1:])
+    after, parts = run(line([0.0], [0.0, 8.0], mass_t=[2.0**50, 1.0], restitution=e), [-16.0, 4.0], 60.0)
+    assert [w for *_, w in events(parts)] == pytest.approx(closing, rel=1e-10)
+    assert events(parts)[-1][0] == pytest.approx(flights, rel=1e-12)
+    assert after.gaps_m.tolist() == [[0.0]] and after.speeds_mps[0, 1] == pytest.approx(0.0, abs=1e-12)
 
 
-def test_bounces__more_than_any_segment_holds_are_reported(monkeypatch):
+def test_bounces__of_three_pressing_vehicles_end_in_contact() -> None:
+    draws, n = Draws(8), 300
+    start = line(
+        np.zeros((n, 2)), draws.uniform(0, 12, (n, 3)), mass_t=draws.uniform(1, 8, (n, 3)),
+        restitution=draws.uniform(0.0, 0.95, (n,)),
+    )  # fmt: skip
+    after, (impacts,) = run(start, np.tile([-16.0, 0.0, 4.0], (n, 1)), 300.0)
+    assert impacts.count.max() > 20
+    assert np.all(after.gaps_m == 0.0) and np.all(after.speeds_mps == after.speeds_mps[:, :1])
+
+
+def test_bounces__more_than_any_segment_holds_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     # e = 1 and a push of 10 m/s2 against a heavy wall: a bounce of 0.2 m/s every 0.04 s for 50,000 s
     if numba.config.DISABLE_JIT:  # a million events would take long
         monkeypatch.setattr(kernel, "BOUND", kernel.BOUND._replace(MOST_EVENTS=50))
-    wall = line([0.0], [0.0, 0.2], mass=[2.0**60, 1.0], e=1.0)
+    wall = line([0.0], [0.0, 0.2], mass_t=[2.0**60, 1.0], restitution=1.0)
     most = kernel.BOUND.MOST_EVENTS
     with pytest.raises(PhysicsError, match=f"world 0: more than {most} events between 0 s and 50000 s"):
         advance(wall, [-10.0, 10.0], 50_000.0)
+
+
+def test_impacts__are_listed_on_demand_in_a_list_that_grows(monkeypatch: pytest.MonkeyPatch) -> None:
+    module, runs = importlib.import_module("ethbrake_marl.physics.batch"), []
+    monkeypatch.setattr(module, "by_parts", lambda *given: runs.append(given) or by_parts(*given))
+    wall = line([0.0], [0.0, 8.0], mass_t=[2.0**50, 1.0], restitution=1.0)  # a bounce each second
+    for until, needed in ((10.5, 1), (129.5, 2)):
+        runs.clear()
+        rows = advance(wall, [-16.0, 16.0], until, record=True)[1].rows
+        assert rows.time_s == pytest.approx(np.arange(until), abs=1e-9) and len(runs) == needed
+    assert advance(wall, [-16.0, 16.0], 129.5)[1].rows is None
+
+
+# ---------------------------------------------------------------- threads
+
+
+@pytest.mark.parametrize("threads", [2, 3, np.int64(2), 500])
+def test_threads__give_the_same_bits_and_the_same_impacts_in_the_same_order(threads: int) -> None:
+    worlds = load_scenario("paper-random").sample(101, 7).worlds
+    command = -0.75 * worlds.vehicles.braking_capacity_mps2
+    one, several = (advance(worlds, command, 8.0, record=True, threads=k) for k in (1, threads))
+    assert len(one[1].rows.world) > 100
+    for mine, its in zip((*several, several[1].rows), (*one, one[1].rows), strict=True):
+        for name in {field.name for field in dataclasses.fields(its)} - {"vehicles", "rows"}:
+            np.testing.assert_array_equal(getattr(mine, name), getattr(its, name), err_msg=name, strict=True)
+
+
+def test_threads__one_is_the_default_and_starts_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiling, "ThreadPoolExecutor", None)
+    assert advance(line([9.0], [4.0, 4.0]), 0.0, 1.0)[0].time_s.tolist() == [1.0]
+
+
+def test_threads__record_more_impacts_than_expected_in_one_part_only() -> None:
+    # Ten standing vehicles behind each other, and a fast one behind: each impact sets off the next one.
+    chain = line(
+        np.full((40, 9), 1.0), np.r_[np.zeros(9), 30.0] * np.ones((40, 1)),
+        restitution=np.r_[np.zeros(20), np.full(20, 0.5)],
+    )  # fmt: skip
+    serial, parallel = (advance(chain, 0.0, 9.0, record=True, threads=k)[1].rows for k in (1, 2))
+    assert (serial.world >= 20).sum() > 4 * 40 + 64
+    assert (parallel.world == serial.world).all() and (parallel.time_s == serial.time_s).all()
+
+
+# ---------------------------------------------------------------- forecasts
+
+
+@pytest.mark.parametrize("vehicle", [0, 1, 2])
+@pytest.mark.parametrize("until", [2.0, 3.5, 8.0])
+def test_forecast__is_the_harm_of_the_advance_bit_for_bit(vehicle: int, until: float) -> None:
+    plain, ahead = driving_lines(166, 40, 3), place_ahead(driving_lines(167, 40, 3), 168, high=15.0)
+    worlds, command = Worlds.concatenate([plain.worlds, ahead.worlds]), np.concatenate([plain.command, ahead.command])
+    worlds, _ = advance(worlds, command, until_s=Draws(11).uniform(0.0, 3.0, (80,)))
+    worlds, command = worlds.take(worlds.time_s < until), command[worlds.time_s < until]
+    candidates = np.tile([-8.0, -4.0, 0.0, 8.0], (worlds.n, 1))
+    first, total = forecast(worlds, np.where(np.arange(3) == vehicle, 99.0, command), vehicle, candidates, until)
+    for c in range(4):
+        command[:, vehicle] = candidates[:, c]
+        impacts = advance(worlds, command, until_s=until)[1]
+        parts = np.column_stack([impacts.obstacle_first_harm, impacts.first_impact_harm])
+        assert first[:, c].tolist() == parts.sum(axis=1).tolist()
+        parts = np.column_stack([impacts.obstacle_total_harm, impacts.total_harm])
+        assert total[:, c].tolist() == parts.sum(axis=1).tolist()
+    assert (first > 0.0).sum() > 30 and (total > first).sum() > 3
+
+
+@pytest.mark.parametrize(("until", "harm"), [(-1.0, 0.0), (0.0, 0.0), (1e-3, 64.0)])
+def test_forecast__an_impact_that_is_due_counts_only_before_the_horizon(until: float, harm: float) -> None:
+    assert forecast(line([[0.0]], [0.0, 8.0]), np.zeros((1, 2)), 0, np.zeros((1, 1)), until)[0].tolist() == [[harm]]

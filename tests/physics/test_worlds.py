@@ -1,28 +1,16 @@
-"""Building, selecting and joining worlds."""
+"""Building, selecting, joining and packing worlds: nothing is lost, nothing is shared."""
 
 from __future__ import annotations
 
-import re
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Worlds, make_worlds
-
-PARAMETERS = {
-    "braking_capacity_mps2": 7.0,
-    "driving_capacity_mps2": 4.0,
-    "latency_s": 0.5,
-    "mass_t": 2.0,
-    "speed_limit_mps": 30.0,
-    "restitution": 0.1,
-}
-
-
-def build(gaps=((5.0, 6.0),), speeds=((10.0, 11.0, 12.0),), **changed) -> Worlds:
-    return make_worlds(gaps, speeds, **{**PARAMETERS, **changed})
+from ethbrake_marl.physics.batch import Packed, columns as places
+from tests.physics.random_worlds import line
 
 
 def columns(worlds: Worlds) -> dict[str, np.ndarray]:
@@ -31,148 +19,175 @@ def columns(worlds: Worlds) -> dict[str, np.ndarray]:
     return {**state, **{f.name: getattr(worlds.vehicles, f.name) for f in fields(worlds.vehicles)}}
 
 
-def numbered(n: int, first: int = 0) -> Worlds:
-    """``n`` worlds whose every number tells which world it belongs to."""
+def assert_same(one: Worlds, expected: dict[str, np.ndarray]) -> None:
+    for name, column in columns(one).items():
+        np.testing.assert_array_equal(column, expected[name], err_msg=name, strict=True)
+
+
+def numbered(n: int, first: int = 0, N: int = 3, *, told: bool = True) -> Worlds:
+    """``n`` worlds whose every number tells which world it belongs to; ``told``: with news of their own."""
     number = np.arange(first, first + n, dtype=np.float64)
-    wide = number[:, None]
-    worlds = make_worlds(
-        wide + np.array([0.25, 0.5]), wide + np.array([1.0, 2.0, 3.0]),
-        braking_capacity_mps2=wide + np.array([4.0, 5.0, 6.0]), driving_capacity_mps2=wide + np.array([7.0, 8.0, 9.0]),
-        latency_s=wide + 0.125, mass_t=wide + 1.5, speed_limit_mps=wide + 99.0, restitution=number / 1000.0,
+    wide, vehicle = number[:, None], np.arange(1.0, N + 1.0)
+    worlds = line(
+        wide + 0.25 * vehicle[1:], wide + vehicle, braking_capacity_mps2=wide + 3.0 + vehicle,
+        driving_capacity_mps2=wide + 6.0 + vehicle, latency_s=wide + 0.125 * vehicle, mass_t=wide + 1.5 * vehicle,
+        speed_limit_mps=wide + 99.0 + vehicle, restitution=number / 1000.0,
     )  # fmt: skip
-    hit = np.stack([number % 2 == 0, number % 3 == 0], axis=1)
-    news = (wide + np.arange(9.0)).reshape(n, 3, 3)
-    worlds = replace(
-        worlds, vehicles=replace(worlds.vehicles, own_latency_s=wide + 0.0625 * np.arange(3.0), known_from_s=news)
-    )
+    news = (wide + np.arange(float(N * N))).reshape(n, N, N)
+    own = wide + 0.0625 * np.arange(float(N))
+    if told:
+        worlds = replace(worlds, vehicles=replace(worlds.vehicles, own_latency_s=own, known_from_s=news))
     return replace(
         worlds,
         time_s=number + 0.75,
-        pair_hit=hit,
-        command_mps2=wide - [1.0, 2.0, 3.0],
+        pair_hit=(number[:, None] + np.arange(N - 1)) % 2 == 0,
+        command_mps2=wide - vehicle,
         obstacle_gap_m=number + 40.0,
         obstacle_hit=number % 2 == 1,
     )
 
 
-def test_make_worlds__starts_at_the_alert_with_nothing_hit_and_nothing_commanded():
-    worlds = build()
-    assert (worlds.n, worlds.N) == (1, 3)
-    assert worlds.time_s.tolist() == [0.0]
+def test_make_worlds__starts_at_the_alert_with_nothing_hit_and_nothing_commanded() -> None:
+    worlds = line([5.0, 6.0], [9.0, 9.0, 9.0])
+    assert (worlds.n, worlds.N, worlds.time_s.tolist()) == (1, 3, [0.0])
     assert worlds.pair_hit.tolist() == [[False, False]] and worlds.pair_hit.dtype == np.bool_
-    assert worlds.command_mps2.tolist() == [[0.0, 0.0, 0.0]]
+    assert worlds.command_mps2.tolist() == [[0.0, 0.0, 0.0]] and worlds.obstacle_gap_m.tolist() == [np.inf]
 
 
-def test_make_worlds__broadcasts_every_parameter_to_its_shape():
-    worlds = build(speeds=np.full((4, 3), 10.0), gaps=5.0, mass_t=[1.0, 2.0, 3.0], latency_s=np.full((4, 1), 0.25))
-    shapes = {name: column.shape for name, column in columns(worlds).items()}
-    wide = {name for name, shape in shapes.items() if shape == (4, 3)}
-    assert shapes["gaps_m"] == shapes["pair_hit"] == (4, 2)
-    of_worlds = {"time_s", "restitution", "obstacle_gap_m", "obstacle_hit"}
-    assert all(shapes[name] == (4,) for name in of_worlds)
-    assert wide == set(shapes) - {"gaps_m", "pair_hit", "known_from_s", "messages"} - of_worlds
-    assert shapes["known_from_s"] == (4, 3, 3)
-    assert worlds.vehicles.mass_t[3].tolist() == [1.0, 2.0, 3.0]
-    assert shapes["messages"] == (4, 0)
-    own = [column for name, column in columns(worlds).items() if name not in ("known_from_s", "messages")]
+def test_make_worlds__broadcasts_every_parameter_to_arrays_of_its_own() -> None:
+    worlds = line(5.0, np.full((4, 3), 10.0), mass_t=[1.0, 2.0, 3.0], latency_s=np.full((4, 1), 0.25))
+    found = columns(worlds)
+    shapes = {
+        **dict.fromkeys(found, (4, 3)),
+        **dict.fromkeys(("gaps_m", "pair_hit"), (4, 2)),
+        **dict.fromkeys(("time_s", "restitution", "obstacle_gap_m", "obstacle_hit"), (4,)),
+        "known_from_s": (4, 3, 3),
+        "messages": (4, 0),
+    }
+    assert {name: column.shape for name, column in found.items()} == shapes
+    own = [column for name, column in found.items() if name not in ("known_from_s", "messages")]
     assert all(column.flags.c_contiguous and column.flags.owndata for column in own)
+    assert worlds.vehicles.mass_t[3].tolist() == [1.0, 2.0, 3.0]
     assert worlds.vehicles.own_latency_s.tolist() == [[0.25] * 3] * 4
 
 
-def test_known_at_once__takes_no_memory_and_cannot_be_written():
-    worlds = build(speeds=np.full((4, 3), 10.0), gaps=5.0, latency_s=[0.0, 0.25, 0.5])
+@pytest.mark.parametrize(
+    ("gaps", "speeds"),
+    [
+        ([[1.0, 2.0], [3.0, 4.0]], [10.0, 11.0, 12.0]),
+        ([1.0, 2.0], np.full((3, 3), 9.0)),
+        ([0.0, 0.0], [0.0, 64.0, 0.0]),
+    ],
+)
+def test_make_worlds__one_set_of_gaps_or_of_speeds_is_that_of_all_worlds(gaps: Any, speeds: Any) -> None:
+    # and the ends of every range are within it
+    worlds = line(gaps, speeds, driving_capacity_mps2=0.0, latency_s=0.0, restitution=1.0, obstacle_gap_m=0.0)
+    expected = [np.broadcast_to(given, (worlds.n, len(np.atleast_2d(given)[0]))).tolist() for given in (gaps, speeds)]
+    assert [worlds.gaps_m.tolist(), worlds.speeds_mps.tolist()] == expected
+
+
+def test_known_at_once__takes_no_memory_and_goes_by_the_numbers() -> None:
+    worlds = line(5.0, np.full((4, 3), 10.0), latency_s=[0.0, 0.25, 0.5])
     two = np.array([2, 0])
     some_rows = (worlds.take(two), worlds.take(np.empty(0, np.int64)))
     for some in (worlds, *some_rows, Worlds.concatenate([worlds, worlds]), worlds.assign(two, some_rows[0])):
         news = some.vehicles.known_from_s
         assert news.tolist() == [[[0.0] * 3, [0.25] * 3, [0.5] * 3]] * some.n
         assert some.vehicles.is_known_at_once and (news.strides[2], news.flags.writeable) == (0, False)
-
-
-def test_is_known_at_once__goes_by_the_numbers():
-    vehicles = build(latency_s=[0.0, 0.25, 0.5]).vehicles
-    assert replace(vehicles, known_from_s=vehicles.known_from_s.copy()).is_known_at_once
-    assert not replace(vehicles, latency_s=vehicles.latency_s + 0.125).is_known_at_once
-    assert not replace(vehicles, own_latency_s=vehicles.latency_s - 0.125).is_known_at_once
+    vehicles = worlds.vehicles
     late = vehicles.known_from_s.copy()
     late[0, 2, 1] = np.inf
-    assert not replace(vehicles, known_from_s=late).is_known_at_once
+    changes = [
+        {"known_from_s": vehicles.known_from_s.copy()},
+        {"latency_s": vehicles.latency_s + 0.125},
+        {"own_latency_s": vehicles.latency_s - 0.125},
+        {"known_from_s": late},
+    ]
+    assert [replace(vehicles, **change).is_known_at_once for change in changes] == [True, False, False, False]
 
 
-def test_make_worlds__many_gaps_make_many_worlds_of_one_set_of_speeds():
-    worlds = build(gaps=[[1.0, 2.0], [3.0, 4.0]], speeds=[10.0, 11.0, 12.0])
-    assert worlds.speeds_mps.tolist() == [[10.0, 11.0, 12.0]] * 2
-    assert build(gaps=[1.0, 2.0], speeds=np.full((3, 3), 9.0)).gaps_m.tolist() == [[1.0, 2.0]] * 3
-
-
-def test_make_worlds__the_speed_limit_defaults_to_40():
+def test_make_worlds__the_speed_limit_defaults_to_40() -> None:
     worlds = make_worlds(
         5.0, [1.0, 2.0], braking_capacity_mps2=1, driving_capacity_mps2=0, latency_s=0, mass_t=1, restitution=1
     )
     assert worlds.vehicles.speed_limit_mps.tolist() == [[40.0, 40.0]]
 
 
-def test_make_worlds__accepts_the_ends_of_every_range():
-    worlds = build(gaps=[0.0, 0.0], speeds=[0.0, 30.0, 0.0], driving_capacity_mps2=0.0, latency_s=0.0, restitution=0.0)
-    assert worlds.vehicles.restitution.tolist() == [0.0] and worlds.gaps_m.tolist() == [[0.0, 0.0]]
-    assert build(restitution=1.0).vehicles.restitution.tolist() == [1.0]
-    assert build(obstacle_gap_m=0.0).obstacle_gap_m.tolist() == [0.0]
-
-
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"gaps": [5.0, -0.5]}, "gaps_m[0, 1] = -0.5: must be finite and in [0, inf]"),
-        ({"gaps": [5.0, float("inf")]}, "gaps_m[0, 1] = inf"),
-        ({"speeds": [10.0, -1.0, 1.0]}, "speeds_mps[0, 1] = -1: must be finite and in [0, inf]"),
-        ({"speeds": [10.0, float("nan"), 1.0]}, "speeds_mps[0, 1] = nan"),
-        (
-            {"speeds": [[1.0, 2.0, 3.0], [1.0, 2.0, 31.0]]},
-            "speeds_mps[1, 2] = 31: above this vehicle's speed_limit_mps 30",
-        ),
-        ({"speeds": [30.0, 31.0, 1.0]}, "speeds_mps[0, 1] = 31: above this vehicle's speed_limit_mps 30"),
-        ({"braking_capacity_mps2": 0.0}, "braking_capacity_mps2[0, 0] = 0: must be finite and in (0, inf]"),
-        ({"driving_capacity_mps2": -1.0}, "driving_capacity_mps2[0, 0] = -1: must be finite and in [0, inf]"),
-        ({"latency_s": [0.0, 0.0, -0.1]}, "latency_s[0, 2] = -0.1: must be finite and in [0, inf]"),
-        ({"mass_t": [1.0, 0.0, 1.0]}, "mass_t[0, 1] = 0: must be finite and in (0, inf]"),
-        ({"speed_limit_mps": 0.0}, "speed_limit_mps[0, 0] = 0: must be finite and in (0, inf]"),
-        ({"restitution": 1.5}, "restitution[0] = 1.5: must be finite and in [0, 1]"),
-        ({"restitution": -0.5}, "restitution[0] = -0.5: must be finite and in [0, 1]"),
-        ({"obstacle_gap_m": -0.5}, "obstacle_gap_m[0] = -0.5: must be finite and in [0, inf]"),
-        ({"mass_t": [1.0, 2.0]}, "mass_t: shape (2,) does not fit (1, 3)"),
-        ({"speeds": [10.0]}, "speeds_mps: shape (1, 1); a line needs at least 2 vehicles, as [n, N]"),
-        ({"speeds": np.zeros((1, 1, 3))}, "speeds_mps: shape (1, 1, 3)"),
-        ({"speeds": np.zeros((2, 3)), "gaps": np.ones((3, 2))}, "speeds_mps: shape (2, 3) does not fit (3, 3)"),
-    ],
-)
-def test_make_worlds__refuses_with_the_place_and_the_range(changed, message):
-    with pytest.raises(InvalidInput, match=re.escape(message)):
-        build(**changed)
-
-
 @pytest.mark.parametrize("rows", [[2, 0], np.array([False, True, True, False])])
-def test_take__selects_every_column_and_copies(rows):
+def test_take__selects_every_column_and_copies(rows: Any) -> None:
     worlds = numbered(4)
     some = worlds.take(rows)
-    for name, column in columns(worlds).items():
-        taken = columns(some)[name]
-        assert taken.tolist() == column[np.asarray(rows)].tolist(), name
-        assert not np.shares_memory(taken, column) and taken.flags.c_contiguous
+    assert_same(some, {name: column[np.asarray(rows)] for name, column in columns(worlds).items()})
+    for name, column in columns(some).items():
+        assert not np.shares_memory(column, columns(worlds)[name]) and column.flags.c_contiguous, name
 
 
-def test_concatenate__is_the_inverse_of_take():
+def test_concatenate__is_the_inverse_of_take() -> None:
     worlds = numbered(5)
     joined = Worlds.concatenate([worlds.take([0, 1]), worlds.take([2]), worlds.take([3, 4])])
-    for name, column in columns(worlds).items():
-        assert columns(joined)[name].tolist() == column.tolist(), name
+    assert_same(joined, columns(worlds))
 
 
-def test_assign__replaces_rows_and_leaves_the_given_worlds_alone():
+def test_assign__replaces_rows_and_leaves_the_given_worlds_alone() -> None:
     worlds, fresh = numbered(4), numbered(2, first=50)
-    before = {name: column.tolist() for name, column in columns(worlds).items()}
-    result = columns(worlds.assign(np.array([3, 1]), fresh))
-    for name, column in columns(worlds).items():
-        assert column.tolist() == before[name], name
-        expected = column.copy()
-        expected[[3, 1]] = columns(fresh)[name]
-        assert result[name].tolist() == expected.tolist(), name
+    expected = {name: column.copy() for name, column in columns(worlds).items()}
+    for name, column in columns(fresh).items():
+        expected[name][[3, 1]] = column
+    assert_same(worlds.assign(np.array([3, 1]), fresh), expected)
+    assert_same(worlds, columns(numbered(4)))
+
+
+def test_with_obstacle__writes_it_out_in_front() -> None:
+    worlds = replace(line([5.0], [10.0, 9.0], obstacle_gap_m=12.0), obstacle_hit=np.array([True])).with_obstacle()
+    found = {name: column[0].tolist() for name, column in columns(worlds).items()}
+    expected = {
+        "gaps_m": [12.0, 5.0],
+        "speeds_mps": [0.0, 10.0, 9.0],
+        "pair_hit": [True, False],
+        "command_mps2": [0.0] * 3,
+        "mass_t": [np.inf, 1.0, 1.0],
+        "speed_limit_mps": [0.0, 64.0, 64.0],
+        "braking_capacity_mps2": [0.0, 16.0, 16.0],
+        "driving_capacity_mps2": [0.0, 16.0, 16.0],
+        "latency_s": [0.0] * 3,
+        "obstacle_gap_m": np.inf,
+        "obstacle_hit": False,
+    }
+    assert {name: found[name] for name in expected} == expected
+    assert worlds.vehicles.known_from_s.shape == (1, 3, 3)
+
+
+# ---------------------------------------------------------------- rows
+
+
+@pytest.mark.parametrize("told", [False, True])
+@pytest.mark.parametrize(("n", "N"), [(1, 2), (1, 3), (40, 3), (7, 6)])
+def test_packed__gives_back_every_bit_in_its_own_memory_widened_or_not(n: int, N: int, told: bool) -> None:
+    given = numbered(n, N=N, told=told)
+    plain = replace(given, obstacle_gap_m=np.full(n, np.inf), obstacle_hit=np.zeros(n, bool))
+    for worlds in (given, plain):
+        rows = Packed.of(worlds)
+        assert (rows.has_news, rows.has_obstacle) == (told, worlds is given)
+        back, wide = rows.worlds(), rows.widened(obstacle=True, news=True).worlds()
+        rows.state[:], rows.params[:] = -1.0, -1.0
+        assert_same(back, columns(worlds))
+        assert_same(wide, columns(worlds))
+
+
+def test_packed__columns_follow_each_other_without_a_hole() -> None:
+    # 3 vehicles, 2 pairs: time | speeds 3 | commands 3 | before 3 | gaps 2 | hit 2 | first 2 | total 2 | count 2
+    # and restitution | braking 3 | driving 3 | latency 3 | mass 3 | limit 3 | own latency 3 | news 9
+    rows = Packed.of(line([5.0, 6.0], [9.0, 9.0, 9.0]))
+    assert places(rows.state) == rows.column == (3, 0, 1, 4, 7, 10, 12, 14, 20, 0, 1, 4, 7, 10, 13, 16, 19, 28)
+    assert (rows.state.shape, rows.params.shape) == ((1, 20), (1, 16))
+    wide = rows.widened(obstacle=True, news=True)
+    assert (wide.state.shape, wide.params.shape) == ((1, 25), (1, 28))
+
+
+def test_packed__ledger_is_that_of_the_columns_of_harm_in_its_own_memory() -> None:
+    rows = Packed(np.arange(25.0)[None], np.empty((1, 16)))
+    first, total, count, *of_obstacle = rows.ledger()
+    rows.state[:] = 5.0
+    assert (first.tolist(), total.tolist(), count.tolist()) == ([[14.0, 15.0]], [[16.0, 17.0]], [[18, 19]])
+    assert [each.tolist() for each in of_obstacle] == [[22.0], [23.0], [24]]
+    assert count.dtype == of_obstacle[2].dtype == np.int64

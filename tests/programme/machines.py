@@ -66,7 +66,7 @@ def lists() -> dict[str, str]:
 
 
 def physics() -> dict[str, str]:
-    from tests.physics.state_hash import figures
+    from tests.golden.test_golden import figures
 
     return {"physics": str(figures("few")["sha256"])}
 
@@ -106,7 +106,7 @@ def searches() -> dict[str, str]:
 
 
 def shields() -> dict[str, str]:
-    from tests.golden.test_shield_decisions import SHIELDS, decisions_hash
+    from tests.golden.test_golden import SHIELDS, decisions_hash
 
     return {f"shield {name}": decisions_hash(make()[0], 10) for name, make in SHIELDS.items()}
 

@@ -8,11 +8,10 @@ import numpy as np
 
 from ethbrake_marl.physics import advance
 from tests.physics.exact_simulator import line_of, simulate
-from tests.physics.measures import rounds
 from tests.physics.programme.gates import Figure, gate
-from tests.physics.random_worlds import Draws, driving_lines, touching_lines
+from tests.physics.random_worlds import Draws, driving_lines, rounds, touching_lines
 from tests.physics.segments import Scan, random_segments, scan
-from tests.physics.test_clusters import accelerations, exact_accelerations, law_error_eps
+from tests.physics.test_oracles import accelerations, exact_accelerations, law_error_eps
 from tests.reference.tolerances import BORDERLINE_SHARE, CLUSTER_EPS, EXACT_RUN, RESTING_MPS2
 
 CHUNK = 200_000

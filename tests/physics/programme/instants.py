@@ -6,9 +6,8 @@ import numpy as np
 
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.physics import Floats, Worlds, advance
-from tests.physics.nearly_joined import nearly_joined, thrown_lines
 from tests.physics.programme.gates import Figure, gate
-from tests.physics.runs import HORIZON_S
+from tests.physics.random_worlds import HORIZON_S, nearly_joined, thrown_lines
 
 NEARLY_JOINED = {2: 200_000, 3: 300_000, 5: 200_000, 10: 200_000, 20: 80_000, 50: 20_000}  # by vehicles
 THROWN = {2: 250_000, 3: 250_000, 5: 200_000, 10: 250_000, 20: 40_000, 50: 10_000}

@@ -7,11 +7,18 @@ import numpy as np
 from ethbrake_marl.harm import empty_ledger, split
 from ethbrake_marl.physics import Impacts, Worlds, advance
 from tests.physics.manufacture import manufactured, pressed, stored
-from tests.physics.measures import energy_rise_eps, momentum_eps, restitution_eps, rounds
 from tests.physics.programme.gates import Figure, gate
-from tests.physics.random_worlds import Draws, driving_lines, touching_lines
-from tests.physics.test_manufactured import at_once, in_steps
-from tests.physics.watched import Watched
+from tests.physics.random_worlds import (
+    Draws,
+    Watched,
+    driving_lines,
+    energy_rise_eps,
+    momentum_eps,
+    restitution_eps,
+    rounds,
+    touching_lines,
+)
+from tests.physics.test_oracles import at_once, in_steps
 from tests.reference.tolerances import ENERGY_EPS, GAP_M, MOMENTUM_EPS, RESTITUTION_EPS
 
 # ---------------------------------------------------------------- manufactured worlds

@@ -11,10 +11,8 @@ import numpy as np
 from ethbrake_marl.physics import Floats, Worlds, advance
 from tests.physics.exact_simulator import line_of, simulate
 from tests.physics.programme.gates import Figure, gate
-from tests.physics.random_worlds import driving_lines, touching_lines
-from tests.physics.runs import HORIZON_S, state_bytes
-from tests.physics.test_clusters import law_error_eps
-from tests.physics.test_obstacle import place_ahead
+from tests.physics.random_worlds import HORIZON_S, driving_lines, place_ahead, state_bytes, touching_lines
+from tests.physics.test_oracles import law_error_eps
 from tests.reference.tolerances import CLUSTER_EPS, EXACT_RUN
 
 

@@ -27,7 +27,7 @@ QUICK = (
     "tests/physics/test_obstacle.py",
     *BY_HAND,
 )
-WHOLE = ("tests/physics", "tests/golden/test_physics_hash.py", "tests/test_harm.py")
+WHOLE = ("tests/physics", "tests/golden/test_golden.py", "tests/test_harm.py")
 
 EVENTS, IMPACT, SEGMENT, ADVANCE = (
     "ethbrake_marl/physics/kernel.py",

@@ -9,10 +9,20 @@ from dataclasses import replace
 import numpy as np
 
 from ethbrake_marl.physics import Impacts, Worlds, advance
+from tests.golden.test_golden import GOLDEN, figures
 from tests.physics.programme.gates import Figure, gate
-from tests.physics.random_worlds import Batch, driving_lines, touching_lines
-from tests.physics.runs import HARMS, HORIZON_S, Split, last_digit_errors, once, split_errors, state_bytes
-from tests.physics.state_hash import GOLDEN, figures
+from tests.physics.random_worlds import (
+    HARMS,
+    HORIZON_S,
+    Batch,
+    Split,
+    driving_lines,
+    last_digit_errors,
+    once,
+    split_errors,
+    state_bytes,
+    touching_lines,
+)
 from tests.reference.tolerances import BOUNCE_SERIES_EPS, EPS, SPLIT, SPLIT_CASCADE
 
 # ---------------------------------------------------------------- what must not matter

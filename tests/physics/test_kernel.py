@@ -1,4 +1,4 @@
-"""The closed forms of the events, one by one and by hand."""
+"""The kernel: the closed forms of its events by hand, and one step of an episode for engine, search and shield."""
 
 from __future__ import annotations
 
@@ -7,7 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from ethbrake_marl.physics.kernel import contact, drift, force_range, settle, solo_motion, speed_event
+from ethbrake_marl.agents.registry import drive, fixed_commands, script_agents
+from ethbrake_marl.physics import Worlds
+from ethbrake_marl.physics.kernel import Decisions, contact, drift, force_range, settle, solo_motion, speed_event
+from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.search import Profiles, profile_problem
 
 NEVER = (math.inf, 0.0)
 CHANGES = math.nan  # an acceleration that is not constant all along
@@ -104,3 +108,52 @@ def test_settle__is_the_value_nearest_to_rest(low, high, expected):
 )
 def test_solo_motion__speed_way_and_whether_the_acceleration_was_constant(speed, command, onset, duration, expected):
     np.testing.assert_array_equal(solo_motion(speed, command, onset, 10.0, duration), expected)
+
+
+# ---------------------------------------------------------------- one step of an episode
+
+
+class Phases:
+    """Drives profiles of equal phases on the grid of decisions."""
+
+    state_free = False
+    name = "phases"
+
+    def __init__(self, commands: np.ndarray, length: int) -> None:
+        self.commands, self.length = commands, length
+
+    def act(self, worlds: Worlds, vehicle: int) -> np.ndarray:
+        started = worlds.vehicles.latency_s[:, vehicle]
+        phase = np.maximum(Decisions(started, 0.1).latest(worlds.time_s), 0) // self.length
+        return self.commands[np.arange(worlds.n), np.minimum(phase, self.commands.shape[1] - 1)]
+
+
+@pytest.mark.parametrize("name", ["paper-random", "paper-random-obstacle", "stress-wide"])
+@pytest.mark.parametrize("length", [1, 7])
+def test_profiles__step_by_step_realise_what_the_engine_does_to_the_bit(name, length):
+    scenario = load_scenario(name)
+    worlds, vehicle = scenario.sample(40, 11).worlds, scenario.learners[0]
+    shares = np.random.default_rng(length).uniform(-1.0, 0.3, (worlds.n, 100 // length))
+    commands = shares * worlds.vehicles.braking_capacity_mps2[:, [vehicle]]
+    commands = np.clip(commands, None, worlds.vehicles.driving_capacity_mps2[:, [vehicle]])
+    others = fixed_commands(script_agents(scenario), worlds, "test", vehicle=vehicle)
+    problem = profile_problem(worlds, [vehicle], horizon_s=scenario.horizon_s, others_mps2=others)
+    ends = np.minimum((np.arange(commands.shape[1]) + 1) * length, problem.last_step[:, np.newaxis])
+    ends[:, -1] = problem.last_step
+    found = problem.follow(Profiles(ends, commands[:, :, np.newaxis]))
+    ledger = drive(worlds, Phases(commands, length), scenario, vehicle).ledger
+    np.testing.assert_array_equal(found, [ledger.world_harm("first"), ledger.world_harm("total")])
+
+
+def test_first_decision__is_the_least_latency_of_who_decides_or_now():
+    worlds = load_scenario("paper-random").sample(3, 1).worlds
+    found = [worlds.first_decision_s(vehicles).tolist() for vehicles in ([1, 2], [2], [])]
+    assert found == [[0.5] * 3, [0.8] * 3, [0.0] * 3]
+
+
+def test_decisions__are_on_the_grid_in_spite_of_rounding_and_the_last_one_ends_at_the_horizon():
+    numbers = [Decisions(np.array([0.5]), 0.1).before(horizon).tolist() for horizon in (8.0, 8.05, 0.55, 0.6)]
+    assert numbers == [[75], [76], [1], [1]]
+    steps = np.arange(2000)
+    assert np.array_equal(Decisions(np.full(2000, 0.5), 0.1).latest(0.5 + steps * 0.1), steps)
+    assert Decisions(np.array([0.5]), 0.1).latest(np.array([0.4999])).tolist() == [-1]
