@@ -10,17 +10,7 @@ from ethbrake_marl.physics import Floats, Worlds, make_worlds
 
 
 def line(
-    gaps,
-    speeds,
-    braking,
-    latency=0.0,
-    *,
-    driving=0.0,
-    mass=5.0,
-    restitution=0.1,
-    limit=40.0,
-    obstacle=None,
-    time_s=0.0,
+    gaps, speeds, braking, latency=0.0, *, driving=0.0, mass=5.0, restitution=0.1, limit=40.0, obstacle=None, time_s=0.0
 ):
     """One world."""
     worlds = make_worlds(
