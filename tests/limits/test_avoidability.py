@@ -199,13 +199,6 @@ def test_front_latency__counts_from_now():
     assert avoidability(line([5, 5], [9, 9, 9], 5, [1, 0.5, 0], time_s=1.0)).reason.shape == (1,)
 
 
-def test_play_profile__ends_at_its_time_and_leaves_out_later_commands():
-    worlds = line([5], [9, 9], 5, 0, driving=5)
-    after, _ = play_profile(worlds, 1, np.array([[0.0, 0.5, 9.0]]), np.array([[0.0, -2.0, 5.0]]), until_s=1.0)
-    assert after.time_s[0] == 1.0
-    assert after.speeds_mps[0].tolist() == [4, 8]
-
-
 def drawn(n, vehicles, controlled, seed):
     """n worlds that do not meet early; for three vehicles a third for each verdict, and some of the paper's."""
     worlds = wide_worlds(40 * n, vehicles, seed)
@@ -232,38 +225,3 @@ def test_exact_verdict__agrees_with_a_linear_programme_where_that_is_certain(
         assert linear.avoidable == exact[k] or not linear.certain, (k, linear.margin_m)
         found += linear.certain
     assert found > certain * worlds.n
-
-
-def test_margin__of_the_programme_comes_close_to_the_exact_one_as_steps_shrink():
-    world, _, exact, _ = BY_HAND["both stop: one metre left"]
-    found = [avoidable_by_lp(world, (1,), step) for step in (0.3, 0.03)]
-    errors = [abs(linear.margin_m - exact) for linear in found]
-    assert errors[0] < found[0].tolerance_m
-    assert errors[1] < 1e-6 or errors[1] < 0.1 * errors[0]
-
-
-def test_profile__of_a_certain_margin_avoids_collision_in_the_physics():
-    worlds = load_scenario("paper-random").sample(20, seed=5).worlds
-    played = 0
-    for k in np.flatnonzero(avoidability(worlds).avoidable):
-        world = worlds.take([k])
-        linear = avoidable_by_lp(world, (1,), 0.08)
-        if not linear.certain:
-            continue
-        count = 0
-        for start, command in zip(linear.time_s, linear.command_mps2, strict=True):
-            everyone = -world.vehicles.braking_capacity_mps2
-            everyone[:, 1] = command
-            world, impacts = advance(world, everyone, until_s=start + 0.08)
-            count += impacts.count.sum()
-        assert count == 0
-        played += 1
-    assert played > 3
-
-
-def test_more_controlled_vehicles__avoid_more():
-    # Vehicle 3 lacks 2 m behind a vehicle 1 that brakes fully; it gets them if vehicle 1 brakes a little less.
-    world, *_ = BY_HAND["paper, 2 m short"]
-    alone, together = (avoidable_by_lp(world, controlled, 0.05) for controlled in ((1,), (0, 1)))
-    assert (alone.avoidable, alone.certain, together.avoidable, together.certain) == (False, True, True, True)
-    assert together.command_mps2.shape == (together.time_s.size, 2)

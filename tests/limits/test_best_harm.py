@@ -17,7 +17,7 @@ from ethbrake_marl.agents.registry import drive
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
-from ethbrake_marl.evaluation.inputs import LADDER, make_lineup
+from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.evaluation.measures import TESTS
 from ethbrake_marl.limits.limits import (
     LEFT_OUT,
@@ -381,8 +381,3 @@ def test_best_harm_command__takes_what_agents_do_better(tmp_path: Path) -> None:
         assert after.header["lowered_by"]["planner:60"][count] >= changed.sum()
         assert count == "first" or changed.sum() >= 3
         assert problem.follow(after.best[count].profiles)[k].tolist() == harm.tolist()
-
-
-def test_best_harm_command__lets_the_whole_ladder_drive(tmp_path: Path) -> None:
-    table = searched(tmp_path / "t.npz", "--episodes", "3", "--harm-count", "total", "--agents", "ladder")
-    assert list(table.header["lowered_by"]) == list(LADDER)

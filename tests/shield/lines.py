@@ -19,11 +19,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents.registry import drive, make_agent
 from ethbrake_marl.engine import Engine
+from ethbrake_marl.physics import Floats, Worlds
 from ethbrake_marl.physics.kernel import CLOCK
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.shield import StepShield
+from ethbrake_marl.shield import ShieldedDriver, StepShield
 from ethbrake_marl.shield.step_shield import Decision, Running, certify
 
 _ROLES = {
@@ -362,6 +363,81 @@ LEAKS: dict[str, Leak] = {
     "the plan is kept with two decimals": plan_rounded,
     "gaps are believed 1 cm longer": gaps_blurred,
 }
+
+
+# Worlds that are corners of what a vehicle does not know, or inside, and attacks on ``+robust:believed`` in them. Every
+# quantity of another vehicle that is open is one of two numbers, so each world of ``LISTS`` is a member of what is
+# certified at its first decision. None of the numbers are round: in a world of equal gaps and equal speeds two impacts
+# fall on one moment, and the last bit decides which of them is first.
+WAYS = ("coast", "drive", "chance")
+ABOVE = 1e-6  # m2/s2; what is told is moved on with rounding
+
+_BASE = load_scenario("cooperation-2-paper").replace(early_impacts="keep")
+NEVER_HEARD = _BASE.replace(
+    gaps_m=[{"choice": [5.13, 9.71]}, {"choice": [5.37, 9.58]}],
+    speeds_mps=[{"choice": [18.23, 21.87]}, {"choice": [18.11, 21.93]}, {"choice": [18.41, 22.19]}],
+    v2x={"preset": "paper", "hears": "front"},
+    mass_t=[4.5, 5.5, {"choice": [3.0, 9.0]}],
+)
+HEARD_LATE = NEVER_HEARD.replace(  # a while after the first decision, by messages 0.6 to 0.9 s old
+    v2x={"preset": "paper", "link_latency_s": 0.6, "persistence": "periodic", "senses": "front", "sensing_s": [3, 3]},
+    latency_s=[0.0, 0.2, 0.6],
+)
+LISTS = {"never heard": NEVER_HEARD, "heard late": HEARD_LATE}
+_INSIDE = {
+    "gaps_m": [{"uniform": [5.13, 9.71]}, {"uniform": [5.37, 9.58]}],
+    "speeds_mps": [{"uniform": [18.23, 21.87]}, {"uniform": [18.11, 21.93]}, {"uniform": [18.41, 22.19]}],
+    "mass_t": [4.5, 5.5, {"uniform": [3.0, 9.0]}],
+}
+INSIDE = {  # the same ranges, and worlds from between the corners
+    **{name: scenario.replace(**_INSIDE) for name, scenario in LISTS.items()},
+    "blocked": NEVER_HEARD.replace(**_INSIDE, v2x={"preset": "blocked", "persistence": "periodic"}),
+    "sensors-only": NEVER_HEARD.replace(**_INSIDE, v2x="sensors-only"),
+}
+
+
+class Hostile:
+    """Proposes what does harm: full driving, nothing at all, or chance."""
+
+    knows = "own sensors"
+
+    def __init__(self, way: str, seed: int = 5) -> None:
+        self.name, self.rng = way, np.random.default_rng(seed)
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """The proposal, [n] m/s2."""
+        vehicles = worlds.vehicles
+        low, high = -vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
+        if self.name == "chance":
+            return self.rng.uniform(low, high)
+        return high.copy() if self.name == "drive" else np.zeros(worlds.n)
+
+
+def shielded(
+    way: str, scenario: Scenario, n: int, seed: int, *, robust: str | None = "corners"
+) -> tuple[Floats, Floats, int]:
+    """Harm realised and first bound of ``n`` worlds [n] m2/s2, and how many proposals were replaced."""
+    mode = {"mode": "step"} if robust is None else {"mode": "robust", "robust": robust}
+    driver = ShieldedDriver(Hostile(way, seed), scenario, believed=True, **mode)
+    episodes = drive(scenario.sample(n, seed).worlds, driver, scenario, 1)
+    shield = episodes.guarded.shield
+    return episodes.ledger.world_harm("first"), shield.predicted_harm, int(shield.interventions.sum())
+
+
+def gate(lists: dict[str, Scenario], robust: str, worlds: int, seed: int) -> bool:
+    """In no world of these lists is harm above the first bound of ``+robust:believed``, whatever is proposed."""
+    good, each = True, max(1, worlds // (len(lists) * len(WAYS)))
+    for name, scenario in lists.items():
+        for way in WAYS:
+            harm, bound, replaced = shielded(way, scenario, each, seed, robust=robust)
+            above, kept = int((harm > bound + ABOVE).sum()), np.isfinite(bound)
+            good = good and above == 0 and replaced > 0
+            print(
+                f"  {robust}, {name:12s} {way:7s} {each:7,} worlds {replaced:9,} replaced  above the bound: {above},"
+                f" without one: {int((~kept).sum())}; harm {harm.mean():.1f}, bound {bound[kept].mean():.1f}",
+                flush=True,
+            )
+    return good
 
 
 STEPS, WORLDS, HIDDEN = 200_000, 64, (64, 64)

@@ -7,7 +7,7 @@ joint   teams of hostile learners at cooperation levels 3 and 4, N = 3 and 5 (``
 interfaces   worlds through every wrapped interface (``tests.shield.interface_attack``)
 interference  refused calls, exceptions and interrupts at random lines on every interface, and wrappers in between
 search  restarts of a search against the shield, and against twelve leaks of it (``tests.shield.lines``)
-believed  worlds that are corners of what was not received (``tests.shield.corners``)
+believed  worlds that are corners of what was not received (``tests.shield.lines``)
 inside  worlds drawn from the inside of intervals, behind robust mode (``tests.shield.inside``)
 speed   decisions per second in a batch, and the latency of one decision
 
@@ -39,11 +39,21 @@ from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import ShieldedDriver
 from ethbrake_marl.shield.step_shield import StepShield, certify
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
-from tests.shield.corners import INSIDE, LISTS, gate
 from tests.shield.inside import inside_gate
 from tests.shield.interface_attack import INTERFACES
 from tests.shield.interference import PLAYS, WRAPPERS, disturbed, wrapped
-from tests.shield.lines import ADVERSARIES, LEAKS, TEAM_ADVERSARIES, attack, line, scenario_of, search
+from tests.shield.lines import (
+    ADVERSARIES,
+    INSIDE,
+    LEAKS,
+    LISTS,
+    TEAM_ADVERSARIES,
+    attack,
+    gate,
+    line,
+    scenario_of,
+    search,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 TOLERANCE = 1e-9  # m2/s2

@@ -18,7 +18,7 @@ from ethbrake_marl.shield import HybridShield, ShieldedDriver, ShieldedEnv, Shie
 from ethbrake_marl.shield.enclosure import Boxes, boxes_of
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from ethbrake_marl.shield.step_shield import BelievedShield
-from tests.shield.corners import ABOVE, HEARD_LATE, INSIDE, LISTS, NEVER_HEARD, WAYS, Hostile, gate, shielded
+from tests.shield.lines import ABOVE, HEARD_LATE, INSIDE, LISTS, NEVER_HEARD, WAYS, Hostile, gate, shielded
 
 BASE = load_scenario("cooperation-2-paper").replace(early_impacts="keep")
 PERIODIC = BASE.replace(v2x={"preset": "blocked", "persistence": "periodic"})
@@ -111,15 +111,6 @@ def test_believed__shields_other_lines(scenario: Scenario, robust: str | None) -
         assert np.isfinite(driven(behind("coast", scenario, robust), scenario, 4)).all()
 
 
-def test_believed__asked_again_at_the_same_moment_says_the_same() -> None:
-    worlds, proposed = PERIODIC.sample(5, 3).worlds, np.zeros(5)
-    later = drive(worlds, make_agent("full_brake", scenario=PERIODIC), PERIODIC, 1).final
-    shield = BelievedShield(PERIODIC, 1)
-    shield.begin(worlds, np.arange(5))
-    first = shield.decide(later, proposed)
-    assert np.array_equal(first, shield.decide(later, proposed + 1.0))
-
-
 @pytest.mark.parametrize(
     "spec",
     [
@@ -173,6 +164,9 @@ def test_parallel__does_what_the_agent_of_evaluations_does(scenario: Scenario, m
         assert harm[0] == alone.ledger.world_harm("first")[0]
         assert sum(each["intervened"] for each in told) == shield.interventions[0]
         assert told[1]["bound_harm"] <= shield.predicted_harm[0]
+        assert all(
+            (each["mode"], each["trusted"], "members" in each) == (mode, *2 * [mode == "robust"]) for each in told
+        )
 
 
 def test_every_interface__decides_alike_and_says_that_the_bound_is_of_the_belief() -> None:
@@ -194,11 +188,6 @@ def test_every_interface__decides_alike_and_says_that_the_bound_is_of_the_belief
         decided += [aec.infos[agent]["shield"]["chosen_action"]] if agent == "vehicle_2" else []
         aec.step(np.array([0.5], np.float32) if agent == "vehicle_2" and not ended else None)
     assert decided[1:] == [each["chosen_action"] for each in told]
-
-
-def test_infos__of_robust_mode_are_trusted_and_tell_the_members() -> None:
-    told = told_in(HybridShield(parallel_env(PERIODIC), mode="robust", believed=True))
-    assert all(each["trusted"] and each["members"] >= 1 and each["mode"] == "robust" for each in told)
 
 
 @pytest.mark.parametrize(

@@ -34,10 +34,6 @@ from ethbrake_marl.shield.enclosure import (
 )
 from ethbrake_marl.shield.step_shield import begin_running, plan_harm
 from ethbrake_marl.shield.uncertainty import Uncertainty
-from tests.shield.lines import line
-
-# What bounds a box takes two minutes to compile; the tests in other files that need it are slow, too.
-pytestmark = pytest.mark.slow
 
 STEPS = 81
 PAPER = load_scenario("paper-random")
@@ -174,6 +170,7 @@ STATES = {
 }
 
 
+@pytest.mark.slow  # it compiles again what the kernel has compiled, part by part
 @pytest.mark.parametrize("name", STATES)
 def test_states__of_every_world_are_those_of_some_path(name):
     (changed, text), rng = STATES[name], np.random.default_rng(2)
@@ -240,18 +237,6 @@ def test_shield__coasting_stays_within_the_bound_in_every_world_of_the_box():
     for k in range(2):
         harm = harm_inside(PAPER, worlds.take([k]), uncertainty, shield.backup.plan[k], 300)
         assert harm.max() <= shield.bound[k] <= shield.first_bound[k] < 200.0
-
-
-def test_no_width__is_step_mode_to_the_bit():
-    scenario = line(3)
-    worlds, bounds = scenario.sample(5, 3).worlds, []
-    for settings in ({}, {"uncertainty": parse_uncertainty("mass_t=0%"), "robust": "interior"}):
-        shield = StepShield(scenario, 1, **settings)
-        shield.begin(worlds, np.arange(5))
-        for _ in range(5):
-            shield.decide(np.zeros(5))
-        bounds.append(shield.bound.tolist())
-    assert bounds[0] == bounds[1]
 
 
 # Where a world drawn from a box leaves the enclosure: its states, not only its harm.

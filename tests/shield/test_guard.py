@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import pickle
-import threading
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import gymnasium
 import numpy as np
@@ -19,6 +20,7 @@ from ethbrake_marl.engine import STEP, Engine
 from ethbrake_marl.envs.interfaces import EthBrakeVectorEnv, parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
+from ethbrake_marl.physics import advance
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import (
     HybridAgent,
@@ -31,7 +33,6 @@ from ethbrake_marl.shield import (
 )
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from tests.fixtures.asked import Asked
-from tests.shield.beyond_horizon import above_later
 
 PAPER = load_scenario("paper-random")
 WORLDS = PAPER.sample(300, 3).worlds
@@ -50,20 +51,6 @@ def play(env, action=DRIVE):
         *_, terminated, truncated, info = env.step(action)
         over = terminated or truncated
     return info
-
-
-def test_refused_call__one_at_the_first_decision_costs_nothing_later():
-    """In 93 of 200 such episodes the harm was above the bound while the shield went on before the environment did."""
-    env = HybridShield(parallel_env(), make_agent("e_v2x_bm"), mode="step")
-    for seed in range(20):
-        env.reset(seed=seed)
-        shield, told = env.attached.shield, []
-        with pytest.raises(InvalidInput, match="unknown agent 'vehicle_9'"):
-            env.step({"vehicle_9": np.zeros(1)})
-        assert env.attached.shield is shield and shield.running.steps.tolist() == [0]
-        while env.agents:
-            told.append(env.step({"vehicle_2": DRIVE} if seed % 2 else {})[4]["vehicle_2"]["shield"]["trusted"])
-        assert all(told) and env.unwrapped.engine.ledger.world_harm("first")[0] <= shield.first_bound[0]
 
 
 class Cheating(Engine):
@@ -148,16 +135,14 @@ def test_ledger__harm_that_nobody_predicted_is_seen_before_the_next_decision(gro
 
 
 def test_past_the_shield__a_step_is_shielded_too_until_it_lets_go():
-    env, engine = shielded(), None
-    engine = env.attached.engine
-    bound = env.attached.shield.first_bound[0]
+    env = shielded()
+    engine, shield = env.attached.engine, env.attached.shield
     while not engine.ended[0]:
         env.unwrapped.step(DRIVE)
-    assert engine.ledger.world_harm("first")[0] <= bound and env.attached.shield.interventions[0] > 0
+    assert engine.ledger.world_harm("first")[0] <= shield.first_bound[0] and env.attached.shield.interventions[0] > 0
     env.reset(seed=0)
     env.attached.close()
-    *_, info = env.unwrapped.step(DRIVE)
-    assert info["chosen_action"][0] == 1.0
+    assert env.unwrapped.step(DRIVE)[-1]["chosen_action"][0] == 1.0
 
 
 def test_wrapped_in_mid_episode__needs_a_reset_first():
@@ -184,8 +169,7 @@ def test_autoreset__of_gymnasium_inside_is_left_alone():
 def test_clone__between_proposal_and_step_goes_on_apart(clone):
     env = ShieldedVecEnv(make_sb3_vec_env(PAPER, 4, seed=2))
     env.reset()
-    for _ in range(10):
-        env.step(np.ones((4, 1), np.float32))
+    env.step(np.ones((4, 1), np.float32))
     env.step_async(np.ones((4, 1), np.float32))
     other = clone(env)
     assert other.attached.engine is other.venv.engine and other.attached.engine is not env.attached.engine
@@ -205,61 +189,21 @@ def test_reset__in_between_brings_the_proposal_to_another_episode_and_its_bound_
         env.step_wait()
 
 
-class Refusing:
-    """Another watcher, which refuses every start when it is told to."""
-
-    refuses = False
-
-    def begun(self, memory, alert, rows):
-        if self.refuses:
-            raise InvalidInput("not now")
-
-    def stepped(self, memory, before, after):
-        if self.refuses:
-            raise InvalidInput("not now")
-
-
-def test_refused__reset_and_step_leave_the_shield_in_its_episode():
-    env, other = shielded(logging=True), Refusing()
-    env.attached.engine.watch(other, None)
-    for _ in range(5):
-        env.step(DRIVE)
-    shield, written = env.attached.shield, len(env.attached.shield.log)
-    other.refuses = True
-    for call in (lambda: env.reset(seed=3), lambda: env.step(DRIVE), lambda: env.step(DRIVE)):
-        with pytest.raises(InvalidInput, match="not now"):
-            call()
-        assert env.attached.shield is shield
-    other.refuses = False
-    info = play(env)
-    log = env.attached.shield.log
-    assert info["shield"]["trusted"] and info["world_first_impact_harm"] == info["shield"]["bound_harm"]
-    assert len(log) == env.attached.shield.interventions[0] > written
-    assert [entry.step for entry in log] == sorted({entry.step for entry in log})
-
-
 def test_threads__no_episode_gets_above_its_bound():
     env = ShieldedVectorEnv(EthBrakeVectorEnv(4, PAPER, autoreset_mode="NextStep"))
     env.reset(seed=0)
-    failures = []
+    trusted = []
 
     def work():
         for _ in range(60):
-            try:
-                told = env.step(np.ones((4, 1)))[4]["shield"]
-                failures.extend([] if told["trusted"].all() else ["distrusted"])
-            except UncertifiedStep:
-                pass
-            except Exception as error:
-                failures.append(error)
+            with contextlib.suppress(UncertifiedStep):
+                trusted.append(env.step(np.ones((4, 1)))[4]["shield"]["trusted"].all())
 
-    threads = [threading.Thread(target=work) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(3) as pool:
+        for done in [pool.submit(work) for _ in range(3)]:
+            done.result()
     shield, engine = env.attached.shield, env.attached.engine
-    assert failures == [] and shield.running.steps.tolist() == engine.steps.tolist()
+    assert all(trusted) and shield.running.steps.tolist() == engine.steps.tolist()
     assert (engine.ledger.world_harm("first") <= shield.first_bound).all()
 
 
@@ -304,9 +248,22 @@ def test_horizon__what_still_moves_then_is_told_and_warned_of_once():
     assert info["shield"]["settles"] is True
 
 
-def test_horizon__beyond_it_the_bound_says_nothing():
-    now, later = above_later("coast", 200)
-    assert now == 0.0 and later > 0.5
+def above_later(proposer, worlds):
+    """Shares of the worlds above their bound at a horizon of 3 s, and once all have braked to a stop."""
+    scenario = PAPER.replace(horizon_s=3.0)
+    driver = ShieldedDriver(make_agent(proposer), scenario)
+    episodes = drive(scenario.sample(worlds, 7).worlds, driver, scenario, 1)
+    final, bound = episodes.final, episodes.guarded.shield.predicted_harm
+    _, impacts = advance(final, -final.vehicles.braking_capacity_mps2, until_s=np.full(worlds, 8.0))
+    now, later = (ledger.world_harm("first") for ledger in (episodes.ledger, episodes.ledger.add(impacts)))
+    return (now > bound).mean(), (later > bound + 1e-9).mean()
+
+
+# The shares that docs/shield.md tells.
+@pytest.mark.parametrize(("proposer", "share"), [("coast", 0.662), ("full_brake", 0.614)])
+def test_horizon__beyond_it_the_bound_says_nothing(proposer, share):
+    now, later = above_later(proposer, 2_000)
+    assert now == 0.0 and round(later, 3) == share
 
 
 # Mode episode: never worse than its baseline, in any world, and as predicted.
@@ -407,10 +364,7 @@ def test_episode__neither_a_prediction_nor_a_refused_call_asks_the_policy_again(
 
 @pytest.mark.parametrize("believed", [False, True])
 def test_policy_with_a_memory__is_asked_once_per_decision_whoever_proposes(believed):
-    asked = []
-
     def remembering(observation, state):
-        asked.append(float(state[0, 0]))
         return -np.minimum(state, 10.0) / 10.0, state + 1.0
 
     policy = eb.policy_agent(remembering, initial_state=lambda n: np.zeros((n, 1)))

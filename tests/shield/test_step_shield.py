@@ -18,7 +18,7 @@ from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver, StepShield, parse_uncertainty
 from ethbrake_marl.shield.step_shield import REASONS, Backup, Proposer, begin_running, certify, plan_harm
 from tests.fixtures.asked import Asked
-from tests.shield.lines import ADVERSARIES, attack, begun, extremes, line, random_actions
+from tests.shield.lines import ADVERSARIES, LEAKS, attack, begun, extremes, line, random_actions, search
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::RuntimeWarning",  # uncompiled, a division by 0 warns
@@ -167,12 +167,14 @@ def test_proposal__that_is_no_number_is_replaced_and_beyond_the_range_is_clipped
     assert decision.intervened[0] == np.isnan(value) == (reason(decision) == "not a number")
 
 
-def test_attack__realised_harm_is_the_last_bound_to_the_bit() -> None:
-    for adversary in (random_actions, extremes):
-        found = attack(TWO, SMALL, adversary)
-        assert (found.bound > 0.0).any()
-        assert (found.realised <= found.bound).all()
-        assert found.realised.tolist() == found.last_bound.tolist()
+# Small enough to run uncompiled.
+@pytest.mark.parametrize("adversary", [random_actions, extremes])
+@pytest.mark.parametrize(("scenario", "worlds"), [(TWO, SMALL), (line(3), line(3).sample(5, 3).worlds)], ids=["2", "3"])
+def test_attack__realised_harm_is_the_last_bound_to_the_bit_and_the_bound_never_rises(scenario, worlds, adversary):
+    found = attack(scenario, worlds, adversary)
+    assert (found.bound > 0.0).any() and found.rises == 0
+    assert (found.realised <= found.bound).all()
+    assert found.realised.tolist() == found.last_bound.tolist()
 
 
 @pytest.mark.parametrize("name", ADVERSARIES)
@@ -187,6 +189,24 @@ def test_attack__comes_within_one_percent_of_the_bound_by_accepted_actions():
     found = attack(line(3), line(3).sample(60, 12).worlds, ADVERSARIES["most_harmful"])
     tried = (found.bound > 1.0) & (found.accepted > 0)
     assert (found.realised[tried] > 0.99 * found.bound[tried]).any()
+
+
+def test_search__finds_no_way_past_the_shield_but_many_without_it():
+    found = search(60, 5)
+    assert (found.above, found.excess) == (0, 0.0)
+    assert found.loose > 0.5
+
+
+@pytest.mark.parametrize("name", [name for name in LEAKS if "further off" not in name])  # that one takes longer lines
+def test_search__finds_each_leak(name):
+    found = search(100, 5, LEAKS[name], until_found=True)
+    assert found.first is not None and found.excess > 1e-6
+
+
+def test_trained_adversary__does_more_harm_under_the_shield_than_chance_does() -> None:
+    worlds = line(3).sample(80, 21).worlds
+    harm = {name: attack(line(3), worlds, ADVERSARIES[name]).realised.mean() for name in ("trained", "random_actions")}
+    assert harm["trained"] > harm["random_actions"]
 
 
 def test_allowance__keeps_what_it_grants_and_no_more():
@@ -441,19 +461,6 @@ def test_rollout__a_policy_that_does_otherwise_when_it_is_tried_out_gets_no_furt
     guarded, harm, reasons = driven(TwoFaced())
     assert (reasons == REASONS.index("policy rollout")).any()
     assert harm.tolist() == guarded.shield.bound.tolist() and (harm <= guarded.shield.predicted_harm).all()
-
-
-def test_rollout__of_some_worlds_alone_is_that_of_the_whole_batch():
-    class Whole:
-        name = "whole"
-
-        def __init__(self):
-            self.policy = LearnedAgent(Weights())
-
-        def act(self, worlds, vehicle):
-            return self.policy.act(worlds, vehicle)
-
-    assert driven(Whole())[1].tolist() == driven(LearnedAgent(Weights()))[1].tolist()
 
 
 def test_later_rollouts__may_be_switched_off():

@@ -150,10 +150,10 @@ def test_every_member__is_bounded_by_the_same_actions():
     assert (shield.bound <= first).all() and (first > 0.0).any()
 
 
-@pytest.mark.parametrize("harm_count", ["first", "total"])
-def test_no_width__is_step_mode_to_the_bit(harm_count):
+@pytest.mark.parametrize(("harm_count", "robust"), [("first", "corners"), ("total", "corners"), ("first", "interior")])
+def test_no_width__is_step_mode_to_the_bit(harm_count, robust):
     scenario, found = line(3), []
-    for settings in ({}, {"uncertainty": "latency_s=0,mass_t=0%"}):
+    for settings in ({}, {"uncertainty": "latency_s=0,mass_t=0%", "robust": robust}):
         driver = ShieldedDriver(Adversary("random"), scenario, harm_count=harm_count, **settings)
         episodes = drive(scenario.sample(12, 3).worlds, driver, scenario, 1)
         found.append((episodes.ledger.world_harm(harm_count).tolist(), episodes.guarded.shield.bound.tolist()))

@@ -1,4 +1,4 @@
-"""The shield on every interface: what it tells, what it takes off the reward, and what it lets go of."""
+"""The shield on every interface: what it tells, takes off the reward, lets go of, and that nothing interferes."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from tests.shield.interface_attack import INTERFACES
+from tests.shield.interference import PLAYS, WRAPPERS, disturbed, wrapped
+from tests.shield.test_step_shield import Speechless
 
 PAPER = load_scenario("paper-random")
 MAKERS = {
@@ -95,39 +97,15 @@ def test_parallel__what_is_told_never_rises_and_holds(allowance):
     assert (bounds[-1] > first) == (allowance > 0.0)
 
 
-class Speechless:
-    """Proposes nothing that is a number."""
-
-    name = "speechless"
-
-    def act(self, worlds, vehicle):
-        return np.full(worlds.n, np.nan)
-
-
 def test_policy__proposes_where_nobody_does_and_is_replaced_where_it_says_no_number():
     told = []
     for policy in (make_agent("constant:5"), Speechless()):
         env = HybridShield(parallel_env(), policy, mode="step")
         env.reset(seed=1)
-        told.append(env.step({})[-1]["vehicle_2"]["shield"])
+        told += [env.step({})[-1]["vehicle_2"]["shield"] for _ in range(8)]
     assert told[0]["proposed_action"] == pytest.approx(-5.0 / 7.0)
-    assert told[1]["reason"] == "not a number" and told[1]["intervened"] and np.isnan(told[1]["proposed_action"])
-
-
-def test_applied__what_something_between_the_shield_and_the_engine_does_is_shielded():
-    class Driving(BaseParallelWrapper):
-        def step(self, actions):
-            return super().step({**actions, "vehicle_3": np.ones(1)})
-
-    env, replaced = HybridShield(Driving(parallel_env("cooperation-3-pair")), mode="step"), 0
-    env.reset(seed=0)
-    bound = env.attached.shield.first_bound[0]
-    while env.agents:
-        *_, infos = env.step({"vehicle_2": [-1.0], "vehicle_3": [-1.0]})
-        told = infos["vehicle_3"]["shield"]
-        assert told["proposed_action"] == 1.0 and told["trusted"]
-        replaced += told["intervened"]
-    assert env.unwrapped.engine.ledger.world_harm("first")[0] <= bound and replaced > 0
+    silent = [each for each in told if np.isnan(each["proposed_action"])]
+    assert silent and all(each["intervened"] and each["reason"] == "not a number" for each in silent)
 
 
 BATCHES = {
@@ -172,6 +150,25 @@ def test_attack__through_every_interface_stays_within_the_bound_at_the_alert(nam
     realised, bound, _ = INTERFACES[name](24, 5)  # make test-shield: 10,000
     assert len(realised) == len(bound) >= 24
     assert (np.array(realised) <= np.array(bound) + 1e-9).all() and max(bound) > 0.0
+
+
+# Samples of the gate "interference".
+BATCHED = ("vector", "vector, next step", "sb3", "team, sb3")
+INSIDE = [name for name in PLAYS if "evaluation" not in name]  # the engine itself asks that one: nothing is in between
+
+
+@pytest.mark.parametrize("name", PLAYS)
+def test_disturbed__calls_that_fail_or_are_interrupted_change_nothing_and_no_episode_gets_above_its_bound(name):
+    found = disturbed(name, 8 if name in BATCHED or "evaluation" in name else 5, seed=3)
+    assert found.refused > 5 and found.interrupted > 3
+    assert (found.above, found.broken) == (0, 0)
+
+
+@pytest.mark.parametrize("wrapper", WRAPPERS)
+@pytest.mark.parametrize("name", INSIDE)
+def test_wrapped__whatever_reaches_the_engine_is_shielded_and_no_episode_gets_above_its_bound(name, wrapper):
+    found = wrapped(name, wrapper, 8 if wrapper == "frame skip 80" else 60, seed=5)
+    assert found.episodes > 0 and (found.above, found.broken) == (0, 0)
 
 
 @pytest.mark.parametrize("interface", MAKERS)
