@@ -363,6 +363,15 @@ def test_episode__neither_a_prediction_nor_a_refused_call_asks_the_policy_again(
 
 
 @pytest.mark.parametrize("believed", [False, True])
+def test_decide__changes_nothing_not_even_the_memory_of_a_policy_that_writes_into_it(believed):
+    env = HybridShield(parallel_env(), Counting(), mode="step", believed=believed)
+    env.reset(seed=4)
+    attached, nothing = env.attached, np.full((1, 1), np.nan)
+    told = [attached.guard.decide(attached.engine, attached.memory, nothing).proposed for _ in range(2)]
+    assert told[0].tolist() == told[1].tolist() and attached.memory.policies[1].tolist() == [0.0]
+
+
+@pytest.mark.parametrize("believed", [False, True])
 def test_policy_with_a_memory__is_asked_once_per_decision_whoever_proposes(believed):
     def remembering(observation, state):
         return -np.minimum(state, 10.0) / 10.0, state + 1.0

@@ -16,9 +16,18 @@ from ethbrake_marl.physics import make_worlds
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver, StepShield, parse_uncertainty
-from ethbrake_marl.shield.step_shield import REASONS, Backup, Proposer, begin_running, certify, plan_harm
+from ethbrake_marl.shield.step_shield import (
+    CONSTANTS,
+    REASONS,
+    Backup,
+    Proposer,
+    begin_running,
+    certify,
+    plan_harm,
+    seen_columns,
+)
 from tests.fixtures.asked import Asked
-from tests.shield.lines import ADVERSARIES, LEAKS, attack, begun, extremes, line, random_actions, search
+from tests.shield.lines import ADVERSARIES, LEAKS, attack, begun, extremes, line, random_actions, search, unshielded
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::RuntimeWarning",  # uncompiled, a division by 0 warns
@@ -167,11 +176,28 @@ def test_proposal__that_is_no_number_is_replaced_and_beyond_the_range_is_clipped
     assert decision.intervened[0] == np.isnan(value) == (reason(decision) == "not a number")
 
 
-# Small enough to run uncompiled.
+@pytest.mark.parametrize(("N", "harm_count"), [(3, "first"), (3, "total"), (5, "total")])
+def test_certify__realises_the_certified_harm_to_the_bit_whatever_is_proposed(N, harm_count):
+    scenario, rng = line(N), np.random.default_rng(N)
+    worlds = scenario.sample(5, N).worlds
+    engine, plan = unshielded(scenario, worlds), np.full((5, STEPS), -0.6)
+    settings = {"others_mps2": engine.wanted_mps2.copy(), "harm_count": harm_count}
+    running, backup = start(worlds, plan, vehicle=scenario.learners[0], **settings)
+    backup, bounds = backup._replace(constants=np.array(CONSTANTS[::5])), [backup.harm]
+    while not engine.ended.all():
+        decision = certify(running, rng.uniform(-1.2, 1.2, 5), backup, backup.harm)
+        engine.step(decision.applied[:, np.newaxis])
+        running, backup = decision.after, decision.backup
+        bounds.append(decision.bound)
+        assert running.ended.tolist() == engine.ended.tolist()
+        assert running.states.tolist() == seen_columns(engine.packed).tolist()
+    assert (np.diff(bounds, axis=0) <= 0.0).all() and (bounds[0] > 0.0).any()
+    assert engine.ledger.world_harm(harm_count).tolist() == backup.harm.tolist()
+
+
 @pytest.mark.parametrize("adversary", [random_actions, extremes])
-@pytest.mark.parametrize(("scenario", "worlds"), [(TWO, SMALL), (line(3), line(3).sample(5, 3).worlds)], ids=["2", "3"])
-def test_attack__realised_harm_is_the_last_bound_to_the_bit_and_the_bound_never_rises(scenario, worlds, adversary):
-    found = attack(scenario, worlds, adversary)
+def test_attack__of_few_worlds_small_enough_to_run_uncompiled(adversary):
+    found = attack(TWO, SMALL, adversary)
     assert (found.bound > 0.0).any() and found.rises == 0
     assert (found.realised <= found.bound).all()
     assert found.realised.tolist() == found.last_bound.tolist()
