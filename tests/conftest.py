@@ -8,7 +8,6 @@ import functools
 import os
 import signal
 import sys
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -25,7 +24,7 @@ os.environ["SDL_VIDEODRIVER"] = "dummy"
 os.environ["SDL_AUDIODRIVER"] = "dummy"
 os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"
 
-pytest_plugins = ["tests.fixtures.evaluation", "tests.fixtures.pictures", "tests.fixtures.policies"]
+pytest_plugins = [f"tests.fixtures.{name}" for name in ("evaluation", "pictures", "policies", "registered")]
 
 # Typer builds all commands for each command line, 100 ms; the suite has a thousand in one process.
 _build_command = functools.cache(typer.main.get_command_from_info)
@@ -40,10 +39,13 @@ def _copied_command(*given: Any, **how: Any) -> Any:
 typer.main.get_command_from_info = _copied_command
 
 # The suite reads the shipped files several thousand times, 10 ms each: what is parsed is the same for the same text.
-_parse = functools.cache(yaml._parse)
+_parse_anew = yaml._parse
+_parse = functools.cache(_parse_anew)
 
 
 def _parsed_once(text: str, file: str) -> yaml.Document:
+    if len(text) > 20_000:  # no scenario: somebody measures what a long one costs
+        return _parse_anew(text, file)
     document = _parse(text, file)
     return dataclasses.replace(document, content=copy.deepcopy(document.content))
 
@@ -56,21 +58,6 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # No deadline: the first example of a property pays for the kernel's compilation.
 settings.register_profile("deterministic", derandomize=True, deadline=None, database=None, print_blob=True)
 settings.load_profile("deterministic")
-
-
-@pytest.fixture(autouse=True)
-def _own_user_files() -> Iterator[None]:
-    """What a test ran of users' files is no part of the versions that the next test's results tell."""
-    plugins = sys.modules.get("ethbrake_marl.files.plugins")
-    tables = ("_RUN", "_READ", "_LOADED")
-    before = [{} if plugins is None else dict(getattr(plugins, name)) for name in tables]
-    yield
-    plugins = sys.modules.get("ethbrake_marl.files.plugins")
-    for name, then in () if plugins is None else zip(tables, before, strict=True):
-        now = getattr(plugins, name)
-        if now != then:
-            now.clear()
-            now.update(then)
 
 
 @pytest.fixture(autouse=True)

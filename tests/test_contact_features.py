@@ -13,9 +13,10 @@ from ethbrake_marl import observations
 from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.observations import FORECAST_S, GROUPS, ObservationSpec, choose_observation, observe
-from ethbrake_marl.physics import advance, make_worlds
+from ethbrake_marl.physics import advance
 from ethbrake_marl.policies import NetworkSpec, Policy
 from ethbrake_marl.scenario import observation_for
+from tests.physics.random_worlds import line
 
 SCENARIO = eb.load_scenario("paper-random")
 STEP_S = 0.1
@@ -29,27 +30,26 @@ def seen_by(worlds, vehicle, spec=CONTACT):
     return {f.name.removeprefix("contact."): values[:, c] * f.scale for c, f in enumerate(spec.features)}
 
 
-def line(gaps, speeds, **changes):
-    setting = {
-        "braking_capacity_mps2": [6.0, 7.0, 6.0], "driving_capacity_mps2": 3.0, "latency_s": [0.0, 0.5, 0.8],
-        "mass_t": [4.5, 5.5, 5.9], "restitution": 0.1,
-    }  # fmt: skip
-    return make_worlds(gaps, speeds, **{**setting, **changes})
+LINE = {"braking_capacity_mps2": [6.0, 7.0, 6.0], "driving_capacity_mps2": 3.0, "latency_s": 0.0, "restitution": 0.1}
 
 
 def test_contact__by_hand():
     """The middle one coasts behind one that brakes at 4 m/s2: 2 t + 2 t^2 = 3 m, closing at sqrt(4 + 2 * 4 * 3)."""
-    worlds = line([3.0, 30.0], [20.0, 22.0, 20.0], latency_s=0.0, braking_capacity_mps2=[4.0, 7.0, 6.0])
-    worlds, _ = advance(worlds, [-4.0, 0.0, -6.0], duration_s=0.0)
-    seen = seen_by(worlds, 1)
+    worlds = line([3.0, 30.0], [20.0, 22.0, 20.0], **{**LINE, "braking_capacity_mps2": [4.0, 7.0, 6.0]})
+    seen = seen_by(advance(worlds, [-4.0, 0.0, -6.0], duration_s=0.0)[0], 1)
     contact_s = (-2.0 + math.sqrt(4.0 + 2 * 4.0 * 3.0)) / 4.0
-    assert seen["coast_front_time"][0] == pytest.approx(contact_s, rel=1e-6)
-    assert seen["coast_front_closing_speed"][0] == pytest.approx(math.sqrt(28.0), rel=1e-6)
-    assert seen["coast_front_steps"][0] == pytest.approx(8)
-    assert seen["coast_front_fraction"][0] == pytest.approx(contact_s / 0.1 - 8, rel=1e-4)
-    assert seen["coast_first_impact_harm"][0] == pytest.approx(28.0, rel=1e-5)
-    assert seen["brake_front_closing_speed"][0] == 0.0 and seen["brake_front_fraction"][0] == 0.0
-    assert seen["brake_front_time"][0] == 4.0 and seen["brake_front_steps"][0] == 20.0  # clipped: there is none
+    by_hand = {
+        "coast_front_time": contact_s,
+        "coast_front_closing_speed": math.sqrt(28.0),
+        "coast_front_steps": 8,
+        "coast_front_fraction": contact_s / 0.1 - 8,
+        "coast_first_impact_harm": 28.0,
+        "brake_front_closing_speed": 0.0,
+        "brake_front_fraction": 0.0,
+        "brake_front_time": 4.0,  # clipped: there is none
+        "brake_front_steps": 20.0,
+    }
+    assert {name: seen[name][0] for name in by_hand} == pytest.approx(by_hand, rel=1e-4)
 
 
 def expected(worlds, vehicle, own_mps2, others_mps2, step_s=STEP_S):
@@ -72,16 +72,15 @@ def expected(worlds, vehicle, own_mps2, others_mps2, step_s=STEP_S):
     return told
 
 
-def check(worlds, vehicle, others_mps2, step_s=STEP_S, skip=()):
+def check(worlds, vehicle, others_mps2, step_s=STEP_S):
     spec = choose_observation(["contact"], step_s)
     seen, v = seen_by(worlds, vehicle, spec), worlds.vehicles
     own = {"brake": -v.braking_capacity_mps2[:, vehicle], "coast": 0.0, "drive": v.driving_capacity_mps2[:, vehicle]}
     bounds = {f.name.removeprefix("contact."): (f.low * f.scale, f.high * f.scale) for f in spec.features}
     for command, own_mps2 in own.items():
         for name, wanted in expected(worlds, vehicle, own_mps2, others_mps2, step_s).items():
-            if not name.startswith(tuple(skip)):
-                full = f"{command}_{name}"
-                np.testing.assert_allclose(seen[full], np.clip(wanted, *bounds[full]), rtol=1e-5, atol=1e-4)
+            full = f"{command}_{name}"
+            np.testing.assert_allclose(seen[full], np.clip(wanted, *bounds[full]), rtol=1e-5, atol=1e-4)
 
 
 @pytest.mark.parametrize("until_s", [0.8, 1.3, 2.1])
@@ -96,34 +95,33 @@ def test_contact__is_what_advance_records(until_s):
 
 
 def test_contact__others_go_on_as_they_are_seen_and_brake_fully_where_nothing_is_seen_yet():
-    start = SCENARIO.sample(40, 3).worlds
-    early, _ = advance(start, np.column_stack([np.full(40, -3.0), np.zeros(40), np.full(40, -2.0)]), until_s=0.5)
+    command = np.tile([-3.0, 0.0, -2.0], (40, 1))
+    early, _ = advance(SCENARIO.sample(40, 3).worlds, command, until_s=0.5)
     assert (early.command_mps2[:, 2] == 0.0).all()  # its latency of 0.8 s has not elapsed
-    check(early, 1, np.column_stack([np.full(40, -3.0), np.zeros(40), -early.vehicles.braking_capacity_mps2[:, 2]]))
-    late, _ = advance(early, np.column_stack([np.full(40, -3.0), np.zeros(40), np.full(40, -2.0)]), until_s=1.0)
-    check(late, 1, np.column_stack([np.full(40, -3.0), np.zeros(40), np.full(40, -2.0)]))
+    check(early, 1, np.column_stack([command[:, :2], -early.vehicles.braking_capacity_mps2[:, 2]]))
+    check(advance(early, command, until_s=1.0)[0], 1, command)
 
 
 def test_contact__sees_the_obstacle_and_vehicle_1_meets_it_in_front():
-    scenario = eb.load_scenario("cooperation-4-all")
-    start = scenario.sample(40, 5).worlds
-    worlds, _ = advance(start, -start.vehicles.braking_capacity_mps2, until_s=1.0)
-    others = -worlds.vehicles.braking_capacity_mps2
-    check(worlds, 0, others, skip=["front"] if worlds.N < 2 else [])
-    check(worlds, 1, others)
-    near = line([8.0, 40.0], [20.0, 18.0, 15.0], latency_s=0.0, obstacle_gap_m=20.0)
+    start = eb.load_scenario("cooperation-4-all").sample(40, 5).worlds
+    others = -start.vehicles.braking_capacity_mps2
+    worlds, _ = advance(start, others, until_s=1.0)
+    for vehicle in (0, 1):
+        check(worlds, vehicle, others)
+    near = line([8.0, 40.0], [20.0, 18.0, 15.0], obstacle_gap_m=20.0, **LINE)
     front = seen_by(near, 0)
     assert front["brake_front_time"][0] == pytest.approx((20 - math.sqrt(400 - 240)) / 6, rel=1e-5)
     assert front["brake_front_closing_speed"][0] == pytest.approx(math.sqrt(160.0), rel=1e-5)
 
 
-def test_contact__hides_whom_no_news_has_come_from():
-    before = line([7.0, 7.0], [20.0, 18.0, 20.0])
-    assert all((values == 0.0).all() for values in seen_by(before, 1).values())  # at the alert it knows of nobody
-    first, last = seen_by(before, 0), seen_by(before, 2)
+def test_contact__at_the_alert_shows_nobody_behind_a_latency():
+    before = line([7.0, 7.0], [20.0, 18.0, 20.0], **{**LINE, "latency_s": [0.0, 0.5, 0.8]})
+    first, middle, last = (seen_by(before, vehicle) for vehicle in range(3))
+    assert not any(values.any() for each in (middle, last) for values in each.values())
     assert (first["brake_front_time"] == 0.0).all() and (first["brake_rear_time"] > 0.0).all()
-    assert all((values == 0.0).all() for values in last.values())
 
+
+def test_contact__hides_whom_no_news_has_come_from_whatever_they_do():
     scenario = SCENARIO.replace(v2x="blocked", horizon_s=20, early_impacts="keep")
     worlds = advance(scenario.sample(300, 1).worlds, np.zeros((300, 3)), until_s=0.6)[0]
     news = worlds.vehicles.known_from_s[:, 1] <= 0.6
@@ -133,17 +131,9 @@ def test_contact__hides_whom_no_news_has_come_from():
     assert ((seen["coast_rear_time"] > 0.0) == news[:, 2]).all()
     alone = ~news[:, 0] & ~news[:, 2]
     assert (seen["drive_total_harm"][alone] == 0.0).all() and alone.any()
-
-
-def test_contact__nothing_of_the_unknown_part_of_the_line_shows():
-    """Whatever an unheard vehicle does, the features of the others are the same to the bit."""
-    scenario = SCENARIO.replace(v2x="blocked", horizon_s=20, early_impacts="keep")
-    worlds = advance(scenario.sample(300, 1).worlds, np.zeros((300, 3)), until_s=0.6)[0]
-    unheard = worlds.vehicles.known_from_s[:, 1, 2] > 0.6
-    speeds = worlds.speeds_mps.copy()
-    speeds[unheard, 2] = 39.0
-    changed = replace(worlds, speeds_mps=speeds)
-    assert observe(changed, 1, CONTACT)[unheard].tobytes() == observe(worlds, 1, CONTACT)[unheard].tobytes()
+    changed = replace(worlds, speeds_mps=worlds.speeds_mps.copy())
+    changed.speeds_mps[~news[:, 2], 2] = 39.0
+    assert observe(changed, 1, CONTACT)[~news[:, 2]].tobytes() == observe(worlds, 1, CONTACT)[~news[:, 2]].tobytes()
 
 
 def test_contact__of_some_commands_only_is_the_same():
@@ -166,15 +156,6 @@ def test_contact__leaves_other_features_alone_in_every_interface():
     assert env.reset(seed=3)[0]["vehicle_2"].tobytes() == wider[0].tobytes()
     listed = eb.make_sb3_vec_env(SCENARIO, 6, seed=3, observation=groups)
     assert listed.reset().tobytes() == wider.tobytes()
-
-
-def test_contact__needs_the_time_step():
-    worlds = SCENARIO.sample(2, 1).worlds
-    with pytest.raises(InvalidInput, match="contact features need the time between two decisions"):
-        observe(worlds, 1, choose_observation(["own", "contact"]))
-    with pytest.raises(InvalidInput, match=r"time_step_s = -1\.0; must be a positive number"):
-        ObservationSpec(contact=True, time_step_s=-1.0)
-    assert choose_observation(["own"], 0.1).time_step_s is None  # nothing that depends on it
 
 
 def contact_policy(scenario, group="contact"):
@@ -200,10 +181,10 @@ def test_policy__observes_contacts_at_the_steps_of_its_training():
     assert policy.observation == choose_observation(["own", "contact"], 0.05)
     outcome = eb.evaluate(SCENARIO.sample(5, 7), {"mine": LearnedAgent(policy)}, scenario=SCENARIO).outcome("mine")
     assert np.isfinite(outcome.total_harm).all()
-    with pytest.raises(InvalidInput, match="time_step_s = None; contact features need a number above 0"):
-        contact_policy({})
-    with pytest.raises(InvalidInput, match="time_step_s = None; contact features need a number above 0"):
-        contact_policy({}, "contact_far")
+    for group in ("contact", "contact_far"):
+        with pytest.raises(InvalidInput, match="time_step_s = None; contact features need a number above 0"):
+            contact_policy({}, group)
+    assert choose_observation(["own"], 0.1).time_step_s is None  # nothing that depends on it
     far = contact_policy(SCENARIO.replace(time_step_s=0.05).model_dump(mode="json"), "contact_far")
     assert far.observation == choose_observation(["own", "contact_far"], 0.05)
 
@@ -230,8 +211,8 @@ def test_contact_far__tells_what_the_others_cut_off():
         assert values.tobytes() == seen[name].tobytes()
     hard = 0
     for command in ("brake", "coast", "drive"):
-        for far, near in (("front_time", "front_time"), ("rear_time", "rear_time")):
-            found, cut = seen[f"contact_far.{command}_{far}"] * 5.0, seen[f"contact.{command}_{near}"] * 2.0
+        for time in ("front_time", "rear_time"):
+            found, cut = seen[f"contact_far.{command}_{time}"] * 5.0, seen[f"contact.{command}_{time}"] * 2.0
             np.testing.assert_allclose(np.minimum(found, 4.0), cut, rtol=1e-6)
             assert (found <= 10.0).all()
         for far, near in (("first_impact_speed", "first_impact_harm"), ("total_speed", "total_harm")):

@@ -12,7 +12,7 @@ from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.engine import Engine
 from ethbrake_marl.errors import FailedWorld, PhysicsError
-from ethbrake_marl.physics import Worlds, advance, forecast, leaving_out_failed
+from ethbrake_marl.physics import advance, forecast, leaving_out_failed
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield.step_shield import Backup, StepShield, begin_running, certify
@@ -40,7 +40,6 @@ def braking(worlds):
 def test_every_search_and_forecast__names_all_of_them(worlds):
     candidates = np.tile([-6.0, 0.0], (N, 1))
     for call in (
-        lambda: advance(worlds, braking(worlds), until_s=8.0),
         lambda: advance(worlds, braking(worlds), until_s=8.0, threads=3),
         lambda: advance(worlds, braking(worlds), until_s=8.0, record=True),
         lambda: forecast(worlds, braking(worlds), 1, candidates, 8.0),
@@ -139,8 +138,3 @@ def test_shield__a_proposal_that_cannot_be_advanced_is_not_certified():
     with pytest.raises(PhysicsError) as raised:
         certify(broken, np.zeros(3), Backup(plan, harm), harm)
     assert list(raised.value.worlds) == [1]  # the plan cannot be followed there either; the others are well
-
-
-def test_concatenated_batches__are_not_told_apart(worlds):
-    both = Worlds.concatenate([worlds, worlds])
-    assert failed_rows(lambda: advance(both, braking(both), until_s=8.0)) == [2, 6, 11, 15]

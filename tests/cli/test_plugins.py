@@ -19,7 +19,7 @@ from ethbrake_marl.files import plugins
 from ethbrake_marl.scenario import new_scenario_text
 from ethbrake_marl.studies.jobs import JobFolder, TrainingJob
 from tests.cli.conftest import TINY_RECIPE
-from tests.extending.conftest import restore, tables
+from tests.fixtures.registered import restore, tables
 
 PLUGIN = '''
 import numpy as np

@@ -1,22 +1,26 @@
-"""The four interfaces behind one small protocol, so that one suite judges them all, and the scenarios for it."""
+"""All interfaces behind one small class, so that one suite judges them all, and small scenarios for it."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from functools import partial
+from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from ethbrake_marl.envs.interfaces import EthBrakeEnv, EthBrakeParallelEnv, EthBrakeVectorEnv
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.envs.interfaces import EthBrakeEnv, EthBrakeParallelEnv, EthBrakeVectorEnv, in_turns
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.physics import Worlds
-from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario
+from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv
+from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 
 Array = NDArray[Any]
+Wrap = Callable[[Any], Any]
 
 PAPER = load_scenario("paper-random")
 FIVE = Scenario(
@@ -37,7 +41,46 @@ FIVE = Scenario(
         "vehicle_5": "copy_leader",
     },
 )
+# Vehicle 1 brakes with 6 m/s2 from 20 m/s; Vehicle 2 may act after 0.5 s. Coasting, it closes 3 m in 1 s and hits with
+# w = 6 m/s: harm 36, of which masses 1 and 3 give Vehicle 1 three quarters (27) and Vehicle 2 the rest (9).
+CRASH = Scenario(
+    name="crash",
+    vehicles=2,
+    gaps_m=3,
+    speeds_mps=20,
+    braking_capacity_mps2=[6, 8],
+    driving_capacity_mps2=[6, 4],
+    mass_t=[1, 3],
+    latency_s=[0, 0.5],
+    restitution=0,
+    horizon_s=1.3,
+)
+
+# Far apart and nearly at rest: Vehicle 2, from 5.7 m/s with 6 m/s2 after 0.5 s, rests at 1.45 s, in its 10th step.
+REST = Scenario(
+    name="rest",
+    vehicles=2,
+    gaps_m=50,
+    speeds_mps=5.7,
+    braking_capacity_mps2=6,
+    driving_capacity_mps2=6,
+    mass_t=1,
+    latency_s=[0, 0.5],
+)
 SCENARIOS = {"paper-random": PAPER, "five": FIVE}
+LEVELS = {
+    entry.name: load_scenario(entry.name) for entry in list_scenarios() if entry.path.parent.name == "cooperation"
+}
+
+
+def line(vehicles: int, v2x: str = "congested", horizon_s: int = 12) -> Scenario:
+    """All learn, an obstacle ahead, over a channel; each for itself and a little for the others."""
+    return Scenario(
+        name=f"line-{vehicles}-{v2x}", vehicles=vehicles, gaps_m={"uniform": [5, 10]}, speeds_mps={"uniform": [18, 22]},
+        braking_capacity_mps2={"uniform": [5, 9]}, driving_capacity_mps2=3, mass_t={"uniform": [1, 8]},
+        latency_s=[0] + [0.3] * (vehicles - 1), horizon_s=horizon_s, v2x=v2x, objective="social:30",
+        roles={f"vehicle_{i}": "learner" for i in range(1, vehicles + 1)}, obstacle_gap_m={"uniform": [35, 45]},
+    )  # fmt: skip
 
 
 @dataclass
@@ -67,64 +110,94 @@ class Turn:
         return b"".join(parts) + repr(sorted(self.harm.items())).encode()
 
 
-class Interface(Protocol):
-    """An interface with one learner in each of n worlds; ended episodes are followed by the next of the stream."""
-
-    env: Any
-    n: int
-    space: Box
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Array: ...
-
-    def step(self, action: Array) -> Turn: ...
-
-
 def harms(info: Mapping[str, Any]) -> tuple[float, float]:
     return float(info["world_first_impact_harm"]), float(info["world_total_harm"])
 
 
-class Parallel:
-    def __init__(self, scenario: Scenario, n: int, **settings: Any) -> None:
-        assert n == 1
-        self.env, self.n = EthBrakeParallelEnv(scenario, **settings), 1
-        self.agent = self.env.possible_agents[self.env.engine.learners[0]]
+def unchanged(env: Any) -> Any:
+    return env
+
+
+class Interface:
+    """One learner in each of n worlds; ended episodes are followed by the next of the stream."""
+
+    env: Any
+    n = 1
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Array:
+        raise NotImplementedError
+
+    def step(self, action: Array) -> Turn:
+        raise NotImplementedError
+
+    def drawn(self) -> list[dict[str, Any]]:
+        """What each running world was drawn as."""
+        return [self.env.unwrapped.describe_world()]
+
+    def one_row(self, observation: Array, reward: float, terminated: bool, truncated: bool, info: Any) -> Turn:
+        turn = Turn(observation[np.newaxis], np.array([reward]), np.array([terminated]), np.array([truncated]))
+        if turn.ended[0]:
+            turn.final, turn.harm = {0: observation}, {0: harms(info)}
+            turn.observation = self.reset()
+        return turn
+
+
+class Parallel(Interface):
+    def __init__(self, scenario: Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
+        self.env = wrap(EthBrakeParallelEnv(scenario, **settings))
+        self.agent = self.env.possible_agents[self.env.unwrapped.engine.learners[0]]
         self.space = self.env.observation_space(self.agent)
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Array:
         return self.env.reset(seed=seed, options=options)[0][self.agent][np.newaxis]
 
     def step(self, action: Array) -> Turn:
-        given = self.env.step({self.agent: action[0]})
-        observation, reward, terminated, truncated, info = (part[self.agent] for part in given)
-        return one_row(self, observation, reward, terminated, truncated, info)
+        return self.one_row(*(part[self.agent] for part in self.env.step({self.agent: action[0]})))
 
 
-class Single:
-    def __init__(self, scenario: Scenario, n: int, **settings: Any) -> None:
-        assert n == 1
-        self.env, self.n = EthBrakeEnv(scenario, **settings), 1
+class InTurn(Parallel):
+    """PettingZoo's other interface: one agent after the other."""
+
+    def __init__(self, scenario: Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
+        super().__init__(scenario, n, wrap, **settings)
+        self.env = in_turns(self.env)
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Array:
+        self.env.reset(seed=seed, options=options)
+        return self.env.observe(self.agent)[np.newaxis]
+
+    def step(self, action: Array) -> Turn:
+        acting = ""
+        while acting != self.env.possible_agents[-1]:
+            acting = self.env.agent_selection
+            self.env.step(action[0] if acting == self.agent else None)
+        told = (self.env.rewards, self.env.terminations, self.env.truncations, self.env.infos)
+        return self.one_row(self.env.observe(self.agent), *(part[self.agent] for part in told))
+
+
+class Single(Interface):
+    def __init__(self, scenario: Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
+        self.env = wrap(EthBrakeEnv(scenario, **settings))
         self.space = self.env.observation_space
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Array:
         return self.env.reset(seed=seed, options=options)[0][np.newaxis]
 
     def step(self, action: Array) -> Turn:
-        return one_row(self, *self.env.step(action[0]))
+        return self.one_row(*self.env.step(action[0]))
 
 
-def one_row(
-    interface: Interface, observation: Array, reward: float, terminated: bool, truncated: bool, info: Any
-) -> Turn:
-    turn = Turn(observation[np.newaxis], np.array([reward]), np.array([terminated]), np.array([truncated]))
-    if turn.ended[0]:
-        turn.final, turn.harm = {0: observation}, {0: harms(info)}
-        turn.observation = interface.reset()
-    return turn
+class Batch(Interface):
+    """Several worlds at once."""
+
+    def drawn(self) -> list[dict[str, Any]]:
+        columns = self.env.unwrapped.describe_worlds()
+        return [{name: column[k].item() for name, column in columns.items()} for k in range(self.n)]
 
 
-class Vector:
-    def __init__(self, scenario: Scenario, n: int, **settings: Any) -> None:
-        self.env, self.n = EthBrakeVectorEnv(n, scenario, autoreset_mode="SameStep", **settings), n
+class Vector(Batch):
+    def __init__(self, scenario: Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
+        self.env, self.n = wrap(EthBrakeVectorEnv(n, scenario, autoreset_mode="SameStep", **settings)), n
         self.space = self.env.single_observation_space
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Array:
@@ -134,15 +207,14 @@ class Vector:
         observation, reward, terminated, truncated, infos = self.env.step(action)
         turn = Turn(observation, reward, terminated, truncated)
         for row in np.flatnonzero(turn.ended).tolist():
-            final = infos["final_info"]
             turn.final[row] = infos["final_obs"][row]
-            turn.harm[row] = float(final["world_first_impact_harm"][row]), float(final["world_total_harm"][row])
+            turn.harm[row] = harms({name: column[row] for name, column in infos["final_info"].items()})
         return turn
 
 
-class Sb3:
-    def __init__(self, scenario: Scenario, n: int, **settings: Any) -> None:
-        self.env, self.n = make_sb3_vec_env(scenario, n, seed=None, **settings), n
+class Sb3(Batch):
+    def __init__(self, scenario: Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
+        self.env, self.n = wrap(make_sb3_vec_env(scenario, n, seed=None, **settings)), n
         self.space = self.env.observation_space
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Array:
@@ -160,13 +232,25 @@ class Sb3:
         return turn
 
 
-INTERFACES: dict[str, type[Parallel] | type[Single] | type[Vector] | type[Sb3]] = {
+# What the suite judges: a new interface is one entry here.
+BARE: dict[str, Callable[..., Interface]] = {
     "parallel": Parallel,
+    "in turn": InTurn,
     "single": Single,
     "vector": Vector,
     "sb3": Sb3,
 }
-BATCHED = ("vector", "sb3")
+STEP: dict[str, Callable[..., Interface]] = {
+    "shielded parallel": partial(Parallel, wrap=partial(HybridShield, mode="step")),
+    "shielded in turn": partial(InTurn, wrap=partial(HybridShield, mode="step")),
+    "shielded single": partial(Single, wrap=ShieldedEnv),
+    "shielded vector": partial(Vector, wrap=ShieldedVectorEnv),
+    "shielded sb3": partial(Sb3, wrap=ShieldedVecEnv),
+}
+EPISODE = partial(HybridShield, policy=make_agent("full_brake"), mode="episode")  # what is proposed is not asked
+SHIELDED = {**STEP, "episode parallel": partial(Parallel, wrap=EPISODE)}
+INTERFACES = {**BARE, **SHIELDED}
+BATCHED = [name for name in INTERFACES if name.endswith(("vector", "sb3"))]
 
 
 def rows_of(name: str) -> int:
@@ -193,7 +277,7 @@ def all_digests() -> dict[str, str]:
     """One digest for each interface and scenario, for another process to compare."""
     return {
         f"{interface} {name}": digest(interface, scenario, 11)
-        for interface in INTERFACES
+        for interface in BARE
         for name, scenario in SCENARIOS.items()
     }
 

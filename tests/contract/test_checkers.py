@@ -4,76 +4,88 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import gymnasium
 import pytest
 from gymnasium.utils.env_checker import check_env
-from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
+from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, render_test, seed_test
 from pettingzoo.test.state_test import state_test
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.env_util import make_vec_env
 
-from ethbrake_marl import ethbrake_v0
-from ethbrake_marl.envs.interfaces import UnknownResetOption
+from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.envs.drawing import HEIGHT, WIDTH, Viewer
+from ethbrake_marl.envs.interfaces import EthBrakeEnv, UnknownResetOption, env, parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from tests.contract.interfaces import FIVE, PAPER, SCENARIOS
-
-Maker = Callable[..., Any]
+from ethbrake_marl.shield import HybridShield, ShieldedEnv, shielded_aec
+from tests.contract.interfaces import FIVE, LEVELS, PAPER, REST, SCENARIOS, line
 
 
 @pytest.fixture(autouse=True)
-def _no_display(monkeypatch: pytest.MonkeyPatch) -> None:
+def _every_warning_is_an_error(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")  # Gymnasium's checker renders in every mode, in a window, too
-
-
-@pytest.fixture(autouse=True)
-def _every_warning_is_an_error() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         # PettingZoo's checkers pass {"options": 1} on purpose; asking for a warning here is our own rule.
         warnings.filterwarnings("ignore", "reset: unknown option options, ignored", UnknownResetOption)
+        warnings.filterwarnings("ignore", ".*is different from the unwrapped version")  # a shield is: that is its use
         yield
 
 
 ANY_START = PAPER.replace(early_impacts="keep")
-SETTINGS: dict[str, dict[str, Any]] = {name: {"scenario": scenario} for name, scenario in SCENARIOS.items()} | {
+LINES = [*LEVELS.values(), *(line(vehicles) for vehicles in (2, 6, 10)), line(10, "nominal", 8)]
+SETTINGS: dict[str, dict[str, Any]] = {
+    **{scenario.name: {"scenario": scenario} for scenario in [*SCENARIOS.values(), *LINES]},
     "nobody learns": {"scenario": ANY_START, "learners": []},
     "two learn": {"scenario": ANY_START, "learners": ["vehicle_2", "vehicle_3"]},
+    "learners alone": {"scenario": LEVELS["cooperation-3-pair"], "agents": "learners"},
+    **{mode: {"scenario": REST, "render_mode": mode} for mode in Viewer.METADATA["render_modes"][1:]},
+}
+STEP, EPISODE = {"mode": "step"}, {"policy": make_agent("full_brake")}
+MAKERS: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
+    **{name: (partial(parallel_env, **given), partial(env, **given)) for name, given in SETTINGS.items()},
+    **{
+        f"shielded, {mode}": (
+            lambda given=given: HybridShield(parallel_env(), **given),
+            lambda given=given: shielded_aec(parallel_env(), **given),
+        )
+        for mode, given in (("step", STEP), ("episode", EPISODE))
+    },
 }
 
 
-@pytest.fixture(params=SETTINGS.values(), ids=list(SETTINGS))
-def settings(request: pytest.FixtureRequest) -> dict[str, Any]:
-    given: dict[str, Any] = request.param
-    return given
+@pytest.mark.parametrize("name", MAKERS)
+def test_pettingzoo__checkers_pass(name: str) -> None:
+    together, in_turn = MAKERS[name]
+    parallel_api_test(together(), num_cycles=100)
+    api_test(in_turn(), num_cycles=60)
+    parallel_seed_test(together, num_cycles=20)
+    if "shielded" not in name:
+        state_test(in_turn(), together(), num_cycles=40)
+    if name not in LEVELS:
+        seed_test(in_turn, num_cycles=20)
 
 
-def test_pettingzoo__parallel_api(settings: dict[str, Any]) -> None:
-    parallel_api_test(ethbrake_v0.parallel_env(**settings), num_cycles=150)
+@pytest.mark.parametrize("scenario", [*SCENARIOS.values(), REST], ids=lambda scenario: scenario.name)
+def test_gymnasium_and_stable_baselines3__checkers_pass(scenario: Any) -> None:
+    plain = gymnasium.make("EthBrake-v0", scenario=scenario).unwrapped
+    check_env(plain)
+    sb3_check_env(plain)
 
 
-def test_pettingzoo__api(settings: dict[str, Any]) -> None:
-    api_test(ethbrake_v0.env(**settings), num_cycles=150)
+def test_gymnasium_and_stable_baselines3__checkers_pass_behind_the_shield() -> None:
+    check_env(ShieldedEnv(EthBrakeEnv()), skip_render_check=True)
+    sb3_check_env(ShieldedEnv(EthBrakeEnv()))
 
 
-def test_pettingzoo__seeds(settings: dict[str, Any]) -> None:
-    parallel_seed_test(lambda: ethbrake_v0.parallel_env(**settings), num_cycles=40)
-    seed_test(lambda: ethbrake_v0.env(**settings), num_cycles=40)
-
-
-def test_pettingzoo__state(settings: dict[str, Any]) -> None:
-    state_test(ethbrake_v0.env(**settings), ethbrake_v0.parallel_env(**settings), num_cycles=40)
-
-
-@pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)
-def test_gymnasium__check_env(scenario: Any) -> None:
-    check_env(gymnasium.make("EthBrake-v0", scenario=scenario).unwrapped)
-
-
-@pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)
-def test_stable_baselines3__check_env(scenario: Any) -> None:
-    sb3_check_env(gymnasium.make("EthBrake-v0", scenario=scenario).unwrapped)
+@pytest.mark.filterwarnings("ignore:.*:UserWarning")
+def test_pettingzoo__render_test_passes() -> None:
+    pytest.importorskip("pygame", reason="needs the extra: pip install 'ethbrake-marl[render]'")
+    warnings.simplefilter("ignore", UserWarning)
+    render_test(lambda render_mode: env(scenario=REST, render_mode=render_mode))
 
 
 @pytest.mark.parametrize("learners", [["vehicle_4"], ["vehicle_2", "vehicle_3"]])
@@ -81,5 +93,10 @@ def test_stable_baselines3__learns_on_the_vec_env(learners: list[str]) -> None:
     vec_env = make_sb3_vec_env(FIVE, 4, learners=learners)
     model = PPO("MlpPolicy", vec_env, n_steps=32, batch_size=32, n_epochs=1, seed=3, device="cpu")
     model.learn(768)
-    assert len(model.ep_info_buffer) > 0
     assert model.ep_info_buffer[0]["l"] > 0
+
+
+def test_stable_baselines3__makes_it_by_its_id() -> None:
+    assert make_vec_env("EthBrake-v0", n_envs=2).reset().shape[0] == 2
+    model = PPO("MlpPolicy", "EthBrake-v0", n_steps=16, batch_size=16, n_epochs=1, device="cpu").learn(16)
+    assert model.get_env().render(mode="rgb_array").shape == (HEIGHT, WIDTH, 3)

@@ -190,7 +190,7 @@ TABLES: dict[str, How] = {
     "| what | measured | by": _by(SPEED),
     # words and settings
     "| preset | ": _by(SUITE, "tests/studies/ablation/test_cooperation_page.py"),
-    "| key | default | unit, range": _by(SUITE, "tests/scenario/test_catalogue.py"),
+    "| key | default | unit, range": _by(SUITE, "tests/scenario/test_schema.py"),
     "| name | gaps | speeds": EXACT,
     "| name | speeds | gaps": EXACT,
     "| licence | packages": _by(SUITE, "tests/programme/test_audit.py"),

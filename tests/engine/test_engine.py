@@ -1,34 +1,35 @@
-"""The engine: a reset or renewal that fails leaves everything as it was; worlds start at the alert."""
+"""The engine: episodes that start at the alert, scripts on their own grid, failures that change nothing, snapshots."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
 
+import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.engine import Engine, Stream
 from ethbrake_marl.envs.interfaces import make_engine
+from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Worlds, advance
-from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.rewards import RewardParams
+from ethbrake_marl.scenario import Scenario, load_scenario
 
 PAPER = load_scenario("paper-random").replace(early_impacts="keep")
 
 
-def engine(n=2, third=None, seed=0, first=None):
+def engine(n: int = 2, third: Any = None, first: Any = None) -> Engine:
     scripts = {0: first or make_agent("full_brake"), 2: third or make_agent("constant:5")}
-    return Engine(PAPER, n, learners=(1,), scripts=scripts, seed=seed)
+    return Engine(PAPER, n, learners=(1,), scripts=scripts, seed=0)
 
 
-def state(running):
+def state(running: Engine) -> list[Any]:
     packed = running.packed
-    return [packed.state.tolist(), packed.params.tolist(), running.wanted_mps2.tolist(), running.ended.tolist()]
-
-
-def too_weak(n):
-    """Worlds in which vehicle 3 cannot brake with 5 m/s2."""
-    given = {"gaps_m": 3, "braking_capacity_mps2": 4, "speeds_mps": 20}
-    return PAPER.worlds_from_state(given).take(np.zeros(n, np.int64))
+    arrays = (packed.state, packed.params, running.wanted_mps2, running.ended, running.seed)
+    return [np.asarray(array).tolist() for array in arrays]
 
 
 class Remembering:
@@ -46,25 +47,32 @@ class Remembering:
         return np.full(worlds.n, -5.0), memory
 
 
+class RefusingWatcher:
+    def begun(self, memory, alert, rows):
+        raise InvalidInput("watcher: no")
+
+
+# ---------------------------------------------------------------- what fails changes nothing
+
+
 @pytest.mark.parametrize("first", [None, Remembering()])
-def test_reset__that_fails_leaves_the_running_episodes_alone(first):
+def test_reset__that_fails_leaves_the_running_episodes_alone(first: Any) -> None:
+    # vehicle 3 of these worlds cannot brake with 5 m/s2
+    weak = PAPER.worlds_from_state({"gaps_m": 3, "braking_capacity_mps2": 4, "speeds_mps": 20}).take([0, 0])
     running, twin = engine(first=first), engine(first=first)
     for one in (running, twin):
         one.step({1: np.zeros(2)})
     before = state(running)
     with pytest.raises(InvalidInput, match=r"constant:5|vehicle_1"):
-        running.reset(seed=9, worlds=too_weak(2))
+        running.reset(seed=9, worlds=weak)
     assert state(running) == before
-    assert running.seed == 0
-    running.step({1: np.zeros(2)})
-    twin.step({1: np.zeros(2)})
-    assert state(running) == state(twin)
-    running.reset()
-    twin.reset()
-    assert state(running) == state(twin)
+    for go_on in (lambda one: one.step({1: np.zeros(2)}), Engine.reset):
+        for one in (running, twin):
+            go_on(one)
+        assert state(running) == state(twin)
 
 
-def test_renew__that_fails_leaves_the_running_episodes_and_the_stream_alone():
+def test_renew__that_fails_leaves_the_running_episodes_and_the_stream_alone() -> None:
     script = Remembering()
     running, twin = engine(third=script), engine(third=Remembering())
     before = state(running)
@@ -73,50 +81,25 @@ def test_renew__that_fails_leaves_the_running_episodes_and_the_stream_alone():
         running.renew(np.array([1]))
     assert state(running) == before
     script.refuses = False
-    running.renew(np.array([1]))
-    twin.renew(np.array([1]))
+    for one in (running, twin):
+        one.renew(np.array([1]))
     assert state(running) == state(twin)
 
 
-def test_renew__a_watcher_that_fails_leaves_the_running_episodes_alone():
+def test_renew__a_watcher_that_fails_leaves_the_running_episodes_alone() -> None:
     running = engine()
     before = state(running)
-
-    class Refusing:
-        def begun(self, memory, alert, rows):
-            raise InvalidInput("watcher: no")
-
-    running.watch(Refusing(), None)
+    running.watch(RefusingWatcher(), None)
     for start in (lambda: running.renew(np.array([0])), running.reset):
         with pytest.raises(InvalidInput, match="watcher"):
             start()
         assert state(running) == before
 
 
-def test_renew__leaves_what_the_other_rows_wanted():
-    class ByTheClock(Remembering):
-        def act(self, worlds, memory, vehicle):
-            return -worlds.time_s, memory
-
-    running = engine(third=ByTheClock())
-    running.step({1: np.zeros(2)})
-    wanted = running.wanted_mps2.copy()
-    running.renew(np.array([1]))
-    assert running.wanted_mps2[0].tolist() == wanted[0].tolist()
-    assert running.wanted_mps2[1, 2] == 0.0
+# ---------------------------------------------------------------- episodes
 
 
-def test_reset__takes_worlds_at_the_alert_only():
-    worlds = PAPER.sample(2, 0).worlds
-    late, _ = advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=[0.0, 0.3])
-    with pytest.raises(InvalidInput, match=r"world 1 is at 0.3 s; episodes start at the alert"):
-        engine().reset(worlds=late)
-    worlds.pair_hit[0, 1] = True
-    with pytest.raises(InvalidInput, match="world 0 is after an impact"):
-        engine().reset(worlds=worlds)
-
-
-def test_stream__gives_every_world_of_its_list_once_and_in_order_across_its_blocks():
+def test_stream__gives_every_world_of_its_list_once_and_in_order_across_its_blocks() -> None:
     scripts = {0: make_agent("full_brake"), 2: make_agent("constant:5")}
     stream = Stream(PAPER, [1], scripts, seed=4)
     taken = Worlds.concatenate([stream.take(count).alert for count in (1000, 100, 3000, 50)])
@@ -124,23 +107,28 @@ def test_stream__gives_every_world_of_its_list_once_and_in_order_across_its_bloc
     assert (taken.gaps_m == expected.gaps_m).all() and (taken.speeds_mps == expected.speeds_mps).all()
 
 
+@pytest.mark.parametrize(("deciders", "start"), [(None, 0.0), ((1,), 0.5), ((2,), 0.8), ((1, 2), 0.5)])
+def test_start__is_the_first_decision_or_the_alert(deciders: Any, start: float) -> None:
+    scripts = {i: make_agent("full_brake") for i in range(3)}
+    worlds = PAPER.sample(1, 0).worlds
+    running = Engine(PAPER, 1, learners=(), scripts=scripts, deciders=deciders, worlds=worlds)
+    assert running.worlds.time_s.tolist() == [start]
+
+
 @pytest.mark.parametrize(
     ("horizon_s", "latency_s", "steps"), [(8.0, 0.5, 75), (3.0, 0.65, 24), (3.0, 2.3, 7), (8.0, 5.1, 29)]
 )
-def test_horizon__is_reached_after_as_many_steps_as_fit(horizon_s, latency_s, steps):
+def test_horizon__is_reached_after_as_many_steps_as_fit(horizon_s: float, latency_s: float, steps: int) -> None:
     scenario = PAPER.replace(horizon_s=horizon_s, latency_s=[0, latency_s, latency_s], gaps_m=100, speeds_mps=30)
-    scripts = {0: make_agent("coast"), 2: make_agent("coast")}
-    running = Engine(scenario, 1, learners=(1,), scripts=scripts)
+    running = Engine(scenario, 1, learners=(1,), scripts={0: make_agent("coast"), 2: make_agent("coast")})
     ended = [bool(running.step(np.zeros((1, 1))).truncated[0]) for _ in range(steps)]
-    assert ended == [False] * (steps - 1) + [True]
-    assert running.worlds.time_s.tolist() == [horizon_s]
+    assert ended == [False] * (steps - 1) + [True] and running.worlds.time_s.tolist() == [horizon_s]
 
 
-def test_ended__rows_are_paid_nothing_until_they_are_renewed():
+def test_ended__rows_are_paid_nothing_until_they_are_renewed() -> None:
     reward = {"harm": 1.0, "risk": 1.0, "jerk": 1.0, "terminal": 5.0, "shaping": 1.0}
     running = make_engine("paper-random", 20, seed=1, reward=reward)
-    rng = np.random.default_rng(0)
-    paid_after = np.zeros(20)
+    rng, paid_after = np.random.default_rng(0), np.zeros(20)
     for _ in range(80):
         over = running.ended
         paid = running.step(rng.uniform(-1.0, 1.0, (20, 1))).reward
@@ -149,12 +137,15 @@ def test_ended__rows_are_paid_nothing_until_they_are_renewed():
     assert (paid_after > 0).all()
 
 
+# ---------------------------------------------------------------- scripts
+
+
 class Counting:
     """Brakes with 5 m/s2 plus a little for each decision it has made; notes when it made them."""
 
     name = "counting"
 
-    def __init__(self, adds=0.1):
+    def __init__(self, adds: float = 0.1) -> None:
         self.adds = adds
 
     def begin(self, alert, vehicle, scripts):
@@ -169,8 +160,12 @@ class Counting:
 OWN_GRID = PAPER.replace(latency_s=[0.03, {"uniform": [0.2, 0.7]}, 0.55], horizon_s=3.0)
 
 
+def decisions_before(end_s: float) -> int:
+    return int(np.ceil((end_s - 0.03) / 0.1 - 1e-9))
+
+
 @pytest.mark.parametrize("learners", [(1,), (2,), (1, 2), ()])
-def test_script__decides_on_its_own_grid_whoever_learns(learners):
+def test_script__decides_on_its_own_grid_whoever_learns(learners: tuple[int, ...]) -> None:
     worlds = OWN_GRID.sample(5, 3).worlds
     others = {i: make_agent("full_brake") for i in (1, 2) if i not in learners}
     running = Engine(OWN_GRID, 5, learners=learners, scripts={0: Counting(), **others}, worlds=worlds)
@@ -190,26 +185,20 @@ def test_script__decides_on_its_own_grid_whoever_learns(learners):
     assert np.abs(alone.ledger.world_harm("first") - ledger).max() < 1e-9
 
 
-def decisions_before(end_s):
-    return int(np.ceil((end_s - 0.03) / 0.1 - 1e-9))
-
-
-def test_script__of_which_a_row_is_renewed_remembers_the_others_as_they_were():
-    scripts = {0: Counting(), 2: make_agent("full_brake")}
-    running = Engine(OWN_GRID, 4, learners=(1,), scripts=scripts, seed=1)
+def test_script__of_which_a_row_is_renewed_remembers_the_others_as_they_were() -> None:
+    running = Engine(OWN_GRID, 4, learners=(1,), scripts={0: Counting(), 2: make_agent("full_brake")}, seed=1)
     for _ in range(4):
         running.step(np.zeros((4, 1)))
     made, wanted, packed = running.memories[0]["made"], running.wanted_mps2.copy(), running.packed.state.copy()
     running.renew(np.array([1]))
-    start_s = running.packed.state[1, 0]
-    expected = np.where(np.arange(4) == 1, decisions_before(start_s), made)
+    expected = np.where(np.arange(4) == 1, decisions_before(running.packed.state[1, 0]), made)
     assert running.memories[0]["made"].tolist() == expected.tolist()
-    for row in (0, 2, 3):
-        assert running.wanted_mps2[row].tolist() == wanted[row].tolist()
-        assert running.packed.state[row].tolist() == packed[row].tolist()
+    others = [0, 2, 3]
+    assert np.array_equal(running.wanted_mps2[others], wanted[others])
+    assert np.array_equal(running.packed.state[others], packed[others])
 
 
-def test_script__that_never_changes_its_mind_changes_no_bit():
+def test_script__that_never_changes_its_mind_changes_no_bit() -> None:
     runs = []
     for third in (Counting(adds=0.0), make_agent("constant:5")):
         running = Engine(OWN_GRID, 20, learners=(1,), scripts={0: make_agent("full_brake"), 2: third}, seed=5)
@@ -219,10 +208,151 @@ def test_script__that_never_changes_its_mind_changes_no_bit():
     assert all(np.array_equal(a, b) for a, b in zip(*runs, strict=True))
 
 
-def test_jerk__of_a_learner_is_counted_over_the_step_though_a_script_decides_within_it():
+def test_jerk__of_a_learner_is_counted_over_the_step_though_a_script_decides_within_it() -> None:
     runs = []
     for first in (Counting(), make_agent("full_brake")):
         scripts = {0: first, 2: make_agent("full_brake")}
         running = Engine(OWN_GRID, 3, learners=(1,), scripts=scripts, reward={"harm": 0.0, "jerk": 1.0}, seed=5)
         runs.append([running.step(np.full((3, 1), action)).further["jerk"][:, 1] for action in (-1.0, 0.5, -0.3, 1.0)])
     assert np.array_equal(*runs) and np.any(runs[0])
+
+
+# ---------------------------------------------------------------- an obstacle ahead of Vehicle 1
+
+ALL = load_scenario("cooperation-4-all")
+NEAR = ALL.replace(obstacle_gap_m={"uniform": [10, 45]})  # within the way of full braking in many worlds
+
+
+def test_engine__steps_as_advance_does_and_its_ledger_counts_the_obstacle() -> None:
+    running = make_engine(NEAR.replace(v2x="congested"), 60, seed=5, reward="total-harm")
+    worlds, ledger = running.worlds, running.ledger
+    rng, rewards = np.random.default_rng(2), np.zeros(60)
+    for _ in range(70):
+        going_on = ~running.ended
+        step = running.step(rng.uniform(-1.0, -0.8, (60, 3)))
+        until = np.where(going_on, running.worlds.time_s, worlds.time_s)
+        worlds, impacts = advance(worlds, running.wanted_mps2, until_s=until)
+        ledger, rewards = ledger.add(impacts), rewards + step.reward[:, 0]
+    assert np.array_equal(running.worlds.obstacle_gap_m, worlds.obstacle_gap_m)
+    assert np.array_equal(running.worlds.obstacle_hit, worlds.obstacle_hit)
+    for harm_count in HARM_COUNTS:
+        assert np.array_equal(running.ledger.obstacle_harm(harm_count), ledger.obstacle_harm(harm_count))
+        shares = running.ledger.vehicle_harm(harm_count)
+        np.testing.assert_allclose(shares.sum(axis=1), running.ledger.world_harm(harm_count), rtol=1e-12)
+    struck = running.ledger.obstacle_count > 0
+    assert struck.sum() > 20 and not struck.all() and running.ledger.collided[struck].all()
+    np.testing.assert_allclose(rewards, -running.ledger.world_harm("total"), rtol=1e-12)
+
+
+def test_infos__tell_the_same_shares_as_the_ledger() -> None:
+    env = eb.parallel_env(NEAR)
+    env.reset(seed=11)
+    while env.agents:
+        infos = env.step({name: np.array([-0.1], np.float32) for name in env.agents})[4]
+    ledger = env.engine.ledger
+    assert ledger.obstacle_count[0] > 0
+    for count, key in (("first", "first_impact_harm"), ("total", "total_harm")):
+        assert [infos[f"vehicle_{i + 1}"][key] for i in range(3)] == ledger.vehicle_harm(count)[0].tolist()
+        assert infos["vehicle_3"][f"world_{key}"] == ledger.world_harm(count)[0]
+    assert env.state()[-2:].tolist() == [np.float32(env.engine.worlds.obstacle_gap_m[0] / 10.0), 1.0]
+    assert env.state_space.contains(env.state()) and len(env.state()) == 28
+
+
+def test_engine__worlds_that_are_given_may_have_an_obstacle_or_none_whatever_the_scenario_says() -> None:
+    plain = load_scenario("cooperation-3-pair")
+    given = Worlds.concatenate([NEAR.sample(2, 1).worlds, plain.sample(2, 1).worlds])
+    for scenario in (plain, ALL.with_learners([1, 2])):
+        running = make_engine(scenario, 4, seed=1)
+        running.reset(worlds=given)
+        for _ in range(30):
+            running.step(np.zeros((4, 2)))
+        assert np.isfinite(running.worlds.obstacle_gap_m).tolist() == [True, True, False, False]
+        running.renew(np.array([0, 3]))
+        own = scenario.obstacle_gap_m is not None
+        assert np.isfinite(running.worlds.obstacle_gap_m).tolist() == [own, True, False, own]
+
+
+# ---------------------------------------------------------------- snapshots
+
+SCENARIO = load_scenario("paper-random")
+SHAPED = RewardParams(harm=0.05, shaping=0.1, shaping_discount=0.99, terminal=0.5)
+
+
+def steps_of(running: Engine, rng: np.random.Generator, steps: int) -> list[np.ndarray]:
+    """Everything that ``steps`` random decisions show, new episodes included."""
+    seen = []
+    for _ in range(steps):
+        step = running.step(rng.uniform(-1.0, 1.0, (running.n, len(running.learners))))
+        seen += [step.reward, step.ended, running.wanted_mps2.copy()]
+        running.renew(np.flatnonzero(step.ended))
+        seen.append(running.observe_all(np.array(running.learners)))
+    return seen
+
+
+def with_script(script: str) -> Scenario:
+    roles = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": script}
+    return SCENARIO.replace(roles=roles, early_impacts="keep")
+
+
+@pytest.mark.parametrize(
+    ("scenario", "reward"),
+    [
+        (SCENARIO, SHAPED),
+        (SCENARIO, "paper"),
+        (SCENARIO.with_learners(["vehicle_2", "vehicle_3"]), SHAPED),
+        (load_scenario("cooperation-4-congested"), SHAPED),
+        (load_scenario("stress-wide"), "total-harm"),
+        (with_script("gentlest_front"), "harm"),
+        (with_script("e_v2x_bm:pairwise"), "harm"),
+        (with_script("planner:20"), "harm"),
+    ],
+)
+@pytest.mark.parametrize("before", [0, 45])
+def test_restore__the_next_steps_are_the_same_to_the_bit(scenario: Scenario, reward: Any, before: int) -> None:
+    first = make_engine(scenario, 6, reward=reward, seed=3)
+    rng = np.random.default_rng(0)
+    steps_of(first, rng, before)
+    kept = first.snapshot()
+    copied = {name: array.copy() for name, array in kept.items()}
+    drawn = rng.bit_generator.state
+    expected = steps_of(first, rng, 50)
+    assert all(np.array_equal(kept[name], copied[name]) for name in kept)  # a copy: the engine went on
+
+    second = make_engine(scenario, 6, reward=reward, seed=99)
+    steps_of(second, np.random.default_rng(5), 7)
+    second.restore(kept)
+    rng.bit_generator.state = drawn
+    for k, (a, b) in enumerate(zip(expected, steps_of(second, rng, 50), strict=True)):
+        assert np.array_equal(a, b), k
+    for name, value in vars(first).items():
+        if isinstance(value, np.ndarray):
+            assert np.array_equal(value, vars(second)[name]), name
+
+
+def test_restore__refuses_another_size_before_it_changes_anything() -> None:
+    kept = make_engine(SCENARIO, 6, seed=3).snapshot()
+    other = make_engine(SCENARIO, 7, seed=3)
+    before = other.snapshot()
+    with pytest.raises(InvalidInput, match=r"engine snapshot: state is \(6, \d+\); \(7, \d+\) is needed"):
+        other.restore(kept)
+    del kept["params"]
+    with pytest.raises(InvalidInput, match="params is nothing"):
+        make_engine(SCENARIO, 6, seed=3).restore(kept)
+    assert all(np.array_equal(before[name], array) for name, array in other.snapshot().items())
+
+
+def test_restore__of_a_vec_env_returns_and_lengths_of_running_episodes_go_on() -> None:
+    first, second = (make_sb3_vec_env(SCENARIO, 6, seed=seed) for seed in (3, 8))
+    first.reset()
+    actions = np.random.default_rng(1).uniform(-1.0, 1.0, (120, 6, 1)).astype(np.float32)
+    for action in actions[:30]:
+        first.step(action)
+    second.restore(first.snapshot())
+    ended = 0
+    for action in actions[30:]:
+        (*seen, infos), (*again, told) = first.step(action), second.step(action)
+        assert all(np.array_equal(a, b) for a, b in zip(seen, again, strict=True))
+        assert [info.get("episode") for info in infos] == [info.get("episode") for info in told]
+        assert [info.keys() for info in infos] == [info.keys() for info in told]
+        ended += int(seen[2].sum())
+    assert ended > 5

@@ -1,101 +1,160 @@
+"""Statistics: exact sums, intervals of rates, means and ratios, and what is told over seeds."""
+
 from __future__ import annotations
+
+import math
+from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, strategies as st
 from scipy.stats import binom, bootstrap
 
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.statistics import mean, paired_difference, rate, relative_decrease
+from ethbrake_marl.evaluation import statistics
+from ethbrake_marl.evaluation.statistics import (
+    PRODUCT_BITS,
+    VALUE_BITS,
+    Moments,
+    exact_sum,
+    interquartile_mean,
+    mean,
+    mean_over_seeds,
+    paired_difference,
+    rate,
+    relative_decrease,
+    root,
+    share_over_seeds,
+)
 from ethbrake_marl.files.sheet import Estimate
 
-T_4, T_1 = 2.7764451, 12.7062047  # 97.5 % quantiles of Student's t with 4 and 1 degrees of freedom
+# ---------------------------------------------------------------- exact sums
+
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+EXTREMES = [0.0, -0.0, 5e-324, -5e-324, 2.2250738585072014e-308, 1.7976931348623157e308, -1.7976931348623157e308, 1.0]
+
+
+@given(st.lists(st.tuples(FINITE, FINITE), max_size=30))
+def test_sums__are_those_of_fractions(rows: list[tuple[float, float]]) -> None:
+    for pairs in (rows, [(a, b) for a in EXTREMES for b in EXTREMES]):
+        x, y = np.array([a for a, _ in pairs]), np.array([b for _, b in pairs])
+        assert Fraction(exact_sum(x), 1 << VALUE_BITS) == sum(Fraction(a) for a, _ in pairs)
+        assert Fraction(exact_sum(x, y), 1 << PRODUCT_BITS) == sum(Fraction(a) * Fraction(b) for a, b in pairs)
+
+
+def test_sums__of_many_of_the_largest_numbers() -> None:
+    many = np.full(100_000, -1.7976931348623157e308)
+    assert exact_sum(many) == 100_000 * exact_sum(many[:1])
+    assert exact_sum(many, many) == 100_000 * exact_sum(many[:1], many[:1])
+
+
+def test_moments__of_parts_in_any_order_are_those_of_the_whole() -> None:
+    rng = np.random.default_rng(3)
+    values = rng.exponential(20.0, 10_000) * (rng.random(10_000) < 0.6)
+    whole = Moments.of(values)
+    for parts in (1, 2, 7, 100):
+        pieces = [Moments.of(part) for part in np.array_split(rng.permutation(values), parts)]
+        assert sum(pieces, Moments()) == whole
+    assert whole.mean == float(sum(map(Fraction, values)) / 10_000)
+    assert whole.standard_error == pytest.approx(values.std(ddof=1) / 100.0, rel=1e-12)
+    equal = Moments.of(np.full(7, 0.1))
+    assert (equal.mean, equal.standard_error) == (0.1, 0.0)
+
+
+def test_difference_and_ratio__are_those_of_the_pairs() -> None:
+    x, y = np.random.default_rng(4).integers(0, 50, (2, 500)).astype(float) / 8.0  # no difference of them is rounded
+    both = exact_sum(x, y)
+    assert Moments.of(x).minus(Moments.of(y), both) == Moments.of(x - y)
+    residual = x - x.mean() / y.mean() * y
+    expected = residual.std(ddof=1) / math.sqrt(500) / y.mean()
+    assert Moments.of(x).ratio_error(Moments.of(y), both) == pytest.approx(expected, rel=1e-10)
+
+
+def test_root__of_what_no_float_holds() -> None:
+    assert (root(10**800, 10**200), root(0, 3)) == (pytest.approx(1e300), 0.0)
+
+
+# ---------------------------------------------------------------- rates
+
 Z_SQUARED = 3.8414588  # of the normal quantile at 97.5 %
 
 
-def test_rate__five_of_ten_is_the_textbook_wilson_interval() -> None:
-    assert rate(5, 10).value == 0.5
-    assert rate(5, 10).interval == pytest.approx((0.2365931, 0.7634069), abs=1e-7)
+@pytest.mark.parametrize(("exact", "interval"), [(False, (0.2365931, 0.7634069)), (True, (0.1870860, 0.8129140))])
+def test_rate__five_of_ten_is_the_textbook_interval_of_wilson_and_of_clopper_and_pearson(exact, interval) -> None:
+    assert rate(5, 10, exact=exact) == Estimate(0.5, pytest.approx(interval, abs=1e-7))
 
 
-@pytest.mark.parametrize("count", [1, 10, 10_000])
-def test_rate__none_and_all_reach_the_end_of_the_range_and_no_further(count: int) -> None:
-    reach = Z_SQUARED / (count + Z_SQUARED)
-    assert rate(0, count).interval == pytest.approx((0.0, reach), abs=1e-8)
-    assert rate(count, count).interval == pytest.approx((1.0 - reach, 1.0), abs=1e-8)
-    assert rate(0, count).interval[0] == 0.0
-    assert rate(count, count).interval[1] == 1.0
+@pytest.mark.parametrize("count", [1, 10, 10_000, 10**8])
+@pytest.mark.parametrize("exact", [False, True])
+def test_rate__none_and_all_reach_the_end_of_the_range_and_no_further(count: int, exact: bool) -> None:
+    reach = 1.0 - 0.025 ** (1.0 / count) if exact else Z_SQUARED / (count + Z_SQUARED)
+    none, every = rate(0, count, exact=exact).interval, rate(count, count, exact=exact).interval
+    assert none == (0.0, pytest.approx(reach, rel=1e-6)) and every == (pytest.approx(1.0 - reach, rel=1e-8), 1.0)
 
 
-@pytest.mark.parametrize(("successes", "count"), [(-1, 10), (11, 10), (0, 0)])
-def test_rate__refuses_impossible_counts(successes: int, count: int) -> None:
-    with pytest.raises(InvalidInput, match="successes"):
-        rate(successes, count)
+@pytest.mark.parametrize(("successes", "count"), [(1, 3), (3, 10**8), (5 * 10**7, 10**8), (10**8 - 2, 10**8)])
+def test_rate__the_ends_of_an_exact_one_have_the_tails_that_they_must(successes: int, count: int) -> None:
+    low, high = rate(successes, count, exact=True).interval
+    assert binom.sf(successes - 1, count, low) == pytest.approx(0.025, rel=1e-6)
+    assert binom.cdf(successes, count, high) == pytest.approx(0.025, rel=1e-6)
 
 
-def test_mean__one_to_five() -> None:
-    half = T_4 * np.sqrt(2.5 / 5.0)  # the variance of 1..5 is 2.5
-    assert mean(np.arange(1.0, 6.0)).value == 3.0
-    assert mean(np.arange(1.0, 6.0)).interval == pytest.approx((3.0 - half, 3.0 + half), abs=1e-6)
+# ---------------------------------------------------------------- means, differences and ratios
+
+T_4, T_1 = 2.7764451, 12.7062047  # 97.5 % quantiles of Student's t with 4 and 1 degrees of freedom
+HALF_5 = T_4 * math.sqrt(2.5 / 5.0)  # the variance of 1..5 is 2.5
 
 
-def test_mean__of_a_single_world_has_no_interval() -> None:
-    assert mean(np.array([7.0])).value == 7.0
-    assert mean(np.array([7.0])).interval is None
+@pytest.mark.parametrize(
+    ("found", "expected"),
+    [
+        (mean(np.arange(1.0, 6.0)), Estimate(3.0, (3.0 - HALF_5, 3.0 + HALF_5))),
+        (mean(np.array([7.0])), Estimate(7.0, None)),
+        (paired_difference(np.array([-2.0, 8.0, 48.0]), np.array([0.0, 10.0, 50.0])), Estimate(-2.0, (-2.0, -2.0))),
+        # ratio 0.75; residuals -0.5 and 0.5, s = sqrt(0.5), standard error sqrt(0.5) / (sqrt(2) * 2) = 0.25
+        (
+            relative_decrease(np.array([1.0, 2.0]), np.array([2.0, 2.0])),
+            Estimate(0.25, (0.25 - 0.25 * T_1, 0.25 + 0.25 * T_1)),
+        ),
+        (relative_decrease(np.array([1.0, 0.0]), np.zeros(2)), None),
+    ],
+)
+def test_estimate__by_hand(found: Estimate | None, expected: Estimate | None) -> None:
+    assert (found is None) == (expected is None)
+    if found is not None:
+        assert found.value == expected.value and found.interval == (
+            expected.interval and pytest.approx(expected.interval, abs=1e-6)
+        )
 
 
-def test_mean__at_the_size_of_our_lists_is_the_bootstrap_interval() -> None:
-    harm = np.maximum(np.random.default_rng(1).normal(2.0, 20.0, 4000), 0.0)  # many zeros and a long tail, as harm has
-    boot = bootstrap((harm,), np.mean, n_resamples=2000, method="percentile", rng=2).confidence_interval
-    ours = mean(harm).interval
-    width = ours[1] - ours[0]
-    assert ours == pytest.approx((boot.low, boot.high), abs=0.05 * width)
+RNG = np.random.default_rng(3)
+BASELINE = RNG.gamma(1.0, 24.0, 4000)
+HARM = np.maximum(RNG.normal(2.0, 20.0, 4000), 0.0)  # many zeros and a long tail, as harm has
+SHARES = BASELINE * RNG.uniform(0.0, 1.0, 4000)
 
 
-def test_paired_difference__a_constant_gain_has_no_spread() -> None:
-    baseline = np.array([0.0, 10.0, 50.0])
-    estimate = paired_difference(baseline - 2.0, baseline)
-    assert estimate.value == -2.0
-    assert estimate.interval == (-2.0, -2.0)
+@pytest.mark.parametrize(
+    ("found", "data", "statistic"),
+    [
+        (mean(HARM), (HARM,), lambda x, axis: x.mean(axis=axis)),
+        (relative_decrease(SHARES, BASELINE), (SHARES, BASELINE), lambda x, y, axis: 1.0 - x.mean(axis) / y.mean(axis)),
+    ],
+    ids=["mean", "paired ratio"],
+)
+def test_estimate__at_the_size_of_our_lists_has_the_bootstrap_interval(found, data, statistic) -> None:
+    boot = bootstrap(data, statistic, paired=len(data) > 1, n_resamples=1000, method="percentile", rng=4)
+    low, high = found.interval
+    assert (low, high) == pytest.approx(tuple(boot.confidence_interval), abs=0.06 * (high - low))
 
 
-def test_relative_decrease__two_worlds_by_hand() -> None:
-    # ratio 0.75; residuals -0.5 and 0.5, s = sqrt(0.5), standard error sqrt(0.5) / (sqrt(2) * 2) = 0.25
-    estimate = relative_decrease(np.array([1.0, 2.0]), np.array([2.0, 2.0]))
-    assert estimate is not None
-    assert estimate.value == 0.25
-    assert estimate.interval == pytest.approx((0.25 - 0.25 * T_1, 0.25 + 0.25 * T_1), abs=1e-6)
-
-
-def test_relative_decrease__is_the_bootstrap_interval_of_the_paired_ratio() -> None:
-    rng = np.random.default_rng(3)
-    baseline = rng.gamma(1.0, 24.0, 4000)
-    values = baseline * rng.uniform(0.0, 1.0, 4000)
-    boot = bootstrap(
-        (values, baseline), lambda x, y, axis: 1.0 - x.mean(axis=axis) / y.mean(axis=axis),
-        paired=True, n_resamples=2000, method="percentile", rng=4,
-    ).confidence_interval  # fmt: skip
-    ours = relative_decrease(values, baseline).interval
-    assert ours == pytest.approx((boot.low, boot.high), abs=0.05 * (ours[1] - ours[0]))
-
-
-def test_relative_decrease__against_a_harmless_baseline_does_not_exist() -> None:
-    assert relative_decrease(np.array([1.0, 0.0]), np.zeros(2)) is None
-
-
-@pytest.mark.parametrize("values", [np.array([]), np.array([1.0, np.nan]), np.array([np.inf]), np.ones((2, 2))])
-def test_statistics__refuse_what_is_not_a_column_of_numbers(values: np.ndarray) -> None:
-    with pytest.raises(InvalidInput, match="finite number per world"):
-        mean(values)
-
-
-def test_statistics__refuse_to_pair_lists_of_different_length() -> None:
-    with pytest.raises(InvalidInput, match="3 values cannot be paired with 2"):
-        paired_difference(np.zeros(3), np.zeros(2))
+def test_estimate__does_not_depend_on_the_order_of_the_worlds() -> None:
+    other = HARM[::-1].copy()
+    assert mean(HARM) == mean(other)
+    assert paired_difference(HARM, other) == paired_difference(other[::-1].copy(), HARM[::-1].copy())
 
 
 def test_json__of_an_estimate_has_its_interval_as_a_list_and_null_for_what_does_not_exist() -> None:
     assert Estimate(2.0, (1.0, 3.0)).to_json() == {"value": 2.0, "interval": [1.0, 3.0]}
-    assert Estimate(2.0, None).to_json() == {"value": 2.0, "interval": None}
     told = Estimate.side_by_side({"harm": Estimate(2.0, (1.0, 3.0)), "alone": Estimate(4.0, None), "absent": None})
     assert list(told.items()) == [
         ("harm", 2.0), ("harm_interval", [1.0, 3.0]), ("alone", 4.0), ("alone_interval", None),
@@ -103,27 +162,103 @@ def test_json__of_an_estimate_has_its_interval_as_a_list_and_null_for_what_does_
     ]  # fmt: skip
 
 
-def test_exact_rate__the_textbook_interval_of_clopper_and_pearson() -> None:
-    assert rate(5, 10, exact=True).value == 0.5
-    assert rate(5, 10, exact=True).interval == pytest.approx((0.1870860, 0.8129140), abs=1e-7)
+# ---------------------------------------------------------------- over seeds
 
 
-@pytest.mark.parametrize("count", [1, 10, 10**8])
-def test_exact_rate__none_and_all_reach_the_ends(count: int) -> None:
-    reach = 1.0 - 0.025 ** (1.0 / count)
-    assert rate(0, count, exact=True).interval == pytest.approx((0.0, reach), rel=1e-6)
-    assert rate(count, count, exact=True).interval == pytest.approx((1.0 - reach, 1.0), rel=1e-9)
+@pytest.mark.parametrize(
+    ("tasks", "expected"),
+    [
+        ([[7.0]], 7.0),
+        ([[1.0, 2.0, 3.0]], 2.0),  # nothing is left out of three
+        ([[1.0, 2.0, 3.0, 100.0]], 2.5),  # 1 and 100 are
+        ([[100.0, 4.0, 6.0, 5.0, -90.0]], 5.0),
+        ([[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 80.0]], 4.5),  # of all eight: 3, 4, 5, 6
+    ],
+)
+def test_interquartile_mean__by_hand_and_the_same_again(tasks: list[list[float]], expected: float) -> None:
+    estimate = interquartile_mean(tasks, resamples=200, seed=3)
+    assert estimate.value == pytest.approx(expected, abs=1e-12)
+    assert (estimate.interval is None) == (len(tasks[0]) == 1)
+    assert estimate == interquartile_mean(tasks, resamples=200, seed=3)
 
 
-@pytest.mark.parametrize(("successes", "count"), [(1, 3), (3, 10**8), (5 * 10**7, 10**8), (10**8 - 2, 10**8)])
-def test_exact_rate__its_ends_have_the_tails_that_they_must(successes: int, count: int) -> None:
-    low, high = rate(successes, count, exact=True).interval
-    assert binom.sf(successes - 1, count, low) == pytest.approx(0.025, rel=1e-6)
-    assert binom.cdf(successes, count, high) == pytest.approx(0.025, rel=1e-6)
+@pytest.mark.parametrize(
+    ("tasks", "expected"),
+    [
+        ([[0.0, 1.0]], Estimate(0.5, (0.0, 1.0))),  # means 0, 1/2, 1 with chances 1/4, 1/2, 1/4
+        ([[1.0] * 3, [9.0] * 3], Estimate(5.0, (5.0, 5.0))),  # strata are not mixed: from 1 to 9
+    ],
+)
+def test_interquartile_mean__has_the_interval_of_its_draws(tasks: list[list[float]], expected: Estimate) -> None:
+    assert interquartile_mean(tasks, resamples=2000) == expected
 
 
-def test_mean__does_not_depend_on_the_order_of_the_worlds() -> None:
-    harm = np.random.default_rng(9).exponential(20.0, 1000)
-    other = harm[::-1].copy()
-    assert mean(harm) == mean(other)
-    assert paired_difference(harm, other) == paired_difference(other[::-1].copy(), harm[::-1].copy())
+def test_interquartile_mean__covers_the_truth_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(1)
+    intervals = [interquartile_mean([rng.normal(size=12)], resamples=300, seed=k).interval for k in range(200)]
+    hits = sum(low <= 0.0 <= high for low, high in intervals)
+    assert 0.84 <= hits / 200 <= 0.99  # the percentile bootstrap is a little short with twelve
+
+
+EASY_AND_HARD = np.array([1.0, 100.0, 1.0, 100.0])
+
+
+@pytest.mark.parametrize(
+    ("seeds", "baseline", "expected"),
+    [
+        # the spread of the worlds cancels, that of the seeds stays
+        ([EASY_AND_HARD - 1.0, EASY_AND_HARD - 3.0], EASY_AND_HARD, (-2.0, (-3.0, -1.0))),
+        ([[1.0] * 50, [3.0] * 50], None, (2.0, (1.0, 3.0))),
+        ([[1.0], [3.0]], [[1.0]], (1.0, None)),
+        # where all worlds were alike, a rate is no certainty
+        (np.ones((2, 20), np.bool_), None, (1.0, rate(20, 20).interval)),
+        (np.zeros((1, 20), np.bool_), None, (0.0, rate(0, 20).interval)),
+        (np.ones((1, 1), np.bool_), None, (1.0, rate(1, 1).interval)),
+    ],
+)
+def test_mean_over_seeds__by_hand(seeds: Any, baseline: Any, expected: tuple[float, Any]) -> None:
+    found = mean_over_seeds(np.array(seeds), *([] if baseline is None else [baseline]))
+    assert (found.value, found.interval) == (pytest.approx(expected[0]), expected[1] and pytest.approx(expected[1]))
+
+
+def test_mean_over_seeds__worlds_of_both_sides_are_drawn_together() -> None:
+    rng = np.random.default_rng(2)
+    worlds, difference = rng.uniform(0.0, 100.0, 500), rng.normal(0.5, 1.0, 500)
+    half = 1.96 * difference.std(ddof=1) / 500**0.5
+    expected = (difference.mean() - half, difference.mean() + half)
+    assert mean_over_seeds(worlds + difference, worlds).interval == pytest.approx(expected, abs=0.02)
+
+
+def test_mean_over_seeds__of_truths_is_a_rate_and_against_a_baseline_a_difference() -> None:
+    happened = np.zeros((4, 50), np.bool_)
+    happened[0] = True  # one seed always, three never
+    low, high = mean_over_seeds(happened).interval
+    assert low == 0.0 and high > 0.7
+    found = mean_over_seeds(np.array([[True, False, False, True]]), np.array([[True] * 4]))
+    assert found.value == -0.5 and found.interval[0] < -0.5 < found.interval[1] <= 0.0
+
+
+def test_share_over_seeds__by_hand() -> None:
+    rng = np.random.default_rng(3)
+    worst, best = 10.0 + rng.normal(size=200), np.full(200, 2.0)
+    seeds = np.array([[4.0], [6.0]]) + 0.1 * rng.normal(size=(2, 200))
+    found = share_over_seeds(seeds, worst, best)
+    assert found.value == pytest.approx((worst.mean() - seeds.mean()) / (worst.mean() - 2.0), rel=1e-12)
+    assert found.interval == pytest.approx((0.5, 0.75), abs=0.02)
+    assert share_over_seeds(seeds, worst, worst) is None
+    assert share_over_seeds([[4.0]], [10.0], [0.0]) == Estimate(0.6, None)
+
+
+def test_intervals__of_two_worlds_exist() -> None:
+    for low, high in (
+        share_over_seeds([[4.0, 6.0]], [10.0, 10.0], [0.0, 0.0]).interval,
+        mean_over_seeds([[4.0, 6.0]], [[0.0, 0.0]]).interval,
+        mean_over_seeds([[4.0, 6.0]]).interval,
+    ):
+        assert low < high
+
+
+@pytest.mark.parametrize("resamples", [1, 2, 3])
+def test_resamples__are_as_many_as_asked_for(resamples: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(statistics, "_AT_ONCE", 4)  # two at a time
+    assert statistics._resample_means((np.arange(4.0).reshape(2, 2),), resamples, 0).shape == (resamples, 1)

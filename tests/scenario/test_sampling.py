@@ -1,225 +1,590 @@
+"""Worlds that are drawn, derived or given; refusals: ``refusals/worlds.txt``."""
+
 from __future__ import annotations
 
+import json
 from dataclasses import fields
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, strategies as st
+from scipy import stats
 
+import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.inputs import worlds_sha256
+from ethbrake_marl.learning.training import Training
 from ethbrake_marl.physics import Vehicles, Worlds
 from ethbrake_marl.scenario import Scenario, load_scenario, sampling
-from ethbrake_marl.scenario.sampling import BLOCK, QUANTITY, uniform_numbers
+from ethbrake_marl.scenario.sampling import (
+    BLOCK,
+    QUANTITY,
+    Choice,
+    LogUniform,
+    Normal,
+    Uniform,
+    support,
+    uniform_numbers,
+    values,
+)
 
-# As printed by: python -c "import ethbrake_marl as eb; print(eb.load_scenario('paper-random').sample(3, 7).worlds)"
-GOLDEN_GAPS_M = [[6.619524755316499, 8.488312854553527], [5.330123950353819, 7.790992608679621]]
-GOLDEN_SPEEDS_MPS = [
-    [20.44900720872454, 21.48658333485936, 21.023493985459318],
-    [18.171640335640056, 18.728364132629064, 21.911283369281954],
-]
+near = pytest.approx
+PAPER = load_scenario("paper-random")
+ALMOST_ONE = 1.0 - 2.0**-53
+
+# ---------------------------------------------------------------- distributions
+
+
+def normal(mean: float, sd: float, low: float, high: float) -> Normal:
+    return Normal.model_validate({"normal": {"mean": mean, "sd": sd, "low": low, "high": high}})
+
+
+@pytest.mark.parametrize(
+    ("quantity", "u", "drawn", "bounds"),
+    [
+        (3.5, [0.0, 0.3, 0.9], [3.5, 3.5, 3.5], (3.5, 3.5)),
+        (Uniform(uniform=(5.0, 10.0)), [0.0, 0.2, 0.5], [5.0, 6.0, 7.5], (5.0, 10.0)),
+        (LogUniform(loguniform=(1.0, 16.0)), [0.0, 0.25, 0.5], near([1.0, 2.0, 4.0], rel=1e-15), (1.0, 16.0)),
+        (normal(20.0, 1.0, 18.0, 22.0), [0.5], [20.0], (18.0, 22.0)),
+        (Choice(choice=(6, 8, 7)), [0.0, 0.33, 0.34, 0.66, 0.67, ALMOST_ONE], [6, 6, 8, 8, 7, 7], (6.0, 8.0)),
+        (
+            Choice(choice=(1, 2, 3), weights=(1, 2, 1)),
+            [0.0, 0.249, 0.25, 0.749, 0.75, ALMOST_ONE],
+            [1, 1, 2, 2, 3, 3],
+            (1.0, 3.0),
+        ),
+    ],
+    ids=lambda value: type(value).__name__,
+)  # fmt: skip
+def test_distribution__by_hand(quantity: Any, u: list[float], drawn: Any, bounds: tuple[float, float]) -> None:
+    assert values(quantity, np.array(u)).tolist() == drawn
+    assert support(quantity) == bounds
+
+
+@given(st.floats(0, 1e4), st.floats(0, 1e4), st.lists(st.floats(1e-6, 1e6), min_size=1, max_size=9))
+def test_distribution__is_never_outside_its_bounds(a: float, b: float, weights: list[float]) -> None:
+    low, high = sorted((a, b))
+    drawn = Uniform(uniform=(low, high)).value(np.array([0.0, 0.1, 0.7, ALMOST_ONE]))
+    assert ((drawn >= low) & (drawn <= high)).all()
+    logarithmic = LogUniform(loguniform=(low + 0.2, high + 0.2)).value(np.array([0.0, 0.4, ALMOST_ONE]))
+    assert ((logarithmic >= low + 0.2) & (logarithmic <= high + 0.2)).all()
+    last = Choice(choice=tuple(float(k) for k in range(len(weights))), weights=tuple(weights))
+    assert last.value(np.array([ALMOST_ONE]))[0] == len(weights) - 1
+
+
+@pytest.mark.parametrize("shape", [(20.0, 1.0, 18.0, 22.0), (0.97, 0.26, 0.3, 3.0), (5.0, 2.0, 9.0, 11.0)])
+def test_normal__has_the_quantiles_of_the_truncated_normal(shape: tuple[float, float, float, float]) -> None:
+    mean, sd, low, high = shape
+    u = (np.arange(0, 200_000, 50) + 0.5) / 200_000
+    other = stats.truncnorm((low - mean) / sd, (high - mean) / sd, mean, sd)
+    assert np.allclose(normal(*shape).value(u), other.ppf(u), rtol=1e-9, atol=1e-9)
+    tail = normal(0.0, 1.0, 4.0, 30.0).value(np.array([0.0, 0.5, 0.999999, ALMOST_ONE]))
+    assert np.all((tail >= 4.0) & (tail <= 30.0)) and np.all(np.diff(tail) > 0.0)
+
+
+# ---------------------------------------------------------------- worlds and their numbers
 
 ALL_RANDOM = Scenario(
     name="all-random",
     gaps_m={"uniform": [5, 10]},
     speeds_mps={"normal": {"mean": 20, "sd": 1, "low": 18, "high": 22}},
     braking_capacity_mps2={"uniform": [5, 9]},
-    driving_capacity_mps2={"choice": [2, 3, 4]},
+    driving_capacity_mps2={"choice": [2, 3, 4], "weights": [0.2, 0.3, 0.5]},
     mass_t={"uniform": [1, 6]},
     latency_s={"uniform": [0, 1]},
     speed_limit_mps={"uniform": [30, 40]},
     restitution={"uniform": [0, 0.3]},
 )
+MIXED, DELAYS = load_scenario("realistic-mixed"), load_scenario("mixture-delays")
 
 
-def closing_pair(gap_m: object) -> Scenario:
+def closing_pair(gap_m: object, **changes: Any) -> Scenario:
     """Two vehicles at 20 m/s; the front one brakes at 6 m/s2, the rear one may act at 1 s: 3 m closer by then."""
-    return Scenario(
-        name="closing-pair", vehicles=2, gaps_m=gap_m, speeds_mps=20, braking_capacity_mps2=6,
-        driving_capacity_mps2=6, mass_t=5, latency_s=[0, 1], early_impacts="reject",
-    )  # fmt: skip
+    given = {
+        "gaps_m": gap_m, "speeds_mps": 20, "braking_capacity_mps2": 6, "driving_capacity_mps2": 6, "mass_t": 5,
+        "latency_s": [0, 1], "early_impacts": "reject",
+    }  # fmt: skip
+    return Scenario(**{"name": "closing-pair", "vehicles": 2, **given, **changes})
 
 
 def quantity(worlds: Worlds, field: str) -> np.ndarray:
     return getattr(worlds, field) if hasattr(worlds, field) else getattr(worlds.vehicles, field)
 
 
-def assert_same_bits(a: Worlds, b: Worlds) -> None:
-    for field in [*fields(Worlds)[1:], *fields(Vehicles)]:
-        assert quantity(a, field.name).tobytes() == quantity(b, field.name).tobytes(), field.name
+def bits(worlds: Worlds) -> dict[str, bytes]:
+    return {field.name: quantity(worlds, field.name).tobytes() for field in [*fields(Worlds)[1:], *fields(Vehicles)]}
 
 
-def test_paper_random__golden_worlds_of_seed_7():
-    worlds = load_scenario("paper-random").sample(2, 7).worlds
-    assert worlds.gaps_m.tolist() == GOLDEN_GAPS_M
-    assert worlds.speeds_mps.tolist() == GOLDEN_SPEEDS_MPS
+def test_paper_random__golden_worlds_of_seed_7() -> None:
+    worlds = PAPER.sample(2, 7).worlds
+    # python -c "import ethbrake_marl as eb; print(eb.load_scenario('paper-random').sample(2, 7).worlds)"
+    assert worlds.gaps_m.tolist() == [[6.619524755316499, 8.488312854553527], [5.330123950353819, 7.790992608679621]]
+    assert worlds.speeds_mps.tolist() == [
+        [20.44900720872454, 21.48658333485936, 21.023493985459318],
+        [18.171640335640056, 18.728364132629064, 21.911283369281954],
+    ]
     assert worlds.vehicles.latency_s.tolist() == [[0.0, 0.5, 0.8]] * 2
     assert worlds.vehicles.mass_t.tolist() == [[4.5, 5.5, 5.9]] * 2
     assert worlds.vehicles.restitution.tolist() == [0.1, 0.1]
-    assert worlds.time_s.tolist() == [0.0, 0.0]
-    assert not worlds.pair_hit.any()
+    assert worlds.time_s.tolist() == [0.0, 0.0] and not worlds.pair_hit.any()
 
 
-def test_uniform_numbers__are_those_of_numpys_own_generator():
+def test_uniform_numbers__are_those_of_numpys_own_generator() -> None:
     key = np.random.SeedSequence([7], spawn_key=(0, 0)).generate_state(2, np.uint64)
     expected = np.random.Generator(np.random.Philox(key=key)).random(5 * 24).reshape(5, 24)
     assert uniform_numbers(7, "list", 0, 0, 5, 24).tolist() == expected.tolist()
     assert uniform_numbers(7, "list", 0, 3, 2, 24).tolist() == expected[3:].tolist()
 
 
-@pytest.mark.parametrize("scenario", [ALL_RANDOM, closing_pair({"uniform": [1, 5]})], ids=lambda s: s.name)
-def test_world_k_alone__is_row_k_bit_for_bit(scenario):
+@pytest.mark.parametrize(
+    "scenario", [ALL_RANDOM, closing_pair({"uniform": [1, 5]}), MIXED, DELAYS], ids=lambda scenario: scenario.name
+)
+def test_world_k__is_the_same_alone_and_in_any_list(scenario: Scenario) -> None:
     whole = scenario.sample(40, 11)
-    for k in range(40):
-        alone = scenario.sample(1, 11, first=k)
-        assert_same_bits(alone.worlds, whole.worlds.take([k]))
-        assert alone.index.tolist() == [k]
-    assert_same_bits(scenario.sample(15, 11, first=20).worlds, whole.worlds.take(np.arange(20, 35)))
     assert whole.index.tolist() == list(range(40))
+    for first, n in (*((k, 1) for k in range(40)), (20, 15)):
+        part, rows = scenario.sample(n, 11, first=first), np.arange(first, first + n)
+        assert bits(part.worlds) == bits(whole.worlds.take(rows)) and part.index.tolist() == rows.tolist()
+        for name, kinds in whole.kinds.items():
+            assert part.kinds[name].tolist() == kinds[rows].tolist()
+    other, training = scenario.sample(40, 12), scenario.sample(40, 11, channel="training")
+    for name, kinds in whole.kinds.items():
+        assert (other.kinds[name] != kinds).any() and (training.kinds[name] != kinds).any()
 
 
-def test_world_k__far_down_the_list():
+def test_world_k__far_down_the_list_and_of_any_whole_seed() -> None:
     far = ALL_RANDOM.sample(3, 0, first=10**15)
     assert far.index.tolist() == [10**15, 10**15 + 1, 10**15 + 2]
-    assert_same_bits(ALL_RANDOM.sample(1, 0, first=10**15 + 2).worlds, far.worlds.take([2]))
+    assert bits(ALL_RANDOM.sample(1, 0, first=10**15 + 2).worlds) == bits(far.worlds.take([2]))
+    assert bits(ALL_RANDOM.sample(2, np.uint64(5)).worlds) == bits(ALL_RANDOM.sample(np.int64(2), 5).worlds)
+    assert ALL_RANDOM.sample(1, 2**200).worlds.n == 1
 
 
-def test_streams__differ_by_seed_and_channel_and_world():
+def test_streams__differ_by_seed_and_channel_and_world() -> None:
     lists = [ALL_RANDOM.sample(50, 1), ALL_RANDOM.sample(50, 2), ALL_RANDOM.sample(50, 1, channel="training")]
     drawn = np.concatenate([np.hstack([s.worlds.gaps_m, s.worlds.speeds_mps, s.worlds.vehicles.mass_t]) for s in lists])
     assert len(np.unique(drawn)) == drawn.size
 
 
 @pytest.mark.parametrize("changed", list(QUANTITY.usual))
-def test_columns__changing_one_quantity_leaves_all_others_alone(changed):
+def test_columns__changing_one_quantity_leaves_all_others_alone(changed: str) -> None:
     fixed_values = {"speeds_mps": 20, "restitution": 0.2, "speed_limit_mps": 35}
-    before = ALL_RANDOM.sample(20, 3).worlds
-    after = ALL_RANDOM.replace(**{changed: fixed_values.get(changed, 2)}).sample(20, 3).worlds
-    for field in QUANTITY.usual:
-        same = quantity(before, field).tobytes() == quantity(after, field).tobytes()
-        assert same == (field != changed), field
+    before, other = ALL_RANDOM.sample(20, 3).worlds, ALL_RANDOM.replace(**{changed: fixed_values.get(changed, 2)})
+    after = other.sample(20, 3).worlds
+    same = {name: (quantity(before, name) == quantity(after, name)).all() for name in QUANTITY.usual}
+    assert same == {name: name != changed for name in QUANTITY.usual}
 
 
-def test_columns__every_entry_of_a_world_has_its_own():
+def test_columns__every_entry_of_a_world_has_its_own() -> None:
     rules = [*QUANTITY.usual.values(), QUANTITY.otherwise["line_speed_mps"]]
     places = [rule.place(index) for rule in rules for index in range(rule.count(64))]
-    assert len(set(places)) == len(places)
+    assert len(set(places)) == len(places) and max(places) < BLOCK * 64 and BLOCK % 4 == 0
     assert [QUANTITY.usual["mass_t"].place(i) for i in range(3)] == [5, 13, 21]
     assert QUANTITY.otherwise["line_speed_mps"].place(0) == 15  # slot 7 of vehicle_2
-    assert max(places) < BLOCK * 64
-    assert BLOCK % 4 == 0
-
-
-def test_columns__one_vehicle_more_does_not_need_another_rule():
-    five = load_scenario("paper-random").replace(
-        vehicles=5,
-        braking_capacity_mps2=6,
-        driving_capacity_mps2=6,
-        mass_t=5,
-        latency_s=0.5,
-        roles={"vehicle_2": "learner"},
-    )
-    worlds = five.sample(7, 1).worlds
-    assert worlds.gaps_m.shape == (7, 4)
+    for_all = {"braking_capacity_mps2": 6, "driving_capacity_mps2": 6, "mass_t": 5, "latency_s": 0.5}
+    worlds = PAPER.replace(vehicles=5, roles={"vehicle_2": "learner"}, **for_all).sample(7, 1).worlds
     assert len(np.unique(worlds.speeds_mps)) == 35  # one entry for all: each vehicle draws its own value
+    assert worlds.gaps_m.shape == (7, 4)
 
 
-def test_paper_random__has_the_stated_means_and_bounds():
-    worlds = load_scenario("paper-random").sample(10_000, 7).worlds
+def test_paper_random__has_the_stated_means_and_bounds() -> None:
+    worlds = PAPER.sample(10_000, 7).worlds
     # Standard errors: (10 - 5) / sqrt(12 * 10,000) = 0.0144 m and 0.0115 m/s; five of them.
     assert np.all(np.abs(worlds.gaps_m.mean(axis=0) - 7.5) < 0.072)
     assert np.all(np.abs(worlds.speeds_mps.mean(axis=0) - 20.0) < 0.058)
     assert np.all(np.abs(worlds.gaps_m.std(axis=0) - 5.0 / np.sqrt(12.0)) < 0.04)
-    assert worlds.gaps_m.min() >= 5.0
-    assert worlds.gaps_m.max() <= 10.0
-    assert worlds.speeds_mps.min() >= 18.0
-    assert worlds.speeds_mps.max() <= 22.0
+    assert 5.0 <= worlds.gaps_m.min() < worlds.gaps_m.max() <= 10.0
+    assert 18.0 <= worlds.speeds_mps.min() < worlds.speeds_mps.max() <= 22.0
     columns = np.hstack([worlds.gaps_m, worlds.speeds_mps])
     assert np.all(np.abs(np.corrcoef(columns.T) - np.eye(5)) < 0.05)
 
 
-def test_early_impacts__are_drawn_again_and_counted():
-    sample = closing_pair({"uniform": [1, 5]}).sample(4000, 5)
+# ---------------------------------------------------------------- early impacts
+
+
+def test_early_impacts__are_drawn_again_and_counted() -> None:
+    scenario = closing_pair({"uniform": [1, 5]})
+    sample = scenario.sample(4000, 5)
     gaps = sample.worlds.gaps_m[:, 0]
     # Only gaps above 3 m survive: half of all draws, so about one refusal per world (its variance is 2).
-    assert gaps.min() > 3.0
-    assert abs(gaps.mean() - 4.0) < 5.0 * (2.0 / np.sqrt(12.0 * 4000))
+    assert gaps.min() > 3.0 and abs(gaps.mean() - 4.0) < 5.0 * (2.0 / np.sqrt(12.0 * 4000))
     assert abs(sample.rejected - 4000) < 5.0 * np.sqrt(2.0 * 4000)
-    assert sample.rejected == sum(
-        closing_pair({"uniform": [1, 5]}).sample(1, 5, first=k).rejected for k in range(100)
-    ) + (closing_pair({"uniform": [1, 5]}).sample(3900, 5, first=100).rejected)
+    parts = [scenario.sample(1, 5, first=k) for k in range(100)] + [scenario.sample(3900, 5, first=100)]
+    assert sample.rejected == sum(part.rejected for part in parts)
+    kept = scenario.replace(early_impacts="keep").sample(200, 5)
+    late = kept.worlds.gaps_m[:, 0] > 3.0  # accepted draws are what they are where all are kept
+    assert kept.rejected == 0 and 50 < late.sum() < 150
+    assert bits(sample.worlds.take(np.flatnonzero(late))) == bits(kept.worlds.take(late))
 
 
-def test_early_impacts__accepted_draws_stay_what_they_were_with_keep():
-    rejecting, keeping = (
-        closing_pair({"uniform": [1, 5]}),
-        closing_pair({"uniform": [1, 5]}).replace(early_impacts="keep"),
-    )
-    kept = keeping.sample(200, 5)
-    late = kept.worlds.gaps_m[:, 0] > 3.0
-    assert kept.rejected == 0
-    assert 50 < late.sum() < 150
-    assert_same_bits(rejecting.sample(200, 5).worlds.take(late), kept.worlds.take(late))
+@pytest.mark.parametrize(
+    ("gap_m", "changes"),
+    [
+        (3.001, {}),  # an impact at 3 m, just when the learner may act, is early: see the list of refusals
+        (0.5, {"roles": {"vehicle_1": "coast", "vehicle_2": "learner"}}),  # nothing closes
+        (1.001, {"roles": {"vehicle_1": "constant:2", "vehicle_2": "learner"}}),  # 1 m closer within 1 s
+        # Braking with 6 m/s2, 2 m are gone after 0.816 s: after vehicle_2 may act, before vehicle_3 may.
+        (2, {"vehicles": 3, "latency_s": [0, 0.5, 1], "roles": {"vehicle_2": "learner", "vehicle_3": "learner"}}),
+    ],
+)
+def test_early_impacts__scripts_are_followed_learners_coast_and_the_first_one_counts(
+    gap_m: float, changes: dict[str, Any]
+) -> None:
+    assert closing_pair(gap_m, **changes).sample(1, 0).rejected == 0
 
 
-def test_early_impacts__an_impact_just_when_the_learner_may_act_is_early():
-    assert closing_pair(3.001).sample(1, 0).rejected == 0
-    with pytest.raises(InvalidInput, match=r"scenario 'closing-pair'.*1000 draws of world 0 all have an impact"):
-        closing_pair(3.0).sample(1, 0)
-
-
-def test_early_impacts__a_scenario_that_always_collides_early_fails_soon():
-    with pytest.raises(InvalidInput, match=r"before vehicle_2 may act; give larger gaps_m"):
-        closing_pair({"uniform": [1, 2]}).sample(10_000, 0)
-
-
-def test_early_impacts__giving_up_costs_few_draws(monkeypatch):
-    drawn = []
-    draw = sampling._draw
+def test_early_impacts__giving_up_costs_few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn, draw = [], sampling._draw
     monkeypatch.setattr(sampling, "_draw", lambda *args: drawn.append(len(args[-1])) or draw(*args))
     with pytest.raises(InvalidInput, match="1000 draws of world 0"):
         closing_pair({"uniform": [1, 2]}).sample(500, 0)
     assert sum(drawn) == 10 * 500 + 990  # ten attempts of all, then one world to its end
 
 
-def test_early_impacts__scripts_are_followed_and_learners_coast():
-    # With the front vehicle coasting nothing closes; braking at 2 m/s2 it comes 1 m closer within 1 s.
-    assert closing_pair(0.5).replace(roles={"vehicle_1": "coast", "vehicle_2": "learner"}).sample(1, 0).rejected == 0
-    gentle = closing_pair(1.001).replace(roles={"vehicle_1": "constant:2", "vehicle_2": "learner"})
-    assert gentle.sample(1, 0).rejected == 0
-    with pytest.raises(InvalidInput, match="1000 draws"):
-        gentle.replace(gaps_m=0.999).sample(1, 0)
+# ---------------------------------------------------------------- gaps as times, speeds of the line, an obstacle ahead
+
+LINE = {"time_gaps_s": {"uniform": [0.2, 2]}, "line_speed_mps": {"uniform": [10, 38]}}
+DEVIATIONS = {"speed_deviations_mps": {"uniform": [-2, 2]}}
 
 
-def test_early_impacts__the_first_learner_counts():
-    # vehicle_1 brakes at 6 m/s2, so 2 m are gone after 0.816 s: after vehicle_2 may act, before vehicle_3 may.
-    both = Scenario(
-        name="both", gaps_m=2, speeds_mps=20, braking_capacity_mps2=6, driving_capacity_mps2=6, mass_t=5,
-        latency_s=[0, 0.5, 1], roles={"vehicle_2": "learner", "vehicle_3": "learner"}, early_impacts="reject",
-    )  # fmt: skip
-    assert both.sample(1, 0).rejected == 0
-    with pytest.raises(InvalidInput, match="before vehicle_3 may act"):
-        both.with_learners(["vehicle_3"]).sample(1, 0)
+def build(**given: Any) -> Scenario:
+    rest = {"braking_capacity_mps2": [6, 7, 6], "driving_capacity_mps2": 6, "mass_t": 5, "latency_s": [0, 0.5, 0.8]}
+    return Scenario(**{"name": "given", **rest, **given})
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("given", "gaps", "speeds"),
     [
-        ({"n": 0, "seed": 1}, "n = 0: must be a whole number, at least 1"),
-        ({"n": 2.0, "seed": 1}, "n = 2.0"),
-        ({"n": True, "seed": 1}, "n = True"),
-        ({"n": 10_000_001, "seed": 1}, "n = 10000001: at most 10,000,000 worlds at once"),
-        ({"n": 10**14, "seed": 1}, "n = 100000000000000: at most"),
-        ({"n": 1, "seed": -1}, "seed = -1: must be a whole number, at least 0"),
-        ({"n": 1, "seed": None}, "seed = None"),
-        ({"n": 1, "seed": 1, "first": -1}, "first = -1"),
-        ({"n": 1, "seed": 1, "first": 2**62}, "first = 4611686018427387904"),
-        ({"n": 1, "seed": 1, "channel": "test"}, "channel 'test': must be one of list, training"),
+        ({"time_gaps_s": [0.5, 2], "speeds_mps": [30, 20, 10]}, [10, 20], [30, 20, 10]),  # 0.5 s x 20, 2 s x 10 m/s
+        ({"gaps_m": 7, "line_speed_mps": 20, "speed_deviations_mps": [1, -2, 0.5]}, [7, 7], [21, 18, 20.5]),
+        ({"gaps_m": 7, "line_speed_mps": 20}, [7, 7], [20, 20, 20]),
+        ({"time_gaps_s": 0.5, "line_speed_mps": 20, "speed_deviations_mps": [0, -2, 2]}, [9, 11], [20, 18, 22]),
     ],
 )
-def test_sample__bad_arguments_are_named(arguments, message):
-    with pytest.raises(InvalidInput, match=message):
-        ALL_RANDOM.sample(**arguments)
+def test_derived__by_hand(given: dict[str, Any], gaps: list[float], speeds: list[float]) -> None:
+    worlds = build(**given).sample(2, 7).worlds
+    assert (worlds.gaps_m.tolist(), worlds.speeds_mps.tolist()) == ([gaps] * 2, [speeds] * 2)
 
 
-def test_sample__any_whole_seed_will_do():
-    assert_same_bits(ALL_RANDOM.sample(2, np.uint64(5)).worlds, ALL_RANDOM.sample(np.int64(2), 5).worlds)
-    assert ALL_RANDOM.sample(1, 2**200).worlds.n == 1
+def test_derived__a_time_gap_has_the_number_of_its_gap_and_a_deviation_that_of_its_speed() -> None:
+    scenario = build(**LINE, **DEVIATIONS)
+    u, worlds = uniform_numbers(7, "list", 0, 0, 50, 24), scenario.sample(50, 7).worlds
+    line = values(scenario.quantities("line_speed_mps")[0], u[:, 15])
+    for i, speed in enumerate(worlds.speeds_mps.T):
+        own = values(scenario.quantities("speed_deviations_mps")[i], u[:, 8 * i + 1])
+        assert speed.tolist() == (line + own).tolist()
+    for pair, gap in enumerate(worlds.gaps_m.T):
+        time_gap = values(scenario.quantities("time_gaps_s")[pair], u[:, 8 * pair])
+        assert gap.tolist() == (time_gap * worlds.speeds_mps[:, pair + 1]).tolist()
+    usual = build(gaps_m=7, speeds_mps=20, restitution={"uniform": [0, 0.3]}, mass_t={"uniform": [1, 40]})
+    before, after = usual.sample(20, 3).worlds, usual.replace(**LINE).sample(20, 3).worlds
+    assert before.vehicles.mass_t.tobytes() == after.vehicles.mass_t.tobytes()
+    assert before.vehicles.restitution.tobytes() == after.vehicles.restitution.tobytes()
+    assert len(np.unique(after.speeds_mps)) == 20  # one speed per world
+    assert len(np.unique(np.hstack([after.gaps_m, after.speeds_mps[:, :1], after.vehicles.mass_t]))) == 20 * 6
+
+
+def test_bounds__hold_for_every_draw_and_are_reached_by_fixed_numbers() -> None:
+    scenario = build(**LINE, **DEVIATIONS)
+    assert (scenario.bounds("speeds_mps"), scenario.bounds("gaps_m")) == (((8.0, 40.0),) * 3, ((1.6, 80.0),) * 2)
+    assert build(time_gaps_s=0.5, speeds_mps=20).bounds("gaps_m") == ((10.0, 10.0),) * 2
+    assert PAPER.bounds("gaps_m") == ((5.0, 10.0),) * 2
+    worlds = scenario.sample(2000, 7).worlds
+    assert 8.0 <= worlds.speeds_mps.min() < worlds.speeds_mps.max() <= 40.0
+    assert 1.6 <= worlds.gaps_m.min() < worlds.gaps_m.max() <= 80.0
+
+
+def test_replace__the_new_way_takes_the_place_of_the_old_one() -> None:
+    scenario = build(**LINE, **DEVIATIONS)
+    assert scenario.replace(gaps_m=7).bounds("gaps_m") == ((7.0, 7.0),) * 2
+    assert scenario.replace(gaps_m=7).time_gaps_s is None
+    assert scenario.replace(speeds_mps=20).declared().keys() & {"line_speed_mps", "speed_deviations_mps"} == set()
+    assert scenario.replace(line_speed_mps=20).bounds("speeds_mps") == ((18.0, 22.0),) * 3
+    assert scenario.replace(gaps_m=7, speeds_mps=20).replace(**LINE).bounds("speeds_mps") == ((10.0, 38.0),) * 3
+    assert Scenario(**scenario.declared()) == scenario
+    margin = build(gaps_m=7, speeds_mps=20, obstacle_margin_m=1.5)
+    assert margin.replace(obstacle_gap_m=42).obstacle_margin_m is None
+    assert margin.replace(obstacle_gap_m=42).replace(obstacle_margin_m=1).obstacle_gap_m is None
+
+
+def ahead(**given: Any) -> Scenario:
+    """An obstacle ahead of Vehicle 1, which may brake with 5 m/s2 after 0.5 s: from 20 m/s it stops after 50 m."""
+    usual = {"gaps_m": 7, "speeds_mps": [20, 18, 20], "braking_capacity_mps2": [5, 7, 6], "latency_s": [0.5, 0.5, 0.8]}
+    return build(**{**usual, **given})
+
+
+def test_margin__is_added_to_the_way_to_standstill_and_has_the_random_number_of_the_distance() -> None:
+    assert ahead(obstacle_margin_m=1.5).sample(2, 7).worlds.obstacle_gap_m.tolist() == [51.5] * 2
+    drawn = {"speeds_mps": {"uniform": [18, 22]}, "braking_capacity_mps2": {"uniform": [5, 7]}}
+    worlds = ahead(obstacle_margin_m={"uniform": [1, 2]}, **drawn).sample(200, 7).worlds
+    speed, capacity = worlds.speeds_mps[:, 0], worlds.vehicles.braking_capacity_mps2[:, 0]
+    margin = worlds.obstacle_gap_m - speed * 0.5 - speed**2 / (2 * capacity)
+    far = ahead(obstacle_gap_m={"uniform": [51, 52]}, **drawn).sample(200, 7).worlds.obstacle_gap_m
+    assert margin == near(far - 50.0, abs=1e-12) and np.ptp(margin) > 0.9
+
+
+def test_margin__is_an_obstacle_for_everybody() -> None:
+    scenario = ahead(obstacle_margin_m=1.5)
+    assert [each.has_obstacle for each in (scenario, ahead(obstacle_gap_m=42), ahead())] == [True, True, False]
+    assert scenario.with_learners(["vehicle_1"]).learners == (0,)
+    assert eb.observation_for(scenario).obstacle
+
+
+# ---------------------------------------------------------------- worlds that are given
+
+HEADER = "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps"
+
+
+def read(folder: Path, text: str, scenario: Scenario = PAPER) -> Worlds:
+    (folder / "worlds.csv").write_text(text, encoding="utf-8")
+    return scenario.read_worlds(folder / "worlds.csv")
+
+
+def test_csv__gives_the_state_and_the_scenario_the_rest(tmp_path: Path) -> None:
+    for scenario in (PAPER, build(**LINE, **DEVIATIONS, restitution=0.1, mass_t=[4.5, 5.5, 5.9])):
+        worlds = read(tmp_path, f"{HEADER}\n10,8,20,18,20\n5,9,22,1.8e1, 20\n", scenario)
+        assert worlds.gaps_m.tolist() == [[10.0, 8.0], [5.0, 9.0]]
+        assert worlds.speeds_mps.tolist() == [[20.0, 18.0, 20.0], [22.0, 18.0, 20.0]]
+        assert worlds.vehicles.latency_s.tolist() == [[0.0, 0.5, 0.8]] * 2
+        assert worlds.vehicles.braking_capacity_mps2.tolist() == [[6.0, 7.0, 6.0]] * 2
+        assert worlds.vehicles.restitution.tolist() == [0.1, 0.1]
+
+
+def test_csv__optional_columns_in_any_order_with_a_byte_order_mark(tmp_path: Path) -> None:
+    text = f"\ufefflatency_2_s,restitution,mass_3_t,speed_limit_1_mps,{HEADER}\n0.2,0.3,6,30,10,8,20,18,20\n"
+    vehicles = read(tmp_path, text, PAPER.replace(mass_t=[4.5, 5.5, {"uniform": [5, 6]}])).vehicles
+    assert (vehicles.latency_s.tolist(), vehicles.restitution.tolist()) == ([[0.0, 0.2, 0.8]], [0.3])
+    assert vehicles.mass_t.tolist() == [[4.5, 5.5, 6.0]]
+    assert vehicles.speed_limit_mps.tolist() == [[30.0, 40.0, 40.0]]
+
+
+@pytest.mark.parametrize("end", ["", "\n", "\n\n", "\r\n\r\n"])
+def test_csv__blank_lines_at_the_end_are_nothing(tmp_path: Path, end: str) -> None:
+    assert read(tmp_path, f"{HEADER}\n10,8,20,18,20{end}").n == 1
+
+
+def test_csv__beyond_the_limit_is_not_read_to_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = f"{HEADER}\n10,8,20,18,20\n"
+    monkeypatch.setattr("ethbrake_marl.scenario.sampling.SIZE_LIMIT", len(text))
+    assert read(tmp_path, text).n == 1
+    with pytest.raises(InvalidInput, match="larger than 0 KiB, the limit for such a file"):
+        read(tmp_path, f"{text}\n")
+
+
+def test_table__equals_the_same_worlds_sampled() -> None:
+    sampled = PAPER.sample(50, 3).worlds
+    columns = {f"gap_{i + 1}_m": sampled.gaps_m[:, i] for i in range(2)}
+    columns |= {f"speed_{i + 1}_mps": sampled.speeds_mps[:, i] for i in range(3)}
+    assert bits(PAPER.worlds_from_table(columns)) == bits(sampled)
+    names = list(closing_pair(7).table_columns)
+    assert names[:4] == ["gap_1_m", "speed_1_mps", "speed_2_mps", "braking_capacity_1_mps2"]
+    assert len(names) == 1 + 6 * 2 + 1
+    table = {f"gap_{p}_m": [7, 7] for p in (1, 2)} | {f"speed_{i}_mps": [10, 20] for i in (1, 2, 3)}
+    assert ahead(obstacle_margin_m=1.5).worlds_from_table(table).obstacle_gap_m.tolist() == [5 + 10 + 1.5, 51.5]
+    given = ahead(obstacle_margin_m=1.5).worlds_from_table({**table, "obstacle_gap_m": [30, 31]})
+    assert given.obstacle_gap_m.tolist() == [30, 31]
+
+
+@pytest.mark.parametrize(
+    ("scenario", "state", "told"),
+    [
+        (PAPER, {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}, {"gaps_m": [7, 7], "restitution": 0.1}),
+        (PAPER, {"gaps_m": 7, "speeds_mps": np.full(3, 20), "restitution": 0.0}, {"restitution": 0, "gaps_m": [7, 7]}),
+        (load_scenario("paper-scenario-1"), {}, {"gaps_m": [10, 8], "speeds_mps": [20, 18, 20]}),
+        (build(time_gaps_s=[0.5, 1], line_speed_mps=20), {"speeds_mps": [30, 20, 10]}, {"gaps_m": [10, 10]}),
+        (build(time_gaps_s=[0.5, 1], line_speed_mps=20), {"speeds_mps": 20, "gaps_m": [7, 8]}, {"gaps_m": [7, 8]}),
+        (build(time_gaps_s=[0.5, 1], speeds_mps=[0, 1, 2]), {}, {"gaps_m": [0.5, 2]}),
+        (
+            ahead(obstacle_margin_m=1.5),
+            {"gaps_m": 7, "speeds_mps": 20, "latency_s": 0, "braking_capacity_mps2": 4},
+            {"obstacle_gap_m": 51.5, "braking_capacity_mps2": [4, 4, 4]},
+        ),
+    ],
+)
+def test_initial_state__the_scenario_fills_in_fixed_fields(
+    scenario: Scenario, state: dict[str, Any], told: dict[str, Any]
+) -> None:
+    worlds = scenario.worlds_from_state(state)
+    usual = {} if "braking_capacity_mps2" in told else {"braking_capacity_mps2": [6, 7, 6]}
+    assert worlds.n == 1
+    assert {name: quantity(worlds, name)[0].tolist() for name in told | usual} == told | usual
+
+
+# ---------------------------------------------------------------- types of vehicles
+
+KINDS = {
+    "car": {"weight": 3, "mass_t": {"uniform": [1, 2]}, "braking_capacity_mps2": {"normal": {
+        "mean": 8, "sd": 1, "low": 6, "high": 10}}},
+    "truck": {"mass_t": {"with_load": [14, 40]}, "braking_capacity_mps2": {"with_load": [7, 4]}},
+}  # fmt: skip
+N = 20_000
+
+
+def typed(**given: Any) -> Scenario:
+    rest = {"gaps_m": 30, "speeds_mps": 20, "driving_capacity_mps2": 3, "latency_s": 0.2}
+    return Scenario(**{"name": "typed", **rest, "vehicle_types": KINDS, **given})
+
+
+def test_types__stand_as_often_as_their_weights_say_and_independently() -> None:
+    types, names = MIXED.sample(N, 7).types, ("car", "van", "truck")
+    for vehicle in range(3):
+        seen = [int((types[:, vehicle] == name).sum()) for name in names]
+        assert stats.chisquare(seen, np.array([0.7, 0.1, 0.2]) * N).pvalue > 0.001
+    table = [[int(((types[:, 0] == a) & (types[:, 1] == b)).sum()) for b in names] for a in names]
+    assert stats.chi2_contingency(table).pvalue > 0.001
+    assert typed(types="truck").sample(50, 1).types.tolist() == [["truck"] * 3] * 50
+
+
+def test_types__of_each_place() -> None:
+    scenario = typed(types=["truck", {"car": 1, "truck": 9}, "any"])
+    counts = (scenario.sample(N, 1).types == "truck").sum(axis=0)
+    assert counts[0] == N
+    assert [stats.binomtest(counts[i], N, p).pvalue > 0.001 for i, p in ((1, 0.9), (2, 0.25))] == [True, True]
+    assert scenario.bounds("mass_t") == ((14.0, 40.0), (1.0, 40.0), (1.0, 40.0))
+    roles = {"vehicle_1": "constant:5", "vehicle_2": "learner"}  # within the capacity of every type of its place
+    assert typed(roles=roles, types=["car", "any", "any"]).scripts[0] == "constant:5"
+
+
+def test_type__is_the_first_number_of_its_own_stream() -> None:
+    u = uniform_numbers(7, "list", 0, 0, 100, 12, of=(3,)).reshape(100, 3, 4)
+    assert (typed().sample(100, 7).types == np.where(u[..., 0] < 0.75, "car", "truck")).all()
+
+
+def test_quantities__follow_the_distribution_of_their_type() -> None:
+    sample = typed().sample(N, 3)
+    car, truck = (sample.types == name for name in ("car", "truck"))
+    mass, braking = (QUANTITY.declared[key].of(sample.worlds) for key in ("mass_t", "braking_capacity_mps2"))
+    for drawn, expected in (
+        (mass[car], stats.uniform(1, 1)),
+        (braking[car], stats.truncnorm(-2, 2, loc=8, scale=1)),
+        (mass[truck], stats.uniform(14, 26)),
+    ):
+        assert stats.kstest(drawn, expected.cdf).pvalue > 0.001
+    assert abs(stats.pearsonr(mass[car], braking[car]).statistic) < 0.02  # a car's are drawn apart
+    load = (mass[truck] - 14.0) / 26.0  # a truck's go together
+    np.testing.assert_allclose(braking[truck], 7.0 - 3.0 * load, rtol=1e-12)
+    assert 0.0 <= load.min() < 0.01 < 0.99 < load.max() <= 1.0
+    kinds = {"van": {"mass_t": {"with_load": [2, 4]}, "braking_capacity_mps2": 6, "load": {"choice": [0, 0.5]}}}
+    assert set(np.unique(typed(vehicle_types=kinds).sample(1_000, 1).worlds.vehicles.mass_t)) == {2.0, 3.0}
+
+
+def test_types__leave_all_other_draws_alone_and_what_they_leave_out_stands_beside_them() -> None:
+    given = {"gaps_m": {"uniform": [5, 50]}, "speeds_mps": {"uniform": [10, 20]}, "latency_s": 0.2, "mass_t": 2}
+    plain = build(**given, driving_capacity_mps2={"uniform": [1, 3]}, braking_capacity_mps2={"uniform": [5, 9]})
+    buses = plain.replace(vehicle_types={"car": {}, "bus": {"mass_t": 12}})
+    one, other = (scenario.sample(500, 7).worlds for scenario in (plain, buses))
+    for key in ("gaps_m", "speeds_mps", "braking_capacity_mps2", "driving_capacity_mps2"):
+        assert (quantity(one, key) == quantity(other, key)).all()
+    assert set(np.unique(other.vehicles.mass_t)) == {2.0, 12.0}
+    brakes = typed(vehicle_types={"car": {"braking_capacity_mps2": 7}}, mass_t=[1, 2, 3])
+    assert brakes.sample(5, 7).worlds.vehicles.mass_t.tolist() == [[1.0, 2.0, 3.0]] * 5
+
+
+def test_types__of_refused_worlds_are_drawn_again() -> None:
+    late = {"latency_s": [0, 0.5, 0.8], "early_impacts": "reject"}
+    sample = typed(gaps_m={"uniform": [0.1, 4]}, speeds_mps=[15, 20, 20], **late).sample(300, 7)
+    assert sample.rejected > 0 and sample.index.tolist() == list(range(300))
+    assert ((sample.worlds.vehicles.mass_t >= 14.0) == (sample.types == "truck")).all()
+
+
+# ---------------------------------------------------------------- mixtures
+
+MEMBERS = ("paper-delay-low", "paper-delay-middle", "paper-delay-high")
+
+
+def mixed(*members: str, **beside: object) -> Scenario:
+    return load_scenario({"name": "mixed", "mixture": [{"scenario": name} for name in members], **beside})
+
+
+@pytest.mark.parametrize("channel", ["list", "training"])
+@pytest.mark.parametrize(
+    "mixture",
+    [
+        DELAYS,
+        mixed("paper-random", "stress-wide", horizon_s=16),  # with early impacts
+        mixed("realistic-mixed", "realistic-truck"),  # with types
+        mixed("cooperation-3-pair", "cooperation-3-congested"),  # with a channel in one
+    ],
+    ids=range(4),
+)
+def test_mixture__world_k_is_that_of_its_member(mixture: Scenario, channel: Any) -> None:
+    sample = mixture.sample(300, 7, channel=channel)
+    assert set(sample.scenarios) == {member.name for member in mixture.members}
+    for member in mixture.members:
+        own = load_scenario(member.name).sample(300, 7, channel=channel)
+        rows = np.flatnonzero(sample.scenarios == member.name)
+        told = sample.worlds.take(rows), own.worlds.take(rows)
+        assert worlds_sha256(told[0], rows) == worlds_sha256(told[1], rows)
+        assert (told[0].vehicles.known_from_s == told[1].vehicles.known_from_s).all()
+        if sample.types is not None:
+            assert (sample.types[rows] == ("" if own.types is None else own.types[rows])).all()
+
+
+def test_mixture__with_a_channel_and_without_is_one_batch() -> None:
+    mixture = mixed("cooperation-3-pair", "cooperation-3-congested")
+    env = eb.parallel_env(scenario=mixture)
+    seen = {env.reset(seed=seed)[1]["vehicle_2"]["known_from_s"].shape for seed in range(6)}
+    assert mixture.by_link and seen == {(3,)}
+
+
+def test_mixture__weights_decide_how_often() -> None:
+    entries = [{"scenario": name, "weight": weight} for name, weight in zip(MEMBERS, (1, 2, 5), strict=True)]
+    names = load_scenario({"name": "mixed", "mixture": entries}).sample(20_000, 3).scenarios
+    seen = [int((names == name).sum()) for name in MEMBERS]
+    assert stats.chisquare(seen, np.array([1, 2, 5]) / 8 * 20_000).pvalue > 0.001
+
+
+def test_mixture__what_stands_beside_holds_for_every_member() -> None:
+    heavy = DELAYS.replace(mass_t=[40, 1, 1])
+    assert heavy.bounds("mass_t")[0] == (40.0, 40.0)
+    assert (heavy.sample(20, 7).worlds.vehicles.mass_t[:, 0] == 40.0).all()
+    assert (heavy.sample(20, 7).worlds.gaps_m == DELAYS.sample(20, 7).worlds.gaps_m).all()
+    assert DELAYS.bounds("latency_s") == ((0.0, 0.0), (0.1, 0.8), (0.3, 1.2))
+    third = DELAYS.with_learners(["vehicle_3"])
+    assert [each.learners for each in (third, *third.members)] == [(2,)] * 4
+    assert Training.of("ppo", DELAYS).identity != Training.of("ppo", heavy).identity
+    assert "1 x paper-delay-low, 1 x paper-delay-middle, 1 x paper-delay-high" in DELAYS._repr_html_()
+
+
+def test_mixture__its_file_may_name_a_file_beside_it_and_its_members_may_be_written_out(tmp_path: Path) -> None:
+    own = PAPER.replace(name="own", title="")
+    (tmp_path / "own.yaml").write_text(json.dumps(own.declared()))
+    (tmp_path / "mine.yaml").write_text("name: mine\nmixture: [{scenario: own.yaml}, {scenario: paper-random-early}]\n")
+    assert [each.name for each in load_scenario(tmp_path / "mine.yaml").members] == ["own", "paper-random-early"]
+    line = "gaps_m: 7, speeds_mps: 20, braking_capacity_mps2: 9, driving_capacity_mps2: 5, latency_s: 0.5, mass_t: 1"
+    text = f"name: mine\nvehicles: 5\nmixture:\n  - scenario: {{name: a, {line}}}\n  - scenario: {{name: b, {line}}}\n"
+    (tmp_path / "mine.yaml").write_text(text)
+    assert [member.vehicles for member in load_scenario(tmp_path / "mine.yaml").members] == [5, 5]
+    assert Scenario(name="x", mixture=[{"scenario": PAPER}]).vehicles == 3
+
+
+def test_results__tell_scenario_and_types_agree_with_the_members_and_can_be_grouped() -> None:
+    agents = {"full_brake": eb.make_agent("full_brake"), "e_v2x_bm": eb.make_agent("e_v2x_bm")}
+    sample = DELAYS.sample(120, 7)
+    found = eb.evaluate(sample, agents, scenario=DELAYS, seed=7)
+    assert found.to_frame("columns")["scenario"].tolist() == sample.scenarios.tolist() * 2
+    groups = eb.summarise_by(found, "scenario")
+    for name in MEMBERS:
+        member, rows = load_scenario(name), np.flatnonzero(sample.scenarios == name)
+        own = eb.evaluate(member.sample(120, 7).take(rows), agents, scenario=member, seed=7)
+        assert (own.outcome("e_v2x_bm").total_harm == found.outcome("e_v2x_bm").total_harm[rows]).all()
+        assert [row.total_harm for row in groups[name]] == [row.total_harm for row in eb.summarise(own)]
+    assert not isinstance(found.limits, str)
+    sample = MIXED.sample(200, 7)
+    found = eb.evaluate(sample, {"full_brake": eb.make_agent("full_brake")}, scenario=MIXED, seed=7)
+    assert found.to_frame("columns")["vehicle_3_type"].tolist() == sample.types[:, 2].tolist()
+    groups = eb.summarise_by(found, "vehicle_3_type")
+    assert list(groups) == ["car", "truck", "van"]
+    told = [(row.episodes, row.collisions) for (row,) in groups.values()]
+    assert np.sum(told, axis=0).tolist() == [200, eb.summarise(found)[0].collisions]
+    with pytest.raises(InvalidInput, match="did you mean 'vehicle_3_type'"):
+        eb.summarise_by(found, "vehicle_3_typ")
+
+
+def test_shields_and_searches__take_a_mixture() -> None:
+    agents = {name: eb.make_agent(name, scenario=DELAYS) for name in ("full_brake+step", "constant:3+episode")}
+    plain = eb.evaluate(DELAYS.sample(20, 7), {"b": eb.make_agent("full_brake")}, scenario=DELAYS).outcome("b")
+    shielded = eb.evaluate(DELAYS.sample(20, 7), agents, scenario=DELAYS).outcome("full_brake+step")
+    assert (shielded.first_impact_harm <= plain.first_impact_harm + 1e-9).all()

@@ -1,17 +1,45 @@
+"""What a scenario says, the shipped ones, and what editors and pages are told; refusals: ``refusals/scenario.txt``."""
+
 from __future__ import annotations
 
 import copy
+import json
 import pickle
-from collections.abc import Callable
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from jsonschema import Draft202012Validator
 from pydantic import ValidationError
 
-from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.scenario import Scenario, Uniform
+from ethbrake_marl.defaults import HARM_COUNTS
+from ethbrake_marl.envs.interfaces import make_engine
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.inputs import scenario_sha256
+from ethbrake_marl.files.yaml import flow_text, read_yaml
+from ethbrake_marl.harm import empty_ledger
+from ethbrake_marl.learning.training import TrainingRecipe
+from ethbrake_marl.physics import advance
+from ethbrake_marl.scenario import (
+    Scenario,
+    Uniform,
+    list_scenarios,
+    load_scenario,
+    new_scenario_text,
+    parse_yaml,
+    scenario_json_schema,
+    schema as shipped_files,
+    shipped_folder,
+)
+from ethbrake_marl.scenario.sampling import QUANTITY, ScriptSpec
+from ethbrake_marl.scenario.v2x import PRESETS
+from tests.contract.interfaces import LEVELS
 
+SHIPPED = [entry.path for entry in list_scenarios()]
+each_shipped = pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "scenarios.md").read_text("utf-8")
 GIVEN = {
     "name": "given",
     "gaps_m": {"uniform": [5, 10]},
@@ -27,138 +55,336 @@ def build(**changes: object) -> Scenario:
     return Scenario(**{**GIVEN, **changes})
 
 
-def test_defaults__are_the_labelled_ones():
+# ---------------------------------------------------------------- one scenario
+
+
+def test_defaults__are_the_labelled_ones() -> None:
     scenario = build()
-    assert scenario.vehicles == 3
-    assert scenario.time_step_s == 0.1
-    assert scenario.horizon_s == 8.0
-    assert scenario.speed_limit_mps == 40.0
-    assert scenario.restitution == 0.1
-    assert scenario.early_impacts == "keep"
+    names = ("vehicles", "time_step_s", "horizon_s", "speed_limit_mps", "restitution", "early_impacts")
+    assert [getattr(scenario, name) for name in names] == [3, 0.1, 8.0, 40.0, 0.1, "keep"]
     assert scenario.roles == {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "full_brake"}
 
 
+TYPED = {"vehicle_types": {"car": {"weight": 3}, "truck": {"mass_t": {"with_load": [14, 40]}}}}
+
+
 @pytest.mark.parametrize(
-    "change",
+    "changes",
     [
-        lambda roles: roles.__setitem__("vehicle_3", "learner"),
-        lambda roles: roles.__delitem__("vehicle_3"),
-        lambda roles: roles.__ior__({"vehicle_3": "learner"}),
-        lambda roles: roles.update(vehicle_3="learner"),
-        lambda roles: roles.setdefault("vehicle_4", "learner"),
-        lambda roles: roles.pop("vehicle_3"),
-        lambda roles: roles.popitem(),
-        lambda roles: roles.clear(),
+        {"mass_t": {"choice": [4, 5], "weights": [1, 2]}, "roles": {"vehicle_2": "constant:3"}},
+        {**TYPED, "types": ["truck", "any", {"car": 2}]},
+        *({"v2x": preset} for preset in PRESETS),
+        None,
     ],
 )
-@pytest.mark.parametrize("given", [{}, {"roles": {"vehicle_2": "learner"}}])
-def test_roles__cannot_be_changed(given: dict[str, Any], change: Callable[[Any], object]):
-    scenario = build(**given)
-    with pytest.raises(InvalidInput, match=r"roles of a scenario are frozen; use scenario.replace"):
-        change(scenario.roles)
-    assert scenario.learners == (1,)
-
-
-def test_roles__survive_copies():
-    scenario = build()
-    for again in (copy.deepcopy(scenario), pickle.loads(pickle.dumps(scenario)), scenario.replace(title="Mine")):
-        assert again.roles == scenario.roles
-        with pytest.raises(InvalidInput, match="frozen"):
-            again.roles["vehicle_3"] = "learner"
-    assert type(scenario.model_dump()["roles"]) is dict
-
-
-def test_python__arguments_raise_the_same_errors():
-    with pytest.raises(InvalidInput, match=r"scenario 'bad': gaps_km: .* gaps_m \(metres\)\? \(and 4 more\)$"):
-        Scenario(name="bad", gaps_km=7)
-    with pytest.raises(InvalidInput, match=r"^scenario 'given': mass_t\[0\] \(vehicle_1\) = -1: "):
-        build(mass_t=[-1, 2, 3])
-    with pytest.raises(InvalidInput, match=r"gaps_m = \.nan"):
-        build(gaps_m=float("nan"))
-    with pytest.raises(InvalidInput, match="gaps_m = true"):
-        build(gaps_m=True)
-    with pytest.raises(InvalidInput, match="unknown key"):
-        build(latency=0.1)
-
-
-def test_scenario__is_frozen():
+def test_scenario__is_the_same_as_a_copy_as_declared_and_as_json_and_told_by_its_hash(changes: Any) -> None:
+    scenario = load_scenario("mixture-delays") if changes is None else build(**changes)
+    again = [copy.deepcopy(scenario), pickle.loads(pickle.dumps(scenario)), Scenario(**scenario.declared())]
+    again.append(Scenario.model_validate_json(json.dumps(scenario.declared())))
+    for each in again:
+        assert each == scenario and scenario_sha256(each) == scenario_sha256(scenario)
+        assert [member.name for member in each.members] == [member.name for member in scenario.members]
+    assert scenario_sha256(scenario.replace(restitution=0.3)) != scenario_sha256(scenario)
     with pytest.raises(ValidationError, match="frozen"):
-        build().vehicles = 4
+        scenario.vehicles = 4
 
 
-def test_quantities__one_entry_stands_for_all():
+def test_quantities__one_entry_stands_for_all() -> None:
     scenario = build(mass_t=5, gaps_m=[7, {"uniform": [5, 10]}])
-    assert scenario.quantities("mass_t") == (5.0, 5.0, 5.0)
-    assert scenario.quantities("gaps_m") == (7.0, Uniform(uniform=(5.0, 10.0)))
-    assert scenario.quantities("restitution") == (0.1,)
+    told = [scenario.quantities(name) for name in ("mass_t", "gaps_m", "restitution")]
+    assert told == [(5.0, 5.0, 5.0), (7.0, Uniform(uniform=(5.0, 10.0))), (0.1,)]
 
 
-def test_roles__left_out_of_a_mapping_brake_fully():
-    scenario = build(roles={"vehicle_3": "learner"})
-    assert scenario.roles == {"vehicle_1": "full_brake", "vehicle_2": "full_brake", "vehicle_3": "learner"}
-    assert scenario.learners == (2,)
-    assert scenario.scripts == {0: "full_brake", 1: "full_brake"}
-
-
-def test_replace__changes_one_field_and_checks_again():
+def test_replace__changes_one_field_and_checks_again() -> None:
     scenario = build().replace(latency_s=[0, 0.2, 0.8])
-    assert scenario.latency_s == (0.0, 0.2, 0.8)
-    assert scenario.mass_t == build().mass_t
-    assert build().latency_s == (0.0, 0.5, 0.8)
-    assert build(speeds_mps=np.array([20, 18, 20]), restitution=np.float64(0.3)).speeds_mps == (20.0, 18.0, 20.0)
-    with pytest.raises(InvalidInput, match=r"latency_s\[1\] \(vehicle_2\) = 9"):
-        build().replace(latency_s=[0, 9, 0.8])
-
-
-def test_replace__another_number_of_vehicles_when_every_entry_stands_for_all():
+    assert (scenario.latency_s, scenario.mass_t) == ((0.0, 0.2, 0.8), build().mass_t)
+    numpys = build(speeds_mps=np.array([20, 18, 20]), restitution=np.float64(0.3))
+    assert (numpys.speeds_mps, numpys.restitution) == ((20.0, 18.0, 20.0), 0.3)
     same = {key: 5 for key in ("speeds_mps", "braking_capacity_mps2", "driving_capacity_mps2", "mass_t")}
     scenario = Scenario(name="any", gaps_m=7, latency_s=0.1, **same)
-    assert scenario.replace(vehicles=5).sample(1, 0).worlds.N == 5
-    assert scenario.replace(vehicles=5).learners == (1,)
+    assert (scenario.replace(vehicles=5).sample(1, 0).worlds.N, scenario.replace(vehicles=5).learners) == (5, (1,))
     assert scenario.replace(vehicles=2).roles == {"vehicle_1": "full_brake", "vehicle_2": "learner"}
-    with pytest.raises(InvalidInput, match=r"latency_s: has 3 entries; 5 vehicles need 5 .*"):
-        scenario.replace(vehicles=5, latency_s=[0, 1, 2])
 
 
 @pytest.mark.parametrize("learners", [["vehicle_2", "vehicle_3"], [1, 2], (np.int64(2), "vehicle_2")])
-def test_learners__by_name_or_index(learners):
+def test_learners__by_name_or_index(learners: Any) -> None:
     scenario = build(roles={"vehicle_1": "constant:3", "vehicle_2": "learner"}).with_learners(learners)
     assert scenario.learners == (1, 2)
     assert scenario.roles == {"vehicle_1": "constant:3", "vehicle_2": "learner", "vehicle_3": "learner"}
 
 
-def test_learners__not_listed_brake_fully():
-    scenario = build().with_learners(["vehicle_3"])
-    assert scenario.roles == {"vehicle_1": "full_brake", "vehicle_2": "full_brake", "vehicle_3": "learner"}
-    assert build(early_impacts="keep").with_learners([]).learners == ()
+def test_roles__left_out_or_no_longer_learning_brake_fully() -> None:
+    for scenario in (build(roles={"vehicle_3": "learner"}), build().with_learners(["vehicle_3"])):
+        assert scenario.roles == {"vehicle_1": "full_brake", "vehicle_2": "full_brake", "vehicle_3": "learner"}
+        assert (scenario.learners, scenario.scripts) == ((2,), {0: "full_brake", 1: "full_brake"})
+    assert build().with_learners([]).learners == ()
+    assert type(build().model_dump()["roles"]) is dict
 
 
 @pytest.mark.parametrize(
-    ("learners", "reason"),
+    ("spec", "parts", "command"),
     [
-        (["vehicle_4"], "did you mean 'vehicle_"),
-        (["Bob"], "unknown vehicle 'Bob'; known: vehicle_1, vehicle_2, vehicle_3"),
-        ([3], "index from 0 to 2"),
-        ([-1], "index from 0 to 2"),
-        ([True], "index from 0 to 2"),
-        ([1.0], "index from 0 to 2"),
-        (["vehicle_2", 1], "vehicle_2 is listed twice"),
-        ("vehicle_2", "must be a list of vehicles"),
+        ("full_brake", ("full_brake", None), [-6.0, -7.0]),
+        ("coast", ("coast", None), [0.0, 0.0]),
+        ("constant:3.5", ("constant", "3.5"), [-3.5, -3.5]),
+        ("constant:6", ("constant", "6"), [-6.0, -6.0]),
+        ("constant:-2", ("constant", "-2"), [2.0, 2.0]),
+        ("e_v2x_bm:pairwise", ("e_v2x_bm", "pairwise"), None),
+        ("learned:runs/my-run", ("learned", "runs/my-run"), None),
+        ("policy@best.v1-a:b:c", ("policy@best.v1-a", "b:c"), None),
     ],
 )
-def test_learners__unknown_or_repeated_are_errors(learners, reason):
-    with pytest.raises(InvalidInput, match=reason):
-        build().with_learners(learners)
-    with pytest.raises(UnknownName):
-        build().with_learners(["Bob"])
+def test_script__splits_at_the_first_colon_and_has_a_command_if_free_of_the_state(
+    spec: str, parts: tuple[str, str | None], command: list[float] | None
+) -> None:
+    script = ScriptSpec.parse(spec)
+    told = script.command([6.0, 7.0], [2.0, 3.0])
+    assert (script, script.is_state_free()) == (parts, command is not None)
+    assert told is command is None or told.tolist() == command
 
 
-def test_declared__builds_the_same_scenario():
-    scenario = build(mass_t={"choice": [4, 5], "weights": [1, 2]})
-    assert Scenario(**scenario.declared()) == scenario
-    assert scenario.declared()["gaps_m"] == {"uniform": [5.0, 10.0]}
+# ---------------------------------------------------------------- the shipped scenarios
+
+# gaps, speeds, latencies as the paper states them (or as our labelled defaults for its three delays).
+RANDOM = {"uniform": [5, 10]}, {"uniform": [18, 22]}
+PAPER = {
+    "paper-random": (*RANDOM, [0, 0.5, 0.8]),
+    "paper-random-early": (*RANDOM, [0, 0.2, 0.8]),
+    "paper-distance": (RANDOM[0], [20, 18, 20], [0, 0.5, 0.8]),
+    "paper-scenario-1": ([10, 8], [20, 18, 20], [0, 0.5, 0.8]),
+    "paper-scenario-2": ([5, 9], [22, 18, 20], [0, 0.5, 0.8]),
+    "paper-delay-low": (*RANDOM, [0, 0.1, 0.3]),
+    "paper-delay-middle": (*RANDOM, [0, 0.3, 0.6]),
+    "paper-delay-high": (*RANDOM, [0, 0.8, 1.2]),
+}
 
 
-def test_scenario__survives_pickling():
-    scenario = build()
-    assert pickle.loads(pickle.dumps(scenario)) == scenario
+def test_list__is_sorted_has_each_name_once_and_these_levels_of_cooperation() -> None:
+    entries = list_scenarios()
+    names = [entry.name for entry in entries]
+    assert names == sorted(names) and set(PAPER) <= set(names)
+    assert all(entry.title and entry.path.is_file() for entry in entries)
+    stems = [path.stem for path in shipped_folder().rglob("*.yaml")]
+    assert sorted(stems) == sorted(set(stems))
+    levels = "0-sensors 1-front 2-blocked 2-five 2-paper 3-congested 3-five 3-pair 4-all 4-congested 4-five"
+    assert list(LEVELS) == [f"cooperation-{level}" for level in levels.split()]
+
+
+@pytest.mark.parametrize("name", PAPER)
+def test_paper_scenarios__have_the_papers_values(name: str) -> None:
+    scenario = load_scenario(name)
+    declared = scenario.declared()
+    assert tuple(declared[key] for key in ("gaps_m", "speeds_mps", "latency_s")) == PAPER[name]
+    assert declared["braking_capacity_mps2"] == declared["driving_capacity_mps2"] == [6, 7, 6]
+    assert declared["mass_t"] == [4.5, 5.5, 5.9]
+    assert (scenario.vehicles, scenario.restitution, scenario.early_impacts) == (3, 0.1, "reject")
+    assert (scenario.time_step_s, scenario.horizon_s, scenario.speed_limit_mps) == (0.1, 8.0, 40.0)
+    assert (scenario.learners, scenario.scripts) == ((1,), {0: "full_brake", 2: "full_brake"})
+
+
+def not_used(scenario: Scenario) -> set[str]:
+    """The keys of the ways to declare gaps, speeds and an obstacle that it does not use; what it does not choose."""
+    if scenario.members:
+        return set(Scenario.model_fields) - {"name", "title", "description", "source", "mixture"}
+    gaps = "gaps_m" if scenario.gaps_m is None else "time_gaps_s"
+    speeds = {"speeds_mps"} if scenario.speeds_mps is None else {"line_speed_mps", "speed_deviations_mps"}
+    obstacle = {key for key in ("obstacle_gap_m", "obstacle_margin_m") if getattr(scenario, key) is None}
+    chosen = ("observation", "vehicle_types", "types", "mixture", *QUANTITY.needed)
+    return {gaps, *speeds, *obstacle, *(key for key in chosen if getattr(scenario, key) is None)}
+
+
+@each_shipped
+def test_shipped__reads_back_by_name_path_and_folder_and_a_new_file_is_based_on_it(path: Path) -> None:
+    scenario, folder = load_scenario(path.stem), path.parent.name
+    text = "\n".join(f"{key}: {flow_text(value)}" for key, value in scenario.declared().items())
+    short = f"{folder}/{path.stem.removeprefix(f'{folder}-')}"
+    assert load_scenario(path) == load_scenario(short) == Scenario.from_document(parse_yaml(text)) == scenario
+    assert scenario.sample(3, 0).worlds.n == 3
+    assert scenario.title and scenario.description and scenario.source
+    text = new_scenario_text("mine", based_on=path.stem)
+    own, new = {"name", "title", "description", "source"}, load_scenario(parse_yaml(text).content)
+    assert new.model_dump(exclude=own) == scenario.model_dump(exclude=own) and new.name == "mine"
+    assert all(re.search(rf"^# .*\n(# )?{key}:", text, re.MULTILINE) for key in Scenario.model_fields)
+    assert {key for key in Scenario.model_fields if f"\n# {key}:" in text} == not_used(scenario)
+    assert not re.search(r"[ \t]$", text, re.MULTILINE)
+    editor = Draft202012Validator(scenario_json_schema())
+    for content in (read_yaml(path).content, parse_yaml(text).content):
+        assert [error.message for error in editor.iter_errors(content)] == []
+
+
+def test_new__its_comments_are_other_ways_that_would_be_valid() -> None:
+    text = new_scenario_text("mine")
+    swapped = text.replace("\ngaps_m:", "\n# gaps_m:").replace("\n# time_gaps_s:", "\ntime_gaps_s:")
+    assert Scenario.from_document(parse_yaml(swapped)).time_gaps_s == (1.0, 1.0)
+    for key in ("line_speed_mps", "speed_deviations_mps"):
+        swapped = swapped.replace(f"\n# {key}:", f"\n{key}:")
+    line = Scenario.from_document(parse_yaml(swapped.replace("\nspeeds_mps:", "\n# speeds_mps:")))
+    assert line.bounds("speeds_mps") == ((20.0, 20.0), (18.0, 18.0), (20.0, 20.0))
+    (told,) = (line for line in text.splitlines() if "3600" in line and "commands" in line)
+    assert told.endswith("below horizon_s")
+
+
+@pytest.mark.parametrize(("suffix", "folder"), [(".yaml", "."), (".yml", "."), ("", "stress")])
+def test_path__of_the_users_own_file_goes_before_a_shipped_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, folder: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path(folder).mkdir(exist_ok=True)
+    path = Path(folder, f"wide{suffix}")
+    path.write_text(new_scenario_text("wide"))
+    assert load_scenario(path) == load_scenario(str(path)) and load_scenario(path).name == "wide"
+    assert load_scenario("stress-wide").name == "stress-wide"
+
+
+def same_lines(one: Scenario, other: Scenario, channel: Any = "list") -> bool:
+    """Whether both have the same gaps and speeds in every world, the other one's latencies at least as long."""
+    ours, theirs = (scenario.sample(500, 7, first=100, channel=channel) for scenario in (one, other))
+    lines = [(s.worlds.gaps_m.tobytes(), s.worlds.speeds_mps.tobytes()) for s in (ours, theirs)]
+    return lines[0] == lines[1] and bool((theirs.worlds.vehicles.latency_s >= ours.worlds.vehicles.latency_s).all())
+
+
+@pytest.mark.parametrize("name", [name for name in LEVELS if not name.endswith("five")])
+def test_levels__of_three_vehicles_have_the_lines_of_the_random_test(name: str) -> None:
+    assert same_lines(load_scenario("paper-random"), LEVELS[name])
+
+
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [("paper-random-brake-only", "driving_capacity_mps2"), ("paper-random-obstacle", "obstacle_margin_m")],
+)
+def test_variants__have_the_lines_of_the_random_test_and_differ_in_one_key(name: str, key: str) -> None:
+    plain, variant = load_scenario("paper-random"), load_scenario(name)
+    assert same_lines(plain, variant) and same_lines(plain, variant, "training")
+    assert plain.sample(500, 7).rejected == variant.sample(500, 7).rejected
+    told, other = (each.model_dump(exclude={"name", "title", "description", "source"}) for each in (plain, variant))
+    assert {field for field in told if told[field] != other[field]} == {key}
+
+
+def test_variants__stand_1_7_m_beyond_where_vehicle_1_stops_or_cannot_drive_on() -> None:
+    worlds = load_scenario("paper-random-obstacle").sample(1000, 7).worlds
+    assert worlds.obstacle_gap_m - worlds.speeds_mps[:, 0] ** 2 / 12 == pytest.approx(1.7, abs=1e-12)
+    assert load_scenario("paper-random-brake-only").bounds("driving_capacity_mps2")[1] == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("name", ["cooperation-3-pair", "cooperation-3-five"])
+def test_level_4__has_the_lines_of_level_3_and_full_braking_never_meets_its_obstacle(name: str) -> None:
+    level_3, level_4 = LEVELS[name], LEVELS[name.replace("3-pair", "4-all").replace("3-five", "4-five")]
+    assert level_4.learners == tuple(range(level_4.vehicles)) and level_4.obstacle_gap_m == 42.0
+    worlds = {"3": level_3.sample(2_000, 7).worlds, "4": level_4.sample(2_000, 7).worlds}
+    assert worlds["4"].gaps_m.tobytes() == worlds["3"].gaps_m.tobytes()
+    ledgers = {}
+    for key, at_alert in worlds.items():
+        _, impacts = advance(at_alert, -at_alert.vehicles.braking_capacity_mps2, until_s=8.0)
+        ledgers[key] = empty_ledger(at_alert).add(impacts)
+    assert not ledgers["4"].obstacle_count.any() and ledgers["3"].collided.sum() > 1_000
+    for harm_count in HARM_COUNTS:
+        assert ledgers["4"].vehicle_harm(harm_count).tobytes() == ledgers["3"].vehicle_harm(harm_count).tobytes()
+    v, a = worlds["4"].speeds_mps[:, 0], worlds["4"].vehicles.braking_capacity_mps2[:, 0]
+    assert (v * v / (2.0 * a) < worlds["4"].obstacle_gap_m).all()
+
+
+def test_obstacle__changes_nothing_in_a_level_whose_line_does_not_reach_it() -> None:
+    plain = LEVELS["cooperation-3-pair"]
+    runs = [make_engine(scenario, 200, seed=3) for scenario in (plain, plain.replace(obstacle_gap_m=42))]
+    for _ in range(80):
+        steps = [run.step(np.full((200, 2), -1.0)) for run in runs]
+        assert steps[0].reward.tobytes() == steps[1].reward.tobytes()
+        assert steps[0].ended.tobytes() == steps[1].ended.tobytes()
+    without, with_it = (run.worlds for run in runs)
+    assert without.gaps_m.tobytes() == with_it.gaps_m.tobytes() and with_it.obstacle_gap_m.min() > 0.0
+    assert runs[0].ledger.total_harm.tobytes() == runs[1].ledger.total_harm.tobytes()
+    assert runs[0].ledger.collided.sum() > 100
+
+
+def test_stress_wide__has_the_stated_ranges() -> None:
+    scenario = load_scenario("stress-wide")
+    worlds = scenario.sample(5000, 7).worlds
+    vehicles = worlds.vehicles
+    for drawn, low, high in (
+        (worlds.speeds_mps, 8, 40),
+        (vehicles.mass_t, 1, 40),
+        (vehicles.braking_capacity_mps2, 3, 10),
+        (vehicles.driving_capacity_mps2, 3, 10),
+        (vehicles.latency_s[:, 1:], 0, 1.5),
+        (vehicles.restitution, 0, 0.3),
+        (worlds.gaps_m / worlds.speeds_mps[:, 1:], 0.2, 2),
+    ):
+        assert low - 1e-12 <= drawn.min() < low + 0.02 * (high - low)
+        assert high - 0.02 * (high - low) < drawn.max() <= high + 1e-12
+    assert (vehicles.latency_s[:, 0] == 0.0).all() and scenario.learners == (1,)
+    assert np.abs(np.diff(worlds.speeds_mps)).max() <= 4.0
+    slowest = vehicles.latency_s + worlds.speeds_mps / vehicles.braking_capacity_mps2
+    assert slowest.max() < 1.5 + 40 / 3 < scenario.horizon_s
+
+
+# ---------------------------------------------------------------- folders, editors, pages
+
+
+@pytest.mark.parametrize("kind", ["scenarios", "recipes"])
+def test_folder__of_an_installed_package_is_inside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    monkeypatch.setattr(shipped_files, "_PACKAGE", tmp_path / "ethbrake_marl")
+    name, find = {"scenarios": ("scenarios", shipped_folder), "recipes": ("train", TrainingRecipe.shipped)}[kind]
+    with pytest.raises(InvalidInput, match=rf"the shipped {kind} are missing: .*reinstall"):
+        find()
+    installed = tmp_path / "ethbrake_marl" / "_data" / name
+    installed.mkdir(parents=True)
+    (installed / "mine.yaml").touch()
+    (tmp_path / name).mkdir()  # somebody else's folder: no pyproject.toml beside it
+    assert find() == (installed if kind == "scenarios" else {"mine": installed / "mine.yaml"})
+    (tmp_path / "pyproject.toml").touch()
+    assert find() == (tmp_path / name if kind == "scenarios" else {})
+
+
+def test_json_schema__names_every_field_asks_for_one_of_two_ways_and_knows_no_null() -> None:
+    schema = json.loads(json.dumps(scenario_json_schema()))
+    assert set(schema["properties"]) == set(Scenario.model_fields)
+    assert (schema["additionalProperties"], schema["required"]) == (False, ["name"])
+    assert schema["if"] == {"not": {"required": ["mixture"]}}  # whose members say everything else
+    gaps, speeds, obstacle, *_, every = schema["then"]["allOf"]
+    assert [way["required"] for way in every["anyOf"]] == [["vehicle_types"], [*QUANTITY.needed]]
+    ways = [[way["required"] for way in pair["oneOf"]] for pair in (gaps, speeds)]
+    assert ways == [[["gaps_m"], ["time_gaps_s"]], [["speeds_mps"], ["line_speed_mps"]]]
+    assert obstacle == {"not": {"required": ["obstacle_gap_m", "obstacle_margin_m"]}}  # not both
+    assert schema["dependentRequired"] == {"speed_deviations_mps": ["line_speed_mps"]}
+    assert "null" not in json.dumps(schema) and schema["properties"]["time_step_s"]["default"] == 0.1
+
+
+def test_page__has_every_key_with_its_default() -> None:
+    rows = dict(re.findall(r"^\| `(\w+)` \| *(.*?) *\|.*\|$", PAGE, re.MULTILINE))
+    other = {"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps"}
+    other |= {new: usual for usual, new in other.items()}
+    expected = {}
+    for key, field in Scenario.model_fields.items():
+        expected[key] = "empty" if field.default == "" else f"`{flow_text(field.default)}`"
+        if field.is_required():
+            expected[key] = "required"
+        elif field.default is None:
+            expected[key] = f"this or `{other[key]}`" if key in other else "none"
+        elif field.default_factory is not None:
+            expected[key] = rows[key]
+    assert rows == expected
+
+
+def test_page__its_examples_are_valid_scenarios() -> None:
+    examples = re.findall(r"^```yaml\n(name:.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+    worlds = [Scenario.from_document(parse_yaml(text, "docs/scenarios.md")).sample(10, 0).worlds for text in examples]
+    assert [each.n for each in worlds] == [10] * len(worlds) != []
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("gaps_m: {uniform: [5, 10]}", "gaps_km: 0.007"),
+        ("mass_t: [4.5, 5.5, 5.9]", "mass_t: [4.5, -5.5, 5.9]"),
+        ("speeds_mps: {uniform: [18, 22]}", "speeds_mps: {uniform: [18, 45]}"),
+        ("\n# Every gap and every speed is drawn on its own.", "time_gaps_s: 1"),
+        ("speeds_mps: {uniform: [18, 22]}", "line_speed_mps: 39\nspeed_deviations_mps: {uniform: [-2, 2]}"),
+    ],
+)
+def test_page__shows_what_answers_a_mistake(old: str, new: str) -> None:
+    text = (shipped_folder() / "paper" / "paper-random.yaml").read_text()
+    with pytest.raises(InvalidInput) as caught:
+        Scenario.from_document(parse_yaml(text.replace(old, new), "my.yaml"))
+    assert old in text and f"\n{caught.value}\n" in PAGE

@@ -1,0 +1,244 @@
+"""What the environments draw: pictures, words and windows of the running worlds."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import sys
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.envs.drawing import BODY_M, HEIGHT, WIDTH, Trace, View, follow
+from ethbrake_marl.envs.interfaces import env, parallel_env
+from ethbrake_marl.errors import InvalidInput, MissingExtra
+from tests.contract.interfaces import CRASH, REST
+
+near = pytest.approx
+MODES = ["human", "rgb_array", "rgb_array_list", "ansi"]
+SHAPE = (HEIGHT, WIDTH, 3)
+FLASH = (255, 214, 10)
+COAST = np.zeros(1, np.float32)
+
+
+@pytest.fixture(autouse=True)
+def _no_display(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+
+
+def crash(mode: str | None = "rgb_array", **changes: Any) -> Any:
+    environment = gymnasium.make("EthBrake-v0", scenario=CRASH.replace(**changes), render_mode=mode)
+    environment.reset(seed=0)
+    return environment
+
+
+def to_its_end(environment: Any) -> list[Any]:
+    """What is rendered after each step, coasting; the world's time stands before it."""
+    shown, ended = [], False
+    while not ended:
+        *_, terminated, truncated, info = environment.step(COAST)
+        shown.append((round(info["time_s"], 3), environment.render()))
+        ended = terminated or truncated
+    return shown
+
+
+def flashes(frame: Any) -> int:
+    """How many pixels have the colour of an impact."""
+    return int((frame == np.array(FLASH, np.uint8)).all(axis=2).sum())
+
+
+def test_frame__is_a_picture_of_the_state_alone_in_its_own_memory() -> None:
+    environment, other = crash(), crash()
+    before = environment.render()
+    assert (before.shape, before.dtype) == (SHAPE, np.uint8)
+    for _ in range(3):
+        environment.step(-1.0 + COAST), other.step(-1.0 + COAST)
+        frame, again = environment.render(), environment.render()
+        assert np.array_equal(frame, again) and np.array_equal(frame, other.render())
+        assert (frame != before).any()
+        before = again
+        frame[:] = 0
+        assert np.array_equal(environment.render(), again)
+
+
+def test_impact__is_shown_where_it_happens_and_then_fades() -> None:
+    seen = {time: flashes(frame) for time, frame in to_its_end(crash())}  # coasting, an impact at 1 s with 6 m/s
+    assert [time for time, count in seen.items() if count and time < 0.999] == []
+    assert seen[1.0] > 50
+
+
+def test_step_frames__show_an_impact_inside_a_step_from_its_moment_on() -> None:
+    environment = crash(latency_s=[0, 0.55])
+    viewer = environment.unwrapped.viewer
+    assert len(viewer.step_frames(50)) == round(0.55 * 50)  # from the alert to the first decision
+    for _ in range(5):
+        environment.step(COAST)  # to 1.05 s; the impact is at 1 s
+    frames = viewer.step_frames(50)
+    assert [flashes(frame) > 0 for frame in frames] == [False, False, True, True, True]
+    assert np.array_equal(frames[-1], environment.render())
+
+
+def test_scene__has_the_numbers_of_the_infos_and_the_places_of_the_physics() -> None:
+    environment = parallel_env("paper-random")
+    trace, engine = Trace(environment.engine, whole=True), environment.engine
+    environment.reset(seed=7)
+    infos: dict[str, Any] = {}
+    while environment.agents:
+        infos = environment.step({"vehicle_2": [-0.3]})[4]
+    motions = trace.motions(engine)
+    shown = [scene for motion in motions for scene in motion.scenes(engine, 0)]
+    start = engine.scenario.sample(1, seed=7, channel="training").worlds
+    record = eb.record_episode(start, eb.make_agent("coast"), scenario=engine.scenario)
+    assert len(shown) == len(motions) == int(engine.steps[0]) + 1
+    last, worlds, told = shown[-1], engine.worlds, infos["vehicle_2"]
+    assert (last.time_s, last.ended) == (worlds.time_s[0], True)
+    harms = [told["world_first_impact_harm"], told["world_total_harm"]]
+    assert [last.first_harm, last.total_harm] == near(harms, abs=1e-9)
+    assert last.gaps_m == near(worlds.gaps_m[0], abs=1e-9)
+    assert last.speeds_mps == near(worlds.speeds_mps[0], abs=1e-9)
+    assert shown[0].front_m[0] == near(record.positions_m[record.time_s.searchsorted(0.5), 0])
+    assert -np.diff(last.front_m) == near(last.gaps_m + BODY_M)
+    for scene in shown:
+        assert scene.view.left_m < scene.front_m[-1] - BODY_M and scene.front_m[0] < scene.view.right_m
+
+
+@pytest.mark.parametrize(
+    ("ends", "view"),
+    [
+        ((44.0, -20.0), View(-30.0, 50.0)),
+        ((55.0, 0.0), View(-20.0, 60.0)),
+        ((55.0, -25.0), View(-32.5, 60.0)),
+        ((0.0, -40.0), View(-47.5, 50.0)),
+    ],
+)
+def test_view__stands_still_until_the_line_would_leave_it(ends: tuple[float, float], view: View) -> None:
+    assert follow(View(-30.0, 50.0), np.array(ends)) == view
+
+
+@pytest.mark.parametrize("make", [gymnasium.make, eb.EthBrakeEnv])
+def test_list__has_the_beginning_and_each_step_once(make: Any) -> None:
+    name = ("EthBrake-v0",) if make is gymnasium.make else ()
+    environment = make(*name, scenario=CRASH, render_mode="rgb_array_list")
+    environment.reset(seed=0)
+    for _ in range(3):
+        environment.step(COAST)
+    frames = environment.render()
+    assert [frame.shape for frame in frames] == [SHAPE] * 4
+    assert environment.render() == []
+    environment.step(COAST)
+    assert len(environment.render()) == 1
+    environment.reset(seed=0)
+    (first,) = environment.render()
+    assert np.array_equal(first, frames[0])
+
+
+def test_ansi__says_it_in_words() -> None:
+    environment = crash("ansi")
+    assert "0.50 s after the alert" in environment.render()
+    _, text = to_its_end(environment)[-1]
+    lines = text.splitlines()
+    assert lines[0] == "crash  1.30 s after the alert  (ended)"
+    assert "[1>" in lines[1] and "[2>" in lines[1] and lines[1].index("2") < lines[1].index("1")
+    assert lines[2].startswith("vehicle_1") and lines[2].endswith("brakes 6.0 m/s2")
+    assert lines[3].startswith("vehicle_2   learns") and "gap ahead" in lines[3] and lines[3].endswith("coasts")
+    assert lines[4] == "harm 36.00 m2/s2 by first impacts, 36.00 in total"
+    assert all(character.isprintable() or character == "\n" for character in text)
+    obstacle = parallel_env("paper-random-obstacle", render_mode="ansi")
+    obstacle.reset(seed=0)
+    assert "#" in obstacle.render() and "obstacle" in obstacle.render()
+
+
+def test_vector__gives_the_frame_of_each_world() -> None:
+    batch = gymnasium.make_vec("EthBrake-v0", num_envs=3, scenario="paper-random", render_mode="rgb_array")
+    single = gymnasium.make("EthBrake-v0", scenario="paper-random", render_mode="rgb_array")
+    batch.reset(seed=5)
+    batch.step(np.full((3, 1), -1.0, np.float32))
+    frames = batch.render()
+    assert len(frames) == 3
+    for k in range(3):
+        single.reset(seed=5 if k == 0 else None)
+        single.step(-1.0 + COAST)
+        assert np.array_equal(frames[k], single.render())
+
+
+@pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
+def test_vector__goes_on_through_automatic_resets(mode: str) -> None:
+    batch = eb.EthBrakeVectorEnv(3, REST.replace(gaps_m={"uniform": [1, 50]}), render_mode="ansi", autoreset_mode=mode)
+    batch.reset(seed=0)
+    ends = 0
+    for _ in range(30):
+        *_, terminated, _truncated, infos = batch.step(np.full((3, 1), -1.0, np.float32))
+        ends += int(terminated.sum())
+        for time, text in zip(infos["time_s"], batch.render(), strict=True):
+            assert f"  {time:.2f} s after the alert" in text
+    assert ends > 3
+
+
+def test_human__shows_each_step_in_real_time_and_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    pygame = pytest.importorskip("pygame", reason="needs the extra: pip install 'ethbrake-marl[render]'")
+    environment = gymnasium.make("EthBrake-v0", scenario=CRASH, render_mode="human")
+    assert pygame.display.get_surface() is None  # no window before there is something to show
+    environment.reset(seed=0)
+    before = pygame.time.get_ticks()
+    environment.step(COAST)
+    assert pygame.time.get_ticks() - before >= 80  # it waits for a step of 0.1 s
+    assert pygame.display.get_surface().get_size() == (WIDTH, HEIGHT)
+    assert environment.render() is None
+    environment.close()
+    assert pygame.display.get_surface() is None
+    monkeypatch.setenv("SDL_VIDEODRIVER", "nothing")
+    with pytest.raises(InvalidInput, match=r"no window can be opened here .*; 'rgb_array' needs no display"):
+        parallel_env(render_mode="human").reset(seed=0)
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(MissingExtra, match=r"^[^\n]*pip install 'ethbrake-marl\[render\]'[^\n]*$"):
+        parallel_env(render_mode="human")
+
+
+def test_metadata__plays_in_real_time() -> None:
+    slow = CRASH.replace(time_step_s=0.05)
+    for environment in (eb.EthBrakeEnv(slow), parallel_env(slow), env(scenario=slow)):
+        assert (environment.metadata["render_modes"], environment.metadata["render_fps"]) == (MODES, 20)
+    assert eb.EthBrakeVectorEnv(2).metadata["render_modes"] == ["rgb_array", "ansi"]
+
+
+@pytest.mark.skipif(find_spec("moviepy") is None, reason="moviepy is not installed; RecordVideo needs it")
+def test_record_video__writes_a_film_of_the_episode(tmp_path: Path) -> None:
+    environment = gymnasium.wrappers.RecordVideo(crash(), str(tmp_path / "films"), episode_trigger=lambda _: True)
+    environment.reset(seed=0)
+    to_its_end(environment)
+    environment.close()
+    (path,) = (tmp_path / "films").glob("*.mp4")
+    told = import_module("imageio_ffmpeg").count_frames_and_secs(str(path))
+    assert told == (9, near(0.9, abs=0.02))  # from 0.5 s to 1.3 s, one frame per step of 0.1 s
+
+
+def test_shields__are_looked_through_and_their_interventions_shown() -> None:
+    scenario = eb.load_scenario("paper-random")
+    single = eb.ShieldedEnv(eb.EthBrakeEnv(scenario, render_mode="ansi"))
+    rows = eb.ShieldedVectorEnv(eb.EthBrakeVectorEnv(2, scenario, render_mode="ansi"))
+    parallel = eb.HybridShield(parallel_env(scenario, render_mode="ansi"), mode="step")
+    hybrid = eb.HybridShield(parallel_env(scenario, render_mode="ansi"), eb.make_agent("coast"))
+    given = ((single, [1.0]), (rows, np.full((2, 1), 1.0)), (parallel, {"vehicle_2": [1.0]}), (hybrid, {}))
+    for environment, action in given:
+        environment.reset(seed=7)
+        assert environment is not single or "shield" not in single.render()
+        environment.step(action)
+    assert [each.render().splitlines()[-1] for each in (single, parallel)] == ["shield: stepped in"] * 2
+    assert rows.render()[0] == single.render()
+    assert "shield: stepped in" in hybrid.render()
+
+
+def test_copies__go_on_drawing_the_same() -> None:
+    environment = parallel_env(CRASH, render_mode="rgb_array")
+    environment.reset(seed=0)
+    environment.step({"vehicle_2": [0.0]})
+    for twin in (copy.deepcopy(environment), pickle.loads(pickle.dumps(environment))):
+        assert np.array_equal(twin.render(), environment.render())
+        twin.step({"vehicle_2": [1.0]})
+        assert not np.array_equal(twin.render(), environment.render())

@@ -1,0 +1,597 @@
+"""What is special to one interface of PettingZoo or Gymnasium; what all promise stands in ``tests/contract``."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pettingzoo
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from pettingzoo.utils.conversions import aec_to_parallel
+
+import ethbrake_marl as eb
+from ethbrake_marl import ethbrake_v0
+from ethbrake_marl.envs.interfaces import EthBrakeParallelEnv, action_box, env, feature_box, parallel_env, raw_env
+from ethbrake_marl.envs.registration import GYMNASIUM_ID, PETTINGZOO_ID, register_environments
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.observations import Feature, ObservationSpec
+from ethbrake_marl.physics import make_worlds
+from ethbrake_marl.scenario import Scenario, full_state, load_scenario, state_features
+from tests.contract.interfaces import CRASH, FIVE, PAPER, REST, actions, initial_state
+from tests.reference.docs_tables import environment_tables, feature_table
+
+near = pytest.approx
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = (ROOT / "docs" / "environment.md").read_text("utf-8")
+COAST, BRAKE = np.zeros(1, np.float32), np.full(1, -1.0, np.float32)
+
+
+def started(*args: Any, seed: int = 0, **settings: Any) -> EthBrakeParallelEnv:
+    environment = parallel_env(*args, **settings)
+    environment.reset(seed=seed)
+    return environment
+
+
+# ---------------------------------------------------------------- PettingZoo: all agents at once
+
+
+def test_agents__are_all_vehicles_until_the_collective_end() -> None:
+    environment, names = parallel_env(REST), ["vehicle_1", "vehicle_2"]
+    assert (environment.possible_agents, environment.agents) == (names, [])
+    environment.reset(seed=0)
+    for k in range(10):
+        assert environment.agents == names
+        results = environment.step({"vehicle_2": BRAKE})
+        assert all(set(part) == set(names) for part in results)
+        assert results[2:4] == (dict.fromkeys(names, k == 9), dict.fromkeys(names, False))
+    assert environment.agents == []
+    with pytest.raises(InvalidInput, match="step: no episode is running; call reset first"):
+        environment.step({"vehicle_2": COAST})
+    environment.reset()
+    environment.agents.clear()  # the list given out is not the environment's own
+    environment.reset()
+    assert environment.agents == names
+
+
+def test_reset__starts_at_the_first_moment_a_learner_may_act_and_else_at_the_alert() -> None:
+    assert started(CRASH).engine.worlds.time_s == [0.5]
+    assert started(CRASH.replace(obstacle_gap_m=30), learners=["vehicle_1"]).engine.worlds.time_s == [0.0]
+    observations, infos = parallel_env(FIVE, learners=["vehicle_5", "vehicle_4"]).reset(seed=0)
+    assert {info["time_s"] for info in infos.values()} == {0.51}
+    assert list(observations) == [f"vehicle_{i}" for i in range(1, 6)]
+    nobody = started("paper-random", learners=[])  # also where early impacts are rejected
+    assert nobody.engine.worlds.time_s == [0.0]
+    assert nobody.step({})[4]["vehicle_2"]["chosen_action"] == BRAKE  # who learned and no longer does brakes fully
+
+
+def test_scripted_vehicle__applies_its_script_whatever_is_passed_and_infos_show_it() -> None:
+    quiet, noisy = started(FIVE), started(FIVE)
+    capacity = quiet.engine.worlds.vehicles.braking_capacity_mps2[0, 3]
+    own = {"vehicle_4": np.array([-0.3], np.float32)}
+    passed = {"vehicle_1": -BRAKE, "vehicle_2": BRAKE * np.nan, "vehicle_3": "coast", "vehicle_5": None}
+    for _ in range(20):
+        expected = quiet.step(own)
+        given = noisy.step(passed | own)
+        assert all(np.array_equal(given[0][agent], expected[0][agent]) for agent in quiet.possible_agents)
+        assert given[1:4] == expected[1:4]
+    infos = given[4]
+    assert all(info["chosen_action"] in noisy.action_space(agent) for agent, info in infos.items())
+    applied = [infos[agent]["chosen_action"].item() for agent in ("vehicle_1", "vehicle_2", "vehicle_4")]
+    assert applied == near([-1.0, -3.0 / 7.0, -0.3])  # constant:3 of 7 m/s2
+    assert [infos[agent]["chosen_command_mps2"] for agent in ("vehicle_2", "vehicle_4")] == near([-3, -0.3 * capacity])
+
+
+def test_infos__a_command_is_in_force_once_its_latency_has_elapsed() -> None:
+    environment = started(PAPER)  # Vehicle 3 wants to brake from t = 0; its latency is 0.8 s
+    infos = [environment.step({"vehicle_2": np.array([0.5], np.float32)})[4] for _ in range(4)]
+    names = ("time_s", "chosen_command_mps2", "command_in_force_mps2")
+    told = [[info["vehicle_3"][name] for name in names] for info in infos]
+    assert [told[0], told[1], told[3]] == [near([0.6, -6.0, 0.0]), near([0.7, -6.0, 0.0]), near([0.9, -6.0, -6.0])]
+    assert [info["vehicle_2"]["command_in_force_mps2"] for info in infos] == [3.5] * 4
+
+
+def test_infos_and_rewards__split_a_crash_by_mass() -> None:
+    environment = started(CRASH)
+    total = dict.fromkeys(environment.agents, 0.0)
+    for _ in range(6):
+        *_, infos = results = environment.step({"vehicle_2": COAST})
+        total = {agent: total[agent] + results[1][agent] for agent in total}
+        assert sum(info["reward_harm"] for info in infos.values()) == sum(results[1].values())
+    assert total == {"vehicle_1": near(-36.0), "vehicle_2": near(-36.0)}
+    names = ("first_impact_harm", "total_harm", "world_first_impact_harm", "collided")
+    told = [[infos[agent][name] for name in names] for agent in total]
+    assert told == [near([27.0, 27.0, 36.0, True]), near([9.0, 9.0, 36.0, True])]
+
+
+def test_infos__keep_both_counts_apart() -> None:
+    # Elastic: after the first impact with w = 6 the pair separates, and meets again while Vehicle 1 brakes.
+    environment = started(CRASH.replace(restitution=1, horizon_s=6), reward="total-harm")
+    results = [environment.step({"vehicle_2": COAST}) for _ in range(55)]  # from 0.5 to 6 s
+    info = results[-1][4]["vehicle_1"]
+    assert info["world_first_impact_harm"] == near(36.0) and info["world_total_harm"] > 71.0
+    assert (info["first_impact_harm"], info["total_harm"]) == (near(27.0), near(0.75 * info["world_total_harm"]))
+    assert sum(result[1]["vehicle_1"] for result in results) == near(-info["world_total_harm"])
+
+
+def test_infos__hold_the_same_keys_in_every_step_and_the_page_names_them() -> None:
+    environment = eb.EthBrakeEnv(REST)
+    at_reset = environment.reset(seed=0)[1]
+    told = [environment.step(BRAKE) for _ in range(10)]
+    assert {frozenset(turn[4]) for turn in told} == {frozenset(at_reset)}
+    assert at_reset["chosen_action"] == at_reset["cost"] == at_reset["reward_harm"] == 0.0
+    assert {type(value) for value in told[0][4].values()} == {float, bool, int, np.ndarray}
+    assert [type(part) for part in told[0][1:4]] == [float, bool, bool]
+    assert {(turn[4]["world_seed"], turn[4]["world"]) for turn in told} == {(0, 0)}
+    given = environment.reset(seed=5, options={"initial_state": {"gaps_m": 7}})[1]
+    assert (given["world_seed"], given["world"]) == (5, -1)
+    rows = re.findall(r"^\| (`.*?) \|", PAGE.split("## Infos")[1].split("There is no clock")[0], re.MULTILINE)
+    assert {name for row in rows for name in re.findall("`(.*?)`", row)} == set(at_reset)
+
+
+@pytest.mark.parametrize(("reward", "total"), [("harm", "world_first_impact_harm"), ("total-harm", "world_total_harm")])
+def test_infos__cost_is_the_harm_of_the_step_as_the_reward_counts_it(reward: str, total: str) -> None:
+    environment = eb.EthBrakeEnv("paper-random", reward=reward)
+    for seed in range(5):
+        _, info = environment.reset(seed=seed)
+        before, costs, over = info[total], [info["cost"]], False
+        while not over:
+            _, _, terminated, truncated, info = environment.step(np.array([0.3], np.float32))
+            over = terminated or truncated
+            costs.append(info["cost"])
+        assert sum(costs) == near(info[total] - before)
+        assert info["reward_harm"] == -info["cost"]
+
+
+def test_rewards__the_papers_terms_are_named_before_their_weights() -> None:
+    *_, infos = results = started(PAPER, reward="paper").step({"vehicle_2": BRAKE})
+    told = infos["vehicle_2"]
+    weights = {"reward_collision": 1.0, "reward_risk": 0.1, "reward_jerk": 1e-5, "reward_terminal": 10.0}
+    assert {name for name in told if name.startswith("reward_")} == set(weights)
+    assert told["reward_jerk"] == near(-(70.0**2))  # from coasting to 7 m/s2 in 0.1 s
+    assert results[1]["vehicle_2"] == near(sum(told[name] * weight for name, weight in weights.items()))
+
+
+def test_rewards__do_not_tell_the_harm_before_the_first_decision() -> None:
+    # 1 m apart, braking against coasting: they meet at sqrt(2/6) s with w = 6 t, harm 12, before 0.6 s.
+    environment = parallel_env(CRASH.replace(gaps_m=1, latency_s=[0, 0.6], horizon_s=3, early_impacts="keep"))
+    _, infos = environment.reset(seed=0)
+    assert infos["vehicle_2"]["world_first_impact_harm"] == near(12.0)
+    told = 0.0
+    while environment.agents:
+        _, rewards, _, _, infos = environment.step({"vehicle_2": BRAKE})
+        told += rewards["vehicle_2"]
+    assert -told == near(infos["vehicle_2"]["world_first_impact_harm"] - 12.0)
+
+
+def test_spaces__are_one_object_for_each_agent() -> None:
+    environment = parallel_env(FIVE)
+    for agent in environment.possible_agents:
+        assert environment.observation_space(agent) is environment.observation_spaces[agent]
+        assert environment.action_space(agent) is environment.action_spaces[agent]
+    assert len({id(space) for space in environment.action_spaces.values()}) == 5
+
+
+def test_state__is_what_a_person_would_write_down() -> None:
+    environment = started(CRASH)
+    environment.step({"vehicle_2": np.array([-0.5])})
+    t = 0.6
+    speeds = [20.0 - 6.0 * t, 20.0 - 4.0 * 0.1]
+    gap = 3.0 - 0.5 * 6.0 * t * t + 0.5 * 4.0 * 0.1 * 0.1
+    own = [[speeds[0] / 20, -0.6, 0.6, 0.6, 0.1, 0.0, 0.0], [speeds[1] / 20, -0.4, 0.8, 0.4, 0.3, 0.0, 0.0]]
+    expected = [*own[0], *own[1], gap / 10, 0.0, t / 1.3]
+    assert environment.state() == near(np.array(expected), abs=1e-6)
+    for _ in range(6):
+        environment.step({"vehicle_2": COAST})
+    assert environment.state()[-3:] == near(np.array([0.0, 1.0, 1.2 / 1.3]), abs=1e-6)
+
+
+@pytest.mark.parametrize("scenario", [PAPER, FIVE], ids=lambda scenario: scenario.name)
+def test_state__has_its_features_stays_in_its_space_and_owns_its_memory(scenario: Scenario) -> None:
+    worlds, N = scenario.sample(3, 0).worlds, scenario.vehicles
+    names = [feature.name for feature in state_features(scenario)]
+    assert len(set(names)) == len(names) == 7 * N + 2 * (N - 1) + 1
+    column = dict(zip(names, full_state(worlds, scenario).T, strict=True))
+    for i in range(N - 1):
+        assert column[f"pair_{i + 1}.gap"] == near(worlds.gaps_m[:, i] / 10.0)
+        assert column[f"vehicle_{i + 2}.speed"] == near(worlds.speeds_mps[:, i + 1] / 20.0)
+    environment, kept = started(scenario), []
+    learner = environment.possible_agents[environment.engine.learners[0]]
+    for action in actions(3, 60, 1):
+        state = environment.state()
+        assert state in environment.state_space and state.dtype == np.float32
+        kept.append((state, state.copy()))
+        if environment.agents:
+            environment.step({learner: action[0]})
+    assert all(np.array_equal(state, copy) for state, copy in kept)
+
+
+def test_state__is_clipped_to_its_bounds() -> None:
+    capacities = {"braking_capacity_mps2": 60, "driving_capacity_mps2": 60}
+    worlds = make_worlds(500.0, [90.0] * 3, **capacities, latency_s=9, mass_t=400, restitution=1, speed_limit_mps=90)
+    state = full_state(worlds, PAPER)[0]
+    assert state in feature_box(state_features(PAPER)) and (state[0], state[21]) == (4.0, 10.0)
+
+
+def test_boxes__have_the_features_bounds() -> None:
+    box = feature_box([Feature("a", "1", 1.0, -2.0, 4.0, ""), Feature("b", "1", 5.0, 0.0, 1.0, "")])
+    assert (box.low.tolist(), box.high.tolist(), box.dtype) == ([-2.0, 0.0], [4.0, 1.0], np.float32)
+    assert (action_box().low.tolist(), action_box().high.tolist(), action_box().dtype) == ([-1.0], [1.0], np.float32)
+
+
+def test_learners_only__are_the_agents_and_nothing_else_changes() -> None:
+    whole, learners = parallel_env("cooperation-3-pair"), parallel_env("cooperation-3-pair", agents="learners")
+    assert learners.possible_agents == ["vehicle_2", "vehicle_3"]
+    assert set(learners.observation_spaces) == set(learners.action_spaces) == set(learners.possible_agents)
+    told, every = learners.reset(seed=4), whole.reset(seed=4)
+    rng = np.random.default_rng(0)
+    while learners.agents:
+        for part, of_all in zip(told, every, strict=True):
+            assert repr(part) == repr({name: of_all[name] for name in learners.possible_agents})
+        given = {name: rng.uniform(-1, 1, 1).astype(np.float32) for name in learners.agents}
+        told, every = learners.step(given), whole.step(given)
+    assert not whole.agents and np.array_equal(learners.state(), whole.state())
+
+
+def test_learners_only__under_the_shield() -> None:
+    environment = eb.HybridShield(parallel_env(agents="learners"), mode="step")
+    _, infos = environment.reset(seed=7)
+    while environment.agents:
+        *_, infos = environment.step({"vehicle_2": np.array([1.0], np.float32)})
+    assert infos["vehicle_2"]["world_first_impact_harm"] <= infos["vehicle_2"]["shield"]["bound_harm"] + 1e-9
+
+
+def test_max_cycles__truncates_unless_the_episode_is_over_before() -> None:
+    environment = parallel_env(max_cycles=3)
+    for _ in range(2):
+        environment.reset(seed=0)
+        assert [environment.step({"vehicle_2": [0.0]})[3]["vehicle_2"] for _ in range(3)] == [False, False, True]
+        assert environment.agents == []
+    plain, limited = started(), started(max_cycles=10_000)
+    while plain.agents:
+        assert plain.step({"vehicle_2": [-1.0]})[2:4] == limited.step({"vehicle_2": [-1.0]})[2:4]
+    assert not limited.agents
+
+
+def test_supersuit__frame_skip_draws_from_the_seed_of_the_reset() -> None:
+    supersuit = pytest.importorskip("supersuit")
+
+    def played() -> list[float]:
+        env = supersuit.frame_skip_v0(parallel_env(scenario="cooperation-3-pair", agents="learners"), (1, 4))
+        env.reset(seed=5)
+        times = []
+        while env.agents:
+            infos = env.step({agent: BRAKE for agent in env.agents})[4]
+            times.append(infos["vehicle_2"]["time_s"])
+        return times
+
+    assert played() == played() and len(set(np.diff(played()).round(6))) > 1
+
+
+# ---------------------------------------------------------------- PettingZoo: one agent after the other
+
+
+@pytest.mark.parametrize("make", [env, raw_env])
+def test_aec__plays_the_same_episode_in_turns(make: Any) -> None:
+    together, in_turn = parallel_env(FIVE), make(scenario=FIVE)
+    together.reset(seed=3), in_turn.reset(seed=3)
+    for action in actions(3, 200, 1):
+        for agent in together.agents:
+            assert in_turn.agent_selection == agent
+            in_turn.step(action[0])
+        observations, *told = together.step({"vehicle_4": action[0]})
+        assert all(np.array_equal(in_turn.observe(agent), observations[agent]) for agent in observations)
+        assert [in_turn.rewards, in_turn.terminations, in_turn.truncations, in_turn.infos] == told
+        assert np.array_equal(in_turn.state(), together.state())
+        if not together.agents:
+            break
+    assert in_turn.terminations["vehicle_1"] or in_turn.truncations["vehicle_1"]
+    while in_turn.agents:
+        in_turn.step(None)
+    assert isinstance(aec_to_parallel(in_turn), EthBrakeParallelEnv)
+
+
+# ---------------------------------------------------------------- Gymnasium: one world
+
+
+def test_seed__of_an_unseeded_environment_can_be_read_and_that_of_the_users_stream_goes_on() -> None:
+    environment = eb.EthBrakeEnv()
+    start, _ = environment.reset()
+    assert np.array_equal(eb.EthBrakeEnv().reset(seed=environment.np_random_seed)[0], start)
+    environment = eb.EthBrakeEnv()
+    environment.np_random = np.random.default_rng(7)
+    info = environment.reset()[1]
+    assert (info["world_seed"], info["world"]) == (0, 1)
+    assert environment.np_random.integers(10**6) == 944_904
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"scenario": REST, "reward": "paper"},
+        {"scenario": json.loads(json.dumps(load_scenario("paper-random").declared()))},
+        {"observation": ObservationSpec(2, 0)},
+        {"observation": eb.choose_observation(["own", "front_1.gap"])},
+        {"scenario": FIVE, "reward": eb.RewardParams(harm=0.5, terminal=2.0), "learners": ["vehicle_3"]},
+    ],
+)
+def test_make__passes_settings_which_survive_the_json_of_a_spec(settings: dict[str, Any]) -> None:
+    made, alone = gymnasium.make("EthBrake-v0", **settings), eb.EthBrakeEnv(**settings)
+    assert made.spec is not None and made.spec.max_episode_steps is alone.spec is None
+    again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(made.spec.to_json()))
+    engines = [environment.unwrapped.engine for environment in (made, again, alone)]
+    for name in ("scenario", "reward", "observation", "learners"):
+        assert [getattr(engine, name) for engine in engines] == [getattr(alone.engine, name)] * 3
+    assert getattr(alone.engine, "observation", None) == settings.get("observation", alone.engine.observation)
+    starts = [environment.reset(seed=5)[0].tobytes() for environment in (made, again, alone)]
+    assert len(set(starts)) == 1 and alone.observation_space.shape == (alone.engine.observation.size,)
+
+
+def test_make__the_scenario_may_be_a_path(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text(json.dumps({**REST.declared(), "name": "mine", "latency_s": 0.25}))
+    assert eb.EthBrakeEnv(f"{tmp_path}/mine.yaml").reset(seed=0)[1]["time_s"] == 0.25
+
+
+# ---------------------------------------------------------------- Gymnasium: many worlds
+
+# Two vehicles 50 m apart at 5.7 m/s: who brakes fully rests in step 10, who coasts reaches the horizon in step 12.
+SHORT = REST.replace(name="short", gaps_m={"uniform": [50, 60]}, horizon_s=1.7)
+BRAKE_AND_COAST = np.array([[-1.0], [0.0]], np.float32)
+MODES = ("NextStep", "SameStep")
+
+
+def made(mode: str, n: int = 2, scenario: Scenario = SHORT) -> eb.EthBrakeVectorEnv:
+    environment = eb.EthBrakeVectorEnv(n, scenario, autoreset_mode=mode)
+    environment.reset(seed=0)
+    return environment
+
+
+# Each row that ends: step, ended at rest, ended at the horizon, times. In the same step it shows the next episode's
+# first moment (0.5 s); in the next one its last (1.5 s; the horizon 1.7 s), and the step after that is the reset.
+@pytest.mark.parametrize(
+    ("mode", "ends"),
+    [
+        ("SameStep", {10: ("r ", 0.5, 1.5), 12: (" c", 0.7, 0.5), 20: ("r ", 0.5, 1.3), 24: (" c", 0.9, 0.5)}),
+        (
+            "NextStep",
+            {
+                10: ("r ", 1.5, 1.5), 11: ("  ", 0.5, 1.6), 12: (" c", 0.6, 1.7), 13: ("  ", 0.7, 0.5),
+                21: ("r ", 1.5, 1.3), 22: ("  ", 0.5, 1.4), 25: (" c", 0.8, 1.7), 26: ("  ", 0.9, 0.5),
+            },
+        ),
+    ],
+)  # fmt: skip
+def test_autoreset__literally(mode: str, ends: dict[int, tuple[str, float, float]]) -> None:
+    environment = made(mode)
+    for k in range(1, 27):
+        _, reward, terminated, truncated, infos = environment.step(BRAKE_AND_COAST)
+        told = "".join("r" if t else "c" if c else " " for t, c in zip(terminated, truncated, strict=True))
+        assert (reward == 0.0).all() and ("final_obs" in infos) == (mode == "SameStep" and told != "  ")
+        if k in ends:
+            assert (told, *infos["time_s"]) == (ends[k][0], near(ends[k][1]), near(ends[k][2]))
+        else:
+            assert told == "  "
+
+
+@pytest.mark.parametrize("ignored", [0.7, np.nan, 5.0])
+def test_autoreset__next_step_ignores_the_action_of_the_reset_and_rewards_nothing(ignored: float) -> None:
+    # Closing 1 m at 6 m/s2 takes 0.58 s: an impact with harm 12 in the first of three steps (0.5 to 0.8 s).
+    crash = SHORT.replace(gaps_m=1, speeds_mps=20, horizon_s=0.8)
+    environment, plain = made("NextStep", scenario=crash), made("NextStep", scenario=crash)
+    for k in range(1, 13):
+        given = np.full((2, 1), ignored if k in (4, 8) else 0.0, np.float32)
+        kept = given.copy()
+        observation, reward, _, truncated, infos = environment.step(given)
+        expected = plain.step(np.zeros((2, 1), np.float32))
+        assert np.array_equal(observation, expected[0]) and np.array_equal(reward, expected[1])
+        assert np.array_equal(given, kept, equal_nan=True)
+        assert reward == near(np.full(2, -12.0 if k in (1, 5, 9) else 0.0)) and truncated.all() == (k in (3, 7, 11))
+        assert np.array_equal(infos["reward_harm"] == 0.0, [k not in (1, 5, 9)] * 2)
+        assert (infos["chosen_action"][:, 0] == 0.0).all()
+    with pytest.raises(InvalidInput, match="action of vehicle_2"):
+        made("NextStep").step(np.full((2, 1), np.nan))
+
+
+class FromOneStream(gymnasium.Wrapper):
+    """Takes each of its worlds from the list that all rows share, as the rows of the native environment do."""
+
+    def __init__(self, worlds: Any, given: list[int]) -> None:
+        super().__init__(eb.EthBrakeEnv(PAPER))
+        self.worlds, self.given = worlds, given
+
+    def reset(self, **_: Any) -> Any:
+        self.given[0] += 1
+        return self.env.reset(options={"initial_state": initial_state(self.worlds, self.given[0] - 1)})
+
+
+def assert_same_infos(ours: dict[str, Any], theirs: dict[str, Any], alone: bool) -> None:
+    """Every info that Gymnasium's gives, where its mask says that it is one; no two share their memory."""
+    assert set(theirs) <= set(ours) == {*ours, *(f"_{name}" for name in ours if not name.startswith("_"))}
+    arrays = [column for column in ours.values() if isinstance(column, np.ndarray)]
+    assert not any(np.shares_memory(one, other) for k, one in enumerate(arrays) for other in arrays[:k])
+    for name, column in theirs.items():
+        if name.startswith("_") or (name in ("world", "world_seed") and not alone):
+            continue  # of a world that was given: none
+        marked = theirs[f"_{name}"]
+        assert np.array_equal(ours[f"_{name}"], marked), name
+        if name == "final_info":
+            assert_same_infos(ours[name], column, alone)
+            continue
+        for row in np.flatnonzero(marked):
+            assert np.array_equal(ours[name][row], column[row]), (name, row)
+
+
+@pytest.mark.parametrize("n", [1, 3])
+@pytest.mark.parametrize("mode", MODES)
+def test_step__is_that_of_gymnasiums_own_vector_environment(mode: str, n: int) -> None:
+    worlds, given = PAPER.sample(60, 5, channel="training").worlds, [0]
+    rows = [lambda: eb.EthBrakeEnv(PAPER)] if n == 1 else [lambda: FromOneStream(worlds, given)] * n
+    native, own = eb.EthBrakeVectorEnv(n, PAPER, autoreset_mode=mode), SyncVectorEnv(rows, autoreset_mode=mode)
+    (ours, told), (theirs, told_own) = (environment.reset(seed=5) for environment in (native, own))
+    assert np.array_equal(ours, theirs)
+    assert_same_infos(told, told_own, n == 1)
+    ends = 0
+    for action in actions(11, 300, n):
+        (ours, *ending, told), (theirs, *ending_own, told_own) = native.step(action), own.step(action)
+        assert np.array_equal(ours, theirs)
+        assert all(np.array_equal(a, b) for a, b in zip(ending, ending_own, strict=True))
+        assert_same_infos(told, told_own, n == 1)
+        ends += int((ending[1] | ending[2]).sum())
+    assert ends >= 4 * n
+
+
+def test_describe_worlds__tells_given_ones_until_others_take_their_places() -> None:
+    start = {"gaps_m": [7, 8], "speeds_mps": [20, 18, 20], "mass_t": [1, 2, 3], "braking_capacity_mps2": 6}
+    start |= {"driving_capacity_mps2": 1, "latency_s": [0, 0.5, 0.8], "speed_limit_mps": 40}
+    mixed = load_scenario("realistic-mixed")
+    environment = eb.EthBrakeVectorEnv(num_envs=2, scenario=mixed)
+    environment.reset(seed=3, options={"initial_state": start})
+    told = environment.describe_worlds()
+    given = [told[name].tolist() for name in ("gap_2_m", "mass_3_t", "world")]
+    assert given == [[8.0, 8.0], [3.0, 3.0], [-1, -1]]
+    environment.engine.renew(np.array([1]))
+    told, kinds = environment.describe_worlds(), mixed.sample(1, 3, channel="training").types
+    assert told["gap_2_m"][0] == 8.0 and told["vehicle_2_type"].tolist() == ["", kinds[0, 1]]
+    environment.engine.restore(environment.engine.snapshot())
+    environment.reset()  # after a snapshot nobody knew
+    assert environment.describe_worlds()["world"].min() >= 1
+
+
+@pytest.mark.parametrize("mode", [*list(AutoresetMode)[:2], *MODES])
+def test_mode__can_be_chosen_in_every_way_and_is_stated(mode: Any) -> None:
+    native = gymnasium.make_vec("EthBrake-v0", num_envs=2, autoreset_mode=mode)
+    kwargs = {"autoreset_mode": AutoresetMode(mode)}
+    sync = gymnasium.make_vec("EthBrake-v0", num_envs=2, vectorization_mode="sync", vector_kwargs=kwargs)
+    assert native.metadata["autoreset_mode"] is sync.metadata["autoreset_mode"] is AutoresetMode(mode)
+    assert eb.EthBrakeVectorEnv(2).autoreset_mode is AutoresetMode.NEXT_STEP
+
+
+@pytest.mark.parametrize("way", [None, "vector_entry_point", "sync", "async"])
+def test_make_vec__makes_it_in_every_way(way: str | None) -> None:
+    environment = gymnasium.make_vec("EthBrake-v0", num_envs=2, vectorization_mode=way, scenario=PAPER)
+    assert environment.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    assert (type(environment.unwrapped) is eb.EthBrakeVectorEnv) == (way in (None, "vector_entry_point"))
+    alone = gymnasium.make("EthBrake-v0", scenario=PAPER)
+    observation, _ = environment.reset(seed=7)
+    assert observation in environment.observation_space and environment.action_space.shape == (2, 1)
+    alone.reset(seed=7)
+    if way in ("sync", "async"):  # Gymnasium gives world k the seed 7 + k
+        assert np.array_equal(observation[1], alone.reset(seed=8)[0])
+        assert np.array_equal(environment.step(np.full((2, 1), -1.0))[0][1], alone.step(BRAKE)[0])
+    environment.close()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_wrappers__gymnasiums_episode_statistics_count_right(mode: str) -> None:
+    environment = RecordEpisodeStatistics(made(mode, 2, PAPER))
+    environment.reset(seed=4)
+    told: list[tuple[float, float]] = []
+    for action in actions(3, 160, 2):
+        _, _, terminated, truncated, infos = environment.step(action)
+        final = infos.get("final_info", infos)
+        for row in np.flatnonzero(terminated | truncated):
+            told.append((-infos["episode"]["r"][row], final["world_first_impact_harm"][row]))
+    assert len(told) >= 4 and np.array(told)[:, 0] == near(np.array(told)[:, 1])
+
+
+def test_wrappers__which_of_gymnasiums_take_same_step_is_what_the_page_says() -> None:
+    wrappers = gymnasium.wrappers.vector
+    for wrap in (wrappers.NormalizeReward, wrappers.RecordEpisodeStatistics, wrappers.ClipAction):
+        wrap(eb.EthBrakeVectorEnv(2, autoreset_mode="SameStep")).reset(seed=1)
+    for wrap in (wrappers.NormalizeObservation, wrappers.FlattenObservation):
+        assert f"`{wrap.__name__}`" in PAGE
+        wrapped = wrap(eb.EthBrakeVectorEnv(2))
+        wrapped.reset(seed=1)
+        assert all(np.isfinite(wrapped.step(action)[0]).all() for action in actions(2, 90, 2))
+        with pytest.raises((ValueError, AssertionError)):  # Gymnasium 1.1 asserts, without a word
+            wrap(eb.EthBrakeVectorEnv(2, autoreset_mode="SameStep"))
+
+
+# ---------------------------------------------------------------- behind the shield
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.MovingAtHorizon")
+def test_shielded_vector__keeps_each_rows_bound_whatever_the_autoreset_mode(mode: str) -> None:
+    shielded = eb.ShieldedVectorEnv(eb.EthBrakeVectorEnv(6, PAPER, autoreset_mode=mode), intervention_penalty=5.0)
+    shielded.reset(seed=3)
+    ended, penalised = 0, 0
+    for action in actions(5, 120, 6):
+        idle, bound = shielded.attached.engine.ended, shielded.attached.shield.first_bound.copy()
+        _, reward, terminated, truncated, infos = shielded.step(np.abs(action))
+        told, over = infos["shield"], terminated | truncated
+        assert infos["_shield"].tolist() == (~idle).tolist() and told["trusted"].all()
+        harm = infos.get("final_info", infos)["world_first_impact_harm"][over]
+        assert harm.tolist() == told["bound_harm"][over].tolist() and (harm <= bound[over]).all()
+        stepped_in = told["intervened"] & ~idle
+        penalised += int(stepped_in.sum())
+        assert (reward[stepped_in] <= -5.0).all()
+        ended += int(over.sum())
+    assert ended >= 6 and penalised > 0
+    inner = shielded.attached.engine
+    shielded.close()
+    assert inner.guard is None
+
+
+# ---------------------------------------------------------------- by id, and what the page shows
+
+
+def test_registration__by_id_twice_and_with_the_projects_name() -> None:
+    before = (gymnasium.registry[GYMNASIUM_ID], pettingzoo.parallel_registry[PETTINGZOO_ID])
+    register_environments()
+    assert (gymnasium.registry[GYMNASIUM_ID], pettingzoo.parallel_registry[PETTINGZOO_ID]) == before
+    named, usual = gymnasium.make("ethbrake/EthBrake-v0"), gymnasium.make("EthBrake-v0")
+    assert type(named.unwrapped) is type(usual.unwrapped) is eb.EthBrakeEnv
+    assert gymnasium.make_vec("ethbrake/EthBrake-v0", num_envs=2).reset(seed=1)[0].shape[0] == 2
+    assert isinstance(pettingzoo.make("parallel", "ethbrake/ethbrake-v0", learners=[2]), EthBrakeParallelEnv)
+    in_turn = pettingzoo.make("aec", "ethbrake/ethbrake-v0")
+    assert isinstance(in_turn, pettingzoo.AECEnv) and isinstance(in_turn.unwrapped, EthBrakeParallelEnv)
+    assert (str(env()), parallel_env.metadata["name"]) == ("ethbrake_v0", "ethbrake_v0")
+    assert parallel_env.metadata["is_parallelizable"] is True
+    assert ethbrake_v0.parallel_env is eb.parallel_env and {"env", "raw_env"} <= set(dir(ethbrake_v0))
+
+
+def test_import__stays_light_until_a_name_is_used_and_lets_gymnasium_make_it_by_id() -> None:
+    program = (
+        "import sys, ethbrake_marl as eb\n"
+        "heavy = lambda: sorted({'torch', 'numba', 'stable_baselines3', 'matplotlib', 'pydantic'} & set(sys.modules))\n"
+        "print(heavy()); p = eb.parallel_env(); p.reset(seed=0); print(heavy())\n"
+        "import gymnasium; e = gymnasium.make('ethbrake_marl:EthBrake-v0'); print(type(e.unwrapped).__name__)\n"
+        "e.reset(seed=0); e.step(e.action_space.sample())\n"
+        "a = eb.EthBrakeEnv(render_mode='ansi'); a.reset(seed=0); a.render()\n"
+        "print(e.unwrapped.engine._watched, p.engine._watched, *{'PIL', 'pygame', 'matplotlib'} & set(sys.modules))"
+    )
+    command = [sys.executable, "-W", "error", "-c", program]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert result.stdout.splitlines() == ["[]", "['numba', 'pydantic']", "EthBrakeEnv", "{} {}"], result.stderr
+
+
+def test_feature_table__has_one_line_for_each_feature() -> None:
+    table = feature_table([Feature("own.speed", "m/s", 20.0, -2.0, 4.0, "own speed")])
+    assert table.splitlines() == [
+        "| # | feature | unit | scale | low | high | meaning |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+        "| 0 | `own.speed` | m/s | 20 | -2 | 4 | own speed |",
+    ]
+
+
+@pytest.mark.parametrize("marker", environment_tables())
+def test_page__shows_the_table_that_the_code_makes(marker: str) -> None:
+    (shown,) = re.findall(f"<!-- {marker} -->\n(.*?)\n<!-- end -->", PAGE, re.DOTALL)
+    assert shown == environment_tables()[marker]
+
+
+def test_page__its_example_runs() -> None:
+    code = re.findall("```python\n(.*?)```", PAGE, re.DOTALL)[0]
+    names: dict[str, object] = {}
+    exec(code.replace("4096", "4").replace("512", "4"), names)
+    assert {"env", "many", "vec"} <= set(names)

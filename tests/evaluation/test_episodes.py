@@ -1,0 +1,322 @@
+"""Single episodes: recorded, as exact motion, as a passport that names them, and as a film."""
+
+from __future__ import annotations
+
+import io
+import re
+import shlex
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ethbrake_marl.agents.registry import Team, drive, make_agent
+from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.errors import InvalidInput, MissingExtra
+from ethbrake_marl.evaluation import Evaluation, episodes, record_episode
+from ethbrake_marl.evaluation.episodes import (
+    MOST_CHARACTERS,
+    EpisodeMotion,
+    Passport,
+    film_bytes,
+    film_scenes,
+    follow_episodes,
+    state_at,
+)
+from ethbrake_marl.physics import Floats
+from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.shield import ShieldedDriver
+from tests.contract.interfaces import CRASH
+from tests.pages.hostile import HOSTILE
+
+IMPACT_S = 0.5 + 0.25 / 3.0  # see PAIR
+BRAKE = make_agent("full_brake")
+
+# ---------------------------------------------------------------- records
+
+
+def test_record__one_impact_by_hand(pair: Scenario) -> None:
+    record = record_episode(pair.sample(1, 0).worlds, BRAKE, scenario=pair)
+    assert record.impacts.first.tolist() == [True]
+    assert (record.impacts.time_s, record.impacts.closing_speed_mps) == (
+        pytest.approx([IMPACT_S]),
+        pytest.approx([3.0]),
+    )
+    time = record.time_s
+    before, coasting = time < IMPACT_S, time <= 0.5
+    front = 20.0 * time - 3.0 * time**2
+    np.testing.assert_allclose(record.positions_m[before, 0], front[before], atol=1e-11)
+    np.testing.assert_allclose(record.positions_m[coasting, 1], 20.0 * time[coasting] - 1.0, atol=1e-11)
+    # braking with 6 m/s2 from the speed after the impact
+    stopped = 20.0 * IMPACT_S - 3.0 * IMPACT_S**2 + 18.315**2 / 12.0
+    np.testing.assert_allclose(record.positions_m[-1], [stopped, stopped - 0.90825], atol=1e-10)
+    np.testing.assert_allclose(record.positions_m[:, 0] - record.positions_m[:, 1], record.gaps_m[:, 0], atol=1e-10)
+
+
+class Countdown:
+    name = "countdown"
+
+    def act(self, worlds: Any, vehicle: int) -> np.ndarray:
+        return np.where(worlds.time_s < 1.05, -1.0, -5.0)
+
+
+def test_record__a_command_is_in_force_from_the_latency_and_its_decision_on(pair: Scenario) -> None:
+    record = record_episode(pair.sample(1, 0).worlds, Countdown(), scenario=pair)
+    expected = np.select([record.time_s < 0.5, record.time_s < 1.1 - 1e-9], [0.0, -1.0], -5.0)
+    assert record.command_mps2[:, 1].tolist() == expected.tolist() and set(expected) == {0.0, -1.0, -5.0}
+    assert (record.command_mps2[:, 0] == -6.0).all() and 0.5 in record.time_s
+
+
+def test_record__agrees_with_the_evaluation_to_the_last_bit(evaluation: Evaluation, gap_agent: Any) -> None:
+    outcome = evaluation.outcome("gap")
+    for k in (0, int(np.argmax(outcome.impacts))):
+        record = record_episode(evaluation.worlds.take([k]), gap_agent, scenario=evaluation.scenario)
+        ends = [record.ledger.total_harm[0], record.gaps_m[-1], record.speeds_mps[-1], record.time_s[-1]]
+        final = outcome.final
+        expected = [outcome.ledger.total_harm[k], final.gaps_m[k], final.speeds_mps[k], final.time_s[k]]
+        assert [np.asarray(each).tolist() for each in ends] == [np.asarray(each).tolist() for each in expected]
+        assert len(record.impacts.time_s) == outcome.impacts[k]
+        assert np.sum(record.impacts.closing_speed_mps**2) == pytest.approx(outcome.total_harm[k], rel=1e-12)
+
+
+@pytest.mark.parametrize("sample_s", [0.02, 0.007, 5.0])
+def test_record__samples_are_as_fine_as_asked_and_never_change_the_motion(
+    evaluation: Evaluation, sample_s: float
+) -> None:
+    world, scenario = evaluation.worlds.take([1]), evaluation.scenario
+    record = record_episode(world, BRAKE, scenario=scenario, sample_s=sample_s)
+    coarse = record_episode(world, BRAKE, scenario=scenario)
+    steps = np.diff(record.time_s)
+    assert record.time_s[0] == 0.0 < steps.min() and steps.max() <= min(sample_s, 0.5) + 1e-12
+    np.testing.assert_array_equal(record.gaps_m[-1], coarse.gaps_m[-1], strict=True)
+    common, shared = np.isin(record.time_s, coarse.time_s), np.isin(coarse.time_s, record.time_s)
+    assert common.sum() > 30
+    np.testing.assert_allclose(record.positions_m[common], coarse.positions_m[shared], atol=1e-10)
+
+
+def test_record__an_impact_at_the_very_alert_is_there(pair: Scenario) -> None:
+    at_once = pair.replace(latency_s=[0.0, 0.0])
+    world = at_once.worlds_from_state({"gaps_m": [0.0], "speeds_mps": [18.0, 20.0]})
+    record = record_episode(world, BRAKE, scenario=at_once)
+    assert (record.impacts.time_s[0], record.impacts.closing_speed_mps[0], record.time_s[0]) == (0.0, 2.0, 0.0)
+    assert (np.diff(record.time_s) > 0.0).all() and len(record.impacts.time_s) == record.ledger.count.sum()
+
+
+def test_record__a_vehicle_pushed_above_its_speed_limit_goes_on() -> None:
+    scenario = Scenario(
+        name="pushed", vehicles=2, gaps_m=5, speeds_mps=[20, 25], braking_capacity_mps2=6, driving_capacity_mps2=3,
+        mass_t=[1.5, 10], latency_s=[0, 0.5], speed_limit_mps=[20, 30], time_step_s=1.0,
+        roles={"vehicle_1": "coast", "vehicle_2": "learner"},
+    )  # fmt: skip
+    record = record_episode(scenario.sample(1, 0).worlds, make_agent("coast"), scenario=scenario)
+    assert (record.speeds_mps[-1] > 24.0).all()  # momentum: 280/11.5 = 24.35 m/s in the mean
+    # Struck at 1 s by 5 m/s, e = 0.1.
+    np.testing.assert_allclose(record.positions_m[-1, 0], 20.0 + 7.0 * (20.0 + 1.1 * 5.0 * 10.0 / 11.5), rtol=1e-12)
+
+
+# ---------------------------------------------------------------- motion
+
+
+def at(motion: EpisodeMotion, time_s: float) -> Floats:
+    """Place of Vehicle 1, gaps, speeds, accelerations at a time."""
+    k = max(int(np.searchsorted(motion.pieces[:, 0], time_s, side="right")) - 1, 0)
+    return state_at(motion.pieces[k], time_s, motion.world.N)
+
+
+def test_motion__one_impact_by_hand(pair: Scenario) -> None:
+    (motion,) = follow_episodes(pair.sample(1, 0).worlds, BRAKE, pair)
+    assert motion.pieces[:3, 0].tolist() == pytest.approx([0.0, 0.5, IMPACT_S])
+    assert motion.pieces[2, 3:5].tolist() == pytest.approx([18.315 - 1.815, 18.015 - 1.815], abs=2.0)
+    assert at(motion, IMPACT_S)[1] == pytest.approx(0.0, abs=1e-12)
+    assert motion.impacts.closing_speed_mps.tolist() == pytest.approx([3.0])
+    assert motion.harm == pytest.approx((9.0, 9.0)) and motion.at_rest and motion.stepped_in_s.size == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "spec"),
+    [("paper-random", "constant:4.5"), ("paper-random", "ppo@shipped"), ("paper-random-obstacle", "full_brake")],
+)
+def test_motion__is_exact_at_every_moment(name: str, spec: str) -> None:
+    scenario = load_scenario(name)
+    worlds, agent = scenario.sample(3, 7).worlds, make_agent(spec, scenario=scenario)
+    for k, motion in enumerate(follow_episodes(worlds, agent, scenario)):
+        record = record_episode(worlds.take([k]), agent, scenario=scenario)
+        found = np.array([at(motion, float(time))[:6] for time in record.time_s])
+        recorded = np.column_stack([record.positions_m[:, 0], record.gaps_m, record.speeds_mps])
+        np.testing.assert_allclose(found, recorded, atol=1e-9)
+        assert motion.impacts.pair.tolist() == record.impacts.pair.tolist()
+
+
+def test_motion__counts_what_the_evaluation_counts(evaluation: Evaluation) -> None:
+    motions = follow_episodes(evaluation.worlds.take(np.arange(60)), make_agent("constant:4.5"), evaluation.scenario)
+    o = evaluation.outcome("constant:4.5")
+    expected = zip(o.first_impact_harm, o.total_harm, o.impacts, o.final.time_s, strict=True)
+    assert [(*each.harm, len(each.impacts.time_s), each.end_s) for each in motions] == list(expected)[:60]
+
+
+@pytest.mark.parametrize("spec", ["constant:3+step", "constant:3+episode"])
+def test_motion__tells_where_a_shield_stepped_in(paper_random: Scenario, spec: str) -> None:
+    agent = make_agent(spec, scenario=paper_random)
+    times = [each.stepped_in_s for each in follow_episodes(paper_random.sample(4, 7).worlds, agent, paper_random)]
+    assert any(each.size for each in times) and min(np.concatenate(times)) >= 0.5  # Vehicle 2 acts from then on
+
+
+def test_motion__tells_where_the_shield_of_a_team_stepped_in_as_its_log_does() -> None:
+    scenario = load_scenario("cooperation-3-pair")
+    worlds = scenario.sample(6, 7).worlds
+    team = ShieldedDriver(Team.of(make_agent("constant:3"), (1, 2)), scenario, logging=True).on((1, 2))
+    log = drive(worlds, team, scenario).guarded.shield.log
+    motions = follow_episodes(worlds, make_agent("constant:3+step", scenario=scenario), scenario)
+    for k, motion in enumerate(motions):
+        np.testing.assert_allclose(motion.stepped_in_s, sorted({entry.time_s for entry in log if entry.world == k}))
+    assert sum(motion.stepped_in_s.size for motion in motions) > 10
+
+
+def test_motion__cascade_of_bounces_stays_small_and_ends_right(pair: Scenario) -> None:
+    bouncy = pair.replace(restitution=0.9)
+    (motion,) = follow_episodes(bouncy.sample(1, 0).worlds, make_agent("coast"), bouncy)
+    assert len(motion.impacts.time_s) > 10 and (np.diff(motion.pieces[:, 0]) > 0.0).all()
+    np.testing.assert_allclose(at(motion, motion.end_s)[1], motion.final.gaps_m[0, 0], atol=1e-6)
+
+
+# ---------------------------------------------------------------- passports
+
+SAFE = re.compile(r"[A-Za-z0-9:.,_@+/=%-]+")
+
+
+@pytest.fixture(scope="module")
+def passport(paper_random: Scenario) -> Passport:
+    (motion,) = follow_episodes(paper_random.sample(1, 7).worlds, BRAKE, paper_random)
+    return Passport.of(motion, paper_random, "full_brake", seed=7, number=0)
+
+
+@pytest.mark.parametrize(
+    "agent",
+    ["full_brake", "ppo@shipped+refined+step", "constant:3.5", "my_file.py:make_agent", "ppo@runs/my run", "ä~b"],
+)
+def test_passport__is_read_as_it_was_written(passport: Passport, agent: str) -> None:
+    for other in (passport, replace(passport, seed=None), replace(passport, harm_count="total", vehicles=(0, 2))):
+        given = replace(other, agent=agent)
+        assert Passport.parse(str(given)) == given == Passport.parse(f"  {given}\n")
+
+
+@pytest.mark.parametrize("agent", HOSTILE)
+def test_passport__is_short_and_no_shell_touches_it(passport: Passport, agent: str) -> None:
+    text = str(replace(passport, agent=agent))
+    assert len(text) <= MOST_CHARACTERS and SAFE.fullmatch(text) and shlex.quote(text) == text
+    assert Passport.parse(text).agent in (agent, "...")
+
+
+def test_passport__of_long_names_leaves_out_what_it_must(passport: Passport) -> None:
+    long = replace(passport, scenario="a" * 64, agent=f"ppo@{'runs/' * 40}+refined+step")
+    assert Passport.parse(str(replace(passport, agent=long.agent))).agent == "ppo@...+refined+step"
+    assert len(str(long)) <= MOST_CHARACTERS
+    assert Passport.parse(str(long)).scenario == "a" * 30 + "..."
+
+
+def test_passport__a_typo_is_told_from_another_kind_of_text(passport: Passport) -> None:
+    text = str(passport)
+    typos = [text[:k] + ("x" if text[k] != "x" else "y") + text[k + 1 :] for k in range(4, len(text))]
+    for wrong in (*typos, text[:-1], text[: len(text) // 2], text + "0"):
+        with pytest.raises(InvalidInput, match="a typo, or a part is missing"):
+            Passport.parse(wrong)
+
+
+def test_passport__says_what_differs(passport: Passport) -> None:
+    assert passport.differences(passport) == []
+    for change, words in (
+        ({"scenario_sha": "0" * 10}, "the scenario"),
+        ({"versions": ("9.9.9", *passport.versions[1:])}, "ethbrake-marl: 9.9.9 here"),
+        ({"world_sha": "0" * 6}, "the world"),
+        ({"policy_sha": "0" * 8}, "the policy"),
+        ({"episode_sha": "0" * 10}, "the episode"),
+    ):
+        (told,) = passport.differences(replace(passport, **change))
+        assert words in told
+
+
+# ---------------------------------------------------------------- films
+
+SVG = "{http://www.w3.org/2000/svg}"
+README = Path(__file__).resolve().parents[2] / "README.md"
+COASTING = film_scenes(CRASH.sample(1, seed=0).worlds, make_agent("coast"), scenario=CRASH)
+
+
+def test_film_scenes__are_evenly_spaced_from_the_alert_to_the_end() -> None:
+    assert [scene.time_s for scene in COASTING] == pytest.approx([*(np.arange(33) / 25), 1.3])
+    assert [scene.ended for scene in COASTING] == [False] * 33 + [True]
+    hit = [scene.time_s for scene in COASTING if scene.total_harm > 0.0]
+    assert hit[0] == pytest.approx(1.0, abs=0.0401) and COASTING[-1].total_harm == pytest.approx(36.0)
+
+
+def test_film_scenes__are_those_of_the_recorded_episode(paper_random: Scenario) -> None:
+    world, agent = paper_random.sample(1, seed=7).worlds, make_agent("e_v2x_bm")
+    record = record_episode(world, agent, scenario=paper_random)
+    shown = film_scenes(world, agent, scenario=paper_random)
+    for scene in shown[::9]:
+        gaps = [np.interp(scene.time_s, record.time_s, record.gaps_m[:, p]) for p in range(2)]
+        assert scene.gaps_m == pytest.approx(gaps, abs=0.01)
+    assert shown[-1].first_harm == pytest.approx(float(record.ledger.world_harm("first")[0]))
+
+
+def test_film__as_gif_plays_in_real_time_and_ends_with_the_longest() -> None:
+    short = COASTING[:14]
+    shown = Image.open(io.BytesIO(film_bytes({"a": short, "b": short[:3]}, ".gif", fps=10)))
+    assert (shown.n_frames, shown.size) == (14, (800, 608))
+    durations = []
+    for k in range(14):
+        shown.seek(k)
+        durations.append(shown.info["duration"])
+    assert durations == [100] * 14
+
+
+def test_film__a_title_of_any_length_and_kind_stays_left_of_the_clock() -> None:
+    frames = [COASTING[0]._replace(title=title).frame() for title in ("", "\u202e\x1b" + "long/name " * 400)]
+    differs = (frames[0] != frames[1]).any(axis=2)
+    assert differs[:30, :560].any() and not differs[:, 560:].any() and not differs[30:].any()
+
+
+def test_film__as_mp4_plays_in_real_time(tmp_path: Path) -> None:
+    library = pytest.importorskip("imageio_ffmpeg", reason="needs the extra: pip install 'ethbrake-marl[render]'")
+    path = tmp_path / "film.mp4"
+    path.write_bytes(film_bytes({"a": COASTING}, ".mp4"))
+    frames, seconds = library.count_frames_and_secs(str(path))
+    assert frames == len(COASTING) and seconds == pytest.approx(len(COASTING) / 25, abs=0.02)
+
+
+def test_film__as_mp4_without_its_library_says_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(MissingExtra, match=r"pip install 'ethbrake-marl\[render\]'"):
+        episodes.check_film(".mp4")
+
+
+def test_film__as_svg_moves_every_vehicle_as_its_scenes_say() -> None:
+    drawn = ElementTree.fromstring(film_bytes({"<b>": COASTING, "c": COASTING[:5]}, ".svg"))
+    assert not [each for each in drawn.iter() if each.tag.endswith("script") or "href" in str(each.attrib)]
+    left, right = COASTING[0].view
+    moved = [each.attrib["values"].split(";") for each in drawn.iter(f"{SVG}animateTransform")]
+    vehicles = len(COASTING[0].front_m)
+    assert len(moved) == 2 * vehicles
+    for i, values in enumerate(moved[:vehicles]):
+        places = [800 * (scene.front_m[i] - left) / (right - left) for scene in COASTING]
+        held = [float(value.split()[0]) for value in values]
+        assert held == pytest.approx(places + places[-1:] * (len(held) - len(places)), abs=0.051)
+    told = {each.text for each in drawn.iter(f"{SVG}text")}
+    assert told >= {"<b>", "harm 36.0 by first impacts, 36.0 in total", "Vehicles 1 and 2: 6.0 m/s"}
+
+
+def test_film__of_the_readme_is_that_of_its_command(tmp_path: Path) -> None:
+    made = tmp_path / "made.svg"
+    text = " ".join(README.read_text("utf-8").split())
+    command = re.search(r"`ethbrake (watch record .*?) --output docs/figures/emergency.svg`", text)[1]
+    assert run_command([*command.split(), "--output", str(made)]) == 0
+    texts = [file.read_text("utf-8") for file in (made, README.parent / "docs" / "figures" / "emergency.svg")]
+    number = re.compile(r"-?\d+\.\d+")
+    assert number.split(texts[0]) == number.split(texts[1])
+    now, then = (np.array(number.findall(text), float) for text in texts)
+    assert now == pytest.approx(then, abs=0.21)

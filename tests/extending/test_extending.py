@@ -1,0 +1,509 @@
+"""Parts of the user's own: trained with, evaluated, told in every output; refusals: ``refusals/extending.txt``."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import json
+import re
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet
+import pytest
+import yaml
+
+import ethbrake_marl as eb
+from ethbrake_marl.agents.policy import LearnedAgent
+from ethbrake_marl.cli.app import app, run_command
+from ethbrake_marl.errors import InvalidInput, Progress
+from ethbrake_marl.evaluation.measures import REGISTERED
+from ethbrake_marl.evaluation.statistics import mean, rate
+from ethbrake_marl.harm import declared_objectives
+from ethbrake_marl.learning.runs import resume, train
+from ethbrake_marl.learning.training import TrainingRecipe, load_recipe
+from ethbrake_marl.observations import FEATURES, observe
+from ethbrake_marl.pages.report import Report
+from ethbrake_marl.policies import load_policy
+from ethbrake_marl.rewards import TERMS, StepOutcome, reward_params
+from ethbrake_marl.scenario import new_scenario_text, scenario_json_schema
+from ethbrake_marl.scenario.v2x import CHANNELS
+from tests.contract.interfaces import BARE
+from tests.learning.tiny import TINY_PPO
+
+near = pytest.approx
+PAPER = eb.load_scenario("paper-random")
+SAMPLE = PAPER.sample(40, 7)
+RURAL = {"preset": "nominal", "lost": 0.3, "message_period_s": 0.2}
+LISTED = ["own", "front_1", "rear_1.known", "urgency", "rear_1.load"]
+MINE = f'''
+import numpy as np
+import ethbrake_marl as eb
+
+
+def urgency(worlds, vehicle):
+    """Own speed for each metre to the vehicle ahead; 0 for the first."""
+    if vehicle == 0:
+        return np.zeros(worlds.n)
+    return worlds.speeds_mps[:, vehicle] / (1.0 + worlds.gaps_m[:, vehicle - 1])
+
+
+def load(worlds, vehicle, neighbour):
+    """Mass of the neighbour for each tonne of the own."""
+    return worlds.vehicles.mass_t[:, neighbour] / worlds.vehicles.mass_t[:, vehicle]
+
+
+def calm(step):
+    """Minus the own deceleration, per step."""
+    return np.minimum(step.command_mps2, 0.0)
+
+
+def hurry(step):
+    """Minus the mean speed of the line."""
+    return -step.speeds_mps.mean(axis=1)
+
+
+def front_first(harm, vehicle):
+    """The harm of the front vehicle and of the own."""
+    return harm.borne[:, 0] + harm.borne[:, vehicle]
+
+
+def worst(episodes):
+    """Largest change of speed in the line."""
+    return episodes.largest_speed_change_mps.max(axis=1)
+
+
+eb.register_feature("urgency", urgency, unit="1/s", scale=10.0, low=0.0, high=4.0)
+eb.register_feature("load", load, unit="1", scale=1.0, low=0.0, high=8.0, of="neighbour", unknown=1.0)
+eb.register_term("calm", calm, unit="m/s2")
+eb.register_term("hurry", hurry, weight=0.0, unit="m/s")
+eb.register_preset("rural", {RURAL})
+eb.register_objective("front-first", front_first)
+eb.register_measure("worst", worst, unit="m/s")
+'''
+
+
+@pytest.fixture
+def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    (tmp_path / "my_parts.py").write_text(MINE)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield importlib.import_module("my_parts")
+    sys.modules.pop("my_parts")
+
+
+def changed(function: Any, told: str = "Another one.") -> Any:
+    """A function of another meaning."""
+    function.__doc__ = told
+    return function
+
+
+def steady(worlds: Any, vehicle: int) -> Any:
+    """Always one."""
+    return np.ones(worlds.n)
+
+
+def one(step: StepOutcome) -> Any:
+    """One for all."""
+    return np.ones(len(step.time_s))
+
+
+def engine_of(worlds: int = 3, **settings: Any) -> eb.Engine:
+    return eb.make_sb3_vec_env(PAPER, worlds, seed=1, **settings).engine
+
+
+# ---------------------------------------------------------------- trainings
+
+
+def test_parts__of_the_users_file_train_and_are_evaluated_and_the_policy_holds_to_its_features(
+    mine: Any, tmp_path: Path
+) -> None:
+    reward = {"harm": 1.0, "calm": 0.5, "hurry": 0.01}
+    content = {**TINY_PPO.model_dump(mode="json"), "name": "mine", "observation": LISTED, "reward": reward}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump({**content, "total_steps": 1024}))
+    recipe = load_recipe(tmp_path / "mine.yaml")
+    scenario = PAPER.replace(objective="front-first", v2x="rural", horizon_s=20, early_impacts="keep")
+    result = train(recipe, scenario, tmp_path / "run")
+    policy = load_policy(result.directory)
+    manifest = policy.manifest
+    assert manifest.observation.features[-3:] == ("rear_1.known", "urgency", "rear_1.load")
+    assert (recipe.reward.terms, manifest.reward["terms"]) == ({"calm": 0.5, "hurry": 0.01},) * 2
+    assert manifest.scenario["v2x"]["preset"] == "rural"
+    told = {"mine": LearnedAgent(policy, "mine"), "shipped": eb.make_agent("ppo@shipped", scenario=PAPER)}
+    harm = eb.evaluate(scenario.sample(10, 7), told, scenario=scenario).outcome("mine").first_impact_harm
+    assert harm.mean() == near(min(entry["first_impact_harm"] for entry in result.evaluations))
+
+    eb.register_feature("mine", steady, unit="1", scale=2.0, low=-1.0, high=1.0)  # others may be added,
+    other = scenario.replace(observation=["mine", "own"])  # and the scenario may declare another observation
+    agent = {"mine": LearnedAgent(load_policy(result.directory))}
+    again = eb.evaluate(other.sample(10, 7), agent, scenario=other)
+    assert again.outcome("mine").first_impact_harm.tolist() == harm.tolist()
+
+    entries = dict(FEATURES)
+    settings = {"unit": "1/s", "scale": 10.0, "low": 0.0, "high": 4.0}
+    for name, registered, message in (
+        ("load", None, "the policy observes 'load', which is not registered; import the file"),
+        ("urgency", settings | {"scale": 3.0}, "observes 'urgency', whose scale was 10.0 when it was trained and is 3"),
+        ("urgency", settings, "observes 'urgency', whose function gives other numbers"),
+    ):
+        del FEATURES[name]
+        if registered:
+            eb.register_feature(name, changed(lambda worlds, i: worlds.speeds_mps[:, i]), **registered)
+        with pytest.raises(InvalidInput, match=message):
+            load_policy(result.directory)
+        FEATURES.update(entries)
+    assert [part.name for part in load_policy(result.directory).manifest.observation.registered] == ["urgency", "load"]
+
+
+def test_training__with_a_feature_goes_on_bit_for_bit_after_a_stop(mine: Any, tmp_path: Path) -> None:
+    recipe = TINY_PPO.replace(observation=["own", "urgency"], total_steps=1024)
+    train(recipe, PAPER, tmp_path / "whole", measure=None)
+
+    def ctrl_c(progress: Progress) -> None:
+        if progress.updates == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    assert train(recipe, PAPER, tmp_path / "run", measure=None, on_progress=ctrl_c).status == "interrupted"
+    assert resume(tmp_path / "run", measure=None).status == "finished"
+    weights = [(tmp_path / run / "policy" / "weights.safetensors").read_bytes() for run in ("run", "whole")]
+    assert weights[0] == weights[1]
+
+
+# ---------------------------------------------------------------- features and terms
+
+
+def test_interfaces__observe_and_pay_the_same_and_infos_tell_the_terms(mine: Any) -> None:
+    reward = {"harm": 0.0, "calm": 1.0, "hurry": 0.5}
+    told = []
+    for make in BARE.values():
+        interface = make(PAPER, 1, reward=reward, observation=LISTED)
+        start, turn = interface.reset(1), interface.step(np.full((1, 1), -0.5, np.float32))
+        told.append((interface.space.shape, start.tobytes(), turn.bits()))
+    assert told == [told[0]] * len(BARE) and told[0][0] == (20,)
+    env = eb.parallel_env(scenario=PAPER.replace(observation=LISTED), reward=reward)
+    vector = eb.EthBrakeVectorEnv(2, PAPER, reward=reward)
+    seen, _ = env.reset(seed=1)
+    vector.reset(seed=1)
+    assert seen["vehicle_2"].tobytes() == told[0][1]  # also where the scenario declares it
+    _, rewards, _, _, infos = env.step(dict.fromkeys(env.agents, np.array([-0.5], np.float32)))
+    for agent, info in infos.items():
+        assert {name for name in info if name.startswith("reward_")} == {"reward_calm", "reward_hurry"}
+        assert info["reward_calm"] == min(info["command_in_force_mps2"], 0.0) and info["reward_hurry"] < 0.0
+        assert rewards[agent] == info["reward_calm"] + 0.5 * info["reward_hurry"]
+    columns = vector.step(np.full((2, 1), -0.5, np.float32))[4]
+    assert columns["reward_calm"][0] == infos["vehicle_2"]["reward_calm"]
+
+
+def test_columns__are_those_of_the_whole_observation_and_of_the_functions(mine: Any) -> None:
+    worlds = PAPER.sample(50, 3).worlds
+    whole = observe(worlds, 1, eb.ObservationSpec())
+    names = [feature.name for feature in eb.ObservationSpec().features]
+    seen = observe(worlds, 1, eb.choose_observation(["rear_1.gap", "urgency", "own", "front_1.load"]))
+    assert seen[:, [0, *range(2, 9)]].tobytes() == whole[:, [names.index("rear_1.gap"), *range(7)]].tobytes()
+    assert seen[:, 1] == near(np.clip(mine.urgency(worlds, 1) / 10.0, 0.0, 4.0), rel=1e-6)
+    known, mass = whole[:, names.index("front_1.known")] == 1.0, worlds.vehicles.mass_t
+    assert seen[:, 9] == near(np.where(known, mass[:, 0] / mass[:, 1], 1.0), rel=1e-6)
+    assert (observe(worlds, 0, eb.choose_observation(["front_1.load"])) == 1.0).all()  # nobody is there
+    assert eb.choose_observation(["own", "front_1", "rear_1"]) == eb.ObservationSpec()
+    silent = PAPER.replace(v2x={"hears": "front", "senses": "none"})  # whose channel hides a neighbour
+    hidden = eb.make_sb3_vec_env(silent, 20, seed=1, observation=["rear_1.known", "rear_1.load"]).engine.observe(1)
+    assert not hidden[:, 0].any() and (hidden[:, 1] == 1.0).all()
+
+
+def test_feature__that_is_not_finite_is_named_with_world_and_step() -> None:
+    def late(worlds: Any, vehicle: int) -> Any:
+        """Fails in the second world after a while."""
+        return np.where((worlds.time_s > 1.0) & (np.arange(worlds.n) == 1), np.inf, 0.0)
+
+    eb.register_feature("mine", late, unit="1", scale=2.0, low=-1.0, high=1.0)
+    eb.register_feature("mine", late, unit="1", scale=2.0, low=-1.0, high=1.0)  # twice is once
+    engine = engine_of(observation=["own", "mine"])
+    message = r"'mine': is inf for vehicle_2 in world 1 at \d.* s after step \d+; must be"
+    with pytest.raises(InvalidInput, match=message):
+        for _ in range(20):
+            engine.step(-np.ones((3, 1)))
+            engine.observe(1)
+
+
+def test_term__per_learner_leaves_the_others_out() -> None:
+    eb.register_term("mine", changed(lambda step: np.broadcast_to(step.learners, (len(step.time_s), 2))))
+    env = eb.parallel_env(scenario=PAPER, reward={"harm": 0.0, "mine": 1.0}, learners=["vehicle_2", "vehicle_3"])
+    env.reset(seed=1)
+    assert list(env.step({agent: [0.0] for agent in env.agents})[1].values()) == [0.0, 1.0, 2.0]
+
+
+@pytest.mark.parametrize("name", TERMS)
+def test_term__built_in_is_counted_as_soon_as_it_has_a_weight(name: str) -> None:
+    env = eb.parallel_env(scenario=PAPER, reward={"harm": 0.0, name: 1.0})
+    env.reset(seed=1)
+    *_, infos = env.step({"vehicle_2": [0.0]})
+    assert [told for told in infos["vehicle_2"] if told.startswith("reward_")] == [f"reward_{name}"]
+
+
+def test_term__has_its_usual_weight_where_a_reward_does_not_say() -> None:
+    eb.register_term("mine", one, weight=0.25)
+    eb.register_term("mine", one, weight=0.25)  # twice is once
+    given = ({"harm": 1.0}, {"mine": 0.0}, "harm", {"harm": 0.0, "terms": {"mine": 2}})
+    assert [reward_params(reward).terms for reward in given] == [{"mine": 0.25}, {"mine": 0.0}, {}, {"mine": 2.0}]
+    settled = eb.RewardParams(harm=1.0, terms={"mine": 3.0})
+    assert eb.RewardParams(**settled.model_dump()) == settled and settled.weight("mine") == 3.0
+
+
+@pytest.mark.parametrize(
+    ("term", "error", "message"),
+    [
+        (lambda step: np.where(np.arange(3) == 2, np.nan, 0.0), InvalidInput, "in world 2 at step 1; must be finite"),
+        (lambda step: step.speed_mps, InvalidInput, r"at step 1: AttributeError: .*test_extending.py, line \d+"),
+        (lambda step: step.speeds_mps.fill(0.0), ValueError, "read-only"),
+    ],
+)
+def test_term__that_is_wrong_is_named_and_the_step_is_not_made(term: Any, error: Any, message: str) -> None:
+    eb.register_term("mine", changed(term))
+    engine = engine_of(reward={"harm": 1.0, "mine": 2.0})
+    before = engine.packed.state.copy()
+    with pytest.raises(error, match=message):
+        engine.step(np.zeros((3, 1)))
+    assert engine.packed.state.tobytes() == before.tobytes()
+
+
+def test_term__counts_in_running_worlds_only() -> None:
+    at_rest = changed(lambda step: np.where(step.speeds_mps.max(axis=1) > 0.0, 1.0, np.nan))
+    eb.register_term("mine", at_rest)
+    engine = engine_of(1, reward={"harm": 1.0, "mine": 2.0})
+    with pytest.raises(InvalidInput, match="at step"):
+        for _ in range(90):
+            engine.step(-np.ones((1, 1)))
+    eb.register_term("calm", one)
+    ending = engine_of(2, reward={"harm": 1.0, "mine": 0.0, "calm": 1.0})
+    while not ending.ended.all():
+        last = ending.step(-np.ones((2, 1)))
+    again = ending.step(-np.ones((2, 1)))
+    assert (last.further["calm"][~last.ended] == 0.0).all() and not again.further["calm"].any()
+
+
+# ---------------------------------------------------------------- presets, objectives, schemas
+
+
+def test_preset__is_drawn_like_the_mapping_that_it_stands_for(mine: Any, tmp_path: Path) -> None:
+    rural, spelt = (PAPER.replace(v2x=v2x, horizon_s=20, early_impacts="keep") for v2x in ("rural", RURAL))
+    assert rural.v2x.channel == spelt.v2x.channel != CHANNELS["nominal"]
+    latencies = [scenario.sample(20, 3).worlds.vehicles.latency_s.tobytes() for scenario in (rural, spelt)]
+    assert latencies[0] == latencies[1]
+    (tmp_path / "rural.yaml").write_text(rural.replace(name="rural").model_dump_json(exclude_unset=True))
+    assert eb.load_scenario(tmp_path / "rural.yaml").v2x == rural.v2x
+    assert rural.replace(v2x={"preset": "rural", "lost": 0.0}).v2x.channel.message_period_s == 0.2
+    eb.register_preset("wired", {"preset": "nominal", "link_latency_s": 0.4})
+    assert rural.replace(v2x="wired").v2x.channel.timing == "fixed"
+
+
+def test_objective__is_paid_by_hand_and_stands_in_tables(mine: Any) -> None:
+    found = eb.evaluate(SAMPLE, {"coast": eb.make_agent("coast")}, scenario=PAPER.replace(objective="front-first"))
+    assert declared_objectives(["standard"], 3)[-1] == "front-first"
+    (row,) = (row for row in found.rescore() if (row.objective, row.harm_count) == ("front-first", "total"))
+    borne = found.outcome("coast").ledger.vehicle_harm("total").mean(axis=0)
+    assert [each.value for each in row.each] == near(borne + borne[0])
+    env = eb.parallel_env(scenario=PAPER, reward={"harm": 1.0, "objective": "front-first"})
+    env.reset(seed=2)
+    totals = dict.fromkeys(env.agents, 0.0)
+    while env.agents:
+        _, rewards, _, _, infos = env.step({"vehicle_2": [0.0]})
+        totals = {agent: totals[agent] + rewards[agent] for agent in totals}
+    harms = [infos[agent]["first_impact_harm"] for agent in totals]
+    assert harms[0] > 0.0 and list(totals.values()) == near([-(harms[0] + harm) for harm in harms])
+
+
+def test_objective__cannot_change_the_ledger() -> None:
+    eb.register_objective("emptied", changed(lambda harm, vehicle: harm.borne.fill(0.0)))
+    env = eb.parallel_env(scenario=PAPER, reward={"harm": 1.0, "objective": "emptied"})
+    env.reset(seed=1)
+    with pytest.raises(InvalidInput, match=r"objective 'emptied': of vehicle_1: ValueError: .*read-only"):
+        env.step({"vehicle_2": [0.0]})
+
+
+def test_schemas__know_what_is_registered(mine: Any) -> None:
+    schema = scenario_json_schema()
+    assert {"urgency", "front_1.load", "own"} <= set(schema["properties"]["observation"]["items"]["anyOf"][0]["enum"])
+    assert "rural" in json.dumps(schema["properties"]["v2x"]) + json.dumps(schema.get("$defs", {}))
+    assert "front-first" in json.dumps(schema["properties"]["objective"])
+    weights = TrainingRecipe.json_schema()["$defs"]["RewardParams"]["properties"]
+    assert weights["calm"]["minimum"] == weights["harm"]["minimum"] == 0
+    assert "observation" not in PAPER.model_dump() and "observation" not in TINY_PPO.model_dump()
+
+
+# ---------------------------------------------------------------- measures
+
+
+def squared(episodes: Any) -> Any:
+    """Squared closing speed of every impact."""
+    rows = episodes.rows
+    return np.bincount(rows.world, rows.closing_speed_mps**2, minlength=episodes.worlds.n)
+
+
+def injury(episodes: Any) -> Any:
+    """Probability of a severe injury by each vehicle's largest change of speed, struck at the front."""
+    return 1.0 / (1.0 + np.exp(4.457 - 0.177 * episodes.largest_speed_change_mps))
+
+
+def change_of_vehicle_3(episodes: Any) -> Any:
+    """Largest change of speed of Vehicle 3 in one impact."""
+    return episodes.largest_speed_change_mps[:, 2]
+
+
+def hit_hard(episodes: Any) -> Any:
+    """Whether Vehicle 3 was hit hard."""
+    return episodes.largest_speed_change_mps[:, 2] > 2.0
+
+
+def evaluated(**options: Any) -> Any:
+    agents = {name: eb.make_agent(name, scenario=PAPER) for name in ("full_brake", "e_v2x_bm", "ppo@shipped+step")}
+    return eb.evaluate(SAMPLE, agents, scenario=PAPER, **options)
+
+
+def test_measure__sees_every_impact_whatever_the_chunk_and_changes_nothing_else() -> None:
+    before = evaluated()
+    eb.register_measure("squared", squared, unit="m2/s2")
+    eb.register_measure("squared", squared, unit="m2/s2")  # twice is once
+    whole, parts = evaluated(), evaluated(chunk=7)
+    for name, outcome in whole.outcomes.items():
+        assert outcome.metrics["squared"] == near(outcome.total_harm, rel=1e-9, abs=1e-9)
+        assert outcome.metrics["squared"].tolist() == parts.outcome(name).metrics["squared"].tolist()
+        assert before.outcome(name).metrics == {}
+        assert before.outcome(name).total_harm.tobytes() == outcome.total_harm.tobytes()
+    taken = whole.outcome("full_brake").take(np.array([3, 1]))
+    assert taken.metrics["squared"].tolist() == whole.outcome("full_brake").metrics["squared"][[3, 1]].tolist()
+    assert evaluated(aftermath=False).outcome("full_brake").metrics == {}
+
+
+def test_measure__of_each_vehicle_stands_in_rows_frame_markdown_and_report() -> None:
+    eb.register_measure("squared", squared, unit="m2/s2")
+    eb.register_measure("injury", injury, unit="1")
+    eb.register_measure("change", changed(lambda episodes: episodes.largest_speed_change_mps), unit="m/s")
+    found = evaluated()
+    rows, braked = eb.summarise(found), found.outcome("full_brake")
+    changes = np.stack([braked.metrics[f"change_{i}"] for i in (1, 2, 3)], axis=1)
+    assert ((changes > 0.0).any(axis=1) == braked.collided).all() and (changes >= 0.0).all()
+    assert [*rows[0].metrics][:4] == ["squared", "injury_1", "injury_2", "injury_3"]
+    assert rows[1].metrics["injury_2"] == mean(found.outcome("e_v2x_bm").metrics["injury_2"])
+    told = rows[0].to_json()
+    assert told["metric_squared"] == near(told["total_harm"]) and len(told["metric_injury_3_interval"]) == 2
+    assert told["metrics"]["injury_3"] == "injury, vehicle 3 (1)"
+    frame, report = found.to_frame("columns"), Report("mine", rows, found).html
+    assert frame["metric_squared"] == near(frame["total_harm"])
+    for text in (rows.markdown(), report):
+        assert "squared (m2/s2)" in text and "injury, vehicle 2 (1)" in text
+    assert "Squared closing speed of every impact." in report
+
+
+def test_measure__one_function_and_it_stands_in_every_output(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    eb.register_measure("change_of_rear", change_of_vehicle_3, unit="m/s")
+    eb.register_measure("hit_hard", hit_hard, unit="1")
+    names, agents = ("metric_change_of_rear", "metric_hit_hard"), ["--agents", "full_brake,coast", "--seed", "7"]
+
+    def told(*words: str) -> str:
+        assert run_command(["evaluate", *agents, *words]) == 0
+        return capsys.readouterr().out
+
+    text = " ".join(told("--episodes", "40", "--per-world", "out.csv", "--report", "out.html").split())
+    rows = list(csv.DictReader(Path("out.csv").read_text().splitlines()))[:40]
+    change, hit = (np.array([float(row[name]) for row in rows]) for name in names)
+    assert np.ptp(change) > 1.0 and set(hit) == {0.0, 1.0} and ((change > 2.0) == hit).all()
+    for page in (text, Path("out.html").read_text()):
+        assert "change_of_rear (m/s)" in page and f"{change.mean():.2f}" in page and "hit_hard (1)" in page
+    results = json.loads(Path("out.csv.json").read_text())[0]
+    expected = [mean(change), rate(int(hit.sum()), 40)]
+    assert [(results[n], tuple(results[f"{n}_interval"])) for n in names] == [(e.value, e.interval) for e in expected]
+    told("--episodes", "40", "--per-world", "out.parquet")
+    table = pyarrow.parquet.read_table("out.parquet")
+    assert [table[name].to_pylist()[:40] for name in names] == [change.tolist(), hit.tolist()]
+    sharded = json.loads(told("--episodes", "1040", "--shards", "2", "--json", "--output", "kept", "--rows"))
+    (whole,) = (row for row in json.loads(told("--episodes", "1040", "--json")) if row["agent"] == "full_brake")
+    assert [sharded[0][name] for name in names] == [whole[name] for name in names]
+    parts = [pyarrow.parquet.read_table(path) for path in sorted(Path("kept").rglob("*.parquet"))]
+    first = [row for part in parts for row in part.to_pylist() if row["agent"] == "full_brake"][:40]
+    assert [row[names[0]] for row in first] == change.tolist()
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (
+            lambda episodes: hit_hard(episodes) if episodes.worlds.n < 10 else change_of_vehicle_3(episodes),
+            "truth per w",
+        ),
+        (lambda episodes: change_of_vehicle_3(episodes) if episodes.worlds.n > 2 else injury(episodes), "number per v"),
+    ],
+)
+def test_measure__of_another_form_than_when_it_was_registered_is_refused(function: Any, message: str) -> None:
+    eb.register_measure("mine", changed(function), unit="1")
+    with pytest.raises(
+        InvalidInput, match=f"'mine': gave a number per world; when it was registered it gave a {message}"
+    ):
+        evaluated()
+
+
+# ---------------------------------------------------------------- folders, the command line, the page
+
+
+def test_folder__makes_its_scenarios_known_by_name_and_a_plugin_may_register_it_on_the_command_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, before, file = tmp_path / "mine", eb.list_scenarios(), tmp_path / "parts.py"
+    folder.mkdir()
+    for name in ("hills", "coast-road"):
+        (folder / f"{name}.yaml").write_text(new_scenario_text(name))
+    file.write_text(f"{MINE}\nfrom pathlib import Path\neb.register_scenarios(Path(__file__).parent / 'mine')\n")
+
+    def told(*words: str) -> Any:
+        assert run_command([*words, "--plugin", str(file)]) == 0
+        return capsys.readouterr().out
+
+    words = ("evaluate", "--scenario", "hills", "--episodes", "5", "--agents", "full_brake")
+    (entry,) = json.loads(told(*words, "--per-world", str(tmp_path / "out.csv"), "--json"))
+    rows = list(csv.DictReader((tmp_path / "out.csv").read_text().splitlines()))
+    assert entry["parameters"]["scenario"] == "hills"
+    assert entry["metric_worst"] == near(np.mean([float(row["metric_worst"]) for row in rows]))
+    assert "worst (m/s)" in told(*words) and "Measures" in told("evaluate", "--help")
+    (line,) = [line for line in told("scenario", "list").splitlines() if line.startswith("hills ")]
+    assert line.endswith(f"(from {folder})")
+    origins = {entry["name"]: entry["origin"] for entry in json.loads(told("scenario", "list", "--json"))}
+    assert (origins["hills"], origins["paper-random"]) == (str(folder), "shipped")
+    eb.register_scenarios(str(folder))  # twice is once
+    added = [entry for entry in eb.list_scenarios() if entry not in before]
+    assert [(entry.name, entry.origin) for entry in added] == [("coast-road", str(folder)), ("hills", str(folder))]
+    assert eb.parallel_env(scenario="hills").reset(seed=1)[0] and {entry.origin for entry in before} == {"shipped"}
+    assert "worst" in REGISTERED
+
+
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "extending.md").read_text("utf-8")
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_page__its_code_runs_from_the_top_down(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(app, "registered_commands", [*app.registered_commands])
+    code = "\n".join(re.findall("```python\n(.*?)```", PAGE, re.DOTALL))
+    names: dict[str, object] = {"__name__": "my_file"}
+    exec(compile(code, "extending.md", "exec"), names)
+    assert names["status"] == 0
+    for command in ("train", "evaluate"):
+        assert run_command([command, "--help"]) == 0
+        told = capsys.readouterr().out
+        assert all(name in told for name in ("comfort", "time_gap", "rural", "front-first", "patient", "absorbed"))
+    policy = eb.load_policy(tmp_path / "runs" / "again")
+    assert policy.manifest.algorithm == "patient" and "comfort" in policy.manifest.reward["terms"]
+    assert policy.manifest.observation.features[-1] == "rear_1.mass_ratio"
+    assert (tmp_path / "runs" / "again" / "harm.png").stat().st_size > 1000
+
+
+def test_page__every_part_has_its_place_in_the_table() -> None:
+    rows = re.findall(r"^\| \[(.*?)\]\(#(.*?)\)", PAGE, re.MULTILINE)
+    headings = [heading.lower() for heading in re.findall("^## (.*)$", PAGE, re.MULTILINE)]
+    assert [(name.lower(), anchor) for name, anchor in rows] == [(name, name.replace(" ", "-")) for name in headings]
