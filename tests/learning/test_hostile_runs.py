@@ -14,8 +14,7 @@ import safetensors.numpy
 
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.learning.runs import resume
-from tests.hostile.run_cases import CHANGES
-from tests.hostile.stopped_runs import RUN, listed_anew, newest, stopped
+from tests.programmes.folders import CHANGES, RUN, listed_anew, newest, stopped
 
 
 @pytest.fixture

@@ -35,9 +35,8 @@ from ethbrake_marl.physics import Floats, Worlds, advance
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from ethbrake_marl.search import Profiles, profile_problem
 from tests.failing_worlds import planted_list, without
-from tests.hostile.archives import bomb
-from tests.hostile.table_cases import CERTAIN, ONLY_A_PROBLEM_KNOWS
 from tests.limits.worlds import line
+from tests.programmes.archives import CERTAIN, ONLY_A_PROBLEM_KNOWS, bomb
 
 BUDGET = 800
 SCENARIO = load_scenario("paper-random")

@@ -18,7 +18,7 @@ from ethbrake_marl.shield import HybridShield, ShieldedDriver, ShieldedEnv, Shie
 from ethbrake_marl.shield.enclosure import Boxes, boxes_of
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from ethbrake_marl.shield.step_shield import BelievedShield
-from tests.shield.lines import ABOVE, HEARD_LATE, INSIDE, LISTS, NEVER_HEARD, WAYS, Hostile, gate, shielded
+from tests.shield.attacks import ABOVE, HEARD_LATE, INSIDE, LISTS, NEVER_HEARD, WAYS, Hostile, shielded
 
 BASE = load_scenario("cooperation-2-paper").replace(early_impacts="keep")
 PERIODIC = BASE.replace(v2x={"preset": "blocked", "persistence": "periodic"})
@@ -55,16 +55,16 @@ def test_interior__between_the_corners_no_world_is_above_the_first_bound(name: s
 
 
 @pytest.mark.slow
-def test_gate__of_the_interior_is_red_where_the_box_is_its_middle_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interior__a_box_that_is_the_middle_alone_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     def middle(*given: object) -> Boxes:
         boxes = boxes_of(*given)
         half = 0.5 * (boxes.low + boxes.high)
         return boxes._replace(low=half, high=half)
 
-    assert gate({"heard late": INSIDE["heard late"]}, "interior", 6, 7)
     monkeypatch.setattr(enclosure, "boxes_of", middle)
     monkeypatch.setattr(BelievedShield, "_corners", lambda self: [{}])
-    assert not gate({"never heard": INSIDE["never heard"]}, "interior", 36, 7)
+    harm, bound, _ = shielded("coast", INSIDE["never heard"], 12, 7, robust="interior")
+    assert (harm > bound + 1.0).any()
 
 
 def test_step__in_the_middle_promises_nothing_of_the_corners() -> None:

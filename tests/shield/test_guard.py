@@ -20,7 +20,6 @@ from ethbrake_marl.engine import STEP, Engine
 from ethbrake_marl.envs.interfaces import EthBrakeVectorEnv, parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
-from ethbrake_marl.physics import advance
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import (
     HybridAgent,
@@ -33,6 +32,7 @@ from ethbrake_marl.shield import (
 )
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from tests.fixtures.asked import Asked
+from tests.shield.attacks import above_later
 
 PAPER = load_scenario("paper-random")
 WORLDS = PAPER.sample(300, 3).worlds
@@ -248,22 +248,9 @@ def test_horizon__what_still_moves_then_is_told_and_warned_of_once():
     assert info["shield"]["settles"] is True
 
 
-def above_later(proposer, worlds):
-    """Shares of the worlds above their bound at a horizon of 3 s, and once all have braked to a stop."""
-    scenario = PAPER.replace(horizon_s=3.0)
-    driver = ShieldedDriver(make_agent(proposer), scenario)
-    episodes = drive(scenario.sample(worlds, 7).worlds, driver, scenario, 1)
-    final, bound = episodes.final, episodes.guarded.shield.predicted_harm
-    _, impacts = advance(final, -final.vehicles.braking_capacity_mps2, until_s=np.full(worlds, 8.0))
-    now, later = (ledger.world_harm("first") for ledger in (episodes.ledger, episodes.ledger.add(impacts)))
-    return (now > bound).mean(), (later > bound + 1e-9).mean()
-
-
-# The shares that docs/shield.md tells.
-@pytest.mark.parametrize(("proposer", "share"), [("coast", 0.662), ("full_brake", 0.614)])
-def test_horizon__beyond_it_the_bound_says_nothing(proposer, share):
-    now, later = above_later(proposer, 2_000)
-    assert now == 0.0 and round(later, 3) == share
+def test_horizon__beyond_it_the_bound_says_nothing():
+    now, later = above_later("coast", 200)
+    assert now == 0.0 and later > 0.5
 
 
 # Mode episode: never worse than its baseline, in any world, and as predicted.

@@ -22,7 +22,7 @@ from ethbrake_marl.shield.step_shield import (
     joint_constants,
     plan_harm,
 )
-from tests.shield.lines import TEAM_ADVERSARIES, attack, scenario_of
+from tests.shield.attacks import TEAM_ADVERSARIES, TEAMS, attack
 
 STEPS = 81
 PAIR, PAPER = load_scenario("cooperation-3-pair"), load_scenario("paper-random")
@@ -123,7 +123,7 @@ def test_caps__reject_what_only_moves_harm_to_another():
 @pytest.mark.parametrize("harm_count", ["first", "total"])
 @pytest.mark.parametrize("name", TEAM_ADVERSARIES)
 def test_attack__realises_the_last_bound_to_the_bit_and_neither_bound_nor_caps_are_broken(name, level, N, harm_count):
-    scenario, cap = scenario_of(level, N), "baseline" if harm_count == "first" else None
+    scenario, cap = load_scenario(TEAMS[level, N]), "baseline" if harm_count == "first" else None
     for hostile in ("all", "one"):
         found = attack(
             scenario, scenario.sample(8 if N == 3 else 4, 5).worlds, TEAM_ADVERSARIES[name], hostile=hostile, seed=1,
@@ -181,7 +181,7 @@ def test_constants__hold_all_alike_and_ladders_each_once():
 
 
 def test_surprise__of_one_world_hands_the_whole_team_to_the_fallback():
-    scenario = scenario_of(4, 3)
+    scenario = load_scenario(TEAMS[4, 3])
     worlds = scenario.sample(3, 1).worlds
     shield = StepShield(scenario, scenario.learners)
     shield.begin(worlds, np.arange(3))

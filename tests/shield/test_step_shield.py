@@ -27,7 +27,7 @@ from ethbrake_marl.shield.step_shield import (
     seen_columns,
 )
 from tests.fixtures.asked import Asked
-from tests.shield.lines import ADVERSARIES, LEAKS, attack, begun, extremes, line, random_actions, search, unshielded
+from tests.shield.attacks import ADVERSARIES, LEAKS, attack, begun, extremes, line, plain_engine, random_actions, search
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::RuntimeWarning",  # uncompiled, a division by 0 warns
@@ -180,7 +180,7 @@ def test_proposal__that_is_no_number_is_replaced_and_beyond_the_range_is_clipped
 def test_certify__realises_the_certified_harm_to_the_bit_whatever_is_proposed(N, harm_count):
     scenario, rng = line(N), np.random.default_rng(N)
     worlds = scenario.sample(5, N).worlds
-    engine, plan = unshielded(scenario, worlds), np.full((5, STEPS), -0.6)
+    engine, plan = plain_engine(scenario, worlds), np.full((5, STEPS), -0.6)
     settings = {"others_mps2": engine.wanted_mps2.copy(), "harm_count": harm_count}
     running, backup = start(worlds, plan, vehicle=scenario.learners[0], **settings)
     backup, bounds = backup._replace(constants=np.array(CONSTANTS[::5])), [backup.harm]
@@ -212,7 +212,7 @@ def test_attack__no_adversary_gets_above_the_bound(name, N, harm_count):
 
 
 def test_attack__comes_within_one_percent_of_the_bound_by_accepted_actions():
-    found = attack(line(3), line(3).sample(60, 12).worlds, ADVERSARIES["most_harmful"])
+    found = attack(line(3), line(3).sample(60, 12).worlds, ADVERSARIES["worst_case"])
     tried = (found.bound > 1.0) & (found.accepted > 0)
     assert (found.realised[tried] > 0.99 * found.bound[tried]).any()
 

@@ -14,7 +14,7 @@ from ethbrake_marl.shield.guard import checked_uncertainty
 from ethbrake_marl.shield.step_shield import REASONS, plan_harm
 from ethbrake_marl.shield.uncertainty import Interval, parse_uncertainty
 from tests.limits.worlds import line as one_line
-from tests.shield.lines import begun, line
+from tests.shield.attacks import begun, line
 
 EVERY = {
     3: "braking_capacity_mps2=5%,latency_s.vehicle_2=0.15,gaps_m.pair_1=0.5,mass_t.vehicle_3=20%",

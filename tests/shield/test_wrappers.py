@@ -17,8 +17,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
-from tests.shield.interface_attack import INTERFACES
-from tests.shield.interference import PLAYS, WRAPPERS, disturbed, wrapped
+from tests.shield.plays import INSIDE, PLAYS, WRAPPERS, disturbed, played, wrapped
 from tests.shield.test_step_shield import Speechless
 
 PAPER = load_scenario("paper-random")
@@ -144,17 +143,8 @@ def test_batch__tells_of_every_row_the_episode_that_ended(name, mode):
         assert len({(entry.world, entry.episode, entry.step) for entry in log}) == len(log) == intervened > 30
 
 
-@pytest.mark.parametrize("name", INTERFACES)
-@pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.guard.MovingAtHorizon")
-def test_attack__through_every_interface_stays_within_the_bound_at_the_alert(name):
-    realised, bound, _ = INTERFACES[name](24, 5)  # make test-shield: 10,000
-    assert len(realised) == len(bound) >= 24
-    assert (np.array(realised) <= np.array(bound) + 1e-9).all() and max(bound) > 0.0
-
-
 # Samples of the gate "interference".
 BATCHED = ("vector", "vector, next step", "sb3", "team, sb3")
-INSIDE = [name for name in PLAYS if "evaluation" not in name]  # the engine itself asks that one: nothing is in between
 
 
 @pytest.mark.parametrize("name", PLAYS)
@@ -162,6 +152,12 @@ def test_disturbed__calls_that_fail_or_are_interrupted_change_nothing_and_no_epi
     found = disturbed(name, 8 if name in BATCHED or "evaluation" in name else 5, seed=3)
     assert found.refused > 5 and found.interrupted > 3
     assert (found.above, found.broken) == (0, 0)
+
+
+@pytest.mark.parametrize("name", PLAYS)
+def test_played__through_every_interface_no_episode_gets_above_its_bound(name):
+    found = played(name, 24, seed=5)
+    assert found.episodes >= 24 and (found.above, found.broken) == (0, 0)
 
 
 @pytest.mark.parametrize("wrapper", WRAPPERS)
