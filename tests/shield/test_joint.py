@@ -126,7 +126,7 @@ def test_attack__realises_the_last_bound_to_the_bit_and_neither_bound_nor_caps_a
     scenario, cap = load_scenario(TEAMS[level, N]), "baseline" if harm_count == "first" else None
     for hostile in ("all", "one"):
         found = attack(
-            scenario, scenario.sample(8 if N == 3 else 4, 5).worlds, TEAM_ADVERSARIES[name], hostile=hostile, seed=1,
+            scenario, scenario.sample(8 if N == 3 else 2, 5).worlds, TEAM_ADVERSARIES[name], hostile=hostile, seed=1,
             harm_count=harm_count, cap=cap,
         )  # fmt: skip
         assert found.realised.tolist() == found.last_bound.tolist()
