@@ -168,7 +168,6 @@ TABLES: dict[str, How] = {
     "| scenario | `ppo` | `sac`": TRAINED,
     "| what learns | 10": TRAINED,
     "| who drives Vehicle 2 | collisions | first-impact | times": TRAINED,
-    "| who drives Vehicle 2 | collisions | first-impact harm | total harm | Vehicle 1": TRAINED,
     "| policy | processor time": TRAINED,
     "| trained for | policy": TRAINED,
     "| after | decisions | harm": TRAINED,
@@ -197,6 +196,7 @@ TABLES: dict[str, How] = {
     "| version | what it is": _by(BY_HAND),
     "| key | range | meaning": _by(BY_HAND),
     "| Python | versions": _by(SEARCH, "make test-bounds"),
+    "| planted | search | first found after": _by(SEARCH),
     "| bug | the first test": _by(SEARCH, "make planted-bugs"),
 }
 
