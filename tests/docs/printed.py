@@ -168,7 +168,6 @@ TABLES: dict[str, How] = {
     "| scenario | `ppo` | `sac`": TRAINED,
     "| what learns | 10": TRAINED,
     "| who drives Vehicle 2 | collisions | first-impact | times": TRAINED,
-    "| who drives Vehicle 2 | collisions | first-impact harm | total harm | Vehicle 1": TRAINED,
     "| policy | processor time": TRAINED,
     "| trained for | policy": TRAINED,
     "| after | decisions | harm": TRAINED,
@@ -192,11 +191,12 @@ TABLES: dict[str, How] = {
     "| key | default | unit, range": _by(SUITE, "tests/scenario/test_schema.py"),
     "| name | gaps | speeds": EXACT,
     "| name | speeds | gaps": EXACT,
-    "| licence | packages": _by(SUITE, "tests/programme/test_audit.py"),
+    "| licence | packages": _by(SUITE, "tests/programmes/test_programmes.py"),
     "| no. | label | the paper": _by(BY_HAND),
     "| version | what it is": _by(BY_HAND),
     "| key | range | meaning": _by(BY_HAND),
     "| Python | versions": _by(SEARCH, "make test-bounds"),
+    "| planted | search | first found after": _by(SEARCH),
     "| bug | the first test": _by(SEARCH, "make planted-bugs"),
 }
 
