@@ -163,7 +163,7 @@ def test_played__through_every_interface_no_episode_gets_above_its_bound(name):
 @pytest.mark.parametrize("wrapper", WRAPPERS)
 @pytest.mark.parametrize("name", INSIDE)
 def test_wrapped__whatever_reaches_the_engine_is_shielded_and_no_episode_gets_above_its_bound(name, wrapper):
-    found = wrapped(name, wrapper, 8 if wrapper == "frame skip 80" else 60, seed=5)
+    found = wrapped(name, wrapper, 8 if wrapper == "frame skip 80" else 120, seed=5)
     assert found.episodes > 0 and (found.above, found.broken) == (0, 0)
 
 
