@@ -209,7 +209,7 @@ def test_batch__rows_that_begin_again_are_those_of_a_fresh_episode(make: Any) ->
         bounds = np.where(fresh, told, bounds)
         assert (told <= bounds + ABOVE)[~idle].all()
         begun += int(fresh.sum())
-    assert begun > 4
+    assert begun >= 4  # each row at least twice: an episode has at most 80 steps
 
 
 def test_refused__calls_leave_the_shield_as_it_was() -> None:
