@@ -1,7 +1,6 @@
 # Everything runs in the project's own environment, .venv, made from Python >= 3.11, this file and .ci/install.
 # TORCH_INDEX: index to take torch from, e.g. make run TORCH_INDEX=ADDRESS; without it uv picks the build (see below)
 # PYTHON:      the interpreter that makes the environment, when the first one found is not the one wanted.
-# PEERS:       the environment of `make bench-peers`, apart from the project's own.
 # ARGS:        passed on by `make run` (to `ethbrake run`), `make test` (to pytest) and the long programmes.
 # WORKERS:     processes of `make test`. 0: one process, as a debugger needs.
 
@@ -10,7 +9,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.docs
-PEERS := .venv-peers
+PROGRAMME := $(BIN)/python -m tests.programmes
 TORCH_INDEX ?=
 PYTHON ?=
 ARGS ?=
@@ -46,10 +45,10 @@ help:
 	@echo "make test-order       the suite ten times in random orders and in parallel: no failure"
 	@echo "make planted-bugs     plant 27 bugs in copies of the physics, 44 in the rest; each must turn a test red"
 	@echo "make mutation [ARGS=] mutation testing of the physics (ARGS='--modules rewards,v2x --sample 40': of others)"
-	@echo "make bench-peers      speed beside other simulators, in an environment of their own: $(PEERS)"
+	@echo "make bench-peers      speed beside other simulators, each in its own environment below .venvs/"
 	@echo "make benchmark        drive suite v2 with the agents of docs/benchmark.md and make its tables (ARGS: some agents)"
 	@echo "make venv             the environment alone: $(VENV)"
-	@echo "make clean            remove $(VENV), $(PEERS), .venvs, caches and builds (runs/ stays)"
+	@echo "make clean            remove $(VENV), .venvs, caches and builds (runs/ stays)"
 	@echo "TORCH_INDEX=URL       take torch from this index; else uv picks the build for this machine"
 
 venv: $(STAMP)
@@ -133,63 +132,64 @@ docs: $(DOCS_STAMP)
 
 figures: $(STAMP)
 	@echo "== what the pages show, made again"
-	@$(BIN)/python -m tests.docs.figures $(ARGS)
+	@$(PROGRAMME) figures $(ARGS)
 
 dist: $(STAMP)
 	@echo "== wheel and sdist, twice"
-	@$(BIN)/python -m tests.wheel.reproducible $(ARGS)
+	@$(PROGRAMME) wheel --only built $(ARGS)
 
 kernels: $(STAMP)
 	@echo "== ready-made kernels, for two levels of x86-64"
-	@$(BIN)/python -m tests.wheel.kernels $(ARGS)
+	@$(PROGRAMME) wheel --only kernels: $(ARGS)
 
 test-physics: $(STAMP)
 	@echo "== long programme on the physics"
-	@$(BIN)/python -m tests.physics.programme $(ARGS)
+	@$(PROGRAMME) physics $(ARGS)
 
 test-resume: $(STAMP)
 	@echo "== long programme on resuming: trainings are killed at random moments"
-	@$(BIN)/python -m tests.learning.programme $(ARGS)
+	@$(PROGRAMME) resume $(ARGS)
 
 test-shield: $(STAMP)
 	@echo "== trying to break the step shield"
-	@$(BIN)/python -m tests.shield.programme $(ARGS)
+	@$(PROGRAMME) shield $(ARGS)
 
 test-light: $(STAMP)
 	@echo "== the wheel alone in an empty environment: size, and what it must do without torch"
-	@$(BIN)/python -m tests.wheel $(ARGS)
+	@$(PROGRAMME) wheel --only light $(ARGS)
 
 test-bounds: $(STAMP)
 	@echo "== the lowest and the highest versions"
-	@$(BIN)/python -m tests.programme.bounds $(ARGS)
+	@$(PROGRAMME) bounds $(ARGS)
 
 test-machines: $(STAMP)
 	@echo "== the same bits on other processors"
-	@$(BIN)/python -m tests.programme.machines $(ARGS)
+	@$(PROGRAMME) machines $(ARGS)
 
 test-order: $(STAMP)
 	@echo "== the suite in random orders"
-	@$(BIN)/python -m tests.programme.order $(ARGS)
+	@$(PROGRAMME) order $(ARGS)
 
 test-hostile: $(STAMP)
 	@echo "== files that a stranger wrote or a disk damaged"
-	@$(BIN)/python -m tests.hostile $(ARGS)
+	@$(PROGRAMME) hostile $(ARGS)
 
 audit: $(STAMP)
 	@echo "== what the package stands on"
-	@$(BIN)/python -m tests.programme.audit
+	@$(PROGRAMME) audit $(ARGS)
 
 test-libraries: $(STAMP)
 	@echo "== other people's libraries"
-	@$(BIN)/python -m tests.libraries $(ARGS)
+	@$(PROGRAMME) libraries $(ARGS)
 
 proofs: $(STAMP)
 	@echo "== proofs"
-	@NUMBA_DISABLE_JIT=1 $(BIN)/python -m tests.proofs
+	@NUMBA_DISABLE_JIT=1 $(PROGRAMME) proofs $(ARGS)
+
 test-cluster: $(STAMP)
 	@echo "== a sweep on a Ray cluster, disturbed"
 	@$(INSTALL) -e ".[cluster]"
-	@$(BIN)/python -m tests.studies.sweep.cluster $(ARGS)
+	@$(PROGRAMME) cluster $(ARGS)
 
 shield-bugs: $(STAMP)
 	@echo "== planted shield bugs"
@@ -205,11 +205,12 @@ mutation: $(STAMP)
 	@$(BIN)/python -m tests.physics.programme.mutation $(ARGS)
 
 bench-peers: $(STAMP)
-	@$(BIN)/python -m tests.benchmarks.peers --environment $(PEERS) --torch-index "$(TORCH_INDEX)" $(ARGS)
+	@echo "== speed beside other simulators"
+	@$(PROGRAMME) peers $(ARGS)
 
 benchmark: $(STAMP)
 	@$(BIN)/python -m tests.studies.benchmark_rows $(ARGS)
 
 clean:
-	rm -rf $(VENV) $(PEERS) .venvs .pytest_cache .ruff_cache .mypy_cache .hypothesis build dist docs/_build
+	rm -rf $(VENV) .venvs .pytest_cache .ruff_cache .mypy_cache .hypothesis build dist docs/_build
 	find ethbrake_marl tests train docs -name __pycache__ -type d -prune -exec rm -rf {} +

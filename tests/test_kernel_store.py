@@ -25,7 +25,7 @@ from ethbrake_marl import kernel_store
 from ethbrake_marl.kernel_store import cache_folder
 from ethbrake_marl.physics import compiling as compiled
 from ethbrake_marl.physics.compiling import digest_of_sources, keep_kernel, kernel_sources, load_kernel
-from tests.wheel.kernels import pack
+from tests.programmes.wheel import pack
 
 needs_compiler = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="compilation is switched off")
 PACKAGE = Path(ethbrake_marl.__file__).parent

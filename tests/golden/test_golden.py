@@ -20,7 +20,7 @@ from ethbrake_marl.physics import Floats, advance
 from ethbrake_marl.scenario import list_scenarios, load_scenario
 from ethbrake_marl.shield import StepShield, parse_uncertainty
 from tests.physics.random_worlds import Draws, driving_lines
-from tests.shield.lines import line
+from tests.shield.attacks import line
 
 GOLDEN = Path(__file__).with_name("physics_worlds.json")
 LINES = {  # by name: vehicles and worlds

@@ -1,24 +1,42 @@
-"""Every interface behind the shield, with something in between: to be stepped, disturbed and looked into."""
+"""Every interface behind the shield, alone and with a team: played, disturbed, stepped with something between.
+
+``disturbed(interface, episodes, seed)`` plays episodes in which calls are refused, raise, or are interrupted at random
+lines; ``wrapped(interface, wrapper, calls, seed)`` steps with a wrapper between the shield and the engine. Harm is read
+by a watcher of its own from the engine's ledger, of every episode that ended, and compared with the bound at the alert.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+import contextlib
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-import pytest
 from pettingzoo.utils import BaseParallelWrapper
 
-from ethbrake_marl.agents.registry import episode_engine
+from ethbrake_marl.agents.registry import Team, episode_engine
 from ethbrake_marl.envs.interfaces import EthBrakeParallelEnv, EthBrakeVectorEnv, parallel_env
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
-from ethbrake_marl.shield import HybridShield, ShieldedDriver, ShieldedEnv, ShieldedVectorEnv, shielded_aec
+from ethbrake_marl.errors import EthBrakeError
+from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.shield import (
+    HybridShield,
+    MovingAtHorizon,
+    ShieldedDriver,
+    ShieldedEnv,
+    ShieldedVectorEnv,
+    shielded_aec,
+)
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
-from tests.shield.lines import line
+from tests.shield.attacks import line
 
 ROWS = 5  # worlds of the batched interfaces
-SCENARIO = line(3)
+ALONE, PAIR = line(3), load_scenario("cooperation-3-pair")
+NO_STATE = {"initial_state": {"gaps_m": [-1, 1], "speeds_mps": [1, 1, 1]}}
 
 
 class Failure(Exception):
@@ -38,47 +56,59 @@ class Recorder:
         return made + 1, [*ended, *zip(harm[over].tolist(), bound[over].tolist(), strict=True)]
 
 
-class Failing:
-    """A policy that brakes by turns, and raises when it is told to."""
+class Unreliable:
+    """A policy that brakes by turns; where told to it raises, gives too many commands, or none that is a number."""
 
-    name, fails, remembers = "failing", False, False
+    name, remembers = "unreliable", False
+    how = ""
 
     def act(self, worlds: Any, vehicle: int) -> np.ndarray:
-        if self.fails:
+        if self.how == "fails":
             raise Failure
+        if self.how == "misshapen":
+            return np.zeros((worlds.n, 2))
         wave = np.sin(17.0 * worlds.time_s + worlds.gaps_m[:, 0])
-        return np.where(wave > 0.0, 0.0, wave * worlds.vehicles.braking_capacity_mps2[:, vehicle])
+        told = np.where(wave > 0.0, 0.0, wave * worlds.vehicles.braking_capacity_mps2[:, vehicle])
+        return np.full(worlds.n, np.nan) if self.how == "mute" else told
 
 
 class Play:
     """One interface, shielded: ``step`` makes a step with fresh proposals, ``bad`` are calls that must raise."""
 
-    scenario = SCENARIO
-
-    def __init__(self, seed: int) -> None:
-        self.rng, self.policy = np.random.default_rng(seed), Failing()
+    def __init__(self, seed: int, *, team: bool = False) -> None:
+        self.rng, self.team, self.scenario = np.random.default_rng(seed), team, PAIR if team else ALONE
+        self.members = {i: Unreliable() for i in self.scenario.learners}
         self.raises: str | None = None  # where the wrapper in between raises
         self.how: Callable[..., Any] = self._failing
         self.bad: list[Callable[[], Any]] = []
-        self._watched()
+        self.done: list[tuple[float, float]] = []  # of engines before this one
+        self.make()
 
-    def _watched(self) -> None:
+    def make(self) -> None:
+        """Make the interface, watch its engine, begin an episode."""
+        raise NotImplementedError
+
+    engine: Any  # both without arguments
+    shield: Any
+
+    def step(self) -> None:
+        raise NotImplementedError
+
+    def watch(self, memory: Any = (0, [])) -> None:
         self.recorder = Recorder()
-        self.engine().watch(self.recorder, (0, []))
+        self.engine().watch(self.recorder, memory)
+
+    def begin(self) -> int:
+        return int(self.rng.integers(10**6))
 
     def made(self) -> int:
         """Steps that the engine made."""
         made: int = self.engine().memory(self.recorder)[0]
         return made
 
-    def engine(self) -> Any:
-        raise NotImplementedError
-
-    def shield(self) -> Any:
-        raise NotImplementedError
-
-    def step(self) -> None:
-        raise NotImplementedError
+    def ended(self) -> list[tuple[float, float]]:
+        """Harm and bound of the episodes that have ended."""
+        return [*self.done, *self.engine().memory(self.recorder)[1]]
 
     def _failing(self, step: Callable[[Any], Any], actions: Any) -> Any:
         if self.raises == "before":
@@ -89,7 +119,7 @@ class Play:
         return told
 
     def drawn(self, *shape: int) -> np.ndarray:
-        return self.rng.choice([self.rng.uniform(-1.0, 1.0), -1.0, 1.0]) * np.ones(shape)
+        return np.where(self.rng.random(shape) < 0.5, np.sign(self.rng.uniform(-1, 1, shape)), self.rng.uniform(-1, 1))
 
     def known(self) -> list[Any]:
         """What must not change when nothing happens: bound, plan, trust, place in the episodes."""
@@ -97,61 +127,81 @@ class Play:
         held = [shield.bound, shield.backup.plan, shield.distrusted, shield.running.steps, shield.running.states]
         return [array.tolist() for array in held]
 
+    def astray(self) -> int:
+        """1 where the shield is not where the engine is, or trusts it no longer."""
+        shield, engine = self.shield(), self.engine()
+        there = (shield.running.steps == engine.steps)[~engine.ended].all()
+        return int(not there or shield.distrusted.any())
+
+    def member_is(self, how: str, asked: Callable[[], Any]) -> Callable[[], None]:
+        """A call in which one member fails so, while the others are well."""
+
+        def call() -> None:
+            one = self.members[int(self.rng.choice(self.scenario.learners))]
+            one.how = how
+            try:
+                asked()
+                raise AssertionError("nobody asked it")
+            except (ValueError, IndexError) as error:
+                raise Failure from error
+            finally:
+                one.how = ""
+
+        return call
+
+    @contextlib.contextmanager
+    def sometimes_mute(self) -> Iterator[None]:
+        """Now and then a member says nothing that is a number: that is no failure, but replaced."""
+        for member in self.members.values():
+            member.how = "mute" if self.rng.random() < 0.15 else ""
+        try:
+            yield
+        finally:
+            for member in self.members.values():
+                member.how = ""
+
 
 class Parallel(Play):
-    """PettingZoo parallel."""
+    """PettingZoo parallel; the members of a team, or the one policy, propose where nobody does."""
 
-    def _watched(self) -> None:
+    def make(self) -> None:
+        policies: Any = {f"vehicle_{i + 1}": member for i, member in self.members.items()}
+        policy = policies if self.team else policies["vehicle_2"]
         inner = _ParallelBetween(parallel_env(self.scenario), self)
-        self.env = HybridShield(inner, self.policy, mode="step")
+        self.env = HybridShield(inner, policy, mode="step", cap="baseline" if self.team else None)
+        last = list(policies)[-1]
         self.bad = [
             lambda: self.env.step({"vehicle_2": np.zeros(1), "vehicle_9": np.zeros(1)}),
-            lambda: self.env.step({"vehicle_2": np.array([np.nan])}),
-            lambda: self.env.step({"vehicle_2": np.zeros(3)}),
-            lambda: self.env.step([0.0]),
-            lambda: self.env.reset(options={"initial_state": {"gaps_m": [-1, 1], "speeds_mps": [1, 1, 1]}}),
-            self._policy_fails,
+            lambda: self.env.step({"vehicle_2": np.zeros(1)} | {last: np.array([np.nan])}),
+            lambda: self.env.step({last: np.zeros(3)}),
+            lambda: self.env.step([0.0] * len(policies)),
+            lambda: self.env.reset(options=NO_STATE),
+            self.member_is("fails", lambda: self.env.step({})),
+            self.member_is("misshapen", lambda: self.env.step({})),
         ]
-        super()._watched()
-        self.env.reset(seed=int(self.rng.integers(10**6)))
-
-    def _policy_fails(self) -> None:
-        self.policy.fails = True
-        try:
-            self.env.step({})
-            raise AssertionError("nobody asked it")
-        finally:
-            self.policy.fails = False
-
-    def engine(self) -> Any:
-        return self.env.unwrapped.engine
-
-    def shield(self) -> Any:
-        return self.env.attached.shield
+        self.engine, self.shield = lambda: self.env.unwrapped.engine, lambda: self.env.attached.shield
+        self.watch()
+        self.env.reset(seed=self.begin())
 
     def step(self) -> None:
         if self.engine().ended[0]:
             self.env.reset()
-        self.env.step({} if self.rng.random() < 0.3 else {"vehicle_2": self.drawn(1)})
+        names = (f"vehicle_{i + 1}" for i in self.members)
+        with self.sometimes_mute():
+            self.env.step({name: self.drawn(1) for name in names if self.rng.random() < 0.65})
 
 
 class Aec(Play):
     """PettingZoo AEC."""
 
-    def _watched(self) -> None:
+    def make(self) -> None:
         self.env = shielded_aec(_ParallelBetween(parallel_env(self.scenario), self), mode="step")
-        shielded: Any = self.env
-        while not isinstance(shielded, HybridShield):
-            shielded = shielded.env
-        self.shielded = shielded
-        super()._watched()
-        self.env.reset(seed=int(self.rng.integers(10**6)))
-
-    def engine(self) -> Any:
-        return self.shielded.unwrapped.engine
-
-    def shield(self) -> Any:
-        return self.shielded.attached.shield
+        inner: Any = self.env
+        while not isinstance(inner, HybridShield):
+            inner = inner.env
+        self.engine, self.shield = lambda: inner.unwrapped.engine, lambda: inner.attached.shield
+        self.watch()
+        self.env.reset(seed=self.begin())
 
     def step(self) -> None:
         if self.engine().ended[0]:
@@ -161,27 +211,31 @@ class Aec(Play):
             self.env.step(self.drawn(1).astype(np.float32))
 
 
-class Single(Play):
+class Attached(Play):
+    """An interface of Gymnasium's form: what its shield is attached to holds the engine."""
+
+    env: Any
+
+    def put(self, env: Any, **begin: int) -> None:
+        self.env = env
+        self.engine, self.shield = lambda: env.attached.engine, lambda: env.attached.shield
+        self.watch()
+        env.reset(**begin)
+
+
+class Single(Attached):
     """Gymnasium."""
 
-    def _watched(self) -> None:
-        plain = gymnasium.make("EthBrake-v0", scenario=SCENARIO).unwrapped
-        self.env = ShieldedEnv(_SingleBetween(plain, self))
+    def make(self) -> None:
+        plain = gymnasium.make("EthBrake-v0", scenario=self.scenario).unwrapped
         self.bad = [
             lambda: self.env.step(np.array([np.nan])),
             lambda: self.env.step(np.zeros(2)),
             lambda: self.env.step(np.array([1j])),
             lambda: self.env.reset(seed=-1),
-            lambda: self.env.reset(options={"initial_state": {"gaps_m": [1], "speeds_mps": [1, 1, 1]}}),
+            lambda: self.env.reset(options=NO_STATE),
         ]
-        super()._watched()
-        self.env.reset(seed=int(self.rng.integers(10**6)))
-
-    def engine(self) -> Any:
-        return self.env.attached.engine
-
-    def shield(self) -> Any:
-        return self.env.attached.shield
+        self.put(ShieldedEnv(_SingleBetween(plain, self)), seed=self.begin())
 
     def step(self) -> None:
         if self.engine().ended[0]:
@@ -189,27 +243,26 @@ class Single(Play):
         self.env.step(self.drawn(1))
 
 
-class Vector(Single):
+class Vector(Attached):
     """Gymnasium vector."""
 
     mode = "SameStep"
 
-    def _watched(self) -> None:
-        inner = _VectorBetween(ROWS, SCENARIO, autoreset_mode=self.mode)
+    def make(self) -> None:
+        inner = _VectorBetween(ROWS, self.scenario, autoreset_mode=self.mode)
         inner.play = self
-        self.env = ShieldedVectorEnv(inner)
         self.bad = [
-            lambda: self.env.step(self._one_bad(np.nan)),
+            lambda: self.env.step(self.one_bad(ROWS, int(np.argmin(self.engine().ended)))),  # others are ignored
             lambda: self.env.step(np.zeros((ROWS + 1, 1))),
             lambda: self.env.step(np.full((ROWS, 1), 1.0 + 1j)),
             lambda: self.env.reset(seed=-1),
         ]
-        Play._watched(self)
-        self.env.reset(seed=int(self.rng.integers(10**6)))
+        self.put(ShieldedVectorEnv(inner), seed=self.begin())
 
-    def _one_bad(self, value: float) -> np.ndarray:
-        actions = np.zeros((ROWS, 1))
-        actions[int(np.argmin(self.engine().ended))] = value  # of a row that runs: others are ignored
+    @staticmethod
+    def one_bad(rows: int, row: int) -> np.ndarray:
+        actions = np.zeros((rows, 1))
+        actions[row] = np.nan
         return actions
 
     def step(self) -> None:
@@ -222,30 +275,23 @@ class NextStepVector(Vector):
     mode = "NextStep"
 
 
-class Sb3(Vector):
-    """Stable-Baselines3."""
+class Sb3(Attached):
+    """Stable-Baselines3; of a team one row of each member and world."""
 
-    def _watched(self) -> None:
-        inner = make_sb3_vec_env(self.scenario, ROWS, seed=int(self.rng.integers(10**6)))
+    def make(self) -> None:
+        inner = make_sb3_vec_env(self.scenario, ROWS, seed=self.begin())
         inner.__class__ = _Sb3Between
         inner.play = self
-        self.env = ShieldedVecEnv(inner)
+        rows = inner.num_envs
         self.bad = [
-            lambda: self.env.step(self._one_bad(np.nan)),
-            lambda: self.env.step(np.zeros((self.env.num_envs, 2))),
-            self._missing,
+            lambda: self.env.step(Vector.one_bad(rows, int(self.rng.integers(rows)))),
+            lambda: self.env.step(np.zeros((rows, 2))),
             self._options,
         ]
-        Play._watched(self)
-        self.env.reset()
-
-    def _missing(self) -> None:
-        with pytest.raises(AttributeError, match="no_such_method"):
-            self.env.env_method("no_such_method")
-        raise Failure
+        self.put(ShieldedVecEnv(inner))
 
     def _options(self) -> None:
-        self.env.set_options({"initial_state": {"gaps_m": [1], "speeds_mps": [1]}})
+        self.env.set_options(NO_STATE)
         self.env.reset()
 
     def step(self) -> None:
@@ -256,43 +302,26 @@ class Sb3(Vector):
 
 
 class Evaluation(Play):
-    """The shielded driver of an evaluation."""
+    """The shielded driver of an evaluation, or its team; nothing can stand in between."""
 
-    def _watched(self) -> None:
-        self._begin()
-        self.bad = [self._policy_fails]
-
-    def _begin(self) -> None:
-        worlds = self.scenario.sample(ROWS, int(self.rng.integers(10**6))).worlds
-        before = getattr(self, "_engine", None)
-        self._engine = self._driven(worlds)
-        made, ended = (0, []) if before is None else before.memory(self.recorder)
-        self.done, self.recorder = [*getattr(self, "done", []), *ended], Recorder()
-        self._engine.watch(self.recorder, (made, []))
-        self._engine.step({})
-
-    def _driven(self, worlds: Any) -> Any:
-        """An engine over these worlds in which a new driver proposes."""
-        return episode_engine(worlds, ShieldedDriver(self.policy, self.scenario), self.scenario, 1)
-
-    def _policy_fails(self) -> None:
-        self.policy.fails = True
-        try:
-            self._engine.step({})
-            raise AssertionError("nobody asked it")
-        finally:
-            self.policy.fails = False
-
-    def engine(self) -> Any:
-        return self._engine
-
-    def shield(self) -> Any:
-        return self._engine.guarded.shield
+    def make(self) -> None:
+        worlds, learners = self.scenario.sample(ROWS, self.begin()).worlds, self.scenario.learners
+        if self.team:
+            driver = ShieldedDriver(Team(self.members, "unreliable"), self.scenario, cap="baseline").on(learners)
+            engine = episode_engine(worlds, driver, self.scenario)
+        else:
+            engine = episode_engine(worlds, ShieldedDriver(self.members[1], self.scenario), self.scenario, 1)
+        made, self.done = (self.made(), self.ended()) if self.bad else (0, [])
+        self.engine, self.shield = lambda: engine, lambda: engine.guarded.shield
+        self.bad = [self.member_is(how, lambda: engine.step({})) for how in ("fails", "misshapen")]
+        self.watch((made, []))
+        engine.step({})
 
     def step(self) -> None:
-        if self._engine.ended.all():
-            self._begin()
-        self.how(self._engine.step, {})
+        if self.engine().ended.all():
+            self.make()
+        with self.sometimes_mute():
+            self.how(self.engine().step, {})
 
 
 class _ParallelBetween(BaseParallelWrapper):
@@ -331,7 +360,162 @@ class _Sb3Between(EthBrakeVecEnv):
         return self.play.how(step, self._actions)
 
 
-PLAYS: dict[str, type[Play]] = {
+PLAYS: dict[str, Callable[[int], Play]] = {
     "parallel": Parallel, "aec": Aec, "single": Single, "vector": Vector, "vector, next step": NextStepVector,
-    "sb3": Sb3, "evaluation": Evaluation,
+    "sb3": Sb3, "evaluation": Evaluation, "team, parallel": partial(Parallel, team=True),
+    "team, aec": partial(Aec, team=True), "team, sb3": partial(Sb3, team=True),
+    "team, evaluation": partial(Evaluation, team=True),
 }  # fmt: skip
+
+
+# ---------------------------------------------------------------- played, disturbed, wrapped
+
+LINES = (50, 200, 800)  # an interrupt comes at one of the first so many lines of a call, if it has so many
+
+
+class Tally(NamedTuple):
+    """What happened."""
+
+    episodes: int
+    above: int  # episodes that ended above the bound told at their alert
+    refused: int  # calls that raised
+    interrupted: int
+    broken: int  # times that bound, plan, trust or place in the episode were not as they should be after that
+
+
+@contextlib.contextmanager
+def interrupt_at(number: int) -> Iterator[None]:
+    """Ctrl-C at that line of Python, counted from here; not within the compiler, which would be left half done."""
+    left = number
+
+    def trace(frame: Any, event: str, argument: Any) -> Any:
+        nonlocal left
+        if "numba" in frame.f_code.co_filename:
+            return None
+        if event == "line":
+            left -= 1
+            if left == 0:
+                raise KeyboardInterrupt
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        yield
+    finally:
+        sys.settrace(before)
+
+
+@contextlib.contextmanager
+def calm() -> Iterator[None]:
+    """Without the warning that something moves at the horizon."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MovingAtHorizon)
+        yield
+
+
+def tally(play: Play, refused: int = 0, interrupted: int = 0, broken: int = 0) -> Tally:
+    ended = play.ended()
+    return Tally(len(ended), sum(harm > bound + 1e-9 for harm, bound in ended), refused, interrupted, broken)
+
+
+@calm()
+def played(name: str, episodes: int, seed: int) -> Tally:
+    """Play so many episodes through an interface, in which nothing fails."""
+    play, broken = PLAYS[name](seed), 0
+    while len(play.ended()) < episodes:
+        play.step()
+        broken += play.astray()
+    return tally(play, broken=broken)
+
+
+@calm()
+def disturbed(name: str, episodes: int, seed: int) -> Tally:
+    """The same; before every second step something fails or is interrupted."""
+    play = PLAYS[name](seed)
+    for _ in range(3):
+        play.step()  # compiles what is not compiled yet: whose lines would be counted
+    refused = interrupted = broken = 0
+    while len(play.ended()) < episodes:
+        if play.engine().ended.all():
+            play.step()  # begins the next episode
+        kind, before, made = int(play.rng.integers(5)), play.known(), play.made()
+        if kind == 0 and play.bad:
+            with contextlib.suppress(EthBrakeError, Failure):
+                play.bad[int(play.rng.integers(len(play.bad)))]()
+                broken += 1  # it did not raise
+            refused += 1
+        elif kind == 1:
+            play.raises = str(play.rng.choice(["before", "after"]))
+            with contextlib.suppress(Failure):
+                play.step()
+            play.raises, refused = None, refused + 1
+        elif kind == 2:
+            try:
+                with interrupt_at(int(play.rng.integers(1, play.rng.choice(LINES)))):
+                    play.step()
+            except KeyboardInterrupt:
+                interrupted += 1
+        else:
+            play.step()
+        if play.made() == made and kind != 2:
+            broken += play.known() != before
+        broken += play.astray()
+    return tally(play, refused, interrupted, broken)
+
+
+def _scaled(actions: Any, factor: float) -> Any:
+    if isinstance(actions, dict):
+        return {name: _scaled(action, factor) for name, action in actions.items()}
+    return np.asarray(actions) * factor
+
+
+def skip(frames: int, step: Callable[[Any], Any], actions: Any) -> Any:
+    """A frame skip."""
+    for _ in range(frames):
+        told = step(actions)
+    return told
+
+
+def changing(step: Callable[[Any], Any], actions: Any) -> Any:
+    return step(_scaled(actions, 0.5))
+
+
+def twice(step: Callable[[Any], Any], actions: Any) -> Any:
+    step(_scaled(actions, 0.0))
+    return step(actions)
+
+
+class Swallowing:
+    """Every third step is not made; the last answer is given again."""
+
+    def __init__(self) -> None:
+        self.calls, self.told = 0, None
+
+    def __call__(self, step: Callable[[Any], Any], actions: Any) -> Any:
+        self.calls += 1
+        if self.calls % 3:
+            self.told = step(actions)
+        return self.told
+
+
+WRAPPERS: dict[str, Callable[[], Callable[..., Any]]] = {
+    "frame skip 2": lambda: partial(skip, 2), "frame skip 80": lambda: partial(skip, 80),
+    "changes actions": lambda: changing, "steps twice": lambda: twice, "swallows steps": Swallowing,
+}  # fmt: skip
+INSIDE = [name for name in PLAYS if "evaluation" not in name]  # the engine itself asks that one: nothing is in between
+
+
+@calm()
+def wrapped(name: str, wrapper: str, calls: int, seed: int) -> Tally:
+    """So many steps with a wrapper inside, whose actions reach the engine; what is raised is caught."""
+    play = PLAYS[name](seed)
+    play.how = WRAPPERS[wrapper]()
+    refused = broken = 0
+    for _ in range(calls):
+        with contextlib.suppress(EthBrakeError):  # at the end of an episode also the plain one, "no episode is running"
+            play.step()
+            refused -= 1
+        refused += 1
+        broken += play.astray()
+    return tally(play, refused, 0, broken)

@@ -442,7 +442,7 @@ def test_local_ray__listens_on_loopback_alone_and_has_no_dashboard():
 @pytest.mark.parametrize(("work", "number"), [("counting", 60), ("training", 8)])
 def test_cluster__of_two_nodes_whose_workers_are_killed_makes_the_same_table(work, number):
     pytest.importorskip("ray")
-    command = [sys.executable, "-m", "tests.studies.sweep.cluster", "--jobs", str(number), "--work", work]
+    command = [sys.executable, "-m", "tests.programmes", "cluster", "--jobs", str(number), "--work", work]
     assert subprocess.run(command, cwd=ROOT, timeout=3600, check=False).returncode == 0
 
 

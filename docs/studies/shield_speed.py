@@ -1,0 +1,84 @@
+"""How fast the step shield is: ``.venv/bin/python docs/studies/shield_speed.py [DECISIONS]``.
+
+Decisions per second of a batch, the latency of one decision, and both with a learned policy behind the shield. The
+figures of single decisions mean something on idle cores only.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import numpy as np
+
+from ethbrake_marl.agents.registry import episode_engine
+from ethbrake_marl.evaluation.inputs import make_agents
+from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.shield import ShieldedDriver
+from ethbrake_marl.shield.step_shield import StepShield, certify
+from ethbrake_marl.shield.uncertainty import parse_uncertainty
+
+SCENARIO = load_scenario("paper-random")
+
+
+def batch_rate(intervals: str | None, n: int) -> tuple[float, int]:
+    """Decisions per second of a batch under random proposals, and the members of each world."""
+    shield = StepShield(SCENARIO, 1, uncertainty=None if intervals is None else parse_uncertainty(intervals))
+    shield.begin(SCENARIO.sample(n, 3).worlds, np.arange(n))
+    rng = np.random.default_rng(0)
+    shield.decide(rng.uniform(-1.0, 1.0, n))
+    done, begun = 0, time.process_time()
+    while not shield.running.finished.all():
+        done += int((~shield.running.finished).sum())
+        shield.decide(rng.uniform(-1.0, 1.0, n))
+    return done / (time.process_time() - begun), shield.running.members
+
+
+def single_times(decisions: int) -> list[float]:
+    """Seconds of one decision after another, by the clock."""
+    rng, took = np.random.default_rng(0), []
+    while len(took) < decisions:
+        shield = StepShield(SCENARIO, 1)
+        shield.begin(SCENARIO.sample(1, 3, first=len(took)).worlds, np.arange(1))
+        while not shield.running.finished.all():
+            proposed = rng.uniform(-1.0, 1.0, 1)
+            begun = time.perf_counter()
+            decision = certify(shield.running, proposed, shield.backup, shield.bound)
+            took.append(time.perf_counter() - begun)
+            shield.running, shield.backup = decision.after, decision.backup
+    return took
+
+
+def policy_times(decisions: int, later: bool) -> list[float]:
+    """Processor seconds per decision of a learned policy behind the shield, one world at a time."""
+    (policy,) = make_agents(["ppo@shipped"], SCENARIO).values()
+    took: list[float] = []
+    world = 0
+    while len(took) < decisions:
+        driver = ShieldedDriver(policy, SCENARIO, later_rollouts=later)
+        engine = episode_engine(SCENARIO.sample(1, 3, first=world).worlds, driver, SCENARIO, 1)
+        while not engine.ended.all():
+            nothing, begun = np.full((1, 1), np.nan), time.process_time()
+            engine.guard.decide(engine, engine.guarded, nothing)  # changes nothing
+            took.append(time.process_time() - begun)
+            engine.step({})
+        world += 1
+    return took
+
+
+def main(decisions: int = 5_000) -> None:
+    """Print one line for each."""
+    for intervals, n in ((None, 4096), ("gaps_m=0.5", 1000), ("braking_capacity_mps2=10%,gaps_m=0.5", 1000)):
+        rate, members = batch_rate(intervals, n)
+        print(f"{members} members a world ({intervals or 'step mode'}): {rate:,.0f} decisions/s batched", flush=True)
+    for told, took in (
+        ("one decision", single_times(decisions)),
+        ("ppo@shipped behind it, inference included, with later rollouts", policy_times(decisions, True)),
+        ("ppo@shipped behind it, inference included, without", policy_times(decisions, False)),
+    ):
+        middle, slow = np.quantile(took, [0.5, 0.99]) * 1e6
+        print(f"{told}: p50 {middle:.0f} us, p99 {slow:.0f} us", flush=True)
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))

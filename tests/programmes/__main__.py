@@ -1,0 +1,75 @@
+"""The programmes: what asks more than a test may take, ``python -m tests.programmes [NAME [options]]``.
+
+Without a name they are listed. Each is a module of this folder with a function ``cases(given)``, which yields a name
+and what is called for it, and where it has options of its own a function ``options(parser)``. What is called gives
+``Told``: whether it was good (None: it was not tried, or claims nothing), and one line of text. An ``AssertionError``
+is not good.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import time
+from importlib import import_module
+from pathlib import Path
+
+from tests.programmes import Told
+
+WORDS = {True: "ok", False: "FAILED", None: "-"}
+FOLDER = Path(__file__).parent
+
+
+def programmes() -> dict[str, str]:
+    """The first line of each programme, by its name."""
+    found = {}
+    for file in sorted(FOLDER.glob("*.py")):
+        text = file.read_text("utf-8")
+        if "\ndef cases(" in text:
+            found[file.stem] = text.removeprefix('"""').partition("\n")[0].removesuffix('"""')
+    return found
+
+
+def main(words: list[str]) -> int:
+    """Run the cases of a programme; 0 where there was one, and none was not good."""
+    if not words or words[0] not in programmes():
+        print("\n".join(f"{name:12} {line}" for name, line in programmes().items()))
+        return 2 if words else 0
+    programme = import_module(f"tests.programmes.{words[0]}")
+    parser = argparse.ArgumentParser(
+        f"python -m tests.programmes {words[0]}",
+        description=programme.__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--only", default="", metavar="TEXT", help="cases whose name contains this, and no other")
+    parser.add_argument("--within", type=float, default=math.inf, metavar="SECONDS", help="begin no case after them")
+    parser.add_argument("--list", action="store_true", help="the names of the cases, and run none")
+    if hasattr(programme, "options"):
+        programme.options(parser)
+    given = parser.parse_args(words[1:])
+    given.until = time.monotonic() + given.within  # a case may look at it
+    ended: list[bool | None] = []
+    for name, run in programme.cases(given):
+        if given.only not in name:
+            continue
+        if given.list:
+            print(name, flush=True)
+            continue
+        begun = time.monotonic()
+        try:
+            good, text = run() if begun < given.until else Told(None, "skipped: no time left")
+        except AssertionError as error:
+            good, text = False, str(error)
+        ended.append(good)
+        print(f"{WORDS[good]:6} {time.monotonic() - begun:7.1f} s  {name}{text and ': '}{text}", flush=True)
+    if given.list:
+        return 0
+    failed, skipped = ended.count(False), ended.count(None)
+    verdict = "FAIL" if failed or not ended else "PASS"
+    print(f"{verdict}: {ended.count(True)} of {len(ended)} good, {failed} failed, {skipped} without a verdict")
+    return int(verdict == "FAIL")
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

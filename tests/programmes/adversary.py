@@ -1,0 +1,58 @@
+"""The trained adversary of the shield: PPO under the shield, paid for the harm of each step; weights in tests/shield.
+
+A minute for each number of vehicles. The weights are plain arrays, and stay those of the repository unless this is run.
+"""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+
+import numpy as np
+
+from tests.programmes import ROOT, Cases, Told
+
+WORLDS, HIDDEN = 64, (64, 64)
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--steps", type=int, default=200_000)
+
+
+def cases(given: argparse.Namespace) -> Cases:
+    for N in (3, 5):
+        yield f"N = {N}", partial(train, N, given.steps)
+
+
+def train(N: int, steps: int) -> Told:
+    """Train against the shield on ``line(N)`` and keep the actor's weights."""
+    import torch
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import VecEnvWrapper
+
+    from ethbrake_marl.envs.sb3 import make_sb3_vec_env
+    from ethbrake_marl.shield.sb3 import ShieldedVecEnv
+    from tests.shield.attacks import line
+
+    class PaidForHarm(VecEnvWrapper):
+        def reset(self):
+            return self.venv.reset()
+
+        def step_wait(self):
+            observation, reward, done, infos = self.venv.step_wait()
+            return observation, -reward, done, infos
+
+    torch.set_num_threads(1)
+    env = PaidForHarm(ShieldedVecEnv(make_sb3_vec_env(line(N), WORLDS, seed=N, reward={"harm": 0.02})))
+    model = PPO(
+        "MlpPolicy", env, n_steps=64, batch_size=1024, n_epochs=4, learning_rate=1e-3, gamma=1.0, gae_lambda=0.95,
+        policy_kwargs={"net_arch": list(HIDDEN)}, seed=N, device="cpu",
+    )  # fmt: skip
+    model.learn(steps)
+    state = model.policy.state_dict()
+    kept = {}
+    for k, name in enumerate([*(f"mlp_extractor.policy_net.{2 * k}" for k in range(len(HIDDEN))), "action_net"]):
+        kept |= {f"weight{k}": state[f"{name}.weight"].numpy(), f"bias{k}": state[f"{name}.bias"].numpy()}
+    np.savez(ROOT / "tests" / "shield" / f"adversary-{N}.npz", **kept)
+    paid = np.mean([episode["r"] for episode in model.ep_info_buffer])
+    return Told(None, f"{steps:,} steps, mean harm of the last episodes {-paid / 0.02:.2f} m2/s2")

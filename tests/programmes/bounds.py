@@ -1,0 +1,147 @@
+"""The tests at the lowest versions that ``pyproject.toml`` allows, and at the newest that resolve.
+
+Each kind and each Python has an environment of its own below ``.venvs/``:
+
+- ``lowest``, ``highest``: the project with what it needs to train and to be tested; pytest runs there.
+- ``lowest-light``, ``highest-light``: the core alone, without torch; the commands of the light wheel run there.
+
+At the lowest versions each bound of ``pyproject.toml`` must be the version that was installed: no bound is lower than
+what was tried. What cannot be installed is skipped with a clear word.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from functools import partial
+from pathlib import Path
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
+
+from tests.programmes import KEPT, ROOT, Cases, Told
+from tests.programmes.environments import TORCH, NotInstalled, call_uv, find_uv, install_torch, new_environment, watched
+from tests.programmes.wheel import calls, run
+
+RESOLUTIONS = {"lowest": "lowest-direct", "highest": "highest"}
+KINDS = (*RESOLUTIONS, *(f"{resolution}-light" for resolution in RESOLUTIONS))
+EXTRAS = ("train", "dev")
+PYTHONS = ("3.11", "3.12", "3.13", "3.14")  # that the light kinds of --ci look for
+# Each interface, the physics with its golden worlds, and what touches most of the packages.
+TESTS = ("contract", "envs", "physics", "golden", "scenario", "agents", "evaluation", "files", "figures", "cli")
+CALM = "ignore::DeprecationWarning"  # that something will go from another package is what other versions differ in
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"of {', '.join(KINDS)}; default: all")
+    parser.add_argument("--python", action="append", help="an interpreter, may be given often; default: this one")
+    parser.add_argument("--tests", nargs="+", default=[f"tests/{folder}" for folder in TESTS])
+    parser.add_argument("--ci", action="store_true", help="the light core with every Python found, the rest with this")
+
+
+def cases(given: argparse.Namespace) -> Cases:
+    assert set(given.kinds) <= set(KINDS), f"{given.kinds}: there are {', '.join(KINDS)}"
+    chosen = [(kind, python) for python in given.python or [sys.executable] for kind in given.kinds or KINDS]
+    if given.ci:  # time may end: the lowest come first, as nobody uses those by chance, and most use the newest
+        light = [(kind, python) for python in PYTHONS for kind in KINDS if kind.endswith("-light")]
+        chosen = [("lowest", sys.executable), *light, ("highest", sys.executable)]
+    for kind, python in chosen:
+        yield f"{kind}, {python}", partial(attempt, kind, python, given.tests, given.until)
+
+
+def attempt(kind: str, python: str, paths: list[str], until: float) -> Told:
+    """Try one kind with one Python."""
+    light = kind.endswith("-light")
+    try:
+        there = make_environment(kind, find_python(python))
+        untried = untried_bounds(there, light) if kind.startswith("lowest") else []
+        tried = run_light(there, until) if light else run_tests(there, paths, until)
+    except NotInstalled as reason:
+        return Told(None, f"skipped: {reason}")
+    return Told(False, "; ".join([*untried, tried.text])) if untried else tried
+
+
+def make_environment(kind: str, python: str) -> Path:
+    """The interpreter of a new environment; raises ``NotInstalled``."""
+    resolution, _, light = kind.partition("-")
+    there = KEPT / f"{kind}-{version_of(python)}" / "bin" / "python"
+    install = new_environment(there, python)
+    resolve = [*install, "--resolution", RESOLUTIONS[resolution], "-e"]
+    if light:
+        call_uv([*resolve, str(ROOT)])
+    else:
+        install_torch(install)
+        call_uv([*resolve, f"{ROOT}[{','.join(EXTRAS)}]", TORCH])
+    return there
+
+
+def version_of(python: str) -> str:
+    """Such as 3.11; raises ``NotInstalled`` where it is no Python."""
+    ask = [python, "-c", "import sys; print('%d.%d' % sys.version_info[:2])"]
+    try:
+        return subprocess.run(ask, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        raise NotInstalled(f"{python} cannot be run") from None
+
+
+def find_python(version: str) -> str:
+    """An interpreter, or one of that version on the search path or kept by pyenv; raises ``NotInstalled``."""
+    if version not in PYTHONS:
+        return version
+    kept = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"), "versions").glob(f"{version}.*/bin/python")
+    for candidate in (shutil.which(f"python{version}"), *map(str, sorted(kept))):
+        try:
+            if candidate and version_of(candidate) == version:
+                return candidate
+        except NotInstalled:
+            continue
+    raise NotInstalled("not on this machine")
+
+
+def untried_bounds(python: Path, light: bool) -> list[str]:
+    """What ``pyproject.toml`` allows below the versions that are installed there; torch's number is given."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    extras = () if light else EXTRAS
+    asked = [*project["dependencies"], *(each for extra in extras for each in project["optional-dependencies"][extra])]
+    command = [find_uv(), "pip", "list", "--format", "json", "--python", str(python)]
+    listed = subprocess.run(command, capture_output=True, check=True)
+    installed = {canonicalize_name(row["name"]): Version(row["version"]) for row in json.loads(listed.stdout)}
+    found = []
+    for requirement in map(Requirement, asked):
+        name = canonicalize_name(requirement.name)
+        for bound in requirement.specifier:
+            if bound.operator == ">=" and name != "torch" and installed[name] != Version(bound.version):
+                found.append(f"{requirement} allows what was not tried: {installed[name]} was installed")
+    return found
+
+
+def run_tests(python: Path, paths: list[str], until: float) -> Told:
+    """Whether pytest passes there, and its last line."""
+    command = [str(python), "-m", "pytest", "-q", "-n", "2", "--dist", "worksteal", "-W", CALM, *paths]
+    caches = {"NUMBA_CACHE_DIR": str(python.parents[1] / "numba"), "PYTHONWARNINGS": CALM}
+    status, told = watched(command, until - time.monotonic(), **caches)
+    if status is None:
+        return Told(None, "skipped: no time left")
+    lines = told.strip().splitlines() or ["no output"]
+    red = [line for line in lines if line.startswith(("FAILED", "ERROR", "E  "))] if status else []
+    return Told(status == 0, "\n".join([lines[-1], *red]))
+
+
+def run_light(python: Path, until: float) -> Told:
+    """Whether all commands of the light core end as they must there, and how many."""
+    done = []
+    with tempfile.TemporaryDirectory(prefix="ethbrake-bounds-") as folder:
+        for call in calls():
+            if time.monotonic() >= until:
+                return Told(None, "skipped: no time left")
+            done.append((call.shown, run(call, python.parents[1], Path(folder))))
+    wrong = [f"\n{name}: {told.text}" for name, told in done if not told.good]
+    return Told(not wrong, f"{len(done) - len(wrong)} of {len(done)} commands of the light core{''.join(wrong)}")

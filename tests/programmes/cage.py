@@ -1,0 +1,337 @@
+"""What a hostile case is, and the cage in which it is judged: it can neither wait, grow, execute nor write unnoticed.
+
+Each case runs in a process of its own, whose folder is removed. The kernel (Landlock) and an audit hook of Python keep
+it, the superuser's too, from writing anywhere else.
+"""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import ctypes
+import dataclasses
+import errno
+import hashlib
+import inspect
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import stat
+import struct
+import sys
+import traceback
+import typing
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.errors import EthBrakeError
+
+CPU_LIMIT_S = 10  # of a case
+WALL_LIMIT_S = 90.0  # on a machine that does other things too
+MEMORY_LIMIT_BYTES = 2 << 30  # beyond what the libraries take
+LINE_LIMIT = 2_000  # characters
+REFUSED = 2
+BROKEN = 99  # exit status of a traceback
+
+Build = Callable[[Path], object]
+INSIDE = "inside"  # of a case's folder: where the command runs
+OUTSIDE = "outside"  # beside it: what no case may touch
+PRECIOUS = "precious.txt"
+HERE = "/@here"  # in a command or a variable: the absolute path of the folder where the command runs
+
+# Text of somebody who wants to move the cursor, hide or turn around what follows, or break a line.
+NASTY = (
+    "\x1b[2J\x1b[1;1H", "\x1b]0;owned\x07", "\x1b[31mred", "\r\nethbrake: OK", "\u202egnp.exe", "\u2066\u2069",
+    "\u200b\u200d", "\u2028line", "\u2029", "\x85", "\x9b31m", "\x08\x08\x08", "\x7f", "\ufeff",
+    "\U000e0001\U000e0041", "\xa0", "a\tb", "\u061c",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Case:
+    """One attempt. ``build`` fills the folder that becomes the current one of ``command``."""
+
+    category: str
+    command: tuple[str, ...]
+    build: Build
+    certain: bool = True  # it must be refused; otherwise it may also be found to be in order
+    reader: Callable[[], object] | None = None  # the same through Python: must raise an error of the project's family
+    meanwhile: Build | None = None  # goes on in another process while the command runs
+    environment: Mapping[str, str] = field(default_factory=dict)
+    may_change: tuple[str, ...] = ()  # what a command that is not refused may write, inside the folder
+
+
+Generator = Callable[[random.Random], Iterator[Case]]
+
+
+def write(path: Path, content: bytes | str) -> None:
+    """Write a file and the folders above it; text in UTF-8, lone surrogates included."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content if isinstance(content, bytes) else content.encode("utf-8", "surrogatepass"))
+
+
+def damaged(rng: random.Random, data: bytes) -> bytes:
+    """Data as a disk or a bad connection leaves it: bits, bytes or blocks changed, lost, doubled or blank."""
+    at, length = rng.randrange(len(data)), rng.choice((1, 2, 16, 512))
+    before, lost, after = data[:at], data[at : at + length], data[at + length :]
+    changed = bytes([data[at] ^ 1 << rng.randrange(8)])
+    middle = rng.choice((changed + lost[1:], b"", bytes(len(lost)), rng.randbytes(length) + lost, data[:length] + lost))
+    return before + middle + (after if rng.random() < 0.8 else b"")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How a case ended; ``faults`` are the rules that it broke."""
+
+    status: int
+    cpu_s: float
+    longest: int  # characters of the longest line
+    message: str
+    faults: tuple[str, ...]
+
+
+def judge(case: Case, folder: Path) -> Verdict:
+    """Build the case in the new ``folder``, run it, and compare what happened with the rules."""
+    inside, beside = folder / INSIDE, frozenset(os.listdir(folder.parent))
+    write(folder / OUTSIDE / PRECIOUS, "years of work")
+    write(folder / OUTSIDE / "step_000000000001" / "kept.txt", "years of work")
+    inside.mkdir()
+    case.build(inside)
+    before = _content(folder)
+    streams = [folder.with_suffix(suffix) for suffix in (".out", ".err", ".seen")]
+    child = _forked(lambda: _run(case, inside, streams))
+    disturbing = _forked(lambda: _disturb(case, inside)) if case.meanwhile else 0
+    status, cpu_s = _wait(child)
+    if disturbing:
+        os.kill(disturbing, signal.SIGKILL)
+        os.waitpid(disturbing, 0)
+    out, err, seen = (path.read_bytes().decode("utf-8", "backslashreplace") for path in streams)
+    after, allowed = _content(folder), tuple(f"{INSIDE}/{name}" for name in case.may_change)
+    names = [] if case.meanwhile else [n for n in sorted(before | after) if before.get(n) != after.get(n)]
+    changed = [f"changed: {name}" for name in names if not (allowed and name.startswith(allowed))]
+    shutil.rmtree(folder, ignore_errors=True)
+    for path in streams:
+        path.unlink()
+    left = [f"left beside its folder: {name}" for name in sorted(frozenset(os.listdir(folder.parent)) - beside)]
+    deeds = [*map(json.loads, seen.splitlines()), *changed][:5]
+    faults = (*_faults_of_end(case, status, out, err), *deeds, *left)
+    return Verdict(status, cpu_s, max(map(len, (out + err).splitlines() or [""])), err.strip()[-LINE_LIMIT:], faults)
+
+
+def _forked(work: Callable[[], int]) -> int:
+    """A process that does this and exits with its status."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    child = os.fork()
+    if child:
+        return child
+    status = BROKEN
+    try:
+        status = work()
+    except BaseException:
+        traceback.print_exc()
+    with contextlib.suppress(BaseException):
+        sys.stdout.flush()
+        sys.stderr.flush()
+    os._exit(status)
+
+
+def _run(case: Case, inside: Path, streams: list[Path]) -> int:
+    for number, path in zip((1, 2), streams, strict=False):
+        os.dup2(os.open(path, os.O_CREAT | os.O_WRONLY), number)
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    seen = os.open(streams[2], os.O_CREAT | os.O_WRONLY | os.O_APPEND)
+    os.chdir(inside)
+    os.environ.update({name: value.replace(HERE, f"{inside}") for name, value in case.environment.items()})
+    size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    for what, most in (("AS", size + MEMORY_LIMIT_BYTES), ("CPU", CPU_LIMIT_S), ("CORE", 0)):
+        resource.setrlimit(getattr(resource, f"RLIMIT_{what}"), (most, most))
+    own = os.path.realpath(inside) + os.sep
+    if can_confine():
+        confine(inside)
+    sys.addaudithook(lambda event, arguments: _watch(event, arguments, seen))
+    sys.addaudithook(lambda event, arguments: _keep_inside(event, arguments, own, seen))
+    if case.reader is not None:
+        _read(case, seen)
+    return run_command([word.replace(HERE, f"{inside}") for word in case.command])
+
+
+def _read(case: Case, seen: int) -> None:
+    """The same through Python; what comes back is told to the judge."""
+    try:
+        case.reader()
+    except EthBrakeError as error:
+        text = str(error)
+        if not text.isprintable() or len(text) > LINE_LIMIT:
+            _tell(seen, f"message of {type(error).__name__}: {text!r:.200}")
+    except MemoryError:
+        _tell(seen, "memory: through Python")
+    except Exception as error:
+        _tell(seen, f"python: {type(error).__name__}: {error!r:.200}")
+    else:
+        if case.certain:
+            _tell(seen, "python: no error")
+
+
+def _disturb(case: Case, inside: Path) -> int:
+    if can_confine():
+        confine(inside)
+    while True:
+        case.meanwhile(inside)
+
+
+def _wait(child: int) -> tuple[int, float]:
+    """Exit status (negative: signal) and processor time; what takes too long is killed."""
+    before = signal.signal(signal.SIGALRM, lambda *_: os.kill(child, signal.SIGKILL))
+    signal.setitimer(signal.ITIMER_REAL, WALL_LIMIT_S)
+    try:
+        _, status, used = os.wait4(child, 0)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    return os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime
+
+
+def _faults_of_end(case: Case, status: int, out: str, err: str) -> Iterator[str]:
+    errors = [line for line in err.split("\n") if line.startswith("ethbrake: error: ")]
+    if status not in (0, REFUSED):
+        yield f"exit status {status}: {err.strip().splitlines()[-1:]}"[:300]
+    if status == 0 and case.certain:
+        yield "was not refused"
+    if status == REFUSED and (len(errors) != 1 or not err.endswith(errors[-1] + "\n")):
+        yield f"not one line of error: {err!r:.300}"
+    if status == REFUSED and case.certain and "not enough memory" in err:
+        yield "was unpacked before it was refused"
+    if "Traceback" in err + out:
+        yield "traceback"
+    kept = "\t" if status else "\t\N{NO-BREAK SPACE}"  # the latter stands between the numbers and units of a result
+    asked = {"FORCE_COLOR", "TTY_COMPATIBLE"} & case.environment.keys()  # colours
+    for line in (out + err).split("\n"):
+        if not line.translate({ord(character): " " for character in kept}).isprintable() and (status or not asked):
+            yield f"a line commands the terminal: {line!r:.200}"
+        if status == REFUSED and len(line) > LINE_LIMIT:
+            yield f"a line of {len(line)} characters"
+
+
+def _content(folder: Path) -> dict[str, str]:
+    """What stands in a folder: for each name its kind, and for a plain file what it holds."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        about = path.lstat()
+        text = f"{stat.S_IFMT(about.st_mode)}"
+        if stat.S_ISREG(about.st_mode):
+            digest = hashlib.sha256(path.read_bytes()).hexdigest() if about.st_size < 1 << 24 else ""
+            text += f" {about.st_size} {digest}"
+        elif stat.S_ISLNK(about.st_mode):
+            text += f" {os.readlink(path)!r}"
+        found[os.fspath(path.relative_to(folder))] = text
+    return found
+
+
+# ---------------------------------------------------------------- the audit hooks
+
+_EXECUTING = (
+    "os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "os.forkpty", "pty.spawn", "subprocess.Popen",
+    "pickle.find_class", "marshal.load", "marshal.loads", "ctypes.dlopen", "code.__new__", "function.__new__",
+    "socket.connect", "socket.bind", "webbrowser.open", "builtins.input",
+)  # fmt: skip
+_WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+# The arguments that an event changes, each with the one that may hold the folder to which its name is relative.
+_CHANGING: dict[str, tuple[tuple[int, int | None], ...]] = {
+    "os.mkdir": ((0, 2),), "os.remove": ((0, 1),), "os.rmdir": ((0, 1),), "os.truncate": ((0, None),),
+    "os.chmod": ((0, 2),), "os.chown": ((0, 3),), "os.utime": ((0, 3),), "os.link": ((1, 3),), "os.symlink": ((1, 2),),
+    "os.rename": ((0, 2), (1, 3)), "shutil.rmtree": ((0, 1),),
+}  # fmt: skip
+_READ_ANNOTATIONS = {inspect.__file__, typing.__file__, dataclasses.__file__, collections.__file__}
+
+
+def _watch(event: str, arguments: tuple[Any, ...], seen: int) -> None:
+    """Tell what is executed; code of a module that is imported late, or an annotation in it, is not."""
+    if event not in _EXECUTING and event != "exec":
+        return  # asking for the caller is an event, too
+    caller = sys._getframe(2)
+    file = caller.f_code.co_filename
+    if event.startswith("marshal.") and file.startswith("<frozen importlib"):
+        return
+    late = os.path.isfile(getattr(arguments[0], "co_filename", "")) or file in _READ_ANNOTATIONS
+    if event != "exec" or not late:
+        _tell(seen, f"executed: {event} {arguments!r:.60} by {file}:{caller.f_lineno}")
+
+
+def _keep_inside(event: str, arguments: tuple[Any, ...], own: str, seen: int) -> None:
+    """Refuse, and tell, whatever would change something outside the case's own folder, whoever runs the attack."""
+    if event == "open":
+        writes = isinstance(arguments[2], int) and arguments[2] & _WRITING
+        places = [os.path.realpath(os.fsdecode(arguments[0]))] if writes and not isinstance(arguments[0], int) else []
+    else:
+        places = [
+            _entry(os.fsdecode(arguments[k]), None if base is None else arguments[base])
+            for k, base in _CHANGING.get(event, ())
+            if not isinstance(arguments[k], int)
+        ]
+    for place in places:
+        if place != os.devnull and not f"{place}{os.sep}".startswith(own):
+            _tell(seen, f"would have changed what is outside: {event} {place}"[:300])
+            raise PermissionError(errno.EPERM, "outside the case's folder", place)
+
+
+def _entry(path: str, base: int | None) -> str:
+    """A path whose last part is not followed; ``base`` is an open folder to which it is relative, or -1."""
+    if isinstance(base, int) and base >= 0:
+        path = os.path.join(os.readlink(f"/proc/self/fd/{base}"), path)
+    return os.path.join(os.path.realpath(os.path.dirname(path) or "."), os.path.basename(path))
+
+
+def _tell(seen: int, what: str) -> None:
+    """Write one line to the judge."""
+    os.write(seen, (json.dumps(what) + "\n").encode())
+
+
+# ---------------------------------------------------------------- the kernel's own cage
+
+OLDEST_ABI = 3  # of Landlock, Linux 6.2: before it, truncation could not be forbidden
+_CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446  # system calls, the same numbers on every machine
+_VERSION_ONLY, _BENEATH = 1, 1
+_SIGNAL_AT_DEATH_OF_PARENT, _NO_NEW_PRIVILEGES = 1, 38  # of prctl
+_WRITE_FILE, _TRUNCATE = 1 << 1, 1 << 14
+_CHANGE = _WRITE_FILE | sum(1 << k for k in range(4, 14)) | _TRUNCATE  # write, remove, make, rename, cut
+
+_kernel = ctypes.CDLL(None, use_errno=True)  # loaded before a case is watched: its audit hook tells what is loaded
+
+
+def die_with_parent() -> None:
+    """Let the kernel end this process when the one that forked it ends."""
+    _accepted(int(_kernel.prctl(_SIGNAL_AT_DEATH_OF_PARENT, signal.SIGKILL, 0, 0, 0)))
+
+
+def can_confine() -> bool:
+    """Whether this kernel can keep a process, the superuser's too, from writing outside a folder."""
+    return int(_kernel.syscall(_CREATE_RULESET, None, ctypes.c_size_t(0), _VERSION_ONLY)) >= OLDEST_ABI
+
+
+def confine(folder: Path) -> None:
+    """From here on this process and its children write below ``folder`` (and to /dev/null) or not at all.
+
+    Cannot be undone; a second call only narrows it. Raises ``OSError`` where the kernel refuses.
+    """
+    size = ctypes.c_size_t(8)
+    rules = _accepted(int(_kernel.syscall(_CREATE_RULESET, struct.pack("<Q", _CHANGE), size, 0)))
+    for place, allowed in ((os.fspath(folder), _CHANGE), (os.devnull, _WRITE_FILE | _TRUNCATE)):
+        opened = os.open(place, os.O_PATH | os.O_CLOEXEC)
+        _accepted(int(_kernel.syscall(_ADD_RULE, rules, _BENEATH, struct.pack("<Qi", allowed, opened), 0)))
+        os.close(opened)
+    _accepted(int(_kernel.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0)))
+    _accepted(int(_kernel.syscall(_RESTRICT_SELF, rules, 0)))
+    os.close(rules)
+
+
+def _accepted(answer: int) -> int:
+    if answer < 0:
+        raise OSError(ctypes.get_errno(), "the kernel refused")
+    return answer

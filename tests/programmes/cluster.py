@@ -1,0 +1,118 @@
+"""A sweep on a Ray cluster of two nodes on this machine, while its workers are killed at random and its driver once.
+
+Jobs only count, with a checkpoint of every step (200 of them take two minutes), or they train a tiny policy (half an
+hour of two cores, most of it for loading torch after each kill). The table must be that of an undisturbed sweep by
+local processes, byte for byte, and no job may be lost or doubled.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import secrets
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+
+import yaml
+
+from tests.programmes import Cases, Told
+from tests.studies.conftest import RECIPE
+from tests.studies.counting import PROGRAM, holders, journal
+
+WORK = {
+    "counting": ([sys.executable, "-m", "tests.studies.counting"], []),
+    "training": ([*PROGRAM, "study", "sweep"], ["--retries", "5", "--output"]),
+}
+NODES = 2  # with one core each
+LONGEST_S = 3600.0
+
+
+def write_sweep(folder: Path, jobs: int) -> Path:
+    (folder / "tiny.yaml").write_text(yaml.safe_dump(RECIPE))
+    grid = {"scenario": "paper-random", "recipe": str(folder / "tiny.yaml"), "seed": {"count": jobs}}
+    path = folder / "sweep.yaml"
+    path.write_text(yaml.safe_dump({"grid": grid}))
+    return path
+
+
+def disturb(
+    driver: subprocess.Popen[bytes], out: Path, hits: dict[str, int], wanted: int, chance: random.Random, ends_at: int
+) -> int:
+    """Kill workers until ``wanted`` jobs were hit once, and the driver at so many finished jobs; its exit status."""
+    seen: dict[str, float] = {}  # job -> when it is killed
+    end = time.monotonic() + LONGEST_S
+    while driver.poll() is None and time.monotonic() < end:
+        now = time.monotonic()
+        for process, job in holders(out).items():
+            if job not in seen:
+                seen[job] = now + chance.uniform(0.0, 0.5) if chance.random() < 0.5 else float("inf")
+            if job not in hits and len(hits) < wanted and now >= seen[job]:
+                with suppress(ProcessLookupError):
+                    os.kill(process, signal.SIGKILL)
+                    hits[job] = process
+        if sum(one["status"] == "finished" for one in journal(out)) >= ends_at:
+            driver.kill()
+        time.sleep(0.02)
+    driver.kill()
+    return driver.wait()
+
+
+def run(folder: Path, given: argparse.Namespace) -> Told:
+    """The sweep by local processes, then on the cluster."""
+    import ray
+    from ray.cluster_utils import Cluster
+
+    jobs, out, wanted = given.jobs, folder / "cluster", round(given.share * given.jobs)
+    file = write_sweep(folder, jobs)
+    started = time.monotonic()
+    program, options = WORK[given.work]
+    subprocess.run([*program, str(file), *options, str(folder / "local"), "--jobs", "2"], check=True)
+    print(f"undisturbed, two local processes: {time.monotonic() - started:.0f} s", flush=True)
+    node = {"num_cpus": 1, "include_dashboard": False, "object_store_memory": 100 << 20}
+    cluster = Cluster(initialize_head=True, head_node_args=node)
+    for _ in range(NODES - 1):
+        cluster.add_node(num_cpus=1, object_store_memory=100 << 20)
+    command = [*program, str(file), *options, str(out), "--ray", cluster.address]
+    hits: dict[str, int] = {}
+    chance, started = random.Random(given.seed), time.monotonic()
+    try:
+        killed = disturb(subprocess.Popen(command), out, hits, wanted, chance, jobs // 2)
+        told = f"the driver by signal {-killed} after {len(journal(out))} attempts"
+        status = disturb(subprocess.Popen(command), out, hits, wanted, chance, jobs + 1)
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+    entries = journal(out)
+    finished = Counter(one["job"] for one in entries if one["status"] == "finished")
+    same = (out / "results.csv").read_bytes() == (folder / "local" / "results.csv").read_bytes()
+    lost, doubled = jobs - len(finished), sum(count > 1 for count in finished.values())
+    return Told(
+        same and not lost and not doubled and status == 0 and len(hits) == wanted,
+        f"{NODES} raylets: {len(hits)} jobs hit, {told}, {time.monotonic() - started:.0f} s;"
+        f" tries again {sum(one['status'] == 'again' for one in entries)}; lost {lost}, doubled {doubled};"
+        f" table {'the same, byte for byte' if same else 'ANOTHER'}",
+    )
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--jobs", type=int, default=200)
+    parser.add_argument("--share", type=float, default=0.2)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--work", choices=list(WORK), default="counting")
+
+
+def cases(given: argparse.Namespace) -> Cases:
+    # Before Ray is loaded: 127.0.0.1 is the address of both nodes, and a token is asked of everybody.
+    os.environ |= {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_AUTH_MODE": "token", "RAY_USAGE_STATS_ENABLED": "0"}
+    os.environ["RAY_raylet_start_wait_time_s"] = "300"  # noqa: SIM112  # Ray's own spelling; much else may run here
+    os.environ |= {"RAY_AUTH_TOKEN": secrets.token_hex(32), "PYTHONPATH": os.getcwd()}
+    with tempfile.TemporaryDirectory(prefix="ethbrake-") as folder:
+        yield f"{given.jobs} jobs, {given.work}", partial(run, Path(folder), given)

@@ -1,0 +1,136 @@
+"""Every printed block, table and picture of the pages that a command makes in minutes, made again and compared.
+
+Blocks must be the same lines, pictures the same pixels; each figure of a table, to its decimals, must be among the
+numbers that its commands tell. What is compared by `make test`, and what by nothing because it takes a training, a long
+search or one machine's speed, is said in tests/docs/printed.py and docs/tests.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from tests.docs.blocks import (
+    ROOT,
+    Shown,
+    agrees,
+    commands_of,
+    missing_figures,
+    pictures,
+    printed_blocks,
+    tables_of_figures,
+)
+from tests.docs.printed import BLOCKS, NIGHTLY, PICTURES, TABLES, How, how
+from tests.programmes import Cases, Told
+
+PROGRESS = re.compile(r": [\d,]+ of [\d,]+$|^compiling ")
+PROGRAM = re.compile(r"```python\n((?:(?!```).)*?{name}(?:(?!```).)*?)```", re.DOTALL)
+
+
+def run(command: str, folder: Path) -> str:
+    """What a command tells on stderr and stdout, in this order; raises ``RuntimeError`` where it fails."""
+    words = shlex.split(command)
+    words[1:] = [str(ROOT / word) if word.startswith("docs/studies/") else word for word in words[1:]]
+    called = [sys.executable, *(["-m", "ethbrake_marl"] if words[0] == "ethbrake" else []), *words[1:]]
+    variables = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "100", "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
+    done = subprocess.run(called, cwd=folder, env=variables, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"exit status {done.returncode}: {done.stderr[-300:]}")
+    return done.stderr + done.stdout
+
+
+@cache
+def told_by(command: str) -> str:
+    """What a command tells that several tables may show."""
+    with tempfile.TemporaryDirectory() as folder:
+        return run(command, Path(folder))
+
+
+def differing_block(block: Shown, place: How, folder: Path) -> list[str]:
+    """What the commands of a block print that is not shown; how far they are (``500 of 2,000``) is not compared."""
+    found = []
+    for command, shown in commands_of(block.text):
+        wanted, told = (
+            [line for line in lines if not PROGRESS.search(line)]
+            for lines in (shown, run(command, folder).splitlines())
+        )
+        if not agrees(wanted, told):
+            found += [f"{command} prints", *(f"    {line}" for line in told if line.rstrip() not in wanted)]
+    return found
+
+
+def differing_table(table: Shown, place: How, folder: Path) -> list[str]:
+    """The figures of a table that its commands do not tell."""
+    told = "\n".join(map(told_by, place.by))
+    return [figure for figure in missing_figures(table.text, told) if figure not in place.quoted]
+
+
+def differing_picture(picture: Shown, place: How, folder: Path) -> list[str]:
+    """Whether a picture has other pixels, in words."""
+    for command in place.by:
+        if command.startswith(("ethbrake", "python")):
+            run(command, folder)
+        else:  # the program that stands on its page
+            found = re.search(
+                PROGRAM.pattern.format(name=re.escape(picture.begin)),
+                (ROOT / picture.page).read_text("utf-8"),
+                re.DOTALL,
+            )
+            if found is None:
+                return ["no program on its page makes it"]
+            run(shlex.join(["python", "-c", found[1]]), folder)
+    if picture.begin.endswith(".svg"):
+        same = (ROOT / "docs" / "figures" / picture.begin).read_bytes() == (folder / picture.begin).read_bytes()
+        return [] if same else ["other bytes"]
+    old, new = (
+        np.asarray(Image.open(path / picture.begin).convert("RGBA"), int)
+        for path in (ROOT / "docs" / "figures", folder)
+    )
+    if old.shape != new.shape:
+        return [f"{new.shape[1]} x {new.shape[0]} pixels, not {old.shape[1]} x {old.shape[0]}"]
+    share = float((np.abs(old - new).max(axis=2) > 8).mean())  # fainter differences are the drawing library's
+    return [f"{share:.2%} of the pixels"] if share > 1e-4 else []
+
+
+def nightly() -> Iterator[tuple[str, Shown, How]]:
+    """(kind, what is shown, how it is made) of all that is compared here; one that several pages show, once."""
+    done = set()
+    for kind, shown, table in (
+        ("block", printed_blocks, BLOCKS),
+        ("table", tables_of_figures, TABLES),
+        ("picture", pictures, PICTURES),
+    ):
+        for each in shown():
+            place = how(table, each.begin)
+            if place is not None and place[1].where == NIGHTLY and (kind, each.text) not in done:
+                done.add((kind, each.text))
+                yield kind, each, place[1]
+
+
+COMPARE = {"block": differing_block, "table": differing_table, "picture": differing_picture}
+
+
+def compare(kind: str, shown: Shown, place: How) -> Told:
+    """Make one of them again."""
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            found = COMPARE[kind](shown, place, Path(folder))
+        except RuntimeError as error:
+            found = [str(error)]
+    return Told(not found, "\n        ".join(f"{each:.200}" for each in found) or "the same")
+
+
+def cases(given: argparse.Namespace) -> Cases:
+    for kind, shown, place in nightly():
+        yield f"{shown.page}: {shown.begin:.70}", partial(compare, kind, shown, place)

@@ -1,0 +1,303 @@
+"""Other people's libraries: every block of docs/other-libraries.md is run as it stands, and what it trained drives.
+
+Each library has an environment of its own below ``.venvs/``, kept for the next run, with this project as it stands.
+What cannot be installed is skipped, and the reason told. A policy is measured on a fixed list of worlds beside full
+braking, and where the library evaluates policies by itself, its harm is compared with ours, world by world.
+``--write`` puts the rows into the table of the page. ``--ci`` takes the libraries that are cheap to install.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tests.programmes import KEPT, ROOT, Cases, Told
+from tests.programmes.environments import NotInstalled, ready_python, watched
+
+PAGE = ROOT / "docs" / "other-libraries.md"
+SCENARIO, EPISODES, SEED = "paper-random", 500, 7
+OWN_EPISODES, CLOSE = 50, 1e-5  # of the library's own evaluation; m2/s2
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+BLOCK = re.compile(
+    r"^(?P<title>[^\n]+) \((?P<ran>[^\n]+)\):\n\n"
+    r"(?:With these networks or settings:\n\n```python\n(?P<before>.*?)```\n\n)?"
+    r"```(?P<language>\w+)\n(?P<code>.*?)```\n(?:\nThe loop that follows:\n\n```python\n(?P<after>.*?)```\n)?",
+    re.MULTILINE | re.DOTALL,
+)
+
+
+class Way(NamedTuple):
+    """One way to train with a library, as the page shows it."""
+
+    library: str
+    title: str
+    ran: str  # which algorithm, and how long
+    language: str
+    code: str  # what a user copies
+    whole: str  # with networks or settings before it, and a loop after it
+
+
+class Library(NamedTuple):
+    """What the environment of a library holds beside this project, at the versions that were tried."""
+
+    requires: tuple[str, ...]
+    package: str = ""  # the distribution whose version is told; empty: the first that is required
+    in_ci: bool = False
+    finish: Callable[[dict[str, Any]], Any] = lambda names: names.get("agent")  # names of a block -> agent or policy
+
+    @property
+    def told(self) -> str:
+        return self.package or re.split(r"[\[=<]", self.requires[0])[0]
+
+
+def ways() -> list[Way]:
+    """Every way, in the order of the page."""
+    found = []
+    for section in PAGE.read_text("utf-8").split("\n## ")[1:]:
+        for each in BLOCK.finditer(section):
+            whole = "\n".join(each[part] or "" for part in ("before", "code", "after"))
+            found.append(
+                Way(section.partition("\n")[0], each["title"], each["ran"], each["language"], each["code"], whole)
+            )
+    return found
+
+
+# ---------------------------------------------------------------- what becomes of a block: an agent, or a policy
+
+
+def deterministic(call: Callable[[Any], Any]) -> Any:
+    """What a policy of TorchRL does, without exploration."""
+    import torch
+    from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        return call(torch)
+
+
+def of_torchrl(names: dict[str, Any]) -> Any:
+    from tensordict import TensorDict
+
+    def torchrl(seen: Any) -> Any:
+        return deterministic(
+            lambda torch: actor(TensorDict({"observation": torch.tensor(seen)}, [len(seen)]))["action"]
+        )
+
+    actor = names.get("actor")
+    return actor and torchrl
+
+
+def of_benchmarl(names: dict[str, Any]) -> Any:
+    if "experiment" not in names:
+        assert list(Path("outputs").rglob(".hydra")), "its command line left nothing"
+        return None
+    from tensordict import TensorDict
+
+    policy = names["experiment"].group_policies["learners"]
+
+    def benchmarl(seen: Any) -> Any:
+        def ask(torch: Any) -> Any:
+            each = TensorDict({"observation": torch.tensor(seen)[:, None]}, [len(seen), 1])
+            return policy(TensorDict({"learners": each}, [len(seen)]))["learners", "action"][:, 0]
+
+        return deterministic(ask)
+
+    return benchmarl
+
+
+def of_zoo(names: dict[str, Any]) -> Any:
+    from stable_baselines3 import PPO
+
+    (file,) = Path("logs").glob("ppo/*/EthBrake-v0.zip")
+    return PPO.load(file)
+
+
+def of_cleanrl(names: dict[str, Any]) -> None:
+    env = names["env"]
+    env.reset(seed=1)
+    for _ in range(2_048):
+        if any(env.step(env.action_space.sample())[2:4]):
+            env.reset()
+    env.close()
+    assert list(Path("videos").rglob("*.mp4")), "no film"
+
+
+def of_skrl(names: dict[str, Any]) -> Any:
+    import torch
+
+    def skrl(seen: Any) -> Any:
+        with torch.no_grad():
+            _, told = names["agent"].policy.act({"observations": torch.tensor(seen)}, role="policy")
+        return told["mean_actions"].clamp(-1, 1)
+
+    return skrl
+
+
+def of_tianshou(names: dict[str, Any]) -> Any:
+    from tianshou.data import Batch
+
+    policy = names["result"].world.algorithm.policy.eval()
+    return lambda seen: policy.map_action(policy(Batch(obs=seen, info=Batch())).act)
+
+
+def of_agilerl(names: dict[str, Any]) -> Any:
+    agent = names["ppo"]
+    agent.set_training_mode(False)
+    return lambda seen: agent.get_action(seen)[0].reshape(-1, 1)
+
+
+def of_minari(names: dict[str, Any]) -> None:
+    """The recovered environment plays every episode again, to the bit."""
+    env = names["data"].recover_environment()
+    assert env.unwrapped.engine.observation.front == 2
+    for k, episode in enumerate(names["data"].iterate_episodes()):
+        observed = [env.reset(seed=k)[0]]
+        for action, paid, cost in zip(episode.actions, episode.rewards, episode.infos["cost"][1:], strict=True):
+            seen, reward, *_, info = env.step(action)
+            observed.append(seen)
+            assert (reward, info["cost"]) == (paid, cost)
+        assert np.array_equal(observed, episode.observations)
+
+
+LIBRARIES = {  # by the heading of their section
+    "Stable-Baselines3": Library(("stable-baselines3==2.9.2",), in_ci=True),
+    "RL Baselines3 Zoo": Library(("rl_zoo3==2.9.2",), finish=of_zoo),
+    "CleanRL": Library(("moviepy==2.2.1",), "gymnasium", in_ci=True, finish=of_cleanrl),
+    "TorchRL": Library(("torchrl==0.14.1",), in_ci=True, finish=of_torchrl),
+    "BenchMARL": Library(
+        ("benchmarl==1.5.2", "torchrl<0.12", "tensordict<0.12", "stable-baselines3==2.9.2"), finish=of_benchmarl
+    ),
+    "RLlib": Library(("ray[rllib]==2.60.0",)),
+    "skrl": Library(("skrl==2.1.1",), finish=of_skrl),
+    "Tianshou": Library(("tianshou[eval]==2.0.1",), finish=of_tianshou),
+    "AgileRL": Library(("agilerl==2.7.1",), finish=of_agilerl),
+    "Minari": Library(("minari[create,hdf5]==0.5.4",), in_ci=True, finish=of_minari),
+    "SuperSuit": Library(("supersuit==3.11.0", "stable-baselines3==2.9.2"), in_ci=True),
+}
+BRIEF = ("Tianshou", "AgileRL")  # run two iterations: too little to learn, so need not beat full braking
+
+
+# ---------------------------------------------------------------- in the library's own environment
+
+
+def tell(k: int) -> None:
+    """Run the k-th way in the current folder, measure what it trained, and print its cells of the table as JSON."""
+    import ethbrake_marl as eb
+
+    way = ways()[k]
+    library, scenario = LIBRARIES[way.library], eb.load_scenario(SCENARIO)
+    drive = partial(eb.evaluate, scenario=scenario)
+    drive(scenario.sample(10, SEED), {"coast": eb.make_agent("coast")})  # compiles the physics: no way's time
+    begun, names = cpu_seconds(), {"__name__": "copied"}
+    if way.language == "sh":
+        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+        subprocess.run(["bash", "-ec", way.code], check=True, env={**os.environ, "PATH": path})
+    else:
+        exec(compile(way.whole, way.title, "exec"), names)
+    seconds = cpu_seconds() - begun
+    policy = library.finish(names)
+    harm = braking = own = ""
+    verdict = "runs"
+    if policy is not None:
+        ready = hasattr(policy, "begin") or isinstance(policy, eb.Team)
+        agent = policy if ready else eb.policy_agent(policy, clip=True)
+        result = drive(scenario.sample(EPISODES, SEED), {"full_brake": eb.make_agent("full_brake"), "theirs": agent})
+        theirs, full = (float(result.outcome(name).first_impact_harm.mean()) for name in ("theirs", "full_brake"))
+        harm, braking = f"{theirs:.2f}", f"{full:.2f}"
+        if way.library == "Stable-Baselines3":
+            difference = evaluated_by_itself(names["model"], agent)
+            assert difference <= CLOSE, f"{difference:.2g} m2/s2 from the library's own evaluation"
+            own = f"{difference:.0e}"
+        if way.library not in BRIEF:
+            assert theirs < full, f"{harm}: does not beat full braking"
+            verdict = "beats full braking"
+    print(json.dumps([version(library.told), harm, braking, own, f"{seconds:.0f}", verdict]))
+
+
+def evaluated_by_itself(model: Any, agent: Any) -> float:
+    """Largest difference of any world's harm, m2/s2, by its own ``evaluate_policy``: the reward is minus the harm."""
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.evaluation import evaluate_policy
+
+    import ethbrake_marl as eb
+
+    scenario = eb.load_scenario(SCENARIO)
+    sample = scenario.sample(OWN_EPISODES, SEED, channel="training")  # the worlds of ``env.reset(seed=SEED)``
+    ours = eb.evaluate(sample, {"theirs": agent}, scenario=scenario).outcome("theirs").first_impact_harm
+    worlds = make_vec_env("EthBrake-v0", seed=SEED)
+    returns, _ = evaluate_policy(model, worlds, OWN_EPISODES, deterministic=True, return_episode_rewards=True)
+    return float(np.abs(ours + returns).max())
+
+
+def cpu_seconds() -> float:
+    """Of this process and of all that it started and that has ended."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(one.ru_utime + one.ru_stime for one in used)
+
+
+# ---------------------------------------------------------------- here
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--ci", action="store_true", help="only the libraries that are cheap to install")
+    parser.add_argument("--limit", type=float, default=900.0, help="seconds for one way")
+    parser.add_argument("--write", action="store_true", help="write the rows into the table of the page")
+
+
+def cases(given: argparse.Namespace) -> Cases:
+    for k, way in enumerate(ways()):
+        if LIBRARIES[way.library].in_ci or not given.ci:
+            yield f"{way.library}: {way.title} ({way.ran})", partial(run, k, way, given)
+
+
+def run(k: int, way: Way, given: argparse.Namespace) -> Told:
+    """Run one way in its library's environment."""
+    name = re.sub(r"\W+", "_", way.library.lower())
+    try:
+        python = ready_python(name, LIBRARIES[way.library].requires)
+    except NotInstalled as reason:
+        return Told(None, f"skipped: {reason}")
+    folder = KEPT / "work" / f"{name}-{k}"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    call = f"import os; os.chdir({str(folder)!r}); from tests.programmes import libraries; libraries.tell({k})"
+    variables = {"MINARI_DATASETS_PATH": str(folder), "PYTHONUNBUFFERED": "1", **ONE_THREAD}  # not among the user's own
+    limit = min(given.limit, given.until - time.monotonic())
+    status, told = watched([str(python), "-W", "ignore", "-c", call], limit, **variables)
+    if status is None:
+        return Told(None if limit < given.limit else False, f"not done after {limit:.0f} s")
+    last = (told.strip().splitlines() or [""])[-1]
+    if status:
+        return Told(False, f"status {status}: {last}")
+    cells = json.loads(last)
+    if given.write:
+        write_row(way, cells)
+    return Told(True, "  ".join(filter(None, cells)))
+
+
+def write_row(way: Way, cells: list[str]) -> None:
+    """Put a row into the table of the page, in the place of the one of the same library and way."""
+    told, *rest = cells
+    row = f"| {' | '.join((way.library, told, lowered(way.title), way.ran, *rest))} |"
+    begin = rf"^\| {re.escape(way.library)} \| [^|]* \| {re.escape(lowered(way.title))} \|.*$"
+    text, found = re.subn(begin, lambda _: row, PAGE.read_text("utf-8"), flags=re.MULTILINE)
+    assert found == 1, f"the page has {found} rows of {way.library}, {way.title}"
+    PAGE.write_text(text, "utf-8")
+
+
+def lowered(title: str) -> str:
+    """A title as it stands in the table."""
+    return title if title[:2].isupper() else title[0].lower() + title[1:]

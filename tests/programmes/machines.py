@@ -1,0 +1,178 @@
+"""The same bits on other processors: every recorded result, computed again as nine older ones would.
+
+Computes one hash for each thing that is recorded somewhere: worlds of every shipped scenario and of the benchmark,
+physics, episodes with rewards and observations, E-V2X-BM, searches, bounds, shield decisions, tallies, intervals and
+the actions of policies. First as this machine does, then in one process for each of the settings below, which make
+numpy, the C library, OpenBLAS or numba behave as on an older processor.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from tests.programmes import ROOT, Cases, Told
+
+SETTINGS: dict[str, dict[str, str]] = {
+    "numpy without AVX-512": {"NPY_DISABLE_CPU_FEATURES": "X86_V4"},
+    "numpy without AVX-512, AVX2, FMA": {"NPY_DISABLE_CPU_FEATURES": "X86_V4 X86_V3"},
+    "C library without FMA, AVX2, AVX": {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-FMA,-AVX2,-AVX"},
+    "OpenBLAS for Nehalem": {"OPENBLAS_CORETYPE": "Nehalem"},
+    "OpenBLAS for Zen": {"OPENBLAS_CORETYPE": "Zen"},
+    "all of these at once": {
+        "NPY_DISABLE_CPU_FEATURES": "X86_V4 X86_V3",
+        "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-FMA,-AVX2,-AVX",
+        "OPENBLAS_CORETYPE": "Nehalem",
+    },
+    "kernels for x86-64-v3": {"NUMBA_CPU_NAME": "x86-64-v3", "NUMBA_CPU_FEATURES": ""},
+    "kernels for x86-64-v2": {"NUMBA_CPU_NAME": "x86-64-v2", "NUMBA_CPU_FEATURES": ""},
+    "kernels for x86-64": {"NUMBA_CPU_NAME": "x86-64", "NUMBA_CPU_FEATURES": ""},
+}
+HARD = ("stress-wide", "realistic-mixed", "paper-random")  # two with distributions that need functions of our own
+
+
+def digest(*columns: Any) -> str:
+    """The first 16 digits of a hash of these arrays."""
+    found = hashlib.sha256()
+    for column in columns:
+        found.update(np.ascontiguousarray(column).tobytes())
+    return found.hexdigest()[:16]
+
+
+def lists() -> dict[str, str]:
+    from ethbrake_marl.evaluation.inputs import worlds_sha256
+    from ethbrake_marl.scenario import list_scenarios, load_scenario
+    from ethbrake_marl.studies.benchmark import load_suite, suite_names
+
+    found = {}
+    for entry in list_scenarios():
+        for seed, channel in ((7, "list"), (0, "training")):
+            sample = load_scenario(entry.name).sample(1_000, seed, channel=channel)
+            found[f"{channel} {entry.name}"] = worlds_sha256(sample.worlds, sample.index)
+    for name in suite_names():
+        for each in load_suite(name).lists:
+            sample = each.scenario.sample(each.content.worlds, each.content.seed)
+            found[f"suite {name} {each.name}"] = worlds_sha256(sample.worlds, sample.index)
+    return found
+
+
+def physics() -> dict[str, str]:
+    from tests.golden.test_golden import figures
+
+    return {"physics": str(figures("few")["sha256"])}
+
+
+def episodes() -> dict[str, str]:
+    """Observations and rewards of random actions, with every term and an angle as objective."""
+    from ethbrake_marl import make_sb3_vec_env
+
+    reward = {"harm": 1.0, "risk": 1.0, "jerk": 1e-5, "collision": 1.0, "shaping": 1.0, "objective": "social:37"}
+    found = {}
+    for name in HARD:
+        env, rng = make_sb3_vec_env(name, 32, seed=0, reward=reward), np.random.default_rng(0)
+        columns = [env.reset()]
+        for _ in range(40):
+            observed, rewards, *_ = env.step(rng.uniform(-1, 1, (32, 1)).astype(np.float32))
+            columns += [observed, rewards]
+        found[f"episodes {name}"] = digest(*columns)
+    return found
+
+
+def searches() -> dict[str, str]:
+    from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
+    from ethbrake_marl.limits.limits import best_harm
+    from ethbrake_marl.limits.lower_bound import lower_bound
+    from ethbrake_marl.scenario import load_scenario
+
+    found = {}
+    for name in HARD:
+        scenario = load_scenario(name)
+        worlds = scenario.sample(20, 7).worlds
+        found[f"e_v2x_bm {name}"] = digest(*optimise_coupled(worlds, 1, harm_count="total"))
+        best = best_harm(scenario, worlds, counts=("total",), budget=200, threads=1).best["total"]
+        found[f"search {name}"] = digest(best.harm, *best.profiles)
+        bound = lower_bound(worlds, 1, harm_count="total")
+        found[f"bound {name}"] = digest(bound.harm)
+    return found
+
+
+def shields() -> dict[str, str]:
+    from tests.golden.test_golden import SHIELDS, decisions_hash
+
+    return {f"shield {name}": decisions_hash(make()[0], 10) for name, make in SHIELDS.items()}
+
+
+def tallies() -> dict[str, str]:
+    from ethbrake_marl.evaluation.results import Question
+    from ethbrake_marl.evaluation.statistics import mean_over_seeds
+    from ethbrake_marl.harm import injury_probability
+    from ethbrake_marl.scenario import load_scenario
+
+    found = {}
+    for name in HARD[:2]:
+        asked = Question(load_scenario(name), ("full_brake", "e_v2x_bm", "universal@shipped"), 200, 11, "total").ask()
+        tally = json.dumps(asked.answer(0, 200).to_json(), sort_keys=True)
+        found[f"tally {name}"] = hashlib.sha256(tally.encode()).hexdigest()[:16]
+    rng = np.random.default_rng(0)
+    estimate = mean_over_seeds(rng.random((3, 400)), rng.random((3, 400)))
+    found["interval over seeds"] = digest(estimate.value, estimate.interval)
+    found["injury"] = digest(injury_probability(rng.uniform(-30, 30, 1_000), "front"))
+    return found
+
+
+def actions() -> dict[str, str]:
+    from ethbrake_marl.policies import load_shipped, shipped_policies
+
+    rng, found = np.random.default_rng(0), {}
+    for name in shipped_policies():
+        policy = load_shipped(name)
+        observed = rng.normal(size=(256, policy.manifest.network.observation_size)).astype(np.float32)
+        found[f"policy {name}"] = digest(policy(observed))
+    return found
+
+
+KINDS: tuple[Callable[[], dict[str, str]], ...] = (lists, physics, episodes, searches, shields, tallies, actions)
+
+
+TELL = "from tests.programmes import machines; machines.tell()"
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--sample", action="store_true", help="without the settings that compile everything anew")
+
+
+def cases(given: argparse.Namespace) -> Cases:
+    here: dict[str, str] = {}
+
+    def differing(setting: dict[str, str]) -> Told:
+        here.update(here or measured({}))
+        found = measured(setting)
+        other = [key for key in here if found[key] != here[key]]
+        return Told(not other, ", ".join(other) or f"all {len(here)} hashes")
+
+    for name, setting in SETTINGS.items():
+        if not (given.sample and "NUMBA_CPU_NAME" in setting):
+            yield name, partial(differing, setting)
+
+
+def tell() -> None:
+    """Print the hashes of this process as JSON."""
+    print(json.dumps({name: value for kind in KINDS for name, value in kind().items()}))
+
+
+def measured(setting: dict[str, str]) -> dict[str, str]:
+    """All hashes, computed in a process of its own."""
+    variables = os.environ | {"PYTHONPATH": str(ROOT)} | setting
+    done = subprocess.run([sys.executable, "-c", TELL], env=variables, capture_output=True, text=True)
+    assert done.returncode == 0, f"exit status {done.returncode}\n{done.stdout}{done.stderr}"
+    found: dict[str, str] = json.loads(done.stdout)
+    return found

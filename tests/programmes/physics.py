@@ -1,0 +1,546 @@
+"""The physics on many worlds: one figure per gate, and its threshold.
+
+The claims of ``tests/physics``, with the tolerances of ``tests/reference/tolerances.py``, on many more worlds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from fractions import Fraction
+from functools import cache, partial
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.errors import PhysicsError
+from ethbrake_marl.harm import empty_ledger, split
+from ethbrake_marl.physics import Floats, Impacts, Worlds, advance
+from tests.golden.test_golden import GOLDEN, figures
+from tests.physics.exact_simulator import line_of, simulate
+from tests.physics.manufacture import manufactured, pressed, stored
+from tests.physics.random_worlds import (
+    HARMS,
+    HORIZON_S,
+    Batch,
+    Draws,
+    Split,
+    Watched,
+    driving_lines,
+    energy_rise_eps,
+    last_digit_errors,
+    momentum_eps,
+    nearly_joined,
+    once,
+    place_ahead,
+    restitution_eps,
+    rounds,
+    split_errors,
+    state_bytes,
+    thrown_lines,
+    touching_lines,
+)
+from tests.physics.segments import Scan, random_segments, scan
+from tests.physics.test_oracles import accelerations, at_once, exact_accelerations, in_steps, law_error_eps
+from tests.programmes import Cases, Told
+from tests.reference.tolerances import (
+    BORDERLINE_SHARE,
+    BOUNCE_SERIES_EPS,
+    CLUSTER_EPS,
+    ENERGY_EPS,
+    EPS,
+    EXACT_RUN,
+    GAP_M,
+    MOMENTUM_EPS,
+    RESTING_MPS2,
+    RESTITUTION_EPS,
+    SPLIT,
+    SPLIT_CASCADE,
+)
+
+
+class Figure(NamedTuple):
+    """One measured figure, good when it does not exceed its threshold; NaN does."""
+
+    value: float
+    threshold: float
+    of: str  # what it was measured on
+
+
+GATES: dict[str, Callable[[], Figure]] = {}
+
+
+def gate(name: str) -> Callable[[Callable[[], Figure]], Callable[[], Figure]]:
+    """Enter a function into the programme under a name."""
+
+    def enter(measure: Callable[[], Figure]) -> Callable[[], Figure]:
+        GATES[name] = measure
+        return measure
+
+    return enter
+
+
+def measured(measure: Callable[[], Figure]) -> Told:
+    value, threshold, of = measure()
+    return Told(value <= threshold, f"{value:.3g} <= {threshold:.3g}, {of}")
+
+
+def cases(given: argparse.Namespace) -> Cases:
+    for name, measure in GATES.items():
+        yield name, partial(measured, measure)
+
+
+# ---------------------------------------------------------------- worlds made backwards, impacts, motion between them
+
+
+@gate("manufactured worlds, not bit for bit")
+def manufactured_worlds() -> Figure:
+    """Worlds built backwards from contact times: stored ones and fresh ones."""
+    cases = stored() + manufactured(9, 2, 1_500) + manufactured(9, 3, 400) + manufactured(9, 4, 100)
+    wrong = sum(bool(at_once(case) or in_steps(case)) for case in cases)
+    hits = sum(len(case.outcome.hits) for case in cases)
+    return Figure(wrong, 0, f"{len(cases)} worlds, {hits} impacts, at once and in steps of 1/8 s")
+
+
+@gate("resting contact worlds, not bit for bit")
+def pressed_worlds() -> Figure:
+    """Worlds that touch at the start."""
+    cases = [case for N in (2, 3, 4, 5) for case in pressed(11, N, 1_000)]
+    return Figure(sum(bool(at_once(case) or in_steps(case)) for case in cases), 0, f"{len(cases)} worlds")
+
+
+@cache
+def impact_batches() -> list[tuple[Worlds, Worlds, Impacts]]:
+    """Touching lines of 2 to 50 vehicles before and after their impacts, with mass ratios up to a million."""
+    batches = []
+    for N in (2, 3, 5, 10, 50):
+        for ratio in (1.0, 1e3, 1e6):
+            before, command = touching_lines(21, 1_000_000 // N, N, heaviest_ratio=ratio)
+            batches.append((before, *advance(before, command, 0.0)))
+    return batches
+
+
+@gate("momentum at impacts [eps of sum m |v|, per round]")
+def momentum() -> Figure:
+    """Momentum before and after."""
+    batches = impact_batches()
+    worst = max(float(np.max(momentum_eps(b, a) / rounds(i))) for b, a, i in batches)
+    return Figure(worst, MOMENTUM_EPS, f"{sum(int(i.count.sum()) for *_, i in batches):,} impacts, N = 2 to 50")
+
+
+@gate("energy rise at impacts [eps of the energy, per round]")
+def energy() -> Figure:
+    """Kinetic energy over ground."""
+    worst = max(float(np.max(energy_rise_eps(b, a) / rounds(i))) for b, a, i in impact_batches())
+    return Figure(worst, ENERGY_EPS, "the same impacts")
+
+
+@gate("restitution of pairs [eps of the larger speed]")
+def restitution() -> Figure:
+    """Separation speed against e times closing speed."""
+    worst, pairs = 0.0, 0
+    for key in range(5):
+        before, command = touching_lines(30 + key, 1_000_000, 2, heaviest_ratio=10.0**key)
+        after, impacts = advance(before, command, 0.0)
+        worst, pairs = max(worst, float(restitution_eps(before, after).max())), pairs + int(impacts.count.sum())
+    return Figure(worst, RESTITUTION_EPS, f"{pairs:,} impacts of two vehicles")
+
+
+@gate("gap against its closed form, and below 0 [m]")
+def gaps() -> Figure:
+    """Stored gaps against those that follow from the speeds."""
+    runs = [Watched(41 + N, 3_000 // N, N, drive=drive) for N in (2, 3, 5, 10) for drive in (False, True)]
+    return Figure(max(run.worst for run in runs), GAP_M, f"{sum(run.checked for run in runs):,} steady steps")
+
+
+@gate("speeds below 0 that no bounce-back explains")
+def negative_speeds() -> Figure:
+    """Braking lines in short steps."""
+    runs = [Watched(51 + N, 3_000 // N, N, drive=False) for N in (2, 3, 5, 10)]
+    seen = sum(int((state.speeds_mps < 0).sum()) for run in runs for state in run.states)
+    return Figure(sum(run.unexplained_negative_speeds() for run in runs), 0, f"{seen:,} negative speeds seen")
+
+
+@gate("steps in which energy rose though nobody drives")
+def energy_in_motion() -> Figure:
+    """Braking lines in short steps."""
+    runs = [Watched(51 + N, 3_000 // N, N, drive=False) for N in (2, 3, 5, 10)]
+    return Figure(sum(run.energy_rises() for run in runs), 0, f"{len(runs) * 300:,} steps of {3_000:,} vehicles")
+
+
+@gate("harm shares that do not add up to the last bit")
+def shares() -> Figure:
+    """Random harm and masses."""
+    draws, n = Draws(61), 2_000_000
+    harm, mass = draws.uniform(0.0, 2_000.0, (n, 1)), 10.0 ** draws.uniform(-2.0, 4.0, (n, 2))
+    both = split(harm, mass)
+    rest = harm[:, 0] - both.max(axis=1)  # exact: the larger share is at least half
+    return Figure(int(np.sum(rest != both.min(axis=1))), 0, f"{n:,} impacts")
+
+
+@gate("worlds whose ledger is not the sum of its rows")
+def ledger() -> Figure:
+    """First-impact and total harm, to the last bit, over three segments."""
+    wrong, impacts_seen = 0, 0
+    for N in (2, 3, 6, 20):
+        worlds, command = driving_lines(62, 60_000 // N, N)
+        book, first, total = empty_ledger(worlds), np.zeros(worlds.gaps_m.shape), np.zeros(worlds.gaps_m.shape)
+        for until in (0.7, 2.0, 6.0):
+            worlds, impacts = advance(worlds, command, until_s=until, record=True)
+            book, rows = book.add(impacts), impacts.rows
+            assert rows is not None
+            segment = np.zeros((2, *first.shape))
+            harm = rows.closing_speed_mps * rows.closing_speed_mps
+            np.add.at(segment[0], (rows.world[rows.first], rows.pair[rows.first]), harm[rows.first])
+            np.add.at(segment[1], (rows.world, rows.pair), harm)
+            first, total, impacts_seen = first + segment[0], total + segment[1], impacts_seen + rows.world.size
+        same = (first == book.first_impact_harm) & (total == book.total_harm)
+        wrong += int((~same).any(axis=1).sum())
+    return Figure(wrong, 0, f"{impacts_seen:,} impacts")
+
+
+# ---------------------------------------------------------------- contacts, and whole runs against exact arithmetic
+
+CHUNK = 200_000
+
+
+SEGMENTS = {2: 10_000_000, 3: 1_000_000, 5: 500_000}
+
+
+@cache
+def scans() -> list[Scan]:
+    """The scans of all random segments."""
+    found = []
+    for N, n in SEGMENTS.items():
+        rng = np.random.default_rng([71, N])
+        found += [scan(random_segments(rng, CHUNK, N)) for _ in range(n // CHUNK)]
+    return found
+
+
+@gate("contacts missed")
+def missed() -> Figure:
+    """Against the smallest value of each gap's closed form; the doubtful ones against exact arithmetic."""
+    found = scans()
+    return Figure(
+        sum(s.missed.size for s in found),
+        0,
+        f"{sum(s.pairs for s in found):,} random segments of pairs, {sum(s.contacts for s in found):,} with contact,"
+        f" {sum(s.in_doubt for s in found):,} decided by exact arithmetic",
+    )
+
+
+@gate("contacts invented")
+def phantom() -> Figure:
+    """The same scan."""
+    return Figure(sum(s.phantom.size for s in scans()), 0, "the same segments")
+
+
+@gate("contacts or gaps misplaced")
+def wrong() -> Figure:
+    """The same scan: time and closing speed of the first contact, final gaps and speeds where there is none."""
+    return Figure(sum(s.wrong.size for s in scans()), 0, "the same segments")
+
+
+@gate("share of contacts that rounding decides")
+def borderline() -> Figure:
+    """Decided otherwise than by exact arithmetic, within the published blur."""
+    pairs = sum(s.pairs for s in scans())
+    return Figure(sum(s.borderline for s in scans()) / pairs, BORDERLINE_SHARE, "the same segments")
+
+
+@cache
+def differences() -> tuple[float, int, int, int]:
+    """(largest difference, worlds with other impacts, worlds, impacts) of whole runs against the exact simulator."""
+    worst, other, total, impacts_seen = 0.0, 0, 0, 0
+    for N, n in {2: 3_000, 3: 2_000, 5: 600, 10: 100, 50: 6}.items():
+        worlds, command = driving_lines(81, n, N)
+        end, impacts = advance(worlds, command, 6.0, record=True)
+        rows = impacts.rows
+        assert rows is not None
+        for k in range(n):
+            exact = simulate(line_of(worlds, command[k].tolist(), k), Fraction(6), bits=160)
+            mine = rows.world == k
+            total, impacts_seen = total + 1, impacts_seen + len(exact.hits)
+            if rows.pair[mine].tolist() != [hit.pair for hit in exact.hits]:
+                other += 1
+                continue
+            pairs = [*zip(end.gaps_m[k], exact.gaps, strict=True), *zip(end.speeds_mps[k], exact.speeds, strict=True)]
+            pairs += zip(rows.time_s[mine], [hit.time for hit in exact.hits], strict=True)
+            pairs += zip(rows.closing_speed_mps[mine], [hit.closing for hit in exact.hits], strict=True)
+            worst = max(worst, *(abs(float(x) - float(y)) for x, y in pairs))
+    return worst, other, total, impacts_seen
+
+
+@gate("difference from exact runs [m, m/s, s]")
+def exact_runs() -> Figure:
+    """Every impact's time and closing speed, final gaps and speeds, after up to hundreds of events."""
+    worst, _, total, impacts_seen = differences()
+    return Figure(worst, EXACT_RUN, f"{total:,} worlds of 2 to 50 vehicles, {impacts_seen:,} impacts")
+
+
+@gate("runs with other impacts than exact ones")
+def exact_counts() -> Figure:
+    """The order and the number of impacts of every pair."""
+    _, other, _, _ = differences()
+    return Figure(other, 0, "the same worlds")
+
+
+@gate("cluster law [eps of the largest speed, per round]")
+def exact_clusters() -> Figure:
+    """Speeds after simultaneous impacts against the exact law."""
+    worst, worlds = 0.0, 0
+    for N, n in {2: 3_000, 3: 3_000, 5: 1_500, 10: 400, 20: 150, 50: 30}.items():
+        for ratio in (1.0, 1e3):
+            before, command = touching_lines(82, n, N, heaviest_ratio=ratio)
+            after, impacts = advance(before, command, 0.0)
+            per_round = rounds(impacts)
+            worst = max(worst, *(law_error_eps(before, after, k, int(per_round[k])) for k in range(n)))
+            worlds += n
+    return Figure(worst, CLUSTER_EPS, f"{worlds:,} exact_clusters of 2 to 50 vehicles")
+
+
+@gate("resting contact against exact force ranges [m/s2]")
+def resting() -> Figure:
+    """Accelerations of touching lines at rest, moving, and at a speed limit."""
+    draws, worst, lines = Draws(83), 0.0, 0
+    for N in (2, 3, 5, 10, 25, 50):
+        for speed in (0.0, 4.0, 8.0):
+            for _ in range(150):
+                command, mass = draws.uniform(-16.0, 16.0, (N,)), draws.uniform(0.5, 8.0, (N,))
+                expected = exact_accelerations(command.tolist(), mass.tolist(), speed)
+                worst = max(worst, float(np.abs(accelerations(command, mass, speed) - expected).max()))
+                lines += 1
+    return Figure(worst, RESTING_MPS2, f"{lines:,} lines of 2 to 50 vehicles")
+
+
+# ---------------------------------------------------------------- an obstacle ahead of Vehicle 1
+
+
+@gate("obstacle: cluster law [eps of the largest speed, per round]")
+def obstacle_clusters() -> Figure:
+    """Speeds after simultaneous impacts of vehicles that touch each other and the obstacle, against the exact law."""
+    worst, worlds = 0.0, 0
+    for N, n in {2: 1_500, 3: 1_500, 5: 800, 10: 200, 20: 80, 50: 15}.items():
+        for ratio in (1.0, 1e3):
+            batch = touching_lines(182, n, N, heaviest_ratio=ratio)
+            before = replace(batch.worlds, obstacle_gap_m=np.zeros(n))
+            after, impacts = advance(before, batch.command, 0.0)
+            rounds = np.maximum(np.maximum(impacts.count.max(axis=1), impacts.obstacle_count), 1)
+            worst = max(worst, *(law_error_eps(before, after, k, int(rounds[k])) for k in range(n)))
+            worlds += n
+    return Figure(worst, CLUSTER_EPS, f"{worlds:,} obstacle_clusters of 2 to 50 vehicles")
+
+
+CASCADE = 100  # impacts of a world; between an obstacle and a line they come ever faster, and rounding multiplies
+OTHER_CASCADES = 1e-3  # share of worlds in which it may change the order of impacts after so many
+
+
+def run_difference(end: Worlds, found: Floats, k: int, line: Worlds, command: list[float]) -> float:
+    """Largest difference of world k from the exact run; infinite if the impacts are others, NaN if after a cascade.
+
+    ``found`` [impacts, 3]: pair, time, closing speed.
+    """
+    exact = simulate(line_of(line, command, k), Fraction(HORIZON_S), bits=160)
+    pairs, true_pairs = found[:, 0].tolist(), [hit.pair for hit in exact.hits]
+    if pairs != true_pairs:
+        return np.nan if pairs[:CASCADE] == true_pairs[:CASCADE] else np.inf
+    assert exact.obstacle is not None
+    mine = [*end.gaps_m[k], *end.speeds_mps[k], end.obstacle_gap_m[k], *found[:, 1:].ravel()]
+    truth = [*exact.gaps, *exact.speeds, exact.obstacle, *(x for hit in exact.hits for x in (hit.time, hit.closing))]
+    return max(abs(float(x) - float(y)) for x, y in zip(mine, truth, strict=True))
+
+
+@cache
+def obstacle_differences() -> tuple[Floats, int]:
+    """``run_difference`` of every world, and how many impacts with the obstacle there were."""
+    worst, with_it = [], 0
+    for N, n in {2: 1_500, 3: 1_000, 5: 300, 10: 40}.items():
+        batch = place_ahead(driving_lines(183, n, N), 184)
+        end, impacts = advance(batch.worlds, batch.command, HORIZON_S, record=True)
+        rows = impacts.rows
+        assert rows is not None
+        columns = np.stack([rows.pair, rows.time_s, rows.closing_speed_mps], axis=1)
+        for k in range(n):
+            command = batch.command[k].tolist()
+            worst.append(run_difference(end, columns[rows.world == k], k, batch.worlds, command))
+        with_it += int(impacts.obstacle_count.sum())
+    return np.array(worst), with_it
+
+
+@gate("obstacle: difference from exact runs [m, m/s, s]")
+def obstacle_runs() -> Figure:
+    """The impacts of every pair and with the obstacle, in order, their times and closing speeds, final state."""
+    found, with_it = obstacle_differences()
+    of = f"{np.isfinite(found).sum():,} worlds of 2 to 10 vehicles, {with_it:,} impacts with the obstacle"
+    return Figure(float(np.nanmax(found)), EXACT_RUN, of)
+
+
+@gate("obstacle: worlds that differ after 100 impacts [share]")
+def cascades() -> Figure:
+    """Worlds in which rounding changes the order of impacts, after so many of them and never before."""
+    found, _ = obstacle_differences()
+    return Figure(float(np.isnan(found).mean()), OTHER_CASCADES, f"{found.size:,} worlds of 2 to 10 vehicles")
+
+
+@gate("obstacle out of reach: worlds with other bits")
+def out_of_reach() -> Figure:
+    """The same lines without an obstacle, and with one that they never reach."""
+    n, changed = 20_000, 0
+    for N in (2, 3, 5):
+        worlds, command = driving_lines(185, n, N)
+        plain, harm = advance(worlds, command, until_s=HORIZON_S)
+        far, same = advance(replace(worlds, obstacle_gap_m=np.full(n, 1e4)), command, until_s=HORIZON_S)
+        changed += state_bytes(replace(far, obstacle_gap_m=plain.obstacle_gap_m), same) != state_bytes(plain, harm)
+    return Figure(changed, 0, f"{3 * n:,} worlds of 2, 3 and 5 vehicles")
+
+
+# ---------------------------------------------------------------- the end of every instant, of any masses
+
+NEARLY_JOINED = {2: 200_000, 3: 300_000, 5: 200_000, 10: 200_000, 20: 80_000, 50: 20_000}  # by vehicles
+THROWN = {2: 250_000, 3: 250_000, 5: 200_000, 10: 250_000, 20: 40_000, 50: 10_000}
+INSTANT_CHUNK = 10_000
+
+
+def unfinished(worlds: Worlds, command: Floats, until_s: float) -> int:
+    """How many of these worlds cannot be advanced."""
+    try:
+        advance(worlds, command, until_s=until_s)
+    except PhysicsError as error:
+        return len(error.worlds)
+    return 0
+
+
+@gate("instants that do not end: joined_clusters a few ulps apart")
+def joined_clusters() -> Figure:
+    """Touching lines at one speed but for the last digits, half of them against an obstacle."""
+    failed = 0
+    for N, n in NEARLY_JOINED.items():
+        for chunk in range(n // INSTANT_CHUNK):
+            worlds = nearly_joined(1_000 * N + chunk, INSTANT_CHUNK, N, obstacle=chunk % 2 == 1)
+            failed += unfinished(worlds, np.zeros((INSTANT_CHUNK, N)), 0.0)
+    return Figure(failed, 0, f"{sum(NEARLY_JOINED.values()):,} joined_clusters of 2 to 50 vehicles")
+
+
+@gate("instants that do not end: lines thrown against an obstacle")
+def thrown() -> Figure:
+    """Whole runs of 6 s."""
+    failed = 0
+    for N, n in THROWN.items():
+        for chunk in range(n // INSTANT_CHUNK):
+            worlds, command = thrown_lines(100_000 + 1_000 * N + chunk, INSTANT_CHUNK, N)
+            failed += unfinished(worlds, command, HORIZON_S)
+    return Figure(failed, 0, f"{sum(THROWN.values()):,} worlds of 2 to 50 vehicles, masses 0.05 to 100 t")
+
+
+# ---------------------------------------------------------------- what must not matter
+
+
+@cache
+def splits() -> list[Split]:
+    """All split worlds."""
+    return [split_errors(N, 60_000 // N, cuts, 91) for N in (2, 3, 5, 10, 20) for cuts in (2, 7, 80)]
+
+
+@gate("a segment that is split, few impacts [relative]")
+def splitting() -> Figure:
+    """Gaps, speeds and harm, relative to at least 100 m, 30 m/s, 900 m2/s2; up to 30 impacts."""
+    worst = max(float(s.error[s.few].max()) for s in splits() if s.few.any())
+    return Figure(worst, SPLIT, f"{sum(int(s.few.sum()) for s in splits()):,} worlds in 2, 7 and 80 parts")
+
+
+@gate("a segment that is split, cascades [relative]")
+def splitting_cascades() -> Figure:
+    """The same for worlds with more impacts; beside it what another last digit of the initial gaps changes in them."""
+    worst = max(float(s.error[~s.few].max()) for s in splits() if not s.few.all())
+    digits = [last_digit_errors(N, 60_000 // N, 91) for N in (3, 5, 10, 20)]
+    known = max(float(s.error[~s.few].max()) for s in digits)
+    worlds = sum(int((~s.few).sum()) for s in splits())
+    return Figure(
+        worst, SPLIT_CASCADE, f"{worlds:,} worlds with more than 30 impacts; a last digit of their gaps: {known:.2g}"
+    )
+
+
+@gate("a segment that is split, worlds with other impacts")
+def splitting_counts() -> Figure:
+    """Worlds in which some pair has another number of impacts."""
+    return Figure(sum(int(s.other.sum()) for s in splits()), 0, "the same worlds")
+
+
+@gate("worlds changed by the origin of time")
+def origin() -> Figure:
+    """To the last bit; times on a grid of 2^-20 s."""
+    batch = driving_lines(92, 50_000, 4)
+    v = batch.worlds.vehicles
+    grid = replace(batch.worlds, vehicles=replace(v, latency_s=np.round(v.latency_s * 2**20) / 2**20))
+    here, impacts = advance(grid, batch.command, until_s=6.0)
+    changed = 0
+    for shift in (-0.5, 64.0, 4096.0):
+        vehicles = replace(grid.vehicles, latency_s=grid.vehicles.latency_s + shift)
+        moved = replace(grid, vehicles=vehicles, time_s=grid.time_s + shift)
+        there, same = advance(moved, batch.command, until_s=6.0 + shift)
+        columns = (
+            (here.gaps_m, there.gaps_m),
+            (here.speeds_mps, there.speeds_mps),
+            (impacts.total_harm, same.total_harm),
+        )
+        changed += int(np.any([(a != b).any(axis=1) for a, b in columns], axis=0).sum())
+    return Figure(changed, 0, "50,000 worlds, three shifts (positions are not stored: space has no origin)")
+
+
+@gate("batches whose bits depend on their make-up")
+def batches() -> Figure:
+    """One world alone, in any order, in one thread or two."""
+    n, changed = 20_000, 0
+    batch = driving_lines(93, n, 3)
+    whole = state_bytes(*once(batch))
+
+    def together(parts: list[tuple[Worlds, Impacts]]) -> tuple[bytes, ...]:
+        harm = [np.concatenate([getattr(i, f) for _, i in parts]) for f in HARMS]
+        return state_bytes(Worlds.concatenate([world for world, _ in parts]), Impacts(*harm))
+
+    def chunk(rows: np.ndarray) -> tuple[Worlds, Impacts]:
+        return once(Batch(batch.worlds.take(rows), batch.command[rows]))
+
+    changed += together([chunk(np.array([k])) for k in range(n)]) != whole
+    changed += state_bytes(*advance(batch.worlds, batch.command, until_s=HORIZON_S, threads=2)) != whole
+    with ThreadPoolExecutor(2) as pool:
+        changed += together(list(pool.map(chunk, np.array_split(np.arange(n), 64)))) != whole
+    for seed in range(10):
+        order = np.random.default_rng(seed).permutation(n)
+        world, impacts = chunk(order)
+        back = np.argsort(order)
+        harm = [getattr(impacts, f)[back] for f in HARMS]
+        changed += state_bytes(world.take(back), Impacts(*harm)) != whole
+    return Figure(changed, 0, f"{n:,} worlds alone, on 2 threads (threads=2, and 64 parts by hand), in 10 orders")
+
+
+@gate("golden hash of 10,000 worlds, different")
+def golden() -> Figure:
+    """``tests/golden/physics_worlds.json``."""
+    found = figures()
+    return Figure(
+        int(found != json.loads(GOLDEN.read_text("utf-8"))["all"]), 0, f"sha256 {str(found['sha256'])[:16]}..."
+    )
+
+
+@gate("bounces: total time of a series [relative]")
+def bounces() -> Figure:
+    """Against the geometric sum of flights, for e from 0.05 to 0.99."""
+    worst = 0.0
+    for e in np.linspace(0.05, 0.99, 95):
+        wall = touching_lines(0, 1, 2).worlds
+        wall = replace(wall, speeds_mps=np.array([[0.0, 8.0]]))
+        vehicles = replace(wall.vehicles, mass_t=np.array([[2.0**50, 1.0]]), restitution=np.array([e]))
+        _, impacts = advance(replace(wall, vehicles=vehicles), [-8.0, 4.0], 2_000.0, record=True)
+        closing = [8.0]
+        while closing[-1] >= 0.05:
+            closing.append(closing[-1] * e)
+        flights = sum(2.0 * w / 4.0 for w in closing[1:])
+        assert impacts.rows is not None
+        if impacts.count[0, 0] != len(closing):
+            return Figure(np.nan, 0, f"e = {e}: {impacts.count[0, 0]} impacts instead of {len(closing)}")
+        worst = max(worst, abs(float(impacts.rows.time_s[-1]) / flights - 1.0))
+    return Figure(worst, BOUNCE_SERIES_EPS * EPS, "95 series of up to 506 impacts")

@@ -1,0 +1,457 @@
+"""Statements about the package's own code that a solver proves, and bugs with which each must be left unproven.
+
+Every statement is a function that raises ``AssertionError`` where the solver does not prove it. It is about real
+numbers, for all values that its assumptions allow. Compilation must be switched off (``NUMBA_DISABLE_JIT=1``), so that
+the functions run as Python.
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import itertools
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from itertools import product
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+import z3
+
+from ethbrake_marl.physics import kernel
+from ethbrake_marl.shield import step_shield
+from tests.programmes import Cases, Told
+from tests.programmes.symbolic import (
+    Condition,
+    Ended,
+    Symbol,
+    SymbolicMath,
+    exact,
+    holds_always,
+    is_infinite,
+    paths,
+    symbols,
+)
+
+Statement = Callable[[], int]  # the number of paths it was proven along
+STATEMENTS: dict[str, Statement] = {}
+
+BOUNCING, PLASTIC = 1.0, 0.01  # m/s, closing speeds above and below ``PLASTIC_SPEED_MPS``
+DECISIONS = ((0, 3), (2, 3), (2, 1))  # in the statements about the shield: how many were made, how many are left
+TEAM_DECISIONS = ((0, 2), (1, 1))  # ... about two shielded vehicles
+
+
+def states(text: str) -> Callable[[Statement], Statement]:
+    """Register a statement."""
+
+    def register(statement: Statement) -> Statement:
+        STATEMENTS[text] = statement
+        return statement
+
+    return register
+
+
+def prove(end: Ended, statement: Any, what: str, *assumed: Any) -> None:
+    """Demand that a statement follows at the end of a path."""
+    assert holds_always([*end.known, *assumed], statement), f"not proven: {what}"
+
+
+@states(
+    "a pair's contact: found where its gap closes, never earlier, never missed; the closing speed there is the root"
+)
+def contact() -> int:
+    """``events.contact`` against ``events.drift``, the gap as a function of time."""
+    gap, closing, pressing, when = symbols("gap closing pressing when")
+    found = list(_run(kernel, lambda: kernel.contact(gap, closing, pressing), [exact(gap) >= 0]))
+    after = exact(kernel.drift(gap, closing, pressing, when))
+    for end in found:
+        time, speed = end.result
+        if isinstance(time, float):
+            assert time == math.inf
+            prove(end, after >= 0, "never closes", exact(when) >= 0)
+            continue
+        prove(end, exact(time) >= 0, "not in the past")
+        prove(end, exact(kernel.drift(gap, closing, pressing, time)) == 0, "the gap is closed then")
+        prove(end, after > 0, "it is open before", exact(when) > 0, exact(when) < exact(time))
+        prove(end, exact(speed) == exact(closing + pressing * time), "the speed is the one then")
+        prove(end, exact(speed) >= 0, "and it approaches")
+    return len(found)
+
+
+@states("a vehicle that brakes stands after v tau + v^2 / (2 a), and never drives backwards")
+def stopping() -> int:
+    """``events.solo_motion`` against ``events.stopping_distance``."""
+    speed, capacity, latency, limit, time = symbols("speed capacity latency limit time")
+    known = [exact(speed) >= 0, exact(capacity) > 0, exact(latency) >= 0, exact(time) >= 0, exact(limit) >= 0]
+    found = list(_run(kernel, lambda: kernel.solo_motion(speed, -capacity, latency, limit, time), known))
+    whole = exact(speed * latency + speed * speed / (2.0 * capacity))
+    for end in found:
+        after, way, _ = end.result
+        prove(end, exact(after) >= 0, "forwards")
+        prove(end, z3.And(exact(way) >= 0, exact(way) <= whole), "no farther than its stopping distance")
+        stopped = exact(time) * exact(capacity) >= exact(latency) * exact(capacity) + exact(speed)
+        prove(end, z3.And(exact(after) == 0, exact(way) == whole), "then it stands, there", stopped, exact(speed) > 0)
+        braking = exact(time - latency) * exact(capacity)
+        slower = exact(speed) - z3.If(braking > 0, braking, 0)
+        prove(end, exact(after) == slower, "until then it slows down by its capacity", z3.Not(stopped))
+    return len(found)
+
+
+def _cluster(vehicles: int, closing: float) -> tuple[list[Symbol], list[Symbol], Symbol, list[Ended]]:
+    """Masses, speeds, restitution, and every path of one impact of so many touching vehicles; results: speeds after."""
+    mass = symbols(" ".join(f"m{i}" for i in range(vehicles)))
+    speed = symbols(" ".join(f"v{i}" for i in range(vehicles)))
+    (restitution,) = symbols("e")
+    known = [exact(m) > 0 for m in mass] + [exact(restitution) >= 0, exact(restitution) <= 1]
+
+    def resolve() -> list[Symbol]:
+        table = np.zeros((kernel.ROW.OF_IMPACT, vehicles), dtype=object)
+        table[kernel.ROW.MASS], table[kernel.ROW.SPEED] = mass, speed
+        table[kernel.ROW.CLOSING, : vehicles - 1] = closing
+        kernel.resolve_cluster(table, restitution, 0, vehicles - 1)
+        return list(table[kernel.ROW.SPEED])
+
+    return mass, speed, restitution, list(_run(kernel, resolve, known))
+
+
+def _sum(*columns: list[Symbol]) -> Any:
+    """The sum over vehicles of the product of these."""
+    return sum(math.prod((exact(x) for x in row), start=exact(1)) for row in zip(*columns, strict=True))
+
+
+@states("an impact of two: momentum is kept, they part with e times the closing speed, as in the paper's equation")
+def two() -> int:
+    """``impact.resolve_cluster`` of two vehicles, against Newton's law."""
+    mass, speed, restitution, found = _cluster(2, BOUNCING)
+    approaching = exact(speed[1]) > exact(speed[0])
+    for end in found:
+        after = end.result
+        prove(end, _sum(mass, after) == _sum(mass, speed), "momentum")
+        parting = exact(after[0] - after[1]) == exact(restitution * (speed[1] - speed[0]))
+        prove(end, parting, "restitution", approaching)
+        kept = z3.And(exact(after[0]) == exact(speed[0]), exact(after[1]) == exact(speed[1]))
+        prove(end, kept, "who does not approach is left alone", z3.Not(approaching))
+    return len(found)
+
+
+@states("an impact of two or three: momentum is kept, and just (1 - e^2) of the energy of what is pooled is lost")
+def energy() -> int:
+    """The energy by an identity, from which the inequality follows: masses are positive and e is at most 1."""
+    count = 0
+    for vehicles in (2, 3):
+        mass, speed, restitution, found = _cluster(vehicles, BOUNCING)
+        for end in found:
+            after = end.result
+            prove(end, _sum(mass, after) == _sum(mass, speed), f"momentum of {vehicles}")
+            moved = [(u - v) / (1.0 + restitution) for u, v in zip(after, speed, strict=True)]
+            lost = exact(1.0 - restitution * restitution) * _sum(mass, moved, moved)
+            prove(end, _sum(mass, speed, speed) - _sum(mass, after, after) == lost, f"energy of {vehicles}")
+        count += len(found)
+    return count
+
+
+@states("a plastic impact of two or three: momentum is kept, and no pair approaches any more")
+def plastic() -> int:
+    """Below the plastic speed nobody bounces, and the line is in order afterwards."""
+    count = 0
+    for vehicles in (2, 3):
+        mass, speed, _, found = _cluster(vehicles, PLASTIC)
+        for end in found:
+            after = end.result
+            prove(end, _sum(mass, after) == _sum(mass, speed), f"momentum of {vehicles}")
+            for ahead, behind in itertools.pairwise(after):
+                prove(end, exact(behind) <= exact(ahead), f"order of {vehicles}")
+        count += len(found)
+    return count
+
+
+@states("a free body's acceleration is the nearest to zero that its forces allow")
+def settling() -> int:
+    """``events.settle`` on any range of forces."""
+    low, high, other = symbols("low high other")
+    found = list(_run(kernel, lambda: kernel.settle(low, high), [exact(low) <= exact(high)]))
+    for end in found:
+        value = exact(end.result)
+        prove(end, z3.And(value >= exact(low), value <= exact(high)), "within the range")
+        allowed = [exact(other) >= exact(low), exact(other) <= exact(high)]
+        prove(end, value * value <= exact(other) * exact(other), "nearest to zero", *allowed)
+    return len(found)
+
+
+class _Line:
+    """A world as the shield sees it: what each action leads to, and the harm of each sequence of actions, unknown.
+
+    An action is one number for each of the shielded ``vehicles``. Of several, a step before the last ends nothing.
+    """
+
+    def __init__(self, made: int, left: int, vehicles: int = 1) -> None:
+        number = z3.RealSort()
+        self.made, self.goes_on = made, vehicles > 1 and left > 1
+        self.harm = z3.Function("harm", *[number] * (left * vehicles), number)  # of the whole episode
+        self.so_far = z3.Function("so_far", *[number] * vehicles, number)  # after the first action
+        self.going = z3.Function("going", *[number] * vehicles, z3.IntSort())  # after the first action: -1, 0 or 1
+        self.plan = np.array(  # of the whole episode
+            [symbols(" ".join(f"plan{k}_{c}" for c in range(vehicles))) for k in range(made + left)], object
+        )
+        self.proposed = symbols(" ".join(f"proposed{c}" for c in range(vehicles)))
+        self.budget, self.certified = symbols("budget certified")
+        self.constants = np.array(  # more than are asked for on any path
+            [symbols(" ".join(f"constant{k}_{c}" for c in range(vehicles))) for k in range(9)], object
+        )
+        self.fresh = 0
+
+    def known(self) -> list[Any]:
+        """The invariant: the plan's harm is certified, and within the budget; its first step does not fail."""
+        plan, first = _exact(self.plan[self.made :]), _exact(self.plan[self.made])
+        return [
+            self.harm(*plan) == exact(self.certified),
+            exact(self.certified) <= exact(self.budget),
+            exact(self.certified) >= 0,
+            self.going(*first) >= 0,
+            z3.Implies(self.going(*first) == 0, self.so_far(*first) == exact(self.certified)),
+        ]
+
+    def take_steps(self, _: Any, __: Any, ___: Any, step: int, action: Any, after: Any, ____: Any) -> int:
+        """The step of one action: it fails, ends the episode, or leaves it going; the same each time it is asked."""
+        assert step == self.made, "another step is taken"
+        after[0] = np.array(action, object)
+        going = self.going(*_exact(action))
+        if self.goes_on:
+            return 1
+        if Condition(going < 0):
+            return -1
+        return 0 if Condition(going == 0) else 1
+
+    def worst_so_far(self, _: Any, after: Any) -> Any:
+        """Harm after the action."""
+        return Symbol(self.so_far(*_exact(after[0])))
+
+    def worst_of_plan(self, _: Any, after: Any, __: Any, step: int, plan: Any, most: Any) -> Any:
+        """Harm of the action and then the plan; infinite above ``most``."""
+        assert step == self.made + 1, "the plan is followed from another step on"
+        harm = self.harm(*_exact(after[0]), *_exact(plan[step:]))
+        if isinstance(most, float) and most == math.inf:
+            return Symbol(harm)
+        return Symbol(harm) if Condition(harm <= exact(most)) else math.inf
+
+    def best_constant(self, *_: Any) -> tuple[int, Symbol]:
+        """Some constant, and what a search says of it, which need not be true."""
+        self.fresh += 1
+        (least,) = symbols(f"least{self.fresh}")
+        return self.fresh - 1, least
+
+    def better_plan(self, *given: Any) -> tuple[Any, Any]:
+        """What ``better_plan`` is proven to do for one vehicle: another plan where it is better, or nothing."""
+        _, after, __, step, constants, value, most, plan, ___ = given
+        constant, least = self.best_constant()
+        rest = [_exact(constants[constant])] * (len(plan) - step)
+        harm = self.harm(*_exact(after[0]), *itertools.chain(*rest))
+        within = [harm <= exact(most)] if not is_infinite(most) else []
+        if Condition(z3.And(*within, *([] if is_infinite(value) else [harm < exact(value)]))):
+            plan[step:] = constants[constant]
+            return Symbol(harm), Symbol(harm)
+        return value, least
+
+
+def _exact(actions: Any) -> list[Any]:
+    """The expressions of some actions."""
+    return [exact(each) for each in np.ravel(actions)]
+
+
+@states(
+    "a decision of the step shield: what is applied and the plan after it have the bound, which is within the budget"
+)
+def decision() -> int:
+    """The induction step, of ``decide_world`` and ``better_plan`` themselves, for a proposal and for none.
+
+    What the physics does is an unknown function of the actions: the same for the same actions, which is all it needs.
+    """
+    return sum(_decided(_Line(*when), (usable,)) for usable, when in product((True, False), DECISIONS))
+
+
+@states("a decision about two shielded vehicles: the same of the vector of their actions, taken one after the other")
+def decision_of_two() -> int:
+    """``decide_world`` for two vehicles, each with a proposal or with none; ``better_plan`` by what it is to do."""
+    usable = product((True, False), repeat=2)
+    return sum(_decided(_Line(*when, 2), both) for both, when in product(usable, TEAM_DECISIONS))
+
+
+def _decided(line: _Line, usable: tuple[bool, ...]) -> int:
+    """Prove the induction step of a decision on which these vehicles propose a number; the number of paths."""
+    vehicles, made = len(usable), line.made
+
+    def decide() -> tuple[Any, Any, Any]:
+        line.fresh = 0
+        plan, room = line.plan.copy(), np.zeros((2, *line.plan.shape), object)
+        after, out, tried = np.zeros(1, object), np.zeros((vehicles, 4), object), np.zeros((2, vehicles), object)
+        proposed = np.array([p if use else math.nan for p, use in zip(line.proposed, usable, strict=True)], object)
+        good = step_shield.decide_world(
+            None, None, np.zeros(1, bool), made, proposed, line.budget, line.certified, line.constants, plan, room,
+            tried, after, np.zeros(1, bool), out,
+        )  # fmt: skip
+        return good, plan, out
+
+    found = list(_run(step_shield, decide, line.known(), line))
+    for end in found:
+        good, plan, out = end.result
+        assert good
+        assert not is_infinite(out[0, 2]), "the bound is infinite"
+        applied, bound = _exact(out[:, 0]), exact(out[0, 2])
+        assert all(exact(each).eq(bound) for each in out[:, 2]), "two vehicles are told two bounds"
+        prove(end, bound <= exact(line.budget), "the bound is within the budget")
+        assert all(a.eq(b) for a, b in zip(_exact(plan[made]), applied, strict=True)), "what is applied is not planned"
+        goes_on = z3.BoolVal(True) if line.goes_on else line.going(*applied) > 0
+        rest = _exact(plan[made + 1 :])
+        prove(end, line.harm(*applied, *rest) == bound, "the plan that is kept has the bound", goes_on)
+        prove(end, line.so_far(*applied) == bound, "so has the harm, if the episode is over", z3.Not(goes_on))
+    return len(found)
+
+
+def _run(module: ModuleType, function: Callable[[], Any], known: list[Any], line: _Line | None = None) -> Any:
+    """The paths of a function of ``module``, with symbolic roots, and ``line`` in the place of the physics."""
+    names = ("take_steps", "worst_so_far", "worst_of_plan", "best_constant") if line else ()
+    if line and len(line.proposed) > 1:
+        names = (*names, "better_plan")
+    before = {name: getattr(module, name) for name in (*names, "math")}
+    try:
+        module.math = SymbolicMath  # type: ignore[attr-defined]
+        for name in names:
+            setattr(module, name, getattr(line, name))
+        yield from paths(function, known)
+    finally:
+        for name, value in before.items():
+            setattr(module, name, value)
+
+
+# ---------------------------------------------------------------- bugs
+
+
+class Bug(NamedTuple):
+    """``old``, which stands in the function once, replaced by ``new``; and the statement that fails then."""
+
+    module: ModuleType
+    function: str
+    old: str
+    new: str
+    breaks: Statement
+
+
+BUGS = {
+    "the earlier root of a contact": Bug(
+        kernel, "contact", "return (speed - closing) / pressing, speed", "return -closing / pressing, speed",
+        contact,
+    ),
+    "a contact missed where the gap opens first": Bug(
+        kernel, "contact", "if pressing > 0.0:", "if pressing > 0.0 and gap < 1.0:", contact
+    ),
+    "the way while nothing is in force is forgotten": Bug(
+        kernel, "solo_motion", "way = speed * onset", "way = 0.0", stopping
+    ),
+    "restitution of what moves, not of what is left over": Bug(
+        kernel, "resolve_cluster", "pooled + bounce * (pooled - table[ROW.SPEED, i])",
+        "pooled + bounce * (pooled + table[ROW.SPEED, i])", two,
+    ),
+    "blocks pooled without their masses": Bug(
+        kernel, "pool", "table[ROW.BLOCK_LOW, count] / mass", "table[ROW.BLOCK_LOW, count] / 2.0", energy
+    ),
+    "a plastic impact is not put in order": Bug(
+        kernel, "resolve_cluster", "bounce = restitution if largest >= BOUND.PLASTIC_SPEED_MPS else 0.0",
+        "bounce = restitution", plastic,
+    ),
+    "the budget may rise": Bug(
+        step_shield, "decide_world", "    if value <= budget:\n        for c in",
+        "    if value <= 2.0 * budget:\n        for c in", decision,
+    ),
+    "later proposals are not certified": Bug(
+        step_shield, "decide_world", "    if value <= budget:\n        for c in",
+        "    if value <= budget or step > 0:\n        for c in", decision,
+    ),
+    "the fallback is the plan's first action": Bug(
+        step_shield, "decide_world", "take_steps(world, states, ended, step, plan[step], after, over)",
+        "take_steps(world, states, ended, step, plan[0], after, over)", decision,
+    ),
+    "the plan is followed from the second decision on": Bug(
+        step_shield, "try_action", "value = worst_of_plan(world, after, over, step + 1,",
+        "value = worst_of_plan(world, after, over, 1,", decision,
+    ),
+    "a constant begins one decision late": Bug(
+        step_shield, "better_plan", "for j in range(step, plan.shape[0]):",
+        "for j in range(step + 1, plan.shape[0]):",
+        decision,
+    ),
+    "a vehicle that never moves": Bug(
+        kernel, "solo_motion", "    way = 0.0\n    steady",
+        "    return speed, 0.0, math.nan\n    way = 0.0\n    steady",
+        stopping,
+    ),
+    "half the time": Bug(
+        kernel, "solo_motion", "    way = 0.0\n    steady", "    duration = duration / 2.0\n    way = 0.0\n    steady",
+        stopping,
+    ),
+    "the plan that was certified with a proposal is not kept": Bug(
+        step_shield, "try_action", "                copy_action(room[0, j], plan[j])", "                pass",
+        decision,
+    ),
+    "a constant counts without being certified": Bug(
+        step_shield, "better_plan", "certified = worst_of_plan(world, states, ended, step, trial, most)",
+        "certified = least", decision,
+    ),
+    "the bound of the plan is told for the proposal": Bug(
+        step_shield, "decide_world", "tell_action(out, plan[step], value, budget - value)",
+        "tell_action(out, plan[step], certified, budget - value)", decision,
+    ),
+    "of two, what was tried last is looked at, not what is applied": Bug(
+        step_shield, "decide_world", "take_steps(world, states, ended, step, plan[step], after, over)",
+        "take_steps(world, states, ended, step, tried[1], after, over)", decision_of_two,
+    ),
+    "the first of two that is accepted keeps the bound from before": Bug(
+        step_shield, "decide_world", "bound, accepted = value, accepted + 1", "accepted = accepted + 1",
+        decision_of_two,
+    ),
+    "a plan for two is written for the first alone": Bug(
+        step_shield, "copy_action", "for c in range(to.shape[0]):", "for c in range(1):", decision_of_two
+    ),
+}  # fmt: skip
+
+
+@contextmanager
+def planted(bug: Bug) -> Iterator[None]:
+    """The module with the bug in it."""
+    before = getattr(bug.module, bug.function)
+    source = inspect.getsource(before)
+    assert source.count(bug.old) == 1, (
+        f"{bug.function}: {bug.old!r} stands there {source.count(bug.old)} times, not once"
+    )
+    try:
+        exec(compile(source.replace(bug.old, bug.new), bug.function, "exec"), vars(bug.module))
+        yield
+    finally:
+        setattr(bug.module, bug.function, before)
+
+
+def proven(statement: Statement) -> Told:
+    return Told(True, f"along {statement()} paths")
+
+
+def unproven(bug: Bug) -> Told:
+    """Whether the bug matters: its statement must not be proven any more."""
+    with planted(bug):
+        try:
+            bug.breaks()
+        except AssertionError as error:
+            return Told(True, str(error))
+    return Told(False, "MISSED: its statement is proven all the same")
+
+
+def cases(given: argparse.Namespace) -> Cases:
+    if os.environ.get("NUMBA_DISABLE_JIT") != "1":
+        sys.exit("compilation must be switched off: NUMBA_DISABLE_JIT=1")
+    for text, statement in STATEMENTS.items():
+        yield text, partial(proven, statement)
+    for name, bug in BUGS.items():
+        yield f"bug: {name}", partial(unproven, bug)

@@ -1,0 +1,156 @@
+"""Resuming: processes that train are killed (-9) at random moments, and must lose nothing."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import multiprocessing
+import random
+import shutil
+import tempfile
+import time
+from functools import partial
+from multiprocessing.context import ForkProcess
+from pathlib import Path
+
+from ethbrake_marl.learning.runs import newest_usable, resume, train
+from ethbrake_marl.learning.training import TrainingRecipe, load_recipe
+from ethbrake_marl.scenario import load_scenario
+from tests.programmes import Cases, Told
+
+SOON_S = 300.0
+
+PPO = load_recipe("ppo").replace(
+    total_steps=60 * 512,
+    n_envs=32,
+    n_steps=16,
+    batch_size=128,
+    network={"policy": [64, 64], "value": [64, 64]},
+    evaluation={"every_updates": 10, "worlds": 50, "seed": 1007},
+    checkpoint_every_updates=4,
+)
+SAC = load_recipe("sac").replace(
+    total_steps=500 * 16,
+    n_envs=16,
+    batch_size=64,
+    buffer_size=5000,
+    learning_starts=500,
+    network={"policy": [64, 64], "value": [64, 64]},
+    evaluation={"every_updates": 100, "worlds": 50, "seed": 1007},
+    checkpoint_every_updates=25,
+    log_every_updates=20,
+)
+WRITING = SAC.replace(checkpoint_every_updates=5, total_steps=4000 * 16, evaluation=PPO.evaluation.model_dump())
+INDEPENDENT = PPO.replace(scheme="independent", n_envs=16)
+RECIPES: dict[str, TrainingRecipe] = {"ppo": PPO, "sac": SAC, "independent": INDEPENDENT, "writing": WRITING}
+
+FORK = multiprocessing.get_context("fork")  # a fresh interpreter needs seconds; test_resume.py kills some of those
+
+
+def work(what: str, run: Path) -> None:
+    """Train from the beginning (``what`` names the recipe), or resume what is there."""
+    if run.exists():
+        resume(run)
+    else:
+        level = "cooperation-3-pair" if what == "independent" else "paper-random"
+        train(RECIPES[what], load_scenario(level), run)
+
+
+def start(what: str, run: Path) -> ForkProcess:
+    """A process that does ``work``."""
+    process = FORK.Process(target=work, args=(what, run))
+    process.start()
+    return process
+
+
+def digest(run: Path) -> str:
+    """What a finished run says and holds: the weights of its policies, the best and the last."""
+    weights = [file.read_bytes() for file in sorted(run.glob("policy*/**/weights.safetensors"))]
+    return hashlib.sha256(b"".join(weights)).hexdigest()
+
+
+def finish(what: str, run: Path) -> str:
+    """Train or resume to the end, undisturbed."""
+    process = start(what, run)
+    process.join()
+    if process.exitcode != 0:
+        raise AssertionError(f"{run}: the process failed")
+    return digest(run)
+
+
+def random_kills(what: str, kills: int, folder: Path, rng: random.Random) -> Told:
+    """How many of ``kills`` trainings, each killed at a random moment and resumed, end with the same weights.
+
+    Moments are even in the progress of the training, and a fraction of a second after it; every fourth is killed twice.
+    """
+    expected = finish(what, folder / "whole")
+    rows = table_rows(folder / "whole")
+    same = 0
+    for k in range(kills):
+        run, at = folder / f"{what}-{k}", []
+        for row in sorted(rng.randrange(rows) for _ in range(2 if k % 4 == 3 else 1)):
+            process = start(what, run)
+            while process.is_alive() and table_rows(run) < row:
+                time.sleep(0.005)
+            time.sleep(rng.uniform(0.0, 0.3))
+            process.kill()
+            process.join()
+            at.append(f"row {table_rows(run)} ({newest(run)})")
+            if not run.exists() or '"finished"' in (run / "run.json").read_text():
+                break
+        finished = run.exists() and '"finished"' in (run / "run.json").read_text()
+        good = (digest(run) if finished else finish(what, run)) == expected
+        same += good
+        print(f"  {what} {k}: killed at {', '.join(at)}: {'same' if good else 'OTHER WEIGHTS'}", flush=True)
+        shutil.rmtree(run)
+    return Told(same == kills, f"{same}/{kills} random kills end with the same weights")
+
+
+def table_rows(run: Path) -> int:
+    """Rows of the progress table."""
+    table = run / "progress.csv"
+    return table.read_text().count("\n") - 1 if table.is_file() else 0
+
+
+def newest(run: Path) -> str:
+    """The newest checkpoint of a run by name."""
+    return max((path.name for path in run.glob("checkpoints/step_*")), default="the beginning")
+
+
+def torn_writes(kills: int, folder: Path, rng: random.Random) -> Told:
+    """How many of ``kills`` that hit the writing of a checkpoint leave one that can be used."""
+    run, usable, hit = folder / "torn", 0, 0
+    while hit < kills:
+        process = start("writing", run)
+        first, deadline = newest(run), time.monotonic() + SOON_S
+        while newest(run) == first or not list(run.glob("checkpoints/.ethbrake-*.partial")):
+            if not process.is_alive() or time.monotonic() > deadline:
+                raise AssertionError(f"{run}: the training ended before it was killed {kills} times")
+            time.sleep(rng.uniform(0.0, 0.002))
+        time.sleep(rng.uniform(0.0, 0.02))
+        process.kill()
+        process.join()
+        if not list(run.glob("checkpoints/.ethbrake-*.partial")):
+            continue  # the write was over
+        hit += 1
+        state, damaged = newest_usable(run / "checkpoints")
+        usable += state is not None
+        where = "none" if state is None else state.steps
+        print(f"  kill {hit} while writing: usable checkpoint at step {where}, {len(damaged)} damaged", flush=True)
+    return Told(usable == kills, f"{usable}/{kills} kills while writing leave a usable one")
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--torn", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=0)
+
+
+def cases(given: argparse.Namespace) -> Cases:
+    with tempfile.TemporaryDirectory() as scratch:
+        for what in ("ppo", "sac", "independent"):
+            (Path(scratch) / what).mkdir()
+            rng = random.Random(f"{given.seed} {what}")
+            yield f"resume, {what}", partial(random_kills, what, given.kills, Path(scratch) / what, rng)
+        rng = random.Random(f"{given.seed} torn")
+        yield "checkpoints", partial(torn_writes, given.torn, Path(scratch), rng)

@@ -1,0 +1,221 @@
+"""Trying to break the step shield: no realised harm may be above the bound at the alert.
+
+bound         random worlds against every adversary of ``tests/shield/attacks.py``, both counts, N = 3 and 5, e to 0.3
+joint         teams of hostile learners at cooperation levels 3 and 4, N = 3 and 5; harm must be the last bound
+interfaces    worlds through every shielded interface, alone and with a team
+interference  refused calls, exceptions and interrupts at random lines on every interface, and wrappers in between
+search        restarts of a search against the shield, and against twelve leaks of it, each of which must be found
+believed      worlds that are corners of what was not received, and worlds from between them
+inside        worlds drawn from the inside of intervals, behind robust mode; corner mode beside it claims no such thing
+horizon       what a bound is worth beyond its horizon; nothing is claimed
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from functools import partial
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.search import profile_problem
+from ethbrake_marl.shield.step_shield import StepShield, begin_running, plan_harm
+from ethbrake_marl.shield.uncertainty import parse_uncertainty
+from tests.programmes import Cases, Told
+from tests.shield.attacks import (
+    ABOVE,
+    ADVERSARIES,
+    INSIDE,
+    LEAKS,
+    LISTS,
+    TEAM_ADVERSARIES,
+    TEAMS,
+    TOLERANCE,
+    WAYS,
+    Attack,
+    above_later,
+    attack,
+    line,
+    search,
+    shielded,
+)
+from tests.shield.plays import INSIDE as WRAPPED, PLAYS, WRAPPERS, Tally, disturbed, played, wrapped
+
+CHUNK = 2_000  # worlds attacked at once
+BATCH = 50_000  # worlds driven at once by what was applied
+CELLS = {3: 3.0, 5: 1.0}  # how many of the worlds each number of vehicles gets: lines of five take five times as long
+SLOW = {"worst_case": 0.14}  # and of those, a search in every step
+TEAM_CELLS = {(3, 3): 5.0, (4, 3): 1.25, (3, 5): 1.0, (4, 5): 0.75}  # by what they cost
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--worlds", type=int, default=1_000_000, help="of 'bound', all cells together, about")
+    parser.add_argument("--joint-worlds", type=int, default=300_000, help="of 'joint', all cells together, about")
+    parser.add_argument("--interface-worlds", type=int, default=10_000, help="through each interface")
+    parser.add_argument("--interfered", type=int, default=1_000, help="episodes with failing calls on each interface")
+    parser.add_argument("--corner-worlds", type=int, default=60_000, help="of 'believed'")
+    parser.add_argument("--range-worlds", type=int, default=1_200, help="of 'believed', from between the corners")
+    parser.add_argument("--restarts", type=int, default=1_000, help="of the search")
+    parser.add_argument("--intervals", default="gaps_m=0.5", help="of 'inside'")
+    parser.add_argument("--boxes", type=int, default=20, help="of 'inside'")
+    parser.add_argument("--draws", type=int, default=50_000, help="worlds out of each box")
+    parser.add_argument("--seed", type=int, default=1)
+
+
+def cases(given: argparse.Namespace) -> Cases:
+    seed = given.seed
+    for robust in ("corners", "interior"):
+        yield f"inside: {robust} ({given.intervals})", partial(inside, robust, given)
+    for name in PLAYS:
+        yield f"interference: {name}", partial(disturbance, name, given.interfered, seed)
+    for wrapper in WRAPPERS:
+        yield f"interference: inside, {wrapper}", partial(in_between, wrapper, given.interfered, seed)
+    for count in ("first", "total"):
+        yield f"search: the shield as it is, {count}", partial(searched, given.restarts, seed, harm_count=count)
+    for name, leak in LEAKS.items():
+        yield f"search: {name}", partial(searched, given.restarts, seed, leak=leak)
+    for lists, robust, worlds in ((LISTS, "corners", given.corner_worlds), (INSIDE, "interior", given.range_worlds)):
+        for name, way in product(lists, WAYS):
+            each = max(1, worlds // (len(lists) * len(WAYS)))
+            yield f"believed, {robust}: {name}, {way}", partial(believed, lists[name], way, each, seed, robust)
+    for name in PLAYS:
+        yield f"interfaces: {name}", partial(interface, name, given.interface_worlds, seed)
+    yield from attacks(given)
+    for proposer in ("coast", "full_brake", "e_v2x_bm"):
+        yield f"horizon: {proposer}", partial(beyond_horizon, proposer)
+
+
+def attacks(given: argparse.Namespace) -> Cases:
+    """Every adversary of one learner, and of teams; no two cases share a world."""
+    first, seed = 0, given.seed
+    one = list(product(CELLS, ("first", "total"), ADVERSARIES))
+    whole = sum(CELLS[N] * SLOW.get(name, 1.0) for N, _, name in one)
+    for N, count, name in one:
+        worlds = max(1, round(given.worlds * CELLS[N] * SLOW.get(name, 1.0) / whole))
+        case = {"harm_count": count, "adversary": ADVERSARIES[name]}
+        yield f"bound: N = {N}, {count}, {name}", partial(attacked, line(N), worlds, first, seed, case)
+        first += worlds
+    teams = list(product(TEAM_CELLS, ("first", "total"), ("all", "one"), TEAM_ADVERSARIES))
+    whole = sum(TEAM_CELLS[which] for which, *_ in teams)
+    for k, (which, count, hostile, name) in enumerate(teams):
+        worlds = max(1, round(given.joint_worlds * TEAM_CELLS[which] / whole))
+        case = {"harm_count": count, "hostile": hostile, "adversary": TEAM_ADVERSARIES[name]}
+        case["cap"] = (None, "baseline")[k % 2]
+        scenario = load_scenario(TEAMS[which])
+        told = f"joint: level {which[0]}, N = {which[1]}, {count}, {hostile} hostile, {name}, cap {case['cap']}"
+        yield told, partial(attacked, scenario, worlds, first, seed, case)
+        first += worlds
+
+
+def attacked(scenario: Any, worlds: int, first: int, seed: int, case: dict[str, Any]) -> Told:
+    """One adversary in some worlds. Of one learner rounding may exceed the bound; of a team harm is the last bound."""
+    found: list[Attack] = []
+    for begin in range(first, first + worlds, CHUNK):
+        sample = scenario.sample(min(CHUNK, first + worlds - begin), seed, first=begin).worlds
+        found.append(attack(scenario, sample, seed=seed + begin, **case))
+    excess = np.concatenate([each.realised - each.bound for each in found])
+    inexact = sum(int((each.realised != each.last_bound).sum()) for each in found)
+    wrong = int((excess > TOLERANCE).sum())
+    if len(scenario.learners) > 1:
+        wrong += int((excess > 0.0).sum()) + inexact + sum(each.rises + each.over_cap for each in found)
+    accepted, decisions = (
+        sum(int(np.sum(getattr(each, name))) for each in found) for name in ("accepted", "decisions")
+    )
+    return Told(
+        wrong == 0,
+        f"{worlds:,} worlds, {decisions:,} decisions, {accepted:,} deviations accepted, above: {wrong}, largest excess"
+        f" {excess.max():.1e}",
+    )
+
+
+def interface(name: str, worlds: int, seed: int) -> Told:
+    found = played(name, worlds, seed)
+    return Told(found.above == found.broken == 0, f"{found.episodes:,} episodes, {found.above} above the bound")
+
+
+def disturbance(name: str, episodes: int, seed: int) -> Told:
+    """Whatever fails: no episode above its bound, and the shield where the engine is."""
+    found = disturbed(name, episodes, seed)
+    good = (found.above, found.broken) == (0, 0) and found.refused > 0 and found.interrupted > 0
+    return Told(
+        good,
+        f"{found.episodes:,} episodes, {found.refused:,} refused, {found.interrupted:,} interrupted, above the bound:"
+        f" {found.above}, changed by what failed: {found.broken}",
+    )
+
+
+def in_between(wrapper: str, calls: int, seed: int) -> Told:
+    """Whatever stands in between, on every interface."""
+    tallies = [wrapped(name, wrapper, calls, seed) for name in WRAPPED]
+    total = Tally(*(sum(column) for column in zip(*tallies, strict=True)))
+    good = total.above == total.broken == 0 and all(each.episodes > 0 for each in tallies)
+    return Told(
+        good,
+        f"{total.episodes:,} episodes, {total.refused:,} steps refused, above the bound: {total.above}, changed by what"
+        f" failed: {total.broken}",
+    )
+
+
+def searched(restarts: int, seed: int, leak: Any = None, harm_count: str = "first") -> Told:
+    """The search against the shield, which must find nothing, or against a leak, which it must find."""
+    found = search(restarts, seed, leak, until_found=leak is not None, harm_count=harm_count)
+    if leak is None:
+        told = f"{found.restarts:,} restarts, {found.above} above the bound, largest excess {found.excess:.1e}"
+        return Told(found.above == 0, f"{told}; the same proposals without it: {found.loose:.0%} above")
+    first = "NOT FOUND" if found.first is None else f"found in restart {found.first}"
+    return Told(found.first is not None, f"{first}, largest excess {found.excess:.2g} m2/s2")
+
+
+def believed(scenario: Any, way: str, worlds: int, seed: int, robust: str) -> Told:
+    """Where the world is a corner of what is not known, or anywhere in the ranges, whatever is proposed."""
+    harm, bound, replaced = shielded(way, scenario, worlds, seed, robust=robust)
+    above, kept = int((harm > bound + ABOVE).sum()), np.isfinite(bound)
+    excess = float(np.maximum(harm - bound, 0.0)[kept].max(initial=0.0))
+    return Told(
+        above == 0 and replaced > 0,
+        f"{worlds:,} worlds, {replaced:,} replaced, above the bound: {above}, largest excess {excess:.2g}, without one:"
+        f" {int((~kept).sum())}; harm {harm.mean():.1f}, bound {bound[kept].mean():.1f}",
+    )
+
+
+def inside(robust: str, given: argparse.Namespace) -> Told:
+    """Worlds out of boxes around worlds of ``paper-random``, behind one robust shield to which ``coast`` is proposed.
+
+    What robust mode applies does not depend on which world of the box is the true one. So one shield decides for a box,
+    and many worlds of it are driven by what it applied.
+    """
+    scenario, uncertainty, boxes = load_scenario("paper-random"), parse_uncertainty(given.intervals), given.boxes
+    told, rng = scenario.sample(boxes, given.seed).worlds, np.random.default_rng(given.seed)
+    shield = StepShield(scenario, 1, uncertainty=uncertainty, robust=robust)
+    shield.begin(told, np.arange(boxes))
+    decisions, begun = 0, time.process_time()
+    while not shield.running.finished.all():
+        decisions += int((~shield.running.finished).sum())
+        shield.decide(np.zeros(boxes))
+    took, above, excess, harm = time.process_time() - begun, 0, -np.inf, 0.0
+    for k, n in product(range(boxes), list(batches(given.draws))):
+        truth = uncertainty.draw(told.take(np.full(n, k)), rng)
+        plan = np.repeat(shield.backup.plan[k : k + 1], n, axis=0)
+        realised = plan_harm(begin_running(profile_problem(truth, [1], horizon_s=scenario.horizon_s)), plan)
+        over = realised - shield.first_bound[k]
+        above, excess, harm = above + int((over > TOLERANCE).sum()), max(excess, over.max()), harm + realised.sum()
+    bound = float(shield.first_bound.mean())
+    return Told(
+        None if robust == "corners" else above == 0 and bool(np.isfinite(bound)),
+        f"{boxes * given.draws:,} worlds of {boxes} boxes, above: {above:,}, most by {excess:.2g}; bound {bound:.2f},"
+        f" harm {harm / (boxes * given.draws):.2f}, replaced {shield.interventions.sum() / decisions:.0%},"
+        f" {1e3 * took / decisions:.2f} ms per decision",
+    )
+
+
+def batches(draws: int) -> Iterator[int]:
+    yield from (min(BATCH, draws - first) for first in range(0, draws, BATCH))
+
+
+def beyond_horizon(proposer: str) -> Told:
+    now, later = above_later(proposer, 2_000)
+    return Told(None, f"above the bound at 3 s: {now:.1%}, once all stand: {later:.1%}")

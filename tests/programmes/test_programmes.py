@@ -1,0 +1,257 @@
+"""The programmes: their runner, what they say on the pages, a sample of the long ones, and the hostile one's cage."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import traceback
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from tests.programmes import ROOT, Told, __main__ as runner, audit, hostile, libraries, peers
+from tests.programmes.cage import Case, can_confine, confine, judge
+
+PAGE = ROOT / "docs" / "security.md"
+
+
+def run(*words: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    """A programme in a process of its own."""
+    command = [sys.executable, "-m", "tests.programmes", *words]
+    given = {**os.environ, "PYTHONPATH": str(ROOT), **variables}
+    return subprocess.run(command, cwd=ROOT, env=given, capture_output=True, text=True, check=False)
+
+
+# ---------------------------------------------------------------- the runner
+
+
+def fails() -> Told:
+    raise AssertionError("why")
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "end"),
+    [
+        ((), 1, "FAIL: 1 of 3 good, 1 failed, 1 without a verdict"),
+        (("--only", "good"), 0, "PASS: 1 of 1 good, 0 failed, 0 without a verdict"),
+        (("--only", "unknown"), 1, "FAIL: 0 of 0 good, 0 failed, 0 without a verdict"),
+        (("--within", "-1"), 0, "PASS: 0 of 3 good, 0 failed, 3 without a verdict"),
+        (("--list",), 0, "skipped"),
+    ],
+)
+def test_runner__says_how_the_cases_ended_and_exits_by_it(words, status, end, monkeypatch, capsys):
+    cases = {"good": lambda: Told(True, "fine"), "fails": fails, "skipped": lambda: Told(None)}
+    programme = type("programme", (), {"cases": staticmethod(lambda given: iter(cases.items()))})
+    monkeypatch.setattr(runner, "import_module", lambda name: programme)
+    assert runner.main(["audit", *words]) == status
+    assert capsys.readouterr().out.splitlines()[-1] == end
+
+
+def test_runner__lists_every_programme_and_make_and_its_help_know_each():
+    named = set(re.findall(r"\$\(PROGRAMME\) (\w+)", (ROOT / "Makefile").read_text("utf-8")))
+    assert runner.programmes().keys() - named == {"adversary"} and named <= runner.programmes().keys()
+    assert runner.main(["nobody"]) == 2
+
+
+# ---------------------------------------------------------------- audit
+
+
+def test_packages__that_are_here_have_licences_that_are_known() -> None:
+    found = [each for each in audit.packages() if each.installed]
+    assert len(found) > 50
+    assert [f"{each.name}: {each.licence!r}" for each in found if not each.family] == []
+
+
+def test_page__lists_every_pinned_package_under_its_licence() -> None:
+    part = PAGE.read_text("utf-8").partition("## The packages it stands on")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| (\S[^|]*?) \| (\d+) \| (.*?) \|$", part, re.MULTILINE)
+    listed = {name: family for family, _, names in rows for name in names.split(", ")}
+    assert all(int(number) == len(names.split(", ")) for _, number, names in rows)
+    found = audit.packages()
+    assert [each.name for each in found if each.name not in listed] == []
+    assert len(listed) == len(found)
+    assert {each.name: each.family for each in found if each.installed} == {
+        each.name: listed[each.name] for each in found if each.installed
+    }
+
+
+@pytest.mark.parametrize(
+    ("licence", "family"),
+    [
+        ("GNU General Public License v3 (GPLv3)", ""),
+        ("AGPL-3.0", ""),
+        ("", ""),
+        ("Proprietary", ""),
+        ("MIT", "MIT"),
+        ("MIT AND GPL-3.0", ""),
+        ("GPL / BSD License", "BSD"),
+    ],
+)
+def test_licence__that_is_not_known_is_a_fault(licence: str, family: str) -> None:
+    package = audit.Package("mine", "1.0", "1.0", licence)
+    assert package.family == family and bool(package.fault) == (not family)
+
+
+def test_version__that_is_not_the_pinned_one_is_a_fault_but_not_its_local_part() -> None:
+    assert audit.Package("torch", "2.13.0", "2.13.0+cpu", "BSD").fault == ""
+    assert audit.Package("torch", "2.13.0", "2.12.0", "BSD").fault == "is pinned to 2.13.0"
+
+
+@pytest.mark.parametrize(
+    ("script", "good", "told"),
+    [
+        ("echo 'No known vulnerabilities found'", True, "No known vulnerabilities found"),
+        ("echo 'Found 1 known vulnerability in 1 package'; exit 1", False, "Found 1 known vulnerability"),
+        ("echo 'ConnectionError: no route to host' >&2; exit 1", None, "not asked, pip-audit could not"),
+    ],
+)
+def test_weaknesses__are_told_or_that_nobody_could_be_asked(script, good, told, tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.executable", str(tmp_path / "python"))
+    assert audit.weaknesses() == (None, "not asked, pip-audit is not installed here")
+    (tmp_path / "pip-audit").write_text(f"#!/bin/sh\n{script}\n")
+    (tmp_path / "pip-audit").chmod(0o755)
+    found = audit.weaknesses()
+    assert found.good is good and told in found.text
+
+
+# ---------------------------------------------------------------- libraries and peers
+
+WAYS = [pytest.param(way, id=f"{way.library}: {way.title}") for way in libraries.ways()]
+HERE = [each for each in WAYS if each.values[0].library in ("Stable-Baselines3", "SuperSuit")]
+
+
+def test_page_of_libraries__has_a_row_for_every_way_and_none_failed():
+    row = r"^\| (.+?) \| [\d.]+ \| (.+?) \| (.+?) \|.*\| (\S[^|]*) \|$"
+    rows = re.findall(row, libraries.PAGE.read_text("utf-8"), re.MULTILINE)
+    ways = [(way.library, libraries.lowered(way.title), way.ran) for way in libraries.ways()]
+    assert [row[:3] for row in rows] == ways and {way[0] for way in ways} == libraries.LIBRARIES.keys()
+    assert {row[3] for row in rows} == {"runs", "beats full braking"}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_way__can_be_copied(way):
+    lines = [line for line in way.code.splitlines() if line.strip()]
+    assert 1 <= len(lines) <= 11 and max(map(len, lines)) <= 120
+    if way.language == "python":
+        compile(way.whole, way.title, "exec")
+
+
+@pytest.mark.parametrize("way", HERE)
+@pytest.mark.filterwarnings("ignore::UserWarning", "ignore::DeprecationWarning")
+def test_way__runs_in_the_projects_own_environment(way, tmp_path, monkeypatch):
+    if find_spec("stable_baselines3") is None:
+        pytest.skip("needs the extra train")
+    from stable_baselines3 import PPO
+
+    monkeypatch.chdir(tmp_path)
+    usual = tuple(64 if value == 2048 else value for value in PPO.__init__.__defaults__)
+    monkeypatch.setattr(PPO.__init__, "__defaults__", usual)
+    names: dict[str, object] = {}
+    exec(re.sub(r"n_steps=\d+", "n_steps=32", re.sub(r"\b\d+_000\b", "64", way.code)), names)
+    assert names["agent"].act is not None
+
+
+def test_peers__each_stands_beside_one_of_ours():
+    ours = {name for name, loop in peers.LOOPS.items() if loop.distribution == peers.OURS}
+    assert {loop.beside for loop in peers.LOOPS.values()} == {*ours, ""}
+    assert all((name in ours) == (loop.beside == "") for name, loop in peers.LOOPS.items())
+    assert [peers.plain(value) for value in (6.944, 13.84, 99.96, 97_512.0)] == ["6.94", "13.8", "100", "97,500"]
+
+
+# ---------------------------------------------------------------- hostile files, proofs
+
+
+@pytest.mark.slow
+def test_hostile_files__a_sample_of_the_attack_breaks_no_rule():
+    done = run("hostile", "--sample", "1", "--only", "e: ")
+    assert done.returncode == 0 and done.stdout.count("\nok ") > 50, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+def test_proofs__every_statement_and_every_planted_bug():
+    pytest.importorskip("z3")
+    done = run("proofs", NUMBA_DISABLE_JIT="1")
+    assert done.stdout.splitlines()[-1] == "PASS: 27 of 27 good, 0 failed, 0 without a verdict", done.stdout
+
+
+def test_proofs__refuse_compiled_functions():
+    done = run("proofs", NUMBA_DISABLE_JIT="0")
+    assert done.returncode == 1 and "compilation must be switched off" in done.stderr
+
+
+def nothing(folder: Path) -> None:
+    """Build nothing."""
+
+
+@pytest.mark.parametrize(
+    ("case", "fault"),
+    [
+        (Case("x", ("nonsense",), lambda folder: (folder / "../../x").touch()), "left beside its folder: x"),
+        (Case("x", ("--version",), lambda folder: None), "was not refused"),
+        (Case("x", ("nonsense",), nothing, reader=lambda: os.mkdir("/tmp/x-of-a-test")), "would have changed"),
+        (Case("x", ("nonsense",), nothing, reader=lambda: os.system("true")), "executed: os.system"),
+        (Case("x", ("nonsense",), nothing, reader=lambda: 1), "python: no error"),
+        (Case("x", ("nonsense",), nothing, reader=lambda: Path("new").touch()), "changed: inside/new"),
+    ],
+)
+def test_judge__tells_what_breaks_a_rule(case, fault, tmp_path):
+    assert [told for told in judge(case, tmp_path / "case").faults if told.startswith(fault)]
+
+
+def ends_well(work: partial[None]) -> bool:
+    """Whether ``work`` ends without an error, in a process of its own."""
+    child = os.fork()
+    if not child:
+        status = 1
+        try:
+            signal.alarm(20)
+            work()
+            status = 0
+        except BaseException:
+            traceback.print_exc()
+        os._exit(status)
+    return os.waitpid(child, 0)[1] == 0
+
+
+@pytest.mark.skipif(not can_confine(), reason="the kernel has no Landlock of version 3")
+def test_confine__keeps_the_superuser_and_his_children_from_changing_what_is_outside(tmp_path):
+    own, outside = tmp_path / "own", tmp_path / "outside"
+    own.mkdir()
+    outside.mkdir()
+    (outside / "kept").write_text("years of work")
+    deeds = (
+        lambda: (outside / "new").touch(),
+        lambda: (outside / "kept").write_text(""),
+        lambda: (outside / "kept").unlink(),
+        lambda: (outside / "folder").mkdir(),
+        lambda: os.mkfifo(outside / "pipe"),
+        lambda: (outside / "link").symlink_to("kept"),
+        lambda: os.truncate(outside / "kept", 0),
+        lambda: os.rename(outside / "kept", own / "kept"),
+        lambda: os.rename(own / "mine", outside / "mine"),
+    )
+
+    def work() -> None:
+        confine(own)
+        (own / "mine").write_text("mine")
+        Path(os.devnull).write_text("may be written to")
+        for deed in deeds:
+            with pytest.raises(OSError):
+                deed()
+        assert os.system(f"touch '{outside}/new' 2>/dev/null") != 0
+
+    assert ends_well(partial(work))
+    assert (os.listdir(outside), (outside / "kept").read_text()) == (["kept"], "years of work")
+    assert os.listdir(own) == ["mine"]
+
+
+def test_page__says_how_much_the_attack_holds():
+    grouped = {kind: hostile.by_category(kind, 0) for kind in hostile.KINDS}
+    counts = {kind: sum(map(len, groups.values())) for kind, groups in grouped.items()}
+    rows = [f"| {kind} | {len(groups)} | {counts[kind]:,} |\n" for kind, groups in grouped.items()]
+    assert "".join([*rows, f"| in all | | {sum(counts.values()):,} |\n"]) in PAGE.read_text("utf-8")

@@ -1,0 +1,438 @@
+"""Hostile text: scenarios, recipes, sweeps, tunings, named worlds and tables of states, as strangers write them.
+
+Every kind of file is changed in the same ways: what is no YAML, the wrong YAML, each value exchanged for others, and
+what ``hostile.yaml`` lists for its own keys.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import string
+from collections.abc import Callable, Iterator
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from ethbrake_marl.evaluation.inputs import NamedWorld, NamedWorlds, states_of
+from ethbrake_marl.learning.training import load_recipe
+from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.studies.sweep import SweepPlan, TuningPlan
+from tests.programmes.cage import NASTY, Case, damaged, write
+
+SCENARIO = """name: mine
+title: A line of three
+description: What a stranger sends.
+vehicles: 3
+time_step_s: 0.1
+horizon_s: 8
+gaps_m: {uniform: [5, 10]}
+speeds_mps: {uniform: [18, 22]}
+braking_capacity_mps2: [6, 7, 6]
+driving_capacity_mps2: [6, 7, 6]
+mass_t: [4.5, 5.5, 5.9]
+latency_s: [0, 0.5, 0.8]
+speed_limit_mps: 40
+restitution: 0.1
+early_impacts: keep
+roles:
+  vehicle_1: full_brake
+  vehicle_2: learner
+  vehicle_3: full_brake
+"""
+RECIPE = """name: mine
+title: Two updates
+algorithm: ppo
+total_steps: 256
+n_envs: 16
+n_steps: 8
+batch_size: 64
+n_epochs: 1
+learning_rate: {start: 3.0e-4, end: 3.0e-5}
+gamma: 0.99
+gae_lambda: 0.95
+clip_range: 0.2
+ent_coef: 0.0
+vf_coef: 0.5
+max_grad_norm: 0.5
+network: {policy: [8], value: [8]}
+reward: {harm: 1.0}
+seed: 3
+evaluation: {every_updates: 1, worlds: 10, seed: 7}
+checkpoint_every_updates: 100
+"""
+SWEEP = """title: Two jobs and one
+set: {total_steps: 256}
+grid:
+  scenario: [paper-random]
+  recipe: [quick]
+  seed: {first: 0, count: 2}
+  set:
+    gamma: [0.99, 0.995]
+jobs:
+  - {scenario: paper-random, recipe: ppo, seed: 0}
+"""
+TUNING = """title: Two settings of the quick recipe
+scenario: paper-random
+recipe: quick
+set: {total_steps: 256}
+search:
+  learning_rate.start: {low: 0.0001, high: 0.1, log: true}
+  network.policy: {choices: [[8], [16, 8]]}
+measure: {worlds: 10, seed: 11, times: 2}
+prune: {after_trials: 2, after_times: 1}
+sampler: {random_trials: 3}
+"""
+NOT_FINITE = (
+    ".nan", ".NaN", ".NAN", ".inf", "-.inf", "+.INF", ".Inf", "nan", "NaN", "inf", "-Infinity", "Infinity", "1e999",
+    "-1e400",
+)  # fmt: skip
+NOT_NUMBERS = (
+    '"7"', "seven", "1_000", "0b101", "1:30", "12:30:45", "2026-11-20", "\u0663", "\uff17", "\u2167", "1,5", "+-3",
+    "0x", "0o9", "1e", "e5", "--1", "7 m", "true", "null", "~", "[]", "{}", "[[7]]", "{a: {b: {c: 1}}}", "!!float 7",
+    "*x", "&x 7", "0xfffffffffffffffff", "9" * 30, "-" + "9" * 5000, "9" * 40000,
+)  # fmt: skip
+TAGS = (
+    "!!python/object/apply:os.system ['touch pwned']", "!!python/name:os.system", "!!python/module:os",
+    "!!python/tuple [1]", "!!python/object/new:subprocess.Popen [['touch', 'pwned']]", "!!binary aGk=", "!!set {a, b}",
+    "!!omap [a: 1]", "!!timestamp 2026-11-20", "!local thing", "!<tag:yaml.org,2002:str> x", "!!int 7", "! x",
+    "!!null ''",
+)  # fmt: skip
+SPECS = (
+    "planner:99999999999", "best_harm:99999999999", "planner:1e99", "planner:" + "9" * 4000, "planner:999999999ms",
+    "planner:0", "planner:0.5", "planner:-1", "planner:\u0663", "best_harm:0", "best_harm:x", "best_harm:\u00b2",
+    "best_harm:" + "9" * 5000, "constant:.inf", "constant:1e400", "constant:nan", "constant:" + "9" * 3000,
+    "constant:-7", "e_v2x_bm:eval", "coast:1", "__import__('os').system('touch pwned')", "ppo@/dev/zero", "ppo@shipped",
+    "hybrid@shipped", "team@.", "learner:1", "Learner", "replay", "a" * 5000, "constant:3;touch pwned",
+    "$(touch pwned)", "../../etc/passwd", "ladder", "gentlest_front:x", "",
+)  # fmt: skip
+ESCAPES = (
+    "\\e[2J", "\\x1b]0;x\\x07", "\\u202e", "\\u2028", "\\0", "\\r\\nOK", "\\x9b", "\\ud800", "\\uFEFF", "\\a\\b\\v\\f",
+    "\\U000e0041",
+)  # fmt: skip
+BROKEN = (
+    "a: b: c", "[", "}", "- x\ny", "'", '"', "a: [1, 2", "\t- a", "@x", "`x`", "a: |x\n", "%", "&", "*", "? ",
+    "a:\n b:\nc\n", ": :", "key: 'it's'",
+)  # fmt: skip
+ELSE = (
+    "", "\n\n", "# nothing\n", "---\n", "7", "text", "[1, 2]", "- a\n- b", "null", "\ufeff", "...", '""',
+    "<html></html>", '{"cells": []}', "[section]\nkey=1\n", "PK\x03\x04", "\x7fELF", "#!/bin/sh\ntouch pwned\n",
+    "import os\n", "GIF89a",
+)  # fmt: skip
+NEEDED = (
+    "name", "gaps_m", "speeds_mps", "braking", "driving", "mass_t", "latency_s", "algorithm", "total", "gamma",
+    "n_envs",
+)  # fmt: skip
+WRONG: tuple[Any, ...] = (
+    None, True, -1, 0, 1.5, 10**30, 10**400, 1e300, "", "x" * 9000, [], {}, [[]], {"a": {"b": []}}, *NASTY,
+)  # fmt: skip
+
+Change = Callable[[random.Random, str], "str | bytes"]
+
+
+def lines_of(text: str) -> list[str]:
+    """The lines that give a key at the top level, with those that belong to it."""
+    parts: list[str] = []
+    for line in text.splitlines():
+        if line.startswith(" "):
+            parts[-1] += "\n" + line
+        else:
+            parts.append(line)
+    return parts
+
+
+def joined(parts: list[str]) -> str:
+    return "\n".join(parts) + "\n"
+
+
+def with_value(rng: random.Random, text: str, value: str, *, numeric: bool = False) -> str:
+    """The text with another value under one of its keys."""
+    parts = lines_of(text)
+    k = rng.choice([k for k, p in enumerate(parts) if not numeric or p.split(": ", 1)[-1][0] in string.digits])
+    parts[k] = f"{parts[k].split(':')[0]}: {value}"
+    return joined(parts)
+
+
+def with_line(rng: random.Random, text: str, line: str) -> str:
+    """The text with one more line."""
+    parts = lines_of(text)
+    parts.insert(rng.randrange(len(parts) + 1), line)
+    return joined(parts)
+
+
+def without(rng: random.Random, text: str) -> str:
+    """The text without one of the keys that are needed."""
+    parts = lines_of(text)
+    del parts[rng.choice([k for k, part in enumerate(parts) if part.startswith(NEEDED)])]
+    return joined(parts)
+
+
+def misspelt(rng: random.Random, text: str) -> str:
+    """The text with one letter of one key changed."""
+    parts = lines_of(text)
+    k = rng.randrange(len(parts))
+    at = rng.randrange(len(parts[k].partition(":")[0]))
+    parts[k] = parts[k][:at] + rng.choice("QXZ9") + parts[k][at + 1 :]
+    return joined(parts)
+
+
+def spliced(rng: random.Random, text: str) -> str:
+    """Pieces of the text in another order."""
+    i, j, k = sorted(rng.randrange(len(text)) for _ in range(3))
+    a, b, c, d = text[:i], text[i:j], text[j:k], text[k:]
+    return rng.choice((a + c + b + d, a + d, a + b + b + c + d, b + a + c + d))
+
+
+def quoted(rng: random.Random) -> str:
+    """A double-quoted scalar whose escapes make what YAML forbids in the open."""
+    return f'"{rng.choice(ESCAPES)}{rng.randrange(99)}"'
+
+
+def changed_somewhere(rng: random.Random, content: Any) -> Any:
+    """JSON with one value, anywhere in it, replaced, removed, or given another key."""
+    places: list[tuple[Any, Any]] = []
+
+    def walk(part: Any) -> None:
+        for key in part if isinstance(part, dict) else range(len(part)):
+            places.append((part, key))
+            if isinstance(part[key], dict | list):
+                walk(part[key])
+
+    content = json.loads(json.dumps(content))
+    walk(content)
+    part, key = rng.choice(places)
+    what = rng.randrange(4)
+    if what == 1:
+        del part[key]
+    elif what == 2 and isinstance(part, dict):
+        part[rng.choice(("more", "__class__", "", *NASTY))] = part.pop(key)
+    else:
+        part[key] = rng.choice([each for each in WRONG if type(each) is not type(part[key]) or each != part[key]])
+    return content
+
+
+def one_of(*texts: str, at: Callable[..., str] = with_line, **how: bool) -> Change:
+    """One of these as a line, or in the place of a value."""
+    return lambda r, t: at(r, t, r.choice(texts), **how)
+
+
+def number(*texts: str) -> Change:
+    return one_of(*texts, at=with_value, numeric=True)
+
+
+def times(text: str, *counts: int) -> tuple[str, ...]:
+    return tuple(text * count for count in counts)
+
+
+# What is refused for certain, whatever the values of the random choices, of every kind of file.
+OF_EVERY_FILE: dict[str, Change] = {
+    "unknown key": lambda r, t: with_line(r, t, f"{''.join(r.choices(string.ascii_lowercase, k=9))}_q: 1"),
+    "misspelt key": misspelt,
+    "key twice": lambda r, t: with_line(r, t, r.choice(lines_of(t))),
+    "tag": one_of(*TAGS, at=with_value),
+    "tag on the document": lambda r, t: f"{r.choice(TAGS).split(' ')[0]}\n{t}",
+    "billion laughs": lambda r, t: (
+        "a: &a [x, x]\n" + "".join(f"b{k}: &b{k} [*a, *a]\n" for k in range(r.randrange(3, 40))) + t
+    ),
+    "merge key": one_of("<<: {vehicles: 4}", "<<: [{a: 1}]", "<<:"),
+    "directive": lambda r, t: r.choice(("%YAML 1.1\n---\n", "%TAG ! tag:x,1:\n---\n", "%YAML 9.9\n---\n")) + t,
+    "second document": lambda r, t: t + r.choice(("---\n", "...\n---\n", "---\n---\n")) + t,
+    "deep, in brackets": one_of(*("[" * n + "]" * n for n in (20, 500, 5000, 30000)), at=with_value),
+    "deep, open": one_of(*times("[", 20, 999, 9000), *times("{a: ", 20, 9000), *times("[{a: ", 999), at=with_value),
+    "deep, by indents": lambda r, t: t + "".join(f"{' ' * k}k:\n" for k in range(r.choice((20, 100, 300)))),
+    "deep, by dashes": one_of(*(f"x: \n {dashes}1" for dashes in times("- ", 20, 999, 20000))),
+    "wide mapping": lambda r, t: with_value(r, t, f"{{{', '.join(f'k{k}: 1' for k in range(r.choice((99, 4000))))}}}"),
+    "many keys": lambda r, t: t + "".join(f"k{k}: 1\n" for k in range(r.choice((99, 4000)))),
+    "key that is no text": one_of("? [a, b]\n: 1", "1: 2", "true: 1", "~: 1", "{a: 1}: 2", "1.5: x"),
+    "long key": one_of(*(f"{key}: 1" for key in times("a", 129, 900, 1023))),
+    "long quoted key": one_of(*(f'? "{key}"\n: 1' for key in times("b", 2000, 60000))),
+    "nasty key": one_of(*(f"k{each}: 1" for each in NASTY)),
+    "nasty quoted key": lambda r, t: with_line(r, t, f"{quoted(r)}: 1"),
+    "look-alike key": one_of("n\u0430me: x", "\uff4eame: x", "name\u200b: x", "tit\u0142e: x", "na\u0301me: y"),
+    "UTF-16 or UTF-32": lambda r, t: t.encode(r.choice(("utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-32-be"))),
+    "not text": lambda r, t: (
+        t.encode()[: (at := r.randrange(len(t)))]
+        + r.choice((b"\xff", b"\xc3", b"\xed\xa0\x80", b"\xf5\x80", b"\xc0\xaf", b"\xe2\x80"))
+        + t.encode()[at:]
+    ),
+    "NUL": one_of("\0", "title: a\0b", "\0: 1", "a: \0"),
+    "control character": one_of(*(f"title2: {each}" for each in ("\7", "\x1b[2J", "\b", "\x7f", "\1"))),
+    "broken syntax": one_of(*BROKEN),
+    "something else": lambda r, t: r.choice(ELSE),
+    "too large": lambda r, t: t + "#" + "x" * (10 << 20),
+}
+# Of files with numbers at their top level.
+WITH_NUMBERS: dict[str, Change] = {
+    "missing key": without,
+    "not finite": number(*NOT_FINITE),
+    "not a number": number(*NOT_NUMBERS),
+    "out of range": number("-1", "-1e300", "-0.5", "-1e-9"),
+    "null": number("null", "~", ""),
+    "anchor": number(*(f"&a{k} 7" for k in range(9))),
+    "alias": number(*(f"*a{k}" for k in range(9))),
+    "wide list": number(*(f"[{', '.join(['7'] * n)}]" for n in (99, 5000, 15000))),
+    "long value": number(*(f'"{text}"' for each in ("x", "x y ", "\u00e9", "'") for text in times(each, 300, 9000))),
+    "nasty quoted value": lambda r, t: with_value(r, t, quoted(r), numeric=True),
+    "nasty name": lambda r, t: t.replace("name: mine", f"name: {quoted(r)}"),
+    "other name": lambda r, t: t.replace(
+        "name: mine", f"name: {r.choice(('', 'Mine', '../mine', 'a' * 65, 'mine ine', '-x', '7' * 3000 + '_'))}"
+    ),
+}
+# What may be in order too.
+UNCERTAIN: dict[str, Change] = {
+    "any value": lambda r, t: json.dumps(changed_somewhere(r, yaml.safe_load(t)), ensure_ascii=False),
+    "spliced": spliced,
+    "a value of another key": lambda r, t: with_value(
+        r, t, r.choice(lines_of(t)).split(": ", 1)[-1].replace("\n", " ")
+    ),
+    "nasty text": lambda r, t: t.replace("title: ", f"title: {quoted(r)} # "),
+    "damaged": lambda r, t: damaged(r, t.encode()),
+}
+SEARCHING = ("planner", "best_harm", "planner:1000000", "best_harm:1000000", "planner:60000ms", "e_v2x_bm")
+SLOW: dict[str, Change] = {
+    "other spelling of a number": number("+7", "0x7", "0o7", ".7", "7.", "7e0", "007", "-0", "7.0"),
+    "role": lambda r, t: t.replace("vehicle_3: full_brake", f"vehicle_3: {json.dumps(r.choice(SPECS))}"),
+    "long lines of vehicles": lambda r, t: t.replace(
+        "vehicles: 3", f"vehicles: {r.choice((1, 0, -3, 64, 65, 10**9, 2**62))}"
+    ),
+    "slow to draw": lambda r, t: (
+        t.replace("early_impacts: keep", "early_impacts: reject")
+        .replace("[5, 10]", f"[{r.choice(('0', '1e-9', '1e-300'))}, {r.choice(('1e-8', '0.001', '0.3'))}]")
+        .replace("0.8]", f"{r.choice((0.8, 3, 7.9))}]")
+    ),
+    "slow to search": lambda r, t: (
+        t.replace("horizon_s: 8", f"horizon_s: {r.choice((8, 3600))}")
+        .replace("time_step_s: 0.1", f"time_step_s: {r.choice((0.1, 0.0001))}")
+        .replace("vehicle_3: full_brake", f"vehicle_3: {r.choice(SEARCHING)}")
+    ),
+}
+
+
+class Text(NamedTuple):
+    """A kind of text file: one that is in order, the command and the function that read it, and how often it is tried.
+
+    The output of some commands is taken: what is in order is refused for that, before anything is trained.
+    """
+
+    text: str
+    command: tuple[str, ...]
+    reader: Callable[[str], object]
+    each: int = 4  # cases of each category
+    certain: dict[str, Change] = OF_EVERY_FILE
+    uncertain: dict[str, Change] = UNCERTAIN
+    file: str = "mine.yaml"
+
+
+@cache
+def worlds_text() -> str:
+    """A file of two named worlds that is in order; nobody does more harm than it says."""
+    scenario = load_scenario("paper-random")
+    states = states_of(scenario.sample(2, 7).worlds, scenario)
+    worlds = [NamedWorld(name=f"world-{k}", score=1e6, harm=1e6, state=state) for k, state in enumerate(states)]
+    return NamedWorlds.of(
+        scenario, scenario="paper-random", settings=["restitution=0.1"], agent="full_brake", measure="harm",
+        harm_count="first", found_by="ethbrake search falsify --measure harm", worlds=worlds,
+    ).text  # fmt: skip
+
+
+HEADER = "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps"
+ROW = "7,7,20,18,20"
+STATES = f"{HEADER}\n{ROW}\n{ROW}\n{ROW}\n"
+LATER = ("scenario of worlds", "settings of worlds", "agent of worlds", "measure")  # looked at when they are driven
+
+
+def texts() -> dict[str, Text]:
+    """Every kind of text."""
+    both, own = {**OF_EVERY_FILE, **WITH_NUMBERS}, {**UNCERTAIN, **SLOW}
+    train = ("train", "--recipe", "mine.yaml", "--output", "taken")
+    sweep = ("study", "sweep", "mine.yaml", "--output", "taken", "--jobs", "1")
+    tune = ("study", "tune", "mine.yaml", "--output", "taken")
+    states = ("evaluate", "--agents", "coast", "--initial-states", "mine.csv")
+    again = ("search", "falsify", "--again", "mine.yaml")
+    paper = load_scenario("paper-random")
+    return {
+        "scenario": Text(SCENARIO, ("scenario", "validate", "mine.yaml"), load_scenario, 25, both, own),
+        "recipe": Text(RECIPE, train, load_recipe, 28, both, UNCERTAIN),
+        "sweep": Text(SWEEP, sweep, SweepPlan.read),
+        "tuning": Text(TUNING, tune, TuningPlan.read),
+        "worlds": Text(worlds_text(), again, lambda path: NamedWorlds.read(path).worlds_of(paper, "x")),
+        "CSV": Text(STATES, states, paper.read_worlds, 10, CSV, {"damaged": UNCERTAIN["damaged"]}, "mine.csv"),
+    }
+
+
+def text_cases(kind: str, rng: random.Random) -> Iterator[Case]:
+    """Every way to change a kind of file, and what is listed for its own keys."""
+    text = texts()[kind]
+    for certain, changes in ((True, text.certain), (False, text.uncertain)):
+        for category, change in changes.items():
+            for _ in range(2 if category == "too large" else text.each * (1 if certain else 2)):
+                yield _case(text, category, partial(change, random.Random(rng.random()), text.text), certain)
+    listed_here = yaml.safe_load(Path(__file__).with_name("hostile.yaml").read_text("utf-8"))
+    for category, listed in listed_here.get(kind, {}).items():
+        for new in listed["to"]:
+            yield _case(text, category, partial(_exchanged, text.text, listed, new), True)
+
+
+def _exchanged(text: str, listed: dict[str, Any], new: str) -> str:
+    """What is listed, which stands in the text, exchanged."""
+    if "of" in listed:
+        assert listed["of"] in text, listed["of"]
+        return text.replace(listed["of"], new, 1)
+    at = text.index(listed["line"])
+    return text[:at] + listed["line"] + new + text[text.index("\n", at) :]
+
+
+def _case(text: Text, category: str, content: Callable[[], str | bytes], certain: bool) -> Case:
+    def build(folder: Path) -> None:
+        write(folder / text.file, content())
+        write(folder / "taken", "precious")
+
+    reader = None if category in LATER else partial(text.reader, text.file)
+    return Case(category, text.command, build, certain=certain, reader=reader)
+
+
+# ---------------------------------------------------------------- tables of initial states
+
+
+def with_field(*texts: str, line: int | None = None) -> Change:
+    """The table with another field in one place."""
+
+    def change(rng: random.Random, text: str) -> str:
+        rows = [row.split(",") for row in text.splitlines()]
+        rows[rng.randrange(1, 4) if line is None else line][rng.randrange(5)] = rng.choice(texts)
+        return joined([",".join(row) for row in rows])
+
+    return change
+
+
+def whole(*contents: str | bytes) -> Change:
+    return lambda r, t: r.choice(contents)
+
+
+NAMES = [each.replace("\r\n", " ") for each in NASTY]
+CSV: dict[str, Change] = {
+    "not finite": with_field(*NOT_FINITE),
+    "not a number": with_field(*(each for each in NOT_NUMBERS if "," not in each)),
+    "out of range": with_field("-1", "1e300", "-1e-9", "201", "1e999", "99999999"),
+    "empty field": with_field("", " ", '""', "\t", "\xa0"),
+    "nasty field": with_field(*NAMES),
+    "formula": with_field("=1+1", "=cmd|'/c calc'!A1", "@SUM(1)", "+7-", "-7+1", "=HYPERLINK(1)"),
+    "long field": with_field(*(text + "z" for text in times("9", 3000, 200_000, 2_000_000))),
+    "nasty column": with_field(*NAMES, line=0),
+    "unknown column": with_field("gap_3_m", "speed_0_mps", "x" * 5000, "GAP_1_M", "gap_1_km", "", "__class__", line=0),
+    "column twice": lambda r, t: t.replace("gap_2_m", "gap_1_m"),
+    "many columns": whole(*(",".join(["gap_1_m"] * n) + "\n1\n" for n in (20, 5000, 100_000))),
+    "columns short or over": with_field("7,7", "7,7,7,7", "7\n7"),
+    "other separator": lambda r, t: t.replace(",", r.choice((";", "\t", "|", " ", "\x1f"))),
+    "no rows": whole("", HEADER, HEADER + "\n", "\n\n\n", "\n" * 100_000, HEADER + "\n\n\n", ",,,,\n", "\ufeff"),
+    "quotes": with_field('"7', '7"7', '"7"7"', '"' * 999, '"7\n7\n7'),
+    "UTF-16 or UTF-32": OF_EVERY_FILE["UTF-16 or UTF-32"],
+    "not text": lambda r, t: t.encode() + r.choice((b"\xff\xfe", b"\xc3(", b"\xed\xa0\x80", b"\x80")),
+    "NUL": with_field("\0", "7\0", "\0\0\0"),
+    "too large": lambda r, t: b"7" * ((64 << 20) + 1),
+    "something else": whole(
+        b"PK\x03\x04" * 9, b"\x7fELF", b"<html>", b"{}", b"%PDF-1.7", b"SQLite format 3\0", b"\x1f\x8b\x08"
+    ),
+}

@@ -1,0 +1,226 @@
+"""The packages: wheel and sdist with the same bytes twice, the wheel alone without torch, and a wheel of kernels.
+
+``built`` leaves wheel and sdist in ``--output``, if two builds have the same SHA-256 (``make dist``). ``kernels``
+leaves there a wheel of ready-made kernels, ``ethbrake-marl-kernels``, for this version of Python: the machine code of
+what Python calls, for two levels of x86-64 (``make kernels``). A kernel's name holds the hash of all that makes it: of
+another version of this package, of numba or of Python it is never loaded. ``light`` installs the wheel in an empty
+environment, weighs it, and runs there what must do without torch; then the sdist in its place, which must bring the
+same files (``make test-light``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import hashlib
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import venv
+import zipfile
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+from ethbrake_marl import __version__
+from tests.programmes import ROOT, Cases, Told
+
+LIMIT_MB = 650
+NOT_OURS = ("pip", "setuptools", "pkg_resources", "wheel", "_distutils_hack")  # what an empty environment begins with
+SHIPPED = "ppo@shipped,ppo@shipped+episode"
+NEEDS_TRAIN = "-m pip install 'ethbrake-marl[train]'"
+LEVELS = ("x86-64-v3", "x86-64-v2")
+KERNELS = "ethbrake_marl_kernels"
+LARGEST_BYTES = 5_000_000
+DATE = (2020, 1, 1, 0, 0, 0)
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--output", type=Path, default=ROOT / "dist", help="folder of what is built")
+    parser.add_argument("--store", type=Path, help="folder below which each level's kernels are kept for the next time")
+    parser.add_argument("--environment", type=Path, help="to install into, instead of a new one; its packages stay")
+
+
+def cases(given: argparse.Namespace) -> Cases:
+    yield "built twice: wheel and sdist", partial(built_twice, given.output)
+    yield "kernels: a wheel of ready-made ones", partial(kernels, given.output, given.store)
+    with tempfile.TemporaryDirectory(prefix="ethbrake-wheel-") as folder:
+        yield from light(Path(folder), given.environment)
+
+
+def build(folder: Path) -> dict[str, bytes]:
+    """Build wheel and sdist into ``folder``, by uv; every file's content by its name."""
+    uv = Path(sys.executable).with_name("uv")
+    subprocess.run([str(uv), "build", "--quiet", "--out-dir", str(folder), str(ROOT)], check=True)
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.suffix in (".whl", ".gz")}
+
+
+def built_twice(output: Path) -> Told:
+    """Build twice, compare, and keep the second."""
+    with tempfile.TemporaryDirectory(prefix="ethbrake-dist-") as first, tempfile.TemporaryDirectory() as second:
+        files, again = build(Path(first)), build(Path(second))
+    if files != again or len(files) != 2:
+        return Told(False, "two builds differ")
+    output.mkdir(exist_ok=True)
+    for name, content in again.items():
+        (output / name).write_bytes(content)
+        print(f"{hashlib.sha256(content).hexdigest()}  {name}", flush=True)
+    return Told(True, "the same bytes")
+
+
+# ---------------------------------------------------------------- kernels
+
+
+def kernels(output: Path, store: Path | None) -> Told:
+    """Compile, pack, and say how large it is."""
+    output.mkdir(exist_ok=True)
+    found: dict[str, bytes] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for level in LEVELS:
+            found |= compile_for(level, (store or Path(folder)) / level)
+    wheel = pack(found, output)
+    size = wheel.stat().st_size
+    print(f"{hashlib.sha256(wheel.read_bytes()).hexdigest()}  {wheel.name}", flush=True)
+    return Told(size <= LARGEST_BYTES, f"{len(found)} kernels, {size / 1e6:.2f} MB, at most {LARGEST_BYTES / 1e6:.0f}")
+
+
+def compile_for(level: str, folder: Path) -> dict[str, bytes]:
+    """The kernels of one level, by name."""
+    chosen = {"NUMBA_CPU_NAME": level, "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": str(folder)}
+    command = [sys.executable, "-m", "ethbrake_marl", "doctor", "--compile"]
+    subprocess.run(command, env={**os.environ, "PYTHONPATH": str(ROOT), **chosen}, cwd=ROOT, check=True)
+    return {file.name: file.read_bytes() for file in sorted(folder.rglob("*.entry"))}
+
+
+def pack(found: dict[str, bytes], folder: Path) -> Path:
+    """Write the wheel."""
+    tag = f"cp{sys.version_info.major}{sys.version_info.minor}-none-manylinux2014_x86_64"
+    about = f"{KERNELS}-{__version__}.dist-info"
+    files = {f"{KERNELS}/__init__.py": b'"""Compiled kernels of ethbrake_marl."""\n'}
+    files |= {f"{KERNELS}/{name}": content for name, content in found.items()}
+    files[f"{about}/METADATA"] = (
+        f"Metadata-Version: 2.1\nName: ethbrake-marl-kernels\nVersion: {__version__}\n".encode()
+    )
+    files[f"{about}/WHEEL"] = (
+        f"Wheel-Version: 1.0\nGenerator: tests.programmes\nRoot-Is-Purelib: true\nTag: {tag}\n".encode()
+    )
+    record = "".join(f"{name},sha256={_digest(content)},{len(content)}\n" for name, content in files.items())
+    files[f"{about}/RECORD"] = f"{record}{about}/RECORD,,\n".encode()
+    wheel = folder / f"{KERNELS}-{__version__}-{tag}.whl"
+    with zipfile.ZipFile(wheel, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(zipfile.ZipInfo(name, DATE), content, zipfile.ZIP_DEFLATED, 9)
+    return wheel
+
+
+def _digest(content: bytes) -> str:
+    return base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
+
+
+# ---------------------------------------------------------------- the wheel alone
+
+
+class Call(NamedTuple):
+    """A command in the environment, the status it must end with, and the end of what it then says on stderr."""
+
+    arguments: tuple[str, ...]
+    status: int = 0
+    error: str = ""
+
+    @property
+    def shown(self) -> str:
+        return f"{' '.join(self.arguments).strip().replace(chr(10), '; '):.100}"
+
+
+COMMANDS = (
+    Call(("ethbrake", "--version")),
+    Call(("ethbrake", "evaluate", "--agents", SHIPPED, "--episodes", "200")),
+    Call(("ethbrake", "evaluate", "--agents", "full_brake,ppo@shipped+step", "--episodes", "20", "--json")),
+    Call(("ethbrake", "shield", "--agents", "ppo@shipped", "--episodes", "20")),
+    Call(("ethbrake", "watch", "picture", "deceleration", "--output", "deceleration.png")),
+    Call(("ethbrake", "watch", "picture", "shield-modes", "--episodes", "20", "--output", "modes.png")),
+    Call(("ethbrake", "scenario", "validate", "paper-random")),
+    Call(("ethbrake", "doctor")),
+    Call(("ethbrake", "train", "--steps", "1000"), 2, NEEDS_TRAIN),
+    Call(("ethbrake", "run"), 2, NEEDS_TRAIN),
+    Call(("ethbrake", "doctor", "speed", "--quick"), 2, NEEDS_TRAIN),
+    Call(("ethbrake", "agent", "export", "shipped/ppo", "--onnx", "ppo.onnx"), 2, "'ethbrake-marl[export]'"),
+    Call(("python", "-c", "import ethbrake_marl as eb; eb.train"), 1, NEEDS_TRAIN),  # an exception, whose end says it
+)
+SMOKE = (COMMANDS[0], COMMANDS[1], COMMANDS[6], COMMANDS[7])  # of the sdist, whose files are the wheel's
+INTERFACES = "eb.env(), eb.parallel_env(), eb.EthBrakeEnv(), eb.EthBrakeVectorEnv(4)"
+ABSENT = "assert not {'torch', 'stable_baselines3', 'tensorboard'} & set(sys.modules)"
+
+
+def readme_example() -> Call:
+    """The first Python program of the README."""
+    found = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)
+    assert found is not None
+    return Call(("python", "-c", found[1]))
+
+
+def calls() -> Iterator[Call]:
+    """Everything that is tried of the light core, in order."""
+    yield readme_example()
+    yield Call(("python", "-W", "error", "-c", f"import sys, ethbrake_marl as eb; {INTERFACES}; {ABSENT}"))
+    yield from COMMANDS
+
+
+def run(call: Call, environment: Path, folder: Path) -> Told:
+    """Run one command in an empty folder, and say how it ended."""
+    program, *arguments = call.arguments
+    given = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_CACHE_DIR": str(folder / "cache")}
+    given.pop("PYTHONPATH", None)
+    command = [str(environment / "bin" / program), *arguments]
+    done = subprocess.run(command, env=given, cwd=folder, capture_output=True, text=True, timeout=900, check=False)
+    last = (done.stderr.strip().splitlines() or [""])[-1]
+    good = done.returncode == call.status and call.error in last
+    return Told(good, "" if good else f"status {done.returncode}; {done.stdout[-500:]}{done.stderr[-1500:]}")
+
+
+def light(folder: Path, environment: Path | None) -> Cases:
+    """Install the wheel, weigh it, try everything; then the sdist."""
+    there = environment.absolute() if environment else folder / "environment"
+    files: set[tuple[str, str]] = set()
+
+    def size() -> Told:
+        if not (there / "bin" / "python").exists():
+            venv.create(there, with_pip=True)
+        for each in ("built", "work"):
+            (folder / each).mkdir()
+        build(folder / "built")
+        files.update(install(there, *folder.glob("built/*.whl")))
+        found = installed_mb(there)
+        return Told(found <= LIMIT_MB, f"{found:.0f} MB, at most {LIMIT_MB}")
+
+    def same() -> Told:
+        again = install(there, *folder.glob("built/*.tar.gz"))
+        return Told(bool(files) and files == again, f"the wheel's {len(files)} files")
+
+    yield "light: what is installed", size
+    yield from ((f"light: {call.shown}", partial(run, call, there, folder / "work")) for call in calls())
+    yield "light: what the sdist brings", same
+    for call in (readme_example(), *SMOKE):
+        yield f"light, from the sdist: {call.shown}", partial(run, call, there, folder / "work")
+
+
+def install(environment: Path, file: Path) -> set[tuple[str, str]]:
+    """Install a wheel or sdist at the versions of constraints.txt; path and hash of each of its files."""
+    pip = [str(environment / "bin" / "python"), "-m", "pip", "--quiet", "--disable-pip-version-check", "install"]
+    constraints = ["-c", str(ROOT / "constraints.txt")]
+    subprocess.run([*pip, *constraints, "--force-reinstall", "--no-deps", str(file)], check=True)
+    subprocess.run([*pip, *constraints, str(file)], check=True)
+    (record,) = environment.glob("lib/python*/site-packages/ethbrake_marl-*.dist-info/RECORD")
+    rows = [line.rsplit(",", 2) for line in record.read_text("utf-8").splitlines()]
+    return {(path, digest) for path, digest, _ in rows if path.startswith("ethbrake_marl/") and digest}
+
+
+def installed_mb(environment: Path) -> float:
+    """Size of what was installed, 10^6 bytes: files of site-packages but those of an empty environment."""
+    (packages,) = environment.glob("lib/python*/site-packages")
+    parts = [part for part in packages.iterdir() if not part.name.startswith(NOT_OURS)]
+    files = [file for part in parts for file in ([part] if part.is_file() else part.rglob("*"))]
+    return sum(file.lstat().st_size for file in files if file.is_file()) / 1e6

@@ -1,0 +1,444 @@
+"""Who tries to get above the bound of a shield, and how: lines, adversaries, attacks, leaks, and the search for a way.
+
+Harm is read from the engine's ledger, not from the shield. A search that finds nothing is worth what it finds where
+there is something: ``LEAKS`` are twelve leaks that a step shield could have, small ones among them, and the same
+search must find harm above the bound through each. (Why not "came within 1 % of the bound"? Realised harm equals the
+last bound to the bit, so that is reached by proposing nothing but the plan.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.registry import drive, make_agent
+from ethbrake_marl.engine import Engine
+from ethbrake_marl.physics import Floats, Worlds, advance
+from ethbrake_marl.physics.kernel import CLOCK
+from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.shield import ShieldedDriver, StepShield
+from ethbrake_marl.shield.step_shield import Decision, Running, certify, seen_columns
+
+# ---------------------------------------------------------------- lines
+
+_ROLES = {
+    3: {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "constant:5"},
+    5: {
+        "vehicle_1": "constant:6",
+        "vehicle_2": "full_brake",
+        "vehicle_3": "learner",
+        "vehicle_4": "constant:4",
+        "vehicle_5": "coast",
+    },
+}
+
+
+def line(N: int, restitution: float = 0.3) -> Scenario:
+    """Random lines of N vehicles, e from 0 to ``restitution``; the learner may also drive."""
+    return Scenario(
+        name=f"line-{N}",
+        vehicles=N,
+        gaps_m={"uniform": [2, 12]},
+        speeds_mps={"uniform": [10, 20]},
+        braking_capacity_mps2={"uniform": [6, 9]},
+        driving_capacity_mps2={"uniform": [0, 4]},
+        mass_t={"uniform": [1, 8]},
+        latency_s={"uniform": [0, 0.7]},
+        restitution={"uniform": [0, restitution]},
+        roles=_ROLES[N],
+        early_impacts="keep",
+    )
+
+
+TEAMS = {  # by cooperation level and number of vehicles
+    (3, 3): "cooperation-3-pair", (4, 3): "cooperation-4-all",
+    (3, 5): "cooperation-3-five", (4, 5): "cooperation-4-five",
+}  # fmt: skip
+
+# ---------------------------------------------------------------- adversaries: what all learners propose, [n, K]
+
+Adversary = Callable[[np.random.Generator, Engine, StepShield, int], Floats]  # ..., number of the step
+
+
+def random_actions(rng, engine, shield, k):
+    return rng.uniform(-1.0, 1.0, shape(shield))
+
+
+def extremes(rng, engine, shield, k):
+    return np.where((k + np.arange(shape(shield)[0])[:, np.newaxis]) % 2, 1.0, -np.ones(shape(shield)))
+
+
+def coast(rng, engine, shield, k):
+    return np.zeros(shape(shield))
+
+
+def full_drive(rng, engine, shield, k):
+    return np.ones(shape(shield))
+
+
+def slow_drift(rng, engine, shield, k):
+    """Random, held for several steps: whole profiles that differ from the plan."""
+    return np.random.default_rng(1_000 + k // 6).uniform(-1.0, 0.5, shape(shield))
+
+
+def bang_bang(rng, engine, shield, k):
+    return np.sign(np.random.default_rng([k // 4, shape(shield)[0]]).uniform(-1.0, 1.0, shape(shield)))
+
+
+def speechless(rng, engine, shield, k):
+    """No number half of the time; at random else."""
+    return np.where(rng.random(shape(shield)) < 0.5, np.nan, rng.uniform(-3.0, 3.0, shape(shield)))
+
+
+def worst_case(rng, engine, shield, k, candidates=8):
+    """Of some candidates the accepted one that leaves the most harm: a search against the shield itself."""
+    n, K = shape(shield)
+    best, action = np.full(n, -1.0), np.ones((n, K))
+    for middle in np.linspace(-1.0, 1.0, candidates):
+        candidate = middle + rng.uniform(-0.1, 0.1, (n, K)) if K == 1 else rng.uniform(-1.0, 1.0, (n, K))
+        decision = certify(shield.running, as_asked(shield, candidate), shield.backup, shield.bound)
+        reason = decision.reason.reshape(n, K)
+        better = ((reason == 1) | (reason == 2)).any(axis=1) & (decision.bound > best)
+        best[better], action[better] = decision.bound[better], np.clip(candidate[better], -1.0, 1.0)
+    return action
+
+
+def sleeper(rng, engine, shield, k):
+    """What the plan says, for some decisions; then driving."""
+    wakes = 3 + 4 * (np.arange(shape(shield)[0]) % 6)[:, np.newaxis]
+    return np.where(k < wakes, planned(shield), 1.0)
+
+
+@cache
+def layers(N: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Weights and biases of the trained adversary, in order; ``tests/programmes/adversary.py`` made them."""
+    with np.load(Path(__file__).with_name(f"adversary-{N}.npz"), allow_pickle=False) as kept:
+        return [(kept[f"weight{k}"], kept[f"bias{k}"]) for k in range(len(kept.files) // 2)]
+
+
+def trained(rng, engine, shield, k):
+    """A policy that was paid for harm under the shield, with a little noise: no two lists are attacked alike."""
+    value = engine.observe(engine.learners[0])
+    *hidden, (weight, bias) = layers(engine.scenario.vehicles)
+    for w, b in hidden:
+        value = np.tanh(value @ w.T + b)
+    action = (value @ weight.T + bias).astype(np.float64)
+    return np.clip(action + rng.normal(0.0, 0.05, action.shape), -1.0, 1.0)
+
+
+_TEAMS_TOO = (random_actions, extremes, coast, full_drive, slow_drift, bang_bang, speechless, worst_case, sleeper)
+TEAM_ADVERSARIES: dict[str, Adversary] = {f.__name__: f for f in _TEAMS_TOO}
+ADVERSARIES: dict[str, Adversary] = {**TEAM_ADVERSARIES, "trained": trained}
+
+
+def shape(shield: StepShield) -> tuple[int, int]:
+    """Of a decision's proposals: worlds, vehicles."""
+    return len(shield.first_bound), len(shield.vehicles)
+
+
+def as_asked(shield: StepShield, proposed: Floats) -> Floats:
+    """Proposals [n, K] as this shield takes them: [n] where it shields one vehicle."""
+    return proposed if isinstance(shield.vehicle, tuple) else proposed[:, 0]
+
+
+def planned(shield: StepShield) -> Floats:
+    """What the plan says now, [n, K]."""
+    plan, (n, K) = shield.backup.plan, shape(shield)
+    return plan[np.arange(n), np.minimum(shield.running.steps, plan.shape[1] - 1)].reshape(n, K)
+
+
+# ---------------------------------------------------------------- attacks
+
+
+class Attack(NamedTuple):
+    """What an adversary achieved; n worlds."""
+
+    realised: Floats  # harm in the engine's ledger
+    bound: Floats  # at the alert
+    last_bound: Floats
+    accepted: Floats  # deviations from the plan that were let through
+    rises: int  # how often the bound that was told rose
+    over_cap: int  # vehicles that bore more than they might
+    decisions: int
+
+
+def attack(
+    scenario: Scenario, worlds: Worlds, adversary: Adversary, *, hostile="all", harm_count="first", allowance=0.0,
+    cap=None, leak: Leak | None = None, seed=0,
+) -> Attack:  # fmt: skip
+    """Let the hostile learners propose in every step: ``all``, or ``one``, another one from world to world.
+
+    Who is not hostile proposes what the plan says, or brakes fully. A ``leak`` changes the shield before each decision.
+    """
+    rng, learners = np.random.default_rng(seed), scenario.learners
+    engine = plain_engine(scenario, worlds)
+    shield = begun(scenario, worlds, harm_count=harm_count, allowance=allowance, cap=cap)
+    first_bound, told, decision = shield.first_bound.copy(), shield.bound, None
+    rows = np.arange(worlds.n)[:, np.newaxis]
+    who, obeys = rows % len(learners) == np.arange(len(learners)), rows % 4 < 2
+    accepted, rises, decisions, k = np.zeros(worlds.n, np.int64), 0, 0, 0
+    while not engine.ended.all():
+        if leak is not None:
+            leak(shield, decision)
+        proposed = adversary(rng, engine, shield, k)
+        if hostile == "one":
+            proposed = np.where(who, proposed, np.where(obeys, planned(shield), -1.0))
+        decision = shield.decide(as_asked(shield, proposed), only=~engine.ended)
+        decisions += int((~engine.ended).sum())
+        reason = decision.reason.reshape(shape(shield))
+        accepted += (((reason == 1) | (reason == 2)) & ~engine.ended[:, np.newaxis]).sum(axis=1)
+        rises, told = rises + int((decision.bound > told).sum()), decision.bound
+        engine.step(decision.applied.reshape(shape(shield)))
+        assert leak is not None or shield.expects(seen_columns(engine.packed)).all()
+        k += 1
+    assert leak is not None or not shield.distrusted.any()
+    over = 0 if cap is None else int((engine.ledger.vehicle_harm(harm_count) > shield.baseline_shares).sum())
+    realised = engine.ledger.world_harm(harm_count)
+    return Attack(realised, first_bound, shield.bound, accepted, rises, over, decisions)
+
+
+def begun(scenario: Scenario, worlds: Worlds, **settings) -> StepShield:
+    """A shield of all learners in its episodes."""
+    learners = scenario.learners
+    shield = StepShield(scenario, learners[0] if len(learners) == 1 else learners, **settings)
+    shield.begin(worlds, np.arange(worlds.n))
+    return shield
+
+
+def plain_engine(scenario: Scenario, worlds: Worlds) -> Engine:
+    """Without a shield."""
+    scripts = {i: make_agent(spec) for i, spec in scenario.scripts.items()}
+    return Engine(scenario, worlds.n, learners=scenario.learners, scripts=scripts, worlds=worlds)
+
+
+def above_later(proposer: str, worlds: int) -> tuple[float, float]:
+    """Share of ``paper-random``'s worlds above their bound at a horizon of 3 s, and once all stand.
+
+    From the horizon on everybody brakes fully.
+    """
+    scenario = load_scenario("paper-random").replace(horizon_s=3.0)
+    episodes = drive(scenario.sample(worlds, 7).worlds, ShieldedDriver(make_agent(proposer), scenario), scenario, 1)
+    final, bound = episodes.final, episodes.guarded.shield.predicted_harm
+    _, impacts = advance(final, -final.vehicles.braking_capacity_mps2, until_s=np.full(worlds, 8.0))
+    now, later = (ledger.world_harm("first") for ledger in (episodes.ledger, episodes.ledger.add(impacts)))
+    return float((now > bound).mean()), float((later > bound + 1e-9).mean())
+
+
+# ---------------------------------------------------------------- the search
+
+TOLERANCE = 1e-9  # m2/s2
+BATCH = 250  # restarts that run together
+
+
+class Restarts:
+    """Random ways to propose, one for each world: at random, at the extremes, held for a time, the worst allowed."""
+
+    def __init__(self, seed: list[int], n: int) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.way, self.held = self.rng.integers(4, size=n), self.rng.uniform(-1.0, 1.0, n)
+        self.proposals: list[Floats] = []
+
+    def __call__(self, _, engine, shield, k):
+        rng, n = self.rng, len(self.way)
+        self.held = np.where(rng.random(n) < 0.2, rng.uniform(-1.0, 1.0, n), self.held)
+        worst = worst_case(rng, engine, shield, k, 6)[:, 0]
+        tried = [rng.uniform(-1.0, 1.0, n), rng.choice([-1.0, 1.0], n), self.held, worst]
+        self.proposals.append(np.choose(self.way, tried)[:, np.newaxis])
+        return self.proposals[-1]
+
+
+class Found(NamedTuple):
+    """What the restarts achieved."""
+
+    restarts: int
+    above: int  # restarts that ended above the bound at the alert
+    first: int | None  # number of the first of them, from 1
+    excess: float  # largest harm above the bound (m2/s2)
+    loose: float  # share of the restarts that would end above the bound if their proposals were applied unshielded
+
+
+def search(
+    restarts: int, seed: int, leak: Leak | None = None, *, until_found: bool = False, harm_count="first"
+) -> Found:
+    """Attack the shield, or one with a leak, from many random starts."""
+    above, first, excess, loose, done = 0, None, -np.inf, 0, 0
+    while done < restarts and not (until_found and first is not None):
+        n, scenario = min(BATCH, restarts - done), line(3 if (done // BATCH) % 2 == 0 else 5)
+        worlds, ways = scenario.sample(n, seed, first=done).worlds, Restarts([seed, done], n)
+        found = attack(scenario, worlds, ways, harm_count=harm_count, leak=leak)
+        over, free = found.realised - found.bound, plain_engine(scenario, worlds)
+        proposals = iter(ways.proposals)
+        while not free.ended.all():
+            free.step(next(proposals, ways.proposals[-1]))
+        broken = np.flatnonzero(over > TOLERANCE)
+        if first is None and broken.size:
+            first = done + int(broken[0]) + 1
+        above, excess = above + broken.size, max(excess, float(over.max()))
+        loose, done = loose + int((free.ledger.world_harm(harm_count) > found.bound).sum()), done + n
+    return Found(done, above, first, excess, loose / done)
+
+
+# ---------------------------------------------------------------- leaks
+
+Leak = Callable[[StepShield, Decision | None], None]  # changes the shield before a decision; the last one, or None
+
+
+def _with_problem(shield: StepShield, **arrays: np.ndarray) -> None:
+    running = shield.running
+    shield.running = running._replace(problem=running.problem._replace(**arrays))
+
+
+def _columns(running: Running, group: int) -> slice:
+    """Columns of the state: 0 gaps, 1 hit flags, 2 first-impact harm, 3 total harm."""
+    N = running.problem.mass.shape[1]
+    return slice(N + group * (N - 1), N + (group + 1) * (N - 1))
+
+
+def _states(shield: StepShield, group: int) -> np.ndarray:
+    return shield.running.states[:, _columns(shield.running, group)].copy()
+
+
+def _with_states(shield: StepShield, group: int, values: np.ndarray | float) -> None:
+    states = shield.running.states.copy()
+    states[:, _columns(shield.running, group)] = values
+    shield.running = shield.running._replace(states=states)
+
+
+def budget_may_rise(percent: float) -> Leak:
+    def leak(shield, last):
+        shield.backup = shield.backup._replace(harm=shield.backup.harm * (1.0 + percent / 100.0))
+
+    return leak
+
+
+def harm_forgotten(shield: StepShield, last: Decision | None) -> None:
+    for group in (2, 3):
+        _with_states(shield, group, _states(shield, group) * 0.99)
+
+
+def impacts_late(shield: StepShield, last: Decision | None) -> None:
+    """What was done in the last step is counted two steps later only."""
+    for group in (2, 3):
+        now, before = _states(shield, group), getattr(shield, f"late{group}", None)
+        setattr(shield, f"late{group}", now)
+        _with_states(shield, group, now if before is None else before)
+
+
+def hits_assumed(shield: StepShield, last: Decision | None) -> None:
+    """A pair that is close counts as hit before: its first impact costs nothing."""
+    _with_states(shield, 1, np.maximum(_states(shield, 1), _states(shield, 0) < 0.5))
+
+
+def belief(name: str, believed: Callable[[np.ndarray], np.ndarray]) -> Leak:
+    """The shield believes a parameter to be something else."""
+
+    def leak(shield, last):
+        if last is None:
+            _with_problem(shield, **{name: believed(getattr(shield.running.problem, name).copy())})
+
+    return leak
+
+
+def half_restitution(clock: np.ndarray) -> np.ndarray:
+    clock[:, CLOCK.RESTITUTION] *= 0.5
+    return clock
+
+
+def far_pairs_forgotten(shield: StepShield, last: Decision | None) -> None:
+    """Harm of pairs that the shielded vehicle is no part of does not count."""
+    vehicle, N = shield.vehicle, shield.running.problem.mass.shape[1]
+    far = [p for p in range(N - 1) if vehicle not in (p, p + 1)]
+    for group in (2, 3):
+        harm = _states(shield, group)
+        harm[:, far] = 0.0
+        _with_states(shield, group, harm)
+
+
+def plan_rounded(shield: StepShield, last: Decision | None) -> None:
+    """The plan is kept with two decimals; its harm is believed unchanged."""
+    shield.backup = shield.backup._replace(plan=np.round(shield.backup.plan, 2))
+
+
+def gaps_blurred(shield: StepShield, last: Decision | None) -> None:
+    """Gaps are believed 1 cm longer than they are, from the third step on."""
+    if last is not None and int(shield.running.steps.max()) == 3:
+        _with_states(shield, 0, _states(shield, 0) + 0.01)
+
+
+LEAKS: dict[str, Leak] = {
+    "the budget may rise by 1 % in each step": budget_may_rise(1.0),
+    "the budget may rise by 0.1 % in each step": budget_may_rise(0.1),
+    "1 % of the harm so far is forgotten in each step": harm_forgotten,
+    "impacts are counted one step late": impacts_late,
+    "a pair closer than 0.5 m counts as hit before": hits_assumed,
+    "the latency of all is believed 10 % longer": belief("latency", lambda latency: latency * 1.1),
+    "the masses are believed equal": belief("mass", np.ones_like),
+    "the others are believed to brake 1 % harder": belief("command", lambda command: command * 1.01),
+    "restitution is believed half of what it is": belief("clock", half_restitution),
+    "harm of pairs further off is forgotten": far_pairs_forgotten,
+    "the plan is kept with two decimals": plan_rounded,
+    "gaps are believed 1 cm longer": gaps_blurred,
+}
+
+# ---------------------------------------------------------------- corners of what a vehicle does not know
+
+# Every quantity of another vehicle that is open is one of two numbers, so each world of the lists is a member of what
+# is certified at its first decision. None of the numbers are round: in a world of equal gaps and equal speeds two
+# impacts fall on one moment, and the last bit decides which of them is first.
+WAYS = ("coast", "drive", "chance")
+ABOVE = 1e-6  # m2/s2; what is told is moved on with rounding
+
+_BASE = load_scenario("cooperation-2-paper").replace(early_impacts="keep")
+NEVER_HEARD = _BASE.replace(
+    gaps_m=[{"choice": [5.13, 9.71]}, {"choice": [5.37, 9.58]}],
+    speeds_mps=[{"choice": [18.23, 21.87]}, {"choice": [18.11, 21.93]}, {"choice": [18.41, 22.19]}],
+    v2x={"preset": "paper", "hears": "front"},
+    mass_t=[4.5, 5.5, {"choice": [3.0, 9.0]}],
+)
+HEARD_LATE = NEVER_HEARD.replace(  # a while after the first decision, by messages 0.6 to 0.9 s old
+    v2x={"preset": "paper", "link_latency_s": 0.6, "persistence": "periodic", "senses": "front", "sensing_s": [3, 3]},
+    latency_s=[0.0, 0.2, 0.6],
+)
+LISTS = {"never heard": NEVER_HEARD, "heard late": HEARD_LATE}
+_INSIDE = {
+    "gaps_m": [{"uniform": [5.13, 9.71]}, {"uniform": [5.37, 9.58]}],
+    "speeds_mps": [{"uniform": [18.23, 21.87]}, {"uniform": [18.11, 21.93]}, {"uniform": [18.41, 22.19]}],
+    "mass_t": [4.5, 5.5, {"uniform": [3.0, 9.0]}],
+}
+INSIDE = {  # the same ranges, and worlds from between the corners
+    **{name: scenario.replace(**_INSIDE) for name, scenario in LISTS.items()},
+    "blocked": NEVER_HEARD.replace(**_INSIDE, v2x={"preset": "blocked", "persistence": "periodic"}),
+    "sensors-only": NEVER_HEARD.replace(**_INSIDE, v2x="sensors-only"),
+}
+
+
+class Hostile:
+    """Proposes what does harm: full driving, nothing at all, or chance."""
+
+    knows = "own sensors"
+
+    def __init__(self, way: str, seed: int = 5) -> None:
+        self.name, self.rng = way, np.random.default_rng(seed)
+
+    def act(self, worlds: Worlds, vehicle: int) -> Floats:
+        """The proposal, [n] m/s2."""
+        vehicles = worlds.vehicles
+        low, high = -vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
+        if self.name == "chance":
+            return self.rng.uniform(low, high)
+        return high.copy() if self.name == "drive" else np.zeros(worlds.n)
+
+
+def shielded(
+    way: str, scenario: Scenario, n: int, seed: int, *, robust: str | None = "corners"
+) -> tuple[Floats, Floats, int]:
+    """Harm realised and first bound of ``n`` worlds [n] m2/s2, and how many proposals were replaced."""
+    mode = {"mode": "step"} if robust is None else {"mode": "robust", "robust": robust}
+    driver = ShieldedDriver(Hostile(way, seed), scenario, believed=True, **mode)
+    episodes = drive(scenario.sample(n, seed).worlds, driver, scenario, 1)
+    shield = episodes.guarded.shield
+    return episodes.ledger.world_harm("first"), shield.predicted_harm, int(shield.interventions.sum())
