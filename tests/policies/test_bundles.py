@@ -1,14 +1,16 @@
+"""Policies as bundles: exact when they come back, refused when damaged or malicious, and those that ship."""
+
 from __future__ import annotations
 
 import hashlib
 import json
 import os
 import pickle
-import socket
 import stat
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +18,20 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
+import ethbrake_marl as eb
 from ethbrake_marl import policies as bundle
+from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput
-from ethbrake_marl.policies import Policy, content_sha256, load_policy
+from ethbrake_marl.evaluation import TESTS, evaluate, make_lineup, summarise
+from ethbrake_marl.policies import (
+    Policy,
+    content_sha256,
+    load_named_policy,
+    load_policy,
+    shipped_name,
+    shipped_policies,
+)
+from ethbrake_marl.shield import HybridAgent
 from tests.docs.site import load
 
 Spoil = Callable[[Path], None]
@@ -35,11 +48,8 @@ def _edit(*, rehash: bool = True, **changes: Any) -> Spoil:
     def spoil(folder: Path) -> None:
         manifest = json.loads((folder / "manifest.json").read_bytes())
         for key, value in changes.items():
-            *outer, last = key.split("__")
-            target = manifest
-            for name in outer:
-                target = target[name]
-            target[last] = value
+            outer, _, inner = key.rpartition("__")
+            (manifest[outer] if outer else manifest)[inner] = value
         if rehash:
             manifest["manifest_sha256"] = content_sha256(manifest)
         (folder / "manifest.json").write_text(json.dumps(manifest))
@@ -91,6 +101,17 @@ def _link(name: str) -> Spoil:
     return spoil
 
 
+def _last_digit_of(name: str) -> Spoil:
+    """Change the last digit of a hash, and nothing else that the manifest's own hash does not follow."""
+
+    def spoil(folder: Path) -> None:
+        digest = json.loads((folder / "manifest.json").read_bytes())[name]
+        changed = digest[:-1] + ("0" if digest[-1] != "0" else "1")
+        _edit(rehash=name != "manifest_sha256", **{name: changed})(folder)
+
+    return spoil
+
+
 def _pipe(folder: Path) -> None:
     (folder / "manifest.json").unlink()
     os.mkfifo(folder / "manifest.json")
@@ -99,17 +120,6 @@ def _pipe(folder: Path) -> None:
 def _folder_instead(folder: Path) -> None:
     (folder / "weights.safetensors").unlink()
     (folder / "weights.safetensors").mkdir()
-
-
-def _socket(folder: Path) -> None:
-    (folder / "weights.safetensors").unlink()
-    here = os.getcwd()
-    os.chdir(folder)  # the name of a socket has a short longest length
-    try:
-        with socket.socket(socket.AF_UNIX) as listening:
-            listening.bind("weights.safetensors")
-    finally:
-        os.chdir(here)
 
 
 def _endless_device(folder: Path) -> None:
@@ -123,29 +133,12 @@ def _endless_device(folder: Path) -> None:
         os.truncate(path, 1 << 40)
 
 
-def _sparse_giant(folder: Path) -> None:
-    os.truncate(folder / "weights.safetensors", 1 << 40)
-
-
 def _first_tensor(**changes: Any) -> Spoil:
     return _header(lambda h: h["policy.0.bias"].update(changes))
 
 
-def _renamed(name: str) -> Spoil:
-    return _header(lambda h: h.update({name: h.pop("policy.0.bias")}))
-
-
 def _raw_header(text: bytes) -> Spoil:
     return _weights(lambda data: len(text).to_bytes(8, "little") + text + data[-400:])
-
-
-def _with(tensors: dict[str, np.ndarray], name: str, value: np.ndarray) -> dict[str, np.ndarray]:
-    return {**tensors, name: value}
-
-
-def _not_finite(tensors: dict[str, np.ndarray], number: float) -> dict[str, np.ndarray]:
-    tensors["value.0.bias"][2] = number
-    return tensors
 
 
 SPOILED: dict[str, tuple[Spoil, str]] = {
@@ -219,14 +212,18 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
         _edit(scenario={"name": "x", "roles": {"vehicle_2": "coast"}}),
         r"manifest.json: learners: vehicle_2: does not learn",
     ),
+    "last_digit_of_the_weights_hash": (
+        _last_digit_of("weights_sha256"),
+        r"weights.safetensors: SHA-256 is [0-9a-f]{64}, the manifest says",
+    ),
+    "last_digit_of_the_own_hash": (_last_digit_of("manifest_sha256"), r"manifest.json: its content has SHA-256"),
     "hash_not_hex": (_edit(weights_sha256="x" * 64), r"manifest.json: weights_sha256"),
     "bit_flip": (
         lambda f: _replace(f / "weights.safetensors", lambda d: d[:-3] + bytes([d[-3] ^ 1]) + d[-2:]),
         r"weights.safetensors: SHA-256 is [0-9a-f]{64}, the manifest says",
     ),
-    "socket": (_socket, r"weights.safetensors: (is not a plain file|cannot be read)"),
     "endless_device": (_endless_device, r"weights.safetensors: (is not a plain file|larger than)"),
-    "sparse_giant": (_sparse_giant, r"weights.safetensors: larger than"),
+    "sparse_giant": (lambda f: os.truncate(f / "weights.safetensors", 1 << 40), r"weights.safetensors: larger than"),
     "other_case": (lambda f: (f / "manifest.json").rename(f / "Manifest.json"), r"manifest.json: is missing"),
     "hidden_file": (lambda f: (f / ".weights.py").write_text("raise SystemExit"), r".weights.py: does not belong"),
     "extra_folder": (lambda f: (f / "__pycache__").mkdir(), r"__pycache__: does not belong"),
@@ -244,8 +241,14 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
         _manifest(lambda data: data.replace(b'"paper-random"', b"[" * 100_000 + b"]" * 100_000)),
         r"manifest.json: (nested too deeply|.*recursion)",
     ),
-    "tensor_path": (_renamed("../../policy.0.bias"), r"tensor 'policy.0.bias' is missing"),
-    "tensor_dunder": (_renamed("__class__.__init__"), r"tensor 'policy.0.bias' is missing"),
+    "tensor_path": (
+        _header(lambda h: h.update({"../../policy.0.bias": h.pop("policy.0.bias")})),
+        r"tensor 'policy.0.bias' is missing",
+    ),
+    "tensor_dunder": (
+        _header(lambda h: h.update({"__class__.__init__": h.pop("policy.0.bias")})),
+        r"tensor 'policy.0.bias' is missing",
+    ),
     "unknown_dtype": (_first_tensor(dtype="F99"), r"tensor 'policy.0.bias' is F99"),
     "object_dtype": (_first_tensor(dtype="O"), r"tensor 'policy.0.bias' is O"),
     "negative_shape": (_first_tensor(shape=[-13]), r"tensor 'policy.0.bias' is F32 \[-13\]"),
@@ -256,7 +259,10 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "deep_header": (_raw_header(b"[" * 200_000), r"weights.safetensors: nested too deeply"),
     "key_twice_in_header": (_raw_header(b'{"a": {}, "a": {}}'), r"weights.safetensors: key 'a' stands twice"),
     "empty_header": (_raw_header(b"{}"), r"tensor 'policy.0.bias' is missing"),
-    "minus_infinite_weight": (_tensors(lambda t: _not_finite(t, -np.inf)), r"tensor 'value.0.bias' holds a number"),
+    "minus_infinite_weight": (
+        _tensors(lambda t: {**t, "value.0.bias": t["value.0.bias"] - np.float32(np.inf)}),
+        r"tensor 'value.0.bias' holds a number",
+    ),
     "empty_weights": (_weights(lambda _: b""), r"weights.safetensors: not a safetensors file"),
     "pickle": (_weights(lambda _: pickle.dumps(_Payload())), r"weights.safetensors: not a safetensors file"),
     "zip": (_weights(lambda _: b"PK\x03\x04" + b"\0" * 4000), r"weights.safetensors: not a safetensors file"),
@@ -274,55 +280,45 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
         r"tensor 'policy.1.bias' is missing",
     ),
     "extra_tensor": (
-        _tensors(lambda t: _with(t, "policy.9.bias", np.zeros(3, "f4"))),
+        _tensors(lambda t: {**t, "policy.9.bias": np.zeros(3, "f4")}),
         r"tensor 'policy.9.bias' does not belong here",
     ),
     "wrong_shape": (
-        _tensors(lambda t: _with(t, "policy.0.bias", np.zeros(14, "f4"))),
+        _tensors(lambda t: {**t, "policy.0.bias": np.zeros(14, "f4")}),
         r"tensor 'policy.0.bias' is F32 \[14\], should be F32 \[13\]",
     ),
     "transposed": (
-        _tensors(lambda t: _with(t, "policy.1.weight", np.ascontiguousarray(t["policy.1.weight"].T))),
+        _tensors(lambda t: {**t, "policy.1.weight": np.ascontiguousarray(t["policy.1.weight"].T)}),
         r"tensor 'policy.1.weight' is F32 \[13, 9\], should be F32 \[9, 13\]",
     ),
     "wrong_dtype": (
-        _tensors(lambda t: _with(t, "policy.0.bias", np.zeros(13, "f8"))),
+        _tensors(lambda t: {**t, "policy.0.bias": np.zeros(13, "f8")}),
         r"tensor 'policy.0.bias' is F64 \[13\], should be F32 \[13\]",
     ),
-    "nan_weight": (_tensors(lambda t: _not_finite(t, np.nan)), r"tensor 'value.0.bias' holds a number that is not"),
-    "infinite_weight": (_tensors(lambda t: _not_finite(t, np.inf)), r"tensor 'value.0.bias' holds a number that is"),
+    "nan_weight": (
+        _tensors(lambda t: {**t, "value.0.bias": np.append(t["value.0.bias"][1:], np.float32(np.nan))}),
+        r"tensor 'value.0.bias' holds a number that is not",
+    ),
+    "infinite_weight": (
+        _tensors(lambda t: {**t, "value.0.bias": t["value.0.bias"] + np.float32(np.inf)}),
+        r"tensor 'value.0.bias' holds a number that is",
+    ),
 }
 
 
-def test_bundle__round_trip_is_exact(policy: Policy, tmp_path: Path) -> None:
-    policy.save(tmp_path / "policy")
-    loaded = load_policy(tmp_path / "policy")
-    assert loaded.manifest == policy.manifest
-    assert loaded.tensors.keys() == policy.tensors.keys()
-    assert all(np.array_equal(loaded.tensors[name], policy.tensors[name]) for name in policy.tensors)
-    seen = np.random.default_rng(0).normal(size=(50, policy.observation.size)).astype(np.float32)
-    assert np.array_equal(loaded(seen), policy(seen))
-    assert np.unique(loaded(seen)).size > 10
-    assert sorted(path.name for path in tmp_path.rglob("*")) == ["manifest.json", "policy", "weights.safetensors"]
-
-
-def test_bundle__the_same_policy_gives_the_same_bytes(policy: Policy, tmp_path: Path) -> None:
-    for name in ("a", "b"):
+def test_bundle__round_trip_is_exact_and_always_of_the_same_bytes(policy: Policy, tmp_path: Path) -> None:
+    for name in ("a", "run/policy"):
         policy.save(tmp_path / name)
+    os.link(tmp_path / "a" / "weights.safetensors", tmp_path / "elsewhere")  # as installers do: no sign of anything
+    for loaded in (load_policy(tmp_path / "a"), load_policy(str(tmp_path / "run"))):
+        assert loaded.manifest == policy.manifest
+        assert loaded.tensors.keys() == policy.tensors.keys()
+        assert all(np.array_equal(loaded.tensors[name], policy.tensors[name]) for name in policy.tensors)
+    seen = np.random.default_rng(0).normal(size=(50, policy.observation.size)).astype(np.float32)
+    assert np.array_equal(loaded(seen), policy(seen)) and np.unique(loaded(seen)).size > 10
+    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["manifest.json", "weights.safetensors"]
     for file in ("manifest.json", "weights.safetensors"):
-        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
-
-
-def test_load_policy__finds_the_policy_of_a_run(policy: Policy, tmp_path: Path) -> None:
-    policy.save(tmp_path / "my-run" / "policy")
-    assert load_policy(str(tmp_path / "my-run")).manifest == policy.manifest
-
-
-@pytest.mark.parametrize(("name", "message"), [("nothing", "is not a folder"), ("empty", "holds no policy")])
-def test_load_policy__where_there_is_none(name: str, message: str, tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(InvalidInput, match=f"{name}: {message}"):
-        load_policy(tmp_path / name)
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "run" / "policy" / file).read_bytes()
 
 
 @pytest.mark.parametrize("name", SPOILED)
@@ -336,18 +332,19 @@ def test_load_policy__refuses_a_damaged_bundle(name: str, policy: Policy, tmp_pa
     assert "\n" not in str(caught.value)
 
 
-def test_load_policy__refuses_a_linked_folder(policy: Policy, tmp_path: Path) -> None:
+@pytest.mark.parametrize("given", ["run", "run/policy"])
+def test_load_policy__refuses_a_linked_folder(given: str, policy: Policy, tmp_path: Path) -> None:
     policy.save(tmp_path / "elsewhere")
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "policy").symlink_to(tmp_path / "elsewhere")
-    for path in (tmp_path / "run", tmp_path / "run" / "policy"):
-        with pytest.raises(CorruptBundle, match="policy: is a symbolic link"):
-            load_policy(path)
+    with pytest.raises(CorruptBundle, match="policy: is a symbolic link"):
+        load_policy(tmp_path / given)
 
 
 _WATCHED_LOADS = """
 import json, sys
 from ethbrake_marl.errors import CorruptBundle
+from ethbrake_marl.learning.training import RunDirectory  # which needs no torch either
 from ethbrake_marl.policies import (load_policy)
 
 root, names = sys.argv[1], json.loads(sys.argv[2])
@@ -399,49 +396,16 @@ def test_ship_policy__acts_the_same_without_the_critic(policy: Policy, tmp_path:
     assert np.array_equal(loaded(seen), policy(seen))
 
 
-def test_load_policy__a_hard_link_is_the_file_itself(policy: Policy, tmp_path: Path) -> None:
-    """Installers link packages hard, so this is no sign of anything; what is in the file is checked all the same."""
-    policy.save(tmp_path / "policy")
-    os.link(tmp_path / "policy" / "weights.safetensors", tmp_path / "elsewhere")
-    assert load_policy(tmp_path / "policy").manifest == policy.manifest
-
-
-@pytest.mark.parametrize("path", [None, 3, b"policy"])
-def test_load_policy__refuses_what_is_no_path(path: object) -> None:
-    with pytest.raises(InvalidInput, match=r"^policy .*: must be the path of a run or of a policy bundle"):
-        load_policy(path)
-
-
 def test_damaged_bundles__are_as_many_as_the_page_says() -> None:
     page = Path(__file__).resolve().parents[2] / "docs" / "learning.md"
     assert f"{len(SPOILED)} damaged and malicious bundles" in " ".join(page.read_text("utf-8").split())
 
 
 def test_save__does_not_replace(policy: Policy, tmp_path: Path) -> None:
-    policy.save(tmp_path / "policy")
-    before = (tmp_path / "policy" / "manifest.json").stat().st_mtime_ns
+    (tmp_path / "policy").mkdir()
     with pytest.raises(AlreadyExists, match="policy: is there already"):
         policy.save(tmp_path / "policy")
-    assert (tmp_path / "policy" / "manifest.json").stat().st_mtime_ns == before
-
-
-@pytest.mark.parametrize("failing_call", [1, 2])
-def test_save__leaves_nothing_when_it_fails(
-    failing_call: int, policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls: list[Path] = []
-    write = bundle.write_file
-
-    def full_disk(path: Path, data: bytes) -> None:
-        calls.append(path)
-        if len(calls) == failing_call:
-            raise OSError(28, "No space left on device")
-        write(path, data)
-
-    monkeypatch.setattr(bundle, "write_file", full_disk)
-    with pytest.raises(OSError, match="No space left"):
-        policy.save(tmp_path / "policy")
-    assert list(tmp_path.iterdir()) == []
+    assert list(tmp_path.rglob("*")) == [tmp_path / "policy"]
 
 
 def test_make_policy__refuses_what_it_could_not_load(policy: Policy) -> None:
@@ -451,3 +415,156 @@ def test_make_policy__refuses_what_it_could_not_load(policy: Policy) -> None:
         Policy.make(policy.tensors, **{**fields, "steps": -1})
     with pytest.raises(InvalidInput, match=r"policy: tensor 'policy.0.bias' holds a number that is not finite"):
         Policy.make({**policy.tensors, "policy.0.bias": np.full(13, np.nan, np.float32)}, **fields)
+
+
+def test_bundle__of_one_network_is_written_as_ever_and_of_several_as_version_3(
+    policy: Policy, mixture: Policy, tmp_path: Path
+) -> None:
+    """Earlier versions of the package, which know no gate, go on reading the first."""
+    policy.save(tmp_path / "one")
+    mixture.save(tmp_path / "three")
+    one, three = (json.loads((tmp_path / name / "manifest.json").read_text()) for name in ("one", "three"))
+    assert one["format_version"] == 2 and not {"networks", "gate_hidden"} & one["network"].keys()
+    assert (three["format_version"], three["network"]["networks"], three["network"]["gate_hidden"]) == (3, 3, [6])
+    assert load_policy(tmp_path / "three").manifest == mixture.manifest
+
+
+SCENARIO = eb.load_scenario("paper-random")
+
+
+@pytest.fixture
+def folder(policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package in which four policies ship; they were trained on paper-random."""
+    for name in ("ppo", "ppo-total", "ppo-paper-distance", "universal"):
+        policy.save(tmp_path / name / "policy")
+        (tmp_path / name / "card.md").write_text(f"# {name}\n")
+    monkeypatch.setattr(bundle, "_FOLDER", tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("kind", "scenario", "harm_count", "name"),
+    [
+        ("ppo", "paper-random", "first", "ppo"),
+        ("ppo", "paper-random", "total", "ppo-total"),
+        ("ppo", "paper-distance", "total", "ppo-paper-distance"),  # better than none
+        ("universal", "paper-delay-low", "first", "universal"),
+        ("ppo", None, "total", "ppo-total"),
+        ("policy", "paper-random", "total", "ppo-total"),
+        ("policy", "paper-delay-low", "first", "universal"),
+    ],
+)
+def test_shipped_name__is_by_kind_scenario_and_count(
+    kind: str, scenario: str | None, harm_count: HarmCount, name: str, folder: Path
+) -> None:
+    assert shipped_name(kind, scenario, harm_count) == name
+
+
+def test_lineup__takes_what_ships(folder: Path) -> None:
+    specs = ["ppo@shipped", "universal@shipped", "policy@shipped", "team@shipped", "ppo@shipped+episode"]
+    lineup = make_lineup([*specs, "ppo@shipped/ppo-paper-distance"], SCENARIO)
+    assert [each.name for each in lineup.values()] == list(lineup)
+    assert isinstance(lineup["ppo@shipped+episode"], HybridAgent)
+    worlds = SCENARIO.sample(5, 1).worlds
+    acts = [lineup[spec].act(worlds, 1).tolist() for spec in specs[:4]]
+    assert acts == [acts[0]] * 4  # four copies of one policy ship here
+
+
+def test_shipped_policies__each_that_ships_is_small_and_has_a_card() -> None:
+    for name, path in shipped_policies().items():
+        assert load_named_policy(f"shipped/{name}").manifest.steps > 0
+        assert sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) < 1_000_000
+        assert (path / "card.md").read_text("utf-8").startswith("# ")
+
+
+@pytest.mark.parametrize("harm_count", HARM_COUNTS)
+@pytest.mark.parametrize("test", list(TESTS))
+def test_shipped__one_for_each_of_the_three_tests_drives_alone_and_behind_its_shield(
+    test: str, harm_count: HarmCount
+) -> None:
+    scenario = eb.load_scenario(test)
+    name = shipped_name("ppo", test, harm_count)
+    assert load_named_policy(f"shipped/{name}").manifest.scenario["name"] == test
+    lineup = make_lineup(["ppo@shipped", "ppo@shipped+episode"], scenario, harm_count=harm_count)
+    result = evaluate(scenario.sample(20, 7), lineup, scenario=scenario, seed=7)
+    alone, shielded = (result.outcome(spec).ledger.world_harm(harm_count) for spec in lineup)
+    assert shielded.mean() <= alone.mean()
+    assert (shielded <= result.outcome("ppo@shipped+episode").predicted_harm + 1e-9).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("harm_count", HARM_COUNTS)
+@pytest.mark.parametrize("test", list(TESTS))
+def test_policy_shipped__is_the_best_that_ships(test: str, harm_count: HarmCount) -> None:
+    """By the mean harm in 2,000 worlds, within a hundredth of the best of all but those of levels of cooperation."""
+    scenario = eb.load_scenario(test)
+    each = [
+        f"ppo@shipped/{name}" if name.startswith("ppo") else f"policy@shipped/{name}"
+        for name in shipped_policies()
+        if "cooperation" not in name
+    ]
+    lineup = make_lineup(["policy@shipped", *each], scenario, harm_count=harm_count)
+    result = evaluate(scenario.sample(2_000, 21), lineup, scenario=scenario, seed=21, aftermath=False)
+    harm = {spec: result.outcome(spec).ledger.world_harm(harm_count).mean() for spec in lineup}
+    assert harm["policy@shipped"] <= 1.01 * min(harm.values())
+
+
+@pytest.mark.parametrize(
+    ("level", "share_of_full_braking", "collisions"),
+    [
+        ("cooperation-1-front", 0.60, 0.80),
+        ("cooperation-2-paper", 0.33, 0.70),
+        ("cooperation-2-blocked", 0.52, 0.87),
+        ("cooperation-3-pair", 0.33, 0.70),
+        ("cooperation-4-all", 0.03, 0.15),
+    ],
+)
+def test_policy_shipped__drives_all_learners_of_a_level_of_cooperation(
+    level: str, share_of_full_braking: float, collisions: float
+) -> None:
+    """At least as well as docs/cooperation.md says, by and large: level 3 collides no more often than level 2."""
+    scenario = eb.load_scenario(level)
+    assert shipped_name("policy", level, "total") == f"counterfactual-{level}"
+    assert load_named_policy(f"shipped/counterfactual-{level}").manifest.learners == tuple(
+        scenario.vehicle_names[i] for i in scenario.learners
+    )
+    lineup = make_lineup(["full_brake", "policy@shipped", "team@shipped"], scenario)
+    result = evaluate(scenario.sample(300, 7), lineup, scenario=scenario, seed=7, aftermath=False)
+    braking, policy, team = (result.outcome(spec) for spec in lineup)
+    assert policy.first_impact_harm.mean() <= share_of_full_braking * braking.first_impact_harm.mean()
+    assert policy.collided.mean() <= collisions
+    assert np.array_equal(policy.first_impact_harm, team.first_impact_harm)
+
+
+@pytest.mark.parametrize("harm_count", HARM_COUNTS)
+def test_shipped__counterfactual_does_less_harm_than_ppo(harm_count: HarmCount) -> None:
+    """On worlds that are no training's: several networks and a gate, trained for this count."""
+    name = shipped_name("counterfactual", "paper-random", harm_count)
+    manifest = load_named_policy(f"shipped/{name}").manifest
+    assert manifest.reward["harm_count"] == harm_count and manifest.network.networks == 2
+    lineup = make_lineup(["ppo@shipped", "counterfactual@shipped"], SCENARIO, harm_count=harm_count)
+    result = evaluate(SCENARIO.sample(600, 9), lineup, scenario=SCENARIO, seed=9, aftermath=False)
+    ppo, counterfactual = (result.outcome(spec).ledger.world_harm(harm_count).mean() for spec in lineup)
+    assert counterfactual < 0.98 * ppo
+
+
+# Of each list of 10,000 (seed 7) the worlds in which a shipped policy, refined, was furthest below an earlier table.
+LOWERED = {
+    "paper-random": (["ppo", "sac"], [400, 1058, 1261, 2987, 4300, 4408, 5872, 5976, 8752]),
+    "paper-random-brake-only": (["ppo"], [1325, 2801, 5278, 5547, 5814, 5984, 7228, 8020, 8166]),
+}
+
+
+@pytest.mark.parametrize("harm_count", ["first", pytest.param("total", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("test", list(LOWERED))
+def test_shipped__refined_is_nowhere_below_the_shipped_table(test: str, harm_count: HarmCount) -> None:
+    scenario = eb.load_scenario(test)
+    kinds, numbers = LOWERED[test]
+    every = scenario.sample(10_000, 7)
+    rows = np.array(numbers)
+    sample = replace(every, worlds=every.worlds.take(rows), index=every.index[rows])
+    lineup = make_lineup([f"{kind}@shipped+refined+episode" for kind in kinds], scenario, harm_count=harm_count)
+    found = summarise(evaluate(sample, lineup, scenario=scenario, seed=7))
+    assert [(row.agent, row.known_best_share, row.below_best_known) for row in found] == [
+        (name, 1.0, 0) for name in lineup
+    ]
