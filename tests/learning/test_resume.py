@@ -24,8 +24,6 @@ import ethbrake_marl as eb
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, Progress
 from ethbrake_marl.learning import Training, TrainResult, resume, runs, train
 from ethbrake_marl.policies import Trained
-from tests.programmes.folders import CHANGES
-from tests.programmes.folders import listed_anew, newest
 from tests.learning.tiny import (
     MODES,
     TINY_COUNTERFACTUAL,
@@ -37,6 +35,7 @@ from tests.learning.tiny import (
     files_of,
     watch_steps,
 )
+from tests.programmes.folders import CHANGES, listed_anew, newest
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
