@@ -203,7 +203,7 @@ bench-peers: $(STAMP)
 	@$(PROGRAMME) peers $(ARGS)
 
 benchmark: $(STAMP)
-	@$(BIN)/python -m tests.studies.benchmark.rows $(ARGS)
+	@$(BIN)/python -m tests.studies.benchmark_rows $(ARGS)
 
 clean:
 	rm -rf $(VENV) .venvs .pytest_cache .ruff_cache .mypy_cache .hypothesis build dist docs/_build

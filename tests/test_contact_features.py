@@ -21,7 +21,6 @@ from tests.physics.random_worlds import line
 SCENARIO = eb.load_scenario("paper-random")
 STEP_S = 0.1
 CONTACT = choose_observation(["contact"], STEP_S)
-SCALE = {f.name.removeprefix("contact."): f.scale for f in CONTACT.features}
 
 
 def seen_by(worlds, vehicle, spec=CONTACT):
@@ -57,18 +56,20 @@ def expected(worlds, vehicle, own_mps2, others_mps2, step_s=STEP_S):
     command = others_mps2.copy()
     command[:, vehicle] = own_mps2
     impacts = advance(worlds, command, duration_s=FORECAST_S, record=True)[1]
-    rows, told = impacts.rows, {}
+    rows = impacts.rows
+    told = {
+        "first_impact_harm": impacts.first_impact_harm.sum(axis=1) + impacts.obstacle_first_harm,
+        "total_harm": impacts.total_harm.sum(axis=1) + impacts.obstacle_total_harm,
+    }
     for side, pair in (("front", vehicle - 1), ("rear", vehicle)):
-        for k in range(worlds.n):
-            at = np.flatnonzero((rows.world == k) & (rows.pair == pair))
-            time = rows.time_s[at[0]] - worlds.time_s[k] if len(at) else FORECAST_S
-            whole = max(math.ceil(time / step_s) - 1, 0)
-            told.setdefault(f"{side}_time", []).append(time)
-            told.setdefault(f"{side}_closing_speed", []).append(rows.closing_speed_mps[at[0]] if len(at) else 0.0)
-            told.setdefault(f"{side}_fraction", []).append(time / step_s - whole if len(at) else 0.0)
-            told.setdefault(f"{side}_steps", []).append(whole)
-    told["first_impact_harm"] = impacts.first_impact_harm.sum(axis=1) + impacts.obstacle_first_harm
-    told["total_harm"] = impacts.total_harm.sum(axis=1) + impacts.obstacle_total_harm
+        world, first = np.unique(rows.world[rows.pair == pair], return_index=True)
+        time, closing, met = np.full(worlds.n, FORECAST_S), np.zeros(worlds.n), np.isin(np.arange(worlds.n), world)
+        time[world] = rows.time_s[rows.pair == pair][first] - worlds.time_s[world]
+        closing[world] = rows.closing_speed_mps[rows.pair == pair][first]
+        whole = np.maximum(np.ceil(time / step_s) - 1, 0)
+        fraction = np.where(met, time / step_s - whole, 0.0)
+        parts = {"time": time, "closing_speed": closing, "fraction": fraction, "steps": whole}
+        told |= {f"{side}_{name}": values for name, values in parts.items()}
     return told
 
 
@@ -148,17 +149,16 @@ def test_contact__leaves_other_features_alone_in_every_interface():
     groups = ["own", "front_1", "rear_1", "contact"]
     declared = SCENARIO.replace(observation=groups)
     assert observation_for(declared) == ObservationSpec(contact=True, time_step_s=0.1)
-    plain, more = (eb.make_sb3_vec_env(s, 6, seed=3) for s in (SCENARIO, declared))
-    seen, wider = plain.reset(), more.reset()
-    assert wider.shape == (6, 27 + len(GROUPS.contact))
-    assert wider[:, :27].tobytes() == seen.tobytes()
-    env = eb.parallel_env(scenario=declared)
-    assert env.reset(seed=3)[0]["vehicle_2"].tobytes() == wider[0].tobytes()
-    listed = eb.make_sb3_vec_env(SCENARIO, 6, seed=3, observation=groups)
-    assert listed.reset().tobytes() == wider.tobytes()
+    seen, wider, listed = (
+        eb.make_sb3_vec_env(scenario, 6, seed=3, **options).reset()
+        for scenario, options in ((SCENARIO, {}), (declared, {}), (SCENARIO, {"observation": groups}))
+    )
+    assert wider.shape == (6, 27 + len(GROUPS.contact)) and wider[:, :27].tobytes() == seen.tobytes()
+    parallel = eb.parallel_env(scenario=declared).reset(seed=3)[0]["vehicle_2"]
+    assert parallel.tobytes() == wider[0].tobytes() and listed.tobytes() == wider.tobytes()
 
 
-def contact_policy(scenario, group="contact"):
+def contact_policy(scenario, group):
     """An untrained policy that observes contacts."""
     spec = choose_observation(["own", group])
     network = NetworkSpec(
@@ -176,17 +176,15 @@ def contact_policy(scenario, group="contact"):
     )  # fmt: skip
 
 
-def test_policy__observes_contacts_at_the_steps_of_its_training():
-    policy = contact_policy(SCENARIO.replace(time_step_s=0.05).model_dump(mode="json"))
-    assert policy.observation == choose_observation(["own", "contact"], 0.05)
+@pytest.mark.parametrize("group", ["contact", "contact_far"])
+def test_policy__observes_contacts_at_the_steps_of_its_training(group):
+    policy = contact_policy(SCENARIO.replace(time_step_s=0.05).model_dump(mode="json"), group)
+    assert policy.observation == choose_observation(["own", group], 0.05)
     outcome = eb.evaluate(SCENARIO.sample(5, 7), {"mine": LearnedAgent(policy)}, scenario=SCENARIO).outcome("mine")
     assert np.isfinite(outcome.total_harm).all()
-    for group in ("contact", "contact_far"):
-        with pytest.raises(InvalidInput, match="time_step_s = None; contact features need a number above 0"):
-            contact_policy({}, group)
+    with pytest.raises(InvalidInput, match="time_step_s = None; contact features need a number above 0"):
+        contact_policy({}, group)
     assert choose_observation(["own"], 0.1).time_step_s is None  # nothing that depends on it
-    far = contact_policy(SCENARIO.replace(time_step_s=0.05).model_dump(mode="json"), "contact_far")
-    assert far.observation == choose_observation(["own", "contact_far"], 0.05)
 
 
 def test_contact__failed_forecast_names_its_world(monkeypatch):

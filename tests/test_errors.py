@@ -34,25 +34,22 @@ def test_message__keeps_beginning_and_end_of_what_is_long(long: str) -> None:
     assert len(text) <= LINE_LIMIT and text.isprintable()
 
 
-def test_unknown_name__says_where_nothing_is_known() -> None:
-    assert str(unknown_name("term", "mine", [])) == "unknown term 'mine'; known: none"
+@pytest.mark.parametrize(
+    ("name", "known", "told"),
+    [
+        ("mine", [], "known: none; one of your own file needs --plugin FILE.py (eb.load_plugin)"),
+        ("mine", ["coast"], "known: coast; one of your own file needs --plugin FILE.py (eb.load_plugin)"),
+        ("cost", ["coast"], "did you mean 'coast'?"),
+    ],
+)
+def test_unknown_name__reminds_of_the_plug_in_where_nothing_is_close(name: str, known: list[str], told: str) -> None:
+    assert str(unknown_name("agent", name, known, may_be_own=True)) == f"unknown agent '{name}'; {told}"
 
 
-def test_unknown_name__reminds_of_the_plug_in_where_nothing_is_close() -> None:
-    told = str(unknown_name("agent", "mine", ["coast"], may_be_own=True))
-    assert told == "unknown agent 'mine'; known: coast; one of your own file needs --plugin FILE.py (eb.load_plugin)"
-    assert (
-        str(unknown_name("agent", "cost", ["coast"], may_be_own=True)) == "unknown agent 'cost'; did you mean 'coast'?"
-    )
-
-
-def test_one_line__is_the_same_the_second_time() -> None:
-    for text in ("plain", "\x1b[2J", "x" * 5000, "a" * LINE_LIMIT):
-        assert one_line(one_line(text)) == one_line(text)
-    assert one_line("a" * LINE_LIMIT) == "a" * LINE_LIMIT
-
-
-def test_plain_text__keeps_only_what_it_is_told_to() -> None:
+@pytest.mark.parametrize("text", ["plain", "\x1b[2J", "x" * 5000, "a" * LINE_LIMIT])
+def test_one_line__is_the_same_the_second_time(text: str) -> None:
+    assert one_line(one_line(text)) == one_line(text)
+    assert len(text) != LINE_LIMIT or one_line(text) == text
     assert plain_text("a\tb\nc\r", keep="\n\t") == "a\tb\nc\\r"
 
 

@@ -1,9 +1,10 @@
-"""The package imports one way, without a circle, and importing it stays light."""
+"""The package imports one way, without a circle, stays light, and its core needs no extra."""
 
 from __future__ import annotations
 
 import ast
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -14,13 +15,23 @@ from pathlib import Path
 
 import pytest
 
+from ethbrake_marl.errors import _EXTRA_OF, MissingExtra, naming_extras
+
 ROOT = Path(__file__).resolve().parents[1]
+
+
 PACKAGE = "ethbrake_marl"
+
 
 # `make lint` holds the package to these contracts: layers, and no circle inside a folder, imports for types included.
 CONTRACTS = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]["contracts"]
+
+
 LAYERS = [layer.split(" | ") for layer in CONTRACTS[0]["layers"]]  # from the top down
+
+
 LEVEL = {room: -level for level, rooms in enumerate(LAYERS) for room in rooms}
+
 
 TORCH = ("torch", "torchrl", "tensordict", "safetensors.torch")
 
@@ -167,30 +178,25 @@ import ethbrake_marl.cli.app
 found |= {"torch", "stable_baselines3"} & set(sys.modules)
 sys.exit(", ".join(found) or None)
 """
-    result = subprocess.run(
-        [sys.executable, "-W", "error", "-c", program],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+    assert ended(program) == (0, "", "")
 
 
-def ended(program: str) -> tuple[int, str, str]:
+def ended(program: str, *, cwd: Path = ROOT, warnings: str = "error") -> tuple[int, str, str]:
     """Exit status, stdout and stderr of a Python program that begins as the script `ethbrake` does."""
     result = subprocess.run(
-        [sys.executable, "-W", "error", "-c", f"import sys; sys.argv[0] = '/somewhere/bin/ethbrake'\n{program}"],
+        [sys.executable, "-W", warnings, "-c", f"import sys; sys.argv[0] = '/somewhere/bin/ethbrake'\n{program}"],
         env={**os.environ, "PYTHONPATH": str(ROOT)},
+        cwd=cwd,
         capture_output=True,
         text=True,
-        timeout=300,
         check=False,
     )
     return result.returncode, result.stdout, result.stderr
 
 
 HEAVY = ("numba", "numpy", "scipy", "gymnasium", "torch", "matplotlib")
+
+
 STARTS = f"""
 import os
 from typer.main import get_command
@@ -234,3 +240,65 @@ assert "EthBrake-v0" in sys.modules["gymnasium"].registry
 """
     status, _, err = ended(program)
     assert (status, err) == (0, "")
+
+
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
+
+
+LINE = "-m pip install 'ethbrake-marl[train]'"
+
+
+# Runs what the core promises where no package of an extra can be imported.
+WITHOUT_EXTRAS = """
+import sys
+for name in {absent}:
+    sys.modules[name] = None
+import ethbrake_marl as eb
+from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.errors import MissingExtra
+from ethbrake_marl import figures
+
+for name in eb.__all__:
+    getattr(eb, name)
+help(eb)
+eb.env(), eb.parallel_env(), eb.EthBrakeEnv(), eb.EthBrakeVectorEnv(2)
+for name in ("train", "resume", "TrainResult", "make_sb3_vec_env", "EthBrakeVecEnv", "ShieldedVecEnv"):
+    assert name not in dir(eb) and name not in eb.__all__
+    try:
+        getattr(eb, name)
+    except MissingExtra as error:
+        assert str(error).endswith({line!r})
+    else:
+        sys.exit(f"{{name}} was imported")
+lineup = "ppo@shipped,ppo@shipped+episode,e_v2x_bm"
+assert run_command(["evaluate", "--agents", lineup, "--episodes", "20", "--json"]) == 0
+assert run_command(["doctor", "speed", "--quick"]) == 2
+sys.exit(run_command(["train", "--steps", "1"]))
+"""
+
+
+def test_core__runs_where_no_extra_can_be_imported(tmp_path: Path) -> None:
+    program = WITHOUT_EXTRAS.format(absent=sorted(_EXTRA_OF), line=LINE)
+    status, _, err = ended(program, cwd=tmp_path, warnings="default")
+    assert status == 2 and err.splitlines()[-1].endswith(LINE), err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_naming_extras__leaves_other_missing_modules_alone() -> None:
+    with pytest.raises(ModuleNotFoundError) as caught, naming_extras():
+        import no_such_package_of_ours  # type: ignore[import-not-found]  # noqa: F401
+    assert not isinstance(caught.value, MissingExtra)
+
+
+def test_extras__are_those_of_the_table_and_all_is_their_sum() -> None:
+    assert {"dev", "docs", "all", "kernels", *_EXTRA_OF.values()} == set(EXTRAS)
+    distribution = {
+        "stable_baselines3": "stable-baselines3",
+        "pygame": "pygame-ce",
+        "imageio_ffmpeg": "imageio-ffmpeg",
+        "hydra": "hydra-core",
+    }
+    for package, extra in _EXTRA_OF.items():
+        names = [re.split(r"[<>=\[]", line)[0] for line in EXTRAS[extra]]
+        assert distribution.get(package, package) in names
+    assert EXTRAS["all"] == [f"ethbrake-marl[{','.join(dict.fromkeys(_EXTRA_OF.values()))}]"]

@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import cache
@@ -46,34 +47,28 @@ def forget() -> None:
 # ---------------------------------------------------------------- the folder
 
 
-def test_cache_folder__is_in_the_named_place(monkeypatch, tmp_path):
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "numba"))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    assert cache_folder() == tmp_path / "numba" / "ethbrake_marl" and cache_folder().is_dir()
-    forget()
+@pytest.mark.parametrize(
+    ("numba", "xdg", "place"), [("numba", "xdg", "numba"), (None, "xdg", "xdg"), (None, None, ".cache")]
+)
+def test_cache_folder__is_in_the_named_place(monkeypatch, tmp_path, numba, xdg, place):
     monkeypatch.delenv("NUMBA_CACHE_DIR")
-    assert cache_folder() == tmp_path / "xdg" / "ethbrake_marl"
-    forget()
-    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setattr(Path, "home", lambda: tmp_path)
-    assert cache_folder() == tmp_path / ".cache" / "ethbrake_marl"
+    for name, folder in (("NUMBA_CACHE_DIR", numba), ("XDG_CACHE_HOME", xdg)):
+        if folder:
+            monkeypatch.setenv(name, str(tmp_path / folder))
+    assert cache_folder() == tmp_path / place / "ethbrake_marl" and cache_folder().is_dir()
 
 
-def test_cache_folder__that_cannot_be_written_is_replaced_by_a_temporary_one(monkeypatch, tmp_path):
-    blocked = tmp_path / "file"
-    blocked.write_text("not a folder", "utf-8")
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(blocked))
-    folder = cache_folder()
-    assert folder.is_dir() and folder.name.startswith("ethbrake_marl-") and tmp_path not in folder.parents
-    folder.rmdir()
-
-
-def test_cache_folder__that_is_temporary_goes_at_the_end_of_the_process(monkeypatch, tmp_path):
+def test_cache_folder__that_cannot_be_written_is_a_temporary_one_that_goes_at_the_end_of_the_process(
+    monkeypatch, tmp_path
+):
     (tmp_path / "file").write_text("not a folder", "utf-8")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
     at_the_end = []
     monkeypatch.setattr(kernel_store.atexit, "register", lambda *call, **options: at_the_end.append((call, options)))
     folder = cache_folder()
+    assert folder.is_dir() and folder.name.startswith("ethbrake_marl-") and tmp_path not in folder.parents
     (folder / "kernel").write_text("machine code", "utf-8")
     [((act, *given), options)] = at_the_end
     act(*given, **options)
@@ -93,16 +88,15 @@ def test_keep_kernel__is_loaded_again():
     assert [file.name for file in cache_folder().iterdir()] == ["one-1"]
 
 
-@pytest.mark.parametrize("harm", ["flipped", "truncated", "emptied", "under another name"])
-def test_load_kernel__of_a_damaged_file_is_nothing(harm):
+@pytest.mark.parametrize(
+    "damage", [lambda content: content[:-1] + b"!", lambda content: content[:-1], lambda content: b""]
+)
+def test_load_kernel__of_a_damaged_file_or_under_another_name_is_nothing(damage):
     keep_kernel("one-1", b"machine code")
     file = cache_folder() / "one-1"
-    content = file.read_bytes()
-    if harm == "under another name":
-        (cache_folder() / "two-2").write_bytes(content)
-    else:
-        file.write_bytes({"flipped": content[:-1] + b"!", "truncated": content[:-1], "emptied": b""}[harm])
-    assert load_kernel("two-2" if harm == "under another name" else "one-1") is None
+    (cache_folder() / "two-2").write_bytes(file.read_bytes())
+    file.write_bytes(damage(file.read_bytes()))
+    assert load_kernel("one-1") is load_kernel("two-2") is None
     keep_kernel("one-1", b"machine code")
     assert load_kernel("one-1") == b"machine code"
 
@@ -170,36 +164,36 @@ def test_digest_of_sources__changes_with_what_its_kernels_are_made_of(copied, mo
     assert (digest_in(copied, kernel) != before) == moves
 
 
-def test_digest_of_sources__is_not_known_of_code_in_no_file_or_edited_since(copied):
+def test_digest_of_sources__is_not_known_of_code_in_no_file_edited_since_or_from_the_future_which_is_told(copied):
     assert digest_of_sources(Path("<stdin>")) == ""
     assert digest_in(copied, "physics/batch.py")
-    since = (compiled._IMPORTED_S + time.time()) / 2
-    os.utime(copied / "physics" / "kernel.py", (since, since))
-    assert digest_in(copied, "physics/batch.py") == ""
+    now = time.time()
+    for date in ((compiled._IMPORTED_S + now) / 2, now + 3600.0):
+        os.utime(copied / "physics" / "kernel.py", (date, date))
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            assert digest_in(copied, "physics/batch.py") == ""
+        expected = [f"{copied}: dates of files lie in the future"] * (date > now)
+        assert [str(each.message)[: len(expected[0])] for each in told] == expected
 
 
-def test_digest_of_sources__is_not_known_of_files_from_the_future_which_is_told(copied):
-    ahead = time.time() + 3600.0
-    os.utime(copied / "physics" / "kernel.py", (ahead, ahead))
-    with pytest.warns(UserWarning, match=f"{copied}: dates of files lie in the future.* touch"):
-        assert digest_in(copied, "physics/batch.py") == ""
+def kernel_files(package: Path) -> list[Path]:
+    found = [source for source in sorted(package.rglob("*.py")) if "@compiled" in source.read_text("utf-8")]
+    return [source for source in found if source.name != "compiled.py"]
 
 
 @needs_compiler
 def test_kernel_sources__hold_every_kernel_that_a_kernel_names():
     checked = 0
-    for source in sorted(Path(ethbrake_marl.__file__).parent.rglob("*.py")):
-        if "@compiled" not in source.read_text("utf-8") or source.name == "compiled.py":
-            continue
-        place = source.relative_to(Path(ethbrake_marl.__file__).parents[1]).with_suffix("")
+    for source in kernel_files(PACKAGE):
+        place = source.relative_to(PACKAGE.parent).with_suffix("")
         sources = kernel_sources(source)
         for kernel in vars(importlib.import_module(".".join(place.parts))).values():
             if hasattr(kernel, "py_func") and kernel.py_func.__code__.co_filename == str(source):
-                for name in kernel.py_func.__code__.co_names:
-                    called = kernel.py_func.__globals__.get(name)
-                    if hasattr(called, "py_func"):
-                        assert Path(called.py_func.__code__.co_filename) in sources, f"{source.name}: {name}"
-                        checked += 1
+                named = [kernel.py_func.__globals__.get(name) for name in kernel.py_func.__code__.co_names]
+                called = [each.py_func.__code__.co_filename for each in named if hasattr(each, "py_func")]
+                assert {Path(file) for file in called} <= set(sources), f"{source.name}: {kernel}"
+                checked += len(called)
     assert checked > 300
 
 
@@ -219,17 +213,16 @@ def test_kernel_sources__are_found_behind_front_doors(copied):
     assert not {"physics/batch.py", "physics/worlds.py", "physics/__init__.py"} & found
 
 
-def test_kernel_sources__find_every_import(copied):
+@pytest.mark.parametrize("source", kernel_files(PACKAGE), ids=lambda source: source.stem)
+def test_kernel_sources__find_every_import(source):
     """Kernels import from this package by ``from ethbrake_marl... import`` alone: no other way would be seen."""
-    for source in copied.rglob("*.py"):
-        if "@compiled" in source.read_text("utf-8"):
-            tree = ast.parse(source.read_text("utf-8"))
-            found = {module.decode() for module, _ in compiled._IMPORT.findall(source.read_bytes())}
-            asked = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module}
-            assert {module for module in asked if module.startswith("ethbrake_marl")} == found, source
-            assert not [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.level], source
-            names = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
-            assert not {name for name in names if name.startswith("ethbrake_marl.")}, source
+    nodes = list(ast.walk(ast.parse(source.read_text("utf-8"))))
+    found = {module.decode() for module, _ in compiled._IMPORT.findall(source.read_bytes())}
+    asked = [node for node in nodes if isinstance(node, ast.ImportFrom)]
+    whole = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    assert {node.module for node in asked if (node.module or "").startswith("ethbrake_marl")} == found
+    assert not any(node.level for node in asked)
+    assert not any(name.startswith("ethbrake_marl.") for name in whole)
 
 
 # ---------------------------------------------------------------- processes
@@ -374,32 +367,22 @@ def test_kernels__raise_and_print_inside_of_what_they_call_also_when_they_were_l
     assert {file.suffix for file in cache_folder().iterdir()} == {".entry", ".linked"}
 
 
-def test_kernels__of_a_numba_that_is_not_known_are_compiled_as_numba_does(monkeypatch):
-    monkeypatch.setattr(compiled, "_KNOWN", False)
+@pytest.mark.parametrize(("known", "linked", "overloads"), [(False, 0, 1), (True, 1, 0)])
+def test_kernels__are_compiled_once_for_all_numbers_or_as_numba_does_where_it_is_not_known(
+    monkeypatch, known, linked, overloads
+):
+    monkeypatch.setattr(compiled, "_KNOWN", compiled._KNOWN and known)
 
-    @compiled.compiled(apart=True)
-    def twice(x: float) -> float:
-        return 2.0 * x
-
-    @compiled.compiled(apart=True)
-    def outer(x: float) -> float:
-        return twice(x) + 1.0
-
-    assert outer(3.0) == 7.0
-    assert len(twice.overloads) == 1 and not twice._linked
-
-
-def test_kernels__are_not_compiled_once_for_each_number_that_stands_in_a_source():
     @compiled.compiled(apart=True)
     def twice(k: int) -> int:
         return 2 * k
 
     @compiled.compiled(apart=True)
     def outer(k: int) -> int:
-        return twice(1) + twice(2) + twice(k)
+        return twice(k) if not known else twice(1) + twice(2) + twice(k)
 
-    assert outer(3) == 12
-    assert len(twice._linked) == 1 and not twice.overloads
+    assert outer(3) == (12 if known else 6)
+    assert (len(twice._linked), len(twice.overloads)) == (linked, overloads)
 
 
 @pytest.mark.skipif((sys.platform, platform.machine()) != ("linux", "x86_64"), reason="none are built for this machine")

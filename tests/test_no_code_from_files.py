@@ -12,14 +12,21 @@ from tests.test_imports import tree_of
 
 ROOT = Path(__file__).resolve().parents[1]
 
+
 # File -> what it alone may use. docs/security.md says why each is none of a stranger's files.
 PLACES = {
     "ethbrake_marl/physics/compiling.py": {"pickle"},  # machine code that this user, or root, has compiled
     "ethbrake_marl/studies/jobs.py": {"pickle"},  # calls between processes of our own
     "ethbrake_marl/files/plugins.py": {"exec", "compile"},  # a plug-in that the user names is code
 }
+
+
 MODULES = {"pickle", "_pickle", "marshal", "shelve", "dill", "cloudpickle", "joblib", "runpy", "code", "codeop"}
+
+
 BUILTINS = {"eval", "exec", "compile", "__import__"}
+
+
 FUNCTIONS = {
     *(f"yaml.{name}" for name in ("load", "load_all", "unsafe_load", "unsafe_load_all", "full_load", "full_load_all")),
     *(f"yaml.{name}" for name in ("Loader", "UnsafeLoader", "FullLoader")),
@@ -27,7 +34,11 @@ FUNCTIONS = {
     *("os.system", "os.popen", "shutil.unpack_archive", "importlib.util.spec_from_file_location"),
     *("subprocess.getoutput", "subprocess.getstatusoutput"),
 }
+
+
 OF_A_MODEL = {"device", "map_location", "weights_only", "custom_objects"}  # arguments of what unpickles a model
+
+
 METHODS = {"extractall", "to_pickle", "read_pickle", "unsafe_load"}
 
 
@@ -36,26 +47,22 @@ def forbidden(tree: ast.Module) -> Iterator[tuple[int, str]]:
     named = _imported(tree)
     for node in ast.walk(tree):
         line = getattr(node, "lineno", 0)
-        if isinstance(node, ast.Import | ast.ImportFrom):
-            yield from ((line, name) for name in _names_of(node) if name.split(".")[0] in MODULES or name in FUNCTIONS)
-        elif isinstance(node, ast.Name) and node.id in BUILTINS:
-            yield line, node.id
-        elif isinstance(node, ast.Attribute):
-            whole = _dotted(node, named)
-            if whole in FUNCTIONS or node.attr in METHODS or whole.removeprefix("builtins.") in BUILTINS:
-                yield line, whole or node.attr
-        elif isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "load" and _of_a_model(node):
-            yield line, "load"
-        elif isinstance(node, ast.keyword) and node.arg in ("shell", "allow_pickle") and not _is_false(node.value):
-            yield node.value.lineno, f"{node.arg}="
-
-
-def _is_false(node: ast.expr) -> bool:
-    return isinstance(node, ast.Constant) and node.value is False
-
-
-def _of_a_model(node: ast.Call) -> bool:
-    return bool({keyword.arg for keyword in node.keywords} & OF_A_MODEL)
+        match node:
+            case ast.Import() | ast.ImportFrom():
+                names = _names_of(node)
+                yield from ((line, name) for name in names if name.split(".")[0] in MODULES or name in FUNCTIONS)
+            case ast.Name(id=name) if name in BUILTINS:
+                yield line, name
+            case ast.Attribute(attr=name):
+                whole = _dotted(node, named)
+                if whole in FUNCTIONS or name in METHODS or whole.removeprefix("builtins.") in BUILTINS:
+                    yield line, whole or name
+            case ast.Call(func=ast.Attribute(attr="load"), keywords=given) if {each.arg for each in given} & OF_A_MODEL:
+                yield line, "load"
+            case ast.keyword(arg="shell" | "allow_pickle", value=ast.Constant(value=False)):
+                pass
+            case ast.keyword(arg="shell" | "allow_pickle" as name, value=value):
+                yield value.lineno, f"{name}="
 
 
 def _names_of(node: ast.Import | ast.ImportFrom) -> list[str]:

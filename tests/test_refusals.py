@@ -112,7 +112,7 @@ def write_answers() -> None:
                 code if code.startswith("$ ") else ">>> " + code.replace("\n", "\n... ") for code in case.done
             )
             old = f"{shown}\n{case.answer}" if case.answer else shown
-            text = text.replace(f"\n\n{old}", f"\n\n{shown}\n{told}", 1)
+            text = text.replace(f"\n\n{old}\n", f"\n\n{shown}\n{told}\n", 1)
         file.write_text(text, "utf-8")
 
 

@@ -1,23 +1,49 @@
-"""One registry, one grammar: who can be named, what can be put around whom, and an agent of the user's own."""
+"""Agents by name: one registry, one grammar, what each asks for, and what can be put around whom."""
 
 from __future__ import annotations
 
-import importlib.util
-import json
+import pickle
 
+import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import registry
-from ethbrake_marl.agents.planner import Refined
-from ethbrake_marl.agents.registry import AgentSpec, make_agent, parse_spec
+from ethbrake_marl.agents import (
+    Refined,
+    agent_entries,
+    agent_names,
+    make_agent,
+    optimise_coupled,
+    optimise_pairwise,
+    parse_spec,
+    register_agent,
+)
+from ethbrake_marl.agents.registry import AgentSpec
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver
+from tests.fixtures.asked import Asked
 
-SCENARIO = load_scenario("paper-random")
+SCENARIO = eb.load_scenario("paper-random")
+ALL = ["full_brake", "coast", "constant:3.5", "copy_leader", "gentlest_front", "e_v2x_bm", "e_v2x_bm:pairwise"]
+
+
+def random_worlds(n: int, seed: int = 31, *, capacity: tuple[float, float, float] = (6, 7, 6)) -> Worlds:
+    rng = np.random.default_rng(seed)
+    return make_worlds(
+        rng.uniform(5, 10, (n, 2)),
+        rng.uniform(18, 22, (n, 3)),
+        braking_capacity_mps2=capacity,
+        driving_capacity_mps2=[6, 5, 6],
+        latency_s=[0, 0.5, 0.8],
+        mass_t=[4.5, 5.5, 5.9],
+        restitution=0.1,
+    )
+
+
+def asked(spec: str, worlds: Worlds, vehicle: int = 1, **settings) -> Floats:
+    return Asked(make_agent(spec, **settings)).begin(worlds, vehicle).act(worlds, vehicle)
 
 
 @pytest.mark.parametrize(
@@ -37,38 +63,6 @@ def test_spec__is_taken_apart_and_written_again(spec, parts):
 
 
 @pytest.mark.parametrize(
-    ("spec", "message"),
-    [
-        ("ful_brake+step", "unknown agent 'ful_brake'; did you mean 'full_brake'"),
-        ("full_brake+stpe", "unknown shield or refinement 'stpe'; did you mean 'step'"),
-        ("ppo@shipped+epsiode", "did you mean 'episode'"),
-        ("full_brake+", "unknown shield or refinement ''"),
-        ("constant:3+setp", "did you mean 'step'"),
-        ("planner+step+episode", "comes first and once, then one shield"),
-        ("planner+step+refined", "comes first and once, then one shield"),
-        ("planner+refined+refined", "comes first and once"),
-        ("coast:1", "coast takes no argument"),
-        ("coast@runs/x", "coast takes no policy"),
-        ("ppo:x@shipped", "ppo takes no argument"),
-        ("ppo@", "a path is needed after '@'"),
-        ("ppo+step", "a policy is needed: ppo@PATH"),
-        ("ppo@shipped+robust", r"agent 'ppo@shipped\+robust': mode robust needs an uncertainty"),
-    ],
-)
-def test_spec__what_nobody_is_called_is_refused(spec, message):
-    with pytest.raises(InvalidInput, match=message):
-        make_agent(spec, scenario=SCENARIO)
-
-
-@pytest.mark.parametrize("spec", ["full_brake+step", "ppo@shipped+refined", "planner+episode", "team@runs/x"])
-def test_make_agent__says_where_a_scenario_is_needed(spec):
-    with pytest.raises(InvalidInput, match="needs a scenario: make_agent"):
-        make_agent(spec)
-    with pytest.raises(InvalidInput, match="must be a Scenario"):
-        make_agent(spec, scenario="paper-random")
-
-
-@pytest.mark.parametrize(
     ("spec", "kind"),
     [
         ("full_brake+step", ShieldedDriver),
@@ -78,75 +72,107 @@ def test_make_agent__says_where_a_scenario_is_needed(spec):
         ("e_v2x_bm+refined+episode", HybridAgent),
         ("gentlest_front+robust", ShieldedDriver),
         ("ppo@shipped+refined+step", ShieldedDriver),
+        ("full_brake+refined:10+episode", HybridAgent),
+        ("full_brake+refined:10+step", ShieldedDriver),
+        ("full_brake+refined:profile+step", ShieldedDriver),
     ],
 )
 def test_shields__go_around_any_agent_and_hold(spec, kind):
-    worlds = SCENARIO.sample(3, 5)
-    agents = {spec: eb.make_agent(spec, scenario=SCENARIO, harm_count="total", uncertainty="gaps_m=0.2")}
+    agents = {spec: make_agent(spec, scenario=SCENARIO, harm_count="total", uncertainty="gaps_m=0.2")}
     assert isinstance(agents[spec], kind)
-    outcome = evaluate(worlds, agents, scenario=SCENARIO).outcome(spec)
+    outcome = eb.evaluate(SCENARIO.sample(3, 5), agents, scenario=SCENARIO).outcome(spec)
     assert (outcome.total_harm <= outcome.predicted_harm + 1e-9).all()
 
 
-@pytest.mark.parametrize("spec", ["hybrid", "hybrid@shipped", "step:rehearsed@shipped", "robust@shipped"])
-def test_agent__names_of_earlier_versions_are_unknown(spec):
-    with pytest.raises(UnknownName, match=f"unknown agent {spec.partition('@')[0].partition(':')[0]!r}; "):
-        make_agent(spec, scenario=SCENARIO)
+@pytest.mark.parametrize(
+    ("spec", "capacity", "expected"),
+    [
+        ("full_brake", 7, -7.0),
+        ("coast", 7, 0.0),
+        ("constant:3.5", 7, -3.5),
+        ("constant:-2", 7, 2.0),
+        ("copy_leader", 7, -6.0),
+        ("copy_leader", 4, -4.0),  # no harder than its own brakes
+    ],
+)
+def test_scripts__ask_for_their_acceleration(spec, capacity, expected):
+    assert asked(spec, random_worlds(3, capacity=(6, capacity, 6))).tolist() == [expected] * 3
 
 
-OWN_FILE = """
-import numpy as np
-import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import Source
+def test_gentlest_front__spares_the_front_vehicle_and_nothing_gentler_does():
+    worlds = random_worlds(300)
+    command = -worlds.vehicles.braking_capacity_mps2
+    command[:, 1] = asked("gentlest_front", worlds)
+    reachable = command[:, 1] > -7.0
+    assert 100 < reachable.sum() < 300
+    alone = worlds.take(reachable)
+    alone.gaps_m[:, 1] = 1000.0  # nobody behind
+    _, impacts = advance(alone, command[reachable], until_s=20.0)
+    assert impacts.count.sum() == 0
+    command[:, 1] += 1e-4
+    _, impacts = advance(alone, command[reachable], until_s=20.0)
+    assert np.all(impacts.count[:, 0] >= 1)
 
 
-class HalfBrake:
-    name, knows = "half_brake", Source.SENSORS
-
-    def __init__(self, share):
-        self.share = share
-
-    def act(self, worlds, vehicle):
-        return -self.share * worlds.vehicles.braking_capacity_mps2[:, vehicle]
-
-
-def make_half_brake(argument, settings):
-    return HalfBrake(float(argument or 0.5))
-
-
-eb.register_agent("half_brake", make_half_brake, about="half of what the brakes can", knows=(Source.SENSORS,))
-"""
+def test_e_v2x_bm__drives_by_its_optimum_of_the_count_and_horizon_it_was_given():
+    worlds = random_worlds(40)
+    pairwise, closed = Asked(make_agent("e_v2x_bm:pairwise")).begin(worlds, 1), optimise_pairwise(worlds, 1)
+    assert np.array_equal(pairwise.predicted_harm, closed.harm)
+    assert np.array_equal(pairwise.act(worlds, 1), -closed.deceleration_mps2)
+    for settings in ({"harm_count": "first"}, {"harm_count": "total"}, {"horizon_s": 1.5}):
+        assert np.array_equal(asked("e_v2x_bm", worlds, **settings), -optimise_coupled(worlds, 1, **settings)[0])
+        other = {"harm_count": "first", "horizon_s": 4.0}
+        assert not np.array_equal(asked("e_v2x_bm", worlds, **settings), asked("e_v2x_bm", worlds, **other))
+    short = SCENARIO.replace(horizon_s=4)  # whose horizon is the agent's
+    assert np.array_equal(asked("e_v2x_bm", worlds, scenario=short), asked("e_v2x_bm", worlds, horizon_s=4.0))
 
 
-def test_own_agent__is_evaluated_and_shielded_from_the_users_own_file(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(registry, "_ENTRIES", dict(registry._ENTRIES))
-    file = tmp_path / "mine.py"
-    file.write_text(OWN_FILE)
-    spec = importlib.util.spec_from_file_location("mine", file)
-    spec.loader.exec_module(importlib.util.module_from_spec(spec))
-    specs = ["half_brake", "half_brake:0.9", "half_brake+step", "half_brake:0.9+refined+episode"]
-    assert run_command(["evaluate", "--agents", ",".join(specs), "--episodes", "4", "--json"]) == 0
-    rows = {row["agent"]: row for row in json.loads(capsys.readouterr().out)}
-    assert list(rows) == specs and rows["half_brake"]["knows"] == "own sensors"
-    assert rows["half_brake+step"]["first_impact_harm"] <= rows["half_brake"]["first_impact_harm"]
-    assert run_command(["agent", "list", "--json"]) == 0
-    listed = {row["agent"]: row for row in json.loads(capsys.readouterr().out)}
-    assert listed["half_brake[:ARGUMENT]"]["about"] == "half of what the brakes can"
-    with pytest.raises(UnknownName, match="did you mean 'half_brake'"):
-        make_agent("half_break")
+@pytest.mark.parametrize("spec", ALL)
+def test_agents__new_episodes_change_their_rows_only_and_agents_can_be_pickled(spec):
+    worlds, fresh = random_worlds(6), random_worlds(2, seed=32)
+    agent = Asked(make_agent(spec)).begin(worlds, 1)
+    before = agent.act(worlds, 1)
+    agent.begin(fresh, 1, np.array([4, 1]))
+    again = Asked(pickle.loads(pickle.dumps(agent.agent)), memory=agent.memory)
+    for after in (again.act(worlds, 1), agent.act(worlds, 1)):
+        assert after[[0, 2, 3, 5]].tolist() == before[[0, 2, 3, 5]].tolist()
+        assert after[[4, 1]].tolist() == asked(spec, fresh).tolist()
+    assert again.name == spec
 
 
-def test_agents__are_listed_with_what_they_know(capsys):
+def test_agent_names__are_those_that_ship_and_are_listed(capsys):
+    scripts = ("coast", "constant", "copy_leader", "e_v2x_bm", "full_brake", "gentlest_front", "planner")
+    names = (*scripts, "best_harm", "ppo", "sac", "counterfactual", "policy", "universal", "team")
+    assert agent_names() == tuple(sorted(names))
     assert run_command(["agent", "list"]) == 0
     table = capsys.readouterr().out
-    for name in (*registry.agent_names(), "+refined", "+episode", "+step", "+robust"):
-        assert name in table
-    assert "own sensors" in table and "also true model" in table
+    assert [name for name in (*names, "+refined", "+episode", "+step", "+robust") if name not in table] == []
+    for entry in agent_entries():
+        assert callable(entry.load()) and entry.about and entry.knows
 
 
-def test_own_horizon__is_the_scenarios():
-    short = SCENARIO.replace(horizon_s=4)
-    worlds = short.sample(20, 1).worlds
-    ours, theirs = make_agent("e_v2x_bm", scenario=short), make_agent("e_v2x_bm", horizon_s=4.0)
-    harms = [agent.begin(worlds, 1, {})["predicted_harm"].tolist() for agent in (ours, theirs)]
-    assert harms[0] == harms[1]
+def test_register_agent__makes_names_and_policies_known():
+    seen = []
+
+    def factory(argument, settings):
+        seen.append((argument, settings.policy, settings.harm_count))
+        return make_agent("coast")
+
+    register_agent("mine", factory, takes_policy=True)
+    register_agent("mine", factory, takes_policy=True)  # the same again changes nothing
+    for spec in ("mine", "mine:x", "mine@my-run", "mine:x@C:/runs/my run@2"):
+        make_agent(spec, harm_count="total")
+    assert [each[:2] for each in seen] == [(None, None), ("x", None), (None, "my-run"), ("x", "C:/runs/my run@2")]
+    assert {each[2] for each in seen} == {"total"} and "mine" in agent_names()
+    with pytest.raises(AlreadyExists, match="agent 'mine' is registered already"):
+        register_agent("mine", lambda argument, settings: make_agent("coast"))
+
+
+def test_registered__takes_a_policy_only_where_it_says_so():
+    register_agent("leads", lambda argument, settings: make_agent(f"constant:{argument}"))
+    told = r"leads takes no policy; register_agent\(..., takes_policy=True\) says"
+    with pytest.raises(InvalidInput, match=told):
+        make_agent("leads@anything")
+    with pytest.raises(InvalidInput, match=told):
+        roles = {"vehicle_1": "leads:3@anything", "vehicle_2": "learner"}
+        eb.parallel_env(SCENARIO.replace(early_impacts="keep", roles=roles))

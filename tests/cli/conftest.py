@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+import csv
+import json
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -100,3 +103,47 @@ def scenario_file(tmp_path: Path) -> Callable[[str, str], Path]:
         return path
 
     return write
+
+
+TINY_SAC = {
+    "name": "tiny-sac",
+    "algorithm": "sac",
+    "total_steps": 320,
+    "n_envs": 16,
+    "batch_size": 16,
+    "buffer_size": 200,
+    "learning_starts": 64,
+    "learning_rate": {"start": 1e-3, "end": 1e-4},
+    "gamma": 0.99,
+    "tau": 0.02,
+    "network": {"policy": [8], "value": [8]},
+    "reward": {"harm": 1.0},
+    "evaluation": {"every_updates": 10, "worlds": 10, "seed": 7},
+    "checkpoint_every_updates": 100,
+    "log_every_updates": 5,
+}
+
+
+@pytest.fixture(scope="session")
+def tiny_sac(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recipe that trains by SAC for 320 decisions."""
+    path = tmp_path_factory.mktemp("recipe") / "tiny-sac.yaml"
+    path.write_text(yaml.safe_dump(TINY_SAC))
+    return path
+
+
+def told_json(answer: Answer) -> Any:
+    """The JSON of a command that ended well."""
+    assert answer.status == 0, answer.err
+    return json.loads(answer.out)
+
+
+def rows_of(file: Path) -> list[dict[str, str]]:
+    """The rows of a CSV file."""
+    return list(csv.DictReader(file.read_text().splitlines()))
+
+
+def check_refused(answer: Answer, *fragments: str) -> None:
+    """Status 2, nothing on stdout, and one line on stderr with these pieces of text."""
+    assert (answer.status, answer.out, answer.err.count("\n")) == (2, "", 1)
+    assert answer.err.startswith("ethbrake: error: ") and all(each in answer.err for each in fragments), answer.err

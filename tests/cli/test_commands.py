@@ -1,238 +1,317 @@
-"""What each command prints, and where."""
+"""The frame of all commands: names, help, options, completion, streams, signals and exit statuses."""
 
 from __future__ import annotations
 
-import csv
-import json
+import io
+import os
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+import typer
+from numba.core import event
+from rich.console import Console
 
-from ethbrake_marl.cli.app import whole_command
-from ethbrake_marl.cli.command import DEFAULTS, MOVED
+from ethbrake_marl import __version__
+from ethbrake_marl.agents.registry import agent_names
+from ethbrake_marl.cli import app as frame, command
+from ethbrake_marl.cli.app import app, run_command, whole_command
+from ethbrake_marl.cli.command import DEFAULTS, MOVED, Commands, Out
+from ethbrake_marl.physics.compiling import compiled
+from tests.cli.conftest import Command, check_refused, told_json
 
-IMPLIED = {f"{group} {default}": group for group, default in DEFAULTS.items()}
+ROOT = Path(__file__).resolve().parents[2]
+CLI = (ROOT / "docs" / "cli.md").read_text("utf-8")
 COMMANDS = [""]  # every one, groups too
 for name, found in whole_command().commands.items():
     COMMANDS += [name, *(f"{name} {each}" for each in getattr(found, "commands", ()))]
 COMMANDS += [f"watch picture {each}" for each in whole_command().commands["watch"].commands["picture"].commands]
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help__has_examples_that_parse_and_a_short_name(ethbrake, command):
-    answer = ethbrake(*command.split(), "--help")
-    assert (answer.status, answer.err) == (0, "")
-    assert ethbrake(*command.split(), "-h").out == answer.out and "-h, --help" in answer.out
+@pytest.mark.parametrize("words", COMMANDS)
+def test_help__has_examples_that_parse_and_a_short_name(ethbrake: Command, words: str) -> None:
+    answer = ethbrake(*words.split(), "--help")
+    assert (answer.status, answer.err) == (0, "") and "-h, --help" in answer.out
+    assert ethbrake(*words.split(), "-h").out == answer.out
     examples = [" ".join(each.split()) for each in re.findall(r"Example: ethbrake ((?:.|\n(?!\n))+)", answer.out)]
     assert len(examples) == (2 if "\nCommands:" in answer.out else 1)
     for example in examples:
         arguments = shlex.split(example.partition(" >")[0])
-        assert " ".join(arguments).startswith(
-            command.removesuffix(f" {DEFAULTS.get(command.split()[0]) if command else None}")
-        )
+        default = DEFAULTS.get(words.split()[0]) if words else None
+        assert " ".join(arguments).startswith(words.removesuffix(f" {default}"))
         assert ethbrake(*arguments, "--help").status == 0
 
 
 @pytest.mark.parametrize("old", sorted(MOVED))
-def test_old_name__is_told_its_new_place(ethbrake, old):
-    answer = ethbrake(old, "--frob")
-    assert (answer.status, answer.out) == (2, "") and MOVED[old] in COMMANDS
-    assert answer.err == f"ethbrake: error: {old} is now: {MOVED[old]} (see: ethbrake --help)\n"
+def test_old_name__is_told_its_new_place(ethbrake: Command, old: str) -> None:
+    told = f"ethbrake: error: {old} is now: {MOVED[old]} (see: ethbrake --help)\n"
+    assert MOVED[old] in COMMANDS and ethbrake(old, "--frob").err == told
 
 
-@pytest.mark.parametrize(
-    ("wrong", "place"),
-    [
-        ("evalute", "did you mean: ethbrake evaluate?"),
-        ("falsfy", "did you mean: ethbrake search falsify?"),
-        ("learning-curve", "did you mean: ethbrake train curves?"),
-        ("train resum", "did you mean: ethbrake train resume?"),
-        ("study resume", "did you mean: ethbrake train resume?"),
-        ("watch pictures", "did you mean: ethbrake watch picture?"),
-        ("watch picture map", "known: criticality, deceleration, shield, shield-modes, robustness"),
-        ("doctor please", "known: check, speed"),
-    ],
-)
-def test_wrong_name__is_told_the_nearest_place(ethbrake, wrong, place):
-    answer = ethbrake(*wrong.split())
-    told = f"unknown command {wrong.split()[-1]!r}; {place}"
-    group = " ".join(["ethbrake", *wrong.split()[:-1]])
-    assert (answer.status, answer.err) == (2, f"ethbrake: error: {told} (see: {group} --help)\n")
-
-
-def test_default_command__has_its_options_on_the_page_of_its_group_and_behind_its_name(ethbrake):
+def test_default_command__has_its_options_on_the_page_of_its_group_and_behind_its_name(ethbrake: Command) -> None:
     for group, default in DEFAULTS.items():
         page, own = ethbrake(group, "--help").out, ethbrake(group, default, "--help").out
         options = own.partition("\nOptions:\n")[2].partition("\n\n")[0]
         assert "--json" in options and options in page
     assert ethbrake("doctor", "check", "--json").out == ethbrake("doctor", "--json").out
-    assert "Missing option '--agent'" in ethbrake("benchmark", "v2").err
 
 
-def test_scenario_sample__draws_the_worlds_that_evaluate_draws(ethbrake, tmp_path):
-    table, scenario = tmp_path / "worlds.csv", "paper-random"
-    told = ethbrake("scenario", "sample", scenario, "--episodes", "20", "--seed", "4", "--output", table, "--json")
-    assert told.status == 0 and told.err == f"worlds: {table}\n"
-    rows = list(csv.DictReader(table.read_text().splitlines()))
-    assert [{name: float(value) for name, value in row.items()} for row in rows] == json.loads(told.out)
-    assert ethbrake("scenario", "sample", scenario, "--episodes", "20", "--seed", "4").out == table.read_text()
-    agents = ("evaluate", "--agents", "full_brake", "--json")
-    (drawn,) = json.loads(ethbrake(*agents, "--episodes", "20", "--seed", "4").out)
-    (given,) = json.loads(ethbrake(*agents, "--initial-states", table).out)
-    assert drawn["first_impact_harm"] == given["first_impact_harm"] and drawn["worlds_sha256"] == given["worlds_sha256"]
-    again = ethbrake("scenario", "sample", scenario, "--output", table)
-    assert again.status == 2 and "is there already" in again.err
-    assert "must end in .csv" in ethbrake("scenario", "sample", scenario, "--output", tmp_path / "x.txt").err
+@pytest.mark.parametrize(
+    ("line", "fragments"),
+    [
+        ("evaluate --episodes many", ["--episodes"]),
+        ("evaluate --harm-count both", ["--harm-count", "both", "first", "total"]),
+        ("evaluate --frobnicate", ["--frobnicate"]),
+        ("search falsify --agent coast --measure hram", ["hram"]),
+        ("search falsify --agent coast --budget 0", ["--budget"]),
+        ("watch explore --no-browser --port 65536", ["65535"]),
+        ("benchmark v2", ["--agent", "see: ethbrake benchmark drive --help"]),
+        ("scenario show", ["NAME|PATH", "see: ethbrake scenario show --help"]),
+        ("", ["Missing command", "see: ethbrake --help"]),
+        (f"evaluate --agents ppo@{5000 * 'a'}", ["cannot be read", "File name too long"]),
+        (f"evaluate --per-world {300 * 'a'}.csv", ["cannot be written", "File name too long"]),
+        (f"train --name {300 * 'a'}", ["up to 128"]),
+    ],
+)
+def test_wrong_option__is_one_line_whatever_library_finds_it(
+    ethbrake: Command, line: str, fragments: list[str]
+) -> None:
+    check_refused(ethbrake(*line.split()), *fragments)
 
 
-@pytest.mark.parametrize("command", ["run", "train", "evaluate"])
-def test_help__long_commands_have_a_seed_and_json(ethbrake, command):
-    out = ethbrake(command, "--help").out
-    assert "--seed" in out
-    assert "--json" in out
-    assert "--force" in out
+def options_of(found: typer.core.TyperCommand) -> set[str]:
+    return {option for each in found.params for option in each.opts if option.startswith("--")} - {"--help"}
 
 
-def test_evaluate__prints_a_table_with_the_papers_rows(ethbrake):
-    answer = ethbrake("evaluate", "--episodes", "40", "--agents", "full_brake,e_v2x_bm")
-    assert answer.status == 0
-    assert "full_brake" in answer.out
-    assert "Hybrid PPO" in answer.out
-    assert "40 worlds, seed 7" in " ".join(answer.out.split())
-    assert "40 of 40" in answer.err
+def test_cli_page__has_every_command_with_every_option_and_every_agent() -> None:
+    table, _, general = CLI.partition("\n## run\n")[0].partition("\n## Where commands were before\n")
+
+    def section(name: str) -> str:
+        return re.search(rf"^(##+) {name}\n(.*?)(?=^##? |^\1 |\Z)", CLI, re.DOTALL | re.MULTILINE)[2]  # type: ignore[index]
+
+    for name, found in whole_command().commands.items():
+        assert f"`{name}" in table
+        for inner, each in getattr(found, "commands", {name: found}).items():
+            in_short = f"`{inner}" in section(name) or f"ethbrake {name} {inner}" in section(name)
+            own = f"### {inner}\n" in section(name)
+            implied = inner in (name, DEFAULTS.get(name))
+            assert implied or in_short or own, inner
+            about = section(name) if implied or (in_short and not own) else section(inner)
+            wanted = set().union(*map(options_of, getattr(each, "commands", {inner: each}).values()))
+            if inner != "generalise":  # whose section shows the usual ones only
+                assert wanted <= set(re.findall(r"--[a-z-]+", general + about)), f"{name} {inner}"
+    assert [agent for agent in agent_names() if f"`{agent}" not in CLI] == []
 
 
-def test_evaluate_json__is_pure_and_complete(ethbrake):
-    answer = ethbrake("evaluate", "--episodes", "40", "--json")
-    assert answer.status == 0
-    rows = json.loads(answer.out)
-    assert [row["agent"] for row in rows] == ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise"]
-    for row in rows:
-        assert row["episodes"] == 40
-        assert 0.0 <= row["collision_rate"] <= 1.0
-        assert row["total_harm"] >= row["first_impact_harm"]
-    assert [("predicted_harm" in row) for row in rows] == [False, True, True]
-    assert rows[0]["parameters"]["seed"] == 7
+def test_cli_page__tells_where_each_old_command_is_now() -> None:
+    told = CLI.partition("## Where commands were before\n")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| (`.*?) \| (`.*) \|$", told, re.MULTILINE)
+    names = [[re.findall("`(.*?)(?: \\.\\.\\.)?`", cell) for cell in row] for row in rows]
+    assert {old: MOVED[old] for old in MOVED} == {old: new for row in names for old, new in zip(*row, strict=True)}
 
 
-def test_evaluate__same_seed_same_figures_other_seed_others(ethbrake):
-    first, again, other = (ethbrake("evaluate", "--episodes", "20", "--seed", s, "--json").out for s in "112")
-    assert first == again
-    assert first != other
+def test_help__tells_the_parts_of_the_package_without_importing_them() -> None:
+    assert command.part_names() == command.PARTS
 
 
-def test_evaluate_count__total_never_has_more_total_harm(ethbrake):
-    arguments = ("evaluate", "--episodes", "200", "--agents", "e_v2x_bm", "--json", "--harm-count")
-    (first,), (total,) = (json.loads(ethbrake(*arguments, count).out) for count in ("first", "total"))
-    assert total["total_harm"] < first["total_harm"]
-    assert total["first_impact_harm"] > first["first_impact_harm"]
+@pytest.mark.parametrize(
+    ("asked", "answered"),
+    [
+        (
+            {"_ETHBRAKE_COMPLETE": "complete_bash", "COMP_WORDS": "ethbrake scenario val", "COMP_CWORD": "2"},
+            "validate\n",
+        ),
+        ({"_ETHBRAKE_COMPLETE": "complete_zsh", "_TYPER_COMPLETE_ARGS": "ethbrake doctor --comp"}, '"--compile"'),
+    ],
+)
+def test_completion__a_shell_that_asks_gets_what_can_follow(monkeypatch, capsys, asked, answered) -> None:
+    for name, value in asked.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(SystemExit) as ended:
+        run_command([])
+    assert ended.value.code == 0 and answered in capsys.readouterr().out
 
 
-def test_evaluate_vehicle__the_driven_one_is_the_named_one(ethbrake):
-    answer = ethbrake("evaluate", "--episodes", "20", "--agents", "full_brake", "--vehicle", "vehicle_3", "--json")
-    (row,) = json.loads(answer.out)
-    assert row["parameters"]["controlled_vehicle"] == "vehicle_3"
-    assert row["parameters"]["scripts"] == {"vehicle_1": "full_brake", "vehicle_2": "full_brake"}
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"_ETHBRAKE_COMPLETE": "bash_source"},
+        {"_ETHBRAKE_COMPLETE": "1"},
+        {"_ETHBRAKE_COMPLETE": "complete_bash"},
+        {"_ETHBRAKE_COMPLETE": "complete_bash", "COMP_WORDS": "ethbrake", "COMP_CWORD": "x"},
+        {"_ETHBRAKE_COMPLETE": "complete_tcsh", "_TYPER_COMPLETE_ARGS": "ethbrake"},
+    ],
+)
+def test_completion__a_variable_that_no_shell_set_changes_nothing(ethbrake: Command, monkeypatch, asked) -> None:
+    for name, value in asked.items():
+        monkeypatch.setenv(name, value)
+    assert ethbrake("--version").out == f"ethbrake {__version__}\n"
 
 
-def test_evaluate_initial_states__a_world_computed_by_hand(ethbrake, tmp_path):
-    # Vehicle 2 at 10 m/s coasts 5 m in its 0.5 s and brakes the last 3 m with 7 m/s2 towards a standing Vehicle 1:
-    # closing speed squared 10^2 - 2 * 7 * 3 = 58. Vehicle 3 stands 5 km behind. In the second world nobody moves.
-    worlds, out = tmp_path / "worlds.csv", tmp_path / "out.csv"
-    worlds.write_text(
-        "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps,restitution\n8,5000,0,10,0,0\n8,5000,0,0,0,0\n"
+@pytest.mark.parametrize(
+    ("loaded", "temporary", "told"),
+    [
+        ([], False, "compiling the physics, once: minutes of one core, then it is kept\n"),
+        (["advance-1"], False, "compiling what was not used before, once, then it is kept\n"),
+        ([], True, "no folder can be written"),
+    ],
+)
+def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, temporary, told) -> None:
+    folder = tmp_path / ("ethbrake_marl-x" if temporary else "kept")
+    folder.mkdir()
+    monkeypatch.setattr("ethbrake_marl.kernel_store.cache_folder", lambda: folder)
+    monkeypatch.setattr("ethbrake_marl.physics.compiling.cache_folder", lambda: folder)
+    monkeypatch.setattr("ethbrake_marl.physics.compiling._loaded", loaded)
+    monkeypatch.setattr("ethbrake_marl.kernel_store._tellers", [])
+    monkeypatch.setitem(event._registered, "numba:compile", [])  # nobody listens any more after this test
+    monkeypatch.setattr("warnings.showwarning", None)
+    frame.prepare_streams()
+
+    @compiled
+    def next_number(x: int) -> int:
+        return x + 1
+
+    assert (next_number(1), next_number(1.5)) == (2, 2.5)
+    captured = capsys.readouterr()
+    assert captured.out == "" and told in captured.err and captured.err.count("\n") == 1
+    monkeypatch.setattr(frame, "EVERY_S", 0.0)
+    assert next_number(1j) == 1 + 1j
+    assert re.search(r"^compiling: \d+ kernels in \d+ s so far$", capsys.readouterr().err, re.MULTILINE)
+
+
+def test_results__stand_alone_on_stdout_whatever_a_file_of_the_users_prints(ethbrake: Command, tmp_path: Path) -> None:
+    (tmp_path / "noise.py").write_text('print("noise of a plug-in")\n')
+    (tmp_path / "mine.py").write_text(
+        "import numpy as np, ethbrake_marl as eb\n"
+        "def act(seen):\n"
+        '    print("noise of a policy")\n'
+        "    return np.full((len(seen), 1), -1.0)\n"
+        "def make(): return eb.policy_agent(act)\n"
     )
-    answer = ethbrake("evaluate", "--initial-states", worlds, "--agents", "full_brake", "--per-world", out, "--json")
-    assert answer.status == 0
-    (row,) = json.loads(answer.out)
-    assert (row["episodes"], row["collision_rate"]) == (2, 0.5)
-    assert row["first_impact_harm"] == pytest.approx(29.0, rel=1e-12)
-    hit, still = csv.DictReader(out.read_text().splitlines())
-    assert float(hit["total_harm"]) == pytest.approx(58.0, rel=1e-12)
-    assert (hit["collided"], hit["impacts"]) == ("1", "1")
-    assert (still["collided"], still["total_harm"], still["final_gap_1_m"]) == ("0", "0.0", "8.0")
+    files = ["--plugin", tmp_path / "noise.py", "--agents", f"full_brake,{tmp_path}/mine.py:make"]
+    told = ethbrake("evaluate", *files, "--episodes", "3", "--json")
+    assert len(told_json(told)) == 2
+    assert "noise of a plug-in" in told.err and "noise of a policy" in told.err
+    assert "noise" not in ethbrake("evaluate", *files, "--episodes", "3").out
 
 
-def test_evaluate_per_world__its_initial_states_give_the_same_harms(ethbrake, tmp_path):
-    drawn, again, worlds = tmp_path / "drawn.csv", tmp_path / "again.csv", tmp_path / "worlds.csv"
-    agents = ("--agents", "full_brake,e_v2x_bm", "--json")
-    list_answer = ethbrake("evaluate", "--episodes", "30", "--seed", "4", *agents, "--per-world", drawn)
-    rows = list(csv.DictReader(drawn.read_text().splitlines()))
-    assert [row["agent"] for row in rows] == ["full_brake"] * 30 + ["e_v2x_bm"] * 30
-    given = ["gap_1_m", "gap_2_m", "speed_1_mps", "speed_2_mps", "speed_3_mps"]
-    lines = [",".join(row[column] for column in given) for row in rows[:30]]
-    worlds.write_text("\n".join([",".join(given), *lines]) + "\n")
-    given_answer = ethbrake("evaluate", "--initial-states", worlds, *agents, "--per-world", again)
-    assert drawn.read_text() == again.read_text()
-    for drawn_row, given_row in zip(json.loads(list_answer.out), json.loads(given_answer.out), strict=True):
-        assert drawn_row["parameters"].pop("seed") == 4
-        assert given_row["parameters"].pop("seed") is None
-        assert (drawn_row["per_world"].pop("file"), given_row["per_world"].pop("file")) == ("drawn.csv", "again.csv")
-        assert drawn_row == given_row
+def test_a_command_of_a_plug_in__prints_where_it_likes(ethbrake: Command, monkeypatch) -> None:
+    monkeypatch.setattr(app, "registered_commands", [*app.registered_commands])
+    app.command("my-words")(lambda: print("words"))
+    assert ethbrake("my-words").out == "words\n"
 
 
-def test_scenario_list__names_every_shipped_scenario(ethbrake):
-    lines = ethbrake("scenario", "list").out.splitlines()
-    names = [entry["name"] for entry in json.loads(ethbrake("scenario", "list", "--json").out)]
-    assert [line.split()[0] for line in lines] == names
-    assert {"paper-random", "paper-random-early", "paper-scenario-1"} <= set(names)
+def test_defect_of_the_program__keeps_its_traceback_and_missing_memory_is_one_line(ethbrake, monkeypatch) -> None:
+    def broken(error: Exception) -> None:
+        raise error
+
+    monkeypatch.setattr("ethbrake_marl.scenario.list_scenarios", lambda: broken(RuntimeError("a defect")))
+    with pytest.raises(RuntimeError, match="a defect"):
+        ethbrake("scenario", "list")
+    short = MemoryError("Unable to allocate 9 TiB")
+    monkeypatch.setattr("ethbrake_marl.evaluation.inputs.choose_worlds", lambda *given, **how: broken(short))
+    check_refused(ethbrake("evaluate"), "not enough memory (Unable to allocate 9 TiB)", "fewer worlds")
 
 
-def test_scenario_show__prints_the_file_itself(ethbrake, scenario_file):
-    path = scenario_file("\nrestitution: 0.1", "\nrestitution: 0.2")
-    assert ethbrake("scenario", "show", path).out == path.read_text()
-    shipped = Path(next(e["path"] for e in json.loads(ethbrake("scenario", "list", "--json").out)))
-    assert ethbrake("scenario", "show", shipped.stem).out == shipped.read_text()
+def program(source: str, **environment: str) -> tuple[int, str, str]:
+    """Exit status, stdout and stderr of Python source in a process of its own."""
+    process = subprocess.run(
+        [sys.executable, "-c", source],
+        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+        capture_output=True,
+        encoding=environment.get("PYTHONIOENCODING", "utf-8"),
+        check=False,
+    )
+    return process.returncode, process.stdout, process.stderr
 
 
-def test_scenario_new__is_valid_and_carries_the_values_it_started_from(ethbrake, tmp_path):
-    assert ethbrake("scenario", "new", "mine", "--based-on", "paper-scenario-1", "--output", tmp_path).status == 0
-    path = tmp_path / "mine.yaml"
-    answer = ethbrake("scenario", "validate", path)
-    assert answer.status == 0
-    assert answer.out.startswith("OK  mine: 3 vehicles, learners: vehicle_2; 1,000 worlds drawn")
-    assert "gaps_m: [10, 8]" in path.read_text()
+def test_program__exit_status_and_streams_and_a_full_disk_behind_stdout() -> None:
+    calling = (
+        "import os, runpy, sys; sys.argv = ['ethbrake', {!r}];{} runpy.run_module('ethbrake_marl', run_name='__main__')"
+    )
+    assert program(calling.format("--version", "")) == (0, f"ethbrake {__version__}\n", "")
+    status, out, err = program(calling.format("evalute", ""))
+    assert (status, out, err.count("\n")) == (2, "", 1)
+    full = program(calling.format("--version", " os.dup2(os.open('/dev/full', os.O_WRONLY), 1);"))
+    assert full == (2, "", "ethbrake: error: output: No space left on device\n")
 
 
-def test_scenario_validate__counts_the_refused_draws(ethbrake, scenario_file):
-    path = scenario_file("\ngaps_m: {uniform: [5, 10]}", "\ngaps_m: {choice: [0.1, 10]}")
-    answer = ethbrake("scenario", "validate", path)
-    assert answer.status == 0
-    refused = re.search(r"([\d,]+) more refused", answer.out)
-    assert refused is not None
-    assert int(refused[1].replace(",", "")) > 100
+@pytest.mark.parametrize("encoding", [pytest.param("latin-1", marks=pytest.mark.slow), "ascii"])
+def test_program__prints_a_table_on_a_narrow_stdout_and_needs_no_torch(encoding: str) -> None:
+    status, out, err = program(
+        "import sys; from ethbrake_marl.cli.app import main\n"
+        "sys.argv[1:] = ['evaluate', '--episodes', '5', '--agents', 'coast']\n"
+        "try:\n    main()\n"
+        "except SystemExit as end:\n    assert not end.code\n"
+        "print('loaded:', *{'torch', 'stable_baselines3', 'matplotlib'} & set(sys.modules))\n"
+        "import ethbrake_marl.studies.reproduction\n"
+        "print('with the items of the paper:', *{'torch'} & set(sys.modules))",
+        PYTHONIOENCODING=encoding,
+    )
+    assert status == 0 and "coast" in out, err
+    assert out.endswith("loaded:\nwith the items of the paper:\n"), out
 
 
-def test_scenario_schema__is_a_json_schema(ethbrake):
-    schema = json.loads(ethbrake("scenario", "schema").out)
-    assert schema["$schema"].startswith("https://json-schema.org/")
-    assert schema["required"] == ["name"]
-    assert {"oneOf": [{"required": ["gaps_m"]}, {"required": ["time_gaps_s"]}]} in schema["then"]["allOf"]
+def test_kernels__a_temporary_cache_is_told_and_removed_at_the_end(tmp_path: Path) -> None:
+    _, out, _ = program(
+        "from ethbrake_marl.kernel_store import cache_folder; print(cache_folder(), cache_folder().is_dir())\n"
+        "from ethbrake_marl.cli.doctor import _kernel_cache; print(_kernel_cache()[1])",
+        NUMBA_CACHE_DIR="/dev/null/x",
+        TMPDIR=str(tmp_path),
+    )
+    where, told = out.splitlines()
+    assert where.startswith(str(tmp_path / "ethbrake_marl-")) and where.endswith(" True") and "temporary" in told
+    assert list(tmp_path.iterdir()) == []
 
 
-def test_scenario__folder_and_short_name_of_a_shipped_one(ethbrake):
-    assert ethbrake("scenario", "show", "stress/wide").out == ethbrake("scenario", "show", "stress-wide").out
-    assert ethbrake("scenario", "validate", "stress/wide").out.startswith("OK  stress-wide: 3 vehicles")
+def test_progress__without_a_terminal_is_lines_and_every_ten_seconds_the_time_that_is_left(capsys, monkeypatch) -> None:
+    out = Out()
+    out.progress("training", 0, 1000, {"first_impact_harm": 9.0})
+    out.progress("training", 500, 1000, {"first_impact_harm": 9.0})
+    out.progress("training", 1000, 1000, {"first_impact_harm": 8.0}, note="stopped")
+    times = iter((100.0, 105.0, 110.5, 111.0, 121.0))
+    monkeypatch.setattr("ethbrake_marl.cli.command.time.monotonic", lambda: next(times))
+    for done in (0, 100, 210, 220, 420):
+        out.progress("ppo", done, 1000)
+    assert capsys.readouterr().err.splitlines() == [
+        "training, first-impact harm 9.00: 0 of 1,000",
+        "stopped",
+        "training, first-impact harm 8.00: 1,000 of 1,000",
+        "ppo: 0 of 1,000",
+        "ppo: 210 of 1,000, about 40 s left",
+        "ppo: 420 of 1,000, about 29 s left",
+    ]
 
 
-def test_evaluate__several_learners_and_objectives(ethbrake, tmp_path):
-    worlds = tmp_path / "worlds.csv"
-    words = ["evaluate", "--scenario", "cooperation-3-pair", "--episodes", "20", "--agents", "full_brake,e_v2x_bm"]
-    words += ["--objective", "own", "--objective", "weighted:1,4,1"]
-    rows = json.loads(ethbrake(*words, "--per-world", worlds, "--json").out)
-    assert rows[0]["parameters"]["controlled_vehicles"] == ["vehicle_2", "vehicle_3"]
-    told = [(one["objective"], one["harm_count"]) for one in rows[1]["objectives"]]
-    assert told == [("own", "first"), ("weighted:1,4,1", "first"), ("own", "total"), ("weighted:1,4,1", "total")]
-    own = rows[0]["objectives"][2]
-    assert sum(own[f"vehicle_{i}"] for i in (1, 2, 3)) == pytest.approx(rows[0]["total_harm"])
-    table = list(csv.DictReader(worlds.read_text().splitlines()))
-    assert float(table[0]["own_total_3"]) == float(table[0]["total_harm_3"])
-    answer = ethbrake(*words)
-    assert "Objectives, first-impact harm" in answer.out and "weighted:1,4,1" in answer.out
+def test_progress__on_a_terminal_each_part_has_one_bar_above_what_comes_next(monkeypatch, capsys) -> None:
+    screen, out = io.StringIO(), Out()
+    monkeypatch.setattr(out, "_stderr", Console(file=screen, force_terminal=True, width=100))
+    out.progress("training", 10, 1000)
+    out.progress("training", 1024, 1000)  # a training ends after the update in which its steps are reached
+    out.progress("ppo", 5, 10, note="said once")
+    bars = out._bars
+    assert bars is not None
+    tasks = [(task.description, task.completed, task.total) for task in bars.tasks]
+    assert tasks == [("training", 1000, 1000), ("ppo", 5, 10)]
+    out.note("written")
+    assert screen.getvalue().count("said once") == 1 and not bars.live.is_started and out._bars is None
+    assert capsys.readouterr().err.endswith("written\n")
 
 
-def test_evaluate__what_drives_one_vehicle_only_is_refused_for_several(ethbrake, finished_run):
-    answer = ethbrake("evaluate", "--scenario", "cooperation-3-pair", "--agents", f"ppo@{finished_run}+episode")
-    assert answer.status == 2 and "vehicle_3 of scenario 'cooperation-3-pair' must be driven too" in answer.err
+def test_command__ctrl_c_is_one_line_and_the_status_of_an_interruption(capsys) -> None:
+    group = Commands()
+
+    @group.add("wait", "wait", kept="what was found is kept")
+    def wait(out: Out) -> None:
+        """Wait."""
+        raise KeyboardInterrupt
+
+    (registered,) = group.registered_commands
+    assert registered.callback is not None
+    with pytest.raises(typer.Exit) as raised:
+        registered.callback()
+    assert raised.value.exit_code == 130
+    assert capsys.readouterr().err == "interrupted; what was found is kept\n"

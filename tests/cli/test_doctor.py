@@ -1,12 +1,11 @@
+"""``ethbrake doctor``: what it finds wrong, what it compiles, and the table of speeds (measured in tests/studies)."""
+
 from __future__ import annotations
 
 import dataclasses
-import json
-import os
-import subprocess
-import sys
-from pathlib import Path
+import re
 
+import numpy as np
 import pytest
 from packaging.requirements import Requirement
 
@@ -14,102 +13,139 @@ from ethbrake_marl import physics, scenario
 from ethbrake_marl.agents import e_v2x_bm
 from ethbrake_marl.cli import doctor
 from ethbrake_marl.cli.doctor import Check, diagnose
-
-ROOT = Path(__file__).resolve().parents[2]
-
-
-def found(name: str) -> Check:
-    return next(check for check in diagnose() if check.name == name)
+from ethbrake_marl.kernel_store import cache_folder
+from ethbrake_marl.studies import speed
+from ethbrake_marl.studies.speed import Benchmark, Effort, Speed, this_machine
+from tests.cli.conftest import Command, told_json
 
 
-def test_doctor__a_sound_installation_is_ok(ethbrake):
-    answer = ethbrake("doctor")
+def found(name: str) -> tuple[bool, str]:
+    """Whether a check is in order, and what it tells."""
+    check = next(check for check in diagnose() if check.name == name)
+    return check.ok, check.detail
+
+
+def test_doctor__a_sound_installation_is_ok(ethbrake: Command) -> None:
+    answer, checks = ethbrake("doctor"), told_json(ethbrake("doctor", "--json"))
     assert (answer.status, answer.err) == (0, "")
     lines = answer.out.splitlines()
-    assert all(line.startswith("OK ") for line in lines)
-    names = {line.split()[1] for line in lines}
-    assert names >= {"python", "numpy", "torch", "physics", "baseline", "scenarios", "kernel"}
-
-
-def test_doctor_json__is_pure(ethbrake):
-    answer = ethbrake("doctor", "--json")
-    checks = json.loads(answer.out)
-    assert [check["name"] for check in checks] == [check.name for check in diagnose()]
-    assert all(check["ok"] is True for check in checks)
+    assert all(line.startswith("OK ") for line in lines) and all(check["ok"] is True for check in checks)
+    assert [line.split()[1] for line in lines] == [check["name"].split()[0] for check in checks]
+    names = {check["name"] for check in checks}
+    assert names >= {"python", "numpy", "torch", "physics", "baseline", "scenarios", "kernel cache"}
 
 
 @pytest.mark.parametrize("form", [[], ["--json"]])
-def test_doctor__one_failure_gives_exit_status_1(ethbrake, monkeypatch, form):
+def test_doctor__one_failure_gives_exit_status_1(ethbrake: Command, monkeypatch, form: list[str]) -> None:
     checks = [Check("a", True, "x"), Check("b", False, "y")]
     monkeypatch.setattr("ethbrake_marl.cli.doctor.diagnose", lambda compile_all: checks)
     answer = ethbrake("doctor", *form)
-    assert answer.status == 1
-    assert ("FAIL  b  y" in answer.out) == (not form)
+    assert answer.status == 1 and ("FAIL  b  y" in answer.out) == (not form)
 
 
-def test_dependencies__too_old_and_missing_ones_fail(monkeypatch):
+def test_dependencies__too_old_missing_and_untested_ones_are_told(monkeypatch) -> None:
     wanted = [("", "numpy>=99"), ("", "no-such-package>=1"), ("", "scipy>=1"), ("train", "no-such-extra>=1")]
     monkeypatch.setattr(doctor, "_requirements", lambda: [(extra, Requirement(line)) for extra, line in wanted])
-    numpy, missing, scipy, optional = (found(name) for name in ("numpy", "no-such-package", "scipy", "no-such-extra"))
-    assert not numpy.ok
-    assert "needs >=99" in numpy.detail
-    assert (missing.ok, missing.detail) == (False, "is not installed; needs >=1")
-    assert scipy.ok
-    assert (optional.ok, optional.detail) == (True, "is not installed; the extra train brings it")
+    monkeypatch.setattr(doctor, "_pinned_versions", lambda path: {"scipy": "1.0"})
+    ok, told = found("numpy")
+    assert not ok and "needs >=99" in told
+    assert found("no-such-package") == (False, "is not installed; needs >=1")
+    assert found("no-such-extra") == (True, "is not installed; the extra train brings it")
+    ok, told = found("scipy")
+    assert ok and "(tested with 1.0)" in told
 
 
-def test_dependencies__another_version_than_the_tested_one_is_mentioned(monkeypatch):
-    monkeypatch.setattr(doctor, "_pinned_versions", lambda path: {"numpy": "1.0"})
-    assert found("numpy").ok
-    assert "(tested with 1.0)" in found("numpy").detail
-
-
-def test_dependencies__each_stands_with_the_extra_that_brings_it():
+def test_dependencies__each_stands_with_the_extra_that_brings_it() -> None:
     extra_of = {requirement.name: extra for extra, requirement in doctor._requirements()}
-    assert extra_of["numpy"] == extra_of["numba"] == ""
-    assert (extra_of["torch"], extra_of["benchmarl"], extra_of["onnx"]) == ("train", "marl", "export")
-    assert extra_of["ray"] == "cluster"
-    assert "pytest" not in extra_of
+    names = ("numpy", "numba", "torch", "benchmarl", "onnx", "ray", "pytest")
+    assert [extra_of.get(name) for name in names] == ["", "", "train", "marl", "export", "cluster", None]
 
 
-def test_physics__a_kernel_that_gives_other_harm_fails(monkeypatch):
-    exact = physics.advance
+def test_checks__other_physics_another_optimum_and_a_damaged_folder_are_findings(monkeypatch) -> None:
+    exact, optimum = physics.advance, e_v2x_bm.optimise_pairwise
 
     def doubled(*args, **kwargs):
         worlds, impacts = exact(*args, **kwargs)
         return worlds, dataclasses.replace(impacts, total_harm=2.0 * impacts.total_harm)
 
-    monkeypatch.setattr(physics, "advance", doubled)
-    assert not found("physics").ok
-    assert "harm 40 (exact: 20)" in found("physics").detail
-
-
-def test_baseline__another_optimum_fails(monkeypatch):
-    exact = e_v2x_bm.optimise_pairwise
-
     def shifted(worlds, vehicle):
-        best = exact(worlds, vehicle)
+        best = optimum(worlds, vehicle)
         return best._replace(deceleration_mps2=best.deceleration_mps2 + 1e-4)
 
-    monkeypatch.setattr(e_v2x_bm, "optimise_pairwise", shifted)
-    assert not found("baseline").ok
-
-
-def test_scenarios__a_damaged_folder_is_a_finding_and_no_crash(monkeypatch):
     def missing() -> None:
         raise OSError("gone")
 
+    monkeypatch.setattr(e_v2x_bm, "optimise_pairwise", shifted)
+    assert not found("baseline")[0]
+    monkeypatch.setattr(physics, "advance", doubled)
+    ok, told = found("physics")
+    assert not ok and "harm 40 (exact: 20)" in told
     monkeypatch.setattr(scenario, "list_scenarios", missing)
-    assert (found("scenarios").ok, found("scenarios").detail) == (False, "OSError: gone")
+    assert found("scenarios") == (False, "OSError: gone")
 
 
-def test_kernel_cache__a_folder_that_cannot_be_written_is_mentioned(tmp_path):
-    blocked = tmp_path / "file"
-    blocked.write_text("")
-    program = "from ethbrake_marl.cli.doctor import _kernel_cache; print(_kernel_cache()[1])"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(blocked)}
-    environment["TMPDIR"] = str(tmp_path)
-    result = subprocess.run(
-        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
-    )
-    assert "temporary" in result.stdout
+def test_compile__only_when_asked_and_says_how_far_it_is_and_what_failed(ethbrake: Command, monkeypatch) -> None:
+    assert "compile" not in ethbrake("doctor").out
+    monkeypatch.setattr(doctor, "_call", lambda door, folder: "no luck" if "shield" in door else "")
+    answer = ethbrake("doctor", "--compile")
+    assert answer.status == 1 and re.search("FAIL +compile +shield failed: no luck", answer.out)
+    *far, failed = [line for line in answer.err.splitlines() if line.startswith("compile: ")]
+    assert re.fullmatch(r"compile: (\d+) of \1 commands done, \d+ files in the cache", far[-1])
+    assert failed == "compile: shield failed: no luck"
+    monkeypatch.setattr(doctor, "is_temporary", lambda folder: True)
+    monkeypatch.setattr(doctor, "_call", None)  # where nothing can be kept it does not begin
+    answer = ethbrake("doctor", "--compile")
+    assert answer.status == 1 and re.search("FAIL +compile +no folder .* NUMBA_CACHE_DIR", answer.out)
+
+
+def test_compile_ahead__for_a_run_alone_calls_one_command(monkeypatch) -> None:
+    called = []
+    monkeypatch.setattr(doctor, "_call", lambda door, folder: called.append(door) or "")
+    assert doctor.compile_ahead(training=False, run_alone=True)[0]
+    ((*_, agents),) = called
+    assert set(agents.split(",")) >= {"full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "ppo@shipped+episode"}
+
+
+@pytest.mark.long
+def test_compile__leaves_nothing_to_compile(ethbrake: Command) -> None:
+    answer = ethbrake("doctor", "--compile", "--json")
+    assert answer.status == 0 and '"name": "compile",\n    "ok": true' in answer.out
+    kernels = set(cache_folder().iterdir())
+    commands = [
+        ("evaluate", "--agents", "full_brake,e_v2x_bm,ppo@shipped,ppo@shipped+episode", "--episodes", "3"),
+        ("shield", "--agents", "full_brake", "--episodes", "3"),
+        ("evaluate", "--agents", "planner,full_brake+step", "--episodes", "3"),
+    ]
+    assert [ethbrake(*command).status for command in commands] == [0, 0, 0]
+    assert set(cache_folder().iterdir()) == kernels
+
+
+SPEEDS = (
+    Speed("engine step", "of a test", 1024, 3, "world-steps/s", 9_876_543.0, 9_000_000.0, 10_000_000.0, 8e6),
+    Speed("import and first step", "of a test", 1, 3, "s", 0.91, 0.9, 0.95, 2.0),
+    Speed("sampling", "of a test", 10_000, 3, "worlds/s", 512.0, 500.0, 540.0),
+)
+
+
+def test_speed__prints_a_table_and_the_machine_or_json(ethbrake: Command, monkeypatch) -> None:
+    efforts: list[Effort] = []  # that were asked for; nothing is measured
+
+    def benchmark(told: Speed) -> Benchmark:
+        def look(effort: Effort) -> np.ndarray:
+            efforts.append(effort)
+            return np.array([told.lowest, told.value, told.highest])
+
+        return Benchmark(told.name, told.workload, told.unit, told.worlds, told.floor, look)
+
+    monkeypatch.setattr(speed, "BENCHMARKS", tuple(map(benchmark, SPEEDS)))
+    lines = ethbrake("doctor", "speed").out.splitlines()
+    rows = {cells[0]: cells[1:] for cells in (re.split(r"  +", line.strip()) for line in lines)}
+    assert rows["engine step"] == ["1,024", "9.88 M world-steps", "9.00 M - 10.0 M", "29.6 M", "8.00 M"]
+    assert rows["import and first step"][1:] == ["0.91 s", "0.9 - 0.95", "2"]
+    assert "512 worlds" in rows["sampling"] and lines[-1].startswith(f"Machine: {this_machine().processor}, ")
+    answer = ethbrake("doctor", "speed", "--quick", "--json")
+    told = told_json(answer)
+    assert [figure["name"] for figure in told["figures"]] == [each.name for each in SPEEDS]
+    assert (told["figures"][0]["value"], told["figures"][0]["relative"]) == (9_876_543.0, 1.0)
+    assert told["machine"]["cores"] >= 1 and told["machine"]["processor"] and "speed: 1 of 3" in answer.err
+    assert efforts == [speed.FULL] * 3 + [speed.QUICK] * 3

@@ -30,7 +30,7 @@ def _by(where: str, *commands: str) -> How:
 
 
 EXACT = _by(SUITE, "tests/docs/test_printed.py")
-TUTORIAL = _by(SUITE, "tests/cli/test_documentation.py")
+TUTORIAL = _by(SUITE, "tests/cli/test_scenarios.py")
 TRAINED = _by(TRAINING)
 
 BLOCKS: dict[str, How] = {
@@ -38,12 +38,12 @@ BLOCKS: dict[str, How] = {
     "ethbrake scenario list": EXACT,
     "ethbrake scenario validate rainy.yaml": EXACT,
     "ethbrake recipe new quick": EXACT,
-    "ethbrake train": _by(SUITE, "tests/test_extras.py"),
+    "ethbrake train": _by(SUITE, "tests/test_imports.py"),
     "cat worlds.csv": TUTORIAL,
     "agent,world,impacts,first_impact_harm,total_harm": TUTORIAL,
     "-1.0 26.97": TUTORIAL,
-    "ethbrake watch replay EB1:": _by(SUITE, "tests/cli/test_replay.py"),
-    "Policy('ppo', 27 observations": _by(SUITE, "tests/docs/test_snippets.py"),
+    "ethbrake watch replay EB1:": _by(SUITE, "tests/cli/test_watch.py"),
+    "Policy('ppo', 27 observations": _by(SUITE, "tests/docs/test_printed.py"),
     "ethbrake evaluate --scenario paper-random --agents full_brake,e_v2x_bm,e_v2x_bm:pairwise": _by(NIGHTLY),
     "ethbrake shield --agents full_brake,ppo@shipped --episodes 30": _by(NIGHTLY),
     "ethbrake watch picture criticality": _by(NIGHTLY),
@@ -140,13 +140,13 @@ TABLES: dict[str, How] = {
     "| d1, d2; v1, v2, v3; tau2, tau3": EXACT,
     "| agent | predicted | collisions": _by(SEARCH),
     "| agent | knows | collisions | first-impact | total": TRAINED,
-    "| List | What | Vehicles | Driven": _by(SUITE, "tests/studies/benchmark"),
-    "|  | Agent | Overall": _by(SUITE, "tests/studies/benchmark"),
+    "| List | What | Vehicles | Driven": _by(SUITE, "tests/docs/test_pages.py"),
+    "|  | Agent | Overall": _by(SUITE, "tests/docs/test_pages.py"),
     "| candidates per world and count": _by(SEARCH),
     "| controlled | first-impact | total": _by(SEARCH),
     "| list (seed 7) | worlds | first-impact, mean": _by(SEARCH),
     "| agent | 0.1, 0.3 s | 0.3, 0.6 s": _by(SEARCH),
-    "| total gap (m) | 10-12": _by(SUITE, "tests/test_paper_page.py"),
+    "| total gap (m) | 10-12": _by(SUITE, "tests/docs/test_pages.py"),
     "| step (s) | first-impact, mean": _by(SUITE, "tests/docs/test_studies.py"),
     "| width | shield | bound": _by(SEARCH),
     "| leak | first restart above": _by(SEARCH, "make test-shield"),
@@ -168,7 +168,6 @@ TABLES: dict[str, How] = {
     "| scenario | `ppo` | `sac`": TRAINED,
     "| what learns | 10": TRAINED,
     "| who drives Vehicle 2 | collisions | first-impact | times": TRAINED,
-    "| who drives Vehicle 2 | collisions | first-impact harm | total harm | Vehicle 1": TRAINED,
     "| policy | processor time": TRAINED,
     "| trained for | policy": TRAINED,
     "| after | decisions | harm": TRAINED,
@@ -188,7 +187,7 @@ TABLES: dict[str, How] = {
     "| | CPU-seconds per million worlds": _by(SPEED),
     "| what | measured | by": _by(SPEED),
     # words and settings
-    "| preset | ": _by(SUITE, "tests/studies/ablation/test_cooperation_page.py"),
+    "| preset | ": _by(SUITE, "tests/docs/test_pages.py"),
     "| key | default | unit, range": _by(SUITE, "tests/scenario/test_schema.py"),
     "| name | gaps | speeds": EXACT,
     "| name | speeds | gaps": EXACT,
@@ -196,13 +195,14 @@ TABLES: dict[str, How] = {
     "| no. | label | the paper": _by(BY_HAND),
     "| version | what it is": _by(BY_HAND),
     "| key | range | meaning": _by(BY_HAND),
+    "| planted | search | first found after": _by(SEARCH),
 }
 
 PICTURES: dict[str, How] = {
     "emergency.svg": _by(
         NIGHTLY, "ethbrake watch record --agents full_brake,counterfactual@shipped --output emergency.svg"
     ),
-    "model-": _by(SUITE, "tests/docs/test_drawings.py"),
+    "model-": _by(SUITE, "tests/docs/test_studies.py"),
     "criticality.png": _by(
         NIGHTLY,
         "ethbrake watch picture criticality --scenario paper-distance --agent e_v2x_bm --output criticality.png",
@@ -222,7 +222,7 @@ PICTURES: dict[str, How] = {
     "learning-curves": _by(TRAINING),
     "explorer.png": _by(BY_HAND),
     "speed-scaling.png": _by(SPEED),
-    "reproduction-trajectories": _by(SUITE, "tests/test_reproduction_page.py"),
+    "reproduction-trajectories": _by(SUITE, "tests/docs/test_pages.py"),
     "reproduction": _by(TRAINING, "ethbrake reproduce --full"),
 }
 

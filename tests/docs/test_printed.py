@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -22,10 +25,15 @@ from tests.docs.blocks import (
     tables_of_figures,
 )
 from tests.docs.printed import BLOCKS, EXACT, PICTURES, TABLES, How, how, where_rows
+from tests.docs.site import DOCS
 from tests.docs.speeds import CASES, line
 
 Run = Callable[..., tuple[str, str]]
-MADE = ("docs/reproduction.md",)  # whole pages that are made from data; tests/test_reproduction_page.py compares them
+
+
+MADE = ("docs/reproduction.md",)  # whole pages that are made from data; tests/docs/test_pages.py compares them
+
+
 KINDS = [
     pytest.param(printed_blocks, BLOCKS, id="blocks"),
     pytest.param(tables_of_figures, TABLES, id="tables"),
@@ -71,7 +79,7 @@ def told(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tm
 def _blocks() -> list[Shown]:
     places = [(each, how(BLOCKS, each.begin)) for each in printed_blocks()]
     own = [each for each, place in places if place is not None and place[1] == EXACT and "ethbrake" in each.begin]
-    return [each for each in own if "tutorials" not in each.page]  # of which tests/cli/test_documentation.py takes care
+    return [each for each in own if "tutorials" not in each.page]  # of which tests/cli/test_scenarios.py takes care
 
 
 @pytest.mark.parametrize("block", _blocks(), ids=lambda block: block.begin[:60])
@@ -164,3 +172,56 @@ def test_agrees__where_dots_stand_for_any_lines(shown: str, printed: str, same: 
 )
 def test_missing_figures__are_those_that_nothing_rounds_to(table: str, printed: str, missing: list[str]) -> None:
     assert missing_figures(table, printed) == missing
+
+
+PAGES = ("pettingzoo-listing", "shipped-policies")
+
+
+PROGRAM = re.compile(r"```python\n(.*?)```(?:\n\n```\n(.*?)```)?", re.DOTALL)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_programs__of_a_page_run_and_print_what_stands_below_them(
+    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {"__name__": "my_file"}
+    programs = PROGRAM.findall((DOCS / f"{page}.md").read_text("utf-8"))
+    assert programs
+    for code, printed in programs:
+        exec(compile(code, f"{page}.md", "exec"), names)
+        told = capsys.readouterr().out
+        assert not printed or told == printed
+
+
+CELL = re.compile(r"^```\{code-cell\} python\n(?::tags: .*\n)?(.*?)^```$", re.DOTALL | re.MULTILINE)
+
+
+TRAIN = ("ablation", "cooperative-learner", "read-a-report", "train-and-shield")
+
+
+NOTEBOOKS = sorted(
+    path.stem for path in (DOCS / "tutorials").glob("*.md") if "\nfile_format: mystnb\n" in path.read_text("utf-8")
+)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.long if name in TRAIN else pytest.mark.slow) for name in NOTEBOOKS]
+)
+def test_notebook__runs_from_its_first_cell_to_its_last(name: str, tmp_path: Path) -> None:
+    cells = CELL.findall((DOCS / "tutorials" / f"{name}.md").read_text("utf-8"))
+    assert cells
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join(cells)],
+        env={**os.environ, "PYTHONPATH": str(DOCS.parent), "OMP_NUM_THREADS": "1"},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+def test_notebooks__that_train_are_there() -> None:
+    assert set(TRAIN) < set(NOTEBOOKS)
+    assert len(NOTEBOOKS) == 8

@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
+from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 
 import ethbrake_marl as eb
+from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.learning.training import TrainingRecipe, load_recipe
 from ethbrake_marl.policies import shipped_policies
+from ethbrake_marl.scenario import list_scenarios, new_scenario_text, scenario_json_schema
 from tests.docs.site import DOCS, load
 
 ROOT = DOCS.parent
+
+
 pages = load("pages")
+
+
 api = load("api")
 
 
@@ -78,3 +90,167 @@ def test_extra__brings_what_the_configuration_loads() -> None:
     assert extensions is not None
     named = re.findall(r'"([a-z_]+)[".]', extensions[1])
     assert {name.replace("_", "-") for name in named if name != "extension"} | {"furo"} == brought
+
+
+GUIDES = ("CONTRIBUTING.md", "CODE_OF_CONDUCT.md", "SECURITY.md", "PULL_REQUEST_TEMPLATE.md")
+
+
+def test_version__is_the_same_wherever_it_stands() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    assert project["version"] == eb.__version__ == citation["version"]
+    assert f"version = {{{eb.__version__}}}" in (ROOT / "README.md").read_text("utf-8")
+    assert citation["license"] == project["license"]
+    assert [author["name"] for author in citation["authors"]] == [author["name"] for author in project["authors"]]
+
+
+@pytest.mark.parametrize(
+    ("file", "schema", "text"),
+    [
+        ("scenarios/scenario.schema.json", scenario_json_schema, new_scenario_text),
+        ("train/recipe.schema.json", TrainingRecipe.json_schema, lambda name: load_recipe("ppo").new_text(name)),
+    ],
+)
+def test_schema__that_ships_is_the_one_that_the_command_prints(
+    file: str, schema: Callable[[], dict[str, Any]], text: Callable[[str], str]
+) -> None:
+    assert (ROOT / file).read_text("utf-8") == json.dumps(schema(), indent=2) + "\n"
+    assert f"# yaml-language-server: $schema={Path(file).name}\n" in text("mine")
+
+
+@pytest.mark.parametrize(("command", "file"), [("sweep", "sweep"), ("tune", "tuning")])
+def test_schema__of_sweeps_and_tunings_is_printed_by_the_command_and_named_by_the_examples(
+    command: str, file: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run_command(["study", command, "--schema"]) == 0
+    assert (ROOT / "docs" / f"{file}.schema.json").read_text("utf-8") == capsys.readouterr().out
+    for example in (ROOT / "docs").glob(f"{file}-*.yaml"):
+        assert example.read_text("utf-8").startswith(f"# yaml-language-server: $schema={file}.schema.json\n")
+
+
+def test_schemas__are_no_scenario_and_no_recipe() -> None:
+    assert all(
+        path.suffix == ".yaml" for path in (*TrainingRecipe.shipped().values(), *(e.path for e in list_scenarios()))
+    )
+
+
+@pytest.mark.parametrize("name", GUIDES)
+def test_guide__has_links_that_lead_somewhere(name: str) -> None:
+    text = (ROOT / ".github" / name).read_text("utf-8")
+    links = re.findall(r"\]\((?!https?:)([^)#\s]+)", text)
+    assert [link for link in links if not (ROOT / ".github" / link).exists()] == []
+
+
+def test_hooks__run_tools_of_the_environment_and_download_nothing() -> None:
+    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text("utf-8"))["repos"]
+    assert [repo["repo"] for repo in hooks] == ["local"]
+    assert all(hook["entry"].startswith(".venv/bin/") for repo in hooks for hook in repo["hooks"])
+
+
+MOST_CHARACTERS = 100
+
+
+MOST_LINES = 8  # of a paragraph
+
+
+PAGES = sorted([ROOT / "README.md", *ROOT.glob(".github/*.md"), *DOCS.glob("*.md"), *DOCS.glob("tutorials/*.md")])
+
+
+FENCE = re.compile(r"\s*(```+|~~~+|:::+)")
+
+
+FREE = re.compile(r"\s*(\||#|<|!\[)|\[[\w-]+\]: |\s*([-*] )?\S+$")  # tables, headings, HTML, pictures, one word
+
+
+BREAK = re.compile(r"\s*(\||#|<|!\[)")
+
+
+ITEM = re.compile(r"\s*(?:[-*]|\d+\.)\s")
+
+
+def prose(text: str) -> Iterator[tuple[int, str]]:
+    """(number, line) of every line that is neither code nor the head of a notebook."""
+    fence = ""
+    head = text.startswith("---\n")
+    for number, line in enumerate(text.splitlines(), 1):
+        if head:
+            head = number == 1 or line != "---"
+            continue
+        found = FENCE.match(line)
+        if fence:
+            if found and line.strip() == fence:
+                fence = ""
+        elif found:
+            fence = found[1]
+        elif not line.startswith("    "):
+            yield number, line
+
+
+def long_lines(text: str) -> list[int]:
+    """Numbers of lines that are too long for no good reason."""
+    return [number for number, line in prose(text) if len(line) > MOST_CHARACTERS and not FREE.match(line)]
+
+
+def long_paragraphs(text: str) -> list[int]:
+    """Number of the first line of every paragraph or item of a list that is too long."""
+    lines = list(prose(text))
+    begins = [(0, ""), *lines]
+    found, start, length = [], 0, 0
+    for (before, _), (number, line) in pairwise(begins):
+        if not line.strip() or BREAK.match(line):
+            length = 0
+            continue
+        if length == 0 or ITEM.match(line) or number != before + 1:
+            start, length = number, 0
+        length += 1
+        if length == MOST_LINES + 1:
+            found.append(start)
+    return found
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_page__has_short_lines_and_short_paragraphs(path: Path) -> None:
+    text = path.read_text("utf-8")
+    wrong = {"lines": long_lines(text), "paragraphs": long_paragraphs(text)}
+    assert not any(wrong.values()), wrong
+
+
+def test_readme__is_short_and_begins_with_a_moving_picture_of_less_than_300_kb() -> None:
+    text = (ROOT / "README.md").read_text("utf-8")
+    assert len(text.splitlines()) <= 120
+    found = re.search(r"!\[[^\]]*\]\(([^)]*\.svg)\)", text)
+    assert found is not None and found.start() < text.index("\n## ")
+    picture = (ROOT / found[1]).read_bytes()
+    assert b"<animate" in picture and len(picture) < 300_000
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_page__has_code_blocks_that_begin_and_end_on_lines_of_their_own(path: Path) -> None:
+    lines = path.read_text("utf-8").splitlines()
+    assert [line for line in lines if re.search(r"\S.*```|```\S+ .*\S *```", line) and "````" not in line] == []
+
+
+@pytest.mark.parametrize(
+    ("text", "lines", "paragraphs"),
+    [
+        ("a " * 50, [], []),
+        ("a " * 50 + "bc", [1], []),
+        ("| " + "a " * 80, [], []),
+        ("# " + "a " * 80, [], []),
+        ("```\n" + "a " * 80 + "\n```\n" + "a " * 60, [4], []),
+        ("````\n```\n" + "a " * 80 + "\n````\n", [], []),
+        ("    " + "a " * 80, [], []),
+        ("see [this](" + "x" * 100 + ") and [that](y)", [1], []),
+        ("- [this](" + "x" * 100 + ")", [], []),
+        ("x" * 130, [], []),
+        ("a b\n" * 8, [], []),
+        ("a b\n" * 9, [], [1]),
+        ("a b\n" * 5 + "\n" + "c d\n" * 8, [], []),
+        ("- a b\n" * 12, [], []),
+        ("- a b\n" + "  c d\n" * 8, [], [1]),
+        ("a b\n" * 6 + "```\nx\n```\n" + "a b\n" * 6, [], []),
+    ],
+)
+def test_rules__find_what_breaks_them(text: str, lines: list[int], paragraphs: list[int]) -> None:
+    assert long_lines(text) == lines
+    assert long_paragraphs(text) == paragraphs

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import time
 
 import numpy as np
 import pytest
@@ -21,9 +20,17 @@ from tests.docs.site import DOCS, load
 sampling, price, equal_time, scaling = (
     load(f"../studies/{name}") for name in ("sampling", "price", "equal_time", "scaling")
 )
+
+
 PAPER = load_scenario("paper-random")
+
+
 BASE = load_scenario("cooperation-2-paper")
+
+
 SHORT = Effort(1, 1e-6)
+
+
 PNG = b"\x89PNG"
 
 
@@ -95,38 +102,6 @@ def test_price__the_page_shows_every_channel():
     assert [f"| {name} | " in page for name in price.channels()] == [True] * 10
 
 
-class Slow:
-    """Coasts, and takes 2 ms of processor time whenever an episode begins."""
-
-    name, knows = "slow", "own sensors"
-
-    def begin(self, alert, vehicle, scripts):
-        until = time.process_time() + 2e-3 * alert.n
-        while time.process_time() < until:
-            pass
-
-    def act(self, worlds, memory, vehicle):
-        return np.zeros(worlds.n), memory
-
-
-def test_equal_time__tells_the_harm_of_an_evaluation_and_the_time_it_took():
-    sample = PAPER.sample(20, 8)
-    agents = {"slow": Slow(), **make_lineup(["full_brake", "e_v2x_bm"], PAPER)}
-    driven = equal_time.drive(sample, agents, PAPER, repeats=2)
-    assert driven["slow"][0] > max(2.0, driven["full_brake"][0])
-    rows = {row[0]: row for row in equal_time.rows_of(driven, "full_brake")}
-    assert list(rows)[-1] == "`slow`" and rows["`e_v2x_bm`"][1] == "true model"
-    full, slow = (driven[name][1].first_impact_harm for name in ("full_brake", "slow"))
-    assert rows["`slow`"][3] == f"{slow.mean():.3f}" and rows["`full_brake`"][5] == ""
-    assert rows["`slow`"][5].startswith(f"{(slow - full).mean():+.3f} [")
-
-
-def test_equal_time__no_table_holds_its_worlds_and_the_page_has_its_columns():
-    worlds = PAPER.sample(equal_time.WORLDS, equal_time.SEED).worlds
-    assert not np.isfinite(best_known(worlds, Task(PAPER, PAPER.learners))["first"]).any()
-    assert f"| {' | '.join(equal_time.HEAD)} |" in (DOCS / "baselines.md").read_text("utf-8")
-
-
 @pytest.mark.slow
 def test_scaling__costs_are_per_world_step() -> None:
     by_worlds = list(scaling.by_worlds(SHORT, (1, 3)))
@@ -146,24 +121,46 @@ def test_scaling__costs_are_per_world_step() -> None:
     assert all(0.0 < cost.nanoseconds < math.inf for cost in by_worlds + by_vehicles)
 
 
-@pytest.mark.parametrize("vehicles", [2, 3, 50])
-def test_lines__are_the_same_every_time_and_apart_in_their_first_step(vehicles: int) -> None:
+drawings = load("../drawings")
+
+
+@pytest.mark.parametrize("name", drawings.DRAWINGS)
+def test_drawing__is_the_one_that_is_shown(name: str) -> None:
+    assert f"](figures/model-{name}.svg)" in (DOCS / "model.md").read_text("utf-8").replace("\n", " ")
+    made = picture_bytes(drawings.DRAWINGS[name](), "made.svg")
+    assert made == (DOCS / "figures" / f"model-{name}.svg").read_bytes()
+
+
+def test_phases__follow_latency_speed_and_command() -> None:
+    time, speed = np.arange(6.0), np.array([5.0, 5.0, 5.0, 4.0, 0.0, 0.0])
+    command = np.array([0.0, 0.0, 2.0, -1.0, -1.0, -1.0])
+    assert list(drawings.phases(time, speed, command, 1.0)) == [
+        (0.0, 1.0, "waits for its news"),
+        (1.0, 2.0, "coasts"),
+        (2.0, 3.0, "drives"),
+        (3.0, 4.0, "brakes"),
+        (4.0, 5.0, "stands"),
+    ]
+
+
+def test_equal_time__tells_the_harm_of_an_evaluation_in_the_columns_of_the_page() -> None:
+    driven = equal_time.drive(
+        PAPER.sample(20, 8), make_lineup(["coast", "full_brake", "e_v2x_bm"], PAPER), PAPER, repeats=2
+    )
+    rows = {row[0]: row for row in equal_time.rows_of(driven, "full_brake")}
+    full, coast = (driven[name][1].first_impact_harm for name in ("full_brake", "coast"))
+    assert rows["`e_v2x_bm`"][1] == "true model" and rows["`full_brake`"][5] == ""
+    assert rows["`coast`"][3] == f"{coast.mean():.3f}"
+    assert rows["`coast`"][5].startswith(f"{(coast - full).mean():+.3f} [")
+    assert f"| {' | '.join(equal_time.HEAD)} |" in (DOCS / "baselines.md").read_text("utf-8")
+    worlds = PAPER.sample(equal_time.WORLDS, equal_time.SEED).worlds  # which no table holds
+    assert not np.isfinite(best_known(worlds, Task(PAPER, PAPER.learners))["first"]).any()
+
+
+@pytest.mark.parametrize("vehicles", [2, 50])
+def test_scaling__its_lines_are_the_same_every_time_and_apart_in_their_first_step(vehicles: int) -> None:
     worlds, again = scaling.make_lines(40, vehicles), scaling.make_lines(40, vehicles)
     assert worlds.speeds_mps.shape == (40, vehicles)
     assert (worlds.gaps_m == again.gaps_m).all() and (worlds.speeds_mps == again.speeds_mps).all()
     after, impacts = advance(worlds, -worlds.vehicles.braking_capacity_mps2, 0.1)
     assert impacts.count.sum() == 0 and (after.gaps_m > 0.0).all()
-
-
-def test_scaling__draws_batches_left_and_single_worlds_right() -> None:
-    by_worlds = [scaling.Cost(scaling.EMERGENCY, n, 3, 50.0) for n in (1, 10, 100)]
-    by_vehicles = [scaling.Cost(scaling.APART, 256, N, 10.0 * N) for N in (2, 4)]
-    figure = scaling.draw(by_worlds, by_vehicles, "somewhere")
-    left, right = figure.axes
-    costs, proportional = left.get_lines()
-    assert costs.get_ydata() == pytest.approx([0.05, 0.5, 5.0]) and proportional.get_ydata() == pytest.approx(
-        [0.05, 0.5, 5.0]
-    )
-    assert right.get_lines()[0].get_ydata() == pytest.approx([20.0, 40.0])
-    assert "ns per vehicle-step" in str(by_worlds[0])
-    assert [text.get_text() for text in right.get_legend().get_texts()] == [scaling.APART, "proportional"]

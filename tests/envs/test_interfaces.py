@@ -15,7 +15,6 @@ import numpy as np
 import pettingzoo
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from pettingzoo.utils.conversions import aec_to_parallel
 
 import ethbrake_marl as eb
@@ -487,19 +486,6 @@ def test_make_vec__makes_it_in_every_way(way: str | None) -> None:
         assert np.array_equal(observation[1], alone.reset(seed=8)[0])
         assert np.array_equal(environment.step(np.full((2, 1), -1.0))[0][1], alone.step(BRAKE)[0])
     environment.close()
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_wrappers__gymnasiums_episode_statistics_count_right(mode: str) -> None:
-    environment = RecordEpisodeStatistics(made(mode, 2, PAPER))
-    environment.reset(seed=4)
-    told: list[tuple[float, float]] = []
-    for action in actions(3, 160, 2):
-        _, _, terminated, truncated, infos = environment.step(action)
-        final = infos.get("final_info", infos)
-        for row in np.flatnonzero(terminated | truncated):
-            told.append((-infos["episode"]["r"][row], final["world_first_impact_harm"][row]))
-    assert len(told) >= 4 and np.array(told)[:, 0] == near(np.array(told)[:, 1])
 
 
 def test_wrappers__which_of_gymnasiums_take_same_step_is_what_the_page_says() -> None:

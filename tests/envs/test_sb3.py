@@ -7,13 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecMonitor
 
 from ethbrake_marl.envs.interfaces import EthBrakeEnv, parallel_env
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import full_state
-from tests.contract.interfaces import CRASH, FIVE, PAPER, REST, actions, initial_state, line
+from tests.contract.interfaces import CRASH, FIVE, PAPER, actions, initial_state, line
 
 near = pytest.approx
 PAIR = ["vehicle_2", "vehicle_3"]
@@ -40,14 +39,6 @@ def test_episode__of_a_crash_by_hand() -> None:
     last = [info["terminal_observation"] for info in infos]
     assert last[0][0] == near((18.5 - 0.45) / 20.0) and not np.shares_memory(*last)
     assert observation[0, 0] == 1.0  # the next episode, at 20 m/s again
-
-
-def test_episode__ended_by_rest_is_not_truncated() -> None:
-    env = begun(REST, 1)
-    for _ in range(10):
-        _, _, done, infos = env.step(np.full((1, 1), -1.0, np.float32))
-    assert done.all() and infos[0]["TimeLimit.truncated"] is False
-    assert (infos[0]["episode"]["l"], infos[0]["terminal_observation"][0]) == (10, 0.0)
 
 
 def test_episode__returns_and_lengths_start_again_with_each_one_and_with_a_reset() -> None:
@@ -144,18 +135,6 @@ def test_attributes__belong_to_the_whole_batch() -> None:
     assert env.env_method("seed", 4) == [[4, 4, 4]] * 3
     assert env.env_is_wrapped(Monitor) == [False] * 3
     env.close()
-
-
-def test_wrappers__vec_monitor_agrees_with_the_episodes_own_figures() -> None:
-    env, monitored = begun(PAPER, 2), VecMonitor(make_sb3_vec_env(PAPER, 2))
-    monitored.reset()
-    seen = []
-    for action in actions(3, 90, 2):
-        for mine, other in zip(env.step(action)[3], monitored.step(action)[3], strict=True):
-            assert ("episode" in mine) == ("episode" in other)
-            if "episode" in mine:
-                seen.append([[info["episode"][figure] for figure in "lr"] for info in (mine, other)])
-    assert len(seen) >= 2 and np.array(seen)[:, 0] == near(np.array(seen)[:, 1])
 
 
 def test_step_async__keeps_its_own_copy_of_the_actions() -> None:

@@ -1,148 +1,450 @@
-"""An algorithm from the user's own file: the one on the page about learning, as it is printed there."""
+"""Algorithms: one of the user's own, how weights become ours, and learning from counterfactuals, modes and a scout."""
 
 from __future__ import annotations
 
 import importlib
-import json
 import re
-import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 import yaml
+from gymnasium.spaces import Box
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.sac.policies import SACPolicy
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.policy import LearnedAgent
-from ethbrake_marl.errors import InvalidInput, Progress
-from ethbrake_marl.learning import training as registry
-from ethbrake_marl.learning.algorithms import Ppo
-from ethbrake_marl.learning.runs import resume, train
-from ethbrake_marl.learning.training import (
-    PpoRecipe,
-    RunDirectory,
-    TrainingRecipe,
-    algorithm_names,
-    load_recipe,
-    register_algorithm,
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.learning import Training, TrainingRecipe, load_recipe, resume, train
+from ethbrake_marl.learning.algorithms import (
+    Adam,
+    CounterfactualModel,
+    ModesModel,
+    NoOtherMode,
+    Scout,
+    Stage,
+    Tried,
+    choose_rows,
+    draw_rows,
+    drive_from,
+    explore,
+    own_worlds,
+    ppo_arguments,
+    sac_arguments,
+    show_templates,
+    stages_of,
+    tensors_of,
+    trusted_targets,
+    visit,
+    widened,
 )
-from ethbrake_marl.policies import load_policy
-from tests.learning.tiny import TINY_PPO
-
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "learning.md").read_text("utf-8")
-SCENARIO = eb.load_scenario("paper-random")
-RECIPE: dict[str, Any] = {
-    **TINY_PPO.model_dump(mode="json", include=set(TrainingRecipe.model_fields)),
-    "name": "mine",
-    "algorithm": "a2c",
-    "total_steps": 3072,
-    "n_steps": 8,
-    "network": {"policy": [8], "value": [8]},
-    "evaluation": {"every_updates": 10, "worlds": 10, "seed": 7},
-    "checkpoint_every_updates": 5,
-}
+from ethbrake_marl.learning.runs import TrainingDiverged, make_environment, make_model
+from ethbrake_marl.learning.training import ModesPlan
+from ethbrake_marl.policies import Actor, load_policy
+from ethbrake_marl.search import profile_problem
+from tests.learning.tiny import MODES, TINY_COUNTERFACTUAL, TINY_MODES, TINY_PPO, ctrl_c_in, files_of, watch_steps
 
 
-@pytest.fixture(autouse=True)
-def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The page's file, imported; what it registers is forgotten afterwards."""
-    monkeypatch.setattr(registry, "_ALGORITHMS", dict(registry._ALGORITHMS))
+@pytest.fixture
+def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The algorithm of the page's file, imported."""
     (source,) = (block for block in re.findall("```python\n(.*?)```", PAGE, re.DOTALL) if "register_algorithm" in block)
     (tmp_path / "my_algorithm.py").write_text(source)
     monkeypatch.syspath_prepend(tmp_path)
-    importlib.import_module("my_algorithm")
-    yield
+    yield importlib.import_module("my_algorithm").A2c
     sys.modules.pop("my_algorithm")
 
 
-def _file(folder: Path, **changes: Any) -> Path:
-    path = folder / "mine.yaml"
-    path.write_text(yaml.safe_dump({**RECIPE, **changes}))
-    return path
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "learning.md").read_text("utf-8")
+SCENARIO = eb.load_scenario("paper-random")
 
 
-def _weights(run: Path) -> list[bytes]:
-    return [(run / name / "weights.safetensors").read_bytes() for name in ("policy", "policy-last")]
+def recipe_file(folder: Path, **changes: Any) -> Path:
+    """A recipe of the own algorithm."""
+    recipe = TINY_PPO.model_dump(mode="json", include=set(TrainingRecipe.model_fields))
+    recipe |= {
+        "name": "mine",
+        "algorithm": "a2c",
+        "total_steps": 1024,
+        "n_steps": 8,
+        "network": {"policy": [8], "value": [8]},
+    }
+    (folder / "mine.yaml").write_text(yaml.safe_dump(recipe | changes))
+    return folder / "mine.yaml"
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_own_algorithm__trains_resumes_bit_for_bit_and_is_evaluated(tmp_path: Path) -> None:
-    recipe = _file(tmp_path)
+@pytest.mark.usefixtures("mine")
+def test_own_algorithm__trains_resumes_bit_for_bit_and_is_evaluated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe, run = recipe_file(tmp_path), tmp_path / "run"
     whole = train(recipe, SCENARIO, tmp_path / "whole")
-    assert (whole.status, whole.steps, whole.updates) == ("finished", 3072, 48)
-
-    def ctrl_c(progress: Progress) -> None:
-        if progress.updates == 23:
-            signal.raise_signal(signal.SIGINT)
-
-    stopped = train(recipe, SCENARIO, tmp_path / "run", on_progress=ctrl_c)
-    assert stopped.status == "interrupted" and stopped.updates < 48
-    assert list((tmp_path / "run" / "checkpoints").iterdir())
-    result = resume(tmp_path / "run")
+    assert (whole.status, whole.steps, whole.updates) == ("finished", 1024, 16)
+    with monkeypatch.context() as patch:
+        watch_steps(patch, ctrl_c_in(61))
+        assert train(recipe, SCENARIO, run).status == "interrupted"
+    config = (run / "config.json").read_text()
+    (run / "config.json").write_text(config.replace('"n_steps": 8', '"n_steps": 4'))
+    with pytest.raises(InvalidInput, match="was changed after the checkpoint"):
+        resume(run)
+    (run / "config.json").write_text(config)
+    result = resume(run)
     assert (result.status, result.evaluations) == ("finished", whole.evaluations)
-    assert _weights(tmp_path / "run") == _weights(tmp_path / "whole")
+    assert files_of(run) == files_of(tmp_path / "whole")
 
-    policy = load_policy(tmp_path / "run")
-    assert policy.manifest.algorithm == "a2c"
-    agents = {"mine": LearnedAgent(policy, "mine"), "team": RunDirectory(tmp_path / "run").load_team(SCENARIO)}
+    assert load_policy(run).manifest.algorithm == "a2c"
+    agents = {f"{kind}@{run}": eb.make_agent(f"{kind}@{run}", scenario=SCENARIO) for kind in ("policy", "team")}
     found = eb.evaluate(SCENARIO.sample(10, 7), agents, scenario=SCENARIO)
     harms = [found.outcome(name).first_impact_harm.mean() for name in agents]
     assert harms[0] == harms[1] == pytest.approx(min(e["first_impact_harm"] for e in result.evaluations))
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_own_algorithm__under_vec_normalize_is_refused_as_no_bundle_holds_its_statistics(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    mine: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from stable_baselines3.common.vec_env import VecNormalize
-
-    own = sys.modules["my_algorithm"].A2c
-    build = own.build
-    monkeypatch.setattr(own, "build", lambda self, training, rows: build(self, training, VecNormalize(rows)))
+    build = mine.build
+    monkeypatch.setattr(mine, "build", lambda self, training, rows: build(self, training, VecNormalize(rows)))
     with pytest.raises(InvalidInput, match="'a2c': its model is trained under VecNormalize, whose statistics are no"):
-        train(_file(tmp_path), SCENARIO, tmp_path / "run")
+        train(recipe_file(tmp_path), SCENARIO, tmp_path / "run")
 
 
-def test_own_algorithm__its_class_checks_the_recipe(tmp_path: Path) -> None:
-    loaded = load_recipe(_file(tmp_path))
-    assert type(loaded).__name__ == "A2cRecipe" and loaded.rounds == 8
-    with pytest.raises(InvalidInput, match=r"mine.yaml, line \d+: n_stepz.*did you mean n_steps"):
-        load_recipe(_file(tmp_path, n_stepz=3))
-    with pytest.raises(InvalidInput, match=r"mine.yaml, line \d+: n_steps = 2.5: must be a whole number"):
-        load_recipe(_file(tmp_path, n_steps=2.5))
-    with pytest.raises(InvalidInput, match=r"algorithm = a3c: must be ppo or sac or counterfactual or a2c"):
-        load_recipe(_file(tmp_path, algorithm="a3c"))
-    with pytest.raises(InvalidInput, match="scheme independent: recipe 'mine' is for A2C; it needs one for PPO"):
-        train(loaded, "cooperation-3-pair", tmp_path / "run", scheme="independent")
+@pytest.mark.usefixtures("mine")
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"n_stepz": 3}, r"mine.yaml, line \d+: n_stepz.*did you mean n_steps"),
+        ({"n_steps": 2.5}, r"mine.yaml, line \d+: n_steps = 2.5: must be a whole number"),
+        ({"algorithm": "a3c"}, r"algorithm = a3c: must be ppo or sac or counterfactual or a2c"),
+        ({"scheme": "independent"}, "scheme independent: recipe 'mine' is for A2C; it needs one for PPO"),
+    ],
+)
+def test_own_algorithm__its_class_checks_the_recipe(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match=message):
+        train(recipe_file(tmp_path, **changes), "cooperation-3-pair", tmp_path / "run")
+    assert load_recipe(recipe_file(tmp_path)).rounds == 8
+
+
+SEEN, ACTION = Box(-10.0, 10.0, (27,), np.float32), Box(-1.0, 1.0, (1,), np.float32)
+
+
+def ppo_policy(activation: str) -> Any:
+    shape = load_recipe("ppo-paper").network.model_copy(update={"activation": activation, "initial_log_std": -0.5})
+    policy = ActorCriticPolicy(SEEN, ACTION, lambda _: 1e-3, **ppo_arguments(shape))
+    with torch.no_grad():
+        policy.action_net.weight *= 100.0  # fresh weights are tiny: fill [-1, 1] and go beyond it
+    return policy
+
+
+def sac_policy(activation: str) -> Any:
+    policy = SACPolicy(SEEN, ACTION, lambda _: 1e-3, **sac_arguments(load_recipe("sac-paper").network))
+    with torch.no_grad():
+        policy.actor.mu.weight *= 10.0
+    return policy
 
 
 @pytest.mark.parametrize(
-    ("name", "recipe", "algorithm", "message"),
+    ("recipe", "make", "activation", "exact"),
     [
-        ("ppo", PpoRecipe, Ppo, "algorithm 'ppo': is registered already; give another name"),
-        ("a2c", PpoRecipe, Ppo, "algorithm 'a2c': is registered already"),
-        ("My algorithm", PpoRecipe, Ppo, "algorithm 'My algorithm': must be 1 to 64 of a-z, 0-9, - and _"),
-        ("new", dict, Ppo, "algorithm 'new': recipe = <class 'dict'>: must be a class with network_spec"),
-        ("new", PpoRecipe, Ppo(), "algorithm 'new': algorithm = .*: must be a class with build"),
+        ("ppo-paper", ppo_policy, "relu", 1e-6),
+        ("ppo-paper", ppo_policy, "tanh", 1e-6),
+        ("sac-paper", sac_policy, "relu", 5e-6),
     ],
 )
-def test_register__refuses_what_cannot_be_used(name: str, recipe: Any, algorithm: Any, message: str) -> None:
-    with pytest.raises(InvalidInput, match=message):
-        register_algorithm(name, recipe, algorithm)
-    assert algorithm_names() == ("ppo", "sac", "counterfactual", "a2c")
+def test_tensors_of__hold_every_weight_once_and_give_sb3s_deterministic_action(
+    recipe: str, make: Callable[[str], Any], activation: str, exact: float
+) -> None:
+    torch.manual_seed(3)
+    policy, spec = make(activation), load_recipe(recipe).network_spec(27).model_copy(update={"activation": activation})
+    tensors = tensors_of(policy, spec)
+    acting = policy.actor if recipe == "sac-paper" else policy
+    assert sum(t.size for t in tensors.values()) == sum(p.numel() for p in acting.parameters())
+    seen = np.random.default_rng(0).uniform(-2.0, 2.0, (2000, 27)).astype(np.float32)
+    expected, _ = policy.predict(seen, deterministic=True)
+    assert np.ptp(expected) > 0.5 and (np.abs(expected) < 0.5).any()
+    np.testing.assert_allclose(Actor(spec, tensors)(seen), expected, rtol=0.0, atol=exact)
+    kept = {name: tensor.copy() for name, tensor in tensors.items()}
+    with torch.no_grad():
+        for parameter in policy.parameters():
+            parameter += 1.0
+    assert all(np.array_equal(tensors[name], kept[name]) for name in kept)  # a copy
 
 
-def test_checkpoint__of_the_own_algorithm_that_was_changed_is_refused(tmp_path: Path) -> None:
-    config = tmp_path / "run" / "config.json"
+SHIPPED = load_recipe("counterfactual")
+STILL = {"learning_rate": {"start": 1e-12, "end": 1e-12}, "total_steps": 1}
 
-    def ctrl_c(progress: Progress) -> None:
-        if progress.updates == 10:
-            signal.raise_signal(signal.SIGINT)
 
-    train(_file(tmp_path), SCENARIO, tmp_path / "run", on_progress=ctrl_c, measure=None)
-    content = json.loads(config.read_text())
-    config.write_text(json.dumps({**content, "recipe": {**content["recipe"], "n_steps": 4}}))
-    with pytest.raises(InvalidInput, match="was changed after the checkpoint"):
-        resume(tmp_path / "run", measure=None)
+def test_targets__keep_the_slope_and_never_leave_the_trust_radius() -> None:
+    """By hand, r = 0.05 and k = 3: g = 0.15 moves by 0.15 / (3 + 3), g = 1e6 by almost 0.05, g = 0 not at all."""
+    gradient = np.array([0.0, 0.15, -0.15, 1e6, 1e6, 0.15, -1e6, -0.15], np.float32)
+    mean = np.array([0.3, 0.0, 0.0, 0.0, 1.0, -2.0, -2.0, 2.0], np.float32)
+    target, weight = trusted_targets(
+        Tried(np.zeros((8, 1), np.float32), mean, gradient, np.ones(8, np.float32)), 0.05, 3.0
+    )
+    np.testing.assert_allclose(target, [0.3, 0.025, -0.025, 0.05, 1.0, -1.975, -2.0, 1.975], rtol=1e-5)
+    np.testing.assert_allclose(weight[[0, 1, 2, 4]], [3.0, 6.0, 6.0, 3.0], rtol=1e-6)
+    np.testing.assert_allclose((weight * (target - mean))[:4], gradient[:4], rtol=1e-5)  # the slope where it stands
+
+
+def test_adam__is_torchs_without_its_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = []
+    for kind in (torch.optim.Adam, Adam):
+        weight = torch.nn.Parameter(torch.linspace(-1.0, 1.0, 30))
+        optimizer = kind([weight], lr=1e-2, eps=1e-5)
+        for step in range(4):
+            optimizer.zero_grad()
+            (weight.sin() * (step + weight)).sum().backward()
+            optimizer.step()
+        kind([weight]).load_state_dict(optimizer.state_dict())
+        ended.append(weight.detach().numpy().tobytes())
+        monkeypatch.setitem(sys.modules, "torch._dynamo", None)  # whoever imports it from now on fails
+    assert ended[0] == ended[1]
+
+
+def test_training__starts_from_a_policy_and_drives_as_it_did(tmp_path: Path) -> None:
+    """New features count for nothing at first: the same policy to the last bits, before anything is learned."""
+    small = {
+        "n_envs": 8,
+        "n_steps": 4,
+        "counterfactuals": 16,
+        "batch_size": 8,
+        "evaluation": TINY_COUNTERFACTUAL.evaluation,
+    }
+    policy = train(SHIPPED.replace(**small, **STILL), SCENARIO, tmp_path / "run", measure=None).policy
+    agents = {"old": eb.LearnedAgent(eb.load_shipped("ppo")), "new": eb.LearnedAgent(policy)}
+    found = eb.evaluate(SCENARIO.sample(50, 7).worlds, agents, scenario=SCENARIO)
+    old, new = (found.outcome(name).first_impact_harm for name in agents)
+    np.testing.assert_allclose(old, new, atol=1e-3)
+    manifest = policy.manifest
+    assert manifest.algorithm == "counterfactual" and manifest.network.value_hidden == ()
+    assert len(manifest.observation.features) == 57 and policy.observation.time_step_s == 0.1
+    assert policy.tensors["policy.log_std"].shape == (1,)
+    assert eb.make_agent(f"counterfactual@{tmp_path / 'run'}").name == f"counterfactual@{tmp_path / 'run'}"
+
+
+def test_widened__puts_every_feature_where_it_is_observed_now() -> None:
+    shipped = eb.load_shipped("ppo")
+    names = list(shipped.manifest.observation.features)
+    turned = Training.of(SHIPPED.replace(observation=["contact.brake_total_harm", *reversed(names)]), SCENARIO)
+    first = widened(shipped, turned)["policy.0.weight"]
+    assert (first[:, 0] == 0.0).all()
+    assert (first[:, 1:] == shipped.tensors["policy.0.weight"][:, ::-1]).all()
+    assert "value.0.weight" not in widened(shipped, turned)
+    with pytest.raises(InvalidInput, match=r"observation: lacks rear_1.known, .* which the policy"):
+        widened(shipped, Training.of(SHIPPED.replace(observation=["own", "front_1", "contact"]), SCENARIO))
+    with pytest.raises(InvalidInput, match=r"policy_hidden is \(64, 64\), but \(128, 128\) in the policy"):
+        widened(shipped, Training.of(SHIPPED.replace(network={"policy": [64, 64]}), SCENARIO))
+
+
+OWN = {"reward": {"harm": 1.0, "harm_count": "total", "objective": "own", "terminal": 0.5}}
+CONTACT = OWN | {"observation": ["own", "front_1", "rear_1", "contact"]}
+SCRIPTED = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "e_v2x_bm:pairwise"}
+
+
+@pytest.mark.parametrize(
+    ("recipe", "scenario"),
+    [
+        (TINY_COUNTERFACTUAL.replace(**CONTACT), SCENARIO.with_learners(["vehicle_2", "vehicle_3"])),
+        (TINY_COUNTERFACTUAL.replace(**CONTACT), SCENARIO.with_learners(["vehicle_3"])),
+        (TINY_COUNTERFACTUAL.replace(**CONTACT), eb.load_scenario("cooperation-2-five")),
+        (TINY_COUNTERFACTUAL, SCENARIO.replace(early_impacts="keep", roles=SCRIPTED)),  # a script that remembers
+        (TINY_MODES.replace(**OWN, modes={**MODES, "networks": 3}), eb.load_scenario("cooperation-2-five")),
+    ],
+)
+def test_training__of_any_learners_objective_and_line(recipe: Any, scenario: Any, tmp_path: Path) -> None:
+    result = train(recipe, scenario, tmp_path / "run", steps=8 * 32 * len(scenario.learners))
+    assert result.status == "finished" and result.updates == 8
+    networks = 3 if recipe.modes else 1
+    assert eb.load_policy(tmp_path / "run").manifest.network.networks == networks
+
+
+FROM_SCRATCH = {
+    "n_envs": 64, "batch_size": 64, "averaging": 0.9, "network": {"policy": [32]},
+    "learning_rate": {"start": 3e-3, "end": 3e-3}, "evaluation": {"every_updates": 1000, "worlds": 300, "seed": 7},
+}  # fmt: skip
+SHARES = {"alone": 0.0, "further": 0.25, "gate": 0.5, "together": 0.25}
+MANY_TRIED = {"n_steps": 8, "counterfactuals": 256, "total_steps": 30 * 512}
+GATED = {
+    "total_steps": 16 * 256,
+    "modes": MODES | {"worlds": 400, "imitation_epochs": 20, "gate_states": 512, "shares": SHARES},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "recipe", [SHIPPED.replace(start=None, **FROM_SCRATCH, **MANY_TRIED), TINY_MODES.replace(**FROM_SCRATCH, **GATED)]
+)
+def test_training__gets_better_from_scratch(recipe: Any, tmp_path: Path) -> None:
+    """Random weights hardly act: much of the harm is gone by trying, or by imitating templates and a gate."""
+    result = train(recipe, SCENARIO, tmp_path / "run")
+    first, last = (result.evaluations[k]["first_impact_harm"] for k in (0, -1))
+    assert last < 0.7 * first
+
+
+def test_training__begins_near_an_action(tmp_path: Path) -> None:
+    """Where the recipe says so: -0.9 is nearly full braking."""
+    recipe = TINY_COUNTERFACTUAL.replace(network={"policy": [8], "initial_action": -0.9}, **STILL)
+    policy = train(recipe, SCENARIO, tmp_path / "run", measure=None).policy
+    seen = np.random.default_rng(0).uniform(0, 1, (50, policy.manifest.network.observation_size)).astype(np.float32)
+    np.testing.assert_allclose(policy(seen), -0.9, atol=0.1)
+
+
+def test_training__numbers_that_are_not_finite_stop_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = CounterfactualModel._try_out
+    calls = []
+
+    def broken(self: CounterfactualModel, seen: Any, moments: Any, actor: Any) -> Tried:
+        tried = real(self, seen, moments, actor)
+        calls.append(1)
+        return tried._replace(mean=tried.mean * np.float32(np.nan)) if len(calls) == 3 else tried
+
+    monkeypatch.setattr(CounterfactualModel, "_try_out", broken)
+    with pytest.raises(TrainingDiverged, match="not finite"):
+        train(TINY_COUNTERFACTUAL, SCENARIO, tmp_path / "run", measure=None)
+    kept = eb.load_policy(tmp_path / "run" / "policy-last")
+    assert all(np.isfinite(tensor).all() for tensor in kept.tensors.values())
+
+
+def _model(**changes: Any) -> tuple[ModesModel, Any]:
+    """A model of the tiny recipe, and the engine of its environment."""
+    training = Training.of(TINY_MODES.replace(**changes), SCENARIO)
+    with closing(make_environment(training)) as environment:
+        environment.reset()
+        model = make_model(training.recipe.make_algorithm(), training, environment)
+        assert isinstance(model, ModesModel)
+        return model, environment.engine
+
+
+def _full_brake(seen: np.ndarray) -> np.ndarray:
+    return np.full(len(seen), -1.0, np.float32)
+
+
+def _coast(seen: np.ndarray) -> np.ndarray:
+    return np.zeros(len(seen), np.float32)
+
+
+def test_stages__share_the_updates_and_leave_none_out() -> None:
+    plan = ModesPlan(**{**MODES, "networks": 3, "shares": {"alone": 0.5, "further": 0.2, "gate": 0.1, "together": 0.2}})
+    assert stages_of(plan, 20) == (
+        Stage("alone", 0, 0, 10),
+        Stage("further", 1, 10, 12),
+        Stage("further", 2, 12, 14),
+        Stage("gate", 0, 14, 16),
+        Stage("together", 0, 16, 20),
+    )
+    for updates in range(1, 30):
+        found = stages_of(plan, updates)
+        assert [s.first for s in found] == [0, *(s.end for s in found[:-1])] and found[-1].end == updates
+
+
+def test_templates__are_played_as_they_were_found_and_depend_on_no_batch() -> None:
+    """In each world the best of its own templates; below the bound, or none."""
+    problem, open_ended = profile_problem(SCENARIO.sample(40, 3).worlds, [1]), np.full(40, np.inf)
+    commands, steps = problem.best_templates(open_ended, number=40, seed=1)
+    assert (steps > 0).all() and (commands >= problem.bounds[:, :, 0]).all()
+    some = np.array([7, 31])
+    assert np.array_equal(problem.take(some).best_templates(np.full(2, np.inf), number=40, seed=1)[0], commands[some])
+    assert not np.array_equal(problem.best_templates(open_ended, number=40, seed=2)[0], commands)
+    assert (problem.best_templates(np.zeros(40), number=40, seed=1)[1] == 0).all()  # no harm is below 0
+
+
+def test_shown__is_what_gains_more_than_every_network() -> None:
+    model, engine = _model()
+    found = explore(engine, model.plan, [_full_brake, _coast], 1.0)
+    each = [drive_from(engine, found.start, act, 1.0) for act in (_full_brake, _coast)]
+    assert np.array_equal(found.gained, np.maximum(each[0][0], each[1][0]))
+    assert np.array_equal(found.harm, -found.gained)  # the recipe's reward is minus the harm by its own count
+    shown = show_templates(engine, model.plan, found, 1.0, 0)
+    assert len(shown.seen) == len(shown.action) > 50 and (np.abs(shown.action) <= 1.0).all()
+    picky = ModesPlan(**{**MODES, "gain": 1e6})
+    assert len(show_templates(engine, picky, found, 1.0, 0).action) == 0
+
+
+def test_own_worlds__are_those_within_the_margin() -> None:
+    model, engine = _model()
+    found = explore(engine, model.plan, [_full_brake], 1.0)
+    gained, _ = drive_from(engine, found.start, _coast, 1.0)
+    own = own_worlds(engine, model.plan, found, _coast, 1.0)
+    kept = (gained > found.gained - 5.0) & (found.harm > 0.0) & (np.abs(gained - found.gained) > 1e-2)
+    assert 0 < len(own.state) < 64 and np.array_equal(own.state, found.start.state[kept])
+
+
+def test_visit__every_decision_of_every_episode() -> None:
+    _, engine = _model()
+    _, start = engine.first_moments(20)
+    seen, moments = visit(engine.branch(start), _full_brake)
+    assert seen.shape == (len(moments.state), 1, 27)
+    assert np.array_equal(moments.take(np.arange(20)).state, start.state)
+    first = engine.branch(moments.take(np.arange(20))).observe_all(np.array([1]))
+    assert np.array_equal(first, seen[:20])
+
+
+def test_gate__learns_what_costs_least_and_what_matters_most() -> None:
+    """Two kinds of decisions look alike; the gate is right where being wrong costs more."""
+    modes = {**MODES, "gate_memory": 1000, "gate_steps": 20}
+    model, _ = _model(learning_rate={"start": 1e-2, "end": 1e-2}, averaging=0.9, batch_size=128, modes=modes)
+    model.set_logger(Logger(None, []))
+    seen = np.zeros((300, 27), np.float32)
+    seen[100:, 0] = 1.0
+    costs = np.tile([0.0, 1.0], (300, 1))
+    costs[100:] = [5.0, 0.0]
+    costs[200:] = [0.0, 1.0]  # as the hundred before, seen from outside
+    assert (model.policy.gate.choose(seen) == 0).all()
+    for _ in range(20):
+        model._train_gate(seen, costs)
+    assert np.array_equal(model.policy.gate.choose(seen), np.repeat([0, 1, 1], 100))
+
+
+def test_training__from_several_networks_is_refused(mixture: eb.Policy, tmp_path: Path) -> None:
+    mixture.save(tmp_path / "first")
+    with pytest.raises(InvalidInput, match="start: has 3 networks; give a policy of one"):
+        train(TINY_MODES.replace(start=f"counterfactual@{tmp_path / 'first'}"), SCENARIO, tmp_path / "again")
+
+
+def test_training__says_that_there_is_no_other_mode(tmp_path: Path) -> None:
+    with pytest.raises(NoOtherMode, match="network 2: in none of 64 worlds did one of 20 templates do better by 1e"):
+        train(TINY_MODES.replace(modes={**MODES, "gain": 1e6}), SCENARIO, tmp_path / "run", measure=None)
+    assert eb.load_policy(tmp_path / "run" / "policy-last").manifest.network.networks == 2
+
+
+def test_drawn__mean_with_their_importance_is_the_mean_of_all() -> None:
+    """One row in ten is worth 5, the others nothing: half a million draws know the mean, 0.5, to a hundredth."""
+    torch.manual_seed(0)
+    value = np.where(np.arange(1000) < 100, 5.0, 0.0)
+    expected = np.where(value > 0.0, 1.0, 1e-3)
+    rows, importance = draw_rows(expected, 500_000, 0.75)
+    assert np.mean(value[rows] * importance) == pytest.approx(value.mean(), rel=1e-2)
+    assert importance.mean() == pytest.approx(1.0, rel=1e-2)
+    assert np.mean(rows < 100) == pytest.approx(0.75 * 100 / 100.9 + 0.25 * 0.1, abs=5e-3)
+    assert importance.max() <= 4.0  # 1 / (1 - focus)
+
+
+def test_chosen__without_focus_each_row_once() -> None:
+    torch.manual_seed(0)
+    observed, rows = np.zeros((50, 3), np.float32), np.arange(10, 30)
+    chosen, importance = choose_rows(observed, rows, 15, 0.0, lambda seen: pytest.fail("nobody is asked"))
+    assert len(set(chosen.tolist())) == 15 and set(chosen.tolist()) <= set(range(10, 30))
+    assert (importance == 1.0).all()
+    assert len(choose_rows(observed, rows[:0], 15, 0.5, lambda seen: np.ones(len(seen)))[0]) == 0
+    assert len(choose_rows(observed, rows, 40, 0.5, lambda seen: np.ones(len(seen)))[0]) == 40
+
+
+def test_scout__learns_the_mean_size_of_what_is_to_be_expected() -> None:
+    """Half of the decisions are worth 3 on average (0 or 6), the others nothing."""
+    torch.manual_seed(0)
+    scout = Scout(2)
+    kind = torch.arange(400) % 2
+    seen, size = torch.nn.functional.one_hot(kind, 2).float(), kind * 6.0 * (torch.arange(400) % 4 == 1)
+    optimizer = torch.optim.Adam(scout.parameters(), lr=1e-2)
+    for _ in range(400):
+        optimizer.zero_grad()
+        scout.loss(seen, size, torch.ones(400)).backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+    expected = scout.expect(np.eye(2, dtype=np.float32))
+    assert expected[1] == pytest.approx(3.0, rel=0.05) and expected[0] < 0.05

@@ -1,10 +1,13 @@
+"""A training that was stopped, killed or damaged goes on to the same bits, or is refused and left as it is."""
+
 from __future__ import annotations
 
 import csv
 import hashlib
 import json
-import os
+import random
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,156 +17,191 @@ from typing import Any
 
 import numpy as np
 import pytest
+import safetensors.numpy
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.learning import runs as train_module
-from ethbrake_marl.learning.runs import TrainResult, resume, train
-from ethbrake_marl.learning.training import RunDirectory, Training, load_recipe
-from ethbrake_marl.policies import Policy, load_policy
-from ethbrake_marl.scenario import load_scenario
-from tests.learning.tiny import TINY_PPO
-
-SCENARIO = load_scenario("paper-random")
-
-PPO = TINY_PPO.replace(total_steps=12 * 128)
-SAC = load_recipe("sac").replace(
-    total_steps=90 * 8,
-    n_envs=8,
-    batch_size=32,
-    buffer_size=400,  # fills up on the way
-    learning_starts=100,
-    network={"policy": [8], "value": [8]},
-    evaluation={"every_updates": 30, "worlds": 10, "seed": 7},
-    checkpoint_every_updates=12,
-    log_every_updates=10,
+import ethbrake_marl as eb
+from ethbrake_marl.errors import CorruptBundle, InvalidInput, Progress
+from ethbrake_marl.learning import Training, TrainResult, resume, runs, train
+from ethbrake_marl.policies import Trained
+from tests.learning.tiny import (
+    MODES,
+    TINY_COUNTERFACTUAL,
+    TINY_MODES,
+    TINY_PPO,
+    TINY_SAC,
+    Answer,
+    ctrl_c_in,
+    files_of,
+    watch_steps,
 )
-RECIPES = {"ppo": PPO, "sac": SAC}
+from tests.programmes.folders import CHANGES, listed_anew, newest
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
+MIXTURE = eb.load_scenario(
+    {"name": "both", "mixture": [{"scenario": "realistic-mixed"}, {"scenario": "realistic-truck", "weight": 2}]}
+)
+REMEMBERING = PAPER.replace(
+    early_impacts="keep", roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "e_v2x_bm:pairwise"}
+)
+PPO = TINY_PPO.replace(total_steps=12 * 128)
+TEAM = TINY_PPO.replace(total_steps=8 * 256)
+TRAININGS = {
+    "ppo": (PPO, PAPER),
+    "sac": (TINY_SAC, PAPER),
+    "mixture": (PPO, MIXTURE),
+    "remembering": (PPO, REMEMBERING),
+    "shared": (TEAM.replace(scheme="shared"), PAIR),
+    "independent": (TEAM.replace(scheme="independent"), PAIR),
+    "turns": (TEAM.replace(scheme="independent", turns=2), PAIR),
+    "centralised": (TEAM.replace(scheme="centralised"), PAIR),
+    "counterfactual": (TINY_COUNTERFACTUAL, PAPER),
+    "modes": (TINY_MODES, PAPER),
+    "scout": (TINY_MODES.replace(focus=0.75, modes=MODES | {"tie_break": 0.0}), PAPER),
+}
+Whole = Callable[[str], tuple[Path, TrainResult]]
 
 
-def _harm(policy: Policy) -> dict[str, float]:
+def measure(training: Training) -> Callable[[Trained], dict[str, float]]:
     """Something that depends on every weight and changes all the time."""
-    digest = hashlib.sha256(policy.manifest.weights_sha256.encode()).digest()
-    return {"first_impact_harm": digest[0] / 8.0, "total_harm": digest[1] / 8.0}
 
+    def harm(trained: Trained) -> dict[str, float]:
+        names = "".join(policy.manifest.weights_sha256 for policy in trained.drivers.values())
+        digest = hashlib.sha256(names.encode()).digest()
+        return {"first_impact_harm": digest[0] / 8.0, "total_harm": digest[1] / 8.0}
 
-def _bundle(run: Path, name: str) -> tuple[bytes, bytes]:
-    return (run / name / "manifest.json").read_bytes(), (run / name / "weights.safetensors").read_bytes()
-
-
-def _rows(run: Path) -> list[dict[str, str]]:
-    """The progress table without its clocks."""
-    rows = csv.DictReader((run / "progress.csv").read_text().splitlines())
-    return [{name: value for name, value in row.items() if name not in CLOCKS} for row in rows]
+    return harm
 
 
 CLOCKS = ("time/fps", "time/time_elapsed")
 
 
-def _events(run: Path) -> dict[str, list[tuple[int, float]]]:
+def told_by(run: Path) -> tuple[list[dict[str, str]], dict[str, list[tuple[int, float]]]]:
+    """The progress table and the events, without their clocks."""
+    rows = csv.DictReader((run / "progress.csv").read_text().splitlines())
     events = EventAccumulator(str(run / "tensorboard"), size_guidance={"scalars": 0})
     events.Reload()
-    return {
-        tag: [(e.step, e.value) for e in events.Scalars(tag)] for tag in events.Tags()["scalars"] if tag not in CLOCKS
-    }
-
-
-def _stop_in(monkeypatch: pytest.MonkeyPatch, step: int, act: Callable[[], None]) -> None:
-    """Do ``act`` in the environment's step of this number."""
-
-    class Watched(EthBrakeVecEnv):
-        count = 0
-
-        def step_wait(self) -> tuple[Any, ...]:
-            self.count += 1
-            if self.count == step:
-                act()
-            return super().step_wait()
-
-    def make(*args: Any, **kwargs: Any) -> EthBrakeVecEnv:
-        environment = make_sb3_vec_env(*args, **kwargs)
-        environment.__class__ = Watched
-        return environment
-
-    monkeypatch.setattr(train_module, "make_sb3_vec_env", make)
-
-
-def _interrupt() -> None:
-    os.kill(os.getpid(), signal.SIGINT)
-
-
-def _measure(training: Training) -> Callable[[Policy], dict[str, float]]:
-    return _harm
+    tags = set(events.Tags()["scalars"]) - set(CLOCKS)
+    return (
+        [{name: value for name, value in row.items() if name not in CLOCKS} for row in rows],
+        {tag: [(e.step, e.value) for e in events.Scalars(tag)] for tag in tags},
+    )
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Path, TrainResult]]:
-    """The training of each algorithm that nobody stops."""
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
+    """The training of each kind that nobody stops."""
     made: dict[str, tuple[Path, TrainResult]] = {}
 
     def get(name: str) -> tuple[Path, TrainResult]:
         if name not in made:
             folder = tmp_path_factory.mktemp("whole") / name
-            made[name] = folder, train(RECIPES[name], SCENARIO, folder, measure=_measure)
+            made[name] = folder, train(*TRAININGS[name], folder, measure=measure)
         return made[name]
 
     return get
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def stop(name: str, run: Path, at: tuple[str, int]) -> TrainResult:
+    """Train until Ctrl-C in a step of the environment, or after an update."""
+    unit, number = at
+
+    def ctrl_c(progress: Progress) -> None:
+        if (unit, number) == ("update", progress.updates):
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.MonkeyPatch.context() as patch:
+        watch_steps(patch, ctrl_c_in(number if unit == "step" else 0))
+        return train(*TRAININGS[name], run, measure=measure, on_progress=ctrl_c)
+
+
+@pytest.fixture(scope="module")
+def stopped_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A PPO run stopped with two checkpoints."""
+    run = tmp_path_factory.mktemp("stopped") / "run"
+    stop("ppo", run, ("step", 100))
+    assert len(list(run.glob("checkpoints/step_*"))) == 2
+    return run
+
+
+@pytest.fixture
+def run(stopped_once: Path, tmp_path: Path) -> Path:
+    """A copy of it that may be changed."""
+    return Path(shutil.copytree(stopped_once, tmp_path / "inside" / "run"))
+
+
+def assert_same(run: Path, reference: Path) -> None:
+    assert files_of(run) == files_of(reference)
+    assert told_by(run) == told_by(reference)
+    assert json.loads((run / "run.json").read_text())["status"] == "finished"
+    assert not (run / "checkpoints").exists()
+
+
+FAST = [("ppo", 37), ("sac", 76), ("mixture", 70), ("remembering", 100), ("turns", 84)]
+
+
 @pytest.mark.parametrize(
-    ("step", "name"),
+    ("name", "at"),
     [
-        pytest.param(step, name, marks=() if (step, name) in ((37, "ppo"), (76, "sac")) else pytest.mark.slow)
-        for step in (1, 37, 61, 76)
-        for name in ("ppo", "sac")
+        *((name, ("step", step)) for name, step in FAST),
+        ("counterfactual", ("update", 7)),
+        ("modes", ("update", 10)),
+        *(
+            pytest.param(name, (unit, number), marks=pytest.mark.slow)
+            for name, unit, numbers in (
+                ("ppo", "step", (1, 61, 76)),
+                ("sac", "step", (1, 37, 61)),
+                ("shared", "step", (84,)),
+                ("independent", "step", (84,)),
+                ("centralised", "step", (84,)),
+                ("modes", "update", (6, 14)),  # in its other stages
+                ("scout", "update", (10,)),
+            )
+            for number in numbers
+        ),
     ],
+    ids=str,
 )
 def test_resume__after_ctrl_c_everything_is_as_if_nobody_had_stopped_it(
-    name: str,
-    step: int,
-    whole: Callable[[str], tuple[Path, TrainResult]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    name: str, at: tuple[str, int], whole: Whole, tmp_path: Path
 ) -> None:
     reference, expected = whole(name)
-    with monkeypatch.context() as patch:
-        _stop_in(patch, step, _interrupt)
-        stopped = train(RECIPES[name], SCENARIO, tmp_path / "run", measure=_measure)
-    assert stopped.status == "interrupted" and stopped.steps < expected.steps
-    result = resume(tmp_path / "run", measure=_measure)
+    stopped = stop(name, tmp_path / "run", at)
+    assert stopped.status == "interrupted" and 0 <= stopped.steps < expected.steps
+    result = resume(tmp_path / "run", measure=measure)
     assert (result.status, result.steps, result.updates) == ("finished", expected.steps, expected.updates)
-    for bundle in ("policy", "policy-last"):
-        assert _bundle(tmp_path / "run", bundle) == _bundle(reference, bundle)
     assert result.evaluations == expected.evaluations
-    assert _rows(tmp_path / "run") == _rows(reference)
-    assert _events(tmp_path / "run") == _events(reference)
-    assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "finished"
-    assert not (tmp_path / "run" / "checkpoints").exists()
+    assert_same(tmp_path / "run", reference)
 
 
-def test_train__keeps_the_policy_of_least_harm_and_the_last_one(
-    whole: Callable[[str], tuple[Path, TrainResult]],
+def test_resume__after_a_failure_and_another_stop_it_ends_as_if_nothing_had_happened(
+    whole: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder, result = whole("ppo")
-    harms = [entry["first_impact_harm"] for entry in result.evaluations]
-    best = result.evaluations[int(np.argmin(harms))]
-    assert harms[-1] > min(harms)  # else the two were one
-    assert load_policy(folder).manifest.steps == best["steps"] == result.policy.manifest.steps
-    assert load_policy(folder / "policy-last").manifest.steps == result.steps == result.last_policy.manifest.steps
-    assert _harm(load_policy(folder))["first_impact_harm"] == min(harms)
+    def fail(step: int, answer: Answer) -> Answer:
+        if step == 5 * 16 + 3:
+            raise RuntimeError("power cut")
+        return answer
+
+    run = tmp_path / "run"
+    with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="power cut"):
+        watch_steps(patch, fail)
+        train(*TRAININGS["turns"], run, measure=measure)
+    with monkeypatch.context() as patch:
+        watch_steps(patch, ctrl_c_in(20))
+        assert resume(run, measure=measure).status == "interrupted"
+    (run / "team.json").write_text("{}")  # follows from the configuration, and is written anew
+    resume(run, measure=measure)
+    assert_same(run, whole("turns")[0])
 
 
-_TRAIN_AND_DIE = """
+KILLED = """
 import os, signal, sys
 from pathlib import Path
-sys.path.insert(0, {root!r})
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.learning.runs import train
-from tests.learning.test_resume import RECIPES, SCENARIO, _measure
-recipe, folder = RECIPES[sys.argv[1]], Path(sys.argv[2])
-step, left = EthBrakeVecEnv.step_wait, [5]
+from tests.learning.test_resume import TRAININGS, measure
+folder, step, left = Path(sys.argv[2]), EthBrakeVecEnv.step_wait, [5]
 
 def step_wait(self):
     left[0] -= bool(list(folder.glob("checkpoints/step_*")))
@@ -172,192 +210,168 @@ def step_wait(self):
     return step(self)
 
 EthBrakeVecEnv.step_wait = step_wait
-train(recipe, SCENARIO, folder, measure=_measure)
+train(*TRAININGS[sys.argv[1]], folder, measure=measure)
 """
 
 
-def train_and_die(name: str, folder: Path) -> int:
-    """Another process that trains until it is killed (-9), in the fifth step after its first checkpoint.
-
-    It kills itself: from outside, on a busy machine, one may come too late.
-    """
-    program = _TRAIN_AND_DIE.format(root=str(Path(__file__).resolve().parents[2]))
-    return subprocess.run([sys.executable, "-c", program, name, str(folder)], check=False).returncode
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ppo", "sac"])
-def test_resume__after_kill_9_the_weights_are_the_same(
-    name: str, whole: Callable[[str], tuple[Path, TrainResult]], tmp_path: Path
-) -> None:
-    reference, _ = whole(name)
-    run = tmp_path / "run"
-    assert train_and_die(name, run) == -signal.SIGKILL
+@pytest.mark.parametrize("name", ["ppo", "sac", "independent"])
+def test_resume__after_kill_9_the_weights_are_the_same(name: str, whole: Whole, tmp_path: Path) -> None:
+    """Another process kills itself in the fifth step after its first checkpoint; from outside one may come too late."""
+    root, run = Path(__file__).resolve().parents[2], tmp_path / "run"
+    killed = subprocess.run([sys.executable, "-c", KILLED, name, str(run)], cwd=root, check=False)
+    assert killed.returncode == -signal.SIGKILL
     assert json.loads((run / "run.json").read_text())["status"] == "running"
-    resume(run, measure=_measure)
-    for bundle in ("policy", "policy-last"):
-        assert _bundle(run, bundle) == _bundle(reference, bundle)
-    assert _rows(run) == _rows(reference)
-
-
-def _stopped(folder: Path, monkeypatch: pytest.MonkeyPatch, step: int = 100) -> list[Path]:
-    """A PPO run stopped with two checkpoints, the newest first."""
-    with monkeypatch.context() as patch:
-        _stop_in(patch, step, _interrupt)
-        train(PPO, SCENARIO, folder, measure=_measure)
-    return sorted(folder.glob("checkpoints/step_*"), reverse=True)
+    resume(run, measure=measure)
+    assert_same(run, whole(name)[0])
 
 
 @pytest.mark.parametrize(
     ("file", "damage"),
     [
-        ("checkpoint.json", "truncated"),
-        pytest.param("checkpoint.json", "missing", marks=pytest.mark.slow),
-        pytest.param("state.json", "flipped", marks=pytest.mark.slow),
-        ("arrays.safetensors", "truncated"),
-        pytest.param("policy/weights.safetensors", "missing", marks=pytest.mark.slow),
+        ("checkpoint.json", lambda data: data[: len(data) // 2]),
+        ("checkpoint.json", None),
+        ("state.json", lambda data: data[: len(data) // 2] + b"\x07" + data[len(data) // 2 + 1 :]),
+        ("arrays.safetensors", lambda data: data[: len(data) // 2]),
+        pytest.param("policy/weights.safetensors", None, marks=pytest.mark.slow),
     ],
 )
 def test_resume__a_damaged_checkpoint_is_found_and_the_one_before_is_used(
-    file: str,
-    damage: str,
-    whole: Callable[[str], tuple[Path, TrainResult]],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    file: str, damage: Callable[[bytes], bytes] | None, whole: Whole, run: Path
 ) -> None:
-    reference, _ = whole("ppo")
-    newest, _ = _stopped(tmp_path / "run", monkeypatch)
-    path = newest / file
-    data = path.read_bytes()
-    if damage == "missing":
+    path, notes = newest(run) / file, []
+    if damage is None:
         path.unlink()
     else:
-        middle = len(data) // 2
-        path.write_bytes(data[:middle] if damage == "truncated" else data[:middle] + b"\x07" + data[middle + 1 :])
-    notes: list[str] = []
-    resume(tmp_path / "run", measure=_measure, on_progress=lambda p: notes.append(p.note) if p.note else None)
-    assert len(notes) == 1 and notes[0].startswith(f"a damaged checkpoint was left aside: {newest}")
-    assert _bundle(tmp_path / "run", "policy-last") == _bundle(reference, "policy-last")
-    assert _rows(tmp_path / "run") == _rows(reference)
+        path.write_bytes(damage(path.read_bytes()))
+    told = f"a damaged checkpoint was left aside: {newest(run)}"
+    resume(run, measure=measure, on_progress=lambda p: notes.append(p.note) if p.note else None)
+    assert len(notes) == 1 and notes[0].startswith(told)
+    assert_same(run, whole("ppo")[0])
 
 
-@pytest.mark.parametrize("key", ["training", "format_version"])
-def test_resume__a_checkpoint_of_another_version_is_refused_and_stays(
-    key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_resume__without_any_checkpoint_it_starts_again(whole: Whole, run: Path) -> None:
+    for file in run.glob("checkpoints/step_*/state.json"):
+        file.unlink()
+    (run / ".ethbrake-left.partial").mkdir()
+    resume(run, measure=measure)
+    assert_same(run, whole("ppo")[0])
+    assert not (run / ".ethbrake-left.partial").exists()
+
+
+def test_resume__of_a_finished_training_or_with_other_versions_is_refused(
+    whole: Whole, run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    newest, before = _stopped(tmp_path / "run", monkeypatch)
-    path, listing = newest / "state.json", json.loads((newest / "checkpoint.json").read_text())
-    if key == "training":  # of a time when no checkpoint said so
-        path.write_text(json.dumps({name: each for name, each in json.loads(path.read_text()).items() if name != key}))
-        data = path.read_bytes()
-        listing["files"]["state.json"] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-    else:
-        listing[key] = 2
-    (newest / "checkpoint.json").write_text(json.dumps(listing))
-    files = {path: path.read_bytes() for path in newest.rglob("*") if path.is_file()}
-    told = {"training": "state.json: training: is missing", "format_version": "format_version = 2: must be 1"}[key]
-    with pytest.raises(InvalidInput, match=rf"{told}; .* is as version .* wrote it, .*: go on with that version, or"):
-        resume(tmp_path / "run", measure=_measure)
-    assert {path: path.read_bytes() for path in newest.rglob("*") if path.is_file()} == files and before.is_dir()
-
-
-def test_resume__without_any_checkpoint_it_starts_again(
-    whole: Callable[[str], tuple[Path, TrainResult]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    reference, _ = whole("ppo")
-    for folder in _stopped(tmp_path / "run", monkeypatch):
-        (folder / "state.json").unlink()
-    (tmp_path / "run" / ".ethbrake-left.partial").mkdir()
-    resume(tmp_path / "run", measure=_measure)
-    assert _bundle(tmp_path / "run", "policy") == _bundle(reference, "policy")
-    assert _rows(tmp_path / "run") == _rows(reference)
-    assert not (tmp_path / "run" / ".ethbrake-left.partial").exists()
-
-
-def test_resume__a_vehicle_with_a_memory_goes_on_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    roles = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "e_v2x_bm:pairwise"}
-    scenario = SCENARIO.replace(roles=roles, early_impacts="keep")
-    train(PPO, scenario, tmp_path / "whole", measure=None)
-    with monkeypatch.context() as patch:
-        _stop_in(patch, 100, _interrupt)
-        train(PPO, scenario, tmp_path / "run", measure=None)
-    resume(tmp_path / "run", measure=None)
-    assert _bundle(tmp_path / "run", "policy") == _bundle(tmp_path / "whole", "policy")
-
-
-def test_resume__refuses_what_it_cannot_go_on_with(
-    whole: Callable[[str], tuple[Path, TrainResult]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with pytest.raises(InvalidInput, match="holds no training; give the folder of a run"):
-        resume(tmp_path)
     with pytest.raises(InvalidInput, match="this training has finished; measure what it has learned with"):
         resume(whole("ppo")[0])
-    _stopped(tmp_path / "run", monkeypatch)
-    monkeypatch.setattr(train_module, "installed_versions", lambda: {"torch": "99.0"})
+    with pytest.raises(InvalidInput, match=r"has finished; .* --scenario cooperation-3-pair --agents team@.*/turns$"):
+        resume(whole("turns")[0])
+    monkeypatch.setattr(runs, "installed_versions", lambda: {"torch": "99.0"})
     with pytest.raises(InvalidInput, match=r"was trained with ethbrake-marl .*: the numbers would differ"):
-        resume(tmp_path / "run")
-    assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "interrupted"
-    assert resume(tmp_path / "run", other_versions=True).status == "finished"
+        resume(run)
+    assert json.loads((run / "run.json").read_text())["status"] == "interrupted"
+    assert resume(run, other_versions=True).status == "finished"
 
 
 @pytest.mark.parametrize(
-    ("part", "change"),
-    [
-        ("recipe", {"gamma": 0.9}),
-        pytest.param("recipe", {"seed": 5}, marks=pytest.mark.slow),
-        pytest.param("scenario", {"horizon_s": 9.0}, marks=pytest.mark.slow),
-    ],
+    ("part", "change"), [("recipe", {"gamma": 0.9}), ("recipe", {"seed": 5}), ("scenario", {"horizon_s": 9.0})]
 )
-def test_resume__an_edited_configuration_is_another_training(
-    part: str, change: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _stopped(tmp_path / "run", monkeypatch)
-    file = tmp_path / "run" / "config.json"
-    asked = file.read_text()
-    config = json.loads(asked)
-    file.write_text(json.dumps({**config, part: {**config[part], **change}}))
+def test_resume__an_edited_configuration_is_another_training(part: str, change: dict[str, Any], run: Path) -> None:
+    config = json.loads((run / "config.json").read_text())
+
+    def edit(**changes: Any) -> None:
+        (run / "config.json").write_text(json.dumps({**config, part: {**config[part], **changes}}))
+
+    edit(**change)
     with pytest.raises(InvalidInput, match=r"config.json: was changed after the checkpoint step_\d+ of this training"):
-        resume(tmp_path / "run", measure=_measure)
-    file.write_text(json.dumps({**config, part: {**config[part], "title": "Words change no training"}}))
-    assert resume(tmp_path / "run", measure=_measure).status == "finished"
+        resume(run, measure=measure)
+    edit(title="Words change no training")
+    assert resume(run, measure=measure).status == "finished"
+
+
+def test_resume__one_process_at_a_time(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    def second(step: int, answer: Answer) -> Answer:
+        if step == 5:
+            asked.append(step)
+            with pytest.raises(InvalidInput, match="another process is training here"):
+                resume(run, measure=measure)
+        return answer
+
+    watch_steps(monkeypatch, second)
+    resume(run, measure=measure)
+    assert asked == [5]
 
 
 @pytest.mark.parametrize(
-    ("file", "content", "message"),
+    ("file", "change", "reason"),
     [
-        ("run.json", None, "is missing"),
-        ("run.json", '{"format": "ethbrake', "is damaged: Unterminated string"),
-        ("run.json", "[]", "is damaged: holds no JSON object"),
-        ("run.json", "{}", "format = None: must be ethbrake-run"),
-        ("run.json", '{"format": "ethbrake-run", "status": "done"}', "status = 'done': must be running or finished"),
-        ("config.json", None, "is missing"),
-        ("config.json", "[]", "is damaged: holds no JSON object"),
-        ("config.json", "{}", "is not the configuration of a training: 'recipe' is missing"),
-        ("config.json", '{"recipe": 3}', "recipe: must be a mapping"),
-        ("config.json", {"scenario": {"name": "paper-random"}}, "scenario: .*braking_capacity_mps2: missing"),
+        ("checkpoint.json", {"format_version": 2}, "format_version = 2: must be 1"),
+        ("state.json", {"training": None}, "training: is missing"),  # of a time when no checkpoint said so
+        ("state.json", {"counters": {}}, "counters.num_timesteps: is missing"),
+        (
+            "state.json",
+            {"random": {"numpy": [0, 0, 0.0], "python": [3, None], "actions": {}}},
+            "random.actions.bit_generator",
+        ),
+        ("state.json", {"log": {"a": ["x", 1, []]}}, "log.a.0"),
+        ("state.json", {"events": {"x": "1"}}, "events.x"),
+        ("state.json", {"between": []}, "between: must be a mapping"),
+        ("state.json", {"more": 1}, "more: unknown key"),
     ],
 )
-def test_resume__names_the_damaged_file(tmp_path: Path, file: str, content: str | dict | None, message: str) -> None:
-    run = RunDirectory(tmp_path / "run").create({"recipe": PPO.model_dump(mode="json")})
-    if content is None:
-        (run.path / file).unlink()
+def test_resume__a_checkpoint_as_another_version_wrote_it_is_refused_and_stays(
+    run: Path, file: str, change: dict[str, Any], reason: str
+) -> None:
+    """Its listing agrees with what is there, so it is not damaged."""
+    path = newest(run) / file
+    content = {**json.loads(path.read_text()), **change}
+    path.write_text(json.dumps({key: value for key, value in content.items() if value is not None}))
+    if file == "state.json":
+        listed_anew(newest(run))
+    before = {file: file.read_bytes() for file in run.glob("checkpoints/**/*.*")}
+    told = rf"{file}: .*{re.escape(reason)}.*is as version .* wrote it, .*: go on with that version, or"
+    with pytest.raises(InvalidInput, match=told):
+        resume(run, measure=measure)
+    assert {file: file.read_bytes() for file in run.glob("checkpoints/**/*.*")} == before
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "reason"),
+    [
+        ("policy.log_std", np.zeros(2, np.float32), r"'policy.log_std' is <f4 \[2\], should be <f4 \[1\]"),
+        ("policy.log_std", np.full(1, np.nan, np.float32), r"'policy.log_std' holds a number that is not finite"),
+        ("environment.begun", np.nan, r"'environment.begun' holds a number that is not finite"),
+        ("environment.engine.script.1.act", np.zeros(3), r"'environment.engine.script.1.act' does not belong here"),
+        ("random.python", np.full(625, 2**40, np.uint64), r"'random.python' is no state"),
+        ("environment.engine.stream", np.array([0, 2**60], np.uint64), r"'environment.engine.stream' is"),
+    ],
+)
+def test_resume__arrays_must_be_those_of_this_training(run: Path, name: str, array: Any, reason: str) -> None:
+    path = newest(run) / "arrays.safetensors"
+    arrays = safetensors.numpy.load(path.read_bytes())
+    arrays[name] = np.full_like(arrays[name], array) if isinstance(array, float) else array
+    path.write_bytes(safetensors.numpy.save(arrays))
+    listed_anew(newest(run))
+    before = {file: file.read_bytes() for file in run.rglob("*") if file.is_file() and file.name != "run.lock"}
+    with pytest.raises(CorruptBundle, match=rf"is not of this training: array {reason}"):
+        resume(run)
+    del before[run / "team.json"]
+    assert all(file.read_bytes() == data for file, data in before.items())
+
+
+@pytest.mark.parametrize("category", [name for name in CHANGES if name.endswith(": link outside")])
+def test_resume__follows_no_link_out_of_the_run(run: Path, category: str) -> None:
+    outside = run.parents[1] / "outside"
+    (outside / "step_000000000001").mkdir(parents=True)
+    (outside / "precious.txt").write_text("years of work")
+    CHANGES[category][3](random.Random(0), run)
+    try:
+        resume(run, measure=None)
+    except (InvalidInput, FileExistsError):
+        pass
     else:
-        text = content if isinstance(content, str) else json.dumps({**json.loads(run.config.read_text()), **content})
-        (run.path / file).write_text(text)
-    with pytest.raises(InvalidInput, match=f"{re.escape(str(run.path / file))}: {message}"):
-        resume(run.path)
-
-
-def test_resume__one_process_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    _stopped(tmp_path / "run", monkeypatch)
-    messages: list[str] = []
-
-    def second() -> None:
-        with pytest.raises(InvalidInput, match="another process is training here") as caught:
-            resume(tmp_path / "run", measure=_measure)
-        messages.append(str(caught.value))
-
-    with monkeypatch.context() as patch:
-        _stop_in(patch, 5, second)
-        resume(tmp_path / "run", measure=_measure)
-    assert len(messages) == 1
+        assert not CHANGES[category][2]
+    assert sorted(path.name for path in outside.iterdir()) == ["precious.txt", "step_000000000001"]
+    assert (outside / "precious.txt").read_text() == "years of work"

@@ -1,7 +1,17 @@
-"""A training of a second, for tests of what surrounds the training."""
+"""Trainings of a second, and what the tests do to them and compare of them."""
 
 from __future__ import annotations
 
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
+from ethbrake_marl.learning import runs
 from ethbrake_marl.learning.training import load_recipe
 
 TINY_PPO = load_recipe("ppo").replace(
@@ -14,3 +24,78 @@ TINY_PPO = load_recipe("ppo").replace(
     evaluation={"every_updates": 3, "worlds": 10, "seed": 7},
     checkpoint_every_updates=2,
 )
+TINY_SAC = load_recipe("sac").replace(
+    total_steps=90 * 8,
+    n_envs=8,
+    batch_size=32,
+    buffer_size=400,  # fills up on the way
+    learning_starts=100,
+    network={"policy": [8], "value": [8]},
+    evaluation={"every_updates": 30, "worlds": 10, "seed": 7},
+    checkpoint_every_updates=12,
+    log_every_updates=10,
+)
+TINY_COUNTERFACTUAL = load_recipe("counterfactual").replace(
+    start=None,
+    observation=None,
+    n_envs=8,
+    n_steps=4,
+    counterfactuals=16,
+    batch_size=8,
+    network={"policy": [8]},
+    total_steps=512,
+    evaluation={"every_updates": 4, "worlds": 10, "seed": 7},
+    checkpoint_every_updates=3,
+)
+MODES = {
+    "networks": 2,
+    "gate": [4],
+    "worlds": 64,
+    "templates": 20,
+    "gain": 0.0,
+    "margin": 5.0,
+    "imitation_epochs": 2,
+    "gate_states": 32,
+    "gate_memory": 100,
+    "gate_steps": 4,
+    "tie_break": 0.05,
+    "together_rate": 0.5,
+    "shares": {"alone": 0.25, "further": 0.25, "gate": 0.25, "together": 0.25},
+}
+TINY_MODES = TINY_COUNTERFACTUAL.replace(modes=MODES)
+Answer = tuple[Any, ...]
+
+
+def watch_steps(monkeypatch: pytest.MonkeyPatch, watch: Callable[[int, Answer], Answer]) -> None:
+    """Let the environment's answer to every step pass through ``watch(number of the step, answer)``."""
+
+    class Watched(EthBrakeVecEnv):
+        count = 0
+
+        def step_wait(self) -> Answer:
+            self.count += 1
+            return watch(self.count, super().step_wait())
+
+    def make(*args: Any, **kwargs: Any) -> EthBrakeVecEnv:
+        environment = make_sb3_vec_env(*args, **kwargs)
+        environment.__class__ = Watched
+        return environment
+
+    monkeypatch.setattr(runs, "make_sb3_vec_env", make)
+
+
+def ctrl_c_in(*steps: int) -> Callable[[int, Answer], Answer]:
+    """For ``watch_steps``: Ctrl-C in each of these steps."""
+
+    def watch(step: int, answer: Answer) -> Answer:
+        if step in steps:
+            os.kill(os.getpid(), signal.SIGINT)
+        return answer
+
+    return watch
+
+
+def files_of(run: Path) -> dict[str, bytes]:
+    """Name and content of all that a run has kept of its policies, and of who drives what."""
+    files = [*run.glob("policy*/**/*.*"), *run.glob("team.json")]
+    return {str(path.relative_to(run)): path.read_bytes() for path in files}

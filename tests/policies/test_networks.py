@@ -1,96 +1,191 @@
-"""Policies of several networks and a gate: what they do, as a bundle, as an agent, behind shields, and as ONNX."""
+"""What a policy's networks compute: by hand, as torch does, the same bits in any batch, behind a gate, and as ONNX."""
 
 from __future__ import annotations
 
-import json
+import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
 import pytest
+import torch
+from torch import nn
 
 import ethbrake_marl as eb
-from ethbrake_marl.policies import NetworkSpec, Policy, load_policy
+from ethbrake_marl.observations import observe
+from ethbrake_marl.physics import advance
+from ethbrake_marl.policies import Actor, NetworkSpec, Policy, dense, squash
 
+
+def _observations(n: int, size: int) -> np.ndarray:
+    return np.random.default_rng(1).uniform(-2.0, 2.0, (n, size)).astype(np.float32)
+
+
+def test_tensors__of_the_papers_network_has_the_tables_tensors() -> None:
+    shapes = {row.name: row.shape for row in eb.load_recipe("ppo-paper").network_spec(27).tensors}
+    assert shapes == {
+        "policy.0.weight": (256, 27),
+        "policy.0.bias": (256,),
+        "policy.1.weight": (256, 256),
+        "policy.1.bias": (256,),
+        "policy.output.weight": (1, 256),
+        "policy.output.bias": (1,),
+        "policy.log_std": (1,),
+        "value.0.weight": (256, 27),
+        "value.0.bias": (256,),
+        "value.1.weight": (256, 256),
+        "value.1.bias": (256,),
+        "value.2.weight": (128, 256),
+        "value.2.bias": (128,),
+        "value.output.weight": (1, 128),
+        "value.output.bias": (1,),
+    }
+
+
+def test_dense__numbers_by_hand() -> None:
+    weight = np.array([[1, 2, 3, 4, 5], [0, 0, 0, 0, -1]], np.float32)
+    bias = np.array([10, 20], np.float32)
+    x = np.array([[1, 0], [1, 0], [1, 0], [1, 0], [1, 2]], np.float32)
+    y = np.empty((2, 2), np.float32)
+    dense(weight, bias, x, y)
+    assert y.tolist() == [[25.0, 20.0], [19.0, 18.0]]
+
+
+@pytest.mark.parametrize(("output", "expected"), [("clip", [1.0, -0.5, -1.0]), ("tanh", np.tanh([3.0, -0.5, -4.0]))])
+def test_actor__relu_then_output_by_hand(output: str, expected: list[float]) -> None:
+    spec = NetworkSpec(
+        observation_size=1, action_size=1, policy_hidden=(2,), value_hidden=(1,), activation="relu", output=output
+    )
+    tensors = {row.name: np.zeros(row.shape, np.float32) for row in spec.tensors}
+    tensors["policy.0.weight"][:, 0] = [1.0, -1.0]  # hidden: max(x, 0), max(-x, 0)
+    tensors["policy.output.weight"][0] = [1.0, -2.0]
+    action = Actor(spec, tensors)(
+        np.array([[3.0], [0.25], [2.0]], np.float32) * np.array([[1.0], [-1.0], [-1.0]], "f4")
+    )
+    np.testing.assert_allclose(action[:, 0], expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("hidden", "activation", "output"),
+    [
+        ((256, 256), "relu", "clip"),
+        ((256, 256), "tanh", "clip"),
+        ((64,), "tanh", "tanh"),
+        (None, "relu", "clip"),  # several networks and a gate
+    ],
+)
+def test_actor__action_is_bitwise_independent_of_the_batch_around_it(
+    hidden: tuple[int, ...] | None, activation: str, output: str, random_tensors: RandomTensors, mixture: Policy
+) -> None:
+    actor: Any = mixture
+    if hidden is not None:
+        spec = NetworkSpec(
+            observation_size=27, action_size=1, policy_hidden=hidden, value_hidden=(8,) if output == "clip" else (),
+            activation=activation, output=output,
+        )  # fmt: skip
+        actor = Actor(spec, random_tensors(spec))
+    seen = _observations(500, 27)
+    together = actor(seen)
+    assert np.unique(together).size > 200  # else equality below would show nothing
+    for first in (0, 1, 3, 17, 63, 64, 255, 256, 300):
+        for n in (0, 1, 2, 5, 63, 64, 65, 200):
+            assert np.array_equal(actor(seen[first : first + n]), together[first : first + n]), (first, n)
+    shuffled = np.random.default_rng(2).permutation(500)
+    assert np.array_equal(actor(seen[shuffled]), together[shuffled])
+
+
+@pytest.mark.parametrize("activation", ["relu", "tanh"])
+def test_actor__agrees_with_torch(activation: str, random_tensors: RandomTensors) -> None:
+    spec = eb.load_recipe("ppo-paper").network_spec(27).model_copy(update={"activation": activation})
+    tensors, seen = random_tensors(spec), _observations(1000, 27)
+    x, function = torch.from_numpy(seen), nn.functional.relu if activation == "relu" else torch.tanh
+    for name in ("policy.0", "policy.1", "policy.output"):
+        y = nn.functional.linear(x, torch.tensor(tensors[f"{name}.weight"]), torch.tensor(tensors[f"{name}.bias"]))
+        x = function(y)
+    np.testing.assert_allclose(Actor(spec, tensors)(seen), y.clip(-1.0, 1.0).numpy(), rtol=0.0, atol=1e-6)
+
+
+def test_squash__is_the_rounded_hyperbolic_tangent() -> None:
+    x = np.concatenate([np.linspace(-12.0, 12.0, 200_001), np.logspace(-30, 0, 2000), [0.0, -0.0, 1e30, -1e30]])
+    single = x.astype(np.float32)[np.newaxis]
+    actual = single.copy()
+    squash(actual)
+    exact = np.tanh(single.astype(np.float64))
+    spacing = np.spacing(np.abs(exact).astype(np.float32)).astype(np.float64)
+    assert (np.abs(actual - exact) <= 0.5001 * spacing).all()
+    assert actual[0, -2:].tolist() == [1.0, -1.0]
+
+
+RandomTensors = Callable[[NetworkSpec], dict[str, np.ndarray]]
 SCENARIO = eb.load_scenario("paper-random")
 
 
-def _seen(rows: int) -> np.ndarray:
-    return np.random.default_rng(1).normal(size=(rows, 27)).astype(np.float32)
-
-
-def _alone(mixture: Policy, number: int) -> Policy:
-    """One network of a mixture as a policy of its own."""
-    network = mixture.manifest.network.model_dump() | {"networks": 1, "gate_hidden": ()}
-    own = f"network_{number + 1}."
-    tensors = {name.replace(own, "policy."): tensor for name, tensor in mixture.tensors.items() if name.startswith(own)}
-    fields = {name: getattr(mixture.manifest, name) for name in type(mixture.manifest).model_fields}
+def another(policy: Policy, tensors: Mapping[str, np.ndarray], **changes: Any) -> Policy:
+    """A policy with these tensors and what else is changed of this one."""
+    fields = {name: getattr(policy.manifest, name) for name in type(policy.manifest).model_fields}
     del fields["weights_sha256"], fields["manifest_sha256"]
-    log_std = np.zeros(1, np.float32)
-    return Policy.make({**tensors, "policy.log_std": log_std}, **{**fields, "network": NetworkSpec(**network)})
+    return Policy.make(tensors, **{**fields, **changes})
 
 
-def test_mixture__acts_as_the_network_that_the_gate_chooses(mixture: Policy) -> None:
-    seen = _seen(300)
-    chosen = mixture._actor.choose(np.ascontiguousarray(seen.T))
-    assert len(set(chosen)) > 1
-    for number in range(3):
-        rows = chosen == number
-        assert np.array_equal(mixture(seen)[rows], _alone(mixture, number)(seen)[rows])
+def test_mixture__acts_as_the_network_that_the_gate_chooses_the_first_of_equal_scores(mixture: Policy) -> None:
+    seen, network = _observations(300, 27), mixture.manifest.network
     hidden = np.maximum(seen @ mixture.tensors["gate.0.weight"].T + mixture.tensors["gate.0.bias"], 0.0)
     scores = hidden @ mixture.tensors["gate.output.weight"].T + mixture.tensors["gate.output.bias"]
-    assert np.array_equal(chosen, scores.argmax(axis=1))
+    chosen = scores.argmax(axis=1)
+    assert len(set(chosen)) > 1
+    one = network.model_copy(update={"networks": 1, "gate_hidden": ()})
+    for number in range(3):
+        own = f"network_{number + 1}."
+        tensors = {name.replace(own, "policy."): each for name, each in mixture.tensors.items() if name.startswith(own)}
+        rows = chosen == number
+        alone = Actor(one, {**tensors, "policy.log_std": np.zeros(1, np.float32)})
+        assert np.array_equal(mixture(seen)[rows], alone(seen)[rows])
+    equal = {name: each * np.float32(not name.startswith("gate.output")) for name, each in mixture.tensors.items()}
+    assert (another(mixture, equal)._actor.choose(np.ascontiguousarray(seen.T)) == 0).all()
 
 
-def test_mixture__a_row_depends_on_itself_alone(mixture: Policy) -> None:
-    seen = _seen(200)
-    whole = mixture(seen)
-    order = np.random.default_rng(2).permutation(200)
-    assert np.array_equal(mixture(seen[order]), whole[order])
-    assert all(np.array_equal(mixture(seen[k : k + 1])[0], whole[k]) for k in range(0, 200, 17))
-
-
-def test_mixture__the_first_of_equal_scores_acts(mixture: Policy) -> None:
-    tensors = dict(mixture.tensors)
-    for name in ("gate.output.weight", "gate.output.bias"):
-        tensors[name] = np.zeros_like(tensors[name])
-    fields = {name: getattr(mixture.manifest, name) for name in type(mixture.manifest).model_fields}
-    del fields["weights_sha256"], fields["manifest_sha256"]
-    assert (Policy.make(tensors, **fields)._actor.choose(np.ascontiguousarray(_seen(50).T)) == 0).all()
-
-
-def test_mixture__as_a_bundle(mixture: Policy, tmp_path: Path) -> None:
-    mixture.save(tmp_path / "mixture")
-    found = load_policy(tmp_path / "mixture")
-    seen = _seen(40)
-    assert np.array_equal(found(seen), mixture(seen)) and found.manifest == mixture.manifest
-    told = json.loads((tmp_path / "mixture" / "manifest.json").read_text())
-    assert (told["format_version"], told["network"]["networks"], told["network"]["gate_hidden"]) == (3, 3, [6])
-    assert {row.name for row in mixture.manifest.network.tensors} == set(mixture.tensors)
-
-
-def test_one_network__is_written_as_ever(policy: Policy, tmp_path: Path) -> None:
-    """Earlier versions of the package, which know no gate, go on reading it."""
-    policy.save(tmp_path / "one")
-    told = json.loads((tmp_path / "one" / "manifest.json").read_text())
-    assert told["format_version"] == 2 and not {"networks", "gate_hidden"} & told["network"].keys()
-
-
-@pytest.mark.parametrize("around", ["", "+episode", "+step", "+refined", "+refined:profile"])
-def test_mixture__drives_alone_shielded_and_refined(around: str, mixture: Policy, tmp_path: Path) -> None:
+@pytest.mark.parametrize("around", ["+episode", "+step", "+refined", "+refined:profile"])
+def test_mixture__drives_shielded_and_refined(around: str, mixture: Policy, tmp_path: Path) -> None:
     mixture.save(tmp_path / "mixture")
     spec = f"counterfactual@{tmp_path / 'mixture'}"
-    worlds = SCENARIO.sample(6, seed=7)
     agents = {name: eb.make_agent(name, scenario=SCENARIO) for name in (spec, spec + around)}
-    found = eb.evaluate(worlds, agents, scenario=SCENARIO)
-    harm = found.outcome(spec + around).first_impact_harm
-    assert np.isfinite(harm).all()
-    if "refined" in around:
-        assert (harm <= found.outcome(spec).first_impact_harm).all()
+    found = eb.evaluate(SCENARIO.sample(4, seed=7).worlds, agents, scenario=SCENARIO)
+    alone, harm = (found.outcome(name).first_impact_harm for name in agents)
+    assert np.isfinite(harm).all() and ((harm <= alone).all() or "refined" not in around)
 
 
-def test_mixture__as_onnx(mixture: Policy) -> None:
-    session = onnxruntime.InferenceSession(mixture.to_onnx(), providers=["CPUExecutionProvider"])
-    seen = _seen(2000)
-    (action,) = session.run(["action"], {"observation": seen})
+def onnx_of(policy: Policy) -> onnxruntime.InferenceSession:
+    return onnxruntime.InferenceSession(policy.to_onnx(), providers=["CPUExecutionProvider"])
+
+
+@pytest.mark.parametrize(("output", "activation"), [("clip", "relu"), ("tanh", "relu"), ("clip", "tanh")])
+def test_onnx__asks_for_the_same_acceleration_in_10_000_states(
+    output: str, activation: str, policy: Policy, random_tensors: RandomTensors
+) -> None:
+    spec = NetworkSpec(
+        observation_size=27, action_size=1, policy_hidden=(64, 48), value_hidden=(), activation=activation,
+        output=output,
+    )  # fmt: skip
+    tensors = random_tensors(spec)
+    tensors["policy.output.weight"] *= 3.0  # so that some actions reach the bounds
+    ours = another(policy, tensors, network=spec, algorithm="sac" if output == "tanh" else "ppo")
+    worlds = SCENARIO.replace(driving_capacity_mps2={"uniform": [1, 3]}).sample(10_000, 5).worlds
+    rng = np.random.default_rng(0)
+    command = -rng.uniform(0.0, 1.0, worlds.speeds_mps.shape) * worlds.vehicles.braking_capacity_mps2
+    worlds, _ = advance(worlds, command, until_s=rng.uniform(0.0, 6.0, worlds.n))
+    seen, expected = observe(worlds, 1, ours.observation), eb.LearnedAgent(ours).act(worlds, 1)
+    action, acceleration = onnx_of(ours).run(["action", "acceleration_mps2"], {"observation": seen})
+    assert np.ptp(expected) > 4.0 and (expected > 0.5).any()
+    np.testing.assert_allclose(action, ours(seen), rtol=0.0, atol=1e-5)
+    np.testing.assert_allclose(acceleration[:, 0], expected, rtol=0.0, atol=1e-4)
+
+
+def test_onnx__of_several_networks_and_without_the_package(mixture: Policy, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = _observations(2000, 27)
+    (action,) = onnx_of(mixture).run(["action"], {"observation": seen})
     np.testing.assert_allclose(action, mixture(seen), rtol=0.0, atol=1e-5)
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(eb.MissingExtra, match=r"-m pip install 'ethbrake-marl\[export\]'$"):
+        mixture.to_onnx()

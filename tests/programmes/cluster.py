@@ -24,11 +24,11 @@ from pathlib import Path
 import yaml
 
 from tests.programmes import Cases, Told
-from tests.studies.sweep.conftest import RECIPE
-from tests.studies.sweep.disturbing import PROGRAM, holders, journal
+from tests.studies.conftest import RECIPE
+from tests.studies.counting import PROGRAM, holders, journal
 
 WORK = {
-    "counting": ([sys.executable, "-m", "tests.studies.sweep.counting"], []),
+    "counting": ([sys.executable, "-m", "tests.studies.counting"], []),
     "training": ([*PROGRAM, "study", "sweep"], ["--retries", "5", "--output"]),
 }
 NODES = 2  # with one core each

@@ -21,7 +21,7 @@ from ethbrake_marl.physics import Floats, Worlds, advance
 from ethbrake_marl.physics.kernel import CLOCK
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.shield import ShieldedDriver, StepShield
-from ethbrake_marl.shield.step_shield import Decision, Running, certify
+from ethbrake_marl.shield.step_shield import Decision, Running, certify, seen_columns
 
 # ---------------------------------------------------------------- lines
 
@@ -176,9 +176,7 @@ def attack(
     """
     rng, learners = np.random.default_rng(seed), scenario.learners
     engine = plain_engine(scenario, worlds)
-    vehicle = learners[0] if len(learners) == 1 else learners
-    shield = StepShield(scenario, vehicle, harm_count=harm_count, allowance=allowance, cap=cap)
-    shield.begin(worlds, np.arange(worlds.n))
+    shield = begun(scenario, worlds, harm_count=harm_count, allowance=allowance, cap=cap)
     first_bound, told, decision = shield.first_bound.copy(), shield.bound, None
     rows = np.arange(worlds.n)[:, np.newaxis]
     who, obeys = rows % len(learners) == np.arange(len(learners)), rows % 4 < 2
@@ -195,11 +193,20 @@ def attack(
         accepted += (((reason == 1) | (reason == 2)) & ~engine.ended[:, np.newaxis]).sum(axis=1)
         rises, told = rises + int((decision.bound > told).sum()), decision.bound
         engine.step(decision.applied.reshape(shape(shield)))
+        assert leak is not None or shield.expects(seen_columns(engine.packed)).all()
         k += 1
     assert leak is not None or not shield.distrusted.any()
     over = 0 if cap is None else int((engine.ledger.vehicle_harm(harm_count) > shield.baseline_shares).sum())
     realised = engine.ledger.world_harm(harm_count)
     return Attack(realised, first_bound, shield.bound, accepted, rises, over, decisions)
+
+
+def begun(scenario: Scenario, worlds: Worlds, **settings) -> StepShield:
+    """A shield of all learners in its episodes."""
+    learners = scenario.learners
+    shield = StepShield(scenario, learners[0] if len(learners) == 1 else learners, **settings)
+    shield.begin(worlds, np.arange(worlds.n))
+    return shield
 
 
 def plain_engine(scenario: Scenario, worlds: Worlds) -> Engine:

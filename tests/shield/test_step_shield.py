@@ -1,17 +1,45 @@
-"""The step shield around an engine, in a few worlds of two vehicles: small enough to run uncompiled."""
+"""The step shield: one decision by hand, and in the engine, where bounds hold and nothing fails silently."""
 
 from __future__ import annotations
+
+import copy
 
 import numpy as np
 import pytest
 
-from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.shield import StepShield
-from ethbrake_marl.shield.step_shield import REASONS
-from tests.shield.attacks import attack, extremes, random_actions
+from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
+from ethbrake_marl.agents.planner import Refined
+from ethbrake_marl.agents.policy import LearnedAgent
+from ethbrake_marl.agents.registry import drive, make_agent
+from ethbrake_marl.observations import ObservationSpec
+from ethbrake_marl.physics import make_worlds
+from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.search import profile_problem
+from ethbrake_marl.shield import HybridAgent, ShieldedDriver, StepShield, parse_uncertainty
+from ethbrake_marl.shield.step_shield import (
+    CONSTANTS,
+    REASONS,
+    Backup,
+    Proposer,
+    begin_running,
+    certify,
+    plan_harm,
+    seen_columns,
+)
+from tests.fixtures.asked import Asked
+from tests.shield.attacks import ADVERSARIES, LEAKS, attack, begun, extremes, line, plain_engine, random_actions, search
 
-pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")  # uncompiled, a division by 0 warns
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::RuntimeWarning",  # uncompiled, a division by 0 warns
+    "ignore::ethbrake_marl.shield.MovingAtHorizon",
+)
 
+STEPS = 81
+PAPER = load_scenario("paper-random")
+PAIR = load_scenario("cooperation-3-pair")
+WORLDS = PAPER.sample(60, 3).worlds
+
+# Three worlds of two vehicles: small enough to run uncompiled.
 TWO = Scenario(
     name="two",
     vehicles=2,
@@ -25,23 +53,454 @@ TWO = Scenario(
     horizon_s=5.0,
     roles={"vehicle_1": "full_brake", "vehicle_2": "learner"},
 )
-WORLDS = TWO.sample(3, 1).worlds
+SMALL = TWO.sample(4, 1).worlds
 
 
-def test_attack__realised_harm_is_the_last_bound_to_the_bit() -> None:
-    for adversary in (random_actions, extremes):
-        found = attack(TWO, WORLDS, adversary)
-        assert (found.bound > 0.0).any()
-        assert (found.realised <= found.bound).all()
-        assert found.realised.tolist() == found.last_bound.tolist()
+def two(speed=10.0, latency=0.0):
+    """Vehicle 1 stands 15 m ahead of Vehicle 2, which brakes with at most 5 m/s2: it stops after 10 m."""
+    scenario = Scenario(
+        name="two", vehicles=2, gaps_m=15, speeds_mps=[0, speed], braking_capacity_mps2=5, driving_capacity_mps2=5,
+        mass_t=1, latency_s=[0, latency], roles={"vehicle_1": "full_brake", "vehicle_2": "learner"},
+    )  # fmt: skip
+    return scenario, scenario.sample(1, 0).worlds
 
 
-def test_surprise__a_front_vehicle_that_brakes_too_hard_is_flagged() -> None:
-    shield = StepShield(TWO, 1)
-    shield.begin(WORLDS, np.arange(3))
-    shield.decide(np.full(3, -0.5), seen=shield.running.states[:, :4].copy())
-    seen = shield.running.states[:, :4].copy()
-    seen[2, 0] -= 0.1
-    decision = shield.decide(np.full(3, 1.0), seen=seen)
-    assert shield.distrusted.tolist() == [False, False, True]
-    assert REASONS[decision.reason[2]] == "assumption broken"
+def start(worlds, plan, uncertainty="gaps_m=0", vehicle=1, **settings):
+    members = parse_uncertainty(uncertainty).members(worlds)
+    running = begin_running(profile_problem(members, [vehicle], **settings), members.n // worlds.n)
+    return running, Backup(plan, plan_harm(running, plan))
+
+
+def braking(action=-1.0):
+    """A plan of one world."""
+    return np.full((1, STEPS), action)
+
+
+def reason(decision):
+    return REASONS[decision.reason[0]]
+
+
+def waits(running, backup):
+    """Decisions about coasting until it is let through no longer."""
+    decisions = []
+    while not decisions or not decisions[-1].intervened[0]:
+        decisions.append(certify(running, np.zeros(1), backup, backup.harm))
+        running, backup = decisions[-1].after, decisions[-1].backup
+    return decisions
+
+
+@pytest.mark.parametrize(
+    ("latency", "uncertainty", "steps"),
+    [
+        (0.0, "gaps_m=0", 5),  # 15 m, 10 m to stop: 5 m at 10 m/s. (To touch at rest is no impact.)
+        (0.5, "gaps_m=0", 0),  # the 5 m to spare go by before the first decision
+        (0.0, "gaps_m=2", 3),  # 13 m in the worst corner
+        (0.0, "braking_capacity_mps2.vehicle_2=20%", 2),  # 12.5 m to stop with 4 m/s2: 2.5 m
+        (0.0, "speeds_mps.vehicle_2=2", 0),  # 12 m/s: 14.4 m to stop; 0.6 m is half a step
+        (0.0, "mass_t=50%", 5),  # changes nothing before an impact
+    ],
+)
+def test_by_hand__coasting_is_let_through_as_long_as_the_worst_corner_can_still_stop(latency, uncertainty, steps):
+    running, backup = start(two(latency=latency)[1], braking(), uncertainty)
+    assert backup.harm[0] == pytest.approx(0.0, abs=1e-9)
+    *let, last = waits(running, backup)
+    assert (len(let), reason(last), last.applied[0]) == (steps, "no certificate", -1.0)
+    if steps == 5:  # one step more: 1 m too far, so an impact at sqrt(2 * 5 * 1) m/s
+        assert last.margin[0] == pytest.approx(-10.0, abs=1e-9)
+
+
+def test_by_hand__what_the_nominal_shield_certifies_breaks_its_bound_in_a_corner():
+    realised = {}
+    for belief in ("gaps_m=0", "gaps_m=2"):
+        applied = [decision.applied[0] for decision in waits(*start(two()[1], braking(), belief))]
+        driven = braking()
+        driven[0, : len(applied)] = applied
+        realised[belief] = start(two()[1], driven, "gaps_m=2")[1].harm[0]
+    # 0.5 s of coasting leave 8 of 13 m, 10 are needed: an impact at sqrt(2 * 5 * 2) m/s
+    assert realised == pytest.approx({"gaps_m=0": 20.0, "gaps_m=2": 0.0}, abs=1e-9)
+
+
+def test_by_hand__a_pair_counts_once_for_the_first_impact_and_each_time_for_the_total():
+    worlds = make_worlds(
+        [[1.0]], [[0.0, 10.0]], braking_capacity_mps2=[[8.0, 1.0]], driving_capacity_mps2=0.0, latency_s=0.0,
+        mass_t=1.0, restitution=0.5,
+    )  # fmt: skip
+    plan, harm = np.where(np.arange(STEPS) < 5, -1.0, 0.0)[np.newaxis], {}
+    for count in ("first", "total"):
+        running, backup = start(worlds, plan, harm_count=count, others_mps2=np.array([[-8.0, 0.0]]))
+        harm[count] = backup.harm[0]
+        for k in range(3):
+            decision = certify(running, plan[:, k], backup, backup.harm)
+            running, backup = decision.after, decision.backup
+        assert backup.harm[0] == harm[count]
+    assert harm["first"] == pytest.approx(98.0, abs=1e-9)  # 10^2 - 2 * 1 * 1
+    assert harm["total"] > harm["first"] + 0.5
+
+
+def test_plan__a_proposal_equal_to_it_costs_nothing_and_changes_nothing():
+    running, backup = start(two(15.0)[1], braking(-0.7))
+    decision = certify(running, np.array([-0.7]), backup, backup.harm)
+    assert reason(decision) == "same as plan" and not decision.intervened[0]
+    assert decision.bound.tolist() == backup.harm.tolist() and decision.margin.tolist() == [0.0]
+
+
+def test_constant__gives_a_certificate_where_the_plan_gives_none():
+    _, worlds = two(12.0)  # 14.4 m to stop
+    plan = braking(-0.96 - 1e-9)  # 15 m to stop: nothing to spare
+    running, backup = start(worlds, plan)
+    assert backup.harm[0] == 0.0
+    decision = certify(running, np.array([-0.9]), backup, backup.harm)
+    assert reason(decision) == "constant" and decision.backup.plan[0, 1:].tolist() == [-1.0] * (STEPS - 1)
+    without = certify(running, np.array([-0.9]), backup._replace(constants=np.zeros(0)), backup.harm)
+    assert without.intervened[0] and without.applied[0] == plan[0, 0]
+
+
+def test_budget__above_the_plan_lets_more_through_but_never_more_than_that():
+    running, backup = start(two(15.0)[1], braking())
+    assert backup.harm[0] == pytest.approx(225.0 - 150.0)
+    budget = backup.harm + 20.0
+    while not running.ended[0]:
+        decision = certify(running, np.ones(1), backup, budget)
+        running, backup = decision.after, decision.backup
+        assert backup.harm[0] <= budget[0]
+    realised = running.states[0, 4]  # two vehicles: speeds 2, gap, hit, first-impact harm
+    assert realised == backup.harm[0] > budget[0] - 20.0
+
+
+@pytest.mark.parametrize(("value", "instead"), [(np.nan, -0.8), (-7.0, -1.0), (-np.inf, -1.0)])
+def test_proposal__that_is_no_number_is_replaced_and_beyond_the_range_is_clipped_before_it_is_certified(value, instead):
+    running, backup = start(two(15.0)[1], braking(-0.8))
+    decision, same = (certify(running, np.array([each]), backup, backup.harm) for each in (value, instead))
+    assert decision.applied.tolist() == [instead] and decision.bound.tolist() == same.bound.tolist()
+    assert decision.after.states.tolist() == same.after.states.tolist()
+    assert decision.intervened[0] == np.isnan(value) == (reason(decision) == "not a number")
+
+
+@pytest.mark.parametrize(("N", "harm_count"), [(3, "first"), (3, "total"), (5, "total")])
+def test_certify__realises_the_certified_harm_to_the_bit_whatever_is_proposed(N, harm_count):
+    scenario, rng = line(N), np.random.default_rng(N)
+    worlds = scenario.sample(5, N).worlds
+    engine, plan = plain_engine(scenario, worlds), np.full((5, STEPS), -0.6)
+    settings = {"others_mps2": engine.wanted_mps2.copy(), "harm_count": harm_count}
+    running, backup = start(worlds, plan, vehicle=scenario.learners[0], **settings)
+    backup, bounds = backup._replace(constants=np.array(CONSTANTS[::5])), [backup.harm]
+    while not engine.ended.all():
+        decision = certify(running, rng.uniform(-1.2, 1.2, 5), backup, backup.harm)
+        engine.step(decision.applied[:, np.newaxis])
+        running, backup = decision.after, decision.backup
+        bounds.append(decision.bound)
+        assert running.ended.tolist() == engine.ended.tolist()
+        assert running.states.tolist() == seen_columns(engine.packed).tolist()
+    assert (np.diff(bounds, axis=0) <= 0.0).all() and (bounds[0] > 0.0).any()
+    assert engine.ledger.world_harm(harm_count).tolist() == backup.harm.tolist()
+
+
+@pytest.mark.parametrize("adversary", [random_actions, extremes])
+def test_attack__of_few_worlds_small_enough_to_run_uncompiled(adversary):
+    found = attack(TWO, SMALL, adversary)
+    assert (found.bound > 0.0).any() and found.rises == 0
+    assert (found.realised <= found.bound).all()
+    assert found.realised.tolist() == found.last_bound.tolist()
+
+
+@pytest.mark.parametrize("name", ADVERSARIES)
+@pytest.mark.parametrize(("N", "harm_count"), [(3, "first"), (5, "total")])
+def test_attack__no_adversary_gets_above_the_bound(name, N, harm_count):
+    found = attack(line(N), line(N).sample(24, 11).worlds, ADVERSARIES[name], harm_count=harm_count)
+    assert (found.realised <= found.bound).all() and found.rises == 0
+    assert found.realised.tolist() == found.last_bound.tolist()
+
+
+def test_attack__comes_within_one_percent_of_the_bound_by_accepted_actions():
+    found = attack(line(3), line(3).sample(60, 12).worlds, ADVERSARIES["worst_case"])
+    tried = (found.bound > 1.0) & (found.accepted > 0)
+    assert (found.realised[tried] > 0.99 * found.bound[tried]).any()
+
+
+def test_search__finds_no_way_past_the_shield_but_many_without_it():
+    found = search(60, 5)
+    assert (found.above, found.excess) == (0, 0.0)
+    assert found.loose > 0.5
+
+
+@pytest.mark.parametrize("name", [name for name in LEAKS if "further off" not in name])  # that one takes longer lines
+def test_search__finds_each_leak(name):
+    found = search(100, 5, LEAKS[name], until_found=True)
+    assert found.first is not None and found.excess > 1e-6
+
+
+def test_trained_adversary__does_more_harm_under_the_shield_than_chance_does() -> None:
+    worlds = line(3).sample(80, 21).worlds
+    harm = {name: attack(line(3), worlds, ADVERSARIES[name]).realised.mean() for name in ("trained", "random_actions")}
+    assert harm["trained"] > harm["random_actions"]
+
+
+def test_allowance__keeps_what_it_grants_and_no_more():
+    worlds = line(3).sample(60, 13).worlds
+    strict, loose = (attack(line(3), worlds, ADVERSARIES["slow_drift"], allowance=a) for a in (0.0, 30.0))
+    assert (loose.realised <= loose.bound + 30.0 + 1e-9).all()
+    assert loose.realised.mean() > strict.realised.mean() + 1.0
+
+
+def test_first_bound__is_what_the_coupled_optimum_realises():
+    assert begun(PAPER, WORLDS).first_bound == pytest.approx(
+        optimise_coupled(WORLDS, 1, horizon_s=PAPER.horizon_s).harm, abs=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("scenario", "settings"),
+    [(PAPER, {}), (PAIR, {"cap": "baseline"}), (line(3), {"uncertainty": parse_uncertainty("gaps_m.pair_1=0.5")})],
+    ids=["one", "team", "robust"],
+)
+def test_begin__of_some_rows_leaves_the_others_alone(scenario, settings):
+    worlds = scenario.sample(6, 3).worlds
+    shield, fresh = begun(scenario, worlds, **settings), begun(scenario, worlds, **settings)
+    shield.decide(np.zeros_like(shield.backup.plan[:, 0]))
+    before = shield.take(np.arange(6))
+    shield.begin(worlds.take([0]), np.array([4]))
+    assert shield.running.steps.tolist() == [1, 1, 1, 1, 0, 1]
+    for row, as_in, there in ((0, before, 0), (5, before, 5), (4, fresh, 0)):
+        now, then = shield.take(np.array([row])), as_in.take(np.array([there]))
+        assert now.running.states.tolist() == then.running.states.tolist()
+        assert np.array_equal(now.running.caps, then.running.caps)
+        assert now.baseline_shares.tolist() == then.baseline_shares.tolist()
+        assert now.bound.tolist() == then.bound.tolist()
+
+
+SURPRISES = {"brakes harder": [-0.3, 0, 0, 0], "not a number": [0, 0, np.nan, 0], "no message": None}
+
+
+@pytest.mark.parametrize("what", SURPRISES)
+def test_surprise__is_flagged_and_falls_back_for_the_rest_of_that_episode_alone(what):
+    shield, seen_columns = begun(TWO, SMALL), 4  # 2 speeds, gap, hit flag
+    stale = shield.running.states[:, :seen_columns].copy()
+    shield.decide(np.full(4, -0.5), seen=stale)
+    seen = shield.running.states[:, :seen_columns].copy()
+    assert not shield.distrusted.any()
+    seen[1] = stale[1] if what == "no message" else seen[1] + SURPRISES[what]
+    for _ in range(3):
+        decision = shield.decide(np.ones(4), seen=seen)
+        assert shield.distrusted.tolist() == [False, True, False, False]
+        assert REASONS[decision.reason[1]] == "assumption broken" and decision.intervened[1]
+        assert decision.applied[1] <= 0.0 and np.isfinite([decision.applied, shield.bound]).all()
+        seen = shield.running.states[:, :seen_columns].copy()
+    shield.begin(SMALL.take([3]), np.array([1]))
+    assert not shield.distrusted.any()
+
+
+def test_step_shield__a_copy_goes_on_apart_its_log_included():
+    shield = StepShield(PAPER, 1, logging=True)
+    shield.begin(PAPER.sample(2, 0).worlds, np.arange(2))
+    other = copy.copy(shield)
+    other.decide(np.ones(2))
+    assert (shield.running.steps.tolist(), other.running.steps.tolist()) == ([0, 0], [1, 1])
+    assert (len(shield.log), len(other.log)) == (0, 2)
+    shield.decide(np.full(2, 0.5))
+    assert [entry.proposed for entry in shield.log + other.log] == [0.5, 0.5, 1.0, 1.0]
+
+
+def test_horizon__settles_says_what_the_plan_comes_to_in_the_engine():
+    worlds = PAPER.sample(60, 5).worlds
+    scenario = PAPER.replace(horizon_s=4.2)
+    shield = StepShield(scenario, 1)
+    shield.begin(worlds, np.arange(60))
+    episodes = drive(worlds, ShieldedDriver(make_agent("e_v2x_bm"), scenario), scenario, 1)
+    rests = (episodes.final.speeds_mps == 0.0).all(axis=1)
+    assert rests.tolist() == shield.settles.tolist() and 0 < rests.sum() < 60
+
+
+class Wavering:
+    """A bad driver that is not constant."""
+
+    name = "wavering"
+
+    def act(self, worlds, vehicle):
+        wave = np.sin(17.0 * worlds.time_s + worlds.gaps_m[:, 0])
+        return np.where(wave > 0.0, 0.0, wave * worlds.vehicles.braking_capacity_mps2[:, vehicle])
+
+
+@pytest.mark.parametrize("harm_count", ["first", "total"])
+def test_agent__is_never_worse_than_the_episode_mode_nor_than_its_prediction(harm_count):
+    driven, alone = (
+        drive(WORLDS, kind(Wavering(), PAPER, harm_count=harm_count), PAPER, 1)
+        for kind in (ShieldedDriver, HybridAgent)
+    )
+    harm, hybrid = (episodes.ledger.world_harm(harm_count) for episodes in (driven, alone))
+    shield = driven.guarded.shield
+    assert (harm <= shield.predicted_harm).all() and (harm <= hybrid + 1e-9).all()
+    assert harm.mean() < hybrid.mean() - 0.2
+    assert harm.tolist() == shield.bound.tolist() and not shield.distrusted.any()
+
+
+def test_agent__a_policy_that_keeps_the_bound_is_left_alone():
+    shield = drive(WORLDS, ShieldedDriver(make_agent("e_v2x_bm"), PAPER), PAPER, 1).guarded.shield
+    fine = shield.alone_harm <= shield.first_bound
+    assert fine.mean() > 0.9 and shield.chosen_policy[fine].all()
+
+
+@pytest.mark.parametrize("kind", [ShieldedDriver, HybridAgent])
+def test_agent__a_worlds_outcome_depends_on_no_other_world_and_on_nothing_driven_before(kind):
+    used, policy = kind(Wavering(), PAPER), Wavering()
+    whole = drive(WORLDS, used, PAPER, 1).ledger.world_harm("first")
+    for rows in ([0], [7], [50], list(range(20))):
+        for agent in (used, kind(policy, PAPER)):
+            episodes = drive(WORLDS.take(rows), agent, PAPER, 1)
+            assert episodes.ledger.world_harm("first").tolist() == whole[rows].tolist()
+            told = episodes.memories[1] if episodes.guarded is None else episodes.guarded.told
+            assert told["predicted_harm"].shape == told["chosen_policy"].shape == (len(rows),)
+
+
+class Speechless:
+    """Full braking, and nothing that is a number in the second half of each second."""
+
+    name = "speechless"
+
+    def act(self, worlds, vehicle):
+        braking = -worlds.vehicles.braking_capacity_mps2[:, vehicle]
+        return np.where(worlds.time_s % 1.0 > 0.5, np.nan, braking)
+
+
+@pytest.mark.parametrize("capacity", [0.0, 5.0])
+def test_agent__what_is_no_number_is_replaced_and_told(capacity):
+    scenario = PAPER.replace(driving_capacity_mps2=capacity)
+    episodes = drive(scenario.sample(20, 3).worlds, ShieldedDriver(Speechless(), scenario, logging=True), scenario, 1)
+    harm, shield = episodes.ledger.world_harm("first"), episodes.guarded.shield
+    assert harm.tolist() == shield.bound.tolist() and (harm <= shield.predicted_harm).all()
+    silent = [entry for entry in shield.log if REASONS[entry.reason] == "not a number"]
+    assert len({entry.world for entry in silent}) == 20 and all(np.isnan(entry.proposed) for entry in silent)
+
+
+# The policy itself as a later certificate: accepted only if its rollout, followed step by step, keeps the budget.
+ROLLED = PAPER.sample(120, 3).worlds
+
+
+class Weights:
+    """A policy of fixed random weights on everything that is observed: it reacts to all, and drives badly."""
+
+    observation = ObservationSpec()
+
+    def __call__(self, observation):
+        weights = np.random.default_rng(1).normal(0.0, 1.0, (observation.shape[1], 1))
+        return np.tanh(observation @ weights - 0.5).astype(np.float32)
+
+
+class Remembering:
+    """A policy whose action depends on how often it was asked in each row, which it counts in place."""
+
+    name = "remembering"
+
+    def begin(self, alert, vehicle, scripts):
+        return {"asked": np.zeros(alert.n), "phase": np.arange(alert.n)}
+
+    def act(self, worlds, memory, vehicle):
+        memory["asked"] += 1.0
+        wave = np.sin(2.0 * memory["asked"] + memory["phase"])
+        return np.where(wave > 0.0, 0.0, wave * worlds.vehicles.braking_capacity_mps2[:, vehicle]), memory
+
+
+class TwoFaced:
+    """Coasts when it is asked what it does, and does otherwise where it is tried out in some of its worlds."""
+
+    name = "two-faced"
+
+    def act(self, worlds, vehicle):
+        other = LearnedAgent(Weights())
+        return np.zeros(worlds.n) if worlds.n == ROLLED.n else other.act(worlds, vehicle)
+
+
+# 14 m are left, 10^2 / (2 * 3.5) = 14.29 m are needed: 2 * 3.5 * 0.2857 = 2 m2/s2
+@pytest.mark.parametrize(
+    ("policy", "why", "plan", "margin"),
+    [
+        (None, "no certificate", [-0.7, -0.7], -np.inf),
+        ("constant:3.5", "no certificate", [-0.7, -0.7], -2.0),
+        ("full_brake", "policy rollout", [0.0, -1.0], 0.0),
+    ],
+)
+def test_rollout__certifies_by_hand_what_plan_and_constants_do_not(policy, why, plan, margin):
+    """10 m/s, 15 m to a vehicle at rest, and a plan (3.5 m/s2: 14.3 m) that coasting would make useless."""
+    scenario, worlds = two()
+    shield = begun(scenario, worlds)
+    shield.backup = Backup(np.full_like(shield.backup.plan, -0.7), np.zeros(1), np.zeros(0))
+    proposer = None if policy is None else Proposer({1: make_agent(policy)}, {1: None}, worlds)
+    decision = shield.decide(np.zeros(1), proposer=proposer)
+    assert (reason(decision), decision.applied[0], decision.bound[0]) == (why, plan[0], 0.0)
+    assert shield.backup.plan[0, :2].tolist() == plan and decision.margin[0] == pytest.approx(margin)
+
+
+def driven(policy, **settings):
+    """What the guard remembers at the end, each world's harm, and the reasons [decisions, n]."""
+    reasons, decide = [], StepShield.decide
+
+    def noted(shield, *arguments, **given):
+        decision = decide(shield, *arguments, **given)
+        reasons.append(np.where(given["only"], decision.reason, -1))
+        return decision
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(StepShield, "decide", noted)
+        episodes = drive(ROLLED, ShieldedDriver(policy, PAPER, **settings), PAPER, 1)
+    return episodes.guarded, episodes.ledger.world_harm("first"), np.array(reasons)
+
+
+@pytest.mark.parametrize("policy", [LearnedAgent(Weights()), Remembering()], ids=["divisible", "remembering"])
+def test_rollout__once_accepted_is_what_the_policy_then_does_and_the_bound_is_exact(policy):
+    guarded, harm, reasons = driven(policy)
+    accepted = reasons == REASONS.index("policy rollout")
+    assert accepted.sum() > 3
+    later = np.cumsum(accepted, axis=0) - accepted > 0  # after the first accepted rollout of that world
+    allowed = [-1, REASONS.index("same as plan"), REASONS.index("ended")]
+    assert np.isin(reasons[later], allowed).all()
+    assert harm.tolist() == guarded.shield.bound.tolist()
+    assert (harm <= guarded.shield.predicted_harm).all() and not guarded.shield.distrusted.any()
+
+
+@pytest.mark.parametrize("distrusted", [False, True])
+def test_rollout__leaves_the_past_in_the_plan_what_was_applied(distrusted, monkeypatch):
+    weaker = parse_uncertainty("braking_capacity_mps2=20%").draw(ROLLED, np.random.default_rng(0))
+    driver = ShieldedDriver(LearnedAgent(Weights()), PAPER, logging=True, told=weaker if distrusted else None)
+    applied, decide = {}, StepShield.decide
+
+    def noted(shield, *arguments, **given):
+        steps, decision = shield.running.steps, decide(shield, *arguments, **given)
+        running = np.flatnonzero(given["only"] & (decision.reason != REASONS.index("ended")))
+        applied.update({(k, steps[k]): decision.applied[k] for k in running})
+        return decision
+
+    monkeypatch.setattr(StepShield, "decide", noted)
+    shield = drive(ROLLED, driver, PAPER, 1).guarded.shield
+    assert (shield.distrusted == distrusted).all()
+    assert all(shield.backup.plan[k, step] == action for (k, step), action in applied.items())
+    for entry in shield.log:
+        assert entry.plan[: entry.step].tolist() == [applied[entry.world, step] for step in range(entry.step)]
+
+
+def test_rollout__leaves_the_policys_memory_alone():
+    policy = Remembering()
+    guarded, _, reasons = driven(policy)
+    assert (reasons == REASONS.index("no certificate")).any()
+    assert set(guarded.policies[1]["asked"]) == {float(len(reasons))}
+
+
+def test_rollout__a_policy_that_does_otherwise_when_it_is_tried_out_gets_no_further_than_the_bound():
+    guarded, harm, reasons = driven(TwoFaced())
+    assert (reasons == REASONS.index("policy rollout")).any()
+    assert harm.tolist() == guarded.shield.bound.tolist() and (harm <= guarded.shield.predicted_harm).all()
+
+
+def test_later_rollouts__may_be_switched_off():
+    _, _, reasons = driven(LearnedAgent(Weights()), later_rollouts=False)
+    assert not (reasons == REASONS.index("policy rollout")).any()
+
+
+def test_rollout__also_of_a_refined_policy_that_cannot_be_divided():
+    driver = ShieldedDriver(Refined(Remembering(), PAPER, tries=2), PAPER)
+    episodes = drive(WORLDS.take(np.arange(20)), driver, PAPER, 1)
+    assert episodes.ledger.world_harm("first").tolist() == episodes.guarded.shield.bound.tolist()
+
+
+def test_take__of_a_refined_policy_drives_on_in_those_rows():
+    worlds, rows = WORLDS.take(np.arange(6)), np.array([4, 1])
+    agent = Asked(Refined(LearnedAgent(Weights()), PAPER, tries=4)).begin(worlds, 1)
+    assert agent.take(rows).act(worlds.take(rows), 1).tolist() == agent.act(worlds, 1)[rows].tolist()

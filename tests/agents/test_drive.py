@@ -1,0 +1,305 @@
+"""Whole episodes: who drives what, what each is told and sees, and that nobody writes into what belongs to all."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.agents import LearnedAgent, Team, drive, make_agent, policy_agent, register_agent, script_agents
+from ethbrake_marl.engine import Engine
+from ethbrake_marl.envs.interfaces import make_engine
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation import evaluate, follow_episodes, record_episode, worlds_sha256
+from ethbrake_marl.evaluation.episodes import Task, film_scenes, record_episodes
+from ethbrake_marl.physics import Floats, Worlds, advance
+from ethbrake_marl.shield import HybridAgent, ShieldedDriver
+
+PAPER = eb.load_scenario("paper-random")
+PAIR = eb.load_scenario("cooperation-3-pair")
+
+
+def with_role(role, vehicle="vehicle_3"):
+    return PAPER.replace(roles={**PAPER.roles, vehicle: role}, early_impacts="keep")
+
+
+@pytest.mark.parametrize("spec", ["e_v2x_bm", "e_v2x_bm+episode"])
+@pytest.mark.parametrize("role", ["constant:3", "coast", "copy_leader", "gentlest_front", "e_v2x_bm"])
+def test_e_v2x_bm__predicts_and_beats_constants_whatever_script_the_others_follow(spec, role):
+    scenario = with_role(role)
+    worlds = scenario.sample(60, 7).worlds
+    episodes = drive(worlds, make_agent(spec, scenario=scenario), scenario, 1)
+    realised = episodes.ledger.world_harm("first")
+    np.testing.assert_allclose(realised, episodes.memories[1]["predicted_harm"], atol=1e-6)
+    for deceleration in np.linspace(0.0, 7.0, 15):
+        constant = drive(worlds, make_agent(f"constant:{deceleration}"), scenario, 1)
+        assert (realised <= constant.ledger.world_harm("first") + 1e-6).all()
+
+
+def test_e_v2x_bm__knows_who_drives_in_the_engines_of_all_interfaces():
+    roles = {"vehicle_1": "learner", "vehicle_2": "e_v2x_bm", "vehicle_3": "constant:3"}
+    scenario = PAPER.replace(roles=roles, early_impacts="keep", obstacle_gap_m=60)
+    engine, alert = make_engine(scenario, 4, seed=3), scenario.sample(4, 3, channel="training").worlds
+    agent, braking = make_agent("e_v2x_bm"), script_agents(PAPER, except_for=1)
+    told, papers, alone = (agent.begin(alert, 1, scripts) for scripts in (script_agents(scenario), braking, {}))
+    assert engine.memories[1]["deceleration_mps2"].tolist() == told["deceleration_mps2"].tolist()
+    assert told["deceleration_mps2"].tolist() != alone["deceleration_mps2"].tolist()
+    assert papers["deceleration_mps2"].tolist() == alone["deceleration_mps2"].tolist()
+
+
+def test_drive__a_scripted_vehicle_that_is_driven_follows_its_script_in_nobodys_plan():
+    plain = with_role("e_v2x_bm")
+    overridden = plain.replace(roles=plain.roles | {"vehicle_2": "coast"})
+    worlds = plain.sample(5, 7).worlds
+    agent = make_agent("full_brake")
+    found = [drive(worlds, agent, scenario, 1).ledger.world_harm("first") for scenario in (overridden, plain)]
+    assert found[0].tolist() == found[1].tolist()
+
+
+@pytest.mark.parametrize("script", ["copy_leader", "gentlest_front"])
+def test_scripts__fixed_at_the_alert_are_asked_once_to_the_same_motion(script):
+    fixed, remembering = make_agent(script), make_agent(script)
+    remembering.state_free = False
+    worlds = PAPER.sample(30, 7).worlds
+    one, other = drive(worlds, fixed, PAPER, 1), drive(worlds, remembering, PAPER, 1)
+    assert one.final.gaps_m.tolist() == other.final.gaps_m.tolist()
+    assert one.ledger.total_harm.tolist() == other.ledger.total_harm.tolist()
+
+
+def test_drive__an_agent_sees_what_a_learner_sees_from_the_first_decision_on():
+    worlds, seen = PAPER.sample(20, 7).worlds, []
+
+    def half(observation):
+        seen.append(observation.tobytes())
+        return np.full((len(observation), 1), -0.5, np.float32)
+
+    drive(worlds, policy_agent(half, scenario=PAPER), PAPER, 1)
+    engine = Engine(PAPER, 20, learners=(1,), scripts=script_agents(PAPER, except_for=1), worlds=worlds)
+    for each in seen[:3]:
+        assert engine.observe(1).tobytes() == each
+        engine.step(np.full((20, 1), -0.5))
+
+
+def test_drive__a_policy_as_a_role_does_what_it_does_when_it_is_driven():
+    def with_roles(**roles):
+        return PAPER.replace(early_impacts="keep", roles={"vehicle_1": "full_brake", **roles})
+
+    universal, braking = make_agent("universal@shipped"), make_agent("full_brake")
+    driven = with_roles(vehicle_2="learner", vehicle_3="full_brake")
+    role = with_roles(vehicle_2="universal@shipped", vehicle_3="learner")
+    both = with_roles(vehicle_2="learner", vehicle_3="learner")
+    worlds = driven.sample(20, 7).worlds
+    harm = drive(worlds, universal, driven, 1).ledger.world_harm("first")
+    for episodes in (drive(worlds, braking, role, 2), drive(worlds, Team({1: universal, 2: braking}, "both"), both)):
+        assert np.abs(episodes.ledger.world_harm("first") - harm).max() < 1e-9
+    assert 0.0 < harm.mean() < drive(worlds, braking, driven, 1).ledger.world_harm("first").mean()
+
+
+class Swinging:
+    """Brakes the harder the later it is: every decision is another command."""
+
+    name = "swinging"
+
+    def act(self, worlds, vehicle):
+        return -worlds.vehicles.braking_capacity_mps2[:, vehicle] * (0.3 + 0.6 * np.sin(7.0 * worlds.time_s) ** 2)
+
+
+@pytest.fixture
+def swinging():
+    """Lines whose first and last vehicle follow a script that decides within the steps of Vehicle 2."""
+    register_agent("swinging", lambda argument, settings: Swinging())
+    roles = {"vehicle_1": "swinging", "vehicle_2": "learner", "vehicle_3": "swinging"}
+    latency = [0.04, 0.5, {"uniform": [0.2, 0.9]}]
+    return PAPER.replace(early_impacts="keep", roles=roles, latency_s=latency, gaps_m=4)
+
+
+def test_drive__shows_every_part_of_a_step_within_which_nobody_decides(swinging):
+    class Replay:
+        def __init__(self, worlds):
+            self.now, self.harm = worlds, np.zeros((worlds.n, 2))
+
+        def see(self, before, command_mps2, until_s):
+            assert np.array_equal(before.gaps_m, self.now.gaps_m) or np.allclose(before.gaps_m, self.now.gaps_m)
+            self.now, impacts = advance(before, command_mps2, until_s=until_s)
+            self.harm += np.stack([impacts.first_impact_harm.sum(axis=1), impacts.total_harm.sum(axis=1)], axis=1)
+
+    worlds = swinging.sample(30, 7).worlds
+    replay = Replay(worlds)
+    episodes = drive(worlds, make_agent("universal@shipped"), swinging, 1, watched_by=[replay])
+    assert np.abs(replay.now.gaps_m - episodes.final.gaps_m).max() < 1e-9
+    for k, count in enumerate(("first", "total")):
+        assert np.abs(replay.harm[:, k] - episodes.ledger.world_harm(count)).max() < 1e-9
+    assert episodes.ledger.world_harm("total").max() > 1.0
+
+
+def test_record__motion_and_dataset_follow_scripts_that_decide_within_a_step(swinging):
+    sample = swinging.sample(4, 7)
+    agent = make_agent("constant:3")
+    outcome = evaluate(sample, {"it": agent}, scenario=swinging).outcome("it")
+    motions = follow_episodes(sample.worlds, agent, swinging)
+    task = Task(swinging, 7, eb.RewardParams(), eb.observation_for(swinging))
+    recording = record_episodes(sample, agent, "it", task)
+    assert outcome.sampled_harm is None  # its samples are the decisions of Vehicle 2 alone
+    for k, motion in enumerate(motions):
+        record = record_episode(sample.worlds.take([k]), agent, scenario=swinging)
+        for impacts in (record.impacts, motion.impacts):
+            assert (impacts.closing_speed_mps**2).sum() == pytest.approx(outcome.total_harm[k])
+        assert record.gaps_m[-1] == pytest.approx(outcome.final.gaps_m[k])
+        last = recording.positions_m[recording.decisions[k], k]
+        assert record.positions_m[-1] == pytest.approx(last, abs=1e-6)
+        scene = film_scenes(sample.worlds.take([k]), agent, scenario=swinging)[-1]
+        assert scene.total_harm == pytest.approx(outcome.total_harm[k])
+        assert scene.front_m[0] == pytest.approx(last[0], abs=1e-6)
+
+
+def test_team__of_one_drives_as_the_agent_alone():
+    sample, agent = PAPER.sample(40, 7), make_agent("e_v2x_bm")
+    result = evaluate(sample, {"alone": agent, "team": Team({1: agent}, "team")}, scenario=PAPER)
+    named = evaluate(sample, {"alone": agent}, scenario=PAPER, vehicle="vehicle_2")
+    for name in ("alone", "team"):
+        outcome, other = result.outcome(name), named.outcome("alone")
+        assert outcome.final.gaps_m.tobytes() == other.final.gaps_m.tobytes()
+        assert outcome.predicted_harm.tobytes() == other.predicted_harm.tobytes()
+    assert result.vehicle == named.vehicle == 1
+
+
+def test_evaluate__an_agent_alone_drives_every_learner_and_a_team_of_nobody_none():
+    brake, gentle = make_agent("full_brake"), make_agent("constant:4")
+    agents = {"alone": brake, "by_hand": Team({1: brake, 2: brake}, "t"), "unlike": Team({1: gentle, 2: brake}, "u")}
+    level = eb.load_scenario("cooperation-0-sensors")
+    scripted = {"scripts": Team({}, "scripts")}
+    found, paper, nobody, driven = (
+        evaluate(scenario.sample(60, 7), drivers, scenario=scenario, vehicle=vehicle)
+        for scenario, drivers, vehicle in (
+            (PAIR, agents, None),
+            (PAPER, {"alone": brake, "unlike": gentle}, None),
+            (level, scripted, None),
+            (level, {"scripts": brake}, 1),
+        )
+    )
+    for other, result, name in ((paper, found, "alone"), (paper, found, "unlike"), (driven, nobody, "scripts")):
+        harms = [each.outcome(name).total_harm for each in (result, other)]
+        np.testing.assert_allclose(*harms, rtol=1e-12)
+    assert found.outcome("alone").total_harm.tolist() == found.outcome("by_hand").total_harm.tolist()
+    assert found.vehicles == (1, 2)
+
+
+def test_evaluate__several_learners_do_what_they_do_in_training(policy: eb.Policy) -> None:
+    worlds = PAIR.sample(50, 3).worlds
+    engine = Engine(PAIR, 50, learners=(1, 2), scripts={0: make_agent("full_brake")}, worlds=worlds)
+    while not engine.ended.all():
+        engine.step({i: policy(engine.observe(i))[:, 0].astype(np.float64) for i in (1, 2)})
+    outcome = evaluate(worlds, {"soft": LearnedAgent(policy)}, scenario=PAIR).outcome("soft")
+    assert outcome.ledger.total_harm.tolist() == engine.ledger.total_harm.tolist()
+    assert outcome.final.gaps_m.tolist() == engine.worlds.gaps_m.tolist()
+
+
+def test_evaluate__one_agent_remembers_each_learner_apart_and_predicts_for_nobody():
+    class Remembering:
+        name = "remembering"
+
+        def begin(self, alert, vehicle, scripts):
+            assert set(scripts) == {0}
+            return {"predicted_harm": np.full(alert.n, float(vehicle))}
+
+        def act(self, worlds, memory, vehicle):
+            assert (memory["predicted_harm"] == vehicle).all()
+            return np.full(worlds.n, -3.0), memory
+
+    assert evaluate(PAIR.sample(3, 0), {"m": Remembering()}, scenario=PAIR).outcome("m").predicted_harm is None
+
+
+def test_e_v2x_bm__takes_the_other_learners_to_brake_fully():
+    worlds = PAIR.sample(30, 7).worlds
+    team = Team.of(make_agent("e_v2x_bm"), (1, 2))
+    both = drive(worlds, team, PAIR).memories[1]
+    alone = drive(worlds, make_agent("e_v2x_bm"), PAIR.with_learners(["vehicle_2"]), 1).memories[1]
+    assert both["deceleration_mps2"].tolist() == alone["deceleration_mps2"].tolist()
+
+
+class _Writes:
+    """Writes into what it is given, when an episode begins or at each decision."""
+
+    knows = "own sensors"
+
+    def __init__(self, when: str, *, state_free: bool) -> None:
+        self.name, self.when, self.state_free = "kmh", when, state_free
+
+    def begin(self, alert, vehicle, scripts):
+        if self.when == "begin":
+            alert.gaps_m[:] = 1000.0
+        return np.zeros(alert.n)
+
+    def act(self, worlds, memory, vehicle):
+        memory += 1.0  # in its own copy
+        if self.when in ("name", "plan"):
+            setattr(self, self.when, "other")
+        if self.when == "act":
+            speeds = worlds.speeds_mps
+            speeds *= 3.6  # a beginner's slip: km/h, in place
+        if self.when == "vehicles":
+            worlds.vehicles.mass_t[:] = 1.0
+        return -worlds.vehicles.braking_capacity_mps2[:, vehicle], memory
+
+
+KEPT = ("name", "plan")  # an attribute that there is, and a new one
+WRAPPED = {
+    "alone": lambda agent: agent,
+    "episode": lambda agent: HybridAgent(agent, PAPER),
+    "step": lambda agent: ShieldedDriver(agent, PAPER),
+}
+
+
+@pytest.mark.parametrize("around", WRAPPED)
+@pytest.mark.parametrize("state_free", [True, False])
+@pytest.mark.parametrize(
+    ("when", "told"),
+    [
+        *((when, r"(begin|act) on .*read-only") for when in ("begin", "act", "vehicles")),
+        *(
+            (name, rf"keeps something in its attribute '{name}'; one that remembers has begin\(alert, ")
+            for name in KEPT
+        ),
+    ],
+)
+def test_agent_that_writes_into_worlds_or_itself__is_refused_by_name(
+    around: str, when: str, told: str, state_free: bool
+) -> None:
+    sample = PAPER.sample(20, 3)
+    before = worlds_sha256(sample.worlds, sample.index)
+    agents = {"full_brake": make_agent("full_brake"), "kmh": WRAPPED[around](_Writes(when, state_free=state_free))}
+    with pytest.raises(InvalidInput, match=rf"agent '(kmh|other)' of vehicle_2: {told}"):
+        evaluate(sample, agents, scenario=PAPER)
+    assert worlds_sha256(sample.worlds, sample.index) == before and sample.worlds.gaps_m.flags.writeable
+    agents["kmh"] = _Writes("memory", state_free=False)  # which is its own
+    found = evaluate(sample, agents, scenario=PAPER)
+    full, kmh = (found.outcome(name).ledger.world_harm("first") for name in agents)
+    assert np.array_equal(full, kmh)
+
+
+@pytest.mark.parametrize(
+    ("begun", "kept", "told"),
+    [
+        (lambda n: None, lambda m, n: np.zeros(n), "another form"),  # rows that begin anew would keep the old one
+        (lambda n: {"a": np.zeros(n)}, lambda m, n: m | {"b": np.zeros(n)}, "another form"),
+        (lambda n: np.zeros(n), lambda m, n: np.zeros(n, np.int64), "another form.*int64.*float64"),
+        (lambda n: np.zeros((n, 1)), lambda m, n: np.zeros((n, 2)), "another form"),
+        (lambda n: {"a": (np.zeros(n), {"b.c": np.zeros(n)})}, lambda m, n: m, "key 'b.c'; must be a name"),
+        (lambda n: {0: np.zeros(n)}, lambda m, n: m, "key 0; must be a name"),
+        (lambda n: np.array([[]] * n + [[1]], object)[:n], lambda m, n: m, "an array of objects"),
+    ],
+)
+def test_memory_of_another_form__is_refused_by_name(begun: Any, kept: Any, told: str) -> None:
+    class Remembers:
+        name = "mine"
+
+        def begin(self, alert: Worlds, vehicle: int, scripts: object) -> Any:
+            return begun(alert.n)
+
+        def act(self, worlds: Worlds, memory: Any, vehicle: int) -> tuple[Floats, Any]:
+            return np.zeros(worlds.n), kept(memory, worlds.n)
+
+    with pytest.raises(InvalidInput, match=f"agent 'mine' of vehicle_2.*{told}"):
+        evaluate(PAPER.sample(3, 3), {"mine": Remembers()}, scenario=PAPER)

@@ -1,0 +1,63 @@
+"""What commands print, byte for byte, as listed in ``tests/cli/printed/*.txt``: each list is one story in one folder.
+
+Below a command line stands what it writes to stdout, then what it writes to stderr behind ``! ``, then its exit status
+where that is not 0; how far it is (``500 of 2,000``) is left out. ``$ cat FILE`` shows a file. ``HERE`` and ``ROOT``
+stand for folders. ``python -m tests.cli.test_printed`` writes what is printed today: read the difference.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import shlex
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from ethbrake_marl.cli.app import run_command
+
+ROOT = Path(__file__).resolve().parents[2]
+STORIES = sorted((Path(__file__).parent / "printed").glob("*.txt"))
+PROGRESS = re.compile(r"^.*: [\d,]+ of [\d,]+(, about .* left)?\n", re.MULTILINE)
+
+
+def printed(line: str) -> str:
+    """What a command line shows, in the folder where this runs."""
+    words, out, err = shlex.split(line), io.StringIO(), io.StringIO()
+    if words[0] == "cat":
+        return Path(words[1]).read_text("utf-8")
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        status = run_command(words[1:])
+    told = "".join(f"! {each}\n" for each in PROGRESS.sub("", err.getvalue()).splitlines())
+    shown = out.getvalue() + told + (f"(status {status})\n" if status else "")
+    return re.sub(r"[ ]+$", "", shown, flags=re.MULTILINE).replace(str(Path().resolve()), "HERE")
+
+
+def told_again(story: Path) -> str:
+    """A story as it would be written today."""
+    parts = re.split(r"^\$ (.*)\n", story.read_text("utf-8"), flags=re.MULTILINE)
+    return parts[0] + "\n".join(f"$ {line}\n{printed(line)}" for line in parts[1::2]).replace(str(ROOT), "ROOT")
+
+
+@pytest.mark.parametrize("story", STORIES, ids=lambda story: story.stem)
+def test_commands__print_what_is_listed(story: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "120")
+    assert told_again(story) == story.read_text("utf-8")
+
+
+def write_stories() -> None:
+    """What is printed today, into the lists."""
+    os.environ["COLUMNS"] = "120"
+    for story in STORIES:
+        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+            text = told_again(story)
+        story.write_text(text, "utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(write_stories())

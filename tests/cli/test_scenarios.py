@@ -1,0 +1,190 @@
+"""``ethbrake scenario`` and ``ethbrake recipe``, ``--set``, and the pages that show them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from ethbrake_marl.evaluation.inputs import load_runnable
+from ethbrake_marl.files.yaml import Override
+from ethbrake_marl.learning.training import TrainingRecipe, load_recipe, read_settings
+from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.search import ProfileProblem
+from tests.cli.conftest import Command, rows_of, told_json
+
+ROOT = Path(__file__).resolve().parents[2]
+TUTORIAL = (ROOT / "docs" / "tutorials" / "first-ten-minutes.md").read_text("utf-8")
+
+
+@pytest.mark.parametrize("script", ["planner", "planner:1000000", "planner:60000ms", "best_harm", "best_harm:1000000"])
+def test_validate__trying_a_search_has_a_budget(ethbrake: Command, scenario_file, monkeypatch, script: str) -> None:
+    budgets, search = [], ProfileProblem.search
+
+    def watched(*given, budget, **how):
+        budgets.append(budget)
+        return search(*given, budget=budget, **how)
+
+    monkeypatch.setattr(ProfileProblem, "search", watched)
+    path = scenario_file("\n  vehicle_3: full_brake\n", f"\n  vehicle_3: {script}\n")
+    path.write_text(path.read_text().replace("early_impacts: reject", "early_impacts: keep"))
+    assert ethbrake("scenario", "validate", path).status == 0
+    assert budgets and max(budgets) <= 16 and len(budgets) <= 2
+
+
+def test_validate__a_script_with_a_state_is_in_order_where_early_impacts_are_kept(ethbrake, scenario_file) -> None:
+    path = scenario_file("\n  vehicle_3: full_brake\n", "\n  vehicle_3: e_v2x_bm\n")
+    path.write_text(path.read_text().replace("early_impacts: reject", "early_impacts: keep"))
+    assert ethbrake("scenario", "validate", path).out.startswith("OK  mine: 3 vehicles, learners: vehicle_2;")
+
+
+def test_validate__tells_refused_draws_and_what_may_not_be_meant(ethbrake: Command, scenario_file) -> None:
+    close = scenario_file("\ngaps_m: {uniform: [5, 10]}", "\ngaps_m: {choice: [0.1, 10]}")
+    refused = re.search(r"([\d,]+) more refused", ethbrake("scenario", "validate", close).out)
+    assert refused is not None and int(refused[1].replace(",", "")) > 100
+    odd = scenario_file("horizon_s: 8", "horizon_s: 2")
+    odd.write_text(odd.read_text().replace("latency_s: [0, ", "latency_s: [0.3, "))
+    told = ethbrake("scenario", "validate", odd).out
+    assert "at the horizon (2 s) something still moves in 1,000 of them" in told
+    assert "Vehicle 1, whose braking is the alert, has a latency above 0 in 1,000 of them" in told
+    found = told_json(ethbrake("scenario", "validate", odd, "--json"))
+    assert (found["moving_at_horizon"], found["vehicle_1_late"], found["worlds"]) == (1000, 1000, 1000)
+
+
+def test_show_and_new__are_the_files_and_only_force_replaces_one(ethbrake: Command, tmp_path: Path) -> None:
+    shipped = {entry["name"]: entry["path"] for entry in told_json(ethbrake("scenario", "list", "--json"))}
+    assert ethbrake("scenario", "show", "stress/wide").out == Path(shipped["stress-wide"]).read_text()
+    assert ethbrake("recipe", "show", "ppo").out == TrainingRecipe.shipped()["ppo"].read_text()
+    assert ethbrake("scenario", "schema").out == (ROOT / "scenarios" / "scenario.schema.json").read_text("utf-8")
+    path = tmp_path / "mine.yaml"
+    path.write_text("precious")
+    assert ethbrake("scenario", "new", "mine", "--based-on", "paper-scenario-1", "--output", tmp_path).status == 2
+    assert path.read_text() == "precious"
+    words = ("scenario", "new", "mine", "--based-on", "paper-scenario-1", "--output", tmp_path, "--force")
+    assert ethbrake(*words).status == 0 and "gaps_m: [10, 8]" in path.read_text()
+    assert ethbrake("scenario", "show", path).out == path.read_text()
+
+
+def test_sample__draws_the_worlds_that_evaluate_draws(ethbrake: Command, tmp_path: Path) -> None:
+    table, drawn = tmp_path / "worlds.csv", ("--episodes", "20", "--seed", "4")
+    told = ethbrake("scenario", "sample", "paper-random", *drawn, "--output", table, "--json")
+    assert [{name: float(value) for name, value in row.items()} for row in rows_of(table)] == told_json(told)
+    assert ethbrake("scenario", "sample", "paper-random", *drawn).out == table.read_text()
+    agents = ("evaluate", "--agents", "full_brake", "--json")
+    (one,) = told_json(ethbrake(*agents, *drawn))
+    (other,) = told_json(ethbrake(*agents, "--initial-states", table))
+    assert all(one[name] == other[name] for name in ("first_impact_harm", "worlds_sha256"))
+
+
+@pytest.mark.parametrize("based_on", sorted(TrainingRecipe.shipped()))
+def test_new_recipe__has_every_key_with_a_comment_and_the_same_values(based_on: str, tmp_path: Path) -> None:
+    text = load_recipe(based_on).new_text("mine")
+    (tmp_path / "mine.yaml").write_text(text)
+    made, base = load_recipe(tmp_path / "mine.yaml"), load_recipe(based_on)
+    words = {"name", "title", "description", "source"}
+    assert made.model_dump(exclude=words) == base.model_dump(exclude=words)
+    lines = text.splitlines()
+    for key in type(base).model_fields:
+        (number,) = (k for k, line in enumerate(lines) if line.removeprefix("# ").startswith(f"{key}:"))
+        assert lines[number - 1].startswith("# "), key
+
+
+def test_settings__are_typed_by_the_rules_of_yaml_and_go_into_mappings_and_lists() -> None:
+    texts = ["a=1", "b=0.5", "c=true", "d=x", "e={uniform: [1, 2]}", "f.g.h=null", "i='1'"]
+    assert Override.put({}, Override.parse(texts)) == {
+        "a": 1, "b": 0.5, "c": True, "d": "x", "e": {"uniform": [1, 2]}, "f": {"g": {"h": None}}, "i": "1",
+    }  # fmt: skip
+    content = {"a": {"b": [1, 2], "c": 3}, "d": 4}
+    assert Override.put(content, Override.parse(["a.b.1=5", "a.e=6"])) == {"a": {"b": [1, 5], "c": 3, "e": 6}}
+    assert content == {"a": {"b": [1, 2], "c": 3}, "d": 4}
+
+
+def test_settings__belong_to_the_recipe_or_the_scenario() -> None:
+    given = read_settings(["gamma=0.9", "scenario.mass_t=40", "recipe.seed=3"], [load_recipe("ppo")])
+    assert [[each.key for each in part] for part in (given.recipe, given.scenario)] == [["gamma", "seed"], ["mass_t"]]
+
+
+def test_settings_of_a_recipe__are_checked_and_a_pair_is_kept_together() -> None:
+    base, told = load_recipe("ppo"), list[str]()
+    changed = read_settings(["learning_rate.start=0.002", "network.policy=[8]"], [base]).change(base)
+    assert changed == base.replace(
+        learning_rate={**base.learning_rate.model_dump(), "start": 0.002},
+        network={**base.network.model_dump(mode="json"), "policy": [8]},
+    )
+    assert read_settings(["gamma=0.9"], [base]).change(base, told.append).gamma == 0.9
+    read_settings(["gamma=0.9", "reward.shaping_discount=0.9"], [base]).change(base, told.append)
+    (note,) = told
+    assert "note: gamma = 0.9, but reward.shaping_discount stays 0.995" in note
+
+
+def test_settings_of_a_scenario__change_what_they_name() -> None:
+    def load(*texts: str) -> Scenario:
+        return load_runnable("paper-random", read_settings(texts).scenario)
+
+    assert load("restitution=0.3").bounds("restitution") == ((0.3, 0.3),)
+    assert load("roles.vehicle_3=coast").scripts[2] == "coast" and load("roles.vehicle_3=coast").learners == (1,)
+    assert load("gaps_m.uniform.1=12").bounds("gaps_m")[0][1] == 12.0
+    assert load("v2x.preset=blocked").v2x.preset == "blocked"
+
+
+def test_set__is_noted_and_about_another_scenario_and_changes_every_one_of_a_mixture(ethbrake, tiny_recipe, tmp_path):
+    settings = ("--set", "seed=5", "--set", "restitution=0.2")
+    assert ethbrake("train", "--recipe", tiny_recipe, *settings, "--output", tmp_path / "run").status == 0
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    told = config["settings"], config["recipe"]["seed"], config["scenario"]["restitution"]
+    assert told == (["seed=5", "restitution=0.2"], 5, 0.2)
+    asked = ("evaluate", "--agents", "coast", "--episodes", "5", "--json")
+    (plain,), (changed,) = (told_json(ethbrake(*asked, *more)) for more in ((), ("--set", "restitution=0.2")))
+    assert changed["parameters"]["restitution"] == 0.2 != plain["parameters"]["restitution"]
+    assert changed["scenario_sha256"] != plain["scenario_sha256"]
+    mixed = ("--scenario", "mixture-delays", "--set", "mass_t=4", "--set", "gaps_m=9")
+    (row,) = told_json(ethbrake(*asked, *mixed))
+    assert (row["parameters"]["mass_t"], row["parameters"]["gaps_m"]) == ([4.0] * 3, [9.0] * 2)
+
+
+@pytest.mark.parametrize("page", ["cli.md", "tutorials/first-ten-minutes.md"])
+def test_page__own_worlds_give_the_printed_harms(ethbrake: Command, tmp_path: Path, page: str) -> None:
+    text = (ROOT / "docs" / page).read_text("utf-8")
+    worlds, out = tmp_path / "worlds.csv", tmp_path / "out.csv"
+    worlds.write_text(
+        "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps\n10,8,20,18,20\n5,9,22,18,20\n7,7,20,18,20\n"
+    )
+    assert worlds.read_text() in text
+    words = ("--initial-states", worlds, "--agents", "full_brake,e_v2x_bm", "--per-world", out)
+    assert ethbrake("evaluate", *words).status == 0
+    printed = re.search(r"\n(agent,world,[^`]+)```", text)
+    assert printed is not None
+    for old, new in zip(csv.DictReader(printed[1].splitlines()), rows_of(out), strict=True):
+        assert (old["agent"], old["world"], old["impacts"]) == (new["agent"], new["world"], new["impacts"])
+        for harm in ("total_harm", "first_impact_harm"):
+            assert float(old[harm]) == pytest.approx(float(new[harm]), rel=1e-9)
+
+
+def test_tutorial__its_program_prints_what_stands_below_it(capsys) -> None:
+    found = re.search(r"```python\n(import numpy.*?)```\n\n```\n(.*?)```", TUTORIAL, re.DOTALL)
+    assert found is not None
+    exec(found[1], {})
+    now = [float(word) for word in capsys.readouterr().out.split()]
+    assert now == pytest.approx([float(word) for word in found[2].split()], rel=1e-9)
+
+
+def test_tutorial__its_changed_scenario_is_valid_and_evaluates_to_the_printed_table(
+    ethbrake: Command, tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert ethbrake("scenario", "new", "rainy").status == 0
+    changed = re.search(r"```yaml\n(gaps_m: .*)\n(braking_capacity_mps2: .*)\n```", TUTORIAL)
+    assert changed is not None
+    text = Path("rainy.yaml").read_text()
+    for line in changed.groups():
+        text, count = re.subn(rf"(?m)^{line.partition(':')[0]}: .*$", line, text)
+        assert count == 1
+    Path("rainy.yaml").write_text(text)
+    assert ethbrake("scenario", "validate", "rainy.yaml").out.strip() in TUTORIAL
+    command = "evaluate --scenario rainy.yaml --agents full_brake,gentlest_front,e_v2x_bm --episodes 2000"
+    printed = TUTORIAL.partition(f"$ ethbrake {command}\n")[2].partition("\n...")[0].splitlines()
+    told = ethbrake(*command.split()).out.splitlines()
+    assert len(printed) == 9 and [line.rstrip() for line in told[:9]] == printed

@@ -1,0 +1,331 @@
+"""``ethbrake run``, ``train`` with ``resume`` and ``curves``, ``agent export``, on trainings of a few small updates."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import shutil
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import onnx
+import pytest
+import yaml
+
+from ethbrake_marl.agents.policy import LearnedAgent
+from ethbrake_marl.cli.command import Out
+from ethbrake_marl.evaluation import evaluate, summarise
+from ethbrake_marl.evaluation.inputs import make_lineup, scenario_sha256, worlds_sha256
+from ethbrake_marl.figures import learning_curve
+from ethbrake_marl.learning.training import load_recipe
+from ethbrake_marl.policies import load_policy
+from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.studies import experiment
+from ethbrake_marl.studies.experiment import run_folder, write_figures
+from tests.cli.conftest import TINY_RECIPE, Command, check_refused, rows_of, told_json
+
+AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "ppo", "hybrid"]
+SCENARIO = load_scenario("paper-random")
+
+
+def status_of(folder: Path, *names: str) -> tuple[Any, ...]:
+    """These entries of run.json."""
+    content = json.loads((folder / "run.json").read_text())
+    return tuple(content[name] for name in names)
+
+
+def ctrl_c_when(monkeypatch: pytest.MonkeyPatch, *moments: Callable[[dict[str, Any]], bool]) -> None:
+    """Press Ctrl-C when what is shown first fits the first moment, then when it first fits the second, ..."""
+    waiting, progress = list(moments), Out.progress
+
+    def press(*args: Any, **kwargs: Any) -> None:
+        progress(*args, **kwargs)
+        shown = inspect.signature(progress).bind(*args, **kwargs).arguments
+        if waiting and waiting[0](shown):
+            waiting.pop(0)
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Out, "progress", press)
+
+
+# A run: training, tests, report
+
+
+def test_run__leaves_results_figures_report_and_policy(finished_run: Path) -> None:
+    names = {path.name for path in finished_run.iterdir()}
+    assert names >= {
+        "config.json", "run.json", "progress.csv", "policy", "results.csv", "results.json", "per_world.csv",
+        "report.html", "learning_curve.png", "harm_against_gap.png", "trajectories.png",
+    }  # fmt: skip
+    page = (finished_run / "report.html").read_text()
+    assert page.count("<figure>") == 6 and "data:image" not in page  # three of them are in the pictures, too
+    assert page.count('"passport":"EB1:paper-random:') == 50 * len(AGENTS)
+    assert status_of(finished_run, "status", "stage", "steps", "reason") == ("finished", "report", 256, None)
+
+
+def test_run__results_agree_in_json_csv_and_per_world_and_the_hybrid_is_never_worse(finished_run: Path) -> None:
+    rows = json.loads((finished_run / "results.json").read_text())
+    flat, worlds = rows_of(finished_run / "results.csv"), rows_of(finished_run / "per_world.csv")
+    assert [row["agent"] for row in rows] == [row["agent"] for row in flat] == AGENTS
+    for row, line in zip(rows, flat, strict=True):
+        mine = [world for world in worlds if world["agent"] == row["agent"]]
+        assert len(mine) == row["episodes"] == int(line["episodes"]) == 60
+        assert float(line["total_harm"]) == row["total_harm"]
+        assert sum(float(world["total_harm"]) for world in mine) / 60 == pytest.approx(row["total_harm"], rel=1e-12)
+        assert [float(line["total_harm_low"]), float(line["total_harm_high"])] == row["total_harm_interval"]
+    assert (flat[0]["predicted_harm"], flat[0]["scenario"]) == ("", "paper-random")
+    harm = {(row["agent"], row["world"]): float(row["first_impact_harm"]) for row in worlds}
+    assert all(harm["hybrid", str(k)] <= harm["e_v2x_bm", str(k)] for k in range(60))
+
+
+def test_run__the_other_two_tests_stand_beside_the_main_one(finished_run: Path) -> None:
+    rows = json.loads((finished_run / "other_tests.json").read_text())
+    flat = rows_of(finished_run / "other_tests.csv")
+    tests = ["paper-random-brake-only", "paper-random-obstacle"]
+    assert [row["parameters"]["scenario"] for row in rows] == [line["scenario"] for line in flat]
+    assert [(row["parameters"]["scenario"], row["agent"]) for row in rows] == [
+        (test, agent) for test in tests for agent in ("full_brake", "e_v2x_bm", "ppo", "hybrid")
+    ]
+    page = (finished_run / "report.html").read_text()
+    assert "<h1>ethbrake run: paper-random (the main test of three)</h1>" in page
+    assert all(f">{test}</h2>" in page for test in tests)
+    assert page.count(">Vehicle 1 shoved (m)</th>") == 3
+    assert page.count(">Sampled harm</th>") == 2  # nobody samples where an obstacle stands ahead
+    for test in tests:
+        scenario = load_scenario(test)
+        result = evaluate(scenario.sample(60, 7), make_lineup(["full_brake"], scenario), scenario=scenario, seed=7)
+        mine = next(r for r in rows if (r["parameters"]["scenario"], r["agent"]) == (test, "full_brake"))
+        assert mine["total_harm"] == summarise(result)[0].total_harm.value
+
+
+def test_run__its_policy_evaluates_to_the_same_figures_afterwards(ethbrake: Command, finished_run: Path) -> None:
+    agents = f"full_brake,ppo@{finished_run},ppo@{finished_run}+episode"
+    now = told_json(ethbrake("evaluate", "--agents", agents, "--episodes", "60", "--json"))
+    then = {row["agent"]: row for row in json.loads((finished_run / "results.json").read_text())}
+    assert {row.pop("per_world")["file"] for row in then.values()} == {"per_world.csv"}
+    names = {f"ppo@{finished_run}": "ppo", f"ppo@{finished_run}+episode": "hybrid"}
+    for row in now:
+        assert row == {**then[names.get(row["agent"], row["agent"])], "agent": row["agent"]}
+
+
+@pytest.mark.slow
+def test_run__json_prints_the_rows_alone_and_force_replaces(ethbrake, tiny_recipe, finished_run, tmp_path) -> None:
+    folder = tmp_path / "again"
+    shutil.copytree(finished_run, folder)
+    (folder / "per_world.csv").write_text("stale")
+    answer = ethbrake("run", "--recipe", tiny_recipe, "--episodes", "60", "--output", folder, "--force", "--json")
+    assert told_json(answer) == json.loads((finished_run / "results.json").read_text())
+    assert (folder / "per_world.csv").read_bytes() == (finished_run / "per_world.csv").read_bytes()
+    assert "training" in answer.err and str(folder / "report.html") in answer.err
+    assert all(picture.read_bytes().startswith(b"\x89PNG") for picture in folder.glob("*.png"))
+
+
+@pytest.mark.slow
+def test_run__vehicle_chooses_among_several_learners(ethbrake, tiny_recipe, scenario_file, tmp_path) -> None:
+    scenario = scenario_file("\n  vehicle_3: full_brake\n", "\n  vehicle_3: learner\n")
+    chosen = ["--scenario", scenario, "--vehicle", "vehicle_3", "--episodes", "20", "--output", tmp_path / "new"]
+    rows = told_json(ethbrake("run", "--recipe", tiny_recipe, *chosen, "--json"))
+    assert {row["parameters"]["controlled_vehicle"] for row in rows} == {"vehicle_3"}
+    assert not (tmp_path / "new" / "other_tests.json").exists()  # not one of the three tests
+
+
+def test_run__the_learning_curve_has_the_lines_of_its_references(monkeypatch, finished_run, tmp_path) -> None:
+    specs = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise"]
+    agents = {**make_lineup(specs, SCENARIO), "ppo": LearnedAgent(load_policy(finished_run), "ppo")}
+    result = evaluate(SCENARIO.sample(5, 7), agents, scenario=SCENARIO, seed=7)
+    drawn = []
+    monkeypatch.setattr(experiment, "learning_curve", lambda *a, **k: drawn.append(learning_curve(*a, **k)) or drawn[0])
+    monkeypatch.setattr(experiment, "write_picture", lambda *given, **settings: None)
+    course = [{"steps": 0.0, "first_impact_harm": 30.0, "total_harm": 33.0, "collision_rate": 1.0}]
+    write_figures(tmp_path, result, summarise(result), course=course, course_caption="", agents=agents)
+    labels = [text.get_text() for text in drawn[0].legends[0].get_texts()]
+    assert labels == ["policy", "full_brake", "e_v2x_bm"]
+
+
+@pytest.mark.slow
+def test_run__interrupted_evaluates_the_policy_so_far_and_goes_on_as_a_training(
+    ethbrake, tiny_recipe, tmp_path, monkeypatch
+) -> None:
+    folder = tmp_path / "stopped"
+    with monkeypatch.context() as patch:
+        ctrl_c_when(patch, lambda shown: shown["done"] == 128)
+        answer = ethbrake("run", "--recipe", tiny_recipe, "--episodes", "40", "--output", folder, "--json")
+    assert answer.status == 130
+    assert [row["agent"] for row in json.loads(answer.out)] == AGENTS
+    assert "interrupted after 128 steps: evaluating the policy so far" in answer.err
+    last = answer.err.splitlines()[-1]
+    assert last.startswith("interrupted after 128 training steps") and str(folder) in last
+    assert status_of(folder, "status", "steps", "stage") == ("interrupted", 128, "report")
+    assert "interrupted" in (folder / "report.html").read_text()
+    assert ethbrake("train", "resume", folder).status == 0
+    assert status_of(folder, "status", "steps") == ("finished", 256)
+
+
+def test_run__interrupted_twice_stops_at_once_and_keeps_the_policy(ethbrake, tiny_recipe, tmp_path, monkeypatch):
+    ctrl_c_when(monkeypatch, lambda shown: shown["done"] == 128, lambda shown: shown["name"] == "e_v2x_bm")
+    folder = tmp_path / "stopped"
+    answer = ethbrake("run", "--recipe", tiny_recipe, "--episodes", "40", "--output", folder)
+    assert (answer.status, answer.out) == (130, "") and answer.err.splitlines()[-1].startswith("interrupted; ")
+    assert status_of(folder, "status", "stage") == ("interrupted", "evaluation")
+    assert not (folder / "results.json").exists() and (folder / "policy" / "weights.safetensors").is_file()
+
+
+def test_run__failed_says_so_in_its_status(ethbrake, tiny_recipe, tmp_path, monkeypatch) -> None:
+    def broken(*args: object, **kwargs: object) -> None:
+        raise RuntimeError("no space left")
+
+    monkeypatch.setattr("ethbrake_marl.studies.experiment.write_results", broken)
+    folder = tmp_path / "failed"
+    with pytest.raises(RuntimeError, match="no space left"):
+        ethbrake("run", "--recipe", tiny_recipe, "--episodes", "20", "--output", folder)
+    status, stage, reason = status_of(folder, "status", "stage", "reason")
+    assert (status, stage) == ("failed", "evaluation") and "no space left" in reason
+
+
+@pytest.mark.slow
+def test_run__with_sac_calls_its_policy_so(ethbrake: Command, tiny_sac: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "new"
+    rows = told_json(ethbrake("run", "--recipe", tiny_sac, "--episodes", "20", "--output", folder, "--json"))
+    assert [row["agent"] for row in rows][-2:] == ["sac", "hybrid"]
+    assert json.loads((folder / "config.json").read_text())["update_ratio"] == 1 / 16
+    assert ethbrake("evaluate", "--episodes", "20", "--agents", f"sac@{folder}", "--json").status == 0
+    check_refused(ethbrake("evaluate", "--agents", f"ppo@{folder}"), "was trained by SAC")
+
+
+def test_evaluate__interrupted_writes_nothing(ethbrake: Command, tmp_path: Path, monkeypatch) -> None:
+    ctrl_c_when(monkeypatch, lambda shown: shown["name"] == "coast")
+    answer = ethbrake("evaluate", "--episodes", "5", "--agents", "coast", "--per-world", tmp_path / "out.csv")
+    assert (answer.status, answer.out) == (130, "")
+    assert answer.err.splitlines()[-1] == "interrupted; nothing was written" and list(tmp_path.iterdir()) == []
+
+
+# A training
+
+
+@pytest.mark.parametrize("command", ["run", "train"])
+def test_existing_run__is_refused_and_left_alone(ethbrake, tiny_recipe, finished_run, command: str) -> None:
+    before = {path: path.read_bytes() for path in finished_run.rglob("*") if path.is_file()}
+    check_refused(ethbrake(command, "--recipe", tiny_recipe, "--output", finished_run), str(finished_run), "force")
+    assert {path: path.read_bytes() for path in finished_run.rglob("*") if path.is_file()} == before
+
+
+def test_run_folder__by_default_says_scenario_recipe_and_seed() -> None:
+    recipe = load_recipe("ppo")
+    folders = [run_folder(SCENARIO, recipe, **given) for given in ({}, {"seed": 4}, {"name": "mine"})]
+    assert [str(path) for path in folders] == [
+        "runs/paper-random-ppo-seed0", "runs/paper-random-ppo-seed4", "runs/mine"
+    ]  # fmt: skip
+    assert run_folder(SCENARIO, recipe, output=Path("/elsewhere/x")) == Path("/elsewhere/x")
+
+
+def test_train__names_its_folder_and_ends_at_the_number_that_it_announces(ethbrake, tiny_recipe, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    answer = ethbrake("train", "--recipe", tiny_recipe, "--seed", "5", "--steps", "200", "--json")
+    folder, figures = Path("runs/paper-random-tiny-seed5"), told_json(answer)
+    assert (figures["directory"], figures["status"], figures["steps"]) == (str(folder), "finished", 256)
+    assert figures["evaluation"]["steps"] == 256 and (folder / "policy" / "manifest.json").is_file()
+    assert "256 of 256\n" in answer.err and "of 200" not in answer.err
+
+
+def test_train__several_learners_share_a_policy(ethbrake, tiny_recipe, scenario_file, tmp_path) -> None:
+    scenario = scenario_file("\n  vehicle_3: full_brake\n", "\n  vehicle_3: learner\n")
+    folder = tmp_path / "two"
+    answer = ethbrake("train", "--scenario", scenario, "--recipe", tiny_recipe, "--output", folder, "--json")
+    told = told_json(answer)
+    assert told["scheme"] == "shared" and told["evaluation"]["first_impact_harm"] > 0.0
+    assert "scheme shared: policy drives vehicle_2, vehicle_3" in answer.err
+    manifest = json.loads((folder / "policy" / "manifest.json").read_text())
+    assert manifest["learners"] == ["vehicle_2", "vehicle_3"]
+
+
+def test_train__by_a_scheme_leaves_a_team_that_evaluate_takes(ethbrake, tiny_recipe, tmp_path) -> None:
+    scenario, folder = ("--scenario", "cooperation-3-pair"), tmp_path / "run"
+    told = "policy/vehicle_2 drives vehicle_2; policy/vehicle_3 drives vehicle_3"
+    answer = ethbrake("train", *scenario, "--recipe", tiny_recipe, "--scheme", "independent", "--output", folder)
+    assert answer.status == 0 and f"scheme independent: {told}" in answer.err
+    words = ("--episodes", "20", "--agents", f"ppo@{folder},team@{folder}", "--json")
+    alone, team = told_json(ethbrake("evaluate", *scenario, *words))
+    assert alone["first_impact_harm"] == team["first_impact_harm"]
+    check_refused(ethbrake("evaluate", *scenario, "--agents", f"sac@{folder}"), "was trained by PPO", f"ppo@{folder}")
+    nobody = ethbrake("evaluate", "--scenario", "cooperation-0-sensors", "--agents", f"team@{folder}")
+    check_refused(nobody, "has no learner to drive; give the scenario that the agents were trained for")
+    check_refused(ethbrake("train", "resume", folder), "evaluate --scenario cooperation-3-pair --agents team@")
+
+
+def test_resume__goes_on_and_ends_as_if_nothing_had_happened(ethbrake, tiny_recipe, tmp_path, monkeypatch) -> None:
+    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
+    assert ethbrake("train", "--recipe", tiny_recipe, "--output", whole).status == 0
+    with monkeypatch.context() as patch:
+        ctrl_c_when(patch, lambda shown: shown["done"] == 128)
+        answer = ethbrake("train", "--recipe", tiny_recipe, "--output", stopped)
+    assert answer.status == 130 and status_of(stopped, "policy") == ("policy",)
+    last = answer.err.splitlines()[-1]
+    assert "interrupted after 128 training steps" in last and f"go on with: ethbrake train resume {stopped}" in last
+    told = told_json(ethbrake("train", "resume", stopped, "--json"))
+    assert (told["status"], told["steps"]) == ("finished", 256)
+    for name in ("policy", "policy-last"):
+        assert load_policy(stopped / name).manifest == load_policy(whole / name).manifest
+    again = ethbrake("train", "resume", stopped)
+    check_refused(again, "has finished", "ethbrake evaluate --scenario paper-random --agents ppo@")
+
+
+# Learning curves
+
+
+def test_curves__one_command_trains_draws_and_goes_on(ethbrake, tiny_recipe, tiny_sac, tmp_path, monkeypatch) -> None:
+    folder = tmp_path / "curves"
+    arguments = ("train", "curves", "--recipes", f"{tiny_recipe}:2,{tiny_sac}:2", "--output", folder, "--json")
+    with monkeypatch.context() as patch:
+        ctrl_c_when(patch, lambda shown: shown["name"] == "tiny-seed1" and shown["done"] == 128)
+        answer = ethbrake(*arguments)
+    assert answer.status == 130 and "the same command goes on" in answer.err
+    kept = (folder / "tiny-seed0" / "policy" / "manifest.json").stat().st_mtime_ns
+    summary = told_json(ethbrake(*arguments))
+    assert (folder / "tiny-seed0" / "policy" / "manifest.json").stat().st_mtime_ns == kept
+    assert (folder / "learning_curves.png").read_bytes().startswith(b"\x89PNG")
+    rows = [row for row in rows_of(folder / "learning_curves.csv") if row["figure"] != "return"]
+    harms = {(row["recipe"], row["seed"], int(row["steps"])): float(row["value"]) for row in rows}
+    steps = {name: {each[2] for each in harms if each[0] == name} for name in ("tiny", "tiny-sac")}
+    assert steps == {"tiny": {0, 128, 256}, "tiny-sac": {0, 160, 320}}
+    told, last = summary["recipes"]["tiny"], [harms["tiny", seed, 256] for seed in "01"]
+    assert told["last"]["each"] == last
+    assert told["last"]["interquartile_mean"] == pytest.approx(sum(last) / 2)
+    low, high = told["last"]["interval"]
+    assert min(last) <= low <= high <= max(last)
+    fixed = SCENARIO.sample(10, 7)
+    assert (summary["kind"], summary["scenario_sha256"]) == ("learning-curves", scenario_sha256(SCENARIO))
+    assert told["worlds_sha256"] == worlds_sha256(fixed.worlds, fixed.index)
+    runs = [load_policy(folder / f"tiny-seed{seed}") for seed in (0, 1)]
+    assert told["policy_sha256"] == [policy.manifest.manifest_sha256 for policy in runs]
+
+
+def test_curves__another_training_or_an_edited_scenario_is_told_before_any_is_begun(
+    ethbrake, tiny_recipe, scenario_file, tmp_path
+) -> None:
+    folder, other = tmp_path / "curves", tmp_path / "other.yaml"
+    command = ("train", "curves", "--recipes", f"{tiny_recipe}:1", "--output", folder, "--scenario")
+    assert ethbrake(*command, scenario_file("horizon_s: 8", "horizon_s: 8")).status == 0
+    drawn = (folder / "learning_curves.json").stat().st_mtime_ns
+    answer = ethbrake(*command, scenario_file("horizon_s: 8", "horizon_s: 9"))
+    check_refused(answer, "tiny-seed0: holds another training (here other: scenario horizon_s); give another folder")
+    other.write_text(yaml.safe_dump({**TINY_RECIPE, "gamma": 0.9}))
+    both = ("train", "curves", "--recipes", f"ppo:1,{other}:1", "--output", folder, "--scenario")
+    answer = ethbrake(*both, scenario_file("horizon_s: 8", "horizon_s: 8"))
+    check_refused(answer, "tiny-seed0: holds another training (here other: recipe gamma); give another folder")
+    assert (folder / "learning_curves.json").stat().st_mtime_ns == drawn and not (folder / "ppo-seed0").exists()
+    words = scenario_file('title: "One line for lists and figures"', 'title: "Another line"')
+    assert ethbrake(*command, words).status == 0  # words change no training: its result is kept
+
+
+def test_export__writes_onnx(ethbrake: Command, finished_run: Path, tmp_path: Path, monkeypatch) -> None:
+    file = tmp_path / "policy.onnx"
+    assert ethbrake("agent", "export", finished_run, "--onnx", file).status == 0
+    assert [output.name for output in onnx.load(str(file)).graph.output] == ["action", "acceleration_mps2"]
+    monkeypatch.setitem(sys.modules, "onnx", None)  # not installed: the output is looked at before that is
+    check_refused(ethbrake("agent", "export", finished_run, "--onnx", file), "is there already")
+    line = f"needs the package onnx, which is not installed: {sys.executable} -m pip install 'ethbrake-marl[export]'"
+    new = ethbrake("agent", "export", finished_run, "--onnx", tmp_path / "new.onnx")
+    assert new.err == f"ethbrake: error: {line}\n" and not (tmp_path / "new.onnx").exists()

@@ -1,0 +1,489 @@
+"""A training from its first decision to its last: what it leaves, tells and measures, when it stops, and its files."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import random
+import signal
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.summary.writer.event_file_writer import EventFileWriter
+
+import ethbrake_marl as eb
+from ethbrake_marl.errors import AlreadyExists, Progress
+from ethbrake_marl.evaluation import evaluate, measures as outcomes, summarise
+from ethbrake_marl.files.store import new_folder, write_file
+from ethbrake_marl.harm import objective_harm, objectives_of
+from ethbrake_marl.learning import Training, TrainingRecipe, load_recipe, resume, runs
+from ethbrake_marl.learning.runs import (
+    Course,
+    EventFile,
+    ProgressTable,
+    TrainingDiverged,
+    cut_back,
+    event_sizes,
+    lost_training,
+    misleading_return,
+)
+from ethbrake_marl.policies import Policy, load_policy, read_trained
+from tests.learning.tiny import TINY_PPO, TINY_SAC, Answer, ctrl_c_in, files_of, watch_steps
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of those who read event files
+SCENARIO = eb.load_scenario("paper-random")
+UPDATE = 8 * 16  # decisions
+EVERY_SECOND = {"every_updates": 2, "worlds": 10, "seed": 7}
+TINY = TINY_PPO.replace(total_steps=3 * UPDATE, evaluation=EVERY_SECOND)
+train = partial(runs.train, measure=None)
+
+
+def status_of(run: Path) -> dict[str, Any]:
+    return json.loads((run / "run.json").read_text())
+
+
+def rows_of(run: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader((run / "progress.csv").read_text().splitlines()))
+
+
+def test_train__leaves_a_complete_folder(tmp_path: Path) -> None:
+    def mean_weight(policy: Policy) -> dict[str, float]:
+        return {"mean_weight": float(policy.tensors["policy.0.weight"].mean())}
+
+    recipe, run, seen = TINY.replace(n_steps=128, total_steps=3 * 1024), tmp_path / "run", list[Progress]()
+    result = train(recipe, SCENARIO, run, measure=lambda training: mean_weight, on_progress=seen.append)
+    steps = [0, 1024, 2048, 3072]
+    assert (result.status, result.steps, result.updates) == ("finished", 3072, 3)
+    assert [e["updates"] for e in result.evaluations] == [0, 2, 3]
+    assert [p.done for p in seen] == steps and seen[-1].metrics["episode_return"] < 0.0
+    assert sorted(path.name for path in run.iterdir() if path.is_dir()) == ["policy", "policy-last", "tensorboard"]
+    assert [path.stat().st_size > 0 for path in (run / "tensorboard").iterdir()] == [True]
+
+    config = json.loads((run / "config.json").read_text())
+    assert TrainingRecipe.of(config["recipe"]) == recipe and config["scenario"]["name"] == "paper-random"
+    assert config["versions"]["torch"] in torch.__version__
+    expected = {"status": "finished", "steps": 3072, "policy": "policy", "checkpoints": [], "alarms": []}
+    assert status_of(run).items() >= expected.items()
+
+    rows = rows_of(run)
+    assert [int(row["steps"]) for row in rows] == steps
+    assert [row["eval/mean_weight"] != "" for row in rows] == [True, False, True, True]
+    assert float(rows[-1]["eval/mean_weight"]) == result.evaluations[-1]["mean_weight"]
+    rates = [float(row["train/learning_rate"]) for row in rows[1:]]
+    assert rates == pytest.approx([recipe.learning_rate.at(share) for share in (2 / 3, 1 / 3, 0.0)])
+    assert 0.0 <= float(rows[-1]["rollout/collision_rate"]) <= 1.0
+    assert float(rows[-1]["rollout/total_harm"]) >= float(rows[-1]["rollout/first_impact_harm"]) > 0.0
+
+    loaded = load_policy(run).manifest
+    assert (loaded, loaded.learners, loaded.steps) == (result.policy.manifest, ("vehicle_2",), 3072)
+
+
+def test_train__is_bitwise_reproducible_and_leaves_global_random_states(tmp_path: Path) -> None:
+    states = random.getstate(), np.random.get_state()[1].tolist(), torch.get_rng_state().tolist()  # noqa: NPY002
+    for name, seed in (("a", 5), ("b", 5), ("c", 6)):
+        train(TINY, SCENARIO, tmp_path / name, seed=seed)
+    a, b, c = (files_of(tmp_path / name) for name in "abc")
+    assert a == b and a["policy/weights.safetensors"] != c["policy/weights.safetensors"]
+    assert states == (random.getstate(), np.random.get_state()[1].tolist(), torch.get_rng_state().tolist())  # noqa: NPY002
+    assert load_policy(tmp_path / "c").manifest.seeds == {"training": 6, "evaluation": TINY.evaluation.seed}
+
+
+def test_train__ctrl_c_stops_after_the_update_in_progress_and_a_second_one_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    once, twice = tmp_path / "once", tmp_path / "twice"
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    watch_steps(monkeypatch, ctrl_c_in(20))  # in the second rollout of 16 steps
+    result = train(TINY, SCENARIO, once, steps=100 * UPDATE)
+    assert (result.status, result.updates, result.steps) == ("interrupted", 2, 2 * UPDATE)
+    watch_steps(monkeypatch, ctrl_c_in(20, 21))
+    with pytest.raises(KeyboardInterrupt):
+        train(TINY, SCENARIO, twice, steps=100 * UPDATE)
+    assert [status_of(run)["status"] for run in (once, twice)] == ["interrupted"] * 2
+    assert [load_policy(run).manifest.steps for run in (once, twice)] == [2 * UPDATE, UPDATE]
+    assert (len(rows_of(once)), signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == (2, *before)
+
+
+def planted(*harms: float) -> Callable[[Training], Callable[[Policy], dict[str, float]]]:
+    """Measures harms that were written down before, so that a training seems to collapse."""
+    left = list(harms)
+    return lambda training: lambda policy: {"first_impact_harm": left.pop(0)}
+
+
+def test_train__a_collapse_raises_an_alarm_and_by_default_goes_on(tmp_path: Path) -> None:
+    said: list[str] = []
+    result = train(
+        TINY, SCENARIO, tmp_path / "run", steps=8 * UPDATE, measure=planted(90.0, 7.0, 60.0, 60.0, 7.0),
+        on_progress=lambda progress: said.append(progress.note),
+    )  # fmt: skip
+    assert (result.status, result.updates, len(result.alarms)) == ("finished", 8, 1)
+    assert "training is lost" in result.alarms[0]
+    assert [note for note in said if note] == [f"alarm: {result.alarms[0]}"]
+    alarms = [row["eval/alarm"] for row in rows_of(tmp_path / "run") if row["eval/alarm"]]
+    assert alarms == ["0", "0", "0", "1", "0"]
+
+
+def not_good_enough(evaluation: Mapping[str, float]) -> str | None:
+    return "60 will not do" if (evaluation["updates"], evaluation["first_impact_harm"]) == (4, 60.0) else None
+
+
+@pytest.mark.parametrize(
+    ("when", "updates", "reason"),
+    [({"stop_when_lost": True}, 6, "training is lost"), ({"stop_at": not_good_enough}, 4, "60 will not do")],
+)
+def test_train__stops_where_it_should_and_goes_on_to_the_same_bits(
+    when: dict[str, Any], updates: int, reason: str, tmp_path: Path
+) -> None:
+    harms = (90.0, 7.0, 60.0, 61.0, 7.0)
+    whole = train(TINY, SCENARIO, tmp_path / "whole", steps=8 * UPDATE, measure=planted(*harms))
+    run = tmp_path / "run"
+    stopped = train(TINY, SCENARIO, run, steps=8 * UPDATE, measure=planted(*harms), **when)
+    assert (stopped.status, stopped.updates, whole.updates) == ("interrupted", updates, 8)
+    assert status_of(run)["status"] == "interrupted" and reason in status_of(run)["reason"]
+    assert load_policy(run).manifest.steps == 2 * UPDATE  # of the least harm
+    left = planted(*harms[1 + updates // 2 :])
+    result = resume(run, measure=left, on_progress=None, **when)
+    assert (result.status, result.evaluations) == ("finished", whole.evaluations)
+    assert files_of(run) == files_of(tmp_path / "whole")
+
+
+def test_train__measures_what_an_evaluation_of_the_kept_policy_tells_and_proves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[str] = []
+    prove = outcomes.known_limits
+    monkeypatch.setattr(outcomes, "known_limits", lambda *given: asked.append("limits") or prove(*given))
+    result = runs.train(TINY, SCENARIO, tmp_path / "run", steps=UPDATE, on_progress=None)
+    assert asked == []
+    worlds = result.training.scenario.sample(TINY.evaluation.worlds, TINY.evaluation.seed)
+    agents = {"policy": eb.LearnedAgent(result.last_policy, "policy")}
+    (row,) = summarise(evaluate(worlds, agents, scenario=result.training.scenario))
+    assert asked == ["limits"]
+    names = ("first_impact_harm", "total_harm", "collision_rate")
+    told = {name: getattr(row, name).value for name in names} | {"horizon_rate": row.horizon_ends / row.episodes}
+    assert result.evaluations[-1].items() >= told.items()
+
+
+NOT_FINITE = r"rewards\[row 0\] = nan at step 160: must be finite"
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # the training library's own statistics overflow first
+@pytest.mark.parametrize(
+    ("recipe", "scheme", "reward", "message"),
+    [
+        (TINY, None, np.nan, NOT_FINITE),
+        (TINY, None, 1e25, r"train/loss = inf after step 256: must be finite"),
+        (TINY, None, 3e38, r"the gradient of the loss is not finite at step 256"),
+        (TINY, "independent", np.nan, NOT_FINITE.replace("160", "320")),
+        (TINY_SAC, None, np.nan, NOT_FINITE),
+        (TINY_SAC, None, 3e38, r"(the gradient of the loss is not finite|critic_loss = inf)"),
+    ],
+)
+def test_train__numbers_that_are_not_finite_stop_it_and_keep_the_last_good_policy(
+    recipe: TrainingRecipe, scheme: Any, reward: float, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def spoil(step: int, answer: Answer) -> Answer:
+        if step == 20:
+            answer[1][:] = reward
+        return answer
+
+    watch_steps(monkeypatch, spoil)
+    scenario = eb.load_scenario("cooperation-3-pair") if scheme else SCENARIO
+    with pytest.raises(TrainingDiverged, match=message):
+        train(recipe, scenario, tmp_path / "run", steps=max(2 * UPDATE, recipe.total_steps), scheme=scheme)
+    assert status_of(tmp_path / "run")["status"] == "failed"
+    assert status_of(tmp_path / "run")["reason"].startswith("TrainingDiverged: training: ")
+    kept = read_trained(tmp_path / "run" / "policy-last")
+    assert 0 < kept.steps <= 256
+    for policy in kept.drivers.values():
+        assert all(np.isfinite(tensor).all() for tensor in policy.tensors.values())
+
+
+def test_train__an_error_of_the_callers_function_is_passed_on(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError):
+        train(TINY, SCENARIO, tmp_path / "run", measure=lambda training: lambda policy: {"harm": 1 / 0})
+    status = status_of(tmp_path / "run")
+    assert (status["status"], status["reason"]) == ("failed", "ZeroDivisionError: division by zero")
+    assert load_policy(tmp_path / "run").manifest.steps == 0
+
+
+OF_THEIR_KIND = ("cooperation", "cooperation-ppo", "modes", "ppo-paper", "sac-paper")  # others differ in numbers
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in OF_THEIR_KIND else pytest.mark.slow)
+        for name in sorted(TrainingRecipe.shipped())
+    ],
+)
+def test_shipped_recipe__trains_for_one_update(name: str, tmp_path: Path) -> None:
+    recipe = load_recipe(name)
+    if recipe.algorithm == "ppo":
+        recipe = recipe.replace(n_envs=16, n_steps=recipe.batch_size // 16)
+    elif recipe.algorithm == "sac":
+        recipe = recipe.replace(n_envs=1)
+    else:  # the fewest worlds whose decisions can be split into batches and tried
+        most = max(recipe.batch_size, recipe.counterfactuals)
+        recipe = recipe.replace(n_envs=max(1, most // recipe.rounds))
+    result = train(recipe, SCENARIO, tmp_path / "run", steps=1)
+    assert (result.status, result.updates, result.steps) == ("finished", 1, recipe.n_envs * recipe.rounds)
+    assert load_policy(tmp_path / "run").manifest.algorithm == recipe.algorithm
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_train__shows_its_progress_on_stderr_and_on_a_terminal_in_one_line(
+    terminal: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stderr.isatty", lambda: terminal)
+    runs.train(TINY, "paper-random", tmp_path / "shown")
+    out, err = capsys.readouterr()
+    lines = err.splitlines()
+    assert out == "" and (err.count("\n") == 1) == (err.count("\r") > 1) == terminal and err.endswith("\n")
+    assert lines[0].startswith("training: 0 of 384, first-impact harm ") or terminal
+    assert "training: 384 of 384, first-impact harm " in lines[-1] and len(lines) == len(set(lines))
+    runs.train(TINY, "paper-random", tmp_path / "quiet", on_progress=None)
+    assert capsys.readouterr().err == ""
+
+
+def test_train__keeps_and_tells_what_the_learners_objectives_make_of_the_harm(tmp_path: Path) -> None:
+    objectives = ["total", "own", "weighted:0.001,0.001,1"]
+    roles = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "learner"}
+    scenario = SCENARIO.replace(objective=objectives, roles=roles)
+    recipe = TINY.replace(total_steps=6 * 128, evaluation={"every_updates": 1, "worlds": 10, "seed": 7})
+    result = runs.train(recipe, scenario, tmp_path / "run", on_progress=None)
+    rows = [row for row in rows_of(tmp_path / "run") if row["eval/objective"]]
+    best = min(result.evaluations, key=lambda each: each["objective"])
+    kept = load_policy(tmp_path / "run" / "policy")
+    assert len(rows) == len(result.evaluations) > 3 and kept.manifest.steps == best["steps"]
+    found = evaluate(scenario.sample(10, 7).worlds, {"kept": eb.LearnedAgent(kept)}, scenario=scenario)
+    harm = objective_harm(found.outcome("kept").ledger, "first", objectives_of(objectives, 3)).mean(axis=0)
+    assert (best["objective_vehicle_2"], best["objective_vehicle_3"]) == (
+        pytest.approx(harm[1]),
+        pytest.approx(harm[2]),
+    )
+    assert best["objective"] == (best["objective_vehicle_2"] + best["objective_vehicle_3"]) / 2
+    assert "objective" not in runs.train(TINY, SCENARIO, tmp_path / "plain", steps=1).evaluations[0]
+
+
+GOAL = 1.10  # harm of the policy, in the least harm known
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(3))
+def test_quick__ends_near_the_best_known_for_every_seed(seed: int, tmp_path: Path) -> None:
+    result = runs.train("quick", "paper-random", tmp_path / "run", seed=seed, on_progress=None)
+    agents = {"last": eb.LearnedAgent(result.last_policy), "kept": eb.LearnedAgent(result.policy)}
+    for row in summarise(evaluate(SCENARIO.sample(10_000, seed=7), agents, scenario=SCENARIO, aftermath=False)):
+        assert row.first_impact_harm.value <= GOAL * row["best_known_first_impact_harm"].value
+    assert result.alarms == ()
+
+
+RISING, HARMS = [-10.0, -9.0, -9.5, -8.0, -7.0, -6.0], [7.0, 7.2, 7.1, 7.5, 8.0, 7.6]
+
+
+def told_of(**columns: list[float | None]) -> list[dict[str, float]]:
+    """Evaluations with these columns, of which None is left out."""
+    rows = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+    return [
+        {"steps": 1000.0 * k} | {name: value for name, value in row.items() if value is not None}
+        for k, row in enumerate(rows)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("returns", "harms", "alarm"),
+    [
+        (RISING, HARMS, True),
+        ([0.50, 0.51, 0.49, 0.52, 0.53, 0.54], HARMS, True),  # near 0 a rise is small
+        (RISING, [7.0, 7.2, 7.1, 7.5, 7.2, 8.0], False),  # once no more than before
+        ([-10.0, -9.0, -9.5, -8.0, -9.0, -6.0], HARMS, False),  # a return as before
+        ([-6.0, -7.0, -8.0, -9.0, -10.0, -11.0], [*HARMS[:5], 9.0], False),  # both bad: no contradiction
+        (RISING, [7.0, 7.0, 7.1, 7.2, 7.2, 7.2], False),  # noise shrinks at the optimum
+        (RISING[1:], [7.0, 7.0, 8.0, 9.0, 10.0], False),  # too few to tell
+        ([99.0, *RISING], [99.0, *HARMS], True),  # the last six count
+        ([None, *RISING[1:]], HARMS, False),  # a return that is not known does not count
+        (RISING, [None, *HARMS[1:]], False),  # nor does a harm
+    ],
+)
+def test_misleading_return__is_a_return_that_rises_together_with_harm(
+    returns: list[float | None], harms: list[float | None], alarm: bool
+) -> None:
+    told = misleading_return(told_of(episode_return=returns, first_impact_harm=harms), "first_impact_harm")
+    assert (told is not None) == alarm
+    if told is not None:
+        assert "first_impact_harm from 7.1 to 7.7 (" in told
+        assert f"since step {1000 * (len(harms) - 4):,} the return rose" in told
+
+
+@pytest.mark.parametrize(
+    ("harms", "at_horizon", "lost"),
+    [
+        ([90.0, 9.0, 7.0, 29.0, 30.0], None, True),
+        ([90.0, 9.0, 7.0, 29.0, 16.0], None, True),  # still more than a tenth of the way back
+        ([90.0, 9.0, 7.0, 29.0], None, False),  # one evaluation may be an accident
+        ([90.0, 9.0, 7.0, 29.0, 15.0], None, False),  # on its way back: less than a tenth of what was gained
+        ([90.0, 9.0, 7.0, 29.0, 9.0, 29.0], None, False),
+        ([90.0, 30.0, 22.0, 29.0, 30.0], None, False),  # not half as much again as the least
+        ([20.0, 0.02, 0.01, 0.04, 0.05], None, False),  # a multiple of next to nothing
+        ([6.9, 6.7, 6.8, 6.9, 6.9], None, False),  # began with a policy that was good already
+        ([6.9, 6.7, 6.8, 29.0, 184.7], None, True),
+        ([90.0, 140.0, 150.0], None, True),  # never learned, and worse than to begin with
+        ([90.0, 7.0, 8.0, 8.1], [1.0, 0.1, 0.7, 1.0], True),  # more harm, and the episodes do not end any more
+        ([90.0, 7.0, 8.0, 8.1], [1.0, 0.1, 0.3, 0.4], False),
+        ([90.0, 7.0, 7.0, 7.1], [1.0, 0.1, 0.7, 1.0], False),  # they do not end, but nobody is hurt by it
+        ([90.0, 9.0, 8.0, 7.0], [1.0, 0.1, 0.7, 1.0], False),
+        ([], None, False),
+        ([None] * 4, None, False),
+    ],
+)
+def test_lost_training__is_harm_that_came_back_and_stays(
+    harms: list[float | None], at_horizon: list[float] | None, lost: bool
+) -> None:
+    told = lost_training(told_of(total_harm=harms, horizon_rate=at_horizon or [None] * len(harms)), "total_harm")
+    assert (told is not None) == lost
+    if told is not None:
+        assert "training is lost" in told and f"step {1000 * (len(harms) - 1):,}:" in told
+        assert ("horizon" in told) == (at_horizon is not None)
+
+
+# As measured every 163,840 decisions (2026-11-21): recipe ppo with contact features and ``horizon_is_end: false``, and
+# recipe ppo for twice its decisions, whose episodes the horizon cuts off more and more often at the same harm.
+COLLAPSED = [91.91, 10.28, 11.56, 12.02, 14.74, 18.90, 25.70, 37.11, 47.96, 70.85]
+STAYED = [
+    91.54, 11.13, 8.73, 7.71, 8.81, 8.77, 8.78, 7.19, 6.97, 6.86, 7.63, 7.01, 7.09, 7.01,
+    7.26, 7.09, 7.43, 6.81, 7.17, 7.12,
+]  # fmt: skip
+CUT_OFF = [0.19, 0.29, *[0.65] * 18]
+
+
+@pytest.mark.parametrize(
+    ("harms", "at_horizon", "alarms"), [(COLLAPSED, [1.0] * 10, [7, 8, 9, 10]), (STAYED, CUT_OFF, [])]
+)
+def test_lost_training__in_two_real_trainings(harms: list[float], at_horizon: list[float], alarms: list[int]) -> None:
+    entries = told_of(total_harm=harms, horizon_rate=at_horizon)
+    assert [k for k in range(len(harms) + 1) if lost_training(entries[:k], "total_harm") is not None] == alarms
+
+
+def test_course__the_best_is_judged_by_the_count_of_the_reward_and_comes_back_from_json(policy) -> None:
+    other = policy.__class__(policy.manifest.model_copy(update={"steps": 5}), policy.tensors)
+    course = Course("total")
+    assert course.add_evaluation(policy, {"first_impact_harm": 9.0, "total_harm": 10.0}, None) is None
+    course.add_evaluation(other, {"first_impact_harm": 1.0, "total_harm": 11.0, "objective": 1.0}, -3.0)
+    again = Course("total")
+    again.restore(course.to_json())
+    assert course.kept is policy  # by the harm, as it was begun without an objective
+    assert (again.evaluations, again.best_harm, again.alarms) == (course.evaluations, 10.0, [])
+    assert again.wall_s >= course.wall_before_s
+    assert course.evaluations[1] == {
+        "steps": 0, "updates": 0, "first_impact_harm": 1.0, "total_harm": 11.0, "objective": 1.0,
+        "episode_return": -3.0,
+    }  # fmt: skip
+
+
+def test_course__the_best_and_the_alarms_go_by_the_objective_where_one_is_told(policy) -> None:
+    by_steps = [policy.__class__(policy.manifest.model_copy(update={"steps": k}), policy.tensors) for k in range(4)]
+    course, alarms = Course(), []
+    for each, line, objective in zip(by_steps, (24.0, 30.0, 20.0, 18.0), (8.0, 0.1, 6.0, 7.0), strict=True):
+        metrics = {"first_impact_harm": line, "objective": objective, "objective_vehicle_2": objective}
+        alarms.append(course.add_evaluation(each, metrics, None))
+    assert course.kept is by_steps[1] and course.best_harm == 0.1
+    assert alarms[:3] == [None] * 3 and "objective is 7, and was 0.1" in alarms[3]
+    adversary = Course()  # an amount below 0 that falls is no harm that has risen
+    for k, each in enumerate([*by_steps, *by_steps]):
+        assert adversary.add_evaluation(each, {"first_impact_harm": 20.0 + k, "objective": -20.0 - k}, float(k)) is None
+    assert adversary.best_harm == -27.0
+
+
+def test_write_file__replaces_in_one_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "run.json"
+    path.write_bytes(b"old")
+    with monkeypatch.context() as patch:
+        patch.setattr("os.replace", lambda *given: 1 / 0)  # a power cut
+        with pytest.raises(ZeroDivisionError):
+            write_file(path, b"new, but only half of i")
+    assert path.read_bytes() == b"old"
+    write_file(path, b"new")
+    assert path.read_bytes() == b"new" and list(tmp_path.iterdir()) == [path]
+
+
+def test_new_folder__is_there_whole_or_not_at_all(tmp_path: Path) -> None:
+    with new_folder(tmp_path / "a" / "good") as partial:
+        (partial / "x").write_text("1")
+        assert not (tmp_path / "a" / "good").exists()
+    with pytest.raises(KeyboardInterrupt), new_folder(tmp_path / "a" / "bad") as partial:
+        (partial / "x").write_text("1")
+        raise KeyboardInterrupt
+    with pytest.raises(AlreadyExists, match="taken: is there already"), new_folder(tmp_path / "a" / "taken"):
+        (tmp_path / "a" / "taken").mkdir()  # meanwhile, by somebody else
+    assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*")) == ["a", "a/good", "a/good/x", "a/taken"]
+
+
+def test_progress_table__columns_are_sorted_and_later_ones_are_filled_in(tmp_path: Path) -> None:
+    table = ProgressTable(tmp_path / "progress.csv")
+    table.write({"train/b": np.float32(0.5), "train/a": 1}, {"train/b": (), "train/a": ()}, step=10)
+    table.write({"train/a": 2}, {"train/a": ()}, step=20)
+    table.write({"eval/z": 3.25, "train/a": 4, "hidden": 1}, {"eval/z": (), "train/a": (), "hidden": ("csv",)}, step=30)
+    text = (tmp_path / "progress.csv").read_text()
+    assert text == "steps,eval/z,train/a,train/b\n10,,1,0.5\n20,,2,\n30,3.25,4,\n"
+    assert len(list(csv.DictReader(text.splitlines()))) == 3
+
+
+def scalars(folder: Path, tag: str) -> list[tuple[int, float]]:
+    """(step, value) as TensorBoard reads them."""
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
+    events.Reload()
+    return [(event.step, event.value) for event in events.Scalars(tag)] if tag in events.Tags()["scalars"] else []
+
+
+def write_one(folder: Path, step: int) -> None:
+    """A file with one row, as one stretch of a training leaves it."""
+    file = EventFile(folder)
+    file.write({"loss": step / 2}, {"loss": ()}, step)
+    file.close()
+
+
+def test_order__is_that_of_their_beginning_even_where_the_clock_stands_still_or_goes_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = iter([1e9] * 20 + [9e8] * 20)
+    monkeypatch.setattr(time, "time", lambda: next(clock))
+    for step in range(1, 13):  # 9 to 12: a name of more digits must not come before
+        monkeypatch.setattr(os, "getpid", lambda pid=1000 - step: pid)
+        write_one(tmp_path, step)
+    monkeypatch.undo()
+    assert scalars(tmp_path, "loss") == [(step, step / 2) for step in range(1, 13)]
+    assert [path.name for path in sorted(tmp_path.iterdir())][::11] == [
+        "events.out.tfevents.0000000001",
+        "events.out.tfevents.0000000012",
+    ]
+
+
+def test_order__goes_on_after_files_that_are_named_by_the_clock(tmp_path: Path) -> None:
+    EventFileWriter(str(tmp_path)).close()
+    write_one(tmp_path, 1)
+    first, second = sorted(tmp_path.iterdir())
+    assert int(second.name.rpartition(".")[2]) == int(first.name.split(".")[3]) + 1
+    assert scalars(tmp_path, "loss") == [(1, 0.5)]
+
+
+def test_file__holds_every_number_at_once_and_can_be_cut_between_two_rows(tmp_path: Path) -> None:
+    file, sizes = EventFile(tmp_path), []
+    told = {"loss": (), "count": (), "csv only": ("tensorboard",)}
+    for step in (1, 2):
+        file.write({"loss": np.float32(step), "count": step, "csv only": 1}, told, step)
+        sizes.append(event_sizes(tmp_path))  # before it is closed
+    assert scalars(tmp_path, "loss") == [(1, 1.0), (2, 2.0)]
+    file.close()
+    write_one(tmp_path, 3)
+    cut_back(tmp_path, sizes[0])
+    assert scalars(tmp_path, "loss") == scalars(tmp_path, "count") == [(1, 1.0)]
+    assert scalars(tmp_path, "csv only") == [] and len(list(tmp_path.iterdir())) == 1

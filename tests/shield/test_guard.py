@@ -1,0 +1,375 @@
+"""The guard in the engine: what it does is what was certified, to the last step, and what fails changes nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import pickle
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.wrappers import Autoreset
+
+import ethbrake_marl as eb
+from ethbrake_marl.agents.planner import Refined
+from ethbrake_marl.agents.registry import drive, episode_engine, make_agent
+from ethbrake_marl.engine import STEP, Engine
+from ethbrake_marl.envs.interfaces import EthBrakeVectorEnv, parallel_env
+from ethbrake_marl.envs.sb3 import make_sb3_vec_env
+from ethbrake_marl.errors import InvalidInput, UncertifiedStep
+from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.shield import (
+    HybridAgent,
+    HybridShield,
+    MovingAtHorizon,
+    ShieldedDriver,
+    ShieldedEnv,
+    ShieldedVectorEnv,
+    parse_uncertainty,
+)
+from ethbrake_marl.shield.sb3 import ShieldedVecEnv
+from tests.fixtures.asked import Asked
+from tests.shield.attacks import above_later
+
+PAPER = load_scenario("paper-random")
+WORLDS = PAPER.sample(300, 3).worlds
+DRIVE = np.array([1.0])
+
+
+def shielded(scenario=PAPER, policy=None, **settings):
+    env = ShieldedEnv(gymnasium.make("EthBrake-v0", scenario=scenario).unwrapped, policy, **settings)
+    env.reset(seed=0)
+    return env
+
+
+def play(env, action=DRIVE):
+    over = False
+    while not over:
+        *_, terminated, truncated, info = env.step(action)
+        over = terminated or truncated
+    return info
+
+
+class Cheating(Engine):
+    """An engine in which something else happens than was predicted, in each step or in an episode's last one only."""
+
+    what, last_only = "", False
+
+    def _advance(self, columns):
+        before = self.ended
+        step = super()._advance(columns)
+        rows = self.ended & ~before if self.last_only else ~before
+        column = self.packed.column
+        if self.what == "a step":
+            self._clock[rows, STEP] += 1.0
+        elif self.what == "first-impact harm":
+            self._state[rows, column.harm] += 1e-12
+        elif self.what == "total harm":
+            self._state[rows, column.harm + column.vehicles - 1] += 1e-12
+        else:
+            self._state[rows, column.speed] += 1e-12
+        return step
+
+
+def cheat(engine, what, last_only):
+    engine.__class__, engine.what, engine.last_only = Cheating, what, last_only
+
+
+CHEATS = {
+    "a step": "is at step 2 of its episode, certified was step 1",
+    "first-impact harm": "first-impact harm of pair 1 is .* certified was",
+    "total harm": "total harm of pair 1 is .* certified was",
+    "speed": "speed of vehicle 1 of the line is .* certified was",
+}
+
+
+@pytest.mark.parametrize("what", CHEATS)
+def test_step__what_is_not_certified_is_refused_and_the_worlds_stay_as_they_are(what):
+    env = shielded()
+    cheat(env.attached.engine, what, last_only=False)
+    before, shield = env.attached.engine.worlds, env.attached.shield
+    with pytest.raises(UncertifiedStep, match=CHEATS[what]):
+        env.step(DRIVE)
+    assert env.attached.engine.worlds.speeds_mps.tolist() == before.speeds_mps.tolist()
+    assert env.attached.shield is shield and not shield.distrusted.any()
+
+
+LAST = [name for name in CHEATS if name != "a step"]
+
+
+@pytest.mark.parametrize("what", LAST)
+@pytest.mark.parametrize("interface", ["single", "vector", "sb3", "evaluation"])
+def test_last_step__is_compared_too_whatever_starts_the_next_episode(interface, what):
+    actions = np.ones((3, 1), np.float32)
+    if interface == "evaluation":
+        short = PAPER.replace(horizon_s=4.0)  # everything moves to the end
+        driver = ShieldedDriver(make_agent("full_brake"), short)
+        engine, step = episode_engine(short.sample(1, 0).worlds, driver, short, 1), None
+    else:
+        env = {
+            "single": lambda: ShieldedEnv(gymnasium.make("EthBrake-v0").unwrapped),
+            "vector": lambda: ShieldedVectorEnv(EthBrakeVectorEnv(3, PAPER)),
+            "sb3": lambda: ShieldedVecEnv(make_sb3_vec_env(PAPER, 3)),
+        }[interface]()
+        env.reset()
+        engine, step = env.attached.engine, lambda: env.step(DRIVE if interface == "single" else actions)
+    cheat(engine, what, last_only=True)
+    with pytest.raises(UncertifiedStep, match=CHEATS[what]):
+        for _ in range(100):
+            engine.step({}) if step is None else step()
+    assert engine.steps.max() > 20
+
+
+@pytest.mark.parametrize("group", [0, 1], ids=["first-impact harm", "total harm"])
+def test_ledger__harm_that_nobody_predicted_is_seen_before_the_next_decision(group):
+    env = shielded()
+    *_, info = env.step(DRIVE)
+    assert info["shield"]["trusted"]
+    engine = env.attached.engine
+    engine._state[0, engine.packed.column.harm + 2 * group] += 1e-12
+    *_, info = env.step(DRIVE)
+    assert not info["shield"]["trusted"] and info["shield"]["reason"] == "assumption broken"
+
+
+def test_past_the_shield__a_step_is_shielded_too_until_it_lets_go():
+    env = shielded()
+    engine, shield = env.attached.engine, env.attached.shield
+    while not engine.ended[0]:
+        env.unwrapped.step(DRIVE)
+    assert engine.ledger.world_harm("first")[0] <= shield.first_bound[0] and env.attached.shield.interventions[0] > 0
+    env.reset(seed=0)
+    env.attached.close()
+    assert env.unwrapped.step(DRIVE)[-1]["chosen_action"][0] == 1.0
+
+
+def test_wrapped_in_mid_episode__needs_a_reset_first():
+    plain = gymnasium.make("EthBrake-v0").unwrapped
+    plain.reset(seed=0)
+    env = ShieldedEnv(plain)
+    with pytest.raises(UncertifiedStep, match="this episode began before the shield was put around it; reset first"):
+        env.step(DRIVE)
+    env.reset(seed=0)
+    env.step(DRIVE)
+
+
+def test_autoreset__of_gymnasium_inside_is_left_alone():
+    env = ShieldedEnv(Autoreset(gymnasium.make("EthBrake-v0").unwrapped))
+    env.reset(seed=0)
+    for _ in range(3):
+        info = play(env)
+        assert info["shield"]["trusted"]
+        env.step(DRIVE)  # begins the next episode
+        assert env.attached.shield.running.steps.tolist() == [0]
+
+
+@pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
+def test_clone__between_proposal_and_step_goes_on_apart(clone):
+    env = ShieldedVecEnv(make_sb3_vec_env(PAPER, 4, seed=2))
+    env.reset()
+    env.step(np.ones((4, 1), np.float32))
+    env.step_async(np.ones((4, 1), np.float32))
+    other = clone(env)
+    assert other.attached.engine is other.venv.engine and other.attached.engine is not env.attached.engine
+    told, again = ([row["shield"] for row in each.step_wait()[3]] for each in (env, other))
+    assert told == again
+    assert env.attached.shield.running.steps.tolist() == other.attached.shield.running.steps.tolist()
+
+
+def test_reset__in_between_brings_the_proposal_to_another_episode_and_its_bound_holds():
+    env = ShieldedVecEnv(make_sb3_vec_env(PAPER, 2))
+    env.reset()
+    env.step_async(np.ones((2, 1), np.float32))
+    env.venv.reset()
+    assert all(row["shield"]["trusted"] for row in env.step_wait()[3])
+    assert env.attached.shield.running.steps.tolist() == env.attached.engine.steps.tolist() == [1, 1]
+    with pytest.raises(InvalidInput, match="no episode is running"):
+        env.step_wait()
+
+
+def test_threads__no_episode_gets_above_its_bound():
+    env = ShieldedVectorEnv(EthBrakeVectorEnv(4, PAPER, autoreset_mode="NextStep"))
+    env.reset(seed=0)
+    trusted = []
+
+    def work():
+        for _ in range(60):
+            with contextlib.suppress(UncertifiedStep):
+                trusted.append(env.step(np.ones((4, 1)))[4]["shield"]["trusted"].all())
+
+    with ThreadPoolExecutor(3) as pool:
+        for done in [pool.submit(work) for _ in range(3)]:
+            done.result()
+    shield, engine = env.attached.shield, env.attached.engine
+    assert all(trusted) and shield.running.steps.tolist() == engine.steps.tolist()
+    assert (engine.ledger.world_harm("first") <= shield.first_bound).all()
+
+
+class DrivesOff:
+    """Brakes until it stands, and then drives."""
+
+    name = "drives_off"
+
+    def act(self, worlds, vehicle):
+        v = worlds.vehicles
+        stands = worlds.speeds_mps[:, vehicle] == 0.0
+        return np.where(stands, v.driving_capacity_mps2[:, vehicle], -v.braking_capacity_mps2[:, vehicle])
+
+
+def test_world__that_goes_on_after_the_shields_own_end_is_braked_fully():
+    worlds = PAPER.sample(40, 7).worlds
+    slower = parse_uncertainty("braking_capacity_mps2=20%").draw(worlds, np.random.default_rng(0), corners=True)
+    engine = episode_engine(
+        worlds, ShieldedDriver(DrivesOff(), PAPER, told=slower, uncertainty="gaps_m=0.02"), PAPER, 1
+    )
+    braking, after = -worlds.vehicles.braking_capacity_mps2[:, 1], np.zeros(40, bool)
+    while not engine.ended.all():
+        over = engine.guarded.shield.running.finished & ~engine.ended
+        engine.step({})
+        assert (engine.wanted_mps2[over, 1] == braking[over]).all()
+        after |= over
+    assert 0 < after.sum() < 40
+
+
+def test_horizon__what_still_moves_then_is_told_and_warned_of_once():
+    short = PAPER.replace(horizon_s=3.0)
+    env = ShieldedEnv(gymnasium.make("EthBrake-v0", scenario=short).unwrapped)
+    with pytest.warns(MovingAtHorizon, match="in 1 of 1 worlds something still moves at the horizon, 3 s") as told:
+        env.reset(seed=0)
+        env.reset(seed=1)
+    assert len(told) == 1
+    *_, info = env.step(DRIVE)
+    assert info["shield"]["settles"] is False
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        *_, info = shielded().step(DRIVE)
+    assert info["shield"]["settles"] is True
+
+
+def test_horizon__beyond_it_the_bound_says_nothing():
+    now, later = above_later("coast", 200)
+    assert now == 0.0 and later > 0.5
+
+
+# Mode episode: never worse than its baseline, in any world, and as predicted.
+
+
+def harm(agent, harm_count="first", worlds=WORLDS):
+    return drive(worlds, agent, PAPER, 1).ledger.world_harm(harm_count)
+
+
+class LateBrake:
+    """Coasts until 0.9 s, then brakes fully: no constant deceleration, so sometimes better than any."""
+
+    name = "late_brake"
+
+    def act(self, worlds, vehicle):
+        return np.where(worlds.time_s < 0.9, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle])
+
+
+def memory_of(agent):
+    return Asked(agent).begin(WORLDS, 1).memory
+
+
+@pytest.mark.parametrize("harm_count", ["first", "total"])
+def test_episode__is_never_worse_than_either_part(harm_count):
+    hybrid = HybridAgent(LateBrake(), PAPER, harm_count=harm_count)
+    realised, memory = harm(hybrid, harm_count), memory_of(hybrid)
+    alone, baseline = harm(LateBrake(), harm_count), harm(make_agent("e_v2x_bm", harm_count=harm_count), harm_count)
+    assert (realised <= np.minimum(alone, baseline)).all()
+    assert realised.tolist() == memory["predicted_harm"].tolist()
+    assert memory["chosen_policy"].tolist() == (alone <= baseline).tolist()
+    assert 0 < memory["chosen_policy"].sum() < WORLDS.n
+
+
+def test_episode__takes_a_refined_policy_at_its_word():
+    hybrid = HybridAgent(Refined(make_agent("constant:5"), PAPER, tries=6), PAPER)
+    realised, plain = harm(hybrid), harm(HybridAgent(make_agent("constant:5"), PAPER))
+    assert realised.tolist() == memory_of(hybrid)["predicted_harm"].tolist()
+    assert (realised <= plain).all() and (realised < plain).any()
+
+
+def test_episode__the_pairwise_bound_is_exceeded_in_the_same_physics():
+    hybrid = HybridAgent(make_agent("constant:0.5"), PAPER, bound="pairwise")
+    assert (harm(hybrid) > memory_of(hybrid)["bound_harm"] + 1.0).mean() > 0.3
+
+
+def test_episode__of_some_rows_leaves_the_others_alone():
+    hybrid = Asked(HybridAgent(make_agent("full_brake"), PAPER)).begin(WORLDS, 1)
+    expected = hybrid.bound_harm.copy()
+    hybrid.begin(WORLDS.take([7]), 1, np.array([2]))
+    expected[2] = expected[7]
+    assert hybrid.bound_harm.tolist() == expected.tolist()
+
+
+def test_episode__applies_the_certified_strategy_whatever_is_proposed():
+    shielded = HybridShield(parallel_env(), make_agent("full_brake"))
+    for seed in range(6):
+        shielded.reset(seed=seed)
+        while shielded.agents:
+            _, _, _, _, infos = shielded.step({"vehicle_2": np.array([1.0])})
+            told = infos["vehicle_2"]["shield"]
+            assert told["proposed_action"] == 1.0 and told["chosen_action"] <= 0.0
+            assert infos["vehicle_2"]["chosen_action"] == pytest.approx(told["chosen_action"], abs=1e-12)
+        realised = shielded.unwrapped.engine.ledger.world_harm("first")[0]
+        assert realised == pytest.approx(min(told["policy_harm"], told["bound_harm"]), abs=1e-9)
+
+
+class Counting:
+    """Brakes harder with every decision that it was asked for: a memory that a refused call must not move."""
+
+    name = "counting"
+
+    def begin(self, alert, vehicle, scripts):
+        return np.zeros(alert.n)
+
+    def act(self, worlds, memory, vehicle):
+        memory += 1.0
+        return -np.minimum(0.3 * memory, 7.0), memory
+
+
+@pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.MovingAtHorizon")
+def test_episode__neither_a_prediction_nor_a_refused_call_asks_the_policy_again():
+    assert (HybridAgent(Counting(), PAPER).begin(WORLDS, 1, {})["policy"] == 0.0).all()
+    harms = []
+    for refused in (0, 3):
+        env = HybridShield(parallel_env(), Counting())
+        env.reset(seed=4)
+        while env.agents:
+            for _ in range(refused):
+                with pytest.raises(InvalidInput, match="unknown agent"):
+                    env.step({"vehicle_9": np.zeros(1)})
+            *_, infos = env.step({})
+        harms.append(infos["vehicle_2"]["world_first_impact_harm"])
+    assert harms[0] == harms[1]
+    env.reset(seed=4)
+    *_, infos = env.unwrapped.step({"vehicle_2": np.zeros(1)})
+    assert infos["vehicle_2"]["chosen_action"] == np.float32(env.attached.infos()[0]["chosen_action"]) < 0.0
+
+
+@pytest.mark.parametrize("believed", [False, True])
+def test_decide__changes_nothing_not_even_the_memory_of_a_policy_that_writes_into_it(believed):
+    env = HybridShield(parallel_env(), Counting(), mode="step", believed=believed)
+    env.reset(seed=4)
+    attached, nothing = env.attached, np.full((1, 1), np.nan)
+    told = [attached.guard.decide(attached.engine, attached.memory, nothing).proposed for _ in range(2)]
+    assert told[0].tolist() == told[1].tolist() and attached.memory.policies[1].tolist() == [0.0]
+
+
+@pytest.mark.parametrize("believed", [False, True])
+def test_policy_with_a_memory__is_asked_once_per_decision_whoever_proposes(believed):
+    def remembering(observation, state):
+        return -np.minimum(state, 10.0) / 10.0, state + 1.0
+
+    policy = eb.policy_agent(remembering, initial_state=lambda n: np.zeros((n, 1)))
+    env = HybridShield(parallel_env(), policy, mode="step", believed=believed)
+    env.reset(seed=7)
+    for actions in ({"vehicle_2": [-0.3]}, {}, {"vehicle_2": [-0.9]}, {"vehicle_2": [1.0]}):
+        env.step(actions)
+    assert env.attached.memory.policies[1]["steps"].tolist() == [4]
+    with pytest.raises(InvalidInput):
+        env.step({"vehicle_2": [-0.3], "vehicle_9": [0.0]})
+    env.step({})
+    assert env.attached.memory.policies[1]["steps"].tolist() == [5]

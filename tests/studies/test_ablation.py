@@ -1,0 +1,694 @@
+"""``study ablate`` and ``generalise``: levels, trainings, joint optima, what is compared and shown, longer lines."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from ethbrake_marl.agents.registry import Team, make_agent
+from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.errors import InvalidInput, Progress
+from ethbrake_marl.evaluation import evaluate
+from ethbrake_marl.evaluation.episodes import Passport
+from ethbrake_marl.figures import ablation_figures, signed_ticks
+from ethbrake_marl.learning import runs as learning_train
+from ethbrake_marl.learning.training import Scheme, TrainingRecipe, load_recipe
+from ethbrake_marl.limits.limits import best_harm, chunks_left
+from ethbrake_marl.policies import Manifest, Policy, load_policy
+from ethbrake_marl.scenario import Sample, load_scenario, scenario_path
+from ethbrake_marl.shield.guard import Shielded
+from ethbrake_marl.studies import ablation as module
+from ethbrake_marl.studies.ablation import (
+    FIGURES,
+    LADDER,
+    STANDARD,
+    Harms,
+    Level,
+    LevelOptimum,
+    LineQuestion,
+    Measured,
+    Plan,
+    ablation_page,
+    best_known,
+    common_worlds,
+    compare,
+    interval_words,
+    lengthen,
+    levels_csv,
+    markdown,
+    measure,
+    questions,
+    read_levels,
+    search_all,
+    with_scheme,
+)
+from ethbrake_marl.studies.jobs import TrainingJob
+from tests.pages.hostile import Page
+from tests.studies.conftest import ABLATE, LEVELS, check_snapshot, study
+from tests.studies.counting import PROGRAM
+
+
+def content(folder: Path) -> dict:
+    found = json.loads((folder / "ablation.json").read_text())
+    return found | {"settings": {k: v for k, v in found["settings"].items() if k not in ("machine", "date")}}
+
+
+def ablate(folder: Path, recipe: Path, *options: object) -> int:
+    return study("ablate", "--output", folder, "--recipes", recipe, *ABLATE, *options)
+
+
+@pytest.fixture
+def copied(finished_ablation: Path, tmp_path: Path) -> Path:
+    """A copy of the small ablation, to be changed."""
+    shutil.copytree(finished_ablation, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def test_read_levels__the_standard_set_is_a_ladder_and_its_worse_channels():
+    levels = read_levels([*STANDARD, "cooperation-3-congested"])
+    assert [level.name for level in levels if level.clear is None] == list(LADDER)
+    assert {level.name: level.clear for level in levels if level.clear} == {
+        "cooperation-2-blocked": "cooperation-2-paper",
+        "cooperation-3-congested": "cooperation-3-pair",
+    }
+    assert [bool(level.scenario.learners) for level in levels] == [False] + [True] * (len(levels) - 1)
+
+
+def test_read_levels__a_channel_belongs_to_the_level_that_came_before_it(tmp_path):
+    late = tmp_path / "mine.yaml"
+    text = scenario_path("cooperation-2-paper").read_text().replace("v2x: paper", "v2x: nominal")
+    late.write_text(text.replace("name: cooperation-2-paper", "name: mine"))
+    assert [level.clear for level in read_levels(["cooperation-2-paper", str(late)])] == [None, "cooperation-2-paper"]
+    assert [level.clear for level in read_levels([str(late), "cooperation-2-paper"])] == [None, "mine"]
+
+
+def test_common_worlds__gaps_and_speeds_are_the_same_at_every_level():
+    samples = common_worlds(read_levels(STANDARD), 50, 7)
+    for sample in samples:
+        np.testing.assert_array_equal(sample.worlds.gaps_m, samples[0].worlds.gaps_m)
+        np.testing.assert_array_equal(sample.worlds.speeds_mps, samples[0].worlds.speeds_mps)
+
+
+PAPER = load_scenario("cooperation-2-paper")
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"gaps_m": 7}, "gaps_m"),
+        (
+            {"mass_t": [4.5, 5.5, 6]},
+            r"mass_t differs from that of 'cooperation-2-paper' \(4.5, 5.5, 6; there 4.5, 5.5, 5.9\)",
+        ),
+        ({"braking_capacity_mps2": 6}, "braking_capacity_mps2"),
+        ({"driving_capacity_mps2": 6}, "driving_capacity_mps2"),
+        ({"restitution": 0.2}, "restitution"),
+        ({"speed_limit_mps": 30}, "speed_limit_mps"),
+        ({"time_step_s": 0.05}, "time_step_s"),
+        ({"horizon_s": 9}, r"horizon_s differs .* \(9; there 8\)"),
+        ({"latency_s": [0, 0.5, 0.9]}, "latency_s"),
+        ({"observation": ["own"]}, "observation differs from that of .cooperation-2-paper."),
+    ],
+)
+def test_common_worlds__other_physics_are_refused(changes, what):
+    other = PAPER.replace(name="mine", roles={"vehicle_3": "learner"}, **changes)
+    with pytest.raises(InvalidInput, match=f"level 'mine': its {what}"):
+        common_worlds([Level(PAPER), Level(other)], 5, 7)
+
+
+def test_common_worlds__news_roles_objectives_and_an_obstacle_may_differ():
+    roles = {"vehicle_1": "learner", "vehicle_3": "coast"}
+    free = PAPER.replace(name="mine", roles=roles, objective="own", obstacle_gap_m=42, v2x="blocked")
+    late = PAPER.replace(name="late", v2x="blocked")
+    assert len(common_worlds([Level(PAPER), Level(free), Level(late)], 5, 7)) == 3
+    with pytest.raises(InvalidInput, match="level 'late': its latency_s differs from that of 'mine'"):
+        common_worlds([Level(PAPER), Level(free), Level(late.replace(latency_s=[0, 0.5, 0.9]))], 5, 7)
+
+
+def test_ablate__writes_tables_and_figures(finished_ablation: Path) -> None:
+    names = {"ablation.json", "ablation.csv", "ablation.md", "ablation.png", "ablation-changes.png",
+             "ablation-who-pays.png", "ablation.html"}  # fmt: skip
+    assert names <= {path.name for path in finished_ablation.iterdir()}
+    found = content(finished_ablation)
+    levels = found["levels"]
+    assert [level["level"] for level in levels] == LEVELS.split(",")
+    assert [level["seeds"] for level in levels] == [1, 2, 2]
+    assert {found["kind"], *(level["kind"] for level in levels)} == {"ablate"}
+    assert len({level["scenario_sha256"] for level in levels}) == 3
+    assert len(levels[1]["worlds_sha256"]) == 64 and levels[1]["versions"]["numpy"]
+    assert len({seed["vehicle_2"] for seed in levels[1]["policy_sha256"]}) == 2 and levels[0]["policy_sha256"] == [{}]
+    steps = [(step["from"], step["to"]) for step in found["channels"]]
+    assert steps == [("cooperation-3-pair", "cooperation-3-congested")]
+    searched = levels[1]["total"]["searched"]
+    assert searched["best_known"]["value"] <= searched["full_brake"]["value"]
+
+
+@pytest.mark.slow
+def test_ablate__the_shield_goes_around_what_was_trained(finished_ablation, copied, tiny_total, capsys) -> None:
+    """The trainings of the other ablation are used, in a copy without its settings."""
+    (copied / "settings.json").unlink()
+    assert ablate(copied, tiny_total, "--shield", "step") == 0
+    assert "to do: 0 trainings" in capsys.readouterr().err
+    found, alone = content(copied), content(finished_ablation)
+    assert (found["settings"]["shield"], alone["settings"]["shield"]) == ("step", None)
+    assert found["levels"][0]["first"]["shielded"] is None
+    for level, before in zip(found["levels"][1:], alone["levels"][1:], strict=True):
+        for count in ("first", "total"):
+            told = level[count].pop("shielded")
+            assert told["above_bound"] == 0 and told["harm"]["value"] <= told["bound"]["value"]
+            difference = told["harm"]["value"] - level[count]["harm"]["value"]
+            assert told["difference"]["value"] == pytest.approx(difference) and difference < -1.0
+            assert 0.1 < told["replaced"] == pytest.approx(sum(told["replaced_vehicles"]) / 2)
+            assert before[count].pop("shielded") is None
+    assert found["levels"][1:] == alone["levels"][1:]  # without the shield as before
+    assert "Behind the step shield" in (copied / "ablation.html").read_text("utf-8")
+
+
+@pytest.mark.parametrize("column", [0, 1])
+def test_page__plays_the_same_worlds_at_every_level(finished_ablation: Path, column: int) -> None:
+    html = (finished_ablation / "ablation.html").read_text("utf-8")
+    told = html.split('<script type="application/json" id="episode_data">')[1].partition("</script>")[0]
+    content = json.loads(told)
+    assert content["agents"] == LEVELS.split(",") and len(html) <= 5 << 20 and 3 <= len(content["worlds"]) <= 7
+    assert [episode["driven"] for episode in content["worlds"][0]["episodes"]] == [[], [1, 2], [1, 2]]
+    passport = Passport.parse(content["worlds"][2]["episodes"][column]["passport"])
+    (folder,) = (finished_ablation / "trainings").glob("cooperation-3-pair-*-seed0")
+    again = passport.replay(agent=f"ppo@{folder}" if column else None)
+    assert again.same and again.passport.policy_sha == passport.policy_sha
+
+
+@pytest.mark.slow
+def test_ablate__goes_on_where_it_was_stopped_to_the_same_result(
+    finished_ablation, tmp_path, tiny_total, monkeypatch, capsys
+) -> None:
+    """Stopped in the middle of the second training; ended by two processes."""
+    folder, trained, calls = tmp_path / "stopped", [], []
+    keep, original = learning_train.train, learning_train.Session._after_update
+
+    def after_update(self, **options):
+        original(self, **options)
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+
+    def stop_in_the_second(recipe, scenario, path, **options):
+        trained.extend([path.name] if path.name != "timed" else [])
+        if len(trained) == 2:
+            monkeypatch.setattr(learning_train.Session, "_after_update", after_update)
+        return keep(recipe, scenario, path, **options)
+
+    monkeypatch.setattr(learning_train, "train", stop_in_the_second)
+    assert ablate(folder, tiny_total) == 130
+    monkeypatch.undo()
+    half = json.loads((folder / "trainings" / trained[1] / "run.json").read_text())
+    assert half["status"] != "finished" and not (folder / "ablation.json").exists()
+    capsys.readouterr()
+    words = ["--output", str(folder), "--recipes", str(tiny_total), *ABLATE, "--jobs", "2"]
+    assert run_command(["study", "ablate", *words]) == 0
+    assert "to do: 3 trainings" in capsys.readouterr().err
+    assert content(folder) == content(finished_ablation)
+
+
+def test_ablate__states_the_cost_first_and_makes_nothing(copied: Path, tiny_total, tmp_path, capsys) -> None:
+    damaged = next((copied / "optimum").glob("*/*.npz"))
+    damaged.write_bytes(b"no table")
+    before = (copied / "ablation.json").stat().st_mtime_ns
+    for folder, options, told in (
+        (copied, [], "to do: 0 trainings, 0 decisions: 0 s; joint optima"),
+        (copied, [], f"{damaged}: is damaged; its worlds are searched again"),
+        (copied, ["--seeds", "3"], "to do: 2 trainings, 512 decisions at"),
+        (tmp_path / "new", ["--seeds", "1"], "to do: 2 trainings, 512 decisions at"),
+    ):
+        assert ablate(folder, tiny_total, *options, "--cost") == 0
+        assert told in capsys.readouterr().err
+    assert (copied / "ablation.json").stat().st_mtime_ns == before and not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "what"),
+    [
+        ("run.json", "{", "run.json: is damaged"),
+        ("config.json", "[]", "config.json: is damaged"),
+        ("run.json", None, "is no training"),
+        ("team.json", "{}", "team.json"),
+        ("policy/manifest.json", "{}", "manifest.json"),
+    ],
+)
+def test_ablate__a_damaged_training_is_named_before_anything_is_searched(copied, tiny_total, capsys, file, text, what):
+    shutil.rmtree(copied / "optimum")
+    shutil.rmtree(copied / "trainings" / "cooperation-3-pair-tiny-shared-seed0")
+    damaged = copied / "trainings" / "cooperation-3-congested-tiny-shared-seed1" / file
+    damaged.unlink()
+    if text is not None:
+        damaged.write_text(text)
+    assert ablate(copied, tiny_total) == 2 and what in capsys.readouterr().err
+    assert not (copied / "optimum").exists() and len(list((copied / "trainings").iterdir())) == 3
+
+
+def test_ablate__another_training_in_the_folder_is_refused(copied: Path, tiny_total: Path, capsys) -> None:
+    (copied / "settings.json").unlink()
+    assert ablate(copied, tiny_total, "--steps", "4096") == 2
+    told = "holds another training (here other: recipe total_steps); give another folder"
+    assert told in capsys.readouterr().err
+
+
+def planned(recipe: TrainingRecipe, scheme: Scheme | None) -> list[tuple[str, TrainingJob, TrainingRecipe]]:
+    """Algorithm, training and its recipe, level by level."""
+    levels = tuple(read_levels(["cooperation-2-paper", "cooperation-3-pair"]))
+    plan = Plan(levels, (with_scheme(recipe, scheme),), 1, 300, 10, 7, 5, 10, Path("any"))
+    return [(algorithm, job, job.training.recipe) for _, algorithm, job in plan.trainings()]
+
+
+def test_plan__one_learner_is_trained_alone_whatever_the_scheme(tiny_total):
+    recipe = load_recipe(str(tiny_total))
+    (_, _, alone), (_, job, pair) = first, _ = planned(recipe, None)
+    assert (alone.scheme, pair.scheme) == (None, "shared")
+    assert (alone.total_steps, pair.total_steps) == (300, 600)
+    assert job.folder.name == "cooperation-3-pair-tiny-shared-seed0"
+    again, (shared, _, _) = planned(recipe, "shared")
+    assert again[1:] == first[1:]
+    assert again[1].folder.name == "cooperation-2-paper-tiny-seed0" and again[0] == shared == "tiny-shared"
+
+
+def test_plan__the_recipes_own_scheme_holds_and_turns_are_for_several(tiny_total):
+    recipe = load_recipe(str(tiny_total))
+    assert [own.scheme for *_, own in planned(recipe.replace(scheme="shared"), None)] == [None, "shared"]
+    (*_, alone), (*_, pair) = planned(recipe.replace(scheme="independent", turns=2), None)
+    assert (alone.turns, pair.turns) == (None, 2)
+    with pytest.raises(InvalidInput, match="turns"):
+        planned(recipe.replace(scheme="independent", turns=5), "shared")
+
+
+@pytest.mark.slow
+def test_ablate__an_interruption_reaches_the_trainings_of_other_processes(tmp_path: Path, tiny_total: Path) -> None:
+    folder = tmp_path / "stopped"
+    options = ["--levels", "cooperation-0-sensors,cooperation-2-paper", "--steps", "1000000", "--jobs", "2"]
+    command = [*PROGRAM, "study", "ablate", "--output", folder, "--recipes", tiny_total, *ABLATE, *options]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            while len(list(folder.glob("trainings/*/checkpoints"))) < 2:
+                assert process.poll() is None
+                time.sleep(0.1)
+            process.send_signal(signal.SIGINT)
+            _, err = process.communicate(timeout=300)
+        finally:
+            process.kill()
+    assert process.returncode == 130 and "interrupted; the same command goes on" in err
+    statuses = [json.loads(path.read_text())["status"] for path in folder.glob("trainings/*/run.json")]
+    assert statuses == ["interrupted"] * 2
+
+
+def test_tables_figures_and_page__show_what_was_found(levels, behind, found) -> None:
+    """What stands there follows from the harms above by hand; a change shows in the snapshot."""
+    other = measured("cooperation-2-paper", "sac", harms((5.0, 3.0, 2.0)), 6.0)
+    shown = [
+        markdown(found, "40 worlds."),
+        markdown(compare(behind, SEARCHED), "40 worlds."),
+        markdown(compare([*levels[:2], other], SEARCHED), ""),
+        levels_csv(behind, SEARCHED),
+        *(interval_words(seeds) for seeds in (1, 2, 3)),
+    ]
+    for told in (found, compare(behind, SEARCHED)):
+        for figure in ablation_figures(told, "40 worlds"):
+            texts = [text.get_text() for axes in figure.axes for text in axes.texts]
+            labels = [
+                label.get_text() for axes in figure.axes for label in axes.get_xticklabels() + axes.get_yticklabels()
+            ]
+            legends = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+            shown.append(repr([texts, labels, legends, figure.get_supxlabel()]))
+    check_snapshot("ablation.txt", "\n\n".join(shown) + "\n")
+    figures = dict(zip(FIGURES, ablation_figures(found, "40 worlds"), strict=True))
+    html = ablation_page({**found, "settings": {"seeds": 2, "machine": "</script><b>"}}, "40 worlds.", figures)
+    page = Page(html)
+    assert page.open == [] and not {"script", "b", "img"} & {tag for tag, _ in page.tags}
+    assert "cooperation-2-paper 100.0 % [91.2, 100.0] 20.00 11.00 [10.00, 12.00]" in page.text
+    assert "`" not in page.text and html.count("<figure>") == 3 and "</script><b>" in page.text
+
+
+def generalise(*runs: Path, scenario: str = "cooperation-3-pair", more: Sequence[str] = ()) -> int:
+    words = ["--runs", ",".join(map(str, runs)), "--scenario", scenario, "--vehicles", "3,6", "--episodes", "10"]
+    return run_command(["study", "generalise", *words, *more])
+
+
+def test_generalise__prints_a_table_or_json(run: Path, capsys) -> None:
+    assert generalise(run, more=["--search-episodes", "2", "--budget", "20", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert [row["vehicles"] for row in rows] == [3, 6] and {row["kind"] for row in rows} == {"generalise"}
+    assert len({row["worlds_sha256"] for row in rows}) == 2 == len({row["scenario_sha256"] for row in rows})
+    assert rows[0]["policy_sha256"] == [load_policy(run).manifest.manifest_sha256]
+    assert rows[1]["best_known"] <= rows[1]["full_brake"] * 10 and rows[1]["share_interval"] is not None
+    assert generalise(run) == 0
+    out = capsys.readouterr().out
+    assert "| 6 |" in out and "one seed says nothing about others" in out
+
+
+WORLDS, SEARCHED = 40, 10
+
+
+def harms(*seeds: tuple[float, float, float]) -> Harms:
+    """The same harm of each vehicle in every world, one triple per seed; total harm is twice the first."""
+    first = np.repeat(np.array(seeds)[:, np.newaxis, :], WORLDS, axis=1)
+    vehicle = {"first": first, "total": 2.0 * first}
+    world = {count: each.sum(axis=2) for count, each in vehicle.items()}
+    return Harms(world, vehicle, first.sum(axis=2) > 0.0)
+
+
+def measured(
+    name: str, algorithm: str | None, reached: Harms, best: float | None, clear: str | None = None
+) -> Measured:
+    braking = harms((4.0, 8.0, 8.0))
+    limit = (
+        None if best is None else {"first": np.full((1, SEARCHED), best), "total": np.full((1, SEARCHED), 2.0 * best)}
+    )
+    return Measured(Level(load_scenario(name), clear), algorithm, reached, braking, limit)
+
+
+@pytest.fixture(scope="module")
+def levels() -> list[Measured]:
+    return [
+        measured("cooperation-0-sensors", None, harms((4.0, 8.0, 8.0)), None),
+        measured("cooperation-2-paper", "ppo", harms((5.0, 3.0, 2.0), (5.0, 5.0, 2.0)), 6.0),
+        measured("cooperation-3-pair", "ppo", harms((1.0, 1.0, 3.0), (1.0, 1.0, 3.0)), 5.0),
+        measured("cooperation-2-blocked", "ppo", harms((5.0, 4.0, 2.0)), 6.0, "cooperation-2-paper"),
+    ]
+
+
+@pytest.fixture(scope="module")
+def found(levels) -> dict:
+    return compare(levels, SEARCHED)
+
+
+def test_compare__each_level(found):
+    sensors, paper, pair, _ = found["levels"]
+    assert paper["first"]["harm"]["value"] == pytest.approx(11.0)
+    assert paper["first"]["harm"]["interval"] == pytest.approx([10.0, 12.0])
+    assert paper["first"]["each_seed"] == pytest.approx([10.0, 12.0])
+    assert paper["first"]["searched"]["realised_share"]["value"] == pytest.approx((20.0 - 11.0) / (20.0 - 6.0))
+    assert paper["total"]["searched"]["best_known"]["value"] == pytest.approx(12.0)
+    assert [one["value"] for one in paper["total"]["vehicles"]] == pytest.approx([10.0, 8.0, 4.0])
+    assert sensors["first"]["searched"]["realised_share"] is None and sensors["algorithm"] is None
+    assert pair["first"]["searched"]["realised_share"]["value"] == pytest.approx(1.0)
+    assert pair["learners"] == ["vehicle_2", "vehicle_3"]
+
+
+def test_compare__the_share_follows_from_what_stands_beside_the_joint_optimum(levels):
+    """The searched worlds are milder than the rest: nothing of the rest may stand in their row."""
+    one = levels[1]
+    mild = np.where(np.arange(WORLDS) < SEARCHED, 0.75, 1.0)
+    reached = replace(one.reached, world={count: harm * mild for count, harm in one.reached.world.items()})
+    braking = replace(one.full_brake, world={count: harm * mild for count, harm in one.full_brake.world.items()})
+    level = compare([replace(one, reached=reached, full_brake=braking)], SEARCHED)["levels"][0]["first"]
+    row = level["searched"]
+    assert (row["full_brake"]["value"], row["harm"]["value"], row["best_known"]["value"]) == (15.0, 8.25, 6.0)
+    assert row["realised_share"]["value"] == pytest.approx((15.0 - 8.25) / (15.0 - 6.0))
+    assert row["each_seed"] == [7.5, 9.0] and row["worlds"] == SEARCHED
+    assert level["full_brake"]["value"] == pytest.approx(20.0 * mild.mean())
+
+
+def test_compare__steps_of_the_ladder_and_lost_messages(found):
+    first, second = found["steps"]
+    assert (first["from"], first["to"]) == ("cooperation-0-sensors", "cooperation-2-paper")
+    assert first["first"]["difference"]["value"] == pytest.approx(-9.0)
+    assert first["first"]["worse_off"]["value"] == 1.0  # Vehicle 1, always
+    assert first["first"]["worse_off_vehicles"] == [1.0, 0.0, 0.0]
+    assert [one["value"] for one in second["first"]["vehicles"]] == pytest.approx([-4.0, -3.0, 1.0])
+    assert second["total"]["difference"]["interval"][1] < 0.0
+    (lost,) = found["channels"]
+    assert (lost["from"], lost["to"]) == ("cooperation-2-paper", "cooperation-2-blocked")
+    assert lost["first"]["difference"]["value"] == pytest.approx(0.0)
+    assert lost["first"]["worse_off"]["value"] == 0.5  # Vehicle 2 against the first of two seeds
+
+
+@pytest.fixture(scope="module")
+def behind(levels) -> list[Measured]:
+    """The shield takes 2 from Vehicle 2 and gives 0.5 to Vehicle 3, in the first seed alone, in every second world."""
+    shielded = {}
+    for count in ("first", "total"):
+        after = levels[2].reached.vehicle[count].copy()
+        after[0, ::2] += [0.0, -2.0, 0.5]
+        replaced = np.zeros((2, WORLDS, 2), np.int64)
+        replaced[0, ::2] = [10, 0]
+        shielded[count] = Shielded(
+            after.sum(axis=2), after, after.sum(axis=2) + 1.0, after, replaced, np.full((2, WORLDS), 50),
+            np.zeros((2, WORLDS), np.bool_),
+        )  # fmt: skip
+    shielded["total"].bound[1, 3] = 0.0
+    return [*levels[:2], replace(levels[2], shielded=shielded), levels[3]]
+
+
+def test_compare__behind_the_shield_stands_the_same_level_without_it(behind):
+    found = compare(behind, SEARCHED)
+    sensors, paper, pair, _ = found["levels"]
+    assert sensors["first"]["shielded"] is None and paper["first"]["shielded"] is None
+    told = pair["first"]["shielded"]
+    assert told["harm"]["value"] == pytest.approx(5.0 - 1.5 / 4) and pair["first"]["harm"]["value"] == pytest.approx(
+        5.0
+    )
+    assert told["difference"]["value"] == pytest.approx(-1.5 / 4) and told["each_seed"] == pytest.approx([4.25, 5.0])
+    assert [one["value"] for one in told["vehicles"]] == pytest.approx([0.0, -0.5, 0.125])
+    assert told["replaced"] == pytest.approx(0.25 * 0.2 / 2) and told["replaced_vehicles"] == pytest.approx([0.05, 0.0])
+    assert told["stepped_in"]["value"] == told["worse_off"]["value"] == 0.25
+    assert told["bound"]["value"] == pytest.approx(told["harm"]["value"] + 1.0)
+    assert told["above_bound"] == 0 and pair["total"]["shielded"]["above_bound"] == 1
+    assert told["above_baseline"]["value"] == 0.0 and told["searched"]["harm"]["value"] == pytest.approx(4.625)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "ticks"),
+    [
+        (-0.47, 0.05, [-0.2, -0.1, 0.0]),
+        (-0.6, 0.3, [-0.3, -0.1, 0.0, 0.1, 0.3]),
+        (-30.0, 12.0, [-10.0, -1.0, -0.1, 0.0, 0.1, 1.0, 10.0]),
+        (-0.02, 0.0, [-0.01, -0.001, 0.0]),
+        (0.0, 0.0, [0.0]),
+    ],
+)
+def test_ticks__are_a_few_round_numbers(low, high, ticks):
+    assert set(ticks) <= set(signed_ticks(low, high)) and len(signed_ticks(low, high)) <= 11
+
+
+def test_figures__texts_stand_inside_and_the_colour_bar_reaches_its_end(found):
+    _, figure, pays = ablation_figures(found, "40 worlds")
+    FigureCanvasAgg(figure).draw()
+    for axes in figure.axes:
+        inside = axes.get_window_extent()
+        for text in axes.texts:
+            box = text.get_window_extent()
+            assert inside.x0 <= box.x0 and box.x1 <= inside.x1 and box.y1 <= inside.y1
+    bar = pays.axes[-1]
+    assert max(bar.get_yticks()) >= 0.3 * bar.get_ylim()[1]
+
+
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_figures__of_one_change_have_room_for_their_caption(levels):
+    found = compare(levels[:2], SEARCHED)
+    for figure in ablation_figures(found, "Conditions of this figure, in many words. " * 14):
+        FigureCanvasAgg(figure).draw()
+        bottom = min(axes.get_tightbbox().y0 for axes in figure.axes)
+        assert figure._supxlabel.get_window_extent().y1 <= bottom + 1.0
+
+
+LINES = 30
+
+
+NAMES = ("cooperation-1-front", "cooperation-2-paper", "cooperation-3-pair", "cooperation-4-all")
+
+
+def answer(level: Level, budget: int, agent: str = "full_brake") -> LevelOptimum:
+    worlds = level.scenario.sample(LINES, 7).worlds
+    table = best_harm(level.scenario, worlds, budget=budget, threads=1)
+    return LevelOptimum(level, worlds, table, (Team.of(make_agent(agent), level.scenario.learners),))
+
+
+@pytest.fixture(scope="module")
+def answers() -> dict[str, LevelOptimum]:
+    """Front does well by its policy alone, the paper by a long search, the pair and all three by neither."""
+    front, paper, pair, everybody = read_levels(NAMES)
+    found = [answer(front, 1, "e_v2x_bm"), answer(paper, 500), answer(pair, 1), answer(everybody, 1)]
+    return {each.level.name: each for each in found}
+
+
+def test_best_known__is_one_for_levels_that_ask_one_question(answers):
+    front, paper = (best_known(answers[name], list(answers.values())) for name in NAMES[:2])
+    scenario = answers[NAMES[0]].level.scenario
+    policy = evaluate(answers[NAMES[0]].worlds, {"e": make_agent("e_v2x_bm")}, scenario=scenario).outcome("e")
+    for count, harm in paper.items():
+        np.testing.assert_array_equal(front[count], harm)
+        assert (harm <= np.minimum(answers[NAMES[1]].searched.best[count].harm, policy.ledger.world_harm(count))).all()
+
+
+def test_best_known__more_learners_are_never_worse_world_by_world(answers):
+    """With the obstacle so far away that nobody reaches it."""
+    far = load_scenario("cooperation-4-all").replace(obstacle_gap_m=200)
+    every = [*list(answers.values())[:3], answer(Level(far), 1)]
+    paper, pair, everybody = (best_known(each, every) for each in every[1:])
+    for harm_count, harm in pair.items():
+        assert (harm <= paper[harm_count] + 1e-9).all() and (everybody[harm_count] <= harm + 1e-9).all()
+        assert harm.mean() < every[2].searched.best[harm_count].harm.mean() - 0.01
+    with_obstacle = best_known(answers["cooperation-4-all"], list(answers.values()))
+    for harm_count, best in answers["cooperation-4-all"].searched.best.items():
+        assert with_obstacle[harm_count].mean() < best.harm.mean() - 0.1
+
+
+def test_best_known__an_obstacle_that_is_reached_counts():
+    """All brake fully: without an obstacle it is harmless; one 20 m ahead stands where Vehicle 1 runs into it."""
+    pair = load_scenario("cooperation-3-pair").replace(gaps_m=60)
+    near = pair.replace(name="near", roles=dict.fromkeys(pair.vehicle_names, "learner"), obstacle_gap_m=20)
+    answers = [answer(Level(pair), 1), answer(Level(near), 1)]
+    assert best_known(answers[0], answers)["total"].max() == 0.0
+    assert best_known(answers[1], answers)["total"].min() > 0.0
+
+
+def test_best_known__other_latencies_scripts_or_learners_count_for_nothing(answers):
+    pair = answers["cooperation-3-pair"]
+    alone = best_known(pair, [pair])
+    late = replace(answers[NAMES[1]].worlds.vehicles, latency_s=pair.worlds.vehicles.latency_s + 0.1)
+    coasting = load_scenario("cooperation-2-paper").replace(name="mine", roles={"vehicle_1": "coast"})
+    others = [
+        replace(answers[NAMES[1]], worlds=replace(answers[NAMES[1]].worlds, vehicles=late)),
+        answer(Level(coasting.replace(roles={"vehicle_1": "coast", "vehicle_2": "learner"})), 1),
+        answers["cooperation-4-all"],
+    ]
+    for count, harm in best_known(pair, [pair, *others]).items():
+        np.testing.assert_array_equal(harm, alone[count])
+
+
+def test_best_known__decisions_at_other_times_count_for_nothing():
+    """Vehicle 3 may act 0.05 s before Vehicle 2, so the pair's decisions fall between those of Vehicle 2 alone."""
+    pair = load_scenario("cooperation-3-pair").replace(latency_s=[0, 0.5, 0.45])
+    one, both = answer(Level(pair.with_learners(["vehicle_2"])), 500), answer(Level(pair), 1)
+    alone = best_known(both, [both])
+    for count, harm in best_known(both, [one, both]).items():
+        np.testing.assert_array_equal(harm, alone[count])
+        assert one.searched.best[count].harm.mean() < harm.mean()
+
+
+def left(plan: Plan, level: Level, part: Sample) -> tuple[int, list[Path]]:
+    return chunks_left(level.scenario, part, budget=plan.budget, chunks=plan.optimum_folder(level))
+
+
+def test_questions__each_is_searched_once_and_what_is_kept_is_not_searched_again(tmp_path, tiny_total):
+    levels = tuple(read_levels(NAMES))
+    recipe = with_scheme(load_recipe(str(tiny_total)), None)
+    plan = Plan(levels, (recipe,), 1, 300, 10, 7, 5, 10, tmp_path)
+    samples = common_worlds(levels, 10, 7)
+    asked = questions(plan, samples)
+    assert [[level.name for level in alike] for *_, alike in asked] == [list(NAMES[:2]), [NAMES[2]], [NAMES[3]]]
+    assert [left(plan, level, part) for level, part, _ in asked] == [(5, [])] * 3
+    told = []
+    search_all(plan, samples, 1, told.append)
+    assert told == [Progress(f"joint optimum of {name}", 5, 5) for name in (NAMES[0], *NAMES[2:])]
+    assert [left(plan, level, part) for level, part, _ in asked] == [(0, [])] * 3
+    assert left(replace(plan, budget=11), *asked[0][:2]) == (5, [])
+    fewer = questions(replace(plan, search_episodes=4), samples)[0]
+    assert left(plan, *fewer[:2]) == (4, [])
+    damaged = tmp_path / "optimum" / NAMES[2] / "0000000.npz"
+    damaged.write_bytes(b"no table")
+    assert left(plan, *asked[1][:2]) == (5, [damaged])
+
+
+def test_measure__all_brake_fully_whatever_their_roles():
+    braking = load_scenario("paper-random").replace(name="braking", roles={"vehicle_1": "full_brake"})
+    coasting = braking.replace(name="coasting", roles={"vehicle_1": "full_brake", "vehicle_3": "coast"})
+    plan = Plan((Level(braking), Level(coasting)), (), 1, 1, 20, 7, 5, 10, Path("unused"))
+    first, second = measure(plan)
+    worlds = coasting.sample(20, 7)
+    told = evaluate(worlds, {"b": make_agent("full_brake")}, scenario=braking, vehicle="vehicle_2").outcome("b")
+    np.testing.assert_allclose(second.full_brake.world["total"][0], told.total_harm, rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(first.reached.world["total"], second.full_brake.world["total"])
+    assert second.reached.world["total"].mean() > 2.0 * told.total_harm.mean()
+
+
+PAIR = load_scenario("cooperation-3-pair")
+
+
+def test_lengthened__vehicle_i_is_like_vehicle_i_minus_2():
+    line = lengthen(PAIR, 6)
+    vehicles = line.sample(2, 7).worlds.vehicles
+    assert vehicles.mass_t[0].tolist() == [4.5, 5.5, 5.9, 5.5, 5.9, 5.5]
+    assert vehicles.latency_s[0].tolist() == [0.0, 0.5, 0.8, 0.5, 0.8, 0.5]
+    assert line.learners == (1, 2, 3, 4, 5)
+    assert line.scripts == {0: "full_brake"}
+    assert lengthen(PAIR, 2).sample(1, 7).worlds.N == 2
+
+
+def test_lengthened__lists_of_pairs_and_objectives_go_on_too():
+    listed = PAIR.replace(gaps_m=[6.0, 8.0], objective=["own", "total", "social:45"])
+    line = lengthen(listed, 5)
+    assert line.sample(1, 7).worlds.gaps_m[0].tolist() == [6.0, 8.0, 6.0, 8.0]
+    assert line.objective == ("own", "total", "social:45", "total", "social:45")
+
+
+def test_drive_longer__full_braking_gains_nothing_on_itself():
+    question = LineQuestion(PAIR, (3, 4), 20, 7, "total", 3, 50)
+    found = question.drive([make_agent("full_brake")])
+    assert [one["vehicles"] for one in found] == [3, 4]
+    for one in found:
+        assert (one["decrease"], one["worse_off"], one["share"]) == (0.0, 0.0, 0.0)
+    three = evaluate(PAIR.sample(20, 7), {"b": make_agent("full_brake")}, scenario=PAIR).outcome("b").total_harm
+    assert found[0]["reached"] == pytest.approx(three.mean(), rel=1e-12)
+
+
+def test_drive_longer__all_lines_are_made_before_one_is_driven(monkeypatch):
+    driven = []
+    monkeypatch.setattr(module, "evaluate", lambda *_, **__: driven.append(1))
+    weighted = PAIR.replace(name="mine", objective="weighted:1,2,3")
+    question = LineQuestion(weighted, (3, 4), 20, 7, "total", 0, 50)
+    with pytest.raises(InvalidInput, match="mine-n4"):
+        question.drive([make_agent("full_brake")])
+    with pytest.raises(InvalidInput, match="vehicles 3, 3: each length once"):
+        replace(question, vehicles=(3, 3)).drive([make_agent("full_brake")])
+    assert not driven
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, tiny_total) -> Path:
+    """The run of a policy that Vehicles 2 and 3 share; not to be changed."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    words = ["train", "--scenario", "cooperation-3-pair", "--recipe", str(tiny_total), "--steps", "64"]
+    assert run_command([*words, "--output", str(folder)]) == 0
+    return folder
+
+
+def test_generalise__runs_that_are_not_seeds_of_one_training_are_refused(run: Path, tmp_path: Path, capsys) -> None:
+    def refused(told: str, *runs: Path, **how: str) -> None:
+        assert generalise(*runs, **how) == 2 and told in capsys.readouterr().err
+
+    refused("are one policy; give each once", run, run.parent / "run")
+    refused("are one policy; give each once", run, run / "policy")
+    other = changed(run, tmp_path / "scenario", scenario={"name": "mine"})
+    refused(f"runs {run} and {other}: differ in scenario; give seeds of one training", run, other)
+    refused("differ in recipe", run, changed(run, tmp_path / "recipe", recipe={"gamma": 0.5}))
+    refused("give one whose Vehicle 1 follows a script", run, scenario="cooperation-4-all")
+    seed = changed(run, tmp_path / "seed", recipe={"seed": 1})
+    assert generalise(run, seed) == 0 and "2 policies" in capsys.readouterr().out
+    team = {"vehicle_2": "policy/vehicle_2", "vehicle_3": "policy/vehicle_3"}
+    content = json.loads((seed / "team.json").read_text()) | {"scheme": "independent", "drivers": team}
+    (seed / "team.json").write_text(json.dumps(content))
+    refused("have a policy each", seed)
+    (seed / "config.json").write_text("[]")
+    refused("config.json: is damaged", run, seed)
+
+
+def changed(run: Path, folder: Path, scenario: Mapping[str, object] = {}, recipe: Mapping[str, object] = {}) -> Path:
+    """A run of another policy, with some other values in its scenario or recipe."""
+    shutil.copytree(run, folder)
+    policy = load_policy(run)
+    fields = {name: getattr(policy.manifest, name) for name in Manifest.model_fields}
+    del fields["weights_sha256"], fields["manifest_sha256"]
+    tensors = {name: tensor + np.float32(0.01) for name, tensor in policy.tensors.items()}
+    other = Policy.make(tensors, **{**fields, "scenario": {**policy.manifest.scenario, **scenario}})
+    other.save(folder / "policy", replace=True)
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(config | {"recipe": {**config["recipe"], **recipe}}))
+    return folder

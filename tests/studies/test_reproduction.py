@@ -1,0 +1,589 @@
+"""The paper made again: verdicts that follow from numbers, its items, and the folder and pages of a reproduction."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from pydantic import ValidationError
+
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.evaluation import evaluate
+from ethbrake_marl.evaluation.episodes import Passport
+from ethbrake_marl.evaluation.measures import PAPER_ROWS, PaperRow
+from ethbrake_marl.evaluation.statistics import rate
+from ethbrake_marl.figures import SeedCurve, estimates_figure
+from ethbrake_marl.files.sheet import Estimate, Sheet
+from ethbrake_marl.files.yaml import Override
+from ethbrake_marl.learning.training import load_recipe
+from ethbrake_marl.policies import load_shipped
+from ethbrake_marl.studies import reproduction
+from ethbrake_marl.studies.reproduction import (
+    FULL_BRAKE,
+    GAPS,
+    HARM,
+    ITEMS,
+    NAMES,
+    NOBODY,
+    PERCENT,
+    READINGS,
+    Beside,
+    Course,
+    Drawn,
+    Group,
+    Item,
+    Less,
+    Made,
+    Reproduction,
+    TrainedRecipe,
+    Verdict,
+    checked_result,
+    compare_number,
+    compare_rows,
+    decrease_verdict,
+    docs_page,
+    judge_statement,
+    lineup,
+    read_results,
+    render_page,
+    rows_table,
+    selection_verdict,
+    stated,
+    summarise_verdicts,
+    write_docs,
+)
+from tests.learning.tiny import TINY_PPO
+from tests.pages.hostile import Page
+
+HOSTILE = "<script>alert('x')</script>\"|*_\u202e"
+
+
+def made(text: str = "told", figures: Mapping[Drawn, Figure] | None = None) -> Made:
+    """What an item may give, with one text everywhere."""
+    sheet = Sheet(text, (text, text), ((text, text),), text)
+    verdicts, parameters = (Verdict(text, "agrees", text),), (stated(text, text, text),)
+    return Made(verdicts, parameters, (sheet,), figures or {}, {"data": "a,b\n"}, (text,))
+
+
+def planted(name: str, make) -> Item:
+    """An item of a known name that does something else."""
+    return Item(name, ("label",), "A title", "What it is.", make, 3)
+
+
+def around(value: float, half: float) -> Estimate:
+    return Estimate(value, (value - half, value + half))
+
+
+FEW, MANY = rate(65, 100), rate(6_500, 10_000)
+
+
+LEAST_FEW, LEAST = ("worlds", rate(63, 100)), ("worlds", rate(6_256, 10_000))
+
+
+@pytest.mark.parametrize(
+    ("printed", "ours", "how", "outcome"),
+    [
+        (11.4, around(10.0, 1.0), {}, "agrees"),  # two lists may be sqrt 2 apart
+        (11.5, around(10.0, 1.0), {}, "differs"),
+        (8.6, around(10.0, 1.0), {}, "agrees"),
+        (11.4, around(10.0, 2.0), {}, "undecided"),  # chance 2.8: it shows nothing
+        (10.1, around(10.0, 2.0), {}, "agrees"),  # within the tolerance all the same
+        (13.0, around(10.0, 2.0), {}, "differs"),
+        (0.95, around(0.945, 0.001), {}, "agrees"),  # within the tolerance of the printed number
+        (0.97, around(0.945, 0.001), {}, "differs"),
+        (0.617, MANY, {"least": LEAST}, "differs"),  # a bound within chance of the printed number proves nothing
+        (0.5974, FEW, {"least": LEAST_FEW}, "undecided"),
+        (0.5974, MANY, {"least": LEAST}, "cannot agree"),
+    ],
+)
+def test_compare_number__follows_from_chance_tolerance_and_bound(printed, ours, how, outcome) -> None:
+    assert compare_number("harm", printed, ours, **how).outcome == outcome
+
+
+def test_compare_number__says_why_and_names_the_nearest_other_reading() -> None:
+    ours, near = around(24.2, 0.3), around(33.4, 0.3)
+    others = {"at 0.2 s": near, "total": around(25.0, 0.3)}
+    told = [
+        compare_number("harm", 33.6, ours, others=others),
+        compare_number("harm", 33.6, ours, others={"total": around(20.0, 0.3)}),
+        compare_number("harm", 11.4, around(10.0, 2.0)),
+        compare_number("collisions", 0.5974, MANY, show=PERCENT, least=("worlds that no command saves", LEAST[1])),
+    ]
+    assert [each.because for each in told] == [
+        "ours 24.20 [23.90, 24.50], printed 33.600 (-28.0 %); nearest: at 0.2 s, 33.40 [33.10, 33.70], which agrees",
+        "ours 24.20 [23.90, 24.50], printed 33.600 (-28.0 %); no other reading here comes nearer",
+        "ours 10.00 [8.00, 12.00], printed 11.400: too few worlds to tell",
+        "worlds that no command saves: at least 62.6 % [61.6, 63.5], whoever drives;"
+        " ours 65.0 % [64.1, 65.9], printed 59.74 %",
+    ]
+
+
+A, B, ZERO = Less("a", around(-3.0, 1.0)), Less("b", around(-2.0, 1.5)), Less("z", around(0.0, 0.0))
+NEITHER = replace(ZERO, neither=True)
+
+
+@pytest.mark.parametrize(
+    ("parts", "or_equal", "outcome", "because"),
+    [
+        ([A, B], False, "agrees", "holds in 2 of 2; the nearest is b, -2.00 [-3.50, -0.50]"),
+        ([A], False, "agrees", "a, -3.00 [-4.00, -2.00]"),
+        ([A, Less("b", around(2.0, 1.5))], False, "differs", "holds in 1 of 2; not so: b, 2.00 [0.50, 3.50]"),
+        ([Less("b", Estimate(0.5, None))], False, "differs", "not so: b, 0.50"),
+        ([A, Less("b", around(-1.0, 1.5))], False, "undecided", "holds in 1 of 2; not shown: b, -1.00 [-2.50, 0.50]"),
+        ([Less("a", around(3.0, 1.0)), Less("b", around(-1.0, 1.5))], False, "differs", None),
+        ([A, NEITHER], False, "agrees", None),
+        ([NEITHER], False, "agrees", "nothing to undercut: both are 0 in z"),
+        ([ZERO], True, "agrees", None),
+        ([ZERO], False, "differs", None),
+        ([Less("a", around(0.0, 0.1))], True, "undecided", None),
+        ([A, Less("b", around(1.0, 0.5), least=around(0.4, 0.1))], False, "cannot agree", None),
+        ([Less("b", around(1.0, 0.5), least=around(0.1, 0.2))], False, "differs", None),
+    ],
+)
+def test_judge_statement__holds_where_every_interval_is_below_zero(parts, or_equal, outcome, because) -> None:
+    verdict = judge_statement("lower", parts, or_equal=or_equal)
+    assert (verdict.outcome, because or verdict.because) == (outcome, verdict.because)
+
+
+def test_judge_statement__names_what_is_proven_and_what_is_left_out() -> None:
+    proven = Less("b", around(1.0, 0.5), least=around(0.4, 0.1))
+    told = judge_statement("lower", [A, proven]).because
+    assert told.endswith("the harm proven to be the least is above it in: b by 0.40 [0.30, 0.50]")
+    left_out = judge_statement("lower", [A, NEITHER]).because
+    assert left_out.startswith("holds in 1 of 1 (both are 0 in z")
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "worst"),
+    [
+        (("agrees", "agrees"), "agrees"),
+        (("agrees", "differs"), "differs"),
+        (("differs", "cannot agree", "agrees"), "cannot agree"),
+        (("agrees", "not run"), "not run"),
+        (("not run", "undecided", "agrees"), "undecided"),
+        ((), "not run"),
+    ],
+)
+def test_summarise_verdicts__tells_the_worst_and_counts(outcomes, worst) -> None:
+    found = summarise_verdicts([Verdict(f"w{k}", outcome, f"b{k}") for k, outcome in enumerate(outcomes)])
+    assert found.outcome == worst
+    if len(outcomes) > 1:
+        first = outcomes.index(worst)
+        assert found.because.startswith(f"of {len(outcomes)} comparisons ")
+        assert found.because.endswith(f"; w{first}: b{first}")
+
+
+AS_STATED, AT_200_MS = READINGS
+
+
+RATE = "collision rate"
+
+
+def printed(table: str, agent: str) -> PaperRow:
+    return next(row for row in PAPER_ROWS if (row.table, row.agent) == (table, agent))
+
+
+def beside(reading, worlds: int = 400) -> Beside:
+    scenario = reading.scenario("paper-random")
+    agents = lineup(scenario, FULL_BRAKE)
+    evaluation = evaluate(scenario.sample(worlds, 7), agents, scenario=scenario, aftermath=False)
+    return Beside(reading.name, evaluation, {"Non-E": (NAMES[FULL_BRAKE],), "Hybrid PPO": (NAMES[FULL_BRAKE],)})
+
+
+def test_selection__the_printed_hybrid_avoids_more_than_its_parts() -> None:
+    rows = [printed("hybrid test", agent) for agent in ("E-V2X-BM", "Standalone DRL", "Hybrid")]
+    verdict = selection_verdict(*rows)
+    assert verdict.outcome == "cannot agree"
+    assert "737 + 1,263 = 2,000 collisions; printed: 2,005" in verdict.because
+    possible = replace(rows[2], collisions=3_000)
+    assert selection_verdict(*rows[:2], possible).outcome == "agrees"
+
+
+def test_decrease__follows_from_the_printed_harms() -> None:
+    baseline, row = printed("random test", "Non-E"), printed("random test", "Hybrid PPO")
+    assert decrease_verdict(row, baseline).outcome == "agrees"
+    assert decrease_verdict(replace(row, harm_decrease=0.85), baseline).outcome == "cannot agree"
+
+
+def test_compare_rows__full_braking_agrees_at_200_ms_and_the_hybrid_is_excluded_as_stated() -> None:
+    besides = [beside(AS_STATED, 1_000), beside(AT_200_MS, 1_000)]
+    rows = [printed("random test", agent) for agent in ("Non-E", "Hybrid PPO")]
+    found = {verdict.what: verdict for verdict in compare_rows(rows, besides)}
+    stated, early = found["Non-E, average harm (as stated)"], found[f"Non-E, average harm ({AT_200_MS.name})"]
+    assert (stated.outcome, early.outcome) == ("differs", "agrees")
+    assert f"nearest: {NAMES[FULL_BRAKE]} ({AT_200_MS.name})" in stated.because
+    assert found["Hybrid PPO, collision rate (as stated)"].outcome in ("cannot agree", "differs")
+    impossible = replace(rows[1], collision_rate=0.3)
+    (first, *_) = compare_rows([impossible], besides)
+    assert first.outcome == "cannot agree"
+    assert "in which no command avoids an impact: at least" in first.because
+
+
+def test_rows_table__ends_with_what_nobody_undercuts() -> None:
+    own = beside(AS_STATED)
+    table = rows_table(own)
+    assert table.rows[-1][0] == NOBODY
+    assert own.numbers[NOBODY][RATE].value <= own.numbers[NAMES[FULL_BRAKE]][RATE].value
+    assert all(len(row) == len(table.columns) for row in table.rows)
+
+
+@pytest.mark.parametrize("row", PAPER_ROWS)
+def test_printed_rows__rates_follow_from_counts(row: PaperRow) -> None:
+    assert row.collisions / row.episodes == pytest.approx(row.collision_rate, abs=1e-4)
+
+
+OUTCOMES = {"agrees", "differs", "cannot agree", "undecided", "not run"}
+
+
+@pytest.fixture(scope="module")
+def made_of(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Made]:
+    """Every item of ten worlds, made once."""
+    settings = Reproduction("quick", tmp_path_factory.mktemp("reproduction"), 10)
+    return {item.name: item.make(settings) for item in ITEMS}
+
+
+@pytest.mark.parametrize("name", [item.name for item in ITEMS])
+def test_item__has_verdicts_parameters_tables_and_data(made_of: dict[str, Made], name: str) -> None:
+    told = made_of[name]
+    assert told.verdicts and {verdict.outcome for verdict in told.verdicts} <= OUTCOMES
+    assert all(verdict.because for verdict in told.verdicts)
+    text = " ".join(verdict.what for verdict in told.verdicts)
+    assert name == "gaps" or ("as stated" in text and "0.2 s" in text)  # the register has it as one of its rows
+    of_paper = {parameter.name for parameter in told.parameters if parameter.origin.startswith("stated")}
+    assert of_paper >= {"masses", "braking capacities"} and not of_paper & {"restitution e", "time step", "horizon"}
+    assert told.tables and all(len(row) == len(table.columns) for table in told.tables for row in table.rows)
+    assert told.data and all(text.count("\n") > 1 for text in told.data.values())
+    assert told.figures or name in ("hybrid-table", "random-table", "learning-high", "learning-low")
+
+
+def test_page__whatever_a_result_says_is_text_and_no_name_leads_elsewhere(settings: Reproduction) -> None:
+    own = replace(settings, folder=settings.folder.parent / "<b>out</b>'\"; {{ 7 * 7 }}\u202e")
+    (result,), _ = own.make([planted("gaps", lambda s: made(HOSTILE))])
+    page, docs = (own.folder / "index.html").read_text("utf-8"), docs_page([result])
+    assert "<script" not in page + docs and "&lt;script&gt;" in page and "\u202e" not in page + docs
+    assert own.folder.name not in page and "data-episodes" not in page
+    assert all(line.count(" | ") <= 2 for line in docs.splitlines() if line.startswith("| "))
+    hostile = replace(result, name="javascript:alert(1)", data=["//x", '" onclick="'])
+    shown = Page(render_page(own.folder, [hostile]))
+    links = [attributes["href"] for tag, attributes in shown.tags if tag == "a"]
+    assert links[-2:] == ["./javascript%3Aalert%281%29/%2F%2Fx", "./javascript%3Aalert%281%29/%22%20onclick%3D%22"]
+    assert not any(name.startswith("on") for _, attributes in shown.tags for name in attributes)
+
+
+def test_make__keeps_what_is_there_and_makes_it_again_by_force_or_for_other_settings(settings: Reproduction) -> None:
+    calls = []
+    items = [planted("gaps", lambda s: calls.append(1) or made())]
+    settings.make(items)
+    settings.make(items)
+    assert len(calls) == 1
+    settings.make(items, force=True)
+    assert len(calls) == 2
+    replace(settings, episodes=30).open_folder(force=True)
+    assert read_results(settings.folder) == []
+    foreign = settings.folder.parent / "mine"
+    foreign.mkdir()
+    (foreign / "thesis.txt").write_text("text")
+    with pytest.raises(AlreadyExists, match="holds no reproduction"):
+        replace(settings, folder=foreign).open_folder(force=True).check()
+    (foreign.parent / "link").symlink_to(foreign)
+    with pytest.raises(InvalidInput, match="no plain folder"):
+        replace(settings, folder=foreign.parent / "link").open_folder()
+
+
+def test_trajectories__of_the_scenarios_have_no_impact_under_the_policies(made_of: dict[str, Made]) -> None:
+    (table,) = made_of["trajectories"].tables
+    assert {row[3] for row in table.rows if row[2] in ("PPO", "SAC")} == {0}
+
+
+def test_register__every_gap_says_what_the_paper_says_and_what_is_measured() -> None:
+    names = [gap.name for gap in GAPS]
+    assert len(set(names)) == len(names)
+    for gap in GAPS:
+        assert gap.paper and gap.ours
+        assert bool(gap.alternatives) != gap.otherwise.startswith(("trained by --full: ", "not measured: ")), gap.name
+
+
+def test_hybrid__is_driven_anew_once_its_policy_was_trained(
+    settings: Reproduction, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = reproduction._drive_hybrid("paper-random", settings, reproduction.READINGS[0])
+    assert reproduction._drive_hybrid("paper-random", settings, reproduction.READINGS[0]) is first
+    monkeypatch.setattr(reproduction, "unconverged_policy", lambda _: (load_shipped("ppo"), "trained since"))
+    assert reproduction._drive_hybrid("paper-random", settings, reproduction.READINGS[0]) is not first
+
+
+def drawn(stem: str = "a-figure") -> dict[Drawn, Figure]:
+    line = {0.0: Estimate(1.0, None), 1.0: Estimate(2.0, (1.0, 3.0))}
+    figure = estimates_figure({"panel": {"line": line}}, x_label="x", y_label="y", caption="c")
+    return {Drawn(stem, "A figure", "What it shows."): figure}
+
+
+def hidden(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob(".*") if path.name != ".lock"]
+
+
+def test_reproduce__writes_figures_data_results_and_one_page(settings: Reproduction) -> None:
+    items = [planted("gaps", lambda s: made(figures=drawn()))]
+    results, finished = settings.make(items)
+    assert finished and [each.name for each in results] == ["gaps"]
+    names = sorted(path.name for path in (settings.folder / "gaps").iterdir())
+    assert names == ["a-figure.png", "a-figure.svg", "data.csv", "result.json"]
+    page = (settings.folder / "index.html").read_text("utf-8")
+    assert page.count("<svg") == 1 and "var(--series-0)" in page and "<img" not in page and "<script" not in page
+    assert re.search(r"https?://", re.sub(r'xmlns(:\w+)?="[^"]*"', "", page)) is None
+    assert hidden(settings.folder) == []
+
+
+def test_page__tells_everything_that_a_result_holds(settings: Reproduction) -> None:
+    told = replace(
+        made(), tables=(Sheet("A table", ("Who", HARM), (("PPO", Estimate(1.5, (1.25, 1.75))),), "Of 24 worlds."),)
+    )
+    (result,), _ = settings.make([planted("gaps", lambda s: told)])
+    page = Page((settings.folder / "index.html").read_text("utf-8"))
+    assert page.open == []
+    for text in ("A table", "PPO 1.50 [1.25, 1.75]", "Of 24 worlds.", "What it is.", "label", "Comparisons: 1"):
+        assert text in page.text
+    assert result.verdict.because in page.text and "stated in the paper (told)" in page.text
+    links = [attributes["href"] for tag, attributes in page.tags if tag == "a"]
+    assert "./gaps/data.csv" in links and links.count("#a-title") == 1
+    around = [attributes.get("class") for tag, attributes in page.tags if tag == "div"]
+    assert around.count("wide") == sum(tag == "table" for tag, _ in page.tags) == 4
+
+
+def test_reproduce__an_interruption_leaves_whole_files_and_goes_on(settings: Reproduction) -> None:
+    def stop(_: Reproduction):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        settings.make([planted("harm-delays", lambda s: made()), planted("gaps", stop)])
+    assert [each.name for each in read_results(settings.folder)] == ["harm-delays"]
+    assert "A title" in (settings.folder / "index.html").read_text("utf-8")
+    assert hidden(settings.folder) == []
+    results, _ = settings.make([planted("harm-delays", stop), planted("gaps", lambda s: made())])
+    assert [each.name for each in results] == ["harm-delays", "gaps"]
+
+
+@pytest.mark.parametrize("stem", ["../../etc/passwd", "a b", "A", "", "x" * 65, "<svg>", "/tmp/x"])
+def test_figures__a_stem_that_is_no_plain_name_is_refused(settings: Reproduction, stem: str) -> None:
+    with pytest.raises(ValidationError, match="for Drawn"):
+        drawn(stem)
+    settings.make([planted("gaps", lambda s: made())])
+    file = settings.folder / "gaps" / "result.json"
+    content = json.loads(file.read_text())
+    content["figures"] = [{"stem": stem, "title": "t", "text": "t"}]
+    file.write_text(json.dumps(content))
+    with pytest.raises(InvalidInput, match="figures: 0: stem: is not what a reproduction writes"):
+        settings.make([planted("harm-delays", lambda s: made())])
+
+
+NONE_OF_OURS = (
+    "<script>alert(1)</script>",
+    '<g onload="alert(1)"/>',
+    '<g style="onload: alert(1)"/>',
+    '<use href="#x"/>',
+    '<use xmlns:l="http://www.w3.org/1999/xlink" l:href="https://example.org/x.svg#x"/>',
+    '<path fill="url(https://example.org/x)"/>',
+    '<path style="fill: URL(https://example.org/x)"/>',
+    "<foreignObject/>",
+    '<g xmlns="http://www.w3.org/1999/xhtml"/>',
+    "<g>",
+    "<g>" * 20_000 + "</g>" * 20_000,
+)
+
+
+def test_page__a_figure_that_is_none_of_ours_is_refused(settings: Reproduction) -> None:
+    results, _ = settings.make([planted("gaps", lambda s: made(figures=drawn()))])
+    file = settings.folder / "gaps" / "a-figure.svg"
+    for inside in NONE_OF_OURS:
+        file.write_text(f'<svg xmlns="http://www.w3.org/2000/svg">{inside}</svg>')
+        with pytest.raises(InvalidInput, match=r"a-figure\.svg: is not a figure as it was drawn"):
+            render_page(settings.folder, results)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"tables": "x"},
+        {"tables": [{"title": "t", "head": ["h"], "rows": [[[1]]], "note": ""}]},
+        {"tables": [{"title": "t", "head": ["h"], "rows": [[["a"]], []], "note": ""}]},
+        {"tables": [{"title": "", "head": [], "rows": [], "note": ""}]},
+        {"verdict": {}},
+        {"figures": [1]},
+        {"figures": [{"stem": 7, "title": "t", "text": "t"}]},
+        {"name": None},
+        {"name": "../elsewhere"},
+        {"name": "random-table"},
+        {"data": ["../../x.csv"]},
+        {"verdict": {"what": "all", "outcome": "agrees", "because": "of 25 comparisons 25 agree"}},
+        {"comparisons": [{"what": "w", "outcome": "<b>great</b>", "because": ""}]},
+        {"comparisons": []},
+        {"comparisons": [{"what": "w"}]},
+        {"notes": ["a", None]},
+    ],
+)
+def test_results__a_damaged_one_is_named(settings: Reproduction, change) -> None:
+    settings.make([planted("gaps", lambda s: made())])
+    file = settings.folder / "gaps" / "result.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
+    with pytest.raises(InvalidInput, match=r"result\.json: [\w: ]+: is not what a reproduction writes"):
+        read_results(settings.folder)
+
+
+def test_write_docs__page_data_and_figures(settings: Reproduction, tmp_path: Path) -> None:
+    results, _ = settings.make([planted("gaps", lambda s: made(figures=drawn()))])
+    file = tmp_path / "page.md"
+    write_docs(file, settings.folder, results)
+    assert json.loads((tmp_path / "page.json").read_text("utf-8")) == [each.in_words() for each in results]
+    assert file.read_text("utf-8") == docs_page(read_results(settings.folder))
+    assert (tmp_path / "figures" / "reproduction-a-figure.svg").is_file()
+    with pytest.raises(InvalidInput, match=r"must end in \.md"):
+        replace(settings, docs=tmp_path / "page.html")
+
+
+def test_pages__say_command_machine_and_how_little_was_made(settings: Reproduction) -> None:
+    results, _ = replace(settings, machine="a CPU, load 3.1, numpy 2.4.6").make([planted("gaps", lambda s: made())])
+    page = Page((settings.folder / "index.html").read_text("utf-8"))
+    for text in (page.text, docs_page(results)):
+        assert "1 of the 10 items" in text and "ethbrake reproduce gaps --quick --episodes 24" in text
+        assert f"({results[0].made_utc[:10]}, a CPU, numpy 2.4.6; " in text
+        assert "At most 24 worlds of each list are driven here; the paper has 10,000." in text
+    content = {name: value for name, value in asdict(results[0]).items() if name != "episodes"}
+    page = Page(render_page(settings.folder, [checked_result(content, "result.json", "gaps")]))
+    assert "worlds of each list" not in page.text and "reproduce gaps --quick (" in page.text
+
+
+TINY = TINY_PPO.replace(total_steps=128 * 8, evaluation={"every_updates": 1, "worlds": 5, "seed": 7})
+
+
+@pytest.fixture
+def tiny_groups(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One training of a second at either delay, in the place of all."""
+    trained = {"ppo": (TrainedRecipe("ppo", TINY.total_steps, 1, 1000), TINY)}
+    groups = {delay: Group(delay, f"paper-delay-{delay}", trained, 1) for delay in ("low", "high")}
+    monkeypatch.setattr(reproduction, "groups", lambda: groups)
+    monkeypatch.setattr(reproduction, "CURVES", {"low": ("low",), "high": ("high",)})
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_full__trains_draws_and_keeps_what_is_trained(tiny_groups, settings: Reproduction) -> None:
+    full = replace(settings, mode="full", episodes=5)
+    (item,) = Reproduction.choose(["learning-low"])
+    small = replace(item, trained=("low", "high"))
+    assert full.seconds_left(small.trained) == pytest.approx(2 * 1.024)
+    (result,), finished = full.make([small])
+    assert finished and result.trained == ["low/ppo", "high/ppo"]
+    assert [each.stem for each in result.figures] == ["learning-low-ours"]
+    assert "1 seeds of ppo to 1,024 decisions" in result.notes[0] and "sac" in result.notes[1]
+    (higher,) = [each for each in result.comparisons if each.what.startswith("both algorithms reach higher")]
+    assert higher.outcome in ("agrees", "differs")
+    assert full.seconds_left(small.trained) == 0.0
+    before = sorted(path.stat().st_mtime_ns for path in (full.folder / "trainings").rglob("run.json"))
+    full.make([small], force=True)
+    assert sorted(path.stat().st_mtime_ns for path in (full.folder / "trainings").rglob("run.json")) == before
+
+
+def test_full__interrupted_makes_the_items_of_what_is_finished(settings: Reproduction, monkeypatch) -> None:
+    asked = []
+    monkeypatch.setattr(Reproduction, "train", lambda *given: bool(asked.append(given)))
+    chosen = [replace(planted("gaps", lambda s: made()), trained=("open",)), planted("harm-delays", lambda s: made())]
+    results, finished = replace(settings, mode="full").make(chosen)
+    assert not finished and len(asked) == 1
+    assert [each.name for each in results] == ["harm-delays", "gaps"]
+
+
+def test_full__an_item_is_made_again_when_more_is_trained(settings: Reproduction, monkeypatch) -> None:
+    trained: dict[str, list[Path]] = {}
+    monkeypatch.setattr(Reproduction, "train", lambda *given: True)
+    monkeypatch.setattr(Reproduction, "trained", lambda *given: trained)
+    calls = []
+    chosen = [replace(planted("gaps", lambda s: calls.append(1) or made()), trained=("open",))]
+    for expected in (1, 1):
+        replace(settings, mode="full").make(chosen)
+        assert len(calls) == expected
+    trained["open/ppo-paper"] = []
+    replace(settings, mode="full").make(chosen)
+    assert len(calls) == 2
+
+
+def test_groups__fit_their_recipes_and_every_item_names_groups_that_exist() -> None:
+    found = reproduction.groups()
+    assert {name for item in ITEMS for name in item.trained} == set(found)
+    for group in found.values():
+        for name, (asked, recipe) in group.trained.items():
+            assert recipe.name == name and recipe.total_steps == asked.decisions
+            stated = load_recipe(asked.recipe)
+            if asked.recipe.endswith("-paper"):  # the paper's table stays as it is
+                for key in ("gamma", "batch_size", "network"):
+                    assert getattr(recipe, key) == getattr(stated, key)
+
+
+def test_cost__is_told_before_and_at_most_an_hour(tmp_path: Path) -> None:
+    settings = Reproduction("full", tmp_path)
+    assert "trainings before them about" in settings.cost(ITEMS)
+    assert 600.0 < settings.seconds_left(list(reproduction.groups())) <= 3_600.0
+    assert "trainings" not in replace(settings, mode="quick").cost(ITEMS)
+    assert settings.trained(["low"]) == {}
+
+
+def course(returns: list[list[float]], harm: list[list[float]]) -> Course:
+    steps = np.arange(len(returns[0]), dtype=float)
+    return Course(SeedCurve(steps, np.array(returns)), SeedCurve(steps, np.array(harm)))
+
+
+def test_course__measures_of_planted_curves() -> None:
+    one = course([[-10.0, -4.0, 0.0, 0.0], [-10.0, -6.0, 0.0, 0.0]], [[100.0, 50.0, 10.0, 0.0], [100.0, 5.0, 1.0, 0.0]])
+    assert one.last_returns.tolist() == [0.0, 0.0]
+    assert one.rise == 10.0
+    assert one.decisions_to_converge.tolist() == [2.0, 1.0]
+    assert one.spread.tolist() == [0.0, 0.0]
+    assert one.unrest(2).tolist() == [0.0, 0.0]
+    assert one.unrest(3).tolist() == pytest.approx([0.1, 0.15])  # changes of 2 and 0, 3 and 0
+    assert one.still_rising == 0.0
+    assert course([[-4.0, -3.0, -2.0, -1.0, 0.0]], [[1.0] * 5]).still_rising == pytest.approx(0.25)
+
+
+def test_returns__of_a_shaped_reward_say_nothing_between_delays_so_its_harm_is_compared() -> None:
+    worse = course([[-9.0] * 20, [-8.99] * 20], [[90.0] * 20, [80.0] * 20])
+    better = course([[-10.0] * 20, [-9.99] * 20], [[10.0] * 20, [8.0] * 20])  # of lower returns
+    for recipe, outcome, told in (("ppo", "agrees", "minus its harm"), ("ppo-paper", "differs", "ppo-paper")):
+        assert bool(load_recipe(recipe).reward.shaping) == (recipe == "ppo")
+        verdict = reproduction._higher_when_low({"high": {recipe: worse}, "low": {recipe: better}})
+        assert (verdict.outcome, told in verdict.because) == (outcome, True)
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """That of the trajectories, made again."""
+    path = tmp_path_factory.mktemp("trajectories") / "out"
+    Reproduction("quick", path, 10).make(Reproduction.choose(["trajectories"]))
+    return (path / "index.html").read_text("utf-8")
+
+
+def played(page: str) -> dict:
+    """What the page gives its player."""
+    text = page.split('type="application/json"')[1].partition(">")[2].partition("</script>")[0]
+    return json.loads(text)
+
+
+@pytest.mark.slow
+def test_trajectories__are_watched_side_by_side(page: str) -> None:
+    shown, content = Page(page), played(page)
+    assert shown.open == [] and "Passports" in shown.text
+    assert [content["agents"][k] for k in content["shown"]] == ["PPO", "SAC"]
+    titles = [world["title"] for world in content["worlds"]]
+    assert titles[0] == "Scenario 1, as stated" and len(set(titles)) == 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("world", [0, 3])
+def test_trajectories__passports_play_them_again(page: str, world: int) -> None:
+    one = played(page)["worlds"][world]
+    settings = tuple(Override.parse([one["why"].partition("--set ")[2]])) if one["why"] else ()
+    again = Passport.parse(one["episodes"][0]["passport"]).replay(settings=settings)
+    assert again.same and again.differences == ()

@@ -1,0 +1,295 @@
+"""``ethbrake study sweep``: its file and the schemas, its table, and that no disturbance shows in it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from jsonschema import Draft202012Validator
+
+from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.yaml import read_yaml
+from ethbrake_marl.learning.runs import train
+from ethbrake_marl.learning.training import Training, load_recipe
+from ethbrake_marl.policies import load_policy
+from ethbrake_marl.studies.sweep import SweepFile, SweepPlan, TuningFile, TuningPlan
+from tests.studies.conftest import Write, study, write_yaml
+from tests.studies.counting import PROGRAM, holders, journal, parent
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+
+
+GRID = {"scenario": "paper-random", "recipe": "ppo"}
+
+
+KINDS = {"sweep": (SweepPlan.json_schema, SweepFile.read_as), "tuning": (TuningPlan.json_schema, TuningFile.read_as)}
+
+
+TABLE = "results.csv"
+
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def read(file: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(file.read_text().splitlines()))
+
+
+def sweep(file: Path, folder: Path, *options: str) -> int:
+    return study("sweep", file, "--output", folder, "--jobs", "1", *options)
+
+
+@pytest.fixture
+def again(finished_sweep: Path, small_sweep: dict[str, Any], tmp_path: Path) -> tuple[Path, Path]:
+    """The file of the finished sweep, and a copy of its folder."""
+    shutil.copytree(finished_sweep, tmp_path / "again")
+    return write_yaml(tmp_path / "sweep.yaml", small_sweep), tmp_path / "again"
+
+
+def test_grid__is_every_combination_seed_by_seed(write_sweep):
+    grid = {
+        "scenario": ["cooperation-2-paper", "cooperation-3-pair"],
+        "recipe": ["ppo", "sac"],
+        "seed": {"first": 4, "count": 2},
+    }
+    plan = SweepPlan.read(write_sweep(set={"total_steps": 100}, grid={**grid, "set": {"mass_t": [5, 6]}}))
+    assert len(plan.rows) == len({row.identity for row in plan.rows}) == 16
+    assert [row.asked.seed for row in plan.rows] == [4] * 8 + [5] * 8
+    assert plan.rows[1].asked.settings == ("total_steps=100", "mass_t=6")
+    assert plan.rows[1].asked.scenario == "cooperation-2-paper"
+    assert [*plan.rows[1].settings] == ["total_steps", "mass_t"] and {
+        row.first.recipe.total_steps for row in plan.rows
+    } == {100}
+
+
+def test_rows__have_the_hash_that_their_trainings_have(write_sweep):
+    listed = [{"scenario": "paper-distance", "recipe": "sac", "seed": 9, "set": {"network.policy": [8, 8]}}]
+    plan = SweepPlan.read(write_sweep(grid={**GRID, "seed": [0, 2**32 - 1]}, jobs=listed))
+    for row in plan.rows:
+        training = plan.training(row)
+        assert training.identity == row.identity and training.recipe.seed == row.asked.seed
+        assert Training.of(training.recipe, training.scenario).identity == row.identity
+    assert plan.training(plan.rows[2]).recipe.network.policy == (8, 8)
+
+
+def test_example__of_the_page_is_in_order():
+    plan = SweepPlan.read(DOCS / "sweep-example.yaml")
+    assert len(plan.rows) == 42 and {row.first.recipe.total_steps for row in plan.rows} == {200_000}
+    assert (DOCS / "sweep-example.yaml").read_text("utf-8") in (DOCS / "scaling.md").read_text("utf-8")
+
+
+def test_table__has_a_row_for_every_job_in_the_order_of_the_file(finished_sweep, small_sweep):
+    rows = read(finished_sweep / TABLE)
+    assert [(row["seed"], row["set.gamma"]) for row in rows] == [
+        ("3", "0.9"), ("3", "0.99"), ("5", "0.9"), ("5", "0.99")
+    ]  # fmt: skip
+    entries = journal(finished_sweep)
+    assert Counter(one["job"].rpartition("-")[2] for one in entries) == Counter(row["hash"][:16] for row in rows)
+    assert all(one["status"] == "finished" and one["wall_s"] > 0.0 for one in entries)
+    for row in rows:
+        (run,) = (finished_sweep / "runs").glob(f"paper-random-tiny-seed{row['seed']}-{row['hash'][:16]}")
+        assert row["policy_sha256"] == load_policy(run).manifest.manifest_sha256
+        assert (row["steps"], row["total_steps"], row["scheme"]) == ("256", "256", "single")
+    assert not (finished_sweep / "failures.csv").exists() and not list((finished_sweep / "logs").iterdir())
+
+
+def test_job__is_the_training_that_train_makes(finished_sweep, tiny, tmp_path):
+    row = read(finished_sweep / TABLE)[0]
+    recipe = load_recipe(str(tiny)).replace(gamma=0.9)
+    alone = train(recipe, "paper-random", tmp_path / "alone", seed=3, on_progress=None)
+    assert alone.training.identity == row["hash"]
+    assert alone.policy.manifest.manifest_sha256 == row["policy_sha256"]
+    least = min(alone.evaluations, key=lambda one: one["first_impact_harm"])
+    assert float(row["first_impact_harm"]) == least["first_impact_harm"]
+    assert float(row["last_total_harm"]) == alone.evaluations[-1]["total_harm"]
+
+
+def test_finished_jobs__are_not_repeated_and_the_table_is_the_same(again, capsys) -> None:
+    file, folder = again
+    whole = (folder / TABLE).read_bytes()
+    (folder / TABLE).unlink()
+    assert sweep(file, folder) == 0 and len(journal(folder)) == 4
+    assert "4 jobs are finished already" in capsys.readouterr().err and (folder / TABLE).read_bytes() == whole
+    jobs_done = [one["job"] for one in journal(folder)]
+    (folder / "journal.jsonl").write_text((folder / "journal.jsonl").read_text()[:-40])  # a writer was killed
+    kept = {path: path.stat().st_mtime_ns for path in (folder / "runs").glob("*/policy/manifest.json")}
+    gone = folder / "runs" / jobs_done[0]
+    shutil.rmtree(gone)  # taken away: to be done again
+    assert sweep(file, folder) == 0
+    assert "2 jobs are finished already; 1 damaged lines of the journal" in capsys.readouterr().err
+    assert (folder / TABLE).read_bytes() == whole and (gone / "run.json").is_file()
+    assert all(path.stat().st_mtime_ns == then for path, then in kept.items() if gone not in path.parents)
+    (folder / "runs" / jobs_done[1] / "policy" / "weights.safetensors").unlink()
+    assert sweep(file, folder) == 0 and (folder / TABLE).read_bytes() == whole
+    assert "3 jobs are finished already" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_team__that_has_lost_a_policy_is_trained_again(write_sweep: Write, tiny: Path, tmp_path: Path) -> None:
+    job = {"scenario": "cooperation-3-pair", "recipe": str(tiny), "set": {"scheme": "independent", "total_steps": 1}}
+    folder, file = tmp_path / "out", write_sweep(jobs=[job])
+    assert sweep(file, folder) == 0
+    whole = (folder / TABLE).read_bytes()
+    (lost,) = folder.glob("runs/*/policy/vehicle_3")
+    shutil.rmtree(lost)
+    assert sweep(file, folder) == 0 and len(journal(folder)) == 2
+    assert (folder / TABLE).read_bytes() == whole and (lost / "manifest.json").is_file()
+
+
+def test_another_file__of_some_of_its_jobs_has_their_rows_alone(again, small_sweep) -> None:
+    file, folder = again
+    before = read(folder / TABLE)
+    write_yaml(file, {"grid": {**small_sweep["grid"], "seed": [5]}})
+    assert sweep(file, folder) == 0 and len(journal(folder)) == 4
+    assert read(folder / TABLE) == [row for row in before if row["seed"] == "5"]
+
+
+def test_dry_run__prints_jobs_and_cost_and_makes_nothing(again, tmp_path: Path, capsys) -> None:
+    file, folder = again
+    assert sweep(file, tmp_path / "new", "--dry-run") == 0
+    told = capsys.readouterr()
+    lines = told.out.splitlines()
+    assert len(lines) == 4 and re.fullmatch("new +paper-random-tiny-seed3-.* gamma=0.9", lines[0])
+    assert "to do: 4 jobs, 1,024 decisions: about" in told.err and not (tmp_path / "new").exists()
+    assert sweep(file, folder, "--dry-run", "--json") == 0
+    assert {job["state"] for job in json.loads(capsys.readouterr().out)["jobs"]} == {"finished"}
+
+
+@pytest.mark.slow
+def test_failures__end_in_a_table_with_their_last_lines(write_sweep, tiny, tmp_path, capsys):
+    good = {"scenario": "paper-random", "recipe": str(tiny)}
+    bad = {**good, "set": {"reward.harm": 1e300}}
+    folder, file = tmp_path / "out", write_sweep(jobs=[bad, good])
+    assert sweep(file, folder) == 1
+    assert "1 of 2 jobs finished" in capsys.readouterr().err
+    (failed,) = read(folder / "failures.csv")
+    assert failed["attempts"] == "1" and failed["reason"].startswith("training: ")  # it would diverge again
+    assert "TrainingDiverged" in failed["last_lines"]
+    assert failed["set"] == "reward.harm=1e+300"
+    assert [row["recipe"] for row in read(folder / TABLE)] == [str(tiny)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("work", ["counting", pytest.param("training", marks=pytest.mark.long)])
+def test_disturbed_sweep__has_the_same_table(work: str, tiny: Path, write_sweep: Write, tmp_path: Path) -> None:
+    file = write_sweep(grid={"scenario": "paper-random", "recipe": str(tiny), "seed": {"count": 6}})
+    program = {"counting": [sys.executable, "-m", "tests.studies.counting", str(file)]}
+    program["training"] = [*PROGRAM, "study", "sweep", str(file), "--output"]
+    command, folder = [*program[work], str(tmp_path / "out"), "--jobs", "2"], tmp_path / "out"
+    alone = [*program[work], str(tmp_path / "alone"), "--jobs", "1"]
+    subprocess.run(alone, cwd=ROOT, stderr=subprocess.DEVNULL, check=True)
+    for end in (signal.SIGKILL, signal.SIGINT):
+        driver = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
+        try:
+            while driver.pid not in map(parent, holders(folder)):
+                assert driver.poll() is None
+                time.sleep(0.01)
+            driver.send_signal(end)
+            assert driver.wait(timeout=300) in (-signal.SIGKILL, 130)
+        finally:
+            driver.kill()
+            driver.wait()
+        while holders(folder):  # processes whose driver was killed end by themselves
+            time.sleep(0.01)
+    finished = subprocess.run(command, cwd=ROOT, stderr=subprocess.PIPE, text=True, check=False)
+    assert finished.returncode == 0, finished.stderr
+    assert (folder / TABLE).read_bytes() == (tmp_path / "alone" / TABLE).read_bytes()
+    ends = Counter(one["job"] for one in journal(folder) if one["status"] == "finished")
+    assert sorted(ends.values()) == [1] * 6
+
+
+@pytest.mark.parametrize("command", ["sweep", "tune"])
+@pytest.mark.parametrize("package", ["ray", "optuna"])
+def test_extra__that_is_missing_is_told_before_anything_is_planned(
+    command: str, package: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    if (command, package) != ("sweep", "optuna"):
+        options = ["--ray", "local", "--dry-run"] if package == "ray" else []
+        assert run_command(["study", command, "no.yaml", "--output", "no", *options]) == 2
+        told, extra = capsys.readouterr().err, {"ray": "cluster", "optuna": "tune"}[package]
+        assert f"needs the package {package}" in told and told.endswith(f"-m pip install 'ethbrake-marl[{extra}]'\n")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_schema__is_one_says_what_every_key_means_and_lets_the_examples_pass(kind: str) -> None:
+    schema = KINDS[kind][0]()
+    Draft202012Validator.check_schema(schema)
+    parts = {"the file": schema, **schema["$defs"]}
+    keys = {f"{part}.{key}": value for part, inner in parts.items() for key, value in inner["properties"].items()}
+    assert [key for key, value in keys.items() if not value.get("description")] == []
+    examples = [read_yaml(path).content for path in DOCS.glob(f"{kind}-*.yaml")]
+    assert examples and [_marked(kind, content) for content in examples] == [set()] * len(examples)
+    for needed in {"sweep": [{"grid", "jobs"}], "tuning": [{"search"}]}[kind]:
+        content = {key: value for key, value in examples[0].items() if key not in needed}
+        assert _marked(kind, content) == {""}
+
+
+EXAMPLES = {"sweep": "sweep-example", "tuning": "tuning-quick"}
+
+
+def _marked(kind: str, content: Any) -> set[str]:
+    """The places where an editor marks a mistake; empty: the whole file."""
+    found = Draft202012Validator(KINDS[kind][0]()).iter_errors(content)
+    return {".".join(map(str, error.absolute_path)) for error in found}
+
+
+@pytest.mark.parametrize(
+    ("kind", "change"),
+    [
+        ("sweep", {"grid": {**GRID, "seed": 3}}),
+        ("sweep", {"grid": {"scenario": ["a", "b"], "recipe": ["ppo"], "seed": [0, 1]}, "jobs": []}),
+        ("sweep", {"jobs": [{"scenario": "a", "recipe": "ppo"}]}),
+        ("tuning", {"prune": None}),
+        ("tuning", {"search": {"holds": {"choices": [[1], "x", 3]}}}),
+        ("tuning", {"search": {"gamma": {"low": 0.5, "high": 1, "log": True}}}),
+    ],
+)
+def test_schema__lets_pass_what_the_reader_takes(kind: str, change: dict[str, Any], tmp_path: Path) -> None:
+    content = {**read_yaml(DOCS / f"{EXAMPLES[kind]}.yaml").content, **change}
+    assert _marked(kind, content) == set()
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(content))
+    KINDS[kind][1](tmp_path / "mine.yaml", "scaling", "")
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "place"),
+    [
+        ("sweep", {"gird": GRID}, ""),
+        ("sweep", {"grid": {**GRID, "level": "2-paper"}}, "grid"),
+        ("sweep", {"grid": {"recipe": "ppo"}}, "grid"),
+        ("sweep", {"grid": {**GRID, "seed": [-1]}}, "grid.seed"),
+        ("sweep", {"grid": {**GRID, "seed": {"first": 1}}}, "grid.seed"),
+        ("sweep", {"grid": {**GRID, "recipe": []}}, "grid.recipe"),
+        ("sweep", {"grid": {**GRID, "set": {"gamma": 0.9}}}, "grid.set.gamma"),
+        ("sweep", {"jobs": [{"scenario": "paper-random"}]}, "jobs.0"),
+        ("sweep", {"jobs": [{**GRID, "seed": [1]}]}, "jobs.0.seed"),
+        ("tuning", {"serach": {"n_epochs": {"low": 1, "high": 4}}}, ""),
+        ("tuning", {"search": {}}, "search"),
+        ("tuning", {"search": {"gamma": {"low": 0.5}}}, "search.gamma"),
+        ("tuning", {"search": {"gamma": {"low": "a", "high": 1}}}, "search.gamma"),
+        ("tuning", {"search": {"gamma": {"choices": [0.9]}}}, "search.gamma"),
+        ("tuning", {"measure": {"worlds": 0}}, "measure.worlds"),
+        ("tuning", {"prune": {"keep": 1.0}}, "prune"),
+        ("tuning", {"sampler": {"name": "grid"}}, "sampler.name"),
+        ("tuning", {"seed": None}, "seed"),
+    ],
+)
+def test_schema__marks_what_the_reader_refuses(kind: str, change: dict[str, Any], place: str, tmp_path: Path) -> None:
+    content = {**read_yaml(DOCS / f"{EXAMPLES[kind]}.yaml").content, **change}
+    assert _marked(kind, content) == {place}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(content))
+    with pytest.raises(InvalidInput):
+        KINDS[kind][1](tmp_path / "mine.yaml", "scaling", "")
