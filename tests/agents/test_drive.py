@@ -9,7 +9,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents import LearnedAgent, Team, drive, make_agent, policy_agent, register_agent, script_agents
-from ethbrake_marl.engine import Engine
+from ethbrake_marl.engine import Engine, ask_script
 from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate, follow_episodes, record_episode, worlds_sha256
@@ -242,6 +242,12 @@ class _Writes:
         if self.when == "vehicles":
             worlds.vehicles.mass_t[:] = 1.0
         return -worlds.vehicles.braking_capacity_mps2[:, vehicle], memory
+
+
+def test_memory__that_an_agent_writes_into_is_its_own_copy():
+    worlds, memory = PAPER.sample(3, seed=1).worlds, np.zeros(3)
+    _, after = ask_script(_Writes("", state_free=True), worlds, memory, 1)
+    assert (memory.tolist(), after.tolist()) == ([0.0] * 3, [1.0] * 3)
 
 
 KEPT = ("name", "plan")  # an attribute that there is, and a new one
