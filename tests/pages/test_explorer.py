@@ -85,7 +85,7 @@ BODIES: list[bytes] = [
 
 
 # What a question may hold that makes it none: each value of a key, in an otherwise good one.
-MISSING = object()
+MISSING = "(taken out)"
 
 
 STATES: list[tuple[str, Any]] = [
