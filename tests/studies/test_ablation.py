@@ -676,8 +676,9 @@ def test_generalise__runs_that_are_not_seeds_of_one_training_are_refused(run: Pa
     content = json.loads((seed / "team.json").read_text()) | {"scheme": "independent", "drivers": team}
     (seed / "team.json").write_text(json.dumps(content))
     refused("have a policy each", seed)
-    (seed / "config.json").write_text("[]")
-    refused("config.json: is damaged", run, seed)
+    damaged = changed(run, tmp_path / "damaged", recipe={"seed": 2})
+    (damaged / "config.json").write_text("[]")
+    refused("config.json: is damaged", run, damaged)
 
 
 def changed(run: Path, folder: Path, scenario: Mapping[str, object] = {}, recipe: Mapping[str, object] = {}) -> Path:
