@@ -267,8 +267,10 @@ def _watch(event: str, arguments: tuple[Any, ...], seen: int) -> None:
 def _keep_inside(event: str, arguments: tuple[Any, ...], own: str, seen: int) -> None:
     """Refuse, and tell, whatever would change something outside the case's own folder, whoever runs the attack."""
     if event == "open":
-        writes = isinstance(arguments[2], int) and arguments[2] & _WRITING
-        places = [os.path.realpath(os.fsdecode(arguments[0]))] if writes and not isinstance(arguments[0], int) else []
+        name, flags = arguments[0], arguments[2]
+        writes = isinstance(flags, int) and flags & _WRITING and not isinstance(name, int)
+        follow = _entry if writes and flags & os.O_NOFOLLOW else lambda path, _: os.path.realpath(path)
+        places = [follow(os.fsdecode(name), None)] if writes else []
     else:
         places = [
             _entry(os.fsdecode(arguments[k]), None if base is None else arguments[base])

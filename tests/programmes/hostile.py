@@ -310,24 +310,27 @@ def by_category(kind: str, seed: int) -> dict[str, list[Case]]:
 
 
 def cases(given: argparse.Namespace) -> Cases:
-    with tempfile.TemporaryDirectory(prefix="hostile-", ignore_cleanup_errors=True) as name:
-        child = 0 if given.list else os.fork()  # what confines it cannot be undone, and a folder is left to remove
-        if child:
-            raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-        own = Path(name).resolve()
-        if not given.list:
-            die_with_parent()
-            os.chdir(own)
-            tempfile.tempdir = os.fspath(own)
-            warm_up(own)
-            if can_confine():
-                confine(own)
-            else:
-                print("this kernel cannot confine a process: the audit hook alone keeps the cases in their folder")
-        for kind in KINDS:
-            for number, (category, group) in enumerate(by_category(kind, given.seed).items()):
-                tried = group[: given.sample]
-                yield f"{kind}: {category}, {len(tried)}", partial(attack, tried, own / f"{kind}-{number}", given)
+    own = Path(tempfile.mkdtemp(prefix="hostile-")).resolve()
+    child = 0 if given.list else os.fork()  # what confines it cannot be undone, and a folder is left to remove
+    if child:
+        status = os.waitpid(child, 0)[1]
+        shutil.rmtree(own, ignore_errors=True)
+        raise SystemExit(os.waitstatus_to_exitcode(status))
+    if given.list:
+        own.rmdir()
+    else:
+        die_with_parent()
+        os.chdir(own)
+        tempfile.tempdir = os.fspath(own)
+        warm_up(own)
+        if can_confine():
+            confine(own)
+        else:
+            print("this kernel cannot confine a process: the audit hook alone keeps the cases in their folder")
+    for kind in KINDS:
+        for number, (category, group) in enumerate(by_category(kind, given.seed).items()):
+            tried = group[: given.sample]
+            yield f"{kind}: {category}, {len(tried)}", partial(attack, tried, own / f"{kind}-{number}", given)
 
 
 def attack(tried: list[Case], folder: Path, given: argparse.Namespace) -> Told:
@@ -364,7 +367,7 @@ WARM = (
           ("study tune", "tuning.yaml", " --output file"),
           ("search falsify --again", "worlds.yaml", ""),
           (" ".join(COMMAND[:-2]), "t.npz", " --json"),
-          ("evaluate --agents ppo@shipped --initial-states", "CSV.yaml", ""),
+          ("evaluate --agents ppo@shipped --initial-states", "CSV.csv", ""),
       )),
     "train resume ppo", "train resume sac", "nonsense", "study generalise --runs x --vehicles 3", "shield --agents x",
     "study ablate --levels x --output x", "train curves --scenario x --output x", "agent export x --onnx x",
@@ -379,7 +382,7 @@ def warm_up(folder: Path) -> None:
     write(folder / "file", "")
     for place in (folder, folder / "bad"):
         for kind, text in texts().items():
-            write(place / f"{kind}.yaml", text.text if place == folder else "bad: [")
+            write(place / f"{kind}{Path(text.file).suffix}", text.text if place == folder else "bad: [")
         write(place / "t.npz", good_bytes() if place == folder else b"")
     with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
         for algorithm in ("ppo", "sac"):
