@@ -168,6 +168,7 @@ def test_dry_run__prints_jobs_and_cost_and_makes_nothing(again, tmp_path: Path, 
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")  # an error in this process alone
+@pytest.mark.filterwarnings("default::RuntimeWarning")  # of what diverges, in this process
 @pytest.mark.slow
 def test_failures__end_in_a_table_with_their_last_lines(write_sweep, tiny, tmp_path, capsys):
     good = {"scenario": "paper-random", "recipe": str(tiny)}

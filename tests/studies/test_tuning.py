@@ -184,6 +184,7 @@ def test_broken_trials__are_marked_failed_and_others_done_in_their_place(write_t
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")  # an error in this process alone
+@pytest.mark.filterwarnings("default::RuntimeWarning")  # of what diverges, in this process
 @pytest.mark.slow
 def test_trial__that_diverges_is_failed_with_its_reason_and_the_others_go_on(write_tuning, tmp_path, capsys) -> None:
     file = write_tuning(search={"reward.harm": {"choices": [0.05, 1e300]}}, sampler={"name": "random"})
