@@ -218,10 +218,8 @@ class Listener:
         self.each_s, self.pipe = each_s, pipe
 
     def pytest_collection_modifyitems(self, items: list[Any]) -> None:
-        """The chosen ones alone; what has another name because of the fault, last."""
-        items[:] = sorted(
-            (i for i in items if i.nodeid in self.places), key=lambda i: self.places[i.nodeid]
-        )  # stable: in the order of the files
+        """The chosen ones alone, in their order."""
+        items[:] = sorted((i for i in items if i.nodeid in self.places), key=lambda i: self.places[i.nodeid])
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self) -> Iterator[Any]:
@@ -342,12 +340,15 @@ class Copy:
             while True:
                 with self.changed(fault):
                     red = self.first_red(tests, compiled=compiled, own_kernels=function.compiled)
-                if not red or red.startswith("(") or red in self.green[compiled]:
+                if not red or red in self.green[compiled]:
                     break
-                again = [test for test in tests if test.startswith(red)][:1]
+                named = not red.startswith("(")  # else all came to an end, which says nothing if they do so anyway
+                again = [test for test in tests if not named or test.startswith(red)][:1]
                 if not self.first_red(again, compiled=compiled):
-                    self.green[compiled].add(red)
+                    self.green[compiled] |= {red} if named else set()
                     break
+                if not named:
+                    raise RuntimeError(f"the tests do not run without a fault, either: {again}: {red}")
                 self.red_anyway[compiled] |= {red, *again}  # it fails without the fault, too
             if red:
                 return red
@@ -374,7 +375,9 @@ def _run(self: Copy, pipe: int, tests: list[str], compiled: bool, own_kernels: b
         compiling.digest_of_sources = cache(lambda source: self.digests.get(str(source), ""))
     plugin = Listener(tests, None if compiled else EACH_S, pipe)
     files = list(dict.fromkeys(test.partition("::")[0] for test in tests))
-    pytest.main([*OPTIONS, *files], plugins=[plugin])
+    status = int(pytest.main([*OPTIONS, *files], plugins=[plugin]))
+    if status in (3, 4):  # pytest itself failed, or could not begin: the fault is met by whoever imports the package
+        os.write(pipe, f"(exit status {status} of pytest)\n".encode())
 
 
 # ---------------------------------------------------------------- all of them
