@@ -8,21 +8,28 @@ from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 
 from extension.api import add_public_names
-from extension.pages import add_cards, add_records, make_changelog, make_start, relink
+from extension.pages import add_cards, list_folder, make_changelog, make_start, relink
+from extension.results import add_reproduction, add_tables
 
 MADE = {
     "index": make_start,
     "changelog": make_changelog,
     "api": add_public_names,
     "shipped-policies": add_cards,
-    "decisions/README": add_records,
+    "results/reproduction": add_reproduction,
 }
 
 
 def make_page(app: Sphinx, docname: str, source: list[str]) -> None:
     """Complete a page that is made, and lead links that leave docs/ to their page on the site."""
     try:
-        source[0] = MADE[docname](source[0]) if docname in MADE else relink(source[0], docname)
+        if docname in MADE:
+            source[0] = MADE[docname](source[0])
+        elif docname.endswith("/README"):
+            source[0] = list_folder(source[0], docname)
+        else:
+            folder, _, name = docname.rpartition("/")
+            source[0] = relink(add_tables(source[0], name) if folder == "results" else source[0], docname)
     except ValueError as error:
         raise ExtensionError(f"{docname}: {error}") from error
 

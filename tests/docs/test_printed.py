@@ -20,11 +20,12 @@ from tests.docs.blocks import (
     agrees,
     commands_of,
     missing_figures,
+    pages,
     pictures,
     printed_blocks,
     tables_of_figures,
 )
-from tests.docs.printed import BLOCKS, EXACT, PICTURES, TABLES, How, how, where_rows
+from tests.docs.printed import BLOCKS, EXACT, MEASURED, PICTURES, TABLES, How, how, results, where_rows
 from tests.docs.site import DOCS
 from tests.docs.speeds import CASES, line
 
@@ -51,7 +52,8 @@ def test_everything_shown__has_its_place(shown: Callable[[], Iterator[Shown]], t
 
 def test_everything_shown__names_tests_and_programs_that_are_there() -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE))
-    for place in (*BLOCKS.values(), *TABLES.values(), *PICTURES.values()):
+    measured = [place for _, place in results()]
+    for place in (*BLOCKS.values(), *TABLES.values(), *PICTURES.values(), *measured):
         for by in place.by:
             assert not by.startswith("tests/") or (ROOT / by).exists(), by
             assert not by.startswith("make ") or by.split()[1] in targets, by
@@ -59,6 +61,24 @@ def test_everything_shown__names_tests_and_programs_that_are_there() -> None:
 
 def test_page__shows_where_each_is_compared() -> None:
     assert "\n".join(where_rows()) + "\n" in (ROOT / "docs" / "tests.md").read_text("utf-8")
+
+
+def test_results__are_linked_where_they_are_and_written_row_by_row(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    anchors = {(Path(each.page).stem, each.begin) for each, _ in results()}
+    links = re.compile(r"\]\((?:\.\./)?(?:docs/)?results/([a-z-]+)\.md#([a-z0-9-]+)\)")
+    linked = {link for page in pages() for link in links.findall(page.read_text("utf-8"))}
+    assert linked <= anchors and len({anchor for _, anchor in anchors}) == len(anchors)
+    files = {path: path.read_text("utf-8") for path in MEASURED.RESULTS.glob("*.json")}
+    tables = {path.name: MEASURED.read_tables(path.stem) for path in files}
+    monkeypatch.setattr(MEASURED, "RESULTS", tmp_path)
+    for path, text in files.items():
+        MEASURED.write_tables(path.stem, tables[path.name])
+        assert (tmp_path / path.name).read_text("utf-8") == text
+    (tmp_path / "paper.json").write_text(files[path.with_name("paper.json")].replace('"note"', '"notes"'), "utf-8")
+    with pytest.raises(ValueError, match="notes"):
+        MEASURED.read_tables("paper")
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 Each library has an environment of its own below ``.venvs/``, kept for the next run, with this project as it stands.
 What cannot be installed is skipped, and the reason told. A policy is measured on a fixed list of worlds beside full
 braking, and where the library evaluates policies by itself, its harm is compared with ours, world by world.
-``--write`` puts the rows into the table of the page. ``--ci`` takes the libraries that are cheap to install.
+``--write`` puts the rows into docs/results/libraries.json. ``--ci`` takes the libraries that are cheap to install.
 """
 
 from __future__ import annotations
@@ -25,10 +25,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tests.docs.site import load
 from tests.programmes import KEPT, ROOT, Cases, Told
 from tests.programmes.environments import NotInstalled, ready_python, watched
 
 PAGE = ROOT / "docs" / "other-libraries.md"
+MEASURED = load("results")
 SCENARIO, EPISODES, SEED = "paper-random", 500, 7
 OWN_EPISODES, CLOSE = 50, 1e-5  # of the library's own evaluation; m2/s2
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
@@ -254,7 +256,7 @@ def cpu_seconds() -> float:
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--ci", action="store_true", help="only the libraries that are cheap to install")
     parser.add_argument("--limit", type=float, default=900.0, help="seconds for one way")
-    parser.add_argument("--write", action="store_true", help="write the rows into the table of the page")
+    parser.add_argument("--write", action="store_true", help="write the rows into docs/results/libraries.json")
 
 
 def cases(given: argparse.Namespace) -> Cases:
@@ -289,13 +291,13 @@ def run(k: int, way: Way, given: argparse.Namespace) -> Told:
 
 
 def write_row(way: Way, cells: list[str]) -> None:
-    """Put a row into the table of the page, in the place of the one of the same library and way."""
+    """Put a row into docs/results/libraries.json, in the place of the one of the same library and way."""
     told, *rest = cells
-    row = f"| {' | '.join((way.library, told, lowered(way.title), way.ran, *rest))} |"
-    begin = rf"^\| {re.escape(way.library)} \| [^|]* \| {re.escape(lowered(way.title))} \|.*$"
-    text, found = re.subn(begin, lambda _: row, PAGE.read_text("utf-8"), flags=re.MULTILINE)
-    assert found == 1, f"the page has {found} rows of {way.library}, {way.title}"
-    PAGE.write_text(text, "utf-8")
+    row = [way.library, told, lowered(way.title), way.ran, *rest]
+    (table,) = MEASURED.read_tables("libraries")
+    rows = [row if (each[0], each[2]) == (row[0], row[2]) else each for each in table.rows]
+    assert row in rows, f"no row of {way.library}, {way.title}"
+    MEASURED.write_tables("libraries", [table.model_copy(update={"rows": rows})])
 
 
 def lowered(title: str) -> str:
