@@ -7,13 +7,14 @@ from typing import Any
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 
-from extension.api import add_public_names
-from extension.pages import add_cards, add_records, make_changelog, make_start, relink
+from extension.api import add_public_names, check_pages
+from extension.pages import add_cards, add_interface, add_records, make_changelog, make_start, relink
+from extension.reference import COMPLETED
 
 MADE = {
     "index": make_start,
     "changelog": make_changelog,
-    "api": add_public_names,
+    "api": add_interface,
     "shipped-policies": add_cards,
     "decisions/README": add_records,
 }
@@ -22,7 +23,11 @@ MADE = {
 def make_page(app: Sphinx, docname: str, source: list[str]) -> None:
     """Complete a page that is made, and lead links that leave docs/ to their page on the site."""
     try:
-        source[0] = MADE[docname](source[0]) if docname in MADE else relink(source[0], docname)
+        text = source[0] + (f"\n{COMPLETED[docname]()}" if docname in COMPLETED else "")
+        text = MADE[docname](text) if docname in MADE else relink(text, docname)
+        if docname == "api":
+            check_pages()
+        source[0] = add_public_names(text)
     except ValueError as error:
         raise ExtensionError(f"{docname}: {error}") from error
 

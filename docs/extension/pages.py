@@ -65,6 +65,12 @@ def add_records(text: str) -> str:
     return f"{relink(text, 'decisions/README')}\n{_navigation(records)}"
 
 
+def add_interface(text: str) -> str:
+    """The page about public names, with their pages in the navigation in the order of its list."""
+    pages = re.findall(r"\]\((api/[a-z]+\.md)\)", text)
+    return f"{relink(text, 'api')}\n{_navigation(pages)}"
+
+
 def add_cards(text: str) -> str:
     """The page about shipped policies, and then the card of each, its headings one level lower."""
     cards = [
