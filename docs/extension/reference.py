@@ -73,7 +73,7 @@ def _commands(group: Any, context: Any, level: int) -> Iterator[str]:
             continue
         usage = command.get_usage(inside).removeprefix("Usage: ")
         examples = re.findall(r"Example: (.*)", command.epilog or "")
-        yield "\n".join(["```console", *(f"$ {each}" for each in [usage, *examples]), "```\n"])
+        yield "\n".join([f"`{usage}`\n", "```console", *(f"$ {each}" for each in examples), "```\n"])
         records = [each.get_help_record(inside) for each in command.params if each.opts[0] not in ON_EVERY_COMMAND]
         if records:
             yield table(("option", "default", "meaning"), (_option(*record) for record in records))
