@@ -7,14 +7,15 @@ from typing import Any
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 
-from extension.api import add_public_names
-from extension.pages import add_cards, list_folder, make_changelog, make_start, relink
+from extension.api import add_public_names, check_pages
+from extension.pages import add_cards, add_interface, list_folder, make_changelog, make_start, relink
+from extension.reference import COMPLETED
 from extension.results import add_reproduction, add_tables
 
 MADE = {
     "index": make_start,
     "changelog": make_changelog,
-    "api": add_public_names,
+    "api": add_interface,
     "shipped-policies": add_cards,
     "results/reproduction": add_reproduction,
 }
@@ -23,13 +24,17 @@ MADE = {
 def make_page(app: Sphinx, docname: str, source: list[str]) -> None:
     """Complete a page that is made, and lead links that leave docs/ to their page on the site."""
     try:
+        text = source[0] + (f"\n{COMPLETED[docname]()}" if docname in COMPLETED else "")
+        folder, _, name = docname.rpartition("/")
         if docname in MADE:
-            source[0] = MADE[docname](source[0])
-        elif docname.endswith("/README"):
-            source[0] = list_folder(source[0], docname)
+            text = MADE[docname](text)
+        elif name == "README":
+            text = list_folder(text, docname)
         else:
-            folder, _, name = docname.rpartition("/")
-            source[0] = relink(add_tables(source[0], name) if folder == "results" else source[0], docname)
+            text = relink(add_tables(text, name) if folder == "results" else text, docname)
+        if docname == "api":
+            check_pages()
+        source[0] = add_public_names(text)
     except ValueError as error:
         raise ExtensionError(f"{docname}: {error}") from error
 

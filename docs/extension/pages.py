@@ -65,6 +65,12 @@ def list_folder(text: str, docname: str) -> str:
     return f"{relink(text, docname)}\n{_navigation(listed)}"
 
 
+def add_interface(text: str) -> str:
+    """The page about public names, with their pages in the navigation in the order of its list."""
+    pages = re.findall(r"\]\((api/[a-z]+\.md)\)", text)
+    return f"{relink(text, 'api')}\n{_navigation(pages)}"
+
+
 def add_cards(text: str) -> str:
     """The page about shipped policies, and then the card of each, its headings one level lower."""
     cards = [

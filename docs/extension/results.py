@@ -56,13 +56,16 @@ def table_of(columns: list[str], rows: list[list[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
+TABLES = TypeAdapter(list[Table])
+
+
 def read_tables(topic: str) -> list[Table]:
     """The tables of a topic. Raises ``ValueError`` for any key too few or too many, and for what is no text."""
-    return TypeAdapter(list[Table]).validate_json((RESULTS / f"{topic}.json").read_bytes())
+    return TABLES.validate_json((RESULTS / f"{topic}.json").read_bytes())
 
 
-def write_tables(topic: str, tables: list[Table]) -> None:
-    """Write the tables of a topic, each row on a line of its own."""
+def text_of(tables: list[Table]) -> str:
+    """The file of these tables, each row on a line of its own."""
     written = []
     for table in tables:
         texts = {key: json.dumps(value, ensure_ascii=False) for key, value in table.model_dump().items()}
@@ -70,7 +73,7 @@ def write_tables(topic: str, tables: list[Table]) -> None:
         texts["rows"] = f"[\n   {rows}\n  ]"
         written.append(",\n  ".join(f'"{key}": {text}' for key, text in texts.items()))
     body = "\n },\n {\n  ".join(written)
-    (RESULTS / f"{topic}.json").write_text(f"[\n {{\n  {body}\n }}\n]\n", "utf-8")
+    return f"[\n {{\n  {body}\n }}\n]\n"
 
 
 def add_tables(page: str, topic: str) -> str:

@@ -26,11 +26,12 @@ from ethbrake_marl.observations import Feature, ObservationSpec
 from ethbrake_marl.physics import make_worlds
 from ethbrake_marl.scenario import Scenario, full_state, load_scenario, state_features
 from tests.contract.interfaces import CRASH, FIVE, PAPER, REST, actions, initial_state
-from tests.reference.docs_tables import environment_tables, feature_table
 
 near = pytest.approx
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = (ROOT / "docs" / "environment.md").read_text("utf-8")
+PAGE, EPISODES, INFOS = (
+    (ROOT / "docs" / f"{name}.md").read_text("utf-8") for name in ("environment", "episodes", "infos")
+)
 COAST, BRAKE = np.zeros(1, np.float32), np.full(1, -1.0, np.float32)
 
 
@@ -132,7 +133,7 @@ def test_infos__hold_the_same_keys_in_every_step_and_the_page_names_them() -> No
     assert {(turn[4]["world_seed"], turn[4]["world"]) for turn in told} == {(0, 0)}
     given = environment.reset(seed=5, options={"initial_state": {"gaps_m": 7}})[1]
     assert (given["world_seed"], given["world"]) == (5, -1)
-    rows = re.findall(r"^\| (`.*?) \|", PAGE.split("## Infos")[1].split("There is no clock")[0], re.MULTILINE)
+    rows = re.findall(r"^\| (`.*?) \|", INFOS.split("There is no clock")[0], re.MULTILINE)
     assert {name for row in rows for name in re.findall("`(.*?)`", row)} == set(at_reset)
 
 
@@ -493,7 +494,7 @@ def test_wrappers__which_of_gymnasiums_take_same_step_is_what_the_page_says() ->
     for wrap in (wrappers.NormalizeReward, wrappers.RecordEpisodeStatistics, wrappers.ClipAction):
         wrap(eb.EthBrakeVectorEnv(2, autoreset_mode="SameStep")).reset(seed=1)
     for wrap in (wrappers.NormalizeObservation, wrappers.FlattenObservation):
-        assert f"`{wrap.__name__}`" in PAGE
+        assert f"`{wrap.__name__}`" in EPISODES
         wrapped = wrap(eb.EthBrakeVectorEnv(2))
         wrapped.reset(seed=1)
         assert all(np.isfinite(wrapped.step(action)[0]).all() for action in actions(2, 90, 2))
@@ -559,21 +560,6 @@ def test_import__stays_light_until_a_name_is_used_and_lets_gymnasium_make_it_by_
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert result.stdout.splitlines() == ["[]", "['numba', 'pydantic']", "EthBrakeEnv", "{} {}"], result.stderr
-
-
-def test_feature_table__has_one_line_for_each_feature() -> None:
-    table = feature_table([Feature("own.speed", "m/s", 20.0, -2.0, 4.0, "own speed")])
-    assert table.splitlines() == [
-        "| # | feature | unit | scale | low | high | meaning |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
-        "| 0 | `own.speed` | m/s | 20 | -2 | 4 | own speed |",
-    ]
-
-
-@pytest.mark.parametrize("marker", environment_tables())
-def test_page__shows_the_table_that_the_code_makes(marker: str) -> None:
-    (shown,) = re.findall(f"<!-- {marker} -->\n(.*?)\n<!-- end -->", PAGE, re.DOTALL)
-    assert shown == environment_tables()[marker]
 
 
 def test_page__its_example_runs() -> None:

@@ -297,7 +297,8 @@ def write_row(way: Way, cells: list[str]) -> None:
     (table,) = MEASURED.read_tables("libraries")
     rows = [row if (each[0], each[2]) == (row[0], row[2]) else each for each in table.rows]
     assert row in rows, f"no row of {way.library}, {way.title}"
-    MEASURED.write_tables("libraries", [table.model_copy(update={"rows": rows})])
+    text = MEASURED.text_of([table.model_copy(update={"rows": rows})])
+    (MEASURED.RESULTS / "libraries.json").write_text(text, "utf-8")
 
 
 def lowered(title: str) -> str:
