@@ -7,7 +7,7 @@ from typing import Any
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 
-from extension.api import add_public_names, check_pages
+from extension.api import PAGES, add_public_names, check_pages
 from extension.pages import add_cards, add_interface, add_records, make_changelog, make_start, relink
 from extension.reference import COMPLETED
 
@@ -32,6 +32,11 @@ def make_page(app: Sphinx, docname: str, source: list[str]) -> None:
         raise ExtensionError(f"{docname}: {error}") from error
 
 
+def made_again(app: Sphinx, env: object, added: set[str], changed: set[str], removed: set[str]) -> list[str]:
+    """The pages that may have changed although their own file has not."""
+    return [*MADE, *COMPLETED, *(f"api/{path.stem}" for path in PAGES.glob("*.md"))]
+
+
 def keep_colon(app: Sphinx, what: str, name: str, value: object, options: object, lines: list[str]) -> None:
     """Keep napoleon from taking what stands before a colon in a property's docstring for its type."""
     if what in ("property", "attribute") and lines:
@@ -40,6 +45,7 @@ def keep_colon(app: Sphinx, what: str, name: str, value: object, options: object
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Connect to Sphinx."""
+    app.connect("env-get-outdated", made_again)
     app.connect("source-read", make_page)
     app.connect("autodoc-process-docstring", keep_colon, priority=400)  # napoleon has 500
     return {"parallel_read_safe": True}
