@@ -171,7 +171,7 @@ MOST_CHARACTERS = 100
 MOST_LINES = 8  # of a paragraph
 
 
-PAGES = sorted([ROOT / "README.md", *ROOT.glob(".github/*.md"), *DOCS.glob("*.md"), *DOCS.glob("tutorials/*.md")])
+PAGES = sorted([ROOT / "README.md", *ROOT.glob(".github/*.md"), *DOCS.glob("*.md"), *DOCS.glob("[art]*/*.md")])
 
 
 FENCE = re.compile(r"\s*(```+|~~~+|:::+)")
