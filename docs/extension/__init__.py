@@ -39,6 +39,12 @@ def make_page(app: Sphinx, docname: str, source: list[str]) -> None:
         raise ExtensionError(f"{docname}: {error}") from error
 
 
+def made_again(app: Sphinx, env: Any, added: set[str], changed: set[str], removed: set[str]) -> list[str]:
+    """The pages that may have changed although their own file has not."""
+    folders = (page for page in env.found_docs if page.startswith(("api/", "results/")) or page.endswith("/README"))
+    return [*MADE, *COMPLETED, *folders]
+
+
 def keep_colon(app: Sphinx, what: str, name: str, value: object, options: object, lines: list[str]) -> None:
     """Keep napoleon from taking what stands before a colon in a property's docstring for its type."""
     if what in ("property", "attribute") and lines:
@@ -47,6 +53,7 @@ def keep_colon(app: Sphinx, what: str, name: str, value: object, options: object
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Connect to Sphinx."""
+    app.connect("env-get-outdated", made_again)
     app.connect("source-read", make_page)
     app.connect("autodoc-process-docstring", keep_colon, priority=400)  # napoleon has 500
     return {"parallel_read_safe": True}

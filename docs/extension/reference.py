@@ -76,14 +76,14 @@ def _commands(group: Any, context: Any, level: int) -> Iterator[str]:
         yield "\n".join([f"`{usage}`\n", "```console", *(f"$ {each}" for each in examples), "```\n"])
         records = [each.get_help_record(inside) for each in command.params if each.opts[0] not in ON_EVERY_COMMAND]
         if records:
-            yield table(("option", "default", "meaning"), (_option(*record) for record in records))
+            yield table(("option", "meaning", "default"), (_option(*record) for record in records))
 
 
 def _option(written: str, about: str) -> tuple[str, str, str]:
     text, _, extra = about.partition("  [")
-    needed = "required" if "required" in extra else ""
     default = re.search(r"default: (.*?)(?:; required)?\]$", extra)
-    return f"`{written}`", needed or (default[1].strip("()") if default else ""), text
+    told = "required" if "required" in extra else default[1].strip("()") if default else ""
+    return " ".join(f"`{word}`" for word in written.split()), text, told
 
 
 # Scenarios and recipes.
@@ -95,15 +95,15 @@ def scenario_keys() -> str:
     kind = schema["$defs"]["VehicleType"]["properties"]
     return sections(
         Keys=table(
-            ("key", "default", "range", "meaning"),
+            ("key", "meaning", "range", "default"),
             [
-                (f"`{key}`", _default(key, field), _range(schema["properties"][key], schema, key), field.description)
+                (f"`{key}`", field.description, _range(schema["properties"][key], schema, key), _default(key, field))
                 for key, field in Scenario.model_fields.items()
             ],
         ),
         Keys_of_a_type=table(
-            ("key", "range", "meaning"),
-            [(f"`{key}`", _range(each, schema, key), each["description"]) for key, each in kind.items()],
+            ("key", "meaning", "range"),
+            [(f"`{key}`", each["description"], _range(each, schema, key)) for key, each in kind.items()],
         ),
     )
 
@@ -169,8 +169,8 @@ def recipe_keys() -> str:
             each = parts[title]["properties"][key]
             default = f"`{each['default']}`" if each.get("default") else ""
             default = "required" if key in parts[title]["required"] else default
-            rows.append((f"`{key}`", default, _range(each, schema), MEANINGS.get(key, "")))
-        tables[title] = table(("key", "default", "range", "meaning"), rows)
+            rows.append((f"`{key}`", MEANINGS.get(key, ""), _range(each, schema), default))
+        tables[title] = table(("key", "meaning", "range", "default"), rows)
     inside = [(f"`{key}`", text) for key, text in MEANINGS.items() if "." in key]
     return sections(**tables, Inside_others=table(("key", "meaning"), inside))
 
@@ -258,8 +258,8 @@ def channels() -> str:
     return sections(
         Presets=table(("preset", "`hears`", "`senses`", "p", "r", "messages lost", "mean burst", "`lost`"), rows),
         Keys_of_v2x=table(
-            ("key", "range", "meaning"),
-            [(f"`{key}`", _range(each, schema), each["description"]) for key, each in keys.items()],
+            ("key", "meaning", "range"),
+            [(f"`{key}`", each["description"], _range(each, schema)) for key, each in keys.items()],
         ),
     )
 

@@ -29,9 +29,7 @@ from tests.contract.interfaces import CRASH, FIVE, PAPER, REST, actions, initial
 
 near = pytest.approx
 ROOT = Path(__file__).resolve().parents[2]
-PAGE, EPISODES, INFOS = (
-    (ROOT / "docs" / f"{name}.md").read_text("utf-8") for name in ("environment", "episodes", "infos")
-)
+EPISODES, INFOS = ((ROOT / "docs" / f"{name}.md").read_text("utf-8") for name in ("episodes", "infos"))
 COAST, BRAKE = np.zeros(1, np.float32), np.full(1, -1.0, np.float32)
 
 
@@ -562,8 +560,9 @@ def test_import__stays_light_until_a_name_is_used_and_lets_gymnasium_make_it_by_
     assert result.stdout.splitlines() == ["[]", "['numba', 'pydantic']", "EthBrakeEnv", "{} {}"], result.stderr
 
 
-def test_page__its_example_runs() -> None:
-    code = re.findall("```python\n(.*?)```", PAGE, re.DOTALL)[0]
+def test_pages__their_examples_run() -> None:
     names: dict[str, object] = {}
-    exec(code.replace("4096", "4").replace("512", "4"), names)
-    assert {"env", "many", "vec"} <= set(names)
+    for page in ("environment", "observations", "rewards", "episodes", "infos", "watching"):
+        for code in re.findall("```python\n(.*?)```", (ROOT / "docs" / f"{page}.md").read_text("utf-8"), re.DOTALL):
+            exec(code.replace("4096", "4").replace("512", "4"), names)
+    assert {"many", "vec", "frame", "smooth"} <= set(names)
