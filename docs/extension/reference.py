@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -224,14 +225,17 @@ def features() -> str:
 def rewards() -> str:
     """Terms, the named rewards, and objectives."""
     settings = {name: params.model_dump() for name, params in REWARDS.items()}
+    told = dict.fromkeys(TERMS, "weight of the term")
+    arguments = (inspect.getdoc(RewardParams) or "").partition("Args:\n")[2].partition("\n\n")[0].replace("``", "`")
+    told |= dict(re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)\.$", arguments, re.MULTILINE))
     rows = [
-        (f"`{field}`", *(_plain(params[field]) for params in settings.values()))
+        (f"`{field}`", told[field], *(_plain(params[field]) for params in settings.values()))
         for field in RewardParams.model_fields
         if field != "terms"
     ]
     return sections(
         Terms=table(("term", "unit", "meaning"), [(f"`{t.name}`", t.unit, t.meaning) for t in TERMS.values()]),
-        Named_rewards=table(("setting", *(f"`{name}`" for name in settings)), rows),
+        Named_rewards=table(("setting", "meaning", *(f"`{name}`" for name in settings)), rows),
         Objectives=table(("objective", "counts"), [(f"`{kind.form}`", kind.about) for kind in KINDS.values()]),
     )
 

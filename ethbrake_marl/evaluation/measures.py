@@ -816,7 +816,10 @@ _OF_THE_LIMITS = (
         "best_known_minus_proven_total", lambda _, r: r.total_harm - r.limits.proof.harm, limits=True,
         about="The same of total harm.",
     ),
-    Measure("mean_regret", "mean_regret_first", limits=True),
+    Measure(
+        "mean_regret", "mean_regret_first", limits=True,
+        about="The same as mean_regret_first.",
+    ),
     Measure(
         "mean_regret_first", lambda o, r: r.regret(o, "first"), "Regret, first-impact", "Regret\nfirst",
         "First-impact harm minus the best known first-impact harm of the same world; mean per world. The best known is"
@@ -824,15 +827,24 @@ _OF_THE_LIMITS = (
         " agent in this table that did better. With ≥: the best of some world is known from these agents alone.",
         limits=True,
     ),
-    Measure("mean_regret_total", lambda o, r: r.regret(o, "total"), limits=True),
-    Measure("realised_share", "mean_regret_first", against="decrease", limits=True),
+    Measure(
+        "mean_regret_total", lambda o, r: r.regret(o, "total"), limits=True,
+        about="The same of total harm.",
+    ),
+    Measure(
+        "realised_share", "mean_regret_first", against="decrease", limits=True,
+        about="The same as realised_share_first.",
+    ),
     Measure(
         "realised_share_first", "mean_regret_first", "Realised share, first-impact", "Realised\nfirst",
         "(Full braking − agent) / (full braking − best known), first-impact harm: how much of the reduction of harm"
         " that is known to be possible the agent brings.",
         percent=True, against="decrease", limits=True,
     ),
-    Measure("realised_share_total", "mean_regret_total", against="decrease", limits=True),
+    Measure(
+        "realised_share_total", "mean_regret_total", against="decrease", limits=True,
+        about="The same of total harm.",
+    ),
 )  # fmt: skip
 
 HORIZON, CHOSEN, KNOWN, BELOW = "horizon_ends", "policy_share", "known", "below_best_known"
