@@ -10,7 +10,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, model_validator
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
-NUMERAL = re.compile(r"[-+−–]?\d.*|–|-|")
+NUMERAL = re.compile(r"[-+−–]?\d[^`]*|–|-|")
 
 
 class Table(BaseModel):
