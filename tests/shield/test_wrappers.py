@@ -22,7 +22,7 @@ from tests.shield.test_step_shield import Speechless
 
 PAPER = load_scenario("paper-random")
 MAKERS = {
-    HybridShield: parallel_env,
+    HybridShield: lambda: parallel_env(agents="learners"),
     ShieldedEnv: EthBrakeEnv,
     ShieldedVectorEnv: lambda: EthBrakeVectorEnv(2),
     ShieldedVecEnv: lambda: make_sb3_vec_env(PAPER, 2),
