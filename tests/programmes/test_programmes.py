@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.programmes import ROOT, Told, __main__ as runner, audit, hostile, libraries, peers
+from tests.programmes import ROOT, Told, __main__ as runner, audit, hostile, libraries
 from tests.programmes.cage import Case, can_confine, confine, judge
 
 PAGE = ROOT / "docs" / "security.md"
@@ -54,7 +54,7 @@ def test_runner__says_how_the_cases_ended_and_exits_by_it(words, status, end, mo
 
 def test_runner__lists_every_programme_and_make_and_its_help_know_each():
     named = set(re.findall(r"\$\(PROGRAMME\) (\w+)", (ROOT / "Makefile").read_text("utf-8")))
-    assert runner.programmes().keys() - named == {"adversary"} and named <= runner.programmes().keys()
+    assert runner.programmes().keys() == named
     assert runner.main(["nobody"]) == 2
 
 
@@ -119,7 +119,7 @@ def test_weaknesses__are_told_or_that_nobody_could_be_asked(script, good, told, 
     assert found.good is good and told in found.text
 
 
-# ---------------------------------------------------------------- libraries and peers
+# ---------------------------------------------------------------- libraries
 
 WAYS = [pytest.param(way, id=f"{way.library}: {way.title}") for way in libraries.ways()]
 HERE = [each for each in WAYS if each.values[0].library in ("Stable-Baselines3", "SuperSuit")]
@@ -154,13 +154,6 @@ def test_way__runs_in_the_projects_own_environment(way, tmp_path, monkeypatch):
     names: dict[str, object] = {}
     exec(re.sub(r"n_steps=\d+", "n_steps=32", re.sub(r"\b\d+_000\b", "64", way.code)), names)
     assert names["agent"].act is not None
-
-
-def test_peers__each_stands_beside_one_of_ours():
-    ours = {name for name, loop in peers.LOOPS.items() if loop.distribution == peers.OURS}
-    assert {loop.beside for loop in peers.LOOPS.values()} == {*ours, ""}
-    assert all((name in ours) == (loop.beside == "") for name, loop in peers.LOOPS.items())
-    assert [peers.plain(value) for value in (6.944, 13.84, 99.96, 97_512.0)] == ["6.94", "13.8", "100", "97,500"]
 
 
 # ---------------------------------------------------------------- hostile files, proofs
