@@ -146,9 +146,7 @@ def test_hooks__run_tools_of_the_environment_and_download_nothing() -> None:
 MOST_CHARACTERS = 100
 PAGES = sorted([ROOT / "README.md", *ROOT.glob(".github/*.md"), *DOCS.glob("*.md"), *DOCS.glob("tutorials/*.md")])
 CODE = re.compile(r"^\s*(```+|~~~+|:::+).*?^\s*\1\s*$", re.DOTALL | re.MULTILINE)
-FREE = re.compile(
-    r"\s*(\||#|<|!\[)|    |\[[\w-]+\]: |\s*([-*] )?\S+$"
-)  # tables, headings, HTML, code, one word
+FREE = re.compile(r"\s*(\||#|<|!\[)|    |\[[\w-]+\]: |\s*([-*] )?\S+$")  # tables, headings, HTML, code, one word
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.relative_to(ROOT).as_posix())
