@@ -17,8 +17,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 RULES = "TID251,S102,S307,S602,S604,S605"
 UNRULED = re.compile(
-    r"(?<![.\w])(?<!def )(?:compile|__import__)\(|\.extractall\b|\.(?:to|read)_pickle\b|unsafe_load|allow_pickle=(?!False)"
-    r"|\.load\([^)]*\b(?:device|map_location|weights_only|custom_objects)="
+    r"(?<![.\w])(?<!def )(?:compile|__import__)\(|\.extractall\b|\.(?:to|read)_pickle\b|unsafe_load"
+    r"|allow_pickle=(?!False)|\.load\([^)]*\b(?:device|map_location|weights_only|custom_objects)="
 )
 PLACES = {"ethbrake_marl/files/plugins.py"}  # a plug-in that the user names is code
 
