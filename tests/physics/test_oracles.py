@@ -1,4 +1,4 @@
-"""The exact advance against other programs: rational arithmetic, closed forms, and tiny steps."""
+"""The exact advance against other programs: rational arithmetic, and closed forms."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from tests.physics.exact_simulator import Hit, Line, line_of, regression, simula
 from tests.physics.manufacture import Case, floats, manufactured, pressed, stored, worlds_of
 from tests.physics.random_worlds import HORIZON_S, Draws, driving_lines, line, place_ahead, touching_lines
 from tests.physics.segments import Scan, meetings, random_segments, scan
-from tests.reference.tiny_steps import simulate as refer_to
 from tests.reference.tolerances import BORDERLINE_SHARE, CLUSTER_EPS, CONTACT_TIME_EPS, EPS
 
 # ---------------------------------------------------------------- rational arithmetic, contact times to 160 bits
@@ -262,26 +261,3 @@ def test_contact_time__is_right_to_the_last_digits_where_the_textbook_root_is_no
         exact = 2 * Fraction(g) / (Fraction(w) + root) if w > 0 else (root - Fraction(w)) / Fraction(b)
         assert abs(Fraction(time) / exact - 1) <= CONTACT_TIME_EPS * EPS * condition
         assert abs(Fraction(speed) / root - 1) <= CONTACT_TIME_EPS * EPS * condition
-
-
-# ---------------------------------------------------------------- tiny steps
-
-
-@pytest.mark.parametrize("N", [2, 3, 5])
-def test_advance__agrees_with_the_tiny_step_reference(N: int) -> None:
-    # In none of these worlds a graze or a bounce at the plastic threshold decides, where the reference needs its step.
-    worlds, command = driving_lines(20, 40, N)
-    end, impacts = advance(worlds, command, until_s=4.0)
-    v = worlds.vehicles
-    found = refer_to(
-        worlds.gaps_m, worlds.speeds_mps, command, latency_s=v.latency_s, mass_t=v.mass_t,
-        speed_limit_mps=v.speed_limit_mps, restitution=v.restitution, horizon_s=np.full(40, 4.0), step_s=1e-4,
-    )  # fmt: skip
-    assert np.array_equal(impacts.count > 0, found.count > 0) and np.array_equal(end.pair_hit, found.count > 0)
-    np.testing.assert_allclose(impacts.first_impact_harm, found.first_impact_harm, rtol=0, atol=1e-5)
-    np.testing.assert_allclose(impacts.total_harm, found.total_harm, rtol=0, atol=1e-5)
-    state, expected = ((w.gaps_m, w.speeds_mps) for w in (end, found))
-    np.testing.assert_allclose(np.hstack(state), np.hstack(expected), rtol=0, atol=1e-6)
-    gained = np.sum(v.mass_t * (end.speeds_mps - worlds.speeds_mps), axis=1)
-    assert gained == pytest.approx(found.driven_impulse, abs=1e-5) and found.momentum_error.max() < 1e-12
-    assert (found.count > 0).any(axis=1).mean() > 0.3
