@@ -17,7 +17,6 @@ from ethbrake_marl.agents import (
     make_agent,
     optimise_coupled,
     planner as refined,
-    record_commands,
     script_agents,
 )
 from ethbrake_marl.agents.planner import HOLDS, SIZES, Planner, RefinedProfile, changes, deviate
@@ -227,8 +226,3 @@ def test_around__drives_knows_and_is_called_as_the_agent_inside():
     alone, around = (Asked(agent).begin(WORLDS, 1) for agent in agents)
     assert around.act(WORLDS, 1).tolist() == alone.act(WORLDS, 1).tolist()
     assert (around.name, Knowledge.of(around.agent)) == ("e_v2x_bm", (Source.MODEL,))
-
-
-def test_record__keeps_what_was_commanded():
-    commands = record_commands(make_agent("constant:5"), WORLDS.take(np.arange(5)), SCENARIO, 1, 75)
-    assert commands.shape == (5, 75) and (commands == -5.0).all()

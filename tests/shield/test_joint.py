@@ -7,12 +7,10 @@ import pytest
 
 from ethbrake_marl.agents.registry import Team, drive, make_agent
 from ethbrake_marl.envs.interfaces import parallel_env
-from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield import HybridShield, ShieldedDriver, StepShield, guard as behind_module
 from ethbrake_marl.shield.guard import Shielded
-from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from ethbrake_marl.shield.step_shield import (
     REASONS,
     Backup,
@@ -210,21 +208,6 @@ def test_parallel__a_team_proposes_where_nobody_does_and_one_may_be_left_out():
         env.reset(seed=1)
         *_, infos = env.step(given)
         assert [infos[agent]["shield"]["proposed_action"] for agent in env.shielded] == proposed
-
-
-def test_sb3__rows_of_one_world_are_decided_together_over_automatic_resets():
-    env = ShieldedVecEnv(make_sb3_vec_env("cooperation-3-pair", 5, seed=3), cap="baseline", intervention_penalty=1.0)
-    env.reset()
-    rng, ended = np.random.default_rng(0), 0
-    for _ in range(120):
-        caps = env.attached.shield.baseline_shares
-        _, _, done, infos = env.step(rng.uniform(-1.0, 1.0, (10, 1)).astype(np.float32))
-        for k in np.flatnonzero(done)[::2]:
-            for info, cap in zip(infos[k : k + 2], caps[k // 2, 1:], strict=True):
-                assert info["world_first_impact_harm"] == info["shield"]["bound_harm"]
-                assert info["first_impact_harm"] == info["shield"]["own_harm"] <= cap
-            ended += 1
-    assert ended >= 5
 
 
 @pytest.mark.parametrize("settings", [{"shares": True}, {"cap": "baseline"}, {"shares": True, "harm_count": "total"}])
