@@ -211,18 +211,6 @@ def test_shipped__reads_back_by_name_path_and_folder_and_a_new_file_is_based_on_
         assert [error.message for error in editor.iter_errors(content)] == []
 
 
-def test_new__its_comments_are_other_ways_that_would_be_valid() -> None:
-    text = new_scenario_text("mine")
-    swapped = text.replace("\ngaps_m:", "\n# gaps_m:").replace("\n# time_gaps_s:", "\ntime_gaps_s:")
-    assert Scenario.from_document(parse_yaml(swapped)).time_gaps_s == (1.0, 1.0)
-    for key in ("line_speed_mps", "speed_deviations_mps"):
-        swapped = swapped.replace(f"\n# {key}:", f"\n{key}:")
-    line = Scenario.from_document(parse_yaml(swapped.replace("\nspeeds_mps:", "\n# speeds_mps:")))
-    assert line.bounds("speeds_mps") == ((20.0, 20.0), (18.0, 18.0), (20.0, 20.0))
-    (told,) = (line for line in text.splitlines() if "3600" in line and "commands" in line)
-    assert told.endswith("below horizon_s")
-
-
 @pytest.mark.parametrize(("suffix", "folder"), [(".yaml", "."), (".yml", "."), ("", "stress")])
 def test_path__of_the_users_own_file_goes_before_a_shipped_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, folder: str

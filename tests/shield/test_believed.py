@@ -39,7 +39,7 @@ def behind(way: str, scenario: Scenario, robust: str | None = None) -> ShieldedD
 @pytest.mark.parametrize("name", LISTS)
 @pytest.mark.parametrize("way", WAYS)
 def test_robust__at_the_corners_no_world_is_above_the_first_bound(name: str, way: str) -> None:
-    harm, bound, replaced = shielded(way, LISTS[name], 8 if way == "drive" else 4, 7)
+    harm, bound, replaced = shielded(way, LISTS[name], 4, 7)
     assert (harm <= bound + ABOVE).all()
     assert replaced > 4
 

@@ -93,20 +93,6 @@ def test_by_hand__who_says_no_number_keeps_the_plan_and_the_other_is_clipped():
     assert decision.applied.tolist() == [[-0.9, -1.0]] and decision.intervened.tolist() == [[True, False]]
 
 
-@pytest.mark.parametrize(("vehicles", "plan"), [((1,), braking(-0.8)[:, :, 0]), ((1, 2), braking(-0.8))])
-def test_certify__changes_nothing_it_is_given(vehicles, plan):
-    running, backup = start(three(), plan, vehicles)
-    before = running.states.copy(), backup.plan.copy(), backup.harm.copy()
-    certify(running, np.full_like(plan[:, 0], 0.3), backup, backup.harm)
-    assert [a.tolist() for a in before] == [running.states.tolist(), backup.plan.tolist(), backup.harm.tolist()]
-
-
-def test_shares__are_those_of_the_ledger_and_the_light_one_bears_more():
-    running, backup = start(three(speeds_mps=[0, 10, 20]), braking())
-    borne = ends_under(running, backup.plan)[1][0]
-    assert borne.sum() == pytest.approx(backup.harm[0]) and borne[1] > borne[2] > 0.0
-
-
 def test_caps__reject_what_only_moves_harm_to_another():
     running, backup = start(three(gaps_m=[3.0, 10.0], speeds_mps=[0, 5, 16]), braking())
     assert backup.harm[0] > 0.0  # Vehicle 3 runs into Vehicle 2, which stands before Vehicle 1
