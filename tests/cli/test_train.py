@@ -72,11 +72,11 @@ def test_run__results_agree_in_json_csv_and_per_world_and_the_hybrid_is_never_wo
     flat, worlds = rows_of(finished_run / "results.csv"), rows_of(finished_run / "per_world.csv")
     assert [row["agent"] for row in rows] == [row["agent"] for row in flat] == AGENTS
     for row, line in zip(rows, flat, strict=True):
-        mine = [world for world in worlds if world["agent"] == row["agent"]]
+        mine = [float(world["total_harm"]) for world in worlds if world["agent"] == row["agent"]]
         assert len(mine) == row["episodes"] == int(line["episodes"]) == 60
-        assert float(line["total_harm"]) == row["total_harm"]
-        assert sum(float(world["total_harm"]) for world in mine) / 60 == pytest.approx(row["total_harm"], rel=1e-12)
-        assert [float(line["total_harm_low"]), float(line["total_harm_high"])] == row["total_harm_interval"]
+        told = [float(line[name]) for name in ("total_harm", "total_harm_low", "total_harm_high")]
+        assert told == [row["total_harm"], *row["total_harm_interval"]]
+        assert sum(mine) / 60 == pytest.approx(row["total_harm"], rel=1e-12)
     assert (flat[0]["predicted_harm"], flat[0]["scenario"]) == ("", "paper-random")
     harm = {(row["agent"], row["world"]): float(row["first_impact_harm"]) for row in worlds}
     assert all(harm["hybrid", str(k)] <= harm["e_v2x_bm", str(k)] for k in range(60))
@@ -263,24 +263,24 @@ def test_curves__one_command_trains_draws_and_goes_on(ethbrake, tiny_recipe, tin
         ctrl_c_when(patch, lambda shown: shown["name"] == "tiny-seed1" and shown["done"] == 128)
         answer = ethbrake(*arguments)
     assert answer.status == 130 and "the same command goes on" in answer.err
-    kept = (folder / "tiny-seed0" / "policy" / "manifest.json").stat().st_mtime_ns
+    manifest = folder / "tiny-seed0" / "policy" / "manifest.json"
+    kept = manifest.stat().st_mtime_ns
     summary = told_json(ethbrake(*arguments))
-    assert (folder / "tiny-seed0" / "policy" / "manifest.json").stat().st_mtime_ns == kept
+    assert manifest.stat().st_mtime_ns == kept
     assert (folder / "learning_curves.png").read_bytes().startswith(b"\x89PNG")
     rows = [row for row in rows_of(folder / "learning_curves.csv") if row["figure"] != "return"]
     harms = {(row["recipe"], row["seed"], int(row["steps"])): float(row["value"]) for row in rows}
     steps = {name: {each[2] for each in harms if each[0] == name} for name in ("tiny", "tiny-sac")}
     assert steps == {"tiny": {0, 128, 256}, "tiny-sac": {0, 160, 320}}
     told, last = summary["recipes"]["tiny"], [harms["tiny", seed, 256] for seed in "01"]
-    assert told["last"]["each"] == last
-    assert told["last"]["interquartile_mean"] == pytest.approx(sum(last) / 2)
     low, high = told["last"]["interval"]
+    assert (told["last"]["each"], told["last"]["interquartile_mean"]) == (last, pytest.approx(sum(last) / 2))
     assert min(last) <= low <= high <= max(last)
     fixed = SCENARIO.sample(10, 7)
     assert (summary["kind"], summary["scenario_sha256"]) == ("learning-curves", scenario_sha256(SCENARIO))
     assert told["worlds_sha256"] == worlds_sha256(fixed.worlds, fixed.index)
-    runs = [load_policy(folder / f"tiny-seed{seed}") for seed in (0, 1)]
-    assert told["policy_sha256"] == [policy.manifest.manifest_sha256 for policy in runs]
+    policies = [load_policy(folder / f"tiny-seed{seed}").manifest.manifest_sha256 for seed in (0, 1)]
+    assert told["policy_sha256"] == policies
 
 
 def test_curves__another_training_or_an_edited_scenario_is_told_before_any_is_begun(

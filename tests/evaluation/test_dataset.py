@@ -244,23 +244,19 @@ def test_check__replaces_nothing_unasked_and_only_datasets_when_asked(
 
 
 def test_work__leaves_a_failed_world_out_and_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recorded: list[Recording] = []
     real: Callable[..., Recording] = episodes.record_episodes
 
     def failing(sample: Any, *rest: Any) -> Recording:
-        bad = {row: "planted" for row, number in enumerate(sample.index) if number == 4}
-        if bad:
+        if bad := {row: "planted" for row, number in enumerate(sample.index) if number == 4}:
             raise PhysicsError(bad)
         return real(sample, *rest)
 
-    monkeypatch.setattr(episodes, "need", lambda package: None)
-    monkeypatch.setattr(episodes, "record_episodes", failing)
-    monkeypatch.setattr(episodes, "BATCH", 3)
-    monkeypatch.setattr(episodes, "parquet_dataset", lambda path, told: nullcontext(recorded.append))
-    seen: list[tuple[str, int]] = []
-    path = tmp_path / "some.parquet"
-    work = eb.write_dataset(path, BRAKE, scenario=PAPER, episodes=7, on_progress=lambda *done: seen.append(done))
-    assert [each.index.tolist() for each in recorded] == [[0, 1, 2], [3, 5], [6]]
-    assert seen == [("full_brake", 3), ("full_brake", 6), ("full_brake", 7)]
+    recorded, seen = Mock(), Mock()
+    for name, planted in (("need", Mock()), ("record_episodes", failing), ("BATCH", 3)):
+        monkeypatch.setattr(episodes, name, planted)
+    monkeypatch.setattr(episodes, "parquet_dataset", lambda path, told: nullcontext(recorded))
+    work = eb.write_dataset(tmp_path / "some.parquet", BRAKE, scenario=PAPER, episodes=7, on_progress=seen)
+    assert [call.args[0].index.tolist() for call in recorded.call_args_list] == [[0, 1, 2], [3, 5], [6]]
+    assert [call.args for call in seen.call_args_list] == [("full_brake", 3), ("full_brake", 6), ("full_brake", 7)]
     assert [tuple(left) for left in work.left_out] == [(4, 7, "full_brake", "planted")]
     assert work.episodes == {"full_brake": 6}

@@ -22,7 +22,7 @@ from ethbrake_marl.figures import ablation_figures, signed_ticks
 from ethbrake_marl.learning import runs as learning_train
 from ethbrake_marl.learning.training import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.limits.limits import best_harm, chunks_left
-from ethbrake_marl.policies import Manifest, Policy, load_policy
+from ethbrake_marl.policies import load_policy
 from ethbrake_marl.scenario import Sample, load_scenario, scenario_path
 from ethbrake_marl.shield.guard import Shielded
 from ethbrake_marl.studies import ablation as module
@@ -52,6 +52,7 @@ from ethbrake_marl.studies.ablation import (
 )
 from ethbrake_marl.studies.jobs import TrainingJob
 from tests.pages.hostile import Page
+from tests.policies.test_networks import another
 from tests.studies.conftest import ABLATE, LEVELS, check_snapshot, study
 from tests.studies.counting import PROGRAM, end_when
 
@@ -511,18 +512,21 @@ def test_questions__each_is_searched_once_and_what_is_kept_is_not_searched_again
     plan = Plan(levels, (recipe,), 1, 300, 10, 7, 5, 10, tmp_path)
     samples = common_worlds(levels, 10, 7)
     asked = questions(plan, samples)
+
+    def all_left() -> list[tuple[int, list[Path]]]:
+        return [left(plan, level, part) for level, part, _ in asked]
+
     assert [[level.name for level in alike] for *_, alike in asked] == [list(NAMES[:2]), [NAMES[2]], [NAMES[3]]]
-    assert [left(plan, level, part) for level, part, _ in asked] == [(5, [])] * 3
+    assert all_left() == [(5, [])] * 3
     told = []
     search_all(plan, samples, 1, told.append)
     assert told == [Progress(f"joint optimum of {name}", 5, 5) for name in (NAMES[0], *NAMES[2:])]
-    assert [left(plan, level, part) for level, part, _ in asked] == [(0, [])] * 3
-    assert left(replace(plan, budget=11), *asked[0][:2]) == (5, [])
+    assert all_left() == [(0, [])] * 3 and left(replace(plan, budget=11), *asked[0][:2]) == (5, [])
     fewer = questions(replace(plan, search_episodes=4), samples)[0]
     assert left(plan, *fewer[:2]) == (4, [])
     damaged = tmp_path / "optimum" / NAMES[2] / "0000000.npz"
     damaged.write_bytes(b"no table")
-    assert left(plan, *asked[1][:2]) == (5, [damaged])
+    assert all_left() == [(0, []), (5, [damaged]), (0, [])]
 
 
 def test_measure__all_brake_fully_whatever_their_roles():
@@ -604,10 +608,8 @@ def changed(run: Path, folder: Path, scenario: Mapping[str, object] = {}, recipe
     """A run of another policy, with some other values in its scenario or recipe."""
     shutil.copytree(run, folder)
     policy = load_policy(run)
-    fields = {name: getattr(policy.manifest, name) for name in Manifest.model_fields}
-    del fields["weights_sha256"], fields["manifest_sha256"]
     tensors = {name: tensor + np.float32(0.01) for name, tensor in policy.tensors.items()}
-    other = Policy.make(tensors, **{**fields, "scenario": {**policy.manifest.scenario, **scenario}})
+    other = another(policy, tensors, scenario={**policy.manifest.scenario, **scenario})
     other.save(folder / "policy", replace=True)
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps(config | {"recipe": {**config["recipe"], **recipe}}))

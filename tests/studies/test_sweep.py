@@ -108,22 +108,25 @@ def test_job__is_the_training_that_train_makes(finished_sweep, tiny, tmp_path):
 
 def test_finished_jobs__are_not_repeated_and_the_table_is_the_same(again, capsys) -> None:
     file, folder = again
-    whole = (folder / TABLE).read_bytes()
-    (folder / TABLE).unlink()
-    assert sweep(file, folder) == 0 and len(journal(folder)) == 4
-    assert "4 jobs are finished already" in capsys.readouterr().err and (folder / TABLE).read_bytes() == whole
-    jobs_done = [one["job"] for one in journal(folder)]
-    (folder / "journal.jsonl").write_text((folder / "journal.jsonl").read_text()[:-40])  # a writer was killed
+    whole, done = (folder / TABLE).read_bytes(), [one["job"] for one in journal(folder)]
     kept = {path: path.stat().st_mtime_ns for path in (folder / "runs").glob("*/policy/manifest.json")}
-    gone = folder / "runs" / jobs_done[0]
-    shutil.rmtree(gone)  # taken away: to be done again
-    assert sweep(file, folder) == 0
-    assert "2 jobs are finished already; 1 damaged lines of the journal" in capsys.readouterr().err
-    assert (folder / TABLE).read_bytes() == whole and (gone / "run.json").is_file()
-    assert all(path.stat().st_mtime_ns == then for path, then in kept.items() if gone not in path.parents)
-    (folder / "runs" / jobs_done[1] / "policy" / "weights.safetensors").unlink()
-    assert sweep(file, folder) == 0 and (folder / TABLE).read_bytes() == whole
-    assert "3 jobs are finished already" in capsys.readouterr().err
+    gone, line = folder / "runs" / done[0], folder / "journal.jsonl"
+
+    def take_away() -> None:
+        line.write_text(line.read_text()[:-40])  # a writer was killed
+        shutil.rmtree(gone)
+
+    lost = folder / "runs" / done[1] / "policy" / "weights.safetensors"
+    for damage, told in (
+        ((folder / TABLE).unlink, "4 jobs are finished already"),
+        (take_away, "2 jobs are finished already; 1 damaged lines of the journal"),
+        (lost.unlink, "3 jobs are finished already"),
+    ):
+        damage()
+        assert sweep(file, folder) == 0 and told in capsys.readouterr().err
+        assert (folder / TABLE).read_bytes() == whole
+        others = {path for path in kept if gone not in path.parents and lost.parent not in path.parents}
+        assert all(path.stat().st_mtime_ns == kept[path] for path in others) and (gone / "run.json").is_file()
 
 
 @pytest.mark.slow

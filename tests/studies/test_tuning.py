@@ -146,16 +146,14 @@ def test_disturbed_tuning__has_the_same_table(finished_tuning, write_tuning, tmp
 @pytest.mark.slow
 def test_broken_trials__are_marked_failed_and_others_done_in_their_place(write_tuning, tmp_path):
     file, folder = write_tuning(), tmp_path / "out"
-    plan = TuningPlan.read(file)
     folder.mkdir()
-    plan.study(folder)._study.ask()  # a command that was killed just then
+    TuningPlan.read(file).study(folder)._study.ask()  # a command that was killed just then
     with (folder / "study.journal").open("a") as journal:
         journal.write('{"op_code": 4, "worker')
     assert tune(file, folder, "--trials", "2") == 0
     rows = read(folder / TABLE)
     assert [row["state"] for row in rows] == ["failed", "finished", "finished"]
     assert rows[0]["reason"] == "was killed while it was asked for"
-    assert [row["state"] for row in read(folder / TABLE)] == ["failed", "finished", "finished"]
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")  # an error in this process alone
