@@ -48,7 +48,10 @@ PRELOADED = (
     "hypothesis", "numba", "numpy", "pytest", "torch", "stable_baselines3", "scipy.stats", "scipy.optimize", "pydantic",
     "matplotlib.pyplot", "gymnasium", "pettingzoo", "yaml", "rich", "typer", "tensorboard.compat.proto.event_pb2",
 )  # fmt: skip
-OPTIONS = ("-x", "-q", "-m", "not long", "-p", "no:cacheprovider", "-p", "no:randomly", "--rootdir=.")
+OPTIONS = (
+    "-x", "-q", "-m", "not long", "-p", "no:cacheprovider", "-p", "no:randomly", "--rootdir=.",
+    "-W", "ignore::pytest.PytestAssertRewriteWarning",  # of what is loaded before
+)  # fmt: skip
 
 BUDGET_S = 40.0  # processor time of the tests that are tried, as they take without a fault
 MOST_FILES = 30
