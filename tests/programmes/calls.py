@@ -181,7 +181,7 @@ class Callers:
         """Tests that may notice a change of a function: likely and quick ones first, as many as the time allows."""
         found = self.of(function, words)
         room = "tests/" + function.key.rpartition(":")[0].removesuffix(".py").partition("/")[0]
-        module = "test_" + function.key.rpartition(":")[0].removesuffix(".py").rpartition("/")[2]
+        module = "/test_" + function.key.rpartition(":")[0].rpartition("/")[2] + "::"
 
         def rank(test: str) -> tuple[bool, bool, float]:
             return (
