@@ -200,7 +200,7 @@ mutation: $(STAMP)
 
 bench-peers: $(STAMP)
 	@echo "== speed beside other simulators"
-	@$(PROGRAMME) peers $(ARGS)
+	@PYTHONPATH="$(CURDIR)" $(BIN)/python docs/studies/peers.py $(ARGS)
 
 benchmark: $(STAMP)
 	@$(BIN)/python -m tests.studies.benchmark_rows $(ARGS)

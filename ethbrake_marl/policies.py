@@ -31,7 +31,7 @@ from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, naming_extras, unknown_name
 from ethbrake_marl.files.arrays import ArrayRow, check_arrays, safetensors_headers
 from ethbrake_marl.files.store import new_folder, read_plain, write_file
-from ethbrake_marl.files.yaml import FileModel, first_mistake, read_json_model
+from ethbrake_marl.files.yaml import NAME_PATTERN, FileModel, first_mistake, read_json_model
 from ethbrake_marl.observations import FEATURES, ObservationSpec, Of, choose_observation, registered_in
 from ethbrake_marl.physics import PER_LN2, compiled, exp_rest
 from ethbrake_marl.scenario import Scenario
@@ -202,7 +202,7 @@ class Manifest(_Strict):
 
     format: Literal["ethbrake-policy"] = "ethbrake-policy"
     format_version: Literal[2, 3] = 2
-    algorithm: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
+    algorithm: Annotated[str, Field(pattern=NAME_PATTERN)]
     network: NetworkSpec
     observation: ObservationSchema
     action: Literal["fraction_of_own_capacity"] = "fraction_of_own_capacity"

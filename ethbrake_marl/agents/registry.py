@@ -256,7 +256,7 @@ BELIEVED = (  # on what was received
 )  # fmt: skip
 AROUND = (*REFINED, *SHIELDS, *BELIEVED)  # in the order in which they are put around an agent
 
-_WITH_BUDGET = re.compile(r"refined:[0-9]+(us)?")
+_WITH_BUDGET = re.compile(r"refined:(0|[1-9][0-9]*)(us)?")
 _IN_FILE = re.compile(r"(?P<name>[^:]+\.py:[A-Za-z_]\w*)(:(?P<argument>[^\s@]+))?(@(?P<policy>.+))?")
 _BEGINS_WITH_FILE = re.compile(r"[^:@]+\.py(:.*)?")
 

@@ -13,7 +13,6 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
-from pydantic_core import ErrorDetails
 
 from ethbrake_marl.agents import (
     Agent,
@@ -182,7 +181,7 @@ class NamedWorlds(FileModel):
     def read(cls, path: str | Path) -> NamedWorlds:
         """Read such a file; raises ``InvalidInput`` naming file, line and key."""
         document = read_yaml(path, SIZE_LIMIT)
-        found = read_model(document, cls, _Words(cls, "search again (ethbrake search falsify)"), "of named worlds")
+        found = read_model(document, cls, Wording(cls, "search again (ethbrake search falsify)"), "of named worlds")
         names = [world.name for world in found.worlds]
         if twice := next((name for k, name in enumerate(names) if name in names[:k]), None):
             raise InvalidInput(f"{path}: world {twice!r} is given twice; names must differ")
@@ -212,13 +211,6 @@ class NamedWorlds(FileModel):
             if world.state.keys() != columns:
                 raise InvalidInput(f"{where}: worlds[{k}].state has other columns than worlds[0]; all need the same")
         return scenario.worlds_from_table({name: [world.state[name] for world in self.worlds] for name in columns})
-
-
-class _Words(Wording):
-    """Names of worlds follow a rule of their own."""
-
-    def right(self, detail: ErrorDetails) -> str:
-        return f"must match {detail['ctx']['pattern']}" if detail["type"] == "string_pattern_mismatch" else ""
 
 
 def states_of(worlds: Worlds, scenario: Scenario) -> list[dict[str, float]]:

@@ -284,8 +284,8 @@ _RIGHT = {
     "model_type": "must be a mapping",
     "model_attributes_type": "must be a mapping",
     "tuple_type": "must be a list",
-    "string_pattern_mismatch": "must be 1 to 64 lower case letters, digits, - and _, beginning with a letter or digit",
 }
+NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
 
 
 class FileModel(BaseModel):
@@ -388,8 +388,6 @@ def first_mistake(error: ValidationError) -> Mistake:
     """Where the first mistake is, and what would be right: for files that programs write, and for settings in code."""
     detail = error.errors(include_url=False)[0]
     right = {"missing": "is missing", "extra_forbidden": "unknown key"}.get(detail["type"])
-    if detail["type"] == "string_pattern_mismatch":  # not always that of a name, as in files that people write
-        right = f"must match {detail['ctx']['pattern']}"
     return Mistake(".".join(str(key) for key in _path(detail)), detail["input"], right or _right(detail))
 
 
@@ -443,7 +441,12 @@ def _right(detail: ErrorDetails) -> str:
     if kind == "too_long":
         return f"must have {detail['ctx']['max_length']} entries"
     if kind == "too_short":
-        return "must not be empty"
+        least = detail["ctx"]["min_length"]
+        return "must not be empty" if least == 1 else f"must have at least {least} entries"
+    if kind == "string_pattern_mismatch":
+        pattern = detail["ctx"]["pattern"]
+        name = "must be 1 to 64 lower case letters, digits, - and _, beginning with a letter or digit"
+        return name if pattern == NAME_PATTERN else f"must match {pattern}"
     if kind == "literal_error":
         return f"must be {detail['ctx']['expected'].replace(chr(39), '')}"
     text = str(detail["msg"]).removeprefix("Value error, ")

@@ -37,6 +37,7 @@ from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput, unk
 from ethbrake_marl.files.plugins import check_plugins, noted_plugins
 from ethbrake_marl.files.store import new_folder, parse_strict_json, read_plain, write_file
 from ethbrake_marl.files.yaml import (
+    NAME_PATTERN,
     Document,
     FileModel,
     FileSchema,
@@ -173,7 +174,7 @@ class TrainingRecipe(FileModel):
     schemes: ClassVar[tuple[Scheme, ...]] = ("single", "shared")  # under which the algorithm can learn
     most_decisions: ClassVar[float] = math.inf  # held in memory between two updates
 
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")  # equal to the file's without .yaml
+    name: str = Field(pattern=NAME_PATTERN)  # equal to the file's without .yaml
     title: str = ""  # one line for lists
     description: str = ""  # what it is for
     source: str = ""  # where the values come from

@@ -33,7 +33,17 @@ from pydantic_core import CoreSchema, PydanticCustomError
 
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.files.store import read_plain
-from ethbrake_marl.files.yaml import UNITS, UNSHOWN, FileModel, YamlPath, parse_numeral, refuse, require, suggestion
+from ethbrake_marl.files.yaml import (
+    NAME_PATTERN,
+    UNITS,
+    UNSHOWN,
+    FileModel,
+    YamlPath,
+    parse_numeral,
+    refuse,
+    require,
+    suggestion,
+)
 from ethbrake_marl.harm import ObjectiveName, objectives_of
 from ethbrake_marl.observations import ListedFeatures, listed_features
 from ethbrake_marl.physics import (
@@ -568,7 +578,7 @@ class Roles(dict[str, str]):
 
 ANY = "any"  # in ``types``: every type, by its weight
 
-TypeName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,63}$")]
+TypeName = Annotated[str, Field(pattern=NAME_PATTERN)]
 Weight = Annotated[float, Field(gt=0.0, le=1e9, allow_inf_nan=False)]
 
 
@@ -665,8 +675,6 @@ def _weight(kinds: Mapping[str, VehicleType], name: str, here: TypesHere) -> flo
 
 
 AnyQuantity = float | Uniform | LogUniform | Normal | Choice
-
-NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
 
 
 _LEFT_OUT: Any = object()  # a key that is not given, where a check must say whether it may be

@@ -18,6 +18,7 @@ from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.files.yaml import (
+    NAME_PATTERN,
     Document,
     FileSchema,
     Wording,
@@ -33,7 +34,6 @@ from ethbrake_marl.harm import check_harm_count
 from ethbrake_marl.scenario.sampling import (
     DISTRIBUTIONS,
     LEARNER,
-    NAME_PATTERN,
     QUANTITY,
     STATE_FREE,
     Member,

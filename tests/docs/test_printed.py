@@ -25,8 +25,7 @@ from tests.docs.blocks import (
     tables_of_figures,
 )
 from tests.docs.printed import BLOCKS, EXACT, PICTURES, TABLES, How, how, where_rows
-from tests.docs.site import DOCS
-from tests.docs.speeds import CASES, line
+from tests.docs.site import DOCS, load
 
 Run = Callable[..., tuple[str, str]]
 
@@ -134,8 +133,11 @@ def test_tables_of_scenarios__hold_the_numbers_of_their_files(begin: str) -> Non
 
 @pytest.mark.slow
 def test_speeds__outside_their_range_are_as_shown() -> None:
-    (block,) = (each for each in printed_blocks() if each.begin.startswith("paper-random full_brake  "))
-    assert [line(*case) for case in CASES] == block.text.splitlines()
+    (block,), speeds = (
+        [b for b in printed_blocks() if b.begin.startswith("paper-random full_brake  ")],
+        load("../studies/speeds"),
+    )
+    assert [speeds.line(*case) for case in speeds.CASES] == block.text.splitlines()
 
 
 @pytest.mark.parametrize(

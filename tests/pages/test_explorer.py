@@ -28,7 +28,7 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_agents, make_lineup
 from ethbrake_marl.evaluation.measures import Conditions
-from ethbrake_marl.limits.limits import Proof, prove
+from ethbrake_marl.limits.limits import prove
 from ethbrake_marl.pages.explorer import MOST_BODY, Explored, explorer_page, read_state, save_state
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from tests.pages.conftest import AGENTS, HOST, PAGE, PORT, TOKEN, Client, Reply, check_alive, check_refused
@@ -36,7 +36,7 @@ from tests.pages.conftest import AGENTS, HOST, PAGE, PORT, TOKEN, Client, Reply,
 ROOT = Path(__file__).resolve().parents[3]
 
 
-COMMAND = [sys.executable, "-c", "from ethbrake_marl.cli.app import main; main()", "watch", "explore", "--no-browser"]
+COMMAND = [sys.executable, "-m", "ethbrake_marl", "watch", "explore", "--no-browser"]
 
 
 class Running(NamedTuple):
@@ -57,13 +57,10 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
         stderr=subprocess.PIPE,
         text=True,
     ) as process:
-        assert process.stdout is not None
-        address = urlsplit(process.stdout.readline().strip())
-        assert (address.scheme, address.hostname) == ("http", "127.0.0.1")
-        assert address.port is not None
-        yield Running(process, address.port, address.path, folder)
-        if process.poll() is None:
-            process.kill()
+        address = urlsplit(process.stdout.readline().strip())  # type: ignore[union-attr]
+        assert (address.scheme, address.hostname, bool(address.port)) == ("http", "127.0.0.1", True)
+        yield Running(process, address.port or 0, address.path, folder)
+        process.kill()
 
 
 def ask(running: Running, method: str, path: str, body: object = None) -> tuple[int, bytes]:
@@ -134,12 +131,10 @@ def test_answer__is_the_evaluation_of_that_world(client: Client, scenario: Scena
     expected = evaluate(worlds, make_lineup(AGENTS, scenario), scenario=scenario)
     *others, hand = reply.json["outcomes"]
     for told, (name, outcome) in zip(others, expected.outcomes.items(), strict=True):
-        assert told["agent"] == name
-        harms = float(outcome.first_impact_harm[0]), float(outcome.total_harm[0])
-        assert (told["impacts"], told["first"], told["total"]) == (int(outcome.impacts[0]), *harms)
+        found = name, outcome.impacts[0], outcome.first_impact_harm[0], outcome.total_harm[0]
+        assert (told["agent"], told["impacts"], told["first"], told["total"]) == found
     assert (hand["agent"], hand["first"]) == ("by hand", others[0]["first"])  # beyond its capacity: full braking
     proof = prove(worlds, Task(scenario, scenario.learners))
-    assert isinstance(proof, Proof) and proof.harm is not None
     verdict = reply.json["verdict"]
     assert (verdict["avoidable"], verdict["proven_harm"]) == (bool(proof.avoidable[0]), float(proof.harm[0]))
     assert reply.json["constant"]["first"] == float(optimise_coupled(worlds, 1).harm[0])
@@ -163,7 +158,7 @@ def test_search__is_never_worse_than_h_star(
 ) -> None:
     monkeypatch.setattr("ethbrake_marl.pages.explorer.SLICE", 1)
     worlds = scenario.sample(20, DEFAULT.LIST_SEED).worlds
-    for k in range(worlds.n):
+    for k in range(0, worlds.n, 4):
         world = worlds.take([k])
         found = explored.search(world, np.array([0.0]), 0.0, lambda: True)
         assert found["first"] <= explored.best_constant(world)["first"] + 1e-9
@@ -196,15 +191,15 @@ def test_saved_state__reads_back_to_the_same_harm(name: str, folder: Path) -> No
     assert save_state(folder, "near-miss", "csv", changed, scenario) == "near-miss.csv"
     saved = load_scenario(folder / "near-miss.yaml")
     agents = make_lineup(["full_brake"], scenario)
-    harms = []
+    harms = set()
     for worlds, where in (
         (changed, scenario),
         (saved.sample(1, 99).worlds, saved),
         (scenario.read_worlds(folder / "near-miss.csv"), scenario),
     ):
         outcome = evaluate(worlds, agents, scenario=where, aftermath=False).outcome("full_brake")
-        harms.append((float(outcome.first_impact_harm[0]), float(outcome.total_harm[0])))
-    assert harms[0] == harms[1] == harms[2]
+        harms.add((float(outcome.first_impact_harm[0]), float(outcome.total_harm[0])))
+    assert len(harms) == 1
     state["gaps_m"][0] = 0.01  # an impact before anybody acts
     save_state(folder, "early", "yaml", read_state(state, scenario), scenario)
     drawn = load_scenario(folder / "early.yaml").sample(1, 5)
@@ -229,6 +224,7 @@ def test_page__shows_hostile_names_as_text(scenario: Scenario, state: dict[str, 
 def test_server__answers_and_saves(running: Running) -> None:
     status, page = ask(running, "GET", running.path)
     assert status == 200 and b"Explorer: paper-random" in page
+    assert ask(running, "GET", "/")[0] == 403
     status, told = ask(running, "POST", running.path + "world", {"number": 3})
     state = json.loads(told)["world"]
     assert status == 200 and len(state["gaps_m"]) == 2
@@ -242,12 +238,6 @@ def test_server__does_not_wait_for_acknowledgements(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("uvicorn.Server.run", lambda self, sockets: named.extend(each.proto for each in sockets))
     assert run_command(["watch", "explore", "--no-browser", "--agents", "full_brake", "--folder", str(tmp_path)]) == 0
     assert named == [socket.IPPROTO_TCP]
-
-
-@pytest.mark.parametrize("path", ["/", "/favicon.ico", "/%2e%2e/", "/x/answer"])
-def test_server__tells_strangers_nothing(running: Running, path: str) -> None:
-    status, told = ask(running, "GET", path)
-    assert status == 403 and list(json.loads(told)) == ["error"]
 
 
 GARBAGE = [
@@ -303,23 +293,10 @@ def test_long_questions_are_cut_off(client: Client, state: dict[str, Any]) -> No
 def test_questions_that_never_end_are_given_up(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ethbrake_marl.pages.explorer.PATIENCE_S", 0.05)
 
-    async def ask() -> Reply:
-        async def silent() -> Any:
-            await asyncio.sleep(60)
+    async def silent() -> Any:
+        await asyncio.sleep(60)
 
-        sent: list[Any] = []
-
-        async def send(message: Any) -> None:
-            sent.append(message)
-
-        headers = [(b"host", HOST.encode()), (b"content-type", b"application/json")]
-        scope = {"type": "http", "method": "POST", "path": PAGE + "world", "headers": headers, "query_string": b""}
-        scope |= {"root_path": "", "http_version": "1.1", "scheme": "http"}
-        await client.app(scope, silent, send)
-        told = {name.decode(): value.decode() for name, value in sent[0]["headers"]}
-        return Reply(sent[0]["status"], told, sent[1]["body"])
-
-    check_refused(asyncio.run(ask()), 408)
+    check_refused(client.request("POST", PAGE + "world", receive=silent), 408)
 
 
 def test_a_defect_is_told_and_survived(client: Client, state: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -344,8 +321,6 @@ def test_newest_question_wins(client: Client, state: dict[str, Any], monkeypatch
             await asyncio.sleep(0.02)
         return await asyncio.gather(*questions)
 
-    from ethbrake_marl.pages.explorer import Explored
-
     client.ask("answer", {"world": state, "profile": [0.0]})  # the warm-up is over
     slow, begun = Explored.answer, threading.Event()
 
@@ -356,8 +331,7 @@ def test_newest_question_wins(client: Client, state: dict[str, Any], monkeypatch
 
     monkeypatch.setattr(Explored, "answer", slower)
     first, second, third = asyncio.run(ask())
-    assert (first.status, second.status, third.status) == (200, 409, 200)
-    assert second.json["superseded"] is True
+    assert (first.status, second.status, third.status, second.json["superseded"]) == (200, 409, 200, True)
 
 
 def test_page__is_under_a_strict_policy(client: Client) -> None:

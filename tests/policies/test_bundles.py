@@ -162,7 +162,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "two_values": (_manifest(lambda data: data + data), r"manifest.json: Extra data"),
     "large": (_manifest(lambda data: data + b" " * (1 << 20)), r"manifest.json: larger than 1 MiB"),
     "unknown_key": (_edit(loader="os.system"), r"manifest.json: loader: unknown key"),
-    "dotted_algorithm": (_edit(algorithm="subprocess.Popen"), r"manifest.json: algorithm: must match"),
+    "dotted_algorithm": (_edit(algorithm="subprocess.Popen"), r"manifest.json: algorithm: must be 1 to 64 lower case"),
     "dotted_activation": (_edit(network__activation="torch.nn.ReLU"), r"manifest.json: network.activation"),
     "future_version": (_edit(format_version=4), r"manifest.json: format_version: must be 2 or 3"),
     "version_of_several_networks": (

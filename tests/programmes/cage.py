@@ -105,8 +105,8 @@ def judge(case: Case, folder: Path) -> Verdict:
     case.build(inside)
     before = _content(folder)
     streams = [folder.with_suffix(suffix) for suffix in (".out", ".err", ".seen")]
-    child = _forked(lambda: _run(case, inside, streams))
-    disturbing = _forked(lambda: _disturb(case, inside)) if case.meanwhile else 0
+    child = forked(lambda: _run(case, inside, streams))
+    disturbing = forked(lambda: _disturb(case, inside)) if case.meanwhile else 0
     status, cpu_s = _wait(child)
     if disturbing:
         os.kill(disturbing, signal.SIGKILL)
@@ -124,7 +124,7 @@ def judge(case: Case, folder: Path) -> Verdict:
     return Verdict(status, cpu_s, max(map(len, (out + err).splitlines() or [""])), err.strip()[-LINE_LIMIT:], faults)
 
 
-def _forked(work: Callable[[], int]) -> int:
+def forked(work: Callable[[], int]) -> int:
     """A process that does this and exits with its status."""
     sys.stdout.flush()
     sys.stderr.flush()
