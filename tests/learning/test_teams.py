@@ -77,10 +77,7 @@ def history(recipe: TrainingRecipe, folder: Path) -> list[dict[str, str]]:
 
 @pytest.mark.parametrize(
     ("changes", "who"),
-    [
-        ({"total_steps": 2 * 256}, [(0, 1)] * 2),
-        ({"turns": 2, "total_steps": 8 * 256}, [(0,), (0,), (1,), (1,)] * 2),
-    ],
+    [({"total_steps": 2 * 256}, [(0, 1)] * 2), ({"turns": 2, "total_steps": 8 * 256}, [(0,), (0,), (1,), (1,)] * 2)],
 )
 def test_independent__all_learn_at_once_or_in_turns(
     changes: dict[str, int], who: list[tuple[int, ...]], tmp_path: Path
