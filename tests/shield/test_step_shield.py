@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
+from ethbrake_marl.agents.planner import Refined
 from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.agents.registry import drive, make_agent
 from ethbrake_marl.observations import ObservationSpec
@@ -16,6 +17,7 @@ from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver, StepShield, parse_uncertainty
 from ethbrake_marl.shield.step_shield import REASONS, Backup, Proposer, begin_running, certify, plan_harm
+from tests.fixtures.asked import Asked
 from tests.shield.attacks import ADVERSARIES, LEAKS, attack, begun, extremes, line, random_actions, search
 
 pytestmark = pytest.mark.filterwarnings(
@@ -434,3 +436,15 @@ def test_rollout__a_policy_that_does_otherwise_when_it_is_tried_out_gets_no_furt
 def test_later_rollouts__may_be_switched_off():
     _, _, reasons = driven(LearnedAgent(Weights()), later_rollouts=False)
     assert not (reasons == REASONS.index("policy rollout")).any()
+
+
+def test_rollout__also_of_a_refined_policy_that_cannot_be_divided():
+    driver = ShieldedDriver(Refined(Remembering(), PAPER, tries=2), PAPER)
+    episodes = drive(WORLDS.take(np.arange(20)), driver, PAPER, 1)
+    assert episodes.ledger.world_harm("first").tolist() == episodes.guarded.shield.bound.tolist()
+
+
+def test_take__of_a_refined_policy_drives_on_in_those_rows():
+    worlds, rows = WORLDS.take(np.arange(6)), np.array([4, 1])
+    agent = Asked(Refined(LearnedAgent(Weights()), PAPER, tries=4)).begin(worlds, 1)
+    assert agent.take(rows).act(worlds.take(rows), 1).tolist() == agent.act(worlds, 1)[rows].tolist()
