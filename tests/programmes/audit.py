@@ -13,10 +13,10 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
-from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, metadata
 from pathlib import Path
+from typing import NamedTuple
 
 from tests.programmes import ROOT, Cases, Told
 
@@ -37,8 +37,7 @@ FAMILIES = {
 }
 
 
-@dataclass(frozen=True)
-class Package:
+class Package(NamedTuple):
     """A pinned package."""
 
     name: str
@@ -70,17 +69,17 @@ def _family(words: str) -> str:
 def packages() -> list[Package]:
     """Every package of constraints.txt, in its order."""
     pins = re.findall(r"^([A-Za-z0-9._-]+)==(\S+)", PINS.read_text("utf-8"), re.MULTILINE)
-    return [_package(name, version) for name, version in pins]
-
-
-def _package(name: str, pinned: str) -> Package:
-    try:
-        known = metadata(name)
-    except PackageNotFoundError:
-        return Package(name, pinned, "", "")
-    classes = [line.split(" :: ")[-1] for line in known.get_all("Classifier", []) if line.startswith("License ::")]
-    own = known.get("License-Expression") or " / ".join(classes) or known.get("License") or ""
-    return Package(name, pinned, known["Version"], own.strip().partition("\n")[0])
+    found = []
+    for name, pinned in pins:
+        try:
+            known = metadata(name)
+        except PackageNotFoundError:
+            found.append(Package(name, pinned, "", ""))
+            continue
+        classes = [line.split(" :: ")[-1] for line in known.get_all("Classifier", []) if line.startswith("License ::")]
+        own = known.get("License-Expression") or " / ".join(classes) or known.get("License") or ""
+        found.append(Package(name, pinned, known["Version"], own.strip().partition("\n")[0]))
+    return found
 
 
 def weaknesses() -> Told:

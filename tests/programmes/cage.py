@@ -92,7 +92,6 @@ class Verdict:
     status: int
     cpu_s: float
     longest: int  # characters of the longest line
-    message: str
     faults: tuple[str, ...]
 
 
@@ -121,7 +120,7 @@ def judge(case: Case, folder: Path) -> Verdict:
     left = [f"left beside its folder: {name}" for name in sorted(frozenset(os.listdir(folder.parent)) - beside)]
     deeds = [*map(json.loads, seen.splitlines()), *changed][:5]
     faults = (*_faults_of_end(case, status, out, err), *deeds, *left)
-    return Verdict(status, cpu_s, max(map(len, (out + err).splitlines() or [""])), err.strip()[-LINE_LIMIT:], faults)
+    return Verdict(status, cpu_s, max(map(len, (out + err).splitlines() or [""])), faults)
 
 
 def forked(work: Callable[[], int]) -> int:

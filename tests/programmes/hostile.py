@@ -296,7 +296,6 @@ KINDS: dict[str, Generator] = {
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sample", type=int, help="so many cases of each category")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--verbose", action="store_true", help="also print each case's message")
 
 
 def by_category(kind: str, seed: int) -> dict[str, list[Case]]:
@@ -330,23 +329,16 @@ def cases(given: argparse.Namespace) -> Cases:
     for kind in KINDS:
         for number, (category, group) in enumerate(by_category(kind, given.seed).items()):
             tried = group[: given.sample]
-            yield f"{kind}: {category}, {len(tried)}", partial(attack, tried, own / f"{kind}-{number}", given)
+            yield f"{kind}: {category}, {len(tried)}", partial(attack, tried, own / f"{kind}-{number}")
 
 
-def attack(tried: list[Case], folder: Path, given: argparse.Namespace) -> Told:
+def attack(tried: list[Case], folder: Path) -> Told:
     """Judge the cases of a category."""
     verdicts = []
     for case in tried:
-        verdict = judge(case, folder)
-        verdicts.append(verdict)
-        if given.verbose:
-            print(f"  {verdict.status} {verdict.cpu_s:.2f} {verdict.message!r:.400}")
-        if verdict.faults:
-            print(
-                f"BROKEN {' '.join(case.command)!a:.120}:",
-                *(f"    {fault!a:.400}" for fault in verdict.faults),
-                sep="\n",
-            )
+        verdicts.append(judge(case, folder))
+        if faults := verdicts[-1].faults:
+            print(f"BROKEN {' '.join(case.command)!a:.120}:", *(f"    {each!a:.400}" for each in faults), sep="\n")
     refused = sum(verdict.status == REFUSED for verdict in verdicts)
     broken = sum(bool(verdict.faults) for verdict in verdicts)
     slowest, longest = max(verdict.cpu_s for verdict in verdicts), max(verdict.longest for verdict in verdicts)
