@@ -3,7 +3,7 @@
 Every case must end within 10 s of processor time and 2 GiB of memory, with exit status 2 and one line of error of at
 most 2,000 characters without control characters (or, where that cannot be said beforehand, in order), and through
 Python with an exception of the project's family; nothing may be executed, and nothing written but what the command is
-for. The kernel keeps the whole attack, the superuser's too, in a folder that is removed at the end.
+for. The whole attack stands in a folder that is removed at the end.
 """
 
 from __future__ import annotations
@@ -34,22 +34,7 @@ from ethbrake_marl.limits.limits import BestHarmTable
 from ethbrake_marl.policies import load_policy
 from tests.programmes import Cases, Told
 from tests.programmes.archives import COMMAND, good_bytes, table_cases
-from tests.programmes.cage import (
-    HERE,
-    INSIDE,
-    NASTY,
-    OUTSIDE,
-    PRECIOUS,
-    REFUSED,
-    Build,
-    Case,
-    Generator,
-    can_confine,
-    confine,
-    die_with_parent,
-    judge,
-    write,
-)
+from tests.programmes.cage import HERE, INSIDE, NASTY, OUTSIDE, PRECIOUS, REFUSED, Build, Case, Generator, judge, write
 from tests.programmes.folders import EVALUATE, MANIFEST, WEIGHTS, bundle, bundle_cases, run_cases, stopped
 from tests.programmes.texts import SPECS, text_cases, texts
 
@@ -309,27 +294,16 @@ def by_category(kind: str, seed: int) -> dict[str, list[Case]]:
 
 
 def cases(given: argparse.Namespace) -> Cases:
-    own = Path(tempfile.mkdtemp(prefix="hostile-")).resolve()
-    child = 0 if given.list else os.fork()  # what confines it cannot be undone, and a folder is left to remove
-    if child:
-        status = os.waitpid(child, 0)[1]
-        shutil.rmtree(own, ignore_errors=True)
-        raise SystemExit(os.waitstatus_to_exitcode(status))
-    if given.list:
-        own.rmdir()
-    else:
-        die_with_parent()
-        os.chdir(own)
+    with tempfile.TemporaryDirectory(prefix="hostile-", ignore_cleanup_errors=True) as folder:
+        own = Path(folder).resolve()
         tempfile.tempdir = os.fspath(own)
-        warm_up(own)
-        if can_confine():
-            confine(own)
-        else:
-            print("this kernel cannot confine a process: the audit hook alone keeps the cases in their folder")
-    for kind in KINDS:
-        for number, (category, group) in enumerate(by_category(kind, given.seed).items()):
-            tried = group[: given.sample]
-            yield f"{kind}: {category}, {len(tried)}", partial(attack, tried, own / f"{kind}-{number}")
+        os.chdir(own)
+        if not given.list:
+            warm_up(own)
+        for kind in KINDS:
+            for number, (category, group) in enumerate(by_category(kind, given.seed).items()):
+                tried = group[: given.sample]
+                yield f"{kind}: {category}, {len(tried)}", partial(attack, tried, own / f"{kind}-{number}")
 
 
 def attack(tried: list[Case], folder: Path) -> Told:
