@@ -67,16 +67,11 @@ def test_price__is_paired_by_world_and_told_of_both_counts():
         told = price.price(found["sensors-only"], "e_v2x_bm:believed", count)
         difference = harm["e_v2x_bm:believed"].world_harm(count) - harm["e_v2x_bm"].world_harm(count)
         assert told.value == pytest.approx(difference.mean(), abs=1e-9)
-        spread = 2.045 * difference.std(ddof=1) / 30**0.5  # t of 29 degrees of freedom
-        assert told.interval == pytest.approx((told.value - spread, told.value + spread), rel=1e-3)
-    heads = [line for line in price.tables(found).splitlines() if line.startswith("| channel")]
-    assert len(heads) == 5 and all(head in (DOCS / "baselines.md").read_text("utf-8") for head in heads)
-    assert picture_bytes(price.draw(found), "price.png").startswith(PNG)
-
-
-def test_price__the_page_shows_every_channel():
     page = (DOCS / "baselines.md").read_text("utf-8")
     assert [f"| {name} | " in page for name in price.channels()] == [True] * 10
+    heads = [line for line in price.tables(found).splitlines() if line.startswith("| channel")]
+    assert len(heads) == 5 and all(head in page for head in heads)
+    assert picture_bytes(price.draw(found), "price.png").startswith(PNG)
 
 
 @pytest.mark.slow
