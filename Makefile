@@ -181,6 +181,9 @@ test-hostile: $(STAMP)
 audit: $(STAMP)
 	@echo "== what the package stands on"
 	@$(PROGRAMME) audit $(ARGS)
+	@if [ -x $(BIN)/pip-audit ]; then \
+	  $(BIN)/pip-audit --requirement constraints.txt --no-deps --disable-pip --progress-spinner off; \
+	else echo "== pip-audit is not installed here: nobody was asked for reported weaknesses"; fi
 
 test-libraries: $(STAMP)
 	@echo "== other people's libraries"

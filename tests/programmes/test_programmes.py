@@ -96,23 +96,6 @@ def test_version__that_is_not_the_pinned_one_is_a_fault_but_not_its_local_part()
     assert audit.Package("torch", "2.13.0", "2.12.0", "BSD").fault == "is pinned to 2.13.0"
 
 
-@pytest.mark.parametrize(
-    ("script", "good", "told"),
-    [
-        ("echo 'No known vulnerabilities found'", True, "No known vulnerabilities found"),
-        ("echo 'Found 1 known vulnerability in 1 package'; exit 1", False, "Found 1 known vulnerability"),
-        ("echo 'ConnectionError: no route to host' >&2; exit 1", None, "not asked, pip-audit could not"),
-    ],
-)
-def test_weaknesses__are_told_or_that_nobody_could_be_asked(script, good, told, tmp_path, monkeypatch):
-    monkeypatch.setattr("sys.executable", str(tmp_path / "python"))
-    assert audit.weaknesses() == (None, "not asked, pip-audit is not installed here")
-    (tmp_path / "pip-audit").write_text(f"#!/bin/sh\n{script}\n")
-    (tmp_path / "pip-audit").chmod(0o755)
-    found = audit.weaknesses()
-    assert found.good is good and told in found.text
-
-
 # ---------------------------------------------------------------- libraries
 
 WAYS = [pytest.param(way, id=f"{way.library}: {way.title}") for way in libraries.ways()]
