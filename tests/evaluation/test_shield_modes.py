@@ -54,14 +54,6 @@ def test_rows__do_not_depend_on_the_size_of_a_chunk(rows: ShieldModes, monkeypat
     assert done == [("full_brake", 25), ("full_brake", 50), ("full_brake", 60)]
 
 
-def test_table_and_figure__show_every_row(rows: ShieldModes) -> None:
-    assert [len(sheet.rows) for sheet in rows.sheets()] == [5]
-    axes = shield_modes_figure(rows).axes[0]
-    drawn = [float(container.lines[0].get_xdata()[0]) for container in axes.containers]
-    expected = [row.against_episode.value for row in rows if row.against_episode is not None]
-    assert np.allclose(sorted(drawn), sorted(expected))
-
-
 def test_worlds_that_cannot_be_advanced__are_out_for_all_modes_and_named(
     rows: ShieldModes, monkeypatch: pytest.MonkeyPatch
 ) -> None:

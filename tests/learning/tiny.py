@@ -25,7 +25,7 @@ TINY_PPO = load_recipe("ppo").replace(
     checkpoint_every_updates=2,
 )
 TINY_SAC = load_recipe("sac").replace(
-    total_steps=90 * 8,
+    total_steps=64 * 8,
     n_envs=8,
     batch_size=32,
     buffer_size=400,  # fills up on the way

@@ -22,7 +22,7 @@ from ethbrake_marl.shield.step_shield import (
     joint_constants,
     plan_harm,
 )
-from tests.shield.attacks import TEAM_ADVERSARIES, TEAMS, attack
+from tests.shield.attacks import TEAM_ADVERSARIES, TEAMS, attack, begun
 
 STEPS = 81
 PAIR, PAPER = load_scenario("cooperation-3-pair"), load_scenario("paper-random")
@@ -126,7 +126,7 @@ def test_attack__realises_the_last_bound_to_the_bit_and_neither_bound_nor_caps_a
     scenario, cap = load_scenario(TEAMS[level, N]), "baseline" if harm_count == "first" else None
     for hostile in ("all", "one"):
         found = attack(
-            scenario, scenario.sample(8 if N == 3 else 2, 5).worlds, TEAM_ADVERSARIES[name], hostile=hostile, seed=1,
+            scenario, scenario.sample(4 if N == 3 else 2, 5).worlds, TEAM_ADVERSARIES[name], hostile=hostile, seed=1,
             harm_count=harm_count, cap=cap,
         )  # fmt: skip
         assert found.realised.tolist() == found.last_bound.tolist()
@@ -150,20 +150,17 @@ def test_one_vehicle_in_a_list__is_the_single_shield_bit_for_bit():
 
 def test_bound_at_the_alert__is_at_most_full_braking_and_any_single_constant():
     worlds = PAIR.sample(40, 8).worlds
-    joint = StepShield(PAIR, (1, 2))
-    joint.begin(worlds, np.arange(40))
+    joint = begun(PAIR, worlds)
     braked = plan_harm(joint.running, np.full((40, STEPS, 2), -1.0))
     assert (joint.first_bound <= braked).all() and joint.first_bound.mean() < 0.8 * braked.mean()
-    for vehicle, other in ((1, 2), (2, 1)):
-        single = StepShield(PAIR, vehicle, others={0: make_agent("full_brake"), other: make_agent("full_brake")})
-        single.begin(worlds, np.arange(40))
-        assert (joint.first_bound <= single.first_bound + 1e-6).all()
+    for vehicle in (1, 2):
+        alone = begun(PAIR.with_learners([vehicle]), worlds)
+        assert (joint.first_bound <= alone.first_bound + 1e-6).all()
 
 
 def test_team__whose_rollout_keeps_the_bound_is_left_alone():
     worlds = PAIR.sample(30, 2).worlds
-    without = StepShield(PAIR, (1, 2))
-    without.begin(worlds, np.arange(30))
+    without = begun(PAIR, worlds)
     for name in ("full_brake", "constant:5"):
         shield, team = StepShield(PAIR, (1, 2)), {i: make_agent(name) for i in (1, 2)}
         shield.begin(worlds, np.arange(30), team)
@@ -182,9 +179,7 @@ def test_constants__hold_all_alike_and_ladders_each_once():
 
 def test_surprise__of_one_world_hands_the_whole_team_to_the_fallback():
     scenario = load_scenario(TEAMS[4, 3])
-    worlds = scenario.sample(3, 1).worlds
-    shield = StepShield(scenario, scenario.learners)
-    shield.begin(worlds, np.arange(3))
+    shield = begun(scenario, scenario.sample(3, 1).worlds)
     seen = shield.running.states.copy()
     seen[1, 1] -= 0.5  # a vehicle is slower than it can be
     decision = shield.decide(np.ones((3, 3)), seen=seen)
