@@ -60,7 +60,6 @@ class Case:
     build: Build
     certain: bool = True  # it must be refused; otherwise it may also be found to be in order
     reader: Callable[[], object] | None = None  # the same through Python: must raise an error of the project's family
-    meanwhile: Build | None = None  # goes on in another process while the command runs
     environment: Mapping[str, str] = field(default_factory=dict)
     may_change: tuple[str, ...] = ()  # what a command that is not refused may write, inside the folder
 
@@ -103,14 +102,10 @@ def judge(case: Case, folder: Path) -> Verdict:
     before = _content(folder)
     streams = [folder.with_suffix(suffix) for suffix in (".out", ".err", ".seen")]
     child = _forked(lambda: _run(case, inside, streams))
-    disturbing = _forked(lambda: _disturb(case, inside)) if case.meanwhile else 0
     status, cpu_s = _wait(child)
-    if disturbing:
-        os.kill(disturbing, signal.SIGKILL)
-        os.waitpid(disturbing, 0)
     out, err, seen = (path.read_bytes().decode("utf-8", "backslashreplace") for path in streams)
     after, allowed = _content(folder), tuple(f"{INSIDE}/{name}" for name in case.may_change)
-    names = [] if case.meanwhile else [n for n in sorted(before | after) if before.get(n) != after.get(n)]
+    names = [name for name in sorted(before | after) if before.get(name) != after.get(name)]
     changed = [f"changed: {name}" for name in names if not (allowed and name.startswith(allowed))]
     shutil.rmtree(folder, ignore_errors=True)
     for path in streams:
@@ -172,11 +167,6 @@ def _read(case: Case, seen: int) -> None:
     else:
         if case.certain:
             _tell(seen, "python: no error")
-
-
-def _disturb(case: Case, inside: Path) -> int:
-    while True:
-        case.meanwhile(inside)
 
 
 def _wait(child: int) -> tuple[int, float]:

@@ -21,7 +21,7 @@ import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import chdir, redirect_stderr, redirect_stdout, suppress
+from contextlib import chdir, redirect_stderr, redirect_stdout
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -109,44 +109,14 @@ PLACES: dict[str, Callable[[Path], object]] = {
 }
 
 
-def _vanishing(path: Path, right: bytes) -> None:
-    path.unlink(missing_ok=True)
-    path.write_bytes(right)
-
-
-def _growing(path: Path, right: bytes) -> None:
-    with path.open("ab") as file:
-        file.write(b"\n" * 4096)
-        if file.tell() > 1 << 20:
-            file.truncate(len(right))
-
-
-def _turning(path: Path, right: bytes) -> None:
-    """Puts a pipe in the file's place and the file back."""
-    os.mkfifo(path.with_name("pipe"))
-    os.replace(path.with_name("pipe"), path)
-    path.with_name("plain").write_bytes(right)
-    os.replace(path.with_name("plain"), path)
-
-
-CHANGING = {"vanishes and comes back": _vanishing, "grows": _growing, "turns into a pipe": _turning}
 LONG = ("a" * 300, "a/" * 3000, "a" * 5000, f"../{INSIDE}/" * 300 + "x", HERE + "/" * 5000 + "x", "é" * 200)
 
 
-def _meanwhile(change: Callable[[Path, bytes], None], target: Target, folder: Path) -> None:
-    with suppress(OSError):
-        change(folder / target.name, target.right)
-
-
 def places(rng: random.Random) -> Iterator[Case]:
-    """Every kind of file replaced by everything, changed while it is read, and called by names that bite."""
+    """Every kind of file replaced by everything, and called by names that bite."""
     for target in targets():
         for place, put in PLACES.items():
             yield _at(target, place, put)
-        for what, change in CHANGING.items():
-            for _ in range(4):
-                disturbing = partial(_meanwhile, change, target)
-                yield _at(target, what, lambda path, right=target.right: path.write_bytes(right), meanwhile=disturbing)
         if "policy/" in target.name:
             continue
         suffix = Path(target.name).suffix
@@ -170,7 +140,7 @@ def _write(name: str, content: bytes, folder: Path) -> None:
     write(folder / name, content)
 
 
-def _at(target: Target, category: str, put: Callable[[Path], object], meanwhile: Build | None = None) -> Case:
+def _at(target: Target, category: str, put: Callable[[Path], object]) -> Case:
     """Something else in the place of the file."""
 
     def build(folder: Path) -> None:
@@ -179,8 +149,7 @@ def _at(target: Target, category: str, put: Callable[[Path], object], meanwhile:
         (folder / target.name).unlink(missing_ok=True)
         put(folder / target.name)
 
-    reader = partial(target.reader, target.name)
-    return Case(category, target.command, build, certain=meanwhile is None, reader=reader, meanwhile=meanwhile)
+    return Case(category, target.command, build, reader=partial(target.reader, target.name))
 
 
 def _named(target: Target, category: str, name: str, build: Build = lambda folder: None) -> Case:
