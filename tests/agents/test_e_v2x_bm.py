@@ -16,13 +16,10 @@ from ethbrake_marl.agents.e_v2x_bm import (
     CoupledOptimum,
     Line,
     Samples,
-    bound_cells,
-    choose,
     closing_speed_squared,
     least_to_spare_front,
     make_line,
     most_to_spare_rear,
-    put_in_order,
     share_start,
     simulate,
     will_stay_apart,
@@ -171,43 +168,6 @@ def test_optimum__takes_the_middle_of_a_flat_minimum():
     assert best.spares_front_mps2[0] == math.inf
     assert best.harm[0] == 4.0
     assert best.deceleration_mps2[0] == pytest.approx(36 / 9.4)
-
-
-def samples(at, harm, other=None) -> Samples:
-    found = Samples(*(np.array(column, dtype=float) for column in (at, harm, harm if other is None else other, at)))
-    put_in_order(found, len(found.at))
-    return found
-
-
-@pytest.mark.parametrize(
-    ("harm", "other", "expected"),
-    [
-        ([3, 1, 2, 2, 4], [0, 9, 0, 0, 0], 1.0),  # the harm decides
-        ([3, 1, 1, 2, 4], [0, 9, 8, 0, 0], 2.0),  # a tie: the other count decides
-        ([3, 0, 0, 0, 4], [0, 0, 0, 0, 0], 2.0),  # still a tie: the middle one
-        ([0, 0, 3, 0, 0], [1, 1, 1, 1, 1], 1.0),  # of an even number the lower one
-    ],
-)
-def test_choose__order_of_preference(harm, other, expected):
-    found = samples([0, 1, 2, 3, 4], harm, other)
-    assert choose(found, 5, np.empty(5)) == expected
-    back = Samples(*(column[::-1].copy() for column in found))
-    assert choose(back, 5, np.empty(5)) == expected
-
-
-@pytest.mark.parametrize(
-    ("at", "harm", "expected"),
-    [
-        # Middle cell: falling by 2 on its left, rising by 3 on its right, each up to twice as fast inside: 3 - 4, 1 - 6
-        ([0, 1, 2, 3], [5, 3, 1, 4], [3.0, -5.0, -3.0]),
-        # With uneven samples the slope counts: falling by 2 over 1, then a cell twice as wide: 3 - 2 * 2 * 2.
-        ([0, 1, 3], [5, 3, 4], [2.0, -5.0]),
-    ],
-)
-def test_bound_cells__let_a_falling_side_run_on(at, harm, expected):
-    found = np.empty(len(at) - 1)
-    bound_cells(samples(at, harm), len(at), found)
-    assert found.tolist() == expected
 
 
 def line_worlds(n: int, vehicles: int, seed: int) -> Worlds:

@@ -45,18 +45,6 @@ def test_burst_periods__at_the_bounds_by_hand():
     assert burst_periods(np.array([0.0]), 0.5, 1.0).tolist() == [1]
 
 
-def test_with_news__sight_goes_hop_by_hop():
-    # hops drawn at the middle: 0.95 s each; nobody hears anything.
-    u = np.full((1, 9 * PER_LINK), 0.5)
-    told = V2X.model_validate("sensors-only").with_news(vehicles([0.0, 0.1, 2.5]), u)
-    assert told.latency_s.tolist() == [[0.0, pytest.approx(0.95), 2.5]]  # 0.95 + 0.95 < 2.5, its own part
-    known = told.known_from_s[0]
-    assert known[0].tolist() == [0.0, pytest.approx(0.95), np.inf]
-    assert known[1].tolist() == [pytest.approx(0.95)] * 3
-    assert known[2].tolist() == [np.inf, 2.5, 2.5]
-    assert told.own_latency_s.tolist() == [[0.0, 0.1, 2.5]]
-
-
 def test_with_news__news_of_the_emergency_comes_by_radio_or_by_sight():
     u = np.full((1, 9 * PER_LINK), 0.5)
     u.reshape(9, PER_LINK)[2 * 3 + 0, 2] = 0.0  # the link from vehicle_1 to vehicle_3 is lost, if any
@@ -146,14 +134,6 @@ def test_v2x__says_whether_it_differs_from_the_paper_and_whether_chance_decides(
     assert (v2x.by_link, v2x.drawn) == (by_link, drawn)
 
 
-def test_paper__is_the_rule_of_the_own_latency():
-    plain, named = PAPER.sample(50, 7).worlds, PAPER.replace(v2x="paper").sample(50, 7).worlds
-    for vehicles in (plain.vehicles, named.vehicles):
-        assert vehicles.own_latency_s.tolist() == vehicles.latency_s.tolist() == [[0.0, 0.5, 0.8]] * 50
-        assert vehicles.known_from_s.tolist() == [[[0.0] * 3, [0.5] * 3, [0.8] * 3]] * 50
-    assert named.gaps_m.tobytes() == plain.gaps_m.tobytes()
-
-
 @pytest.mark.parametrize("name", MESSAGES)
 def test_sample__a_world_alone_has_the_same_news_and_the_line_of_the_paper(name):
     scenario = channel_of(name)
@@ -218,18 +198,6 @@ def test_observe__what_is_not_known_changes_no_bit(name, obstacle, latency):
         assert (observe(worlds, 1, spec)[:, at] == ~unknown[:, : len(at)]).all()
         seen += int(unknown.sum())
     assert seen > 600
-
-
-def test_engine__tells_what_is_known_when_and_starts_when_a_learner_may_act():
-    running = make_engine(channel_of("blocked"), 20, seed=3)
-    vehicles = running.worlds.vehicles
-    assert running.packed.known_from_s.tolist() == vehicles.known_from_s.tolist()
-    assert running.worlds.time_s.tolist() == vehicles.latency_s[:, 1].tolist()
-    assert np.ptp(running.worlds.time_s) > 0.2
-    before = running.packed.known_from_s.copy()
-    running.renew(np.array([4]))
-    after = running.packed.known_from_s
-    assert (np.delete(after, 4, 0) == np.delete(before, 4, 0)).all() and (after[4] != before[4]).any()
 
 
 def test_engine__takes_worlds_with_and_without_news_by_link():

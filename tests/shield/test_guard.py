@@ -124,17 +124,6 @@ def test_ledger__harm_that_nobody_predicted_is_seen_before_the_next_decision(gro
     assert not info["shield"]["trusted"] and info["shield"]["reason"] == "assumption broken"
 
 
-def test_past_the_shield__a_step_is_shielded_too_until_it_lets_go():
-    env = shielded()
-    engine, shield = env.attached.engine, env.attached.shield
-    while not engine.ended[0]:
-        env.unwrapped.step(DRIVE)
-    assert engine.ledger.world_harm("first")[0] <= shield.first_bound[0] and env.attached.shield.interventions[0] > 0
-    env.reset(seed=0)
-    env.attached.close()
-    assert env.unwrapped.step(DRIVE)[-1]["chosen_action"][0] == 1.0
-
-
 def test_autoreset__of_gymnasium_inside_is_left_alone():
     env = ShieldedEnv(Autoreset(gymnasium.make("EthBrake-v0").unwrapped))
     env.reset(seed=0)

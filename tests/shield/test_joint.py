@@ -7,12 +7,10 @@ import pytest
 
 from ethbrake_marl.agents.registry import Team, drive, make_agent
 from ethbrake_marl.envs.interfaces import parallel_env
-from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield import HybridShield, ShieldedDriver, StepShield, guard as behind_module
 from ethbrake_marl.shield.guard import Shielded
-from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from ethbrake_marl.shield.step_shield import (
     REASONS,
     Backup,
@@ -93,20 +91,6 @@ def test_by_hand__who_says_no_number_keeps_the_plan_and_the_other_is_clipped():
     decision = certify(running, np.array([[np.nan, -7.0]]), backup, backup.harm)
     assert told(decision) == ["not a number", "plan remains"]
     assert decision.applied.tolist() == [[-0.9, -1.0]] and decision.intervened.tolist() == [[True, False]]
-
-
-@pytest.mark.parametrize(("vehicles", "plan"), [((1,), braking(-0.8)[:, :, 0]), ((1, 2), braking(-0.8))])
-def test_certify__changes_nothing_it_is_given(vehicles, plan):
-    running, backup = start(three(), plan, vehicles)
-    before = running.states.copy(), backup.plan.copy(), backup.harm.copy()
-    certify(running, np.full_like(plan[:, 0], 0.3), backup, backup.harm)
-    assert [a.tolist() for a in before] == [running.states.tolist(), backup.plan.tolist(), backup.harm.tolist()]
-
-
-def test_shares__are_those_of_the_ledger_and_the_light_one_bears_more():
-    running, backup = start(three(speeds_mps=[0, 10, 20]), braking())
-    borne = ends_under(running, backup.plan)[1][0]
-    assert borne.sum() == pytest.approx(backup.harm[0]) and borne[1] > borne[2] > 0.0
 
 
 def test_caps__reject_what_only_moves_harm_to_another():
@@ -210,21 +194,6 @@ def test_parallel__a_team_proposes_where_nobody_does_and_one_may_be_left_out():
         env.reset(seed=1)
         *_, infos = env.step(given)
         assert [infos[agent]["shield"]["proposed_action"] for agent in env.shielded] == proposed
-
-
-def test_sb3__rows_of_one_world_are_decided_together_over_automatic_resets():
-    env = ShieldedVecEnv(make_sb3_vec_env("cooperation-3-pair", 5, seed=3), cap="baseline", intervention_penalty=1.0)
-    env.reset()
-    rng, ended = np.random.default_rng(0), 0
-    for _ in range(120):
-        caps = env.attached.shield.baseline_shares
-        _, _, done, infos = env.step(rng.uniform(-1.0, 1.0, (10, 1)).astype(np.float32))
-        for k in np.flatnonzero(done)[::2]:
-            for info, cap in zip(infos[k : k + 2], caps[k // 2, 1:], strict=True):
-                assert info["world_first_impact_harm"] == info["shield"]["bound_harm"]
-                assert info["first_impact_harm"] == info["shield"]["own_harm"] <= cap
-            ended += 1
-    assert ended >= 5
 
 
 @pytest.mark.parametrize("settings", [{"shares": True}, {"cap": "baseline"}, {"shares": True, "harm_count": "total"}])

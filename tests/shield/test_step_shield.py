@@ -313,16 +313,6 @@ class Speechless:
         return np.where(worlds.time_s % 1.0 > 0.5, np.nan, braking)
 
 
-@pytest.mark.parametrize("capacity", [0.0, 5.0])
-def test_agent__what_is_no_number_is_replaced_and_told(capacity):
-    scenario = PAPER.replace(driving_capacity_mps2=capacity)
-    episodes = drive(scenario.sample(20, 3).worlds, ShieldedDriver(Speechless(), scenario, logging=True), scenario, 1)
-    harm, shield = episodes.ledger.world_harm("first"), episodes.guarded.shield
-    assert harm.tolist() == shield.bound.tolist() and (harm <= shield.predicted_harm).all()
-    silent = [entry for entry in shield.log if REASONS[entry.reason] == "not a number"]
-    assert len({entry.world for entry in silent}) == 20 and all(np.isnan(entry.proposed) for entry in silent)
-
-
 # The policy itself as a later certificate: accepted only if its rollout, followed step by step, keeps the budget.
 ROLLED = PAPER.sample(120, 3).worlds
 
