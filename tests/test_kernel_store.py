@@ -25,7 +25,7 @@ from ethbrake_marl import kernel_store
 from ethbrake_marl.kernel_store import cache_folder
 from ethbrake_marl.physics import compiling as compiled
 from ethbrake_marl.physics.compiling import digest_of_sources, keep_kernel, kernel_sources, load_kernel
-from tests.programmes.wheel import pack
+from tests.docs.site import load
 
 needs_compiler = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="compilation is switched off")
 PACKAGE = Path(ethbrake_marl.__file__).parent
@@ -371,7 +371,9 @@ def test_ready_made_kernels__are_taken_where_the_own_store_has_none_unless_they_
         chosen.setenv("NUMBA_CPU_NAME", "x86-64-v2")
         chosen.setenv("NUMBA_CPU_FEATURES", "")
         assert run(way="cold") == COMPILED
-    wheel = pack({file.name: file.read_bytes() for file in cache_folder().glob("*.entry")}, tmp_path)
+    wheel = load("../../.ci/kernels").pack(
+        {file.name: file.read_bytes() for file in cache_folder().glob("*.entry")}, tmp_path
+    )
     site = tmp_path / "site"
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", str(site)]
     subprocess.run([*pip, str(wheel)], check=True, timeout=120)

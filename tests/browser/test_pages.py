@@ -108,13 +108,12 @@ def contrast(first: np.ndarray, second: np.ndarray) -> float:
     return float(lights.max() / lights.min())
 
 
-def test_report__without_scripts_says_what_is_missing(open_page: Open, report_file: Path) -> None:
+def test_report__says_what_is_missing_without_scripts_and_every_control_has_a_name(
+    open_page: Open, report_file: Path, report_page: Any
+) -> None:
     page = open_page(report_file.as_uri(), java_script_enabled=False)
     assert page.get_by_text("scripts are switched off here").is_visible()
     assert page.get_by_text("Means with 95 % intervals").is_visible() and page.locator(".controls").is_hidden()
-
-
-def test_report__every_control_has_a_name(report_page: Any) -> None:
     nameless = report_page.evaluate(
         "[...document.querySelectorAll('button, input, select, [role=img], [role=region], [tabindex=\"0\"]')]"
         ".filter((e) => !(e.getAttribute('aria-label') || e.textContent.trim() || e.labels?.length))"

@@ -12,7 +12,7 @@ from ethbrake_marl.agents.registry import drive, make_agent
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.figures import picture_bytes
 from ethbrake_marl.limits.limits import best_known
-from ethbrake_marl.physics import advance, make_worlds
+from ethbrake_marl.physics import advance
 from ethbrake_marl.scenario import Task, load_scenario
 from ethbrake_marl.studies.speed import Effort
 from tests.docs.site import DOCS, load
@@ -34,21 +34,6 @@ SHORT = Effort(1, 1e-6)
 PNG = b"\x89PNG"
 
 
-def test_chain_impact__is_one_that_moves_a_third_vehicle():
-    # Vehicles 1 and 2 touch at rest when Vehicle 3 comes; in the second world they stand 9 m apart.
-    worlds = make_worlds(
-        [[0.0, 4.0], [9.0, 4.0]],
-        [0.0, 0.0, 4.0],
-        braking_capacity_mps2=6.0,
-        driving_capacity_mps2=6.0,
-        latency_s=0.0,
-        mass_t=1.0,
-        restitution=0.0,
-    )
-    _, impacts = advance(worlds, [0.0, 0.0, 0.0], 1.5, record=True)
-    assert sampling.chain_impacts(worlds, impacts.rows).tolist() == [True, False]
-
-
 @pytest.mark.parametrize("agent", sampling.CONTROLS)
 def test_sampling__the_table_in_the_docs_is_the_one_that_it_prints(agent):
     page = (DOCS / "sampled.md").read_text("utf-8")
@@ -60,14 +45,6 @@ def test_sampling__the_table_in_the_docs_is_the_one_that_it_prints(agent):
     at = docs.index(printed[0])
     assert docs[at : at + 8] == printed[:-1]
     assert picture_bytes(sampling.draw([study]), "study.png").startswith(PNG)
-
-
-def test_order__is_the_slope_of_the_error_up_to_a_tenth_of_a_second():
-    worlds = PAPER.sample(200, 7).worlds
-    study = sampling.convergence(worlds, "full_brake", steps_s=(0.2, 0.1, 0.05))
-    low, high = study.errors[[2, 1], 2]
-    assert study.order(2) == pytest.approx(math.log2(high / low))
-    assert sampling.convergence(worlds, "full_brake", steps_s=(0.2, 0.1)).order(2) is None
 
 
 def test_price__is_nothing_where_everything_is_known():
@@ -90,16 +67,11 @@ def test_price__is_paired_by_world_and_told_of_both_counts():
         told = price.price(found["sensors-only"], "e_v2x_bm:believed", count)
         difference = harm["e_v2x_bm:believed"].world_harm(count) - harm["e_v2x_bm"].world_harm(count)
         assert told.value == pytest.approx(difference.mean(), abs=1e-9)
-        spread = 2.045 * difference.std(ddof=1) / 30**0.5  # t of 29 degrees of freedom
-        assert told.interval == pytest.approx((told.value - spread, told.value + spread), rel=1e-3)
-    heads = [line for line in price.tables(found).splitlines() if line.startswith("| channel")]
-    assert len(heads) == 5 and all(head in (DOCS / "baselines.md").read_text("utf-8") for head in heads)
-    assert picture_bytes(price.draw(found), "price.png").startswith(PNG)
-
-
-def test_price__the_page_shows_every_channel():
     page = (DOCS / "baselines.md").read_text("utf-8")
     assert [f"| {name} | " in page for name in price.channels()] == [True] * 10
+    heads = [line for line in price.tables(found).splitlines() if line.startswith("| channel")]
+    assert len(heads) == 5 and all(head in page for head in heads)
+    assert picture_bytes(price.draw(found), "price.png").startswith(PNG)
 
 
 @pytest.mark.slow
@@ -121,18 +93,6 @@ def test_drawing__is_the_one_that_is_shown(name: str) -> None:
     assert f"](figures/model-{name}.svg)" in (DOCS / "model.md").read_text("utf-8").replace("\n", " ")
     made = picture_bytes(drawings.DRAWINGS[name](), "made.svg")
     assert made == (DOCS / "figures" / f"model-{name}.svg").read_bytes()
-
-
-def test_phases__follow_latency_speed_and_command() -> None:
-    time, speed = np.arange(6.0), np.array([5.0, 5.0, 5.0, 4.0, 0.0, 0.0])
-    command = np.array([0.0, 0.0, 2.0, -1.0, -1.0, -1.0])
-    assert list(drawings.phases(time, speed, command, 1.0)) == [
-        (0.0, 1.0, "waits for its news"),
-        (1.0, 2.0, "coasts"),
-        (2.0, 3.0, "drives"),
-        (3.0, 4.0, "brakes"),
-        (4.0, 5.0, "stands"),
-    ]
 
 
 def test_equal_time__tells_the_harm_of_an_evaluation_in_the_columns_of_the_page() -> None:

@@ -26,7 +26,7 @@ from ethbrake_marl.observations import Feature, ObservationSpec
 from ethbrake_marl.physics import make_worlds
 from ethbrake_marl.scenario import Scenario, full_state, load_scenario, state_features
 from tests.contract.interfaces import CRASH, FIVE, PAPER, REST, actions, initial_state
-from tests.reference.docs_tables import environment_tables
+from tests.docs.site import load
 
 near = pytest.approx
 ROOT = Path(__file__).resolve().parents[2]
@@ -477,10 +477,13 @@ def test_import__stays_light_until_a_name_is_used_and_lets_gymnasium_make_it_by_
     assert result.stdout.splitlines() == ["[]", "['numba', 'pydantic']", "EthBrakeEnv", "{} {}"], result.stderr
 
 
-@pytest.mark.parametrize("marker", environment_tables())
+TABLES = load("../studies/environment_tables").environment_tables()
+
+
+@pytest.mark.parametrize("marker", TABLES)
 def test_page__shows_the_table_that_the_code_makes(marker: str) -> None:
     (shown,) = re.findall(f"<!-- {marker} -->\n(.*?)\n<!-- end -->", PAGE, re.DOTALL)
-    assert shown == environment_tables()[marker]
+    assert shown == TABLES[marker]
 
 
 def test_page__its_example_runs() -> None:

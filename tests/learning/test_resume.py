@@ -145,8 +145,8 @@ FAST = [("ppo", 37), ("sac", 52), ("mixture", 70), ("remembering", 100), ("turns
     ("name", "at"),
     [
         *((name, ("step", step)) for name, step in FAST),
-        ("counterfactual", ("update", 7)),
-        ("modes", ("update", 10)),
+        ("counterfactual", ("update", 5)),
+        ("modes", ("update", 5)),
         *(
             pytest.param(name, (unit, number), marks=pytest.mark.slow)
             for name, unit, numbers in (
@@ -155,8 +155,8 @@ FAST = [("ppo", 37), ("sac", 52), ("mixture", 70), ("remembering", 100), ("turns
                 ("shared", "step", (72,)),
                 ("independent", "step", (72,)),
                 ("centralised", "step", (72,)),
-                ("modes", "update", (6, 14)),  # in its other stages
-                ("scout", "update", (10,)),
+                ("modes", "update", (3, 7)),  # in its other stages
+                ("scout", "update", (5,)),
             )
             for number in numbers
         ),

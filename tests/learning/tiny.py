@@ -43,7 +43,7 @@ TINY_COUNTERFACTUAL = load_recipe("counterfactual").replace(
     counterfactuals=16,
     batch_size=8,
     network={"policy": [8]},
-    total_steps=512,
+    total_steps=256,
     evaluation={"every_updates": 4, "worlds": 10, "seed": 7},
     checkpoint_every_updates=3,
 )

@@ -3,7 +3,7 @@
 Each library has an environment of its own below ``.venvs/``, kept for the next run, with this project as it stands.
 What cannot be installed is skipped, and the reason told. A policy is measured on a fixed list of worlds beside full
 braking, and where the library evaluates policies by itself, its harm is compared with ours, world by world.
-``--write`` puts the rows into the table of the page. ``--ci`` takes the libraries that are cheap to install.
+The row of the page's table is printed. ``--ci`` takes the libraries that are cheap to install.
 """
 
 from __future__ import annotations
@@ -254,7 +254,6 @@ def cpu_seconds() -> float:
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--ci", action="store_true", help="only the libraries that are cheap to install")
     parser.add_argument("--limit", type=float, default=900.0, help="seconds for one way")
-    parser.add_argument("--write", action="store_true", help="write the rows into the table of the page")
 
 
 def cases(given: argparse.Namespace) -> Cases:
@@ -282,20 +281,8 @@ def run(k: int, way: Way, given: argparse.Namespace) -> Told:
     last = (told.strip().splitlines() or [""])[-1]
     if status:
         return Told(False, f"status {status}: {last}")
-    cells = json.loads(last)
-    if given.write:
-        write_row(way, cells)
-    return Told(True, "  ".join(filter(None, cells)))
-
-
-def write_row(way: Way, cells: list[str]) -> None:
-    """Put a row into the table of the page, in the place of the one of the same library and way."""
-    told, *rest = cells
-    row = f"| {' | '.join((way.library, told, lowered(way.title), way.ran, *rest))} |"
-    begin = rf"^\| {re.escape(way.library)} \| [^|]* \| {re.escape(lowered(way.title))} \|.*$"
-    text, found = re.subn(begin, lambda _: row, PAGE.read_text("utf-8"), flags=re.MULTILINE)
-    assert found == 1, f"the page has {found} rows of {way.library}, {way.title}"
-    PAGE.write_text(text, "utf-8")
+    release, *rest = json.loads(last)
+    return Told(True, f"\n| {' | '.join((way.library, release, lowered(way.title), way.ran, *rest))} |")
 
 
 def lowered(title: str) -> str:

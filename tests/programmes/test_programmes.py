@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.programmes import ROOT, Told, __main__ as runner, audit, hostile, libraries
-from tests.programmes.cage import Case, can_confine, confine, forked, judge
+from tests.programmes.cage import Case, judge
 
 PAGE = ROOT / "docs" / "security.md"
 
@@ -96,23 +96,6 @@ def test_version__that_is_not_the_pinned_one_is_a_fault_but_not_its_local_part()
     assert audit.Package("torch", "2.13.0", "2.12.0", "BSD").fault == "is pinned to 2.13.0"
 
 
-@pytest.mark.parametrize(
-    ("script", "good", "told"),
-    [
-        ("echo 'No known vulnerabilities found'", True, "No known vulnerabilities found"),
-        ("echo 'Found 1 known vulnerability in 1 package'; exit 1", False, "Found 1 known vulnerability"),
-        ("echo 'ConnectionError: no route to host' >&2; exit 1", None, "not asked, pip-audit could not"),
-    ],
-)
-def test_weaknesses__are_told_or_that_nobody_could_be_asked(script, good, told, tmp_path, monkeypatch):
-    monkeypatch.setattr("sys.executable", str(tmp_path / "python"))
-    assert audit.weaknesses() == (None, "not asked, pip-audit is not installed here")
-    (tmp_path / "pip-audit").write_text(f"#!/bin/sh\n{script}\n")
-    (tmp_path / "pip-audit").chmod(0o755)
-    found = audit.weaknesses()
-    assert found.good is good and told in found.text
-
-
 # ---------------------------------------------------------------- libraries
 
 WAYS = [pytest.param(way, id=f"{way.library}: {way.title}") for way in libraries.ways()]
@@ -188,36 +171,6 @@ def nothing(folder: Path) -> None:
 )
 def test_judge__tells_what_breaks_a_rule(case, fault, tmp_path):
     assert [told for told in judge(case, tmp_path / "case").faults if told.startswith(fault)]
-
-
-@pytest.mark.skipif(not can_confine(), reason="the kernel has no Landlock of version 3")
-def test_confine__keeps_the_superuser_and_his_children_from_changing_what_is_outside(tmp_path):
-    own, outside = tmp_path / "own", tmp_path / "outside"
-    own.mkdir()
-    outside.mkdir()
-    (outside / "kept").write_text("years of work")
-    deeds = (
-        lambda: (outside / "new").touch(),
-        lambda: (outside / "kept").write_text(""),
-        lambda: (outside / "kept").unlink(),
-        lambda: (outside / "folder").mkdir(),
-        lambda: os.mkfifo(outside / "pipe"),
-        lambda: os.truncate(outside / "kept", 0),
-        lambda: os.rename(own / "mine", outside / "mine"),
-    )
-
-    def work() -> int:
-        confine(own)
-        (own / "mine").write_text("mine")
-        Path(os.devnull).write_text("may be written to")
-        for deed in deeds:
-            with pytest.raises(OSError):
-                deed()
-        return int(os.system(f"touch '{outside}/new' 2>/dev/null") == 0)
-
-    assert os.waitpid(forked(work), 0)[1] == 0
-    assert (os.listdir(outside), os.listdir(own)) == (["kept"], ["mine"])
-    assert (outside / "kept").read_text() == "years of work"
 
 
 def test_page__says_how_much_the_attack_holds():

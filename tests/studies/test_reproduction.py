@@ -224,8 +224,8 @@ OUTCOMES = {"agrees", "differs", "cannot agree", "undecided", "not run"}
 
 @pytest.fixture(scope="module")
 def made_of(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Made]:
-    """Every item of ten worlds, made once."""
-    settings = Reproduction("quick", tmp_path_factory.mktemp("reproduction"), 10)
+    """Every item of four worlds, made once."""
+    settings = Reproduction("quick", tmp_path_factory.mktemp("reproduction"), 4)
     return {item.name: item.make(settings) for item in ITEMS}
 
 

@@ -1,4 +1,7 @@
-"""The tables that docs/environment.md shows, made from the code; a test compares the two."""
+"""The tables that docs/environment.md shows, made from the code; a test compares the two.
+
+``.venv/bin/python docs/studies/environment_tables.py`` prints them.
+"""
 
 from __future__ import annotations
 
@@ -79,3 +82,8 @@ def _plain(value: float | str | None) -> str:
 def _markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+if __name__ == "__main__":
+    for name, table in environment_tables().items():
+        print(f"<!-- {name} -->\n{table}\n<!-- end -->\n")
