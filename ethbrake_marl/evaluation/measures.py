@@ -1411,7 +1411,7 @@ class SummaryRow:
 
 
 class SummaryTable(list[SummaryRow]):
-    """The rows of ``summarise``: a list that a notebook shows as a table.
+    """The rows of ``summarise``: a list that ``print`` and a notebook show as a table.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -1421,6 +1421,17 @@ class SummaryTable(list[SummaryRow]):
     (True, 1)
 
     """
+
+    def __repr__(self) -> str:
+        return f"SummaryTable({', '.join(row.agent for row in self)})"
+
+    def __str__(self) -> str:
+        from rich.console import Console
+
+        console = Console(highlight=False)
+        with console.capture() as captured:
+            console.print(*self.tables())
+        return captured.get()
 
     def _repr_html_(self) -> str:
         note = "Harm: means per world in m²/s². In brackets: 95 % intervals. Decrease: of full braking's harm."
