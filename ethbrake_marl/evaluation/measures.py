@@ -671,12 +671,12 @@ class Between:
         """What is known of them, as a sentence after another; empty without such a world."""
         if self.rate == 0.0:
             return ""
-        text = f" In the {100 * self.rate:.1f} % between, whether an impact can be avoided is open"
+        text = f" In {100 * self.rate:.1f} % contact is certain, but perhaps no impact"
         if self.mean_first is None or self.harmless_rate is None:
             return f"{text}."
         return (
-            f"{text}: the best known do {self.mean_first:.2f} there on average, and next to none in"
-            f" {100 * self.harmless_rate:.0f} % of them."
+            f"{text}: the least harm known there is {self.mean_first:.2f} on average, and practically none in"
+            f" {100 * self.harmless_rate:.0f} % of these."
         )
 
     @classmethod
