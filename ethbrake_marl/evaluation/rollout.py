@@ -178,7 +178,7 @@ def evaluate(
     scenario = load_scenario(scenario)
     if isinstance(agents, str):
         agents = agents.split(",")
-    if not isinstance(agents, Mapping):
+    if isinstance(agents, Sequence):
         agents = make_lineup(agents, scenario)
     if worlds is None:
         seed = DEFAULT.LIST_SEED if seed is None else seed
@@ -237,11 +237,15 @@ def evaluate_list(
     return whole, left_out
 
 
-def _check_request(worlds: object, agents: Mapping[str, Driver], chunk: object) -> None:
+def _check_request(worlds: object, agents: object, chunk: object) -> None:
     """Refuse arguments of ``evaluate`` that are not what they must be."""
     if not isinstance(worlds, Worlds | Sample):
         raise InvalidInput(
             f"evaluate: worlds = {worlds!r}: must be worlds or a sample, as scenario.sample(n, seed) gives"
+        )
+    if not isinstance(agents, Mapping):
+        raise InvalidInput(
+            f"evaluate: agents = {agents!r}: must be specs such as 'full_brake,ppo@shipped', or a mapping of agents"
         )
     if not agents:
         raise InvalidInput("evaluate: no agents given; at least one is needed, for instance full_brake")

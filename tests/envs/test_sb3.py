@@ -135,6 +135,14 @@ def test_attributes__belong_to_the_whole_batch() -> None:
     assert env.env_is_wrapped(Monitor) == [False] * 3
 
 
+def test_video__shows_every_world_of_the_batch() -> None:
+    env = make_sb3_vec_env("paper-random", 3, render_mode="rgb_array")
+    env.reset()
+    env.step(np.zeros((3, 1)))
+    assert env.metadata["render_fps"] == 10 and [image.shape for image in env.get_images()] == [(304, 800, 3)] * 3
+    assert (env.render() != 0).any()
+
+
 def test_step_async__keeps_its_own_copy_of_the_actions() -> None:
     env, untouched = begun(PAPER, 2), begun(PAPER, 2)
     action = np.full((1, 2), -0.5, np.float32)  # lying: the only row of a batch of columns

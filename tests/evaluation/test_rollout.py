@@ -78,6 +78,18 @@ def test_evaluate__is_what_a_learner_with_the_same_commands_gets() -> None:
     np.testing.assert_array_equal(outcome.final.gaps_m, engine.worlds.gaps_m, strict=True)
 
 
+def test_evaluate__takes_names_for_scenario_agents_and_worlds_and_prints_a_table() -> None:
+    named = evaluate(scenario="paper-random", agents="full_brake,coast", episodes=4)
+    agents = {name: make_agent(name) for name in ("full_brake", "coast")}
+    given = evaluate(PAPER.sample(4, seed=7), agents, scenario=PAPER, seed=7)
+    for name in agents:
+        assert_same(named.outcome(name), given.outcome(name))
+    assert summarise(named) == summarise(given)
+    table = summarise(named)
+    assert repr(table) == "SummaryTable(full_brake, coast)" and str(table).startswith("Agent,")
+    assert f"{table[0].total_harm.value:.2f}" in str(table)
+
+
 def test_evaluate__applies_commands_unrounded() -> None:
     # -3.52 / 7 * 7 is not -3.52 in floating point: a way through the action would show here.
     agents = {"c": make_agent("constant:3.52")}
