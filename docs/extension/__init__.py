@@ -7,24 +7,42 @@ from typing import Any
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 
-from extension.api import add_public_names
-from extension.pages import add_cards, add_records, make_changelog, make_start, relink
+from extension.api import add_public_names, check_pages
+from extension.pages import add_cards, add_interface, list_folder, make_changelog, make_start, relink
+from extension.reference import COMPLETED
+from extension.results import add_reproduction, add_tables
 
 MADE = {
     "index": make_start,
     "changelog": make_changelog,
-    "api": add_public_names,
+    "api": add_interface,
     "shipped-policies": add_cards,
-    "decisions/README": add_records,
+    "results/reproduction": add_reproduction,
 }
 
 
 def make_page(app: Sphinx, docname: str, source: list[str]) -> None:
     """Complete a page that is made, and lead links that leave docs/ to their page on the site."""
     try:
-        source[0] = MADE[docname](source[0]) if docname in MADE else relink(source[0], docname)
+        text = source[0] + (f"\n{COMPLETED[docname]()}" if docname in COMPLETED else "")
+        folder, _, name = docname.rpartition("/")
+        if docname in MADE:
+            text = MADE[docname](text)
+        elif name == "README":
+            text = list_folder(text, docname)
+        else:
+            text = relink(add_tables(text, name) if folder == "results" else text, docname)
+        if docname == "api":
+            check_pages()
+        source[0] = add_public_names(text)
     except ValueError as error:
         raise ExtensionError(f"{docname}: {error}") from error
+
+
+def made_again(app: Sphinx, env: Any, added: set[str], changed: set[str], removed: set[str]) -> list[str]:
+    """The pages that may have changed although their own file has not."""
+    folders = (page for page in env.found_docs if page.startswith(("api/", "results/")) or page.endswith("/README"))
+    return [*MADE, *COMPLETED, *folders]
 
 
 def keep_colon(app: Sphinx, what: str, name: str, value: object, options: object, lines: list[str]) -> None:
@@ -35,6 +53,7 @@ def keep_colon(app: Sphinx, what: str, name: str, value: object, options: object
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Connect to Sphinx."""
+    app.connect("env-get-outdated", made_again)
     app.connect("source-read", make_page)
     app.connect("autodoc-process-docstring", keep_colon, priority=400)  # napoleon has 500
     return {"parallel_read_safe": True}

@@ -1,4 +1,4 @@
-"""The page of public names, made from their docstrings."""
+"""The pages of public names: each name on one page, described by its docstring."""
 
 from __future__ import annotations
 
@@ -8,21 +8,22 @@ from pathlib import Path
 
 import ethbrake_marl
 
-TABLE = Path(ethbrake_marl.__file__)
-HEADING = re.compile(r"^    # (.*)$")
-ENTRY = re.compile(r"\b(\w+) as \1\b")
+PAGES = Path(__file__).resolve().parents[1] / "api"
+BLOCK = re.compile(r"^```\{public\}\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 
-def read_groups(text: str) -> dict[str, list[str]]:
-    """The public names by the comment above them, as the table in ``ethbrake_marl/__init__.py`` lists them."""
-    groups: dict[str, list[str]] = {}
-    title = ""
-    for line in text.splitlines():
-        if heading := HEADING.match(line):
-            title = heading[1]
-        elif names := ENTRY.findall(line):
-            groups.setdefault(title, []).extend(names)
-    return groups
+def check_pages() -> None:
+    """Raise ``ValueError`` for a public name that is on no page, or on two, or a name there that is not public."""
+    listed = [
+        name
+        for path in PAGES.glob("*.md")
+        for block in BLOCK.findall(path.read_text("utf-8"))
+        for name in block.split()
+    ]
+    public = {name for name in ethbrake_marl.__all__ if name != "__version__"}
+    wrong = sorted(public.symmetric_difference(listed) | {name for name in listed if listed.count(name) > 1})
+    if wrong:
+        raise ValueError(f"each public name belongs on one page of docs/api: {', '.join(wrong)}")
 
 
 def describe(name: str) -> str:
@@ -37,8 +38,9 @@ def describe(name: str) -> str:
 
 
 def add_public_names(page: str) -> str:
-    """The page, and then every public name under the heading of its group."""
-    parts = [page]
-    for title, names in read_groups(TABLE.read_text("utf-8")).items():
-        parts += [f"## {title}\n", "```{eval-rst}", *map(describe, names), "```\n"]
-    return "\n".join(parts)
+    """The page with the names that it lists described in their place."""
+
+    def shown(block: re.Match[str]) -> str:
+        return "\n".join(["```{eval-rst}", *map(describe, block[1].split()), "```"])
+
+    return BLOCK.sub(shown, page)

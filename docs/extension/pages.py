@@ -59,10 +59,16 @@ def make_changelog(_: str) -> str:
     return relink((ROOT / "CHANGELOG.md").read_text("utf-8"), "changelog", ROOT)
 
 
-def add_records(text: str) -> str:
-    """The page about decisions, with its records in the navigation."""
-    records = sorted(path.name for path in (DOCS / "decisions").glob("0*.md"))
-    return f"{relink(text, 'decisions/README')}\n{_navigation(records)}"
+def list_folder(text: str, docname: str) -> str:
+    """The page about the other pages of its folder, with these in the navigation."""
+    listed = sorted(path.name for path in (DOCS / docname).parent.glob("*.md") if path.name != "README.md")
+    return f"{relink(text, docname)}\n{_navigation(listed)}"
+
+
+def add_interface(text: str) -> str:
+    """The page about public names, with their pages in the navigation in the order of its list."""
+    pages = re.findall(r"\]\((api/[a-z]+\.md)\)", text)
+    return f"{relink(text, 'api')}\n{_navigation(pages)}"
 
 
 def add_cards(text: str) -> str:

@@ -448,13 +448,13 @@ class EthBrakeEnv(_OneWorld, gymnasium.Env[Observations, NDArray[Any]]):
 
     Observation: float32 [F], the features of ``ObservationSpec``. Action: [1] in [-1, 1]; -1 full braking capacity, 0
     coasts, +1 full driving capacity. Terminated: all at rest and no command that would move one. Truncated: the
-    horizon. Infos: see docs/environment.md. ``reset(seed=s)`` starts the stream of worlds of s, ``reset()`` goes on in
+    horizon. Infos: see docs/infos.md. ``reset(seed=s)`` starts the stream of worlds of s, ``reset()`` goes on in
     it; ``options={"initial_state": {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}}`` starts from there. Raises
     ``InvalidInput`` for more or fewer than one learner, an action outside [-1, 1], a step without an episode.
 
     Args:
         scenario: a shipped name, the path of a YAML file, or a ``Scenario``.
-        render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/environment.md, Watching).
+        render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/watching.md).
         learners: the one vehicle that learns instead of the scenario's, by name (``vehicle_2``) or index from 0.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         observation: what the learner observes; None: ``observation_for(scenario)``.
@@ -514,7 +514,7 @@ class EthBrakeEnv(_OneWorld, gymnasium.Env[Observations, NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode; see docs/environment.md."""
+        """Start an episode; see docs/episodes.md."""
         super().reset(seed=self._restart(seed, options))
         self._running = True
         self.viewer.began()
@@ -594,7 +594,7 @@ class EthBrakeVectorEnv(Begun, VectorEnv[Observations, NDArray[Any], NDArray[Any
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode in every world; see docs/environment.md."""
+        """Start an episode in every world; see docs/episodes.md."""
         super().reset(seed=self._restart(seed, options))
         every = np.ones(self.num_envs, np.bool_)
         return self.engine.observe(self.learner), report(self.engine).batch_info(self.learner, every, ~every)
@@ -689,7 +689,7 @@ class EthBrakeParallelEnv(_OneWorld, ParallelEnv[str, Observations, NDArray[Any]
 
     Args:
         scenario: a shipped name, the path of a YAML file, its content as a mapping, or a ``Scenario``.
-        render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/environment.md, Watching).
+        render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/watching.md).
         learners: vehicles that learn instead of the scenario's, by name (``vehicle_2``) or index from 0; any number.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         observation: what every vehicle observes; None: ``observation_for(scenario)``.
@@ -745,7 +745,7 @@ class EthBrakeParallelEnv(_OneWorld, ParallelEnv[str, Observations, NDArray[Any]
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observations], Infos]:
-        """Start an episode; see docs/environment.md."""
+        """Start an episode; see docs/episodes.md."""
         given = self._restart(seed, options)
         if given is not None:
             self.np_random = np.random.default_rng(given)

@@ -758,8 +758,14 @@ _OF_THE_EPISODE = (
         "vehicle_1_shoved_far_rate", lambda o, _: None if o.shoved_m is None else o.shoved_m > FAR_M,
         "Vehicle 1 shoved > 5 m", "Shoved\n> 5 m", percent=True,
     ),
-    Measure("first_impact_harm_difference", "first_impact_harm", against="difference"),
-    Measure("total_harm_difference", "total_harm", against="difference"),
+    Measure(
+        "first_impact_harm_difference", "first_impact_harm", against="difference",
+        about="First-impact harm minus that of full braking, paired by world.",
+    ),
+    Measure(
+        "total_harm_difference", "total_harm", against="difference",
+        about="The same of total harm.",
+    ),
     Measure(
         "harm_decrease_first", "first_impact_harm", "Decrease, first-impact", "Decrease\nfirst",
         "1 − harm / harm of full braking in the same worlds; interval by the delta method, paired by world.",
@@ -777,18 +783,43 @@ _OF_THE_EPISODE = (
 )  # fmt: skip
 
 _OF_THE_LIMITS = (
-    Measure("unavoidable_rate", lambda _, r: None if r.avoidable is None else ~r.avoidable, limits=True),
-    Measure("impact_proven_rate", lambda _, r: r.limits.proof.impact, limits=True),
+    Measure(
+        "unavoidable_rate", lambda _, r: None if r.avoidable is None else ~r.avoidable, limits=True,
+        about="Share of worlds in which contact is proven unavoidable.",
+    ),
+    Measure(
+        "impact_proven_rate", lambda _, r: r.limits.proof.impact, limits=True,
+        about="Share of worlds in which an impact is proven unavoidable.",
+    ),
     Measure(
         "avoidable_collision_rate",
         lambda o, r: None if r.avoidable is None else o.collided & r.avoidable, limits=True,
+        about="Share of worlds with a collision, though contact is proven avoidable.",
     ),
-    Measure("best_known_first_impact_harm", lambda _, r: r.first_impact_harm, limits=True),
-    Measure("best_known_total_harm", lambda _, r: r.total_harm, limits=True),
-    Measure("proven_harm", lambda _, r: r.limits.proof.harm, limits=True),
-    Measure("best_known_minus_proven_first", lambda _, r: r.first_impact_harm - r.limits.proof.harm, limits=True),
-    Measure("best_known_minus_proven_total", lambda _, r: r.total_harm - r.limits.proof.harm, limits=True),
-    Measure("mean_regret", "mean_regret_first", limits=True),
+    Measure(
+        "best_known_first_impact_harm", lambda _, r: r.first_impact_harm, limits=True,
+        about="The least first-impact harm known of the same worlds.",
+    ),
+    Measure(
+        "best_known_total_harm", lambda _, r: r.total_harm, limits=True,
+        about="The same of total harm.",
+    ),
+    Measure(
+        "proven_harm", lambda _, r: r.limits.proof.harm, limits=True,
+        about="Proven: nobody can do less.",
+    ),
+    Measure(
+        "best_known_minus_proven_first", lambda _, r: r.first_impact_harm - r.limits.proof.harm, limits=True,
+        about="What is left between the best known and the proof.",
+    ),
+    Measure(
+        "best_known_minus_proven_total", lambda _, r: r.total_harm - r.limits.proof.harm, limits=True,
+        about="The same of total harm.",
+    ),
+    Measure(
+        "mean_regret", "mean_regret_first", limits=True,
+        about="The same as mean_regret_first.",
+    ),
     Measure(
         "mean_regret_first", lambda o, r: r.regret(o, "first"), "Regret, first-impact", "Regret\nfirst",
         "First-impact harm minus the best known first-impact harm of the same world; mean per world. The best known is"
@@ -796,15 +827,24 @@ _OF_THE_LIMITS = (
         " agent in this table that did better. With ≥: the best of some world is known from these agents alone.",
         limits=True,
     ),
-    Measure("mean_regret_total", lambda o, r: r.regret(o, "total"), limits=True),
-    Measure("realised_share", "mean_regret_first", against="decrease", limits=True),
+    Measure(
+        "mean_regret_total", lambda o, r: r.regret(o, "total"), limits=True,
+        about="The same of total harm.",
+    ),
+    Measure(
+        "realised_share", "mean_regret_first", against="decrease", limits=True,
+        about="The same as realised_share_first.",
+    ),
     Measure(
         "realised_share_first", "mean_regret_first", "Realised share, first-impact", "Realised\nfirst",
         "(Full braking − agent) / (full braking − best known), first-impact harm: how much of the reduction of harm"
         " that is known to be possible the agent brings.",
         percent=True, against="decrease", limits=True,
     ),
-    Measure("realised_share_total", "mean_regret_total", against="decrease", limits=True),
+    Measure(
+        "realised_share_total", "mean_regret_total", against="decrease", limits=True,
+        about="The same of total harm.",
+    ),
 )  # fmt: skip
 
 HORIZON, CHOSEN, KNOWN, BELOW = "horizon_ends", "policy_share", "known", "below_best_known"
@@ -1490,7 +1530,7 @@ class SummaryTable(list[SummaryRow]):
 
     def meanings(self) -> dict[str, str]:
         """What the columns mean, by the beginning of their headings; those of registered measures last."""
-        about = {each.heading.partition(",")[0]: each.about for each in measures() if each.about}
+        about = {each.heading.partition(",")[0]: each.about for each in measures() if each.about and each.heading}
         own = [_registered(column) for column in self[0].metrics] if self else []
         return _HEAD | about | {metric.name: metric.about for metric in own if metric is not None}
 

@@ -108,19 +108,39 @@ Preset = Annotated[str, AfterValidator(_known_preset), _PresetSchema]
 class V2X(FileModel):
     """A preset, and what differs from it; see ``docs/cooperation.md``. Written as its name alone, or as a mapping."""
 
-    preset: Preset = "paper"
-    hears: Hears | None = None
-    senses: Senses | None = None
-    link_latency_s: Seconds | None = None
-    lost: Share | None = None
-    message_period_s: Annotated[float, Field(gt=0.0, le=60.0, allow_inf_nan=False)] | None = None
-    loss_begins: Share | None = None
-    loss_ends: Annotated[float, Field(ge=0.01, le=1.0, allow_inf_nan=False)] | None = None
-    radio_s: Seconds | None = None
-    processing_s: Seconds | None = None
-    actuation_s: Seconds | None = None
-    sensing_s: Annotated[tuple[Seconds, Seconds], Field(strict=False)] | None = None
-    persistence: Persistence | None = Field(default=None, exclude_if=not_)
+    preset: Preset = Field(
+        default="paper", description="where to start from; the other keys take the place of its values"
+    )
+    hears: Hears | None = Field(
+        default=None, description="whose messages a vehicle gets: everybody's, only those from ahead, nobody's"
+    )
+    senses: Senses | None = Field(default=None, description="which direct neighbours are in sight")
+    link_latency_s: Seconds | None = Field(
+        default=None, description="fixed delay of every link, in place of the generated one"
+    )
+    lost: Share | None = Field(
+        default=None, description="share of links, not of vehicles, on which nothing ever arrives"
+    )
+    message_period_s: Annotated[float, Field(gt=0.0, le=60.0, allow_inf_nan=False)] | None = Field(
+        default=None, description="T, time between two messages"
+    )
+    loss_begins: Share | None = Field(
+        default=None, description="p, chance per message period that a burst of losses begins"
+    )
+    loss_ends: Annotated[float, Field(ge=0.01, le=1.0, allow_inf_nan=False)] | None = Field(
+        default=None, description="r, chance per message period that it ends"
+    )
+    radio_s: Seconds | None = Field(default=None, description="L_radio, time on the air")
+    processing_s: Seconds | None = Field(default=None, description="t_proc, time until the receiver has read it")
+    actuation_s: Seconds | None = Field(default=None, description="t_act, time until the brakes answer")
+    sensing_s: Annotated[tuple[Seconds, Seconds], Field(strict=False)] | None = Field(
+        default=None, description="[low, high]: the delay of sight, a hop, is drawn evenly from it"
+    )
+    persistence: Persistence | None = Field(
+        default=None,
+        exclude_if=not_,
+        description="whether what was once heard stays present, or grows old until the next message",
+    )
 
     @model_validator(mode="before")
     @classmethod

@@ -1999,49 +1999,42 @@ def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
 
 
 def docs_page(results: Sequence[Result]) -> str:
-    """The page of these results as Markdown."""
+    """The page of these results as Markdown: verdicts; the site shows everything else from the ``.json`` beside it."""
     lead, command, made, few = _account(results)
-    verdicts = [
-        (f"[{_escaped(each.title)}](#{_escaped(each.name)})", each.verdict.outcome, _escaped(each.verdict.because))
-        for each in results
-    ]
+    verdicts = [(f"[{_escaped(each.title)}](#{_escaped(each.name)})", each.verdict.outcome) for each in results]
     blocks = [
         f"# {_TITLE}",
         "What comes out where the paper's experiments are made again, and where it cannot?",
         _wrapped(lead),
         _wrapped(f"Made by `{command} --output runs/reproduction --docs docs/reproduction.md` ({_escaped(made)})."),
         _wrapped(
-            "The page, its figures and `reproduction.json`, which holds the same as data, are written by that command"
-            " and not by hand; `ethbrake reproduce` makes them again without training. [The paper, line by line]"
+            "That command writes the page, its figures and `reproduction.json`, which holds everything as data; nothing"
+            " is written by hand. `ethbrake reproduce` makes them again without training. [All that was measured]"
+            "(results/reproduction.md) has the tables, figures and parameters of each item; [the paper, line by line]"
             "(paper.md) has the account of every equation."
         ),
         *map(_wrapped, few),
         "## Overview",
-        _table(("Item", "Verdict", "Because"), verdicts),
+        _table(("Item", "Verdict"), verdicts),
     ]
     for result in results:
-        what = f"**{_escaped(result.title)}**. {_escaped(result.what)}"
-        labels = f" ({', '.join(map(_escaped, result.labels))})" if result.labels else ""
-        because = f"**{result.verdict.outcome}**: {_escaped(result.verdict.because)}"
-        blocks += [f"## {_escaped(result.name)}", *map(_wrapped, (what + labels, because))]
-        blocks += [_wrapped(_escaped(note)) for note in result.notes]
-        for drawn in result.figures:
-            blocks.append(f"![{_escaped(drawn.title)}. {_escaped(drawn.text)}]({FIGURES}/{PREFIX}{drawn.stem}.svg)")
-        compared = [(each.what, each.outcome, each.because) for each in result.comparisons]
-        found = [(each.name, each.value, each.origin) for each in result.parameters]
-        tables: list[tuple[str, Sequence[str], Sequence[Sequence[str]], str]] = [
-            *(
-                (each.title, each.head, [[c.in_words for c in row] for row in each.rows], each.note)
-                for each in result.tables
-            ),
-            ("Comparisons with the paper", ("What", "Verdict", "Because"), compared, ""),
-            ("Parameters", ("Parameter", "Value", "Origin"), found, ""),
+        compared: dict[str, dict[str, list[str]]] = {}  # outcome and its readings, which stand in brackets
+        for each in result.comparisons:
+            what, _, reading = each.what.removesuffix(")").partition(" (")
+            compared.setdefault(what, {}).setdefault(each.outcome, []).append(reading)
+        rows = [
+            (what, *found)
+            if len(found) == 1
+            else (what, "; ".join(f"{outcome}: {' / '.join(readings)}" for outcome, readings in found.items()))
+            for what, found in compared.items()
         ]
-        for title, head, rows, note in tables:
-            lines = _table([*map(_escaped, head)], [[*map(_escaped, row)] for row in rows])
-            if len(rows) > 12:
-                lines = f"<details>\n<summary>{len(rows)} rows</summary>\n\n{lines}\n\n</details>"
-            blocks += [f"### {_escaped(title)}", lines, *([_wrapped(_escaped(note))] if note else [])]
+        labels = f" ({', '.join(map(_escaped, result.labels))})" if result.labels else ""
+        blocks += [
+            f"## {_escaped(result.name)}",
+            _wrapped(f"**{_escaped(result.title)}**. {_escaped(result.what)}{labels}"),
+            _wrapped(f"**{result.verdict.outcome}**: {_escaped(result.verdict.because)}"),
+            _table(("What", "Verdict"), [[*map(_escaped, row)] for row in rows]),
+        ]
     return "\n\n".join(blocks) + "\n"
 
 

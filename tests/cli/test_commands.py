@@ -18,7 +18,6 @@ from numba.core import event
 from rich.console import Console
 
 from ethbrake_marl import __version__
-from ethbrake_marl.agents.registry import agent_names
 from ethbrake_marl.cli import app as frame, command
 from ethbrake_marl.cli.app import app, run_command, whole_command
 from ethbrake_marl.cli.command import DEFAULTS, MOVED, Commands, Out
@@ -26,7 +25,6 @@ from ethbrake_marl.physics.compiling import compiled
 from tests.cli.conftest import Command, check_refused, told_json
 
 ROOT = Path(__file__).resolve().parents[2]
-CLI = (ROOT / "docs" / "cli.md").read_text("utf-8")
 COMMANDS = [""]  # every one, groups too
 for name, found in whole_command().commands.items():
     COMMANDS += [name, *(f"{name} {each}" for each in getattr(found, "commands", ()))]
@@ -82,37 +80,6 @@ def test_wrong_option__is_one_line_whatever_library_finds_it(
     ethbrake: Command, line: str, fragments: list[str]
 ) -> None:
     check_refused(ethbrake(*line.split()), *fragments)
-
-
-def options_of(found: typer.core.TyperCommand) -> set[str]:
-    return {option for each in found.params for option in each.opts if option.startswith("--")} - {"--help"}
-
-
-def test_cli_page__has_every_command_with_every_option_and_every_agent() -> None:
-    table, _, general = CLI.partition("\n## run\n")[0].partition("\n## Where commands were before\n")
-
-    def section(name: str) -> str:
-        return re.search(rf"^(##+) {name}\n(.*?)(?=^##? |^\1 |\Z)", CLI, re.DOTALL | re.MULTILINE)[2]  # type: ignore[index]
-
-    for name, found in whole_command().commands.items():
-        assert f"`{name}" in table
-        for inner, each in getattr(found, "commands", {name: found}).items():
-            in_short = f"`{inner}" in section(name) or f"ethbrake {name} {inner}" in section(name)
-            own = f"### {inner}\n" in section(name)
-            implied = inner in (name, DEFAULTS.get(name))
-            assert implied or in_short or own, inner
-            about = section(name) if implied or (in_short and not own) else section(inner)
-            wanted = set().union(*map(options_of, getattr(each, "commands", {inner: each}).values()))
-            if inner != "generalise":  # whose section shows the usual ones only
-                assert wanted <= set(re.findall(r"--[a-z-]+", general + about)), f"{name} {inner}"
-    assert [agent for agent in agent_names() if f"`{agent}" not in CLI] == []
-
-
-def test_cli_page__tells_where_each_old_command_is_now() -> None:
-    told = CLI.partition("## Where commands were before\n")[2].partition("\n## ")[0]
-    rows = re.findall(r"^\| (`.*?) \| (`.*) \|$", told, re.MULTILINE)
-    names = [[re.findall("`(.*?)(?: \\.\\.\\.)?`", cell) for cell in row] for row in rows]
-    assert {old: MOVED[old] for old in MOVED} == {old: new for row in names for old, new in zip(*row, strict=True)}
 
 
 def test_help__tells_the_parts_of_the_package_without_importing_them() -> None:

@@ -135,9 +135,8 @@ def test_set__is_noted_and_about_another_scenario_and_changes_every_one_of_a_mix
     assert (row["parameters"]["mass_t"], row["parameters"]["gaps_m"]) == ([4.0] * 3, [9.0] * 2)
 
 
-@pytest.mark.parametrize("page", ["cli.md", "tutorials/first-ten-minutes.md"])
-def test_page__own_worlds_give_the_printed_harms(ethbrake: Command, tmp_path: Path, page: str) -> None:
-    text = (ROOT / "docs" / page).read_text("utf-8")
+def test_tutorial__own_worlds_give_the_printed_harms(ethbrake: Command, tmp_path: Path) -> None:
+    text = TUTORIAL
     worlds, out = tmp_path / "worlds.csv", tmp_path / "out.csv"
     worlds.write_text(
         "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps\n10,8,20,18,20\n5,9,22,18,20\n7,7,20,18,20\n"

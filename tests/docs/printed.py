@@ -1,7 +1,8 @@
 """Where each printed block, table of figures and picture of the pages is made again and compared.
 
 A block is known by its first command (or first line), a table by how its header begins, a picture by its name; what is
-in none of these tables, or no longer in a page, turns `tests/docs/test_printed.py` red. `docs/tests.md` shows them.
+in none of these tables, or no longer in a page, turns `tests/docs/test_printed.py` red. The tables of docs/results say
+it themselves. `docs/tests.md` counts them all.
 """
 
 from __future__ import annotations
@@ -9,8 +10,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from tests.docs.blocks import Shown
+from tests.docs.site import load
+
+MEASURED = load("results")
 SUITE = "in the suite"  # compared by `make test`
-NIGHTLY = "`make figures`"  # made again and compared there
+NIGHTLY = "make figures"  # made again and compared there
 TRAINING = "a training"  # minutes to hours, other on another machine: said with date and machine
 SEARCH = "a long search"  # as long
 SPEED = "a speed"  # of one machine
@@ -18,11 +23,10 @@ BY_HAND = "nothing to compare"  # a file to copy, something that waits for a per
 
 
 class How(NamedTuple):
-    """Where it is compared, by which test or commands; and the figures in it that somebody else printed."""
+    """Where it is compared, and by which test or commands."""
 
     where: str
     by: tuple[str, ...] = ()
-    quoted: tuple[str, ...] = ()
 
 
 def _by(where: str, *commands: str) -> How:
@@ -35,167 +39,46 @@ TRAINED = _by(TRAINING)
 
 BLOCKS: dict[str, How] = {
     "ethbrake evaluate --agents ful_brake": EXACT,
-    "ethbrake scenario list": EXACT,
     "ethbrake scenario validate rainy.yaml": EXACT,
-    "ethbrake recipe new quick": EXACT,
     "ethbrake train": _by(SUITE, "tests/test_imports.py"),
-    "cat worlds.csv": TUTORIAL,
     "agent,world,impacts,first_impact_harm,total_harm": TUTORIAL,
     "-1.0 26.97": TUTORIAL,
-    "ethbrake watch replay EB1:": _by(SUITE, "tests/cli/test_watch.py"),
     "Policy('ppo', 27 observations": _by(SUITE, "tests/docs/test_printed.py"),
-    "ethbrake evaluate --scenario paper-random --agents full_brake,e_v2x_bm,e_v2x_bm:pairwise": _by(NIGHTLY),
-    "ethbrake shield --agents full_brake,ppo@shipped --episodes 30": _by(NIGHTLY),
-    "ethbrake watch picture criticality": _by(NIGHTLY),
-    "ethbrake watch record --agents full_brake,e_v2x_bm": _by(NIGHTLY),
-    "ethbrake watch dataset --agents full_brake,best_harm": _by(NIGHTLY),
-    "ethbrake run": TRAINED,
-    "ethbrake train --scenario paper-random-early": TRAINED,
     "ethbrake train --scenario cooperation-3-pair": TRAINED,
     "ethbrake agent export runs/early": TRAINED,
     "First-impact        Total Sampled": _by(TRAINING, "make run"),
     "resume, ppo: 20/20": _by(TRAINING, "make test-resume"),
-    "ethbrake search best-harm --scenario paper-random --episodes 10000": _by(SEARCH),
     "ethbrake doctor speed": _by(SPEED),
     "make bench-peers": _by(SPEED),
     ".venv/bin/python docs/studies/threads.py": _by(SPEED),
-    "ethbrake watch explore": _by(BY_HAND),
-    "ethbrake doctor": _by(BY_HAND),
     "gap_1_m,gap_2_m,speed_1_mps": _by(BY_HAND),
     "paper-random full_brake        backward": EXACT,
 }
 
-_SHIPPED = (
-    "full_brake,e_v2x_bm,ppo@shipped,counterfactual@shipped,counterfactual@shipped+refined:profile+episode,best_harm"
+_SHIPPED = "counterfactual@shipped,counterfactual@shipped+refined:profile+episode"
+_TESTS = tuple(
+    f"ethbrake evaluate --scenario paper-random{test} --agents full_brake,e_v2x_bm,{agents},best_harm --episodes 2000"
+    " --seed 7 --json"
+    for test, agents in (
+        ("", f"ppo@shipped,{_SHIPPED}"),
+        ("-brake-only", f"ppo@shipped,{_SHIPPED}"),
+        ("-obstacle --harm-count total", "ppo@shipped/ppo,ppo@shipped,ppo@shipped+refined+episode"),
+    )
 )
-_TOTAL = "full_brake,e_v2x_bm,ppo@shipped/ppo,ppo@shipped,ppo@shipped+refined+episode,best_harm"
-_THREE = "full_brake,e_v2x_bm,ppo@shipped/ppo,ppo@shipped,ppo@shipped+episode,ppo@shipped+refined+episode,best_harm"
-
-
-def _evaluate(scenario: str, agents: str, more: str = "") -> str:
-    return f"ethbrake evaluate --scenario {scenario} --agents {agents} --episodes 2000 --seed 7 --json{more}"
-
 
 TABLES: dict[str, How] = {
-    # the three tests
-    "| who drives Vehicle 2 | knows | collisions": _by(
-        NIGHTLY,
-        _evaluate("paper-random", _SHIPPED),
-        _evaluate("paper-random-brake-only", _SHIPPED),
-        _evaluate("paper-random-obstacle", _TOTAL, " --harm-count total"),
-    ),
-    "| who drives Vehicle 2 | collisions | first-impact harm | total harm | sampled harm": _by(
-        NIGHTLY,
-        _evaluate("paper-random", _THREE),
-        _evaluate("paper-random-brake-only", _THREE),
-        _evaluate("paper-random-obstacle", _THREE, " --harm-count total"),
-    ),
-    "| test | full braking | E-V2X-BM coupled | PPO trained for it": _by(
-        NIGHTLY,
-        *(
-            _evaluate(f"paper-random{test}", "full_brake,e_v2x_bm,ppo@shipped,best_harm")
-            for test in ("", "-brake-only")
-        ),
-        _evaluate("paper-random-obstacle", "full_brake,e_v2x_bm,ppo@shipped,best_harm", " --harm-count total"),
-    ),
-    "| test, harm | alone | episode | step": _by(
-        NIGHTLY,
-        "ethbrake shield --scenario paper-random-brake-only --agents ppo@shipped --json",
-        "ethbrake shield --scenario paper-random-obstacle --harm-count total --agents ppo@shipped --json",
-    ),
+    "| who drives Vehicle 2 | knows | collisions": _by(NIGHTLY, *_TESTS),
     "| what | first-impact harm | of the best known": TRAINED,
-    "| training seed | default, tuning": TRAINED,
     "| what the vehicles do | first-impact harm": TRAINED,
-    "| list | above B, interior": _by(SEARCH, "make test-shield"),
-    "| channel | `": _by(NIGHTLY, "python docs/studies/price.py price-of-not-knowing.png"),
-    "| level | who proposes | alone": _by(SEARCH),
-    "| robust mode | worlds | above": _by(SEARCH, "make test-shield"),
-    "| intervals | mode | above": _by(SEARCH, "make test-shield"),
-    "| agents | worlds | processor time": _by(SPEED),
-    # lists of worlds
-    "| Agent | Knows | Collisions": _by(
-        NIGHTLY, "ethbrake evaluate --agents full_brake,e_v2x_bm,e_v2x_bm:pairwise --episodes 10000 --seed 7 --json"
-    ),
-    "| agent | collisions | avoidable ones": _by(
-        NIGHTLY, "ethbrake evaluate --agents ladder --scenario paper-random --episodes 10000 --seed 7 --json"
-    ),
-    "| scenario | unavoidable | `full_brake` collides": _by(
-        NIGHTLY,
-        *(
-            _evaluate(scenario, "full_brake,e_v2x_bm")
-            for scenario in (
-                "stress-wide",
-                *(f"realistic-{name}" for name in ("motorway", "platoon", "truck", "mixed")),
-            )
-        ),
-    ),
-    "| reading | full braking | E-V2X-BM pairwise": _by(
-        NIGHTLY,
-        "ethbrake evaluate --scenario paper-distance --agents full_brake,e_v2x_bm:pairwise --episodes 5000 --json",
-        "ethbrake evaluate --scenario paper-random --agents full_brake,e_v2x_bm:pairwise --json",
-    )._replace(quoted=("85.26", "9.8514")),  # the paper's
     "| list | worlds | proven | best known, first": EXACT,
-    "| level | driven | proven | best known": _by(SEARCH),
-    "| list | unavoidable | front | rear": _by(SEARCH, "make test-physics"),
     "| d1, d2; v1, v2, v3; tau2, tau3": EXACT,
-    "| agent | predicted | collisions": _by(SEARCH),
-    "| agent | knows | collisions | first-impact | total": TRAINED,
     "| List | What | Vehicles | Driven": _by(SUITE, "tests/docs/test_pages.py"),
     "|  | Agent | Overall": _by(SUITE, "tests/docs/test_pages.py"),
-    "| candidates per world and count": _by(SEARCH),
-    "| controlled | first-impact | total": _by(SEARCH),
-    "| list (seed 7) | worlds | first-impact, mean": _by(SEARCH),
-    "| agent | 0.1, 0.3 s | 0.3, 0.6 s": _by(SEARCH),
     "| total gap (m) | 10-12": _by(SUITE, "tests/docs/test_pages.py"),
     "| step (s) | first-impact, mean": _by(SUITE, "tests/docs/test_studies.py"),
-    "| width | shield | bound": _by(SEARCH),
-    "| leak | first restart above": _by(SEARCH, "make test-shield"),
-    "| gate | measured | at most": _by(SEARCH, "make test-physics"),
-    # trainings
-    "| who proposes | alone | episode": TRAINED,
-    "| scheme | first-impact harm": TRAINED,
-    "| level | collisions": TRAINED,
-    "| level | first-impact harm: reached": TRAINED,
-    "| level | first-impact harm: without": TRAINED,
-    "| level | seed | collisions": TRAINED,
-    "| step | first-impact harm": TRAINED,
-    "| step | Vehicle 1": TRAINED,
-    "| vehicles | all brake fully": TRAINED,
-    "| who drives | learnt from": TRAINED,
-    "| seed | processor time": TRAINED,
-    "| changed | ": TRAINED,
-    "| scenario | `quick` | `ppo`": TRAINED,
-    "| scenario | `ppo` | `sac`": TRAINED,
-    "| what learns | 10": TRAINED,
-    "| who drives Vehicle 2 | collisions | first-impact | times": TRAINED,
-    "| policy | processor time": TRAINED,
-    "| trained for | policy": TRAINED,
-    "| after | decisions | harm": TRAINED,
-    "| scenario | policy | processor time": TRAINED,
-    "| trained on | what": TRAINED,
-    "| list | full braking | `universal-ppo`": TRAINED,
-    "| list (seed 7) | alone": TRAINED,
-    "| list (seed 7) | policy | hybrid": TRAINED,
-    "| recipe | decisions, time": TRAINED,
-    "| test | policy | trained for": TRAINED,
     "| | full braking | E-V2X-BM | this policy": _by(TRAINING, "make run"),
-    "| library | version": _by(TRAINING, "make test-libraries"),
-    # speeds
-    "| what | processor time | a whole job": _by(SPEED),
-    "| agent | knows | CPU, ms per world": _by(SPEED),
-    "| agent | CPU time | first": _by(SPEED),
-    "| | CPU-seconds per million worlds": _by(SPEED),
-    "| what | measured | by": _by(SPEED),
-    # words and settings
-    "| preset | ": _by(SUITE, "tests/docs/test_pages.py"),
-    "| key | default | unit, range": _by(SUITE, "tests/scenario/test_schema.py"),
-    "| name | gaps | speeds": EXACT,
-    "| name | speeds | gaps": EXACT,
     "| licence | packages": _by(SUITE, "tests/programmes/test_programmes.py"),
     "| no. | label | the paper": _by(BY_HAND),
-    "| version | what it is": _by(BY_HAND),
-    "| key | range | meaning": _by(BY_HAND),
-    "| planted | search | first found after": _by(SEARCH),
 }
 
 PICTURES: dict[str, How] = {
@@ -222,8 +105,6 @@ PICTURES: dict[str, How] = {
     "learning-curves": _by(TRAINING),
     "explorer.png": _by(BY_HAND),
     "speed-scaling.png": _by(SPEED),
-    "reproduction-trajectories": _by(SUITE, "tests/docs/test_pages.py"),
-    "reproduction": _by(TRAINING, "ethbrake reproduce --full"),
 }
 
 
@@ -233,18 +114,21 @@ def how(table: dict[str, How], begin: str) -> tuple[str, How] | None:
     return (key := max(fitting, key=len), table[key]) if fitting else None
 
 
+def results() -> Iterator[tuple[Shown, How]]:
+    """Every table of docs/results, by its anchor, and how it is compared."""
+    for path in sorted(MEASURED.RESULTS.glob("*.json")):
+        for table in MEASURED.read_tables(path.stem):
+            yield (
+                Shown(f"docs/results/{path.name}", table.id, table.markdown),
+                How(table.compared, tuple(table.commands)),
+            )
+
+
 def where_rows() -> Iterator[str]:
     """The table of docs/tests.md: one row for each place where something is compared, and how much."""
+    kinds = ([*BLOCKS.values()], [*TABLES.values(), *(place for _, place in results())], [*PICTURES.values()])
     for where in (SUITE, NIGHTLY, TRAINING, SEARCH, SPEED, BY_HAND):
-        counts = (sum(each.where == where for each in table.values()) for table in (BLOCKS, TABLES, PICTURES))
-        by = sorted(
-            {
-                by
-                for table in (BLOCKS, TABLES, PICTURES)
-                for each in table.values()
-                if each.where == where
-                for by in each.by
-            }
-        )
-        named = ", ".join(f"`{each}`" for each in by if each.startswith(("tests/", "make ")))
+        counts = (sum(each.where == where for each in kind) for kind in kinds)
+        by = {" ".join(by.split()[:2]) for kind in kinds for each in kind if each.where == where for by in each.by}
+        named = ", ".join(f"`{each}`" for each in sorted(by) if each.startswith(("tests/", "make ")))
         yield f"| {where} | {' | '.join(str(count) for count in counts)} | {named or '–'} |"

@@ -13,18 +13,19 @@ import pytest
 
 from ethbrake_marl.agents.e_v2x_bm import optimise_pairwise, pairwise_harm
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.scenario import load_scenario, scenario_path
+from ethbrake_marl.scenario import load_scenario
 from tests.docs.blocks import (
     ROOT,
     Shown,
     agrees,
     commands_of,
     missing_figures,
+    pages,
     pictures,
     printed_blocks,
     tables_of_figures,
 )
-from tests.docs.printed import BLOCKS, EXACT, PICTURES, TABLES, How, how, where_rows
+from tests.docs.printed import BLOCKS, EXACT, MEASURED, PICTURES, TABLES, How, how, results, where_rows
 from tests.docs.site import DOCS, load
 
 Run = Callable[..., tuple[str, str]]
@@ -50,7 +51,8 @@ def test_everything_shown__has_its_place(shown: Callable[[], Iterator[Shown]], t
 
 def test_everything_shown__names_tests_and_programs_that_are_there() -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE))
-    for place in (*BLOCKS.values(), *TABLES.values(), *PICTURES.values()):
+    measured = [place for _, place in results()]
+    for place in (*BLOCKS.values(), *TABLES.values(), *PICTURES.values(), *measured):
         for by in place.by:
             assert not by.startswith("tests/") or (ROOT / by).exists(), by
             assert not by.startswith("make ") or by.split()[1] in targets, by
@@ -58,6 +60,17 @@ def test_everything_shown__names_tests_and_programs_that_are_there() -> None:
 
 def test_page__shows_where_each_is_compared() -> None:
     assert "\n".join(where_rows()) + "\n" in (ROOT / "docs" / "tests.md").read_text("utf-8")
+
+
+def test_results__are_linked_where_they_are_and_written_row_by_row() -> None:
+    anchors = [(Path(each.page).stem, each.begin) for each, _ in results()]
+    text = "".join(page.read_text("utf-8") for page in pages())
+    assert set(re.findall(r"results/([a-z-]+)\.md#([a-z0-9-]+)\)", text)) <= set(anchors)
+    assert len({anchor for _, anchor in anchors}) == len(anchors)
+    for path in MEASURED.RESULTS.glob("*.json"):
+        assert MEASURED.text_of(MEASURED.read_tables(path.stem)) == path.read_text("utf-8")
+        with pytest.raises(ValueError, match="notes"):
+            MEASURED.TABLES.validate_json(path.read_bytes().replace(b'"note"', b'"notes"'))
 
 
 @pytest.fixture
@@ -112,23 +125,6 @@ def test_reference_values__are_those_of_the_closed_form() -> None:
         told = [found.spares_front_mps2, found.spares_rear_mps2, found.deceleration_mps2, found.harm]
         told.append(pairwise_harm(worlds, [6, 7, 6]).sum(axis=1))
         assert missing_figures(f"{ends} {optimum} {full}", " ".join(repr(float(each[0])) for each in told)) == [], row
-
-
-@pytest.mark.parametrize("begin", ["| name | gaps | speeds", "| name | speeds | gaps"])
-def test_tables_of_scenarios__hold_the_numbers_of_their_files(begin: str) -> None:
-    (table,) = (each for each in tables_of_figures() if each.begin.startswith(begin))
-    for row in table.text.splitlines()[2:]:
-        name, *cells = [cell.strip() for cell in row.strip("|").split("|")]
-        declared = re.sub(
-            r"(?m)^(?!\w+(_m|_s|_mps|_mps2|_t|types|roles):|  ).*$",
-            "",
-            scenario_path(name.strip("`")).read_text("utf-8"),
-        )
-        told = [
-            re.sub(r"m/s2|vehicles? \d", "", cell) for cell in cells[: 3 if "in the paper" in begin else len(cells)]
-        ]
-        numbers = {float(each) for each in re.findall(r"\d+(?:\.\d+)?", declared)}
-        assert {float(each) for each in re.findall(r"\d+(?:\.\d+)?", " ".join(told[:3]))} <= numbers, row
 
 
 @pytest.mark.slow

@@ -28,12 +28,15 @@ pages = load("pages")
 api = load("api")
 
 
+reference = load("reference")
+
+
 def test_list_of_pages__has_every_page_once_in_five_sections() -> None:
     sections = pages.read_sections((DOCS / "README.md").read_text("utf-8"))
     assert list(sections) == ["Start here", "Tutorials", "How-to", "Reference", "Explanation"]
     listed = [page for each in sections.values() for page in each]
     there = {path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md") if "_build" not in path.parts}
-    records = {page for page in there if re.match(r"decisions/\d", page)}
+    records = {page for page in there if re.match(r"(decisions|results)/(?!README)|api/", page)}
     assert len(listed) == len(set(listed))
     assert set(listed) == there - records - {"README.md", "index.md"}
 
@@ -57,26 +60,41 @@ def test_links__of_a_page_lead_to_the_page_on_the_site(
     assert pages.relink(link, docname, written_in) == (led or link)
 
 
-def test_public_names__stand_once_each_on_their_page() -> None:
-    groups = api.read_groups((ROOT / "ethbrake_marl" / "__init__.py").read_text("utf-8"))
-    listed = [name for names in groups.values() for name in names]
-    assert sorted([*listed, "__version__"]) == sorted(eb.__all__)
-    page = api.add_public_names("# Python interface")
-    assert all(f":: ethbrake_marl.{name}\n" in page for name in listed)
-    assert all(f"\n## {title}\n" in page for title in groups)
+def test_public_names__stand_once_each_on_the_pages_by_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    api.check_pages()
+    shown = "".join(api.add_public_names(path.read_text("utf-8")) for path in api.PAGES.glob("*.md"))
+    assert all(f":: ethbrake_marl.{name}\n" in shown for name in eb.__all__ if name != "__version__")
+    links = set(re.findall(r"\]\((api/.*?)\)", (DOCS / "api.md").read_text("utf-8")))
+    assert links == {f"api/{path.name}" for path in api.PAGES.glob("*.md")}
+    monkeypatch.setattr(api.ethbrake_marl, "__all__", [*eb.__all__, "planted"])
+    with pytest.raises(ValueError, match="each public name belongs on one page of docs/api: planted"):
+        api.check_pages()
 
 
 def test_public_name__without_a_docstring_stops_the_build(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(eb, "Policy", type("Planted", (), {}))
     with pytest.raises(ValueError, match="the public name Policy has no docstring"):
-        api.add_public_names("# Python interface")
+        api.add_public_names("```{public}\nPolicy\n```")
 
 
-def test_page_of_shipped_policies__links_and_holds_every_card() -> None:
-    text = (DOCS / "shipped-policies.md").read_text("utf-8")
-    names = re.findall(r"^\| \[`(.*?)`\]\(\.\./ethbrake_marl/_policies/\1/card\.md\)", text, re.MULTILINE)
-    assert set(names) == set(shipped_policies())
-    assert set(re.findall(r"^## (\S+)$", pages.add_cards(text), re.MULTILINE)) == set(names)
+def test_reference__is_made_of_the_code_below_a_short_beginning() -> None:
+    assert {path.stem for path in (DOCS / "reference").glob("*.md")} | {"cli", "shipped-policies"} == {
+        name.removeprefix("reference/") for name in reference.COMPLETED
+    }
+    for name, make in reference.COMPLETED.items():
+        assert len((DOCS / f"{name}.md").read_text("utf-8").split()) < 120
+        made = make()
+        assert made.count("| --- |") >= 1 and "m/s2" not in re.sub("`.*?`", "", made), name
+    commands = reference.COMPLETED["cli"]()
+    assert "\n### train resume\n" in commands and "| `--other-versions` |" in commands
+    assert "`ethbrake train` alone is `ethbrake train start`." in commands
+    assert "| `mass_t` | mass of each vehicle | (0, 1000] t | required |" in reference.scenario_keys()
+
+
+def test_cards__are_those_of_the_shipped_policies() -> None:
+    names = shipped_policies()
+    assert set(re.findall(r"^## (\S+)$", pages.add_cards(""), re.MULTILINE)) == set(names)
+    assert all(f"| [`{name}`](#{name}) |" in reference.policies() for name in names)
 
 
 def test_extra__brings_what_the_configuration_loads() -> None:
@@ -144,7 +162,7 @@ def test_hooks__run_tools_of_the_environment_and_download_nothing() -> None:
 
 
 MOST_CHARACTERS = 100
-PAGES = sorted([ROOT / "README.md", *ROOT.glob(".github/*.md"), *DOCS.glob("*.md"), *DOCS.glob("tutorials/*.md")])
+PAGES = sorted([ROOT / "README.md", *ROOT.glob(".github/*.md"), *DOCS.glob("*.md"), *DOCS.glob("[art]*/*.md")])
 CODE = re.compile(r"^\s*(```+|~~~+|:::+).*?^\s*\1\s*$", re.DOTALL | re.MULTILINE)
 FREE = re.compile(r"\s*(\||#|<|!\[)|    |\[[\w-]+\]: |\s*([-*] )?\S+$")  # tables, headings, HTML, code, one word
 

@@ -26,11 +26,10 @@ from ethbrake_marl.observations import Feature, ObservationSpec
 from ethbrake_marl.physics import make_worlds
 from ethbrake_marl.scenario import Scenario, full_state, load_scenario, state_features
 from tests.contract.interfaces import CRASH, FIVE, PAPER, REST, actions, initial_state
-from tests.docs.site import load
 
 near = pytest.approx
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = (ROOT / "docs" / "environment.md").read_text("utf-8")
+EPISODES, INFOS = ((ROOT / "docs" / f"{name}.md").read_text("utf-8") for name in ("episodes", "infos"))
 COAST, BRAKE = np.zeros(1, np.float32), np.full(1, -1.0, np.float32)
 
 
@@ -116,7 +115,7 @@ def test_infos__hold_the_same_keys_in_every_step_and_the_page_names_them() -> No
     assert {(turn[4]["world_seed"], turn[4]["world"]) for turn in told} == {(0, 0)}
     given = environment.reset(seed=5, options={"initial_state": {"gaps_m": 7}})[1]
     assert (given["world_seed"], given["world"]) == (5, -1)
-    rows = re.findall(r"^\| (`.*?) \|", PAGE.split("## Infos")[1].split("There is no clock")[0], re.MULTILINE)
+    rows = re.findall(r"^\| (`.*?) \|", INFOS.split("There is no clock")[0], re.MULTILINE)
     assert {name for row in rows for name in re.findall("`(.*?)`", row)} == set(at_reset)
 
 
@@ -432,7 +431,7 @@ def test_wrappers__which_of_gymnasiums_take_same_step_is_what_the_page_says() ->
     for wrap in (wrappers.NormalizeReward, wrappers.RecordEpisodeStatistics, wrappers.ClipAction):
         wrap(eb.EthBrakeVectorEnv(2, autoreset_mode="SameStep")).reset(seed=1)
     for wrap in (wrappers.NormalizeObservation, wrappers.FlattenObservation):
-        assert f"`{wrap.__name__}`" in PAGE
+        assert f"`{wrap.__name__}`" in EPISODES
         wrapped = wrap(eb.EthBrakeVectorEnv(2))
         wrapped.reset(seed=1)
         assert all(np.isfinite(wrapped.step(action)[0]).all() for action in actions(2, 90, 2))
@@ -477,20 +476,12 @@ def test_import__stays_light_until_a_name_is_used_and_lets_gymnasium_make_it_by_
     assert result.stdout.splitlines() == ["[]", "['numba', 'pydantic']", "EthBrakeEnv", "{} {}"], result.stderr
 
 
-TABLES = load("../studies/environment_tables").environment_tables()
-
-
-@pytest.mark.parametrize("marker", TABLES)
-def test_page__shows_the_table_that_the_code_makes(marker: str) -> None:
-    (shown,) = re.findall(f"<!-- {marker} -->\n(.*?)\n<!-- end -->", PAGE, re.DOTALL)
-    assert shown == TABLES[marker]
-
-
-def test_page__its_example_runs() -> None:
-    code = re.findall("```python\n(.*?)```", PAGE, re.DOTALL)[0]
+def test_pages__their_examples_run() -> None:
     names: dict[str, object] = {}
-    exec(code.replace("4096", "4").replace("512", "4"), names)
-    assert {"env", "many", "vec"} <= set(names)
+    for page in ("environment", "observations", "rewards", "episodes", "infos", "watching"):
+        for code in re.findall("```python\n(.*?)```", (ROOT / "docs" / f"{page}.md").read_text("utf-8"), re.DOTALL):
+            exec(code.replace("4096", "4").replace("512", "4"), names)
+    assert {"many", "vec", "frame", "smooth"} <= set(names)
 
 
 @pytest.mark.parametrize("scenario", [PAPER, FIVE], ids=lambda scenario: scenario.name)

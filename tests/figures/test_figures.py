@@ -338,7 +338,7 @@ def test_deceleration_figure__marks_what_e_v2x_bm_takes_and_the_best_known(
     axes, strips = figure.axes
     told = " | ".join(legend(figure))
     assert "a* = 5.170 m/s², closed form: predicts 4.03" in told
-    assert "coupled, least first-impact harm: 10.55" in told  # 10.546 in docs/cli.md
+    assert "coupled, least first-impact harm: 10.55" in told
     best = "best known profile: 1.25 first-impact, 2.50 total; proven: no less than 0.50"
     assert best in [text.get_text() for text in axes.texts] and axes.get_title(loc="left") == "a title"
     assert {(1.25, 1.25), (2.5, 2.5)} <= {tuple(each.get_ydata()) for each in axes.lines}

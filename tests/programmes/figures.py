@@ -31,7 +31,7 @@ from tests.docs.blocks import (
     printed_blocks,
     tables_of_figures,
 )
-from tests.docs.printed import BLOCKS, NIGHTLY, PICTURES, TABLES, How, how
+from tests.docs.printed import BLOCKS, NIGHTLY, PICTURES, TABLES, How, how, results
 from tests.programmes import Cases, Told
 
 PROGRESS = re.compile(r": [\d,]+ of [\d,]+$|^compiling ")
@@ -72,8 +72,7 @@ def differing_block(block: Shown, place: How, folder: Path) -> list[str]:
 
 def differing_table(table: Shown, place: How, folder: Path) -> list[str]:
     """The figures of a table that its commands do not tell."""
-    told = "\n".join(map(told_by, place.by))
-    return [figure for figure in missing_figures(table.text, told) if figure not in place.quoted]
+    return missing_figures(table.text, "\n".join(map(told_by, place.by)))
 
 
 def differing_picture(picture: Shown, place: How, folder: Path) -> list[str]:
@@ -105,17 +104,14 @@ def differing_picture(picture: Shown, place: How, folder: Path) -> list[str]:
 
 def nightly() -> Iterator[tuple[str, Shown, How]]:
     """(kind, what is shown, how it is made) of all that is compared here; one that several pages show, once."""
+    kinds = (("block", printed_blocks, BLOCKS), ("table", tables_of_figures, TABLES), ("picture", pictures, PICTURES))
+    found = [(kind, each, how(table, each.begin)) for kind, shown, table in kinds for each in shown()]
+    found += [("table", each, ("", place)) for each, place in results()]
     done = set()
-    for kind, shown, table in (
-        ("block", printed_blocks, BLOCKS),
-        ("table", tables_of_figures, TABLES),
-        ("picture", pictures, PICTURES),
-    ):
-        for each in shown():
-            place = how(table, each.begin)
-            if place is not None and place[1].where == NIGHTLY and (kind, each.text) not in done:
-                done.add((kind, each.text))
-                yield kind, each, place[1]
+    for kind, each, place in found:
+        if place is not None and place[1].where == NIGHTLY and (kind, each.text) not in done:
+            done.add((kind, each.text))
+            yield kind, each, place[1]
 
 
 COMPARE = {"block": differing_block, "table": differing_table, "picture": differing_picture}

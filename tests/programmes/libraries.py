@@ -3,7 +3,7 @@
 Each library has an environment of its own below ``.venvs/``, kept for the next run, with this project as it stands.
 What cannot be installed is skipped, and the reason told. A policy is measured on a fixed list of worlds beside full
 braking, and where the library evaluates policies by itself, its harm is compared with ours, world by world.
-The row of the page's table is printed. ``--ci`` takes the libraries that are cheap to install.
+``--write`` puts the rows into docs/results/libraries.json. ``--ci`` takes the libraries that are cheap to install.
 """
 
 from __future__ import annotations
@@ -25,10 +25,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tests.docs.site import load
 from tests.programmes import KEPT, ROOT, Cases, Told
 from tests.programmes.environments import NotInstalled, ready_python, watched
 
 PAGE = ROOT / "docs" / "other-libraries.md"
+MEASURED = load("results")
 SCENARIO, EPISODES, SEED = "paper-random", 500, 7
 OWN_EPISODES, CLOSE = 50, 1e-5  # of the library's own evaluation; m2/s2
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
@@ -254,6 +256,7 @@ def cpu_seconds() -> float:
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--ci", action="store_true", help="only the libraries that are cheap to install")
     parser.add_argument("--limit", type=float, default=900.0, help="seconds for one way")
+    parser.add_argument("--write", action="store_true", help="write the rows into docs/results/libraries.json")
 
 
 def cases(given: argparse.Namespace) -> Cases:
@@ -281,8 +284,21 @@ def run(k: int, way: Way, given: argparse.Namespace) -> Told:
     last = (told.strip().splitlines() or [""])[-1]
     if status:
         return Told(False, f"status {status}: {last}")
-    release, *rest = json.loads(last)
-    return Told(True, f"\n| {' | '.join((way.library, release, lowered(way.title), way.ran, *rest))} |")
+    cells = json.loads(last)
+    if given.write:
+        write_row(way, cells)
+    return Told(True, "  ".join(filter(None, cells)))
+
+
+def write_row(way: Way, cells: list[str]) -> None:
+    """Put a row into docs/results/libraries.json, in the place of the one of the same library and way."""
+    told, *rest = cells
+    row = [way.library, told, lowered(way.title), way.ran, *rest]
+    (table,) = MEASURED.read_tables("libraries")
+    rows = [row if (each[0], each[2]) == (row[0], row[2]) else each for each in table.rows]
+    assert row in rows, f"no row of {way.library}, {way.title}"
+    text = MEASURED.text_of([table.model_copy(update={"rows": rows})])
+    (MEASURED.RESULTS / "libraries.json").write_text(text, "utf-8")
 
 
 def lowered(title: str) -> str:

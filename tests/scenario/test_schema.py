@@ -298,22 +298,6 @@ def test_json_schema__names_every_field_asks_for_one_of_two_ways_and_knows_no_nu
     assert "null" not in json.dumps(schema) and schema["properties"]["time_step_s"]["default"] == 0.1
 
 
-def test_page__has_every_key_with_its_default() -> None:
-    rows = dict(re.findall(r"^\| `(\w+)` \| *(.*?) *\|.*\|$", PAGE, re.MULTILINE))
-    other = {"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps"}
-    other |= {new: usual for usual, new in other.items()}
-    expected = {}
-    for key, field in Scenario.model_fields.items():
-        expected[key] = "empty" if field.default == "" else f"`{flow_text(field.default)}`"
-        if field.is_required():
-            expected[key] = "required"
-        elif field.default is None:
-            expected[key] = f"this or `{other[key]}`" if key in other else "none"
-        elif field.default_factory is not None:
-            expected[key] = rows[key]
-    assert rows == expected
-
-
 def test_page__its_examples_are_valid_scenarios() -> None:
     examples = re.findall(r"^```yaml\n(name:.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
     worlds = [Scenario.from_document(parse_yaml(text, "docs/scenarios.md")).sample(10, 0).worlds for text in examples]
