@@ -31,9 +31,6 @@ from tests.docs.site import DOCS, load
 Run = Callable[..., tuple[str, str]]
 
 
-MADE = ("docs/reproduction.md",)  # whole pages that are made from data; tests/docs/test_pages.py compares them
-
-
 KINDS = [
     pytest.param(printed_blocks, BLOCKS, id="blocks"),
     pytest.param(tables_of_figures, TABLES, id="tables"),
@@ -43,7 +40,7 @@ KINDS = [
 
 @pytest.mark.parametrize(("shown", "table"), KINDS)
 def test_everything_shown__has_its_place(shown: Callable[[], Iterator[Shown]], table: dict[str, How]) -> None:
-    found = [(each, how(table, each.begin)) for each in shown() if each.page not in MADE or table is PICTURES]
+    found = [(each, how(table, each.begin)) for each in shown()]
     assert [f"{each.page}: {each.begin}" for each, place in found if place is None] == []
     used = {place[0] for _, place in found if place is not None}
     assert [key for key in table if key not in used] == []
@@ -51,8 +48,7 @@ def test_everything_shown__has_its_place(shown: Callable[[], Iterator[Shown]], t
 
 def test_everything_shown__names_tests_and_programs_that_are_there() -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE))
-    measured = [place for _, place in results()]
-    for place in (*BLOCKS.values(), *TABLES.values(), *PICTURES.values(), *measured):
+    for place in (*BLOCKS.values(), *TABLES.values(), *PICTURES.values(), *(place for _, place in results())):
         for by in place.by:
             assert not by.startswith("tests/") or (ROOT / by).exists(), by
             assert not by.startswith("make ") or by.split()[1] in targets, by

@@ -292,13 +292,12 @@ def run(k: int, way: Way, given: argparse.Namespace) -> Told:
 
 def write_row(way: Way, cells: list[str]) -> None:
     """Put a row into docs/results/libraries.json, in the place of the one of the same library and way."""
-    told, *rest = cells
-    row = [way.library, told, lowered(way.title), way.ran, *rest]
+    row = [way.library, cells[0], lowered(way.title), way.ran, *cells[1:]]
     (table,) = MEASURED.read_tables("libraries")
     rows = [row if (each[0], each[2]) == (row[0], row[2]) else each for each in table.rows]
     assert row in rows, f"no row of {way.library}, {way.title}"
-    text = MEASURED.text_of([table.model_copy(update={"rows": rows})])
-    (MEASURED.RESULTS / "libraries.json").write_text(text, "utf-8")
+    changed = table.model_copy(update={"rows": rows})
+    (MEASURED.RESULTS / "libraries.json").write_text(MEASURED.text_of([changed]), "utf-8")
 
 
 def lowered(title: str) -> str:
