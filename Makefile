@@ -3,6 +3,7 @@
 # PYTHON:      the interpreter that makes the environment, when the first one found is not the one wanted.
 # ARGS:        passed on by `make run` (to `ethbrake run`), `make test` (to pytest) and the long programmes.
 # WORKERS:     processes of `make test`. 0: one process, as a debugger needs.
+# SEEDS:       of the orders of `make test-order`.
 
 SHELL := /bin/sh
 VENV := .venv
@@ -14,6 +15,7 @@ TORCH_INDEX ?=
 PYTHON ?=
 ARGS ?=
 WORKERS ?= 2
+SEEDS ?= 1 2 3 4 5 6 7 8 9 10
 INSTALL := sh .ci/install $(VENV)
 # uv compiles nothing (all of it would take 48 CPU-s). Python compiles what it imports, once, unless this is passed on.
 unexport PYTHONDONTWRITEBYTECODE
@@ -139,7 +141,7 @@ dist: $(STAMP)
 
 kernels: $(STAMP)
 	@echo "== ready-made kernels, for two levels of x86-64"
-	@$(PROGRAMME) wheel --only kernels: $(ARGS)
+	@$(BIN)/python .ci/kernels.py $(ARGS)
 
 test-physics: $(STAMP)
 	@echo "== long programme on the physics"
@@ -167,7 +169,10 @@ test-machines: $(STAMP)
 
 test-order: $(STAMP)
 	@echo "== the suite in random orders"
-	@$(PROGRAMME) order $(ARGS)
+	@for seed in $(SEEDS); do \
+	  $(BIN)/python -m pytest -q -p randomly -p xdist --randomly-seed=$$seed -n 2 --dist worksteal $(ARGS) || \
+	    { echo "== repeat it with SEEDS=$$seed" >&2; exit 1; }; \
+	done
 
 test-hostile: $(STAMP)
 	@echo "== files that a stranger wrote or a disk damaged"
@@ -176,6 +181,9 @@ test-hostile: $(STAMP)
 audit: $(STAMP)
 	@echo "== what the package stands on"
 	@$(PROGRAMME) audit $(ARGS)
+	@if [ -x $(BIN)/pip-audit ]; then \
+	  $(BIN)/pip-audit --requirement constraints.txt --no-deps --disable-pip --progress-spinner off; \
+	else echo "== pip-audit is not installed here: nobody was asked for reported weaknesses"; fi
 
 test-libraries: $(STAMP)
 	@echo "== other people's libraries"
@@ -200,7 +208,7 @@ mutation: $(STAMP)
 
 bench-peers: $(STAMP)
 	@echo "== speed beside other simulators"
-	@$(PROGRAMME) peers $(ARGS)
+	@PYTHONPATH="$(CURDIR)" $(BIN)/python docs/studies/peers.py $(ARGS)
 
 benchmark: $(STAMP)
 	@$(BIN)/python -m tests.studies.benchmark_rows $(ARGS)

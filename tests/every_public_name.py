@@ -26,39 +26,27 @@ def make_cautious(argument: str | None, settings: eb.AgentSettings) -> eb.Agent:
 def register(recipe: type[eb.TrainingRecipe], algorithm: type[Any]) -> tuple[str, ...]:
     eb.register_agent("cautious", make_cautious)
     eb.register_algorithm("own", recipe, algorithm)
-    eb.load_plugin("my_parts.py")
-    driver: eb.Agent = eb.policy_agent(lambda seen: -abs(seen[:, :1]), name="mine", clip=True)
-    assert driver.name == "mine"
     eb.register_term("smooth", lambda step: -np.abs(step.command_mps2), weight=0.1, unit="m/s2")
     eb.register_feature("load", lambda worlds, i: worlds.vehicles.mass_t[:, i], unit="t", scale=10.0, low=0.0, high=6.0)
     eb.register_preset("deaf", {"preset": "nominal", "lost": 0.5})
     eb.register_objective("front", lambda harm, vehicle: harm.borne[:, 0])
     eb.register_measure("delta_v", lambda episodes: episodes.largest_speed_change_mps, unit="m/s")
+    driver: eb.Agent = eb.policy_agent(lambda seen: -abs(seen[:, :1]), name="mine", clip=True)
+    eb.load_plugin("my_parts.py")
     eb.register_scenarios("my_scenarios")
-    return eb.agent_names()
+    return (driver.name, *eb.agent_names())
 
 
-def interfaces() -> list[Any]:
-    reward = eb.RewardParams(harm=2.0)
+def interfaces(policy: eb.Policy) -> list[Any]:
+    reward, engine = eb.RewardParams(harm=2.0), eb.make_sb3_vec_env("paper-random", 4).engine
     observation = eb.ObservationSpec(front=2) if reward.harm else eb.choose_observation(["own", "front_1"])
     batch: eb.EthBrakeVecEnv = eb.make_sb3_vec_env("paper-random", 4, reward=reward, observation=observation)
-    engine: eb.Engine = batch.engine
     parallel: eb.EthBrakeParallelEnv = eb.parallel_env(scenario="paper-random")
-    single, vector = eb.EthBrakeEnv(), eb.EthBrakeVectorEnv(num_envs=4)
-    return [batch, engine, parallel, single, vector, eb.env(), eb.raw_env()]
-
-
-def shields(policy: eb.Policy) -> list[Any]:
-    options = eb.ShieldOptions(mode="step")
-    parallel, batch = eb.parallel_env(), eb.make_sb3_vec_env("paper-random", 4)
+    assert_type(engine, eb.Engine)
     return [
-        options,
-        eb.HybridShield(parallel, policy, mode="step"),
-        eb.shielded_aec(eb.parallel_env(), mode="step"),
-        eb.shield(eb.parallel_env()),
-        eb.ShieldedEnv(eb.EthBrakeEnv()),
-        eb.ShieldedVectorEnv(eb.EthBrakeVectorEnv()),
-        eb.ShieldedVecEnv(batch),
+        *(eb.EthBrakeEnv(), eb.EthBrakeVectorEnv(num_envs=4), eb.env(), eb.raw_env(), eb.ShieldOptions(mode="step")),
+        *(eb.HybridShield(parallel, policy, mode="step"), eb.shielded_aec(parallel, mode="step"), eb.shield(parallel)),
+        *(eb.ShieldedEnv(eb.EthBrakeEnv()), eb.ShieldedVectorEnv(eb.EthBrakeVectorEnv()), eb.ShieldedVecEnv(batch)),
     ]
 
 
@@ -105,18 +93,14 @@ def measure(folder: Path) -> list[eb.SummaryRow]:
 
 
 def show(found: eb.Evaluation, folder: Path) -> list[Any]:
-    rows = eb.summarise(found)
-    assert_type(rows, eb.SummaryTable)
     record = eb.record_episode(found.worlds.take([0]), Cautious(), scenario=found.scenario)
     eb.write_picture(folder / "episode.svg", eb.trajectories({"world 0": record}))
-    fixed = eb.load_scenario("paper-distance")
-    cells = eb.criticality_map(fixed, {"cautious": Cautious()}, cells=3)
-    curve = eb.deceleration_curve(found.worlds.take([0]), found.task)
     eb.compare_results(eb.read_result(folder / "a.json"), eb.read_result(folder / "b.json"))
+    cells = eb.criticality_map(eb.load_scenario("paper-distance"), {"cautious": Cautious()}, cells=3)
+    curve = eb.deceleration_curve(found.worlds.take([0]), found.task)
+    assert_type(eb.summarise(found), eb.SummaryTable)
+    assert_type(eb.summarise_by(found, "scenario"), dict[str, eb.SummaryTable])
     figures = [eb.criticality_figure(cells), eb.deceleration_figure(curve), eb.harm_against_total_gap(found)]
-    mixed = eb.load_scenario("mixture-delays")
-    parts = eb.summarise_by(eb.evaluate(mixed.sample(10, 7), {"mine": Cautious()}, scenario=mixed), "scenario")
-    assert_type(parts, dict[str, eb.SummaryTable])
     return [found.to_frame(), *figures]
 
 

@@ -14,8 +14,8 @@ from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.observations import FORECAST_S, GROUPS, ObservationSpec, choose_observation, observe
 from ethbrake_marl.physics import advance
-from ethbrake_marl.policies import NetworkSpec, Policy
 from ethbrake_marl.scenario import observation_for
+from tests.fixtures.policies import make_policy
 from tests.physics.random_worlds import line
 
 SCENARIO = eb.load_scenario("paper-random")
@@ -158,32 +158,15 @@ def test_contact__leaves_other_features_alone_in_every_interface():
     assert parallel.tobytes() == wider[0].tobytes() and listed.tobytes() == wider.tobytes()
 
 
-def contact_policy(scenario, group):
-    """An untrained policy that observes contacts."""
-    spec = choose_observation(["own", group])
-    network = NetworkSpec(
-        observation_size=spec.size, action_size=1, policy_hidden=(4,), value_hidden=(), activation="relu", output="clip"
-    )
-    draw = np.random.default_rng(0)
-    shapes = {
-        "policy.0.weight": (4, spec.size), "policy.0.bias": (4,), "policy.output.weight": (1, 4),
-        "policy.output.bias": (1,), "policy.log_std": (1,),
-    }  # fmt: skip
-    tensors = {name: draw.normal(size=shape).astype(np.float32) for name, shape in shapes.items()}
-    return Policy.make(
-        tensors, algorithm="counterfactual", network=network, observation=spec,
-        learners=("vehicle_2",), scenario=scenario, reward={}, seeds={}, steps=0,
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize("group", ["contact", "contact_far"])
 def test_policy__observes_contacts_at_the_steps_of_its_training(group):
-    policy = contact_policy(SCENARIO.replace(time_step_s=0.05).model_dump(mode="json"), group)
+    spec = choose_observation(["own", group])
+    policy = make_policy(spec, SCENARIO.replace(time_step_s=0.05).model_dump(mode="json"))
     assert policy.observation == choose_observation(["own", group], 0.05)
     outcome = eb.evaluate(SCENARIO.sample(5, 7), {"mine": LearnedAgent(policy)}, scenario=SCENARIO).outcome("mine")
     assert np.isfinite(outcome.total_harm).all()
     with pytest.raises(InvalidInput, match="time_step_s = None; contact features need a number above 0"):
-        contact_policy({}, group)
+        make_policy(spec, {})
     assert choose_observation(["own"], 0.1).time_step_s is None  # nothing that depends on it
 
 

@@ -66,7 +66,7 @@ def test_error__lists_a_few_and_counts_the_rest_and_travels_between_processes():
     error = PhysicsError({k: "broke" for k in range(8)})
     assert str(error).startswith("world 0: broke; world 1: broke;") and str(error).endswith("and 3 more worlds")
     copy = pickle.loads(pickle.dumps(error))
-    assert copy.worlds == error.worlds and str(copy) == str(error)
+    assert (copy.worlds, str(copy)) == (error.worlds, str(error))
 
 
 def engine(n=3, seed=5):
@@ -90,14 +90,12 @@ def test_engine__cuts_the_episode_off_names_the_world_and_steps_the_others():
     with pytest.warns(FailedWorld, match=r"^world 1 of seed 5: a contact was missed between 0.6 s and 0.7 s"):
         step = running.step(np.full((3, 1), -0.5))
     expected = twin.step(np.full((3, 1), -0.5))
-    assert step.truncated.tolist() == [False, True, False] and not step.terminated.any()
-    assert step.failed.nonzero()[0].tolist() == [1] and list(running.roster.failed) == [1]
-    assert step.reward[1].tolist() == [0.0, 0.0, 0.0]
+    assert step.truncated.tolist() == (step.failed > 0).tolist() == running.ended.tolist() == [False, True, False]
+    assert not step.terminated.any() and list(running.roster.failed) == [1] and not step.reward[1].any()
     assert np.array_equal(running.packed.state[[0, 2]], twin.packed.state[[0, 2]])
     assert np.array_equal(step.reward[[0, 2]], expected.reward[[0, 2]])
     kept = [0, *range(running.packed.column.gap, before.size)]  # time, gaps, flags, harm
     assert np.array_equal(running.packed.state[1, kept], before[kept])
-    assert running.ended.tolist() == [False, True, False]
     running.renew(np.array([1]))  # the next world of the stream
     assert running.roster.failed == {} and not running.ended.any()
     break_row(running, 1)
@@ -134,7 +132,5 @@ def test_shield__a_proposal_that_cannot_be_advanced_is_not_certified():
     states = running.states.copy()
     states[1, :5] = [10.0, 20.0, 16.0, 0.5, -1.0]
     broken = running._replace(states=states)
-    harm = np.full(3, 1e3)
-    with pytest.raises(PhysicsError) as raised:
-        certify(broken, np.zeros(3), Backup(plan, harm), harm)
-    assert list(raised.value.worlds) == [1]  # the plan cannot be followed there either; the others are well
+    harm = np.full(3, 1e3)  # the plan cannot be followed there either; the others are well
+    assert failed_rows(lambda: certify(broken, np.zeros(3), Backup(plan, harm), harm)) == [1]

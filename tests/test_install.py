@@ -50,7 +50,9 @@ def variables_of(place: Path) -> dict[str, str]:
     return {name: value for name, _, value in (line.partition("=") for line in lines) if name in TOLD}
 
 
-def test_settings_of_pip__are_handed_on_to_uv_without_what_is_missing(place: Path, tmp_path: Path) -> None:
+def test_settings_of_pip__are_handed_on_to_uv_without_what_is_missing_or_uv_has_itself(
+    place: Path, tmp_path: Path
+) -> None:
     (tmp_path / "wheels").mkdir()
     (place / "settings").write_text(
         f"global.extra-index-url='\\nhttps://one/simple\\nfile://{tmp_path}/wheels\\nfile:///none/simple'\n"
@@ -58,36 +60,28 @@ def test_settings_of_pip__are_handed_on_to_uv_without_what_is_missing(place: Pat
         f"global.index-url='https://two/simple'\nglobal.timeout='9'\nglobal.cert='{tmp_path}/wheels'\n"
     )
     asked, told = install(place, "-e", ".[train]")
-    assert asked == ["uv -e .[train]"]
-    assert variables_of(place) == {
+    found = {
         "UV_DEFAULT_INDEX": "https://two/simple",
         "UV_INDEX": f"https://one/simple file://{tmp_path}/wheels",
         "UV_FIND_LINKS": f"{tmp_path}/wheels,{tmp_path}",
         "SSL_CERT_FILE": f"{tmp_path}/wheels",
         "UV_INDEX_STRATEGY": "unsafe-best-match",
     }
-    assert [line for line in told.splitlines() if "extra-index-url" in line] == [
-        "== extra-index-url of pip's settings: file:///none/simple is neither a file nor a directory, and left out"
-    ]
-
-
-def test_settings_of_uv__come_before_those_of_pip(place: Path) -> None:
-    (place / "settings").write_text("global.index-url='https://pip/simple'\nglobal.extra-index-url='https://more/'\n")
-    install(place, "-e", ".", UV_DEFAULT_INDEX="https://uv/simple", UV_INDEX_STRATEGY="first-index")
+    assert (asked, variables_of(place)) == (["uv -e .[train]"], found)
+    assert "extra-index-url of pip's settings: file:///none/simple is neither a file nor a directory, and left" in told
     own = {"UV_DEFAULT_INDEX": "https://uv/simple", "UV_INDEX_STRATEGY": "first-index"}
-    assert variables_of(place) == {"UV_INDEX": "https://more/"} | own
+    install(place, "-e", ".", **own)
+    assert variables_of(place) == found | own
 
 
-def test_no_uv__is_brought_by_pip_or_pip_installs(place: Path) -> None:
+def test_no_uv__is_brought_by_pip_or_pip_installs_as_where_uv_fails(place: Path) -> None:
     asked, told = install(place, "-e", ".", NO_UV="1", PIP_HAS_NO_UV="0")
     assert (asked[0].endswith(" uv"), asked[1:], told) == (True, ["uv -e ."], "")
     (place / "asked").unlink()
     asked, told = install(place, "-e", ".", NO_UV="1")
     assert [line.partition("constraints.txt ")[2] for line in asked] == ["--quiet uv", "-e ."]
     assert told == "== no uv to be had (above): pip installs, which takes longer\n"
-
-
-def test_uv_that_fails__leaves_it_to_pip(place: Path) -> None:
+    (place / "asked").unlink()
     asked, told = install(place, "-e", ".", UV_FAILS="-e .")
     assert [line.partition(" ")[0] for line in asked] == ["uv", "pip"]
     assert told == "error: no route\n== uv could not (above): pip tries\n"

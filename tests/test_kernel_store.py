@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import importlib
 import json
 import os
@@ -16,6 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import cache
 from pathlib import Path
+from unittest.mock import Mock
 
 import numba
 import pytest
@@ -25,7 +25,7 @@ from ethbrake_marl import kernel_store
 from ethbrake_marl.kernel_store import cache_folder
 from ethbrake_marl.physics import compiling as compiled
 from ethbrake_marl.physics.compiling import digest_of_sources, keep_kernel, kernel_sources, load_kernel
-from tests.programmes.wheel import pack
+from tests.docs.site import load
 
 needs_compiler = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="compilation is switched off")
 PACKAGE = Path(ethbrake_marl.__file__).parent
@@ -81,24 +81,19 @@ def test_cache_folder__that_cannot_be_written_is_a_temporary_one_that_goes_at_th
 
 def test_keep_kernel__is_loaded_again():
     assert load_kernel("one-1") is None
-    keep_kernel("one-1", b"machine code")
-    assert load_kernel("one-1") == b"machine code"
-    keep_kernel("one-1", b"other code")
-    assert load_kernel("one-1") == b"other code"
+    for content in (b"machine code", b"other code"):
+        keep_kernel("one-1", content)
+        assert load_kernel("one-1") == content
     assert [file.name for file in cache_folder().iterdir()] == ["one-1"]
 
 
-@pytest.mark.parametrize(
-    "damage", [lambda content: content[:-1] + b"!", lambda content: content[:-1], lambda content: b""]
-)
+@pytest.mark.parametrize("damage", [lambda good: good[:-1] + b"!", lambda good: good[:-1], lambda good: b""])
 def test_load_kernel__of_a_damaged_file_or_under_another_name_is_nothing(damage):
     keep_kernel("one-1", b"machine code")
-    file = cache_folder() / "one-1"
-    (cache_folder() / "two-2").write_bytes(file.read_bytes())
-    file.write_bytes(damage(file.read_bytes()))
+    good = (cache_folder() / "one-1").read_bytes()
+    (cache_folder() / "two-2").write_bytes(good)
+    (cache_folder() / "one-1").write_bytes(damage(good))
     assert load_kernel("one-1") is load_kernel("two-2") is None
-    keep_kernel("one-1", b"machine code")
-    assert load_kernel("one-1") == b"machine code"
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
@@ -118,10 +113,7 @@ def test_load_kernel__of_another_users_file_is_nothing(monkeypatch, user, loaded
 
 
 def test_keep_kernel__on_a_full_disk_costs_a_warning(monkeypatch):
-    def full(*paths):
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr(compiled.os, "replace", full)
+    monkeypatch.setattr(compiled.os, "replace", Mock(side_effect=OSError("No space left on device")))
     with pytest.warns(UserWarning, match="could not be kept: No space left"):
         keep_kernel("one-1", b"machine code")
     assert list(cache_folder().iterdir()) == []
@@ -211,18 +203,6 @@ def test_kernel_sources__are_found_behind_front_doors(copied):
     found = {source.relative_to(copied).as_posix() for source in kernel_sources(kernel)}
     assert {"kernel_of_mine.py", "physics/kernel.py"} <= found
     assert not {"physics/batch.py", "physics/worlds.py", "physics/__init__.py"} & found
-
-
-@pytest.mark.parametrize("source", kernel_files(PACKAGE), ids=lambda source: source.stem)
-def test_kernel_sources__find_every_import(source):
-    """Kernels import from this package by ``from ethbrake_marl... import`` alone: no other way would be seen."""
-    nodes = list(ast.walk(ast.parse(source.read_text("utf-8"))))
-    found = {module.decode() for module, _ in compiled._IMPORT.findall(source.read_bytes())}
-    asked = [node for node in nodes if isinstance(node, ast.ImportFrom)]
-    whole = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
-    assert {node.module for node in asked if (node.module or "").startswith("ethbrake_marl")} == found
-    assert not any(node.level for node in asked)
-    assert not any(name.startswith("ethbrake_marl.") for name in whole)
 
 
 # ---------------------------------------------------------------- processes
@@ -391,7 +371,9 @@ def test_ready_made_kernels__are_taken_where_the_own_store_has_none_unless_they_
         chosen.setenv("NUMBA_CPU_NAME", "x86-64-v2")
         chosen.setenv("NUMBA_CPU_FEATURES", "")
         assert run(way="cold") == COMPILED
-    wheel = pack({file.name: file.read_bytes() for file in cache_folder().glob("*.entry")}, tmp_path)
+    wheel = load("../../.ci/kernels").pack(
+        {file.name: file.read_bytes() for file in cache_folder().glob("*.entry")}, tmp_path
+    )
     site = tmp_path / "site"
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", str(site)]
     subprocess.run([*pip, str(wheel)], check=True, timeout=120)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from ethbrake_marl import rewards as terms
 from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import WithoutEffect
 from ethbrake_marl.physics import Impacts, Worlds, advance, forecast, make_worlds
@@ -207,21 +206,6 @@ def test_potential__of_two_learners_lets_each_choose_given_the_other_twice_round
         every[:, c] = forecast(worlds, command, 1, -braking[:, 1:2] * shares, 8.0)[0].min(axis=1)
     assert (every.min(axis=1) <= pair).all() and (pair <= alone).all()
     assert (alone > 1.0).sum() > 100 and pair.mean() < 0.1 * alone.mean()  # Vehicle 1 simply does not brake
-
-
-@pytest.mark.parametrize(("learners", "asked"), [((1,), [1]), ((1, 2), [1, 2, 1, 2])])
-def test_potential__asks_one_learner_once_and_several_twice(
-    learners: Any, asked: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    told = []
-
-    def watched(worlds: Worlds, command: Any, vehicle: int, candidates: Any, horizon_s: float) -> Any:
-        told.append(vehicle)
-        return forecast(worlds, command, vehicle, candidates, horizon_s)
-
-    monkeypatch.setattr(terms, "forecast", watched)
-    RewardParams().potential(PAPER.sample(2, seed=3).worlds, learners, 8.0)
-    assert told == asked
 
 
 def test_reward__without_harm_says_that_the_scenarios_objective_changes_nothing() -> None:

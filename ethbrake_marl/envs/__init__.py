@@ -29,7 +29,6 @@ if TYPE_CHECKING:
         parallel_env as parallel_env,
         raw_env as raw_env,
         report as report,
-        resolve_scenario as resolve_scenario,
     )
     from ethbrake_marl.envs.registration import register_environments as register_environments
     from ethbrake_marl.envs.sb3 import EthBrakeVecEnv as EthBrakeVecEnv, make_sb3_vec_env as make_sb3_vec_env

@@ -59,7 +59,7 @@ def make_engine(
     and is not listed brakes fully. Scripts come from the scenario's roles.
     """
     check_whole_number("number of worlds", n, 1)
-    loaded = resolve_scenario(scenario)
+    loaded = load_scenario(scenario)
     if not (observation is None or isinstance(observation, ObservationSpec | list | tuple | Mapping)):
         raise InvalidInput(
             f"observation = {observation!r}: must be an ObservationSpec, for instance ObservationSpec(1, 1), its fields"
@@ -112,11 +112,6 @@ def learner_actions(engine: Engine, actions: Mapping[str, Any]) -> Floats | dict
             action = checked_action(actions[name], (1,), name)
         columns[0, c] = action.item()
     return columns
-
-
-def resolve_scenario(scenario: AnyScenario) -> Scenario:
-    """The scenario of a shipped name, of a YAML file, of what such a file would say, or itself."""
-    return scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
 
 
 INITIAL_STATE = "initial_state"
@@ -818,23 +813,23 @@ def _agent_vehicles(engine: Engine, agents: WhoIsAgent) -> Ints:
 parallel_env = EthBrakeParallelEnv
 
 
-def raw_env(**settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
+def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
     """The same environment with agents acting in turn (AEC), front to rear; arguments as ``parallel_env``.
 
     >>> import ethbrake_marl as eb
-    >>> env = eb.raw_env(scenario="paper-random")
+    >>> env = eb.raw_env("paper-random")
     >>> env.reset(seed=7)
     >>> env.agent_selection
     'vehicle_1'
 
     """
-    return in_turns(parallel_env(**settings))
+    return in_turns(parallel_env(scenario, **settings))
 
 
-def env(**settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
+def env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
     """The AEC environment with PettingZoo's usual wrapper, order enforcement, which ``raw_env`` already has.
 
     Actions are not clipped and nothing ends an episode early: an unusable action is an ``InvalidInput`` in its agent's
     turn, which stays.
     """
-    return raw_env(**settings)
+    return raw_env(scenario, **settings)

@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from ethbrake_marl.engine import Arrays, Engine, Step
+from ethbrake_marl.envs.drawing import Viewer
 from ethbrake_marl.envs.interfaces import (
     INITIAL_STATE,
     AnyScenario,
@@ -42,6 +43,7 @@ def make_sb3_vec_env(
     horizon_is_end: bool = False,
     appended: Appended | None = None,
     step_infos: bool = False,
+    render_mode: str | None = None,
 ) -> EthBrakeVecEnv:
     """``n_envs`` worlds for Stable-Baselines3.
 
@@ -60,6 +62,7 @@ def make_sb3_vec_env(
             critic.
         step_infos: infos tell what the other interfaces tell in every step, not at the end of an episode alone; that
             costs time.
+        render_mode: ``rgb_array`` or None; ``render`` and ``VecVideoRecorder`` show all worlds side by side.
 
     >>> import ethbrake_marl as eb
     >>> eb.make_sb3_vec_env("paper-random", 4, seed=7).reset().shape
@@ -68,7 +71,9 @@ def make_sb3_vec_env(
     """
     begin = chosen_seed(seed)
     engine = make_engine(scenario, n_envs, learners=learners, reward=reward, observation=observation)
-    return EthBrakeVecEnv(engine, begin, horizon_is_end=horizon_is_end, appended=appended, step_infos=step_infos)
+    return EthBrakeVecEnv(
+        engine, begin, horizon_is_end=horizon_is_end, appended=appended, step_infos=step_infos, render_mode=render_mode
+    )
 
 
 class EthBrakeVecEnv(Begun, VecEnv):
@@ -86,6 +91,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         horizon_is_end: as in ``make_sb3_vec_env``.
         appended: as in ``make_sb3_vec_env``.
         step_infos: as in ``make_sb3_vec_env``.
+        render_mode: as in ``make_sb3_vec_env``.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -99,8 +105,6 @@ class EthBrakeVecEnv(Begun, VecEnv):
 
     """
 
-    render_mode: str | None = None
-
     def __init__(
         self,
         engine: Engine,
@@ -109,6 +113,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         horizon_is_end: bool = False,
         appended: Appended | None = None,
         step_infos: bool = False,
+        render_mode: str | None = None,
     ) -> None:
         features = row_features(engine.observation.features, appended, engine.scenario)
         if not engine.learners:
@@ -117,6 +122,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self.horizon_is_end = horizon_is_end
         self.appended = appended
         self.step_infos = step_infos
+        self.render_mode, self.viewer = render_mode, Viewer(engine, render_mode, batch=True)
         self._next_seed: int | None = seed
         self._learners = np.array(engine.learners, np.int64)
         self._actions: NDArray[Any] | None = None
@@ -125,6 +131,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self._steps = np.zeros(rows, np.int64)
         self._begun = np.zeros(0)  # values of the report at each episode's beginning
         super().__init__(rows, feature_box(features), action_box())
+        self.metadata = self.viewer.metadata
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Start the stream of ``seed`` at the next reset (None: fresh entropy); one stream serves all rows."""
@@ -173,6 +180,10 @@ class EthBrakeVecEnv(Begun, VecEnv):
             engine.renew(ended)
             self._begun[ended] = report(engine, rows=ended).values
         return self._observe(), reward.astype(np.float32), self._by_row(over), infos
+
+    def get_images(self) -> list[NDArray[np.uint8]]:
+        """A frame [H, W, 3] of each world."""
+        return list(self.viewer.render())
 
     def close(self) -> None:
         """Nothing to release."""

@@ -671,12 +671,12 @@ class Between:
         """What is known of them, as a sentence after another; empty without such a world."""
         if self.rate == 0.0:
             return ""
-        text = f" In the {100 * self.rate:.1f} % between, whether an impact can be avoided is open"
+        text = f" In {100 * self.rate:.1f} % contact is certain, but perhaps no impact"
         if self.mean_first is None or self.harmless_rate is None:
             return f"{text}."
         return (
-            f"{text}: the best known do {self.mean_first:.2f} there on average, and next to none in"
-            f" {100 * self.harmless_rate:.0f} % of them."
+            f"{text}: the least harm known there is {self.mean_first:.2f} on average, and practically none in"
+            f" {100 * self.harmless_rate:.0f} % of these."
         )
 
     @classmethod
@@ -1451,7 +1451,7 @@ class SummaryRow:
 
 
 class SummaryTable(list[SummaryRow]):
-    """The rows of ``summarise``: a list that a notebook shows as a table.
+    """The rows of ``summarise``: a list that ``print`` and a notebook show as a table.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -1461,6 +1461,17 @@ class SummaryTable(list[SummaryRow]):
     (True, 1)
 
     """
+
+    def __repr__(self) -> str:
+        return f"SummaryTable({', '.join(row.agent for row in self)})"
+
+    def __str__(self) -> str:
+        from rich.console import Console
+
+        console = Console(highlight=False)
+        with console.capture() as captured:
+            console.print(*self.tables())
+        return captured.get()
 
     def _repr_html_(self) -> str:
         note = "Harm: means per world in m²/s². In brackets: 95 % intervals. Decrease: of full braking's harm."

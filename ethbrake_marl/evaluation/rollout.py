@@ -5,15 +5,17 @@ Counting "the first episodes that finish" instead would over-count short ones, a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.agents import Driver, Knowledge, Team, check_agent, drive, script_agents
+from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.engine import check_alert, is_state_free
 from ethbrake_marl.errors import (
     AgentFailed,
@@ -23,7 +25,7 @@ from ethbrake_marl.errors import (
     check_whole_number,
     unknown_name,
 )
-from ethbrake_marl.evaluation.inputs import policies_of
+from ethbrake_marl.evaluation.inputs import make_lineup, policies_of
 from ethbrake_marl.evaluation.measures import REGISTERED, Evaluation, LeftOut, Outcome, Tape
 from ethbrake_marl.physics import (
     Decisions,
@@ -36,7 +38,7 @@ from ethbrake_marl.physics import (
     sample_on,
     sum_rows,
 )
-from ethbrake_marl.scenario import Sample, Scenario, ScriptSpec, Task
+from ethbrake_marl.scenario import Sample, Scenario, ScriptSpec, Task, load_scenario
 
 # The aftermath of a line: where Vehicle 1 ends, and how much of that others pushed it.
 #
@@ -139,11 +141,12 @@ OnWorlds = Callable[[str, int], None]  # agent, worlds done so far
 
 
 def evaluate(
-    worlds: Worlds | Sample,
-    agents: Mapping[str, Driver],
+    worlds: Worlds | Sample | None = None,
+    agents: str | Sequence[str] | Mapping[str, Driver] = (),
     *,
-    scenario: Scenario,
+    scenario: str | Path | Scenario,
     vehicle: int | str | None = None,
+    episodes: int = DEFAULT.EPISODES,
     seed: int | None = None,
     chunk: int | None = None,
     on_progress: OnWorlds | None = None,
@@ -156,11 +159,13 @@ def evaluate(
     all of them, and stands in ``left_out``.
 
     Args:
-        worlds: at the alert, or a sample of the scenario's list.
-        agents: name -> agent, of which each driven vehicle gets its own copy, or ``Team``; they are left as they are.
-        scenario: of the worlds.
+        worlds: at the alert, or a sample of the scenario's list; None: its first ``episodes`` of ``seed``.
+        agents: specs as on the command line (``"full_brake,ppo@shipped"``, or a list of them); or name -> agent, of
+            which each driven vehicle gets its own copy, or ``Team``; they are left as they are.
+        scenario: of the worlds, also by name or path.
         vehicle: the one that is driven, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
-        seed: of the list; noted, not used.
+        episodes: worlds of the list, where none are given.
+        seed: of the list, 7 where none is given; noted, not used, where worlds are given.
         chunk: worlds advanced together; None: 10,000, or 2,500 with ``on_progress``.
         on_progress: is called with an agent's name and its worlds done so far.
         aftermath: look how far Vehicle 1 is shoved, what the paper's sum over samples is, and what registered harm
@@ -170,7 +175,15 @@ def evaluate(
     the alert, no agents, no vehicle to drive, a team of other vehicles, or a learner that nobody drives.
 
     """
-    _check_request(worlds, agents, scenario, chunk)
+    scenario = load_scenario(scenario)
+    if isinstance(agents, str):
+        agents = agents.split(",")
+    if isinstance(agents, Sequence):
+        agents = make_lineup(agents, scenario)
+    if worlds is None:
+        seed = DEFAULT.LIST_SEED if seed is None else seed
+        worlds = scenario.sample(episodes, seed=seed)
+    _check_request(worlds, agents, chunk)
     sample = worlds if isinstance(worlds, Sample) else Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0)
     if not sample.worlds.n:
         raise InvalidInput("evaluate: worlds: there are none; at least one is needed")
@@ -224,17 +237,15 @@ def evaluate_list(
     return whole, left_out
 
 
-def _check_request(worlds: object, agents: object, scenario: object, chunk: object) -> None:
+def _check_request(worlds: object, agents: object, chunk: object) -> None:
     """Refuse arguments of ``evaluate`` that are not what they must be."""
     if not isinstance(worlds, Worlds | Sample):
         raise InvalidInput(
             f"evaluate: worlds = {worlds!r}: must be worlds or a sample, as scenario.sample(n, seed) gives"
         )
-    if not isinstance(scenario, Scenario):
-        raise InvalidInput(f"evaluate: scenario = {scenario!r}: must be a Scenario, as load_scenario(name) gives")
     if not isinstance(agents, Mapping):
         raise InvalidInput(
-            f"evaluate: agents = {agents!r}: must be a mapping, for instance {{'coast': make_agent('coast')}}"
+            f"evaluate: agents = {agents!r}: must be specs such as 'full_brake,ppo@shipped', or a mapping of agents"
         )
     if not agents:
         raise InvalidInput("evaluate: no agents given; at least one is needed, for instance full_brake")

@@ -17,9 +17,9 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from ethbrake_marl.envs import feature_box, make_engine, resolve_scenario
+from ethbrake_marl.envs import feature_box, make_engine
 from ethbrake_marl.rewards import Reward
-from ethbrake_marl.scenario import Scenario, full_state, observation_for, state_features
+from ethbrake_marl.scenario import Scenario, full_state, load_scenario, observation_for, state_features
 
 GROUP = "learners"
 
@@ -91,7 +91,7 @@ class LineTask(TaskClass):  # type: ignore[misc]
     """
 
     def __init__(self, name: str, config: dict[str, Any]) -> None:
-        super().__init__(name, {**config, "scenario": resolve_scenario(config["scenario"])})
+        super().__init__(name, {**config, "scenario": load_scenario(config["scenario"])})
 
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:
         """How to make the worlds."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from ethbrake_marl.evaluation import (
     rate,
 )
 from ethbrake_marl.figures import harm_by_agent, harm_in_parts, regret_distribution
-from ethbrake_marl.files.sheet import Column, Sheet, Shown
+from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.limits import Unproven
 from ethbrake_marl.pages.page import Page, Part, Played, Section
@@ -262,11 +263,31 @@ class Report:
             Section("Versions", versions),
         ]
         shown = [section for section in sections if section is not None and section.body]
-        return Page(self.title, shown, lead=self.summary).html
+        return Page(self.title, shown, lead=f"{self._found()}{self.summary}").html
 
     def write(self, path: str | Path, *, force: bool = False) -> None:
         """Write the page; raises ``AlreadyExists`` unless ``force``, ``InvalidInput`` without a folder."""
         write_output(path, self.html.encode("utf-8"), force=force)
+
+    def _found(self) -> str:
+        """What full braking and the agent in focus cost, and what nobody could avoid, each with its 95 % interval."""
+        rows = {row.agent: row for row in self.rows}
+        before, after = rows.get(_BASELINE), rows.get(self.focus)
+        if before is None or after is None or after is before:
+            return ""
+        percent = partial(Estimate.in_words, digits=0, scale=100.0, unit=" %")
+        less, certain = after["harm_decrease_first"], after["impact_proven_rate"]
+        found = (
+            f"Harm per emergency, first impacts: {before.first_impact_harm.in_words()} m²/s² by full braking,"
+            f" {after.first_impact_harm.in_words()} by {self.focus}"
+            f"{'' if less is None else f', which is {percent(less)} less'}. Emergencies with a collision:"
+            f" {percent(before.collision_rate)} and {percent(after.collision_rate)}"
+        )
+        return (
+            found
+            + ("" if certain is None else f"; in {percent(certain)} no command could have avoided one (proven)")
+            + ". "
+        )
 
     def _results(self) -> Section:
         rows = SummaryTable(self.rows)

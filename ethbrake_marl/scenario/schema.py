@@ -533,12 +533,16 @@ def register_scenarios(folder: str | os.PathLike[str]) -> None:
         raise
 
 
-def load_scenario(scenario: str | Path | Mapping[str, Any]) -> Scenario:
+def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenario:
     """Load a shipped or registered scenario by name, or a file by path (see ``scenario_path``), or what one would say.
+
+    A ``Scenario`` is given back as it is.
 
     Raises ``UnknownName`` with a suggestion for an unknown name, and ``InvalidInput`` with file, line, path inside
     it and value for a file that does not describe a scenario, or whose name differs from the file's.
     """
+    if isinstance(scenario, Scenario):
+        return scenario
     if isinstance(scenario, Mapping):
         document = _with_members(Document("scenario", dict(scenario), {}), Path())
         return Scenario(**document.content)

@@ -85,18 +85,6 @@ def test_believed__an_old_message_is_moved_on_by_the_script_to_the_truth() -> No
     assert free.sum() > 3
 
 
-def test_odometer__is_exact_without_impacts() -> None:
-    scenario = BASE.replace(gaps_m=[500.0, 500.0])
-    engine, alert = engine_of(scenario, n=5), scenario.sample(5, 7).worlds
-    odometer = Odometer.begun(alert, 1)
-    v = alert.speeds_mps[:, 1]
-    while not engine.ended.all():
-        odometer = odometer.look(engine.worlds, 1)
-        t = np.minimum(engine.worlds.time_s - 0.5, v / 7.0)
-        np.testing.assert_allclose(odometer.way_m, 0.5 * v + v * t - 3.5 * t * t, atol=1e-9)
-        engine.step(np.full((5, 1), -1.0))
-
-
 @pytest.mark.parametrize(
     ("vehicles", "v2x"),
     [*((3, v2x) for v2x in (DEAF, PERIODIC, "blocked", "sensors-only")), (2, PERIODIC), (5, PERIODIC), (5, "blocked")],

@@ -9,7 +9,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents import LearnedAgent, Team, drive, make_agent, policy_agent, register_agent, script_agents
-from ethbrake_marl.engine import Engine, ask_script
+from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate, follow_episodes, record_episode, worlds_sha256
@@ -33,7 +33,7 @@ def test_e_v2x_bm__predicts_and_beats_constants_whatever_script_the_others_follo
     episodes = drive(worlds, make_agent(spec, scenario=scenario), scenario, 1)
     realised = episodes.ledger.world_harm("first")
     np.testing.assert_allclose(realised, episodes.memories[1]["predicted_harm"], atol=1e-6)
-    for deceleration in np.linspace(0.0, 7.0, 15):
+    for deceleration in np.linspace(0.0, 7.0, 8):
         constant = drive(worlds, make_agent(f"constant:{deceleration}"), scenario, 1)
         assert (realised <= constant.ledger.world_harm("first") + 1e-6).all()
 
@@ -56,16 +56,6 @@ def test_drive__a_scripted_vehicle_that_is_driven_follows_its_script_in_nobodys_
     agent = make_agent("full_brake")
     found = [drive(worlds, agent, scenario, 1).ledger.world_harm("first") for scenario in (overridden, plain)]
     assert found[0].tolist() == found[1].tolist()
-
-
-@pytest.mark.parametrize("script", ["copy_leader", "gentlest_front"])
-def test_scripts__fixed_at_the_alert_are_asked_once_to_the_same_motion(script):
-    fixed, remembering = make_agent(script), make_agent(script)
-    remembering.state_free = False
-    worlds = PAPER.sample(30, 7).worlds
-    one, other = drive(worlds, fixed, PAPER, 1), drive(worlds, remembering, PAPER, 1)
-    assert one.final.gaps_m.tolist() == other.final.gaps_m.tolist()
-    assert one.ledger.total_harm.tolist() == other.ledger.total_harm.tolist()
 
 
 def test_drive__an_agent_sees_what_a_learner_sees_from_the_first_decision_on():
@@ -158,10 +148,8 @@ def test_team__of_one_drives_as_the_agent_alone():
     sample, agent = PAPER.sample(40, 7), make_agent("e_v2x_bm")
     result = evaluate(sample, {"alone": agent, "team": Team({1: agent}, "team")}, scenario=PAPER)
     named = evaluate(sample, {"alone": agent}, scenario=PAPER, vehicle="vehicle_2")
-    for name in ("alone", "team"):
-        outcome, other = result.outcome(name), named.outcome("alone")
-        assert outcome.final.gaps_m.tobytes() == other.final.gaps_m.tobytes()
-        assert outcome.predicted_harm.tobytes() == other.predicted_harm.tobytes()
+    outcomes = result.outcome("alone"), result.outcome("team"), named.outcome("alone")
+    assert len({(each.final.gaps_m.tobytes(), each.predicted_harm.tobytes()) for each in outcomes}) == 1
     assert result.vehicle == named.vehicle == 1
 
 
@@ -242,12 +230,6 @@ class _Writes:
         if self.when == "vehicles":
             worlds.vehicles.mass_t[:] = 1.0
         return -worlds.vehicles.braking_capacity_mps2[:, vehicle], memory
-
-
-def test_memory__that_an_agent_writes_into_is_its_own_copy():
-    worlds, memory = PAPER.sample(3, seed=1).worlds, np.zeros(3)
-    _, after = ask_script(_Writes("", state_free=True), worlds, memory, 1)
-    assert (memory.tolist(), after.tolist()) == ([0.0] * 3, [1.0] * 3)
 
 
 KEPT = ("name", "plan")  # an attribute that there is, and a new one

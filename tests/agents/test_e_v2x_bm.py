@@ -16,13 +16,10 @@ from ethbrake_marl.agents.e_v2x_bm import (
     CoupledOptimum,
     Line,
     Samples,
-    bound_cells,
-    choose,
     closing_speed_squared,
     least_to_spare_front,
     make_line,
     most_to_spare_rear,
-    put_in_order,
     share_start,
     simulate,
     will_stay_apart,
@@ -34,8 +31,8 @@ from ethbrake_marl.physics.kernel import FLAG, ROW
 PAPER = eb.load_scenario("paper-random")
 
 
-def wide_worlds(n: int, vehicles: int, seed: int, *, front_first: bool = False, exact_zeros: bool = False) -> Worlds:
-    """Lines far beyond the paper's ranges; ``front_first``: each vehicle may brake no earlier than the one ahead."""
+def wide_worlds(n: int, vehicles: int, seed: int, *, exact_zeros: bool = False) -> Worlds:
+    """Lines far beyond the paper's ranges."""
     rng = np.random.default_rng(seed)
     gaps = rng.uniform(0, 60, (n, vehicles - 1)) * rng.choice([0.05, 0.3, 1.0], (n, 1))
     speeds = rng.uniform(0, 35, (n, vehicles))
@@ -48,7 +45,7 @@ def wide_worlds(n: int, vehicles: int, seed: int, *, front_first: bool = False, 
         speeds,
         braking_capacity_mps2=rng.uniform(1, 10, (n, vehicles)),
         driving_capacity_mps2=3,
-        latency_s=np.sort(latency, axis=1) if front_first else latency,
+        latency_s=latency,
         mass_t=5,
         restitution=0.1,
     )
@@ -171,43 +168,6 @@ def test_optimum__takes_the_middle_of_a_flat_minimum():
     assert best.spares_front_mps2[0] == math.inf
     assert best.harm[0] == 4.0
     assert best.deceleration_mps2[0] == pytest.approx(36 / 9.4)
-
-
-def samples(at, harm, other=None) -> Samples:
-    found = Samples(*(np.array(column, dtype=float) for column in (at, harm, harm if other is None else other, at)))
-    put_in_order(found, len(found.at))
-    return found
-
-
-@pytest.mark.parametrize(
-    ("harm", "other", "expected"),
-    [
-        ([3, 1, 2, 2, 4], [0, 9, 0, 0, 0], 1.0),  # the harm decides
-        ([3, 1, 1, 2, 4], [0, 9, 8, 0, 0], 2.0),  # a tie: the other count decides
-        ([3, 0, 0, 0, 4], [0, 0, 0, 0, 0], 2.0),  # still a tie: the middle one
-        ([0, 0, 3, 0, 0], [1, 1, 1, 1, 1], 1.0),  # of an even number the lower one
-    ],
-)
-def test_choose__order_of_preference(harm, other, expected):
-    found = samples([0, 1, 2, 3, 4], harm, other)
-    assert choose(found, 5, np.empty(5)) == expected
-    back = Samples(*(column[::-1].copy() for column in found))
-    assert choose(back, 5, np.empty(5)) == expected
-
-
-@pytest.mark.parametrize(
-    ("at", "harm", "expected"),
-    [
-        # Middle cell: falling by 2 on its left, rising by 3 on its right, each up to twice as fast inside: 3 - 4, 1 - 6
-        ([0, 1, 2, 3], [5, 3, 1, 4], [3.0, -5.0, -3.0]),
-        # With uneven samples the slope counts: falling by 2 over 1, then a cell twice as wide: 3 - 2 * 2 * 2.
-        ([0, 1, 3], [5, 3, 4], [2.0, -5.0]),
-    ],
-)
-def test_bound_cells__let_a_falling_side_run_on(at, harm, expected):
-    found = np.empty(len(at) - 1)
-    bound_cells(samples(at, harm), len(at), found)
-    assert found.tolist() == expected
 
 
 def line_worlds(n: int, vehicles: int, seed: int) -> Worlds:
@@ -377,7 +337,6 @@ def test_coupled__is_not_worse_than_an_even_grid(n, vehicles, vehicle, rear_mps2
     for count, harms in zip(("first", "total"), forecast(worlds, others, vehicle, grid, 8.0), strict=True):
         found = optimise_coupled(worlds, vehicle, others_mps2=others, harm_count=count).harm
         excess = found - harms.min(axis=1)
-        print(f"{count}: largest excess {excess.max():.1e}, mean {excess.mean():.5f} m2/s2")
         assert excess.max() <= 1e-9
         assert (np.mean(excess) < 0.0) == (vehicles != 2)  # narrowing finds more; of one pair an end is best
 
@@ -480,14 +439,14 @@ def test_coupled__finds_what_hides_between_two_samples_of_its_grid(worlds, vehic
 
 # By the code of 20 November 2026 (6d87c15); `stress-wide` on worlds that are the same on every processor.
 RECORDED = {
-    "paper-random first": "eb977f84e862da51",
-    "paper-random total": "5a7e4d67e109dd5b",
-    "stress-wide first": "6fbae1551393a66b",
-    "stress-wide total": "9dda59f1c805c213",
-    "cooperation-2-five first": "2825cd3b113bef4d",
-    "cooperation-2-five total": "8c25fd12ae0b3644",
-    "paper-random-obstacle first": "d0eca3c7efc06914",
-    "paper-random-obstacle total": "ead90c9d9c7a9bfc",
+    "paper-random first": "f6036961a834b1aa",
+    "paper-random total": "5548d34fa2c72965",
+    "stress-wide first": "8acd5e1399f3c8e6",
+    "stress-wide total": "e0f215e3b3fb51c7",
+    "cooperation-2-five first": "03149d118acf6d73",
+    "cooperation-2-five total": "6b755b628058f8d0",
+    "paper-random-obstacle first": "f5aa1e29bc9839de",
+    "paper-random-obstacle total": "62ed6d773c287e98",
     "2 alert 0": "6cb904efc8483c24",
     "2 alert 1": "13f625a162e41fff",
     "2 others 0": "0728ecb5c28b8fd1",
@@ -525,7 +484,7 @@ RECORDED = {
 
 def recorded_cases() -> Iterator[tuple[str, CoupledOptimum]]:
     for name in ("paper-random", "stress-wide", "cooperation-2-five", "paper-random-obstacle"):
-        worlds = eb.load_scenario(name).sample(60, seed=7).worlds
+        worlds = eb.load_scenario(name).sample(20, seed=7).worlds
         for harm_count in ("first", "total"):
             yield f"{name} {harm_count}", optimise_coupled(worlds, 1, harm_count=harm_count)
     for vehicles in (2, 4, 7):

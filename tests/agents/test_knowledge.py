@@ -12,17 +12,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.actions import action_to_command, command_to_action
-from ethbrake_marl.agents import (
-    Agent,
-    Knowledge,
-    Source,
-    Team,
-    Told,
-    agent_entries,
-    make_agent,
-    parse_spec,
-    script_agents,
-)
+from ethbrake_marl.agents import Agent, Knowledge, Source, Team, Told, agent_entries, parse_spec, script_agents
 from ethbrake_marl.agents.registry import find_entry
 from ethbrake_marl.engine import Engine, Memory, Script, ask_script, begin_script
 from ethbrake_marl.evaluation import make_lineup
@@ -246,12 +236,19 @@ class Silent:
 
 
 class Leaking(Silent):
-    """Says it knows messages, and looks at the speed of the vehicle behind."""
+    """Says it knows messages, and decides on who is behind it, what others have heard, or what it will never hear."""
 
     name, knows = "leaking", "messages"
 
+    def __init__(self, reads="behind"):
+        self.reads = reads
+
     def act(self, worlds, vehicle):
-        return -0.1 * worlds.speeds_mps[:, vehicle + 1]
+        known = worlds.vehicles.known_from_s
+        seen = known[:, 2, 0] <= worlds.time_s if self.reads == "others" else np.isinf(known[:, vehicle]).any(axis=1)
+        if self.reads == "behind":
+            seen = worlds.speeds_mps[:, vehicle + 1] > 15.0
+        return np.where(seen, -1.0, -0.5) * worlds.vehicles.braking_capacity_mps2[:, vehicle]
 
 
 def agent_of(spec: str, scenario: eb.Scenario = PAPER) -> Agent:
@@ -325,7 +322,7 @@ def test_own_sensors_and_messages__what_was_not_received_changes_no_action(spec,
 )
 def test_own_sensors_and_messages__nor_where_an_obstacle_is_that_was_not_received(spec, channel):
     scenario = eb.load_scenario("cooperation-4-all").with_learners(["vehicle_2"]).replace(v2x=channel)
-    assert changed_decisions(agent_of(spec, scenario), scenario, n=5 if "robust" in spec else 20) == 0
+    assert changed_decisions(agent_of(spec, scenario), scenario, n=3 if "robust" in spec else 20) == 0
     assert changed_decisions(agent_of("gentlest_front", scenario), scenario, n=20) > 0
 
 
@@ -338,30 +335,9 @@ def test_messages__contact_features_tell_nothing_that_was_not_received(channel, 
     assert changed_decisions(agent, scenario) == 0
 
 
-def test_own_sensors_and_messages__a_planted_leak_is_found():
-    assert changed_decisions(Leaking(), BLOCKED) > 50
-
-
-class Guessing(Leaking):
-    """Decides on what others have heard, or on what it will never hear."""
-
-    def __init__(self, reads):
-        self.reads = reads
-
-    def act(self, worlds, vehicle):
-        known = worlds.vehicles.known_from_s
-        seen = known[:, 2, 0] <= worlds.time_s if self.reads == "others" else np.isinf(known[:, vehicle]).any(axis=1)
-        return np.where(seen, -1.0, -0.5) * worlds.vehicles.braking_capacity_mps2[:, vehicle]
-
-
-@pytest.mark.parametrize(("reads", "vehicle"), [("others", 1), ("never", 2)])
-def test_changed_decisions__finds_who_reads_what_others_heard_or_what_will_never_come(reads, vehicle):
-    assert changed_decisions(Guessing(reads), BLOCKED, vehicle=vehicle) > 10
-
-
-def test_changed_decisions__lets_other_learners_brake_fully():
-    pair = eb.load_scenario("cooperation-3-pair").replace(v2x="blocked")
-    assert [changed_decisions(make_agent("full_brake"), pair, vehicle=i) for i in (1, 2)] == [0, 0]
+@pytest.mark.parametrize(("reads", "vehicle"), [("behind", 1), ("others", 1), ("never", 2)])
+def test_own_sensors_and_messages__a_planted_leak_is_found(reads, vehicle):
+    assert changed_decisions(Leaking(reads), BLOCKED, vehicle=vehicle) > 10
 
 
 @pytest.mark.parametrize("spec", ["e_v2x_bm:believed", "coast+step:believed", "ppo@shipped/ppo+episode:believed"])
@@ -386,7 +362,7 @@ def test_true_state_and_model__is_not_said_without_need(spec):
         scenario, vehicle = BLOCKED.with_learners(["vehicle_3"]), 2
     else:
         scenario, vehicle = BLOCKED.replace(v2x={"preset": "paper", "hears": "front"}), 1
-    n = 40 if vehicle == 2 else 6
+    n = 40 if vehicle == 2 else 4
     assert changed_decisions(agent_of(spec, scenario), scenario, vehicle=vehicle, decisions=1, n=n) > 0
 
 

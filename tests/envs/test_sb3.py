@@ -129,12 +129,18 @@ def test_attributes__belong_to_the_whole_batch() -> None:
     env = make_sb3_vec_env(CRASH, 3)
     assert isinstance(env, EthBrakeVecEnv) and env.get_attr("render_mode") == [None] * 3
     assert [engine is env.engine for engine in env.get_attr("engine", indices=[0, 2])] == [True, True]
-    assert env.has_attr("engine") and not env.has_attr("nothing")
     env.set_attr("label", 7)
-    assert env.get_attr("label") == [7, 7, 7]
-    assert env.env_method("seed", 4) == [[4, 4, 4]] * 3
+    assert (env.get_attr("label"), env.env_method("seed", 4)) == ([7] * 3, [[4] * 3] * 3)
+    assert (env.has_attr("engine"), env.has_attr("nothing")) == (True, False)
     assert env.env_is_wrapped(Monitor) == [False] * 3
-    env.close()
+
+
+def test_video__shows_every_world_of_the_batch() -> None:
+    env = make_sb3_vec_env("paper-random", 3, render_mode="rgb_array")
+    env.reset()
+    env.step(np.zeros((3, 1)))
+    assert env.metadata["render_fps"] == 10 and [image.shape for image in env.get_images()] == [(304, 800, 3)] * 3
+    assert (env.render() != 0).any()
 
 
 def test_step_async__keeps_its_own_copy_of_the_actions() -> None:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import json
-import sys
+import re
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 
 import ethbrake_marl as eb
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, MissingExtra, PhysicsError
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, PhysicsError
 from ethbrake_marl.evaluation import episodes
 from ethbrake_marl.evaluation.episodes import KEY, Recording, Task, decision_columns, env_spec, record_episodes
 from ethbrake_marl.evaluation.inputs import make_lineup
@@ -39,11 +40,10 @@ def record(spec: str = "full_brake", scenario: Scenario = PAPER, n: int = 12, re
 
 @pytest.mark.parametrize("spec", ["full_brake", "ppo@shipped"])
 def test_record__an_agent_whose_commands_are_actions_is_as_in_an_evaluation(spec: str) -> None:
-    found = record(spec)
-    outcome = eb.evaluate(PAPER.sample(12, 7), make_lineup([spec], PAPER), scenario=PAPER).outcome(spec)
+    found, expected = record(spec), eb.evaluate(PAPER.sample(12, 7), make_lineup([spec], PAPER), scenario=PAPER)
+    ledgers = found.ledger, expected.outcome(spec).ledger
     assert found.off_by == 0.0
-    assert np.array_equal(found.ledger.world_harm("first"), outcome.first_impact_harm)
-    assert np.array_equal(found.ledger.world_harm("total"), outcome.total_harm)
+    np.testing.assert_array_equal(*(np.stack([each.world_harm(c) for c in ("first", "total")]) for each in ledgers))
 
 
 @pytest.mark.parametrize("spec", ["best_harm", "e_v2x_bm", "full_brake+step", "ppo@shipped+refined+episode"])
@@ -106,9 +106,9 @@ def test_columns__tell_two_learners_step_by_step() -> None:
             expected = {"world": world, "decision": decision, "time_s": infos["vehicle_1"]["time_s"]}
             for i in (1, 2, 3):
                 expected[f"command_in_force_{i}_mps2"] = infos[f"vehicle_{i}"]["command_in_force_mps2"]
-            for i in (2, 3):
-                observed = [told[f"observation_{i}.{f.name}"] for f in env.engine.observation.features]
-                assert np.array_equal(observed, seen[f"vehicle_{i}"])
+            names = [f.name for f in env.engine.observation.features]
+            observed = {f"vehicle_{i}": [told[f"observation_{i}.{name}"] for name in names] for i in (2, 3)}
+            assert all(np.array_equal(values, seen[name]) for name, values in observed.items())
             actions = {f"vehicle_{i}": told[f"action_{i}"] for i in (2, 3)}
             seen, rewards, terminated, truncated, infos = env.step(actions)
             for i, name in ((2, "vehicle_2"), (3, "vehicle_3")):
@@ -123,19 +123,16 @@ def test_columns__tell_two_learners_step_by_step() -> None:
                 }
             assert {name: told[name] for name in expected} == expected
             row, decision = row + 1, decision + 1
-        info = infos["vehicle_1"]
-        ends = columns["first_impact_harm"][row - 1], columns["total_harm"][row - 1]
-        assert ends == (info["world_first_impact_harm"], info["world_total_harm"])
+        told = {name: columns[name][row - 1] for name in ("first_impact_harm", "total_harm")}
+        assert told == {name: infos["vehicle_1"][f"world_{name}"] for name in told}
     assert {len(column) for column in columns.values()} == {row}
 
 
 def test_page__lists_every_column() -> None:
     text = DOCS.read_text("utf-8")
     for name in decision_columns(record(n=1)):
-        listed = name.replace("_1_", "_I_").replace("_2_", "_I_").replace("_3_", "_I_")
-        listed = "observation_I.FEATURE" if "." in name else listed
-        listed = f"{listed[:-2]}_I" if listed.endswith("_2") else listed
-        listed = "reward_TERM_I" if listed in ("reward_harm_I", "reward_jerk_I") else listed
+        listed = re.sub(r"_[123](?=_|$)", "_I", name)
+        listed = "observation_I.FEATURE" if "." in name else re.sub("^reward_(harm|jerk)_I", "reward_TERM_I", listed)
         assert f"`{listed}`" in text, name
 
 
@@ -164,13 +161,10 @@ def test_file__has_the_columns_in_row_groups_and_tells_what_they_are(
 def test_file__appears_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pyarrow")
     monkeypatch.setattr(episodes, "BATCH", 3)
-
-    def stop(agent: str, done: int) -> None:
-        raise KeyboardInterrupt
-
+    stop = Mock(side_effect=KeyboardInterrupt)
     with pytest.raises(KeyboardInterrupt):
         eb.write_dataset(tmp_path / "a.parquet", BRAKE, scenario=PAPER, episodes=5, on_progress=stop)
-    assert list(tmp_path.iterdir()) == []
+    assert stop.called and list(tmp_path.iterdir()) == []
 
 
 # ---------------------------------------------------------------- Minari
@@ -207,19 +201,16 @@ def test_replay__gives_the_recorded_bits(
     beside = dataset.storage.get_episode_metadata(range(dataset.total_episodes))
     for k, (episode, told) in enumerate(zip(dataset.iterate_episodes(), beside, strict=True)):
         assert (told["agent"], told["options"]["listed_world"]["number"]) == ([*lineup][k // 4], k % 4)
-        seen, info = env.reset(seed=told["seed"], options=told["options"])
-        observed, infos, rewards, ends = [seen], [info], [], []
-        for action in episode.actions:
-            seen, gained, *ended, info = env.step(action)
-            for told_so_far, new in ((observed, seen), (rewards, gained), (ends, ended), (infos, info)):
-                told_so_far.append(new)
-        assert np.array_equal(observed, episode.observations)
-        assert rewards == episode.rewards.tolist() and episode.rewards.dtype == np.float64
-        assert ends == np.stack([episode.terminations, episode.truncations], axis=1).tolist() and any(ends[-1])
-        assert set(infos[0]) == set(episode.infos)
+        first, info = env.reset(seed=told["seed"], options=told["options"])
+        steps = [env.step(action) for action in episode.actions]
+        observed, rewards, terminated, truncated, infos = zip(*steps, strict=True)
+        assert np.array_equal([first, *observed], episode.observations)
+        assert [*rewards] == episode.rewards.tolist() and episode.rewards.dtype == np.float64
+        assert [*terminated] == episode.terminations.tolist() and [*truncated] == episode.truncations.tolist()
+        assert (terminated[-1] or truncated[-1]) and set(info) == set(episode.infos)
         for name, values in episode.infos.items():
-            assert np.array_equal([each[name] for each in infos], values), name
-        harms = info["world_first_impact_harm"], info["world_total_harm"]
+            assert np.array_equal([each[name] for each in (info, *infos)], values), name
+        harms = infos[-1]["world_first_impact_harm"], infos[-1]["world_total_harm"]
         assert harms == (told["first_impact_harm"], told["total_harm"])
 
 
@@ -252,36 +243,20 @@ def test_check__replaces_nothing_unasked_and_only_datasets_when_asked(
         episodes.check_dataset(tmp_path / "a-v0", PAPER, force=True)
 
 
-@pytest.mark.parametrize(("name", "package"), [("a.parquet", "pyarrow"), ("a-v0", "minari")])
-def test_write__without_the_extra_names_the_line_that_installs_it(
-    name: str, package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for missing in ("pyarrow", "minari", "h5py"):
-        monkeypatch.setitem(sys.modules, missing, None)
-    told = rf"{package}, which is not installed: .* install 'ethbrake-marl\[data\]'"
-    with pytest.raises(MissingExtra, match=told):
-        eb.write_dataset(tmp_path / name, BRAKE, scenario=PAPER, episodes=1)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_work__leaves_a_failed_world_out_and_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recorded: list[Recording] = []
     real: Callable[..., Recording] = episodes.record_episodes
 
     def failing(sample: Any, *rest: Any) -> Recording:
-        bad = {row: "planted" for row, number in enumerate(sample.index) if number == 4}
-        if bad:
+        if bad := {row: "planted" for row, number in enumerate(sample.index) if number == 4}:
             raise PhysicsError(bad)
         return real(sample, *rest)
 
-    monkeypatch.setattr(episodes, "need", lambda package: None)
-    monkeypatch.setattr(episodes, "record_episodes", failing)
-    monkeypatch.setattr(episodes, "BATCH", 3)
-    monkeypatch.setattr(episodes, "parquet_dataset", lambda path, told: nullcontext(recorded.append))
-    seen: list[tuple[str, int]] = []
-    path = tmp_path / "some.parquet"
-    work = eb.write_dataset(path, BRAKE, scenario=PAPER, episodes=7, on_progress=lambda *done: seen.append(done))
-    assert [each.index.tolist() for each in recorded] == [[0, 1, 2], [3, 5], [6]]
-    assert seen == [("full_brake", 3), ("full_brake", 6), ("full_brake", 7)]
+    recorded, seen = Mock(), Mock()
+    for name, planted in (("need", Mock()), ("record_episodes", failing), ("BATCH", 3)):
+        monkeypatch.setattr(episodes, name, planted)
+    monkeypatch.setattr(episodes, "parquet_dataset", lambda path, told: nullcontext(recorded))
+    work = eb.write_dataset(tmp_path / "some.parquet", BRAKE, scenario=PAPER, episodes=7, on_progress=seen)
+    assert [call.args[0].index.tolist() for call in recorded.call_args_list] == [[0, 1, 2], [3, 5], [6]]
+    assert [call.args for call in seen.call_args_list] == [("full_brake", 3), ("full_brake", 6), ("full_brake", 7)]
     assert [tuple(left) for left in work.left_out] == [(4, 7, "full_brake", "planted")]
     assert work.episodes == {"full_brake": 6}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 import re
 import sys
 from collections.abc import Callable, Iterator
@@ -29,7 +30,6 @@ from ethbrake_marl.learning.algorithms import (
     ModesModel,
     NoOtherMode,
     Scout,
-    Stage,
     Tried,
     choose_rows,
     draw_rows,
@@ -69,13 +69,8 @@ SCENARIO = eb.load_scenario("paper-random")
 def recipe_file(folder: Path, **changes: Any) -> Path:
     """A recipe of the own algorithm."""
     recipe = TINY_PPO.model_dump(mode="json", include=set(TrainingRecipe.model_fields))
-    recipe |= {
-        "name": "mine",
-        "algorithm": "a2c",
-        "total_steps": 1024,
-        "n_steps": 8,
-        "network": {"policy": [8], "value": [8]},
-    }
+    own = {"name": "mine", "algorithm": "a2c", "total_steps": 512, "n_steps": 8}
+    recipe |= own | {"network": {"policy": [8], "value": [8]}, "checkpoint_every_updates": 3}
     (folder / "mine.yaml").write_text(yaml.safe_dump(recipe | changes))
     return folder / "mine.yaml"
 
@@ -86,9 +81,9 @@ def test_own_algorithm__trains_resumes_bit_for_bit_and_is_evaluated(
 ) -> None:
     recipe, run = recipe_file(tmp_path), tmp_path / "run"
     whole = train(recipe, SCENARIO, tmp_path / "whole")
-    assert (whole.status, whole.steps, whole.updates) == ("finished", 1024, 16)
+    assert (whole.status, whole.steps, whole.updates) == ("finished", 512, 8)
     with monkeypatch.context() as patch:
-        watch_steps(patch, ctrl_c_in(61))
+        watch_steps(patch, ctrl_c_in(37))
         assert train(recipe, SCENARIO, run).status == "interrupted"
     config = (run / "config.json").read_text()
     (run / "config.json").write_text(config.replace('"n_steps": 8', '"n_steps": 4'))
@@ -97,9 +92,7 @@ def test_own_algorithm__trains_resumes_bit_for_bit_and_is_evaluated(
     (run / "config.json").write_text(config)
     result = resume(run)
     assert (result.status, result.evaluations) == ("finished", whole.evaluations)
-    assert files_of(run) == files_of(tmp_path / "whole")
-
-    assert load_policy(run).manifest.algorithm == "a2c"
+    assert files_of(run) == files_of(tmp_path / "whole") and load_policy(run).manifest.algorithm == "a2c"
     agents = {f"{kind}@{run}": eb.make_agent(f"{kind}@{run}", scenario=SCENARIO) for kind in ("policy", "team")}
     found = eb.evaluate(SCENARIO.sample(10, 7), agents, scenario=SCENARIO)
     harms = [found.outcome(name).first_impact_harm.mean() for name in agents]
@@ -209,20 +202,15 @@ def test_adam__is_torchs_without_its_compiler(monkeypatch: pytest.MonkeyPatch) -
 
 def test_training__starts_from_a_policy_and_drives_as_it_did(tmp_path: Path) -> None:
     """New features count for nothing at first: the same policy to the last bits, before anything is learned."""
-    small = {
-        "n_envs": 8,
-        "n_steps": 4,
-        "counterfactuals": 16,
-        "batch_size": 8,
-        "evaluation": TINY_COUNTERFACTUAL.evaluation,
-    }
+    names = ("n_envs", "n_steps", "counterfactuals", "batch_size", "evaluation")
+    small = {name: getattr(TINY_COUNTERFACTUAL, name) for name in names}
     policy = train(SHIPPED.replace(**small, **STILL), SCENARIO, tmp_path / "run", measure=None).policy
     agents = {"old": eb.LearnedAgent(eb.load_shipped("ppo")), "new": eb.LearnedAgent(policy)}
     found = eb.evaluate(SCENARIO.sample(50, 7).worlds, agents, scenario=SCENARIO)
     old, new = (found.outcome(name).first_impact_harm for name in agents)
     np.testing.assert_allclose(old, new, atol=1e-3)
     manifest = policy.manifest
-    assert manifest.algorithm == "counterfactual" and manifest.network.value_hidden == ()
+    assert (manifest.algorithm, manifest.network.value_hidden) == ("counterfactual", ())
     assert len(manifest.observation.features) == 57 and policy.observation.time_step_s == 0.1
     assert policy.tensors["policy.log_std"].shape == (1,)
     assert eb.make_agent(f"counterfactual@{tmp_path / 'run'}").name == f"counterfactual@{tmp_path / 'run'}"
@@ -244,7 +232,7 @@ def test_widened__puts_every_feature_where_it_is_observed_now() -> None:
 
 OWN = {"reward": {"harm": 1.0, "harm_count": "total", "objective": "own", "terminal": 0.5}}
 CONTACT = OWN | {"observation": ["own", "front_1", "rear_1", "contact"]}
-SCRIPTED = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "e_v2x_bm:pairwise"}
+SCRIPTED = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "planner:8"}
 
 
 @pytest.mark.parametrize(
@@ -296,13 +284,11 @@ def test_training__begins_near_an_action(tmp_path: Path) -> None:
 
 
 def test_training__numbers_that_are_not_finite_stop_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = CounterfactualModel._try_out
-    calls = []
+    real, calls = CounterfactualModel._try_out, itertools.count(1)
 
     def broken(self: CounterfactualModel, seen: Any, moments: Any, actor: Any) -> Tried:
         tried = real(self, seen, moments, actor)
-        calls.append(1)
-        return tried._replace(mean=tried.mean * np.float32(np.nan)) if len(calls) == 3 else tried
+        return tried._replace(mean=tried.mean * np.float32(np.nan if next(calls) == 3 else 1.0))
 
     monkeypatch.setattr(CounterfactualModel, "_try_out", broken)
     with pytest.raises(TrainingDiverged, match="not finite"):
@@ -321,23 +307,18 @@ def _model(**changes: Any) -> tuple[ModesModel, Any]:
         return model, environment.engine
 
 
-def _full_brake(seen: np.ndarray) -> np.ndarray:
-    return np.full(len(seen), -1.0, np.float32)
+def constant(value: float) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda seen: np.full(len(seen), value, np.float32)
 
 
-def _coast(seen: np.ndarray) -> np.ndarray:
-    return np.zeros(len(seen), np.float32)
+_full_brake, _coast = constant(-1.0), constant(0.0)
 
 
 def test_stages__share_the_updates_and_leave_none_out() -> None:
     plan = ModesPlan(**{**MODES, "networks": 3, "shares": {"alone": 0.5, "further": 0.2, "gate": 0.1, "together": 0.2}})
-    assert stages_of(plan, 20) == (
-        Stage("alone", 0, 0, 10),
-        Stage("further", 1, 10, 12),
-        Stage("further", 2, 12, 14),
-        Stage("gate", 0, 14, 16),
-        Stage("together", 0, 16, 20),
-    )
+    expected = [("alone", 0, 0, 10), ("further", 1, 10, 12), ("further", 2, 12, 14), ("gate", 0, 14, 16),
+                ("together", 0, 16, 20)]  # fmt: skip
+    assert [*stages_of(plan, 20)] == expected
     for updates in range(1, 30):
         found = stages_of(plan, updates)
         assert [s.first for s in found] == [0, *(s.end for s in found[:-1])] and found[-1].end == updates
@@ -390,11 +371,9 @@ def test_gate__learns_what_costs_least_and_what_matters_most() -> None:
     modes = {**MODES, "gate_memory": 1000, "gate_steps": 20}
     model, _ = _model(learning_rate={"start": 1e-2, "end": 1e-2}, averaging=0.9, batch_size=128, modes=modes)
     model.set_logger(Logger(None, []))
-    seen = np.zeros((300, 27), np.float32)
-    seen[100:, 0] = 1.0
-    costs = np.tile([0.0, 1.0], (300, 1))
-    costs[100:] = [5.0, 0.0]
-    costs[200:] = [0.0, 1.0]  # as the hundred before, seen from outside
+    seen = np.repeat([[0.0], [1.0], [1.0]], 100, axis=0) * np.eye(27)[0]
+    seen = seen.astype(np.float32)
+    costs = np.repeat([[0.0, 1.0], [5.0, 0.0], [0.0, 1.0]], 100, axis=0)  # the last look as the hundred before
     assert (model.policy.gate.choose(seen) == 0).all()
     for _ in range(20):
         model._train_gate(seen, costs)
@@ -431,8 +410,10 @@ def test_chosen__without_focus_each_row_once() -> None:
     chosen, importance = choose_rows(observed, rows, 15, 0.0, lambda seen: pytest.fail("nobody is asked"))
     assert len(set(chosen.tolist())) == 15 and set(chosen.tolist()) <= set(range(10, 30))
     assert (importance == 1.0).all()
-    assert len(choose_rows(observed, rows[:0], 15, 0.5, lambda seen: np.ones(len(seen)))[0]) == 0
-    assert len(choose_rows(observed, rows, 40, 0.5, lambda seen: np.ones(len(seen)))[0]) == 40
+    drawn = [
+        choose_rows(observed, of, n, 0.5, lambda seen: np.ones(len(seen)))[0] for of, n in ((rows[:0], 15), (rows, 40))
+    ]
+    assert [len(each) for each in drawn] == [0, 40]
 
 
 def test_scout__learns_the_mean_size_of_what_is_to_be_expected() -> None:

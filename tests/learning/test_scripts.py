@@ -211,8 +211,7 @@ def test_clone__drives_as_the_network_itself(clone: ModuleType, tmp_path: Path) 
 
 def test_clone__refuses_what_it_cannot_clone(clone: ModuleType, tmp_path: Path) -> None:
     (tmp_path / "no.parquet").write_text("no")
-    agents = {"full_brake": eb.make_agent("full_brake")}
-    eb.write_dataset(tmp_path / "two.parquet", agents, scenario=PAIR, episodes=1)
+    eb.write_dataset(tmp_path / "two.parquet", {"b": eb.make_agent("full_brake")}, scenario=PAIR, episodes=1)
     for name, told in (("no", "is no dataset of `ethbrake watch dataset`"), ("two", "holds 2 learners, one is needed")):
         with pytest.raises(InvalidInput, match=told):
             clone.train(tmp_path / f"{name}.parquet", 0, tmp_path / "clone")

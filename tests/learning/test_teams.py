@@ -22,29 +22,27 @@ from tests.learning.tiny import TINY_PPO, Answer, files_of, watch_steps
 PAIR = eb.load_scenario("cooperation-3-pair")
 ALONE = eb.load_scenario("cooperation-2-paper")
 NAMES = ("vehicle_2", "vehicle_3")
-TINY = TINY_PPO.replace(total_steps=8 * 256)
+TINY = TINY_PPO.replace(total_steps=4 * 256)
 
 
 @pytest.mark.parametrize("scheme", ["shared", "independent", "centralised"])
 def test_train__leaves_a_folder_that_drives_by_itself(scheme: Any, tmp_path: Path) -> None:
     result = train(TINY, PAIR, tmp_path / "run", scheme=scheme)
-    assert (result.status, result.steps, result.updates, result.training.scheme) == ("finished", 8 * 256, 8, scheme)
-    assert [entry["updates"] for entry in result.evaluations] == [0, 3, 6, 8]
+    assert (result.status, result.steps, result.updates, result.training.scheme) == ("finished", 4 * 256, 4, scheme)
+    assert [entry["updates"] for entry in result.evaluations] == [0, 3, 4]
     separate = scheme == "independent"
     given = {name: f"policy/{name}" if separate else "policy" for name in NAMES}
     content = json.loads((tmp_path / "run" / "team.json").read_text())
     assert (content["scheme"], content["vehicles"], content["drivers"]) == (scheme, 3, given)
     assert result.training.drivers == given and RunDirectory(tmp_path / "run").is_team == separate
-
-    moved = tmp_path / "elsewhere"
-    shutil.move(tmp_path / "run", moved)
+    moved = Path(shutil.move(tmp_path / "run", tmp_path / "elsewhere"))
     team = RunDirectory(moved).load_team(PAIR)
     assert sorted(team.drivers) == [1, 2]
     harm = eb.evaluate(PAIR.sample(10, 7), {"team": team}, scenario=PAIR).outcome("team").first_impact_harm.mean()
     assert harm == pytest.approx(min(entry["first_impact_harm"] for entry in result.evaluations))
     manifests = [load_policy(moved / given[name]).manifest for name in NAMES]
-    assert [each.learners for each in manifests] == ([(name,) for name in NAMES] if separate else [NAMES] * 2)
-    assert [bool(each.network.value_hidden) for each in manifests] == [scheme != "centralised"] * 2
+    told = [(each.learners, bool(each.network.value_hidden)) for each in manifests]
+    assert told == [((name,) if separate else NAMES, scheme != "centralised") for name in NAMES]
     assert len({each.weights_sha256 for each in manifests}) == (2 if separate else 1)
 
 
@@ -78,7 +76,8 @@ def history(recipe: TrainingRecipe, folder: Path) -> list[dict[str, str]]:
 
 
 @pytest.mark.parametrize(
-    ("changes", "who"), [({"total_steps": 2 * 256}, [(0, 1)] * 2), ({"turns": 2}, [(0,), (0,), (1,), (1,)] * 2)]
+    ("changes", "who"),
+    [({"total_steps": 2 * 256}, [(0, 1)] * 2), ({"turns": 2, "total_steps": 8 * 256}, [(0,), (0,), (1,), (1,)] * 2)],
 )
 def test_independent__all_learn_at_once_or_in_turns(
     changes: dict[str, int], who: list[tuple[int, ...]], tmp_path: Path

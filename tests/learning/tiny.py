@@ -25,7 +25,7 @@ TINY_PPO = load_recipe("ppo").replace(
     checkpoint_every_updates=2,
 )
 TINY_SAC = load_recipe("sac").replace(
-    total_steps=90 * 8,
+    total_steps=64 * 8,
     n_envs=8,
     batch_size=32,
     buffer_size=400,  # fills up on the way
@@ -43,7 +43,7 @@ TINY_COUNTERFACTUAL = load_recipe("counterfactual").replace(
     counterfactuals=16,
     batch_size=8,
     network={"policy": [8]},
-    total_steps=512,
+    total_steps=256,
     evaluation={"every_updates": 4, "worlds": 10, "seed": 7},
     checkpoint_every_updates=3,
 )

@@ -68,7 +68,7 @@ def test_bound_of_one_vehicle_of_two__is_that_of_lower_bound(vehicle):
 
 
 def test_bound__of_the_paper_line_is_hardly_below_that_of_vehicle_2_alone_and_0_where_that_one_keeps_apart():
-    worlds = PAIR.sample(300, seed=5).worlds
+    worlds = PAIR.sample(150, seed=5).worlds
     alone = lower_bound(worlds, 1, time_step_s=0.1).harm
     both, any_time = (team_bound(worlds, (1, 2), time_step_s=step) for step in (0.1, None))
     assert 0.995 * alone.mean() < both.harm.mean() < alone.mean()

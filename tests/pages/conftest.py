@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Iterable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,16 +44,8 @@ class Client:
         body = content if isinstance(content, bytes) else json.dumps(content).encode()
         return self.request("POST", f"/{TOKEN}/{what}", body, **changes)
 
-    def request(
-        self,
-        method: str,
-        path: str,
-        body: bytes | Iterable[bytes] = b"",
-        *,
-        headers: dict[str, str | None] | None = None,
-        twice: tuple[str, str] | None = None,
-    ) -> Reply:
-        return asyncio.run(self.asked(method, path, body, headers=headers, twice=twice))
+    def request(self, method: str, path: str, body: bytes | Iterable[bytes] = b"", **how: Any) -> Reply:
+        return asyncio.run(self.asked(method, path, body, **how))
 
     async def asked(
         self,
@@ -63,6 +55,7 @@ class Client:
         *,
         headers: dict[str, str | None] | None = None,
         twice: tuple[str, str] | None = None,
+        receive: Callable[[], Awaitable[Any]] | None = None,
     ) -> Reply:
         usual = {"host": HOST, "origin": f"http://{HOST}", "content-type": "application/json"}
         usual |= {"sec-fetch-site": "same-origin"}
@@ -75,27 +68,24 @@ class Client:
             "path": path, "raw_path": path.encode("utf-8", "replace"), "query_string": b"", "root_path": "",
             "headers": pairs, "client": ("127.0.0.1", 1), "server": ("127.0.0.1", PORT),
         }  # fmt: skip
-        parts = self._parts([body] if isinstance(body, bytes) else body)
         sent: list[Any] = []
-
-        async def receive() -> Any:
-            return await anext(parts)
 
         async def send(message: Any) -> None:
             sent.append(message)
 
-        await self.app(scope, receive, send)
+        await self.app(scope, receive or aiter_parts([body] if isinstance(body, bytes) else body).__anext__, send)
         start, *rest = sent
         kept = {name.decode().lower(): value.decode() for name, value in start["headers"]}
         return Reply(start["status"], kept, b"".join(each.get("body", b"") for each in rest))
 
-    @staticmethod
-    async def _parts(body: Iterable[bytes]) -> AsyncIterator[dict[str, Any]]:
-        for part in body:
-            yield {"type": "http.request", "body": part, "more_body": True}
-        yield {"type": "http.request", "body": b"", "more_body": False}
-        while True:
-            yield {"type": "http.disconnect"}
+
+async def aiter_parts(body: Iterable[bytes]) -> AsyncIterator[dict[str, Any]]:
+    """What a server hands on of a body, part by part; then the other end hangs up."""
+    for part in body:
+        yield {"type": "http.request", "body": part, "more_body": True}
+    yield {"type": "http.request", "body": b"", "more_body": False}
+    while True:
+        yield {"type": "http.disconnect"}
 
 
 @pytest.fixture(scope="package")
@@ -116,9 +106,8 @@ def state(scenario: Scenario) -> dict[str, Any]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    place = tmp_path / "kept"
-    place.mkdir()
-    return place
+    (tmp_path / "kept").mkdir()
+    return tmp_path / "kept"
 
 
 @pytest.fixture
@@ -131,11 +120,9 @@ def client(explored: Explored, folder: Path) -> Iterator[Client]:
 
 def check_refused(reply: Reply, status: int) -> None:
     assert reply.status == status, reply.body
-    assert reply.headers["content-type"] == "application/json"
-    assert reply.headers["x-content-type-options"] == "nosniff"
-    told = reply.json["error"]
-    assert 0 < len(told) <= 1_500 and told.isprintable()
-    assert TOKEN not in told
+    told, kept = reply.json["error"], reply.headers
+    assert (kept["content-type"], kept["x-content-type-options"]) == ("application/json", "nosniff")
+    assert 0 < len(told) <= 1_500 and told.isprintable() and TOKEN not in told
 
 
 def check_alive(client: Client) -> None:

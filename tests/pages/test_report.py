@@ -4,6 +4,7 @@ import base64
 import hashlib
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,9 +46,7 @@ HARMLESS = Page(whole_page("Harmless"))
 def test_page__no_text_becomes_markup(text: str) -> None:
     html = whole_page(text)
     found = Page(html)
-    assert found.shape == HARMLESS.shape
-    assert found.open == []
-    assert not set(html) & UNSEEN
+    assert (found.shape, found.open) == (HARMLESS.shape, []) and not set(html) & UNSEEN
     assert " ".join(plain_text(text, keep="\u00a0").split()) in found.text
     for _, attributes in found.tags:
         assert (attributes.get("href") or "#").startswith("#")
@@ -59,8 +58,7 @@ def test_page__no_text_becomes_markup(text: str) -> None:
 def test_data__stays_data(text: str) -> None:
     html = str(Part.data("x", {text: [text, 1.5, None]}).html)
     inner = html.removeprefix('<script type="application/json" id="x">').removesuffix("</script>\n")
-    assert not set("<>&") & set(inner)
-    assert inner.isascii()
+    assert inner.isascii() and not set("<>&") & set(inner)
     assert json.loads(inner) == {text: [text, 1.5, None]}
 
 
@@ -100,47 +98,32 @@ def test_drawing__names_of_two_figures_do_not_collide() -> None:
 
 
 def test_drawing__has_text_as_outlines_and_the_colours_of_the_page() -> None:
-    html = Part.drawing(a_figure(), "One", "What it shows.").html
-    assert "<text" not in html and "font-family" not in html
-    assert " style=" not in html and "<style" not in html
+    html, css = str(Part.drawing(a_figure(), "One", "What it shows.").html), read_file("page.css")
+    assert [each for each in ("<text", "font-family", " style=", "<style") if each in html] == []
     assert all(f"var(--series-{k})" in html for k in range(len(COLOURS)))
     assert 'aria-label="One. What it shows."' in html
     assert "var(" not in Part.drawing(a_figure(), "One", "d", alone=True).html
+    assert re.findall(r"--series-\d: (#\w+)", css)[:7] == [colour.lower() for colour in COLOURS]
 
 
-@pytest.mark.parametrize("text", HOSTILE[:24])
-def test_drawing__label_is_text(text: str) -> None:
-    tags = [tag for tag, _ in Page(str(inline_svg(b'<svg xmlns="http://www.w3.org/2000/svg"/>', text)[0])).tags]
-    assert tags == ["svg"]
-
-
-def test_page__has_the_palette_of_the_figures() -> None:
-    css = read_file("page.css")
-    assert [re.search(rf"--series-{k}: (#\w+)", css)[1].lower() for k in range(7)] == [c.lower() for c in COLOURS]  # type: ignore[index]
+def test_drawing__its_label_is_text() -> None:
+    for text in HOSTILE[:24]:
+        svg = inline_svg(b'<svg xmlns="http://www.w3.org/2000/svg"/>', text)[0]
+        assert [tag for tag, _ in Page(str(svg)).tags] == ["svg"]
 
 
 def test_drawing__the_caption_is_text_of_the_page() -> None:
     figure = new_figure(6.0, 3.0)
     figure.subplots().plot([0.0, 1.0])
-    text = (
-        "One hundred worlds of the list of seed 7; gaps from 5 to 10 m, each drawn alone, and the first-impact harm "
-        * 2
-    )
-    add_caption(figure, f"{text.strip()} Known.")
-    html = Part.drawing(figure, "Title", "Words.", known="Known.").html
-    shown = Page(str(html)).text.replace("\n", " ")
-    assert shown.endswith(text.strip()) and "<!--" not in html
-    taken = re.search(r'viewBox="0 0 432 ([0-9.]+)"', html)
-    assert taken is not None and float(taken[1]) < 216.0
-    names = set(re.findall(r' id="([^"]+)"', html))
-    assert set(re.findall(r'href="#([^"]+)"', html)) <= names
-    assert figure.get_supxlabel().startswith("One hundred worlds")
+    text = " ".join(["One hundred worlds of the list of seed 7; gaps from 5 to 10 m, and the first-impact harm"] * 3)
+    add_caption(figure, f"{text} Known.")
+    html = str(Part.drawing(figure, "Title", "Words.", known="Known.").html)
+    assert Page(html).text.replace("\n", " ").endswith(text) and "<!--" not in html
+    (taken,) = re.findall(r'viewBox="0 0 432 ([0-9.]+)"', html)
+    assert float(taken) < 216.0 and figure.get_supxlabel().startswith("One hundred worlds")
 
 
 EXTERNAL = re.compile(r"""(https?:)?//|@import|<(link|iframe|object|embed|base)\b""", re.IGNORECASE)
-
-
-PAIR_AGENTS = ("full_brake", "constant:4")
 
 
 COASTING = {"coast": make_agent("coast")}
@@ -149,10 +132,7 @@ COASTING = {"coast": make_agent("coast")}
 @pytest.fixture(scope="module")
 def report(evaluation: Evaluation) -> Report:
     agents = {name: make_agent(name) for name in ("full_brake", "constant:4.5")}
-    part = Evaluation(
-        evaluation.scenario, evaluation.vehicles, evaluation.worlds, evaluation.index, evaluation.seed,
-        {name: evaluation.outcome(name) for name in agents},
-    )  # fmt: skip
+    part = replace(evaluation, outcomes={name: evaluation.outcome(name) for name in agents})
     return Report(
         title="PPO on paper-random",
         rows=summarise(part),
@@ -171,55 +151,43 @@ def html(report: Report) -> str:
 
 
 def test_report__loads_nothing_from_anywhere(html: str) -> None:
-    assert EXTERNAL.search(re.sub(r'xmlns(:\w+)?="[^"]*"|"http://www.w3.org/2000/svg"', "", no_comments(html))) is None
+    own = re.sub(r"(?m)//.*$|<script type=.*</script>", "", html)  # without comments of scripts, numbers of episodes,
+    assert EXTERNAL.search(re.sub(r'xmlns(:\w+)?="[^"]*"|"http://www.w3.org/2000/svg"', "", own)) is None  # and names
     for _, attributes in Page(html).tags:
-        assert (attributes.get("href") or "#").startswith("#")
-        assert "src" not in attributes
-
-
-def no_comments(html: str) -> str:
-    """Without the comments of our scripts and the numbers of the episodes."""
-    return re.sub(r"(?m)//.*$|<script type=.*</script>", "", html)
+        assert (attributes.get("href") or "#").startswith("#") and "src" not in attributes
 
 
 def test_report__is_well_formed_and_says_everything(html: str, report: Report) -> None:
     page = Page(html)
-    assert page.open == []
-    text = page.text.replace("\u00a0", " ")
+    told = [
+        "paper-random: 200 worlds, seed 7; d = ", "Training seed 5 Command ethbrake run", "numpy 2.4.6",
+        "Hybrid PPO 59.74 % 5.6202", "62.3 %", report.rows[0].worlds_sha256, "from the alert to rest.",
+        "m²/s² by full braking,", "by constant:4.5, which is",
+        "no command could have avoided one (proven). One million",
+    ]  # fmt: skip
     for row in report.rows:
         for estimate in (row.first_impact_harm, row.total_harm):
-            assert f"{estimate.value:.2f}" in text
-            assert f"{estimate.interval[0]:.2f}, {estimate.interval[1]:.2f}" in text
-        assert row.agent in text
-    assert "paper-random: 200 worlds, seed 7; d = " in text
-    assert "Training seed 5 Command ethbrake run" in text
-    assert "numpy 2.4.6" in text
-    assert "Hybrid PPO 59.74 % 5.6202" in text
-    assert "62.3 %" in text
-    assert report.rows[0].worlds_sha256 in text
+            told += [row.agent, f"{estimate.value:.2f}", f"{estimate.interval[0]:.2f}, {estimate.interval[1]:.2f}"]
+    text = page.text.replace("\u00a0", " ")
+    assert page.open == [] and [each for each in told if each not in text] == []
 
 
 def test_report__embeds_fifty_worlds_whose_counts_are_the_ledgers(html: str, report: Report) -> None:
     content = episode_data(html)
-    assert content["agents"] == ["full_brake", "constant:4.5"]
-    assert len(content["worlds"]) == 50
     numbers = [world["number"] for world in content["worlds"]]
-    assert len(set(numbers)) == 50
-    assert report.evaluation is not None
-    row_of = {int(number): k for k, number in enumerate(report.evaluation.index)}
+    assert content["agents"] == ["full_brake", "constant:4.5"] and len(numbers) == len(set(numbers)) == 50
     for world in content["worlds"]:
+        k = report.evaluation.index.tolist().index(world["number"])
         for agent, episode in zip(content["agents"], world["episodes"], strict=True):
-            outcome, k = report.evaluation.outcome(agent), row_of[world["number"]]
-            impacts, first, total = episode["impacts"][-1][4:] if episode["impacts"] else (0, 0.0, 0.0)
-            assert (impacts, first, total) == (
-                outcome.impacts[k], outcome.first_impact_harm[k], outcome.total_harm[k],
-            )  # fmt: skip
+            outcome = report.evaluation.outcome(agent)
+            told = episode["impacts"][-1][4:] if episode["impacts"] else [0, 0.0, 0.0]
+            assert told == [outcome.impacts[k], outcome.first_impact_harm[k], outcome.total_harm[k]]
 
 
 def episode_data(html: str) -> dict:
-    found = re.search(r'<script type="application/json" id="episode_data">(.*?)</script>', html)
-    assert found is not None
-    return json.loads(found[1])
+    """The numbers that the player shows."""
+    (text,) = re.findall(r'<script type="application/json" id="episode_data">(.*?)</script>', html)
+    return json.loads(text)
 
 
 def test_report__says_who_did_not_repeat_itself(pair: Scenario, html: str) -> None:
@@ -238,32 +206,22 @@ def test_report__says_who_did_not_repeat_itself(pair: Scenario, html: str) -> No
     assert "did not repeat itself" not in html
 
 
-def test_chosen__begin_with_the_worst_and_are_the_same_each_time(report: Report) -> None:
-    assert report.evaluation is not None
+def test_chosen__begin_with_those_of_the_largest_regret_and_say_whose_harm_it_is(
+    report: Report, pair: Scenario
+) -> None:
     chosen = choose_shown(report.evaluation, "constant:4.5")
-    worst = worst_rows(report.evaluation, "constant:4.5")
-    assert list(chosen)[:10] == worst.tolist()
-    assert chosen == choose_shown(report.evaluation, "constant:4.5")
+    assert list(chosen)[:10] == worst_rows(report.evaluation, "constant:4.5").tolist()
+    assert chosen == choose_shown(report.evaluation, "constant:4.5") and report.focus == "constant:4.5"
     assert len({each.kind for each in chosen.values()}) >= 4
-    assert report.focus == "constant:4.5" and [one.number for one in report.played] == [
-        one.number for one in chosen.values()
-    ]
-
-
-def test_chosen__say_whose_harm_it_is(report: Report) -> None:
-    assert report.evaluation is not None
-    outcome = report.evaluation.outcome("full_brake")
-    for row, each in choose_shown(report.evaluation, "full_brake").items():
+    assert [one.number for one in report.played] == [one.number for one in chosen.values()]
+    outcome = report.evaluation.outcome("constant:4.5")
+    for row, each in chosen.items():
         first, total = outcome.first_impact_harm[row], outcome.total_harm[row]
-        assert each.why == f"full_brake: harm {first:.2f} first-impact, {total:.2f} total"
-
-
-def test_worst__are_those_of_the_largest_regret(pair: Scenario) -> None:
+        assert each.why == f"constant:4.5: harm {first:.2f} first-impact, {total:.2f} total"
     worlds = pair.replace(gaps_m={"uniform": [0.5, 9.0]}).sample(40, 0)
-    result = evaluate(worlds, {"coast": make_agent("coast")}, scenario=pair)
-    rows = worst_rows(result, "coast")
+    result = evaluate(worlds, COASTING, scenario=pair)
     harm = result.outcome("coast").total_harm
-    assert harm[rows].tolist() == sorted(harm, reverse=True)[:10]
+    assert harm[worst_rows(result, "coast")].tolist() == sorted(harm, reverse=True)[:10]
 
 
 @pytest.mark.parametrize(
@@ -279,12 +237,10 @@ def test_report__hostile_names_are_text_everywhere(pair: Scenario, first: int, m
     given = Report(words, summarise(result), result, focus=names[0], summary=words, settings=told, versions=told)
     html = given.driven(agents).html
     found = Page(html)
-    assert found.open == []
-    assert not set(html) & UNSEEN
+    assert found.open == [] and not set(html) & UNSEEN and html.count("<script") == 2
     assert {tag for tag, _ in found.tags} <= ALLOWED
     assert not any(key.startswith("on") for _, attributes in found.tags for key in attributes)
     assert [len(world["episodes"]) for world in episode_data(html)["worlds"]] == [len(names)] * 3
-    assert html.count("<script") == 2
 
 
 ALLOWED = set(
@@ -349,49 +305,34 @@ ALLOWED = set(
 )
 
 
-def test_report__of_another_scenario_leaves_the_papers_rows_out(pair: Scenario) -> None:
-    result = evaluate(pair.sample(2, 0), {"full_brake": make_agent("full_brake")}, scenario=pair)
-    text = Page(Report(title="Pair", rows=summarise(result), evaluation=result).html).text
-    assert "9.00" in text
-    assert "as printed" not in text
-    assert "5.6202" not in text
-
-
-def test_report__leaves_out_columns_without_a_value_and_says_so(pair: Scenario) -> None:
-    result = evaluate(pair.sample(2, 0), {"coast": make_agent("coast")}, scenario=pair)
-    page = Page(Report("t", summarise(result), result).driven(COASTING).html)
-    assert "left out: Decrease, first-impact; Decrease, total; Predicted harm" in page.text
-    assert page.text.count("Decrease, total") == page.text.count("Predicted harm") == 1
-    assert "1 − harm / harm of full braking" not in page.text
-    assert "First-impact harm" in page.text and "Squared closing speed" in page.text
-
-
-def test_report__says_where_the_horizon_cut_episodes_off(pair: Scenario, html: str) -> None:
+def test_report__leaves_out_what_has_no_value_and_says_where_the_horizon_cut_episodes_off(pair: Scenario) -> None:
     short = pair.replace(horizon_s=1.0)
     result = evaluate(short.sample(2, 0), COASTING, scenario=short)
     text = Page(Report("t", summarise(result), result).driven(COASTING).html).text
+    assert "left out: Decrease, first-impact; Decrease, total; Predicted harm" in text
+    assert text.count("Decrease, total") == text.count("Predicted harm") == 1
+    assert "First-impact harm" in text and "Squared closing speed" in text
+    absent = ("1 − harm / harm of full braking", "as printed", "5.6202")  # the paper's rows are of its own scenario
+    assert [each for each in absent if each in text] == []
     moving = 2 - int(result.outcome("coast").at_rest.sum())
     assert moving and f"to the horizon of 1 s: in {moving} worlds the line of some agent" in text
-    assert "from the alert to rest." in html
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_write_report__overwrites_only_by_force(tmp_path: Path, pair: Scenario) -> None:
-    found = evaluate(pair.sample(2, 0), {"coast": make_agent("coast")}, scenario=pair)
-    rows = summarise(found)
-    path = tmp_path / "report.html"
-    Report("Mine", rows, found).write(path)
-    assert path.read_text("utf-8") == Report("Mine", rows, found).html
+    found, path = evaluate(pair.sample(2, 0), COASTING, scenario=pair), tmp_path / "report.html"
+    mine = Report("Mine", summarise(found), found)
+    mine.write(path)
     with pytest.raises(AlreadyExists):
-        Report("Mine", rows, found).write(path)
-    Report(title="Other", rows=[], evaluation=found).write(path, force=True)
+        mine.write(path)
+    assert path.read_text("utf-8") == mine.html
+    replace(mine, title="Other").write(path, force=True)
     assert "<h1>Other</h1>" in path.read_text("utf-8")
 
 
 def test_report__counts_a_cascade_whole_but_draws_its_last_impact(pair: Scenario) -> None:
     bouncy = pair.replace(restitution=0.8)
-    result = evaluate(bouncy.sample(1, 0), {"coast": make_agent("coast")}, scenario=bouncy)
-    html = Report("t", summarise(result), result).driven(COASTING).html
-    (episode,) = episode_data(html)["worlds"][0]["episodes"]
+    result = evaluate(bouncy.sample(1, 0), COASTING, scenario=bouncy)
+    (episode,) = episode_data(Report("t", summarise(result), result).driven(COASTING).html)["worlds"][0]["episodes"]
     assert episode["impacts"][-1][4] == result.outcome("coast").impacts[0] > len(episode["impacts"]) - 1
     assert np.diff([impact[4] for impact in episode["impacts"]]).min() > 0

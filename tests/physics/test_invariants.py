@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 import pytest
@@ -160,28 +159,18 @@ def test_thrown_lines__against_an_obstacle_come_to_their_end(N, n):
 
 @pytest.mark.parametrize("N", [2, 3, 5])
 @pytest.mark.parametrize("drive", [False, True])
-def test_motion__gaps_follow_the_speeds_and_never_turn_negative(N, drive):
-    motion = Watched(41, 400, N, drive=drive)
-    assert motion.checked > 0.7 * 400 * 300 and motion.worst <= GAP_M
+def test_motion__gaps_follow_the_speeds_and_nothing_speeds_up_but_by_driving_to_its_limit_or_a_push(N, drive):
+    motion = Watched(41, 150, N, drive=drive)
+    assert motion.checked > 0.7 * 150 * 300 and motion.worst <= GAP_M
     assert min(state.gaps_m.min() for state in motion.states) >= 0.0
-
-
-@pytest.mark.parametrize("N", [2, 3, 5])
-def test_motion__under_brakes_nothing_speeds_up_and_only_a_bounce_back_is_negative(N):
-    motion = Watched(42, 150, N, drive=False)
-    assert (motion.energy_rises(), motion.unexplained_negative_speeds()) == (0, 0)
-    assert sum(int((state.speeds_mps < 0.0).sum()) for state in motion.states) > 0
-
-
-@pytest.mark.parametrize("N", [2, 4])
-def test_motion__driving_ends_at_the_limit_unless_pushed(N):
-    motion = Watched(43, 150, N, drive=True)
-    limit, reached = motion.start.vehicles.speed_limit_mps, 0
-    for state in motion.states:
-        alone = ~state.pair_hit.any(axis=1)
-        assert np.all((state.speeds_mps <= limit)[alone])
-        reached += int((state.speeds_mps == limit)[alone].sum())
-    assert reached > 100
+    if drive:
+        speeds = np.stack([state.speeds_mps for state in motion.states])
+        alone = np.stack([~state.pair_hit.any(axis=1) for state in motion.states])
+        limit = motion.start.vehicles.speed_limit_mps
+        assert (speeds <= limit)[alone].all() and (speeds == limit)[alone].sum() > 100
+    else:
+        assert (motion.energy_rises(), motion.unexplained_negative_speeds()) == (0, 0)
+        assert sum(int((state.speeds_mps < 0.0).sum()) for state in motion.states) > 0
 
 
 def test_resting__members_of_a_block_keep_the_same_bits():
@@ -194,21 +183,6 @@ def test_resting__members_of_a_block_keep_the_same_bits():
         touching = worlds.gaps_m == 0.0
         assert np.all((worlds.speeds_mps[:, 1:] == worlds.speeds_mps[:, :-1])[touching])
         assert impacts.count.sum() == 0 and touching.any() and not touching.all()
-
-
-def test_obstacle__takes_momentum_forward_only_and_no_impact_adds_energy():
-    batch = driving_lines(161, 300, 3)
-    coasting = replace(
-        batch.worlds, obstacle_gap_m=Draws(162).uniform(1.0, 200.0, (300,)),
-        vehicles=replace(batch.worlds.vehicles, latency_s=np.full((300, 3), 1e9)),
-    )  # fmt: skip
-    after, impacts = advance(coasting, 0.0, HORIZON_S)
-    number = impacts.count.sum(axis=1) + impacts.obstacle_count
-    assert (energy_rise_eps(coasting, after) <= ENERGY_EPS * (number + 1)).all()
-    spared = impacts.obstacle_count == 0
-    before, now = ((w.vehicles.mass_t * w.speeds_mps).sum(axis=1) for w in (coasting, after))
-    np.testing.assert_allclose(now[spared], before[spared], rtol=1e-12)
-    assert (now < before)[~spared].all() and 50 < spared.sum() < 250
 
 
 # ---------------------------------------------------------------- how a segment is cut
@@ -227,20 +201,6 @@ def test_split__of_cascades_changes_no_more_than_ten_times_what_the_last_digit_o
     cut, digit = split_errors(20, 400, 7, 61), last_digit_errors(20, 400, 61)
     assert (~cut.few).sum() > 100
     assert cut.error[~cut.few].max() <= 10.0 * digit.error[~digit.few].max()
-
-
-def test_split__ahead_of_an_obstacle_changes_nothing_either():
-    worlds, command = place_ahead(driving_lines(164, 200, 3), 165)
-    whole, impacts = advance(worlds, command, until_s=HORIZON_S)
-    few = impacts.count.sum(axis=1) + impacts.obstacle_count <= 30
-    found: Any = 0
-    for until in (0.37, 0.9, 1.7, 2.2, 3.9, HORIZON_S):
-        worlds, part = advance(worlds, command, until_s=until)
-        found = found + np.stack([part.obstacle_count, part.obstacle_total_harm, part.obstacle_first_harm])
-    expected = np.stack([impacts.obstacle_count, impacts.obstacle_total_harm, impacts.obstacle_first_harm])
-    assert np.array_equal(found[0, few], expected[0, few]) and few.sum() > 150
-    np.testing.assert_allclose(found[1:, few], expected[1:, few], rtol=0, atol=SPLIT * 900.0)
-    np.testing.assert_allclose(worlds.obstacle_gap_m[few], whole.obstacle_gap_m[few], rtol=0, atol=SPLIT * 100.0)
 
 
 # ---------------------------------------------------------------- the origin, the batch, units and neighbours
@@ -292,38 +252,3 @@ def test_units__masses_in_other_units_give_the_same_bits():
     v = batch.worlds.vehicles
     heavy = replace(batch.worlds, vehicles=replace(v, mass_t=v.mass_t * 1024.0))
     assert state_bytes(*once(Batch(heavy, batch.command))) == state_bytes(*once(batch))
-
-
-def test_units__twice_the_length_is_twice_every_speed_and_four_times_the_harm():
-    w, command = driving_lines(67, 1_000, 3)
-    v = replace(w.vehicles, restitution=np.zeros(1_000))  # no bounce: the plastic speed has no unit to matter in
-    names = ("braking_capacity_mps2", "driving_capacity_mps2", "speed_limit_mps")
-    twice = replace(v, **{name: 2 * getattr(v, name) for name in names})
-    small, impacts = once(Batch(replace(w, vehicles=v), command))
-    large, more = once(Batch(replace(w, vehicles=twice, gaps_m=2 * w.gaps_m, speeds_mps=2 * w.speeds_mps), 2 * command))
-    same = (impacts.count == more.count).all(axis=1)  # not where an impact is near the touch speed
-    assert same.mean() > 0.99
-    for factor, one, other in (
-        (2, small.gaps_m, large.gaps_m),
-        (2, small.speeds_mps, large.speeds_mps),
-        (4, impacts.total_harm, more.total_harm),
-    ):
-        assert (factor * one)[same].tobytes() == other[same].tobytes()
-
-
-def test_neighbours__far_away_do_not_matter():
-    w, command = driving_lines(68, 1_000, 3)
-
-    def between(value: float, column: np.ndarray) -> np.ndarray:
-        return np.pad(column, ((0, 0), (1, 1)), constant_values=value)
-
-    v = w.vehicles
-    far = line(
-        between(1e4, w.gaps_m), between(20.0, w.speeds_mps), latency_s=between(0.0, v.latency_s),
-        mass_t=between(1.0, v.mass_t), speed_limit_mps=between(40.0, v.speed_limit_mps), restitution=v.restitution,
-    )  # fmt: skip
-    alone, impacts = once(Batch(w, command))
-    among, more = once(Batch(far, between(0.0, command)))
-    assert more.count.tolist() == between(0, impacts.count).tolist()
-    np.testing.assert_allclose(among.gaps_m[:, 1:-1], alone.gaps_m, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(among.speeds_mps[:, 1:-1], alone.speeds_mps, rtol=0, atol=1e-10)

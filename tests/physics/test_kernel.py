@@ -145,12 +145,6 @@ def test_profiles__step_by_step_realise_what_the_engine_does_to_the_bit(name, le
     np.testing.assert_array_equal(found, [ledger.world_harm("first"), ledger.world_harm("total")])
 
 
-def test_first_decision__is_the_least_latency_of_who_decides_or_now():
-    worlds = load_scenario("paper-random").sample(3, 1).worlds
-    found = [worlds.first_decision_s(vehicles).tolist() for vehicles in ([1, 2], [2], [])]
-    assert found == [[0.5] * 3, [0.8] * 3, [0.0] * 3]
-
-
 def test_decisions__are_on_the_grid_in_spite_of_rounding_and_the_last_one_ends_at_the_horizon():
     numbers = [Decisions(np.array([0.5]), 0.1).before(horizon).tolist() for horizon in (8.0, 8.05, 0.55, 0.6)]
     assert numbers == [[75], [76], [1], [1]]

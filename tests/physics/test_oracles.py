@@ -1,4 +1,4 @@
-"""The exact advance against other programs: rational arithmetic, closed forms, and tiny steps."""
+"""The exact advance against other programs: rational arithmetic, and closed forms."""
 
 from __future__ import annotations
 
@@ -6,19 +6,17 @@ from collections import Counter
 from dataclasses import replace
 from fractions import Fraction
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from ethbrake_marl.physics import Bools, Floats, ImpactRows, Impacts, Worlds, advance, make_worlds
+from ethbrake_marl.physics import Floats, ImpactRows, Worlds, advance
 from ethbrake_marl.physics.kernel import contact
 from tests.physics.exact_simulator import Hit, Line, line_of, regression, simulate, square_root
 from tests.physics.manufacture import Case, floats, manufactured, pressed, stored, worlds_of
 from tests.physics.random_worlds import HORIZON_S, Draws, driving_lines, line, place_ahead, touching_lines
 from tests.physics.segments import Scan, meetings, random_segments, scan
-from tests.reference.tiny_steps import Outcome, simulate as refer_to
 from tests.reference.tolerances import BORDERLINE_SHARE, CLUSTER_EPS, CONTACT_TIME_EPS, EPS
 
 # ---------------------------------------------------------------- rational arithmetic, contact times to 160 bits
@@ -26,7 +24,7 @@ from tests.reference.tolerances import BORDERLINE_SHARE, CLUSTER_EPS, CONTACT_TI
 CLOSE = 1e-9
 
 
-@pytest.mark.parametrize(("N", "n"), [(2, 60), (3, 50), (5, 15), (10, 6), (20, 1)])
+@pytest.mark.parametrize(("N", "n"), [(2, 30), (3, 25), (5, 10), (10, 3)])
 @pytest.mark.parametrize("obstacle", [False, True])
 @pytest.mark.parametrize("drive", [True, False])
 def test_advance__agrees_with_exact_arithmetic_event_by_event(N: int, n: int, obstacle: bool, drive: bool) -> None:
@@ -71,7 +69,7 @@ def manufactured_cases() -> list[Case]:
 
 @pytest.fixture(scope="module")
 def pressed_cases() -> list[Case]:
-    return [case for N in (2, 3, 4, 5) for case in pressed(7, N, 60)]
+    return [case for N in (2, 3, 4, 5) for case in pressed(7, N, 40)]
 
 
 def told(rows: ImpactRows) -> list[tuple[float, ...]]:
@@ -134,7 +132,7 @@ def law_error_eps(before: Worlds, after: Worlds, k: int, rounds: int) -> float:
     return float(max(off)) / scale / EPS / rounds
 
 
-@pytest.mark.parametrize(("N", "n"), [(2, 300), (3, 300), (4, 200), (8, 80), (20, 20), (50, 6)])
+@pytest.mark.parametrize(("N", "n"), [(2, 150), (3, 150), (4, 100), (8, 40), (20, 10), (50, 4)])
 @pytest.mark.parametrize(("ratio", "obstacle"), [(1.0, False), (1e3, False), (1.0, True)])
 def test_cluster__of_any_size_follows_the_exact_law(N: int, n: int, ratio: float, obstacle: bool) -> None:
     before, command = touching_lines(71, n, N, heaviest_ratio=ratio)
@@ -178,7 +176,7 @@ def exact_accelerations(command: list[float], mass: list[float], speed: float) -
 COMMANDS = st.lists(st.floats(-16.0, 16.0, width=16).map(lambda u: round(u, 3)), min_size=2, max_size=8)
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(COMMANDS, st.data(), st.sampled_from([0.0, 4.0, 8.0]))
 def test_resting__accelerations_are_the_generalised_regression_of_force_ranges(command, data, speed) -> None:
     mass = data.draw(st.lists(st.floats(0.25, 64.0, width=16), min_size=len(command), max_size=len(command)))
@@ -197,7 +195,7 @@ def test_resting__long_lines_too(N: int, speed: float) -> None:
         np.testing.assert_allclose(accelerations(command, mass, speed), expected, rtol=0, atol=1e-9)
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(st.lists(st.tuples(st.fractions(0, 30), st.fractions(1, 8)), min_size=1, max_size=7))
 def test_oracle__the_min_max_formula_is_the_best_decreasing_fit(vehicles) -> None:
     v, mass = zip(*vehicles, strict=True)
@@ -263,103 +261,3 @@ def test_contact_time__is_right_to_the_last_digits_where_the_textbook_root_is_no
         exact = 2 * Fraction(g) / (Fraction(w) + root) if w > 0 else (root - Fraction(w)) / Fraction(b)
         assert abs(Fraction(time) / exact - 1) <= CONTACT_TIME_EPS * EPS * condition
         assert abs(Fraction(speed) / root - 1) <= CONTACT_TIME_EPS * EPS * condition
-
-
-# ---------------------------------------------------------------- tiny steps
-
-# A world may differ only where a discontinuity decides (a graze, a bounce at the plastic threshold) and the reference,
-# run again at half its step, disagrees with itself. Such worlds are counted, not skipped.
-WORLDS = 60  # per line, of three restitutions: a step of the reference costs much the same for one world
-STEP_S = 1e-4
-HARM_M2PS2 = 0.05  # per pair, each count
-STATE = 0.01  # m and m/s at the horizon
-AMBIGUOUS_SHARE = 0.01
-
-
-class Random(NamedTuple):
-    """Random worlds as both sides need them; commands are constant."""
-
-    worlds: Worlds
-    command_mps2: Floats
-    horizon_s: Floats
-
-
-def random_case(seed: int, n: int, N: int, e: float | Floats) -> Random:
-    rng = np.random.default_rng([seed, N])
-    worlds = make_worlds(
-        rng.uniform(1.0, 8.0, (n, N - 1)),
-        rng.uniform(5.0, 25.0, (n, N)),
-        braking_capacity_mps2=7.0,
-        driving_capacity_mps2=7.0,
-        latency_s=rng.uniform(0.0, 1.0, (n, N)),
-        mass_t=rng.uniform(1.0, 8.0, (n, N)),
-        speed_limit_mps=rng.uniform(25.0, 40.0, (n, N)),
-        restitution=e,
-    )
-    return Random(worlds, rng.uniform(-7.0, 7.0, (n, N)), rng.uniform(4.0, 5.0, n))
-
-
-def refer(case: Random, rows: np.ndarray, step_s: float) -> Outcome:
-    """Run the reference on these rows of a case."""
-    worlds = case.worlds.take(rows)
-    return refer_to(
-        worlds.gaps_m,
-        worlds.speeds_mps,
-        case.command_mps2[rows],
-        latency_s=worlds.vehicles.latency_s,
-        mass_t=worlds.vehicles.mass_t,
-        speed_limit_mps=worlds.vehicles.speed_limit_mps,
-        restitution=worlds.vehicles.restitution,
-        horizon_s=case.horizon_s[rows],
-        step_s=step_s,
-    )
-
-
-def disagreements(outcome: Outcome, end: Worlds, impacts: Impacts, horizon_s: Floats) -> Bools:
-    """Worlds [n] in which the kernel and the reference differ: pairs hit, a pair's harm, the state at the horizon."""
-    hit = outcome.count > 0
-    apart = np.any((impacts.count > 0) != hit, axis=1) | np.any(end.pair_hit != hit, axis=1)
-    for ours, theirs, tolerance in (
-        (impacts.first_impact_harm, outcome.first_impact_harm, HARM_M2PS2),
-        (impacts.total_harm, outcome.total_harm, HARM_M2PS2),
-        (end.gaps_m, outcome.gaps_m, STATE),
-        (end.speeds_mps, outcome.speeds_mps, STATE),
-        (end.time_s[:, None], horizon_s[:, None], 1e-9),
-    ):
-        apart |= ~np.all(np.abs(ours - theirs) <= tolerance, axis=1)
-    return apart
-
-
-def refers_to_itself(coarse: Outcome, fine: Outcome) -> Bools:
-    """Worlds [n] in which halving the step changes neither the pairs hit nor any harm by a fifth of the tolerance."""
-    same = np.all((coarse.count > 0) == (fine.count > 0), axis=1)
-    same &= np.all(np.abs(coarse.first_impact_harm - fine.first_impact_harm) <= HARM_M2PS2 / 5, axis=1)
-    return same & np.all(np.abs(coarse.total_harm - fine.total_harm) <= HARM_M2PS2 / 5, axis=1)
-
-
-@pytest.mark.parametrize("N", [2, 3, 5])
-def test_advance__agrees_with_the_tiny_step_reference(N: int) -> None:
-    case = random_case(20, WORLDS, N, np.resize([0.0, 0.1, 0.3], WORLDS))
-    end, impacts = advance(case.worlds, case.command_mps2, until_s=case.horizon_s)
-    outcome = refer(case, np.arange(WORLDS), STEP_S)
-    assert np.mean(np.any(outcome.count > 0, axis=1)) > 0.3  # the worlds have something to say about impacts
-
-    apart = np.flatnonzero(disagreements(outcome, end, impacts, case.horizon_s))
-    certain = refers_to_itself(Outcome(*(column[apart] for column in outcome)), refer(case, apart, STEP_S / 2))
-    assert apart[certain].tolist() == []
-    assert np.sum(~certain) < AMBIGUOUS_SHARE * WORLDS
-
-    agreed = np.setdiff1d(np.arange(WORLDS), apart)
-    gained = np.sum(case.worlds.vehicles.mass_t * (end.speeds_mps - case.worlds.speeds_mps), axis=1)
-    assert gained[agreed] == pytest.approx(outcome.driven_impulse[agreed], abs=STATE)
-    assert outcome.momentum_error.max() < 1e-12
-
-
-def test_disagreements__finds_a_planted_error_of_which_the_reference_is_certain() -> None:
-    case = random_case(22, 40, 3, 0.1)
-    end, impacts = advance(case.worlds, case.command_mps2, until_s=case.horizon_s)
-    vehicles = replace(case.worlds.vehicles, mass_t=case.worlds.vehicles.mass_t * [1.0, 1.02, 1.0])
-    planted = case._replace(worlds=replace(case.worlds, vehicles=vehicles))
-    coarse, fine = (refer(planted, np.arange(40), h) for h in (2 * STEP_S, STEP_S))
-    assert np.mean(disagreements(coarse, end, impacts, case.horizon_s)) > 0.2
-    assert np.all(refers_to_itself(coarse, fine))

@@ -203,17 +203,6 @@ def test_steps__of_one_call_are_a_billion_at_most() -> None:
 # ---------------------------------------------------------------- many worlds
 
 
-def test_momentum__is_kept_by_every_sample() -> None:
-    rng = np.random.default_rng(3)
-    mass = rng.uniform(1, 40, (200, 5))
-    worlds = line(
-        rng.uniform(0, 1, (200, 4)), rng.uniform(0, 30, (200, 5)), mass_t=mass, restitution=rng.uniform(0, 1, 200)
-    )
-    after, impacts = advance_sampled(worlds, 0.0, until_s=2.0, step_s=0.1)
-    assert impacts.count.sum() > 400
-    assert (mass * after.speeds_mps).sum(axis=1) == pytest.approx((mass * worlds.speeds_mps).sum(axis=1), rel=1e-13)
-
-
 def papers_equations(worlds: Worlds, command: Floats, steps: int, step: float) -> tuple[list[float], ...]:
     """Three vehicles by their positions, equations as printed (with the gate), one world: (x, v, harm by pair)."""
     m, e = worlds.vehicles.mass_t[0], worlds.vehicles.restitution[0]
@@ -251,17 +240,6 @@ def test_map__equals_the_papers_equations_written_by_position(step: float) -> No
         assert after.speeds_mps[k] == pytest.approx(v, abs=1e-10)
         assert impacts.total_harm[k] == pytest.approx(harm, abs=1e-9)
     assert (impacts.count.sum(axis=0) > 20).all()
-
-
-def test_no_collision__equals_the_exact_advance() -> None:
-    worlds, command = paper_random(200)
-    worlds = replace(worlds, gaps_m=worlds.gaps_m + 40.0)
-    for until, most in ((2.0, 1e-12), (8.0, 7.0 * 0.1**2 / 8)):  # each vehicle stops at most a h^2 / 8 too far
-        exact, _ = advance(worlds, command, until_s=until)
-        found, impacts = advance_sampled(worlds, command, until_s=until)
-        error = np.abs(found.gaps_m - exact.gaps_m)
-        assert impacts.count.sum() == 0 and error.max() <= most and (error.max() > 0.0 or until < 8.0)
-        assert found.speeds_mps == pytest.approx(exact.speeds_mps, abs=1e-12)
 
 
 def test_calls__can_be_chained_at_samples_and_before_them() -> None:

@@ -48,10 +48,12 @@ def numbered(n: int, first: int = 0, N: int = 3, *, told: bool = True) -> Worlds
 
 
 def test_make_worlds__starts_at_the_alert_with_nothing_hit_and_nothing_commanded() -> None:
-    worlds = line([5.0, 6.0], [9.0, 9.0, 9.0])
+    given = {"braking_capacity_mps2": 1, "driving_capacity_mps2": 0, "latency_s": 0, "mass_t": 1, "restitution": 1}
+    worlds = make_worlds([5.0, 6.0], [9.0, 9.0, 9.0], **given)
     assert (worlds.n, worlds.N, worlds.time_s.tolist()) == (1, 3, [0.0])
     assert worlds.pair_hit.tolist() == [[False, False]] and worlds.pair_hit.dtype == np.bool_
     assert worlds.command_mps2.tolist() == [[0.0, 0.0, 0.0]] and worlds.obstacle_gap_m.tolist() == [np.inf]
+    assert worlds.vehicles.speed_limit_mps.tolist() == [[40.0] * 3]
 
 
 def test_make_worlds__broadcasts_every_parameter_to_arrays_of_its_own() -> None:
@@ -104,13 +106,6 @@ def test_known_at_once__takes_no_memory_and_goes_by_the_numbers() -> None:
         {"known_from_s": late},
     ]
     assert [replace(vehicles, **change).is_known_at_once for change in changes] == [True, False, False, False]
-
-
-def test_make_worlds__the_speed_limit_defaults_to_40() -> None:
-    worlds = make_worlds(
-        5.0, [1.0, 2.0], braking_capacity_mps2=1, driving_capacity_mps2=0, latency_s=0, mass_t=1, restitution=1
-    )
-    assert worlds.vehicles.speed_limit_mps.tolist() == [[40.0, 40.0]]
 
 
 @pytest.mark.parametrize("rows", [[2, 0], np.array([False, True, True, False])])

@@ -124,9 +124,8 @@ SCENARIO = eb.load_scenario("paper-random")
 
 def another(policy: Policy, tensors: Mapping[str, np.ndarray], **changes: Any) -> Policy:
     """A policy with these tensors and what else is changed of this one."""
-    fields = {name: getattr(policy.manifest, name) for name in type(policy.manifest).model_fields}
-    del fields["weights_sha256"], fields["manifest_sha256"]
-    return Policy.make(tensors, **{**fields, **changes})
+    names = set(type(policy.manifest).model_fields) - {"weights_sha256", "manifest_sha256"}
+    return Policy.make(tensors, **{**{name: getattr(policy.manifest, name) for name in names}, **changes})
 
 
 def test_mixture__acts_as_the_network_that_the_gate_chooses_the_first_of_equal_scores(mixture: Policy) -> None:

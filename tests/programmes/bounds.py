@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -42,7 +40,9 @@ CALM = "ignore::DeprecationWarning"  # that something will go from another packa
 
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"of {', '.join(KINDS)}; default: all")
-    parser.add_argument("--python", action="append", help="an interpreter, may be given often; default: this one")
+    parser.add_argument(
+        "--python", action="append", help="or a version that uv finds; may be given often; default: this"
+    )
     parser.add_argument("--tests", nargs="+", default=[f"tests/{folder}" for folder in TESTS])
     parser.add_argument("--ci", action="store_true", help="the light core with every Python found, the rest with this")
 
@@ -61,7 +61,7 @@ def attempt(kind: str, python: str, paths: list[str], until: float) -> Told:
     """Try one kind with one Python."""
     light = kind.endswith("-light")
     try:
-        there = make_environment(kind, find_python(python))
+        there = make_environment(kind, python)
         untried = untried_bounds(there, light) if kind.startswith("lowest") else []
         tried = run_light(there, until) if light else run_tests(there, paths, until)
     except NotInstalled as reason:
@@ -70,9 +70,9 @@ def attempt(kind: str, python: str, paths: list[str], until: float) -> Told:
 
 
 def make_environment(kind: str, python: str) -> Path:
-    """The interpreter of a new environment; raises ``NotInstalled``."""
+    """The interpreter of a new environment; raises ``NotInstalled``, also where this machine has no such Python."""
     resolution, _, light = kind.partition("-")
-    there = KEPT / f"{kind}-{version_of(python)}" / "bin" / "python"
+    there = KEPT / f"{kind}-{Path(python).name}" / "bin" / "python"
     install = new_environment(there, python)
     resolve = [*install, "--resolution", RESOLUTIONS[resolution], "-e"]
     if light:
@@ -81,29 +81,6 @@ def make_environment(kind: str, python: str) -> Path:
         install_torch(install)
         call_uv([*resolve, f"{ROOT}[{','.join(EXTRAS)}]", TORCH])
     return there
-
-
-def version_of(python: str) -> str:
-    """Such as 3.11; raises ``NotInstalled`` where it is no Python."""
-    ask = [python, "-c", "import sys; print('%d.%d' % sys.version_info[:2])"]
-    try:
-        return subprocess.run(ask, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        raise NotInstalled(f"{python} cannot be run") from None
-
-
-def find_python(version: str) -> str:
-    """An interpreter, or one of that version on the search path or kept by pyenv; raises ``NotInstalled``."""
-    if version not in PYTHONS:
-        return version
-    kept = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"), "versions").glob(f"{version}.*/bin/python")
-    for candidate in (shutil.which(f"python{version}"), *map(str, sorted(kept))):
-        try:
-            if candidate and version_of(candidate) == version:
-                return candidate
-        except NotInstalled:
-            continue
-    raise NotInstalled("not on this machine")
 
 
 def untried_bounds(python: Path, light: bool) -> list[str]:

@@ -1,14 +1,13 @@
 """What a hostile case is, and the cage in which it is judged: it can neither wait, grow, execute nor write unnoticed.
 
-Each case runs in a process of its own, whose folder is removed. The kernel (Landlock) and an audit hook of Python keep
-it, the superuser's too, from writing anywhere else.
+Each case runs in a process of its own, whose folder is removed. An audit hook of Python keeps it from writing anywhere
+else, and what stands in and beside its folder is compared with what stood there before.
 """
 
 from __future__ import annotations
 
 import collections
 import contextlib
-import ctypes
 import dataclasses
 import errno
 import hashlib
@@ -20,7 +19,6 @@ import resource
 import shutil
 import signal
 import stat
-import struct
 import sys
 import traceback
 import typing
@@ -62,7 +60,6 @@ class Case:
     build: Build
     certain: bool = True  # it must be refused; otherwise it may also be found to be in order
     reader: Callable[[], object] | None = None  # the same through Python: must raise an error of the project's family
-    meanwhile: Build | None = None  # goes on in another process while the command runs
     environment: Mapping[str, str] = field(default_factory=dict)
     may_change: tuple[str, ...] = ()  # what a command that is not refused may write, inside the folder
 
@@ -92,7 +89,6 @@ class Verdict:
     status: int
     cpu_s: float
     longest: int  # characters of the longest line
-    message: str
     faults: tuple[str, ...]
 
 
@@ -106,14 +102,10 @@ def judge(case: Case, folder: Path) -> Verdict:
     before = _content(folder)
     streams = [folder.with_suffix(suffix) for suffix in (".out", ".err", ".seen")]
     child = _forked(lambda: _run(case, inside, streams))
-    disturbing = _forked(lambda: _disturb(case, inside)) if case.meanwhile else 0
     status, cpu_s = _wait(child)
-    if disturbing:
-        os.kill(disturbing, signal.SIGKILL)
-        os.waitpid(disturbing, 0)
     out, err, seen = (path.read_bytes().decode("utf-8", "backslashreplace") for path in streams)
     after, allowed = _content(folder), tuple(f"{INSIDE}/{name}" for name in case.may_change)
-    names = [] if case.meanwhile else [n for n in sorted(before | after) if before.get(n) != after.get(n)]
+    names = [name for name in sorted(before | after) if before.get(name) != after.get(name)]
     changed = [f"changed: {name}" for name in names if not (allowed and name.startswith(allowed))]
     shutil.rmtree(folder, ignore_errors=True)
     for path in streams:
@@ -121,7 +113,7 @@ def judge(case: Case, folder: Path) -> Verdict:
     left = [f"left beside its folder: {name}" for name in sorted(frozenset(os.listdir(folder.parent)) - beside)]
     deeds = [*map(json.loads, seen.splitlines()), *changed][:5]
     faults = (*_faults_of_end(case, status, out, err), *deeds, *left)
-    return Verdict(status, cpu_s, max(map(len, (out + err).splitlines() or [""])), err.strip()[-LINE_LIMIT:], faults)
+    return Verdict(status, cpu_s, max(map(len, (out + err).splitlines() or [""])), faults)
 
 
 def _forked(work: Callable[[], int]) -> int:
@@ -153,8 +145,6 @@ def _run(case: Case, inside: Path, streams: list[Path]) -> int:
     for what, most in (("AS", size + MEMORY_LIMIT_BYTES), ("CPU", CPU_LIMIT_S), ("CORE", 0)):
         resource.setrlimit(getattr(resource, f"RLIMIT_{what}"), (most, most))
     own = os.path.realpath(inside) + os.sep
-    if can_confine():
-        confine(inside)
     sys.addaudithook(lambda event, arguments: _watch(event, arguments, seen))
     sys.addaudithook(lambda event, arguments: _keep_inside(event, arguments, own, seen))
     if case.reader is not None:
@@ -177,13 +167,6 @@ def _read(case: Case, seen: int) -> None:
     else:
         if case.certain:
             _tell(seen, "python: no error")
-
-
-def _disturb(case: Case, inside: Path) -> int:
-    if can_confine():
-        confine(inside)
-    while True:
-        case.meanwhile(inside)
 
 
 def _wait(child: int) -> tuple[int, float]:
@@ -293,47 +276,3 @@ def _entry(path: str, base: int | None) -> str:
 def _tell(seen: int, what: str) -> None:
     """Write one line to the judge."""
     os.write(seen, (json.dumps(what) + "\n").encode())
-
-
-# ---------------------------------------------------------------- the kernel's own cage
-
-OLDEST_ABI = 3  # of Landlock, Linux 6.2: before it, truncation could not be forbidden
-_CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446  # system calls, the same numbers on every machine
-_VERSION_ONLY, _BENEATH = 1, 1
-_SIGNAL_AT_DEATH_OF_PARENT, _NO_NEW_PRIVILEGES = 1, 38  # of prctl
-_WRITE_FILE, _TRUNCATE = 1 << 1, 1 << 14
-_CHANGE = _WRITE_FILE | sum(1 << k for k in range(4, 14)) | _TRUNCATE  # write, remove, make, rename, cut
-
-_kernel = ctypes.CDLL(None, use_errno=True)  # loaded before a case is watched: its audit hook tells what is loaded
-
-
-def die_with_parent() -> None:
-    """Let the kernel end this process when the one that forked it ends."""
-    _accepted(int(_kernel.prctl(_SIGNAL_AT_DEATH_OF_PARENT, signal.SIGKILL, 0, 0, 0)))
-
-
-def can_confine() -> bool:
-    """Whether this kernel can keep a process, the superuser's too, from writing outside a folder."""
-    return int(_kernel.syscall(_CREATE_RULESET, None, ctypes.c_size_t(0), _VERSION_ONLY)) >= OLDEST_ABI
-
-
-def confine(folder: Path) -> None:
-    """From here on this process and its children write below ``folder`` (and to /dev/null) or not at all.
-
-    Cannot be undone; a second call only narrows it. Raises ``OSError`` where the kernel refuses.
-    """
-    size = ctypes.c_size_t(8)
-    rules = _accepted(int(_kernel.syscall(_CREATE_RULESET, struct.pack("<Q", _CHANGE), size, 0)))
-    for place, allowed in ((os.fspath(folder), _CHANGE), (os.devnull, _WRITE_FILE | _TRUNCATE)):
-        opened = os.open(place, os.O_PATH | os.O_CLOEXEC)
-        _accepted(int(_kernel.syscall(_ADD_RULE, rules, _BENEATH, struct.pack("<Qi", allowed, opened), 0)))
-        os.close(opened)
-    _accepted(int(_kernel.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0)))
-    _accepted(int(_kernel.syscall(_RESTRICT_SELF, rules, 0)))
-    os.close(rules)
-
-
-def _accepted(answer: int) -> int:
-    if answer < 0:
-        raise OSError(ctypes.get_errno(), "the kernel refused")
-    return answer

@@ -71,7 +71,7 @@ def install_torch(install: list[str]) -> None:
 
 def call_uv(command: list[str]) -> None:
     """Run uv where pip's own settings hold too; raises ``NotInstalled`` with the line that says what is wrong."""
-    given = {"UV_HTTP_TIMEOUT": "60", "UV_HTTP_RETRIES": "1", **os.environ}
+    given = {"UV_HTTP_TIMEOUT": "60", "UV_HTTP_RETRIES": "1", "UV_PYTHON_DOWNLOADS": "never", **os.environ}
     if "PIP_FIND_LINKS" in given:
         given.setdefault("UV_FIND_LINKS", ",".join(given["PIP_FIND_LINKS"].split()))
     done = subprocess.run(command, env=given, capture_output=True, text=True, check=False)
@@ -80,8 +80,7 @@ def call_uv(command: list[str]) -> None:
     told = " ".join(done.stderr.split())
     if any(word in told.lower() for word in NO_NETWORK):
         raise NotInstalled("the package index cannot be reached")
-    _, _, reason = told.rpartition("we can conclude that your requirements")
-    raise NotInstalled(f"does not resolve: {((reason and told) or told)[:300]}")
+    raise NotInstalled(f"does not resolve: {told[:300]}")
 
 
 def watched(command: Sequence[str], limit: float, **variables: str) -> tuple[int | None, str]:

@@ -48,7 +48,10 @@ PRELOADED = (
     "hypothesis", "numba", "numpy", "pytest", "torch", "stable_baselines3", "scipy.stats", "scipy.optimize", "pydantic",
     "matplotlib.pyplot", "gymnasium", "pettingzoo", "yaml", "rich", "typer", "tensorboard.compat.proto.event_pb2",
 )  # fmt: skip
-OPTIONS = ("-x", "-q", "-m", "not long", "-p", "no:cacheprovider", "-p", "no:randomly", "--rootdir=.")
+OPTIONS = (
+    "-q", "-m", "not long", "-p", "no:cacheprovider", "-p", "no:randomly", "--rootdir=.",
+    "-W", "ignore::pytest.PytestAssertRewriteWarning",  # of what is loaded before
+)  # fmt: skip
 
 BUDGET_S = 40.0  # processor time of the tests that are tried, as they take without a fault
 MOST_FILES = 30
@@ -323,14 +326,14 @@ class Copy:
         for name in [name for name in sys.modules if name.split(".")[0] in ("tests", PACKAGE.name)]:
             del sys.modules[name]  # those of the working tree
 
-    def first_red(self, tests: list[str], *, compiled: bool, own_kernels: bool = False) -> str:
-        """The first of these tests that fails as the copy is now; empty where none does."""
+    def red(self, tests: list[str], *, compiled: bool, own_kernels: bool = False, every: bool = False) -> list[str]:
+        """The first of these tests that fails as the copy is now, or every one; empty where none does."""
         tests = [test for test in tests if test not in self.red_anyway[compiled]]
         if not tests:
-            return ""
+            return []
         limit = COMPILING_S + 3.0 * BUDGET_S if compiled else INTERPRETED_S
-        red = self.ask(_run, tests, compiled, own_kernels, cpu_s=limit).partition("\n")[0]
-        return "" if not compiled and red == "(no end)" else red
+        red = self.ask(_run, tests, compiled, own_kernels, every, cpu_s=limit).splitlines()
+        return [] if not compiled and red == ["(no end)"] else red
 
     def verdict(self, fault: Fault) -> str:
         """The first test that notices a fault; empty where none does."""
@@ -339,19 +342,20 @@ class Copy:
         for compiled in (False, True) if function.compiled else (True,):
             while True:
                 with self.changed(fault):
-                    red = self.first_red(tests, compiled=compiled, own_kernels=function.compiled)
-                if not red or red in self.green[compiled]:
+                    red = self.red(tests, compiled=compiled, own_kernels=function.compiled)[:1]
+                if not red or red[0] in self.green[compiled]:
                     break
-                named = not red.startswith("(")  # else all came to an end, which says nothing if they do so anyway
-                again = [test for test in tests if not named or test.startswith(red)][:1]
-                if not self.first_red(again, compiled=compiled):
-                    self.green[compiled] |= {red} if named else set()
+                named = not red[0].startswith("(")  # else all came to an end, which says nothing if they do so anyway
+                again = [test for test in tests if not named or test.startswith(red[0])][:1]
+                if not self.red(again, compiled=compiled):
+                    self.green[compiled] |= set(red) if named else set()
                     break
                 if not named:
                     raise RuntimeError(f"the tests do not run without a fault, either: {again}: {red}")
-                self.red_anyway[compiled] |= {red, *again}  # it fails without the fault, too
+                # It fails without the fault, too, and is seldom alone in that.
+                self.red_anyway[compiled] |= {*red, *again, *self.red(tests, compiled=compiled, every=True)}
             if red:
-                return red
+                return red[0]
         return ""
 
 
@@ -363,8 +367,8 @@ def _digests(self: Copy, pipe: int) -> None:
     os.write(pipe, json.dumps(found).encode())
 
 
-def _run(self: Copy, pipe: int, tests: list[str], compiled: bool, own_kernels: bool) -> None:
-    """In a child: some tests, until one fails, which is written to the pipe."""
+def _run(self: Copy, pipe: int, tests: list[str], compiled: bool, own_kernels: bool, every: bool) -> None:
+    """In a child: some tests, until one fails or all of them; those that fail are written to the pipe."""
     import numba
 
     numba.config.DISABLE_JIT = not compiled
@@ -375,7 +379,7 @@ def _run(self: Copy, pipe: int, tests: list[str], compiled: bool, own_kernels: b
         compiling.digest_of_sources = cache(lambda source: self.digests.get(str(source), ""))
     plugin = Listener(tests, None if compiled else EACH_S, pipe)
     files = list(dict.fromkeys(test.partition("::")[0] for test in tests))
-    status = int(pytest.main([*OPTIONS, *files], plugins=[plugin]))
+    status = int(pytest.main([*OPTIONS, *([] if every else ["-x"]), *files], plugins=[plugin]))
     if status in (3, 4):  # pytest itself failed, or could not begin: the fault is met by whoever imports the package
         os.write(pipe, f"(exit status {status} of pytest)\n".encode())
 

@@ -12,16 +12,17 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from fractions import Fraction
 from functools import cache, partial
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
 from ethbrake_marl.errors import PhysicsError
-from ethbrake_marl.harm import empty_ledger, split
+from ethbrake_marl.harm import split
 from ethbrake_marl.physics import Floats, Impacts, Worlds, advance
 from tests.golden.test_golden import GOLDEN, figures
 from tests.physics.exact_simulator import line_of, simulate
-from tests.physics.manufacture import manufactured, pressed, stored
+from tests.physics.manufacture import Case, manufactured, pressed, stored
 from tests.physics.random_worlds import (
     HARMS,
     HORIZON_S,
@@ -60,6 +61,7 @@ from tests.reference.tolerances import (
     SPLIT,
     SPLIT_CASCADE,
 )
+from tests.test_harm import booked
 
 
 class Figure(NamedTuple):
@@ -96,20 +98,24 @@ def cases(given: argparse.Namespace) -> Cases:
 # ---------------------------------------------------------------- worlds made backwards, impacts, motion between them
 
 
+def inexact(cases: list[Case]) -> int:
+    """How many worlds are not what rational arithmetic says to the last bit, at once and in steps."""
+    return sum(bool(at_once(case) or in_steps(case)) for case in cases)
+
+
 @gate("manufactured worlds, not bit for bit")
 def manufactured_worlds() -> Figure:
     """Worlds built backwards from contact times: stored ones and fresh ones."""
     cases = stored() + manufactured(9, 2, 1_500) + manufactured(9, 3, 400) + manufactured(9, 4, 100)
-    wrong = sum(bool(at_once(case) or in_steps(case)) for case in cases)
     hits = sum(len(case.outcome.hits) for case in cases)
-    return Figure(wrong, 0, f"{len(cases)} worlds, {hits} impacts, at once and in steps of 1/8 s")
+    return Figure(inexact(cases), 0, f"{len(cases)} worlds, {hits} impacts, at once and in steps of 1/8 s")
 
 
 @gate("resting contact worlds, not bit for bit")
 def pressed_worlds() -> Figure:
     """Worlds that touch at the start."""
     cases = [case for N in (2, 3, 4, 5) for case in pressed(11, N, 1_000)]
-    return Figure(sum(bool(at_once(case) or in_steps(case)) for case in cases), 0, f"{len(cases)} worlds")
+    return Figure(inexact(cases), 0, f"{len(cases)} worlds")
 
 
 @cache
@@ -156,19 +162,24 @@ def gaps() -> Figure:
     return Figure(max(run.worst for run in runs), GAP_M, f"{sum(run.checked for run in runs):,} steady steps")
 
 
+@cache
+def braking_runs() -> list[Watched]:
+    """Braking lines in short steps."""
+    return [Watched(51 + N, 3_000 // N, N, drive=False) for N in (2, 3, 5, 10)]
+
+
 @gate("speeds below 0 that no bounce-back explains")
 def negative_speeds() -> Figure:
     """Braking lines in short steps."""
-    runs = [Watched(51 + N, 3_000 // N, N, drive=False) for N in (2, 3, 5, 10)]
-    seen = sum(int((state.speeds_mps < 0).sum()) for run in runs for state in run.states)
-    return Figure(sum(run.unexplained_negative_speeds() for run in runs), 0, f"{seen:,} negative speeds seen")
+    seen = sum(int((state.speeds_mps < 0).sum()) for run in braking_runs() for state in run.states)
+    return Figure(sum(run.unexplained_negative_speeds() for run in braking_runs()), 0, f"{seen:,} negative speeds seen")
 
 
 @gate("steps in which energy rose though nobody drives")
 def energy_in_motion() -> Figure:
     """Braking lines in short steps."""
-    runs = [Watched(51 + N, 3_000 // N, N, drive=False) for N in (2, 3, 5, 10)]
-    return Figure(sum(run.energy_rises() for run in runs), 0, f"{len(runs) * 300:,} steps of {3_000:,} vehicles")
+    rises = sum(run.energy_rises() for run in braking_runs())
+    return Figure(rises, 0, f"{len(braking_runs()) * 300:,} steps of {3_000:,} vehicles")
 
 
 @gate("harm shares that do not add up to the last bit")
@@ -182,23 +193,13 @@ def shares() -> Figure:
 
 
 @gate("worlds whose ledger is not the sum of its rows")
-def ledger() -> Figure:
+def ledgers() -> Figure:
     """First-impact and total harm, to the last bit, over three segments."""
     wrong, impacts_seen = 0, 0
     for N in (2, 3, 6, 20):
-        worlds, command = driving_lines(62, 60_000 // N, N)
-        book, first, total = empty_ledger(worlds), np.zeros(worlds.gaps_m.shape), np.zeros(worlds.gaps_m.shape)
-        for until in (0.7, 2.0, 6.0):
-            worlds, impacts = advance(worlds, command, until_s=until, record=True)
-            book, rows = book.add(impacts), impacts.rows
-            assert rows is not None
-            segment = np.zeros((2, *first.shape))
-            harm = rows.closing_speed_mps * rows.closing_speed_mps
-            np.add.at(segment[0], (rows.world[rows.first], rows.pair[rows.first]), harm[rows.first])
-            np.add.at(segment[1], (rows.world, rows.pair), harm)
-            first, total, impacts_seen = first + segment[0], total + segment[1], impacts_seen + rows.world.size
-        same = (first == book.first_impact_harm) & (total == book.total_harm)
-        wrong += int((~same).any(axis=1).sum())
+        book, first, total, count = booked(62, 60_000 // N, N)
+        same = (first == book.first_impact_harm) & (total == book.total_harm) & (count == book.count)
+        wrong, impacts_seen = wrong + int((~same).any(axis=1).sum()), impacts_seen + int(count.sum())
     return Figure(wrong, 0, f"{impacts_seen:,} impacts")
 
 
@@ -223,13 +224,9 @@ def scans() -> list[Scan]:
 @gate("contacts missed")
 def missed() -> Figure:
     """Against the smallest value of each gap's closed form; the doubtful ones against exact arithmetic."""
-    found = scans()
-    return Figure(
-        sum(s.missed.size for s in found),
-        0,
-        f"{sum(s.pairs for s in found):,} random segments of pairs, {sum(s.contacts for s in found):,} with contact,"
-        f" {sum(s.in_doubt for s in found):,} decided by exact arithmetic",
-    )
+    pairs, contacts, in_doubt = (sum(getattr(s, name) for s in scans()) for name in ("pairs", "contacts", "in_doubt"))
+    of = f"{pairs:,} random segments of pairs, {contacts:,} with contact, {in_doubt:,} decided by exact arithmetic"
+    return Figure(sum(s.missed.size for s in scans()), 0, of)
 
 
 @gate("contacts invented")
@@ -247,91 +244,8 @@ def wrong() -> Figure:
 @gate("share of contacts that rounding decides")
 def borderline() -> Figure:
     """Decided otherwise than by exact arithmetic, within the published blur."""
-    pairs = sum(s.pairs for s in scans())
-    return Figure(sum(s.borderline for s in scans()) / pairs, BORDERLINE_SHARE, "the same segments")
-
-
-@cache
-def differences() -> tuple[float, int, int, int]:
-    """(largest difference, worlds with other impacts, worlds, impacts) of whole runs against the exact simulator."""
-    worst, other, total, impacts_seen = 0.0, 0, 0, 0
-    for N, n in {2: 3_000, 3: 2_000, 5: 600, 10: 100, 50: 6}.items():
-        worlds, command = driving_lines(81, n, N)
-        end, impacts = advance(worlds, command, 6.0, record=True)
-        rows = impacts.rows
-        assert rows is not None
-        for k in range(n):
-            exact = simulate(line_of(worlds, command[k].tolist(), k), Fraction(6), bits=160)
-            mine = rows.world == k
-            total, impacts_seen = total + 1, impacts_seen + len(exact.hits)
-            if rows.pair[mine].tolist() != [hit.pair for hit in exact.hits]:
-                other += 1
-                continue
-            pairs = [*zip(end.gaps_m[k], exact.gaps, strict=True), *zip(end.speeds_mps[k], exact.speeds, strict=True)]
-            pairs += zip(rows.time_s[mine], [hit.time for hit in exact.hits], strict=True)
-            pairs += zip(rows.closing_speed_mps[mine], [hit.closing for hit in exact.hits], strict=True)
-            worst = max(worst, *(abs(float(x) - float(y)) for x, y in pairs))
-    return worst, other, total, impacts_seen
-
-
-@gate("difference from exact runs [m, m/s, s]")
-def exact_runs() -> Figure:
-    """Every impact's time and closing speed, final gaps and speeds, after up to hundreds of events."""
-    worst, _, total, impacts_seen = differences()
-    return Figure(worst, EXACT_RUN, f"{total:,} worlds of 2 to 50 vehicles, {impacts_seen:,} impacts")
-
-
-@gate("runs with other impacts than exact ones")
-def exact_counts() -> Figure:
-    """The order and the number of impacts of every pair."""
-    _, other, _, _ = differences()
-    return Figure(other, 0, "the same worlds")
-
-
-@gate("cluster law [eps of the largest speed, per round]")
-def exact_clusters() -> Figure:
-    """Speeds after simultaneous impacts against the exact law."""
-    worst, worlds = 0.0, 0
-    for N, n in {2: 3_000, 3: 3_000, 5: 1_500, 10: 400, 20: 150, 50: 30}.items():
-        for ratio in (1.0, 1e3):
-            before, command = touching_lines(82, n, N, heaviest_ratio=ratio)
-            after, impacts = advance(before, command, 0.0)
-            per_round = rounds(impacts)
-            worst = max(worst, *(law_error_eps(before, after, k, int(per_round[k])) for k in range(n)))
-            worlds += n
-    return Figure(worst, CLUSTER_EPS, f"{worlds:,} exact_clusters of 2 to 50 vehicles")
-
-
-@gate("resting contact against exact force ranges [m/s2]")
-def resting() -> Figure:
-    """Accelerations of touching lines at rest, moving, and at a speed limit."""
-    draws, worst, lines = Draws(83), 0.0, 0
-    for N in (2, 3, 5, 10, 25, 50):
-        for speed in (0.0, 4.0, 8.0):
-            for _ in range(150):
-                command, mass = draws.uniform(-16.0, 16.0, (N,)), draws.uniform(0.5, 8.0, (N,))
-                expected = exact_accelerations(command.tolist(), mass.tolist(), speed)
-                worst = max(worst, float(np.abs(accelerations(command, mass, speed) - expected).max()))
-                lines += 1
-    return Figure(worst, RESTING_MPS2, f"{lines:,} lines of 2 to 50 vehicles")
-
-
-# ---------------------------------------------------------------- an obstacle ahead of Vehicle 1
-
-
-@gate("obstacle: cluster law [eps of the largest speed, per round]")
-def obstacle_clusters() -> Figure:
-    """Speeds after simultaneous impacts of vehicles that touch each other and the obstacle, against the exact law."""
-    worst, worlds = 0.0, 0
-    for N, n in {2: 1_500, 3: 1_500, 5: 800, 10: 200, 20: 80, 50: 15}.items():
-        for ratio in (1.0, 1e3):
-            batch = touching_lines(182, n, N, heaviest_ratio=ratio)
-            before = replace(batch.worlds, obstacle_gap_m=np.zeros(n))
-            after, impacts = advance(before, batch.command, 0.0)
-            rounds = np.maximum(np.maximum(impacts.count.max(axis=1), impacts.obstacle_count), 1)
-            worst = max(worst, *(law_error_eps(before, after, k, int(rounds[k])) for k in range(n)))
-            worlds += n
-    return Figure(worst, CLUSTER_EPS, f"{worlds:,} obstacle_clusters of 2 to 50 vehicles")
+    share = sum(s.borderline for s in scans()) / sum(s.pairs for s in scans())
+    return Figure(share, BORDERLINE_SHARE, "the same segments")
 
 
 CASCADE = 100  # impacts of a world; between an obstacle and a line they come ever faster, and rounding multiplies
@@ -347,18 +261,18 @@ def run_difference(end: Worlds, found: Floats, k: int, line: Worlds, command: li
     pairs, true_pairs = found[:, 0].tolist(), [hit.pair for hit in exact.hits]
     if pairs != true_pairs:
         return np.nan if pairs[:CASCADE] == true_pairs[:CASCADE] else np.inf
-    assert exact.obstacle is not None
-    mine = [*end.gaps_m[k], *end.speeds_mps[k], end.obstacle_gap_m[k], *found[:, 1:].ravel()]
-    truth = [*exact.gaps, *exact.speeds, exact.obstacle, *(x for hit in exact.hits for x in (hit.time, hit.closing))]
+    ahead, true_ahead = ([], []) if exact.obstacle is None else ([end.obstacle_gap_m[k]], [exact.obstacle])
+    mine = [*end.gaps_m[k], *end.speeds_mps[k], *ahead, *found[:, 1:].ravel()]
+    truth = [*exact.gaps, *exact.speeds, *true_ahead, *(x for hit in exact.hits for x in (hit.time, hit.closing))]
     return max(abs(float(x) - float(y)) for x, y in zip(mine, truth, strict=True))
 
 
 @cache
-def obstacle_differences() -> tuple[Floats, int]:
-    """``run_difference`` of every world, and how many impacts with the obstacle there were."""
-    worst, with_it = [], 0
-    for N, n in {2: 1_500, 3: 1_000, 5: 300, 10: 40}.items():
-        batch = place_ahead(driving_lines(183, n, N), 184)
+def differences(obstacle: bool) -> tuple[Floats, int, int]:
+    """``run_difference`` of every world, and how many impacts there were, and how many with the obstacle."""
+    worst, impacts_seen, with_it = [], 0, 0
+    for N, n in {2: 1_500, 3: 1_000, 5: 300, 10: 40}.items() if obstacle else WHOLE_RUNS.items():
+        batch = place_ahead(driving_lines(183, n, N), 184) if obstacle else driving_lines(81, n, N)
         end, impacts = advance(batch.worlds, batch.command, HORIZON_S, record=True)
         rows = impacts.rows
         assert rows is not None
@@ -366,14 +280,71 @@ def obstacle_differences() -> tuple[Floats, int]:
         for k in range(n):
             command = batch.command[k].tolist()
             worst.append(run_difference(end, columns[rows.world == k], k, batch.worlds, command))
-        with_it += int(impacts.obstacle_count.sum())
-    return np.array(worst), with_it
+        impacts_seen, with_it = impacts_seen + len(columns), with_it + int(impacts.obstacle_count.sum())
+    return np.array(worst), impacts_seen, with_it
+
+
+WHOLE_RUNS = {2: 3_000, 3: 2_000, 5: 600, 10: 100, 50: 6}
+
+
+@gate("difference from exact runs [m, m/s, s]")
+def exact_runs() -> Figure:
+    """Every impact's time and closing speed, final gaps and speeds, after up to hundreds of events."""
+    found, impacts_seen, _ = differences(obstacle=False)
+    of = f"{found.size:,} worlds of 2 to 50 vehicles, {impacts_seen:,} impacts"
+    return Figure(float(found[np.isfinite(found)].max()), EXACT_RUN, of)
+
+
+@gate("runs with other impacts than exact ones")
+def exact_counts() -> Figure:
+    """The order and the number of impacts of every pair."""
+    return Figure(int((~np.isfinite(differences(obstacle=False)[0])).sum()), 0, "the same worlds")
+
+
+def law_error(key: int, counts: dict[int, int], obstacle: bool) -> tuple[float, int]:
+    """Largest error of the cluster law in so many touching lines of each number of vehicles, and how many there are."""
+    worst = 0.0
+    for (N, n), ratio in product(counts.items(), (1.0, 1e3)):
+        before, command = touching_lines(key, n, N, heaviest_ratio=ratio)
+        before = replace(before, obstacle_gap_m=np.zeros(n)) if obstacle else before
+        after, impacts = advance(before, command, 0.0)
+        rounds = np.maximum(np.maximum(impacts.count.max(axis=1), impacts.obstacle_count), 1)
+        worst = max(worst, *(law_error_eps(before, after, k, int(rounds[k])) for k in range(n)))
+    return worst, 2 * sum(counts.values())
+
+
+@gate("cluster law [eps of the largest speed, per round]")
+def exact_clusters() -> Figure:
+    """Speeds after simultaneous impacts against the exact law."""
+    worst, worlds = law_error(82, {2: 3_000, 3: 3_000, 5: 1_500, 10: 400, 20: 150, 50: 30}, obstacle=False)
+    return Figure(worst, CLUSTER_EPS, f"{worlds:,} clusters of 2 to 50 vehicles")
+
+
+@gate("resting contact against exact force ranges [m/s2]")
+def resting() -> Figure:
+    """Accelerations of touching lines at rest, moving, and at a speed limit."""
+    draws, found = Draws(83), []
+    for N, speed, _ in product((2, 3, 5, 10, 25, 50), (0.0, 4.0, 8.0), range(150)):
+        command, mass = draws.uniform(-16.0, 16.0, (N,)), draws.uniform(0.5, 8.0, (N,))
+        expected = exact_accelerations(command.tolist(), mass.tolist(), speed)
+        found.append(float(np.abs(accelerations(command, mass, speed) - expected).max()))
+    return Figure(max(found), RESTING_MPS2, f"{len(found):,} lines of 2 to 50 vehicles")
+
+
+# ---------------------------------------------------------------- an obstacle ahead of Vehicle 1
+
+
+@gate("obstacle: cluster law [eps of the largest speed, per round]")
+def obstacle_clusters() -> Figure:
+    """Speeds after simultaneous impacts of vehicles that touch each other and the obstacle, against the exact law."""
+    worst, worlds = law_error(182, {2: 1_500, 3: 1_500, 5: 800, 10: 200, 20: 80, 50: 15}, obstacle=True)
+    return Figure(worst, CLUSTER_EPS, f"{worlds:,} clusters of 2 to 50 vehicles")
 
 
 @gate("obstacle: difference from exact runs [m, m/s, s]")
 def obstacle_runs() -> Figure:
     """The impacts of every pair and with the obstacle, in order, their times and closing speeds, final state."""
-    found, with_it = obstacle_differences()
+    found, _, with_it = differences(obstacle=True)
     of = f"{np.isfinite(found).sum():,} worlds of 2 to 10 vehicles, {with_it:,} impacts with the obstacle"
     return Figure(float(np.nanmax(found)), EXACT_RUN, of)
 
@@ -381,7 +352,7 @@ def obstacle_runs() -> Figure:
 @gate("obstacle: worlds that differ after 100 impacts [share]")
 def cascades() -> Figure:
     """Worlds in which rounding changes the order of impacts, after so many of them and never before."""
-    found, _ = obstacle_differences()
+    found, *_ = differences(obstacle=True)
     return Figure(float(np.isnan(found).mean()), OTHER_CASCADES, f"{found.size:,} worlds of 2 to 10 vehicles")
 
 
@@ -404,34 +375,35 @@ THROWN = {2: 250_000, 3: 250_000, 5: 200_000, 10: 250_000, 20: 40_000, 50: 10_00
 INSTANT_CHUNK = 10_000
 
 
-def unfinished(worlds: Worlds, command: Floats, until_s: float) -> int:
-    """How many of these worlds cannot be advanced."""
-    try:
-        advance(worlds, command, until_s=until_s)
-    except PhysicsError as error:
-        return len(error.worlds)
-    return 0
+def unfinished(counts: dict[int, int], make: Callable[[int, int], Batch], until_s: float) -> int:
+    """How many worlds cannot be advanced, of so many for each number of vehicles, ``make(vehicles, chunk)`` at once."""
+    failed = 0
+    for N, n in counts.items():
+        for chunk in range(n // INSTANT_CHUNK):
+            worlds, command = make(N, chunk)
+            try:
+                advance(worlds, command, until_s=until_s)
+            except PhysicsError as error:
+                failed += len(error.worlds)
+    return failed
 
 
-@gate("instants that do not end: joined_clusters a few ulps apart")
+@gate("instants that do not end: clusters a few ulps apart")
 def joined_clusters() -> Figure:
     """Touching lines at one speed but for the last digits, half of them against an obstacle."""
-    failed = 0
-    for N, n in NEARLY_JOINED.items():
-        for chunk in range(n // INSTANT_CHUNK):
-            worlds = nearly_joined(1_000 * N + chunk, INSTANT_CHUNK, N, obstacle=chunk % 2 == 1)
-            failed += unfinished(worlds, np.zeros((INSTANT_CHUNK, N)), 0.0)
-    return Figure(failed, 0, f"{sum(NEARLY_JOINED.values()):,} joined_clusters of 2 to 50 vehicles")
+
+    def make(N: int, chunk: int) -> Batch:
+        worlds = nearly_joined(1_000 * N + chunk, INSTANT_CHUNK, N, obstacle=chunk % 2 == 1)
+        return Batch(worlds, np.zeros((INSTANT_CHUNK, N)))
+
+    failed = unfinished(NEARLY_JOINED, make, 0.0)
+    return Figure(failed, 0, f"{sum(NEARLY_JOINED.values()):,} clusters of 2 to 50 vehicles")
 
 
 @gate("instants that do not end: lines thrown against an obstacle")
 def thrown() -> Figure:
     """Whole runs of 6 s."""
-    failed = 0
-    for N, n in THROWN.items():
-        for chunk in range(n // INSTANT_CHUNK):
-            worlds, command = thrown_lines(100_000 + 1_000 * N + chunk, INSTANT_CHUNK, N)
-            failed += unfinished(worlds, command, HORIZON_S)
+    failed = unfinished(THROWN, lambda N, chunk: thrown_lines(100_000 + 1_000 * N + chunk, INSTANT_CHUNK, N), HORIZON_S)
     return Figure(failed, 0, f"{sum(THROWN.values()):,} worlds of 2 to 50 vehicles, masses 0.05 to 100 t")
 
 
@@ -481,12 +453,12 @@ def origin() -> Figure:
         vehicles = replace(grid.vehicles, latency_s=grid.vehicles.latency_s + shift)
         moved = replace(grid, vehicles=vehicles, time_s=grid.time_s + shift)
         there, same = advance(moved, batch.command, until_s=6.0 + shift)
-        columns = (
+        pairs = (
             (here.gaps_m, there.gaps_m),
             (here.speeds_mps, there.speeds_mps),
             (impacts.total_harm, same.total_harm),
         )
-        changed += int(np.any([(a != b).any(axis=1) for a, b in columns], axis=0).sum())
+        changed += int(np.any([(a != b).any(axis=1) for a, b in pairs], axis=0).sum())
     return Figure(changed, 0, "50,000 worlds, three shifts (positions are not stored: space has no origin)")
 
 

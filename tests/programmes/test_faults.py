@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import ast
 
-import pytest
-
 from tests.programmes import faults
 from tests.programmes.calls import PACKAGE, Callers, functions_of
 
@@ -16,11 +14,10 @@ def test_bugs__each_patch_stands_in_the_code_exactly_once() -> None:
     assert {bug.folder for bug in bugs} >= {"physics", "shield", "limits", "learning", "evaluation", "ethbrake_marl"}
 
 
-@pytest.mark.parametrize("folder", faults.folders())
-def test_mutants__are_code_of_as_many_lines_and_the_same_for_the_same_seed(folder: str) -> None:
-    mutants = faults.sample_of(folder, 20, 3)
-    assert len(mutants) == 20
-    assert [m.digest for m in faults.sample_of(folder, 5, 3)] == [m.digest for m in mutants[:5]]
+def test_mutants__are_code_of_as_many_lines_and_the_same_for_the_same_seed() -> None:
+    mutants = faults.sample_of("limits", 40, 3)
+    assert len(mutants) == 40
+    assert [m.digest for m in faults.sample_of("limits", 5, 3)] == [m.digest for m in mutants[:5]]
     for mutant in mutants:
         ((file, text),) = mutant.texts
         original = (PACKAGE / file).read_text("utf-8")

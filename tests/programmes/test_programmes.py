@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import os
 import re
-import signal
 import subprocess
 import sys
-import traceback
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
-from tests.programmes import ROOT, Told, __main__ as runner, audit, hostile, libraries, peers
-from tests.programmes.cage import Case, can_confine, confine, judge
+from tests.programmes import ROOT, Told, __main__ as runner, audit, hostile, libraries
+from tests.programmes.cage import Case, judge
 
 PAGE = ROOT / "docs" / "security.md"
 
@@ -54,7 +51,7 @@ def test_runner__says_how_the_cases_ended_and_exits_by_it(words, status, end, mo
 
 def test_runner__lists_every_programme_and_make_and_its_help_know_each():
     named = set(re.findall(r"\$\(PROGRAMME\) (\w+)", (ROOT / "Makefile").read_text("utf-8")))
-    assert runner.programmes().keys() - named == {"adversary"} and named <= runner.programmes().keys()
+    assert runner.programmes().keys() == named
     assert runner.main(["nobody"]) == 2
 
 
@@ -73,11 +70,8 @@ def test_page__lists_every_pinned_package_under_its_licence() -> None:
     listed = {name: family for family, _, names in rows for name in names.split(", ")}
     assert all(int(number) == len(names.split(", ")) for _, number, names in rows)
     found = audit.packages()
-    assert [each.name for each in found if each.name not in listed] == []
-    assert len(listed) == len(found)
-    assert {each.name: each.family for each in found if each.installed} == {
-        each.name: listed[each.name] for each in found if each.installed
-    }
+    assert sorted(each.name for each in found) == sorted(listed)
+    assert [each.name for each in found if each.installed and each.family != listed[each.name]] == []
 
 
 @pytest.mark.parametrize(
@@ -102,24 +96,7 @@ def test_version__that_is_not_the_pinned_one_is_a_fault_but_not_its_local_part()
     assert audit.Package("torch", "2.13.0", "2.12.0", "BSD").fault == "is pinned to 2.13.0"
 
 
-@pytest.mark.parametrize(
-    ("script", "good", "told"),
-    [
-        ("echo 'No known vulnerabilities found'", True, "No known vulnerabilities found"),
-        ("echo 'Found 1 known vulnerability in 1 package'; exit 1", False, "Found 1 known vulnerability"),
-        ("echo 'ConnectionError: no route to host' >&2; exit 1", None, "not asked, pip-audit could not"),
-    ],
-)
-def test_weaknesses__are_told_or_that_nobody_could_be_asked(script, good, told, tmp_path, monkeypatch):
-    monkeypatch.setattr("sys.executable", str(tmp_path / "python"))
-    assert audit.weaknesses() == (None, "not asked, pip-audit is not installed here")
-    (tmp_path / "pip-audit").write_text(f"#!/bin/sh\n{script}\n")
-    (tmp_path / "pip-audit").chmod(0o755)
-    found = audit.weaknesses()
-    assert found.good is good and told in found.text
-
-
-# ---------------------------------------------------------------- libraries and peers
+# ---------------------------------------------------------------- libraries
 
 WAYS = [pytest.param(way, id=f"{way.library}: {way.title}") for way in libraries.ways()]
 HERE = [each for each in WAYS if each.values[0].library in ("Stable-Baselines3", "SuperSuit")]
@@ -155,13 +132,6 @@ def test_way__runs_in_the_projects_own_environment(way, tmp_path, monkeypatch):
     names: dict[str, object] = {}
     exec(re.sub(r"n_steps=\d+", "n_steps=32", re.sub(r"\b\d+_000\b", "64", way.code)), names)
     assert names["agent"].act is not None
-
-
-def test_peers__each_stands_beside_one_of_ours():
-    ours = {name for name, loop in peers.LOOPS.items() if loop.distribution == peers.OURS}
-    assert {loop.beside for loop in peers.LOOPS.values()} == {*ours, ""}
-    assert all((name in ours) == (loop.beside == "") for name, loop in peers.LOOPS.items())
-    assert [peers.plain(value) for value in (6.944, 13.84, 99.96, 97_512.0)] == ["6.94", "13.8", "100", "97,500"]
 
 
 # ---------------------------------------------------------------- hostile files, proofs
@@ -202,53 +172,6 @@ def nothing(folder: Path) -> None:
 )
 def test_judge__tells_what_breaks_a_rule(case, fault, tmp_path):
     assert [told for told in judge(case, tmp_path / "case").faults if told.startswith(fault)]
-
-
-def ends_well(work: partial[None]) -> bool:
-    """Whether ``work`` ends without an error, in a process of its own."""
-    child = os.fork()
-    if not child:
-        status = 1
-        try:
-            signal.alarm(20)
-            work()
-            status = 0
-        except BaseException:
-            traceback.print_exc()
-        os._exit(status)
-    return os.waitpid(child, 0)[1] == 0
-
-
-@pytest.mark.skipif(not can_confine(), reason="the kernel has no Landlock of version 3")
-def test_confine__keeps_the_superuser_and_his_children_from_changing_what_is_outside(tmp_path):
-    own, outside = tmp_path / "own", tmp_path / "outside"
-    own.mkdir()
-    outside.mkdir()
-    (outside / "kept").write_text("years of work")
-    deeds = (
-        lambda: (outside / "new").touch(),
-        lambda: (outside / "kept").write_text(""),
-        lambda: (outside / "kept").unlink(),
-        lambda: (outside / "folder").mkdir(),
-        lambda: os.mkfifo(outside / "pipe"),
-        lambda: (outside / "link").symlink_to("kept"),
-        lambda: os.truncate(outside / "kept", 0),
-        lambda: os.rename(outside / "kept", own / "kept"),
-        lambda: os.rename(own / "mine", outside / "mine"),
-    )
-
-    def work() -> None:
-        confine(own)
-        (own / "mine").write_text("mine")
-        Path(os.devnull).write_text("may be written to")
-        for deed in deeds:
-            with pytest.raises(OSError):
-                deed()
-        assert os.system(f"touch '{outside}/new' 2>/dev/null") != 0
-
-    assert ends_well(partial(work))
-    assert (os.listdir(outside), (outside / "kept").read_text()) == (["kept"], "years of work")
-    assert os.listdir(own) == ["mine"]
 
 
 def test_page__says_how_much_the_attack_holds():

@@ -1,17 +1,13 @@
-"""The packages: wheel and sdist with the same bytes twice, the wheel alone without torch, and a wheel of kernels.
+"""The packages: wheel and sdist with the same bytes twice, and the wheel alone without torch.
 
-``built`` leaves wheel and sdist in ``--output``, if two builds have the same SHA-256 (``make dist``). ``kernels``
-leaves there a wheel of ready-made kernels, ``ethbrake-marl-kernels``, for this version of Python: the machine code of
-what Python calls, for two levels of x86-64 (``make kernels``). A kernel's name holds the hash of all that makes it: of
-another version of this package, of numba or of Python it is never loaded. ``light`` installs the wheel in an empty
-environment, weighs it, and runs there what must do without torch; then the sdist in its place, which must bring the
-same files (``make test-light``).
+``built`` leaves wheel and sdist in ``--output``, if two builds have the same SHA-256 (``make dist``). ``light``
+installs the wheel in an empty environment, weighs it, and runs there what must do without torch; then the sdist in its
+place, which must bring the same files (``make test-light``).
 """
 
 from __future__ import annotations
 
 import argparse
-import base64
 import hashlib
 import os
 import re
@@ -19,34 +15,26 @@ import subprocess
 import sys
 import tempfile
 import venv
-import zipfile
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from ethbrake_marl import __version__
 from tests.programmes import ROOT, Cases, Told
 
 LIMIT_MB = 650
 NOT_OURS = ("pip", "setuptools", "pkg_resources", "wheel", "_distutils_hack")  # what an empty environment begins with
 SHIPPED = "ppo@shipped,ppo@shipped+episode"
 NEEDS_TRAIN = "-m pip install 'ethbrake-marl[train]'"
-LEVELS = ("x86-64-v3", "x86-64-v2")
-KERNELS = "ethbrake_marl_kernels"
-LARGEST_BYTES = 5_000_000
-DATE = (2020, 1, 1, 0, 0, 0)
 
 
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--output", type=Path, default=ROOT / "dist", help="folder of what is built")
-    parser.add_argument("--store", type=Path, help="folder below which each level's kernels are kept for the next time")
     parser.add_argument("--environment", type=Path, help="to install into, instead of a new one; its packages stay")
 
 
 def cases(given: argparse.Namespace) -> Cases:
     yield "built twice: wheel and sdist", partial(built_twice, given.output)
-    yield "kernels: a wheel of ready-made ones", partial(kernels, given.output, given.store)
     with tempfile.TemporaryDirectory(prefix="ethbrake-wheel-") as folder:
         yield from light(Path(folder), given.environment)
 
@@ -69,55 +57,6 @@ def built_twice(output: Path) -> Told:
         (output / name).write_bytes(content)
         print(f"{hashlib.sha256(content).hexdigest()}  {name}", flush=True)
     return Told(True, "the same bytes")
-
-
-# ---------------------------------------------------------------- kernels
-
-
-def kernels(output: Path, store: Path | None) -> Told:
-    """Compile, pack, and say how large it is."""
-    output.mkdir(exist_ok=True)
-    found: dict[str, bytes] = {}
-    with tempfile.TemporaryDirectory() as folder:
-        for level in LEVELS:
-            found |= compile_for(level, (store or Path(folder)) / level)
-    wheel = pack(found, output)
-    size = wheel.stat().st_size
-    print(f"{hashlib.sha256(wheel.read_bytes()).hexdigest()}  {wheel.name}", flush=True)
-    return Told(size <= LARGEST_BYTES, f"{len(found)} kernels, {size / 1e6:.2f} MB, at most {LARGEST_BYTES / 1e6:.0f}")
-
-
-def compile_for(level: str, folder: Path) -> dict[str, bytes]:
-    """The kernels of one level, by name."""
-    chosen = {"NUMBA_CPU_NAME": level, "NUMBA_CPU_FEATURES": "", "NUMBA_CACHE_DIR": str(folder)}
-    command = [sys.executable, "-m", "ethbrake_marl", "doctor", "--compile"]
-    subprocess.run(command, env={**os.environ, "PYTHONPATH": str(ROOT), **chosen}, cwd=ROOT, check=True)
-    return {file.name: file.read_bytes() for file in sorted(folder.rglob("*.entry"))}
-
-
-def pack(found: dict[str, bytes], folder: Path) -> Path:
-    """Write the wheel."""
-    tag = f"cp{sys.version_info.major}{sys.version_info.minor}-none-manylinux2014_x86_64"
-    about = f"{KERNELS}-{__version__}.dist-info"
-    files = {f"{KERNELS}/__init__.py": b'"""Compiled kernels of ethbrake_marl."""\n'}
-    files |= {f"{KERNELS}/{name}": content for name, content in found.items()}
-    files[f"{about}/METADATA"] = (
-        f"Metadata-Version: 2.1\nName: ethbrake-marl-kernels\nVersion: {__version__}\n".encode()
-    )
-    files[f"{about}/WHEEL"] = (
-        f"Wheel-Version: 1.0\nGenerator: tests.programmes\nRoot-Is-Purelib: true\nTag: {tag}\n".encode()
-    )
-    record = "".join(f"{name},sha256={_digest(content)},{len(content)}\n" for name, content in files.items())
-    files[f"{about}/RECORD"] = f"{record}{about}/RECORD,,\n".encode()
-    wheel = folder / f"{KERNELS}-{__version__}-{tag}.whl"
-    with zipfile.ZipFile(wheel, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in files.items():
-            archive.writestr(zipfile.ZipInfo(name, DATE), content, zipfile.ZIP_DEFLATED, 9)
-    return wheel
-
-
-def _digest(content: bytes) -> str:
-    return base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
 
 
 # ---------------------------------------------------------------- the wheel alone

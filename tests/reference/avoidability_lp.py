@@ -21,7 +21,6 @@ import numpy as np
 from scipy import sparse
 from scipy.optimize import linprog
 
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.physics.kernel import solo_motion
 
@@ -44,21 +43,13 @@ def avoidable_by_lp(
 
     The margin is off by at most ``step_s^2 max(a + a_u)`` as long as the best profile changes its command no more than
     six times; a verdict within that tolerance is not ``certain``. ``horizon_s`` counts from the world's time; the
-    default is the last standstill or latency of all, plus ``limit / a`` of each controlled vehicle.
-
-    Raises ``InvalidInput`` unless ``world`` is a single one that moves forward, without an obstacle ahead,
-    ``controlled`` are different vehicles of it (at least one), and 0 < step_s and the controlled vehicles' latencies
-    lie below the horizon.
+    default is the last standstill or latency of all, plus ``limit / a`` of each controlled vehicle. The step and the
+    latencies of the controlled vehicles must lie below it; the world moves forward, and has no obstacle.
     """
-    _check(world, controlled)
     cars = tuple(sorted(controlled))
     onset = _onset_s(world)
     horizon = default_horizon_s(world, cars) if horizon_s is None else horizon_s
-    if not 0.0 < step_s < horizon < math.inf or not np.all(onset[list(cars)] < horizon):
-        raise InvalidInput(
-            f"avoidable_by_lp: step_s {step_s!r}, horizon_s {horizon!r}: the step and all latencies must lie below the"
-            " horizon"
-        )
+    assert 0.0 < step_s < horizon < math.inf and np.all(onset[list(cars)] < horizon)
     steps = math.ceil(horizon / step_s - 1e-9)
     programme = _Programme(world, cars, onset, step_s * np.arange(steps + 1, dtype=np.float64))
     return programme.solve()
@@ -75,8 +66,7 @@ def default_horizon_s(world: Worlds, controlled: Sequence[int]) -> float:
 
 def _onset_s(world: Worlds) -> Floats:
     """Time from now at which each vehicle may act, [N]."""
-    onset: Floats = np.maximum(world.vehicles.latency_s[0] - world.time_s[0], 0.0)
-    return onset
+    return np.maximum(world.vehicles.latency_s[0] - world.time_s[0], 0.0)
 
 
 class _Programme:
@@ -103,8 +93,7 @@ class _Programme:
             objective, A_ub=rows, b_ub=right, A_eq=self._motion(), b_eq=np.zeros(2 * K * len(self._cars)),
             bounds=self._bounds(), method="highs",
         )  # fmt: skip
-        if found.status != 0:
-            raise InvalidInput(f"avoidable_by_lp: {found.message} (is horizon_s long enough to come to rest?)")
+        assert found.status == 0, f"{found.message} (is horizon_s long enough to come to rest?)"
         margin = min(-float(found.fun), fixed) if fixed < 0.0 else -float(found.fun)
         v = world.vehicles
         tolerance = self._step * self._step * float((v.braking_capacity_mps2 + v.driving_capacity_mps2).max())
@@ -187,19 +176,3 @@ class _Programme:
         speed, onset = float(self._world.speeds_mps[0, i]), float(self._onset[i])
         ways = [solo_motion(speed, braking, onset, math.inf, float(t))[1] if t > 0.0 else 0.0 for t in self._time]
         return np.asarray(self._start[i] + np.array(ways))
-
-
-def _check(world: Worlds, controlled: Sequence[int]) -> None:
-    if world.n != 1:
-        raise InvalidInput(f"avoidable_by_lp: {world.n} worlds; one at a time, for instance worlds.take([k])")
-    if not controlled or len(set(controlled)) < len(controlled) or not set(controlled) <= set(range(world.N)):
-        raise InvalidInput(
-            f"avoidable_by_lp: controlled {list(controlled)}: must be different indices in 0..{world.N - 1}, at least"
-            " one"
-        )
-    if not np.all(world.speeds_mps >= 0.0):
-        raise InvalidInput(f"avoidable_by_lp: speeds_mps {world.speeds_mps[0].tolist()}: all must be >= 0")
-    if np.isfinite(world.obstacle_gap_m[0]):
-        raise InvalidInput(
-            f"avoidable_by_lp: obstacle_gap_m {world.obstacle_gap_m[0]:g}: the programme knows no obstacle"
-        )

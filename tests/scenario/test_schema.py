@@ -15,7 +15,6 @@ from jsonschema import Draft202012Validator
 from pydantic import ValidationError
 
 from ethbrake_marl.defaults import HARM_COUNTS
-from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import scenario_sha256
 from ethbrake_marl.files.yaml import flow_text, read_yaml
@@ -212,18 +211,6 @@ def test_shipped__reads_back_by_name_path_and_folder_and_a_new_file_is_based_on_
         assert [error.message for error in editor.iter_errors(content)] == []
 
 
-def test_new__its_comments_are_other_ways_that_would_be_valid() -> None:
-    text = new_scenario_text("mine")
-    swapped = text.replace("\ngaps_m:", "\n# gaps_m:").replace("\n# time_gaps_s:", "\ntime_gaps_s:")
-    assert Scenario.from_document(parse_yaml(swapped)).time_gaps_s == (1.0, 1.0)
-    for key in ("line_speed_mps", "speed_deviations_mps"):
-        swapped = swapped.replace(f"\n# {key}:", f"\n{key}:")
-    line = Scenario.from_document(parse_yaml(swapped.replace("\nspeeds_mps:", "\n# speeds_mps:")))
-    assert line.bounds("speeds_mps") == ((20.0, 20.0), (18.0, 18.0), (20.0, 20.0))
-    (told,) = (line for line in text.splitlines() if "3600" in line and "commands" in line)
-    assert told.endswith("below horizon_s")
-
-
 @pytest.mark.parametrize(("suffix", "folder"), [(".yaml", "."), (".yml", "."), ("", "stress")])
 def test_path__of_the_users_own_file_goes_before_a_shipped_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, folder: str
@@ -260,12 +247,6 @@ def test_variants__have_the_lines_of_the_random_test_and_differ_in_one_key(name:
     assert {field for field in told if told[field] != other[field]} == {key}
 
 
-def test_variants__stand_1_7_m_beyond_where_vehicle_1_stops_or_cannot_drive_on() -> None:
-    worlds = load_scenario("paper-random-obstacle").sample(1000, 7).worlds
-    assert worlds.obstacle_gap_m - worlds.speeds_mps[:, 0] ** 2 / 12 == pytest.approx(1.7, abs=1e-12)
-    assert load_scenario("paper-random-brake-only").bounds("driving_capacity_mps2")[1] == (0.0, 0.0)
-
-
 @pytest.mark.parametrize("name", ["cooperation-3-pair", "cooperation-3-five"])
 def test_level_4__has_the_lines_of_level_3_and_full_braking_never_meets_its_obstacle(name: str) -> None:
     level_3, level_4 = LEVELS[name], LEVELS[name.replace("3-pair", "4-all").replace("3-five", "4-five")]
@@ -281,40 +262,6 @@ def test_level_4__has_the_lines_of_level_3_and_full_braking_never_meets_its_obst
         assert ledgers["4"].vehicle_harm(harm_count).tobytes() == ledgers["3"].vehicle_harm(harm_count).tobytes()
     v, a = worlds["4"].speeds_mps[:, 0], worlds["4"].vehicles.braking_capacity_mps2[:, 0]
     assert (v * v / (2.0 * a) < worlds["4"].obstacle_gap_m).all()
-
-
-def test_obstacle__changes_nothing_in_a_level_whose_line_does_not_reach_it() -> None:
-    plain = LEVELS["cooperation-3-pair"]
-    runs = [make_engine(scenario, 200, seed=3) for scenario in (plain, plain.replace(obstacle_gap_m=42))]
-    for _ in range(80):
-        steps = [run.step(np.full((200, 2), -1.0)) for run in runs]
-        assert steps[0].reward.tobytes() == steps[1].reward.tobytes()
-        assert steps[0].ended.tobytes() == steps[1].ended.tobytes()
-    without, with_it = (run.worlds for run in runs)
-    assert without.gaps_m.tobytes() == with_it.gaps_m.tobytes() and with_it.obstacle_gap_m.min() > 0.0
-    assert runs[0].ledger.total_harm.tobytes() == runs[1].ledger.total_harm.tobytes()
-    assert runs[0].ledger.collided.sum() > 100
-
-
-def test_stress_wide__has_the_stated_ranges() -> None:
-    scenario = load_scenario("stress-wide")
-    worlds = scenario.sample(5000, 7).worlds
-    vehicles = worlds.vehicles
-    for drawn, low, high in (
-        (worlds.speeds_mps, 8, 40),
-        (vehicles.mass_t, 1, 40),
-        (vehicles.braking_capacity_mps2, 3, 10),
-        (vehicles.driving_capacity_mps2, 3, 10),
-        (vehicles.latency_s[:, 1:], 0, 1.5),
-        (vehicles.restitution, 0, 0.3),
-        (worlds.gaps_m / worlds.speeds_mps[:, 1:], 0.2, 2),
-    ):
-        assert low - 1e-12 <= drawn.min() < low + 0.02 * (high - low)
-        assert high - 0.02 * (high - low) < drawn.max() <= high + 1e-12
-    assert (vehicles.latency_s[:, 0] == 0.0).all() and scenario.learners == (1,)
-    assert np.abs(np.diff(worlds.speeds_mps)).max() <= 4.0
-    slowest = vehicles.latency_s + worlds.speeds_mps / vehicles.braking_capacity_mps2
-    assert slowest.max() < 1.5 + 40 / 3 < scenario.horizon_s
 
 
 # ---------------------------------------------------------------- folders, editors, pages

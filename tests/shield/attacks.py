@@ -115,7 +115,7 @@ def sleeper(rng, engine, shield, k):
 
 @cache
 def layers(N: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Weights and biases of the trained adversary, in order; ``tests/programmes/adversary.py`` made them."""
+    """Weights and biases of the trained adversary, in order; ``docs/studies/shield_adversary.py`` made them."""
     with np.load(Path(__file__).with_name(f"adversary-{N}.npz"), allow_pickle=False) as kept:
         return [(kept[f"weight{k}"], kept[f"bias{k}"]) for k in range(len(kept.files) // 2)]
 

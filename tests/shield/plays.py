@@ -16,11 +16,10 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-from pettingzoo.utils import BaseParallelWrapper
 
 from ethbrake_marl.agents.registry import Team, episode_engine
-from ethbrake_marl.envs.interfaces import EthBrakeParallelEnv, EthBrakeVectorEnv, parallel_env
-from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
+from ethbrake_marl.envs.interfaces import EthBrakeVectorEnv, parallel_env
+from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import (
@@ -40,7 +39,7 @@ NO_STATE = {"initial_state": {"gaps_m": [-1, 1], "speeds_mps": [1, 1, 1]}}
 
 
 class Failure(Exception):
-    """Raised by a policy or a wrapper of the tests."""
+    """Raised by a policy or between the shield and the engine."""
 
 
 class Recorder:
@@ -84,15 +83,16 @@ class Play:
         self.done: list[tuple[float, float]] = []  # of engines before this one
         self.make()
 
-    def make(self) -> None:
-        """Make the interface, watch its engine, begin an episode."""
-        raise NotImplementedError
-
-    engine: Any  # both without arguments
+    make: Any  # the interface, watch its engine, begin an episode; all without arguments
+    engine: Any
     shield: Any
+    step: Any
 
-    def step(self) -> None:
-        raise NotImplementedError
+    def between(self, env: Any) -> Any:
+        """The environment, each of whose steps goes through ``how``."""
+        step = env.step
+        env.step = lambda actions: self.how(step, actions)
+        return env
 
     def watch(self, memory: Any = (0, [])) -> None:
         self.recorder = Recorder()
@@ -101,10 +101,9 @@ class Play:
     def begin(self) -> int:
         return int(self.rng.integers(10**6))
 
-    def made(self) -> int:
+    def made(self) -> Any:
         """Steps that the engine made."""
-        made: int = self.engine().memory(self.recorder)[0]
-        return made
+        return self.engine().memory(self.recorder)[0]
 
     def ended(self) -> list[tuple[float, float]]:
         """Harm and bound of the episodes that have ended."""
@@ -167,7 +166,7 @@ class Parallel(Play):
     def make(self) -> None:
         policies: Any = {f"vehicle_{i + 1}": member for i, member in self.members.items()}
         policy = policies if self.team else policies["vehicle_2"]
-        inner = _ParallelBetween(parallel_env(self.scenario), self)
+        inner = self.between(parallel_env(self.scenario))
         self.env = HybridShield(inner, policy, mode="step", cap="baseline" if self.team else None)
         last = list(policies)[-1]
         self.bad = [
@@ -195,7 +194,7 @@ class Aec(Play):
     """PettingZoo AEC."""
 
     def make(self) -> None:
-        self.env = shielded_aec(_ParallelBetween(parallel_env(self.scenario), self), mode="step")
+        self.env = shielded_aec(self.between(parallel_env(self.scenario)), mode="step")
         inner: Any = self.env
         while not isinstance(inner, HybridShield):
             inner = inner.env
@@ -235,7 +234,7 @@ class Single(Attached):
             lambda: self.env.reset(seed=-1),
             lambda: self.env.reset(options=NO_STATE),
         ]
-        self.put(ShieldedEnv(_SingleBetween(plain, self)), seed=self.begin())
+        self.put(ShieldedEnv(self.between(plain)), seed=self.begin())
 
     def step(self) -> None:
         if self.engine().ended[0]:
@@ -249,8 +248,7 @@ class Vector(Attached):
     mode = "SameStep"
 
     def make(self) -> None:
-        inner = _VectorBetween(ROWS, self.scenario, autoreset_mode=self.mode)
-        inner.play = self
+        inner = self.between(EthBrakeVectorEnv(ROWS, self.scenario, autoreset_mode=self.mode))
         self.bad = [
             lambda: self.env.step(self.one_bad(ROWS, int(np.argmin(self.engine().ended)))),  # others are ignored
             lambda: self.env.step(np.zeros((ROWS + 1, 1))),
@@ -280,8 +278,13 @@ class Sb3(Attached):
 
     def make(self) -> None:
         inner = make_sb3_vec_env(self.scenario, ROWS, seed=self.begin())
-        inner.__class__ = _Sb3Between
-        inner.play = self
+        plain = inner.step_wait
+
+        def step(actions: Any) -> Any:
+            inner._actions = actions
+            return plain()
+
+        inner.step_wait = lambda: self.how(step, inner._actions)
         rows = inner.num_envs
         self.bad = [
             lambda: self.env.step(Vector.one_bad(rows, int(self.rng.integers(rows)))),
@@ -324,42 +327,6 @@ class Evaluation(Play):
             self.how(self.engine().step, {})
 
 
-class _ParallelBetween(BaseParallelWrapper):
-    def __init__(self, env: EthBrakeParallelEnv, play: Play) -> None:
-        super().__init__(env)
-        self.play = play
-
-    def step(self, actions: Any) -> Any:
-        return self.play.how(super().step, actions)
-
-
-class _SingleBetween(gymnasium.Wrapper):
-    def __init__(self, env: Any, play: Play) -> None:
-        super().__init__(env)
-        self.play = play
-
-    def step(self, action: Any) -> Any:
-        return self.play.how(self.env.step, action)
-
-
-class _VectorBetween(EthBrakeVectorEnv):
-    play: Play
-
-    def step(self, actions: Any) -> Any:
-        return self.play.how(super().step, actions)
-
-
-class _Sb3Between(EthBrakeVecEnv):
-    play: Play
-
-    def step_wait(self) -> Any:
-        def step(actions: Any) -> Any:
-            self._actions = actions
-            return EthBrakeVecEnv.step_wait(self)
-
-        return self.play.how(step, self._actions)
-
-
 PLAYS: dict[str, Callable[[int], Play]] = {
     "parallel": Parallel, "aec": Aec, "single": Single, "vector": Vector, "vector, next step": NextStepVector,
     "sb3": Sb3, "evaluation": Evaluation, "team, parallel": partial(Parallel, team=True),
@@ -381,6 +348,11 @@ class Tally(NamedTuple):
     refused: int  # calls that raised
     interrupted: int
     broken: int  # times that bound, plan, trust or place in the episode were not as they should be after that
+
+    @classmethod
+    def of(cls, play: Play, refused: int = 0, interrupted: int = 0, broken: int = 0) -> Tally:
+        ended = play.ended()
+        return cls(len(ended), sum(harm > bound + 1e-9 for harm, bound in ended), refused, interrupted, broken)
 
 
 @contextlib.contextmanager
@@ -414,11 +386,6 @@ def calm() -> Iterator[None]:
         yield
 
 
-def tally(play: Play, refused: int = 0, interrupted: int = 0, broken: int = 0) -> Tally:
-    ended = play.ended()
-    return Tally(len(ended), sum(harm > bound + 1e-9 for harm, bound in ended), refused, interrupted, broken)
-
-
 @calm()
 def played(name: str, episodes: int, seed: int) -> Tally:
     """Play so many episodes through an interface, in which nothing fails."""
@@ -426,7 +393,7 @@ def played(name: str, episodes: int, seed: int) -> Tally:
     while len(play.ended()) < episodes:
         play.step()
         broken += play.astray()
-    return tally(play, broken=broken)
+    return Tally.of(play, broken=broken)
 
 
 @calm()
@@ -461,7 +428,7 @@ def disturbed(name: str, episodes: int, seed: int) -> Tally:
         if play.made() == made and kind != 2:
             broken += play.known() != before
         broken += play.astray()
-    return tally(play, refused, interrupted, broken)
+    return Tally.of(play, refused, interrupted, broken)
 
 
 def _scaled(actions: Any, factor: float) -> Any:
@@ -518,4 +485,4 @@ def wrapped(name: str, wrapper: str, calls: int, seed: int) -> Tally:
             refused -= 1
         refused += 1
         broken += play.astray()
-    return tally(play, refused, 0, broken)
+    return Tally.of(play, refused, 0, broken)

@@ -10,7 +10,6 @@ import pytest
 from ethbrake_marl.agents.registry import drive, make_agent
 from ethbrake_marl.envs.interfaces import EthBrakeEnv, EthBrakeVectorEnv, parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Scenario, load_scenario
@@ -40,7 +39,7 @@ def behind(way: str, scenario: Scenario, robust: str | None = None) -> ShieldedD
 @pytest.mark.parametrize("name", LISTS)
 @pytest.mark.parametrize("way", WAYS)
 def test_robust__at_the_corners_no_world_is_above_the_first_bound(name: str, way: str) -> None:
-    harm, bound, replaced = shielded(way, LISTS[name], 8 if way == "drive" else 4, 7)
+    harm, bound, replaced = shielded(way, LISTS[name], 4, 7)
     assert (harm <= bound + ABOVE).all()
     assert replaced > 4
 
@@ -210,16 +209,3 @@ def test_batch__rows_that_begin_again_are_those_of_a_fresh_episode(make: Any) ->
         assert (told <= bounds + ABOVE)[~idle].all()
         begun += int(fresh.sum())
     assert begun >= 4  # each row at least twice: an episode has at most 80 steps
-
-
-def test_refused__calls_leave_the_shield_as_it_was() -> None:
-    envs = [HybridShield(parallel_env(PERIODIC), mode="step", believed=True) for _ in range(2)]
-    for env in envs:
-        env.reset(seed=2)
-    while envs[0].agents:
-        with pytest.raises(InvalidInput):
-            envs[0].step({"vehicle_2": np.array([np.nan, 1.0])})
-        attached = envs[0].attached
-        attached.guard.decide(attached.engine, attached.memory, np.array([[-1.0]]))  # certified, and never carried out
-        told = [env.step({"vehicle_2": np.array([0.7])})[4]["vehicle_2"]["shield"] for env in envs]
-        assert told[0] == told[1]

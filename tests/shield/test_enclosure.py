@@ -14,12 +14,16 @@ from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield import ShieldedDriver, StepShield, enclosure, parse_uncertainty
 from ethbrake_marl.shield.enclosure import (
     CLOSING,
+    HARDEST,
     OPENING,
+    SOFTEST,
+    TOUCH_WIDTH,
     TOUCHES,
     WIDE,
     Known,
     Path,
     backwards,
+    bounce,
     boxes_of,
     cell_of,
     go_on,
@@ -34,6 +38,7 @@ from ethbrake_marl.shield.enclosure import (
 )
 from ethbrake_marl.shield.step_shield import begin_running, plan_harm
 from ethbrake_marl.shield.uncertainty import Uncertainty
+from tests.shield.test_uncertainty import STANDING
 
 STEPS = 81
 PAPER = load_scenario("paper-random")
@@ -68,6 +73,16 @@ def boxed(text, scenario=EARLY, *, seed=3, first=0, **changes):
     command = fixed_commands(others, possible, "test", vehicle=1)
     problem = profile_problem(possible, [1], horizon_s=scenario.horizon_s, others_mps2=command)
     return Case(scenario, worlds, uncertainty, boxes_of(possible, problem, 1, scenario, others))
+
+
+def cell_in(case, low, plan, vehicle=1):
+    """The cell of the part of the box above ``low``, and by how much its first decision may be late."""
+    boxes = case.boxes
+    known = Known(
+        vehicle, boxes.constant[0], boxes.limit[0], float(boxes.restitution[0]), float(boxes.begin_s[0]),
+        boxes.time_step_s, boxes.horizon_s,
+    )  # fmt: skip
+    return cell_of(low, boxes.high[0], np.flatnonzero(boxes.high[0] > boxes.low[0]), known, plan)
 
 
 def bound_of(case, plan, cells):
@@ -112,13 +127,6 @@ def test_forms__enclose_what_they_stand_for(name):
         assert (np.abs(exact(a, b) - out[0] - at @ out[1:4]) <= out[4] + 1e-12).all()
 
 
-# Full braking by 5 m/s2 behind one that stands 15 m ahead.
-STANDING = Scenario(
-    name="two", vehicles=2, gaps_m=15, speeds_mps=[0, 14], braking_capacity_mps2=5, driving_capacity_mps2=5,
-    mass_t=1, latency_s=0, roles={"vehicle_1": "full_brake", "vehicle_2": "learner"},
-)  # fmt: skip
-
-
 @pytest.mark.parametrize(
     ("text", "cells", "harm", "more"),
     [
@@ -131,6 +139,24 @@ def test_by_hand__two_vehicles_the_bound_is_that_of_the_least_gap(text, cells, h
     assert harm - 1e-9 <= found <= harm + more
 
 
+def test_by_hand__a_drive_that_a_speed_limit_may_end_gives_any_part_of_its_way():
+    # 20 m/s are its limit: 2 m in 0.1 s, and not the 2.035 m of a drive with 7 m/s2
+    case = boxed("gaps_m=1", speeds_mps=20, speed_limit_mps=20, latency_s=0)
+    cell, _ = cell_in(case, case.boxes.low[0], np.ones(STEPS))
+    path = Path(np.concatenate([cell.speed, cell.gap, 0 * cell.gap[:1]]), np.zeros((2, TOUCH_WIDTH)), np.zeros(5, int))
+    move_alone(cell, path, 0, motion := new_motion(3, cell.drive.shape[0]))
+    assert [enclosure.low(motion.reach[1]), enclosure.high(motion.reach[1])] == pytest.approx([2.0, 2.035], abs=1e-9)
+
+
+@pytest.mark.parametrize(("length", "wide"), [(0.1, 0.1), (1.0, 0.125)])
+def test_by_hand__a_gap_in_contact_is_as_wide_as_the_flight_of_its_piece_or_the_highest_one(length, wide):
+    # It opens with 1 m/s at most, and 4 m/s2 press it together: 1 / (2 * 4) m.
+    case, touch = boxed("gaps_m=1"), np.zeros(TOUCH_WIDTH)
+    touch[[OPENING, SOFTEST, HARDEST]] = 1.0, 4.0, 4.0
+    bounce(cell_in(case, case.boxes.low[0], np.full(STEPS, -1.0))[0], touch, 0, 4.0, 4.0, length, 0.0)
+    assert touch[WIDE] == wide
+
+
 @pytest.mark.parametrize("name", UNUSUAL)
 def test_bound__is_at_least_the_harm_of_every_world_drawn_from_the_box(name):
     (changed, text), rng = UNUSUAL[name], np.random.default_rng(5)
@@ -140,8 +166,6 @@ def test_bound__is_at_least_the_harm_of_every_world_drawn_from_the_box(name):
             assert harm_inside(*case[:3], plan, 25).max() <= bound_of(case, plan, 5) < np.inf
 
 
-# an impact, and then: bounces while they brake to a stop; a pair pressed together, a push beyond a speed limit, a drive
-# that begins at an uncertain time and ends at a limit; a light one between two heavy ones
 # an impact, and then: bounces while they brake to a stop; a pair pressed together, a push beyond a speed limit, a drive
 # that begins at an uncertain time and ends at a limit; a light one between two heavy ones
 STATES = {
@@ -176,22 +200,16 @@ def test_states__of_every_world_are_those_of_some_path(name):
     (changed, text), rng = STATES[name], np.random.default_rng(2)
     case = boxed(text, **changed)
     for plan in plans(rng, -1.0):
-        found = outside(case, plan, 12, rng)
-        assert found.outside[:3] == []
-        assert 0 < found.touching < found.states
+        states, touching, found = outside(case, plan, 12, rng)
+        assert found[:3] == [] and 0 < touching < states
 
 
 @pytest.mark.parametrize(("low", "met"), [(0.05, True), (0.5, False)])
 def test_by_hand__an_impact_before_the_first_decision_is_not_waited_for(low, met):
     # 9.5 m/s faster, 1 m apart: they meet 0.1 s after the alert; decisions begin between 0.05 and 0.55 s
-    _, _, _, boxes = boxed(
-        "latency_s.vehicle_2=0.25", gaps_m=[1, 30], speeds_mps=[10, 19.5, 10], latency_s=[0.9, 0.3, 0.9]
-    )
-    known = Known(1, boxes.constant[0], boxes.limit[0], 0.1, 0.0, boxes.time_step_s, boxes.horizon_s)
-    free = np.flatnonzero(boxes.high[0] > boxes.low[0])
-    box = boxes.low[0].copy()
-    box[free] = low
-    assert wait(*cell_of(box, boxes.high[0], free, known, np.full(STEPS, -1.0))) != met
+    case = boxed("latency_s.vehicle_2=0.25", gaps_m=[1, 30], speeds_mps=[10, 19.5, 10], latency_s=[0.9, 0.3, 0.9])
+    box = np.where(case.boxes.high[0] > case.boxes.low[0], low, case.boxes.low[0])
+    assert wait(*cell_in(case, box, np.full(STEPS, -1.0))) != met
 
 
 def test_bound__is_never_above_what_speeds_allow():
@@ -244,14 +262,6 @@ ROOM = 1e-7  # for what two ways to compute a state differ by
 MOST = 20_000  # states of paths
 
 
-class Outside(NamedTuple):
-    """What was found."""
-
-    states: int  # looked at
-    touching: int  # of which a pair was in contact
-    outside: list[str]  # those that no path encloses
-
-
 def follow_paths(cell):
     """Every path at every piece of time, by its number; whether all of them were followed to their end."""
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -293,21 +303,16 @@ def realised(scenario, truth: Worlds, vehicle: int, plan, times):
         yield truth, harm.sum(axis=1)
 
 
-def outside(case: Case, plan, draws: int, rng) -> Outside:
-    """Draw worlds out of the box of one world, and look for states that no path encloses.
+def outside(case: Case, plan, draws: int, rng) -> tuple[int, int, list[str]]:
+    """States looked at, those in which a pair is in contact, and those that no path encloses, of worlds of the box.
 
     ``follow_paths`` goes the way of ``enclosure.most_harm`` and keeps every path at every piece of time. A state that
     was realised must be that of some path with the same pairs hit. What follows a vehicle that may be thrown backwards
     is told by its harm alone, and not looked at.
     """
-    boxes, vehicle = case.boxes, 1
-    low, up = boxes.low[0], boxes.high[0]
+    vehicle, low, up = 1, case.boxes.low[0], case.boxes.high[0]
     free = np.flatnonzero(up > low)
-    known = Known(
-        vehicle, boxes.constant[0], boxes.limit[0], float(boxes.restitution[0]), float(boxes.begin_s[0]),
-        boxes.time_step_s, boxes.horizon_s,
-    )  # fmt: skip
-    cell, late = cell_of(low, up, free, known, plan)
+    cell, late = cell_in(case, low, plan)
     paths, whole = follow_paths(cell)
     assert wait(cell, late) and whole
     truth = case.uncertainty.draw(case.worlds.take(np.zeros(draws, np.int64)), rng)
@@ -328,7 +333,7 @@ def outside(case: Case, plan, draws: int, rng) -> Outside:
             touching += any((path.marks[truth.N - 1 : -1] == TOUCHES).any() for path in here)
             if not here:
                 found.append(f"piece {piece}, hit {hit}, {now.speeds_mps[k]} m/s, {now.gaps_m[k]} m")
-    return Outside(looked, touching, found)
+    return looked, touching, found
 
 
 def encloses(cell, path: Path, now: Worlds, harm, k: int, at) -> bool:

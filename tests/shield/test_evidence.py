@@ -65,23 +65,16 @@ def test_interior__keeps_its_bound_inside():
     assert found["robust", "inside"].above == found["robust", "corner"].above == 0.0
 
 
-def test_same_case__is_driven_once(monkeypatch):
-    drives = []
-    monkeypatch.setattr("ethbrake_marl.shield.evidence.drive", lambda *given: drives.append(given) or drive(*given))
-    robustness(FEW.take([0]), make_agent("full_brake"), TASK, INTERVALS, widths=(0.0, 1.0))
-    assert len(drives) == 1 + 5  # nothing differs at width 0, nor for step mode where the world is as told
-
-
 def test_figure__draws_the_points(points):
     figure = robustness_figure(points, caption="x")
-    price, above, excess = figure.axes
-    lines = {line.get_label(): line.get_ydata().tolist() for line in price.get_lines()}
+    price, above, excess = (
+        {line.get_label(): line.get_ydata().tolist() for line in axes.get_lines()} for axes in figure.axes
+    )
     told = [p for p in points if p.truth == "as told"]
-    assert lines["step: harm"] == [p.harm for p in told if p.mode == "step"]
-    assert lines["robust: bound at the alert"] == [p.bound for p in told if p.mode == "robust"]
-    drawn = {line.get_label(): line.get_ydata().tolist() for line in above.get_lines()}
-    assert drawn["step, a corner"] == [p.above for p in points if (p.mode, p.truth) == ("step", "corner")]
-    assert len(excess.get_lines()) == 4
+    assert price["step: harm"] == [p.harm for p in told if p.mode == "step"]
+    assert price["robust: bound at the alert"] == [p.bound for p in told if p.mode == "robust"]
+    assert above["step, a corner"] == [p.above for p in points if (p.mode, p.truth) == ("step", "corner")]
+    assert len(excess) == 4
 
 
 def test_worlds_that_cannot_be_advanced__are_in_no_point_and_named():

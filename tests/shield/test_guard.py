@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import copy
 import pickle
-import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import gymnasium
@@ -14,7 +13,6 @@ import pytest
 from gymnasium.wrappers import Autoreset
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.planner import Refined
 from ethbrake_marl.agents.registry import drive, episode_engine, make_agent
 from ethbrake_marl.engine import STEP, Engine
 from ethbrake_marl.envs.interfaces import EthBrakeVectorEnv, parallel_env
@@ -43,14 +41,6 @@ def shielded(scenario=PAPER, policy=None, **settings):
     env = ShieldedEnv(gymnasium.make("EthBrake-v0", scenario=scenario).unwrapped, policy, **settings)
     env.reset(seed=0)
     return env
-
-
-def play(env, action=DRIVE):
-    over = False
-    while not over:
-        *_, terminated, truncated, info = env.step(action)
-        over = terminated or truncated
-    return info
 
 
 class Cheating(Engine):
@@ -134,32 +124,14 @@ def test_ledger__harm_that_nobody_predicted_is_seen_before_the_next_decision(gro
     assert not info["shield"]["trusted"] and info["shield"]["reason"] == "assumption broken"
 
 
-def test_past_the_shield__a_step_is_shielded_too_until_it_lets_go():
-    env = shielded()
-    engine, shield = env.attached.engine, env.attached.shield
-    while not engine.ended[0]:
-        env.unwrapped.step(DRIVE)
-    assert engine.ledger.world_harm("first")[0] <= shield.first_bound[0] and env.attached.shield.interventions[0] > 0
-    env.reset(seed=0)
-    env.attached.close()
-    assert env.unwrapped.step(DRIVE)[-1]["chosen_action"][0] == 1.0
-
-
-def test_wrapped_in_mid_episode__needs_a_reset_first():
-    plain = gymnasium.make("EthBrake-v0").unwrapped
-    plain.reset(seed=0)
-    env = ShieldedEnv(plain)
-    with pytest.raises(UncertifiedStep, match="this episode began before the shield was put around it; reset first"):
-        env.step(DRIVE)
-    env.reset(seed=0)
-    env.step(DRIVE)
-
-
 def test_autoreset__of_gymnasium_inside_is_left_alone():
     env = ShieldedEnv(Autoreset(gymnasium.make("EthBrake-v0").unwrapped))
     env.reset(seed=0)
     for _ in range(3):
-        info = play(env)
+        over = False
+        while not over:
+            *_, terminated, truncated, info = env.step(DRIVE)
+            over = terminated or truncated
         assert info["shield"]["trusted"]
         env.step(DRIVE)  # begins the next episode
         assert env.attached.shield.running.steps.tolist() == [0]
@@ -185,8 +157,6 @@ def test_reset__in_between_brings_the_proposal_to_another_episode_and_its_bound_
     env.venv.reset()
     assert all(row["shield"]["trusted"] for row in env.step_wait()[3])
     assert env.attached.shield.running.steps.tolist() == env.attached.engine.steps.tolist() == [1, 1]
-    with pytest.raises(InvalidInput, match="no episode is running"):
-        env.step_wait()
 
 
 def test_threads__no_episode_gets_above_its_bound():
@@ -234,18 +204,12 @@ def test_world__that_goes_on_after_the_shields_own_end_is_braked_fully():
 
 
 def test_horizon__what_still_moves_then_is_told_and_warned_of_once():
-    short = PAPER.replace(horizon_s=3.0)
-    env = ShieldedEnv(gymnasium.make("EthBrake-v0", scenario=short).unwrapped)
+    env = ShieldedEnv(gymnasium.make("EthBrake-v0", scenario=PAPER.replace(horizon_s=3.0)).unwrapped)
     with pytest.warns(MovingAtHorizon, match="in 1 of 1 worlds something still moves at the horizon, 3 s") as told:
         env.reset(seed=0)
         env.reset(seed=1)
     assert len(told) == 1
-    *_, info = env.step(DRIVE)
-    assert info["shield"]["settles"] is False
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        *_, info = shielded().step(DRIVE)
-    assert info["shield"]["settles"] is True
+    assert [each.step(DRIVE)[-1]["shield"]["settles"] for each in (env, shielded())] == [False, True]
 
 
 def test_horizon__beyond_it_the_bound_says_nothing():
@@ -284,13 +248,6 @@ def test_episode__is_never_worse_than_either_part(harm_count):
     assert 0 < memory["chosen_policy"].sum() < WORLDS.n
 
 
-def test_episode__takes_a_refined_policy_at_its_word():
-    hybrid = HybridAgent(Refined(make_agent("constant:5"), PAPER, tries=6), PAPER)
-    realised, plain = harm(hybrid), harm(HybridAgent(make_agent("constant:5"), PAPER))
-    assert realised.tolist() == memory_of(hybrid)["predicted_harm"].tolist()
-    assert (realised <= plain).all() and (realised < plain).any()
-
-
 def test_episode__the_pairwise_bound_is_exceeded_in_the_same_physics():
     hybrid = HybridAgent(make_agent("constant:0.5"), PAPER, bound="pairwise")
     assert (harm(hybrid) > memory_of(hybrid)["bound_harm"] + 1.0).mean() > 0.3
@@ -317,6 +274,34 @@ def test_episode__applies_the_certified_strategy_whatever_is_proposed():
         assert realised == pytest.approx(min(told["policy_harm"], told["bound_harm"]), abs=1e-9)
 
 
+@pytest.mark.parametrize(
+    "settings", [{"mode": "episode"}, {"mode": "step"}, {"mode": "step", "believed": True}], ids=str
+)
+def test_policy_with_a_memory__is_asked_once_per_decision_whoever_proposes(settings):
+    def remembering(observation, state):
+        state += 1.0  # a memory that no decision which is not carried out must move
+        return -np.minimum(state - 1.0, 10.0) / 10.0, state
+
+    def asked():
+        memory = attached.memory.shield["policy"] if settings["mode"] == "episode" else attached.memory.policies[1]
+        return memory["steps"].tolist()
+
+    policy = eb.policy_agent(remembering, initial_state=lambda n: np.zeros((n, 1)))
+    env = HybridShield(parallel_env(), policy, **settings)
+    env.reset(seed=7)
+    attached = env.attached
+    assert asked() == [0]
+    for k, actions in enumerate(({"vehicle_2": [-0.3]}, {}, {"vehicle_2": [-0.9]}, {"vehicle_2": [1.0]}, {})):
+        nothing = np.full((1, 1), np.nan)
+        told = [attached.guard.decide(attached.engine, attached.memory, nothing).proposed for _ in range(2)]
+        assert np.array_equal(*told, equal_nan=True)
+        with pytest.raises(InvalidInput):
+            env.step({"vehicle_2": [-0.3], "vehicle_9": [0.0]})
+        env.step(actions)
+        assert asked() == [k + 1]
+        assert settings != {"mode": "step"} or attached.shield.running.steps.tolist() == [k + 1]
+
+
 class Counting:
     """Brakes harder with every decision that it was asked for: a memory that a refused call must not move."""
 
@@ -330,25 +315,6 @@ class Counting:
         return -np.minimum(0.3 * memory, 7.0), memory
 
 
-@pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.MovingAtHorizon")
-def test_episode__neither_a_prediction_nor_a_refused_call_asks_the_policy_again():
-    assert (HybridAgent(Counting(), PAPER).begin(WORLDS, 1, {})["policy"] == 0.0).all()
-    harms = []
-    for refused in (0, 3):
-        env = HybridShield(parallel_env(), Counting())
-        env.reset(seed=4)
-        while env.agents:
-            for _ in range(refused):
-                with pytest.raises(InvalidInput, match="unknown agent"):
-                    env.step({"vehicle_9": np.zeros(1)})
-            *_, infos = env.step({})
-        harms.append(infos["vehicle_2"]["world_first_impact_harm"])
-    assert harms[0] == harms[1]
-    env.reset(seed=4)
-    *_, infos = env.unwrapped.step({"vehicle_2": np.zeros(1)})
-    assert infos["vehicle_2"]["chosen_action"] == np.float32(env.attached.infos()[0]["chosen_action"]) < 0.0
-
-
 @pytest.mark.parametrize("believed", [False, True])
 def test_decide__changes_nothing_not_even_the_memory_of_a_policy_that_writes_into_it(believed):
     env = HybridShield(parallel_env(), Counting(), mode="step", believed=believed)
@@ -356,20 +322,3 @@ def test_decide__changes_nothing_not_even_the_memory_of_a_policy_that_writes_int
     attached, nothing = env.attached, np.full((1, 1), np.nan)
     told = [attached.guard.decide(attached.engine, attached.memory, nothing).proposed for _ in range(2)]
     assert told[0].tolist() == told[1].tolist() and attached.memory.policies[1].tolist() == [0.0]
-
-
-@pytest.mark.parametrize("believed", [False, True])
-def test_policy_with_a_memory__is_asked_once_per_decision_whoever_proposes(believed):
-    def remembering(observation, state):
-        return -np.minimum(state, 10.0) / 10.0, state + 1.0
-
-    policy = eb.policy_agent(remembering, initial_state=lambda n: np.zeros((n, 1)))
-    env = HybridShield(parallel_env(), policy, mode="step", believed=believed)
-    env.reset(seed=7)
-    for actions in ({"vehicle_2": [-0.3]}, {}, {"vehicle_2": [-0.9]}, {"vehicle_2": [1.0]}):
-        env.step(actions)
-    assert env.attached.memory.policies[1]["steps"].tolist() == [4]
-    with pytest.raises(InvalidInput):
-        env.step({"vehicle_2": [-0.3], "vehicle_9": [0.0]})
-    env.step({})
-    assert env.attached.memory.policies[1]["steps"].tolist() == [5]

@@ -16,18 +16,9 @@ from ethbrake_marl.physics import make_worlds
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver, StepShield, parse_uncertainty
-from ethbrake_marl.shield.step_shield import (
-    CONSTANTS,
-    REASONS,
-    Backup,
-    Proposer,
-    begin_running,
-    certify,
-    plan_harm,
-    seen_columns,
-)
+from ethbrake_marl.shield.step_shield import REASONS, Backup, Proposer, begin_running, certify, plan_harm
 from tests.fixtures.asked import Asked
-from tests.shield.attacks import ADVERSARIES, LEAKS, attack, begun, extremes, line, plain_engine, random_actions, search
+from tests.shield.attacks import ADVERSARIES, LEAKS, attack, begun, extremes, line, random_actions, search
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::RuntimeWarning",  # uncompiled, a division by 0 warns
@@ -109,17 +100,6 @@ def test_by_hand__coasting_is_let_through_as_long_as_the_worst_corner_can_still_
         assert last.margin[0] == pytest.approx(-10.0, abs=1e-9)
 
 
-def test_by_hand__what_the_nominal_shield_certifies_breaks_its_bound_in_a_corner():
-    realised = {}
-    for belief in ("gaps_m=0", "gaps_m=2"):
-        applied = [decision.applied[0] for decision in waits(*start(two()[1], braking(), belief))]
-        driven = braking()
-        driven[0, : len(applied)] = applied
-        realised[belief] = start(two()[1], driven, "gaps_m=2")[1].harm[0]
-    # 0.5 s of coasting leave 8 of 13 m, 10 are needed: an impact at sqrt(2 * 5 * 2) m/s
-    assert realised == pytest.approx({"gaps_m=0": 20.0, "gaps_m=2": 0.0}, abs=1e-9)
-
-
 def test_by_hand__a_pair_counts_once_for_the_first_impact_and_each_time_for_the_total():
     worlds = make_worlds(
         [[1.0]], [[0.0, 10.0]], braking_capacity_mps2=[[8.0, 1.0]], driving_capacity_mps2=0.0, latency_s=0.0,
@@ -176,25 +156,6 @@ def test_proposal__that_is_no_number_is_replaced_and_beyond_the_range_is_clipped
     assert decision.intervened[0] == np.isnan(value) == (reason(decision) == "not a number")
 
 
-@pytest.mark.parametrize(("N", "harm_count"), [(3, "first"), (3, "total"), (5, "total")])
-def test_certify__realises_the_certified_harm_to_the_bit_whatever_is_proposed(N, harm_count):
-    scenario, rng = line(N), np.random.default_rng(N)
-    worlds = scenario.sample(5, N).worlds
-    engine, plan = plain_engine(scenario, worlds), np.full((5, STEPS), -0.6)
-    settings = {"others_mps2": engine.wanted_mps2.copy(), "harm_count": harm_count}
-    running, backup = start(worlds, plan, vehicle=scenario.learners[0], **settings)
-    backup, bounds = backup._replace(constants=np.array(CONSTANTS[::5])), [backup.harm]
-    while not engine.ended.all():
-        decision = certify(running, rng.uniform(-1.2, 1.2, 5), backup, backup.harm)
-        engine.step(decision.applied[:, np.newaxis])
-        running, backup = decision.after, decision.backup
-        bounds.append(decision.bound)
-        assert running.ended.tolist() == engine.ended.tolist()
-        assert running.states.tolist() == seen_columns(engine.packed).tolist()
-    assert (np.diff(bounds, axis=0) <= 0.0).all() and (bounds[0] > 0.0).any()
-    assert engine.ledger.world_harm(harm_count).tolist() == backup.harm.tolist()
-
-
 @pytest.mark.parametrize("adversary", [random_actions, extremes])
 def test_attack__of_few_worlds_small_enough_to_run_uncompiled(adversary):
     found = attack(TWO, SMALL, adversary)
@@ -209,12 +170,6 @@ def test_attack__no_adversary_gets_above_the_bound(name, N, harm_count):
     found = attack(line(N), line(N).sample(24, 11).worlds, ADVERSARIES[name], harm_count=harm_count)
     assert (found.realised <= found.bound).all() and found.rises == 0
     assert found.realised.tolist() == found.last_bound.tolist()
-
-
-def test_attack__comes_within_one_percent_of_the_bound_by_accepted_actions():
-    found = attack(line(3), line(3).sample(60, 12).worlds, ADVERSARIES["worst_case"])
-    tried = (found.bound > 1.0) & (found.accepted > 0)
-    assert (found.realised[tried] > 0.99 * found.bound[tried]).any()
 
 
 def test_search__finds_no_way_past_the_shield_but_many_without_it():
@@ -294,9 +249,8 @@ def test_step_shield__a_copy_goes_on_apart_its_log_included():
     shield.begin(PAPER.sample(2, 0).worlds, np.arange(2))
     other = copy.copy(shield)
     other.decide(np.ones(2))
-    assert (shield.running.steps.tolist(), other.running.steps.tolist()) == ([0, 0], [1, 1])
-    assert (len(shield.log), len(other.log)) == (0, 2)
     shield.decide(np.full(2, 0.5))
+    assert (shield.running.steps.tolist(), other.running.steps.tolist()) == ([1, 1], [1, 1])
     assert [entry.proposed for entry in shield.log + other.log] == [0.5, 0.5, 1.0, 1.0]
 
 
@@ -359,16 +313,6 @@ class Speechless:
     def act(self, worlds, vehicle):
         braking = -worlds.vehicles.braking_capacity_mps2[:, vehicle]
         return np.where(worlds.time_s % 1.0 > 0.5, np.nan, braking)
-
-
-@pytest.mark.parametrize("capacity", [0.0, 5.0])
-def test_agent__what_is_no_number_is_replaced_and_told(capacity):
-    scenario = PAPER.replace(driving_capacity_mps2=capacity)
-    episodes = drive(scenario.sample(20, 3).worlds, ShieldedDriver(Speechless(), scenario, logging=True), scenario, 1)
-    harm, shield = episodes.ledger.world_harm("first"), episodes.guarded.shield
-    assert harm.tolist() == shield.bound.tolist() and (harm <= shield.predicted_harm).all()
-    silent = [entry for entry in shield.log if REASONS[entry.reason] == "not a number"]
-    assert len({entry.world for entry in silent}) == 20 and all(np.isnan(entry.proposed) for entry in silent)
 
 
 # The policy itself as a later certificate: accepted only if its rollout, followed step by step, keeps the budget.

@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 from pettingzoo import AECEnv
-from pettingzoo.utils import BaseParallelWrapper, BaseWrapper
+from pettingzoo.utils import BaseParallelWrapper
 from stable_baselines3.common.vec_env import VecMonitor
 
 import ethbrake_marl as eb
@@ -15,14 +15,14 @@ from ethbrake_marl.envs.interfaces import EthBrakeEnv, EthBrakeVectorEnv, env as
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
+from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
-from tests.shield.plays import INSIDE, PLAYS, WRAPPERS, disturbed, played, wrapped
+from tests.shield.plays import INSIDE, PLAYS, WRAPPERS, disturbed, wrapped
 from tests.shield.test_step_shield import Speechless
 
 PAPER = load_scenario("paper-random")
 MAKERS = {
-    HybridShield: parallel_env,
+    HybridShield: lambda: parallel_env(agents="learners"),
     ShieldedEnv: EthBrakeEnv,
     ShieldedVectorEnv: lambda: EthBrakeVectorEnv(2),
     ShieldedVecEnv: lambda: make_sb3_vec_env(PAPER, 2),
@@ -70,7 +70,7 @@ def test_interfaces__have_every_mode_and_the_penalty_and_tell_the_bound_after_a_
         for _ in range(3):
             _, reward, *_, infos = env.step(DRIVE[interface])
             told = rows_told(interface, infos)
-            assert told == env.attached.infos()
+            assert told == env.attached.infos() and (mode != "step" or set(told[0]) == KEYS)
             rewards.append(reward["vehicle_2"] if interface is HybridShield else reward)
             intervened.append([bool(each["intervened"]) for each in told])
             for start, step in zip(starts, told, strict=True):
@@ -79,21 +79,6 @@ def test_interfaces__have_every_mode_and_the_penalty_and_tell_the_bound_after_a_
         paid.append(np.array(rewards).reshape(3, -1))
     assert np.any(intervened)
     assert paid[0] - paid[1] == pytest.approx(7.0 * np.array(intervened), abs=1e-5)
-
-
-@pytest.mark.parametrize("allowance", [0.0, 50.0])
-def test_parallel__what_is_told_never_rises_and_holds(allowance):
-    env, told = HybridShield(parallel_env(), mode="step", allowance=allowance), []
-    env.reset(seed=7)
-    first = env.attached.shield.first_bound[0]
-    while env.agents:
-        *_, infos = env.step({"vehicle_2": np.array([1.0])})
-        told.append(infos["vehicle_2"]["shield"])
-    bounds = [each["bound_harm"] for each in told]
-    assert all(set(each) == KEYS and each["trusted"] for each in told)
-    assert [first + allowance, *bounds] == sorted([first + allowance, *bounds], reverse=True)
-    assert bounds[-1] == env.unwrapped.engine.ledger.world_harm("first")[0]
-    assert (bounds[-1] > first) == (allowance > 0.0)
 
 
 def test_policy__proposes_where_nobody_does_and_is_replaced_where_it_says_no_number():
@@ -127,14 +112,16 @@ def test_batch__tells_of_every_row_the_episode_that_ended(name, mode):
     ended, intervened, rng = 0, 0, np.random.default_rng(0)
     for _ in range(120):
         running, shield = ~env.attached.engine.ended, env.attached.shield
-        before = shield["bound_harm"].copy() if mode == "episode" else None
+        before = shield["bound_harm"].copy() if mode == "episode" else shield.first_bound.copy()
         found = env.step(rng.uniform(-1.0, 1.0, (8, 1)).astype(np.float32))
         over, infos = (found[2], found[3]) if name == "sb3" else (found[2] | found[3], found[4])
+        assert name == "sb3" or infos["_shield"].tolist() == running.tolist()
         for k in np.flatnonzero(over):
             told = {key: column[k] for key, column in infos["shield"].items()} if name != "sb3" else infos[k]["shield"]
             final = infos[k] if name == "sb3" else infos.get("final_info", infos)
             harm = np.atleast_1d(final["first_impact_harm"])[0 if name == "sb3" else k]
             assert told["own_harm"] == harm if mode == "step" else told["bound_harm"] == before[k]
+            assert mode == "episode" or (told["trusted"] and told["bound_harm"] <= before[k])
         ended += int(over.sum())
         intervened += int((env.attached.tell()["intervened"][:, 0] & running).sum())
     assert ended > 8
@@ -154,54 +141,11 @@ def test_disturbed__calls_that_fail_or_are_interrupted_change_nothing_and_no_epi
     assert (found.above, found.broken) == (0, 0)
 
 
-@pytest.mark.parametrize("name", PLAYS)
-def test_played__through_every_interface_no_episode_gets_above_its_bound(name):
-    found = played(name, 24, seed=5)
-    assert found.episodes >= 24 and (found.above, found.broken) == (0, 0)
-
-
 @pytest.mark.parametrize("wrapper", WRAPPERS)
 @pytest.mark.parametrize("name", INSIDE)
 def test_wrapped__whatever_reaches_the_engine_is_shielded_and_no_episode_gets_above_its_bound(name, wrapper):
-    found = wrapped(name, wrapper, 8 if wrapper == "frame skip 80" else 120, seed=5)
+    found = wrapped(name, wrapper, 3 if wrapper == "frame skip 80" else 100, seed=5)
     assert found.episodes > 0 and (found.above, found.broken) == (0, 0)
-
-
-@pytest.mark.parametrize("interface", MAKERS)
-def test_closed__a_shield_lets_go_of_the_environment_and_says_so(interface):
-    env = MAKERS[interface]()
-    shielded = interface(env, make_agent("full_brake"), mode="step")
-    reset(shielded, interface)
-    shielded.close()
-    assert env.unwrapped.engine.guard is None if interface is not ShieldedVecEnv else env.engine.guard is None
-    for call in (shielded.reset, lambda: shielded.step(DRIVE[interface])):
-        with pytest.raises(InvalidInput, match="this shield was closed; put a new one around the environment"):
-            call()
-    interface(env, make_agent("full_brake"), mode="step").reset()
-
-
-@pytest.mark.parametrize(
-    ("first", "again", "between"),
-    [
-        (lambda: HybridShield(parallel_env(), mode="step"), HybridShield, BaseParallelWrapper),
-        (lambda: HybridShield(parallel_env(), mode="step"), shielded_aec, BaseParallelWrapper),
-        (lambda: shielded_aec(parallel_env(), mode="step"), shielded_aec, BaseWrapper),
-        (lambda: shielded_aec(parallel_env(), mode="step"), HybridShield, BaseWrapper),
-        (lambda: ShieldedEnv(EthBrakeEnv()), ShieldedEnv, gymnasium.wrappers.RecordEpisodeStatistics),
-        (
-            lambda: ShieldedVectorEnv(EthBrakeVectorEnv(2)),
-            ShieldedVectorEnv,
-            gymnasium.wrappers.vector.RecordEpisodeStatistics,
-        ),
-        (lambda: ShieldedVecEnv(make_sb3_vec_env("paper-random", 2)), ShieldedVecEnv, VecMonitor),
-    ],
-)
-def test_shield__of_a_shielded_environment_is_refused_naming_the_first(first, again, between):
-    shielded = first()
-    name = "HybridShield" if isinstance(shielded, AECEnv) else type(shielded).__name__
-    for inner in (shielded, between(shielded), shielded.unwrapped):
-        with pytest.raises(InvalidInput, match=rf"a {name} \(mode step\) shields this environment already"):
-            again(inner, mode="step")
 
 
 def test_shield__under_which_the_environment_is_exchanged_tells_nothing() -> None:
@@ -222,6 +166,7 @@ def test_shield__under_which_the_environment_is_exchanged_tells_nothing() -> Non
     ("make", "kind"),
     [
         (parallel_env, HybridShield),
+        (aec_env, HybridShield),
         (lambda: BaseParallelWrapper(parallel_env()), HybridShield),
         (lambda: gymnasium.wrappers.RescaleAction(EthBrakeEnv(), np.float32(-1.0), np.float32(1.0)), ShieldedEnv),
         (lambda: EthBrakeVectorEnv(2), ShieldedVectorEnv),
@@ -230,23 +175,30 @@ def test_shield__under_which_the_environment_is_exchanged_tells_nothing() -> Non
 )
 def test_shield__chooses_the_wrapper_of_the_interface(make, kind):
     env = eb.shield(make(), make_agent("full_brake"), shares=True)
-    assert isinstance(env, kind) and env.attached.options.mode == "step"
-    env.reset()
-    action = np.ones((2, 1) if kind in (ShieldedVectorEnv, ShieldedVecEnv) else 1, np.float32)
-    infos = env.step({"vehicle_2": action} if kind is HybridShield else action)[-1]
-    told = infos[0] if kind is ShieldedVecEnv else infos.get("vehicle_2", infos)
-    assert "own_harm" in told["shield"]
-
-
-def test_shield__of_agents_in_turns_is_put_around_the_parallel_environment():
-    env = eb.shield(aec_env(), mode="step")
-    env.reset(seed=7)
-    for _ in range(3):
-        env.step(np.ones(1, np.float32))
-    assert env.infos["vehicle_2"]["shield"]["proposed_action"] == 1.0
+    env.reset(**{} if kind is ShieldedVecEnv else {"seed": 7})
+    if isinstance(env, AECEnv):
+        for _ in range(3):
+            env.step(np.ones(1, np.float32))
+        infos = env.infos
+    else:
+        assert isinstance(env, kind) and env.attached.options.mode == "step"
+        action = np.ones((2, 1) if kind in (ShieldedVectorEnv, ShieldedVecEnv) else 1, np.float32)
+        infos = env.step({"vehicle_2": action} if kind is HybridShield else action)[-1]
+    told = (infos[0] if kind is ShieldedVecEnv else infos.get("vehicle_2", infos))["shield"]
+    assert "own_harm" in told and np.all(told["proposed_action"] == 1.0)
 
 
 def test_shield__is_the_folder_and_the_function_whichever_is_asked_for_first():
     import ethbrake_marl.shield.guard as guard
 
     assert eb.shield.guard is guard and callable(eb.shield)
+
+
+@pytest.mark.parametrize("interface", MAKERS)
+def test_closed__a_shield_lets_go_of_the_environment(interface):
+    env = MAKERS[interface]()
+    shielded = interface(env, mode="step")
+    reset(shielded, interface)
+    shielded.close()
+    assert (env if interface is ShieldedVecEnv else env.unwrapped).engine.guard is None
+    interface(env, mode="step").reset()

@@ -12,8 +12,11 @@ import argparse
 import hashlib
 import json
 import os
+import signal
+import subprocess
 import sys
 import time
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,7 @@ from filelock import FileLock
 
 from ethbrake_marl.studies.jobs import Answer, answer
 
+ROOT = Path(__file__).resolve().parents[2]
 RESULTS = 10  # values of a row
 
 
@@ -102,6 +106,20 @@ def parent(process: int) -> int:
         return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
     except OSError:
         return 0
+
+
+def end_when(command: list[Any], ready: Callable[[int], bool], by: signal.Signals) -> tuple[int, str]:
+    """Run a command until ``ready(its process)``, then send it a signal; its exit status and what it told."""
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as driver:
+        try:
+            while not ready(driver.pid):
+                assert driver.poll() is None
+                time.sleep(0.01)
+            driver.send_signal(by)
+            _, told = driver.communicate(timeout=300)
+        finally:
+            driver.kill()
+    return driver.returncode, told
 
 
 class Inside:

@@ -29,10 +29,11 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folders of a sharded evaluation and of a reproduction; not to be changed."""
     folder = tmp_path_factory.mktemp("done")
     assert run_command(["evaluate", *SHARDS, "--output", str(folder / "shards")]) == 0
-    assert run_command(["reproduce", "accelerations", "--output", str(folder / "reproduction")]) == 0
+    assert run_command([*REPRODUCE, "--output", str(folder / "reproduction")]) == 0
     return folder
 
 
+REPRODUCE = ("reproduce", "learning-low", "--episodes", "20")
 SHARDS = ("--agents", "coast", "--episodes", "20", "--shards", "2")
 
 
@@ -44,21 +45,16 @@ def study(request: pytest.FixtureRequest, tmp_path: Path) -> Study:
         told = "holds shards with other settings (seed 7, here 8)"
         return Study(("evaluate", *SHARDS), get("done") / name, ("--seed", "8"), told, "question.json")
     if name == "reproduction":
-        told = "(episodes 10000, here 50)"
-        return Study(
-            ("reproduce", "accelerations"), get("done") / name, ("--episodes", "50"), told, "reproduction.json"
-        )
+        more, told = ("--episodes", "50"), "(episodes 20, here 50)"
+        return Study(REPRODUCE, get("done") / name, more, told, "reproduction.json")
     if name == "ablation":
-        line, told = (
-            ("study", "ablate", "--recipes", get("tiny_total"), *ABLATE),
-            "(seeds 2, here 3; budget 50, here 60)",
-        )
-        return Study(line, get("finished_ablation"), ("--budget", "60", "--seeds", "3"), told, "settings.json")
+        line, more = ("study", "ablate", "--recipes", get("tiny_total"), *ABLATE), ("--budget", "60", "--seeds", "3")
+        return Study(line, get("finished_ablation"), more, "(seeds 2, here 3; budget 50, here 60)", "settings.json")
     if name == "tuning":
-        other, told = get("write_tuning")(seed=1), "holds a tuning with other settings"
         file = write_yaml(tmp_path / "same.yaml", get("small_tuning"))
-        line = ("study", "tune", file, "--trials", TRIALS)
-        return Study(line, get("finished_tuning"), ("study", "tune", other, "--trials", TRIALS), told, "tuning.json")
+        line, more = ("study", "tune", file, "--trials", TRIALS), ("--trials", TRIALS)
+        other = ("study", "tune", get("write_tuning")(seed=1), *more)
+        return Study(line, get("finished_tuning"), other, "holds a tuning with other settings", "tuning.json")
     file = get("write_sweep")(**get("small_sweep"))
     return Study(("study", "sweep", file, "--jobs", "1"), get("finished_sweep"), (), "", "")
 

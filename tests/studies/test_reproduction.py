@@ -153,10 +153,9 @@ def test_judge_statement__holds_where_every_interval_is_below_zero(parts, or_equ
 
 def test_judge_statement__names_what_is_proven_and_what_is_left_out() -> None:
     proven = Less("b", around(1.0, 0.5), least=around(0.4, 0.1))
-    told = judge_statement("lower", [A, proven]).because
-    assert told.endswith("the harm proven to be the least is above it in: b by 0.40 [0.30, 0.50]")
-    left_out = judge_statement("lower", [A, NEITHER]).because
-    assert left_out.startswith("holds in 1 of 1 (both are 0 in z")
+    one, other = (judge_statement("lower", [A, part]).because for part in (proven, NEITHER))
+    assert one.endswith("the harm proven to be the least is above it in: b by 0.40 [0.30, 0.50]")
+    assert other.startswith("holds in 1 of 1 (both are 0 in z")
 
 
 @pytest.mark.parametrize(
@@ -167,48 +166,41 @@ def test_judge_statement__names_what_is_proven_and_what_is_left_out() -> None:
         (("differs", "cannot agree", "agrees"), "cannot agree"),
         (("agrees", "not run"), "not run"),
         (("not run", "undecided", "agrees"), "undecided"),
-        ((), "not run"),
     ],
 )
 def test_summarise_verdicts__tells_the_worst_and_counts(outcomes, worst) -> None:
     found = summarise_verdicts([Verdict(f"w{k}", outcome, f"b{k}") for k, outcome in enumerate(outcomes)])
-    assert found.outcome == worst
-    if len(outcomes) > 1:
-        first = outcomes.index(worst)
-        assert found.because.startswith(f"of {len(outcomes)} comparisons ")
-        assert found.because.endswith(f"; w{first}: b{first}")
+    first = outcomes.index(worst)
+    assert found.outcome == worst and found.because.startswith(f"of {len(outcomes)} comparisons ")
+    assert found.because.endswith(f"; w{first}: b{first}") and summarise_verdicts([]).outcome == "not run"
 
 
 AS_STATED, AT_200_MS = READINGS
-
-
-RATE = "collision rate"
 
 
 def printed(table: str, agent: str) -> PaperRow:
     return next(row for row in PAPER_ROWS if (row.table, row.agent) == (table, agent))
 
 
-def beside(reading, worlds: int = 400) -> Beside:
+def beside(reading, worlds: int) -> Beside:
     scenario = reading.scenario("paper-random")
     agents = lineup(scenario, FULL_BRAKE)
     evaluation = evaluate(scenario.sample(worlds, 7), agents, scenario=scenario, aftermath=False)
     return Beside(reading.name, evaluation, {"Non-E": (NAMES[FULL_BRAKE],), "Hybrid PPO": (NAMES[FULL_BRAKE],)})
 
 
-def test_selection__the_printed_hybrid_avoids_more_than_its_parts() -> None:
+def test_printed__the_hybrid_avoids_more_than_its_parts_and_decreases_follow_from_harms() -> None:
     rows = [printed("hybrid test", agent) for agent in ("E-V2X-BM", "Standalone DRL", "Hybrid")]
-    verdict = selection_verdict(*rows)
-    assert verdict.outcome == "cannot agree"
-    assert "737 + 1,263 = 2,000 collisions; printed: 2,005" in verdict.because
-    possible = replace(rows[2], collisions=3_000)
-    assert selection_verdict(*rows[:2], possible).outcome == "agrees"
-
-
-def test_decrease__follows_from_the_printed_harms() -> None:
     baseline, row = printed("random test", "Non-E"), printed("random test", "Hybrid PPO")
-    assert decrease_verdict(row, baseline).outcome == "agrees"
-    assert decrease_verdict(replace(row, harm_decrease=0.85), baseline).outcome == "cannot agree"
+    verdict = selection_verdict(*rows)
+    assert "737 + 1,263 = 2,000 collisions; printed: 2,005" in verdict.because
+    outcomes = [
+        verdict.outcome,
+        selection_verdict(*rows[:2], replace(rows[2], collisions=3_000)).outcome,
+        decrease_verdict(row, baseline).outcome,
+        decrease_verdict(replace(row, harm_decrease=0.85), baseline).outcome,
+    ]
+    assert outcomes == ["cannot agree", "agrees", "agrees", "cannot agree"]
 
 
 def test_compare_rows__full_braking_agrees_at_200_ms_and_the_hybrid_is_excluded_as_stated() -> None:
@@ -219,23 +211,12 @@ def test_compare_rows__full_braking_agrees_at_200_ms_and_the_hybrid_is_excluded_
     assert (stated.outcome, early.outcome) == ("differs", "agrees")
     assert f"nearest: {NAMES[FULL_BRAKE]} ({AT_200_MS.name})" in stated.because
     assert found["Hybrid PPO, collision rate (as stated)"].outcome in ("cannot agree", "differs")
-    impossible = replace(rows[1], collision_rate=0.3)
-    (first, *_) = compare_rows([impossible], besides)
+    (first, *_) = compare_rows([replace(rows[1], collision_rate=0.3)], besides)
     assert first.outcome == "cannot agree"
     assert "in which no command avoids an impact: at least" in first.because
-
-
-def test_rows_table__ends_with_what_nobody_undercuts() -> None:
-    own = beside(AS_STATED)
-    table = rows_table(own)
-    assert table.rows[-1][0] == NOBODY
-    assert own.numbers[NOBODY][RATE].value <= own.numbers[NAMES[FULL_BRAKE]][RATE].value
-    assert all(len(row) == len(table.columns) for row in table.rows)
-
-
-@pytest.mark.parametrize("row", PAPER_ROWS)
-def test_printed_rows__rates_follow_from_counts(row: PaperRow) -> None:
-    assert row.collisions / row.episodes == pytest.approx(row.collision_rate, abs=1e-4)
+    own, table = besides[0].numbers, rows_table(besides[0])
+    assert own[NOBODY]["collision rate"].value <= own[NAMES[FULL_BRAKE]]["collision rate"].value
+    assert table.rows[-1][0] == NOBODY and {len(row) for row in table.rows} == {len(table.columns)}
 
 
 OUTCOMES = {"agrees", "differs", "cannot agree", "undecided", "not run"}
@@ -243,8 +224,8 @@ OUTCOMES = {"agrees", "differs", "cannot agree", "undecided", "not run"}
 
 @pytest.fixture(scope="module")
 def made_of(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Made]:
-    """Every item of ten worlds, made once."""
-    settings = Reproduction("quick", tmp_path_factory.mktemp("reproduction"), 10)
+    """Every item of four worlds, made once."""
+    settings = Reproduction("quick", tmp_path_factory.mktemp("reproduction"), 4)
     return {item.name: item.make(settings) for item in ITEMS}
 
 
@@ -279,21 +260,19 @@ def test_page__whatever_a_result_says_is_text_and_no_name_leads_elsewhere(settin
 def test_make__keeps_what_is_there_and_makes_it_again_by_force_or_for_other_settings(settings: Reproduction) -> None:
     calls = []
     items = [planted("gaps", lambda s: calls.append(1) or made())]
-    settings.make(items)
-    settings.make(items)
-    assert len(calls) == 1
-    settings.make(items, force=True)
-    assert len(calls) == 2
+    for force, number in ((False, 1), (False, 1), (True, 2)):
+        settings.make(items, force=force)
+        assert len(calls) == number
     replace(settings, episodes=30).open_folder(force=True)
     assert read_results(settings.folder) == []
-    foreign = settings.folder.parent / "mine"
+    foreign, link = settings.folder.parent / "mine", settings.folder.parent / "link"
     foreign.mkdir()
     (foreign / "thesis.txt").write_text("text")
+    link.symlink_to(foreign)
     with pytest.raises(AlreadyExists, match="holds no reproduction"):
         replace(settings, folder=foreign).open_folder(force=True).check()
-    (foreign.parent / "link").symlink_to(foreign)
     with pytest.raises(InvalidInput, match="no plain folder"):
-        replace(settings, folder=foreign.parent / "link").open_folder()
+        replace(settings, folder=link).open_folder()
 
 
 def test_trajectories__of_the_scenarios_have_no_impact_under_the_policies(made_of: dict[str, Made]) -> None:
@@ -312,10 +291,10 @@ def test_register__every_gap_says_what_the_paper_says_and_what_is_measured() -> 
 def test_hybrid__is_driven_anew_once_its_policy_was_trained(
     settings: Reproduction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = reproduction._drive_hybrid("paper-random", settings, reproduction.READINGS[0])
-    assert reproduction._drive_hybrid("paper-random", settings, reproduction.READINGS[0]) is first
+    first, again = (reproduction._drive_hybrid("paper-random", settings, READINGS[0]) for _ in range(2))
+    assert again is first
     monkeypatch.setattr(reproduction, "unconverged_policy", lambda _: (load_shipped("ppo"), "trained since"))
-    assert reproduction._drive_hybrid("paper-random", settings, reproduction.READINGS[0]) is not first
+    assert reproduction._drive_hybrid("paper-random", settings, READINGS[0]) is not first
 
 
 def drawn(stem: str = "a-figure") -> dict[Drawn, Figure]:
@@ -328,16 +307,21 @@ def hidden(folder: Path) -> list[Path]:
     return [path for path in folder.rglob(".*") if path.name != ".lock"]
 
 
-def test_reproduce__writes_figures_data_results_and_one_page(settings: Reproduction) -> None:
-    items = [planted("gaps", lambda s: made(figures=drawn()))]
-    results, finished = settings.make(items)
-    assert finished and [each.name for each in results] == ["gaps"]
+def test_reproduce__writes_figures_data_results_docs_and_one_page(settings: Reproduction, tmp_path: Path) -> None:
+    results, finished = settings.make([planted("gaps", lambda s: made(figures=drawn()))])
+    assert finished and [each.name for each in results] == ["gaps"] and hidden(settings.folder) == []
     names = sorted(path.name for path in (settings.folder / "gaps").iterdir())
     assert names == ["a-figure.png", "a-figure.svg", "data.csv", "result.json"]
     page = (settings.folder / "index.html").read_text("utf-8")
     assert page.count("<svg") == 1 and "var(--series-0)" in page and "<img" not in page and "<script" not in page
     assert re.search(r"https?://", re.sub(r'xmlns(:\w+)?="[^"]*"', "", page)) is None
-    assert hidden(settings.folder) == []
+    file = tmp_path / "page.md"
+    write_docs(file, settings.folder, results)
+    assert json.loads((tmp_path / "page.json").read_text("utf-8")) == [each.in_words() for each in results]
+    assert file.read_text("utf-8") == docs_page(read_results(settings.folder))
+    assert (tmp_path / "figures" / "reproduction-a-figure.svg").is_file()
+    with pytest.raises(InvalidInput, match=r"must end in \.md"):
+        replace(settings, docs=tmp_path / "page.html")
 
 
 def test_page__tells_everything_that_a_result_holds(settings: Reproduction) -> None:
@@ -435,17 +419,6 @@ def test_results__a_damaged_one_is_named(settings: Reproduction, change) -> None
         read_results(settings.folder)
 
 
-def test_write_docs__page_data_and_figures(settings: Reproduction, tmp_path: Path) -> None:
-    results, _ = settings.make([planted("gaps", lambda s: made(figures=drawn()))])
-    file = tmp_path / "page.md"
-    write_docs(file, settings.folder, results)
-    assert json.loads((tmp_path / "page.json").read_text("utf-8")) == [each.in_words() for each in results]
-    assert file.read_text("utf-8") == docs_page(read_results(settings.folder))
-    assert (tmp_path / "figures" / "reproduction-a-figure.svg").is_file()
-    with pytest.raises(InvalidInput, match=r"must end in \.md"):
-        replace(settings, docs=tmp_path / "page.html")
-
-
 def test_pages__say_command_machine_and_how_little_was_made(settings: Reproduction) -> None:
     results, _ = replace(settings, machine="a CPU, load 3.1, numpy 2.4.6").make([planted("gaps", lambda s: made())])
     page = Page((settings.folder / "index.html").read_text("utf-8"))
@@ -461,54 +434,41 @@ def test_pages__say_command_machine_and_how_little_was_made(settings: Reproducti
 TINY = TINY_PPO.replace(total_steps=128 * 8, evaluation={"every_updates": 1, "worlds": 5, "seed": 7})
 
 
-@pytest.fixture
-def tiny_groups(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("undrawn")
+def test_full__trains_draws_and_keeps_what_is_trained(settings: Reproduction, monkeypatch) -> None:
     """One training of a second at either delay, in the place of all."""
     trained = {"ppo": (TrainedRecipe("ppo", TINY.total_steps, 1, 1000), TINY)}
     groups = {delay: Group(delay, f"paper-delay-{delay}", trained, 1) for delay in ("low", "high")}
     monkeypatch.setattr(reproduction, "groups", lambda: groups)
     monkeypatch.setattr(reproduction, "CURVES", {"low": ("low",), "high": ("high",)})
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_full__trains_draws_and_keeps_what_is_trained(tiny_groups, settings: Reproduction) -> None:
     full = replace(settings, mode="full", episodes=5)
     (item,) = Reproduction.choose(["learning-low"])
     small = replace(item, trained=("low", "high"))
     assert full.seconds_left(small.trained) == pytest.approx(2 * 1.024)
     (result,), finished = full.make([small])
-    assert finished and result.trained == ["low/ppo", "high/ppo"]
+    assert finished and result.trained == ["low/ppo", "high/ppo"] and full.seconds_left(small.trained) == 0.0
     assert [each.stem for each in result.figures] == ["learning-low-ours"]
     assert "1 seeds of ppo to 1,024 decisions" in result.notes[0] and "sac" in result.notes[1]
     (higher,) = [each for each in result.comparisons if each.what.startswith("both algorithms reach higher")]
     assert higher.outcome in ("agrees", "differs")
-    assert full.seconds_left(small.trained) == 0.0
-    before = sorted(path.stat().st_mtime_ns for path in (full.folder / "trainings").rglob("run.json"))
+    before = {path: path.stat().st_mtime_ns for path in (full.folder / "trainings").rglob("run.json")}
     full.make([small], force=True)
-    assert sorted(path.stat().st_mtime_ns for path in (full.folder / "trainings").rglob("run.json")) == before
+    assert before == {path: path.stat().st_mtime_ns for path in before} and len(before) == 2
 
 
-def test_full__interrupted_makes_the_items_of_what_is_finished(settings: Reproduction, monkeypatch) -> None:
-    asked = []
-    monkeypatch.setattr(Reproduction, "train", lambda *given: bool(asked.append(given)))
-    chosen = [replace(planted("gaps", lambda s: made()), trained=("open",)), planted("harm-delays", lambda s: made())]
-    results, finished = replace(settings, mode="full").make(chosen)
-    assert not finished and len(asked) == 1
-    assert [each.name for each in results] == ["harm-delays", "gaps"]
-
-
-def test_full__an_item_is_made_again_when_more_is_trained(settings: Reproduction, monkeypatch) -> None:
-    trained: dict[str, list[Path]] = {}
-    monkeypatch.setattr(Reproduction, "train", lambda *given: True)
+def test_full__interrupted_makes_what_is_finished_and_an_item_again_when_more_is_trained(
+    settings: Reproduction, monkeypatch
+) -> None:
+    full, calls, trained, whole = replace(settings, mode="full"), [], {}, [False, True, True, True]
+    monkeypatch.setattr(Reproduction, "train", lambda *given: whole.pop(0))
     monkeypatch.setattr(Reproduction, "trained", lambda *given: trained)
-    calls = []
-    chosen = [replace(planted("gaps", lambda s: calls.append(1) or made()), trained=("open",))]
-    for expected in (1, 1):
-        replace(settings, mode="full").make(chosen)
-        assert len(calls) == expected
-    trained["open/ppo-paper"] = []
-    replace(settings, mode="full").make(chosen)
-    assert len(calls) == 2
+    gaps = replace(planted("gaps", lambda s: calls.append(1) or made()), trained=("open",))
+    results, finished = full.make([gaps, planted("harm-delays", lambda s: made())])
+    assert not finished and [each.name for each in results] == ["harm-delays", "gaps"]
+    for more, number in (({}, 1), ({}, 1), ({"open/ppo-paper": []}, 2)):
+        trained |= more
+        full.make([gaps])
+        assert len(calls) == number
 
 
 def test_groups__fit_their_recipes_and_every_item_names_groups_that_exist() -> None:
@@ -538,13 +498,10 @@ def course(returns: list[list[float]], harm: list[list[float]]) -> Course:
 
 def test_course__measures_of_planted_curves() -> None:
     one = course([[-10.0, -4.0, 0.0, 0.0], [-10.0, -6.0, 0.0, 0.0]], [[100.0, 50.0, 10.0, 0.0], [100.0, 5.0, 1.0, 0.0]])
-    assert one.last_returns.tolist() == [0.0, 0.0]
-    assert one.rise == 10.0
-    assert one.decisions_to_converge.tolist() == [2.0, 1.0]
-    assert one.spread.tolist() == [0.0, 0.0]
-    assert one.unrest(2).tolist() == [0.0, 0.0]
-    assert one.unrest(3).tolist() == pytest.approx([0.1, 0.15])  # changes of 2 and 0, 3 and 0
-    assert one.still_rising == 0.0
+    arrays = [one.last_returns, one.decisions_to_converge, one.spread, one.unrest(2), one.unrest(3)]
+    expected = [[0.0, 0.0], [2.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.1, 0.15]]  # changes of 2 and 0, 3 and 0
+    np.testing.assert_allclose(arrays, expected, atol=1e-12)
+    assert (one.rise, one.still_rising) == (10.0, 0.0)
     assert course([[-4.0, -3.0, -2.0, -1.0, 0.0]], [[1.0] * 5]).still_rising == pytest.approx(0.25)
 
 
@@ -557,33 +514,17 @@ def test_returns__of_a_shaped_reward_say_nothing_between_delays_so_its_harm_is_c
         assert (verdict.outcome, told in verdict.because) == (outcome, True)
 
 
-@pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """That of the trajectories, made again."""
-    path = tmp_path_factory.mktemp("trajectories") / "out"
-    Reproduction("quick", path, 10).make(Reproduction.choose(["trajectories"]))
-    return (path / "index.html").read_text("utf-8")
-
-
-def played(page: str) -> dict:
-    """What the page gives its player."""
-    text = page.split('type="application/json"')[1].partition(">")[2].partition("</script>")[0]
-    return json.loads(text)
-
-
 @pytest.mark.slow
-def test_trajectories__are_watched_side_by_side(page: str) -> None:
-    shown, content = Page(page), played(page)
+def test_trajectories__are_watched_side_by_side_and_their_passports_play_them_again(tmp_path: Path) -> None:
+    Reproduction("quick", tmp_path / "out", 10).make(Reproduction.choose(["trajectories"]))
+    page = (tmp_path / "out" / "index.html").read_text("utf-8")
+    shown, text = Page(page), page.split('type="application/json"')[1].partition(">")[2]
+    content = json.loads(text.partition("</script>")[0])
     assert shown.open == [] and "Passports" in shown.text
     assert [content["agents"][k] for k in content["shown"]] == ["PPO", "SAC"]
     titles = [world["title"] for world in content["worlds"]]
     assert titles[0] == "Scenario 1, as stated" and len(set(titles)) == 4
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("world", [0, 3])
-def test_trajectories__passports_play_them_again(page: str, world: int) -> None:
-    one = played(page)["worlds"][world]
-    settings = tuple(Override.parse([one["why"].partition("--set ")[2]])) if one["why"] else ()
-    again = Passport.parse(one["episodes"][0]["passport"]).replay(settings=settings)
-    assert again.same and again.differences == ()
+    for one in (content["worlds"][0], content["worlds"][3]):
+        settings = tuple(Override.parse([one["why"].partition("--set ")[2]])) if one["why"] else ()
+        again = Passport.parse(one["episodes"][0]["passport"]).replay(settings=settings)
+        assert again.same and again.differences == ()

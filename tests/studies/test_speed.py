@@ -16,7 +16,6 @@ from ethbrake_marl.studies.speed import (
     BENCHMARKS,
     Benchmark,
     Effort,
-    Speed,
     brake_apart,
     braking,
     measure,
@@ -25,11 +24,6 @@ from ethbrake_marl.studies.speed import (
 )
 
 SHORT = Effort(1, 1e-6)
-
-
-def speeds_of(name: str, effort: Effort) -> list[Speed]:
-    """The figures of this name, measured now."""
-    return [each.measure(effort) for each in BENCHMARKS if each.name == name]
 
 
 def test_rates__are_work_per_processor_second_without_the_first_round(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -64,15 +58,8 @@ def test_braking__counts_world_steps_to_rest() -> None:
 
 
 def test_until_rest__ends_where_nothing_ever_rests() -> None:
-    coasting = make_worlds(
-        10.0,
-        [20.0, 20.0],
-        braking_capacity_mps2=6.0,
-        driving_capacity_mps2=0.0,
-        latency_s=0.0,
-        mass_t=1.0,
-        restitution=0.0,
-    )
+    physical = dict.fromkeys(("driving_capacity_mps2", "latency_s", "restitution"), 0.0)
+    coasting = make_worlds(10.0, [20.0, 20.0], braking_capacity_mps2=6.0, mass_t=1.0, **physical)
     assert benchmark.until_rest(coasting, np.zeros((1, 2)))() == benchmark.MOST_STEPS
 
 
@@ -84,23 +71,15 @@ def test_calibration__brakes_by_half_a_metre_per_second_and_starts_again() -> No
     assert (speeds == 20.0).all()
 
 
-def test_benchmarks__each_measures_something() -> None:
-    for each in BENCHMARKS:
-        assert each.workload and each.worlds >= 1
-        if each.name != "import and first step":  # measured below
-            speed = each.measure(SHORT)
-            assert 0.0 < speed.lowest == speed.value == speed.highest
-
-
-@pytest.mark.slow
-def test_start__takes_processor_time_of_another_process() -> None:
-    (speed,) = speeds_of("import and first step", SHORT)
-    assert (speed.unit, speed.floor, speed.worlds) == ("s", 2.0, 1)
-    assert 0.0 < speed.value < math.inf
+@pytest.mark.parametrize(
+    "each", [pytest.param(each, marks=pytest.mark.slow if each.unit == "s" else ()) for each in BENCHMARKS]
+)
+def test_benchmarks__each_measures_something(each: Benchmark) -> None:
+    speed = each.measure(SHORT)
+    assert each.workload and each.worlds >= 1 and 0.0 < speed.lowest == speed.value == speed.highest < math.inf
 
 
 def test_machine__is_named_in_words() -> None:
     machine = this_machine()
-    words = str(machine)
-    assert machine.processor in words and f"{machine.cores_usable} of {machine.cores} cores" in words
-    assert f"numba {numba.__version__}" in words and machine.processor
+    parts = (machine.processor, f"{machine.cores_usable} of {machine.cores} cores", f"numba {numba.__version__}")
+    assert machine.processor and all(part in str(machine) for part in parts)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 import shutil
@@ -11,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +25,11 @@ from ethbrake_marl.learning.runs import train
 from ethbrake_marl.learning.training import Training, load_recipe
 from ethbrake_marl.policies import load_policy
 from ethbrake_marl.studies.sweep import SweepFile, SweepPlan, TuningFile, TuningPlan
+from tests.cli.conftest import rows_of as read
 from tests.studies.conftest import Write, study, write_yaml
-from tests.studies.counting import PROGRAM, holders, journal, parent
+from tests.studies.counting import PROGRAM, ROOT, end_when, holders, journal, parent
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
+DOCS = ROOT / "docs"
 
 
 GRID = {"scenario": "paper-random", "recipe": "ppo"}
@@ -38,13 +39,6 @@ KINDS = {"sweep": (SweepPlan.json_schema, SweepFile.read_as), "tuning": (TuningP
 
 
 TABLE = "results.csv"
-
-
-ROOT = Path(__file__).resolve().parents[2]
-
-
-def read(file: Path) -> list[dict[str, str]]:
-    return list(csv.DictReader(file.read_text().splitlines()))
 
 
 def sweep(file: Path, folder: Path, *options: str) -> int:
@@ -59,19 +53,15 @@ def again(finished_sweep: Path, small_sweep: dict[str, Any], tmp_path: Path) -> 
 
 
 def test_grid__is_every_combination_seed_by_seed(write_sweep):
-    grid = {
-        "scenario": ["cooperation-2-paper", "cooperation-3-pair"],
-        "recipe": ["ppo", "sac"],
-        "seed": {"first": 4, "count": 2},
-    }
-    plan = SweepPlan.read(write_sweep(set={"total_steps": 100}, grid={**grid, "set": {"mass_t": [5, 6]}}))
+    scenarios, seeds = ["cooperation-2-paper", "cooperation-3-pair"], {"first": 4, "count": 2}
+    grid = {"scenario": scenarios, "recipe": ["ppo", "sac"], "seed": seeds, "set": {"mass_t": [5, 6]}}
+    plan = SweepPlan.read(write_sweep(set={"total_steps": 100}, grid=grid))
     assert len(plan.rows) == len({row.identity for row in plan.rows}) == 16
     assert [row.asked.seed for row in plan.rows] == [4] * 8 + [5] * 8
-    assert plan.rows[1].asked.settings == ("total_steps=100", "mass_t=6")
-    assert plan.rows[1].asked.scenario == "cooperation-2-paper"
-    assert [*plan.rows[1].settings] == ["total_steps", "mass_t"] and {
-        row.first.recipe.total_steps for row in plan.rows
-    } == {100}
+    asked = plan.rows[1].asked
+    assert (asked.settings, asked.scenario) == (("total_steps=100", "mass_t=6"), "cooperation-2-paper")
+    assert [*plan.rows[1].settings] == ["total_steps", "mass_t"]
+    assert {row.first.recipe.total_steps for row in plan.rows} == {100}
 
 
 def test_rows__have_the_hash_that_their_trainings_have(write_sweep):
@@ -118,22 +108,25 @@ def test_job__is_the_training_that_train_makes(finished_sweep, tiny, tmp_path):
 
 def test_finished_jobs__are_not_repeated_and_the_table_is_the_same(again, capsys) -> None:
     file, folder = again
-    whole = (folder / TABLE).read_bytes()
-    (folder / TABLE).unlink()
-    assert sweep(file, folder) == 0 and len(journal(folder)) == 4
-    assert "4 jobs are finished already" in capsys.readouterr().err and (folder / TABLE).read_bytes() == whole
-    jobs_done = [one["job"] for one in journal(folder)]
-    (folder / "journal.jsonl").write_text((folder / "journal.jsonl").read_text()[:-40])  # a writer was killed
+    whole, done = (folder / TABLE).read_bytes(), [one["job"] for one in journal(folder)]
     kept = {path: path.stat().st_mtime_ns for path in (folder / "runs").glob("*/policy/manifest.json")}
-    gone = folder / "runs" / jobs_done[0]
-    shutil.rmtree(gone)  # taken away: to be done again
-    assert sweep(file, folder) == 0
-    assert "2 jobs are finished already; 1 damaged lines of the journal" in capsys.readouterr().err
-    assert (folder / TABLE).read_bytes() == whole and (gone / "run.json").is_file()
-    assert all(path.stat().st_mtime_ns == then for path, then in kept.items() if gone not in path.parents)
-    (folder / "runs" / jobs_done[1] / "policy" / "weights.safetensors").unlink()
-    assert sweep(file, folder) == 0 and (folder / TABLE).read_bytes() == whole
-    assert "3 jobs are finished already" in capsys.readouterr().err
+    gone, line = folder / "runs" / done[0], folder / "journal.jsonl"
+
+    def take_away() -> None:
+        line.write_text(line.read_text()[:-40])  # a writer was killed
+        shutil.rmtree(gone)
+
+    lost = folder / "runs" / done[1] / "policy" / "weights.safetensors"
+    for damage, told in (
+        ((folder / TABLE).unlink, "4 jobs are finished already"),
+        (take_away, "2 jobs are finished already; 1 damaged lines of the journal"),
+        (lost.unlink, "3 jobs are finished already"),
+    ):
+        damage()
+        assert sweep(file, folder) == 0 and told in capsys.readouterr().err
+        assert (folder / TABLE).read_bytes() == whole
+        others = {path for path in kept if gone not in path.parents and lost.parent not in path.parents}
+        assert all(path.stat().st_mtime_ns == kept[path] for path in others) and (gone / "run.json").is_file()
 
 
 @pytest.mark.slow
@@ -192,17 +185,9 @@ def test_disturbed_sweep__has_the_same_table(work: str, tiny: Path, write_sweep:
     command, folder = [*program[work], str(tmp_path / "out"), "--jobs", "2"], tmp_path / "out"
     alone = [*program[work], str(tmp_path / "alone"), "--jobs", "1"]
     subprocess.run(alone, cwd=ROOT, stderr=subprocess.DEVNULL, check=True)
-    for end in (signal.SIGKILL, signal.SIGINT):
-        driver = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
-        try:
-            while driver.pid not in map(parent, holders(folder)):
-                assert driver.poll() is None
-                time.sleep(0.01)
-            driver.send_signal(end)
-            assert driver.wait(timeout=300) in (-signal.SIGKILL, 130)
-        finally:
-            driver.kill()
-            driver.wait()
+    for by, status in ((signal.SIGKILL, -signal.SIGKILL), (signal.SIGINT, 130)):
+        found, _ = end_when(command, lambda driver: driver in map(parent, holders(folder)), by)
+        assert found == status
         while holders(folder):  # processes whose driver was killed end by themselves
             time.sleep(0.01)
     finished = subprocess.run(command, cwd=ROOT, stderr=subprocess.PIPE, text=True, check=False)
@@ -212,17 +197,18 @@ def test_disturbed_sweep__has_the_same_table(work: str, tiny: Path, write_sweep:
     assert sorted(ends.values()) == [1] * 6
 
 
-@pytest.mark.parametrize("command", ["sweep", "tune"])
-@pytest.mark.parametrize("package", ["ray", "optuna"])
+@pytest.mark.parametrize(
+    ("command", "package", "extra"),
+    [("sweep", "ray", "cluster"), ("tune", "ray", "cluster"), ("tune", "optuna", "tune")],
+)
 def test_extra__that_is_missing_is_told_before_anything_is_planned(
-    command: str, package: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    command: str, package: str, extra: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
-    if (command, package) != ("sweep", "optuna"):
-        options = ["--ray", "local", "--dry-run"] if package == "ray" else []
-        assert run_command(["study", command, "no.yaml", "--output", "no", *options]) == 2
-        told, extra = capsys.readouterr().err, {"ray": "cluster", "optuna": "tune"}[package]
-        assert f"needs the package {package}" in told and told.endswith(f"-m pip install 'ethbrake-marl[{extra}]'\n")
+    options = ["--ray", "local", "--dry-run"] if package == "ray" else []
+    assert run_command(["study", command, "no.yaml", "--output", "no", *options]) == 2
+    told = capsys.readouterr().err
+    assert f"needs the package {package}" in told and told.endswith(f"-m pip install 'ethbrake-marl[{extra}]'\n")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -249,26 +235,14 @@ def _marked(kind: str, content: Any) -> set[str]:
 
 
 @pytest.mark.parametrize(
-    ("kind", "change"),
-    [
-        ("sweep", {"grid": {**GRID, "seed": 3}}),
-        ("sweep", {"grid": {"scenario": ["a", "b"], "recipe": ["ppo"], "seed": [0, 1]}, "jobs": []}),
-        ("sweep", {"jobs": [{"scenario": "a", "recipe": "ppo"}]}),
-        ("tuning", {"prune": None}),
-        ("tuning", {"search": {"holds": {"choices": [[1], "x", 3]}}}),
-        ("tuning", {"search": {"gamma": {"low": 0.5, "high": 1, "log": True}}}),
-    ],
-)
-def test_schema__lets_pass_what_the_reader_takes(kind: str, change: dict[str, Any], tmp_path: Path) -> None:
-    content = {**read_yaml(DOCS / f"{EXAMPLES[kind]}.yaml").content, **change}
-    assert _marked(kind, content) == set()
-    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(content))
-    KINDS[kind][1](tmp_path / "mine.yaml", "scaling", "")
-
-
-@pytest.mark.parametrize(
     ("kind", "change", "place"),
     [
+        ("sweep", {"grid": {**GRID, "seed": 3}}, None),
+        ("sweep", {"grid": {"scenario": ["a", "b"], "recipe": ["ppo"], "seed": [0, 1]}, "jobs": []}, None),
+        ("sweep", {"jobs": [{"scenario": "a", "recipe": "ppo"}]}, None),
+        ("tuning", {"prune": None}, None),
+        ("tuning", {"search": {"holds": {"choices": [[1], "x", 3]}}}, None),
+        ("tuning", {"search": {"gamma": {"low": 0.5, "high": 1, "log": True}}}, None),
         ("sweep", {"gird": GRID}, ""),
         ("sweep", {"grid": {**GRID, "level": "2-paper"}}, "grid"),
         ("sweep", {"grid": {"recipe": "ppo"}}, "grid"),
@@ -289,9 +263,11 @@ def test_schema__lets_pass_what_the_reader_takes(kind: str, change: dict[str, An
         ("tuning", {"seed": None}, "seed"),
     ],
 )
-def test_schema__marks_what_the_reader_refuses(kind: str, change: dict[str, Any], place: str, tmp_path: Path) -> None:
+def test_schema__marks_what_the_reader_refuses_and_that_alone(
+    kind: str, change: dict[str, Any], place: str | None, tmp_path: Path
+) -> None:
     content = {**read_yaml(DOCS / f"{EXAMPLES[kind]}.yaml").content, **change}
-    assert _marked(kind, content) == {place}
+    assert _marked(kind, content) == ({place} - {None})
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(content))
-    with pytest.raises(InvalidInput):
+    with nullcontext() if place is None else pytest.raises(InvalidInput):
         KINDS[kind][1](tmp_path / "mine.yaml", "scaling", "")

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import shutil
 import signal
 import subprocess
-import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +15,11 @@ import pytest
 from ethbrake_marl.learning.runs import train
 from ethbrake_marl.learning.training import TrainingRecipe, load_recipe
 from ethbrake_marl.studies.sweep import TuningPlan
+from tests.cli.conftest import rows_of as read
 from tests.studies.conftest import TRIALS, study, write_yaml
-from tests.studies.counting import PROGRAM
+from tests.studies.counting import PROGRAM, ROOT, end_when
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
+DOCS = ROOT / "docs"
 
 
 def test_every_trial__is_measured_as_often_whatever_an_update_holds(write_tuning):
@@ -33,43 +33,37 @@ def test_every_trial__is_measured_as_often_whatever_an_update_holds(write_tuning
         assert len(set(steps)) == len(steps) and 6 <= len(steps) <= 8 and max(steps) == 7
 
 
-def test_own_values__are_the_recipes_where_the_space_has_them(write_tuning):
-    search = {"network.policy": {"choices": [[9], [8]]}, "vf_coef": {"low": 0, "high": 1.0}}
-    file = write_tuning(search=search)
-    assert TuningPlan.read(file).own_values() == {"network.policy": [8], "vf_coef": 0.5}
-    file = write_tuning(search={"gamma": {"low": 0, "high": 1}})  # whole numbers alone, and the recipe has 0.995
-    assert TuningPlan.read(file).own_values() is None
-    file = write_tuning(search={"max_grad_norm": {"low": 0.6, "high": 0.9}})
-    assert TuningPlan.read(file).own_values() is None
+@pytest.mark.parametrize(
+    ("search", "own"),
+    [
+        (
+            {"network.policy": {"choices": [[9], [8]]}, "vf_coef": {"low": 0, "high": 1.0}},
+            {"network.policy": [8], "vf_coef": 0.5},
+        ),
+        ({"gamma": {"low": 0, "high": 1}}, None),  # whole numbers alone, and the recipe has 0.995
+        ({"max_grad_norm": {"low": 0.6, "high": 0.9}}, None),
+    ],
+)
+def test_own_values__are_the_recipes_where_the_space_has_them(write_tuning, search, own):
+    assert TuningPlan.read(write_tuning(search=search)).own_values() == own
 
 
 def test_identity__is_that_of_all_that_changes_a_trial(write_tuning):
-    def identity(**changes):
-        return str(TuningPlan.read(write_tuning(**changes)).question)
-
-    same = identity()
-    assert identity(title="words") == same
     others = [{"seed": 1}, {"set": {"mass_t": 9}}, {"measure": {"seed": 12}}, {"prune": None}, {"sampler": {"seed": 1}}]
-    assert len({same, *(identity(**changes) for changes in others)}) == len(others) + 1
+    same, titled, *found = (
+        str(TuningPlan.read(write_tuning(**changes)).question) for changes in ({}, {"title": "words"}, *others)
+    )
+    assert titled == same and len({same, *found}) == len(others) + 1
 
 
 @pytest.mark.parametrize("name", ["tuning-quick", "tuning-ppo"])
 def test_shipped_spaces__are_in_order_and_hold_their_recipe(name):
-    plan = TuningPlan.read(DOCS / f"{name}.yaml")
+    plan, text = TuningPlan.read(DOCS / f"{name}.yaml"), (DOCS / f"{name}.yaml").read_text("utf-8")
     assert plan.own_values() is not None and plan.file.recipe in TrainingRecipe.shipped()
-    assert (DOCS / f"{name}.yaml").read_text("utf-8") in (DOCS / "tuning.md").read_text(
-        "utf-8"
-    ) or name != "tuning-quick"
+    assert text in (DOCS / "tuning.md").read_text("utf-8") or name != "tuning-quick"
 
 
 TABLE = "trials.csv"
-
-
-ROOT = Path(__file__).resolve().parents[2]
-
-
-def read(file: Path) -> list[dict[str, str]]:
-    return list(csv.DictReader(file.read_text().splitlines()))
 
 
 def tune(file: Path, folder: Path, *options: str) -> int:
@@ -121,46 +115,27 @@ def test_export__is_a_recipe_that_trains_the_best_trial_again_to_the_bit(finishe
 def test_trials__that_ended_are_kept_and_more_go_on_as_if_they_had_been_asked_for_at_once(
     finished_tuning, write_tuning, tmp_path, capsys
 ):
-    folder, file = tmp_path / "out", write_tuning()
+    folder, file, whole = tmp_path / "out", write_tuning(), (finished_tuning / TABLE).read_bytes()
     assert tune(file, folder, "--trials", "2") == 0
     assert [row["trial"] for row in read(folder / TABLE)] == ["0", "1"]
-    written = (folder / "trials" / "0001" / "run.json").stat().st_mtime_ns
+    kept = folder / "trials" / "0001" / "run.json"
+    written = kept.stat().st_mtime_ns
     assert tune(file, folder) == 0 and "2 trials ended already" in capsys.readouterr().err
-    assert (folder / TABLE).read_bytes() == (finished_tuning / TABLE).read_bytes()
-    assert (folder / "trials" / "0001" / "run.json").stat().st_mtime_ns == written
+    assert (folder / TABLE).read_bytes() == whole and kept.stat().st_mtime_ns == written
     assert tune(file, folder, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert sum(told["trials"].values()) == TRIALS and told["best"]["harm"] > 0.0 and not told["interrupted"]
-    assert (folder / TABLE).read_bytes() == (finished_tuning / TABLE).read_bytes()
+    assert (folder / TABLE).read_bytes() == whole
 
 
 @pytest.mark.slow
 def test_disturbed_tuning__has_the_same_table(finished_tuning, write_tuning, tmp_path):
-    file, folder = write_tuning(), tmp_path / "out"
-    export = tmp_path / "best.yaml"
-    command = [
-        *PROGRAM,
-        "study",
-        "tune",
-        str(file),
-        "--output",
-        str(folder),
-        "--trials",
-        str(TRIALS),
-        "--export",
-        str(export),
-    ]
-    for trial, end in ((1, signal.SIGKILL), (3, signal.SIGINT)):
-        driver = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
-        try:
-            while not (folder / "trials" / f"{trial:04d}" / "run.json").is_file():
-                assert driver.poll() is None
-                time.sleep(0.01)
-            driver.send_signal(end)
-            assert driver.wait(timeout=300) in (-signal.SIGKILL, 130)
-        finally:
-            driver.kill()
-            driver.wait()
+    folder, export = tmp_path / "out", tmp_path / "best.yaml"
+    options = ["--output", folder, "--trials", str(TRIALS), "--export", export]
+    command = [*PROGRAM, "study", "tune", write_tuning(), *options]
+    for trial, by, status in ((1, signal.SIGKILL, -signal.SIGKILL), (3, signal.SIGINT, 130)):
+        begun = folder / "trials" / f"{trial:04d}" / "run.json"
+        assert end_when(command, lambda _, begun=begun: begun.is_file(), by)[0] == status
     assert not export.exists()  # or the same command could not go on
     done = subprocess.run(command, cwd=ROOT, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -171,16 +146,14 @@ def test_disturbed_tuning__has_the_same_table(finished_tuning, write_tuning, tmp
 @pytest.mark.slow
 def test_broken_trials__are_marked_failed_and_others_done_in_their_place(write_tuning, tmp_path):
     file, folder = write_tuning(), tmp_path / "out"
-    plan = TuningPlan.read(file)
     folder.mkdir()
-    plan.study(folder)._study.ask()  # a command that was killed just then
+    TuningPlan.read(file).study(folder)._study.ask()  # a command that was killed just then
     with (folder / "study.journal").open("a") as journal:
         journal.write('{"op_code": 4, "worker')
     assert tune(file, folder, "--trials", "2") == 0
     rows = read(folder / TABLE)
     assert [row["state"] for row in rows] == ["failed", "finished", "finished"]
     assert rows[0]["reason"] == "was killed while it was asked for"
-    assert [row["state"] for row in read(folder / TABLE)] == ["failed", "finished", "finished"]
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")  # an error in this process alone
@@ -210,15 +183,43 @@ def test_same_command__exports_again_over_its_own_recipe_alone(finished_tuning, 
     assert "best.yaml: is there already" in capsys.readouterr().err
 
 
-def test_folder_of_other_versions__is_refused_with_their_names(finished_tuning, write_tuning, tmp_path, capsys):
-    folder = tmp_path / "out"
-    shutil.copytree(finished_tuning, folder)
+def other_versions(folder: Path) -> None:
+    """The folder of the tuning as another torch left it."""
     record = json.loads((folder / "tuning.json").read_text())
     record["versions"]["torch"] = "1.0"
     (folder / "tuning.json").write_text(json.dumps(record))
+
+
+def in_journal(old: str, new: str) -> Callable[[Path], None]:
+    """Damage of the journal."""
+
+    def damage(folder: Path) -> None:
+        journal = folder / "study.journal"
+        assert old in journal.read_text()
+        journal.write_text(journal.read_text().replace(old, new))
+
+    return damage
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (other_versions, "holds a tuning with other settings (versions torch 1.0, here 2."),
+        (in_journal('{"op_code":0', '{"op_kode":0'), "cannot be used"),
+        (in_journal('{"op_code":0', "\x00"), "cannot be used"),
+        (in_journal('"results":"[', '"results":"{'), "trial 0 is damaged"),
+        (in_journal('"results":"[', '"results":7,"x":"['), "cannot be used"),
+    ],
+)
+def test_folder__of_other_versions_or_damaged_is_refused_in_one_line(
+    finished_tuning, write_tuning, tmp_path, capsys, change, reason
+):
+    folder = tmp_path / "out"
+    shutil.copytree(finished_tuning, folder)
+    change(folder)
     assert tune(write_tuning(), folder) == 2
     told = capsys.readouterr().err
-    assert "(versions torch 1.0, here 2." in told and "numpy" not in told
+    assert reason in told and "numpy" not in told and len(told.splitlines()) == 1
 
 
 def test_dry_run__prints_space_and_cost_and_makes_nothing(write_tuning, tmp_path, capsys):
@@ -229,23 +230,3 @@ def test_dry_run__prints_space_and_cost_and_makes_nothing(write_tuning, tmp_path
     assert tune(write_tuning(), tmp_path / "new", "--dry-run", "--json") == 0
     found = json.loads(capsys.readouterr().out)
     assert found["own_values"]["n_epochs"] == 2 and found["core_s_per_trial"] > 0.0
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "reason"),
-    [
-        ('{"op_code":0', '{"op_kode":0', "cannot be used"),
-        ('{"op_code":0', "\x00", "cannot be used"),
-        ('"results":"[', '"results":"{', "trial 0 is damaged"),
-        ('"results":"[', '"results":7,"x":"[', "cannot be used"),
-    ],
-)
-def test_damaged_journal__is_refused_in_one_line(finished_tuning, write_tuning, tmp_path, capsys, old, new, reason):
-    folder = tmp_path / "out"
-    shutil.copytree(finished_tuning, folder)
-    journal = folder / "study.journal"
-    assert old in journal.read_text()
-    journal.write_text(journal.read_text().replace(old, new))
-    assert tune(write_tuning(), folder) == 2
-    told = capsys.readouterr().err
-    assert reason in told and len(told.splitlines()) == 1

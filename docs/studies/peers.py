@@ -1,4 +1,4 @@
-"""This project beside other simulators, all measured now, by one loop, on this machine.
+"""Beside other simulators: speeds, all measured now, by one loop, on this machine: ``make bench-peers``.
 
 Each peer has an environment of its own below ``.venvs/``: some have licences or dependencies that this project does not
 want. One that cannot be installed or measured is told with the reason. Work is counted per second of processor time of
@@ -8,7 +8,6 @@ imports inside functions.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import statistics
@@ -20,7 +19,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.programmes import Cases, Told
 from tests.programmes.environments import NotInstalled, ready_python, watched
 
 Work = Callable[[], int]  # does some work and says how many worlds it advanced by a step
@@ -184,16 +182,8 @@ def tell(name: str) -> None:
     print(json.dumps({"version": version(loop.distribution), "rates": rates(loop.make())}))
 
 
-def cases(given: argparse.Namespace) -> Cases:
-    medians: dict[str, float] = {}
-    print(f"World-steps per CPU-second: median of {REPETITIONS} x {SECONDS:g} s, lowest - highest; load", end=" ")
-    print(f"{os.getloadavg()[0]:.1f}", flush=True)
-    for name, loop in LOOPS.items():
-        yield f"{name}: {loop.distribution}, {loop.what}", partial(measured, name, medians)
-
-
-def measured(name: str, medians: dict[str, float]) -> Told:
-    """One line of the table; of a peer also how many times our loop is faster."""
+def measured(name: str, medians: dict[str, float]) -> str:
+    """What is told of a loop; of a peer also how many times our loop is faster."""
     loop = LOOPS[name]
     pins = ["-c", str(VERSIONS)]
     try:
@@ -202,20 +192,30 @@ def measured(name: str, medians: dict[str, float]) -> Told:
             holds = NEEDS.get(loop.distribution, (loop.distribution,))
             python = ready_python(holds[-1], [*pins, *holds], project=False, torch=loop.distribution == "vmas")
     except NotInstalled as reason:
-        return Told(None, f"not installed: {reason}")
-    command = [str(python), "-c", f"from tests.programmes import peers; peers.tell({name!r})"]
-    status, told = watched(command, MOST_SECONDS, **THREADS)
+        return f"not installed: {reason}"
+    status, told = watched([str(python), str(Path(__file__).resolve()), name], MOST_SECONDS, **THREADS)
     last = (told.strip().splitlines() or [""])[-1]
     if status != 0:
-        return Told(None, f"not measured: {last or f'ended with status {status}'}")
+        return f"not measured: {last or f'ended with status {status}'}"
     found = json.loads(last)
     medians[name] = statistics.median(found["rates"])
-    text = f"{plain(medians[name])}   {plain(found['rates'][0])} - {plain(found['rates'][-1])}"
-    if loop.beside in medians:
-        text += f"   ours: {plain(medians[loop.beside] / medians[name])} x"
-    return Told(True, f"{found['version']}   {text}")
+    text = f"{found['version']}   {plain(medians[name])}   {plain(found['rates'][0])} - {plain(found['rates'][-1])}"
+    return f"{text}   ours: {plain(medians[loop.beside] / medians[name])} x" if loop.beside in medians else text
 
 
 def plain(value: float) -> str:
     """Three digits, with commas from 1,000 on."""
     return f"{float(f'{value:.3g}'):,.{0 if value >= 99.95 else 1 if value >= 9.995 else 2}f}"
+
+
+def main() -> None:
+    """Print one line for each loop."""
+    medians: dict[str, float] = {}
+    print(f"World-steps per CPU-second: median of {REPETITIONS} x {SECONDS:g} s, lowest - highest; load", end=" ")
+    print(f"{os.getloadavg()[0]:.1f}", flush=True)
+    for name, loop in LOOPS.items():
+        print(f"{name}: {loop.distribution}, {loop.what}: {measured(name, medians)}", flush=True)
+
+
+if __name__ == "__main__":
+    tell(sys.argv[1]) if len(sys.argv) > 1 else main()

@@ -1,30 +1,21 @@
 """The trained adversary of the shield: PPO under the shield, paid for the harm of each step; weights in tests/shield.
 
-A minute for each number of vehicles. The weights are plain arrays, and stay those of the repository unless this is run.
+``PYTHONPATH=. .venv/bin/python docs/studies/shield_adversary.py``: a minute for each number of vehicles. The weights
+are plain arrays, and stay those of the repository unless this is run.
 """
 
 from __future__ import annotations
 
-import argparse
-from functools import partial
+from pathlib import Path
 
 import numpy as np
 
-from tests.programmes import ROOT, Cases, Told
-
+STEPS = 200_000
 WORLDS, HIDDEN = 64, (64, 64)
+FOLDER = Path(__file__).resolve().parents[2] / "tests" / "shield"
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--steps", type=int, default=200_000)
-
-
-def cases(given: argparse.Namespace) -> Cases:
-    for N in (3, 5):
-        yield f"N = {N}", partial(train, N, given.steps)
-
-
-def train(N: int, steps: int) -> Told:
+def train(N: int, steps: int) -> str:
     """Train against the shield on ``line(N)`` and keep the actor's weights."""
     import torch
     from stable_baselines3 import PPO
@@ -53,6 +44,11 @@ def train(N: int, steps: int) -> Told:
     kept = {}
     for k, name in enumerate([*(f"mlp_extractor.policy_net.{2 * k}" for k in range(len(HIDDEN))), "action_net"]):
         kept |= {f"weight{k}": state[f"{name}.weight"].numpy(), f"bias{k}": state[f"{name}.bias"].numpy()}
-    np.savez(ROOT / "tests" / "shield" / f"adversary-{N}.npz", **kept)
+    np.savez(FOLDER / f"adversary-{N}.npz", **kept)
     paid = np.mean([episode["r"] for episode in model.ep_info_buffer])
-    return Told(None, f"{steps:,} steps, mean harm of the last episodes {-paid / 0.02:.2f} m2/s2")
+    return f"N = {N}: {steps:,} steps, mean harm of the last episodes {-paid / 0.02:.2f} m2/s2"
+
+
+if __name__ == "__main__":
+    for vehicles in (3, 5):
+        print(train(vehicles, STEPS))
