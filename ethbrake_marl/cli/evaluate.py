@@ -587,9 +587,9 @@ def picture_criticality(
     ] = None,
     settings: list[str] | None = None,
 ) -> None:
-    """Harm of an agent over both gaps, with the boundary of what is avoidable.
+    """Harm of an agent over both gaps.
 
-    Everything else must be a fixed number in the scenario.
+    With the boundary of what is avoidable. Everything else must be a fixed number in the scenario.
     """
     figures = _figures(out, output)
     chosen = _asked_task(scenario, None, settings, alone=True).scenario
@@ -634,7 +634,10 @@ def picture_deceleration(
     vehicle: str | None = None,
     settings: list[str] | None = None,
 ) -> None:
-    """Harm of one world against the constant deceleration of one vehicle: predicted, realised, and the best known."""
+    """Harm of one world by constant deceleration.
+
+    Predicted and realised, of one vehicle, and the best known.
+    """
     figures = _figures(out, output)
     task = _asked_task(scenario, vehicle, settings, alone=True)
     curve = evaluation.deceleration_curve(task.scenario.sample(1, seed, first=world).worlds, task)
@@ -653,9 +656,9 @@ def picture_shield(
     vehicle: str | None = None,
     settings: list[str] | None = None,
 ) -> None:
-    """How often the step shield intervenes against the harm that remains, from no allowance to any.
+    """How often the shield intervenes, and what remains.
 
-    The agents propose, and --harm-count is the harm that is guaranteed.
+    From no allowance of harm to any. The agents propose, and --harm-count is the harm that is guaranteed.
     """
     from ethbrake_marl.shield import operating_curves
 
@@ -681,7 +684,10 @@ def picture_shield_modes(
     vehicle: str | None = None,
     settings: list[str] | None = None,
 ) -> None:
-    """Harm without a shield and in step mode beside episode mode, as ``ethbrake shield`` measures it."""
+    """Harm without a shield and in each of its modes.
+
+    As `ethbrake shield` measures it.
+    """
     figures = _figures(out, output)
     task = _asked_task(scenario, vehicle, settings, harm_count)
     rows = _measure_modes(out, agents, task.scenario.sample(episodes, DEFAULT.LIST_SEED), task)
@@ -712,9 +718,9 @@ def picture_robustness(
     vehicle: str | None = None,
     settings: list[str] | None = None,
 ) -> None:
-    """What it costs not to know a world: the robust shield's price, and both shields where the truth differs.
+    """What it costs not to know a world.
 
-    Prints the figures, too.
+    The robust shield's price, and both shields where the truth differs. Prints the figures, too.
     """
     from ethbrake_marl.agents import Agent
     from ethbrake_marl.shield import parse_uncertainty, robustness
