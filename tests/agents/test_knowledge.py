@@ -331,7 +331,7 @@ def test_own_sensors_and_messages__nor_where_an_obstacle_is_that_was_not_receive
 def test_messages__contact_features_tell_nothing_that_was_not_received(channel, tmp_path):
     scenario = BLOCKED.replace(v2x=channel)
     make_policy(choose_observation(["own", "contact"]), scenario.model_dump(mode="json")).save(tmp_path / "policy")
-    agent = agent_of(f"counterfactual@{tmp_path}", scenario)
+    agent = agent_of(f"ppo@{tmp_path}", scenario)
     assert Knowledge.of(agent) == (MESSAGES,)
     assert changed_decisions(agent, scenario) == 0
 
