@@ -146,7 +146,7 @@ def evaluate(
     *,
     scenario: str | Path | Scenario,
     vehicle: int | str | None = None,
-    episodes: int = DEFAULT.EPISODES,
+    episodes: int | None = None,
     seed: int | None = None,
     chunk: int | None = None,
     on_progress: OnWorlds | None = None,
@@ -160,11 +160,11 @@ def evaluate(
 
     Args:
         worlds: at the alert, or a sample of the scenario's list; None: its first ``episodes`` of ``seed``.
-        agents: specs as on the command line (``"full_brake,ppo@shipped"``, or a list of them); or name -> agent, of
-            which each driven vehicle gets its own copy, or ``Team``; they are left as they are.
+        agents: specs as on the command line (``"full_brake,ppo@shipped"``, or a list), made for first-impact harm; or
+            name -> agent, of which each driven vehicle gets its own copy, or ``Team``; they are left as they are.
         scenario: of the worlds, also by name or path.
         vehicle: the one that is driven, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
-        episodes: worlds of the list, where none are given.
+        episodes: worlds of the list, 10,000 where neither they nor their number is given.
         seed: of the list, 7 where none is given; noted, not used, where worlds are given.
         chunk: worlds advanced together; None: 10,000, or 2,500 with ``on_progress``.
         on_progress: is called with an agent's name and its worlds done so far.
@@ -182,7 +182,9 @@ def evaluate(
         agents = make_lineup(agents, scenario)
     if worlds is None:
         seed = DEFAULT.LIST_SEED if seed is None else seed
-        worlds = scenario.sample(episodes, seed=seed)
+        worlds = scenario.sample(DEFAULT.EPISODES if episodes is None else episodes, seed=seed)
+    elif episodes is not None:
+        raise InvalidInput(f"evaluate: episodes = {episodes!r}: the worlds are given; leave one of the two out")
     _check_request(worlds, agents, chunk)
     sample = worlds if isinstance(worlds, Sample) else Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0)
     if not sample.worlds.n:
