@@ -122,6 +122,8 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self.horizon_is_end = horizon_is_end
         self.appended = appended
         self.step_infos = step_infos
+        if render_mode not in (None, "rgb_array"):
+            raise InvalidInput(f"render_mode = {render_mode!r}: must be 'rgb_array', or None")
         self.render_mode, self.viewer = render_mode, Viewer(engine, render_mode, batch=True)
         self._next_seed: int | None = seed
         self._learners = np.array(engine.learners, np.int64)
@@ -131,7 +133,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self._steps = np.zeros(rows, np.int64)
         self._begun = np.zeros(0)  # values of the report at each episode's beginning
         super().__init__(rows, feature_box(features), action_box())
-        self.metadata = self.viewer.metadata
+        self.metadata = {**self.viewer.metadata, "render_modes": ["rgb_array"]}
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Start the stream of ``seed`` at the next reset (None: fresh entropy); one stream serves all rows."""

@@ -65,7 +65,7 @@ def check_target(path: str | Path, *, force: bool = False) -> Path:
             raise InvalidInput(f"{target}: is a symbolic link; give the file it points to")
         if target.is_dir():
             raise InvalidInput(f"{target}: is a folder; give the name of a file")
-        if target.exists() and not target.is_file():
+        if os.access(target, os.F_OK) and not target.is_file():  # unlike exists, it does not take a NUL for no file
             raise InvalidInput(f"{target}: is a device or a pipe, not a plain file; give another name")
         if not target.parent.is_dir():
             raise InvalidInput(f"{target}: there is no folder {target.parent}; make it first")

@@ -141,6 +141,9 @@ def test_video__shows_every_world_of_the_batch() -> None:
     env.step(np.zeros((3, 1)))
     assert env.metadata["render_fps"] == 10 and [image.shape for image in env.get_images()] == [(304, 800, 3)] * 3
     assert (env.render() != 0).any()
+    for mode in ("ansi", "human"):  # neither of which Stable-Baselines3 can show
+        with pytest.raises(InvalidInput, match=f"render_mode = '{mode}': must be 'rgb_array', or None"):
+            make_sb3_vec_env("paper-random", 3, render_mode=mode)
 
 
 def test_step_async__keeps_its_own_copy_of_the_actions() -> None:

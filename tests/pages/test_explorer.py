@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
@@ -33,7 +34,7 @@ from ethbrake_marl.pages.explorer import MOST_BODY, Explored, explorer_page, rea
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from tests.pages.conftest import AGENTS, HOST, PAGE, PORT, TOKEN, Client, Reply, check_alive, check_refused
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 COMMAND = [sys.executable, "-m", "ethbrake_marl", "watch", "explore", "--no-browser"]
@@ -46,10 +47,9 @@ class Running(NamedTuple):
     folder: Path
 
 
-@pytest.fixture(scope="module")
-def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+@contextmanager
+def started(folder: Path) -> Iterator[Running]:
     pytest.importorskip("uvicorn", reason="no uvicorn: pip install 'ethbrake-marl[explore]'")
-    folder = tmp_path_factory.mktemp("explored") / "new"
     with subprocess.Popen(
         [*COMMAND, "--agents", "full_brake,coast", "--folder", str(folder)],
         env={**os.environ, "PYTHONPATH": str(ROOT)},
@@ -61,6 +61,12 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
         assert (address.scheme, address.hostname, bool(address.port)) == ("http", "127.0.0.1", True)
         yield Running(process, address.port or 0, address.path, folder)
         process.kill()
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    with started(tmp_path_factory.mktemp("explored") / "new") as server:
+        yield server
 
 
 def ask(running: Running, method: str, path: str, body: object = None) -> tuple[int, bytes]:
@@ -263,13 +269,14 @@ def test_server__listens_on_this_machine_alone(running: Running) -> None:
     assert "00000000" + port not in listening
 
 
-def test_server__ends_at_ctrl_c(running: Running) -> None:
-    """The last test of this file: the server is gone after it."""
-    with socket.create_connection(("127.0.0.1", running.port)):  # somebody is still there
-        running.process.send_signal(signal.SIGINT)
-        assert running.process.wait(timeout=60) == 0
-    assert running.process.stderr is not None
-    assert running.process.stderr.read().splitlines()[-1] == "ended"
+def test_server__ends_at_ctrl_c(tmp_path: Path) -> None:
+    """A server of its own: which of this file's tests comes last is for the runner to say."""
+    with started(tmp_path / "new") as running:
+        with socket.create_connection(("127.0.0.1", running.port)):  # somebody is still there
+            running.process.send_signal(signal.SIGINT)
+            assert running.process.wait(timeout=60) == 0
+        assert running.process.stderr is not None
+        assert running.process.stderr.read().splitlines()[-1] == "ended"
 
 
 def test_long_questions_are_cut_off(client: Client, state: dict[str, Any]) -> None:
