@@ -1,6 +1,6 @@
 """Harm for each budget of the search, and of a Vehicle 2 that may only brake: docs/best-harm.md.
 
-    .venv/bin/python docs/studies/least_harm.py
+.venv/bin/python docs/studies/least_harm.py
 """
 
 from __future__ import annotations

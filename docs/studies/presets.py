@@ -1,6 +1,6 @@
 """When the news arrives over each preset: docs/v2x.md, "The delay of a message".
 
-    .venv/bin/python docs/studies/presets.py
+.venv/bin/python docs/studies/presets.py
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """One pair of vehicles in each regime of the closed form: the figure of docs/proofs/constant-deceleration.md.
 
-    .venv/bin/python docs/studies/regimes.py docs/figures/regimes.png
+.venv/bin/python docs/studies/regimes.py docs/figures/regimes.png
 """
 
 from __future__ import annotations

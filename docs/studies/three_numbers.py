@@ -1,11 +1,9 @@
 """Predicted, realised and coupled harm: docs/baselines.md, "Three numbers that are never confused".
 
-    .venv/bin/python docs/studies/three_numbers.py
+.venv/bin/python docs/studies/three_numbers.py
 """
 
 from __future__ import annotations
-
-import numpy as np
 
 from ethbrake_marl import load_scenario
 from ethbrake_marl.agents import make_agent, pairwise_harm

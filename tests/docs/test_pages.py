@@ -187,7 +187,9 @@ def test_ablate_cooperation__its_files_and_commands_make_what_it_says(
     small = "--seeds 1 --steps 512 --episodes 20 --search-episodes 3 --budget 50"
     for command in re.findall(r"^\$ (.*)", ABLATION, re.MULTILINE):
         words = command.replace("--seeds 3", small).split()[1:]
-        done = subprocess.run([sys.executable, "-m", "ethbrake_marl", *words], cwd=tmp_path, env=environment, check=False)
+        done = subprocess.run(
+            [sys.executable, "-m", "ethbrake_marl", *words], cwd=tmp_path, env=environment, check=False
+        )
         assert done.returncode == 0, command
     made = {path.name for path in (tmp_path / "runs" / "mine").iterdir()}
     assert {"ablation.html", "ablation.md", "ablation.csv", "settings.json", "trainings", "optimum"} <= made
