@@ -71,9 +71,7 @@ TABLES: dict[str, How] = {
     "| what | first-impact harm | of the best known": TRAINED,
     "| what the vehicles do | first-impact harm": TRAINED,
     "| What | Verdict |": _by(SUITE, "tests/docs/test_pages.py"),
-    "| total gap (m) | 10-12": _by(SUITE, "tests/docs/test_pages.py"),
     "| | full braking | E-V2X-BM | this policy": _by(TRAINING, "make run"),
-    "| licence | packages": _by(SUITE, "tests/programmes/test_programmes.py"),
     "| no. | label | the paper": _by(BY_HAND),
 }
 
