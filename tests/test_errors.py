@@ -34,11 +34,14 @@ def test_message__keeps_beginning_and_end_of_what_is_long(long: str) -> None:
     assert len(text) <= LINE_LIMIT and text.isprintable()
 
 
+OWN = "one of your own needs eb.register_... first, or --plugin FILE.py (docs/extending.md)"
+
+
 @pytest.mark.parametrize(
     ("name", "known", "told"),
     [
-        ("mine", [], "known: none; one of your own file needs --plugin FILE.py (eb.load_plugin)"),
-        ("mine", ["coast"], "known: coast; one of your own file needs --plugin FILE.py (eb.load_plugin)"),
+        ("mine", [], f"known: none; {OWN}"),
+        ("mine", ["coast"], f"known: coast; {OWN}"),
         ("cost", ["coast"], "did you mean 'coast'?"),
     ],
 )

@@ -251,9 +251,10 @@ def speed_command(
     out: Out,
     quick: Annotated[bool, typer.Option("--quick", help="In about 20 s instead of a minute or two; coarser.")] = False,
 ) -> None:
-    """Measure speed on this machine, per second of processor time on one core.
+    """Measure speed on this machine.
 
-    Medians over repetitions. Other programs that run at the same time make all figures worse.
+    Per second of processor time on one core. Medians over repetitions. Other programs that run at the same time make
+    all figures worse.
     """
     from ethbrake_marl.studies.speed import measure, this_machine
 

@@ -347,11 +347,12 @@ def shield_command(
     vehicle: str | None = None,
     settings: list[str] | None = None,
 ) -> None:
-    """Compare no shield, episode mode and step mode on the same worlds.
+    """Compare agents without and behind the shield.
 
-    The agents propose, without a shield of their own, and --harm-count is the harm that is guaranteed. Where several
-    vehicles learn: no shield, step mode, and step mode with caps, for the whole team. Each decision that step mode
-    replaced is simulated again without it: needed (harm would have been higher), harmless (the same), costly (lower).
+    No shield, episode mode and step mode, on the same worlds. The agents propose, without a shield of their own, and
+    --harm-count is the harm that is guaranteed. Where several vehicles learn: no shield, step mode, and step mode with
+    caps, for the whole team. Each decision that step mode replaced is simulated again without it: needed (harm would
+    have been higher), harmless (the same), costly (lower).
     """
     task = _asked_task(scenario, vehicle, settings, harm_count)
     sample = task.scenario.sample(episodes, DEFAULT.LIST_SEED)
@@ -399,7 +400,10 @@ def record_command(
     vehicle: str | None = None,
     uncertainty: str | None = None,
 ) -> None:
-    """Agents in one world of the list, in real time: the road to scale, commands, impacts, harm."""
+    """Film agents in one world, in real time.
+
+    It shows the road to scale, commands, impacts and harm.
+    """
     out.check(output)
     evaluation.check_film(output.suffix.lower())
     chosen = _asked_task(scenario, vehicle, None).scenario
@@ -490,9 +494,10 @@ def explore_command(
     port: Annotated[int, typer.Option(help="On 127.0.0.1; 0 takes a free one.", min=0, max=65535)] = 0,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address, open nothing.")] = False,
 ) -> None:
-    """Open a local page: sliders for one emergency, every agent's harm and motion at once.
+    """Open a local page with sliders for one emergency.
 
-    It listens on this machine alone, and its address holds a token that is new each time. Ctrl-C ends it.
+    It shows every agent's harm and motion at once. It listens on this machine alone, and its address holds a token that
+    is new each time. Ctrl-C ends it.
     """
     from ethbrake_marl.evaluation import make_agents
     from ethbrake_marl.pages.explorer import Explored, serve_explorer
@@ -526,10 +531,10 @@ def dataset_command(
     uncertainty: str | None = None,
     settings: list[str] | None = None,
 ) -> None:
-    """Record what agents see, do and are rewarded with, decision by decision.
+    """Record what agents see, do and are rewarded with.
 
-    As one Parquet file of any agents and learners, or as a dataset of Minari of one learner. The recorded actions
-    replay to the same bits. The reward counts the harm of --harm-count, too.
+    Decision by decision, as one Parquet file of any agents and learners, or as a dataset of Minari of one learner. The
+    recorded actions replay to the same bits. The reward counts the harm of --harm-count, too.
     """
     chosen = _asked_task(scenario, vehicle, settings, harm_count).scenario
     evaluation.check_dataset(output, chosen, format, force=out.force)
@@ -559,7 +564,7 @@ def dataset_command(
 
 picture_group = watch_group.group(
     "picture",
-    "Draw what is critical in a scenario, what one world asks for, or what the shield does.",
+    "Draw a scenario, one world, or the shield's work.",
     "watch picture criticality --output map.png",
     "watch picture shield-modes --episodes 500 --output modes.png",
 )
@@ -582,9 +587,9 @@ def picture_criticality(
     ] = None,
     settings: list[str] | None = None,
 ) -> None:
-    """Harm of an agent over both gaps, with the boundary of what is avoidable.
+    """Harm of an agent over both gaps.
 
-    Everything else must be a fixed number in the scenario.
+    With the boundary of what is avoidable. Everything else must be a fixed number in the scenario.
     """
     figures = _figures(out, output)
     chosen = _asked_task(scenario, None, settings, alone=True).scenario
@@ -629,7 +634,10 @@ def picture_deceleration(
     vehicle: str | None = None,
     settings: list[str] | None = None,
 ) -> None:
-    """Harm of one world against the constant deceleration of one vehicle: predicted, realised, and the best known."""
+    """Harm of one world by constant deceleration.
+
+    Predicted and realised, of one vehicle, and the best known.
+    """
     figures = _figures(out, output)
     task = _asked_task(scenario, vehicle, settings, alone=True)
     curve = evaluation.deceleration_curve(task.scenario.sample(1, seed, first=world).worlds, task)
@@ -648,9 +656,9 @@ def picture_shield(
     vehicle: str | None = None,
     settings: list[str] | None = None,
 ) -> None:
-    """How often the step shield intervenes against the harm that remains, from no allowance to any.
+    """How often the shield intervenes, and what remains.
 
-    The agents propose, and --harm-count is the harm that is guaranteed.
+    From no allowance of harm to any. The agents propose, and --harm-count is the harm that is guaranteed.
     """
     from ethbrake_marl.shield import operating_curves
 
@@ -676,7 +684,10 @@ def picture_shield_modes(
     vehicle: str | None = None,
     settings: list[str] | None = None,
 ) -> None:
-    """Harm without a shield and in step mode beside episode mode, as ``ethbrake shield`` measures it."""
+    """Harm without a shield and in each of its modes.
+
+    As `ethbrake shield` measures it.
+    """
     figures = _figures(out, output)
     task = _asked_task(scenario, vehicle, settings, harm_count)
     rows = _measure_modes(out, agents, task.scenario.sample(episodes, DEFAULT.LIST_SEED), task)
@@ -707,9 +718,9 @@ def picture_robustness(
     vehicle: str | None = None,
     settings: list[str] | None = None,
 ) -> None:
-    """What it costs not to know a world: the robust shield's price, and both shields where the truth differs.
+    """What it costs not to know a world.
 
-    Prints the figures, too.
+    The robust shield's price, and both shields where the truth differs. Prints the figures, too.
     """
     from ethbrake_marl.agents import Agent
     from ethbrake_marl.shield import parse_uncertainty, robustness

@@ -30,7 +30,10 @@ scenario_group = app.group(
 
 @scenario_group.add("list", "scenario list", json=True)
 def scenario_list(out: Out) -> None:
-    """List the scenarios that have a name: that and the title, and the folder of those that a plug-in registers."""
+    """List the scenarios that have a name.
+
+    Name and title, and the folder of those that a plug-in registers.
+    """
     entries = scenarios.list_scenarios()
     width = max(len(entry.name) for entry in entries)
     out.result(
@@ -48,7 +51,10 @@ def scenario_show(out: Out, scenario: NameArgument) -> None:
 
 @scenario_group.add("validate", "scenario validate my-scenario.yaml", json=True)
 def scenario_validate(out: Out, path: NameArgument) -> None:
-    """Check a scenario: one line, OK or what is wrong; then what may not be meant."""
+    """Check a scenario.
+
+    One line: OK, or what is wrong; then what may not be meant.
+    """
     from ethbrake_marl.agents import Team, drive, make_agent
 
     scenario = evaluation.load_runnable(path)
@@ -101,9 +107,10 @@ def scenario_sample(
         Path | None, typer.Option(metavar="FILE.csv", help="Write the table to this file.", show_default="stdout")
     ] = None,
 ) -> None:
-    """Draw the first worlds of a list, as the table that `ethbrake evaluate --initial-states` reads.
+    """Draw the first worlds of a list as a table.
 
-    A column is what the scenario does not fix. The same list, seed and number are the same worlds on every machine.
+    `ethbrake evaluate --initial-states` reads it. A column is what the scenario does not fix. The same list, seed and
+    number are the same worlds on every machine.
     """
     out.check(output, ".csv", what="a table of worlds")
     chosen = evaluation.load_runnable(scenario, learning.read_settings(settings).scenario)

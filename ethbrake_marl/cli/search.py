@@ -175,11 +175,12 @@ def falsify_command(
         Path | None, typer.Option(metavar="FILE.yaml", help="Drive the worlds of a file again instead of searching.")
     ] = None,
 ) -> None:
-    """Search a scenario's ranges for the worlds in which an agent is worst.
+    """Search for the worlds in which an agent is worst.
 
-    regret: what the agent does more than --against, by default the best profile found with hindsight. bound: how near
-    a shield comes to the bound it told; above zero it is broken. difference: where two agents differ most. With
-    --again FILE the kept worlds are driven again, by --agent or who drove then; exit status 1: one of them is worse.
+    It searches the ranges of a scenario. regret: what the agent does more than --against, by default the best profile
+    found with hindsight. bound: how near a shield comes to the bound it told; above zero it is broken. difference:
+    where two agents differ most. With --again FILE the kept worlds are driven again, by --agent or who drove then; exit
+    status 1: one of them is worse.
     """
     import numpy as np
 

@@ -108,10 +108,11 @@ def start_command(
     output: OutputOption = None,
     stop_when_lost: StopWhenLostOption = False,
 ) -> None:
-    """Train a policy, or the policies of several learners, into a run's folder.
+    """Train a policy, or those of several learners.
 
-    Afterwards: `ethbrake evaluate --agents full_brake,ppo@FOLDER,ppo@FOLDER+episode`; of several: `team@FOLDER`.
-    Ctrl-C ends the training after the update in progress and keeps the policy; `ethbrake train resume FOLDER` goes on.
+    They are kept in a run's folder. Afterwards: `ethbrake evaluate --agents full_brake,ppo@FOLDER,ppo@FOLDER+episode`;
+    of several: `team@FOLDER`. Ctrl-C ends the training after the update in progress and keeps the policy; `ethbrake
+    train resume FOLDER` goes on.
     """
     from ethbrake_marl.studies.experiment import run_folder
 
@@ -177,9 +178,10 @@ def curves_command(
     steps: int | None = None,
     jobs: int = 1,
 ) -> None:
-    """Train several seeds of several recipes, and draw their learning curves in one figure.
+    """Train several seeds of recipes, and draw the curves.
 
-    The same command goes on after an interruption: finished trainings are kept, begun ones go on.
+    One figure shows all learning curves. The same command goes on after an interruption: finished trainings are kept,
+    begun ones go on.
     """
     from ethbrake_marl.studies.learning_curves import LearningCurves
 
@@ -273,10 +275,10 @@ def sweep_command(
     dry_run: DryRunOption = False,
     schema: _schema_option("SweepPlan") = False,  # type: ignore[valid-type]  # made here, read by Typer
 ) -> None:
-    """Train every job of a file, and write one table of what they reached.
+    """Train every job of a file, and write one table.
 
-    The same command goes on after an interruption: finished jobs are kept, begun ones go on. Exit status 1 where jobs
-    failed: failures.csv holds the last lines of each.
+    It tells what they reached. The same command goes on after an interruption: finished jobs are kept, begun ones go
+    on. Exit status 1 where jobs failed: failures.csv holds the last lines of each.
     """
     from ethbrake_marl.studies.jobs import open_workers
     from ethbrake_marl.studies.sweep import SweepPlan
@@ -327,10 +329,10 @@ def tune_command(
     dry_run: DryRunOption = False,
     schema: _schema_option("TuningPlan") = False,  # type: ignore[valid-type]  # made here, read by Typer
 ) -> None:
-    """Search the settings of a recipe that do least harm on a list of worlds of its own.
+    """Search the settings of a recipe for the least harm.
 
-    The same command goes on after an interruption: trials that ended are kept, those that were begun go on. Exit status
-    1 where no trial came to its end.
+    Harm on a list of worlds of its own. The same command goes on after an interruption: trials that ended are kept,
+    those that were begun go on. Exit status 1 where no trial came to its end.
     """
     from ethbrake_marl.studies.jobs import open_workers
     from ethbrake_marl.studies.sweep import TuningPlan
@@ -523,10 +525,10 @@ def reproduce_command(
     cost: CostOption = False,
     listed: Annotated[bool, typer.Option("--list", help="List the items; stop.")] = False,
 ) -> None:
-    """Make the paper's figures and tables again, and say what agrees, what differs and what cannot agree.
+    """Make the paper's figures and tables again.
 
-    Writes one page (index.html), and for each item its figures, its data and its result. Says first what it will take.
-    The same command goes on after an interruption.
+    Says what agrees, what differs and what cannot agree. Writes one page (index.html), and for each item its figures,
+    its data and its result. Says first what it will take. The same command goes on after an interruption.
     """
     from ethbrake_marl.studies.reproduction import Reproduction
     from ethbrake_marl.studies.speed import this_machine
@@ -601,9 +603,9 @@ def table_command(
     entries: Annotated[list[Path], typer.Argument(metavar="ENTRY.json...", help="Entries of one suite.")],
     output: Annotated[Path | None, typer.Option(metavar="FILE.md", help="Also write the table, as Markdown.")] = None,
 ) -> None:
-    """Show entries of `ethbrake benchmark` as one table, sorted by their score.
+    """Show entries of `ethbrake benchmark` as one table.
 
-    Refused by name: entries of another suite, and changed ones.
+    It is sorted by their score. Refused by name: entries of another suite, and changed ones.
     """
     from ethbrake_marl.studies.benchmark import read_leaderboard
 

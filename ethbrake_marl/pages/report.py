@@ -276,18 +276,15 @@ class Report:
         if before is None or after is None or after is before:
             return ""
         percent = partial(Estimate.in_words, digits=0, scale=100.0, unit=" %")
+        costs = [
+            f"{name} does {row.first_impact_harm.in_words()} m²/s² of harm per emergency by first impacts,"
+            f" {row.total_harm.in_words()} by all impacts, and collides in {percent(row.collision_rate)}"
+            for name, row in (("Full braking", before), (self.focus, after))
+        ]
         less, certain = after["harm_decrease_first"], after["impact_proven_rate"]
-        found = (
-            f"Harm per emergency, first impacts: {before.first_impact_harm.in_words()} m²/s² by full braking,"
-            f" {after.first_impact_harm.in_words()} by {self.focus}"
-            f"{'' if less is None else f', which is {percent(less)} less'}. Emergencies with a collision:"
-            f" {percent(before.collision_rate)} and {percent(after.collision_rate)}"
-        )
-        return (
-            found
-            + ("" if certain is None else f"; in {percent(certain)} no command could have avoided one (proven)")
-            + ". "
-        )
+        saved = "" if less is None else f", {percent(less)} less by first impacts"
+        proven = "" if certain is None else f" In {percent(certain)} no command could have avoided one (proven)."
+        return f"{costs[0]}. {costs[1]}{saved}.{proven} "
 
     def _results(self) -> Section:
         rows = SummaryTable(self.rows)

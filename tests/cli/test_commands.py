@@ -32,9 +32,13 @@ COMMANDS += [f"watch picture {each}" for each in whole_command().commands["watch
 
 
 @pytest.mark.parametrize("words", COMMANDS)
-def test_help__has_examples_that_parse_and_a_short_name(ethbrake: Command, words: str) -> None:
+def test_help__has_examples_that_parse_and_a_short_name(
+    ethbrake: Command, monkeypatch: pytest.MonkeyPatch, words: str
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
     answer = ethbrake(*words.split(), "--help")
     assert (answer.status, answer.err) == (0, "") and "-h, --help" in answer.out
+    assert not re.search(r"^  [a-z][a-z-]* .*\.\.\.$", answer.out, re.MULTILINE)  # no command's sentence is cut
     assert ethbrake(*words.split(), "-h").out == answer.out
     examples = [" ".join(each.split()) for each in re.findall(r"Example: ethbrake ((?:.|\n(?!\n))+)", answer.out)]
     assert len(examples) == (2 if "\nCommands:" in answer.out else 1)
