@@ -70,9 +70,7 @@ TABLES: dict[str, How] = {
     "| list | worlds | proven | best known, first": EXACT,
     "| d1, d2; v1, v2, v3; tau2, tau3": EXACT,
     "| What | Verdict |": _by(SUITE, "tests/docs/test_pages.py"),
-    "| total gap (m) | 10-12": _by(SUITE, "tests/docs/test_pages.py"),
     "| | full braking | E-V2X-BM | this policy": _by(TRAINING, "make run"),
-    "| licence | packages": _by(SUITE, "tests/programmes/test_programmes.py"),
     "| no. | label | the paper": _by(BY_HAND),
 }
 
