@@ -201,7 +201,7 @@ def train(
         scenario: a scenario, its name, or the path of its file; its roles say who learns.
         directory: the run's folder.
         scheme: overrides the recipe's; without any, one learner is ``single`` and several are ``shared``.
-        turns: overrides the recipe's, of independent learners (docs/cooperation.md).
+        turns: overrides the recipe's, of independent learners (docs/training-schemes.md).
         seed: overrides the recipe's.
         steps: overrides the recipe's decisions of learners; training ends after the first update at or beyond them.
         force: replace an earlier run.
