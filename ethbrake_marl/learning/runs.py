@@ -208,7 +208,7 @@ def train(
         settings: by which recipe and scenario differ from their files, ``KEY=VALUE`` each: noted in ``config.json``.
         measure: makes of the training what measures its policies before the first update, then as the recipe says, and
             at the end: by default on the recipe's fixed list. None: nothing is measured.
-        stop_when_lost: stop, ``interrupted``, at an evaluation that finds the training lost (docs/learning.md).
+        stop_when_lost: stop, ``interrupted``, at an evaluation that finds the training lost (docs/run-folder.md).
         stop_at: is given every evaluation, as it stands in ``TrainResult.evaluations``, and gives a reason to stop
             there, ``interrupted``, or None.
         on_progress: is told how far the training is; by default stderr shows it, None: nobody is told.

@@ -48,9 +48,6 @@ BLOCKS: dict[str, How] = {
     "ethbrake agent export runs/early": TRAINED,
     "First-impact        Total Sampled": _by(TRAINING, "make run"),
     "resume, ppo: 20/20": _by(TRAINING, "make test-resume"),
-    "ethbrake doctor speed": _by(SPEED),
-    "make bench-peers": _by(SPEED),
-    ".venv/bin/python docs/studies/threads.py": _by(SPEED),
     "gap_1_m,gap_2_m,speed_1_mps": _by(BY_HAND),
     "paper-random full_brake        backward": EXACT,
 }

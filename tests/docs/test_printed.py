@@ -27,6 +27,7 @@ from tests.docs.blocks import (
 )
 from tests.docs.printed import BLOCKS, EXACT, MEASURED, PICTURES, TABLES, How, how, results, where_rows
 from tests.docs.site import DOCS, load
+from tests.programmes.libraries import harm_of_howto
 
 Run = Callable[..., tuple[str, str]]
 
@@ -186,6 +187,12 @@ def test_programs__of_a_page_run_and_print_what_stands_below_them(
         exec(compile(code, f"{page}.md", "exec"), names)
         told = capsys.readouterr().out
         assert not printed or told == printed
+
+
+@pytest.mark.slow
+def test_howto_train__runs_and_beats_full_braking(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # MAPPO of BenchMARL, where it is missing here, is run by ``make test-libraries``
+    assert {"one", "pair"} <= harm_of_howto().keys()
 
 
 CELL = re.compile(r"^```\{code-cell\} python\n(?::tags: .*\n)?(.*?)^```$", re.DOTALL | re.MULTILINE)
