@@ -2,7 +2,7 @@
 
     .venv/bin/python docs/studies/equal_time.py [AGENT ...]
 
-With agents of your own the first is what the others are compared with (docs/shield.md, "Refined policies"). Each is
+With agents of your own the first is what the others are compared with (docs/refined-policies.md). Each is
 measured with its whole episode: what it does at the alert, every decision, and the motion of the worlds.
 No shipped table holds the worlds of this list, so ``best_harm:K`` has to search them.
 """

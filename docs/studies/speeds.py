@@ -1,6 +1,6 @@
 """Speeds outside their range: how often vehicles roll backward or are above their limit when a decision is due.
 
-``.venv/bin/python docs/studies/speeds.py`` prints the block of docs/paper.md: the first 2,000 worlds of seed 7.
+``.venv/bin/python docs/studies/speeds.py`` prints the block of docs/paper-motion.md: the first 2,000 worlds of seed 7.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """E-V2X-BM: the constant deceleration of least harm, in closed form and in the engine's physics, and as an agent.
 
 First the closed form of one pair: its first contact, and the thresholds that avoid it. Symbols, for a pair alone
-(docs/baselines.md derives every formula):
+(docs/proofs/constant-deceleration.md derives every formula):
 
 =============  ===============================================================
 l, f           leader (front vehicle), follower (rear vehicle)
@@ -270,7 +270,7 @@ def most_to_spare_rear(gap: float, v_l: float, onset_l: float, v_f: float, a_f: 
 # The controlled vehicle's neighbours brake at full capacity from their own latencies; its front and its rear pair are
 # treated as independent, so each counts its first contact only and no velocity is exchanged. Predicted harm is
 # ``H(a) = c_front(a)^2 + c_rear(a)^2`` (m2/s2). Between a handful of closed-form breakpoints it is concave in ``a``, so
-# its minimum is at one of them: no grid. docs/baselines.md derives all of it.
+# its minimum is at one of them: no grid. docs/proofs/constant-deceleration.md derives all of it.
 
 CANDIDATES = 6  # 0, capacity, the two thresholds, and two more where the vehicle may brake before its front neighbour
 _TIE = 1e-12  # harms closer than this, relative to 1 + harm, are one harm

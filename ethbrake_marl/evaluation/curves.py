@@ -220,7 +220,8 @@ def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> De
 def regimes_of(worlds: Worlds, pair: int, deceleration_mps2: Floats) -> NDArray[np.str_]:
     """How one pair, alone, first meets under constant decelerations [n, N] from now (t = 0) on, [n].
 
-    ``A``, ``A'``, ``B`` or ``C`` as in docs/baselines.md, ``early``: before the pair's leader brakes, or ``none``.
+    ``A``, ``A'``, ``B`` or ``C`` as in docs/proofs/constant-deceleration.md, ``early``: before the pair's leader
+    brakes, or ``none``.
     """
     own = slice(pair, pair + 2)
     v = worlds.vehicles

@@ -347,7 +347,7 @@ class Evaluation:
         return Conditions.of_test(self.task, self.seed, self.worlds.n, because, Conditions.of(self.worlds))
 
     def per_world(self, objectives: Sequence[Declared] = (), *, limits: bool = True) -> Columns:
-        """One row per agent and world; docs/evaluation.md lists the columns. None where there is no value.
+        """One row per agent and world; docs/per-world.md lists the columns. None where there is no value.
 
         Without ``limits`` those of the best known harm are left out, every quantity is told, and no world that was left
         out: the rows of a shard, which have the same columns as those of any other. Initial quantities are named as in
@@ -388,7 +388,7 @@ class Evaluation:
         return found
 
     def to_frame(self, library: str | None = None) -> Any:
-        """One row per agent and world: the columns of ``--per-world`` (docs/evaluation.md), NaN for no number.
+        """One row per agent and world: the columns of ``--per-world`` (docs/per-world.md), NaN for no number.
 
         A pandas ``DataFrame`` where pandas is installed, else one of polars, else a mapping of column names to arrays.
         ``library`` asks for one of them: ``pandas``, ``polars`` or ``columns``. Raises ``UnknownName`` for another, and

@@ -69,7 +69,7 @@ def write_per_world(
 ) -> None:
     """Write one row per agent and world: Parquet where the name ends in ``.parquet``, else CSV.
 
-    docs/evaluation.md lists the columns; ``objectives`` adds theirs. A world that was left out has a row with nothing
+    docs/per-world.md lists the columns; ``objectives`` adds theirs. A world that was left out has a row with nothing
     but its number and, in ``ended``, why. The file appears whole or not at all. Raises ``AlreadyExists`` unless
     ``force``, ``InvalidInput`` without a folder or for another ending, ``MissingExtra`` without pyarrow for Parquet.
     """

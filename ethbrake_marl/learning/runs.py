@@ -201,14 +201,14 @@ def train(
         scenario: a scenario, its name, or the path of its file; its roles say who learns.
         directory: the run's folder.
         scheme: overrides the recipe's; without any, one learner is ``single`` and several are ``shared``.
-        turns: overrides the recipe's, of independent learners (docs/cooperation.md).
+        turns: overrides the recipe's, of independent learners (docs/training-schemes.md).
         seed: overrides the recipe's.
         steps: overrides the recipe's decisions of learners; training ends after the first update at or beyond them.
         force: replace an earlier run.
         settings: by which recipe and scenario differ from their files, ``KEY=VALUE`` each: noted in ``config.json``.
         measure: makes of the training what measures its policies before the first update, then as the recipe says, and
             at the end: by default on the recipe's fixed list. None: nothing is measured.
-        stop_when_lost: stop, ``interrupted``, at an evaluation that finds the training lost (docs/learning.md).
+        stop_when_lost: stop, ``interrupted``, at an evaluation that finds the training lost (docs/run-folder.md).
         stop_at: is given every evaluation, as it stands in ``TrainResult.evaluations``, and gives a reason to stop
             there, ``interrupted``, or None.
         on_progress: is told how far the training is; by default stderr shows it, None: nobody is told.

@@ -106,7 +106,7 @@ Preset = Annotated[str, AfterValidator(_known_preset), _PresetSchema]
 
 
 class V2X(FileModel):
-    """A preset, and what differs from it; see ``docs/cooperation.md``. Written as its name alone, or as a mapping."""
+    """A preset, and what differs from it; see ``docs/v2x.md``. Written as its name alone, or as a mapping."""
 
     preset: Preset = Field(
         default="paper", description="where to start from; the other keys take the place of its values"

@@ -3,7 +3,7 @@
 A quantity of one vehicle (or pair) that was told as x lies in [x - h, x + h], h being a number in its unit or a share
 of x, cut to what is possible (no latency, speed or gap below 0, no speed above the vehicle's limit). The *members* of
 a world are the world as it was told, and every corner of the box of all these intervals: 2^d of them, for d uncertain
-numbers. What robust mode proves, it proves for the members (``docs/shield.md``).
+numbers. What robust mode proves, it proves for the members (``docs/shield-intervals.md``).
 """
 
 from __future__ import annotations

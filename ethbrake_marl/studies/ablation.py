@@ -703,7 +703,7 @@ TOLERANCE = 1e-6  # m2/s2; a vehicle whose harm rose by more is worse off
 
 
 def compare(measured: Sequence[Measured], searched: int) -> Json:
-    """Plain data for JSON: ``levels``, ``steps`` of the ladder, ``channels`` (lost messages); see docs/cooperation.md.
+    """Plain data for JSON: ``levels``, ``steps`` of the ladder, ``channels``; see docs/ablate-cooperation.md.
 
     The joint optimum is known in the first ``searched`` worlds; what stands beside it is of these worlds too. Each
     algorithm has a ladder of its own; levels in which nobody learns are in all of them.

@@ -13,12 +13,13 @@ import pytest
 from ethbrake_marl.evaluation.inputs import load_runnable
 from ethbrake_marl.files.yaml import Override
 from ethbrake_marl.learning.training import TrainingRecipe, load_recipe, read_settings
-from ethbrake_marl.scenario import Scenario
+from ethbrake_marl.scenario import Scenario, parse_yaml
 from ethbrake_marl.search import ProfileProblem
 from tests.cli.conftest import Command, rows_of, told_json
 
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIAL = (ROOT / "docs" / "tutorials" / "first-ten-minutes.md").read_text("utf-8")
+ADD, OWN_DATA = ((ROOT / "docs" / f"{name}.md").read_text("utf-8") for name in ("add-a-scenario", "own-vehicle-data"))
 
 
 @pytest.mark.parametrize("script", ["planner", "planner:1000000", "planner:60000ms", "best_harm", "best_harm:1000000"])
@@ -176,3 +177,44 @@ def test_tutorial__its_changed_scenario_is_valid_and_evaluates_to_the_printed_ta
     printed = TUTORIAL.partition(f"$ ethbrake {command}\n")[2].partition("\n...")[0].splitlines()
     told = ethbrake(*command.split()).out.splitlines()
     assert len(printed) == 9 and [line.rstrip() for line in told[:9]] == printed
+
+
+def test_how_to_add__its_commands_lead_from_a_copy_to_the_figures_that_it_tells(
+    ethbrake: Command, tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    told = {}
+    for command in re.findall(r"^\$ ethbrake (.*)$", ADD, re.MULTILINE):
+        told[command.split()[1]] = (done := ethbrake(*command.split())).out
+        assert done.status == 0, command
+        if command.startswith("scenario new"):
+            change_lines("rainy.yaml", ADD)
+    assert f"    {told['validate']}" in ADD
+    assert Path("worlds.csv").read_text().splitlines()[0].split(",")[:2] == ["gap_1_m", "gap_2_m"]
+    told_of = r"collides in ([\d.]+ %) of them and does ([\d.]+) .*?collides in ([\d.]+ %) and does ([\d.]+\d)"
+    figures = re.search(told_of, ADD.replace("\n", " "))
+    assert figures is not None and [each for each in figures.groups() if each not in told["--scenario"]] == []
+
+
+def change_lines(path: str, page: str) -> None:
+    """The lines of a scenario that the page's first YAML block changes."""
+    block = re.search(r"```yaml\n(.*?)```", page, re.DOTALL)
+    assert block is not None
+    text = Path(path).read_text()
+    for line in block[1].splitlines():
+        text, count = re.subn(rf"(?m)^{line.partition(':')[0]}: .*$", line, text)
+        assert count == 1
+    Path(path).write_text(text)
+
+
+def test_how_to_own_data__its_table_is_read_and_its_distributions_are_valid(tmp_path: Path) -> None:
+    paper = load_runnable("paper-random")
+    table = re.search(r"```text\n(gap_1_m.*?)```", OWN_DATA, re.DOTALL)
+    assert table is not None
+    (tmp_path / "mine.csv").write_text(table[1])
+    vehicles = paper.read_worlds(tmp_path / "mine.csv").vehicles
+    assert (vehicles.mass_t[:, 1].tolist(), vehicles.braking_capacity_mps2[:, 1].tolist()) == ([1.4, 12], [7.5, 5.5])
+    drawn, typed = (parse_yaml(text, "page").content for text in re.findall(r"```yaml\n(.*?)```", OWN_DATA, re.DOTALL))
+    assert set(paper.replace(**drawn).sample(100, 7).worlds.vehicles.mass_t.flat) == {1.3, 1.5, 1.9, 2.4}
+    content = {key: value for key, value in paper.declared().items() if key not in typed["vehicle_types"]["car"]}
+    assert set(Scenario(**content, **typed).sample(100, 7).types.flat) == {"car", "truck"}

@@ -27,7 +27,7 @@ class Shown:
 
 def pages() -> list[Path]:
     """README and every page but records of decisions, which tell how things were when they were decided."""
-    return [ROOT / "README.md", *sorted(DOCS.glob("*.md")), *sorted((DOCS / "tutorials").glob("*.md"))]
+    return [ROOT / "README.md", *sorted(DOCS.glob("*.md")), *sorted(DOCS.glob("[pt]*s/*.md"))]
 
 
 def printed_blocks() -> Iterator[Shown]:

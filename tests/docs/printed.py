@@ -48,9 +48,6 @@ BLOCKS: dict[str, How] = {
     "ethbrake agent export runs/early": TRAINED,
     "First-impact        Total Sampled": _by(TRAINING, "make run"),
     "resume, ppo: 20/20": _by(TRAINING, "make test-resume"),
-    "ethbrake doctor speed": _by(SPEED),
-    "make bench-peers": _by(SPEED),
-    ".venv/bin/python docs/studies/threads.py": _by(SPEED),
     "gap_1_m,gap_2_m,speed_1_mps": _by(BY_HAND),
     "paper-random full_brake        backward": EXACT,
 }
@@ -70,12 +67,8 @@ TABLES: dict[str, How] = {
     "| who drives Vehicle 2 | knows | collisions": _by(NIGHTLY, *_TESTS),
     "| what | first-impact harm | of the best known": TRAINED,
     "| what the vehicles do | first-impact harm": TRAINED,
-    "| list | worlds | proven | best known, first": EXACT,
-    "| d1, d2; v1, v2, v3; tau2, tau3": EXACT,
     "| What | Verdict |": _by(SUITE, "tests/docs/test_pages.py"),
-    "| total gap (m) | 10-12": _by(SUITE, "tests/docs/test_pages.py"),
     "| | full braking | E-V2X-BM | this policy": _by(TRAINING, "make run"),
-    "| licence | packages": _by(SUITE, "tests/programmes/test_programmes.py"),
     "| no. | label | the paper": _by(BY_HAND),
 }
 
@@ -98,7 +91,7 @@ PICTURES: dict[str, How] = {
     "price-of-not-knowing.png": _by(NIGHTLY, "python docs/studies/price.py price-of-not-knowing.png"),
     "shield-operating.png": _by(TRAINING),
     "shield-modes.png": _by(TRAINING),
-    "regimes.png": _by(NIGHTLY, "the program on its page"),
+    "regimes.png": _by(NIGHTLY, "python docs/studies/regimes.py regimes.png"),
     "cooperation-ablation": _by(TRAINING),
     "learning-curves": _by(TRAINING),
     "explorer.png": _by(BY_HAND),

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any, get_args
 
@@ -16,20 +19,22 @@ from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.evaluation.measures import PAPER_NOTE, PAPER_ROWS
 from ethbrake_marl.harm import KINDS, scored
 from ethbrake_marl.learning.training import Scheme
-from ethbrake_marl.scenario import Scenario, load_scenario, parse_yaml
+from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies import reproduction
 from ethbrake_marl.studies.benchmark import read_entry
 from ethbrake_marl.studies.reproduction import FULL_BRAKE, GAPS, ITEMS, NAMES, Reproduction, Result, checked_result
 from tests.docs.site import DOCS, load
 from tests.studies.benchmark_rows import ENTRIES, MEASURED as BENCHMARK, tables
 
-PAPER, MADE_AGAIN, COOPERATION = (
-    (DOCS / f"{name}.md").read_text("utf-8") for name in ("paper", "reproduction", "cooperation")
-)
+MADE_AGAIN = (DOCS / "reproduction.md").read_text("utf-8")
+COOPERATION = "".join((DOCS / f"{name}.md").read_text("utf-8") for name in ("cooperation", "v2x", "training-schemes"))
+ABLATION = (DOCS / "ablate-cooperation.md").read_text("utf-8")
+PAPER_PAGES = [(DOCS / f"{name}.md").read_text("utf-8") for name in ("paper-motion", "paper", "paper-figures")]
+PAPER = "".join(PAPER_PAGES)
 SITE = load("results")
 MEASURED = {table.id: table for table in SITE.read_tables("paper")}
 
-# Every \label of an equation, algorithm, figure or table in the paper's source, by the heading of the page.
+# Every \label of an equation, algorithm, figure or table in the paper's source, by the heading of the pages.
 LABELS = {
     "Equations": (
         "dynamics", "eq:olle1", "eq:olle2", "eq:4", "eq:5", "eq:52", "eq:rel_distance", "gamma", "eq:rel_velocity",
@@ -54,7 +59,7 @@ def rows(page: str, heading: str, level: str = "\n## ") -> list[list[str]]:
 
 @pytest.mark.parametrize("title", LABELS)
 def test_paper__treats_every_label_and_everything_that_has_a_number_once(title: str) -> None:
-    told = [row for row in rows(PAPER, f"\n## {title}\n") if len(row) == 5]
+    told = [row for page in PAPER_PAGES for row in rows(page, f"\n## {title}\n") if len(row) == 5]
     second = " ".join(row[1] for row in told)
     assert [label for label in LABELS[title] if f"`{label}`" not in second] == []
     numbers = [number for row in told for number in row[0].split(", ") if number.isalnum()]
@@ -94,7 +99,8 @@ def test_paper__full_braking_over_the_total_distance_is_as_printed() -> None:
     result = evaluate(scenario.sample(5_000, 7), make_lineup(["full_brake"], scenario), scenario=scenario)
     groups = np.digitize(result.worlds.gaps_m.sum(axis=1), (12.0, 14.0, 16.0, 18.0))
     harm = result.outcome("full_brake").first_impact_harm
-    assert f"| `full_brake` | {' | '.join(f'{harm[groups == group].mean():.2f}' for group in range(5))} |" in PAPER
+    told = MEASURED["harm-over-total-distance"].rows[0]
+    assert told == ["`full_brake`", *(f"{harm[groups == group].mean():.2f}" for group in range(5))]
 
 
 # docs/reproduction.md is what its committed data say, and the data are what the worlds give.
@@ -144,7 +150,7 @@ def test_reproduction__trajectories_and_full_braking_are_as_committed(tmp_path: 
         assert row[1].value == reproduction.PERCENT.show(rate).in_words
 
 
-# docs/cooperation.md
+# docs/cooperation.md and the pages of its dials
 
 
 def first_cells(heading: str) -> dict[str, list[str]]:
@@ -166,19 +172,33 @@ def test_cooperation__its_examples_run(tmp_path: Path, monkeypatch: pytest.Monke
     quick = '("cooperation-ppo").replace(total_steps=1, n_envs=8)'
     for block in blocks:
         of_block = {} if "result = eb.train(" in block else names
-        if "for preset in PRESETS" not in block:  # 100,000 worlds of each
-            exec(block.replace('("cooperation-ppo")', quick).replace("1000", "20"), of_block)
+        exec(block.replace('("cooperation-ppo")', quick).replace("1000", "20"), of_block)
         assert of_block is names or of_block["harm"].shape == (20,)
     assert (tmp_path / "runs" / "pair" / "team.json").is_file()
-    assert len(blocks) == 5 and names["columns"]["social:45"].shape == (20, 3)
+    assert len(blocks) == 4 and names["columns"]["social:45"].shape == (20, 3)
     assert names["columns"].keys() == scored(names["result"].outcome("full_brake").ledger, "first").keys()
 
 
-def test_cooperation__its_level_is_valid_and_its_messages_are_those_of_the_code() -> None:
-    (text,) = re.findall("```yaml\n(.*?)```", COOPERATION, re.DOTALL)
-    scenario = Scenario.from_document(parse_yaml(text, "docs/cooperation.md"))
-    assert scenario.objective == ("total", "social:45", "total") and scenario.v2x.channel.hears == "front"
-    assert not scenario.sample(5, 0).worlds.vehicles.is_known_at_once
+@pytest.mark.slow
+def test_ablate_cooperation__its_files_and_commands_make_what_it_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for language, name in (("python", "my_objective.py"), ("yaml", "my-level.yaml")):
+        (text,) = re.findall(f"```{language}\n(.*?)```", ABLATION, re.DOTALL)
+        (tmp_path / name).write_text(text, "utf-8")
+    environment = {**os.environ, "PYTHONPATH": str(DOCS.parent), "OMP_NUM_THREADS": "1"}
+    small = "--seeds 1 --steps 512 --episodes 20 --search-episodes 3 --budget 50"
+    for command in re.findall(r"^\$ (.*)", ABLATION, re.MULTILINE):
+        words = command.replace("--seeds 3", small).split()[1:]
+        done = subprocess.run(
+            [sys.executable, "-m", "ethbrake_marl", *words], cwd=tmp_path, env=environment, check=False
+        )
+        assert done.returncode == 0, command
+    made = {path.name for path in (tmp_path / "runs" / "mine").iterdir()}
+    assert {"ablation.html", "ablation.md", "ablation.csv", "settings.json", "trainings", "optimum"} <= made
+
+
+def test_cooperation__its_messages_are_those_of_the_code() -> None:
     ten = {"vehicles": 10, "gaps_m": 5, "speeds_mps": 20, "latency_s": 0.0, "mass_t": 5}
     ten |= {"braking_capacity_mps2": 6, "driving_capacity_mps2": 6}
     given = [{"v2x": {"preset": "clear", "senses": "none"}}, {"v2x": "blocked", **ten}]

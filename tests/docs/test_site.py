@@ -162,7 +162,7 @@ def test_hooks__run_tools_of_the_environment_and_download_nothing() -> None:
 
 
 MOST_CHARACTERS = 100
-PAGES = sorted([ROOT / "README.md", *ROOT.glob(".github/*.md"), *DOCS.glob("*.md"), *DOCS.glob("[art]*/*.md")])
+PAGES = sorted([ROOT / "README.md", *ROOT.glob(".github/*.md"), *DOCS.glob("*.md"), *DOCS.glob("[aprt]*/*.md")])
 CODE = re.compile(r"^\s*(```+|~~~+|:::+).*?^\s*\1\s*$", re.DOTALL | re.MULTILINE)
 FREE = re.compile(r"\s*(\||#|<|!\[)|    |\[[\w-]+\]: |\s*([-*] )?\S+$")  # tables, headings, HTML, code, one word
 

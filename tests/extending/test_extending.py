@@ -462,7 +462,8 @@ def test_folder__makes_its_scenarios_known_by_name_and_a_plugin_may_register_it_
     assert "worst" in REGISTERED
 
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "extending.md").read_text("utf-8")
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+PAGE = "".join((DOCS / f"{name}.md").read_text("utf-8") for name in ("extending", "own-policy"))
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")

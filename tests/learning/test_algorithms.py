@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import itertools
-import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -54,15 +53,47 @@ from tests.learning.tiny import MODES, TINY_COUNTERFACTUAL, TINY_MODES, TINY_PPO
 
 @pytest.fixture
 def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """The algorithm of the page's file, imported."""
-    (source,) = (block for block in re.findall("```python\n(.*?)```", PAGE, re.DOTALL) if "register_algorithm" in block)
-    (tmp_path / "my_algorithm.py").write_text(source)
+    """An algorithm of a user's file, imported."""
+    (tmp_path / "my_algorithm.py").write_text(A2C)
     monkeypatch.syspath_prepend(tmp_path)
     yield importlib.import_module("my_algorithm").A2c
     sys.modules.pop("my_algorithm")
 
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "learning.md").read_text("utf-8")
+A2C = '''
+"""A2C, from Stable-Baselines3."""
+
+from stable_baselines3 import A2C
+
+from ethbrake_marl import TrainingRecipe, register_algorithm
+from ethbrake_marl.learning.algorithms import ppo_arguments
+from ethbrake_marl.learning.training import Algorithm
+from ethbrake_marl.learning.training import NetworkShape
+
+
+class A2cRecipe(TrainingRecipe):
+    n_steps: int  # decisions of each learner between two updates
+    network: NetworkShape
+
+
+class A2c(Algorithm):
+    def build(self, training, environment):
+        """A fresh model, seeded by the recipe."""
+        recipe = training.recipe
+        return A2C(
+            "MlpPolicy",
+            environment,
+            learning_rate=recipe.learning_rate.at,
+            n_steps=recipe.n_steps,
+            gamma=recipe.gamma,
+            policy_kwargs=ppo_arguments(recipe.network),
+            seed=recipe.seed,
+            device="cpu",
+        )
+
+
+register_algorithm("a2c", A2cRecipe, A2c)
+'''
 SCENARIO = eb.load_scenario("paper-random")
 
 

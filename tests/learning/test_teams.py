@@ -189,7 +189,7 @@ def test_load_team__a_damaged_folder_is_refused(damage: Any, message: str, train
 
 @pytest.mark.long
 def test_cooperation__two_learners_avoid_what_can_be_avoided(tmp_path: Path) -> None:
-    """Contact cannot be avoided in 65 % of these worlds; PPO's pairs collided in every one (docs/cooperation.md)."""
+    """Contact cannot be avoided in 65 % of these worlds; PPO's pairs collided in every one (docs/levels.md)."""
     train("cooperation", PAIR, tmp_path / "run", steps=800_000)
     result = eb.evaluate(PAIR.sample(1000, 7), {"team": RunDirectory(tmp_path / "run").load_team(PAIR)}, scenario=PAIR)
     assert result.outcome("team").collided.mean() < 0.70

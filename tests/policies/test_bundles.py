@@ -369,7 +369,7 @@ def test_load_policy__refuses_a_damaged_bundle_and_runs_and_opens_nothing_else(
 
 
 def test_damaged_bundles__are_as_many_as_the_page_says() -> None:
-    page = Path(__file__).resolve().parents[2] / "docs" / "learning.md"
+    page = Path(__file__).resolve().parents[2] / "docs" / "policy-bundles.md"
     assert f"{len(SPOILED)} damaged and malicious bundles" in " ".join(page.read_text("utf-8").split())
 
 
@@ -482,7 +482,7 @@ def test_policy_shipped__is_the_best_that_ships(test: str, harm_count: HarmCount
 def test_policy_shipped__drives_all_learners_of_a_level_of_cooperation(
     level: str, share_of_full_braking: float, collisions: float
 ) -> None:
-    """At least as well as docs/cooperation.md says, by and large: level 3 collides no more often than level 2."""
+    """At least as well as docs/levels.md says, by and large: level 3 collides no more often than level 2."""
     scenario = eb.load_scenario(level)
     assert shipped_name("policy", level, "total") == f"counterfactual-{level}"
     assert load_named_policy(f"shipped/counterfactual-{level}").manifest.learners == tuple(

@@ -35,7 +35,6 @@ from tests.docs.printed import BLOCKS, NIGHTLY, PICTURES, TABLES, How, how, resu
 from tests.programmes import Cases, Told
 
 PROGRESS = re.compile(r": [\d,]+ of [\d,]+$|^compiling ")
-PROGRAM = re.compile(r"```python\n((?:(?!```).)*?{name}(?:(?!```).)*?)```", re.DOTALL)
 
 
 def run(command: str, folder: Path) -> str:
@@ -78,17 +77,7 @@ def differing_table(table: Shown, place: How, folder: Path) -> list[str]:
 def differing_picture(picture: Shown, place: How, folder: Path) -> list[str]:
     """Whether a picture has other pixels, in words."""
     for command in place.by:
-        if command.startswith(("ethbrake", "python")):
-            run(command, folder)
-        else:  # the program that stands on its page
-            found = re.search(
-                PROGRAM.pattern.format(name=re.escape(picture.begin)),
-                (ROOT / picture.page).read_text("utf-8"),
-                re.DOTALL,
-            )
-            if found is None:
-                return ["no program on its page makes it"]
-            run(shlex.join(["python", "-c", found[1]]), folder)
+        run(command, folder)
     if picture.begin.endswith(".svg"):
         same = (ROOT / "docs" / "figures" / picture.begin).read_bytes() == (folder / picture.begin).read_bytes()
         return [] if same else ["other bytes"]

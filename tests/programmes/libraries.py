@@ -1,5 +1,7 @@
 """Other people's libraries: every block of docs/other-libraries.md is run as it stands, and what it trained drives.
 
+So is docs/howto-train.md, in the environment of BenchMARL.
+
 Each library has an environment of its own below ``.venvs/``, kept for the next run, with this project as it stands.
 What cannot be installed is skipped, and the reason told. A policy is measured on a fixed list of worlds beside full
 braking, and where the library evaluates policies by itself, its harm is compared with ours, world by world.
@@ -20,6 +22,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +32,7 @@ from tests.docs.site import load
 from tests.programmes import KEPT, ROOT, Cases, Told
 from tests.programmes.environments import NotInstalled, ready_python, watched
 
-PAGE = ROOT / "docs" / "other-libraries.md"
+PAGE, HOWTO = ROOT / "docs" / "other-libraries.md", ROOT / "docs" / "howto-train.md"
 MEASURED = load("results")
 SCENARIO, EPISODES, SEED = "paper-random", 500, 7
 OWN_EPISODES, CLOSE = 50, 1e-5  # of the library's own evaluation; m2/s2
@@ -229,6 +232,28 @@ def tell(k: int) -> None:
     print(json.dumps([version(library.told), harm, braking, own, f"{seconds:.0f}", verdict]))
 
 
+def harm_of_howto() -> dict[str, dict[str, float]]:
+    """What each training of docs/howto-train.md comes to, beside full braking; without BenchMARL those before it.
+
+    A minute is too little for MAPPO to beat full braking, which the page says.
+    """
+    names: dict[str, Any] = {"__name__": "copied"}
+    for code in re.findall("```python\n(.*?)```", HOWTO.read_text("utf-8"), re.DOTALL):
+        if "from benchmarl" in code and find_spec("benchmarl") is None:
+            break
+        exec(compile(code, HOWTO.name, "exec"), names)
+    for trained, harms in names["harm"].items():
+        full, theirs = harms.values()
+        assert theirs < full or trained == "mappo", f"{trained}: {theirs:.2f} does not beat full braking, {full:.2f}"
+    found: dict[str, dict[str, float]] = names["harm"]
+    return found
+
+
+def tell_howto() -> None:
+    """Run the how-to in the current folder, and print what each training came to as JSON."""
+    print(json.dumps([f"{name} {harm:.2f}" for harms in harm_of_howto().values() for name, harm in harms.items()]))
+
+
 def evaluated_by_itself(model: Any, agent: Any) -> float:
     """Largest difference of any world's harm, m2/s2, by its own ``evaluate_policy``: the reward is minus the harm."""
     from stable_baselines3.common.env_util import make_vec_env
@@ -262,20 +287,21 @@ def options(parser: argparse.ArgumentParser) -> None:
 def cases(given: argparse.Namespace) -> Cases:
     for k, way in enumerate(ways()):
         if LIBRARIES[way.library].in_ci or not given.ci:
-            yield f"{way.library}: {way.title} ({way.ran})", partial(run, k, way, given)
+            yield f"{way.library}: {way.title} ({way.ran})", partial(run, way.library, f"tell({k})", given, way)
+    yield f"BenchMARL: docs/{HOWTO.name}", partial(run, "BenchMARL", "tell_howto()", given)
 
 
-def run(k: int, way: Way, given: argparse.Namespace) -> Told:
-    """Run one way in its library's environment."""
-    name = re.sub(r"\W+", "_", way.library.lower())
+def run(library: str, function: str, given: argparse.Namespace, way: Way | None = None) -> Told:
+    """Run one way, or the how-to, in its library's environment."""
+    name = re.sub(r"\W+", "_", library.lower())
     try:
-        python = ready_python(name, LIBRARIES[way.library].requires)
+        python = ready_python(name, LIBRARIES[library].requires)
     except NotInstalled as reason:
         return Told(None, f"skipped: {reason}")
-    folder = KEPT / "work" / f"{name}-{k}"
+    folder = KEPT / "work" / f"{name}-{re.sub(r'[^a-z0-9]+', '-', function)}"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    call = f"import os; os.chdir({str(folder)!r}); from tests.programmes import libraries; libraries.tell({k})"
+    call = f"import os; os.chdir({str(folder)!r}); from tests.programmes import libraries; libraries.{function}"
     variables = {"MINARI_DATASETS_PATH": str(folder), "PYTHONUNBUFFERED": "1", **ONE_THREAD}  # not among the user's own
     limit = min(given.limit, given.until - time.monotonic())
     status, told = watched([str(python), "-W", "ignore", "-c", call], limit, **variables)
@@ -285,7 +311,7 @@ def run(k: int, way: Way, given: argparse.Namespace) -> Told:
     if status:
         return Told(False, f"status {status}: {last}")
     cells = json.loads(last)
-    if given.write:
+    if given.write and way is not None:
         write_row(way, cells)
     return Told(True, "  ".join(filter(None, cells)))
 
