@@ -66,7 +66,6 @@ _TESTS = tuple(
 TABLES: dict[str, How] = {
     "| who drives Vehicle 2 | knows | collisions": _by(NIGHTLY, *_TESTS),
     "| what | first-impact harm | of the best known": TRAINED,
-    "| what the vehicles do | first-impact harm": TRAINED,
     "| | full braking | E-V2X-BM | this policy": _by(TRAINING, "make run"),
     "| no. | label | the paper": _by(BY_HAND),
 }
