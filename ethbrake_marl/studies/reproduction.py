@@ -2001,7 +2001,6 @@ def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
 def docs_page(results: Sequence[Result]) -> str:
     """The page of these results as Markdown: verdicts; the site shows everything else from the ``.json`` beside it."""
     lead, command, made, few = _account(results)
-    verdicts = [f"| [{_escaped(each.title)}](#{_escaped(each.name)}) | {each.verdict.outcome} |" for each in results]
     blocks = [
         f"# {_TITLE}",
         "What comes out where the paper's experiments are made again, and where it cannot?",
@@ -2014,15 +2013,13 @@ def docs_page(results: Sequence[Result]) -> str:
             " equation."
         ),
         *map(_wrapped, few),
-        "## Overview",
-        "\n".join(["| Item | Verdict |", "| --- | --- |", *verdicts]),
     ]
     for result in results:
         labels = f" ({', '.join(map(_escaped, result.labels))})" if result.labels else ""
         blocks += [
-            f"## {_escaped(result.name)}",
-            _wrapped(f"**{_escaped(result.title)}**. {_escaped(result.what)}{labels}"),
-            _wrapped(f"**{result.verdict.outcome}**: {_escaped(result.verdict.because)}"),
+            f"## {_escaped(result.title)}: {result.verdict.outcome}",
+            _wrapped(f"{_escaped(result.what)}{labels}"),
+            _wrapped(_escaped(result.verdict.because[:1].upper() + result.verdict.because[1:])),
         ]
     return "\n\n".join(blocks) + "\n"
 
