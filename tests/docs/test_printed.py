@@ -225,4 +225,4 @@ def test_notebook__runs_from_its_first_cell_to_its_last(name: str, tmp_path: Pat
 
 def test_notebooks__that_train_are_there() -> None:
     assert set(TRAIN) < set(NOTEBOOKS)
-    assert len(NOTEBOOKS) == 8
+    assert len(NOTEBOOKS) == 7
