@@ -198,7 +198,7 @@ def test_howto_train__runs_and_beats_full_braking(tmp_path: Path, monkeypatch: p
 CELL = re.compile(r"^```\{code-cell\} python\n(?::tags: .*\n)?(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 
-TRAIN = ("ablation", "cooperative-learner", "read-a-report", "train-and-shield")
+TRAIN = ("cooperative-learner", "read-a-report", "train-and-shield")
 
 
 NOTEBOOKS = sorted(
@@ -225,4 +225,4 @@ def test_notebook__runs_from_its_first_cell_to_its_last(name: str, tmp_path: Pat
 
 def test_notebooks__that_train_are_there() -> None:
     assert set(TRAIN) < set(NOTEBOOKS)
-    assert len(NOTEBOOKS) == 8
+    assert len(NOTEBOOKS) == 6
