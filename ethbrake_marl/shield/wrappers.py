@@ -41,15 +41,15 @@ class HybridShield(_Closing, BaseParallelWrapper[str, Observations, NDArray[Any]
 
     Mode ``step``, the default, certifies every action, or replaces it, of several learners together; ``robust`` does so
     in every member of an uncertainty. Mode ``episode`` is the paper's Algorithm 1: policy or E-V2X-BM drives a whole
-    episode, whatever is proposed. Bounds hold where the other vehicles follow their scripts. ``infos[agent]["shield"]`` says what was
-    done. See docs/shield.md.
+    episode, whatever is proposed. Bounds hold where the other vehicles follow their scripts.
+    ``infos[agent]["shield"]`` says what was done. See docs/shield.md.
 
     Args:
         env: ``eb.parallel_env(...)`` with one learner (mode ``step``: or more), or what wraps it.
         policy: an agent or a policy, a ``Team``, or one for each learner by its name; mode ``episode`` needs one, the
             others take its harm as bound where that is lower.
         agents: the learners that are shielded, as a list of names: all there are, which None also says.
-        options: keywords of ``ShieldOptions``, the ``mode`` among them; raises ``InvalidInput`` for one that the mode does not take.
+        options: keywords of ``ShieldOptions``, ``mode`` among them; raises ``InvalidInput`` for what does not fit it.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.HybridShield(eb.parallel_env(scenario="paper-random"))
