@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import io
 import os
+import re
 import sys
 import time
 import warnings
@@ -53,7 +54,9 @@ def run_command(arguments: Sequence[str]) -> int:
     except TyperException as error:
         context = getattr(error, "ctx", None)
         where = context.command_path if context else "ethbrake"
-        return _refuse(f"{error.format_message().replace('Value error, ', '')} (see: {where} --help)")
+        told = re.sub(r"Value error, |, unable to parse string as an? \w+", "", error.format_message())
+        told = told.replace("Input should be", "must be").replace("a valid integer", "a whole number")
+        return _refuse(f"{told} (see: {where} --help)")
     except EthBrakeError as error:
         return _refuse(str(error))
     except OSError as error:

@@ -68,12 +68,11 @@ class HybridShield(_Closing, BaseParallelWrapper[str, Observations, NDArray[Any]
         agents: Sequence[str] | None = None,
         **options: Any,
     ) -> None:
-        maker = "eb.parallel_env; with agents acting in turn eb.shielded_aec(that)"
         if isinstance(agents, str) or not (agents is None or isinstance(agents, Iterable)):
             raise InvalidInput(
                 f"HybridShield: agents = {agents!r}: must be a list of names, for instance ['vehicle_2']"
             )
-        self.attached = Attached(env, ParallelEnv, maker, policy, "HybridShield", options)
+        self.attached = Attached(env, ParallelEnv, "eb.parallel_env", policy, "HybridShield", options)
         super().__init__(env)
         engine = self.attached.engine
         self.shielded = tuple(engine.scenario.vehicle_names[i] for i in engine.learners)  # front to rear
