@@ -11,6 +11,7 @@ sys.path.insert(0, str(Path(__file__).parent))  # for the folder extension/
 
 project = "ethbrake_marl"
 author = "ethbrake_marl contributors"
+copyright = f"2026, {author}"
 release = version = __version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton", "extension"]
