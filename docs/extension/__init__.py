@@ -8,12 +8,13 @@ from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 
 from extension.api import add_public_names, check_pages
+from extension.demo import add_demonstration
 from extension.pages import add_cards, add_interface, list_folder, make_changelog, make_start, relink
 from extension.reference import COMPLETED
 from extension.results import add_reproduction, add_tables
 
 MADE = {
-    "index": make_start,
+    "index": lambda text: add_demonstration(make_start(text)),
     "changelog": make_changelog,
     "api": add_interface,
     "shipped-policies": add_cards,

@@ -106,6 +106,22 @@ def test_extra__brings_what_the_configuration_loads() -> None:
     assert {name.replace("_", "-") for name in named if name != "extension"} | {"furo"} == brought
 
 
+def test_demonstration__plays_the_picture_of_the_first_page_and_says_it_in_words(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    demo = load("demo")
+    monkeypatch.setattr(demo, "WORLDS", (0,))
+    monkeypatch.setattr(demo, "AGENTS", {"Full braking": "full_brake", demo.OWN: ""})
+    monkeypatch.setattr(demo, "TESTS", {"Main test": demo.TESTS["Main test"]})
+    page = demo.add_demonstration((ROOT / "README.md").read_text("utf-8"))
+    assert (
+        "Vehicle 2 strikes Vehicle 1 after 2.17 s at 2.4 m/s; Vehicle 3 strikes Vehicle 2 after 3.30 s at 5.3" in page
+    )
+    assert page.index('class="demo"') < page.index("## Quick start") and page.count('"pieces":') == 2
+    with pytest.raises(ValueError, match="no heading 'Quick start'"):
+        demo.add_demonstration("# Another README")
+
+
 GUIDES = ("CONTRIBUTING.md", "CODE_OF_CONDUCT.md", "SECURITY.md", "PULL_REQUEST_TEMPLATE.md")
 
 
