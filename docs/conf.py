@@ -45,6 +45,7 @@ html_extra_path = [
 ]
 html_static_path = ["static"]
 html_css_files = ["site.css"]
+html_search_scorer = str(Path(__file__).parent / "static" / "search.js")
 html_copy_source = False
 html_show_sourcelink = False
 copybutton_prompt_text = "$ "
