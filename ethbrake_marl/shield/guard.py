@@ -845,6 +845,17 @@ def put_shield(driver: Driver, task: Task, **settings: Any) -> Team:
     return ShieldedDriver(driver, task.scenario, harm_count=task.harm_count, **settings).on(task.vehicles)
 
 
+def shielded(driver: Driver, scenario: Scenario, mode: str, **options: Any) -> Driver:
+    """An agent or a team behind a shield; an agent whose scenario has several learners drives each by a copy."""
+    if mode == "episode":
+        settings = ShieldOptions(mode, **options)
+        return HybridAgent(driver, scenario, bound=settings.bound, harm_count=settings.harm_count)  # type: ignore[arg-type]  # which refuses a team
+    if isinstance(driver, Agent) and len(scenario.learners) > 1:
+        driver = Team.of(driver, scenario.learners)
+    around = ShieldedDriver(driver, scenario, mode=mode, **options)
+    return around.on(driver.drivers) if isinstance(driver, Team) else around
+
+
 # Factories of what the registry puts around an agent: the shields, with and without ``:believed``.
 
 
@@ -887,10 +898,7 @@ def shield_steps(policy: Driver, argument: str | None, settings: AgentSettings) 
     several = isinstance(policy, Team) or len(scenario.learners) > 1
     if several and believes:
         raise InvalidInput(f"agent {settings.spec!r}: :believed shields one learner, not several; take +step")
-    if several and isinstance(policy, Agent):
-        policy = Team.of(policy, scenario.learners)
-    shielded = ShieldedDriver(policy, scenario, mode="step", harm_count=settings.harm_count, believed=believes)
-    return shielded.on(policy.drivers) if isinstance(policy, Team) else shielded
+    return shielded(policy, scenario, "step", harm_count=settings.harm_count, believed=believes)
 
 
 def shield_steps_robustly(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:

@@ -15,12 +15,13 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils import BaseParallelWrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
-from ethbrake_marl.agents import Agent, LearnedPolicy
+from ethbrake_marl.agents import Agent, LearnedPolicy, Team
 from ethbrake_marl.envs import InTurns, in_turns
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats
-from ethbrake_marl.shield.guard import Attached, Proposing
+from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.shield.guard import Attached, HybridAgent, Proposing, ShieldedDriver, shielded
 
 Told = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # what a step of the environment returns
 
@@ -214,17 +215,19 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
 
 
 def shield(env: Any, policy: Proposing | None = None, mode: str = "step", **options: Any) -> Any:
-    """An environment behind a shield: the action wrapper for whatever interface it has.
+    """An environment behind a shield: the action wrapper for whatever interface it has. Or an agent behind one.
 
     Args:
         env: of this package, whatever wraps it: PettingZoo parallel or AEC, Gymnasium, its vector interface, or
             Stable-Baselines3's ``VecEnv``. A wrapper inside may change actions: what reaches the engine is certified.
+            Or an agent or team, for tables; then ``scenario`` says in which its actions are certified.
         policy: proposes where nobody else does, and bounds the harm where its own is lower; mode ``episode`` needs it.
         mode: ``episode``, ``step`` or ``robust``.
         options: further keywords of ``ShieldOptions``.
 
     Returns ``HybridShield``, that with agents acting in turn, ``ShieldedEnv``, ``ShieldedVectorEnv`` or
-    ``ShieldedVecEnv``. Raises ``InvalidInput`` for anything else, and for what those raise.
+    ``ShieldedVecEnv``; an agent or a team for an agent or a team. Raises ``InvalidInput`` for anything else, and for
+    what those raise.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.shield(eb.parallel_env(scenario="paper-random"))
@@ -234,6 +237,12 @@ def shield(env: Any, policy: Proposing | None = None, mode: str = "step", **opti
 
     """
     settings = {"mode": mode, **options}
+    if isinstance(env, Agent | Team | ShieldedDriver):
+        if isinstance(env, HybridAgent | ShieldedDriver) or (isinstance(env, Team) and env.shield is not None):
+            raise InvalidInput(f"shield: agent {env.name!r} is behind a shield already")
+        if policy is not None or "scenario" not in options:
+            raise InvalidInput(f"shield: agent {env.name!r} needs scenario=, in which to certify, and takes no policy")
+        return shielded(env, load_scenario(settings.pop("scenario")), **settings)
     if isinstance(env, AECEnv):
         inside: Any = env
         while type(inside) in (InTurns, OrderEnforcingWrapper):  # those of eb.env; another one may change actions
@@ -256,5 +265,5 @@ def shield(env: Any, policy: Proposing | None = None, mode: str = "step", **opti
         return HybridShield(env, policy, **settings)
     raise InvalidInput(
         f"shield: {env!r:.200} has none of the interfaces: parallel_env, env (agents in turn), EthBrakeEnv,"
-        " EthBrakeVectorEnv or make_sb3_vec_env"
+        " EthBrakeVectorEnv, make_sb3_vec_env, or an agent"
     )

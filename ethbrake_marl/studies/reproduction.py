@@ -2001,46 +2001,27 @@ def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
 def docs_page(results: Sequence[Result]) -> str:
     """The page of these results as Markdown: verdicts; the site shows everything else from the ``.json`` beside it."""
     lead, command, made, few = _account(results)
-    verdicts = [(f"[{_escaped(each.title)}](#{_escaped(each.name)})", each.verdict.outcome) for each in results]
     blocks = [
         f"# {_TITLE}",
         "What comes out where the paper's experiments are made again, and where it cannot?",
         _wrapped(lead),
         _wrapped(f"Made by `{command} --output runs/reproduction --docs docs/reproduction.md` ({_escaped(made)})."),
         _wrapped(
-            "That command writes the page, its figures and `reproduction.json`, which holds everything as data; nothing"
-            " is written by hand. `ethbrake reproduce` makes them again without training. [All that was measured]"
-            "(results/reproduction.md) has the tables, figures and parameters of each item; [the paper, line by line]"
-            "(paper.md) has the account of every equation."
+            "That command writes this page, its figures and `reproduction.json`; nothing is written by hand. `ethbrake"
+            " reproduce` makes them again without training. [All that was measured](results/reproduction.md) has every"
+            " comparison, table, figure and parameter of each item; [the paper, line by line](paper.md) has every"
+            " equation."
         ),
         *map(_wrapped, few),
-        "## Overview",
-        _table(("Item", "Verdict"), verdicts),
     ]
     for result in results:
-        compared: dict[str, dict[str, list[str]]] = {}  # outcome and its readings, which stand in brackets
-        for each in result.comparisons:
-            what, _, reading = each.what.removesuffix(")").partition(" (")
-            compared.setdefault(what, {}).setdefault(each.outcome, []).append(reading)
-        rows = [
-            (what, *found)
-            if len(found) == 1
-            else (what, "; ".join(f"{outcome}: {' / '.join(readings)}" for outcome, readings in found.items()))
-            for what, found in compared.items()
-        ]
         labels = f" ({', '.join(map(_escaped, result.labels))})" if result.labels else ""
         blocks += [
-            f"## {_escaped(result.name)}",
-            _wrapped(f"**{_escaped(result.title)}**. {_escaped(result.what)}{labels}"),
-            _wrapped(f"**{result.verdict.outcome}**: {_escaped(result.verdict.because)}"),
-            _table(("What", "Verdict"), [[*map(_escaped, row)] for row in rows]),
+            f"## {_escaped(result.title)}: {result.verdict.outcome}",
+            _wrapped(f"{_escaped(result.what)}{labels}"),
+            _wrapped(_escaped(result.verdict.because[:1].upper() + result.verdict.because[1:])),
         ]
     return "\n\n".join(blocks) + "\n"
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table whose cells are Markdown already."""
-    return "\n".join(f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *rows))
 
 
 def _wrapped(text: str) -> str:

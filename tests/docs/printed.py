@@ -66,8 +66,6 @@ _TESTS = tuple(
 TABLES: dict[str, How] = {
     "| who drives Vehicle 2 | knows | collisions": _by(NIGHTLY, *_TESTS),
     "| what | first-impact harm | of the best known": TRAINED,
-    "| what the vehicles do | first-impact harm": TRAINED,
-    "| What | Verdict |": _by(SUITE, "tests/docs/test_pages.py"),
     "| | full braking | E-V2X-BM | this policy": _by(TRAINING, "make run"),
     "| no. | label | the paper": _by(BY_HAND),
 }
@@ -89,7 +87,6 @@ PICTURES: dict[str, How] = {
         SEARCH, "ethbrake watch picture robustness --agent ppo@shipped --episodes 300 --output shield-robustness.png"
     ),
     "price-of-not-knowing.png": _by(NIGHTLY, "python docs/studies/price.py price-of-not-knowing.png"),
-    "shield-operating.png": _by(TRAINING),
     "shield-modes.png": _by(TRAINING),
     "regimes.png": _by(NIGHTLY, "python docs/studies/regimes.py regimes.png"),
     "cooperation-ablation": _by(TRAINING),

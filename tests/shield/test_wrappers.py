@@ -194,6 +194,21 @@ def test_shield__is_the_folder_and_the_function_whichever_is_asked_for_first():
     assert eb.shield.guard is guard and callable(eb.shield)
 
 
+@pytest.mark.parametrize(
+    ("name", "mode"), [("paper-random", "step"), ("paper-random", "episode"), ("cooperation-3-pair", "step")]
+)
+def test_shield__around_an_agent_is_that_of_its_spec(name: str, mode: str) -> None:
+    coast, scenario = make_agent("coast"), load_scenario(name)
+    agents = {
+        "object": eb.shield(coast, scenario=name, mode=mode),
+        "spec": make_agent(f"coast+{mode}", scenario=scenario),
+    }
+    found = eb.evaluate(agents=agents, scenario=name, episodes=30)
+    plain = eb.evaluate(agents={"plain": coast}, scenario=name, episodes=30).outcome("plain").first_impact_harm
+    ours, theirs = (found.outcome(agent).first_impact_harm for agent in agents)
+    assert np.array_equal(ours, theirs) and ours.sum() < plain.sum()
+
+
 @pytest.mark.parametrize("interface", MAKERS)
 def test_closed__a_shield_lets_go_of_the_environment(interface):
     env = MAKERS[interface]()
