@@ -11,6 +11,7 @@ sys.path.insert(0, str(Path(__file__).parent))  # for the folder extension/
 
 project = "ethbrake_marl"
 author = "ethbrake_marl contributors"
+copyright = f"2026, {author}"
 release = version = __version__
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton", "extension"]
@@ -44,6 +45,7 @@ html_extra_path = [
 ]
 html_static_path = ["static"]
 html_css_files = ["site.css"]
+html_search_scorer = str(Path(__file__).parent / "static" / "search.js")
 html_copy_source = False
 html_show_sourcelink = False
 copybutton_prompt_text = "$ "

@@ -30,7 +30,9 @@ def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str) -> Flo
         raise InvalidInput(f"action of {names}: shape {given.shape}; {shape} is needed")
     good = (given >= -LARGEST) & (given <= LARGEST)
     if not good.all():
-        raise InvalidInput(f"action of {names}: {float(given[~good].flat[0])!r}; must be in [-1, 1]")
+        raise InvalidInput(
+            f"action of {names}: {float(given[~good].flat[0])!r}; must be in [-1, 1], from full braking to full driving"
+        )
     return given.reshape(shape).clip(-1.0, 1.0)
 
 

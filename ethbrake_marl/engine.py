@@ -614,7 +614,7 @@ def check_alert(worlds: Worlds, n: int, vehicles: int) -> None:
     """Refuse worlds, with ``InvalidInput``, that are not ``n`` lines of ``vehicles`` at the alert: t = 0, no impact."""
     if (worlds.n, worlds.N) != (n, vehicles):
         raise InvalidInput(
-            f"reset: {count_of(worlds.n, 'world')} of {worlds.N} vehicles given; {n} of {vehicles} needed"
+            f"reset: {count_of(worlds.n, 'world')} of {worlds.N} vehicles are given; {n} of {vehicles} vehicles needed"
         )
     at_alert = (worlds.time_s == 0.0) & ~worlds.pair_hit.any(axis=1) & ~worlds.obstacle_hit
     if not at_alert.all():

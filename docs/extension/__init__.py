@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
+from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 
 from extension.api import add_public_names, check_pages
+from extension.demo import add_demonstration
 from extension.pages import add_cards, add_interface, list_folder, make_changelog, make_start, relink
 from extension.reference import COMPLETED
 from extension.results import add_reproduction, add_tables
+from extension.sought import SOUGHT
 
 MADE = {
-    "index": make_start,
+    "index": lambda text: add_demonstration(make_start(text)),
     "changelog": make_changelog,
     "api": add_interface,
     "shipped-policies": add_cards,
@@ -51,9 +55,23 @@ def keep_colon(app: Sphinx, what: str, name: str, value: object, options: object
         lines[0] = f": {lines[0]}"  # an empty type, which it leaves out
 
 
+def add_keywords(app: Sphinx, doctree: nodes.document) -> None:
+    """Let the search find a page by the words that stand for it in ``SOUGHT``."""
+    if words := SOUGHT.get(app.env.docname):
+        doctree.insert(0, nodes.meta(name="keywords", content=", ".join(words.split())))
+
+
+def tell_search(app: Sphinx, pagename: str, template: str, context: dict[str, Any], doctree: object) -> None:
+    """Give the page of the search what static/search.js ranks by."""
+    if pagename == "search":
+        app.add_js_file(None, body=f"const SOUGHT = {json.dumps(SOUGHT)};")
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Connect to Sphinx."""
     app.connect("env-get-outdated", made_again)
     app.connect("source-read", make_page)
+    app.connect("doctree-read", add_keywords)
+    app.connect("html-page-context", tell_search)
     app.connect("autodoc-process-docstring", keep_colon, priority=400)  # napoleon has 500
     return {"parallel_read_safe": True}

@@ -45,7 +45,7 @@ def adapt_policy(policy: Any, name: str, features: int, initial_state: Begin | N
         if callable(policy):
             call = policy if initial_state else lambda seen, _: (_without_memory(policy(seen)), None)
             return call, initial_state
-        raise InvalidInput(f"agent {name!r}: a {type(policy).__name__} is no policy; must be {_KINDS}")
+        raise InvalidInput(f"agent {name!r}: {policy!r:.80} is no policy; must be {_KINDS}")
     if initial_state is not None:
         raise InvalidInput(
             f"agent {name!r}: initial_state is for a function (observation, state) -> (action, state); write one"

@@ -5,12 +5,14 @@ from __future__ import annotations
 import gc
 import io
 import os
+import re
 import sys
 import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
+from threading import Thread
 from typing import Annotated, Any
 
 import typer
@@ -18,7 +20,7 @@ from typer.exceptions import TyperException
 from typer.main import get_command
 
 from ethbrake_marl.cli import doctor, evaluate, scenario, search, train
-from ethbrake_marl.cli.command import EVERY_S, Out, app
+from ethbrake_marl.cli.command import EVERY_S, Out, app, say
 from ethbrake_marl.envs import register_environments
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, IncompleteTable, WithoutEffect, naming_extras
 from ethbrake_marl.files.plugins import load_plugin
@@ -52,7 +54,9 @@ def run_command(arguments: Sequence[str]) -> int:
     except TyperException as error:
         context = getattr(error, "ctx", None)
         where = context.command_path if context else "ethbrake"
-        return _refuse(f"{error.format_message().replace('Value error, ', '')} (see: {where} --help)")
+        told = re.sub(r"Value error, |, unable to parse string as an? \w+", "", error.format_message())
+        told = told.replace("Input should be", "must be").replace("a valid integer", "a whole number")
+        return _refuse(f"{told} (see: {where} --help)")
     except EthBrakeError as error:
         return _refuse(str(error))
     except OSError as error:
@@ -100,7 +104,10 @@ def prepare_streams() -> None:
 
 
 def tell_compilation(folder: Path, empty: bool) -> None:
-    """Say what is compiled, when it begins, and every ten seconds how many kernels are, as long as that takes."""
+    """Say that kernels are compiled, when it begins, and every ten seconds how many are done, as long as it goes on.
+
+    A thread says it: one kernel may take a minute, and nothing else is heard of it meanwhile.
+    """
     if is_temporary(folder):
         Out().note(
             "compiling the physics; no folder can be written to keep it, so every command does (ethbrake doctor)"
@@ -112,20 +119,25 @@ def tell_compilation(folder: Path, empty: bool) -> None:
     from numba.core import event  # loaded by whatever compiles, and by nothing that does not
 
     events: Any = event  # numba's own types end here
-    begun, said, count = time.monotonic(), time.monotonic(), 0
+    begun, done, running = time.monotonic(), 0, 0
 
     class Count(event.Listener):  # type: ignore[misc]  # numba has no types
         def on_start(self, event_: event.Event) -> None:
-            """Nothing: it counts what is done."""
+            nonlocal running
+            running += 1
 
         def on_end(self, event_: event.Event) -> None:
-            nonlocal said, count
-            count, now = count + 1, time.monotonic()
-            if now - said >= EVERY_S:
-                said = now
-                Out().note(f"compiling: {count} kernels in {now - begun:.0f} s so far")
+            nonlocal done, running
+            done, running = done + 1, running - 1
+
+    def tell() -> None:
+        while True:
+            time.sleep(EVERY_S)
+            if running:
+                say(f"still compiling: {done} kernels are done, after {time.monotonic() - begun:.0f} s")
 
     events.register("numba:compile", Count())
+    Thread(target=tell, daemon=True).start()
 
 
 def abandon_output() -> None:

@@ -46,7 +46,7 @@ class Out:
         self._stderr: Console = _PlainConsole(sys.stderr)
         self._bars: Progress | None = None
         self._tasks: dict[str, TaskID] = {}
-        self._last_label, self._last_done, self._said_s = "", False, 0.0
+        self._said_s = -EVERY_S  # when a line was said last, where stderr is no terminal
         self._begun: dict[str, tuple[float, int]] = {}  # when each part was first heard of, and how far it was
 
     def result(self, content: Any, *shown: RenderableType, end: str = "\n") -> None:
@@ -103,7 +103,8 @@ class Out:
     ) -> None:
         """The part ``name`` has come to ``done`` of ``total``; ``note`` is said once, above the bars.
 
-        On a terminal one bar per part, else a line: news, and every ten seconds.
+        On a terminal one bar per part, else a line at the beginning and every ten seconds. What stands behind ": " in
+        a name is a stage of the part before it, and shares its bar.
         """
         harm = (metrics or {}).get("first_impact_harm")
         label = one_line(name if harm is None else f"{name}, first-impact harm {harm:.2f}")
@@ -118,19 +119,18 @@ class Out:
             text = TextColumn("{task.description}", markup=False)
             self._bars = Progress(text, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=self._stderr)
             self._bars.start()
-        if name not in self._tasks:
-            self._tasks[name] = self._bars.add_task(label, total=total)
-        self._bars.update(self._tasks[name], completed=min(done, total), total=total, description=label)
+        part = name.partition(": ")[0]
+        if part not in self._tasks:
+            self._tasks[part] = self._bars.add_task(label, total=total)
+        self._bars.update(self._tasks[part], completed=min(done, total), total=total, description=label)
 
     def _say_progress(self, name: str, label: str, done: int, total: int) -> None:
         now = time.monotonic()
-        news = label != self._last_label or (done >= total and not self._last_done)
         begun_s, first = self._begun.setdefault(name, (now, done))
-        if news or now - self._said_s >= EVERY_S:
+        if now - self._said_s >= EVERY_S:
             left_s = (now - begun_s) * (total - done) / (done - first) if done > first else 0.0
             say(f"{label}: {done:,} of {total:,}{f', about {left_s:.0f} s left' if left_s >= 1.0 else ''}")
             self._said_s = now
-        self._last_label, self._last_done = label, done >= total
 
     def show_progress(self, progress: PartProgress) -> None:
         """``progress`` of a ``Progress``, as the package tells it."""

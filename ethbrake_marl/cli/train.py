@@ -71,12 +71,15 @@ def run_command(
         settings=given.texts,
         on_progress=out.show_progress,
     )
-    told = evaluation.results_to_json(result.rows, per_world=result.per_world)
-    shown: list[Any] = [*result.rows.tables()]
-    for test, found in result.beside.items():  # each below what its test asks
-        shown += [Text(f"\n{evaluation.TESTS[test]}\n"), found.terminal()]
-    out.result(told, *shown)
-    out.note(f"report: {result.report}")
+    trained = result.trained
+    told = (
+        f"Trained by recipe {plan.name}, seed {plan.seed if seed is None else seed}: {trained.steps:,} decisions in"
+        f" {trained.wall_s:.0f} s ({trained.status}). {trained.policy.manifest.algorithm} is the policy, hybrid the"
+        " policy behind its shield.\n"
+    )
+    figures = evaluation.results_to_json(result.rows, per_world=result.per_world)
+    out.result(figures, Text(told), result.rows.brief(result.beside), *result.rows.tables()[1:])
+    out.note(f"report, with every measure and the paper's rows: {result.report}")
     _end(out, result.trained)
 
 

@@ -337,7 +337,8 @@ def make_lineup(
             raise InvalidInput(f"agent {spec!r}: is a team, one agent is needed here: ppo@RUN/policy/vehicle_2")
         if bare and parse_spec(spec).shield is not None:
             raise InvalidInput(
-                f"agent {spec!r}: has a shield already; here the shields are put around what proposes: ppo@PATH"
+                f"agent {spec!r}: has a shield already; this command puts its own around each agent, so name the agent"
+                " alone, for instance ppo@PATH"
             )
     return found
 
@@ -359,7 +360,8 @@ def choose_worlds(
         return scenario.sample(DEFAULT.EPISODES if episodes is None else episodes, list_seed), list_seed
     if episodes is not None or seed is not None:
         raise InvalidInput(
-            f"{initial_states}: gives the worlds, and a number of episodes or a seed draws them; use one"
+            f"{initial_states}: gives the worlds already; leave out the number of episodes and the seed, which would"
+            " draw others"
         )
     if initial_states.suffix.lower() in (".yaml", ".yml"):
         worlds = NamedWorlds.read(initial_states).worlds_of(scenario, str(initial_states))

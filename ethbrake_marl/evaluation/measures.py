@@ -1581,6 +1581,26 @@ class SummaryTable(list[SummaryRow]):
         own = Sheet("Measures", ["Agent", Column("Measure", text=True), Column("Mean or rate")], lines)
         return [self.terminal(), own] if lines else [self.terminal()]
 
+    def brief(self, beside: Mapping[str, SummaryTable]) -> Sheet:
+        """The table on one screen: collisions and both harms, also in the tests ``beside``, and what must be told.
+
+        The paper's rows, and the other measures, are not in it.
+        """
+        ours = SummaryTable(replace(row, beside_paper=False) for row in self)
+        sheet = ours.terminal()
+        kept = sheet.only(k for k, name in enumerate(sheet.names) if k == 0 or name in _BELOW)
+        columns, rows = list(kept.columns), [list(row) for row in kept.rows]
+        note = f"{ours[0].parameters.line}. Harm: mean per world in m²/s², below it the 95 % interval."
+        notes = [note, *(text for _, text in ours.notes())]
+        for test, table in beside.items():
+            drove = {row.agent: row for row in table}
+            columns.append(Column(f"{TESTS[test].partition(' test')[0]}:\nfirst, total"))
+            for row, each in zip(rows, (drove.get(row.agent) for row in self), strict=True):
+                row.append(each and f"{each.first_impact_harm.value:.2f}, {each.total_harm.value:.2f}")
+            must = [text for kind, text in table.notes() if kind == "note"]
+            notes.append(" ".join([TESTS[test], f"{count_of(table[0].episodes, 'world')}.", *must]))
+        return replace(kept, columns=columns, rows=rows, note="\n".join(notes))
+
     def markdown(self) -> str:
         """The table for a document, with the conditions of ours and of the paper's below it."""
         return f"{self.sheet().markdown()}\n\n{self._conditions()}\n"

@@ -65,7 +65,7 @@ def load_function(path: str, function: str) -> Any:
     """
     found = getattr(_run_file(Path(path), f"file {path!r}")[1], function, None)
     if not callable(found):
-        raise InvalidInput(f"file {path!r}: has no function {function}; it is what makes the agent")
+        raise InvalidInput(f"file {path!r}: has no function {function!r}; name the one that makes the agent")
     return found
 
 

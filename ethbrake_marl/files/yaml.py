@@ -114,8 +114,8 @@ class Document:
     def explain(self, error: ValidationError, wording: Wording) -> InvalidInput:
         """The error where it does not fit its schema.
 
-        The first defect is shown, unknown keys before all others, and "(and k more)" counts the rest. A missing key
-        that an unknown one was probably meant to be is not counted.
+        The first is shown, unknown keys before all others, and "(and k more mistakes)" tells the rest. A missing
+        key that an unknown one was probably meant to be is not counted.
         """
         # A default that needs another field is not made after an error elsewhere: no defect of its own.
         details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
@@ -127,7 +127,8 @@ class Document:
         path = _path(shown)
         absent = shown["type"] == "missing" and len(path) == 1
         where = self.file if absent else self.where(path)
-        return InvalidInput(f"{where}: {_describe(shown, path, wording)}{f' (and {more} more)' if more else ''}")
+        told = f" (and {more} more mistake{'s' * (more > 1)})" if more else ""
+        return InvalidInput(f"{where}: {_describe(shown, path, wording)}{told}")
 
 
 def read_yaml(path: str | Path, limit: int = SIZE_LIMIT) -> Document:
@@ -278,7 +279,7 @@ class _Reader:
 UNITS = {"s": "seconds", "m": "metres", "mps": "metres per second", "mps2": "metres per second squared", "t": "tonnes"}
 _RIGHT = {
     "finite_number": "must be a finite number",
-    "int_type": "must be a whole number, written without a decimal point",
+    "int_type": "must be a whole number, written without a decimal point or an exponent",
     "string_type": "must be text",
     "dict_type": "must be a mapping",
     "model_type": "must be a mapping",

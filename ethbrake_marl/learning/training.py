@@ -577,7 +577,7 @@ def _checked(source: Path | Document) -> TrainingRecipe:
     document = source if isinstance(source, Document) else read_yaml(source)
     name = document.content.get("algorithm", "ppo") if isinstance(document.content, dict) else "ppo"
     if not isinstance(name, str) or name not in _ALGORITHMS:
-        where, right = document.where(("algorithm",)), " or ".join(_ALGORITHMS)
+        where, right = document.where(("algorithm",)), f"one of {', '.join(_ALGORITHMS)}"
         raise InvalidInput(f"{where}: algorithm = {flow_text(name, 60)}: must be {right}")
     shipped = f"; every key is in the shipped recipe {name}" if name in TrainingRecipe.shipped() else ""
     model = _ALGORITHMS[name][0]

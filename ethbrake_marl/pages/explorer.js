@@ -42,7 +42,7 @@ class Explorer {
     this.find("number").value = data.world;
     this.fillChoices();
     this.listen();
-    const slow = setTimeout(() => this.say("Compiling the physics, once; some twenty seconds …"), SLOW_MS);
+    const slow = setTimeout(() => this.say("Compiling the physics, once: this can take minutes. The terminal says how far it is …"), SLOW_MS);
     this.move().then(() => clearTimeout(slow));
   }
 

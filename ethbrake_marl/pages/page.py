@@ -136,6 +136,7 @@ class Part:
         *,
         focus: str = "",
         shown_first: Sequence[int] = (),
+        folded: bool = False,
     ) -> Part:
         """The player of these worlds, all driven by the same agents.
 
@@ -144,6 +145,7 @@ class Part:
             driven: indices (0 = front) of the vehicles that the agents drive; by agent where they drive others.
             focus: the agent that is shown from the beginning, between the first and the last.
             shown_first: numbers of the agents that are shown from the beginning, where those are others.
+            folded: traces and passports show when their title is chosen.
 
         """
         agents, one = list(worlds[0].motions), next(iter(worlds[0].motions.values())).world
@@ -174,16 +176,25 @@ class Part:
             "worlds": told,
         }
         shielded = any(episode["stepped"] for world in told for episode in world["episodes"])
-        return cls.live_player(one.N, shielded=shielded, name=_DATA, episodes=cls.data(_DATA, content).html)
+        return cls.live_player(
+            one.N, shielded=shielded, folded=folded, name=_DATA, episodes=cls.data(_DATA, content).html
+        )
 
     @classmethod
     def live_player(
-        cls, vehicles: int, *, shielded: bool, name: str | None = None, episodes: Markup | str = ""
+        cls,
+        vehicles: int,
+        *,
+        shielded: bool,
+        folded: bool = False,
+        name: str | None = None,
+        episodes: Markup | str = "",
     ) -> Part:
         """A player for a page whose own script gives it one world after another, or of the data of that name."""
         values: dict[str, Any] = {
             "vehicles": vehicles,
             "shielded": shielded,
+            "folded": folded,
             "name": name,
             "episodes": episodes,
             "body": BODY_M,

@@ -97,7 +97,7 @@ class Lane {
     this.flashes.replaceChildren(...this.flashesAt(time, fronts));
     const now = countedBy(this.episode, time);
     const words = state.speeds.map((v, i) => `Vehicle ${i + 1} ${plain(v, 1)} metres per second`).join(", ");
-    const told = `${this.episode.agent} at ${plain(time, 2)} seconds: ${now.impacts} impacts; ${words}`;
+    const told = `${this.episode.agent} at ${plain(time, 2)} seconds: ${now.impacts} ${now.impacts === 1 ? "impact" : "impacts"}; ${words}`;
     this.svg.setAttribute("aria-label", told);
     return { state, now };
   }

@@ -48,6 +48,7 @@ class Player {
     on("after", "click", () => this.choose(this.world + 1));
     on("scrub", "input", (event) => this.seek(Number(event.target.value)));
     on("speed", "change", (event) => { this.speed = Number(event.target.value); });
+    on("more", "toggle", () => this.build()); // what is folded has no width to draw in
     for (const button of this.root.querySelectorAll("[data-do]")) button.addEventListener("click", () => this.act(button.dataset.do));
     this.root.addEventListener("keydown", (event) => this.press(event));
     document.addEventListener("click", (event) => {

@@ -172,7 +172,8 @@ def shield_section(rows: ShieldModes, conditions: str) -> Section:
     return Section("Shield", body)
 
 
-_OTHERS = ("sampled_harm", "vehicle_1_shoved_m", "vehicle_1_shoved_far_rate", "predicted_harm")
+_SHORT = {"collision_rate", "first_impact_harm", "total_harm", "harm_decrease_first"}  # what the page begins with
+_OTHERS = {"Knows", "sampled_harm", "vehicle_1_shoved_m", "vehicle_1_shoved_far_rate", "predicted_harm"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,11 +243,9 @@ class Report:
         sheet, nowhere = all_rows.sheet(), set(_empty(all_rows))
         for title, about, told_rows in self.tests:
             rows = SummaryTable(told_rows)
-            told = [_table(rows.sheet(), title, {"Knows"}), *_told(rows), Part.paragraph(rows.identity_line(), "quiet")]
+            told = [*_measured(rows), Part.paragraph(rows.identity_line(), "quiet")]
             sections.append(Section(title, [about, *told]))
             nowhere.intersection_update(_empty(rows))
-        ours = replace(sheet, rows=sheet.rows[: len(self.rows)])
-        others = _table(ours, "In the same worlds", set(sheet.names) - {"Knows", *_OTHERS})
         unseen = tuple(name for name in sheet.headings[2:] if name in nowhere)
         seen = tuple(name for name in sheet.headings[2:] if name not in nowhere)
         meanings = {
@@ -257,7 +256,6 @@ class Report:
         versions = [Part.facts(self.versions)] if self.versions else []
         versions += [Part.paragraph(all_rows.identity_line(), "quiet")] if all_rows else []
         sections += [
-            Section("Other measures", [others]),
             Section("How to read the tables", [Part.facts(meanings)]),
             Section("Settings and seeds", [Part.facts(self.settings)] if self.settings else ()),
             Section("Versions", versions),
@@ -275,7 +273,7 @@ class Report:
         before, after = rows.get(_BASELINE), rows.get(self.focus)
         if before is None or after is None or after is before:
             return ""
-        percent = partial(Estimate.in_words, digits=0, scale=100.0, unit=" %")
+        percent = partial(Estimate.in_words, digits=0, scale=100.0, unit="\N{NO-BREAK SPACE}%")
         costs = [
             f"{name} does {row.first_impact_harm.in_words()} m²/s² of harm per emergency by first impacts,"
             f" {row.total_harm.in_words()} by all impacts, and collides in {percent(row.collision_rate)}"
@@ -287,15 +285,13 @@ class Report:
         return f"{costs[0]}. {costs[1]}{saved}.{proven} "
 
     def _results(self) -> Section:
-        rows = SummaryTable(self.rows)
-        body: list[str | Part] = []
+        rows, limits = SummaryTable(self.rows), self.evaluation.limits
+        because = f" Nothing is proven of these worlds: {limits.because}." if isinstance(limits, Unproven) else ""
+        body = _measured(rows, because)
         if rows:
             about = "Mean per world of the squared closing speed of impacts: each pair's first one, and every one."
             body.append(Part.drawing(harm_by_agent(rows), "Harm of each agent", about))
-        limits = self.evaluation.limits
-        because = f" Nothing is proven of these worlds: {limits.because}." if isinstance(limits, Unproven) else ""
-        table = _table(rows.sheet(), "Means with 95 % intervals", {"Knows", *_OTHERS})
-        return Section("Results", [*body, table, *_told(rows, because)])
+        return Section("Results", body)
 
     def _episodes(self) -> Section:
         """The episodes to watch; which agents drove otherwise when they drove once more, and where episodes end."""
@@ -328,12 +324,27 @@ class Report:
         return Section("Episodes", body)
 
 
-def _told(rows: SummaryTable, because: str = "") -> list[Part]:
-    """What stands below the table of these rows; ``because``: why columns of it may be empty."""
-    told = [("quiet", f"{row.parameters.line}. Harm in m²/s².") for row in rows[:1]]
-    if empty := _empty(rows):
-        told.append(("quiet", f"Columns without a value in any row are left out: {'; '.join(empty)}.{because}"))
-    return [Part.paragraph(text, kind) for kind, text in (*told, *rows.notes())]
+def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
+    """The short table of these rows, what stands below it, and folded every measure with the paper's rows.
+
+    ``because``: why columns may be empty.
+    """
+    ours = SummaryTable(replace(row, beside_paper=False) for row in rows)
+    whole, notes, empty = rows.sheet(), ours.notes(), _empty(rows)
+    folded = [
+        _table(whole, "Every harm and what it is compared with", set(whole.names) - _OTHERS),
+        _table(ours.sheet(), "In the same worlds", _OTHERS),
+    ]
+    left_out = f"Columns without a value in any row are left out: {'; '.join(empty)}.{because}"
+    told = [*([("quiet", left_out)] if empty else []), *(note for note in rows.notes() if note not in notes)]
+    folded += [Part.paragraph(text, kind) for kind, text in told]
+    notes = [*(("quiet", f"{row.parameters.line}. Harm in m²/s².") for row in rows[:1]), *notes]
+    title = "Every measure" + (", and the paper's rows" if len(whole.rows) > len(rows) else "")
+    return [
+        _table(ours.sheet(), "Means with 95 % intervals", _SHORT),
+        *(Part.paragraph(text, kind) for kind, text in notes),
+        Part.opened(title, folded),
+    ]
 
 
 def _empty(rows: SummaryTable) -> list[str]:
@@ -343,10 +354,10 @@ def _empty(rows: SummaryTable) -> list[str]:
     return [name for k, name in enumerate(sheet.headings) if k not in filled]
 
 
-def _table(sheet: Sheet, caption: str, left_out: set[str]) -> Part:
-    """Columns of a table but some by name, below those of the agent; what is empty is left out, too."""
+def _table(sheet: Sheet, caption: str, names: set[str]) -> Part:
+    """Columns of a table by name, beside those of the agent; what is empty is left out."""
     filled = set(sheet.filled())
-    some = sheet.only(k for k, name in enumerate(sheet.names) if k == 0 or (name not in left_out and k in filled))
+    some = sheet.only(k for k, name in enumerate(sheet.names) if k == 0 or (name in names and k in filled))
     rows = [
         f"The paper's {row.removeprefix('paper, ')}, as printed" if isinstance(row, str) else row for row in some.rows
     ]

@@ -972,10 +972,14 @@ class ScenarioFields(FileModel):
         World k of a mixture is drawn from one member, by weight, and is then that member's own world k under the same
         seed, bit for bit. So results on a mixture can be compared with results on its members, world by world.
         """
-        for name, value, least in (("n", n, 1), ("seed", seed, 0), ("first", first, 0)):
-            check_whole_number(f"sample: {name}", value, least)
+        for name, value, least in (
+            ("number of worlds", n, 1),
+            ("seed of the list", seed, 0),
+            ("first world", first, 0),
+        ):
+            check_whole_number(name, value, least)
         if not n <= MOST_AT_ONCE:
-            raise InvalidInput(f"sample: n = {n}: at most {MOST_AT_ONCE:,} worlds at once; draw a longer list in parts")
+            raise InvalidInput(f"number of worlds = {n}: at most {MOST_AT_ONCE:,} at once; draw a longer list in parts")
         if not int(first) + int(n) <= _MOST_WORLDS:
             raise InvalidInput(f"sample: first = {first!r}: a list has {_MOST_WORLDS} worlds")
         if channel not in CHANNELS:

@@ -126,7 +126,7 @@ def _check_scripts(scenario: ScenarioFields) -> None:
         capacity = scenario.supports(field)[i][0]
         right = f"is above this vehicle's {field}, {capacity:g} m/s2"
         require(abs(deceleration) <= capacity, ("roles", f"vehicle_{i + 1}"), script, right)
-    right = "has nothing to lose without an obstacle ahead; give obstacle_gap_m too, for instance obstacle_gap_m: 42"
+    right = "has nothing to brake for without an obstacle ahead; give obstacle_gap_m too, for instance 42"
     require(0 not in scenario.learners or scenario.has_obstacle, ("roles", "vehicle_1"), LEARNER, right)
     for i, script in scenario.scripts.items() if scenario.early_impacts == "reject" and scenario.learners else ():
         spec = ScriptSpec.parse(script)

@@ -655,7 +655,9 @@ class Attached:
         if isinstance(getattr(env, "attached", None), Attached):
             raise InvalidInput(f"{where}: {env} is a shield that was closed; put this one around what that is around")
         if not (isinstance(env, interface) and isinstance(engine, Engine)):
-            raise InvalidInput(f"{where}: {env} is not one of this package's environments ({maker})")
+            raise InvalidInput(
+                f"{where}: goes around {maker}, not {env}; eb.shield(env) chooses the one for an environment of ours"
+            )
         self.engine, self._left = engine, Guarded(None, {})
         self.guard = guard_of(engine, policy, self.options)
         engine.protect(self.guard)

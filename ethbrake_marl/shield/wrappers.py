@@ -40,21 +40,20 @@ class _Closing:
 class HybridShield(_Closing, BaseParallelWrapper[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
     """Shield the learners of a parallel environment, who are driven by the caller's actions or by a policy.
 
-    Mode ``episode`` is the paper's Algorithm 1: policy or E-V2X-BM drives a whole episode, whatever is proposed. Mode
-    ``step`` certifies every action, or replaces it, of several learners together; ``robust`` does so in every member of
-    an uncertainty. Bounds hold where the other vehicles follow their scripts. ``infos[agent]["shield"]`` says what was
-    done. See docs/shield.md.
+    Mode ``step``, the default, certifies every action, or replaces it, of several learners together; ``robust`` does so
+    in every member of an uncertainty. Mode ``episode`` is the paper's Algorithm 1: policy or E-V2X-BM drives a whole
+    episode, whatever is proposed. Bounds hold where the other vehicles follow their scripts.
+    ``infos[agent]["shield"]`` says what was done. See docs/shield.md.
 
     Args:
         env: ``eb.parallel_env(...)`` with one learner (mode ``step``: or more), or what wraps it.
         policy: an agent or a policy, a ``Team``, or one for each learner by its name; mode ``episode`` needs one, the
             others take its harm as bound where that is lower.
-        mode: ``episode``, ``step`` or ``robust``.
         agents: the learners that are shielded, as a list of names: all there are, which None also says.
-        options: keywords of ``ShieldOptions``; raises ``InvalidInput`` for one that the mode does not take.
+        options: keywords of ``ShieldOptions``, ``mode`` among them; raises ``InvalidInput`` for what does not fit it.
 
     >>> import ethbrake_marl as eb
-    >>> env = eb.HybridShield(eb.parallel_env(scenario="paper-random"), mode="step")
+    >>> env = eb.HybridShield(eb.parallel_env(scenario="paper-random"))
     >>> observations, infos = env.reset(seed=7)
     >>> infos = env.step({"vehicle_2": [1.0]})[4]
     >>> infos["vehicle_2"]["shield"]["intervened"]
@@ -67,16 +66,14 @@ class HybridShield(_Closing, BaseParallelWrapper[str, Observations, NDArray[Any]
         env: ParallelEnv[str, Observations, NDArray[Any]],
         policy: Proposing | None = None,
         *,
-        mode: str = "episode",
         agents: Sequence[str] | None = None,
         **options: Any,
     ) -> None:
-        maker = "eb.parallel_env; with agents acting in turn eb.shielded_aec(that)"
         if isinstance(agents, str) or not (agents is None or isinstance(agents, Iterable)):
             raise InvalidInput(
                 f"HybridShield: agents = {agents!r}: must be a list of names, for instance ['vehicle_2']"
             )
-        self.attached = Attached(env, ParallelEnv, maker, policy, "HybridShield", {"mode": mode, **options})
+        self.attached = Attached(env, ParallelEnv, "eb.parallel_env", policy, "HybridShield", options)
         super().__init__(env)
         engine = self.attached.engine
         self.shielded = tuple(engine.scenario.vehicle_names[i] for i in engine.learners)  # front to rear
@@ -88,7 +85,6 @@ class HybridShield(_Closing, BaseParallelWrapper[str, Observations, NDArray[Any]
                 " unshielded one does is an assumption that nothing checks: give it a script (learners=[...] of the"
                 " environment)"
             )
-        self.mode = mode
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -214,7 +210,7 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
         return {"shield": {name: column[:, 0].copy() for name, column in self.attached.tell().items()}, "_shield": rows}
 
 
-def shield(env: Any, policy: Proposing | None = None, mode: str = "step", **options: Any) -> Any:
+def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, **options: Any) -> Any:
     """An environment behind a shield: the action wrapper for whatever interface it has. Or an agent behind one.
 
     Args:
@@ -222,7 +218,7 @@ def shield(env: Any, policy: Proposing | None = None, mode: str = "step", **opti
             Stable-Baselines3's ``VecEnv``. A wrapper inside may change actions: what reaches the engine is certified.
             Or an agent or team, for tables; then ``scenario`` says in which its actions are certified.
         policy: proposes where nobody else does, and bounds the harm where its own is lower; mode ``episode`` needs it.
-        mode: ``episode``, ``step`` or ``robust``.
+        mode: ``step``, ``robust`` or ``episode``; None: ``robust`` with an ``uncertainty``, else ``step``.
         options: further keywords of ``ShieldOptions``.
 
     Returns ``HybridShield``, that with agents acting in turn, ``ShieldedEnv``, ``ShieldedVectorEnv`` or

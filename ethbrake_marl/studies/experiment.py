@@ -16,7 +16,7 @@ import numpy as np
 
 from ethbrake_marl.agents import Agent, LearnedAgent
 from ethbrake_marl.defaults import DEFAULT
-from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, check_one_learner, count_of
+from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, check_one_learner
 from ethbrake_marl.evaluation import (
     TESTS,
     Evaluation,
@@ -202,31 +202,32 @@ def run_experiment(
     run = RunDirectory(trained.directory)
     with _status(run, trained.status):
         agents = _agents(trained.policy, scenario)
-        total = sample.worlds.n
+        order, n = list(agents), sample.worlds.n
+        total = n * len(order)
         if trained.status == "interrupted":
             note = (
                 f"interrupted after {trained.steps:,} steps: evaluating the policy so far; Ctrl-C again stops at once"
             )
-            tell(Progress(next(iter(agents)), 0, total, note=note))
+            tell(Progress("evaluation", 0, total, note=note))
         evaluation = evaluate(
             sample,
             agents,
             scenario=scenario,
             seed=list_seed,
-            on_progress=lambda name, done: tell(Progress(name, done, total)),
+            on_progress=lambda name, done: tell(Progress("evaluation", n * order.index(name) + done, total)),
         )
         others, done = other_tests(scenario), count()
 
-        def begin(note: str) -> None:
-            """Tell that a part of the report begins, or that all have ended."""
-            tell(Progress("report", next(done), 3 + len(others), note=note))
+        def begin(stage: str) -> None:
+            """Tell that a stage of the report begins, or that all have ended."""
+            tell(Progress(f"report{stage and ': '}{stage}", next(done), 3 + len(others)))
 
-        begin("what nobody can avoid in these worlds, proven world by world")
+        begin("what nobody can avoid")
         rows = summarise(evaluation)
         beside: dict[str, SummaryTable] = {}
         for other in others:  # the policy was trained on ``scenario`` alone
             part = other.sample(min(episodes, 2_000), list_seed)
-            begin(f"the same policy on {other.name}: {count_of(part.worlds.n, 'world')}")
+            begin(f"the same policy on {other.name}")
             driven = evaluate(part, _agents(trained.policy, other, BESIDE), scenario=other, seed=list_seed)
             beside[other.name] = summarise(driven)
         begin("results and figures")
@@ -291,7 +292,7 @@ def _show(
         summary += f" {TESTS[evaluation.scenario.name]} The other two tests stand below."
     if trained.status == "interrupted":
         summary += " The training was interrupted; this is the policy it had by then."
-    begin("the page, and the episodes to watch there")
+    begin("the page and its episodes")
     name, learned = evaluation.scenario.name, learned_name(evaluation)
     spellings = {learned: f"{learned}@{run.path}", "hybrid": f"{learned}@{run.path}+episode"}
     report = Report(

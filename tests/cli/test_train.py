@@ -163,7 +163,7 @@ def test_run__interrupted_evaluates_the_policy_so_far_and_goes_on_as_a_training(
 
 
 def test_run__interrupted_twice_stops_at_once_and_keeps_the_policy(ethbrake, tiny_recipe, tmp_path, monkeypatch):
-    ctrl_c_when(monkeypatch, lambda shown: shown["done"] == 128, lambda shown: shown["name"] == "e_v2x_bm")
+    ctrl_c_when(monkeypatch, lambda shown: shown["done"] == 128, lambda shown: shown["name"] == "evaluation")
     folder = tmp_path / "stopped"
     answer = ethbrake("run", "--recipe", tiny_recipe, "--episodes", "40", "--output", folder)
     assert (answer.status, answer.out) == (130, "") and answer.err.splitlines()[-1].startswith("interrupted; ")
@@ -222,7 +222,7 @@ def test_train__names_its_folder_and_ends_at_the_number_that_it_announces(ethbra
     folder, figures = Path("runs/paper-random-tiny-seed5"), told_json(answer)
     assert (figures["directory"], figures["status"], figures["steps"]) == (str(folder), "finished", 256)
     assert figures["evaluation"]["steps"] == 256 and (folder / "policy" / "manifest.json").is_file()
-    assert "256 of 256\n" in answer.err and "of 200" not in answer.err
+    assert ": 0 of 256\n" in answer.err and "after 256 training steps" in answer.err and "of 200" not in answer.err
 
 
 def test_train__by_a_scheme_leaves_a_team_that_evaluate_takes(ethbrake, tiny_recipe, tmp_path) -> None:

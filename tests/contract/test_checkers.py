@@ -44,7 +44,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "learners alone": {"scenario": LEVELS["cooperation-3-pair"], "agents": "learners"},
     **{mode: {"scenario": REST, "render_mode": mode} for mode in Viewer.METADATA["render_modes"][1:]},
 }
-STEP, EPISODE = {"mode": "step"}, {"policy": make_agent("full_brake")}
+STEP, EPISODE = {}, {"mode": "episode", "policy": make_agent("full_brake")}
 MAKERS: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
     **{name: (partial(parallel_env, **given), partial(env, **given)) for name, given in SETTINGS.items()},
     **{

@@ -106,6 +106,50 @@ def test_extra__brings_what_the_configuration_loads() -> None:
     assert {name.replace("_", "-") for name in named if name != "extension"} | {"furo"} == brought
 
 
+QUESTIONS = {
+    "train ppo": "howto-train",
+    "add scenario": "add-a-scenario",
+    "cooperation level": "cooperation",
+    "shield my policy": "shield",
+    "own vehicle data": "own-vehicle-data",
+    "install without torch": "installing",
+    "what is harm": "harms",
+    "E-V2X-BM": "baselines",
+    "reward": "rewards",
+    "pettingzoo wrapper": "environment",
+}
+
+
+@pytest.mark.parametrize("question", QUESTIONS)
+def test_search__is_told_the_page_that_answers_a_question_of_somebody_new(question: str) -> None:
+    asked = set(re.findall(r"\w+", question.lower())) - {"is"}  # a word that the search passes over
+    sought = load("sought").SOUGHT
+    assert all((DOCS / f"{page}.md").exists() for page in sought)
+
+    def words(page: str, text: str) -> set[str]:
+        title = (DOCS / f"{page}.md").read_text("utf-8").partition("\n")[0]
+        return asked.intersection(re.findall(r"\w+", f"{title} {text}".lower()))
+
+    told = {page: len(words(page, text)) for page, text in sought.items()}
+    assert [page for page, count in told.items() if count == len(asked)] == [QUESTIONS[question]]
+
+
+def test_demonstration__plays_the_picture_of_the_first_page_and_says_it_in_words(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    demo = load("demo")
+    monkeypatch.setattr(demo, "WORLDS", (0,))
+    monkeypatch.setattr(demo, "AGENTS", {"Full braking": "full_brake", demo.OWN: ""})
+    monkeypatch.setattr(demo, "TESTS", {"Main test": demo.TESTS["Main test"]})
+    page = demo.add_demonstration((ROOT / "README.md").read_text("utf-8"))
+    assert (
+        "Vehicle 2 strikes Vehicle 1 after 2.17 s at 2.4 m/s; Vehicle 3 strikes Vehicle 2 after 3.30 s at 5.3" in page
+    )
+    assert page.index('class="demo"') < page.index("## Quick start") and page.count('"pieces":') == 2
+    with pytest.raises(ValueError, match="no heading 'Quick start'"):
+        demo.add_demonstration("# Another README")
+
+
 GUIDES = ("CONTRIBUTING.md", "CODE_OF_CONDUCT.md", "SECURITY.md", "PULL_REQUEST_TEMPLATE.md")
 
 

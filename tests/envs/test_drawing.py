@@ -220,8 +220,8 @@ def test_shields__are_looked_through_and_their_interventions_shown() -> None:
     scenario = eb.load_scenario("paper-random")
     single = eb.ShieldedEnv(eb.EthBrakeEnv(scenario, render_mode="ansi"))
     rows = eb.ShieldedVectorEnv(eb.EthBrakeVectorEnv(2, scenario, render_mode="ansi"))
-    parallel = eb.HybridShield(parallel_env(scenario, render_mode="ansi"), mode="step")
-    hybrid = eb.HybridShield(parallel_env(scenario, render_mode="ansi"), eb.make_agent("coast"))
+    parallel = eb.HybridShield(parallel_env(scenario, render_mode="ansi"))
+    hybrid = eb.HybridShield(parallel_env(scenario, render_mode="ansi"), eb.make_agent("coast"), mode="episode")
     given = ((single, [1.0]), (rows, np.full((2, 1), 1.0)), (parallel, {"vehicle_2": [1.0]}), (hybrid, {}))
     for environment, action in given:
         environment.reset(seed=7)

@@ -262,7 +262,7 @@ def test_episode__of_some_rows_leaves_the_others_alone():
 
 
 def test_episode__applies_the_certified_strategy_whatever_is_proposed():
-    shielded = HybridShield(parallel_env(), make_agent("full_brake"))
+    shielded = HybridShield(parallel_env(), make_agent("full_brake"), mode="episode")
     for seed in range(6):
         shielded.reset(seed=seed)
         while shielded.agents:

@@ -60,6 +60,14 @@ def rows_told(interface, infos):
     return [info["shield"] for info in (infos if interface is ShieldedVecEnv else [infos.get("vehicle_2", infos)])]
 
 
+@pytest.mark.parametrize("interface", [*MAKERS, eb.shield])
+def test_interfaces__have_the_same_default_mode(interface):
+    for options, mode in (({}, "step"), ({"uncertainty": "gaps_m=0.5"}, "robust")):
+        env = interface(MAKERS.get(interface, EthBrakeEnv)(), **options)
+        assert env.attached.options.mode == mode
+        env.attached.close()
+
+
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("interface", MAKERS)
 def test_interfaces__have_every_mode_and_the_penalty_and_tell_the_bound_after_a_reset_already(interface, mode):
