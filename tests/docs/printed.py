@@ -46,7 +46,7 @@ BLOCKS: dict[str, How] = {
     "Policy('ppo', 27 observations": _by(SUITE, "tests/docs/test_printed.py"),
     "ethbrake train --scenario cooperation-3-pair": TRAINED,
     "ethbrake agent export runs/early": TRAINED,
-    "First-impact        Total Sampled": _by(TRAINING, "make run"),
+    "Agent,                           First-impact": _by(TRAINING, "make run"),
     "resume, ppo: 20/20": _by(TRAINING, "make test-resume"),
     "gap_1_m,gap_2_m,speed_1_mps": _by(BY_HAND),
     "paper-random full_brake        backward": EXACT,
@@ -66,7 +66,6 @@ _TESTS = tuple(
 TABLES: dict[str, How] = {
     "| who drives Vehicle 2 | knows | collisions": _by(NIGHTLY, *_TESTS),
     "| what | first-impact harm | of the best known": TRAINED,
-    "| | full braking | E-V2X-BM | this policy": _by(TRAINING, "make run"),
     "| no. | label | the paper": _by(BY_HAND),
 }
 

@@ -145,7 +145,7 @@ def test_own_algorithm__under_vec_normalize_is_refused_as_no_bundle_holds_its_st
     [
         ({"n_stepz": 3}, r"mine.yaml, line \d+: n_stepz.*did you mean n_steps"),
         ({"n_steps": 2.5}, r"mine.yaml, line \d+: n_steps = 2.5: must be a whole number"),
-        ({"algorithm": "a3c"}, r"algorithm = a3c: must be ppo or sac or counterfactual or a2c"),
+        ({"algorithm": "a3c"}, r"algorithm = a3c: must be one of ppo, sac, counterfactual, a2c"),
         ({"scheme": "independent"}, "scheme independent: recipe 'mine' is for A2C; it needs one for PPO"),
     ],
 )
