@@ -285,10 +285,12 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def cases(given: argparse.Namespace) -> Cases:
+    taken = {library for library in LIBRARIES if LIBRARIES[library].in_ci or not given.ci}
     for k, way in enumerate(ways()):
-        if LIBRARIES[way.library].in_ci or not given.ci:
+        if way.library in taken:
             yield f"{way.library}: {way.title} ({way.ran})", partial(run, way.library, f"tell({k})", given, way)
-    yield f"BenchMARL: docs/{HOWTO.name}", partial(run, "BenchMARL", "tell_howto()", given)
+    if "BenchMARL" in taken:
+        yield f"BenchMARL: docs/{HOWTO.name}", partial(run, "BenchMARL", "tell_howto()", given)
 
 
 def run(library: str, function: str, given: argparse.Namespace, way: Way | None = None) -> Told:
