@@ -154,7 +154,10 @@ def test_commands__write_and_print_entries_and_the_leaderboard(suites, entries, 
     assert json.loads(told("tiny", "--agent", "coast", "--json")[0]) == json.loads(Path("coast.json").read_text())
     partly, _ = told("tiny", "--agent", "full_brake+episode")
     table, _ = told("table", *map(str, paths(entries)), "--output", "table.md")
-    check_snapshot("benchmark.txt", "\n".join([printed, partly, table, Path("table.md").read_text()]))
+    text = "\n".join([printed, partly, table, Path("table.md").read_text()])
+    own = load_suite("tiny", suites).sha256  # of zip archives, whose headers and packing are those of each Python
+    assert text.count(own) == 1
+    check_snapshot("benchmark.txt", text.replace(own, "(its own)"))
     found = json.loads(told("table", *map(str, paths(entries)), "--json")[0])
     assert {entry["agent"] for entry in found["entries"]} == set(NAMES)
 
