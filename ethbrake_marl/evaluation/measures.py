@@ -1626,8 +1626,8 @@ class SummaryTable(list[SummaryRow]):
         left_out = LeftOut.line([str(left) for left in row.left_out], row.episodes + len(row.left_out))
         moving = ", ".join(f"{each.agent} {each.horizon_ends:,}" for each in self if each.horizon_ends)
         cut_off = (
-            f"At the horizon ({row.parameters['horizon_s']:g} s) something still moved, and what came after"
-            f" counts nowhere; worlds, of {row.episodes:,}: {moving}."
+            f"At the horizon ({row.parameters['horizon_s']:g} s) something still moved; harm after it is not counted."
+            f" Worlds, of {row.episodes:,}: {moving}."
         )
         paper = [("quiet", f"Paper, {name}: {told}.") for name, told in PAPER_PARAMETERS.items()]
         told = [
@@ -1676,7 +1676,7 @@ class SummaryTable(list[SummaryRow]):
         below = [
             f"{each.agent} in {count_of(each.below_best_known, 'world')}" for each in self if each.below_best_known
         ]
-        return text + (f" Below what was known: {', '.join(below)}." if below else "")
+        return text + (f" Less harm than the best known before: {', '.join(below)}." if below else "")
 
     def identity_line(self) -> str:
         """By which hashes this result is recognised, as a sentence; empty without rows."""

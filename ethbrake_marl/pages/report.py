@@ -280,8 +280,10 @@ class Report:
             for name, row in (("Full braking", before), (self.focus, after))
         ]
         less, certain = after["harm_decrease_first"], after["impact_proven_rate"]
-        saved = "" if less is None else f", {percent(less)} less by first impacts"
-        proven = "" if certain is None else f" In {percent(certain)} no command could have avoided one (proven)."
+        saved = "" if less is None else f", {percent(less)} less harm by first impacts"
+        proven = (
+            "" if certain is None else f" In {percent(certain)} no command could have avoided a collision (proven)."
+        )
         return f"{costs[0]}. {costs[1]}{saved}.{proven} "
 
     def _results(self) -> Section:

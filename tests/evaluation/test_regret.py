@@ -146,7 +146,10 @@ def test_distance__a_best_that_is_not_known_everywhere_realises_nothing(four: Ev
     assert (full["below_best_known"], agent["below_best_known"]) == (0, 1)
     table = summarise(four).markdown()
     assert "WARNING: the table of best known harm holds 2 of these 4 worlds" in table and "≥ 0.75" in table
-    assert "Found beforehand in 75.0 % of the worlds" in table and "Below what was known: a in 1 world." in table
+    assert (
+        "Found beforehand in 75.0 % of the worlds" in table
+        and "Less harm than the best known before: a in 1 world." in table
+    )
 
 
 # ---------------------------------------------------------------- lists with and without limits
