@@ -723,7 +723,7 @@ class Measure:
     def column(self) -> Column:
         """Its column in a table."""
         shown = {"digits": 1, "scale": 100.0, "unit": " %"} if self.percent else {}
-        return Column(self.heading, self.name, short=self.short, sign="-", **shown)  # type: ignore[arg-type]
+        return Column(self.heading, self.name, short=self.short, **shown)  # type: ignore[arg-type]
 
 
 _OF_THE_EPISODE = (
@@ -1258,7 +1258,7 @@ def shipped_bounds(tables: Iterable[BestHarmTable] | None = None) -> tuple[list[
     A header names a shipped scenario and a list of it, of which every world is compared; raises ``InvalidInput`` if
     the table does not hold them. A gap is best known minus proven harm, as a share of the best known.
     """
-    harm, share = partial(Column, digits=3, sign="-"), partial(Column, digits=1, scale=100.0, unit=" %", sign="-")
+    harm, share = partial(Column, digits=3), partial(Column, digits=1, scale=100.0, unit=" %")
     columns = (
         "list", Column("worlds"), harm("proven"), harm("best known, first"), share("gap"), harm("best known, total"),
         share("gap"), share("contact proven"), share("impact proven"), share("between"),
@@ -1541,11 +1541,11 @@ class SummaryTable(list[SummaryRow]):
         paper's rows, where they are about the same test.
         """
         columns = [each.column() for each in measures() if each.heading]
-        columns += [Column(_heading(name), COLUMN + name, sign="-") for name in (self[0].metrics if self else ())]
+        columns += [Column(_heading(name), COLUMN + name) for name in (self[0].metrics if self else ())]
         lines: list[Row] = []
         for row in self:
             cells: dict[str, Cell] = {column.name: row[column.name] for column in columns}
-            value, interval = Column("", sign="-").show(row["mean_regret_first"])
+            value, interval = Column("").show(row["mean_regret_first"])
             bound = row.known_best_share is not None and row.known_best_share < 1.0
             cells["mean_regret_first"] = Shown(f"≥ {value}" if bound else value, interval)
             lines.append((row.agent, SEES_THROUGH * row.sees_through + row.knows.text, *cells.values()))
@@ -1650,7 +1650,7 @@ class SummaryTable(list[SummaryRow]):
         row = self[0]
         driven = row.parameters.get("controlled_vehicle")
         command = f"command of {str(driven).replace('vehicle_', 'Vehicle ')}" if driven else "joint command"
-        share = Column("", digits=1, scale=100.0, unit=" %", sign="-")
+        share = Column("", digits=1, scale=100.0, unit=" %")
         contact, impact = (share.show(row[name]).in_words for name in ("unavoidable_rate", "impact_proven_rate"))
         if row["unavoidable_rate"] is None:
             text = f"In {impact} of these worlds no {command} avoids an impact (proven)."

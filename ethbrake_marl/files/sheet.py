@@ -83,7 +83,7 @@ class Column:
     digits: int = 2
     scale: float = 1.0
     unit: str = ""
-    sign: Literal["z", "+", "-"] = "z"  # as in a format: never -0.00, always a sign, as it comes
+    sign: Literal["z", "+"] = "z"  # as in a format: never -0.00, or always a sign
     text: bool = False  # flush left, and folded where a terminal is narrow
     short: str = ""  # the heading for a terminal; "": the heading
     wide: bool = False  # shown only in a terminal of ``WIDE`` characters

@@ -737,6 +737,6 @@ def serve_explorer(
             h11_max_incomplete_event_size=16 * 1024,
         )
         listening.listen()
-        ready(f"http://127.0.0.1:{chosen}/{token}/")
-        with suppress(KeyboardInterrupt):
+        with suppress(KeyboardInterrupt):  # from the moment at which the address is told
+            ready(f"http://127.0.0.1:{chosen}/{token}/")
             uvicorn.Server(config).run(sockets=[listening])

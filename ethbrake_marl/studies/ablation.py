@@ -978,12 +978,12 @@ def interval_words(seeds: int) -> str:
     return f"95 % intervals for other seeds and other worlds{rough}"
 
 
-def _harm(heading: str, sign: Literal["-", "+"] = "-") -> Column:
+def _harm(heading: str, sign: Literal["z", "+"] = "z") -> Column:
     return Column(heading, sign=sign)
 
 
 def _share(heading: str) -> Column:
-    return Column(heading, digits=1, scale=100.0, unit=" %", sign="-")
+    return Column(heading, digits=1, scale=100.0, unit=" %")
 
 
 FIGURES = {  # those of ``ablation_figures``, each with its title and what it shows

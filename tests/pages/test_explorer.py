@@ -30,7 +30,7 @@ from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_agents, make_lineup
 from ethbrake_marl.evaluation.measures import Conditions
 from ethbrake_marl.limits.limits import prove
-from ethbrake_marl.pages.explorer import MOST_BODY, Explored, explorer_page, read_state, save_state
+from ethbrake_marl.pages.explorer import MOST_BODY, Explored, explorer_page, read_state, save_state, serve_explorer
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from tests.pages.conftest import AGENTS, HOST, PAGE, PORT, TOKEN, Client, Reply, check_alive, check_refused
 
@@ -277,6 +277,15 @@ def test_server__ends_at_ctrl_c(tmp_path: Path) -> None:
             assert running.process.wait(timeout=60) == 0
         assert running.process.stderr is not None
         assert running.process.stderr.read().splitlines()[-1] == "ended"
+
+
+def test_ctrl_c_while_the_address_is_told_ends_it_too(explored: Explored, tmp_path: Path) -> None:
+    pytest.importorskip("uvicorn")
+
+    def interrupted(address: str) -> None:
+        raise KeyboardInterrupt
+
+    serve_explorer(explored, tmp_path, 0, interrupted, seed=DEFAULT.LIST_SEED, world=0)
 
 
 def test_long_questions_are_cut_off(client: Client, state: dict[str, Any]) -> None:
