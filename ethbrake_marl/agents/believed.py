@@ -118,13 +118,13 @@ class Ranges:
                 f"scenario {scenario.name!r}: is a mixture, and a vehicle that is not known could be of any of {names};"
                 " believed agents need one of these"
             )
-        world = scenario.sample_by(lambda width, of: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
+        world = scenario.middle_world()
         low, high = ({key: np.array(scenario.bounds(key)).T[k] for key in ("gaps_m", *OF_OTHERS[1:5])} for k in (0, 1))
         named = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "speed_limit_mps")
         one, N = np.ones((1, scenario.vehicles)), scenario.vehicles
         heard = Vehicles.at_once(one, one, np.zeros((1, N)), one, one, np.zeros(1))  # no latency but that of the news
         if scenario.v2x.by_link:
-            heard = scenario.v2x.with_news(heard, np.full((1, scenario.v2x.width(N)), 0.5))
+            heard = scenario.v2x.with_news(heard, np.full((1, scenario.v2x.width(N)), 0.5), scenario.equipped())
         middle = {
             "place": _places(world.gaps_m[0], world.gaps_m[0], vehicle),
             "speeds_mps": world.speeds_mps[0],
@@ -135,7 +135,7 @@ class Ranges:
         low["place"] = _places(low["gaps_m"], high["gaps_m"], vehicle)
         high["place"] = _places(high["gaps_m"], low["gaps_m"], vehicle)
         low["news_s"] = np.zeros(scenario.vehicles)
-        high["news_s"] = scenario.v2x.latest_reaction_s(low["news_s"])
+        high["news_s"] = scenario.v2x.latest_reaction_s(low["news_s"], scenario.equipped())
         others = script_agents(scenario, except_for=vehicle) if others is None else others
         return cls(vehicle, others, middle, low, high, float(world.obstacle_gap_m[0]))
 
@@ -192,6 +192,7 @@ class Ranges:
         line = replace(
             worlds, vehicles=vehicles, speeds_mps=np.minimum(speed, of["speed_limit_mps"]), pair_hit=told.hit,
             command_mps2=np.zeros((n, N)), gaps_m=usual_gaps, messages=np.zeros((n, 0)), obstacle_hit=told.obstacle_hit,
+            road=np.zeros((n, 0)),
         )  # fmt: skip
         command = fixed_commands(self.others, line, "believed", vehicle=vehicle)
         speed, way = move_on(

@@ -15,7 +15,7 @@ from ethbrake_marl.evaluation.measures import Evaluation, Outcome
 from ethbrake_marl.evaluation.rollout import controlled_vehicle, evaluate
 from ethbrake_marl.limits import Limits, Unproven, avoidability, known_limits, scripted_commands, undecided_because
 from ethbrake_marl.physics import Bools, Floats, Worlds, advance, forecast, make_worlds
-from ethbrake_marl.scenario import QUANTITY, Scenario, Task
+from ethbrake_marl.scenario import Scenario, Task
 
 CELLS = 81  # along each gap
 CHUNK = 500  # worlds between two reports of progress
@@ -129,10 +129,9 @@ def _halve(avoidable: Callable[[Floats, Floats], Bools], gap_1_m: Floats, ends: 
 def _worlds_at(scenario: Scenario, gap_1_m: Floats, gap_2_m: Floats) -> Worlds:
     """Worlds with these first two gaps; everything else as the scenario fixes it."""
     columns = {"gap_1_m": gap_1_m, "gap_2_m": gap_2_m}
-    for field, rule in QUANTITY.usual.items():
-        for i in range(2 if field == "gaps_m" else 0, rule.count(scenario.vehicles)):
-            low, high = scenario.bounds(field)[i]
-            name = QUANTITY.usual[field].column_of(i)
+    for name, (field, i) in scenario.table_columns.items():
+        if name not in columns and field != "obstacle_gap_m":
+            low, high = scenario.bounds(field, dry=True)[i]
             if low != high:
                 raise InvalidInput(
                     f"scenario {scenario.name!r}: {name} is random, from {low:g} to {high:g}; a criticality map needs"

@@ -526,6 +526,7 @@ _SYMBOLS = {
     "mass_t": ("m", "t"),
     "restitution": ("e", ""),
     "obstacle_gap_m": ("obstacle at", "m"),
+    "friction": ("friction", ""),
 }
 _STAY = "\u00a0"  # a blank at which no line is broken
 

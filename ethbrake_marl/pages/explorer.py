@@ -68,6 +68,7 @@ _SLIDERS: dict[str, tuple[str, float, float, float, bool]] = {
     "restitution": ("Restitution", 0.0, 1.0, 0.01, False),
     "obstacle_gap_m": ("Obstacle ahead of Vehicle 1 at", 1.0, 150.0, 0.5, True),
     "speed_limit_mps": ("Speed limit of driving", 1.0, 60.0, 0.5, False),
+    "friction": ("Friction of the road", 0.1, 1.0, 0.01, True),
 }
 
 
@@ -83,7 +84,7 @@ def slider_groups(scenario: Scenario, state: State) -> list[dict[str, Any]]:
             continue
         rule = _RULES[field]
         values = state[field] if isinstance(state[field], list) else [state[field]]
-        bounds = [] if field in QUANTITY.optional else scenario.bounds(field)
+        bounds = [] if field in QUANTITY.optional else scenario.bounds(field, dry=True)
         number = range(1, rule.count(scenario.vehicles) + 1)
         names = {"vehicle": [f"Vehicle {i}" for i in number], "pair": [f"{i} to {i + 1}" for i in number]}
         found.append({
@@ -107,8 +108,7 @@ def read_state(given: object, scenario: Scenario) -> Worlds:
     """
     if not isinstance(given, Mapping):
         raise InvalidInput("world: must be an object such as {'gaps_m': [7, 7], ...}")
-    known = _RULES if scenario.has_obstacle else QUANTITY.usual
-    for key, rule in known.items():
+    for key, rule in {field: _RULES[field] for field, _ in scenario.table_columns.values()}.items():
         if key not in given:
             raise InvalidInput(f"world: {key} is missing; every quantity must be given")
         if rule.per != "world" and not isinstance(given[key], list):
@@ -416,7 +416,7 @@ class Newest:
 # States of the explorer as files in one folder: a scenario as YAML, or a table of initial states with one row.
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}", re.ASCII)
-_DRAWN = {*QUANTITY.otherwise, "vehicle_types", "types"}  # other ways to say what a state says
+_DRAWN = {*QUANTITY.otherwise, "vehicle_types", "types", "table"}  # other ways to say what a state says
 _DEVICES = {"con", "prn", "aux", "nul", *(f"{port}{k}" for port in ("com", "lpt") for k in range(10))}
 
 

@@ -71,6 +71,8 @@ from ethbrake_marl.physics.messages import (
     move_on as move_on,
 )
 from ethbrake_marl.physics.worlds import (
+    GRAVITY_MPS2 as GRAVITY_MPS2,
+    ON_ROADS as ON_ROADS,
     Bools as Bools,
     Floats as Floats,
     Ints as Ints,

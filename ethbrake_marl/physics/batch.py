@@ -230,6 +230,7 @@ class Packed(NamedTuple):
             np.full(len(state), np.inf) if far else state[:, column.obstacle].copy(),
             np.zeros(len(state), np.bool_) if far else state[:, column.obstacle + 1] == 1.0,
             params[:, column.messages :].copy(),
+            np.zeros((len(state), 0)),
         )
 
     def _vehicles(self) -> Vehicles:

@@ -30,6 +30,9 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 UInt64s = NDArray[np.uint64]
 
+GRAVITY_MPS2 = 9.81
+ON_ROADS = ("braking_capacity_mps2", "driving_capacity_mps2")  # what friction limits
+
 
 @dataclass(frozen=True, slots=True)
 class Vehicles:
@@ -134,6 +137,9 @@ class Worlds:
     obstacle_gap_m: Floats  # [n] from Vehicle 1's front to an unmovable obstacle ahead, >= 0; infinite: there is none
     obstacle_hit: Bools  # [n] Vehicle 1 has had an impact with it
     messages: Floats  # [n, M] what periodic messages have told whom (``physics.messages``); [n, 0] without them
+    # [n, 1 + 2 N] friction of the road, and what brakes and engines of each vehicle can on a dry one (m/s2), of which
+    # the capacities are what the road allows; [n, 0]: nothing is known of a road
+    road: Floats
 
     def __repr__(self) -> str:
         found = f"gaps {_span(self.gaps_m)} m, speeds {_span(self.speeds_mps)} m/s, at {_span(self.time_s)} s"
@@ -167,6 +173,7 @@ class Worlds:
     @staticmethod
     def concatenate(parts: Sequence[Worlds]) -> Worlds:
         """Join worlds with the same number of vehicles into one batch."""
+        parts = _on_roads_alike(parts)
         return parts[0]._each(lambda *columns: np.concatenate(columns), *parts[1:])
 
     def assign(self, rows: Ints, fresh: Worlds) -> Worlds:
@@ -177,11 +184,39 @@ class Worlds:
             copy[rows] = part
             return copy
 
-        return self._each(assigned, fresh)
+        whole, part = _on_roads_alike((self, fresh))
+        return whole._each(assigned, part)
 
     def read_only(self) -> Worlds:
         """The same worlds as arrays that cannot be written to; these stay as they are."""
         return self._each(_unwritable)
+
+    def on_road(
+        self, friction: Floats, braking_mps2: Floats | None = None, driving_mps2: Floats | None = None
+    ) -> Worlds:
+        """These worlds on a road of that ``friction`` [n]: no capacity is above ``friction * GRAVITY_MPS2``.
+
+        ``braking_mps2`` and ``driving_mps2`` [n, N] are the capacities on a dry road; by default those of now.
+        """
+        v, most = self.vehicles, (friction * GRAVITY_MPS2)[:, np.newaxis]
+        dry = [v.braking_capacity_mps2 if braking_mps2 is None else braking_mps2,
+               v.driving_capacity_mps2 if driving_mps2 is None else driving_mps2]  # fmt: skip
+        braking, driving = (np.minimum(capacity, most) for capacity in dry)
+        vehicles = replace(v, braking_capacity_mps2=braking, driving_capacity_mps2=driving)
+        return replace(self, vehicles=vehicles, road=np.concatenate([friction[:, np.newaxis], *dry], axis=1))
+
+    @property
+    def friction(self) -> Floats:
+        """Friction of the road, [n]; infinite where nothing is known of it."""
+        return self.road[:, 0] if self.road.shape[1] else np.full(self.n, np.inf)
+
+    def dry(self, name: str) -> Floats:
+        """A field of ``vehicles``, a capacity as it is on a dry road, [n, N]."""
+        value: Floats = getattr(self.vehicles, name)
+        if self.road.shape[1] and name in ON_ROADS:
+            begin = 1 + self.N * ON_ROADS.index(name)
+            value = self.road[:, begin : begin + self.N]
+        return value
 
     def first_decision_s(self, deciders: Sequence[int]) -> Floats:
         """Time of the first decision, [n] s: the least latency of the ``deciders``, or the worlds' time if it is later.
@@ -226,6 +261,7 @@ class Worlds:
             np.full(self.n, np.inf),
             np.zeros(self.n, np.bool_),
             self.messages,
+            np.zeros((self.n, 0)),
         )
 
     def with_post_ahead(self, duration_s: Floats) -> Worlds:
@@ -241,6 +277,13 @@ class Worlds:
         energy = sum_rows(vehicles.mass_t * (self.speeds_mps * self.speeds_mps / 2.0 + driving))
         farthest = 1.01 * duration_s * np.sqrt(2.0 * energy / vehicles.mass_t[:, 0])
         return replace(self, obstacle_gap_m=np.where(self.obstacle_ahead, self.obstacle_gap_m, farthest + 1.0))
+
+
+def _on_roads_alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
+    """The same worlds; where something is known of the road of some, it is of infinite friction for the others."""
+    if len({part.road.shape[1] for part in parts}) == 1:
+        return parts
+    return [part if part.road.shape[1] else part.on_road(part.friction) for part in parts]
 
 
 _OF_WORLDS = tuple(f.name for f in fields(Worlds))[1:]
@@ -292,6 +335,7 @@ def make_worlds(
     restitution: ArrayLike,
     speed_limit_mps: ArrayLike = 40.0,
     obstacle_gap_m: ArrayLike | None = None,
+    friction: ArrayLike | None = None,
 ) -> Worlds:
     """Build checked worlds at ``t = 0``; every parameter broadcasts to its full shape.
 
@@ -305,6 +349,7 @@ def make_worlds(
         restitution: of every impact, in [0, 1], to [n].
         speed_limit_mps: driving stops here, to [n, N], m/s.
         obstacle_gap_m: distance to an obstacle ahead of Vehicle 1, to [n], m; None: there is none.
+        friction: of the road, to [n]: capacities are at most ``friction * GRAVITY_MPS2``; None: as they are given.
 
     Raises ``InvalidInput`` naming the field, the first bad entry and its range.
 
@@ -331,7 +376,7 @@ def make_worlds(
             f"speeds_mps[{world}, {vehicle}] = {speeds[world, vehicle]:g}: above this vehicle's"
             f" speed_limit_mps {vehicles.speed_limit_mps[world, vehicle]:g}"
         )
-    return Worlds(
+    worlds = Worlds(
         vehicles,
         _full("gaps_m", gaps, (n, N - 1), 0.0, np.inf),
         speeds,
@@ -341,7 +386,9 @@ def make_worlds(
         np.full(n, np.inf) if obstacle_gap_m is None else _full("obstacle_gap_m", obstacle_gap_m, (n,), 0.0, np.inf),
         np.zeros(n, dtype=np.bool_),
         np.zeros((n, 0)),
+        np.zeros((n, 0)),
     )
+    return worlds if friction is None else worlds.on_road(_full("friction", friction, (n,), 0.0, np.inf, open_low=True))
 
 
 def _full(

@@ -24,6 +24,7 @@ from pydantic import (
     GetJsonSchemaHandler,
     PrivateAttr,
     Tag,
+    ValidationError,
     ValidationInfo,
     field_validator,
     model_validator,
@@ -47,6 +48,8 @@ from ethbrake_marl.files.yaml import (
 from ethbrake_marl.harm import ObjectiveName, objectives_of
 from ethbrake_marl.observations import ListedFeatures, listed_features
 from ethbrake_marl.physics import (
+    GRAVITY_MPS2,
+    ON_ROADS,
     Bools,
     Floats,
     Ints,
@@ -59,9 +62,20 @@ from ethbrake_marl.physics import (
     normal_quantile_each,
     stopping_distances,
 )
-from ethbrake_marl.scenario.v2x import V2X
+from ethbrake_marl.scenario.v2x import V2X, Equipage, Equipped
 
 BLOCK = 8  # uniform numbers per vehicle and world; a multiple of 4, the numbers of one Philox counter
+V2X_NEWS = (1,)  # the stream of the links' delays and losses
+OBSTACLE = (2,)  # the stream of the obstacle's distance
+TYPES = (3,)  # the stream of the vehicles' types and loads
+MIXTURE = (4,)  # the stream of what each world of a mixture is drawn from
+LATER_LOSSES = (5,)  # the stream of a world's key, from which its later messages are lost or not
+SURROUNDINGS = (6,)  # the stream of friction, of the row of a table, and of the time before the alert
+OF_WORLD = 4  # numbers per world of the streams of obstacle, mixture, later losses and surroundings
+PER_TYPE = 4  # numbers per vehicle of the stream of types: type, load, and two that are free; one Philox counter
+ROW = (SURROUNDINGS, 1)  # the place of the number that chooses the row of a table
+
+Place = tuple[tuple[int, ...], int]  # a stream of uniform numbers, and the column in it
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +93,7 @@ class QuantityRule:
     example: str
     low: float = 0.0  # smallest allowed value
     block: int = 0  # vehicle (from 0) in whose block of uniform numbers entry 0 stands
+    stream: tuple[int, ...] = ()  # of uniform numbers of its own, in which its slot is the column
 
     @property
     def symbol(self) -> str:
@@ -99,9 +114,9 @@ class QuantityRule:
         """How many values a world of ``vehicles`` vehicles has."""
         return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
 
-    def place(self, index: int) -> int:
+    def place(self, index: int) -> Place:
         """Which of a world's uniform numbers belongs to entry ``index`` (from 0)."""
-        return BLOCK * (self.block + index) + self.slot
+        return self.stream, BLOCK * (self.block + index) + self.slot
 
     def column_of(self, index: int) -> str:
         """Name of the column that holds entry ``index`` (from 0) in a table of initial states."""
@@ -113,8 +128,11 @@ class QuantityRule:
         return {"vehicle": front, "pair": f"{front} to vehicle_{index + 2}", "world": ""}[self.per]
 
     def of(self, worlds: Worlds) -> Floats:
-        """The values that these worlds have, [n, entries]: one entry per vehicle, pair or world."""
-        values: Floats = getattr(worlds.vehicles if hasattr(worlds.vehicles, self.name) else worlds, self.name)
+        """The values that these worlds have, [n, entries]: one entry per vehicle, pair or world.
+
+        Capacities are those on a dry road, as a scenario declares them.
+        """
+        values: Floats = worlds.dry(self.name) if hasattr(worlds.vehicles, self.name) else getattr(worlds, self.name)
         return values.reshape(worlds.n, -1)
 
 
@@ -131,8 +149,8 @@ class Quantities(NamedTuple):
     declared: dict[str, QuantityRule]  # every key that declares one
 
     def of(self, worlds: Worlds) -> dict[str, QuantityRule]:
-        """Those that these worlds have: the distance to an obstacle only where there is one."""
-        return {**self.usual, **self.optional} if worlds.obstacle_ahead.all() else self.usual
+        """Those that these worlds have: the distance to an obstacle, and friction, only where there is such."""
+        return self.usual | {key: r for key, r in self.optional.items() if np.isfinite(getattr(worlds, key)).all()}
 
     def columns(self, worlds: Worlds) -> dict[str, Floats]:
         """Every one of the worlds, each [n], named as in a table of initial states: ``gap_1_m``, ``mass_2_t``."""
@@ -200,12 +218,24 @@ _OTHERWISE = _by_name(
     QuantityRule(
         "obstacle_margin_m", "m", "world", 1e4, True, 0, "",
         "distance of that obstacle from where vehicle_1 stops by full braking as soon as it can", "1.7",
+        stream=OBSTACLE,
+    ),
+    QuantityRule(
+        "alert_s", "s", "world", 3600.0, False, 2, "",
+        "time from the start until the alert, from which latencies count; until then only scripts that depend on the"
+        " state act", "{uniform: [1, 5]}", stream=SURROUNDINGS,
     ),
 )  # fmt: skip
 _OPTIONAL = _by_name(
     QuantityRule(
         "obstacle_gap_m", "m", "world", 1e4, True, 0, "obstacle_gap_m",
         "distance from the front of vehicle_1 to an unmovable obstacle ahead, at the alert", "42",
+        stream=OBSTACLE,
+    ),
+    QuantityRule(
+        "friction", "", "world", 2.0, True, 0, "friction",
+        f"friction of the road: no capacity is above friction x {GRAVITY_MPS2:g} m/s2", "{uniform: [0.2, 0.9]}",
+        stream=SURROUNDINGS,
     ),
 )  # fmt: skip
 QUANTITY = Quantities(
@@ -225,6 +255,7 @@ _MEANING = {key: rule.meaning for key, rule in QUANTITY.declared.items()}
 
 _LEAVE_OUT = "must be a number or a distribution; a key that is not used is left out"
 LEAST_MASS = 1e-6  # of a normal distribution inside its bounds; below it the inverse loses its digits
+_LEAST = f"[low, high] must hold at least {LEAST_MASS:g} of the untruncated distribution"
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Pair = Annotated[tuple[Number, Number], Field(strict=False)]
@@ -302,8 +333,7 @@ class Normal(_Distribution):
         require(shape.sd > 0.0, ("normal",), shape, "sd must be above 0")
         require(shape.low < shape.high, ("normal",), shape, "low must be below high")
         below, above = self._bounds()
-        right = f"[low, high] must hold at least {LEAST_MASS:g} of the untruncated distribution"
-        require(above - below >= LEAST_MASS, ("normal",), shape, right)
+        require(above - below >= LEAST_MASS, ("normal",), shape, _LEAST)
         return self
 
     def _bounds(self) -> tuple[float, float]:
@@ -323,6 +353,45 @@ class Normal(_Distribution):
         below, above = self._bounds()
         quantile = normal_quantile_each((below + (above - below) * u).ravel()).reshape(u.shape)
         return np.clip(shape.mean + shape.sd * quantile, shape.low, shape.high)
+
+
+class LogNormalShape(_Distribution):
+    """Median, standard deviation of the logarithm, and the bounds that cut it."""
+
+    median: Number
+    sigma: Number
+    low: Number
+    high: Number
+
+
+class LogNormal(_Distribution):
+    """``{lognormal: {median, sigma, low, high}}``: its logarithm is normal; truncated to [low, high]."""
+
+    lognormal: LogNormalShape
+    _of_logarithm: Normal = PrivateAttr()
+
+    @model_validator(mode="after")
+    def _possible(self) -> LogNormal:
+        shape, at = self.lognormal, ("lognormal",)
+        require(min(shape.median, shape.low) > 0.0, at, shape, "median and low must be above 0")
+        require(shape.sigma > 0.0, at, shape, "sigma must be above 0")
+        require(shape.low < shape.high, at, shape, "low must be below high")
+        middle, low, high = (log(value) for value in (shape.median, shape.low, shape.high))
+        try:
+            self._of_logarithm = Normal(normal={"mean": middle, "sd": shape.sigma, "low": low, "high": high})  # type: ignore[arg-type]
+        except ValidationError:
+            refuse(at, shape, _LEAST)
+        return self
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest value that can be drawn."""
+        return self.lognormal.low, self.lognormal.high
+
+    def value(self, u: Floats) -> Floats:
+        """``exp`` of the normal logarithm at ``u`` in [0, 1); same shape as ``u``."""
+        drawn = exp_each(self._of_logarithm.value(u).ravel()).reshape(u.shape)
+        return np.clip(drawn, *self.support)
 
 
 class Choice(_Distribution):
@@ -352,20 +421,33 @@ class Choice(_Distribution):
         return np.asarray(self.choice)[np.searchsorted(cumulative, u, side="right")]
 
 
-class WithLoad(_Distribution):
-    """``{with_load: [empty, full]}``, of a vehicle type only: moves with the load of the vehicle, from 0 to 1."""
+@dataclass(frozen=True, slots=True, repr=False)
+class TableColumn:
+    """A column of a scenario's table: every world takes the value of its own row."""
 
-    with_load: Pair = Field(description="[empty, full]: at load 0 and at load 1")
+    name: str
+    rows: Floats  # [rows]
+    cumulative: Floats  # [rows] share of the worlds up to this row
+
+    def __repr__(self) -> str:
+        return f"column {self.name} of the table"
 
     @property
     def support(self) -> tuple[float, float]:
         """Smallest and largest value that can be drawn."""
-        return min(self.with_load), max(self.with_load)
+        return float(self.rows.min()), float(self.rows.max())
 
-    def value(self, load: Floats) -> Floats:
-        """``empty + (full - empty) load``, in the shape of ``load`` in [0, 1]; never beyond either end."""
-        empty, full = self.with_load
-        return np.clip(empty + (full - empty) * load, *self.support)
+    @property
+    def middle(self) -> TableColumn:
+        """The one row that stands for all: the median."""
+        order = np.argsort(self.rows, kind="stable")
+        shares = np.cumsum(np.diff(self.cumulative, prepend=0.0)[order])
+        return replace(self, rows=self.rows[order][[np.searchsorted(shares, 0.5)]], cumulative=np.ones(1))
+
+    def value(self, u: Floats) -> Floats:
+        """That of the first row whose cumulative weight is above ``u``; same shape as ``u`` in [0, 1)."""
+        found: Floats = self.rows[np.searchsorted(self.cumulative, u, side="right")]
+        return found
 
 
 def _kind(value: object) -> str | None:
@@ -377,7 +459,7 @@ def _kind(value: object) -> str | None:
     return None if isinstance(value, list | tuple) else "#number"
 
 
-DISTRIBUTIONS = ("uniform", "loguniform", "normal", "choice")
+DISTRIBUTIONS = ("uniform", "loguniform", "normal", "lognormal", "choice")
 
 # Tags begin with # so that they can be told from keys in the location of an error.
 Quantity = Annotated[
@@ -385,17 +467,44 @@ Quantity = Annotated[
     | Annotated[Uniform, Tag("#uniform")]
     | Annotated[LogUniform, Tag("#loguniform")]
     | Annotated[Normal, Tag("#normal")]
+    | Annotated[LogNormal, Tag("#lognormal")]
     | Annotated[Choice, Tag("#choice")],
     Discriminator(_kind, custom_error_type="quantity", custom_error_message="no such quantity"),
 ]
 
 
-def support(quantity: float | Uniform | LogUniform | Normal | Choice | WithLoad) -> tuple[float, float]:
+class WithLoad(_Distribution):
+    """``{with_load: [empty, full]}``, of a vehicle type only: moves with the load of the vehicle, from 0 to 1.
+
+    ``spread`` is added to it, of its own for every vehicle.
+    """
+
+    with_load: Pair = Field(description="[empty, full]: at load 0 and at load 1")
+    spread: Quantity = Field(default=0.0, exclude_if=not_, description="what each vehicle adds to it by chance")
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest value that can be drawn."""
+        low, high = support(self.spread)
+        return min(self.with_load) + low, max(self.with_load) + high
+
+    def value(self, load: Floats, u: Floats) -> Floats:
+        """``empty + (full - empty) load``, and the spread at ``u``; ``load`` in [0, 1] and ``u`` have one shape."""
+        empty, full = self.with_load
+        moved = np.clip(empty + (full - empty) * load, min(self.with_load), max(self.with_load))
+        return moved if self.spread == 0.0 else moved + values(self.spread, u)
+
+
+AnyQuantity = float | Uniform | LogUniform | Normal | LogNormal | Choice | TableColumn
+AnyTypeQuantity = AnyQuantity | WithLoad
+
+
+def support(quantity: AnyTypeQuantity) -> tuple[float, float]:
     """Smallest and largest value that the quantity can take."""
     return (quantity, quantity) if isinstance(quantity, float) else quantity.support
 
 
-def values(quantity: float | Uniform | LogUniform | Normal | Choice, u: Floats) -> Floats:
+def values(quantity: AnyQuantity, u: Floats) -> Floats:
     """The quantity's values for uniform numbers ``u`` in [0, 1), in the shape of ``u``."""
     return np.full(u.shape, quantity) if isinstance(quantity, float) else quantity.value(u)
 
@@ -589,7 +698,6 @@ def _loaded(value: object) -> str:
 TypeQuantity = Annotated[
     Annotated[Quantity, Tag("#one")] | Annotated[WithLoad, Tag("#with_load")], Discriminator(_loaded)
 ]
-AnyTypeQuantity = float | Uniform | LogUniform | Normal | Choice | WithLoad
 
 
 class VehicleType(FileModel):
@@ -604,6 +712,7 @@ class VehicleType(FileModel):
     mass_t: TypeQuantity | None = Field(default=None, description=_MEANING["mass_t"])
     latency_s: TypeQuantity | None = Field(default=None, description=_MEANING["latency_s"])
     speed_limit_mps: TypeQuantity | None = Field(default=None, description=_MEANING["speed_limit_mps"])
+    v2x: Equipage | None = Field(default=None, exclude_if=not_, description="what it has of V2X; by default all")
 
     @field_validator(*QUANTITY.of_a_type)
     @classmethod
@@ -674,9 +783,6 @@ def _weight(kinds: Mapping[str, VehicleType], name: str, here: TypesHere) -> flo
     return here.get(name, 0.0)
 
 
-AnyQuantity = float | Uniform | LogUniform | Normal | Choice
-
-
 _LEFT_OUT: Any = object()  # a key that is not given, where a check must say whether it may be
 
 
@@ -692,6 +798,54 @@ class _MemberSchema:
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         return {"anyOf": [{"type": "string"}, {"type": "object"}]}
+
+
+MOST_NUMBERS = 100_000  # of a table: a scenario is kept whole wherever it is used
+
+Column = Annotated[str, Field(pattern=r"^[a-z_]+(_[0-9]+)?[a-z0-9_]*$", max_length=64)]
+
+
+class Table(FileModel):
+    """Rows of which every world takes one, by weight; in a scenario file read from a CSV file beside it."""
+
+    file: str = Field(default="", exclude_if=not_, description="CSV file with a header, from the scenario's folder on")
+    columns: Annotated[tuple[Column, ...], Field(strict=False, min_length=1)] = Field(
+        description="as in a table of initial states: gap_1_m, speed_2_mps, ...; of a file those that are used"
+    )
+    weights: str | Annotated[Numbers, Field()] | None = Field(
+        default=None, exclude_if=not_, description="how likely each row is; of a file the column that says it"
+    )
+    rows: Annotated[tuple[Numbers, ...], Field(strict=False, min_length=1)] | None = Field(
+        default=None, description="one row of numbers for each; left out with a file, which has them"
+    )
+
+    @model_validator(mode="after")
+    def _complete(self) -> Table:
+        read = "files are read where they stand in a file (load_scenario); give rows"
+        require(self.rows is not None and not isinstance(self.weights, str), ("rows",), UNSHOWN, read)
+        rows = self.rows or ()
+        for k, row in enumerate(rows):
+            right = f"has {len(row)} numbers; there are {len(self.columns)} columns"
+            require(len(row) == len(self.columns), ("rows", k), UNSHOWN, right)
+        numbers = len(rows) * len(self.columns)
+        require(numbers <= MOST_NUMBERS, ("rows",), UNSHOWN, f"{numbers:,} numbers; at most {MOST_NUMBERS:,}")
+        twice = [name for name in self.columns if self.columns.count(name) > 1]
+        require(not twice, ("columns",), twice[:1], "each column can be given once")
+        if isinstance(self.weights, tuple):
+            fits = f"must be one for each of {len(rows)} rows, all above 0, and their sum finite"
+            good = len(self.weights) == len(rows) and min(self.weights) > 0.0 and math.isfinite(sum(self.weights))
+            require(good, ("weights",), UNSHOWN, fits)
+        return self
+
+    def column_values(self) -> dict[str, TableColumn]:
+        """The columns by name."""
+        rows = np.array(self.rows)
+        weights = self.weights if isinstance(self.weights, tuple) else (1.0,) * len(rows)
+        cumulative = np.cumsum(np.asarray(weights))
+        return {
+            name: TableColumn(name, column, cumulative / cumulative[-1])
+            for name, column in zip(self.columns, rows.T, strict=True)
+        }
 
 
 class Member(FileModel):
@@ -719,6 +873,9 @@ class ScenarioFields(FileModel):
     )
     mixture: Annotated[tuple[Member, ...], Field(strict=False)] | None = Field(
         default=None, exclude_if=not_, description="scenarios that each world is drawn from one of, by weight"
+    )
+    table: Table | None = Field(
+        default=None, exclude_if=not_, description="measured rows of which every world takes one; the rest is drawn"
     )
     time_step_s: float = Field(default=0.1, ge=1e-4, allow_inf_nan=False, description="time between two decisions")
     horizon_s: float = Field(
@@ -749,6 +906,8 @@ class ScenarioFields(FileModel):
     )
     obstacle_gap_m: Quantity | None = Field(default=None, description=_MEANING["obstacle_gap_m"])
     obstacle_margin_m: Quantity | None = Field(default=None, description=_MEANING["obstacle_margin_m"])
+    friction: Quantity | None = Field(default=None, exclude_if=not_, description=_MEANING["friction"])
+    alert_s: Quantity | None = Field(default=None, exclude_if=not_, description=_MEANING["alert_s"])
     early_impacts: Literal["keep", "reject"] = Field(
         default="keep", description="what happens to worlds with an impact before the first learner may act"
     )
@@ -764,8 +923,11 @@ class ScenarioFields(FileModel):
     )
 
     _members: tuple[ScenarioFields, ...] = PrivateAttr(default=())
+    _columns: dict[Entry, TableColumn] = PrivateAttr(default_factory=dict)  # those of the table
 
-    @field_validator(*QUANTITY.alternatives, *QUANTITY.alternatives.values(), mode="before")
+    @field_validator(
+        *QUANTITY.alternatives, *QUANTITY.alternatives.values(), *QUANTITY.optional, "alert_s", mode="before"
+    )
     @classmethod
     def _given(cls, value: Any) -> Any:
         """``null`` is no value: a key that is not used is left out."""
@@ -783,14 +945,14 @@ class ScenarioFields(FileModel):
             require(value is not None, (), value, _LEAVE_OUT)
             require(kinds is None or without is not None, (), value, "every type declares it; leave it out")
             return value
-        if data.get("mixture") is None and {"vehicle_types", "mixture"} <= data.keys():
+        if data.get("mixture") is None and {"vehicle_types", "mixture"} <= data.keys() and not _tabled(data, key):
             if kinds is None:
                 raise PydanticCustomError("missing", "missing", {"at": ()})
             right = f"type {without} does not declare it: give it there, or here for every type that does not"
             require(without is None, (), UNSHOWN, right)
         return None
 
-    @field_validator("vehicle_types", "types", "mixture", mode="before")
+    @field_validator("vehicle_types", "types", "mixture", "table", mode="before")
     @classmethod
     def _not_empty(cls, value: Any) -> Any:
         empty = value is None or (isinstance(value, dict | list | tuple) and not value)
@@ -816,6 +978,22 @@ class ScenarioFields(FileModel):
                 hint = suggestion(name, kinds) or f"known: {', '.join(kinds)}"
                 known = name in kinds or (name == ANY and isinstance(entry, str))
                 require(known, at, entry, f"unknown type {name}; {hint}")
+        return value
+
+    @field_validator("table")
+    @classmethod
+    def _columns_of_line(cls, value: Table | None, info: ValidationInfo) -> Table | None:
+        """Every column is one of this line's, and its numbers are in range."""
+        if value is None or "vehicles" not in info.data:
+            return value
+        known = _table_columns({**QUANTITY.usual, **QUANTITY.optional}, info.data["vehicles"])
+        for name, column in value.column_values().items():
+            hint = suggestion(name, known) or f"known: {', '.join(known)}"
+            require(name in known, ("columns",), name, f"unknown column; {hint}")
+            rule = QUANTITY.declared[known[name][0]]
+            bad = [k for k, number in enumerate(column.rows.tolist()) if not rule.allows(number, number)]
+            at = ("rows", bad[0], value.columns.index(name)) if bad else ()
+            require(not bad, at, column.rows[bad[0]] if bad else 0.0, f"{name} must be {rule.interval}")
         return value
 
     @field_validator(*QUANTITY.declared)
@@ -900,7 +1078,30 @@ class ScenarioFields(FileModel):
         """Whether an obstacle stands ahead of Vehicle 1, however its distance is declared."""
         if self.members:
             return any(member.has_obstacle for member in self.members)
-        return self.obstacle_gap_m is not None or self.obstacle_margin_m is not None
+        return self.declares("obstacle_gap_m") or self.obstacle_margin_m is not None
+
+    @property
+    def has_friction(self) -> bool:
+        """Whether the road is known, in some member of a mixture at least."""
+        return any(member.has_friction for member in self.members) or self.declares("friction")
+
+    @property
+    def awaits_alert(self) -> Floats:
+        """1 for every vehicle that does nothing before the alert, 0 for one whose script depends on the state, [N]."""
+        reacts = {i for i, script in self.scripts.items() if not ScriptSpec.parse(script).is_state_free()}
+        return np.array([float(i not in reacts) for i in range(self.vehicles)])
+
+    def declares(self, field: str) -> bool:
+        """Whether it says what a quantity is: under its key, or in its table for every vehicle or pair."""
+        return getattr(self, field) is not None or _tabled({"table": self.table, "vehicles": self.vehicles}, field)
+
+    @property
+    def table_entries(self) -> dict[Entry, TableColumn]:
+        """The columns of the table by what they say; none without a table."""
+        if self.table is not None and not self._columns:
+            known = _table_columns(QUANTITY.declared, self.vehicles)
+            self._columns.update({known[name]: column for name, column in self.table.column_values().items()})
+        return self._columns
 
     @property
     def by_link(self) -> bool:
@@ -922,6 +1123,9 @@ class ScenarioFields(FileModel):
             return tuple({0: each} for each in self.quantities(field))
         found: list[dict[int, AnyTypeQuantity]] = []
         for i in range(self.vehicles):
+            if (field, i) in self.table_entries:
+                found.append({0: self.table_entries[field, i]})
+                continue
             own = {kind: getattr(line.kinds[kind], field) for kind in line.possible(i)}
             found.append({kind: self.quantities(field)[i] if each is None else each for kind, each in own.items()})
         return tuple(found)
@@ -942,21 +1146,26 @@ class ScenarioFields(FileModel):
         declared: AnyQuantity | tuple[AnyQuantity, ...] | None = getattr(self, QUANTITY.declared[field].name)
         if self.members:
             raise InvalidInput(f"scenario {self.name!r}: is a mixture; its members say what {field} is")
-        if declared is None:
+        if declared is None and not self.declares(field):
             raise InvalidInput(f"scenario {self.name!r}: {field} is not given; it is derived, see Scenario.bounds")
-        if isinstance(declared, tuple):
-            return declared
-        return (declared,) * QUANTITY.declared[field].count(self.vehicles)
+        count = QUANTITY.declared[field].count(self.vehicles)
+        entries: tuple[Any, ...] = declared if isinstance(declared, tuple) else (declared,) * count
+        return tuple(self.table_entries.get((field, i), entry) for i, entry in enumerate(entries))
 
-    def bounds(self, field: str) -> tuple[tuple[float, float], ...]:
-        """Smallest and largest value of each entry of ``gaps_m``, ``speeds_mps``, ..., however it is declared."""
-        lows, highs = zip(*(_all_bounds(member)[field] for member in self.members or (self,)), strict=True)
+    def bounds(self, field: str, *, dry: bool = False) -> tuple[tuple[float, float], ...]:
+        """Smallest and largest value of each entry of ``gaps_m``, ``speeds_mps``, ..., however it is declared.
+
+        Capacities are what the road allows; ``dry``: what they are on a dry one.
+        """
+        found = [world_quantities(member, _supports_of(member)) for member in self.members or (self,)]
+        lows, highs = zip(*((each if dry else on_road(each))[field] for each in found), strict=True)
         return tuple(zip(np.min(lows, axis=0).tolist(), np.max(highs, axis=0).tolist(), strict=True))
 
     @property
     def farthest_obstacle_m(self) -> float:
         """Upper bound of the distance to an obstacle that is declared by its margin."""
-        low, high = ({key: bounds[[row]] for key, bounds in _all_bounds(self).items()} for row in (0, 1))
+        found = on_road(world_quantities(self, _supports_of(self)))
+        low, high = ({key: bounds[[row]] for key, bounds in found.items()} for row in (0, 1))
         slowest = high | {"braking_capacity_mps2": low["braking_capacity_mps2"]}
         farthest = obstacle_gap(self, slowest, lambda key: np.array([support(self.quantities(key)[0])[1]]))
         assert farthest is not None
@@ -999,6 +1208,29 @@ class ScenarioFields(FileModel):
                 parts.append(replace(drawn, types=no_type, scenarios=np.full(len(index), member.name)))
         return Sample.join(parts, sum(part.rejected for part in parts))
 
+    def equipped(self, types: Ints | None = None) -> Equipped:
+        """Who has what of V2X in worlds with these types [n, N]; without them, what everybody surely has, [1, N]."""
+        line, each = self.types_of_line, []
+        own = self.v2x.vehicles or {}
+        for i, name in enumerate(self.vehicle_names):
+            kinds = [Equipage()] if line is None else [kind.v2x or Equipage() for kind in line.kinds]
+            if name in own:
+                kinds = [own[name]] * len(kinds)
+            here = Equipped.of(kinds)
+            if types is not None:
+                each.append((here.sends[0, types[:, i]], here.hears[0, types[:, i]]))
+            else:
+                possible = [0] if line is None else line.possible(i)
+                each.append((here.sends[:, possible].all(axis=1), here.hears[:, possible].max(axis=1)))
+        sends, hears = zip(*each, strict=True)
+        return Equipped(np.stack(sends, axis=1), np.stack(hears, axis=1))
+
+    def middle_world(self) -> Worlds:
+        """The world (n = 1) in which every number is in the middle of its distribution: the median."""
+        alone = self.model_copy()
+        alone._columns = {entry: column.middle for entry, column in self.table_entries.items()}
+        return alone.sample_by(lambda width, of: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
+
     def sample_by(self, numbers: Callable[[int, tuple[int, ...]], Floats], index: Ints) -> Sample:
         """The worlds of ``numbers(width, of)``, uniform numbers [n, width] of a stream, ``()`` the first; all of them.
 
@@ -1008,27 +1240,25 @@ class ScenarioFields(FileModel):
         if line is not None:
             u = numbers(PER_TYPE * self.vehicles, TYPES)
             typed = line.draw(u.reshape(len(u), self.vehicles, PER_TYPE))
-        drawn = drawn_quantities(self, numbers(BLOCK * self.vehicles, ()), typed)
-        obstacle_gap_m = obstacle_gap(
-            self, drawn, lambda key: values(self.quantities(key)[0], numbers(OF_WORLD, OBSTACLE)[:, 0])
+        declared = drawn_quantities(self, numbers, typed)
+        drawn = world_quantities(self, declared)
+        obstacle_gap_m = obstacle_gap(self, on_road(drawn), lambda key: declared(key)[:, 0])
+        of_world = {key: drawn.pop(key)[:, 0] for key in ("restitution", "friction") if key in drawn}
+        worlds = make_worlds(
+            drawn.pop("gaps_m"), drawn.pop("speeds_mps"), obstacle_gap_m=obstacle_gap_m, **of_world, **drawn
         )
-        restitution, gaps, speeds = drawn.pop("restitution")[:, 0], drawn.pop("gaps_m"), drawn.pop("speeds_mps")
-        worlds = make_worlds(gaps, speeds, restitution=restitution, obstacle_gap_m=obstacle_gap_m, **drawn)
         if self.v2x.by_link:
             u = numbers(self.v2x.width(self.vehicles), V2X_NEWS)
             periodic = self.v2x.channel.persistence == "periodic"
             key = numbers(OF_WORLD, LATER_LOSSES)[:, 0] if periodic else np.zeros(len(u))
-            worlds = self.v2x.with_channel(worlds, u, key, self.time_step_s)
+            equipped = self.equipped(None if typed is None else typed[0])
+            worlds = self.v2x.with_channel(worlds, u, key, self.time_step_s, equipped)
         return Sample(worlds, index, 0, None if typed is None or line is None else np.array(line.names)[typed[0]])
 
     @property
     def table_columns(self) -> dict[str, Entry]:
         """Columns that a table of initial states may have for this scenario: ``gap_1_m``, ``speed_1_mps``, ..."""
-        return {
-            rule.column_of(index): (field, index)
-            for field, rule in _quantities(self).items()
-            for index in range(rule.count(self.vehicles))
-        }
+        return _table_columns(_quantities(self), self.vehicles)
 
     def read_worlds(self, path: str | Path) -> Worlds:
         """Read worlds from a CSV file with a header line; columns as in ``worlds_from_table``.
@@ -1041,14 +1271,7 @@ class ScenarioFields(FileModel):
         entries = _known_columns(header, self, f"{file}, line 1")
         table = np.empty((len(rows), len(header)))
         for r, row in enumerate(rows):
-            if len(row) != len(header):
-                right = f"the header has {len(header)} columns"
-                raise InvalidInput(f"{file}, line {lines[r]}: {len(row)} values, but {right}")
-            for c, text in enumerate(row):
-                number = parse_numeral(text.strip())
-                if number is None:
-                    raise InvalidInput(f"{file}, line {lines[r]}, column {header[c]}: {text!r:.60} is not a number")
-                table[r, c] = number
+            table[r] = [_number_at(file, header, row, lines[r], name) for name in header]
         given = {entry: table[:, c] for c, entry in enumerate(entries)}
         return _worlds(given, self, _Naming(str(file), "file", lines))
 
@@ -1128,11 +1351,21 @@ def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]
     """
     other = {"gaps_m": scenario.time_gaps_s, "speeds_mps": scenario.line_speed_mps}
     found = {key: declared(key) for key in QUANTITY.usual if other.get(key) is None}
+    if scenario.alert_s is not None:
+        found["latency_s"] = found["latency_s"] + declared("alert_s") * scenario.awaits_alert
+    if scenario.declares("friction"):
+        found["friction"] = declared("friction")
     if scenario.line_speed_mps is not None:
         found["speeds_mps"] = declared("line_speed_mps") + declared("speed_deviations_mps")
     if scenario.time_gaps_s is not None:
         found["gaps_m"] = declared("time_gaps_s") * found["speeds_mps"][:, 1:]
-    return {key: found[key] for key in QUANTITY.usual}
+    return {key: found[key] for key in (*QUANTITY.usual, "friction") if key in found}
+
+
+def on_road(found: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Quantities of worlds, their capacities as the road allows them: at most friction times gravity."""
+    most = found["friction"] * GRAVITY_MPS2 if "friction" in found else np.inf
+    return {key: np.minimum(value, most) if key in ON_ROADS else value for key, value in found.items()}
 
 
 def obstacle_gap(
@@ -1142,7 +1375,7 @@ def obstacle_gap(
 
     As declared, or ``margin + v_1 tau_1 + v_1^2 / (2 a_1)``: so far beyond where Vehicle 1 stops by itself.
     """
-    if scenario.obstacle_gap_m is not None:
+    if scenario.declares("obstacle_gap_m"):
         return declared("obstacle_gap_m")
     if scenario.obstacle_margin_m is None:
         return None
@@ -1151,44 +1384,45 @@ def obstacle_gap(
 
 
 def drawn_quantities(
-    scenario: ScenarioFields, u: Floats, typed: tuple[Ints, Floats] | None = None
-) -> dict[str, Floats]:
-    """Every quantity of n worlds, each [n, entries], from their uniform numbers ``u`` [n, width].
+    scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...]], Floats], typed: tuple[Ints, Floats] | None
+) -> Callable[[str], Floats]:
+    """What each declared key is in n worlds, [n, entries], from ``numbers`` as of ``ScenarioFields.sample_by``.
 
     ``typed``: type (index) and load of every vehicle, both [n, N], where the scenario has types.
     """
+    streams: dict[tuple[int, ...], Floats] = {(): numbers(BLOCK * scenario.vehicles, ())}
+
+    def at(place: Place) -> Floats:
+        of, column = place
+        if of not in streams:
+            streams[of] = numbers(OF_WORLD, of)
+        return streams[of][:, column]
 
     def drawn(key: str) -> Floats:
         entries, rule = scenario.possible_quantities(key), QUANTITY.declared[key]
-        found = np.empty((len(u), len(entries)))
+        found = np.empty((len(streams[()]), len(entries)))
         for i, possible in enumerate(entries):
             for kind, entry in possible.items():
                 rows = slice(None) if typed is None or len(possible) == 1 else typed[0][:, i] == kind
+                u = at(ROW if isinstance(entry, TableColumn) else rule.place(i))[rows]
                 if isinstance(entry, WithLoad):
                     assert typed is not None
-                    found[rows, i] = entry.value(typed[1][rows, i])
+                    found[rows, i] = entry.value(typed[1][rows, i], u)
                 else:
-                    found[rows, i] = values(entry, u[rows, rule.place(i)])
+                    found[rows, i] = values(entry, u)
         return found
 
-    return world_quantities(scenario, drawn)
+    return drawn
 
 
-def _all_bounds(scenario: ScenarioFields) -> dict[str, Floats]:
-    """Smallest and largest value of every entry of every quantity of a world, each [2, entries]."""
-    return world_quantities(scenario, lambda key: np.array(scenario.supports(key)).T)
+def _supports_of(scenario: ScenarioFields) -> Callable[[str], Floats]:
+    """Smallest and largest value of every entry of each declared key, [2, entries]."""
+    return lambda key: np.array(scenario.supports(key)).T
 
 
 Channel = Literal["list", "training"]
 
 CHANNELS: dict[str, int] = {"list": 0, "training": 1}
-V2X_NEWS = (1,)  # the stream of the links' delays and losses
-OBSTACLE = (2,)  # the stream of the obstacle's distance
-TYPES = (3,)  # the stream of the vehicles' types and loads
-MIXTURE = (4,)  # the stream of what each world of a mixture is drawn from
-LATER_LOSSES = (5,)  # the stream of a world's key, from which its later messages are lost or not
-OF_WORLD = 4  # numbers per world of the streams of obstacle, mixture and later losses; the first is used
-PER_TYPE = 4  # its numbers per vehicle: type, load, and two that are free; one Philox counter
 MOST_ATTEMPTS = 1000  # draws of one world before its scenario is declared unusable
 _PATIENCE = 10  # attempts of a whole list before one world is tried to its end
 
@@ -1322,7 +1556,22 @@ class _Naming:
 
 def _quantities(scenario: ScenarioFields) -> dict[str, QuantityRule]:
     """What a world of this scenario has."""
-    return {**QUANTITY.usual, **QUANTITY.optional} if scenario.has_obstacle else QUANTITY.usual
+    there = {"obstacle_gap_m": scenario.has_obstacle, "friction": scenario.has_friction}
+    return QUANTITY.usual | {key: rule for key, rule in QUANTITY.optional.items() if there[key]}
+
+
+def _table_columns(rules: Mapping[str, QuantityRule], vehicles: int) -> dict[str, Entry]:
+    """The columns of a table with these quantities, and the entry of each."""
+    named = {key: rule for key, rule in rules.items() if rule.column}
+    return {rule.column_of(i): (key, i) for key, rule in named.items() for i in range(rule.count(vehicles))}
+
+
+def _tabled(data: Mapping[str, Any], key: str) -> bool:
+    """Whether the table of fields of a scenario has every entry of a quantity."""
+    table, rule = data.get("table"), QUANTITY.declared[key]
+    if table is None or "vehicles" not in data or not rule.column:
+        return False
+    return all(rule.column_of(i) in table.columns for i in range(rule.count(data["vehicles"])))
 
 
 def _worlds(given: Mapping[Entry, Floats], scenario: ScenarioFields, naming: _Naming) -> Worlds:
@@ -1335,7 +1584,8 @@ def _worlds(given: Mapping[Entry, Floats], scenario: ScenarioFields, naming: _Na
     n = len(next(iter(given.values()))) if given else 1
     full: dict[str, Floats] = {}
     rules = _quantities(scenario)
-    for field, rule in sorted(rules.items(), key=lambda item: item[0] == "gaps_m"):  # gaps may need the speeds
+    last = ("gaps_m", "obstacle_gap_m")  # may need the others
+    for field, rule in sorted(rules.items(), key=lambda item: item[0] in last):
         full[field] = np.empty((n, rule.count(scenario.vehicles)))
         for index in range(rule.count(scenario.vehicles)):
             column = given.get((field, index))
@@ -1350,7 +1600,11 @@ def _worlds(given: Mapping[Entry, Floats], scenario: ScenarioFields, naming: _Na
     _check_together(full, scenario, naming)
     of_world = {field: full.pop(field)[:, 0] for field, rule in rules.items() if rule.per == "world"}
     worlds = make_worlds(full.pop("gaps_m"), full.pop("speeds_mps"), **of_world, **full)
-    return scenario.v2x.with_fixed_news(worlds, scenario.time_step_s, naming.where)
+    line = scenario.types_of_line
+    drawn = line is not None and any(kind.v2x is not None for kind in line.kinds)
+    return scenario.v2x.with_fixed_news(
+        worlds, scenario.time_step_s, naming.where, None if drawn else scenario.equipped()
+    )
 
 
 def _fixed(scenario: ScenarioFields, field: str, index: int, full: Mapping[str, Floats]) -> Floats | None:
@@ -1358,12 +1612,12 @@ def _fixed(scenario: ScenarioFields, field: str, index: int, full: Mapping[str, 
 
     A time gap is taken at the speeds in ``full``, the margin to an obstacle from where Vehicle 1 stops there.
     """
-    if field in QUANTITY.optional:
-        declared = QUANTITY.alternatives[field] if getattr(scenario, field) is None else field
-        low, high = support(scenario.quantities(declared)[0])
-        return obstacle_gap(scenario, full, lambda key: np.array([low])) if low == high else None
+    if field == "obstacle_gap_m":
+        low, high = support(scenario.quantities(field if scenario.declares(field) else "obstacle_margin_m")[0])
+        return obstacle_gap(scenario, on_road(full), lambda key: np.array([low])) if low == high else None
     by_time = field == "gaps_m" and scenario.time_gaps_s is not None
-    low, high = support(scenario.quantities("time_gaps_s")[index]) if by_time else scenario.bounds(field)[index]
+    told = scenario.bounds(field, dry=True)[index]
+    low, high = support(scenario.quantities("time_gaps_s")[index]) if by_time else told
     if low != high:
         return None
     return low * full["speeds_mps"][:, index + 1] if by_time else np.array([low])
@@ -1436,12 +1690,41 @@ def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:
     return [name.strip() for name in rows[0]], rows[1:], lines[1:]
 
 
+def read_table(file: Path, columns: object, weights: object) -> dict[str, Any]:
+    """The rows of a scenario's table, and their weights, from these columns of a CSV file; all columns by default.
+
+    Raises ``InvalidInput`` naming file, line and column.
+    """
+    header, rows, lines = _read_csv(file)
+    weights_of = [] if weights is None else [weights]
+    named = [name for name in header if name != weights] if columns is None else columns
+    if not isinstance(named, list | tuple):
+        raise InvalidInput(f"{file}: columns = {named!r:.60}: must be a list of columns")
+    for name in (*named, *weights_of):
+        if header.count(name) != 1:
+            many = "is there twice" if name in header else f"is not there; {suggestion(str(name), header)}"
+            raise InvalidInput(f"{file}, line 1: column {name!r:.60} {many.removesuffix('; ')}")
+    found = [[_number_at(file, header, row, line, str(name)) for name in (*named, *weights_of)]
+             for row, line in zip(rows, lines, strict=True)]  # fmt: skip
+    told: dict[str, Any] = {"columns": list(named), "rows": [row[: len(named)] for row in found]}
+    return told if weights is None else told | {"weights": [row[-1] for row in found]}
+
+
+def _number_at(file: Path, header: list[str], row: list[str], line: int, column: str) -> float:
+    """The number in this column of a row of a CSV file."""
+    if len(row) != len(header):
+        raise InvalidInput(f"{file}, line {line}: {len(row)} values, but the header has {len(header)} columns")
+    text = row[header.index(column)]
+    number = parse_numeral(text.strip())
+    if number is None:
+        raise InvalidInput(f"{file}, line {line}, column {column}: {text!r:.60} is not a number")
+    return number
+
+
 # The ranges of a scenario as a unit cube: one coordinate for each number that it draws.
 #
 # A search moves in the cube, where every point is as likely as any other and gives one world; a list is a random sample
 # of it.
-
-Place = tuple[tuple[int, ...], int]  # a stream of uniform numbers, and the column in it
 
 _UNUSED = 0.5  # in the place of numbers that change nothing
 
@@ -1460,7 +1743,7 @@ class Ranges:
         A scenario that rejects early impacts does not accept worlds that have one.
         """
         n, vehicles = len(points), self.scenario.vehicles
-        widths = {(): BLOCK * vehicles, TYPES: PER_TYPE * vehicles, OBSTACLE: OF_WORLD}
+        widths = {(): BLOCK * vehicles, TYPES: PER_TYPE * vehicles, OBSTACLE: OF_WORLD, SURROUNDINGS: OF_WORLD}
         streams = {of: np.full((n, width), _UNUSED) for of, width in widths.items()}
         for (of, column), u in zip(self.places, points.T, strict=True):
             streams[of][:, column] = u
@@ -1479,15 +1762,15 @@ def _of_quantities(scenario: ScenarioFields) -> dict[str, Place]:
         return np.ones((1, len(scenario.possible_quantities(key))))
 
     world_quantities(scenario, note)
+    used += [key for key in ("obstacle_gap_m", "obstacle_margin_m") if getattr(scenario, key) is not None]
     places: dict[str, Place] = {
-        _name(key, i): ((), QUANTITY.declared[key].place(i))
+        _name(key, i): QUANTITY.declared[key].place(i)
         for key in used
         for i, possible in enumerate(scenario.possible_quantities(key))
-        if any(not isinstance(entry, WithLoad) and _drawn(entry) for entry in possible.values())
+        if any(_drawn(entry.spread if isinstance(entry, WithLoad) else entry) for entry in possible.values())
     }
-    for key in ("obstacle_gap_m", "obstacle_margin_m"):
-        if getattr(scenario, key) is not None and _drawn(scenario.quantities(key)[0]):
-            places[key] = (OBSTACLE, 0)
+    if any(_drawn(column, tabled=True) for column in scenario.table_entries.values()):
+        places["row of the table"] = ROW
     return places
 
 
@@ -1505,9 +1788,9 @@ def _of_types(scenario: ScenarioFields) -> dict[str, Place]:
     return places
 
 
-def _drawn(entry: object) -> bool:
-    low, high = support(entry)  # type: ignore[arg-type]
-    return low != high
+def _drawn(entry: AnyTypeQuantity, *, tabled: bool = False) -> bool:
+    low, high = support(entry)
+    return low != high and isinstance(entry, TableColumn) == tabled
 
 
 def _name(key: str, index: int) -> str:

@@ -19,6 +19,7 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.files.yaml import (
     NAME_PATTERN,
+    UNSHOWN,
     Document,
     FileSchema,
     Wording,
@@ -39,6 +40,7 @@ from ethbrake_marl.scenario.sampling import (
     Member,
     ScenarioFields,
     ScriptSpec,
+    read_table,
     support,
 )
 
@@ -54,8 +56,16 @@ def check_whole(scenario: ScenarioFields) -> None:
     alone = "speed_deviations_mps" in scenario.model_fields_set and scenario.line_speed_mps is None
     right = "needs line_speed_mps, the speed that it is added to"
     require(not alone, ("speed_deviations_mps",), scenario.speed_deviations_mps, right)
+    for key in scenario.model_fields_set & QUANTITY.declared.keys():
+        tabled = [entry for entry in scenario.table_entries if entry[0] == key]
+        whole = len(tabled) == QUANTITY.declared[key].count(scenario.vehicles)
+        require(not whole, (key,), getattr(scenario, key), "the table says it for all; leave it out")
     for usual, other in QUANTITY.alternatives.items():
         given = [key for key in (usual, other) if getattr(scenario, key) is not None]
+        columns = [column.name for (key, _), column in scenario.table_entries.items() if key == usual]
+        right = f"the table has {', '.join(columns)}: give {usual} for the rest, not {other}"
+        require(not (columns and other in given), (other,), getattr(scenario, other), right)
+        given += [usual] * (usual not in given and scenario.declares(usual))
         if not given and usual not in QUANTITY.optional:
             raise PydanticCustomError("missing", "missing", {"at": (usual,)})
         right = f"give either {usual} or {other}, not both"
@@ -76,8 +86,18 @@ def check_whole(scenario: ScenarioFields) -> None:
 
 def _check_reactions(scenario: ScenarioFields) -> None:
     """However late the news is, every vehicle may act before the horizon."""
-    own = np.array([latest for _, latest in scenario.supports("latency_s")])
-    for i, latest in enumerate(scenario.v2x.latest_reaction_s(own)):
+    for name in scenario.v2x.vehicles or ():
+        right = f"unknown vehicle; this scenario has vehicle_1 ... vehicle_{scenario.vehicles}"
+        require(name in scenario.vehicle_names, ("v2x", "vehicles", name), UNSHOWN, right)
+    kinds = {name: kind.v2x for name, kind in (scenario.vehicle_types or {}).items() if kind.v2x is not None}
+    right = f"v2x {scenario.v2x.preset} has no messages that a type could lack; give a v2x that has, such as nominal"
+    for name, equipage in kinds.items():
+        sent = scenario.v2x.channel.timing != "latency" and scenario.v2x.channel.hears != "none"
+        require(sent, ("vehicle_types", name, "v2x"), equipage, right)
+    right = "only without messages one by one (v2x: paper): what was heard before the alert is not modelled"
+    require(scenario.alert_s is None or not scenario.v2x.by_link, ("alert_s",), scenario.alert_s, right)
+    own = np.array([latest for _, latest in scenario.bounds("latency_s")])
+    for i, latest in enumerate(scenario.v2x.latest_reaction_s(own, scenario.equipped())):
         right = (
             f"vehicle_{i + 1} may have no news until {latest:g} s; it must be below horizon_s"
             f" ({scenario.horizon_s:g} s), which may be raised"
@@ -123,7 +143,7 @@ def _check_scripts(scenario: ScenarioFields) -> None:
     for i, script in scenario.scripts.items():
         deceleration = ScriptSpec.parse(script).deceleration_mps2 or 0.0
         field = "braking_capacity_mps2" if deceleration > 0.0 else "driving_capacity_mps2"
-        capacity = scenario.supports(field)[i][0]
+        capacity = scenario.bounds(field)[i][0]
         right = f"is above this vehicle's {field}, {capacity:g} m/s2"
         require(abs(deceleration) <= capacity, ("roles", f"vehicle_{i + 1}"), script, right)
     right = "has nothing to brake for without an obstacle ahead; give obstacle_gap_m too, for instance 42"
@@ -617,18 +637,35 @@ def _load(path: Path) -> Scenario:
 
 
 def _with_members(document: Document, folder: Path) -> Document:
-    """The document of a mixture with the content of every member in place of its name, or of a path from ``folder``."""
-    content = document.content
+    """The document with what it names in place of the names: members of a mixture, and files of tables.
+
+    Paths count from ``folder``.
+    """
+    content = _with_rows(document, (), document.content, folder)
     listed = content.get("mixture") if isinstance(content, dict) else None
-    if not isinstance(listed, list | tuple):
-        return document
-    found = [
-        {**entry, "scenario": _member(entry["scenario"], document.where(("mixture", i, "scenario")), i, folder)}
-        if isinstance(entry, dict) and isinstance(entry.get("scenario"), str)
-        else entry
-        for i, entry in enumerate(listed)
-    ]
-    return Document(document.file, {**content, "mixture": found}, document.lines)
+    if isinstance(listed, list | tuple):
+        found = []
+        for i, entry in enumerate(listed):
+            member, at = entry.get("scenario") if isinstance(entry, dict) else None, ("mixture", i, "scenario")
+            if isinstance(member, str):
+                entry = {**entry, "scenario": _member(member, document.where(at), i, folder)}
+            elif isinstance(member, dict):
+                entry = {**entry, "scenario": _with_rows(document, at, member, folder)}
+            found.append(entry)
+        content = {**content, "mixture": found}
+    return Document(document.file, content, document.lines)
+
+
+def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> Any:
+    """What a scenario says, with the rows of its table's file."""
+    table = content.get("table") if isinstance(content, dict) else None
+    if not (isinstance(table, dict) and isinstance(table.get("file"), str)) or "rows" in table:
+        return content
+    path, where = Path(table["file"]), document.where((*at, "table", "file"))
+    if path.is_absolute() or ".." in path.parts:
+        raise InvalidInput(f"{where}: table.file = {table['file']}: must be a path from the scenario's folder on")
+    with document.refusing_at((*at, "table", "file")):
+        return {**content, "table": {**table, **read_table(folder / path, table.get("columns"), table.get("weights"))}}
 
 
 def _member(name: str, where: str, i: int, folder: Path) -> dict[str, Any]:

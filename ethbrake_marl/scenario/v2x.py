@@ -24,10 +24,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from operator import not_
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from pydantic import AfterValidator, Field, GetJsonSchemaHandler, ValidationError, model_validator
@@ -36,7 +36,7 @@ from pydantic_core import CoreSchema
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.files.yaml import Document, FileModel, Wording, require
-from ethbrake_marl.physics import Floats, Ints, Messages, Vehicles, Worlds
+from ethbrake_marl.physics import Bools, Floats, Ints, Messages, Vehicles, Worlds
 
 PER_LINK = 4  # uniform numbers of one link: wait, burst, loss, hop; one Philox counter
 
@@ -45,6 +45,34 @@ Senses = Literal["both", "front", "none"]
 Persistence = Literal["first", "periodic"]
 Seconds = Annotated[float, Field(ge=0.0, le=60.0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
+
+
+class Equipage(FileModel):
+    """What one vehicle, or a type of vehicles, has of V2X."""
+
+    sends: bool = Field(default=True, description="whether others can hear of it")
+    hears: Hears = Field(default="all", description="whose messages it gets, of those that the channel brings")
+
+
+class Equipped(NamedTuple):
+    """Who has what of V2X in n worlds; of one world also what every possible world has."""
+
+    sends: Bools  # [n, N]
+    hears: Ints  # [n, N] index of a word of ``Hears``
+
+    @classmethod
+    def of(cls, equipage: Sequence[Equipage]) -> Equipped:
+        """One world of these vehicles, [1, N]."""
+        hears = [get_args(Hears).index(each.hears) for each in equipage]
+        return cls(np.array([[each.sends for each in equipage]]), np.array([hears]))
+
+    @property
+    def unheard(self) -> Bools:
+        """Whether vehicle i never gets a message of vehicle j, [n, N, N]."""
+        receiver, sender = np.indices((self.sends.shape[1],) * 2)
+        hears = self.hears[:, :, np.newaxis]
+        unheard: Bools = ~self.sends[:, np.newaxis] | (hears == 2) | ((hears == 1) & (sender >= receiver))
+        return unheard
 
 
 class Channel(NamedTuple):
@@ -141,6 +169,11 @@ class V2X(FileModel):
         exclude_if=not_,
         description="whether what was once heard stays present, or grows old until the next message",
     )
+    vehicles: dict[str, Equipage] | None = Field(
+        default=None,
+        exclude_if=not_,
+        description="vehicle -> what it has of V2X, where that differs: {vehicle_3: {sends: false, hears: none}}",
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -156,13 +189,13 @@ class V2X(FileModel):
         right = "nobody sends messages one by one here; give a preset that generates them, such as nominal"
         self._require(channel.persistence == "first" or sent, "persistence", right)
         if channel.hears == "none":
-            self._leave_out(("link_latency_s", "lost", *_OF_MESSAGES), "hears none has no messages")
+            self._leave_out(("link_latency_s", "lost", "vehicles", *_OF_MESSAGES), "hears none has no messages")
         elif channel.timing == "fixed":
             later = _OF_LATER if channel.persistence == "periodic" else ()
             parts = tuple(name for name in _OF_MESSAGES if name not in later)
             self._leave_out(parts, "a fixed link_latency_s has no generated messages")
         elif channel.timing == "latency":
-            self._leave_out(_OF_MESSAGES, f"preset {self.preset} has no generated messages")
+            self._leave_out((*_OF_MESSAGES, "vehicles"), f"preset {self.preset} has no generated messages")
         if channel.senses == "none":
             self._leave_out(("sensing_s",), "senses none has nobody in sight")
         low, high = channel.sensing_s
@@ -183,7 +216,7 @@ class V2X(FileModel):
 
     def _require(self, holds: bool, name: str, right: str) -> None:
         value = getattr(self, name)
-        require(holds, (name,), getattr(self.channel, name) if value is None else value, right)
+        require(holds, (name,), getattr(self.channel, name, value) if value is None else value, right)
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
@@ -213,8 +246,8 @@ class V2X(FileModel):
         lossy = lossy or (channel.persistence == "periodic" and channel.loss_begins > 0.0)
         return self.by_link and (by_messages or lossy or (channel.senses != "none" and low != high))
 
-    def latest_reaction_s(self, own_latency_s: Floats) -> Floats:
-        """Upper bound of each vehicle's latency, [N], from that of its own part [N]."""
+    def latest_reaction_s(self, own_latency_s: Floats, equipped: Equipped) -> Floats:
+        """Upper bound of each vehicle's latency, [N], from that of its own part [N], and what all surely have."""
         channel, latest = self.channel, own_latency_s.copy()
         if channel.timing == "latency":
             return latest
@@ -222,7 +255,7 @@ class V2X(FileModel):
         heard = float(link_delays(channel, _LATEST)[0]) if sure else np.inf
         for i in range(1, len(latest)):
             seen = latest[i - 1] + channel.sensing_s[1] if channel.senses != "none" else np.inf
-            latest[i] = max(latest[i], min(seen, heard))
+            latest[i] = max(latest[i], min(seen, np.inf if equipped.unheard[0, i, 0] else heard))
         return latest
 
     @staticmethod
@@ -230,12 +263,12 @@ class V2X(FileModel):
         """How many uniform numbers the news of a line takes."""
         return PER_LINK * vehicles * vehicles
 
-    def with_news(self, vehicles: Vehicles, u: Floats) -> Vehicles:
+    def with_news(self, vehicles: Vehicles, u: Floats, equipped: Equipped) -> Vehicles:
         """These vehicles with the latencies and the news of the channel drawn by ``u`` [n, N * N * PER_LINK] in [0, 1).
 
         Their latencies, so far all own, stay as ``own_latency_s``.
         """
-        (N, channel), (heard, seen) = (vehicles.latency_s.shape[1], self.channel), self.heard_and_seen(vehicles, u)
+        (N, channel), (heard, seen) = (vehicles.latency_s.shape[1], self.channel), self.heard_and_seen(u, equipped)
         latency = vehicles.latency_s.copy()
         if channel.timing != "latency":
             for i in range(1, N):
@@ -245,21 +278,21 @@ class V2X(FileModel):
         known[:, np.arange(N), np.arange(N)] = latency  # no vehicle waits for a message from itself
         return replace(vehicles, latency_s=latency, known_from_s=known)
 
-    def heard_and_seen(self, vehicles: Vehicles, u: Floats) -> tuple[Floats, Floats]:
+    def heard_and_seen(self, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
         """When a first message of vehicle j reaches vehicle i, and when i sees j, [n, N, N] s each; infinite: never."""
-        n, N = vehicles.latency_s.shape
-        channel, links = self.channel, u.reshape(n, N, N, PER_LINK)
+        N = equipped.sends.shape[1]
+        channel, links = self.channel, u.reshape(len(u), N, N, PER_LINK)
         low, high = channel.sensing_s
         hop = low + (high - low) * links[..., 3]
         heard = link_delays(channel, links)
         receiver, sender = np.indices((N, N))
         unheard = {"all": sender < 0, "front": sender >= receiver, "none": sender >= 0}
-        heard[:, unheard[channel.hears]] = np.inf
+        heard = np.where(unheard[channel.hears] | equipped.unheard, np.inf, heard)
         ahead = sender == receiver - 1
         in_sight = {"both": ahead | (sender == receiver + 1), "front": ahead, "none": sender < 0}
         return heard, np.where(in_sight[channel.senses], hop, np.inf)
 
-    def with_channel(self, worlds: Worlds, u: Floats, key: Floats, time_step_s: float) -> Worlds:
+    def with_channel(self, worlds: Worlds, u: Floats, key: Floats, time_step_s: float, equipped: Equipped) -> Worlds:
         """These worlds at the alert with their news and, where messages are periodic, their columns, none sent yet.
 
         Args:
@@ -267,30 +300,34 @@ class V2X(FileModel):
             u: what the news is drawn by, [n, N * N * PER_LINK] in [0, 1).
             key: [n] in [0, 1), one for all later losses of a world.
             time_step_s: between two decisions, at which vehicles sample their states.
+            equipped: who has what of it, in each world or in all.
 
         """
         channel = self.channel
-        worlds = replace(worlds, vehicles=self.with_news(worlds.vehicles, u))
+        worlds = replace(worlds, vehicles=self.with_news(worlds.vehicles, u, equipped))
         if channel.persistence == "first":
             return worlds
-        heard, seen = self.heard_and_seen(worlds.vehicles, u)
+        heard, seen = self.heard_and_seen(u, equipped)
         messages = Messages.silent(
             heard, seen, key * 2.0**53, channel.samples(time_step_s), period_s=channel.message_period_s,
             delay_s=channel.delay_s, loss_begins=channel.loss_begins, loss_ends=channel.loss_ends,
         )  # fmt: skip
         return replace(worlds, messages=messages.columns)
 
-    def with_fixed_news(self, worlds: Worlds, time_step_s: float, where: str) -> Worlds:
-        """Worlds that somebody gives with this channel; ``InvalidInput`` where it leaves something to chance."""
+    def with_fixed_news(self, worlds: Worlds, time_step_s: float, where: str, equipped: Equipped | None) -> Worlds:
+        """Worlds that somebody gives with this channel; ``InvalidInput`` where it leaves something to chance.
+
+        ``equipped``: who has what of it; None: that is drawn, too.
+        """
         if not self.by_link:
             return worlds
-        if self.drawn:
+        if self.drawn or equipped is None:
             raise InvalidInput(
                 f"{where}: the scenario draws what each vehicle knows when (v2x: {self.preset}); take one whose channel"
                 " is fixed, for instance scenario.replace(v2x='paper')"
             )
         n, N = worlds.speeds_mps.shape
-        return self.with_channel(worlds, np.zeros((n, self.width(N))), np.zeros(n), time_step_s)
+        return self.with_channel(worlds, np.zeros((n, self.width(N))), np.zeros(n), time_step_s, equipped)
 
 
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:

@@ -18,7 +18,7 @@ import numpy as np
 
 from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.physics import Floats, Vehicles, Worlds
+from ethbrake_marl.physics import ON_ROADS, Floats, Vehicles, Worlds
 from ethbrake_marl.scenario import QUANTITY, Scenario
 
 # Checks of what a shield is built with: amounts, scenario, policy, environment.
@@ -42,8 +42,8 @@ def check_scenario(scenario: object, where: str) -> None:
 
 
 OF_VEHICLES = ("braking_capacity_mps2", "driving_capacity_mps2", "latency_s", "mass_t")  # fields of ``Vehicles``
-QUANTITIES = (*OF_VEHICLES, "speeds_mps", "gaps_m")
-POSITIVE = ("braking_capacity_mps2", "mass_t")  # must stay above 0
+QUANTITIES = (*OF_VEHICLES, "speeds_mps", "gaps_m", "friction")
+POSITIVE = ("braking_capacity_mps2", "mass_t", "friction")  # must stay above 0
 MOST_CORNERS = 1024  # of one world: each costs as much as the world itself
 _FORM = f"must be quantity=half-width, for instance {DEFAULT.UNCERTAINTY_EXAMPLE}"
 
@@ -70,6 +70,8 @@ class Interval:
             raise InvalidInput(f"uncertainty: {self.quantity}: half-width {self.half_width!r}: must be {told}")
         if self.place is not None and not (isinstance(self.place, int | np.integer) and self.place >= 0):
             raise InvalidInput(f"uncertainty: {self.quantity}: place {self.place!r}: must be an index from 0")
+        if self.quantity == "friction" and self.place is not None:
+            raise InvalidInput("uncertainty: friction is one number for the whole line; give it without a vehicle")
 
     def __str__(self) -> str:
         kind = "pair" if self.quantity == "gaps_m" else "vehicle"
@@ -148,6 +150,8 @@ class Uncertainty:
             every, name = _values(worlds, interval.quantity), interval.quantity
             if interval.half_width == 0.0:
                 continue
+            if not np.isfinite(every).all():
+                raise InvalidInput(f"uncertainty: {interval}: the scenario has no friction; declare it there")
             if interval.place is not None and interval.place >= every.shape[1]:
                 raise InvalidInput(f"uncertainty: {interval}: the line has only {every.shape[1]} of these")
             for place in range(every.shape[1]) if interval.place is None else (interval.place,):
@@ -157,7 +161,7 @@ class Uncertainty:
                 if name in POSITIVE and not (low > 0.0).all():
                     k = int(np.argmin(low))
                     raise InvalidInput(
-                        f"uncertainty: {interval}: {told[k]:g} of vehicle_{place + 1} in world {k} may be as low as"
+                        f"uncertainty: {interval}: {told[k]:g}{_of(name, place)} in world {k} may be as low as"
                         f" {low[k]:g}; it must stay above 0"
                     )
                 most = worlds.vehicles.speed_limit_mps[:, place] if name == "speeds_mps" else np.inf
@@ -165,7 +169,7 @@ class Uncertainty:
                 if not (high <= rule.high).all():
                     k = int(np.argmax(high))
                     raise InvalidInput(
-                        f"uncertainty: {interval}: {told[k]:g} of {rule.owner(place)} in world {k} may be as high as"
+                        f"uncertainty: {interval}: {told[k]:g}{_of(name, place)} in world {k} may be as high as"
                         f" {high[k]:g}; must be {rule.interval}"
                     )
                 sides.append((name, place, np.maximum(low, 0.0), high))
@@ -198,15 +202,20 @@ def parse_uncertainty(text: str) -> Uncertainty:
 
 
 def _values(worlds: Worlds, quantity: str) -> Floats:
-    """What was told, [n, N] or [n, P]."""
-    return np.asarray(getattr(worlds.vehicles if quantity in OF_VEHICLES else worlds, quantity), np.float64)
+    """What was told, [n, N], [n, P] or, of the road, [n, 1]; capacities as they are on a dry road."""
+    return QUANTITY.declared[quantity].of(worlds)
+
+
+def _of(quantity: str, place: int) -> str:
+    owner = QUANTITY.declared[quantity].owner(place)
+    return f" of {owner}" if owner else ""
 
 
 def _placed(worlds: Worlds, sides: list[_Side], share: Callable[[int], Floats | int]) -> Worlds:
     """The worlds with each uncertain number at ``share(k)`` of its interval: 0 its least value, 1 its largest.
 
     Without a channel an uncertain latency is also what others are told, and when the news is known. With one, only the
-    reaction is uncertain.
+    reaction is uncertain. Friction limits the capacities of all vehicles together.
     """
     changed: dict[str, Any] = {}
     for k, (quantity, place, low, high) in enumerate(sides):
@@ -216,5 +225,9 @@ def _placed(worlds: Worlds, sides: list[_Side], share: Callable[[int], Floats | 
     if "latency_s" in changed and worlds.vehicles.is_known_at_once:
         latency = changed["latency_s"]
         changed |= {"own_latency_s": latency, "known_from_s": Vehicles.known_at_once(latency)}
+    friction = changed.pop("friction", worlds.friction[:, np.newaxis])[:, 0]
     vehicles = replace(worlds.vehicles, **{name: v for name, v in changed.items() if hasattr(worlds.vehicles, name)})
-    return replace(worlds, vehicles=vehicles, **{name: v for name, v in changed.items() if hasattr(worlds, name)})
+    placed = replace(worlds, vehicles=vehicles, **{name: v for name, v in changed.items() if hasattr(worlds, name)})
+    if not worlds.road.shape[1]:
+        return placed
+    return placed.on_road(friction, *(changed.get(name, worlds.dry(name)) for name in ON_ROADS))

@@ -215,7 +215,9 @@ train(*TRAININGS[sys.argv[1]], folder, measure=measure)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ppo", "sac", "independent"])
+@pytest.mark.parametrize(
+    "name", ["ppo", *(pytest.param(name, marks=pytest.mark.long) for name in ("sac", "independent"))]
+)
 def test_resume__after_kill_9_the_weights_are_the_same(name: str, whole: Whole, tmp_path: Path) -> None:
     """Another process kills itself in the fifth step after its first checkpoint; from outside one may come too late."""
     root, run = Path(__file__).resolve().parents[2], tmp_path / "run"

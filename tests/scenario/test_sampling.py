@@ -179,10 +179,11 @@ def test_columns__changing_one_quantity_leaves_all_others_alone(changed: str) ->
 
 def test_columns__every_entry_of_a_world_has_its_own() -> None:
     rules = [*QUANTITY.usual.values(), QUANTITY.otherwise["line_speed_mps"]]
-    places = [rule.place(index) for rule in rules for index in range(rule.count(64))]
+    streams, places = zip(*(rule.place(index) for rule in rules for index in range(rule.count(64))), strict=True)
+    assert set(streams) == {()}
     assert len(set(places)) == len(places) and max(places) < BLOCK * 64 and BLOCK % 4 == 0
-    assert [QUANTITY.usual["mass_t"].place(i) for i in range(3)] == [5, 13, 21]
-    assert QUANTITY.otherwise["line_speed_mps"].place(0) == 15  # slot 7 of vehicle_2
+    assert [QUANTITY.usual["mass_t"].place(i) for i in range(3)] == [((), 5), ((), 13), ((), 21)]
+    assert QUANTITY.otherwise["line_speed_mps"].place(0) == ((), 15)  # slot 7 of vehicle_2
     for_all = {"braking_capacity_mps2": 6, "driving_capacity_mps2": 6, "mass_t": 5, "latency_s": 0.5}
     worlds = PAPER.replace(vehicles=5, roles={"vehicle_2": "learner"}, **for_all).sample(7, 1).worlds
     assert len(np.unique(worlds.speeds_mps)) == 35  # one entry for all: each vehicle draws its own value

@@ -20,7 +20,7 @@ from ethbrake_marl.physics.batch import Packed
 from ethbrake_marl.physics.kernel import CLOCK
 from ethbrake_marl.physics.messages import CHANNEL, Messages, chance
 from ethbrake_marl.scenario import Scenario, full_state, load_scenario, observation_for, state_features
-from ethbrake_marl.scenario.v2x import CHANNELS, PER_LINK, PRESETS, V2X, Channel, burst_periods
+from ethbrake_marl.scenario.v2x import CHANNELS, PER_LINK, PRESETS, V2X, Channel, Equipage, Equipped, burst_periods
 from ethbrake_marl.search import identities
 from tests.agents.test_knowledge import alter_unreceived
 
@@ -37,6 +37,10 @@ def vehicles(latency_s, n=1):
     return make_worlds(5.0, np.full((n, np.shape(latency_s)[-1]), 20.0), latency_s=latency_s, **given).vehicles
 
 
+def everybody(vehicles: int) -> Equipped:
+    return Equipped.of([Equipage()] * vehicles)
+
+
 def test_burst_periods__at_the_bounds_by_hand():
     # p = r = 0.5: P(k >= 1) = 1/2, P(k >= 2) = 1/4, P(k >= 3) = 1/8; all exact in binary.
     u = np.array([0.5, 0.4999, 0.25, 0.2499, 0.125, 0.1249, 0.99])
@@ -50,7 +54,7 @@ def test_with_news__news_of_the_emergency_comes_by_radio_or_by_sight():
     u.reshape(9, PER_LINK)[2 * 3 + 0, 2] = 0.0  # the link from vehicle_1 to vehicle_3 is lost, if any
     for lost, third in ((0.0, [0.6, 0.6, 0.6]), (0.1, [np.inf, pytest.approx(1.35), pytest.approx(1.35)])):
         v2x = V2X.model_validate({"preset": "nominal", "link_latency_s": 0.4, "lost": lost})
-        told = v2x.with_news(vehicles([0.0, 0.1, 0.6]), u)
+        told = v2x.with_news(vehicles([0.0, 0.1, 0.6]), u, everybody(3))
         assert told.latency_s.tolist() == [[0.0, 0.4, third[1]]]  # by sight it takes 0.95 s more
         assert told.known_from_s[0].tolist() == [[0.0, 0.4, 0.4], [0.4, 0.4, 0.4], third]
 
@@ -92,7 +96,7 @@ def slow_news(channel: Channel, own_s: list[float], links: np.ndarray) -> tuple[
 def test_with_news__is_what_a_loop_over_the_links_gives(given):
     v2x, rng = V2X.model_validate(given), np.random.default_rng(6)
     u, own = rng.random((40, 16 * PER_LINK)), rng.choice([0.0, 0.2, 0.7, 1.5], (40, 4))
-    told = v2x.with_news(vehicles(own, 40), u)
+    told = v2x.with_news(vehicles(own, 40), u, everybody(4))
     for k in range(40):
         latency, known = slow_news(v2x.channel, own[k].tolist(), u[k].reshape(4, 4, PER_LINK))
         assert told.latency_s[k] == pytest.approx(latency, rel=1e-12)
@@ -223,11 +227,11 @@ def test_initial_state__of_a_channel_without_chance_has_its_news() -> None:
 def test_v2x__where_nothing_is_lost_the_longest_burst_bounds_the_news(name, latest):
     # 48 and 50 periods, in which the share of a burst falls below 2^-53; one of waiting; 20 + 100 + 200 ms.
     v2x = V2X(preset=name)
-    assert v2x.latest_reaction_s(np.zeros(12)).tolist()[5:] == pytest.approx([latest] * 7)
+    assert v2x.latest_reaction_s(np.zeros(12), everybody(12)).tolist()[5:] == pytest.approx([latest] * 7)
     u = np.random.default_rng(3).random((2_000, 144 * PER_LINK))
     u.reshape(2_000, 144, PER_LINK)[:1_000, :, 1] = 0.0  # the longest bursts everywhere
-    drawn = v2x.with_news(vehicles([0.0] * 12, 2_000), u).latency_s
-    assert (drawn <= v2x.latest_reaction_s(np.zeros(12))).all() and drawn.max() > latest - 0.1
+    drawn = v2x.with_news(vehicles([0.0] * 12, 2_000), u, everybody(12)).latency_s
+    assert (drawn <= v2x.latest_reaction_s(np.zeros(12), everybody(12))).all() and drawn.max() > latest - 0.1
 
 
 def test_identities__do_not_depend_on_the_news():

@@ -128,7 +128,7 @@ def test_trials__that_ended_are_kept_and_more_go_on_as_if_they_had_been_asked_fo
     assert (folder / TABLE).read_bytes() == whole
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_disturbed_tuning__has_the_same_table(finished_tuning, write_tuning, tmp_path):
     folder, export = tmp_path / "out", tmp_path / "best.yaml"
     options = ["--output", folder, "--trials", str(TRIALS), "--export", export]

@@ -1,0 +1,335 @@
+"""Keys as engineers think of them: friction, tables, lognormal, equipage, spread, alert; outcomes by hand."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import lognorm
+
+from ethbrake_marl.agents import Team, drive, make_agent
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation import states_of
+from ethbrake_marl.limits.limits import prove
+from ethbrake_marl.physics import Floats, Worlds
+from ethbrake_marl.scenario import Scenario, Task, load_scenario
+from ethbrake_marl.shield.uncertainty import parse_uncertainty
+
+PAPER = load_scenario("paper-random")
+FIXED = PAPER.replace(gaps_m=40, speeds_mps=20, latency_s=0, early_impacts="keep", horizon_s=30)
+TABLE = {"columns": ["gap_1_m", "speed_2_mps"], "rows": [[5.0, 18.0], [6.0, 19.0], [7.0, 20.0]]}
+
+
+def final(scenario: Scenario, worlds: Worlds | None = None) -> Worlds:
+    """The worlds once everybody has braked fully, or as its script says."""
+    worlds = scenario.sample(1, 7).worlds if worlds is None else worlds
+    return drive(worlds, Team.of(make_agent("full_brake"), list(scenario.learners)), scenario).final
+
+
+def refused(scenario: Scenario | dict[str, Any], message: str, **changes: Any) -> None:
+    with pytest.raises(InvalidInput, match=message):
+        scenario.replace(**changes) if isinstance(scenario, Scenario) else Scenario(**scenario, **changes)
+
+
+# Friction: stopping ways are v^2 / (2 min(capacity, 9.81 mu)).
+
+
+@pytest.mark.parametrize(
+    ("friction", "capacity", "gaps"),
+    [
+        # 4 < 5.886 < 7: 50, 33.979, 33.979 m
+        (0.6, [4.0, 7.0, 7.0], [40 + 50 - 400 / 11.772, 40.0]),
+        # all 2.943: the same way of 67.96 m for all
+        (0.3, [4.0, 7.0, 7.0], [40.0, 40.0]),
+        # dry enough: 50, 28.571, 33.333 m
+        (1.0, [4.0, 7.0, 6.0], [40 + 50 - 400 / 14, 40 + 400 / 14 - 400 / 12]),
+    ],
+)
+def test_friction__gaps_at_rest_by_hand(friction: float, capacity: list[float], gaps: list[float]) -> None:
+    found = final(FIXED.replace(friction=friction, braking_capacity_mps2=capacity))
+    assert found.gaps_m[0] == pytest.approx(gaps, abs=1e-9)
+
+
+def test_friction__is_one_number_for_the_whole_line_and_moves_nothing_else() -> None:
+    wet = PAPER.replace(friction={"uniform": [0.2, 0.9]}, early_impacts="keep")
+    worlds, dry = wet.sample(200, 7).worlds, PAPER.replace(early_impacts="keep").sample(200, 7).worlds
+    friction = worlds.friction
+    assert 0.2 <= friction.min() < 0.22 and 0.88 < friction.max() <= 0.9
+    for name in ("braking_capacity_mps2", "driving_capacity_mps2"):
+        own = getattr(dry.vehicles, name)
+        assert (getattr(worlds.vehicles, name) == np.minimum(own, 9.81 * friction[:, np.newaxis])).all()
+        assert (worlds.dry(name) == own).all()
+    for name in ("gaps_m", "speeds_mps"):
+        assert (getattr(worlds, name) == getattr(dry, name)).all()
+    assert wet.bounds("braking_capacity_mps2") == ((9.81 * 0.2, 6.0), (9.81 * 0.2, 7.0), (9.81 * 0.2, 6.0))
+    assert wet.bounds("braking_capacity_mps2", dry=True) == ((6.0, 6.0), (7.0, 7.0), (6.0, 6.0))
+    assert wet.ranges().names[-1] == "friction"
+
+
+def test_friction__of_a_margin_and_of_a_constant_script() -> None:
+    short = FIXED.replace(friction=0.3, obstacle_margin_m=1.7)
+    assert short.sample(1, 7).worlds.obstacle_gap_m[0] == pytest.approx(1.7 + 400 / (2 * 2.943), abs=1e-9)
+    assert short.farthest_obstacle_m == pytest.approx(1.7 + 400 / (2 * 2.943), abs=1e-9)
+    refused(FIXED, r"above this vehicle's braking_capacity_mps2, 2.943 m/s2",
+            friction={"uniform": [0.3, 0.9]}, roles={"vehicle_1": "constant:5", "vehicle_2": "learner"})  # fmt: skip
+    refused(FIXED, r"friction = 0: must be finite and in \(0, 2\]", friction=0)
+    refused(FIXED, "friction = null: must be a number or a distribution", friction=None)
+
+
+def test_friction__a_table_of_initial_states_gives_the_same_worlds() -> None:
+    wet = PAPER.replace(friction={"uniform": [0.2, 0.9]}, braking_capacity_mps2={"uniform": [3, 9]})
+    worlds = wet.sample(50, 3).worlds
+    states = states_of(worlds, wet)
+    assert list(states[0])[-1] == "friction" and "braking_capacity_2_mps2" in states[0]
+    again = wet.worlds_from_table({name: [state[name] for state in states] for name in states[0]})
+    assert (again.road == worlds.road).all()
+    assert (again.vehicles.braking_capacity_mps2 == worlds.vehicles.braking_capacity_mps2).all()
+    assert wet.worlds_from_state({name: 0.5 for name in ("friction",)} | state_of(worlds)).friction.tolist() == [0.5]
+
+
+def state_of(worlds: Worlds) -> dict[str, Any]:
+    dry = worlds.dry("braking_capacity_mps2")[0].tolist()
+    return {"gaps_m": worlds.gaps_m[0].tolist(), "speeds_mps": worlds.speeds_mps[0].tolist(),
+            "braking_capacity_mps2": dry}  # fmt: skip
+
+
+def test_friction__its_uncertainty_moves_all_capacities_together() -> None:
+    worlds = FIXED.replace(friction=0.6, braking_capacity_mps2=[4, 7, 9]).sample(1, 7).worlds
+    members = parse_uncertainty("friction=0.2,braking_capacity_mps2.vehicle_3=3").members(worlds)
+    low, high = 9.81 * (0.6 - 0.2), 9.81 * (0.6 + 0.2)
+    assert members.vehicles.braking_capacity_mps2 == pytest.approx(
+        np.array([[4, 5.886, 5.886], [low, low, low], [4, 7, 6], [low, low, low], [4, 7, high]]), abs=1e-12
+    )  # vehicle_3 is 6 or 12 on a dry road
+    with pytest.raises(InvalidInput, match="friction is one number for the whole line"):
+        parse_uncertainty("friction.vehicle_2=0.1")
+    with pytest.raises(InvalidInput, match="friction=0.1: the scenario has no friction"):
+        parse_uncertainty("friction=0.1").members(FIXED.sample(1, 7).worlds)
+    with pytest.raises(InvalidInput, match="0.6 in world 0 may be as low as -0.4; it must stay above 0"):
+        parse_uncertainty("friction=1").members(worlds)
+
+
+def test_friction__of_some_members_of_a_mixture() -> None:
+    wet = PAPER.replace(name="wet", friction=0.4).declared()
+    mixed = Scenario(name="road", mixture=[{"scenario": PAPER}, {"scenario": wet}])
+    worlds = mixed.sample(40, 7).worlds
+    assert set(worlds.friction.tolist()) == {0.4, math.inf}
+    assert set(worlds.vehicles.braking_capacity_mps2[:, 1].tolist()) == {7.0, 9.81 * 0.4}
+
+
+def test_friction__the_proof_reads_what_the_road_allows() -> None:
+    near = FIXED.replace(gaps_m=30, braking_capacity_mps2=[9, 7, 6], latency_s=[0, 0.5, 0.8])
+    proofs = {mu: prove(near.replace(friction=mu).sample(1, 7).worlds, Task(near, (1,))) for mu in (0.3, 1.0)}
+    assert proofs[0.3].avoidable.tolist() == [True] == proofs[1.0].avoidable.tolist()
+    apart = FIXED.replace(gaps_m=[4, 40], latency_s=[0, 0.5, 0.5])  # 20 x 0.5 = 10 m are lost where all brake alike
+    assert final(apart.replace(friction=0.3)).pair_hit[0].tolist() == [True, False]
+
+
+# A table: one row for each world, the rest drawn.
+
+
+def tabled(**changes: Any) -> Scenario:
+    given = {key: value for key, value in PAPER.declared().items() if key not in ("gaps_m", "speeds_mps")}
+    return Scenario(**{**given, "gaps_m": 9.0, "speeds_mps": {"uniform": [18, 22]}, "table": TABLE, **changes})
+
+
+def test_table__rows_are_never_torn_and_the_rest_is_drawn_as_without_it() -> None:
+    found = tabled().sample(600, 7).worlds
+    rows = np.stack([found.gaps_m[:, 0], found.speeds_mps[:, 1]], axis=1)
+    kinds, counts = np.unique(rows, axis=0, return_counts=True)
+    assert kinds.tolist() == TABLE["rows"] and (np.abs(counts - 200) < 60).all()
+    assert (found.gaps_m[:, 1] == 9.0).all()
+    alone = tabled(table={**TABLE, "weights": [1, 1, 8]}).sample(600, 7).worlds
+    assert (alone.speeds_mps[:, [0, 2]] == found.speeds_mps[:, [0, 2]]).all()  # early impacts: none here
+    assert np.mean(alone.gaps_m[:, 0] == 7.0) == pytest.approx(0.8, abs=0.05)
+
+
+def test_table__a_world_by_hand() -> None:
+    one = Scenario(**{**FIXED.declared(), "table": {"columns": ["gap_1_m", "mass_3_t"], "rows": [[12, 30]]}})
+    worlds = one.sample(3, 7).worlds
+    assert worlds.gaps_m.tolist() == [[12.0, 40.0]] * 3 and worlds.vehicles.mass_t[:, 2].tolist() == [30.0] * 3
+    assert final(one).gaps_m[0] == pytest.approx([12 + 400 / 12 - 400 / 14, 40 + 400 / 14 - 400 / 12], abs=1e-9)
+    with pytest.raises(InvalidInput, match="draws nothing"):
+        one.ranges()
+    assert tabled().ranges().names[-1] == "row of the table"
+    assert tabled().bounds("gaps_m") == ((5.0, 7.0), (9.0, 9.0))
+    assert tabled().middle_world().gaps_m[0].tolist() == [6.0, 9.0]
+
+
+def test_table__of_a_file_is_read_once_and_goes_along(tmp_path: Path) -> None:
+    whole = {"gap_1_m": 5.5, "gap_2_m": 6.5, "speed_1_mps": 20, "speed_2_mps": 19, "speed_3_mps": 18, "count": 3}
+    lines = [",".join(whole), *(",".join(str(value + k) for value in whole.values()) for k in range(1200))]
+    (tmp_path / "rows.csv").write_text("\n".join(lines) + "\n")
+    keys = {**PAPER.declared(), "name": "mine", "early_impacts": "keep"}
+    del keys["gaps_m"], keys["speeds_mps"]
+    columns = "[gap_1_m, gap_2_m, speed_1_mps, speed_2_mps, speed_3_mps]"
+    text = "\n".join(f"{key}: {value if not isinstance(value, str) else repr(value)}" for key, value in keys.items())
+    (tmp_path / "mine.yaml").write_text(f"{text}\ntable: {{file: rows.csv, columns: {columns}, weights: count}}\n")
+    with pytest.raises(InvalidInput, match=r"table.rows\[181\]\[2\] = 201: speed_1_mps must be finite and in"):
+        load_scenario(tmp_path / "mine.yaml")
+    (tmp_path / "rows.csv").write_text("\n".join(lines[:15]) + "\n")
+    mine = load_scenario(tmp_path / "mine.yaml")
+    (tmp_path / "rows.csv").unlink()
+    again = Scenario(**mine.declared()).replace(horizon_s=9)
+    assert again.table is not None and len(again.table.rows or ()) == 14 and again.table.weights == (*range(3, 17),)
+    assert (again.sample(50, 7).worlds.gaps_m == mine.sample(50, 7).worlds.gaps_m).all()
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({**TABLE, "columns": ["gap_1_m", "gap_9_m"]}, "gap_9_m: unknown column; did you mean gap_2_m"),
+        ({**TABLE, "columns": ["gap_1_m", "gap_1_m"]}, "each column can be given once"),
+        ({**TABLE, "rows": [[5.0]]}, r"rows\[0\]: has 1 numbers; there are 2 columns"),
+        ({**TABLE, "rows": [[5.0, -1.0]]}, "speed_2_mps must be finite and in"),
+        ({**TABLE, "weights": [1, 1]}, "must be one for each of 3 rows"),
+        ({**TABLE, "weights": "count"}, "files are read where they stand in a file"),
+        ({"file": "rows.csv", "columns": ["gap_1_m"]}, "files are read where they stand in a file"),
+        ({"columns": ["gap_1_m", "gap_2_m"], "rows": [[5, 6]]}, "gaps_m.*the table says it for all; leave it out"),
+    ],
+)
+def test_table__what_is_wrong_is_named(table: dict[str, Any], message: str) -> None:
+    with pytest.raises(InvalidInput, match=message):
+        tabled(table=table)
+
+
+def test_table__its_file_stays_in_the_folder_and_is_named_where_it_is_wrong(tmp_path: Path) -> None:
+    for file, message in (("../rows.csv", "must be a path from the scenario's folder on"), ("no.csv", "no.csv")):
+        with pytest.raises(InvalidInput, match=message):
+            load_scenario({**PAPER.declared(), "table": {"file": file}})
+
+
+# Lognormal: the logarithm is normal.
+
+
+def test_lognormal__is_the_truncated_one_of_the_textbook() -> None:
+    shape = {"median": 1.1, "sigma": 0.4, "low": 0.3, "high": 3.0}
+    scenario = PAPER.replace(time_gaps_s={"lognormal": shape}, early_impacts="keep", line_speed_mps=20)
+    drawn = np.sort((scenario.sample(4000, 7).worlds.gaps_m / 20).ravel())
+    law = lognorm(s=0.4, scale=1.1)
+    low, high = law.cdf(0.3), law.cdf(3.0)
+    expected = law.ppf(low + (high - low) * (np.arange(len(drawn)) + 0.5) / len(drawn))
+    assert np.abs(drawn - expected).max() < 0.35 and np.abs(drawn - expected).mean() < 0.01
+    entry = scenario.quantities("time_gaps_s")[0]
+    u = np.array([0.0, 0.5, 0.975])
+    assert entry.value(u) == pytest.approx(law.ppf(low + (high - low) * u), rel=1e-9)  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"median": 0.0}, "median and low must be above 0"),
+        ({"sigma": 0.0}, "sigma must be above 0"),
+        ({"low": 3.0, "high": 3.0}, "low must be below high"),
+        ({"low": 1e3, "high": 2e3}, "must hold at least 1e-06"),
+    ],
+)
+def test_lognormal__what_is_none_is_refused(changes: dict[str, float], message: str) -> None:
+    shape = {"median": 7.0, "sigma": 0.4, "low": 3.0, "high": 30.0, **changes}
+    refused(PAPER, message, gaps_m={"lognormal": shape})
+
+
+# Equipage: who sends, who hears.
+
+FIXED_LINKS = {"preset": "nominal", "link_latency_s": 0.3, "sensing_s": [1.0, 1.0]}
+
+
+@pytest.mark.parametrize(
+    ("vehicles", "latency", "known_of_2_by_3"),
+    [
+        ({}, [0.0, 0.3, 0.3], 0.3),
+        ({"vehicle_1": {"sends": False}}, [0.0, 1.0, 2.0], 2.0),  # one sees it brake, the other one that
+        ({"vehicle_3": {"sends": False, "hears": "none"}}, [0.0, 0.3, 1.3], 1.3),
+        ({"vehicle_2": {"sends": False, "hears": "front"}}, [0.0, 0.3, 0.3], 1.0),
+    ],
+)
+def test_equipage__reactions_by_hand(vehicles: dict[str, Any], latency: list[float], known_of_2_by_3: float) -> None:
+    v2x = {**FIXED_LINKS, **({"vehicles": vehicles} if vehicles else {})}
+    found = FIXED.replace(v2x=v2x).sample(1, 7).worlds.vehicles
+    assert found.latency_s[0] == pytest.approx(latency, abs=1e-12)
+    assert found.known_from_s[0, 2, 1] == pytest.approx(known_of_2_by_3, abs=1e-12)
+    if "vehicle_2" in vehicles:
+        assert found.known_from_s[0, 1, 2] == pytest.approx(1.0, abs=1e-12)  # of vehicle_3 it sees only
+
+
+def test_equipage__of_types_is_drawn_with_them() -> None:
+    kinds = {"equipped": {"weight": 7}, "without": {"weight": 3, "v2x": {"sends": False, "hears": "none"}}}
+    line = FIXED.replace(vehicle_types=kinds, v2x=FIXED_LINKS)
+    sample = line.sample(2000, 7)
+    assert sample.types is not None
+    silent = sample.types == "without"
+    assert silent.mean() == pytest.approx(0.3, abs=0.02)
+    latency = sample.worlds.vehicles.latency_s
+    second = np.where(silent[:, 0] | silent[:, 1], 1.0, 0.3)
+    third = np.where(silent[:, 0] | silent[:, 2], second + 1.0, 0.3)
+    assert (latency[:, 1] == second).all() and np.abs(latency[:, 2] - third).max() < 1e-12
+    with pytest.raises(InvalidInput, match="the scenario draws what each vehicle knows when"):
+        line.worlds_from_state({"gaps_m": [7, 7], "speeds_mps": [20, 20, 20]})
+
+
+def test_equipage__where_it_would_do_nothing_is_refused() -> None:
+    silent = {"sends": False, "hears": "none"}
+    refused(PAPER, "preset paper has no generated messages; leave it out", v2x={"vehicles": {"vehicle_2": silent}})
+    refused(PAPER, "has no messages that a type could lack", vehicle_types={"car": {"v2x": silent}})
+    refused(PAPER, "unknown vehicle; this scenario has", v2x={**FIXED_LINKS, "vehicles": {"vehicle_4": silent}})
+    blind = {**FIXED_LINKS, "vehicles": {"vehicle_2": silent}, "senses": "none"}
+    del blind["sensing_s"]
+    refused(PAPER, "vehicle_2 may have no news until inf", v2x=blind)
+
+
+# Spread around what the load gives.
+
+
+def lorries(spread: Any) -> Scenario:
+    capacity = {"with_load": [7, 5], **({} if spread is None else {"spread": spread})}
+    kinds = {"lorry": {"mass_t": {"with_load": [10, 40]}, "braking_capacity_mps2": capacity}}
+    given = {key: value for key, value in FIXED.declared().items() if key not in ("mass_t", "braking_capacity_mps2")}
+    return Scenario(**given, vehicle_types=kinds)
+
+
+def test_spread__is_added_to_what_the_load_gives() -> None:
+    plain, wide = (lorries(spread).sample(3000, 7).worlds.vehicles for spread in (None, {"uniform": [-0.5, 0.5]}))
+    by_load = 7 - 2 * (plain.mass_t - 10) / 30
+    assert plain.braking_capacity_mps2 == pytest.approx(by_load, abs=1e-12)
+    more = wide.braking_capacity_mps2 - by_load
+    assert (wide.mass_t == plain.mass_t).all() and -0.5 <= more.min() < -0.49 and 0.49 < more.max() <= 0.5
+    expected = -1 / math.sqrt(1 + (1 / 12) / (4 / 12))  # of two independent uniform parts, 2 and 1 wide
+    assert correlation(wide.mass_t, wide.braking_capacity_mps2) == pytest.approx(expected, abs=0.01)
+    assert correlation(plain.mass_t, plain.braking_capacity_mps2) == pytest.approx(-1.0, abs=1e-12)
+    assert lorries({"uniform": [-0.5, 0.5]}).bounds("braking_capacity_mps2")[0] == (4.5, 7.5)
+    with pytest.raises(InvalidInput, match=r"braking_capacity_mps2.*must be finite and in \(0, 100\]"):
+        lorries({"uniform": [-5, 0]})
+    names = lorries({"uniform": [-0.5, 0.5]}).ranges().names
+    assert "braking_capacity_mps2 of vehicle_1" in names and "mass_t of vehicle_1" not in names
+
+
+def correlation(one: Floats, other: Floats) -> float:
+    return float(np.corrcoef(one.ravel(), other.ravel())[0, 1])
+
+
+# The alert comes later.
+
+
+def test_alert__everybody_goes_on_until_then() -> None:
+    late = FIXED.replace(alert_s=2, speeds_mps=[20, 18, 20], latency_s=[0, 0.5, 0.8])
+    assert late.sample(1, 7).worlds.vehicles.latency_s.tolist() == [[2.0, 2.5, 2.8]]
+    now = late.replace(gaps_m=[40 + 2 * 2, 40 - 2 * 2])
+    at_once = Scenario(**{key: value for key, value in now.declared().items() if key != "alert_s"})
+    assert final(late).gaps_m == pytest.approx(final(at_once).gaps_m, abs=1e-9)
+    drawn = FIXED.replace(alert_s={"uniform": [1, 5]})
+    latency = drawn.sample(100, 7).worlds.vehicles.latency_s
+    assert (latency == latency[:, :1]).all() and 1 <= latency.min() < 1.2 and 4.8 < latency.max() <= 5
+    assert drawn.bounds("latency_s") == ((1.0, 5.0),) * 3 and drawn.ranges().names == ("alert_s",)
+
+
+def test_alert__a_script_that_depends_on_the_state_acts_before_it() -> None:
+    roles = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "copy_leader"}
+    late = FIXED.replace(alert_s=2, roles=roles, latency_s=[0, 0.5, 0.8])
+    assert late.sample(1, 7).worlds.vehicles.latency_s.tolist() == [[2.0, 2.5, 0.8]]
+
+
+def test_alert__what_it_cannot_go_with_is_refused() -> None:
+    refused(FIXED, "only without messages one by one", alert_s=2, v2x="nominal")
+    refused(FIXED, "must be below horizon_s", alert_s=40)
