@@ -8,7 +8,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field as data_field, replace
 from difflib import get_close_matches
 from functools import lru_cache
 from operator import not_
@@ -222,8 +222,8 @@ _OTHERWISE = _by_name(
     ),
     QuantityRule(
         "alert_s", "s", "world", 3600.0, False, 2, "",
-        "time from the start until the alert, from which latencies count; until then only scripts that depend on the"
-        " state act", "{uniform: [1, 5]}", stream=SURROUNDINGS,
+        "time from the start until the alert, from which latencies count; until then all go on at their speeds",
+        "{uniform: [1, 5]}", stream=SURROUNDINGS,
     ),
 )  # fmt: skip
 _OPTIONAL = _by_name(
@@ -426,8 +426,8 @@ class TableColumn:
     """A column of a scenario's table: every world takes the value of its own row."""
 
     name: str
-    rows: Floats  # [rows]
-    cumulative: Floats  # [rows] share of the worlds up to this row
+    rows: Floats = data_field(compare=False)  # [rows]
+    cumulative: Floats = data_field(compare=False)  # [rows] share of the worlds up to this row
 
     def __repr__(self) -> str:
         return f"column {self.name} of the table"
@@ -925,6 +925,13 @@ class ScenarioFields(FileModel):
     _members: tuple[ScenarioFields, ...] = PrivateAttr(default=())
     _columns: dict[Entry, TableColumn] = PrivateAttr(default_factory=dict)  # those of the table
 
+    @model_validator(mode="after")
+    def _tabulated(self) -> ScenarioFields:
+        if self.table is not None:
+            known = _table_columns(QUANTITY.declared, self.vehicles)
+            self._columns = {known[name]: column for name, column in self.table.column_values().items()}
+        return self
+
     @field_validator(
         *QUANTITY.alternatives, *QUANTITY.alternatives.values(), *QUANTITY.optional, "alert_s", mode="before"
     )
@@ -1085,12 +1092,6 @@ class ScenarioFields(FileModel):
         """Whether the road is known, in some member of a mixture at least."""
         return any(member.has_friction for member in self.members) or self.declares("friction")
 
-    @property
-    def awaits_alert(self) -> Floats:
-        """1 for every vehicle that does nothing before the alert, 0 for one whose script depends on the state, [N]."""
-        reacts = {i for i, script in self.scripts.items() if not ScriptSpec.parse(script).is_state_free()}
-        return np.array([float(i not in reacts) for i in range(self.vehicles)])
-
     def declares(self, field: str) -> bool:
         """Whether it says what a quantity is: under its key, or in its table for every vehicle or pair."""
         return getattr(self, field) is not None or _tabled({"table": self.table, "vehicles": self.vehicles}, field)
@@ -1098,9 +1099,6 @@ class ScenarioFields(FileModel):
     @property
     def table_entries(self) -> dict[Entry, TableColumn]:
         """The columns of the table by what they say; none without a table."""
-        if self.table is not None and not self._columns:
-            known = _table_columns(QUANTITY.declared, self.vehicles)
-            self._columns.update({known[name]: column for name, column in self.table.column_values().items()})
         return self._columns
 
     @property
@@ -1352,7 +1350,7 @@ def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]
     other = {"gaps_m": scenario.time_gaps_s, "speeds_mps": scenario.line_speed_mps}
     found = {key: declared(key) for key in QUANTITY.usual if other.get(key) is None}
     if scenario.alert_s is not None:
-        found["latency_s"] = found["latency_s"] + declared("alert_s") * scenario.awaits_alert
+        found["latency_s"] = found["latency_s"] + declared("alert_s")
     if scenario.declares("friction"):
         found["friction"] = declared("friction")
     if scenario.line_speed_mps is not None:
@@ -1691,22 +1689,21 @@ def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:
 
 
 def read_table(file: Path, columns: object, weights: object) -> dict[str, Any]:
-    """The rows of a scenario's table, and their weights, from these columns of a CSV file; all columns by default.
+    """The rows of a scenario's table, and their weights, from these columns of a CSV file.
 
     Raises ``InvalidInput`` naming file, line and column.
     """
     header, rows, lines = _read_csv(file)
     weights_of = [] if weights is None else [weights]
-    named = [name for name in header if name != weights] if columns is None else columns
-    if not isinstance(named, list | tuple):
-        raise InvalidInput(f"{file}: columns = {named!r:.60}: must be a list of columns")
-    for name in (*named, *weights_of):
+    if not isinstance(columns, list | tuple):
+        raise InvalidInput(f"{file}: columns = {columns!r:.60}: must be a list of columns: {', '.join(header)}")
+    for name in (*columns, *weights_of):
         if header.count(name) != 1:
             many = "is there twice" if name in header else f"is not there; {suggestion(str(name), header)}"
             raise InvalidInput(f"{file}, line 1: column {name!r:.60} {many.removesuffix('; ')}")
-    found = [[_number_at(file, header, row, line, str(name)) for name in (*named, *weights_of)]
+    found = [[_number_at(file, header, row, line, str(name)) for name in (*columns, *weights_of)]
              for row, line in zip(rows, lines, strict=True)]  # fmt: skip
-    told: dict[str, Any] = {"columns": list(named), "rows": [row[: len(named)] for row in found]}
+    told: dict[str, Any] = {"rows": [row[: len(columns)] for row in found]}
     return told if weights is None else told | {"weights": [row[-1] for row in found]}
 
 

@@ -427,7 +427,8 @@ def scenario_json_schema() -> dict[str, Any]:
         for pair in QUANTITY.alternatives.items()
     ]
     by_types = {"anyOf": [{"required": ["vehicle_types"]}, {"required": [*QUANTITY.needed]}]}
-    whole = {"if": {"not": {"required": ["mixture"]}}, "then": {"allOf": [*one_of_two, by_types]}}
+    elsewhere = {"anyOf": [{"required": ["mixture"]}, {"required": ["table"]}]}
+    whole = {"if": {"not": elsewhere}, "then": {"allOf": [*one_of_two, by_types]}}
     needed = {"speed_deviations_mps": ["line_speed_mps"]}
     schema = Scenario.model_json_schema(schema_generator=FileSchema)
     return FileSchema.publish({**schema, **whole, "dependentRequired": needed})

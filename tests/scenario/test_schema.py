@@ -185,11 +185,12 @@ def not_used(scenario: Scenario) -> set[str]:
     """The keys of the ways to declare gaps, speeds and an obstacle that it does not use; what it does not choose."""
     if scenario.members:
         return set(Scenario.model_fields) - {"name", "title", "description", "source", "mixture"}
-    gaps = "gaps_m" if scenario.gaps_m is None else "time_gaps_s"
-    speeds = {"speeds_mps"} if scenario.speeds_mps is None else {"line_speed_mps", "speed_deviations_mps"}
+    gaps = {key for key in ("gaps_m", "time_gaps_s") if getattr(scenario, key) is None}
+    speeds = {key for key in ("speeds_mps", "line_speed_mps") if getattr(scenario, key) is None}
+    speeds |= {"speed_deviations_mps"} if scenario.line_speed_mps is None else set()
     obstacle = {key for key in ("obstacle_gap_m", "obstacle_margin_m") if getattr(scenario, key) is None}
-    chosen = ("observation", "vehicle_types", "types", "mixture", *QUANTITY.needed)
-    return {gaps, *speeds, *obstacle, *(key for key in chosen if getattr(scenario, key) is None)}
+    chosen = ("observation", "vehicle_types", "types", "mixture", "table", "friction", "alert_s", *QUANTITY.needed)
+    return {*gaps, *speeds, *obstacle, *(key for key in chosen if getattr(scenario, key) is None)}
 
 
 @each_shipped
