@@ -266,7 +266,8 @@ def _told(scenario: ScenarioFields, key: str) -> str:
 # The wording of messages about a scenario file: its keys, their places and their meanings.
 
 _DISTRIBUTION = (
-    "{uniform: [low, high]}, {loguniform: [low, high]}, {normal: {mean, sd, low, high}} or {choice: [a, b, ...]}"
+    "{uniform: [low, high]}, {loguniform: [low, high]}, {normal: {mean, sd, low, high}},"
+    " {lognormal: {median, sigma, low, high}} or {choice: [a, b, ...]}"
 )
 
 
@@ -274,10 +275,12 @@ class ScenarioWording(Wording):
     """The ``Wording`` of a scenario, or of a part of one."""
 
     def instead(self, key: str) -> str:
-        """What the model has in place of friction: what each vehicle's brakes can on that road."""
-        if "friction" not in key and key != "mu":
-            return ""
-        return "the model has no friction; braking_capacity_mps2 is what brakes and road allow, about 9.81 x friction"
+        """What the model has in place of another word for friction, and of a slope."""
+        if "friction" in key or key == "mu":
+            return "friction is that of the road, one for the whole line, for instance friction: 0.5"
+        if key in ("grade", "slope"):
+            return "the model has no slopes; downhill, braking capacities are 9.81 x grade less, driving ones more"
+        return ""
 
     def needed(self, path: YamlPath) -> str:
         """What is needed at ``path``, with an example."""
@@ -323,7 +326,7 @@ class Scenario(ScenarioFields):
     """A line of vehicles, how each quantity is drawn, and who learns.
 
     A quantity is a number, ``{uniform: [low, high]}``, ``{loguniform: [low, high]}``, ``{normal: {mean, sd, low,
-    high}}`` or ``{choice: [...]}``. One entry stands for every vehicle (each draws its own value); a list has one entry
+    high}}``, ``{lognormal: {median, sigma, low, high}}`` or ``{choice: [...]}``. One entry stands for every vehicle (each draws its own value); a list has one entry
     per vehicle, gaps one per pair. Every way to build one (``Scenario(...)``, ``load_scenario``, ``replace``) raises
     ``InvalidInput`` with one message: where, value, what would be right.
 
@@ -687,6 +690,7 @@ _HEAD = """\
 # A quantity is a number, or is drawn for every world:
 #   {{uniform: [low, high]}}, {{loguniform: [low, high]}}
 #   {{normal: {{mean: 20, sd: 1, low: 18, high: 22}}}}    truncated to [low, high]
+#   {{lognormal: {{median: 1.1, sigma: 0.4, low: 0.3, high: 3}}}}    its logarithm is normal, truncated
 #   {{choice: [6, 7, 8]}}    optionally with weights: [1, 2, 1]
 # One entry stands for every vehicle (each draws its own value); a list has one entry per vehicle, front to rear.
 """
@@ -730,6 +734,7 @@ _EXAMPLES = {
     "vehicle_types": "{car: {weight: 9, mass_t: 1.5}, truck: {mass_t: {with_load: [14, 40]}}}",
     "types": "[car, any, truck]",
     "mixture": "[{scenario: paper-random, weight: 2}, {scenario: paper-random-early}]",
+    "table": "{file: rows.csv, columns: [gap_1_m, gap_2_m]}",
     "roles": "{vehicle_2: learner}",
     "v2x": "nominal",
 }  # of keys that are no quantity and may be left out

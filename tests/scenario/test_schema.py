@@ -289,7 +289,9 @@ def test_json_schema__names_every_field_asks_for_one_of_two_ways_and_knows_no_nu
     schema = json.loads(json.dumps(scenario_json_schema()))
     assert set(schema["properties"]) == set(Scenario.model_fields)
     assert (schema["additionalProperties"], schema["required"]) == (False, ["name"])
-    assert schema["if"] == {"not": {"required": ["mixture"]}}  # whose members say everything else
+    assert schema["if"] == {
+        "not": {"anyOf": [{"required": ["mixture"]}, {"required": ["table"]}]}
+    }  # which say the rest
     gaps, speeds, obstacle, *_, every = schema["then"]["allOf"]
     assert [way["required"] for way in every["anyOf"]] == [["vehicle_types"], [*QUANTITY.needed]]
     ways = [[way["required"] for way in pair["oneOf"]] for pair in (gaps, speeds)]
