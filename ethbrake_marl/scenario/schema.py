@@ -326,9 +326,10 @@ class Scenario(ScenarioFields):
     """A line of vehicles, how each quantity is drawn, and who learns.
 
     A quantity is a number, ``{uniform: [low, high]}``, ``{loguniform: [low, high]}``, ``{normal: {mean, sd, low,
-    high}}``, ``{lognormal: {median, sigma, low, high}}`` or ``{choice: [...]}``. One entry stands for every vehicle (each draws its own value); a list has one entry
-    per vehicle, gaps one per pair. Every way to build one (``Scenario(...)``, ``load_scenario``, ``replace``) raises
-    ``InvalidInput`` with one message: where, value, what would be right.
+    high}}``, ``{lognormal: {median, sigma, low, high}}`` or ``{choice: [...]}``. One entry stands for every vehicle
+    (each draws its own value); a list has one entry per vehicle, gaps one per pair. Every way to build one
+    (``Scenario(...)``, ``load_scenario``, ``replace``) raises ``InvalidInput`` with one message: where, value, what
+    would be right.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random").replace(mass_t=[4.5, 5.5, 40.0])
