@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         policy_agent as policy_agent,
     )
     from ethbrake_marl.agents.registry import (
+        SHIELDS as SHIELDS,
         Agent as Agent,
         AgentAround as AgentAround,
         AgentSettings as AgentSettings,
