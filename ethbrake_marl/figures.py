@@ -119,12 +119,12 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     return ShownFigure(figsize=(width_in, height_in), layout="constrained")
 
 
-def style_axes(axes: Axes) -> None:
+def style_axes(axes: Axes, labelsize: float = 9) -> None:
     """Thin grid behind the data, no frame where nothing is read off."""
     axes.grid(visible=True, color="#dddddd", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(labelsize=9, color=GREY)
+    axes.tick_params(labelsize=labelsize, color=GREY)
 
 
 def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **how: Any) -> tuple[Figure, list[Axes]]:
@@ -731,7 +731,7 @@ def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
 _ABREAST = 4  # distributions in a row
 _MOST_APART = 4  # outlines in one of them that are named
 _MOST_PAIRED = 5  # quantities that are drawn in pairs
-_LABEL_CHARACTERS = 20  # of a line beside such a pair
+_LABEL_CHARACTERS = 18  # of a line beside such a pair
 _MOST_NAMED = 8  # vehicles of a line whose gaps and speeds are written
 _SHOWN = {0.0: "shortest line", 0.5: "median line", 1.0: "longest line"}  # by the rank of the sum of gaps
 
@@ -760,11 +760,11 @@ def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
     parts = figure.subfigures(len(drawings), 1, squeeze=False, height_ratios=heights_in).ravel()
     for part, (_, draw) in zip(parts, drawings, strict=True):
         draw(part)
-    caption = (
+    return finish(
+        figure,
         f"{label_text(scenario.name, 80)}, {count_of(worlds.n, 'world')} of the list of seed {seed}. Lines to scale,"
-        f" vehicles {BODY_M:g} m long; above: gaps (m), below: speeds (m/s)."
+        f" vehicles {BODY_M:g} m long; above: gaps (m), below: speeds (m/s).",
     )
-    return finish(figure, caption)
 
 
 def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
@@ -772,11 +772,12 @@ def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
     found: list[tuple[int, str, Floats]] = []
     for rule in QUANTITY.of(worlds).values():
         values, own = rule.of(worlds), {"vehicle": focus, "pair": max(focus - 1, 0), "world": 0}[rule.per]
-        nearest = sorted(np.flatnonzero(np.ptp(values, axis=0)).tolist(), key=lambda i, own=own: abs(i - own))
+        varying = np.flatnonzero(np.ptp(values, axis=0))
+        nearest = varying[np.argsort(np.abs(varying - own), kind="stable")].tolist()
         for i in sorted(nearest):
             owner = "" if rule.per == "world" else f"{rule.per.capitalize()} {i + 1}, "
             found.append((nearest.index(i), textwrap.fill(owner + rule.label, _LABEL_CHARACTERS), values[:, i]))
-    chosen = sorted(range(len(found)), key=lambda k: found[k][0])[:_MOST_PAIRED]
+    chosen = np.argsort([place for place, *_ in found], kind="stable")[:_MOST_PAIRED]
     return {found[k][1]: found[k][2] for k in sorted(chosen)}
 
 
@@ -787,7 +788,7 @@ def _distributions(panels: Mapping[str, Sequence[Drawn]], part: Any) -> None:
     for axes in every[len(panels) :]:
         axes.set_axis_off()
     for axes, (key, drawn) in zip(every, panels.items(), strict=False):
-        style_axes(axes)
+        style_axes(axes, 7)
         every_value = np.concatenate([each.values.ravel() for each in drawn])
         for number, each in enumerate(drawn):
             style, shares = series_style(number + 2), np.full(each.values.size, 1.0 / each.values.size)
@@ -800,20 +801,19 @@ def _distributions(panels: Mapping[str, Sequence[Drawn]], part: Any) -> None:
             axes.legend(fontsize=6.5, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 0.98), borderpad=0.0)
         axes.locator_params(nbins=3)
         axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-        axes.tick_params(labelsize=7)
-        axes.set_xlabel(QUANTITY.declared[key].label, fontsize=8)
-    every[0].set_ylabel("Share of worlds", fontsize=8)
+        name_axes(axes, x=QUANTITY.declared[key].label)
+    name_axes(every[0], y="Share of worlds")
 
 
 def _pairs(paired: Mapping[str, Floats], kinds: Any, part: Any) -> None:
     """Each pair of quantities as points, below the diagonal; a colour for each kind of world."""
     labels, values, names = list(paired), list(paired.values()), np.unique(kinds)
     grid = part.subplots(len(paired) - 1, len(paired) - 1, squeeze=False, sharex="col", sharey="row")
-    for (row, column), axes in np.ndenumerate(grid):
-        if column > row:
-            axes.set_axis_off()
-            continue
-        style_axes(axes)
+    for axes in grid[np.triu_indices(len(grid), 1)]:
+        axes.set_axis_off()
+    for row, column in zip(*np.tril_indices(len(grid)), strict=True):
+        axes = grid[row, column]
+        style_axes(axes, 7)
         for number, name in enumerate(names):
             chosen, style = kinds == name, series_style(number + 2)
             axes.scatter(
@@ -821,9 +821,7 @@ def _pairs(paired: Mapping[str, Floats], kinds: Any, part: Any) -> None:
                 marker=style["marker"], color=style["color"], label=label_text(str(name)),
             )  # fmt: skip
         axes.locator_params(nbins=3)
-        axes.tick_params(labelsize=7)
-        axes.set_xlabel(labels[column], fontsize=8)
-        axes.set_ylabel(labels[row + 1], fontsize=8)
+        name_axes(axes, x=labels[column], y=labels[row + 1])
         axes.label_outer()
     if len(names) > 1:
         part.legend(*grid[0][0].get_legend_handles_labels(), fontsize=8, frameon=False, markerscale=2.5)
@@ -831,19 +829,17 @@ def _pairs(paired: Mapping[str, Floats], kinds: Any, part: Any) -> None:
 
 def _lines(sample: Sample, shown: Mapping[int, str], part: Any) -> None:
     """Some of the worlds at the alert, to scale."""
-    worlds = sample.worlds
-    every = part.subplots(len(shown), 1, squeeze=False, sharex=True).ravel()
+    worlds, every = sample.worlds, part.subplots(len(shown), 1, squeeze=False, sharex=True).ravel()
     for axes, (row, name) in zip(every, shown.items(), strict=True):
-        style_axes(axes)
+        style_axes(axes, 7)
         axes.set(yticks=[], ylim=(-1.5, 1.0))
-        axes.tick_params(labelsize=7)
         axes.use_sticky_edges = False  # some road ahead and behind
         axes.axhline(-0.4, color=GREY, linewidth=0.8)
-        axes.set_title(f"World {sample.index[row]}, {name}", loc="left", fontsize=8)
+        name_axes(axes, f"World {sample.index[row]}, {name}")
         gaps, ahead = worlds.gaps_m[row], worlds.obstacle_gap_m[row]
         fronts = -np.concatenate([[0.0], np.cumsum(gaps + BODY_M)])
-        colours = [vehicle_colour(i) for i in range(worlds.N)]
-        axes.barh(np.zeros(worlds.N), BODY_M, 0.8, left=fronts - BODY_M, color=colours)
+        bodies = {"left": fronts - BODY_M, "color": [vehicle_colour(i) for i in range(worlds.N)]}
+        axes.barh(np.zeros(worlds.N), BODY_M, 0.8, **bodies)
         told = [(front + 0.5 * gap, 0.65, f"{gap:.1f}") for front, gap in zip(fronts[1:], gaps, strict=True)]
         for i, front in enumerate(fronts - 0.5 * BODY_M):
             kind = "" if sample.types is None else f"\n{label_text(str(sample.types[row, i]), 20)}"
@@ -853,7 +849,7 @@ def _lines(sample: Sample, shown: Mapping[int, str], part: Any) -> None:
             told.append((0.5 * ahead, 0.65, f"{ahead:.1f} to the obstacle"))
         for x, y, text in told if worlds.N <= _MOST_NAMED else ():
             axes.text(x, y, text, ha="center", va="center", fontsize=7, color="black" if y else "white")
-    every[-1].set_xlabel("Position from the front of Vehicle 1, at the alert (m)", fontsize=8)
+    name_axes(every[-1], x="Position from the front of Vehicle 1, at the alert (m)")
 
 
 # The price of the step shield: how often it intervenes against the harm that remains.

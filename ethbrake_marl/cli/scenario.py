@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import textwrap
 from collections import Counter
 from collections.abc import Iterator
@@ -21,10 +20,10 @@ from ethbrake_marl.files.store import read_plain
 from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.harm import KINDS
 from ethbrake_marl.physics import Worlds
-from ethbrake_marl.scenario import CHANNELS, QUANTITY, Scenario, ScriptSpec
+from ethbrake_marl.scenario import CHANNELS, QUANTITY, Scenario
 
 TRIED_WORLDS = 200  # by `scenario validate`
-MOST_RANGES = 9  # that it tells apart
+MOST_RANGES = 8  # that it tells apart
 SCREEN = 24  # lines
 TABLE_WORLDS, PICTURE_WORLDS = 10, 1000  # by `scenario sample`
 
@@ -74,36 +73,35 @@ def scenario_validate(out: Out, path: NameArgument) -> None:
     n, names = sample.worlds.n, [scenario.vehicle_names[i] for i in scenario.learners]
     ranges, fixed, quantities = _drawn_lines(sample.worlds, scenario)
     found = evaluation.try_scenario(scenario, sample.worlds)
-    told = {"name": scenario.name, "vehicles": scenario.vehicles, "learners": names, "worlds": n, **found}
-    told |= {"rejected": sample.rejected, "quantities": quantities}
-    told |= {"kinds": {kind: dict(Counter(drawn.tolist())) for kind, drawn in sample.kinds.items()}}
-    learners, moving, late = ", ".join(names) or "none", found["moving_at_horizon"], found["vehicle_1_late"]
-    beyond, odd = found["commands_out_of_range"], found["not_state_free"]
-    early = f"an impact before {learners if len(names) == 1 else 'the first learner'} may act"
-    if scenario.early_impacts == "reject":
-        early = f"refused for {early}: {_share(sample.rejected, sample.rejected + n, 'draws')}"
-    else:
-        early = f"{early}: in {_share(found['early_impacts'], n)}"
-    (head, *notes) = (
-        f"{'NOT OK' if beyond else 'OK'}  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners};"
-        f" tried in {n} worlds",
+    told = {
+        "name": scenario.name, "vehicles": scenario.vehicles, "learners": names, "worlds": n, **found,
+        "rejected": sample.rejected, "quantities": quantities,
+        "kinds": {kind: dict(Counter(drawn.tolist())) for kind, drawn in sample.kinds.items()},
+    }  # fmt: skip
+    odd, beyond, late = (found[each] for each in ("not_state_free", "commands_out_of_range", "vehicle_1_late"))
+    head, *notes = (
+        f"{'NOT OK' if beyond else 'OK'}  {scenario.name}: {scenario.vehicles} vehicles, learners:"
+        f" {', '.join(names) or 'none'}; tried in {n} worlds",
         sample.count_kinds().removeprefix("; "),
-        early if names else "",
-        f"at the horizon ({scenario.horizon_s:g} s) something still moves in {_share(moving, n)}"
-        + ("; what comes after counts nowhere, a longer horizon_s sees more" if moving else ""),
+        f"early impacts: {_share(sample.rejected, sample.rejected + n, 'draws')} refused,"
+        f" {_share(found['early_impacts'], n)} kept",
+        f"at the horizon ({scenario.horizon_s:g} s) something still moves in {_share(found['moving_at_horizon'], n)}"
+        + ("; what comes after counts nowhere, a longer horizon_s sees more" if found["moving_at_horizon"] else ""),
         f"Vehicle 1, whose braking is the alert, has a latency above 0 in {_share(late, n)}" if late else "",
-        "; ".join(f"{each} ({scenario.roles[each]}) asks for too much in {len(rows)}" for each, rows in beyond.items()),
+        "; ".join(f"{each} asks for more than it can in {_share(len(rows), n)}" for each, rows in beyond.items()),
         f"not state-free: {', '.join(f'{each} ({script})' for each, script in odd.items())}; therefore refused by"
         f" {', '.join(found['refused_by']) or 'nothing'}"
         if odd
         else "",
     )
-    above, below = _folded(head, 2) + ranges, [line for note in notes for line in _folded(note, 2)]
+    above, below = _folded(head, 2) + ranges, [line for note in notes for line in _folded(note, 3)]
     out.result(told, *above, *_folded(fixed, max(SCREEN - len(above) - len(below), 1)), *below)
-    for vehicle, rows in list(beyond.items())[:1]:
-        script, first = scenario.roles[vehicle], next(iter(rows.values()))
-        what = f"asks for more than its vehicle can in {_share(len(rows), n)}; {first}"
-        raise InvalidInput(f"scenario {scenario.name!r}: roles.{vehicle} = {script}: {what}")
+    if beyond:
+        (vehicle, rows), *_ = beyond.items()
+        raise InvalidInput(
+            f"scenario {scenario.name!r}: roles.{vehicle} = {scenario.roles[vehicle]}: asks for more than its vehicle"
+            f" can in {_share(len(rows), n)}; {next(iter(rows.values()))}"
+        )
 
 
 def _drawn_lines(worlds: Worlds, scenario: Scenario) -> tuple[list[str], str, dict[str, dict[str, float]]]:
@@ -116,16 +114,17 @@ def _drawn_lines(worlds: Worlds, scenario: Scenario) -> tuple[list[str], str, di
     lines = [f"{'drawn':{width}} {'least':>8} {'median':>8} {'largest':>8}"] if ranges else []
     for name, drawn in ranges.items():
         lines.append(f"{name:{width}}" + "".join(f" {each:>8.4g}" for each in np.quantile(drawn, (0.0, 0.5, 1.0))))
-    fixed = []
-    for key, rule in QUANTITY.of(worlds).items():
-        told = ["drawn" if np.ptp(each) else f"{each[0]:g}" for each in rule.of(worlds).T]
-        if key not in ranges:
-            fixed.append(f"{key} {told[0] if len(set(told)) == 1 else ', '.join(told)}")
+    others = {
+        key: ["drawn" if np.ptp(each) else f"{each[0]:g}" for each in rule.of(worlds).T]
+        for key, rule in QUANTITY.of(worlds).items()
+        if key not in ranges
+    }
+    told = (f"{key} {each[0] if len(set(each)) == 1 else ', '.join(each)}" for key, each in others.items())
     columns = {
         name: dict(zip(("least", "median", "largest"), np.quantile(drawn, (0.0, 0.5, 1.0)).tolist(), strict=True))
         for name, drawn in QUANTITY.columns(worlds).items()
     }
-    return lines, f"fixed: {'; '.join(fixed)}" if fixed else "", columns
+    return lines, f"fixed: {'; '.join(told)}" if others else "", columns
 
 
 def _folded(text: str, most: int, width: int = 80) -> list[str]:
@@ -150,21 +149,20 @@ def scenario_explain(out: Out, scenario: NameArgument) -> None:
 
 def _sentences(scenario: Scenario) -> Iterator[str]:
     """What is declared, piece by piece; empty where there is nothing to say."""
-    from ethbrake_marl.agents import agent_entries
+    from ethbrake_marl.agents import find_entry, parse_spec
 
-    yield f"{scenario.name}: {scenario.title or 'no title'}"
-    yield scenario.description
+    yield f"{scenario.name}: {scenario.title or 'no title'}. {scenario.description}".rstrip()
     learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners) or "nobody"
-    ahead = "an obstacle" if scenario.has_obstacle else "no obstacle"
-    yield f"{scenario.vehicles} vehicles in line, vehicle_1 in front, {ahead} ahead. Learning: {learners}."
-    abouts = {re.split(r"[\[:@]", each.form)[0]: each.about for each in agent_entries()}
+    yield (
+        f"{scenario.vehicles} vehicles in line, vehicle_1 in front, {'an' if scenario.has_obstacle else 'no'} obstacle"
+        f" ahead. Learning: {learners}."
+    )
     for script in dict.fromkeys(scenario.scripts.values()):
         who = ", ".join(name for name, role in scenario.roles.items() if role == script)
-        yield f"By script {script} ({abouts[ScriptSpec.parse(script).name]}): {who}."
+        yield f"By script {script} ({find_entry(parse_spec(script)).about}): {who}."
     if scenario.mixture is not None:
-        whole = sum(each.weight for each in scenario.mixture)
-        members = (f"{each.scenario['name']} ({100.0 * each.weight / whole:.3g} %)" for each in scenario.mixture)
-        yield f"Each world is drawn from one of: {', '.join(members)}. All of them together:"
+        members = ", ".join(f"{each.scenario['name']} ({each.weight:g})" for each in scenario.mixture)
+        yield f"Each world is drawn from one of these scenarios, by weight: {members}. All of them together:"
     for name, kind in (scenario.vehicle_types or {}).items():
         own = {QUANTITY.declared[key].label: getattr(kind, key) for key in QUANTITY.of_a_type}
         told = "; ".join(f"{label} {_in_words(each)}" for label, each in own.items() if each is not None)
@@ -173,27 +171,23 @@ def _sentences(scenario: Scenario) -> Iterator[str]:
     for key, rule in QUANTITY.declared.items():
         told = _declared_in_words(scenario, key)
         yield f"{rule.label[0].upper()}{rule.label[1:]}: {told}; {rule.meaning}." if told else ""
-    yield _news_in_words(scenario)
-    early = "stays" if scenario.early_impacts == "keep" else "is drawn again"
-    told = f" A world with an impact before a learner may act {early}." if _is_common(scenario, "early_impacts") else ""
-    yield f"A decision every {scenario.time_step_s:g} s; an episode is cut off after {scenario.horizon_s:g} s.{told}"
+    common = scenario.model_fields_set if scenario.members else type(scenario).model_fields  # to a whole mixture
+    yield _news_in_words(scenario) if "v2x" in common else "Who knows what when (V2X) differs between these scenarios."
+    early = "stays in the list" if scenario.early_impacts == "keep" else "is drawn again"
+    yield (
+        f"A decision every {scenario.time_step_s:g} s; an episode is cut off after {scenario.horizon_s:g} s."
+        + (f" A world with an impact before a learner may act {early}." if "early_impacts" in common else "")
+    )
     objectives = dict.fromkeys([scenario.objective] if isinstance(scenario.objective, str) else scenario.objective)
     aims = ", ".join(f"{each} ({KINDS[each.partition(':')[0]].about})" for each in objectives)
     yield f"Objective: {aims}; a shield always bounds the harm of the whole line."
 
 
-def _is_common(scenario: Scenario, key: str) -> bool:
-    """Whether the scenario says it; of a mixture, whether all of its scenarios agree."""
-    return not scenario.members or key in scenario.model_fields_set
-
-
 def _declared_in_words(scenario: Scenario, key: str) -> str:
     """How a quantity is drawn; empty where it is not declared, or by each type."""
     if scenario.members:
-        if key not in QUANTITY.usual:
-            return ""
-        low, high = np.min(scenario.bounds(key)), np.max(scenario.bounds(key))
-        return f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
+        ends = [end for each in (scenario.bounds(key) if key in QUANTITY.usual else ()) for end in each]
+        return " to ".join(dict.fromkeys(f"{end(ends):.4g}" for end in (min, max))) if ends else ""
     given = getattr(scenario, key)
     if given is None or (key in QUANTITY.otherwise and key not in scenario.model_fields_set):
         return ""
@@ -207,28 +201,19 @@ def _in_words(quantity: Any) -> str:
     """A number or a distribution."""
     if isinstance(quantity, float):
         return f"{quantity:g}"
-    (kind, shape), *weights = quantity.model_dump(exclude_none=True).items()
-    if kind == "choice":
-        weighted = f" (weights {', '.join(f'{each:g}' for each in weights[0][1])})" if weights else ""
-        return " or ".join(f"{each:g}" for each in shape) + weighted
-    if kind == "with_load":
-        return f"{shape[0]:g} empty to {shape[1]:g} full"
-    low, high = quantity.support
-    inner = shape.items() if isinstance(shape, dict) else ()
-    told = "".join(f", {name} {each:g}" for name, each in inner if name not in ("low", "high"))
-    return f"{low:g} to {high:g} ({kind}{told})"
+    (kind, shape), *more = quantity.model_dump(exclude_none=True).items()
+    inner, ends = (shape, quantity.support) if isinstance(shape, dict) else (dict(more), shape)
+    told = [f"{name} {flow_text(each)}" for name, each in inner.items() if name not in ("low", "high")]
+    values = (" or " if kind == "choice" else " to ").join(f"{each:g}" for each in ends)
+    return f"{values} ({', '.join([kind.replace('_', ' '), *told])})"
 
 
 def _news_in_words(scenario: Scenario) -> str:
     """Who knows what, and when."""
-    if not _is_common(scenario, "v2x"):
-        return "Who knows what when (V2X) differs between these scenarios."
-    if not scenario.by_link:
-        return "V2X preset paper: from its latency on each vehicle knows the whole line."
     channel, about = scenario.v2x.channel._asdict(), type(scenario.v2x).model_fields
     other = {key: value for key, value in channel.items() if key in about and value != getattr(CHANNELS["paper"], key)}
     told = "; ".join(f"{key} {flow_text(value)} ({about[key].description})" for key, value in other.items())
-    return f"V2X preset {scenario.v2x.preset}: {told}."
+    return f"V2X preset {scenario.v2x.preset}: {told or 'from its latency on each vehicle knows the whole line'}."
 
 
 @scenario_group.add("new", "scenario new my-scenario --based-on paper-distance", force=True)
@@ -270,16 +255,16 @@ def scenario_sample(
     """
     out.check(output, ".csv", ".png", ".svg", ".pdf", what="worlds")
     chosen = evaluation.load_runnable(scenario, learning.read_settings(settings).scenario)
-    pictured = output is not None and output.suffix.lower() != ".csv"
-    sample = chosen.sample(episodes or (PICTURE_WORLDS if pictured else TABLE_WORLDS), seed)
+    pictured = None if output is None or output.suffix.lower() == ".csv" else output
+    usual = TABLE_WORLDS if pictured is None else PICTURE_WORLDS
+    sample = chosen.sample(usual if episodes is None else episodes, seed)
     states = evaluation.states_of(sample.worlds, chosen)
     lines = [",".join(states[0]), *(",".join(map(repr, state.values())) for state in states)]
-    if pictured:
+    if pictured is not None:
         from ethbrake_marl.figures import worlds_figure, write_picture
 
-        assert output is not None
-        write_picture(output, worlds_figure(chosen, sample, seed=seed), force=out.force)
-        out.note(f"picture: {output}")
+        write_picture(pictured, worlds_figure(chosen, sample, seed=seed), force=out.force)
+        out.note(f"picture: {pictured}")
     elif output is not None:
         out.write(output, "\n".join([*lines, ""]), what="worlds")
     if output is None or out.as_json:

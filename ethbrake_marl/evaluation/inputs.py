@@ -25,6 +25,7 @@ from ethbrake_marl.agents import (
     PolicyAgent,
     Team,
     episode_engine,
+    find_entry,
     make_agent,
     make_single_agent,
     parse_spec,
@@ -324,11 +325,13 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
     ``refused_by`` is what does not take scripts that depend on the state -> its message. Raises ``InvalidInput`` for
     whatever a script raises, ``PhysicsError`` as ``drive``.
     """
-    settings = {"horizon_s": scenario.horizon_s, "time_step_s": scenario.time_step_s}
-    scripts = {
-        i: make_single_agent(scenario.scripts.get(i, "full_brake"), most_candidates=TRIED_CANDIDATES, **settings)
-        for i in range(scenario.vehicles)
+    searches = {
+        scenario.vehicle_names[i]: f"{ScriptSpec.parse(script).name}:{TRIED_CANDIDATES}"
+        for i, script in scenario.scripts.items()
+        if "CANDIDATES" in find_entry(parse_spec(script)).form
     }
+    tried = scenario.replace(roles={**scenario.roles, **searches})
+    scripts = {**script_agents(tried), **dict.fromkeys(scenario.learners, make_single_agent("full_brake"))}
     early, moving = np.zeros((2, worlds.n), np.bool_)
     beyond: dict[str, dict[int, str]] = {}
 
@@ -347,10 +350,13 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
                 drive_rows(np.array([row]))
             except AgentFailed as error:
                 beyond.setdefault(error.reason.partition(" ")[0], {})[row] = str(error.renumbered([row]))
-    names = scenario.vehicle_names
-    odd = {names[i]: each for i, each in scenario.scripts.items() if not ScriptSpec.parse(each).is_state_free()}
+    odd = {
+        scenario.vehicle_names[i]: script
+        for i, script in scenario.scripts.items()
+        if not ScriptSpec.parse(script).is_state_free()
+    }
     usual = scenario.replace(roles={**scenario.roles, **dict.fromkeys(odd, "full_brake")})
-    refused, anyway = (_refusals(each, worlds.take([0])) if odd else {} for each in (scenario, usual))
+    refused, anyway = (_refusals(each, worlds.take([0])) if odd else {} for each in (tried, usual))
     return {
         "early_impacts": int(early.sum()),
         "moving_at_horizon": int(moving.sum()),
@@ -365,8 +371,9 @@ def _refusals(scenario: Scenario, worlds: Worlds) -> dict[str, str]:
     """What refuses the scenario, each asked itself: agents, shields, a search, ``early_impacts: reject``; and why."""
 
     def drive_by(spec: str) -> None:
-        most, uncertainty = TRIED_CANDIDATES, DEFAULT.UNCERTAINTY_EXAMPLE
-        agent = make_agent(spec, scenario=scenario, most_candidates=most, uncertainty=uncertainty)
+        agent = make_agent(
+            spec, scenario=scenario, most_candidates=TRIED_CANDIDATES, uncertainty=DEFAULT.UNCERTAINTY_EXAMPLE
+        )
         check_agents({spec: agent}, worlds, scenario)
 
     asked: dict[str, Callable[[], object]] = {spec: partial(drive_by, spec) for spec in LADDER}

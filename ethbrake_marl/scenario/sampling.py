@@ -88,8 +88,9 @@ class QuantityRule:
     @property
     def label(self) -> str:
         """Its name in words, with its unit, as an axis has it: ``braking capacity (m/s²)``."""
-        words = self.name.removesuffix(f"_{self.unit}").replace("_", " ")
-        return f"{words} ({self.symbol.replace('s2', 's²')})" if self.unit else words
+        return self.name.removesuffix(f"_{self.unit}").replace("_", " ") + (
+            f" ({self.symbol.replace('s2', 's²')})" if self.unit else ""
+        )
 
     @property
     def interval(self) -> str:
