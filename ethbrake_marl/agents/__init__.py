@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         policy_agent as policy_agent,
     )
     from ethbrake_marl.agents.registry import (
+        SHIELDS as SHIELDS,
         Agent as Agent,
         AgentAround as AgentAround,
         AgentSettings as AgentSettings,
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
         check_agent as check_agent,
         drive as drive,
         episode_engine as episode_engine,
+        find_entry as find_entry,
         fixed_commands as fixed_commands,
         make_agent as make_agent,
         make_single_agent as make_single_agent,

@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+import textwrap
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+import numpy as np
 import typer
 
 from ethbrake_marl import evaluation, learning, scenario as scenarios
 from ethbrake_marl.cli.command import Out, app
 from ethbrake_marl.defaults import DEFAULT
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.files.store import read_plain
+from ethbrake_marl.files.yaml import flow_text
+from ethbrake_marl.harm import KINDS
+from ethbrake_marl.physics import Worlds
+from ethbrake_marl.scenario import CHANNELS, QUANTITY, Scenario
 
-CHECKED_DRAWS = 1000  # worlds that `scenario validate` draws
+TRIED_WORLDS = 200  # by `scenario validate`
+MOST_RANGES = 8  # that it tells apart
+SCREEN = 24  # lines
+TABLE_WORLDS, PICTURE_WORLDS = 10, 1000  # by `scenario sample`
 
 NameArgument = Annotated[str, typer.Argument(metavar="NAME|PATH")]
 NewNameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Of the new file.")]
@@ -51,32 +63,157 @@ def scenario_show(out: Out, scenario: NameArgument) -> None:
 
 @scenario_group.add("validate", "scenario validate my-scenario.yaml", json=True)
 def scenario_validate(out: Out, path: NameArgument) -> None:
-    """Check a scenario.
+    """Check a scenario, and try it in 200 worlds.
 
-    One line: OK, or what is wrong; then what may not be meant.
+    Tells what is drawn, and what may not be meant; or what is wrong. The first worlds of its list are drawn, the
+    scripts drive, and learners brake fully.
     """
-    from ethbrake_marl.agents import Team, drive, make_agent
-
     scenario = evaluation.load_runnable(path)
-    sample = scenario.sample(CHECKED_DRAWS, DEFAULT.LIST_SEED)
-    names = [scenario.vehicle_names[i] for i in scenario.learners]
-    free = {i for i, script in scenario.scripts.items() if scenarios.ScriptSpec.parse(script).is_state_free()}
-    deciding = [i for i in range(scenario.vehicles) if i not in free]
-    braking = Team.of(make_agent("full_brake"), deciding)
-    moving = int((~drive(sample.worlds, braking, scenario).at_rest).sum())
-    late = int((sample.worlds.vehicles.latency_s[:, 0] > 0.0).sum())
-    told = {"name": scenario.name, "vehicles": scenario.vehicles, "learners": names, "worlds": CHECKED_DRAWS}
-    counts = f"{CHECKED_DRAWS:,} worlds drawn, {sample.rejected:,} more refused for an early impact"
-    learners = ", ".join(names) or "none"
-    shown = [f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; {counts}{sample.count_kinds()}"]
-    if moving:
-        shown.append(
-            f"note: at the horizon ({scenario.horizon_s:g} s) something still moves in {moving:,} of them, though"
-            " whoever decides brakes fully; what comes after counts nowhere. A longer horizon_s sees more"
+    sample = scenario.sample(TRIED_WORLDS, DEFAULT.LIST_SEED)
+    n, names = sample.worlds.n, [scenario.vehicle_names[i] for i in scenario.learners]
+    ranges, fixed, quantities = _drawn_lines(sample.worlds, scenario)
+    found = evaluation.try_scenario(scenario, sample.worlds)
+    told = {
+        "name": scenario.name, "vehicles": scenario.vehicles, "learners": names, "worlds": n, **found,
+        "rejected": sample.rejected, "quantities": quantities,
+        "kinds": {kind: dict(Counter(drawn.tolist())) for kind, drawn in sample.kinds.items()},
+    }  # fmt: skip
+    odd, beyond, late = (found[each] for each in ("not_state_free", "commands_out_of_range", "vehicle_1_late"))
+    head, *notes = (
+        f"{'NOT OK' if beyond else 'OK'}  {scenario.name}: {scenario.vehicles} vehicles, learners:"
+        f" {', '.join(names) or 'none'}; tried in {n} worlds",
+        sample.count_kinds().removeprefix("; "),
+        f"early impacts: {_share(sample.rejected, sample.rejected + n, 'draws')} refused,"
+        f" {_share(found['early_impacts'], n)} kept",
+        f"at the horizon ({scenario.horizon_s:g} s) something still moves in {_share(found['moving_at_horizon'], n)}"
+        + ("; what comes after counts nowhere, a longer horizon_s sees more" if found["moving_at_horizon"] else ""),
+        f"Vehicle 1, whose braking is the alert, has a latency above 0 in {_share(late, n)}" if late else "",
+        "; ".join(f"{each} asks for more than it can in {_share(len(rows), n)}" for each, rows in beyond.items()),
+        f"not state-free: {', '.join(f'{each} ({script})' for each, script in odd.items())}; therefore refused by"
+        f" {', '.join(found['refused_by']) or 'nothing'}"
+        if odd
+        else "",
+    )
+    above, below = _folded(head, 2) + ranges, [line for note in notes for line in _folded(note, 3)]
+    out.result(told, *above, *_folded(fixed, max(SCREEN - len(above) - len(below), 1)), *below)
+    if beyond:
+        (vehicle, rows), *_ = beyond.items()
+        raise InvalidInput(
+            f"scenario {scenario.name!r}: roles.{vehicle} = {scenario.roles[vehicle]}: asks for more than its vehicle"
+            f" can in {_share(len(rows), n)}; {next(iter(rows.values()))}"
         )
-    if late:
-        shown.append(f"note: Vehicle 1, whose braking is the alert, has a latency above 0 in {late:,} of them")
-    out.result({**told, "rejected": sample.rejected, "moving_at_horizon": moving, "vehicle_1_late": late}, *shown)
+
+
+def _drawn_lines(worlds: Worlds, scenario: Scenario) -> tuple[list[str], str, dict[str, dict[str, float]]]:
+    """The range of each quantity that varies, a line each below a head; what is fixed; all of them by column."""
+    varying = evaluation.drawn_alike(worlds, scenario)
+    ranges = {each.key + (f" of {each.owners}" if each.owners else ""): each.values for each in varying}
+    if len(ranges) > MOST_RANGES:
+        ranges = {each.key: QUANTITY.declared[each.key].of(worlds) for each in varying}
+    width = max(map(len, ranges), default=0)
+    lines = [f"{'drawn':{width}} {'least':>8} {'median':>8} {'largest':>8}"] if ranges else []
+    for name, drawn in ranges.items():
+        lines.append(f"{name:{width}}" + "".join(f" {each:>8.4g}" for each in np.quantile(drawn, (0.0, 0.5, 1.0))))
+    others = {
+        key: ["drawn" if np.ptp(each) else f"{each[0]:g}" for each in rule.of(worlds).T]
+        for key, rule in QUANTITY.of(worlds).items()
+        if key not in ranges
+    }
+    told = (f"{key} {each[0] if len(set(each)) == 1 else ', '.join(each)}" for key, each in others.items())
+    columns = {
+        name: dict(zip(("least", "median", "largest"), np.quantile(drawn, (0.0, 0.5, 1.0)).tolist(), strict=True))
+        for name, drawn in QUANTITY.columns(worlds).items()
+    }
+    return lines, f"fixed: {'; '.join(told)}" if others else "", columns
+
+
+def _folded(text: str, most: int, width: int = 80) -> list[str]:
+    """The lines of a text, at most so many."""
+    return textwrap.wrap(text, width, max_lines=most, placeholder=" ...", break_on_hyphens=False)
+
+
+def _share(part: int, whole: int, things: str = "worlds") -> str:
+    return f"{part:,} of {whole:,} {things} ({100.0 * part / whole:.1f} %)"
+
+
+@scenario_group.add("explain", "scenario explain paper-random", json=True)
+def scenario_explain(out: Out, scenario: NameArgument) -> None:
+    """Say in plain sentences what a scenario is.
+
+    Who stands in line, how each quantity is drawn, who knows what when, and whose harm counts.
+    """
+    chosen = evaluation.load_runnable(scenario)
+    told = [each for each in _sentences(chosen) if each]
+    out.result({"name": chosen.name, "sentences": told}, *(line for each in told for line in _folded(each, 4, 100)))
+
+
+def _sentences(scenario: Scenario) -> Iterator[str]:
+    """What is declared, piece by piece; empty where there is nothing to say."""
+    from ethbrake_marl.agents import find_entry, parse_spec
+
+    yield f"{scenario.name}: {scenario.title or 'no title'}. {scenario.description}".rstrip()
+    learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners) or "nobody"
+    yield (
+        f"{scenario.vehicles} vehicles in line, vehicle_1 in front, {'an' if scenario.has_obstacle else 'no'} obstacle"
+        f" ahead. Learning: {learners}."
+    )
+    for script in dict.fromkeys(scenario.scripts.values()):
+        who = ", ".join(name for name, role in scenario.roles.items() if role == script)
+        yield f"By script {script} ({find_entry(parse_spec(script)).about}): {who}."
+    if scenario.mixture is not None:
+        members = ", ".join(f"{each.scenario['name']} ({each.weight:g})" for each in scenario.mixture)
+        yield f"Each world is drawn from one of these scenarios, by weight: {members}. All of them together:"
+    for name, kind in (scenario.vehicle_types or {}).items():
+        own = {QUANTITY.declared[key].label: getattr(kind, key) for key in QUANTITY.of_a_type}
+        told = "; ".join(f"{label} {_in_words(each)}" for label, each in own.items() if each is not None)
+        yield f"Type {name}, weight {kind.weight:g}, load {_in_words(kind.load)}: {told}."
+    yield f"Types along the line: {flow_text(scenario.types or 'any')}." if scenario.vehicle_types else ""
+    for key, rule in QUANTITY.declared.items():
+        told = _declared_in_words(scenario, key)
+        yield f"{rule.label[0].upper()}{rule.label[1:]}: {told}; {rule.meaning}." if told else ""
+    common = scenario.model_fields_set if scenario.members else type(scenario).model_fields  # to a whole mixture
+    yield _news_in_words(scenario) if "v2x" in common else "Who knows what when (V2X) differs between these scenarios."
+    early = "stays in the list" if scenario.early_impacts == "keep" else "is drawn again"
+    yield (
+        f"A decision every {scenario.time_step_s:g} s; an episode is cut off after {scenario.horizon_s:g} s."
+        + (f" A world with an impact before a learner may act {early}." if "early_impacts" in common else "")
+    )
+    objectives = dict.fromkeys([scenario.objective] if isinstance(scenario.objective, str) else scenario.objective)
+    aims = ", ".join(f"{each} ({KINDS[each.partition(':')[0]].about})" for each in objectives)
+    yield f"Objective: {aims}; a shield always bounds the harm of the whole line."
+
+
+def _declared_in_words(scenario: Scenario, key: str) -> str:
+    """How a quantity is drawn; empty where it is not declared, or by each type."""
+    if scenario.members:
+        ends = [end for each in (scenario.bounds(key) if key in QUANTITY.usual else ()) for end in each]
+        return " to ".join(dict.fromkeys(f"{end(ends):.4g}" for end in (min, max))) if ends else ""
+    given = getattr(scenario, key)
+    if given is None or (key in QUANTITY.otherwise and key not in scenario.model_fields_set):
+        return ""
+    if isinstance(given, tuple):
+        return ", ".join(map(_in_words, given))
+    per = QUANTITY.declared[key].per
+    return _in_words(given) + ("" if isinstance(given, float) or per == "world" else f", drawn for each {per}")
+
+
+def _in_words(quantity: Any) -> str:
+    """A number or a distribution."""
+    if isinstance(quantity, float):
+        return f"{quantity:g}"
+    (kind, shape), *more = quantity.model_dump(exclude_none=True).items()
+    inner, ends = (shape, quantity.support) if isinstance(shape, dict) else (dict(more), shape)
+    told = [f"{name} {flow_text(each)}" for name, each in inner.items() if name not in ("low", "high")]
+    values = (" or " if kind == "choice" else " to ").join(f"{each:g}" for each in ends)
+    return f"{values} ({', '.join([kind.replace('_', ' '), *told])})"
+
+
+def _news_in_words(scenario: Scenario) -> str:
+    """Who knows what, and when."""
+    channel, about = scenario.v2x.channel._asdict(), type(scenario.v2x).model_fields
+    other = {key: value for key, value in channel.items() if key in about and value != getattr(CHANNELS["paper"], key)}
+    told = "; ".join(f"{key} {flow_text(value)} ({about[key].description})" for key, value in other.items())
+    return f"V2X preset {scenario.v2x.preset}: {told or 'from its latency on each vehicle knows the whole line'}."
 
 
 @scenario_group.add("new", "scenario new my-scenario --based-on paper-distance", force=True)
@@ -96,27 +233,39 @@ def scenario_schema(out: Out) -> None:
     out.print_json(scenarios.scenario_json_schema())
 
 
-@scenario_group.add("sample", "scenario sample paper-random --episodes 10 --output worlds.csv", json=True, force=True)
+@scenario_group.add("sample", "scenario sample paper-random --output worlds.png", json=True, force=True)
 def scenario_sample(
     out: Out,
     scenario: NameArgument,
-    episodes: int = 10,
+    episodes: Annotated[
+        int | None,
+        typer.Option(help="Worlds of the list.", show_default=f"{TABLE_WORLDS}, of a picture {PICTURE_WORLDS}"),
+    ] = None,
     seed: int = DEFAULT.LIST_SEED,
     settings: list[str] | None = None,
     output: Annotated[
-        Path | None, typer.Option(metavar="FILE.csv", help="Write the table to this file.", show_default="stdout")
+        Path | None, typer.Option(metavar="FILE", help="Write .csv, .png, .svg or .pdf.", show_default="stdout")
     ] = None,
 ) -> None:
-    """Draw the first worlds of a list as a table.
+    """Draw worlds of a list, as a table or a picture.
 
-    `ethbrake evaluate --initial-states` reads it. A column is what the scenario does not fix. The same list, seed and
-    number are the same worlds on every machine.
+    `ethbrake evaluate --initial-states` reads the table. A column is what the scenario does not fix. The picture shows
+    distributions, pairs of quantities, and three worlds. The same list, seed and number are the same worlds on every
+    machine.
     """
-    out.check(output, ".csv", what="a table of worlds")
+    out.check(output, ".csv", ".png", ".svg", ".pdf", what="worlds")
     chosen = evaluation.load_runnable(scenario, learning.read_settings(settings).scenario)
-    states = evaluation.states_of(chosen.sample(episodes, seed).worlds, chosen)
+    pictured = None if output is None or output.suffix.lower() == ".csv" else output
+    usual = TABLE_WORLDS if pictured is None else PICTURE_WORLDS
+    sample = chosen.sample(usual if episodes is None else episodes, seed)
+    states = evaluation.states_of(sample.worlds, chosen)
     lines = [",".join(states[0]), *(",".join(map(repr, state.values())) for state in states)]
-    if output is not None:
+    if pictured is not None:
+        from ethbrake_marl.figures import worlds_figure, write_picture
+
+        write_picture(pictured, worlds_figure(chosen, sample, seed=seed), force=out.force)
+        out.note(f"picture: {pictured}")
+    elif output is not None:
         out.write(output, "\n".join([*lines, ""]), what="worlds")
     if output is None or out.as_json:
         out.result(states, *lines)

@@ -23,11 +23,13 @@ if TYPE_CHECKING:
         write_dataset as write_dataset,
     )
     from ethbrake_marl.evaluation.inputs import (
+        Drawn as Drawn,
         NamedWorld as NamedWorld,
         NamedWorlds as NamedWorlds,
         check_agents as check_agents,
         choose_worlds as choose_worlds,
         content_sha256 as content_sha256,
+        drawn_alike as drawn_alike,
         driving_policy as driving_policy,
         load_runnable as load_runnable,
         make_agents as make_agents,
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
         result_identity as result_identity,
         result_versions as result_versions,
         states_of as states_of,
+        try_scenario as try_scenario,
         worlds_sha256 as worlds_sha256,
     )
     from ethbrake_marl.evaluation.measures import (

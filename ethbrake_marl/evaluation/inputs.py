@@ -5,36 +5,41 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import fields, is_dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
 from ethbrake_marl.agents import (
+    SHIELDS,
     Agent,
     AgentAround,
     Driver,
+    Episodes,
     LearnedAgent,
     PolicyAgent,
     Team,
     episode_engine,
+    find_entry,
     make_agent,
     make_single_agent,
     parse_spec,
     script_agents,
 )
 from ethbrake_marl.defaults import DEFAULT, HarmCount
-from ethbrake_marl.engine import ask_script, begin_script
+from ethbrake_marl.engine import Engine, ask_script, begin_script
 from ethbrake_marl.errors import AgentFailed, InvalidInput, check_one_learner
 from ethbrake_marl.files.plugins import files_run
 from ethbrake_marl.files.yaml import FileModel, Override, Wording, flow_text, read_model, read_yaml
-from ethbrake_marl.physics import Ints, Worlds
+from ethbrake_marl.limits import task_problem
+from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.policies import Policy
-from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, load_scenario
+from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, ScriptSpec, Task, load_scenario
 from ethbrake_marl.shield import ShieldedDriver, Uncertainty
 
 # The identity of a result: the worlds, the scenario and the policies that it is about, and what computed it.
@@ -229,6 +234,31 @@ def states_of(worlds: Worlds, scenario: Scenario) -> list[dict[str, float]]:
     return [{name: float(values[k]) for name, values in columns.items()} for k in range(worlds.n)]
 
 
+class Drawn(NamedTuple):
+    """A quantity that differs from world to world, of the vehicles or pairs that draw it alike."""
+
+    key: str
+    owners: str  # these vehicles or pairs, in a few words; empty: all that there are
+    values: Floats  # [n, entries]
+
+
+_LONGEST_OWNERS = 30  # characters
+
+
+def drawn_alike(worlds: Worlds, scenario: Scenario) -> list[Drawn]:
+    """Every quantity in which the worlds differ, apart for vehicles and pairs that have other bounds."""
+    found = []
+    for key, rule in QUANTITY.of(worlds).items():
+        values, groups = rule.of(worlds), dict[object, list[int]]()
+        for i in np.flatnonzero(np.ptp(values, axis=0)).tolist():
+            groups.setdefault(None if rule.per == "world" else scenario.bounds(key)[i], []).append(i)
+        for alike in groups.values():
+            names = ", ".join(map(rule.owner, alike))
+            few = names if len(names) <= _LONGEST_OWNERS else f"{len(alike)} {rule.per}s"
+            found.append(Drawn(key, "" if len(alike) == values.shape[1] else few, values[:, alike]))
+    return found
+
+
 TRIED_CANDIDATES = 16  # of a script that searches, when a scenario is only checked
 
 LADDER = (  # from no decision at all up to the best that is known
@@ -285,6 +315,78 @@ def load_runnable(
             " (--scenario), or say which vehicle is driven, for instance --vehicle vehicle_2"
         )
     return scenario
+
+
+def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
+    """Drive worlds at the alert, and tell, as plain data, in how many what happens that may not be meant.
+
+    Scripts are as they are, but for a search, which has few candidates; learners brake fully. Where a command is beyond
+    its vehicle's capacities, each world is driven alone: ``commands_out_of_range`` is vehicle -> row -> message.
+    ``refused_by`` is what does not take scripts that depend on the state -> its message. Raises ``InvalidInput`` for
+    whatever a script raises, ``PhysicsError`` as ``drive``.
+    """
+    searches = {
+        scenario.vehicle_names[i]: f"{ScriptSpec.parse(script).name}:{TRIED_CANDIDATES}"
+        for i, script in scenario.scripts.items()
+        if "CANDIDATES" in find_entry(parse_spec(script)).form
+    }
+    tried = scenario.replace(roles={**scenario.roles, **searches})
+    scripts = {**script_agents(tried), **dict.fromkeys(scenario.learners, make_single_agent("full_brake"))}
+    early, moving = np.zeros((2, worlds.n), np.bool_)
+    beyond: dict[str, dict[int, str]] = {}
+
+    def drive_rows(rows: Ints) -> None:
+        some = worlds.take(rows)
+        engine = Engine(scenario, some.n, learners=(), scripts=scripts, deciders=scenario.learners, worlds=some)
+        engine.roster.warns = False  # of a world that fails ``Episodes`` tells
+        early[rows] = engine.ledger.count.any(axis=1) | (engine.ledger.obstacle_count > 0)
+        moving[rows] = ~Episodes.of(engine, some).at_rest
+
+    try:
+        drive_rows(np.arange(worlds.n))
+    except AgentFailed:
+        for row in range(worlds.n):
+            try:
+                drive_rows(np.array([row]))
+            except AgentFailed as error:
+                beyond.setdefault(error.reason.partition(" ")[0], {})[row] = str(error.renumbered([row]))
+    odd = {
+        scenario.vehicle_names[i]: script
+        for i, script in scenario.scripts.items()
+        if not ScriptSpec.parse(script).is_state_free()
+    }
+    usual = scenario.replace(roles={**scenario.roles, **dict.fromkeys(odd, "full_brake")})
+    refused, anyway = (_refusals(each, worlds.take([0])) if odd else {} for each in (tried, usual))
+    return {
+        "early_impacts": int(early.sum()),
+        "moving_at_horizon": int(moving.sum()),
+        "vehicle_1_late": int((worlds.vehicles.latency_s[:, 0] > 0.0).sum()),
+        "commands_out_of_range": beyond,
+        "not_state_free": odd,
+        "refused_by": {what: why for what, why in refused.items() if what not in anyway},
+    }
+
+
+def _refusals(scenario: Scenario, worlds: Worlds) -> dict[str, str]:
+    """What refuses the scenario, each asked itself: agents, shields, a search, ``early_impacts: reject``; and why."""
+
+    def drive_by(spec: str) -> None:
+        agent = make_agent(
+            spec, scenario=scenario, most_candidates=TRIED_CANDIDATES, uncertainty=DEFAULT.UNCERTAINTY_EXAMPLE
+        )
+        check_agents({spec: agent}, worlds, scenario)
+
+    asked: dict[str, Callable[[], object]] = {spec: partial(drive_by, spec) for spec in LADDER}
+    asked |= {f"+{shield}": partial(drive_by, f"full_brake+{shield}") for shield in SHIELDS}
+    asked["search best-harm"] = lambda: task_problem(worlds, Task(scenario, scenario.learners))
+    asked["early_impacts: reject"] = lambda: scenario.replace(early_impacts="reject")
+    refused = {}
+    for what, ask in asked.items():
+        try:
+            ask()
+        except InvalidInput as error:
+            refused[what] = str(error)
+    return refused
 
 
 def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario) -> None:

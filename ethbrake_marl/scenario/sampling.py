@@ -101,6 +101,13 @@ class QuantityRule:
         return {"mps": "m/s", "mps2": "m/s2"}.get(self.unit, self.unit)
 
     @property
+    def label(self) -> str:
+        """Its name in words, with its unit, as an axis has it: ``braking capacity (m/s²)``."""
+        return self.name.removesuffix(f"_{self.unit}").replace("_", " ") + (
+            f" ({self.symbol.replace('s2', 's²')})" if self.unit else ""
+        )
+
+    @property
     def interval(self) -> str:
         """The allowed range, with its unit, as messages write it."""
         unit = f" {self.symbol} ({UNITS[self.unit]})" if self.unit else ""

@@ -15,6 +15,7 @@ from ethbrake_marl.evaluation import EpisodeRecord, Evaluation, curves as module
 from ethbrake_marl.evaluation.curves import avoidability_boundary, criticality_map, deceleration_curve, regimes_of
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.figures import (
+    BODY_M,
     COLOURS,
     SeedCurve,
     ShownFigure,
@@ -31,6 +32,7 @@ from ethbrake_marl.figures import (
     seed_curves,
     series_style,
     trajectories,
+    worlds_figure,
 )
 from ethbrake_marl.limits.limits import Limits, Proof, known_limits
 from ethbrake_marl.physics import Worlds
@@ -122,6 +124,30 @@ def test_series_style__neighbours_differ_in_more_than_colour() -> None:
     for k in range(len(COLOURS) - 1):
         one, other = series_style(k), series_style(k + 1)
         assert all(one[name] != other[name] for name in ("color", "marker", "linestyle"))
+
+
+# ---------------------------------------------------------------- of a scenario
+
+
+def test_worlds_figure__shows_every_quantity_that_varies_and_lines_to_scale() -> None:
+    scenario = load_scenario("paper-random-obstacle")
+    sample = scenario.sample(50, 7)
+    figure = worlds_figure(scenario, sample, seed=7)
+    shares, pairs, lines = ([*part.axes] for part in figure.subfigs)
+    assert [axes.get_xlabel() for axes in shares] == ["gaps (m)", "speeds (m/s)", "obstacle gap (m)"]
+    for axes in shares:
+        heights = [end for patch in axes.patches for end in np.unique(patch.get_xy()[:, 1])]
+        assert max(heights) < 1.0 and min(heights) == 0.0
+    drawn = {(axes.get_subplotspec().rowspan.start, axes.get_subplotspec().colspan.start): axes for axes in pairs}
+    points = np.asarray(drawn[3, 2].collections[0].get_offsets())
+    assert points == pytest.approx(np.column_stack([sample.worlds.speeds_mps[:, 0], sample.worlds.obstacle_gap_m]))
+    total = sample.worlds.gaps_m.sum(axis=1)
+    for axes, row in zip(lines, (total.argmin(), None, total.argmax()), strict=True):
+        if row is not None:
+            left = [patch.get_x() for patch in axes.patches]
+            assert axes.get_title(loc="left").startswith(f"World {row}, ") and left[0] == -BODY_M
+            assert np.diff(left) == pytest.approx(-(sample.worlds.gaps_m[row] + BODY_M))
+    assert "50 worlds of the list of seed 7" in caption(figure)
 
 
 # ---------------------------------------------------------------- of a list
