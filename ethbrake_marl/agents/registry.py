@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from enum import StrEnum
 from importlib import import_module
+from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -25,7 +26,7 @@ from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, Phy
 from ethbrake_marl.files.plugins import load_function, note_file
 from ethbrake_marl.harm import Ledger, check_harm_count
 from ethbrake_marl.physics import Bools, Floats, Worlds
-from ethbrake_marl.scenario import Scenario, ScriptSpec
+from ethbrake_marl.scenario import Scenario, ScriptSpec, load_scenario
 
 # The vocabulary in which every agent states what it knows of the line while it drives.
 #
@@ -373,7 +374,7 @@ class AgentSettings:
         if self.scenario is None:
             raise InvalidInput(
                 f"agent {self.spec!r}: needs a scenario: make_agent({self.spec!r},"
-                " scenario=eb.load_scenario('paper-random')); as a vehicle's script it cannot be used"
+                " scenario='paper-random'); as a vehicle's script it cannot be used"
             )
         return self.scenario
 
@@ -486,7 +487,7 @@ _WRAPPERS: dict[str, Entry] = {
 def make_agent(
     spec: str,
     *,
-    scenario: Scenario | None = None,
+    scenario: Scenario | str | Path | None = None,
     harm_count: HarmCount = "first",
     horizon_s: float | None = None,
     most_candidates: int | None = None,
@@ -499,7 +500,8 @@ def make_agent(
         spec: ``name[:argument][@policy]`` and what is put around it, for instance ``constant:3.5``, ``planner:20ms``,
             ``ppo@shipped+refined+step``; ``ethbrake agent list`` has all. ``my_file.py:make_agent`` runs that file,
             which can do whatever you can: its function gets what a factory of ``register_agent`` gets, or nothing.
-        scenario: needed by teams, by what is put around an agent, and to find the shipped policy of this scenario.
+        scenario: also its name or the path of its file; needed by teams, by what is put around an agent, and to find
+            the shipped policy of this scenario.
         harm_count: which harm an optimising agent minimises, ``first`` or ``total``.
         horizon_s: until when it looks ahead, s; None: the scenario's horizon, or 8 s.
         most_candidates: for trying an agent out: no search of it takes more.
@@ -510,13 +512,12 @@ def make_agent(
     horizon, and for a scenario that is missing.
 
     >>> import ethbrake_marl as eb
-    >>> eb.make_agent("ppo@shipped+step", scenario=eb.load_scenario("paper-random")).name
+    >>> eb.make_agent("ppo@shipped+step", scenario="paper-random").name
     'ppo@shipped+step'
 
     """
     check_harm_count(harm_count)
-    if not (scenario is None or isinstance(scenario, Scenario)):
-        raise InvalidInput(f"scenario = {scenario!r}: must be a Scenario; eb.load_scenario(name) loads one")
+    scenario = None if scenario is None else load_scenario(scenario)
     if horizon_s is None:
         horizon_s = HORIZON_S if scenario is None else scenario.horizon_s
     if not isinstance(horizon_s, int | float | np.number) or not 0.0 < horizon_s < float("inf"):

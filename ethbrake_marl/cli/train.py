@@ -78,6 +78,7 @@ def run_command(
         " policy behind its shield.\n"
     )
     figures = evaluation.results_to_json(result.rows, per_world=result.per_world)
+    figures = [row | {"training_start": trained.training.begins} for row in figures]
     out.result(figures, Text(told), result.rows.brief(result.beside), *result.rows.tables()[1:])
     out.note(f"report, with every measure and the paper's rows: {result.report}")
     _end(out, result.trained)
@@ -206,6 +207,7 @@ def _tell(out: Out, result: learning.TrainResult) -> None:
     out.result({
         "directory": str(result.directory),
         "status": result.status,
+        "start": result.training.begins,
         "steps": result.steps,
         "scheme": result.training.scheme,
         "drivers": dict(result.training.drivers),

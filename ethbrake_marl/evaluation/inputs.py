@@ -39,7 +39,7 @@ from ethbrake_marl.files.yaml import FileModel, Override, Wording, flow_text, re
 from ethbrake_marl.limits import task_problem
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.policies import Policy
-from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, ScriptSpec, Task, load_scenario
+from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, ScriptSpec, Task, load_scenario, scenario_path
 from ethbrake_marl.shield import ShieldedDriver, Uncertainty
 
 # The identity of a result: the worlds, the scenario and the policies that it is about, and what computed it.
@@ -301,8 +301,8 @@ def load_runnable(
         except InvalidInput as error:
             role = scenario.vehicle_names[i]
             where = f"scenario {name_or_path!r}"
-            if Path(name_or_path).is_file():
-                where = read_yaml(name_or_path).where(("roles", role))
+            if not any(setting.top == "roles" for setting in settings):
+                where = read_yaml(scenario_path(name_or_path)).where(("roles", role))
             raise InvalidInput(f"{where}: roles.{role} = {script}: {error}") from None
     if vehicle is not None:
         return scenario.with_learners([vehicle])

@@ -450,13 +450,13 @@ class Counterfactual(Algorithm):
     """Gradients of the return by playing on from the same moment in two ways; one actor for all learners."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> CounterfactualModel:
-        """The model, from the policy of ``start`` if the recipe names one."""
+        """The model, from the policy of the training's ``start`` if it has one."""
         recipe = training.recipe
         assert isinstance(recipe, CounterfactualRecipe)
         environment.engine.branch(environment.engine.moment())  # refuses what cannot be branched before it begins
         model = (CounterfactualModel if recipe.modes is None else ModesModel)(environment, recipe)
-        if recipe.start is not None:  # ppo@PATH, ppo@shipped or universal@shipped
-            kind, _, path = recipe.start.partition("@")
+        if training.start is not None:
+            kind, _, path = training.start.partition("@")
             policy = load_named_policy(path, kind, training.scenario, recipe.reward.harm_count)
             first = model.policy.actors[0] if isinstance(model, ModesModel) else model.policy
             first.take_over(widened(policy, training))

@@ -292,6 +292,8 @@ def _run(
             session = Session(run, training, algorithm, model, wishes, evaluate, stop)
             if state is not None:
                 check_fits(run.checkpoints, state, model, algorithm, trained_policies(training, algorithm, model))
+            if state is None and training.begins is not None:
+                session.notes.append(f"begins with {training.begins}")
             session.notes += [f"a damaged checkpoint was left aside: {reason}" for reason in damaged]
             status = session.learn(state)
     course = session.course
@@ -356,7 +358,7 @@ class Session(BaseCallback):
     def learn(self, state: TrainingState | None) -> Ended:
         """Train from ``state`` (None: from the beginning) to the end, and leave the folder complete whatever it is."""
         model = self.model
-        self.run.write_status("running")
+        self.run.write_status("running", start=self.training.begins)
         if state is None:
             self.run.progress.unlink(missing_ok=True)
         else:
@@ -526,6 +528,7 @@ class Session(BaseCallback):
                 policy.save(folder, replace=True)
         left_over = () if status == "finished" else run.checkpoints.glob("step_*")
         told = {
+            "start": self.training.begins,
             "reason": reason,
             "wall_s": round(course.wall_s, 3),
             "steps": course.steps,

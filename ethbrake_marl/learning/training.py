@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple,
 from filelock import FileLock, Timeout
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pydantic.json_schema import models_json_schema
+from pydantic_core import ErrorDetails
 
 from ethbrake_marl.agents import AgentSettings, Driver, LearnedAgent, Team
 from ethbrake_marl.defaults import HarmCount
@@ -59,6 +60,7 @@ from ethbrake_marl.policies import (
     installed_versions,
     load_named_policy,
     load_policy,
+    shipped_name,
 )
 from ethbrake_marl.rewards import RewardParams, registered_terms, setting_names
 from ethbrake_marl.scenario import Scenario, check_file_name, load_scenario, observation_for, shipped_folder
@@ -482,7 +484,8 @@ Steps = Annotated[int, Field(ge=1, le=1000)]
 class CounterfactualRecipe(TrainingRecipe):
     """Try ``counterfactuals`` of the ``n_envs x n_steps`` decisions of a round otherwise, then learn from all of them.
 
-    ``start`` names a policy to go on from; without one it begins with random weights.
+    ``start`` names a policy to go on from; without one it begins with random weights. ``ppo@shipped`` is the policy
+    that ships for the scenario, and random weights where none does; ``Training.begins`` tells which.
     """
 
     most_decisions = 2**22
@@ -586,6 +589,11 @@ def _checked(source: Path | Document) -> TrainingRecipe:
 
 
 class _RecipeWording(Wording):
+    def right(self, detail: ErrorDetails) -> str:
+        """A policy to start from, in words."""
+        right = "must be ppo@, counterfactual@ or universal@ and a policy, for instance ppo@shipped or ppo@runs/my-run"
+        return right if (detail["type"], detail["loc"][-1:]) == ("string_pattern_mismatch", ("start",)) else ""
+
     def known(self, path: YamlPath) -> list[str]:
         """Registered terms have their weights beside the others."""
         return setting_names() if path[:-1] == ("reward",) else super().known(path)
@@ -629,7 +637,7 @@ MEANINGS = {
     "initial_ent_coef": "where an automatic ent_coef starts",
     "target_entropy": "what an automatic ent_coef keeps; without it -1 per action",
     "target_update_interval": "updates between two of the target critic",
-    "start": "a policy to go on from, ppo@shipped; left out: random weights",
+    "start": "a policy to go on from, ppo@shipped (random weights where none ships); left out: random weights",
     "counterfactuals": "how many of the decisions of a round are tried in two ways",
     "offset": "how far an action is moved to see what comes of it; the logarithm of what is drawn is uniform",
     "holds": "for how many steps it is moved, one of these",
@@ -945,6 +953,28 @@ class Training:
         if recipe.observation is not None:
             observation = choose_observation(recipe.observation, scenario.time_step_s)
         return cls(recipe, scenario, scheme, drivers, observation)
+
+    @property
+    def start(self) -> str | None:
+        """The policy whose weights it begins with, ``ppo@shipped/ppo``; None: random weights.
+
+        A recipe's ``ppo@shipped`` stands for what ships for the scenario, if anything does.
+        """
+        asked = self.recipe.start if isinstance(self.recipe, CounterfactualRecipe) else None
+        kind, _, path = (asked or "").partition("@")
+        if path != SHIPPED:
+            return asked
+        with suppress(InvalidInput):
+            return f"{asked}/{shipped_name(kind, self.scenario.name, self.recipe.reward.harm_count)}"
+        return None
+
+    @property
+    def begins(self) -> str | None:
+        """What its weights begin as, in words; None where no recipe of its algorithm names a policy."""
+        if not isinstance(self.recipe, CounterfactualRecipe):
+            return None
+        asked, name = self.recipe.start, self.scenario.name
+        return self.start or f"random weights{'' if asked is None else f', as {asked} has none for scenario {name!r}'}"
 
     def content(self) -> dict[str, dict[str, Any]]:
         """What makes it what it is: plain data with every default in it, without words."""

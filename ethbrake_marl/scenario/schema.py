@@ -15,7 +15,7 @@ from pydantic import BaseModel, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from ethbrake_marl.defaults import HarmCount
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName, unknown_name
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.files.yaml import (
     NAME_PATTERN,
@@ -435,7 +435,26 @@ def scenario_json_schema() -> dict[str, Any]:
     whole = {"if": {"not": elsewhere}, "then": {"allOf": [*one_of_two, by_types]}}
     needed = {"speed_deviations_mps": ["line_speed_mps"]}
     schema = Scenario.model_json_schema(schema_generator=FileSchema)
-    return FileSchema.publish({**schema, **whole, "dependentRequired": needed})
+    ranges = {key: _range(key, rule.low, rule.high, rule.positive) for key, rule in QUANTITY.declared.items()}
+    ranges["load"] = _range("load", 0.0, 1.0)
+    for properties in (schema["properties"], schema["$defs"]["VehicleType"]["properties"]):
+        for key in properties.keys() & ranges.keys():
+            properties[key]["allOf"] = [_reference(key)]
+    defined = schema["$defs"] | {f"range_{key}": limits for key, limits in ranges.items()}
+    return FileSchema.publish({**schema, **whole, "dependentRequired": needed, "$defs": defined})
+
+
+def _reference(key: str) -> dict[str, Any]:
+    return {"$ref": f"#/$defs/range_{key}"}
+
+
+def _range(key: str, low: float, high: float, positive: bool = False) -> dict[str, Any]:
+    """What a quantity's range is for a number, and for each that can be drawn of a distribution or of a list."""
+    limits = {"exclusiveMinimum" if positive else "minimum": low, "maximum": high}
+    above = {"exclusiveMinimum": 0}
+    inside = dict.fromkeys(("low", "high", "with_load", *DISTRIBUTIONS), _reference(key))
+    inside |= {"loguniform": {"items": {**limits, **above}}, "sd": above, "weights": {"items": above}}
+    return {**limits, "items": _reference(key), "properties": inside}
 
 
 def _build(scenario: Scenario, document: Document) -> None:
@@ -574,26 +593,32 @@ def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenar
     return _load(scenario_path(scenario))
 
 
-def scenario_path(name_or_path: str | Path) -> Path:
+def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
     """The file of a scenario; it need not exist when a path is given.
 
-    A path is anything with a separator, ``.yaml`` or ``.yml``. A shipped scenario has its name, ``stress-wide``; where
-    that begins with its folder's, ``stress/wide`` means the same unless there is such a file.
+    A path is what ends in ``.yaml`` or ``.yml``. A shipped scenario has its name, ``stress-wide``; where that begins
+    with its folder's, ``stress/wide`` means the same unless there is such a file. A registered one has its name. Any
+    other name, ``mine`` or ``my/folder/mine``, is that of ``mine.yaml`` in ``folder``. Shipped and registered names go
+    first, so that a stray file cannot change what a paper's command means.
     Raises ``UnknownName`` with a suggestion for an unknown name.
     """
     text = str(name_or_path)
-    path = Path(text)
-    if path.suffix in _SUFFIXES or "\\" in text or ("/" in text and os.path.exists(path)):
+    path = folder / text
+    if path.suffix in _SUFFIXES or "\\" in text or ("/" in text and os.path.isfile(path)):
         return path
+    paths = _known_paths()
     if "/" in text:
-        paths = _shipped_paths()
-        return {f"{p.parent.name}/{p.stem.removeprefix(p.parent.name + '-')}": p for p in paths.values()}.get(
-            text, path
-        )
-    known = _known_paths()
-    if text not in known:
-        raise unknown_name("scenario", text, known)
-    return known[text]
+        paths = {f"{p.parent.name}/{p.stem.removeprefix(p.parent.name + '-')}": p for p in _shipped_paths().values()}
+    if text in paths:
+        return paths[text]
+    if os.path.isfile(beside := f"{path}.yaml"):
+        return Path(beside)
+    patterns = (f"{path.name}.yml", f"*/{path.name}.y*ml") if re.fullmatch(NAME_PATTERN, path.name) else ()
+    if near := sorted(each for pattern in patterns for each in path.parent.glob(pattern)):
+        raise UnknownName(f"unknown scenario {text!r}; did you mean {os.path.relpath(near[0], folder)}?")
+    if "/" in text:
+        return path
+    raise unknown_name("scenario", text, paths)
 
 
 def list_scenarios() -> list[CatalogueEntry]:
@@ -675,9 +700,7 @@ def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> 
 
 def _member(name: str, where: str, i: int, folder: Path) -> dict[str, Any]:
     try:
-        path = Path(scenario_path(name))
-        if path not in _shipped_paths().values():
-            path = folder / path
+        path = scenario_path(name, folder)
         document = read_yaml(path)
         if isinstance(document.content, dict) and "mixture" in document.content:
             raise InvalidInput(f"{name} is a mixture itself; list its scenarios here")

@@ -279,6 +279,7 @@ def _show(
     told = {
         "Training": f"{config['recipe']['title'] or config['recipe']['name']}: {trained.steps:,} steps"
         f" of {config['recipe']['total_steps']:,} ({trained.status}), {trained.wall_s:.0f} s",
+        "Start": trained.training.begins,
         "Seeds": f"training {config['seeds']['training']}, evaluation list {evaluation.seed}",
         "Reward": ", ".join(f"{name} {value}" for name, value in reward.items()) or "minus the first-impact harm",
         "Whole run": f"{wall_s:.0f} s",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import itertools
+import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -245,6 +246,23 @@ def test_training__starts_from_a_policy_and_drives_as_it_did(tmp_path: Path) -> 
     assert len(manifest.observation.features) == 57 and policy.observation.time_step_s == 0.1
     assert policy.tensors["policy.log_std"].shape == (1,)
     assert eb.make_agent(f"counterfactual@{tmp_path / 'run'}").name == f"counterfactual@{tmp_path / 'run'}"
+
+
+@pytest.mark.parametrize("name", ["cooperation-4-all", "cooperation-2-five"])
+def test_training__starts_from_nothing_where_no_policy_ships_and_says_so(tmp_path: Path, name: str) -> None:
+    """With several learners, an obstacle ahead, or five vehicles: nearly full braking at first."""
+    names = ("n_envs", "n_steps", "counterfactuals", "batch_size", "evaluation")
+    small = {name: getattr(TINY_COUNTERFACTUAL, name) for name in names}
+    notes: list[str] = []
+    tell = lambda progress: notes.append(progress.note)  # noqa: E731
+    result = train(SHIPPED.replace(**small, **STILL), name, tmp_path / "run", on_progress=tell)
+    told = f"random weights, as ppo@shipped has none for scenario {name!r}"
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["start"] == result.training.begins == told
+    assert notes[0] == f"begins with {told}"
+    assert result.policy.tensors["policy.output.bias"] == pytest.approx(-0.9, abs=1e-3)
+    fits = Training.of(SHIPPED, SCENARIO), Training.of(SHIPPED, "paper-random-obstacle")
+    assert [each.begins for each in fits] == ["ppo@shipped/ppo", "ppo@shipped/ppo-paper-random-obstacle"]
+    assert (Training.of("quick", SCENARIO).begins, Training.of("ppo", SCENARIO).begins) == ("random weights", None)
 
 
 def test_widened__puts_every_feature_where_it_is_observed_now() -> None:

@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.inputs import scenario_sha256
+from ethbrake_marl.evaluation.inputs import load_runnable, scenario_sha256
 from ethbrake_marl.files.yaml import flow_text, read_yaml
 from ethbrake_marl.harm import empty_ledger
 from ethbrake_marl.learning.training import TrainingRecipe
@@ -33,12 +33,16 @@ from ethbrake_marl.scenario import (
     shipped_folder,
 )
 from ethbrake_marl.scenario.sampling import QUANTITY, ScriptSpec
+from ethbrake_marl.scenario.schema import changed_content
 from ethbrake_marl.scenario.v2x import PRESETS
 from tests.contract.interfaces import LEVELS
 
 SHIPPED = [entry.path for entry in list_scenarios()]
 each_shipped = pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "scenarios.md").read_text("utf-8")
+PAGE, MIXTURES = (
+    (Path(__file__).resolve().parents[2] / "docs" / name).read_text("utf-8")
+    for name in ("scenarios.md", "types-and-mixtures.md")
+)
 GIVEN = {
     "name": "given",
     "gaps_m": {"uniform": [5, 10]},
@@ -224,6 +228,26 @@ def test_path__of_the_users_own_file_goes_before_a_shipped_one(
     assert load_scenario("stress-wide").name == "stress-wide"
 
 
+def test_path__a_name_that_nobody_has_is_that_of_a_file_without_its_ending(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("my/folder").mkdir(parents=True)
+    for file in ("mine.yaml", "my/folder/mine.yaml", "my/folder/bad.yaml", "paper-random.yaml"):
+        declared = {**load_scenario("paper-random").declared(), "name": Path(file).stem, "title": file}
+        bad = {"roles": {"vehicle_3": "brak"}} if "bad" in file else {}
+        Path(file).write_text(json.dumps({**declared, "early_impacts": "keep", **bad}))
+    Path("my/folder/mixed.yaml").write_text("name: mixed\nmixture: [{scenario: mine}, {scenario: paper-random}]\n")
+    for name in ("mine", "./mine", "my/folder/mine", Path("my/folder/mine")):
+        assert load_scenario(name).title == f"{Path(name)}.yaml"
+    assert load_scenario("paper-random").title != "paper-random.yaml"  # the shipped one, whatever lies here
+    with pytest.raises(InvalidInput, match=r"^my/folder/bad.yaml, line 1: roles.vehicle_3 = brak: unknown agent"):
+        load_runnable("my/folder/bad")
+    Path("mine.yaml").unlink()
+    own, shipped = load_scenario("my/folder/mixed").members  # looked for beside the mixture
+    assert (own.early_impacts, shipped.early_impacts) == ("keep", "reject")
+
+
 def same_lines(one: Scenario, other: Scenario, channel: Any = "list") -> bool:
     """Whether both have the same gaps and speeds in every world, the other one's latencies at least as long."""
     ours, theirs = (scenario.sample(500, 7, first=100, channel=channel) for scenario in (one, other))
@@ -301,10 +325,49 @@ def test_json_schema__names_every_field_asks_for_one_of_two_ways_and_knows_no_nu
     assert "null" not in json.dumps(schema) and schema["properties"]["time_step_s"]["default"] == 0.1
 
 
+def written(key: str, x: float, inside: float) -> list[dict[str, Any]]:
+    """Scenarios with the number ``x`` in every place of a quantity, also of a type; ``inside`` is in its range."""
+    low, high = sorted((x, inside))
+    drawn = [
+        x,
+        {"uniform": [low, high]},
+        {"loguniform": [low, high]},
+        {"normal": {"mean": inside, "sd": high - low, "low": low, "high": high}},
+        {"choice": [inside, x], "weights": [1, 5000]},
+    ]
+    rule = QUANTITY.declared.get(key)
+    entries = drawn if rule is None or rule.per == "world" else [*drawn, *([each] * rule.count(3) for each in drawn)]
+    beside = {"line_speed_mps": 9} if key == "speed_deviations_mps" else {}
+    alone = [changed_content(GIVEN, {**beside, key: entry}) for entry in entries if rule is not None]
+    of_a_type = [*drawn, {"with_load": [x, inside]}] if key in QUANTITY.of_a_type else drawn * (key == "load")
+    return [*alone, *({**GIVEN, "vehicle_types": {"car": {key: entry}}} for entry in of_a_type)]
+
+
+def in_range(content: dict[str, Any]) -> bool:
+    """Whether the reader finds every number in its range, whatever it says of keys that limit each other."""
+    try:
+        Scenario(**content)
+    except InvalidInput as error:
+        return re.search(r"must be (finite and )?in |low must be above 0", str(error)) is None
+    return True
+
+
+@pytest.mark.parametrize("key", [*QUANTITY.declared, "load"])
+def test_json_schema__a_number_is_in_range_exactly_where_the_reader_says_so(key: str) -> None:
+    editor = Draft202012Validator(scenario_json_schema())
+    rule = QUANTITY.declared.get(key, QUANTITY.declared["restitution"])  # of both the range is [0, 1]
+    least, most = (np.nextafter(0.0, 1.0) if rule.positive else rule.low), rule.high
+    inside = (least + 3 * most) / 4
+    for x, good in ((least, True), (np.nextafter(least, -1e9), False), (most, True), (np.nextafter(most, 1e9), False)):
+        for content in written(key, float(x), inside):
+            told = in_range(content), editor.is_valid(content)
+            above_0 = "loguniform" in str(content) and x <= 0.0
+            assert told == (good and not above_0,) * 2, content
+
+
 def test_page__its_examples_are_valid_scenarios() -> None:
-    examples = re.findall(r"^```yaml\n(name:.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
-    worlds = [Scenario.from_document(parse_yaml(text, "docs/scenarios.md")).sample(10, 0).worlds for text in examples]
-    assert [each.n for each in worlds] == [10] * len(worlds) != []
+    examples = re.findall(r"^```yaml\n(name:.*?)^```$", PAGE + MIXTURES, re.MULTILINE | re.DOTALL)
+    assert [Scenario.from_document(parse_yaml(text)).sample(10, 0).worlds.n for text in examples] == [10, 10]
 
 
 @pytest.mark.parametrize(
