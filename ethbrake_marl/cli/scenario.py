@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 
 from ethbrake_marl import evaluation, learning, scenario as scenarios
@@ -18,9 +17,6 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.files.store import read_plain
 from ethbrake_marl.files.yaml import flow_text
-from ethbrake_marl.harm import KINDS
-from ethbrake_marl.physics import Worlds
-from ethbrake_marl.scenario import CHANNELS, QUANTITY, Scenario
 
 TRIED_WORLDS = 200  # by `scenario validate`
 MOST_RANGES = 8  # that it tells apart
@@ -71,7 +67,7 @@ def scenario_validate(out: Out, path: NameArgument) -> None:
     scenario = evaluation.load_runnable(path)
     sample = scenario.sample(TRIED_WORLDS, DEFAULT.LIST_SEED)
     n, names = sample.worlds.n, [scenario.vehicle_names[i] for i in scenario.learners]
-    ranges, fixed, quantities = _drawn_lines(sample.worlds, scenario)
+    ranges, fixed, quantities = _drawn_lines(scenario, sample)
     found = evaluation.try_scenario(scenario, sample.worlds)
     told = {
         "name": scenario.name, "vehicles": scenario.vehicles, "learners": names, "worlds": n, **found,
@@ -104,25 +100,27 @@ def scenario_validate(out: Out, path: NameArgument) -> None:
         )
 
 
-def _drawn_lines(worlds: Worlds, scenario: Scenario) -> tuple[list[str], str, dict[str, dict[str, float]]]:
+def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tuple[list[str], str, dict[str, Any]]:
     """The range of each quantity that varies, a line each below a head; what is fixed; all of them by column."""
-    varying = evaluation.drawn_alike(worlds, scenario)
+    import numpy as np
+
+    worlds, varying = sample.worlds, evaluation.drawn_alike(sample.worlds, scenario)
     ranges = {each.key + (f" of {each.owners}" if each.owners else ""): each.values for each in varying}
     if len(ranges) > MOST_RANGES:
-        ranges = {each.key: QUANTITY.declared[each.key].of(worlds) for each in varying}
+        ranges = {each.key: scenarios.QUANTITY.declared[each.key].of(worlds) for each in varying}
     width = max(map(len, ranges), default=0)
     lines = [f"{'drawn':{width}} {'least':>8} {'median':>8} {'largest':>8}"] if ranges else []
     for name, drawn in ranges.items():
         lines.append(f"{name:{width}}" + "".join(f" {each:>8.4g}" for each in np.quantile(drawn, (0.0, 0.5, 1.0))))
     others = {
         key: ["drawn" if np.ptp(each) else f"{each[0]:g}" for each in rule.of(worlds).T]
-        for key, rule in QUANTITY.of(worlds).items()
+        for key, rule in scenarios.QUANTITY.of(worlds).items()
         if key not in ranges
     }
     told = (f"{key} {each[0] if len(set(each)) == 1 else ', '.join(each)}" for key, each in others.items())
     columns = {
         name: dict(zip(("least", "median", "largest"), np.quantile(drawn, (0.0, 0.5, 1.0)).tolist(), strict=True))
-        for name, drawn in QUANTITY.columns(worlds).items()
+        for name, drawn in scenarios.QUANTITY.columns(worlds).items()
     }
     return lines, f"fixed: {'; '.join(told)}" if others else "", columns
 
@@ -147,9 +145,10 @@ def scenario_explain(out: Out, scenario: NameArgument) -> None:
     out.result({"name": chosen.name, "sentences": told}, *(line for each in told for line in _folded(each, 4, 100)))
 
 
-def _sentences(scenario: Scenario) -> Iterator[str]:
+def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
     """What is declared, piece by piece; empty where there is nothing to say."""
     from ethbrake_marl.agents import find_entry, parse_spec
+    from ethbrake_marl.harm import KINDS
 
     yield f"{scenario.name}: {scenario.title or 'no title'}. {scenario.description}".rstrip()
     learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners) or "nobody"
@@ -164,11 +163,11 @@ def _sentences(scenario: Scenario) -> Iterator[str]:
         members = ", ".join(f"{each.scenario['name']} ({each.weight:g})" for each in scenario.mixture)
         yield f"Each world is drawn from one of these scenarios, by weight: {members}. All of them together:"
     for name, kind in (scenario.vehicle_types or {}).items():
-        own = {QUANTITY.declared[key].label: getattr(kind, key) for key in QUANTITY.of_a_type}
+        own = {scenarios.QUANTITY.declared[key].label: getattr(kind, key) for key in scenarios.QUANTITY.of_a_type}
         told = "; ".join(f"{label} {_in_words(each)}" for label, each in own.items() if each is not None)
         yield f"Type {name}, weight {kind.weight:g}, load {_in_words(kind.load)}: {told}."
     yield f"Types along the line: {flow_text(scenario.types or 'any')}." if scenario.vehicle_types else ""
-    for key, rule in QUANTITY.declared.items():
+    for key, rule in scenarios.QUANTITY.declared.items():
         told = _declared_in_words(scenario, key)
         yield f"{rule.label[0].upper()}{rule.label[1:]}: {told}; {rule.meaning}." if told else ""
     common = scenario.model_fields_set if scenario.members else type(scenario).model_fields  # to a whole mixture
@@ -183,17 +182,17 @@ def _sentences(scenario: Scenario) -> Iterator[str]:
     yield f"Objective: {aims}; a shield always bounds the harm of the whole line."
 
 
-def _declared_in_words(scenario: Scenario, key: str) -> str:
+def _declared_in_words(scenario: scenarios.Scenario, key: str) -> str:
     """How a quantity is drawn; empty where it is not declared, or by each type."""
     if scenario.members:
-        ends = [end for each in (scenario.bounds(key) if key in QUANTITY.usual else ()) for end in each]
+        ends = [end for each in (scenario.bounds(key) if key in scenarios.QUANTITY.usual else ()) for end in each]
         return " to ".join(dict.fromkeys(f"{end(ends):.4g}" for end in (min, max))) if ends else ""
     given = getattr(scenario, key)
-    if given is None or (key in QUANTITY.otherwise and key not in scenario.model_fields_set):
+    if given is None or (key in scenarios.QUANTITY.otherwise and key not in scenario.model_fields_set):
         return ""
     if isinstance(given, tuple):
         return ", ".join(map(_in_words, given))
-    per = QUANTITY.declared[key].per
+    per = scenarios.QUANTITY.declared[key].per
     return _in_words(given) + ("" if isinstance(given, float) or per == "world" else f", drawn for each {per}")
 
 
@@ -208,10 +207,11 @@ def _in_words(quantity: Any) -> str:
     return f"{values} ({', '.join([kind.replace('_', ' '), *told])})"
 
 
-def _news_in_words(scenario: Scenario) -> str:
+def _news_in_words(scenario: scenarios.Scenario) -> str:
     """Who knows what, and when."""
     channel, about = scenario.v2x.channel._asdict(), type(scenario.v2x).model_fields
-    other = {key: value for key, value in channel.items() if key in about and value != getattr(CHANNELS["paper"], key)}
+    usual = scenarios.CHANNELS["paper"]._asdict()
+    other = {key: value for key, value in channel.items() if key in about and value != usual[key]}
     told = "; ".join(f"{key} {flow_text(value)} ({about[key].description})" for key, value in other.items())
     return f"V2X preset {scenario.v2x.preset}: {told or 'from its latency on each vehicle knows the whole line'}."
 

@@ -17,6 +17,7 @@ from ethbrake_marl.evaluation.inputs import load_runnable
 from ethbrake_marl.files.yaml import Override
 from ethbrake_marl.learning.training import TrainingRecipe, load_recipe, read_settings
 from ethbrake_marl.scenario import QUANTITY, Scenario, list_scenarios, load_scenario, parse_yaml
+from ethbrake_marl.scenario.sampling import early_impact
 from ethbrake_marl.search import ProfileProblem
 from tests.cli.conftest import Answer, Command, check_refused, rows_of, told_json
 from tests.fixtures.registered import restore, tables
@@ -42,6 +43,10 @@ def test_validate__tells_refused_draws_and_what_may_not_be_meant(ethbrake: Comma
     close = scenario_file("\ngaps_m: {uniform: [5, 10]}", "\ngaps_m: {choice: [0.1, 10]}")
     refused = re.search(r"early impacts: (\d+) of (\d+) draws", ethbrake("scenario", "validate", close).out)
     assert refused is not None and int(refused[1]) > 20 and int(refused[2]) - int(refused[1]) == 200
+    early = early_impact(kept := load_scenario(close).replace(early_impacts="keep"), kept.sample(200, 7).worlds)
+    close.write_text(close.read_text().replace("early_impacts: reject", "early_impacts: keep"))
+    found = told_json(ethbrake("scenario", "validate", close, "--json"))
+    assert found["early_impacts"] == early.sum() > 20 and found["rejected"] == 0
     odd = scenario_file("horizon_s: 8", "horizon_s: 2")
     odd.write_text(odd.read_text().replace("latency_s: [0, ", "latency_s: [0.3, "))
     told = " ".join(ethbrake("scenario", "validate", odd).out.split())
