@@ -83,7 +83,9 @@ def scenario_validate(out: Out, path: NameArgument) -> None:
         f" {_share(found['early_impacts'], n)} kept",
         f"at the horizon ({scenario.horizon_s:g} s) something still moves in {_share(found['moving_at_horizon'], n)}"
         + ("; what comes after counts nowhere, a longer horizon_s sees more" if found["moving_at_horizon"] else ""),
-        f"Vehicle 1, whose braking is the alert, has a latency above 0 in {_share(late, n)}" if late else "",
+        f"Vehicle 1, whose braking is the alert, has a latency above 0 in {_share(late, n)}"
+        if late and scenario.alert_s is None
+        else "",
         "; ".join(f"{each} asks for more than it can in {_share(len(rows), n)}" for each, rows in beyond.items()),
         f"not state-free: {', '.join(f'{each} ({script})' for each, script in odd.items())}; therefore refused by"
         f" {', '.join(found['refused_by']) or 'nothing'}"
@@ -115,7 +117,7 @@ def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tupl
     others = {
         key: ["drawn" if np.ptp(each) else f"{each[0]:g}" for each in rule.of(worlds).T]
         for key, rule in scenarios.QUANTITY.of(worlds).items()
-        if key not in ranges
+        if key not in ranges and not np.ptp(rule.of(worlds), axis=0).all()
     }
     told = (f"{key} {each[0] if len(set(each)) == 1 else ', '.join(each)}" for key, each in others.items())
     columns = {
@@ -162,10 +164,15 @@ def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
     if scenario.mixture is not None:
         members = ", ".join(f"{each.scenario['name']} ({each.weight:g})" for each in scenario.mixture)
         yield f"Each world is drawn from one of these scenarios, by weight: {members}. All of them together:"
+    if scenario.table is not None:
+        rows, file = len(scenario.table.rows or ()), scenario.table.file
+        columns = ", ".join(scenario.table.columns)
+        yield f"Each world takes one of {rows:,} rows{f' of {file}' if file else ''}: {columns}."
     for name, kind in (scenario.vehicle_types or {}).items():
         own = {scenarios.QUANTITY.declared[key].label: getattr(kind, key) for key in scenarios.QUANTITY.of_a_type}
         told = "; ".join(f"{label} {_in_words(each)}" for label, each in own.items() if each is not None)
-        yield f"Type {name}, weight {kind.weight:g}, load {_in_words(kind.load)}: {told}."
+        told += f"; V2X {flow_text(kind.v2x)}" if kind.v2x is not None else ""
+        yield f"Type {name}, weight {kind.weight:g}, load {_in_words(kind.load)}: {told.removeprefix('; ') or 'as beside the types'}."
     yield f"Types along the line: {flow_text(scenario.types or 'any')}." if scenario.vehicle_types else ""
     for key, rule in scenarios.QUANTITY.declared.items():
         told = _declared_in_words(scenario, key)
@@ -213,6 +220,7 @@ def _news_in_words(scenario: scenarios.Scenario) -> str:
     usual = scenarios.CHANNELS["paper"]._asdict()
     other = {key: value for key, value in channel.items() if key in about and value != usual[key]}
     told = "; ".join(f"{key} {flow_text(value)} ({about[key].description})" for key, value in other.items())
+    told += f"; {flow_text(scenario.v2x.vehicles)}" if scenario.v2x.vehicles else ""
     return f"V2X preset {scenario.v2x.preset}: {told or 'from its latency on each vehicle knows the whole line'}."
 
 

@@ -251,7 +251,7 @@ def drawn_alike(worlds: Worlds, scenario: Scenario) -> list[Drawn]:
     for key, rule in QUANTITY.of(worlds).items():
         values, groups = rule.of(worlds), dict[object, list[int]]()
         for i in np.flatnonzero(np.ptp(values, axis=0)).tolist():
-            groups.setdefault(None if rule.per == "world" else scenario.bounds(key)[i], []).append(i)
+            groups.setdefault(None if rule.per == "world" else scenario.bounds(key, dry=True)[i], []).append(i)
         for alike in groups.values():
             names = ", ".join(map(rule.owner, alike))
             few = names if len(names) <= _LONGEST_OWNERS else f"{len(alike)} {rule.per}s"

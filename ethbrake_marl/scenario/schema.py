@@ -453,7 +453,8 @@ def _range(key: str, low: float, high: float, positive: bool = False) -> dict[st
     limits = {"exclusiveMinimum" if positive else "minimum": low, "maximum": high}
     above = {"exclusiveMinimum": 0}
     inside = dict.fromkeys(("low", "high", "with_load", *DISTRIBUTIONS), _reference(key))
-    inside |= {"loguniform": {"items": {**limits, **above}}, "sd": above, "weights": {"items": above}}
+    inside |= {"loguniform": {"items": {**limits, **above}}, "sd": above, "sigma": above, "weights": {"items": above}}
+    inside["lognormal"] = {"allOf": [_reference(key)], "properties": {"median": above, "low": above}}
     return {**limits, "items": _reference(key), "properties": inside}
 
 
