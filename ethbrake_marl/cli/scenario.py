@@ -172,7 +172,8 @@ def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
         own = {scenarios.QUANTITY.declared[key].label: getattr(kind, key) for key in scenarios.QUANTITY.of_a_type}
         told = "; ".join(f"{label} {_in_words(each)}" for label, each in own.items() if each is not None)
         told += f"; V2X {flow_text(kind.v2x)}" if kind.v2x is not None else ""
-        yield f"Type {name}, weight {kind.weight:g}, load {_in_words(kind.load)}: {told.removeprefix('; ') or 'as beside the types'}."
+        told = told.removeprefix("; ") or "as beside the types"
+        yield f"Type {name}, weight {kind.weight:g}, load {_in_words(kind.load)}: {told}."
     yield f"Types along the line: {flow_text(scenario.types or 'any')}." if scenario.vehicle_types else ""
     for key, rule in scenarios.QUANTITY.declared.items():
         told = _declared_in_words(scenario, key)

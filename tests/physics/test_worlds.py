@@ -65,9 +65,10 @@ def test_make_worlds__broadcasts_every_parameter_to_arrays_of_its_own() -> None:
         **dict.fromkeys(("time_s", "restitution", "obstacle_gap_m", "obstacle_hit"), (4,)),
         "known_from_s": (4, 3, 3),
         "messages": (4, 0),
+        "road": (4, 0),
     }
     assert {name: column.shape for name, column in found.items()} == shapes
-    own = [column for name, column in found.items() if name not in ("known_from_s", "messages")]
+    own = [column for name, column in found.items() if name not in ("known_from_s", "messages", "road")]
     assert all(column.flags.c_contiguous and column.flags.owndata for column in own)
     assert worlds.vehicles.mass_t[3].tolist() == [1.0, 2.0, 3.0]
     assert worlds.vehicles.own_latency_s.tolist() == [[0.25] * 3] * 4
