@@ -49,7 +49,6 @@ from ethbrake_marl.evaluation import (
     Conditions,
     CriticalityMap,
     DecelerationCurve,
-    Drawn,
     EpisodeRecord,
     Evaluation,
     ShieldModes,
@@ -742,9 +741,7 @@ def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
     In pairs are quantities of the first learner, and of the pair ahead of it, before those of others. Colours tell
     the scenarios of a mixture apart, or the types of that vehicle.
     """
-    worlds, panels = sample.worlds, dict[str, list[Drawn]]()
-    for each in drawn_alike(worlds, scenario):
-        panels.setdefault(each.key, []).append(each)
+    worlds, panels = sample.worlds, drawn_alike(sample.worlds, scenario)
     focus = scenario.learners[0] if scenario.learners else 0
     kinds = sample.kinds.get("scenario", sample.kinds.get(f"vehicle_{focus + 1}_type", np.full(worlds.n, "")))
     paired, ranked = _paired(worlds, focus), np.argsort(worlds.gaps_m.sum(axis=1), kind="stable")
@@ -781,7 +778,7 @@ def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
     return {found[k][1]: found[k][2] for k in sorted(chosen)}
 
 
-def _distributions(panels: Mapping[str, Sequence[Drawn]], part: Any) -> None:
+def _distributions(panels: Mapping[str, Mapping[str, Floats]], part: Any) -> None:
     """Shares of each quantity's values: an outline for all who draw alike."""
     columns = min(len(panels), _ABREAST)
     every = part.subplots(-(-len(panels) // columns), columns, squeeze=False).ravel()
@@ -789,15 +786,15 @@ def _distributions(panels: Mapping[str, Sequence[Drawn]], part: Any) -> None:
         axes.set_axis_off()
     for axes, (key, drawn) in zip(every, panels.items(), strict=False):
         style_axes(axes, 7)
-        every_value = np.concatenate([each.values.ravel() for each in drawn])
-        for number, each in enumerate(drawn):
-            style, shares = series_style(number + 2), np.full(each.values.size, 1.0 / each.values.size)
+        every_value = np.concatenate([values.ravel() for values in drawn.values()])
+        for number, (owners, values) in enumerate(drawn.items()):
+            style, shares = series_style(number + 2), np.full(values.size, 1.0 / values.size)
             axes.hist(
-                each.values.ravel(), np.linspace(every_value.min(), every_value.max(), 25), weights=shares,
+                values.ravel(), np.linspace(every_value.min(), every_value.max(), 25), weights=shares,
                 histtype="step" if number else "stepfilled", color=style["color"], linestyle=style["linestyle"],
-                linewidth=1.4, label=each.owners.replace("vehicle_", "Vehicle "),
+                linewidth=1.4, label=owners.replace("vehicle_", "Vehicle "),
             )  # fmt: skip
-        if drawn[0].owners and len(drawn) <= _MOST_APART:
+        if "" not in drawn and len(drawn) <= _MOST_APART:
             axes.legend(fontsize=6.5, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 0.98), borderpad=0.0)
         axes.locator_params(nbins=3)
         axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))

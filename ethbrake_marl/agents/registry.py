@@ -549,11 +549,12 @@ def make_single_agent(spec: str, **settings: Any) -> Agent:
     return agent
 
 
-def find_entry(written: AgentSpec) -> Entry:
+def find_entry(spec: AgentSpec | str) -> Entry:
     """The registry's entry of an agent.
 
     Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for an argument or a policy that it does not take.
     """
+    written = parse_spec(spec) if isinstance(spec, str) else spec
     if written.file is not None:
         return Entry(f"{written.name}[:ARGUMENT][@POLICY]", "your own", Source.UNSTATED, _FROM_FILE)
     if written.name not in _ENTRIES:

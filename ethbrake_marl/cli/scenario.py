@@ -107,9 +107,9 @@ def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tupl
     import numpy as np
 
     worlds, varying = sample.worlds, evaluation.drawn_alike(sample.worlds, scenario)
-    ranges = {each.key + (f" of {each.owners}" if each.owners else ""): each.values for each in varying}
+    ranges = {f"{key} of {who}" if who else key: each for key, drawn in varying.items() for who, each in drawn.items()}
     if len(ranges) > MOST_RANGES:
-        ranges = {each.key: scenarios.QUANTITY.declared[each.key].of(worlds) for each in varying}
+        ranges = {key: scenarios.QUANTITY.declared[key].of(worlds) for key in varying}
     width = max(map(len, ranges), default=0)
     lines = [f"{'drawn':{width}} {'least':>8} {'median':>8} {'largest':>8}"] if ranges else []
     for name, drawn in ranges.items():
@@ -149,7 +149,7 @@ def scenario_explain(out: Out, scenario: NameArgument) -> None:
 
 def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
     """What is declared, piece by piece; empty where there is nothing to say."""
-    from ethbrake_marl.agents import find_entry, parse_spec
+    from ethbrake_marl.agents import find_entry
     from ethbrake_marl.harm import KINDS
 
     yield f"{scenario.name}: {scenario.title or 'no title'}. {scenario.description}".rstrip()
@@ -160,7 +160,7 @@ def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
     )
     for script in dict.fromkeys(scenario.scripts.values()):
         who = ", ".join(name for name, role in scenario.roles.items() if role == script)
-        yield f"By script {script} ({find_entry(parse_spec(script)).about}): {who}."
+        yield f"By script {script} ({find_entry(script).about}): {who}."
     if scenario.mixture is not None:
         members = ", ".join(f"{each.scenario['name']} ({each.weight:g})" for each in scenario.mixture)
         yield f"Each world is drawn from one of these scenarios, by weight: {members}. All of them together:"

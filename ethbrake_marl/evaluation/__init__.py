@@ -23,7 +23,6 @@ if TYPE_CHECKING:
         write_dataset as write_dataset,
     )
     from ethbrake_marl.evaluation.inputs import (
-        Drawn as Drawn,
         NamedWorld as NamedWorld,
         NamedWorlds as NamedWorlds,
         check_agents as check_agents,

@@ -10,7 +10,7 @@ from dataclasses import fields, is_dataclass
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -234,28 +234,25 @@ def states_of(worlds: Worlds, scenario: Scenario) -> list[dict[str, float]]:
     return [{name: float(values[k]) for name, values in columns.items()} for k in range(worlds.n)]
 
 
-class Drawn(NamedTuple):
-    """A quantity that differs from world to world, of the vehicles or pairs that draw it alike."""
-
-    key: str
-    owners: str  # these vehicles or pairs, in a few words; empty: all that there are
-    values: Floats  # [n, entries]
-
-
 _LONGEST_OWNERS = 30  # characters
 
 
-def drawn_alike(worlds: Worlds, scenario: Scenario) -> list[Drawn]:
-    """Every quantity in which the worlds differ, apart for vehicles and pairs that have other bounds."""
-    found = []
+def drawn_alike(worlds: Worlds, scenario: Scenario) -> dict[str, dict[str, Floats]]:
+    """Every quantity in which the worlds differ, by key, apart for vehicles and pairs that have other bounds.
+
+    Their values [n, entries] stand under who they are, in a few words; under "" if they are all that there are.
+    """
+    found: dict[str, dict[str, Floats]] = {}
     for key, rule in QUANTITY.of(worlds).items():
         values, groups = rule.of(worlds), dict[object, list[int]]()
         for i in np.flatnonzero(np.ptp(values, axis=0)).tolist():
             groups.setdefault(None if rule.per == "world" else scenario.bounds(key, dry=True)[i], []).append(i)
-        for alike in groups.values():
+        for number, alike in enumerate(groups.values()):
             names = ", ".join(map(rule.owner, alike))
             few = names if len(names) <= _LONGEST_OWNERS else f"{len(alike)} {rule.per}s"
-            found.append(Drawn(key, "" if len(alike) == values.shape[1] else few, values[:, alike]))
+            of_key = found.setdefault(key, {})
+            few += f" ({number + 1})" if few in of_key else ""
+            of_key["" if len(alike) == values.shape[1] else few] = values[:, alike]
     return found
 
 
@@ -328,7 +325,7 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
     searches = {
         scenario.vehicle_names[i]: f"{ScriptSpec.parse(script).name}:{TRIED_CANDIDATES}"
         for i, script in scenario.scripts.items()
-        if "CANDIDATES" in find_entry(parse_spec(script)).form
+        if "CANDIDATES" in find_entry(script).form
     }
     tried = scenario.replace(roles={**scenario.roles, **searches})
     scripts = {**script_agents(tried), **dict.fromkeys(scenario.learners, make_single_agent("full_brake"))}

@@ -71,14 +71,13 @@ from ethbrake_marl.physics.messages import (
     move_on as move_on,
 )
 from ethbrake_marl.physics.worlds import (
-    GRAVITY_MPS2 as GRAVITY_MPS2,
-    ON_ROADS as ON_ROADS,
     Bools as Bools,
     Floats as Floats,
     Ints as Ints,
     UInt64s as UInt64s,
     Vehicles as Vehicles,
     Worlds as Worlds,
+    as_road_allows as as_road_allows,
     make_worlds as make_worlds,
     sum_rows as sum_rows,
 )

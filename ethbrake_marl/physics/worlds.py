@@ -16,7 +16,7 @@ Only gaps and speeds are stored: absolute positions would lose digits as the lin
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -31,7 +31,13 @@ Ints = NDArray[np.int64]
 UInt64s = NDArray[np.uint64]
 
 GRAVITY_MPS2 = 9.81
-ON_ROADS = ("braking_capacity_mps2", "driving_capacity_mps2")  # what friction limits
+_ON_ROADS = ("braking_capacity_mps2", "driving_capacity_mps2")  # what friction limits
+
+
+def as_road_allows(quantities: Mapping[str, Floats], friction: Floats) -> dict[str, Floats]:
+    """The quantities, of which no capacity is above ``friction * GRAVITY_MPS2``."""
+    most = friction * GRAVITY_MPS2
+    return {key: np.minimum(value, most) if key in _ON_ROADS else value for key, value in quantities.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,19 +197,13 @@ class Worlds:
         """The same worlds as arrays that cannot be written to; these stay as they are."""
         return self._each(_unwritable)
 
-    def on_road(
-        self, friction: Floats, braking_mps2: Floats | None = None, driving_mps2: Floats | None = None
-    ) -> Worlds:
-        """These worlds on a road of that ``friction`` [n]: no capacity is above ``friction * GRAVITY_MPS2``.
-
-        ``braking_mps2`` and ``driving_mps2`` [n, N] are the capacities on a dry road; by default those of now.
-        """
-        v, most = self.vehicles, (friction * GRAVITY_MPS2)[:, np.newaxis]
-        dry = [v.braking_capacity_mps2 if braking_mps2 is None else braking_mps2,
-               v.driving_capacity_mps2 if driving_mps2 is None else driving_mps2]  # fmt: skip
-        braking, driving = (np.minimum(capacity, most) for capacity in dry)
-        vehicles = replace(v, braking_capacity_mps2=braking, driving_capacity_mps2=driving)
-        return replace(self, vehicles=vehicles, road=np.concatenate([friction[:, np.newaxis], *dry], axis=1))
+    def on_road(self, friction: Floats, dry: Mapping[str, Floats] | None = None) -> Worlds:
+        """These worlds on a road of that ``friction`` [n]; ``dry``: other capacities on a dry one, [n, N]."""
+        on_dry = {name: self.dry(name) for name in _ON_ROADS} | dict(dry or {})
+        vehicles = replace(self.vehicles, **as_road_allows(on_dry, friction[:, np.newaxis]))
+        return replace(
+            self, vehicles=vehicles, road=np.concatenate([friction[:, np.newaxis], *on_dry.values()], axis=1)
+        )
 
     @property
     def friction(self) -> Floats:
@@ -213,8 +213,8 @@ class Worlds:
     def dry(self, name: str) -> Floats:
         """A field of ``vehicles``, a capacity as it is on a dry road, [n, N]."""
         value: Floats = getattr(self.vehicles, name)
-        if self.road.shape[1] and name in ON_ROADS:
-            begin = 1 + self.N * ON_ROADS.index(name)
+        if self.road.shape[1] and name in _ON_ROADS:
+            begin = 1 + self.N * _ON_ROADS.index(name)
             value = self.road[:, begin : begin + self.N]
         return value
 

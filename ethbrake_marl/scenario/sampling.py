@@ -48,13 +48,12 @@ from ethbrake_marl.files.yaml import (
 from ethbrake_marl.harm import ObjectiveName, objectives_of
 from ethbrake_marl.observations import ListedFeatures, listed_features
 from ethbrake_marl.physics import (
-    GRAVITY_MPS2,
-    ON_ROADS,
     Bools,
     Floats,
     Ints,
     Worlds,
     advance,
+    as_road_allows,
     exp_each,
     log,
     make_worlds,
@@ -241,7 +240,7 @@ _OPTIONAL = _by_name(
     ),
     QuantityRule(
         "friction", "", "world", 2.0, True, 0, "friction",
-        f"friction of the road: no capacity is above friction x {GRAVITY_MPS2:g} m/s2", "{uniform: [0.2, 0.9]}",
+        "friction of the road: no capacity is above friction x 9.81 m/s2", "{uniform: [0.2, 0.9]}",
         stream=SURROUNDINGS,
     ),
 )  # fmt: skip
@@ -1369,8 +1368,7 @@ def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]
 
 def on_road(found: Mapping[str, Floats]) -> dict[str, Floats]:
     """Quantities of worlds, their capacities as the road allows them: at most friction times gravity."""
-    most = found["friction"] * GRAVITY_MPS2 if "friction" in found else np.inf
-    return {key: np.minimum(value, most) if key in ON_ROADS else value for key, value in found.items()}
+    return as_road_allows(found, found["friction"]) if "friction" in found else dict(found)
 
 
 def obstacle_gap(

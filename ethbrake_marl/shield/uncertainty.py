@@ -18,7 +18,7 @@ import numpy as np
 
 from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.physics import ON_ROADS, Floats, Vehicles, Worlds
+from ethbrake_marl.physics import Floats, Vehicles, Worlds
 from ethbrake_marl.scenario import QUANTITY, Scenario
 
 # Checks of what a shield is built with: amounts, scenario, policy, environment.
@@ -230,4 +230,4 @@ def _placed(worlds: Worlds, sides: list[_Side], share: Callable[[int], Floats | 
     placed = replace(worlds, vehicles=vehicles, **{name: v for name, v in changed.items() if hasattr(worlds, name)})
     if not worlds.road.shape[1]:
         return placed
-    return placed.on_road(friction, *(changed.get(name, worlds.dry(name)) for name in ON_ROADS))
+    return placed.on_road(friction, {name: v for name, v in changed.items() if name.endswith("capacity_mps2")})

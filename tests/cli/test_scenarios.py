@@ -318,7 +318,15 @@ def test_how_to_own_data__its_table_is_read_and_its_distributions_are_valid(tmp_
     (tmp_path / "mine.csv").write_text(table[1])
     vehicles = paper.read_worlds(tmp_path / "mine.csv").vehicles
     assert (vehicles.mass_t[:, 1].tolist(), vehicles.braking_capacity_mps2[:, 1].tolist()) == ([1.4, 12], [7.5, 5.5])
-    drawn, typed = (parse_yaml(text, "page").content for text in re.findall(r"```yaml\n(.*?)```", OWN_DATA, re.DOTALL))
+    blocks = (parse_yaml(text, "page").content for text in re.findall(r"```yaml\n(.*?)```", OWN_DATA, re.DOTALL))
+    drawn, typed, rows = blocks
     assert set(paper.replace(**drawn).sample(100, 7).worlds.vehicles.mass_t.flat) == {1.3, 1.5, 1.9, 2.4}
     content = {key: value for key, value in paper.declared().items() if key not in typed["vehicle_types"]["car"]}
     assert set(Scenario(**content, **typed).sample(100, 7).types.flat) == {"car", "truck"}
+    (tmp_path / "triples.csv").write_text(
+        "seconds,gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps\n2,10,9,20,19,18\n"
+    )
+    keys = {key: value for key, value in paper.declared().items() if key not in ("name", "gaps_m", "speeds_mps")}
+    text = "\n".join(f"{key}: {flow_text(value)}" for key, value in {"name": "mine", **keys, **rows}.items())
+    (tmp_path / "mine.yaml").write_text(text)
+    assert load_runnable(tmp_path / "mine.yaml").sample(2, 7).worlds.speeds_mps.tolist() == [[20, 19, 18]] * 2
