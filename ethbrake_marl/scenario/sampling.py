@@ -1279,6 +1279,25 @@ class ScenarioFields(FileModel):
         given = {entry: table[:, c] for c, entry in enumerate(entries)}
         return _worlds(given, self, _Naming(str(file), "file", lines))
 
+    @staticmethod
+    def read_rows(file: Path, columns: object, weights: object) -> dict[str, Any]:
+        """The rows of a scenario's table, and their weights, from these columns of a CSV file.
+
+        Raises ``InvalidInput`` naming file, line and column.
+        """
+        header, rows, lines = _read_csv(file)
+        weights_of = [] if weights is None else [weights]
+        if not isinstance(columns, list | tuple):
+            raise InvalidInput(f"{file}: columns = {columns!r:.60}: must be a list of columns: {', '.join(header)}")
+        for name in (*columns, *weights_of):
+            if header.count(name) != 1:
+                many = "is there twice" if name in header else f"is not there; {suggestion(str(name), header)}"
+                raise InvalidInput(f"{file}, line 1: column {name!r:.60} {many.removesuffix('; ')}")
+        found = [[_number_at(file, header, row, line, str(name)) for name in (*columns, *weights_of)]
+                 for row, line in zip(rows, lines, strict=True)]  # fmt: skip
+        told: dict[str, Any] = {"rows": [row[: len(columns)] for row in found]}
+        return told if weights is None else told | {"weights": [row[-1] for row in found]}
+
     def worlds_from_table(self, columns: Mapping[str, ArrayLike]) -> Worlds:
         """Worlds from columns of equal length n: ``gap_1_m`` ..., ``speed_1_mps`` ..., and optionally the others.
 
@@ -1691,25 +1710,6 @@ def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:
     if len(rows) == 1:
         raise InvalidInput(f"{file}: has a header but no rows; one row is one world")
     return [name.strip() for name in rows[0]], rows[1:], lines[1:]
-
-
-def read_table(file: Path, columns: object, weights: object) -> dict[str, Any]:
-    """The rows of a scenario's table, and their weights, from these columns of a CSV file.
-
-    Raises ``InvalidInput`` naming file, line and column.
-    """
-    header, rows, lines = _read_csv(file)
-    weights_of = [] if weights is None else [weights]
-    if not isinstance(columns, list | tuple):
-        raise InvalidInput(f"{file}: columns = {columns!r:.60}: must be a list of columns: {', '.join(header)}")
-    for name in (*columns, *weights_of):
-        if header.count(name) != 1:
-            many = "is there twice" if name in header else f"is not there; {suggestion(str(name), header)}"
-            raise InvalidInput(f"{file}, line 1: column {name!r:.60} {many.removesuffix('; ')}")
-    found = [[_number_at(file, header, row, line, str(name)) for name in (*columns, *weights_of)]
-             for row, line in zip(rows, lines, strict=True)]  # fmt: skip
-    told: dict[str, Any] = {"rows": [row[: len(columns)] for row in found]}
-    return told if weights is None else told | {"weights": [row[-1] for row in found]}
 
 
 def _number_at(file: Path, header: list[str], row: list[str], line: int, column: str) -> float:

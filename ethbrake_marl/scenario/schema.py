@@ -40,7 +40,6 @@ from ethbrake_marl.scenario.sampling import (
     Member,
     ScenarioFields,
     ScriptSpec,
-    read_table,
     support,
 )
 
@@ -696,7 +695,8 @@ def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> 
     if path.is_absolute() or ".." in path.parts:
         raise InvalidInput(f"{where}: table.file = {table['file']}: must be a path from the scenario's folder on")
     with document.refusing_at((*at, "table", "file")):
-        return {**content, "table": {**table, **read_table(folder / path, table.get("columns"), table.get("weights"))}}
+        rows = ScenarioFields.read_rows(folder / path, table.get("columns"), table.get("weights"))
+        return {**content, "table": {**table, **rows}}
 
 
 def _member(name: str, where: str, i: int, folder: Path) -> dict[str, Any]:

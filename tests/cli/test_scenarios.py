@@ -14,7 +14,7 @@ import pytest
 
 from ethbrake_marl.cli import scenario as module
 from ethbrake_marl.evaluation.inputs import load_runnable
-from ethbrake_marl.files.yaml import Override
+from ethbrake_marl.files.yaml import Override, flow_text
 from ethbrake_marl.learning.training import TrainingRecipe, load_recipe, read_settings
 from ethbrake_marl.scenario import QUANTITY, Scenario, list_scenarios, load_scenario, parse_yaml
 from ethbrake_marl.scenario.sampling import early_impact
