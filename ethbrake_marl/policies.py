@@ -735,7 +735,10 @@ def shipped_name(kind: str, scenario: str | None, harm_count: HarmCount) -> str:
                 return name
     wanted = kind if scenario is None or kind == "universal" else f"{kind} for scenario {scenario!r}"
     every = ", ".join(names) or "none"
-    raise InvalidInput(f"shipped policy {wanted}: there is none; shipped are: {every} (each as {SHIPPED}/NAME)")
+    raise InvalidInput(
+        f"shipped policy {wanted}: there is none; shipped are: {every}; each is driven as {kind}@{SHIPPED}/NAME,"
+        " and universal@shipped in every scenario"
+    )
 
 
 def load_shipped(name: str) -> Policy:

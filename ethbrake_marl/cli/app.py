@@ -50,6 +50,8 @@ def run_command(arguments: Sequence[str]) -> int:
     except SystemExit as stop:
         if asked:
             raise
+        if isinstance(stop.__context__, BrokenPipeError):  # whoever read the output has had enough
+            return 1
         return _refuse(f"code of yours ended the process: SystemExit: {stop.code}")
     except TyperException as error:
         context = getattr(error, "ctx", None)

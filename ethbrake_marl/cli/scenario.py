@@ -165,9 +165,8 @@ def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
         members = ", ".join(f"{each.scenario['name']} ({each.weight:g})" for each in scenario.mixture)
         yield f"Each world is drawn from one of these scenarios, by weight: {members}. All of them together:"
     if scenario.table is not None:
-        rows, file = len(scenario.table.rows or ()), scenario.table.file
-        columns = ", ".join(scenario.table.columns)
-        yield f"Each world takes one of {rows:,} rows{f' of {file}' if file else ''}: {columns}."
+        rows, columns = len(scenario.table.rows or ()), ", ".join(scenario.table.columns)
+        yield f"Each world takes one of {rows:,} rows of a table: {columns}."
     for name, kind in (scenario.vehicle_types or {}).items():
         own = {scenarios.QUANTITY.declared[key].label: getattr(kind, key) for key in scenarios.QUANTITY.of_a_type}
         told = "; ".join(f"{label} {_in_words(each)}" for label, each in own.items() if each is not None)
@@ -193,7 +192,10 @@ def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
 def _declared_in_words(scenario: scenarios.Scenario, key: str) -> str:
     """How a quantity is drawn; empty where it is not declared, or by each type."""
     if scenario.members:
-        ends = [end for each in (scenario.bounds(key) if key in scenarios.QUANTITY.usual else ()) for end in each]
+        told = key in scenarios.QUANTITY.usual or (
+            key == "friction" and all(each.declares(key) for each in scenario.members)
+        )
+        ends = [end for each in (scenario.bounds(key) if told else ()) for end in each]
         return " to ".join(dict.fromkeys(f"{end(ends):.4g}" for end in (min, max))) if ends else ""
     given = getattr(scenario, key)
     if given is None or (key in scenarios.QUANTITY.otherwise and key not in scenario.model_fields_set):

@@ -136,9 +136,12 @@ class QuantityRule:
     def of(self, worlds: Worlds) -> Floats:
         """The values that these worlds have, [n, entries]: one entry per vehicle, pair or world.
 
-        Capacities are those on a dry road, as a scenario declares them.
+        Capacities are those on a dry road, as a scenario declares them, where the friction of all is told beside them.
         """
-        values: Floats = worlds.dry(self.name) if hasattr(worlds.vehicles, self.name) else getattr(worlds, self.name)
+        of_vehicles = hasattr(worlds.vehicles, self.name)
+        values: Floats = getattr(worlds.vehicles if of_vehicles else worlds, self.name)
+        if of_vehicles and np.isfinite(worlds.friction).all():
+            values = worlds.dry(self.name)
         return values.reshape(worlds.n, -1)
 
 
@@ -228,7 +231,7 @@ _OTHERWISE = _by_name(
     ),
     QuantityRule(
         "alert_s", "s", "world", 3600.0, False, 2, "",
-        "time from the start until the alert, from which latencies count; until then all go on at their speeds",
+        "time from the start, at which gaps and speeds are told, to the alert, from which latencies count; all go on",
         "{uniform: [1, 5]}", stream=SURROUNDINGS,
     ),
 )  # fmt: skip
@@ -487,6 +490,13 @@ class WithLoad(_Distribution):
 
     with_load: Pair = Field(description="[empty, full]: at load 0 and at load 1")
     spread: Quantity = Field(default=0.0, exclude_if=not_, description="what each vehicle adds to it by chance")
+
+    @field_validator("spread")
+    @classmethod
+    def _spreads(cls, value: Any) -> Any:
+        right = "must be a distribution around 0, such as {uniform: [-0.3, 0.3]}"
+        require(not isinstance(value, float), (), value, right)
+        return value
 
     @property
     def support(self) -> tuple[float, float]:
@@ -828,6 +838,7 @@ class Table(FileModel):
     @model_validator(mode="after")
     def _complete(self) -> Table:
         read = "files are read where they stand in a file (load_scenario); give rows"
+        require(not (self.file and self.rows), ("file",), self.file, "give either a file or rows, not both")
         require(self.rows is not None and not isinstance(self.weights, str), ("rows",), UNSHOWN, read)
         rows = self.rows or ()
         for k, row in enumerate(rows):
@@ -1293,8 +1304,10 @@ class ScenarioFields(FileModel):
             if header.count(name) != 1:
                 many = "is there twice" if name in header else f"is not there; {suggestion(str(name), header)}"
                 raise InvalidInput(f"{file}, line 1: column {name!r:.60} {many.removesuffix('; ')}")
-        found = [[_number_at(file, header, row, line, str(name)) for name in (*columns, *weights_of)]
-                 for row, line in zip(rows, lines, strict=True)]  # fmt: skip
+        found = [
+            [_number_at(file, header, row, line, str(name)) for name in (*columns, *weights_of)]
+            for row, line in zip(rows, lines, strict=False)  # blank lines at the end are no rows
+        ]
         told: dict[str, Any] = {"rows": [row[: len(columns)] for row in found]}
         return told if weights is None else told | {"weights": [row[-1] for row in found]}
 

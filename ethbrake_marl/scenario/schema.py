@@ -96,6 +96,10 @@ def _check_reactions(scenario: ScenarioFields) -> None:
     right = "only without messages one by one (v2x: paper): what was heard before the alert is not modelled"
     require(scenario.alert_s is None or not scenario.v2x.by_link, ("alert_s",), scenario.alert_s, right)
     own = np.array([latest for _, latest in scenario.bounds("latency_s")])
+    right = (
+        f"with latency_s a vehicle may act as late as {own.max():g} s; it must be below horizon_s, which may be raised"
+    )
+    require(scenario.alert_s is None or own.max() < scenario.horizon_s, ("alert_s",), scenario.alert_s, right)
     for i, latest in enumerate(scenario.v2x.latest_reaction_s(own, scenario.equipped())):
         right = (
             f"vehicle_{i + 1} may have no news until {latest:g} s; it must be below horizon_s"
@@ -290,7 +294,12 @@ class ScenarioWording(Wording):
             return "two numbers [low, high] are needed"
         rule = QUANTITY.declared.get(key)
         if rule is None and len(path) > 1:
-            return "a number is needed, as in {normal: {mean: 20, sd: 1, low: 18, high: 22}}"
+            shape = (
+                "median: 20, sigma: 1, low: 5, high: 90"
+                if "lognormal" in path
+                else "mean: 20, sd: 1, low: 18, high: 22"
+            )
+            return f"a number is needed, as in {{{'log' * ('lognormal' in path)}normal: {{{shape}}}}}"
         if rule is None:
             return f"it is needed, for instance {key}: my-scenario"
         other = (
@@ -317,6 +326,8 @@ class ScenarioWording(Wording):
 
 
 def _misspelt(given: Any) -> str:
+    if isinstance(given, dict) and "with_load" in given:
+        return "; with_load stands in a type of vehicle_types"
     hints = [suggestion(key, DISTRIBUTIONS) for key in given if isinstance(key, str)] if isinstance(given, dict) else []
     return "".join(f"; {hint}" for hint in hints if hint)
 
@@ -696,7 +707,8 @@ def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> 
         raise InvalidInput(f"{where}: table.file = {table['file']}: must be a path from the scenario's folder on")
     with document.refusing_at((*at, "table", "file")):
         rows = ScenarioFields.read_rows(folder / path, table.get("columns"), table.get("weights"))
-        return {**content, "table": {**table, **rows}}
+        kept = {key: value for key, value in table.items() if key != "file"}  # the rows are the scenario, not the file
+        return {**content, "table": {**kept, **rows}}
 
 
 def _member(name: str, where: str, i: int, folder: Path) -> dict[str, Any]:

@@ -1115,7 +1115,10 @@ class StepShield:
                 f"uncertainty: {self.uncertainty}: vehicle_{vehicles[0] + 1} may decide first at {latest:g} s; must be"
                 f" before the horizon, {horizon_s:g} s"
             )
-        others = fixed_commands(self._others, possible, "shield", vehicle=None)
+        try:
+            others = fixed_commands(self._others, possible, "shield", vehicle=None)
+        except InvalidInput as error:
+            raise error if members == 1 else InvalidInput(f"uncertainty: {self.uncertainty}: {error}") from None
         with renumbered(np.repeat(np.arange(worlds.n), members)):
             problem = profile_problem(
                 possible, vehicles, harm_count=self.harm_count, horizon_s=horizon_s,
@@ -1258,8 +1261,8 @@ class StepShield:
 
         One member: where it is what was predicted, to the bit. Several: where it lies within the range of their
         predictions, by column; once one of them has had an impact, worlds between the corners may leave that range, and
-        any finite numbers will do. So they will where the own latency of a box is uncertain: a decision falls at
-        another time in each of its worlds then.
+        any finite numbers will do. So they will where the own latency of a box is uncertain (a decision falls at
+        another time in each of its worlds then), and where friction is.
         """
         running, boxes = self.running, self.boxes
         assert running is not None
@@ -1273,6 +1276,8 @@ class StepShield:
         if boxes is not None:
             own = 2 * boxes.limit.shape[1] + boxes.vehicle
             anywhere |= boxes.high[:, own] > boxes.low[:, own]
+        if self.uncertainty is not None and self.uncertainty.moves_together:
+            anywhere[:] = True
         return np.asarray(within | (anywhere & np.isfinite(seen).all(axis=1)), np.bool_)
 
     def _compare(self, seen: Floats, asked: Bools) -> None:

@@ -108,6 +108,11 @@ class Uncertainty:
     def __str__(self) -> str:
         return ",".join(str(interval) for interval in self.intervals)
 
+    @property
+    def moves_together(self) -> bool:
+        """Whether one uncertain number moves several quantities: then gaps and speeds have no extremes in corners."""
+        return any(each.quantity == "friction" and each.half_width > 0.0 for each in self.intervals)
+
     def scaled(self, factor: float) -> Uncertainty:
         """The same intervals, ``factor`` times as wide."""
         return Uncertainty(tuple(replace(each, half_width=each.half_width * factor) for each in self.intervals))
@@ -151,7 +156,9 @@ class Uncertainty:
             if interval.half_width == 0.0:
                 continue
             if not np.isfinite(every).all():
-                raise InvalidInput(f"uncertainty: {interval}: the scenario has no friction; declare it there")
+                raise InvalidInput(
+                    f"uncertainty: {interval}: friction is not known in every world; declare it in the scenario"
+                )
             if interval.place is not None and interval.place >= every.shape[1]:
                 raise InvalidInput(f"uncertainty: {interval}: the line has only {every.shape[1]} of these")
             for place in range(every.shape[1]) if interval.place is None else (interval.place,):

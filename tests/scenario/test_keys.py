@@ -15,7 +15,8 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import states_of
 from ethbrake_marl.limits.limits import prove
 from ethbrake_marl.physics import Floats, Worlds
-from ethbrake_marl.scenario import Scenario, Task, load_scenario
+from ethbrake_marl.scenario import QUANTITY, Scenario, Task, load_scenario
+from ethbrake_marl.shield import ShieldedDriver
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 
 PAPER = load_scenario("paper-random")
@@ -105,7 +106,7 @@ def test_friction__its_uncertainty_moves_all_capacities_together() -> None:
     )  # vehicle_3 is 6 or 12 on a dry road
     with pytest.raises(InvalidInput, match="friction is one number for the whole line"):
         parse_uncertainty("friction.vehicle_2=0.1")
-    with pytest.raises(InvalidInput, match=r"friction=0\.1: the scenario has no friction"):
+    with pytest.raises(InvalidInput, match=r"friction=0\.1: friction is not known in every world"):
         parse_uncertainty("friction=0.1").members(FIXED.sample(1, 7).worlds)
     with pytest.raises(InvalidInput, match=r"0\.6 in world 0 may be as low as -0\.4; it must stay above 0"):
         parse_uncertainty("friction=1").members(worlds)
@@ -116,7 +117,10 @@ def test_friction__of_some_members_of_a_mixture() -> None:
     mixed = Scenario(name="road", mixture=[{"scenario": PAPER}, {"scenario": wet}])
     worlds = mixed.sample(40, 7).worlds
     assert set(worlds.friction.tolist()) == {0.4, math.inf}
-    assert set(worlds.vehicles.braking_capacity_mps2[:, 1].tolist()) == {7.0, 9.81 * 0.4}
+    braking = worlds.vehicles.braking_capacity_mps2
+    assert set(braking[:, 1].tolist()) == {7.0, 9.81 * 0.4}
+    told = QUANTITY.columns(worlds)  # no friction is told for all: then the capacities are what the road allows
+    assert "friction" not in told and (told["braking_capacity_2_mps2"] == braking[:, 1]).all()
 
 
 def test_friction__the_proof_reads_what_the_road_allows() -> None:
@@ -125,6 +129,18 @@ def test_friction__the_proof_reads_what_the_road_allows() -> None:
     assert proofs[0.3].avoidable.tolist() == [True] == proofs[1.0].avoidable.tolist()
     apart = FIXED.replace(gaps_m=[4, 40], latency_s=[0, 0.5, 0.5])  # 20 x 0.5 = 10 m are lost where all brake alike
     assert final(apart.replace(friction=0.3)).pair_hit[0].tolist() == [True, False]
+
+
+def test_friction__no_truth_of_its_box_is_distrusted_and_no_corner_is_above_the_bound() -> None:
+    wet = load_scenario("engineering-wet-road").replace(time_gaps_s={"uniform": [0.2, 0.9]})
+    told, rng = wet.sample(60, 7).worlds, np.random.default_rng(0)
+    uncertainty = parse_uncertainty("friction=0.1")
+    for corners, spec in ((True, "coast"), (True, "full_brake"), (False, "full_brake")):
+        shield = ShieldedDriver(make_agent(spec), wet, told=told, uncertainty=uncertainty)
+        found = drive(uncertainty.draw(told, rng, corners=corners), shield, wet, 1)
+        assert not found.guarded.shield.distrusted.any()
+        harm = found.ledger.world_harm("first")
+        assert not corners or (harm <= found.guarded.shield.predicted_harm + 1e-9).all()
 
 
 # A table: one row for each world, the rest drawn.
@@ -169,7 +185,7 @@ def test_table__of_a_file_is_read_once_and_goes_along(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(f"{text}\ntable: {{file: rows.csv, columns: {columns}, weights: count}}\n")
     with pytest.raises(InvalidInput, match=r"table.rows\[181\]\[2\] = 201: speed_1_mps must be finite and in"):
         load_scenario(tmp_path / "mine.yaml")
-    (tmp_path / "rows.csv").write_text("\n".join(lines[:15]) + "\n")
+    (tmp_path / "rows.csv").write_text("\n".join(lines[:15]) + "\n\n")
     mine = load_scenario(tmp_path / "mine.yaml")
     (tmp_path / "rows.csv").unlink()
     again = Scenario(**mine.declared()).replace(horizon_s=9)
@@ -185,6 +201,7 @@ def test_table__of_a_file_is_read_once_and_goes_along(tmp_path: Path) -> None:
         ({**TABLE, "rows": [[5.0]]}, r"rows\[0\]: has 1 numbers; there are 2 columns"),
         ({**TABLE, "rows": [[5.0, -1.0]]}, "speed_2_mps must be finite and in"),
         ({**TABLE, "weights": [1, 1]}, "must be one for each of 3 rows"),
+        ({**TABLE, "file": "other.csv"}, "give either a file or rows, not both"),
         ({**TABLE, "weights": "count"}, "files are read where they stand in a file"),
         ({"file": "rows.csv", "columns": ["gap_1_m"]}, "files are read where they stand in a file"),
         ({"columns": ["gap_1_m", "gap_2_m"], "rows": [[5, 6]]}, "gaps_m.*the table says it for all; leave it out"),
@@ -301,6 +318,8 @@ def test_spread__is_added_to_what_the_load_gives() -> None:
     assert lorries({"uniform": [-0.5, 0.5]}).bounds("braking_capacity_mps2")[0] == (4.5, 7.5)
     with pytest.raises(InvalidInput, match=r"braking_capacity_mps2.*must be finite and in \(0, 100\]"):
         lorries({"uniform": [-5, 0]})
+    with pytest.raises(InvalidInput, match=r"spread = 0\.3: must be a distribution around 0"):
+        lorries(0.3)
     names = lorries({"uniform": [-0.5, 0.5]}).ranges().names
     assert "braking_capacity_mps2 of vehicle_1" in names and "mass_t of vehicle_1" not in names
 
@@ -326,4 +345,4 @@ def test_alert__everybody_goes_on_until_then() -> None:
 
 def test_alert__what_it_cannot_go_with_is_refused() -> None:
     refused(FIXED, "only without messages one by one", alert_s=2, v2x="nominal")
-    refused(FIXED, "must be below horizon_s", alert_s=40)
+    refused(FIXED, r"alert_s = 40: with latency_s a vehicle may act as late as 40 s", alert_s=40)
