@@ -8,9 +8,11 @@ numbers. What robust mode proves, it proves for the members (``docs/shield-inter
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import product
 from numbers import Real
 from typing import Any
 
@@ -44,6 +46,7 @@ def check_scenario(scenario: object, where: str) -> None:
 OF_VEHICLES = ("braking_capacity_mps2", "driving_capacity_mps2", "latency_s", "mass_t")  # fields of ``Vehicles``
 QUANTITIES = (*OF_VEHICLES, "speeds_mps", "gaps_m", "friction")
 POSITIVE = ("braking_capacity_mps2", "mass_t", "friction")  # must stay above 0
+_OF_FRICTION = (0.0, 0.125, 0.25, 0.375, 0.625, 0.75, 0.875, 1.0)  # shares of its interval; told is 0.5
 MOST_CORNERS = 1024  # of one world: each costs as much as the world itself
 _FORM = f"must be quantity=half-width, for instance {DEFAULT.UNCERTAINTY_EXAMPLE}"
 
@@ -121,17 +124,20 @@ class Uncertainty:
         """The members [n * M] of worlds at the alert: for each world itself, then its corners, the next world's after.
 
         Corners come in the order of binary numbers, the first interval's bit being the lowest; intervals of no
-        width make none. Raises ``InvalidInput`` for a vehicle that is not there, a capacity or mass that may be 0, or
+        width make none. Friction moves all capacities together, and harm is not monotone in it: it has eight instead
+        of two ends. Raises ``InvalidInput`` for a vehicle that is not there, a capacity or mass that may be 0, or
         more than ``MOST_CORNERS`` corners.
         """
         sides = self._sides(worlds)
-        corners = 2 ** len(sides) if sides else 0
+        ends = [_OF_FRICTION if name == "friction" else (0.0, 1.0) for name, *_ in reversed(sides)]
+        corners = math.prod(map(len, ends)) if sides else 0
         if corners > MOST_CORNERS:
             raise InvalidInput(
                 f"uncertainty: {len(sides)} uncertain numbers in each world make {corners} corners; at most"
                 f" {MOST_CORNERS} can be certified: name vehicles or pairs, for instance {DEFAULT.UNCERTAINTY_EXAMPLE}"
             )
-        parts = [worlds] + [_placed(worlds, sides, lambda k, c=c: c >> k & 1) for c in range(corners)]  # type: ignore[misc]
+        every = [shares[::-1] for shares in product(*ends)] if sides else []
+        parts = [worlds] + [_placed(worlds, sides, shares.__getitem__) for shares in every]
         return self.interleaved(parts)
 
     @staticmethod
@@ -218,7 +224,7 @@ def _of(quantity: str, place: int) -> str:
     return f" of {owner}" if owner else ""
 
 
-def _placed(worlds: Worlds, sides: list[_Side], share: Callable[[int], Floats | int]) -> Worlds:
+def _placed(worlds: Worlds, sides: list[_Side], share: Callable[[int], Floats | float]) -> Worlds:
     """The worlds with each uncertain number at ``share(k)`` of its interval: 0 its least value, 1 its largest.
 
     Without a channel an uncertain latency is also what others are told, and when the news is known. With one, only the

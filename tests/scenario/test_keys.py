@@ -100,10 +100,9 @@ def state_of(worlds: Worlds) -> dict[str, Any]:
 def test_friction__its_uncertainty_moves_all_capacities_together() -> None:
     worlds = FIXED.replace(friction=0.6, braking_capacity_mps2=[4, 7, 9]).sample(1, 7).worlds
     members = parse_uncertainty("friction=0.2,braking_capacity_mps2.vehicle_3=3").members(worlds)
-    low, high = 9.81 * (0.6 - 0.2), 9.81 * (0.6 + 0.2)
-    assert members.vehicles.braking_capacity_mps2 == pytest.approx(
-        np.array([[4, 5.886, 5.886], [low, low, low], [4, 7, 6], [low, low, low], [4, 7, high]]), abs=1e-12
-    )  # vehicle_3 is 6 or 12 on a dry road
+    shares, dry = [0, 0.125, 0.25, 0.375, 0.625, 0.75, 0.875, 1], ([4, 7, 6], [4, 7, 12])
+    expected = [[4, 5.886, 5.886]] + [np.minimum(d, 9.81 * (0.4 + 0.4 * share)) for d in dry for share in shares]
+    assert members.vehicles.braking_capacity_mps2 == pytest.approx(np.array(expected), abs=1e-12)
     with pytest.raises(InvalidInput, match="friction is one number for the whole line"):
         parse_uncertainty("friction.vehicle_2=0.1")
     with pytest.raises(InvalidInput, match=r"friction=0\.1: friction is not known in every world"):
