@@ -78,9 +78,6 @@ def run_command(
         " policy behind its shield.\n"
     )
     figures = evaluation.results_to_json(result.rows, per_world=result.per_world)
-    for row in figures:
-        if row["agent"] in (trained.policy.manifest.algorithm, "hybrid"):
-            row["training_start"] = trained.training.begins
     out.result(figures, Text(told), result.rows.brief(result.beside), *result.rows.tables()[1:])
     out.note(f"report, with every measure and the paper's rows: {result.report}")
     _end(out, result.trained)

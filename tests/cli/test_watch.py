@@ -62,7 +62,8 @@ def test_replay__writes_a_page_and_a_film(ethbrake: Command) -> None:
 
 
 def test_replay__says_that_the_scenario_was_edited_and_what_is_missing(ethbrake: Command) -> None:
-    path = Path("mine.yaml").absolute()
+    path = Path("elsewhere/mine.yaml").absolute()  # a file beside the caller would be found
+    path.parent.mkdir()
     path.write_text(new_scenario_text("mine"))
     text = passport_of("full_brake", path)
     for words, told in (
