@@ -231,7 +231,7 @@ _OTHERWISE = _by_name(
     ),
     QuantityRule(
         "alert_s", "s", "world", 3600.0, False, 2, "",
-        "time from the start, at which gaps and speeds are told, to the alert, from which latencies count; all go on",
+        "time from the start, when gaps and speeds are as told, to the alert, from which latencies count",
         "{uniform: [1, 5]}", stream=SURROUNDINGS,
     ),
 )  # fmt: skip
