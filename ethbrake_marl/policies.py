@@ -69,6 +69,9 @@ class NetworkSpec(FileModel):
     With ``networks`` above 1 there are as many actors of this shape, and a gate with ``gate_hidden`` layers that gives
     each a score: the actor of the highest score acts, the first of equal ones. The gate is asked at each decision and
     remembers nothing. There is neither noise nor critic then.
+
+    With output ``choice`` the actor gives each of ``choices`` actions, evenly from -1 to 1, a score, and the action of
+    the highest one is taken, the lowest of equal ones. Again there is neither noise nor critic.
     """
 
     observation_size: Annotated[int, Field(ge=1, le=4096)]
@@ -76,7 +79,8 @@ class NetworkSpec(FileModel):
     policy_hidden: Annotated[PerhapsHidden, Field(min_length=1)]
     value_hidden: PerhapsHidden
     activation: Activation
-    output: Literal["clip", "tanh"]
+    output: Literal["clip", "tanh", "choice"]
+    choices: Annotated[int, Field(ge=2, le=4096, exclude_if=lambda choices: choices is None)] | None = None
     networks: Annotated[int, Field(ge=1, le=16, exclude_if=lambda networks: networks == 1)] = 1
     gate_hidden: Annotated[PerhapsHidden, Field(exclude_if=not_)] = ()
 
@@ -88,6 +92,12 @@ class NetworkSpec(FileModel):
             )
         if self.networks > 1 and self.value_hidden:
             raise ValueError(f"value_hidden = {list(self.value_hidden)}: must be empty beside several networks")
+        if (self.output == "choice") != (self.choices is not None):
+            raise ValueError(
+                f"choices = {self.choices} with output {self.output}; output choice needs a number of them"
+            )
+        if self.choices is not None and (self.value_hidden or self.networks > 1 or self.action_size > 1):
+            raise ValueError("output choice is for one network without a critic, and one action")
         return self
 
     @property
@@ -96,8 +106,10 @@ class NetworkSpec(FileModel):
         return ("policy",) if self.networks == 1 else tuple(f"network_{m + 1}" for m in range(self.networks))
 
     @property
-    def format_version(self) -> Literal[2, 3]:
+    def format_version(self) -> Literal[2, 3, 4]:
         """Of a bundle with this network."""
+        if self.choices is not None:
+            return 4
         return 2 if self.networks == 1 else 3
 
     @property
@@ -128,6 +140,8 @@ class NetworkSpec(FileModel):
                 for m, name in enumerate(self.actors)
             ]
             return (*chain(*actors), *gate)
+        if self.choices is not None:
+            return tuple(network("policy", "average", hidden, f"average.{2 * len(hidden)}", self.choices))
         if self.output == "clip":
             rows = network("policy", "mlp_extractor.policy_net", hidden, "action_net", actions)
             rows.append(TensorRow("policy.log_std", (actions,), "log_std"))
@@ -197,11 +211,12 @@ class ObservationSchema(_Strict):
 class Manifest(_Strict):
     """Everything about a policy but its tensors; ``action`` is a fraction of the own capacity, -1 = full braking.
 
-    Format 3 is for policies of several networks; one network is written as ever, for earlier versions too.
+    Format 3 is for policies of several networks, 4 for one that scores its choices; any other network is written as
+    ever, for earlier versions too.
     """
 
     format: Literal["ethbrake-policy"] = "ethbrake-policy"
-    format_version: Literal[2, 3] = 2
+    format_version: Literal[2, 3, 4] = 2
     algorithm: Annotated[str, Field(pattern=NAME_PATTERN)]
     network: NetworkSpec
     observation: ObservationSchema
@@ -220,8 +235,8 @@ class Manifest(_Strict):
         network, features, step = self.network, self.observation.features, self.scenario.get("time_step_s")
         if self.format_version != network.format_version:
             raise ValueError(
-                f"format_version: {self.format_version} for {network.networks} networks; must be"
-                f" {network.format_version}"
+                f"format_version: {self.format_version} for {network.networks} networks and output {network.output};"
+                f" must be {network.format_version}"
             )
         if len(features) != network.observation_size:
             raise ValueError(
@@ -263,6 +278,12 @@ _SATURATED = 10.0  # from 9.02 on the single-precision result is 1
 _SMALL = 1e-4  # below, x - x^3 / 3 is exact to double precision
 
 
+def even_actions(number: int) -> Float32s:
+    """So many actions, evenly from -1 to 1, [number]."""
+    found: Float32s = np.linspace(-1.0, 1.0, number).astype(np.float32)
+    return found
+
+
 @compiled
 def squash(values: NDArray[np.float32]) -> None:
     """Replace ``values`` [k, rows] by their hyperbolic tangents, within half a unit of the last place (and a hair)."""
@@ -297,6 +318,7 @@ class Actor:
         self.spec = spec
         self._networks = [_layers_of(name, len(spec.policy_hidden), tensors) for name in spec.actors]
         self._gate = _layers_of("gate", len(spec.gate_hidden), tensors) if spec.networks > 1 else []
+        self._choices = even_actions(spec.choices or 2)
 
     def __call__(self, observation: Float32s) -> Float32s:
         """Return the action of each row; raises ``InvalidInput`` on a wrong shape, dtype or a non-finite entry."""
@@ -316,6 +338,8 @@ class Actor:
         """[F, rows] -> [A, rows]."""
         if len(self._networks) == 1:
             y = self._forward(self._networks[0], x)
+            if self.spec.choices is not None:
+                return self._choices[y.argmax(axis=0)][np.newaxis]
         else:
             chosen = self.choose(x)
             y = np.empty((self.spec.action_size, x.shape[1]), dtype=np.float32)
@@ -518,6 +542,9 @@ class Policy:
             x = node("GatherElements", [node("Concat", outputs, axis=1), chosen], axis=1)
         if spec.output == "tanh":
             action = node("Tanh", [x], output="action")
+        elif spec.choices is not None:
+            chosen = node("ArgMax", [x], axis=1, keepdims=1)
+            action = node("Gather", [constant("choices", even_actions(spec.choices)), chosen], output="action")
         else:
             bounds = [constant(name, np.array(at, np.float32)) for name, at in (("lowest", -1.0), ("highest", 1.0))]
             action = node("Clip", [x, *bounds], output="action")
@@ -702,7 +729,7 @@ def read_trained(folder: Path) -> Trained:
 # it is and where it is bad.
 
 SHIPPED = "shipped"
-_BEST_FIRST = ("counterfactual", "ppo", "sac", "universal")  # of ``policy``, where several are
+_BEST_FIRST = ("counterfactual", "options", "ppo", "sac", "universal")  # of ``policy``, where several are
 
 _FOLDER = Path(__file__).resolve().parent / "_policies"
 

@@ -444,6 +444,9 @@ _ENTRIES: dict[str, Entry] = {
     "counterfactual": Entry(
         "counterfactual@PATH", "a policy trained by counterfactuals: a run or a bundle", Source.MESSAGES, _POLICIES
     ),
+    "options": Entry(
+        "options@PATH", "a policy trained by options: a run, a bundle, or shipped", Source.MESSAGES, _POLICIES
+    ),
     "policy": Entry(
         "policy@PATH",
         "a policy, whatever trained it: a run, a bundle, or shipped, the best for scenario and harm",

@@ -106,8 +106,9 @@ class Out:
         On a terminal one bar per part, else a line at the beginning and every ten seconds. What stands behind ": " in
         a name is a stage of the part before it, and shares its bar.
         """
-        harm = (metrics or {}).get("first_impact_harm")
-        label = one_line(name if harm is None else f"{name}, first-impact harm {harm:.2f}")
+        words = {"first_impact_harm": "first-impact harm", "total_harm": "total harm"}
+        harms = [f", {words[key]} {value:.2f}" for key, value in (metrics or {}).items() if key in words]
+        label = one_line(name + "".join(harms[:1]))  # the first one is what is trained for
         if not self._stderr.is_terminal:
             if note:
                 say(note)
@@ -223,7 +224,7 @@ PARTS = [  # as ``part_names`` tells them: to ask for them takes the engine, and
     ("Observation", "own, front_K, rear_K, role, obstacle, front_K.age, rear_K.age"),
     ("V2X presets", "paper, clear, nominal, congested, blocked, sensors-only"),
     ("Objectives", "total, own, social:ANGLE, maximin, mass-weighted, weighted:W1,W2,..."),
-    ("Algorithms", "ppo, sac, counterfactual"),
+    ("Algorithms", "ppo, sac, counterfactual, options"),
 ]
 
 

@@ -42,6 +42,7 @@ from ethbrake_marl.learning.training import (
     CounterfactualRecipe,
     ModesPlan,
     NetworkShape,
+    OptionsRecipe,
     PpoRecipe,
     SacRecipe,
     SquashedShape,
@@ -49,7 +50,7 @@ from ethbrake_marl.learning.training import (
 )
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats, Ints, Packed, Worlds, columns, compiled
-from ethbrake_marl.policies import Activation, Float32s, NetworkSpec, Policy, load_named_policy
+from ethbrake_marl.policies import Activation, Float32s, NetworkSpec, Policy, even_actions, load_named_policy
 from ethbrake_marl.search import profile_problem
 
 ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh}
@@ -801,6 +802,148 @@ def choose_rows(
         return some, np.ones(len(some), np.float32)
     drawn, importance = draw_rows(expect(observed[rows]), count, focus)
     return rows[drawn], importance
+
+
+# Options: several actions are tried at a decision, and the actor learns to choose the one that costs least.
+
+
+class Options(Algorithm):
+    """Policy iteration by what actions cost in closed loop; one actor for all learners."""
+
+    def build(self, training: Training, environment: EthBrakeVecEnv) -> OptionsModel:
+        """The model, from random weights and full braking."""
+        recipe = training.recipe
+        assert isinstance(recipe, OptionsRecipe)
+        environment.engine.branch(environment.engine.moment())  # refuses what cannot be branched before it begins
+        return OptionsModel(environment, recipe)
+
+
+class ChoosingActor(_Deterministic):
+    """An actor that scores actions (``learning``), the average of its weights (``average``), which drives, and what it
+    remembers: the last decisions at which actions were tried, and how much more than the best one each of them costs.
+    """
+
+    seen: Tensor  # [M, F]
+    tried: Tensor  # [M, C] numbers of actions, the one that was taken first
+    more: Tensor  # [M, C]
+    known: Tensor  # [1] decisions so far; the newest take the places of the oldest
+
+    def __init__(self, observation_space: Space[Any], action_space: Any, rate: Schedule, recipe: OptionsRecipe) -> None:
+        super().__init__(observation_space, action_space)
+        inputs, shape, room = flatdim(observation_space), recipe.network, (recipe.memory, 1 + recipe.others)
+        layers = create_mlp(inputs, shape.choices, list(shape.policy), ACTIVATIONS[shape.activation])
+        nn.init.zeros_(layers[-1].weight)  # type: ignore[arg-type]  # until it learns, it brakes fully
+        nn.init.zeros_(layers[-1].bias)  # type: ignore[arg-type]
+        self.average = nn.Sequential(*layers)
+        self.learning = copy.deepcopy(self.average)
+        self.optimizer = adam(rate(1.0), self.learning)
+        self.actions = even_actions(shape.choices)
+        self.register_buffer("seen", torch.zeros(recipe.memory, inputs))
+        self.register_buffer("tried", torch.zeros(room, dtype=torch.int64))
+        self.register_buffer("more", torch.zeros(room))
+        self.register_buffer("known", torch.zeros(1, dtype=torch.int64))
+
+    @torch.no_grad()
+    def choose(self, observation: Float32s) -> Ints:
+        """Numbers of its actions [rows] for observations [rows, F]."""
+        chosen: Ints = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
+        return chosen
+
+    def act(self, observation: Float32s) -> Float32s:
+        return self.actions[self.choose(observation)]
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Actions [rows, 1] of the average."""
+        return torch.from_numpy(self.actions)[self.average(observation).argmax(dim=1)][:, None]
+
+    def remember(self, seen: Float32s, tried: Ints, more: Floats) -> None:
+        """Keep decisions."""
+        places = torch.arange(int(self.known), int(self.known) + len(seen)) % len(self.seen)
+        self.seen[places], self.tried[places] = torch.from_numpy(seen), torch.from_numpy(tried)
+        self.more[places] = torch.from_numpy(more.astype(np.float32))
+        self.known += len(seen)
+
+    def loss(self, count: int, guide: float) -> Tensor:
+        """Of some of the kept decisions: the expected cost of choosing with the chances of a softmax of the scores.
+
+        Where the chances are nearly 0 or 1 this has no slope. So ``guide`` times a convex loss is added: each action
+        that is not the best should have a lower score, the more so the more it costs.
+        """
+        some = torch.randint(min(int(self.known), len(self.seen)), (count,))
+        more = self.more[some]
+        scores = self.learning(self.seen[some]).gather(1, self.tried[some])
+        best = scores.gather(1, more.argmin(dim=1, keepdim=True))
+        expected = (scores.softmax(dim=1) * more).sum(dim=1)
+        found: Tensor = (expected + guide * (more * softplus(scores - best)).sum(dim=1)).mean()
+        return found
+
+
+class OptionsModel(CounterfactualModel):
+    """Visits decisions by its actor, tries several actions at some of them, and learns what each costs."""
+
+    policy: ChoosingActor  # type: ignore[assignment]
+    recipe: OptionsRecipe  # type: ignore[assignment]
+
+    def _setup_model(self) -> None:
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        self.policy = ChoosingActor(self.observation_space, self.action_space, self.lr_schedule, self.recipe)
+
+    def _update(self, told: BaseCallback, total: int) -> None:
+        recipe, actor = self.recipe, self.policy
+        seen, moments = self._visit(told, actor.act)
+        told.on_rollout_end()
+        self._update_current_progress_remaining(self.num_timesteps, total)
+        self._update_learning_rate(actor.optimizer)
+        observed, tried, costs = self._try_actions(seen, moments)
+        more = np.minimum(costs - costs.min(axis=1, keepdims=True), recipe.largest_cost)
+        telling = np.flatnonzero(more.max(axis=1) > 1e-9)
+        actor.remember(observed[telling], tried[telling], more[telling])
+        self.logger.record("train/regret", float(more[:, 0].mean()) if len(more) else 0.0)
+        self.logger.record("train/telling", len(telling))
+        losses = []
+        for _ in range(recipe.gradient_steps if int(actor.known) else 0):
+            loss = actor.loss(recipe.batch_size, recipe.guide)
+            descend(actor.optimizer, loss)
+            follow(actor.average.parameters(), actor.learning, recipe.averaging)
+            losses.append(loss.item())
+        self._n_updates += len(losses)
+        self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
+
+    def _try_actions(self, seen: Float32s, moments: Moment) -> tuple[Float32s, Ints, Floats]:
+        """At some decisions: what is seen [B, F], numbers of the actions tried [B, C], and what each costs [B, C].
+
+        The first one is the one that the actor takes.
+        """
+        recipe, actor, learners = self.recipe, self.policy, len(self.engine.learners)
+        observed, last = seen.reshape(-1, seen.shape[2]), recipe.network.choices - 1
+        moving = np.flatnonzero(moving_rows(moments).repeat(learners))
+        rows = moving[torch.randperm(len(moving))[: recipe.tried].numpy()]
+        taken = actor.choose(observed[rows])
+        numbers = [taken]
+        for near in recipe.near:
+            ratio = (near.largest / near.smallest) ** torch.rand(len(rows), dtype=torch.float64).numpy()
+            far = np.maximum(np.rint(near.smallest * ratio * last / 2.0).astype(np.int64), 1)
+            numbers += [taken - far, taken + far]
+        numbers += [np.full(len(rows), round((action + 1.0) * last / 2.0)) for action in recipe.fixed]
+        numbers += [torch.randint(last + 1, (len(rows),)).numpy() for _ in range(recipe.drawn)]
+        tried = np.clip(np.stack(numbers, axis=1), 0, last)
+        holds = np.array(recipe.holds, np.int64)[torch.randint(len(recipe.holds), (len(rows),)).numpy()]
+        each, back = np.unique(np.arange(len(rows))[:, None] * (last + 1) + tried, return_inverse=True)
+        row, number = each // (last + 1), each % (last + 1)
+        learner, steps, actions = rows[row] % learners, holds[row], actor.actions[number].astype(np.float64)
+
+        def decide(now: Observations, some: Ints, done: int) -> Floats:
+            wanted = actor.act(now.reshape(-1, now.shape[2])).astype(np.float64).reshape(now.shape[:2])
+            held = np.flatnonzero(done < steps[some])
+            wanted[held, learner[some[held]]] = actions[some[held]]
+            return wanted
+
+        engine = self.engine.branch(moments.take(rows[row] // learners))
+        gained = play_on(engine, decide, recipe.gamma, at_least=max(recipe.holds))
+        costs = -gained[np.arange(len(row)), learner][back].reshape(tried.shape)
+        good = np.isfinite(costs).all(axis=1)
+        return observed[rows[good]], tried[good], costs[good]
 
 
 # Several networks: which updates of a training do what.

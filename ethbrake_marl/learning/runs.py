@@ -493,6 +493,8 @@ class Session(BaseCallback):
             return
         course = self.course
         metrics = dict(course.evaluations[-1]) if course.evaluations else {}
+        if metrics and self.recipe.reward.harm_count == "total":  # what is trained for stands first
+            metrics = {"total_harm": metrics["total_harm"], **metrics}
         recent = self._recent_return()
         if recent is not None:
             metrics[RETURN] = recent

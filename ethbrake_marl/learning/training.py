@@ -139,6 +139,18 @@ class ActorShape(_Shape):
     )
 
 
+class ChoosingShape(_Shape):
+    """Hidden layers of an actor that scores a number of actions, evenly from -1 to 1."""
+
+    policy: Layers
+    activation: Activation = "relu"
+    choices: Annotated[int, Field(ge=2, le=4096)]
+
+    def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
+        """The actor, which takes the action of the highest score."""
+        return super().spec(observation_size, output="choice", choices=self.choices, **more)
+
+
 class OffsetRange(FileModel):
     """How far an action is moved to see what comes of it; the logarithm of what is drawn is uniform."""
 
@@ -219,7 +231,7 @@ class TrainingRecipe(FileModel):
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
         """The network of the policy's bundle: that of the recipe's ``network``."""
-        shape: NetworkShape | SquashedShape | ActorShape = vars(self)["network"]
+        shape: _Shape = vars(self)["network"]
         return shape.spec(observation_size)
 
     @property
@@ -479,6 +491,7 @@ class SacRecipe(TrainingRecipe):
 
 
 Steps = Annotated[int, Field(ge=1, le=1000)]
+_NO_SHAPING = "must be 0: what is tried is played to the end, where shaping tells nothing more"
 
 
 class CounterfactualRecipe(TrainingRecipe):
@@ -511,8 +524,7 @@ class CounterfactualRecipe(TrainingRecipe):
     @model_validator(mode="after")
     def _keys_fit(self) -> CounterfactualRecipe:
         if self.reward.shaping > 0.0:
-            right = "must be 0: a counterfactual is played to the end, where shaping tells nothing more"
-            refuse(("reward", "shaping"), self.reward.shaping, right)
+            refuse(("reward", "shaping"), self.reward.shaping, _NO_SHAPING)
         visited = self.n_envs * self.n_steps
         if not self.counterfactuals <= visited:
             refuse(("counterfactuals",), self.counterfactuals, f"must be at most n_envs x n_steps = {visited}")
@@ -530,6 +542,49 @@ class CounterfactualRecipe(TrainingRecipe):
             raise InvalidInput(f"recipe {self.name!r}: modes: are for one learner, not for {learners}; leave modes out")
 
 
+class OptionsRecipe(TrainingRecipe):
+    """Try ``tried`` of the ``n_envs x n_steps`` decisions of a round with several actions each; learn to choose.
+
+    The actions of the policy are ``network.choices``, evenly from -1 to 1. Tried are the one that it takes, one below
+    and one above it in each of the distances ``near``, the actions ``fixed``, and ``drawn`` ones.
+    """
+
+    most_decisions = 2**22
+
+    algorithm: Literal["options"]
+    n_steps: Annotated[int, Field(ge=1)]
+    tried: Annotated[int, Field(ge=1)]
+    near: Annotated[tuple[OffsetRange, ...], Field(strict=False, max_length=8)]
+    fixed: Annotated[tuple[Annotated[float, Field(ge=-1.0, le=1.0)], ...], Field(strict=False, max_length=64)]
+    drawn: Annotated[int, Field(ge=0, le=64)]
+    holds: Annotated[tuple[Steps, ...], Field(strict=False, min_length=1, max_length=16)]
+    largest_cost: Positive
+    guide: NonNegative
+    memory: Annotated[int, Field(ge=1, le=10_000_000)]
+    gradient_steps: Annotated[int, Field(ge=1, le=100_000)]
+    batch_size: Annotated[int, Field(ge=2)]
+    averaging: Fraction
+    network: ChoosingShape
+
+    @model_validator(mode="after")
+    def _keys_fit(self) -> OptionsRecipe:
+        if self.reward.shaping > 0.0:
+            refuse(("reward", "shaping"), self.reward.shaping, _NO_SHAPING)
+        visited = self.n_envs * self.n_steps
+        if not self.tried <= visited:
+            refuse(("tried",), self.tried, f"must be at most n_envs x n_steps = {visited}")
+        if not self.memory >= self.tried:
+            refuse(("memory",), self.memory, f"must be at least tried = {self.tried}")
+        if not self.others:
+            refuse(("near",), list(self.near), "must hold a range where there are neither fixed nor drawn actions")
+        return self
+
+    @property
+    def others(self) -> int:
+        """How many actions are tried beside the one that the policy takes."""
+        return 2 * len(self.near) + len(self.fixed) + self.drawn
+
+
 # The names of the learning algorithms, each with the class of its recipes and the algorithm itself.
 #
 # An algorithm of the package is a string ``module:attribute``, imported when it is first used: torch takes seconds.
@@ -539,6 +594,7 @@ _ALGORITHMS: dict[str, tuple[type[TrainingRecipe], str | type[Any]]] = {
     "ppo": (PpoRecipe, "ethbrake_marl.learning.algorithms:Ppo"),
     "sac": (SacRecipe, "ethbrake_marl.learning.algorithms:Sac"),
     "counterfactual": (CounterfactualRecipe, "ethbrake_marl.learning.algorithms:Counterfactual"),
+    "options": (OptionsRecipe, "ethbrake_marl.learning.algorithms:Options"),
 }
 
 
@@ -606,7 +662,7 @@ MEANINGS = {
     "title": "one line for lists",
     "description": "what it is for",
     "source": "where the values come from",
-    "algorithm": "a registered name: ppo, sac, counterfactual",
+    "algorithm": "a registered name: ppo, sac, counterfactual, options",
     "scheme": "how several learners train together: single, shared, independent, centralised",
     "total_steps": "decisions of all learners",
     "n_envs": "worlds that are advanced together",
@@ -647,12 +703,20 @@ MEANINGS = {
     "averaging": "share of itself that the average of the weights, which drives, keeps in each gradient step",
     "focus": "share of what is tried that a scout chooses; left out: 0, all decisions alike",
     "modes": "several networks and a gate between them; left out: one network",
+    "tried": "how many of the decisions of a round are tried with other actions",
+    "near": "ranges of distances to the action taken, each tried below and above it; the logarithm drawn is uniform",
+    "fixed": "actions that are tried at each of these decisions, from -1 (full braking) to 1",
+    "drawn": "how many more actions are tried there, any of the choices",
+    "largest_cost": "an action that costs more than this beyond the best one counts as this much more",
+    "guide": "weight of the convex part of the loss, without which learning can stand still at the beginning",
+    "memory": "decisions, the last ones that were tried, which are learned from",
     "log_every_updates": "updates between two rows of the progress table",
     # of the keys inside others: for the documentation
     "learning_rate.schedule": "end + (start - end) (1 + cos(pi p)) / 2, where p is the share of steps done",
     "network.policy": "hidden layers of the actor",
     "network.value": "hidden layers of the critic; sac: of each of its two",
     "network.initial_log_std": "logarithm of the exploration noise at the start",
+    "network.choices": "how many actions, evenly from -1 to 1, the network scores",
     "network.initial_action": "about what the network does at first, [-1, 1]; left out: 0, which coasts",
     "modes.networks": "how many",
     "modes.gate": "hidden layers of the gate",

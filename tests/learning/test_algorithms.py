@@ -1,10 +1,11 @@
-"""Algorithms: one of the user's own, how weights become ours, and learning from counterfactuals, modes and a scout."""
+"""Algorithms: one of the user's own, how weights become ours, and learning from counterfactuals, modes, options."""
 
 from __future__ import annotations
 
 import importlib
 import itertools
 import json
+import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -49,7 +50,16 @@ from ethbrake_marl.learning.runs import TrainingDiverged, make_environment, make
 from ethbrake_marl.learning.training import ModesPlan
 from ethbrake_marl.policies import Actor, load_policy
 from ethbrake_marl.search import profile_problem
-from tests.learning.tiny import MODES, TINY_COUNTERFACTUAL, TINY_MODES, TINY_PPO, ctrl_c_in, files_of, watch_steps
+from tests.learning.tiny import (
+    MODES,
+    TINY_COUNTERFACTUAL,
+    TINY_MODES,
+    TINY_OPTIONS,
+    TINY_PPO,
+    ctrl_c_in,
+    files_of,
+    watch_steps,
+)
 
 
 @pytest.fixture
@@ -146,7 +156,7 @@ def test_own_algorithm__under_vec_normalize_is_refused_as_no_bundle_holds_its_st
     [
         ({"n_stepz": 3}, r"mine.yaml, line \d+: n_stepz.*did you mean n_steps"),
         ({"n_steps": 2.5}, r"mine.yaml, line \d+: n_steps = 2.5: must be a whole number"),
-        ({"algorithm": "a3c"}, r"algorithm = a3c: must be one of ppo, sac, counterfactual, a2c"),
+        ({"algorithm": "a3c"}, r"algorithm = a3c: must be one of ppo, sac, counterfactual, options, a2c"),
         ({"scheme": "independent"}, "scheme independent: recipe 'mine' is for A2C; it needs one for PPO"),
     ],
 )
@@ -292,12 +302,14 @@ SCRIPTED = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "pla
         (TINY_COUNTERFACTUAL.replace(**CONTACT), eb.load_scenario("cooperation-2-five")),
         (TINY_COUNTERFACTUAL, SCENARIO.replace(early_impacts="keep", roles=SCRIPTED)),  # a script that remembers
         (TINY_MODES.replace(**OWN, modes={**MODES, "networks": 3}), eb.load_scenario("cooperation-2-five")),
+        (TINY_OPTIONS.replace(**CONTACT), SCENARIO.with_learners(["vehicle_2", "vehicle_3"])),
+        (TINY_OPTIONS.replace(**OWN), eb.load_scenario("cooperation-2-five")),
     ],
 )
 def test_training__of_any_learners_objective_and_line(recipe: Any, scenario: Any, tmp_path: Path) -> None:
     result = train(recipe, scenario, tmp_path / "run", steps=8 * 32 * len(scenario.learners))
     assert result.status == "finished" and result.updates == 8
-    networks = 3 if recipe.modes else 1
+    networks = 3 if getattr(recipe, "modes", None) else 1
     assert eb.load_policy(tmp_path / "run").manifest.network.networks == networks
 
 
@@ -313,9 +325,20 @@ GATED = {
 }
 
 
+CHOOSING = {
+    "n_steps": 8, "tried": 256, "memory": 4000, "gradient_steps": 60, "total_steps": 12 * 512,
+    "network": {"policy": [32], "choices": 9},
+}  # fmt: skip
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "recipe", [SHIPPED.replace(start=None, **FROM_SCRATCH, **MANY_TRIED), TINY_MODES.replace(**FROM_SCRATCH, **GATED)]
+    "recipe",
+    [
+        SHIPPED.replace(start=None, **FROM_SCRATCH, **MANY_TRIED),
+        TINY_MODES.replace(**FROM_SCRATCH, **GATED),
+        TINY_OPTIONS.replace(**FROM_SCRATCH | CHOOSING),
+    ],
 )
 def test_training__gets_better_from_scratch(recipe: Any, tmp_path: Path) -> None:
     """Random weights hardly act: much of the harm is gone by trying, or by imitating templates and a gate."""
@@ -478,3 +501,44 @@ def test_scout__learns_the_mean_size_of_what_is_to_be_expected() -> None:
         optimizer.step()
     expected = scout.expect(np.eye(2, dtype=np.float32))
     assert expected[1] == pytest.approx(3.0, rel=0.05) and expected[0] < 0.05
+
+
+def choosing(**changes: Any) -> Any:
+    """A new model that chooses among actions."""
+    training = Training.of(TINY_OPTIONS.replace(**changes), SCENARIO)
+    return make_model(training.recipe.make_algorithm(), training, make_environment(training))
+
+
+def test_options__costs_are_those_of_episodes_driven_so() -> None:
+    """Full braking but for what is tried: each action for its steps, then the policy, to the end."""
+    model = choosing(tried=8, near=[], fixed=[1.0], drawn=1, holds=[3], network={"policy": [8], "choices": 5})
+    model._setup_learn(1)
+    start = model.engine.moment()
+    torch.manual_seed(5)
+    seen, tried, costs = model._try_actions(model._last_obs[np.newaxis], start)
+    order = np.argsort(seen[:, 0])
+    assert len(tried) == 8 and (tried[:, 0] == 0).all() and (tried[:, 1] == 4).all() and len(set(tried[:, 2])) > 1
+    rows = np.argsort(model._last_obs[:, 0])
+    for way in range(3):
+        engine = model.engine.branch(start.take(rows))
+        for step in range(200):
+            action = -1.0 + 0.5 * tried[order, way] if step < 3 else np.full(8, -1.0)
+            engine.step(action[:, np.newaxis].astype(np.float64))
+            if engine.ended.all():
+                break
+        np.testing.assert_allclose(costs[order, way], engine.ledger.world_harm("total"), rtol=1e-12, atol=1e-12)
+
+
+def test_options__loss_by_hand_and_what_is_remembered_last() -> None:
+    actor = choosing(
+        tried=2, memory=2, near=[], fixed=[0.0, 1.0], drawn=0, network={"policy": [8], "choices": 3}
+    ).policy
+    seen, tried = np.zeros((2, actor.seen.shape[1]), np.float32), np.array([[0, 1, 2], [0, 1, 2]])
+    actor.remember(seen, tried, np.array([[9.0, 9.0, 9.0], [0.0, 2.0, 4.0]]))
+    actor.remember(seen[:1], tried[:1], np.array([[0.0, 2.0, 4.0]]))
+    assert int(actor.known) == 3 and actor.more.tolist() == [[0.0, 2.0, 4.0], [0.0, 2.0, 4.0]]
+    with torch.no_grad():
+        actor.learning[-1].bias.copy_(torch.log(torch.tensor([1.0, 2.0, 1.0])))
+    convex = 2.0 * math.log(1.0 + 2.0) + 4.0 * math.log(2.0)
+    assert actor.loss(4, 0.0).item() == pytest.approx(0.5 * 2.0 + 0.25 * 4.0)
+    assert actor.loss(4, 0.1).item() == pytest.approx(2.0 + 0.1 * convex)

@@ -28,6 +28,7 @@ from tests.learning.tiny import (
     MODES,
     TINY_COUNTERFACTUAL,
     TINY_MODES,
+    TINY_OPTIONS,
     TINY_PPO,
     TINY_SAC,
     Answer,
@@ -58,6 +59,7 @@ TRAININGS = {
     "centralised": (TEAM.replace(scheme="centralised"), PAIR),
     "counterfactual": (TINY_COUNTERFACTUAL, PAPER),
     "modes": (TINY_MODES, PAPER),
+    "options": (TINY_OPTIONS, PAPER),
     "scout": (TINY_MODES.replace(focus=0.75, modes=MODES | {"tie_break": 0.0}), PAPER),
 }
 Whole = Callable[[str], tuple[Path, TrainResult]]

@@ -47,6 +47,19 @@ TINY_COUNTERFACTUAL = load_recipe("counterfactual").replace(
     evaluation={"every_updates": 4, "worlds": 10, "seed": 7},
     checkpoint_every_updates=3,
 )
+TINY_OPTIONS = load_recipe("options").replace(
+    observation=None,
+    n_envs=8,
+    n_steps=4,
+    tried=16,
+    memory=40,  # fills up on the way
+    gradient_steps=3,
+    batch_size=8,
+    network={"policy": [8], "choices": 9},
+    total_steps=256,
+    evaluation={"every_updates": 4, "worlds": 10, "seed": 7},
+    checkpoint_every_updates=3,
+)
 MODES = {
     "networks": 2,
     "gate": [4],

@@ -73,6 +73,7 @@ def test_actor__relu_then_output_by_hand(output: str, expected: list[float]) -> 
         ((256, 256), "relu", "clip"),
         ((256, 256), "tanh", "clip"),
         ((64,), "tanh", "tanh"),
+        ((64,), "relu", "choice"),
         (None, "relu", "clip"),  # several networks and a gate
     ],
 )
@@ -83,12 +84,12 @@ def test_actor__action_is_bitwise_independent_of_the_batch_around_it(
     if hidden is not None:
         spec = NetworkSpec(
             observation_size=27, action_size=1, policy_hidden=hidden, value_hidden=(8,) if output == "clip" else (),
-            activation=activation, output=output,
+            activation=activation, output=output, choices=801 if output == "choice" else None,
         )  # fmt: skip
         actor = Actor(spec, random_tensors(spec))
     seen = _observations(500, 27)
     together = actor(seen)
-    assert np.unique(together).size > 200  # else equality below would show nothing
+    assert np.unique(together).size > 100  # else equality below would show nothing
     for first in (0, 1, 3, 17, 63, 64, 255, 256, 300):
         for n in (0, 1, 2, 5, 63, 64, 65, 200):
             assert np.array_equal(actor(seen[first : first + n]), together[first : first + n]), (first, n)
@@ -116,6 +117,20 @@ def test_squash__is_the_rounded_hyperbolic_tangent() -> None:
     spacing = np.spacing(np.abs(exact).astype(np.float32)).astype(np.float64)
     assert (np.abs(actual - exact) <= 0.5001 * spacing).all()
     assert actual[0, -2:].tolist() == [1.0, -1.0]
+
+
+def test_choice__is_the_action_of_the_highest_score_and_the_lowest_of_equal_ones() -> None:
+    spec = NetworkSpec(
+        observation_size=1, action_size=1, policy_hidden=(2,), value_hidden=(), activation="relu", output="choice",
+        choices=5,
+    )  # fmt: skip
+    tensors = {row.name: np.zeros(row.shape, np.float32) for row in spec.tensors}
+    assert list(tensors) == ["policy.0.weight", "policy.0.bias", "policy.output.weight", "policy.output.bias"]
+    tensors["policy.0.weight"][:, 0] = [1.0, -1.0]  # hidden: max(x, 0), max(-x, 0)
+    tensors["policy.output.weight"][:, 0] = [0.0, 1.0, 0.0, 2.0, 2.0]
+    tensors["policy.output.weight"][:, 1] = [0.0, 0.0, 3.0, 0.0, 0.0]
+    action = Actor(spec, tensors)(np.array([[1.0], [0.0], [-1.0]], np.float32))
+    assert action.tolist() == [[0.5], [-1.0], [0.0]]
 
 
 RandomTensors = Callable[[NetworkSpec], dict[str, np.ndarray]]
@@ -159,17 +174,19 @@ def onnx_of(policy: Policy) -> onnxruntime.InferenceSession:
     return onnxruntime.InferenceSession(policy.to_onnx(), providers=["CPUExecutionProvider"])
 
 
-@pytest.mark.parametrize(("output", "activation"), [("clip", "relu"), ("tanh", "relu"), ("clip", "tanh")])
+@pytest.mark.parametrize(
+    ("output", "activation"), [("clip", "relu"), ("tanh", "relu"), ("clip", "tanh"), ("choice", "relu")]
+)
 def test_onnx__asks_for_the_same_acceleration_in_10_000_states(
     output: str, activation: str, policy: Policy, random_tensors: RandomTensors
 ) -> None:
     spec = NetworkSpec(
         observation_size=27, action_size=1, policy_hidden=(64, 48), value_hidden=(), activation=activation,
-        output=output,
+        output=output, choices=33 if output == "choice" else None,
     )  # fmt: skip
     tensors = random_tensors(spec)
     tensors["policy.output.weight"] *= 3.0  # so that some actions reach the bounds
-    ours = another(policy, tensors, network=spec, algorithm="sac" if output == "tanh" else "ppo")
+    ours = another(policy, tensors, network=spec, algorithm={"tanh": "sac", "choice": "options"}.get(output, "ppo"))
     worlds = SCENARIO.replace(driving_capacity_mps2={"uniform": [1, 3]}).sample(10_000, 5).worlds
     rng = np.random.default_rng(0)
     command = -rng.uniform(0.0, 1.0, worlds.speeds_mps.shape) * worlds.vehicles.braking_capacity_mps2
