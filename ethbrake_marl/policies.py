@@ -106,6 +106,12 @@ class NetworkSpec(FileModel):
         return ("policy",) if self.networks == 1 else tuple(f"network_{m + 1}" for m in range(self.networks))
 
     @property
+    def actions(self) -> Float32s:
+        """Those among which output ``choice`` chooses, [choices]."""
+        found: Float32s = np.linspace(-1.0, 1.0, self.choices or 0).astype(np.float32)
+        return found
+
+    @property
     def format_version(self) -> Literal[2, 3, 4]:
         """Of a bundle with this network."""
         if self.choices is not None:
@@ -278,12 +284,6 @@ _SATURATED = 10.0  # from 9.02 on the single-precision result is 1
 _SMALL = 1e-4  # below, x - x^3 / 3 is exact to double precision
 
 
-def even_actions(number: int) -> Float32s:
-    """So many actions, evenly from -1 to 1, [number]."""
-    found: Float32s = np.linspace(-1.0, 1.0, number).astype(np.float32)
-    return found
-
-
 @compiled
 def squash(values: NDArray[np.float32]) -> None:
     """Replace ``values`` [k, rows] by their hyperbolic tangents, within half a unit of the last place (and a hair)."""
@@ -318,7 +318,7 @@ class Actor:
         self.spec = spec
         self._networks = [_layers_of(name, len(spec.policy_hidden), tensors) for name in spec.actors]
         self._gate = _layers_of("gate", len(spec.gate_hidden), tensors) if spec.networks > 1 else []
-        self._choices = even_actions(spec.choices or 2)
+        self._actions = spec.actions
 
     def __call__(self, observation: Float32s) -> Float32s:
         """Return the action of each row; raises ``InvalidInput`` on a wrong shape, dtype or a non-finite entry."""
@@ -339,7 +339,7 @@ class Actor:
         if len(self._networks) == 1:
             y = self._forward(self._networks[0], x)
             if self.spec.choices is not None:
-                return self._choices[y.argmax(axis=0)][np.newaxis]
+                return self._actions[np.newaxis, y.argmax(axis=0)]
         else:
             chosen = self.choose(x)
             y = np.empty((self.spec.action_size, x.shape[1]), dtype=np.float32)
@@ -544,7 +544,7 @@ class Policy:
             action = node("Tanh", [x], output="action")
         elif spec.choices is not None:
             chosen = node("ArgMax", [x], axis=1, keepdims=1)
-            action = node("Gather", [constant("choices", even_actions(spec.choices)), chosen], output="action")
+            action = node("Gather", [constant("choices", spec.actions), chosen], output="action")
         else:
             bounds = [constant(name, np.array(at, np.float32)) for name, at in (("lowest", -1.0), ("highest", 1.0))]
             action = node("Clip", [x, *bounds], output="action")

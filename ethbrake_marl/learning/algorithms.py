@@ -45,12 +45,11 @@ from ethbrake_marl.learning.training import (
     OptionsRecipe,
     PpoRecipe,
     SacRecipe,
-    SquashedShape,
     Training,
 )
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats, Ints, Packed, Worlds, columns, compiled
-from ethbrake_marl.policies import Activation, Float32s, NetworkSpec, Policy, even_actions, load_named_policy
+from ethbrake_marl.policies import Activation, Float32s, NetworkSpec, Policy, load_named_policy
 from ethbrake_marl.search import profile_problem
 
 ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh}
@@ -294,7 +293,7 @@ class Sac(Algorithm):
             target_update_interval=recipe.target_update_interval,
             target_entropy="auto" if recipe.target_entropy is None else recipe.target_entropy,
             stats_window_size=max(100, environment.num_envs),
-            policy_kwargs=sac_arguments(recipe.network),
+            policy_kwargs=sac_arguments(recipe),
             seed=recipe.seed,
             device="cpu",
         )
@@ -314,8 +313,9 @@ class Sac(Algorithm):
         return None if model.log_ent_coef is None else model.log_ent_coef.detach()
 
 
-def sac_arguments(shape: SquashedShape) -> dict[str, Any]:
+def sac_arguments(recipe: SacRecipe) -> dict[str, Any]:
     """Arguments of SAC's policy: an actor and two critics."""
+    shape = recipe.network
     return {
         "net_arch": {"pi": list(shape.policy), "qf": list(shape.value)},
         "activation_fn": ACTIVATIONS[shape.activation],
@@ -815,7 +815,7 @@ class Options(Algorithm):
         recipe = training.recipe
         assert isinstance(recipe, OptionsRecipe)
         environment.engine.branch(environment.engine.moment())  # refuses what cannot be branched before it begins
-        return OptionsModel(environment, recipe)
+        return OptionsModel(environment, recipe)  # type: ignore[arg-type]  # it has what all models ask for
 
 
 class ChoosingActor(_Deterministic):
@@ -837,7 +837,7 @@ class ChoosingActor(_Deterministic):
         self.average = nn.Sequential(*layers)
         self.learning = copy.deepcopy(self.average)
         self.optimizer = adam(rate(1.0), self.learning)
-        self.actions = even_actions(shape.choices)
+        self.actions = shape.spec(inputs).actions
         self.register_buffer("seen", torch.zeros(recipe.memory, inputs))
         self.register_buffer("tried", torch.zeros(room, dtype=torch.int64))
         self.register_buffer("more", torch.zeros(room))

@@ -178,7 +178,7 @@ def ppo_policy(activation: str) -> Any:
 
 
 def sac_policy(activation: str) -> Any:
-    policy = SACPolicy(SEEN, ACTION, lambda _: 1e-3, **sac_arguments(load_recipe("sac-paper").network))
+    policy = SACPolicy(SEEN, ACTION, lambda _: 1e-3, **sac_arguments(load_recipe("sac-paper")))
     with torch.no_grad():
         policy.actor.mu.weight *= 10.0
     return policy

@@ -164,14 +164,14 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "unknown_key": (_edit(loader="os.system"), r"manifest.json: loader: unknown key"),
     "dotted_algorithm": (_edit(algorithm="subprocess.Popen"), r"manifest.json: algorithm: must be 1 to 64 lower case"),
     "dotted_activation": (_edit(network__activation="torch.nn.ReLU"), r"manifest.json: network.activation"),
-    "future_version": (_edit(format_version=4), r"manifest.json: format_version: must be 2 or 3"),
+    "future_version": (_edit(format_version=5), r"manifest.json: format_version: must be 2, 3 or 4"),
     "version_of_several_networks": (
         _edit(format_version=3),
-        r"manifest.json: format_version: 3 for 1 networks; must be 2",
+        r"manifest.json: format_version: 3 for 1 networks and output clip; must be 2",
     ),
     "several_networks_in_an_old_version": (
         _edit(network__networks=2, network__gate_hidden=[4], network__value_hidden=[]),
-        r"manifest.json: format_version: 2 for 2 networks; must be 3",
+        r"manifest.json: format_version: 2 for 2 networks and output clip; must be 3",
     ),
     "several_networks_without_a_gate": (
         _edit(format_version=3, network__networks=2, network__value_hidden=[]),
@@ -181,6 +181,19 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "critic_beside_several_networks": (
         _edit(format_version=3, network__networks=2, network__gate_hidden=[4]),
         r"manifest.json: network: value_hidden = \[5\]: must be empty beside several networks",
+    ),
+    "choice_among_nothing": (
+        _edit(format_version=4, network__output="choice", network__value_hidden=[]),
+        r"manifest.json: network: choices = None with output choice; output choice needs a number of them",
+    ),
+    "choices_that_nobody_takes": (_edit(network__choices=9), r"manifest.json: network: choices = 9 with output clip"),
+    "critic_beside_choices": (
+        _edit(format_version=4, network__output="choice", network__choices=9),
+        r"manifest.json: network: output choice is for one network without a critic",
+    ),
+    "choices_in_an_old_version": (
+        _edit(network__output="choice", network__choices=9, network__value_hidden=[]),
+        r"manifest.json: format_version: 2 for 1 networks and output choice; must be 4",
     ),
     "too_many_networks": (_edit(network__networks=17), r"manifest.json: network.networks"),
     "networks_without_their_tensors": (
@@ -196,7 +209,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     ),
     "other_features": (_edit(observation__features=[f"own.{k}" for k in range(27)]), r"manifest.json: observation: "),
     "other_scaling": (_edit(observation__scaling_sha256="0" * 64), r"manifest.json: observation: features or their"),
-    "older_version": (_edit(format_version=1), r"manifest.json: format_version: must be 2 or 3"),
+    "older_version": (_edit(format_version=1), r"manifest.json: format_version: must be 2, 3 or 4"),
     "other_activation": (_edit(rehash=False, network__activation="tanh"), r"manifest.json: its content has SHA-256"),
     "other_output": (_edit(rehash=False, network__output="tanh"), r"manifest.json: its content has SHA-256"),
     "other_steps": (_edit(rehash=False, steps=999_999_999), r"manifest.json: its content has SHA-256"),
