@@ -693,8 +693,11 @@ class CounterfactualModel(BaseAlgorithm):
         offsets = Offsets(np.tile(rows % learners, 2), np.concatenate([sizes, -sizes]), np.tile(holds, 2))
         gained, moved = (np.split(each, 2) for each in play_to_the_end(engine, actor.act, offsets, recipe.gamma))
         limit = recipe.gradient_limit
-        gradient = np.clip((gained[0] - gained[1]) / (moved[0] - moved[1]), -limit, limit)
-        good = np.isfinite(gradient)
+        measured = (gained[0] - gained[1]) / (moved[0] - moved[1])
+        good = np.isfinite(measured)
+        gradient = np.clip(measured, -limit, limit)
+        whole = float(np.abs(measured[good]).sum())
+        self.logger.record("train/gradient_cut", 1.0 - float(np.abs(gradient[good]).sum()) / whole if whole else 0.0)
         then = observed[rows[good]]
         return Tried(then, actor.means(then), gradient[good].astype(np.float32), importance[good])
 
