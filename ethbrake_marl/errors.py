@@ -282,6 +282,13 @@ class Progress:
     updates: int = 0  # of a training
     wall_s: float = 0.0  # of a training
 
+    @property
+    def harm(self) -> str:
+        """The harm that a training is for, in words: that of ``metrics`` which stands first; empty without one."""
+        words = {"first_impact_harm": "first-impact harm", "total_harm": "total harm"}
+        told = [f"{words[key]} {value:.2f}" for key, value in self.metrics.items() if key in words]
+        return ", ".join(told[:1])
+
     @staticmethod
     def listener(told: Told) -> OnProgress | None:
         """The function to tell; for ``show`` one that writes on stderr."""
@@ -299,17 +306,17 @@ class ShownProgress:
 
     def __init__(self) -> None:
         self._terminal = sys.stderr.isatty()
-        self._last: tuple[float | None, int] | None = None  # harm and tenth of the last line
+        self._last: tuple[str, int] | None = None  # harm and tenth of the last line
 
     def __call__(self, progress: Progress) -> None:
         """Show it, if it is news."""
-        ended, harm = progress.done >= progress.total, progress.metrics.get("first_impact_harm")
+        ended, harm = progress.done >= progress.total, progress.harm
         news = (harm, 10 * progress.done // max(progress.total, 1))
         if not (self._terminal or progress.note or news != self._last):
             return
         self._last = news
         text = f"{progress.name}: {progress.done:,} of {progress.total:,}"
-        text += "" if harm is None else f", first-impact harm {harm:.2f}"
+        text += f", {harm}" if harm else ""
         text += f"; {progress.note}" if progress.note else ""
         sys.stderr.write(f"\r{text}\x1b[K{chr(10) if ended else ''}" if self._terminal else f"{text}\n")
         sys.stderr.flush()

@@ -98,17 +98,13 @@ class Out:
         self.note(told)
         raise typer.Exit(130)  # 128 + SIGINT, as shells expect
 
-    def progress(
-        self, name: str, done: int, total: int, metrics: Mapping[str, float] | None = None, note: str = ""
-    ) -> None:
+    def progress(self, name: str, done: int, total: int, harm: str = "", note: str = "") -> None:
         """The part ``name`` has come to ``done`` of ``total``; ``note`` is said once, above the bars.
 
         On a terminal one bar per part, else a line at the beginning and every ten seconds. What stands behind ": " in
         a name is a stage of the part before it, and shares its bar.
         """
-        words = {"first_impact_harm": "first-impact harm", "total_harm": "total harm"}
-        harms = [f", {words[key]} {value:.2f}" for key, value in (metrics or {}).items() if key in words]
-        label = one_line(name + "".join(harms[:1]))  # the first one is what is trained for
+        label = one_line(f"{name}, {harm}" if harm else name)
         if not self._stderr.is_terminal:
             if note:
                 say(note)
@@ -135,7 +131,7 @@ class Out:
 
     def show_progress(self, progress: PartProgress) -> None:
         """``progress`` of a ``Progress``, as the package tells it."""
-        self.progress(progress.name, progress.done, progress.total, progress.metrics, progress.note)
+        self.progress(progress.name, progress.done, progress.total, progress.harm, progress.note)
 
     def end_progress(self) -> None:
         """Leave the bars as they are; what comes next stands below them."""

@@ -555,12 +555,12 @@ class OptionsRecipe(TrainingRecipe):
     n_steps: Annotated[int, Field(ge=1)]
     tried: Annotated[int, Field(ge=1)]
     near: Annotated[tuple[OffsetRange, ...], Field(strict=False, max_length=8)]
-    fixed: Annotated[tuple[Annotated[float, Field(ge=-1.0, le=1.0)], ...], Field(strict=False, max_length=64)]
-    drawn: Annotated[int, Field(ge=0, le=64)]
+    fixed: Annotated[tuple[Annotated[float, Field(ge=-1.0, le=1.0)], ...], Field(strict=False, max_length=16)]
+    drawn: Annotated[int, Field(ge=0, le=16)]
     holds: Annotated[tuple[Steps, ...], Field(strict=False, min_length=1, max_length=16)]
     largest_cost: Positive
     guide: NonNegative
-    memory: Annotated[int, Field(ge=1, le=10_000_000)]
+    memory: Annotated[int, Field(ge=1, le=500_000)]
     gradient_steps: Annotated[int, Field(ge=1, le=100_000)]
     batch_size: Annotated[int, Field(ge=2)]
     averaging: Fraction
@@ -675,7 +675,7 @@ MEANINGS = {
     "evaluation": "the fixed list on which the policy is measured while it learns, and how often",
     "checkpoint_every_updates": "updates between two checkpoints",
     "batch_size": "decisions in one step of the optimiser",
-    "network": "hidden layers of actor and critic, and their activation",
+    "network": "hidden layers of the actor, and of the critic if there is one, and their activation",
     "ent_coef": "weight of the policy's entropy; sac: auto, or a number",
     "n_steps": "decisions of each world between two updates",
     "n_epochs": "how often an update goes through what was collected",
@@ -696,7 +696,7 @@ MEANINGS = {
     "start": "a policy to go on from, ppo@shipped (random weights where none ships); left out: random weights",
     "counterfactuals": "how many of the decisions of a round are tried in two ways",
     "offset": "how far an action is moved to see what comes of it; the logarithm of what is drawn is uniform",
-    "holds": "for how many steps it is moved, one of these",
+    "holds": "for how many steps an action is tried, one of these",
     "gradient_limit": "a larger gradient, at a jump, counts as this one; return per unit of action",
     "trust_radius": "farthest that one update asks an action to move",
     "anchor": "how much an action that makes no difference holds to where it is",
@@ -705,11 +705,11 @@ MEANINGS = {
     "modes": "several networks and a gate between them; left out: one network",
     "tried": "how many of the decisions of a round are tried with other actions",
     "near": "ranges of distances to the action taken, each tried below and above it; the logarithm drawn is uniform",
-    "fixed": "actions that are tried at each of these decisions, from -1 (full braking) to 1",
+    "fixed": "actions tried at each of these decisions, from -1 (full braking) to 1; the nearest of the choices is",
     "drawn": "how many more actions are tried there, any of the choices",
     "largest_cost": "an action that costs more than this beyond the best one counts as this much more",
     "guide": "weight of the convex part of the loss, without which learning can stand still at the beginning",
-    "memory": "decisions, the last ones that were tried, which are learned from",
+    "memory": "how many decisions are learned from: the last ones at which the tried actions differ in cost",
     "log_every_updates": "updates between two rows of the progress table",
     # of the keys inside others: for the documentation
     "learning_rate.schedule": "end + (start - end) (1 + cos(pi p)) / 2, where p is the share of steps done",
@@ -1225,7 +1225,7 @@ def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
         policy = load_named_policy(path, "policy" if name == "team" else name, settings.scenario, settings.harm_count)
         agent = LearnedAgent(policy, name=spec)
     trained_by = policy.manifest.algorithm
-    if name in ("ppo", "sac", "counterfactual") and name != trained_by:
+    if name in ("ppo", "sac", "counterfactual", "options") and name != trained_by:
         raise InvalidInput(
             f"agent '{name}@{path}': that policy was trained by {trained_by.upper()}: {trained_by}@{path}"
         )

@@ -232,16 +232,16 @@ def test_kernels__a_temporary_cache_is_told_and_removed_at_the_end(tmp_path: Pat
 
 def test_progress__without_a_terminal_is_lines_and_every_ten_seconds_the_time_that_is_left(capsys, monkeypatch) -> None:
     out = Out()
-    out.progress("training", 0, 1000, {"first_impact_harm": 9.0})
-    out.progress("training", 500, 1000, {"first_impact_harm": 8.0})
-    out.progress("training", 1000, 1000, {"first_impact_harm": 8.0}, note="stopped")
+    out.progress("training", 0, 1000, "total harm 9.00")
+    out.progress("training", 500, 1000, "total harm 8.00")
+    out.progress("training", 1000, 1000, "total harm 8.00", note="stopped")
     times, out = iter((100.0, 105.0, 110.5, 111.0, 121.0, 140.0)), Out()
     monkeypatch.setattr("ethbrake_marl.cli.command.time.monotonic", lambda: next(times))
     for done in (0, 100, 210, 220, 420):
         out.progress("ppo", done, 1000)
     out.progress("report: figures", 1, 5)
     assert capsys.readouterr().err.splitlines() == [
-        "training, first-impact harm 9.00: 0 of 1,000",
+        "training, total harm 9.00: 0 of 1,000",
         "stopped",
         "ppo: 0 of 1,000",
         "ppo: 210 of 1,000, about 40 s left",

@@ -307,7 +307,9 @@ SCRIPTED = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "pla
     ],
 )
 def test_training__of_any_learners_objective_and_line(recipe: Any, scenario: Any, tmp_path: Path) -> None:
-    result = train(recipe, scenario, tmp_path / "run", steps=8 * 32 * len(scenario.learners))
+    told: list[eb.Progress] = []
+    result = train(recipe, scenario, tmp_path / "run", steps=8 * 32 * len(scenario.learners), on_progress=told.append)
+    assert told[-1].harm.partition(" harm ")[0] == {"first": "first-impact", "total": "total"}[recipe.reward.harm_count]
     assert result.status == "finished" and result.updates == 8
     networks = 3 if getattr(recipe, "modes", None) else 1
     assert eb.load_policy(tmp_path / "run").manifest.network.networks == networks
