@@ -11,6 +11,7 @@ import ast
 import hashlib
 import json
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -177,15 +178,23 @@ class Callers:
             frontier = {f.key.rpartition(":")[2].rpartition(".")[2] for f in mentioning}
         return found
 
-    def ordered(self, function: Function, words: Iterable[str], budget_s: float, most_files: int) -> list[str]:
-        """Tests that may notice a change of a function: likely and quick ones first, as many as the time allows."""
+    def ordered(
+        self, function: Function, words: Iterable[str], topic: str, budget_s: float, most_files: int
+    ) -> list[str]:
+        """Tests that may notice a change of a function: likely and quick ones first, as many as the time allows.
+
+        Likely are those of its module, those that are named by a word of the ``topic``, and those of its folder.
+        """
         found = self.of(function, words)
         room = "tests/" + function.key.rpartition(":")[0].removesuffix(".py").partition("/")[0]
         module = "/test_" + function.key.rpartition(":")[0].rpartition("/")[2] + "::"
 
-        def rank(test: str) -> tuple[bool, bool, float]:
+        subjects = set(re.findall("[a-z]{6,}", topic.lower()))
+
+        def rank(test: str) -> tuple[bool, bool, bool, float]:
             return (
                 module not in test,
+                not any(subject in test for subject in subjects),
                 not test.startswith((room + "/", room.replace("tests/", "tests/test_"))),
                 self.cpu_s[test],
             )

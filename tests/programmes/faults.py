@@ -338,7 +338,7 @@ class Copy:
     def verdict(self, fault: Fault) -> str:
         """The first test that notices a fault; empty where none does."""
         function = self.function(fault)
-        tests = self.tests.ordered(function, fault.words, BUDGET_S, MOST_FILES)
+        tests = self.tests.ordered(function, fault.words, fault.name, BUDGET_S, MOST_FILES)
         for compiled in (False, True) if function.compiled else (True,):
             while True:
                 with self.changed(fault):

@@ -31,6 +31,7 @@ def test_tests_of_a_function__are_those_that_call_it_or_who_mentions_it() -> Non
         "tests/test_a.py::test_one": (0.1, ["physics/batch.py:advance"]),
         "tests/test_b.py::test_two": (0.2, ["physics/worlds.py:sum_rows"]),
         "tests/physics/test_c.py::test_three": (9.0, ["physics/worlds.py:sum_rows"]),
+        "tests/test_d.py::test_shoving": (9.0, ["physics/worlds.py:sum_rows"]),
     }
     tests = Callers(recorded)
     kernel = next(f for f in functions_of(PACKAGE / "physics/batch.py") if f.key.endswith(":advance_worlds"))
@@ -40,5 +41,11 @@ def test_tests_of_a_function__are_those_that_call_it_or_who_mentions_it() -> Non
     line = file.read_text("utf-8").splitlines().index("def sum_rows(values: Floats) -> Floats:") + 1
     summed = tests.at(file, line + 2)
     assert summed.key == "physics/worlds.py:sum_rows"
-    assert tests.ordered(summed, (), 10.0, 9) == ["tests/physics/test_c.py::test_three", "tests/test_b.py::test_two"]
-    assert tests.ordered(summed, (), 5.0, 9) == ["tests/test_b.py::test_two"]
+    three, two, shoving = (
+        "tests/physics/test_c.py::test_three",
+        "tests/test_b.py::test_two",
+        "tests/test_d.py::test_shoving",
+    )
+    assert tests.ordered(summed, (), "", 10.0, 9) == [three, two]
+    assert tests.ordered(summed, (), "", 5.0, 9) == [two]
+    assert tests.ordered(summed, (), "shoving counted twice", 10.0, 9) == [shoving, two]
