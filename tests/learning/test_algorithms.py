@@ -540,7 +540,7 @@ def test_options__loss_by_hand_and_what_is_remembered_last() -> None:
     actor.remember(seen[:1], tried[:1], np.array([[0.0, 2.0, 4.0]]))
     assert int(actor.known) == 3 and actor.more.tolist() == [[0.0, 2.0, 4.0], [0.0, 2.0, 4.0]]
     with torch.no_grad():
-        actor.learning[-1].bias.copy_(torch.log(torch.tensor([1.0, 2.0, 1.0])))
-    convex = 2.0 * math.log(1.0 + 2.0) + 4.0 * math.log(2.0)
-    assert actor.loss(4, 0.0).item() == pytest.approx(0.5 * 2.0 + 0.25 * 4.0)
-    assert actor.loss(4, 0.1).item() == pytest.approx(2.0 + 0.1 * convex)
+        actor.learning[-1].bias.copy_(torch.log(torch.tensor([1.0, 2.0, 3.0])))
+    expected, convex = (2.0 * 2.0 + 4.0 * 3.0) / 6.0, 2.0 * math.log(1.0 + 2.0) + 4.0 * math.log(1.0 + 3.0)
+    assert actor.loss(4, 0.0).item() == pytest.approx(expected)
+    assert actor.loss(4, 0.1).item() == pytest.approx(expected + 0.1 * convex)
