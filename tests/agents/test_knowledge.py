@@ -207,7 +207,7 @@ STATED = {  # every agent there is: all of the registry, and what ``make_lineup`
     "ppo@shipped/ppo+robust": (MESSAGES, MODEL),
     "ppo@shipped/ppo+robust:interior": (MESSAGES, MODEL),
 }
-APART = {"counterfactual@PATH", "team@RUN"}  # they need a run, and have tests of their own
+APART = {"counterfactual@PATH", "options@PATH", "team@RUN"}  # of other scenarios or a run; tested on their own
 USUAL = {"planner": "planner:20", "planner:believed": "planner:20:believed", "best_harm": "best_harm:20"}  # budgets
 WORDS = {"A": "3", "CANDIDATES": "20", "20ms": "20", "200us": "50", "PATH": "shipped", "RUN": "shipped"}
 HONEST, SEEING = (  # what bounds a box takes minutes to compile

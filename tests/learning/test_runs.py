@@ -227,8 +227,8 @@ def test_shipped_recipe__trains_for_one_update(name: str, tmp_path: Path) -> Non
     elif recipe.algorithm == "sac":
         recipe = recipe.replace(n_envs=1)
     else:  # the fewest worlds whose decisions can be split into batches and tried
-        most = max(recipe.batch_size, recipe.counterfactuals)
-        recipe = recipe.replace(n_envs=max(1, most // recipe.rounds))
+        most = max(recipe.batch_size, recipe.tried if recipe.algorithm == "options" else recipe.counterfactuals)
+        recipe = recipe.replace(n_envs=-(-most // recipe.rounds))
     result = train(recipe, SCENARIO, tmp_path / "run", steps=1)
     assert (result.status, result.updates, result.steps) == ("finished", 1, recipe.n_envs * recipe.rounds)
     assert load_policy(tmp_path / "run").manifest.algorithm == recipe.algorithm
