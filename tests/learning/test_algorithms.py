@@ -217,12 +217,12 @@ STILL = {"learning_rate": {"start": 1e-12, "end": 1e-12}, "total_steps": 1}
 
 def test_targets__keep_the_slope_and_never_leave_the_trust_radius() -> None:
     """By hand, r = 0.05 and k = 3: g = 0.15 moves by 0.15 / (3 + 3), g = 1e6 by almost 0.05, g = 0 not at all."""
-    gradient = np.array([0.0, 0.15, -0.15, 1e6, 1e6, 0.15, -1e6, -0.15], np.float32)
-    mean = np.array([0.3, 0.0, 0.0, 0.0, 1.0, -2.0, -2.0, 2.0], np.float32)
+    gradient = np.array([0.0, 0.15, -0.15, 1e6, 1e6, 0.15, -1e6, -0.15, -1e6], np.float32)
+    mean = np.array([0.3, 0.0, 0.0, 0.0, 1.0, -2.0, -2.0, 2.0, -1.0], np.float32)
     target, weight = trusted_targets(
-        Tried(np.zeros((8, 1), np.float32), mean, gradient, np.ones(8, np.float32)), 0.05, 3.0
+        Tried(np.zeros((9, 1), np.float32), mean, gradient, np.ones(9, np.float32)), 0.05, 3.0
     )
-    np.testing.assert_allclose(target, [0.3, 0.025, -0.025, 0.05, 1.0, -1.975, -2.0, 1.975], rtol=1e-5)
+    np.testing.assert_allclose(target, [0.3, 0.025, -0.025, 0.05, 1.0, -1.975, -2.0, 1.975, -1.0], rtol=1e-5)
     np.testing.assert_allclose(weight[[0, 1, 2, 4]], [3.0, 6.0, 6.0, 3.0], rtol=1e-6)
     np.testing.assert_allclose((weight * (target - mean))[:4], gradient[:4], rtol=1e-5)  # the slope where it stands
 
@@ -505,16 +505,36 @@ def test_scout__learns_the_mean_size_of_what_is_to_be_expected() -> None:
     assert expected[1] == pytest.approx(3.0, rel=0.05) and expected[0] < 0.05
 
 
+def new_model(recipe: TrainingRecipe) -> Any:
+    """What is trained, before its first update."""
+    training = Training.of(recipe, SCENARIO)
+    model: Any = make_model(training.recipe.make_algorithm(), training, make_environment(training))
+    model._setup_learn(1)
+    model.set_logger(Logger(None, []))
+    return model
+
+
 def choosing(**changes: Any) -> Any:
     """A new model that chooses among actions."""
-    training = Training.of(TINY_OPTIONS.replace(**changes), SCENARIO)
-    return make_model(training.recipe.make_algorithm(), training, make_environment(training))
+    return new_model(TINY_OPTIONS.replace(**changes))
+
+
+def test_gradients__are_cut_at_their_limit_and_the_share_is_told() -> None:
+    found = {}
+    for limit in (0.01, 1e9):
+        model = new_model(TINY_COUNTERFACTUAL.replace(gradient_limit=limit))
+        torch.manual_seed(5)
+        tried = model._try_out(model._last_obs[np.newaxis], model.engine.moment(), model.policy)
+        found[limit] = tried.gradient, model.logger.name_to_value["train/gradient_cut"]
+    (cut, share), (whole, none) = found.values()
+    assert np.abs(whole).max() > 0.1 and none == 0.0
+    np.testing.assert_array_equal(cut, np.clip(whole, -0.01, 0.01))
+    assert share == pytest.approx(1.0 - np.abs(cut).sum() / np.abs(whole).sum(), rel=1e-5)
 
 
 def test_options__costs_are_those_of_episodes_driven_so() -> None:
     """Full braking but for what is tried: each action for its steps, then the policy, to the end."""
     model = choosing(tried=8, near=[], fixed=[1.0], drawn=1, holds=[3], network={"policy": [8], "choices": 5})
-    model._setup_learn(1)
     start = model.engine.moment()
     torch.manual_seed(5)
     seen, tried, costs = model._try_actions(model._last_obs[np.newaxis], start)
