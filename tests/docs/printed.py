@@ -59,7 +59,7 @@ _TESTS = tuple(
     for test, agents in (
         ("", f"ppo@shipped,{_SHIPPED}"),
         ("-brake-only", f"ppo@shipped,{_SHIPPED}"),
-        ("-obstacle --harm-count total", "ppo@shipped/ppo,options@shipped,ppo@shipped+refined+episode"),
+        ("-obstacle --harm-count total", "ppo@shipped/ppo,options@shipped"),
     )
 )
 

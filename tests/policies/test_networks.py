@@ -89,7 +89,7 @@ def test_actor__action_is_bitwise_independent_of_the_batch_around_it(
         actor = Actor(spec, random_tensors(spec))
     seen = _observations(500, 27)
     together = actor(seen)
-    assert np.unique(together).size > 100  # else equality below would show nothing
+    assert np.unique(together).size > (100 if output == "choice" else 200)  # else equality below would show nothing
     for first in (0, 1, 3, 17, 63, 64, 255, 256, 300):
         for n in (0, 1, 2, 5, 63, 64, 65, 200):
             assert np.array_equal(actor(seen[first : first + n]), together[first : first + n]), (first, n)
