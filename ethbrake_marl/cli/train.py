@@ -75,10 +75,9 @@ def run_command(
     told = (
         f"Trained by recipe {plan.name}, seed {plan.seed if seed is None else seed}: {trained.steps:,} decisions in"
         f" {trained.wall_s:.0f} s ({trained.status}). {trained.policy.manifest.algorithm} is the policy, hybrid the"
-        " policy behind its shield.\n"
+        f" policy behind its shield. All minimise {plan.reward.harm_count} harm.\n"
     )
-    figures = evaluation.results_to_json(result.rows, per_world=result.per_world)
-    out.result(figures, Text(told), result.rows.brief(result.beside), *result.rows.tables()[1:])
+    out.result(result.results, Text(told), result.rows.brief(result.beside), *result.rows.tables()[1:])
     out.note(f"report, with every measure and the paper's rows: {result.report}")
     _end(out, result.trained)
 

@@ -279,8 +279,11 @@ class Report:
             f" {row.total_harm.in_words()} by all impacts, and collides in {percent(row.collision_rate)}"
             for name, row in (("Full braking", before), (self.focus, after))
         ]
-        less, certain = after["harm_decrease_first"], after["impact_proven_rate"]
-        saved = "" if less is None else f", {percent(less)} less harm by first impacts"
+        first, total, certain = (
+            after[name] for name in ("harm_decrease_first", "harm_decrease_total", "impact_proven_rate")
+        )
+        saved = "" if first is None else f", {percent(first)} less harm by first impacts"
+        saved += "" if first is None or total is None else f" and {percent(total)} less by all"
         proven = (
             "" if certain is None else f" In {percent(certain)} no command could have avoided a collision (proven)."
         )

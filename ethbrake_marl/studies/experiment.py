@@ -11,11 +11,12 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ethbrake_marl.agents import Agent, LearnedAgent
-from ethbrake_marl.defaults import DEFAULT
+from ethbrake_marl.defaults import DEFAULT, HarmCount
 from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, check_one_learner
 from ethbrake_marl.evaluation import (
     TESTS,
@@ -47,11 +48,15 @@ BESIDE = ("full_brake", "e_v2x_bm")  # beside the policy: in its figures, and on
 RUNS = Path("runs")
 
 
-def write_results(folder: Path, name: str, rows: Sequence[SummaryRow], per_world: Path | None = None) -> None:
-    """Write the rows as ``NAME.json`` and, flat, as ``NAME.csv``."""
-    content = json.dumps(results_to_json(rows, per_world=per_world), indent=2, allow_nan=False) + "\n"
+def write_results(
+    folder: Path, name: str, rows: Sequence[SummaryRow], harm_count: HarmCount, per_world: Path | None = None
+) -> list[dict[str, Any]]:
+    """Write the rows as ``NAME.json`` and, flat, as ``NAME.csv``; gives what the JSON holds."""
+    results = results_to_json(rows, per_world=per_world, settings={"harm_count": harm_count, "uncertainty": None})
+    content = json.dumps(results, indent=2, allow_nan=False) + "\n"
     write_output(folder / f"{name}.json", content.encode(), force=True)
     write_output(folder / f"{name}.csv", results_csv(rows).encode(), force=True)
+    return results
 
 
 def results_csv(rows: Sequence[SummaryRow]) -> str:
@@ -74,10 +79,11 @@ def write_figures(
     course: Sequence[Mapping[str, float]],
     course_caption: str,
     agents: Mapping[str, Agent],
+    harm_count: HarmCount = "first",
 ) -> list[Part]:
     """Draw the three figures, write them as PNG, and give them for the report."""
     references = [row for row in rows if row.agent in BESIDE]
-    shown = telling_world(evaluation)
+    shown = telling_world(evaluation, harm_count)
     world, row = int(evaluation.index[shown]), evaluation.worlds.take([shown])
     records = {
         name: record_episode(row, agents[name], scenario=evaluation.scenario, vehicle=evaluation.vehicle)
@@ -111,13 +117,13 @@ def learned_name(evaluation: Evaluation) -> str:
     return next(name for name in algorithm_names() if name in evaluation.outcomes)
 
 
-def telling_world(evaluation: Evaluation) -> int:
+def telling_world(evaluation: Evaluation, harm_count: HarmCount = "first") -> int:
     """Row of the world to draw: median saving of the policy among the worlds where full braking harms, else row 0."""
-    before = evaluation.outcome(BESIDE[0]).first_impact_harm
+    before = evaluation.outcome(BESIDE[0]).world_harm(harm_count)
     rows = np.flatnonzero(before > 0.0)
     if not len(rows):
         return 0
-    saved = before[rows] - evaluation.outcome(learned_name(evaluation)).first_impact_harm[rows]
+    saved = before[rows] - evaluation.outcome(learned_name(evaluation)).world_harm(harm_count)[rows]
     order = np.argsort(saved, kind="stable")
     return int(rows[order[(len(order) - 1) // 2]])
 
@@ -129,7 +135,7 @@ class ExperimentResult:
     trained: TrainResult  # interrupted: the policy was not trained to the end, everything else is there
     rows: SummaryTable
     report: Path
-    per_world: Path
+    results: list[dict[str, Any]]
     beside: Mapping[str, SummaryTable] = field(default_factory=dict)  # by test: the other two of the three tests
 
 
@@ -174,6 +180,7 @@ def run_experiment(
 ) -> ExperimentResult:
     """Train a policy on ``scenario``, evaluate it, its hybrid and the baselines on a fixed list, write everything.
 
+    Hybrid and baselines minimise the harm that the policy is trained for (``reward.harm_count`` of the recipe).
     On one of the three tests the policy also drives the other two, which it was not trained for.
 
     ``seed`` is the training's; the list is ``episodes`` worlds of ``list_seed``; ``settings`` are noted;
@@ -201,7 +208,8 @@ def run_experiment(
     )
     run = RunDirectory(trained.directory)
     with _status(run, trained.status):
-        agents = _agents(trained.policy, scenario)
+        harm_count = recipe.reward.harm_count
+        agents = _agents(trained.policy, scenario, harm_count)
         order, n = list(agents), sample.worlds.n
         total = n * len(order)
         if trained.status == "interrupted":
@@ -228,30 +236,30 @@ def run_experiment(
         for other in others:  # the policy was trained on ``scenario`` alone
             part = other.sample(min(episodes, 2_000), list_seed)
             begin(f"the same policy on {other.name}")
-            driven = evaluate(part, _agents(trained.policy, other, BESIDE), scenario=other, seed=list_seed)
+            driven = evaluate(part, _agents(trained.policy, other, harm_count, BESIDE), scenario=other, seed=list_seed)
             beside[other.name] = summarise(driven)
         begin("results and figures")
         per_world = run.path / "per_world.csv"
         write_per_world(per_world, evaluation, force=True)
-        write_results(run.path, "results", rows, per_world)
+        results = write_results(run.path, "results", rows, harm_count, per_world)
         if beside:
-            write_results(run.path, "other_tests", [row for rows in beside.values() for row in rows])
+            write_results(run.path, "other_tests", [row for rows in beside.values() for row in rows], harm_count)
         wall_s = time.monotonic() - started
-        report = _show(run, evaluation, rows, beside, trained, agents, begin, wall_s=wall_s)
+        report = _show(run, evaluation, rows, beside, trained, agents, harm_count, begin, wall_s=wall_s)
         begin("")
-    return ExperimentResult(trained, rows, report, per_world, beside)
+    return ExperimentResult(trained, rows, report, results, beside)
 
 
 def _agents(
-    policy: Policy, scenario: Scenario, baselines: Sequence[str] = (*BESIDE, "e_v2x_bm:pairwise")
+    policy: Policy, scenario: Scenario, harm_count: HarmCount, baselines: Sequence[str] = (*BESIDE, "e_v2x_bm:pairwise")
 ) -> dict[str, Agent]:
     """The baselines, the policy alone (``ppo`` or ``sac``), and the policy behind its shield (``hybrid``)."""
     name = policy.manifest.algorithm
     learned: dict[str, Agent] = {
         name: LearnedAgent(policy, name),
-        "hybrid": HybridAgent(LearnedAgent(policy, name), scenario),
+        "hybrid": HybridAgent(LearnedAgent(policy, name), scenario, harm_count=harm_count),
     }
-    return {**make_agents(baselines, scenario), **learned}
+    return {**make_agents(baselines, scenario, harm_count=harm_count), **learned}
 
 
 def _show(
@@ -261,6 +269,7 @@ def _show(
     beside: Mapping[str, SummaryTable],
     trained: TrainResult,
     agents: Mapping[str, Agent],
+    harm_count: HarmCount,
     begin: Callable[[str], None],
     *,
     wall_s: float,
@@ -273,8 +282,9 @@ def _show(
         f" point; training seed {config['seeds']['training']}. Level lines: {rows[0].parameters.line}."
     )
     figures = write_figures(
-        run.path, evaluation, rows, course=trained.evaluations, course_caption=caption, agents=agents
-    )
+        run.path, evaluation, rows, course=trained.evaluations, course_caption=caption, agents=agents,
+        harm_count=harm_count,
+    )  # fmt: skip
     reward = RewardParams(**config["recipe"]["reward"]).model_dump(exclude_defaults=True)
     told = {
         "Training": f"{config['recipe']['title'] or config['recipe']['name']}: {trained.steps:,} steps"
@@ -282,6 +292,7 @@ def _show(
         "Start": trained.training.begins,
         "Seeds": f"training {config['seeds']['training']}, evaluation list {evaluation.seed}",
         "Reward": ", ".join(f"{name} {value}" for name, value in reward.items()) or "minus the first-impact harm",
+        "Harm that agents minimise": "first impacts only" if harm_count == "first" else "every impact",
         "Whole run": f"{wall_s:.0f} s",
         "Settings": ", ".join(config.get("settings", ())),
         "Plug-ins": ", ".join(f"{each['name']} (SHA-256 {each['sha256']})" for each in config["plugins"]),
@@ -308,7 +319,7 @@ def _show(
         versions=installed_versions(),
     )
     path = run.path / "report.html"
-    report.driven(agents, spellings=spellings).write(path, force=True)
+    report.driven(agents, spellings=spellings, harm_count=harm_count).write(path, force=True)
     return path
 
 

@@ -181,10 +181,17 @@ def test_run__failed_says_so_in_its_status(ethbrake, tiny_recipe, tmp_path, monk
 
 
 @pytest.mark.slow
-def test_run__with_sac_calls_its_policy_so(ethbrake: Command, tiny_sac: Path, tmp_path: Path) -> None:
+def test_run__with_sac_calls_its_policy_so_and_all_minimise_the_harm_it_is_for(ethbrake, tiny_sac, tmp_path) -> None:
     folder = tmp_path / "new"
-    rows = told_json(ethbrake("run", "--recipe", tiny_sac, "--episodes", "20", "--output", folder, "--json"))
+    total = ("--set", "reward.harm_count=total", "--episodes", "20", "--output", folder)
+    rows = told_json(ethbrake("run", "--recipe", tiny_sac, *total, "--json"))
     assert [row["agent"] for row in rows][-2:] == ["sac", "hybrid"]
+    agents = f"full_brake,e_v2x_bm,sac@{folder}+episode"
+    asked = ("--episodes", "20", "--harm-count", "total", "--per-world", tmp_path / "w.csv", "--json")
+    for row, then in zip(
+        told_json(ethbrake("evaluate", "--agents", agents, *asked)), (rows[0], rows[1], rows[4]), strict=True
+    ):
+        assert row == {**then, "agent": row["agent"], "per_world": row["per_world"]}
     assert json.loads((folder / "config.json").read_text())["update_ratio"] == 1 / 16
     assert ethbrake("evaluate", "--episodes", "20", "--agents", f"sac@{folder}", "--json").status == 0
     check_refused(ethbrake("evaluate", "--agents", f"ppo@{folder}"), "was trained by SAC")
