@@ -437,7 +437,7 @@ def _unquote(detail: ErrorDetails) -> str:
 
 def _right(detail: ErrorDetails) -> str:
     kind = detail["type"]
-    if kind == "float_type":
+    if kind == "float_type" or detail["input"] != detail["input"]:  # not a number
         return "must be a number"
     if kind == "too_long":
         return f"must have {detail['ctx']['max_length']} entries"

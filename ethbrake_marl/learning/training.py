@@ -77,6 +77,7 @@ WORDS = ("title", "description", "source")  # fields that tell about a recipe an
 
 Scheme = Literal["single", "shared", "independent", "centralised"]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+Averaging = Annotated[float, Field(ge=0.0, lt=1.0)]  # 1 would keep the first weights for ever
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Rate = Annotated[float, Field(gt=0.0, le=1.0)]
@@ -514,7 +515,7 @@ class CounterfactualRecipe(TrainingRecipe):
     anchor: Positive
     n_epochs: Annotated[int, Field(ge=1, le=1000)]
     batch_size: Annotated[int, Field(ge=2)]
-    averaging: Fraction
+    averaging: Averaging
     focus: Annotated[float, Field(ge=0.0, le=0.99, exclude_if=not_)] = (
         0.0  # share of what is tried that a scout chooses
     )
@@ -563,7 +564,7 @@ class OptionsRecipe(TrainingRecipe):
     memory: Annotated[int, Field(ge=1, le=500_000)]
     gradient_steps: Annotated[int, Field(ge=1, le=100_000)]
     batch_size: Annotated[int, Field(ge=2)]
-    averaging: Fraction
+    averaging: Averaging
     network: ChoosingShape
 
     @model_validator(mode="after")
