@@ -32,6 +32,7 @@ from ethbrake_marl.rewards import TERMS, StepOutcome, reward_params
 from ethbrake_marl.scenario import new_scenario_text, scenario_json_schema
 from ethbrake_marl.scenario.v2x import CHANNELS
 from tests.contract.interfaces import BARE
+from tests.fixtures.policies import make_policy
 from tests.learning.tiny import TINY_PPO
 
 near = pytest.approx
@@ -117,9 +118,7 @@ def engine_of(worlds: int = 3, **settings: Any) -> eb.Engine:
 # ---------------------------------------------------------------- trainings
 
 
-def test_parts__of_the_users_file_train_and_are_evaluated_and_the_policy_holds_to_its_features(
-    mine: Any, tmp_path: Path
-) -> None:
+def test_parts__of_the_users_file_train_and_are_evaluated(mine: Any, tmp_path: Path) -> None:
     reward = {"harm": 1.0, "calm": 0.5, "hurry": 0.01}
     content = {**TINY_PPO.model_dump(mode="json"), "name": "mine", "observation": LISTED, "reward": reward}
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump({**content, "total_steps": 1024}))
@@ -140,7 +139,11 @@ def test_parts__of_the_users_file_train_and_are_evaluated_and_the_policy_holds_t
     agent = {"mine": LearnedAgent(load_policy(result.directory))}
     again = eb.evaluate(other.sample(10, 7), agent, scenario=other)
     assert again.outcome("mine").first_impact_harm.tolist() == harm.tolist()
+    assert [part.name for part in manifest.observation.registered] == ["urgency", "load"]
 
+
+def test_policy__is_refused_where_a_registered_feature_gives_other_numbers(mine: Any, tmp_path: Path) -> None:
+    make_policy(eb.choose_observation(LISTED), {"name": "paper-random"}).save(tmp_path / "kept")
     entries = dict(FEATURES)
     settings = {"unit": "1/s", "scale": 10.0, "low": 0.0, "high": 4.0}
     for name, registered, message in (
@@ -150,11 +153,11 @@ def test_parts__of_the_users_file_train_and_are_evaluated_and_the_policy_holds_t
     ):
         del FEATURES[name]
         if registered:
-            eb.register_feature(name, changed(lambda worlds, i: worlds.speeds_mps[:, i]), **registered)
+            eb.register_feature(name, changed(lambda worlds, i: 1.001 * mine.urgency(worlds, i)), **registered)
         with pytest.raises(InvalidInput, match=message):
-            load_policy(result.directory)
+            load_policy(tmp_path / "kept")
         FEATURES.update(entries)
-    assert [part.name for part in load_policy(result.directory).manifest.observation.registered] == ["urgency", "load"]
+    load_policy(tmp_path / "kept")
 
 
 # ---------------------------------------------------------------- features and terms
@@ -366,7 +369,7 @@ def test_measure__of_each_vehicle_stands_in_rows_frame_markdown_and_report() -> 
     found = evaluated()
     rows, braked = eb.summarise(found), found.outcome("full_brake")
     changes = np.stack([braked.metrics[f"change_{i}"] for i in (1, 2, 3)], axis=1)
-    assert ((changes > 0.0).any(axis=1) == braked.collided).all() and (changes >= 0.0).all()
+    assert (((changes > 0.0).sum(axis=1) > 1) == braked.collided).all() and (changes >= 0.0).all()  # of both in a pair
     assert [*rows[0].metrics][:4] == ["squared", "injury_1", "injury_2", "injury_3"]
     assert rows[1].metrics["injury_2"] == mean(found.outcome("e_v2x_bm").metrics["injury_2"])
     told = rows[0].to_json()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import itertools
 import json
@@ -31,6 +32,7 @@ from ethbrake_marl.learning.algorithms import (
     ModesModel,
     NoOtherMode,
     Scout,
+    Shown,
     Tried,
     choose_rows,
     draw_rows,
@@ -441,17 +443,28 @@ def test_visit__every_decision_of_every_episode() -> None:
 
 
 def test_gate__learns_what_costs_least_and_what_matters_most() -> None:
-    """Two kinds of decisions look alike; the gate is right where being wrong costs more."""
+    """Of two kinds of decisions that look alike the gate is right where being wrong costs more, or counts for more."""
     modes = {**MODES, "gate_memory": 1000, "gate_steps": 20}
     model, _ = _model(learning_rate={"start": 1e-2, "end": 1e-2}, averaging=0.9, batch_size=128, modes=modes)
     model.set_logger(Logger(None, []))
-    seen = np.repeat([[0.0], [1.0], [1.0]], 100, axis=0) * np.eye(27)[0]
-    seen = seen.astype(np.float32)
-    costs = np.repeat([[0.0, 1.0], [5.0, 0.0], [0.0, 1.0]], 100, axis=0)  # the last look as the hundred before
+    seen = np.repeat(np.eye(27, dtype=np.float32)[[0, 1, 1, 2, 2]], 100, axis=0)
+    costs = np.repeat([[0.0, 1.0], [5.0, 0.0], [0.0, 1.0], [2.0, 0.0], [0.0, 4.0]], 100, axis=0)
+    importance = np.repeat(np.float32([1.0, 1.0, 1.0, 4.0, 0.5]), 100)
     assert (model.policy.gate.choose(seen) == 0).all()
     for _ in range(20):
-        model._train_gate(seen, costs)
-    assert np.array_equal(model.policy.gate.choose(seen), np.repeat([0, 1, 1], 100))
+        model._train_gate(seen, costs, importance)
+    assert np.array_equal(model.policy.gate.choose(seen), np.repeat([0, 1, 1, 1, 1], 100))
+
+
+def test_imitation__draws_from_the_stream_of_its_own_seed() -> None:
+    model, _ = _model(batch_size=8)
+    rng, taught = np.random.default_rng(0), []
+    shown = Shown(rng.random((32, 27), np.float32), rng.random(32, np.float32))
+    for seed in (1, 1, 2):
+        pupil = copy.deepcopy(model.policy.actors[0])
+        model._imitate(pupil, shown, seed)
+        taught.append(pupil.act(shown.seen).tolist())
+    assert taught[0] == taught[1] != taught[2]
 
 
 def test_training__from_several_networks_is_refused(mixture: eb.Policy, tmp_path: Path) -> None:

@@ -128,6 +128,15 @@ def test_believed__the_script_of_the_driven_vehicle_itself_does_not_count(spec: 
     np.testing.assert_array_equal(*harms)
 
 
+def test_believed__latencies_that_are_over_are_not_waited_for_again() -> None:
+    late = Scenario(
+        name="late", vehicles=2, gaps_m=15, speeds_mps=[0, 10], braking_capacity_mps2=5, driving_capacity_mps2=5,
+        mass_t=1, latency_s=[0, 0.6], roles={"vehicle_1": "full_brake", "vehicle_2": "learner"},
+    )  # fmt: skip
+    for found in driven(make_agent("full_brake+episode:believed", scenario=late), late, 1):
+        assert found == pytest.approx([10.0**2 - 2 * 5 * 9])  # 9 m are left when it begins to brake
+
+
 def test_believed__bounds_nothing_where_its_vehicle_had_an_impact_before_the_first_decision() -> None:
     late = BASE.replace(latency_s=[0.0, 1.2, 0.5])
     agents = {spec: make_agent(spec, scenario=late) for spec in ("coast+step", "coast+step:believed")}

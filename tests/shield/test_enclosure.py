@@ -128,14 +128,16 @@ def test_forms__enclose_what_they_stand_for(name):
 
 
 @pytest.mark.parametrize(
-    ("text", "cells", "harm", "more"),
+    ("text", "horizon", "cells", "harm", "more"),
     [
-        ("gaps_m=2", 1, 14.0**2 - 2 * 5 * 13, 1e-3),  # 13 m in the worst world
-        ("gaps_m=2,speeds_mps.vehicle_2=1", 25, 15.0**2 - 2 * 5 * 13, 1.0),
+        ("gaps_m=2", 8.0, 1, 14.0**2 - 2 * 5 * 13, 1e-3),  # 13 m in the worst world
+        ("gaps_m=2", 1.2, 1, 14.0**2 - 2 * 5 * 13, 1e-3),  # which meets at 1.18 s, in the last step
+        ("gaps_m=2", 1.1, 1, 0.0, 1e-3),
+        ("gaps_m=2,speeds_mps.vehicle_2=1", 8.0, 25, 15.0**2 - 2 * 5 * 13, 1.0),
     ],
 )
-def test_by_hand__two_vehicles_the_bound_is_that_of_the_least_gap(text, cells, harm, more):
-    found = bound_of(boxed(text, STANDING), np.full(STEPS, -1.0), cells)
+def test_by_hand__two_vehicles_the_bound_up_to_the_horizon_is_that_of_the_least_gap(text, horizon, cells, harm, more):
+    found = bound_of(boxed(text, STANDING, horizon_s=horizon), np.full(STEPS, -1.0), cells)
     assert harm - 1e-9 <= found <= harm + more
 
 

@@ -14,8 +14,10 @@ from ethbrake_marl.shield.guard import Shielded
 from ethbrake_marl.shield.step_shield import (
     REASONS,
     Backup,
+    Proposer,
     begin_running,
     certify,
+    certify_rollouts,
     ends_under,
     joint_constants,
     plan_harm,
@@ -93,14 +95,19 @@ def test_by_hand__who_says_no_number_keeps_the_plan_and_the_other_is_clipped():
     assert decision.applied.tolist() == [[-0.9, -1.0]] and decision.intervened.tolist() == [[True, False]]
 
 
-def test_caps__reject_what_only_moves_harm_to_another():
-    running, backup = start(three(gaps_m=[3.0, 10.0], speeds_mps=[0, 5, 16]), braking())
+def test_caps__reject_what_only_moves_harm_to_another_vehicle_also_in_a_later_rollout():
+    worlds = three(gaps_m=[3.0, 10.0], speeds_mps=[0, 5, 16])
+    running, backup = start(worlds, braking())
     assert backup.harm[0] > 0.0  # Vehicle 3 runs into Vehicle 2, which stands before Vehicle 1
     proposed, budget = np.array([[0.0, -1.0]]), backup.harm + 50.0
     assert not certify(running, proposed, backup, budget).intervened.any()
     capped = running._replace(caps=ends_under(running, backup.plan)[1])
     decision = certify(capped, proposed, backup, budget)
     assert decision.intervened.tolist() == [[True, False]] and decision.applied[0, 0] == -1.0
+    team = Proposer(dict.fromkeys((1, 2), make_agent("full_brake")), {1: None, 2: None}, worlds)
+    for each, refused in ((running, False), (capped, True)):
+        found = certify_rollouts(each, proposed, np.arange(1), budget, backup.plan, team)
+        assert found.intervened.tolist() == [[refused, refused]] and found.margin.min() > 0.0
 
 
 @pytest.mark.parametrize(("level", "N"), [(3, 3), (4, 3), (3, 5)])

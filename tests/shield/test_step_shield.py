@@ -244,6 +244,16 @@ def test_surprise__is_flagged_and_falls_back_for_the_rest_of_that_episode_alone(
     assert not shield.distrusted.any()
 
 
+def test_surprise__after_the_last_step_of_a_world_that_surprises_replaces_nothing():
+    shield = begun(TWO.replace(horizon_s=0.5), SMALL)  # decisions at 0.35 and 0.45 s
+    while not shield.running.finished.all():
+        shield.decide(np.ones(4))
+    replaced, seen = shield.interventions.tolist(), shield.running.states + 0.1
+    decision = shield.decide(np.ones(4), seen=seen, only=np.ones(4, bool))
+    assert shield.distrusted.all() and [REASONS[each] for each in decision.reason] == ["ended"] * 4
+    assert shield.interventions.tolist() == replaced and shield.running.steps.tolist() == [2] * 4
+
+
 def test_step_shield__a_copy_goes_on_apart_its_log_included():
     shield = StepShield(PAPER, 1, logging=True)
     shield.begin(PAPER.sample(2, 0).worlds, np.arange(2))
@@ -355,20 +365,21 @@ class TwoFaced:
 
 # 14 m are left, 10^2 / (2 * 3.5) = 14.29 m are needed: 2 * 3.5 * 0.2857 = 2 m2/s2
 @pytest.mark.parametrize(
-    ("policy", "why", "plan", "margin"),
+    ("proposed", "policy", "why", "plan", "margin"),
     [
-        (None, "no certificate", [-0.7, -0.7], -np.inf),
-        ("constant:3.5", "no certificate", [-0.7, -0.7], -2.0),
-        ("full_brake", "policy rollout", [0.0, -1.0], 0.0),
+        (0.0, None, "no certificate", [-0.7, -0.7], -np.inf),
+        (0.0, "constant:3.5", "no certificate", [-0.7, -0.7], -2.0),
+        (0.0, "full_brake", "policy rollout", [0.0, -1.0], 0.0),
+        (7.0, "full_brake", "policy rollout", [1.0, -1.0], 0.0),  # 10.5 m/s: 11.025 m; from 13.5 m/s it were 18.2 m
     ],
 )
-def test_rollout__certifies_by_hand_what_plan_and_constants_do_not(policy, why, plan, margin):
+def test_rollout__certifies_by_hand_what_plan_and_constants_do_not(proposed, policy, why, plan, margin):
     """10 m/s, 15 m to a vehicle at rest, and a plan (3.5 m/s2: 14.3 m) that coasting would make useless."""
     scenario, worlds = two()
     shield = begun(scenario, worlds)
     shield.backup = Backup(np.full_like(shield.backup.plan, -0.7), np.zeros(1), np.zeros(0))
     proposer = None if policy is None else Proposer({1: make_agent(policy)}, {1: None}, worlds)
-    decision = shield.decide(np.zeros(1), proposer=proposer)
+    decision = shield.decide(np.full(1, proposed), proposer=proposer)
     assert (reason(decision), decision.applied[0], decision.bound[0]) == (why, plan[0], 0.0)
     assert shield.backup.plan[0, :2].tolist() == plan and decision.margin[0] == pytest.approx(margin)
 
