@@ -211,6 +211,10 @@ class WithoutEffect(UserWarning):
     """Something that was given changes nothing here."""
 
 
+class Unfamiliar(UserWarning):
+    """A trained policy drives in worlds beyond those that it was trained in."""
+
+
 class IncompleteTable(UserWarning):
     """A table of best known harm holds some of the worlds asked about, and not the others."""
 

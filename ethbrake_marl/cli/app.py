@@ -22,7 +22,7 @@ from typer.main import get_command
 from ethbrake_marl.cli import doctor, evaluate, scenario, search, train
 from ethbrake_marl.cli.command import EVERY_S, Out, app, say
 from ethbrake_marl.envs import register_environments
-from ethbrake_marl.errors import AlreadyExists, EthBrakeError, IncompleteTable, WithoutEffect, naming_extras
+from ethbrake_marl.errors import AlreadyExists, EthBrakeError, naming_extras
 from ethbrake_marl.files.plugins import load_plugin
 from ethbrake_marl.kernel_store import is_temporary, on_first_compilation
 
@@ -96,7 +96,7 @@ def prepare_streams() -> None:
     shown = warnings.showwarning
 
     def show_warning(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
-        if issubclass(category, IncompleteTable | WithoutEffect):
+        if category.__module__ == EthBrakeError.__module__:
             Out().note(f"warning: {message}")
         else:
             shown(message, category, *place, **more)

@@ -58,10 +58,13 @@ def _intervals(uncertainty: str | None) -> Uncertainty | None:
 def _make_drivers(
     agents: str, scenario: Scenario, harm_count: HarmCount = "first", uncertainty: str | None = None
 ) -> dict[str, Driver]:
-    """Who is named on the command line, with commas between them."""
-    return evaluation.make_lineup(
-        agents.split(","), scenario, harm_count=harm_count, uncertainty=_intervals(uncertainty)
-    )
+    """Who is named on the command line, with commas between them; tells which policies ``@shipped`` stands for."""
+    specs, intervals = agents.split(","), _intervals(uncertainty)
+    lineup = evaluation.make_lineup(specs, scenario, harm_count=harm_count, uncertainty=intervals)
+    for spec, driver in lineup.items():
+        if "@shipped" in spec and (meant := getattr(driver, "name", spec)) != spec:
+            Out().note(f"{spec} is {meant}")
+    return lineup
 
 
 @app.add(
@@ -145,7 +148,9 @@ def evaluate_command(
         question = evaluation.Question(
             chosen, tuple(lineup), number, list_seed, harm_count, uncertainty, tuple(objectives)
         )
-        evaluation.check_agents(lineup, chosen.sample(1, list_seed).worlds, chosen)
+        some = chosen.sample(min(number, 1_000), list_seed).worlds
+        evaluation.check_agents(lineup, some, chosen)
+        evaluation.warn_unfamiliar(lineup, some, chosen, chosen.learners)
         _evaluate_in_shards(out, question, shards, jobs, ray, output, rows)
         return
     sample, drawn_by = evaluation.choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from functools import partial
 from importlib.metadata import version
@@ -33,7 +35,7 @@ from ethbrake_marl.agents import (
 )
 from ethbrake_marl.defaults import DEFAULT, HarmCount
 from ethbrake_marl.engine import Engine, ask_script, begin_script
-from ethbrake_marl.errors import AgentFailed, InvalidInput, check_one_learner
+from ethbrake_marl.errors import AgentFailed, EthBrakeError, InvalidInput, Unfamiliar, check_one_learner
 from ethbrake_marl.files.plugins import files_run
 from ethbrake_marl.files.yaml import FileModel, Override, Wording, flow_text, read_model, read_yaml
 from ethbrake_marl.limits import task_problem
@@ -402,6 +404,52 @@ def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenari
             tried = worlds if getattr(driver, "state_free", False) else worlds.take([0])
             with AgentFailed.naming(name, [script.name for script in scripts.values()]):
                 ask_script(driver, tried, begin_script(driver, tried, vehicle, scripts), vehicle)
+
+
+_MOST_BEYOND = 0.05  # share of the worlds: as many may lie beyond without a word
+_TRAINED = 2_000  # worlds of a training that say where it took place
+
+
+def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario, vehicles: Sequence[int]) -> None:
+    """Warn (``Unfamiliar``) where a trained policy drives in worlds beyond those that it was trained in.
+
+    These are drawn from the scenario in its manifest. Where that cannot be drawn here, nothing is said.
+    """
+    told: set[str] = set()
+    for name, agent in agents.items():
+        for vehicle, driver in Team.of(agent, vehicles).drivers.items():
+            policy = driving_policy(driver)
+            if not isinstance(policy, Policy) or policy.manifest.manifest_sha256 in told:
+                continue
+            told.add(policy.manifest.manifest_sha256)
+            with suppress(ValueError, EthBrakeError):
+                trained = Scenario.of_dump(policy.manifest.scenario)
+                found = _beyond(trained, worlds, scenario)
+                if (driven := f"vehicle_{vehicle + 1}") not in policy.manifest.learners:
+                    found.insert(0, driven)
+                if found:
+                    beyond = f"trained on {trained.name}, and not for what is here: {', '.join(found)}"
+                    warnings.warn(f"{name}: {beyond}", Unfamiliar, stacklevel=1)
+
+
+def _beyond(trained: Scenario, worlds: Worlds, scenario: Scenario) -> list[str]:
+    """What lies beyond the worlds of a training: time step, number of vehicles, quantities."""
+    before = trained.sample(_TRAINED, 0).worlds
+    found = ["time_step_s"] if trained.time_step_s != scenario.time_step_s else []
+    if worlds.N != before.N:
+        return [*found, f"{worlds.N} vehicles"]
+    known, here = QUANTITY.of(before), QUANTITY.of(worlds)
+    for key, rule in here.items():
+        if key not in known:
+            found.append(key)
+            continue
+        values, seen = rule.of(worlds), rule.of(before)
+        low, high = seen.min(axis=0), seen.max(axis=0)
+        margin = 0.01 * (high - low)
+        share = ((values < low - margin) | (values > high + margin)).any(axis=1).mean()
+        if share > _MOST_BEYOND:
+            found.append(f"{key} in {100.0 * share:.0f} % of the worlds")
+    return found + [f"no {key}" for key in known if key not in here]
 
 
 def make_lineup(

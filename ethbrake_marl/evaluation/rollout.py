@@ -25,7 +25,7 @@ from ethbrake_marl.errors import (
     check_whole_number,
     unknown_name,
 )
-from ethbrake_marl.evaluation.inputs import make_lineup, policies_of
+from ethbrake_marl.evaluation.inputs import make_lineup, policies_of, warn_unfamiliar
 from ethbrake_marl.evaluation.measures import REGISTERED, Evaluation, LeftOut, Outcome, Tape
 from ethbrake_marl.physics import (
     Decisions,
@@ -171,7 +171,8 @@ def evaluate(
         aftermath: look how far Vehicle 1 is shoved, what the paper's sum over samples is, and what registered harm
             metrics are; costs time.
 
-    Raises ``PhysicsError`` if no world is left; ``InvalidInput`` for worlds that do not fit the scenario or are not at
+    Warns (``Unfamiliar``) where a policy drives in worlds beyond those that it was trained in. Raises
+    ``PhysicsError`` if no world is left; ``InvalidInput`` for worlds that do not fit the scenario or are not at
     the alert, no agents, no vehicle to drive, a team of other vehicles, or a learner that nobody drives.
 
     """
@@ -190,6 +191,7 @@ def evaluate(
     if not sample.worlds.n:
         raise InvalidInput("evaluate: worlds: there are none; at least one is needed")
     check_alert(sample.worlds, sample.worlds.n, scenario.vehicles)
+    warn_unfamiliar(agents, sample.worlds, scenario, driven_vehicles(scenario, vehicle, agents))
     whole, left_out = evaluate_list(sample, agents, scenario, seed, vehicle, chunk, on_progress, aftermath)
     if whole is None:
         raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in left_out})

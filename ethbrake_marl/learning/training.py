@@ -1223,8 +1223,11 @@ def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
         first: Any = agent.drivers[min(agent.drivers)]
         policy: Policy = first.policy
     else:
-        policy = load_named_policy(path, "policy" if name == "team" else name, settings.scenario, settings.harm_count)
-        agent = LearnedAgent(policy, name=spec)
+        kind, known = "policy" if name == "team" else name, settings.scenario
+        if path == SHIPPED:
+            path = f"{SHIPPED}/{shipped_name(kind, None if known is None else known.name, settings.harm_count)}"
+        policy = load_named_policy(path, kind, known, settings.harm_count)
+        agent = LearnedAgent(policy, name=spec if path == f"{SHIPPED}/{kind}" else f"{kind}@{path}")
     trained_by = policy.manifest.algorithm
     if name in ("ppo", "sac", "counterfactual", "options") and name != trained_by:
         raise InvalidInput(

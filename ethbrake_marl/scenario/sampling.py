@@ -13,7 +13,7 @@ from difflib import get_close_matches
 from functools import lru_cache
 from operator import not_
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, NoReturn
+from typing import Annotated, Any, Literal, NamedTuple, NoReturn, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -948,6 +948,18 @@ class ScenarioFields(FileModel):
             known = _table_columns(QUANTITY.declared, self.vehicles)
             self._columns = {known[name]: column for name, column in self.table.column_values().items()}
         return self
+
+    @classmethod
+    def of_dump(cls, content: Mapping[str, Any]) -> Self:
+        """That of which ``model_dump`` wrote every key, also those that nobody gave; raises ``ValueError``."""
+        usual = {key: field.default for key, field in cls.model_fields.items()}
+
+        def given(part: Any) -> Any:
+            if isinstance(part, Mapping):
+                return {k: given(v) for k, v in part.items() if v is not None and (k not in usual or v != usual[k])}
+            return [given(each) for each in part] if isinstance(part, list | tuple) else part
+
+        return cls.model_validate(given(content))
 
     @field_validator(
         *QUANTITY.alternatives, *QUANTITY.alternatives.values(), *QUANTITY.optional, "alert_s", mode="before"
