@@ -40,7 +40,7 @@ from ethbrake_marl.files.plugins import files_run
 from ethbrake_marl.files.yaml import FileModel, Override, Wording, flow_text, read_model, read_yaml
 from ethbrake_marl.limits import task_problem
 from ethbrake_marl.physics import Floats, Ints, Worlds
-from ethbrake_marl.policies import Policy
+from ethbrake_marl.policies import Manifest, Policy
 from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, ScriptSpec, Task, load_scenario, scenario_path
 from ethbrake_marl.shield import ShieldedDriver, Uncertainty
 
@@ -415,21 +415,19 @@ def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scen
 
     These are drawn from the scenario in its manifest. Where that cannot be drawn here, nothing is said.
     """
-    told: set[str] = set()
+    drives: dict[str, tuple[str, Manifest, dict[str, None]]] = {}  # by hash: the first agent, vehicles in order
     for name, agent in agents.items():
         for vehicle, driver in Team.of(agent, vehicles).drivers.items():
-            policy = driving_policy(driver)
-            if not isinstance(policy, Policy) or policy.manifest.manifest_sha256 in told:
-                continue
-            told.add(policy.manifest.manifest_sha256)
-            with suppress(ValueError, EthBrakeError):
-                trained = Scenario.of_dump(policy.manifest.scenario)
-                found = _beyond(trained, worlds, scenario)
-                if (driven := f"vehicle_{vehicle + 1}") not in policy.manifest.learners:
-                    found.insert(0, driven)
-                if found:
-                    beyond = f"trained on {trained.name}, and not for what is here: {', '.join(found)}"
-                    warnings.warn(f"{name}: {beyond}", Unfamiliar, stacklevel=1)
+            if isinstance(policy := driving_policy(driver), Policy):
+                sha256 = policy.manifest.manifest_sha256
+                drives.setdefault(sha256, (name, policy.manifest, {}))[2][f"vehicle_{vehicle + 1}"] = None
+    for name, manifest, driven in drives.values():
+        with suppress(ValueError, EthBrakeError):
+            trained = Scenario.of_dump(manifest.scenario)
+            found = [each for each in driven if each not in manifest.learners] + _beyond(trained, worlds, scenario)
+            if found:
+                beyond = f"trained on {trained.name}, and not for what is here: {', '.join(found)}"
+                warnings.warn(f"{name}: {beyond}", Unfamiliar, stacklevel=1)
 
 
 def _beyond(trained: Scenario, worlds: Worlds, scenario: Scenario) -> list[str]:

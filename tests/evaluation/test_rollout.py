@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import warnings
 from dataclasses import fields, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -16,7 +17,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.engine import Engine
-from ethbrake_marl.errors import PhysicsError
+from ethbrake_marl.errors import PhysicsError, Unfamiliar
 from ethbrake_marl.evaluation import Evaluation, Outcome, evaluate, record_episode, summarise, write_per_world
 from ethbrake_marl.evaluation.inputs import make_agents, policy_sha256, scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.measures import FAR_M
@@ -359,3 +360,31 @@ def test_every_results_file__says_its_kind_worlds_scenario_and_versions(
     for part in content if isinstance(content, list) else [content]:
         assert part["kind"] == kind and {key: part[key] for key in ABOUT} == ABOUT
         assert part["versions"]["numpy"] == version("numpy")
+
+
+@pytest.mark.parametrize(
+    ("agent", "scenario", "beyond"),
+    [
+        ("universal@shipped+step", load_scenario("paper-random-obstacle"), "obstacle_gap_m"),
+        ("options@shipped/options-paper-random-obstacle-total", PAPER, "no obstacle_gap_m"),
+        ("ppo@shipped/ppo", PAPER.replace(time_step_s=0.05), "time_step_s"),
+        ("ppo@shipped/ppo", PAPER.replace(latency_s=[0.0, 0.5, 1.2]), "latency_s in 100 % of the worlds"),
+        ("ppo@shipped/ppo", PAPER.replace(speeds_mps={"uniform": [18.0, 30.0]}), "speeds_mps in 9. % of the worlds"),
+        (
+            "ppo@shipped/ppo",
+            load_scenario("cooperation-4-five"),
+            "vehicle_1, vehicle_3, vehicle_4, vehicle_5, 5 vehicles",
+        ),
+    ],
+)
+def test_policy__that_drives_beyond_what_it_was_trained_for_is_told_so_once(agent, scenario, beyond) -> None:
+    with pytest.warns(Unfamiliar, match=f"{agent.partition('+')[0]}.*, and not for what is here: {beyond}$") as told:
+        evaluate(None, [agent], scenario=scenario, episodes=50, vehicle=None)
+    assert len(told) == 1
+
+
+def test_policy__that_drives_where_it_was_trained_is_not_warned_of() -> None:
+    with warnings.catch_warnings(action="error"):
+        evaluate(None, "universal@shipped,ppo@shipped,ppo@shipped/ppo-total", scenario=PAPER, episodes=200)
+        evaluate(None, "universal@shipped", scenario="stress-wide", episodes=200)
+        evaluate(None, "team@shipped", scenario="cooperation-3-pair", episodes=100)

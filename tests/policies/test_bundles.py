@@ -22,6 +22,7 @@ from ethbrake_marl import policies as bundle
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import CorruptBundle
 from ethbrake_marl.evaluation import TESTS, evaluate, make_lineup, summarise
+from ethbrake_marl.evaluation.inputs import scenario_sha256
 from ethbrake_marl.policies import (
     Policy,
     content_sha256,
@@ -30,6 +31,7 @@ from ethbrake_marl.policies import (
     shipped_name,
     shipped_policies,
 )
+from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield import HybridAgent
 from tests.docs.site import load
 
@@ -434,7 +436,9 @@ def test_shipped_name__is_by_kind_scenario_and_count(
 def test_lineup__takes_what_ships(folder: Path) -> None:
     specs = ["ppo@shipped", "universal@shipped", "policy@shipped", "team@shipped", "ppo@shipped+episode"]
     lineup = make_lineup([*specs, "ppo@shipped/ppo-paper-distance"], SCENARIO)
-    assert [each.name for each in lineup.values()] == list(lineup)
+    shipped = "policy@shipped/ppo-paper-distance"
+    told = [spec.replace("policy@shipped", shipped).replace("team@shipped", shipped) for spec in lineup]
+    assert [each.name for each in lineup.values()] == told
     assert isinstance(lineup["ppo@shipped+episode"], HybridAgent)
     worlds = SCENARIO.sample(5, 1).worlds
     acts = [lineup[spec].act(worlds, 1).tolist() for spec in specs[:4]]
@@ -443,7 +447,9 @@ def test_lineup__takes_what_ships(folder: Path) -> None:
 
 def test_shipped_policies__each_that_ships_is_small_and_has_a_card() -> None:
     for name, path in shipped_policies().items():
-        assert load_named_policy(f"shipped/{name}").manifest.steps > 0
+        manifest = load_named_policy(f"shipped/{name}").manifest
+        trained = eb.load_scenario(str(manifest.scenario["name"]))
+        assert manifest.steps > 0 and scenario_sha256(Scenario.of_dump(manifest.scenario)) == scenario_sha256(trained)
         assert sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) < 1_000_000
         assert (path / "card.md").read_text("utf-8").startswith("# ")
 
