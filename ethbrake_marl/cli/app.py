@@ -20,7 +20,7 @@ from typer.exceptions import TyperException
 from typer.main import get_command
 
 from ethbrake_marl.cli import doctor, evaluate, scenario, search, train
-from ethbrake_marl.cli.command import EVERY_S, Out, app, say
+from ethbrake_marl.cli.command import EVERY_S, Out, app
 from ethbrake_marl.envs import register_environments
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, naming_extras
 from ethbrake_marl.files.plugins import load_plugin
@@ -136,7 +136,7 @@ def tell_compilation(folder: Path, empty: bool) -> None:
         while True:
             time.sleep(EVERY_S)
             if running:
-                say(f"still compiling: {done} kernels are done, after {time.monotonic() - begun:.0f} s")
+                Out().note(f"still compiling: {done} kernels are done, after {time.monotonic() - begun:.0f} s")
 
     events.register("numba:compile", Count())
     Thread(target=tell, daemon=True).start()

@@ -148,9 +148,7 @@ def evaluate_command(
         question = evaluation.Question(
             chosen, tuple(lineup), number, list_seed, harm_count, uncertainty, tuple(objectives)
         )
-        some = chosen.sample(min(number, 1_000), list_seed).worlds
-        evaluation.check_agents(lineup, some, chosen)
-        evaluation.warn_unfamiliar(lineup, some, chosen, chosen.learners)
+        evaluation.check_agents(lineup, chosen.sample(min(number, 1_000), list_seed).worlds, chosen, warn=True)
         _evaluate_in_shards(out, question, shards, jobs, ray, output, rows)
         return
     sample, drawn_by = evaluation.choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)

@@ -38,7 +38,6 @@ if TYPE_CHECKING:
         result_versions as result_versions,
         states_of as states_of,
         try_scenario as try_scenario,
-        warn_unfamiliar as warn_unfamiliar,
         worlds_sha256 as worlds_sha256,
     )
     from ethbrake_marl.evaluation.measures import (

@@ -49,7 +49,6 @@ from ethbrake_marl.evaluation.inputs import (
     load_runnable,
     make_lineup,
     policies_of,
-    policy_sha256,
     result_versions,
     scenario_sha256,
     worlds_sha256,
@@ -1159,7 +1158,7 @@ def tell(task: Task, agents: Mapping[str, Driver], episodes: int) -> dict[str, A
         "episodes": int(episodes),
         "learners": [scenario.vehicle_names[i] for i in scenario.learners],
         "agents": {
-            name: {scenario.vehicle_names[i]: policy_sha256(agent) for i, agent in drivers.items()}
+            name: dict.fromkeys(scenario.vehicle_names[i] for i in drivers) | policies_of(drivers)
             for name, drivers in teams.items()
         },
         "observation": [feature.name for feature in task.observation.features],

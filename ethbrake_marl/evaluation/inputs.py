@@ -35,12 +35,12 @@ from ethbrake_marl.agents import (
 )
 from ethbrake_marl.defaults import DEFAULT, HarmCount
 from ethbrake_marl.engine import Engine, ask_script, begin_script
-from ethbrake_marl.errors import AgentFailed, EthBrakeError, InvalidInput, Unfamiliar, check_one_learner
+from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar, check_one_learner
 from ethbrake_marl.files.plugins import files_run
 from ethbrake_marl.files.yaml import FileModel, Override, Wording, flow_text, read_model, read_yaml
 from ethbrake_marl.limits import task_problem
 from ethbrake_marl.physics import Floats, Ints, Worlds
-from ethbrake_marl.policies import Manifest, Policy
+from ethbrake_marl.policies import Policy
 from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, ScriptSpec, Task, load_scenario, scenario_path
 from ethbrake_marl.shield import ShieldedDriver, Uncertainty
 
@@ -388,11 +388,14 @@ def _refusals(scenario: Scenario, worlds: Worlds) -> dict[str, str]:
     return refused
 
 
-def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario) -> None:
+def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario, *, warn: bool = False) -> None:
     """Try every agent before the first of them starts a long evaluation; raises what it would raise then.
 
-    Scripts that need no state are tried on all worlds, which takes no time; all others on the first.
+    Scripts that need no state are tried on all worlds, which takes no time; all others on the first. ``warn``: as
+    ``warn_unfamiliar``.
     """
+    if warn:
+        warn_unfamiliar(agents, worlds, scenario, scenario.learners)
     for name, agent in agents.items():
         team = Team.of(agent, scenario.learners)
         scripts = script_agents(scenario, except_for=team.drivers)
@@ -415,16 +418,18 @@ def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scen
 
     These are drawn from the scenario in its manifest. Where that cannot be drawn here, nothing is said.
     """
-    drives: dict[str, tuple[str, Manifest, dict[str, None]]] = {}  # by hash: the first agent, vehicles in order
+    drives: dict[str, tuple[str, Policy, dict[str, None]]] = {}  # by hash: the first agent, vehicles in order
     for name, agent in agents.items():
         for vehicle, driver in Team.of(agent, vehicles).drivers.items():
             if isinstance(policy := driving_policy(driver), Policy):
                 sha256 = policy.manifest.manifest_sha256
-                drives.setdefault(sha256, (name, policy.manifest, {}))[2][f"vehicle_{vehicle + 1}"] = None
-    for name, manifest, driven in drives.values():
-        with suppress(ValueError, EthBrakeError):
-            trained = Scenario.of_dump(manifest.scenario)
-            found = [each for each in driven if each not in manifest.learners] + _beyond(trained, worlds, scenario)
+                drives.setdefault(sha256, (name, policy, {}))[2][f"vehicle_{vehicle + 1}"] = None
+    for name, policy, driven in drives.values():
+        with suppress(ValueError):
+            trained = Scenario.of_dump(policy.manifest.scenario)
+            found = [each for each in driven if each not in policy.manifest.learners] + _beyond(
+                trained, worlds, scenario
+            )
             if found:
                 beyond = f"trained on {trained.name}, and not for what is here: {', '.join(found)}"
                 warnings.warn(f"{name}: {beyond}", Unfamiliar, stacklevel=1)

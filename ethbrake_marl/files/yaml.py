@@ -437,7 +437,9 @@ def _unquote(detail: ErrorDetails) -> str:
 
 def _right(detail: ErrorDetails) -> str:
     kind = detail["type"]
-    if kind == "float_type" or detail["input"] != detail["input"]:  # not a number
+    if detail["input"] != detail["input"]:  # NaN, which is not less than anything, either
+        return "must be a finite number"
+    if kind == "float_type":
         return "must be a number"
     if kind == "too_long":
         return f"must have {detail['ctx']['max_length']} entries"
