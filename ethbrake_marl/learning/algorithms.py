@@ -12,7 +12,6 @@ import copy
 import inspect
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import cached_property
 from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
@@ -397,18 +396,17 @@ def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) 
     return gained
 
 
-def visit(engine: Engine, act: Act) -> tuple[Observations, Moment, Ints]:
-    """Play every row to its end by ``act``: of each decision [m] what is seen [m, L, F], the moment, and the row."""
-    seen_then, moments, where = [], [], []
+def visit(engine: Engine, act: Act) -> tuple[Observations, Moment]:
+    """Play every row to its end by ``act``: what is seen at each decision [m, L, F], and those moments [m]."""
+    seen_then, moments = [], []
 
     def decide(seen: Observations, rows: Ints, number: int) -> Floats:
         seen_then.append(seen)
         moments.append(engine.moment().take(rows))
-        where.append(rows)
         return act(seen.reshape(-1, seen.shape[2])).astype(np.float64).reshape(seen.shape[:2])
 
     play_on(engine, decide, 1.0)
-    return np.concatenate(seen_then), Moment.join(moments), np.concatenate(where)
+    return np.concatenate(seen_then), Moment.join(moments)
 
 
 def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
@@ -825,15 +823,13 @@ class Options(Algorithm):
 
 class ChoosingActor(_Deterministic):
     """An actor that scores actions (``learning``), the average of its weights (``average``), which drives, and what it
-    remembers: the last decisions at which actions were tried, and how much more than the best one each of them costs;
-    and of each world of its training how much more harm than full braking it did there when it last drove.
+    remembers: the last decisions at which actions were tried, and how much more than the best one each of them costs.
     """
 
     seen: Tensor  # [M, F]
     tried: Tensor  # [M, C] numbers of actions, the one that was taken first
     more: Tensor  # [M, C]
     known: Tensor  # [1] decisions so far; the newest take the places of the oldest
-    beyond: Tensor  # [W]
 
     def __init__(self, observation_space: Space[Any], action_space: Any, rate: Schedule, recipe: OptionsRecipe) -> None:
         super().__init__(observation_space, action_space)
@@ -849,7 +845,6 @@ class ChoosingActor(_Deterministic):
         self.register_buffer("tried", torch.zeros(room, dtype=torch.int64))
         self.register_buffer("more", torch.zeros(room))
         self.register_buffer("known", torch.zeros(1, dtype=torch.int64))
-        self.register_buffer("beyond", torch.zeros(recipe.starts, dtype=torch.float64))
 
     @torch.no_grad()
     def choose(self, observation: Float32s) -> Ints:
@@ -887,18 +882,10 @@ class ChoosingActor(_Deterministic):
 
 
 class OptionsModel(CounterfactualModel):
-    """Drives in some of the first worlds, tries several actions at some decisions, and learns what each costs."""
+    """Visits decisions by its actor, tries several actions at some of them, and learns what each costs."""
 
     policy: ChoosingActor  # type: ignore[assignment]
     recipe: OptionsRecipe  # type: ignore[assignment]
-
-    @cached_property
-    def _worlds(self) -> tuple[Moment, Floats]:
-        """Where the worlds of the training start, and the harm of full braking there, [W]. A resume finds the same."""
-        _, start = self.engine.first_moments(self.recipe.starts)
-        engine = self.engine.branch(start)
-        play_on(engine, lambda now, some, done: np.full(now.shape[:2], -1.0), 1.0)
-        return start, engine.ledger.world_harm(engine.reward.harm_count)
 
     def _setup_model(self) -> None:
         self._setup_lr_schedule()
@@ -906,19 +893,12 @@ class OptionsModel(CounterfactualModel):
         self.policy = ChoosingActor(self.observation_space, self.action_space, self.lr_schedule, self.recipe)
 
     def _update(self, told: BaseCallback, total: int) -> None:
-        recipe, actor, (start, full) = self.recipe, self.policy, self._worlds
-        even = torch.full_like(actor.beyond, 1.0 / len(full))
-        chance = torch.lerp(even, actor.beyond / actor.beyond.sum(), recipe.replay) if actor.beyond.any() else even
-        some = torch.multinomial(chance, self.n_envs).numpy()
-        engine = self.engine.branch(start.take(some))
-        seen, moments, rows = visit(engine, actor.act)
-        harm = engine.ledger.world_harm(self.engine.reward.harm_count)
-        actor.beyond[some] = torch.from_numpy(np.clip(harm - full[some], 0.0, recipe.largest_cost))
-        self.num_timesteps += self.n_envs * recipe.n_steps
+        recipe, actor = self.recipe, self.policy
+        seen, moments = self._visit(told, actor.act)
         told.on_rollout_end()
         self._update_current_progress_remaining(self.num_timesteps, total)
         self._update_learning_rate(actor.optimizer)
-        observed, tried, costs = self._try_actions(seen, moments, full[some[rows]])
+        observed, tried, costs = self._try_actions(seen, moments)
         more = costs - costs.min(axis=1, keepdims=True)
         telling = np.flatnonzero(more.max(axis=1) > 1e-9)
         more = np.minimum(more, recipe.largest_cost)
@@ -934,11 +914,11 @@ class OptionsModel(CounterfactualModel):
         self._n_updates += len(losses)
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
 
-    def _try_actions(self, seen: Observations, moments: Moment, full: Floats) -> tuple[Float32s, Ints, Floats]:
+    def _try_actions(self, seen: Float32s, moments: Moment) -> tuple[Float32s, Ints, Floats]:
         """At some decisions: what is seen [B, F], numbers of the actions tried [B, C], and what each costs [B, C].
 
-        The first one is the one that the actor takes. Harm of the whole episode beyond that of full braking (``full``,
-        by decision) counts 1 + ``caution`` times.
+        The first one is the one that the actor takes. What an action costs beyond full braking from here to the end
+        counts ``caution`` times more.
         """
         recipe, actor, learners = self.recipe, self.policy, len(self.engine.learners)
         observed, last = seen.reshape(-1, seen.shape[2]), recipe.network.choices - 1
@@ -955,8 +935,9 @@ class OptionsModel(CounterfactualModel):
         tried = np.clip(np.stack(numbers, axis=1), 0, last)
         holds = np.array(recipe.holds, np.int64)[torch.randint(len(recipe.holds), (len(rows),)).numpy()]
         each, back = np.unique(np.arange(len(rows))[:, None] * (last + 1) + tried, return_inverse=True)
-        row, number = each // (last + 1), each % (last + 1)
+        row, number = np.append(each // (last + 1), np.arange(len(rows))), np.append(each % (last + 1), 0 * rows)
         learner, steps, actions = rows[row] % learners, holds[row], actor.actions[number].astype(np.float64)
+        steps[len(each) :] = np.iinfo(np.int64).max  # full braking to the end
 
         def decide(now: Observations, some: Ints, done: int) -> Floats:
             wanted = actor.act(now.reshape(-1, now.shape[2])).astype(np.float64).reshape(now.shape[:2])
@@ -966,9 +947,9 @@ class OptionsModel(CounterfactualModel):
 
         engine = self.engine.branch(moments.take(rows[row] // learners))
         gained = play_on(engine, decide, recipe.gamma, at_least=max(recipe.holds))
-        beyond = engine.ledger.world_harm(engine.reward.harm_count) - full[rows[row] // learners]
-        each_costs = recipe.caution * np.maximum(beyond, 0.0) - gained[np.arange(len(row)), learner]
-        costs = each_costs[back].reshape(tried.shape)
+        every = -gained[np.arange(len(row)), learner]
+        costs = every[back].reshape(tried.shape)
+        costs += recipe.caution * np.maximum(costs - every[len(each) :, None], 0.0)
         good = np.isfinite(costs).all(axis=1)
         return observed[rows[good]], tried[good], costs[good]
 
@@ -1198,7 +1179,7 @@ class ModesModel(CounterfactualModel):
         if stage.does == "further":  # whole episodes in some of the stage's own worlds
             assert self._own is not None
             some = torch.randint(len(self._own.state), (self.n_envs,)).numpy()
-            found, moments, _ = visit(self.engine.branch(self._own.take(some)), member.act)
+            found, moments = visit(self.engine.branch(self._own.take(some)), member.act)
             seen = found.reshape(1, -1, found.shape[2])
             self.num_timesteps += each
         else:

@@ -544,19 +544,16 @@ class CounterfactualRecipe(TrainingRecipe):
 
 
 class OptionsRecipe(TrainingRecipe):
-    """Try ``tried`` decisions of ``n_envs`` whole episodes of a round with several actions each; learn to choose.
+    """Try ``tried`` of the ``n_envs x n_steps`` decisions of a round with several actions each; learn to choose.
 
-    An episode counts as ``n_steps`` decisions. The actions of the policy are ``network.choices``, evenly from -1 to 1.
-    Tried are the one that it takes, one below and one above it in each of the distances ``near``, the actions
-    ``fixed``, and ``drawn`` ones.
+    The actions of the policy are ``network.choices``, evenly from -1 to 1. Tried are the one that it takes, one below
+    and one above it in each of the distances ``near``, the actions ``fixed``, and ``drawn`` ones.
     """
 
     most_decisions = 2**22
 
     algorithm: Literal["options"]
     n_steps: Annotated[int, Field(ge=1)]
-    starts: Annotated[int, Field(ge=1, le=500_000)]
-    replay: Annotated[float, Field(ge=0.0, le=0.99)]
     tried: Annotated[int, Field(ge=1)]
     near: Annotated[tuple[OffsetRange, ...], Field(strict=False, max_length=8)]
     fixed: Annotated[tuple[Annotated[float, Field(ge=-1.0, le=1.0)], ...], Field(strict=False, max_length=16)]
@@ -575,8 +572,9 @@ class OptionsRecipe(TrainingRecipe):
     def _keys_fit(self) -> OptionsRecipe:
         if self.reward.shaping > 0.0:
             refuse(("reward", "shaping"), self.reward.shaping, _NO_SHAPING)
-        if not self.starts >= self.n_envs:
-            refuse(("starts",), self.starts, f"must be at least n_envs = {self.n_envs}")
+        visited = self.n_envs * self.n_steps
+        if not self.tried <= visited:
+            refuse(("tried",), self.tried, f"must be at most n_envs x n_steps = {visited}")
         if not self.memory >= self.tried:
             refuse(("memory",), self.memory, f"must be at least tried = {self.tried}")
         if not self.others:
@@ -707,14 +705,12 @@ MEANINGS = {
     "averaging": "share of itself that the average of the weights, which drives, keeps in each gradient step",
     "focus": "share of what is tried that a scout chooses; left out: 0, all decisions alike",
     "modes": "several networks and a gate between them; left out: one network",
-    "tried": "how many of the decisions of a round, at most, are tried with other actions",
+    "tried": "how many of the decisions of a round are tried with other actions",
     "near": "ranges of distances to the action taken, each tried below and above it; the logarithm drawn is uniform",
     "fixed": "actions tried at each of these decisions, from -1 (full braking) to 1; the nearest of the choices is",
     "drawn": "how many more actions are tried there, any of the choices",
     "largest_cost": "an action that costs more than this beyond the best one counts as this much more",
-    "starts": "how many worlds its episodes begin in: the first ones of the training",
-    "replay": "share of episodes drawn by how much more harm than full braking the policy did there; others: evenly",
-    "caution": "harm of an episode beyond that of full braking counts 1 + this times",
+    "caution": "how much more harm beyond that of full braking, from the decision on, counts",
     "guide": "weight of the convex part of the loss, without which learning can stand still at the beginning",
     "memory": "how many decisions are learned from: the last ones at which the tried actions differ in cost",
     "log_every_updates": "updates between two rows of the progress table",

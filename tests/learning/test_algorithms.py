@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -436,13 +435,11 @@ def test_own_worlds__are_those_within_the_margin() -> None:
 def test_visit__every_decision_of_every_episode() -> None:
     _, engine = _model()
     _, start = engine.first_moments(20)
-    seen, moments, rows = visit(engine.branch(start), _full_brake)
+    seen, moments = visit(engine.branch(start), _full_brake)
     assert seen.shape == (len(moments.state), 1, 27)
     assert np.array_equal(moments.take(np.arange(20)).state, start.state)
     first = engine.branch(moments.take(np.arange(20))).observe_all(np.array([1]))
     assert np.array_equal(first, seen[:20])
-    same = [np.array_equal(moments.params, start.take(rows).params), (np.bincount(rows) > 1).all()]
-    assert same == [True, True] and rows[:20].tolist() == list(range(20))
 
 
 def test_gate__learns_what_costs_least_and_what_matters_most() -> None:
@@ -549,46 +546,26 @@ def test_gradients__are_cut_at_their_limit_and_the_share_is_told() -> None:
 
 
 def test_options__costs_are_those_of_episodes_driven_so() -> None:
-    """Full braking but for what is tried: each action for its steps, then the policy, to the end; and caution."""
+    """Full braking but for what is tried: each action for its steps, then the policy, to the end; and with caution."""
     network = {"policy": [8], "choices": 5}
     model = choosing(tried=8, near=[], fixed=[1.0], drawn=1, holds=[3], caution=0.5, network=network)
     start = model.engine.moment()
     torch.manual_seed(5)
-    full = np.linspace(0.0, 100.0, 8)  # said to be what full braking does in these worlds
-    seen, tried, costs = model._try_actions(model._last_obs[:, np.newaxis], start, full)
+    seen, tried, costs = model._try_actions(model._last_obs[np.newaxis], start)
     order = np.argsort(seen[:, 0])
     assert len(tried) == 8 and (tried[:, 0] == 0).all() and (tried[:, 1] == 4).all() and len(set(tried[:, 2])) > 1
-    rows = np.argsort(model._last_obs[:, 0])
-    for way in range(3):
+    rows, harms = np.argsort(model._last_obs[:, 0]), []
+    for way in range(3):  # the first is full braking
         engine = model.engine.branch(start.take(rows))
         for step in range(200):
             action = -1.0 + 0.5 * tried[order, way] if step < 3 else np.full(8, -1.0)
             engine.step(action[:, np.newaxis].astype(np.float64))
             if engine.ended.all():
                 break
-        harm = engine.ledger.world_harm("total")
-        expected = harm + 0.5 * np.maximum(harm - full[rows], 0.0)
+        harms.append(engine.ledger.world_harm("total"))
+        expected = harms[way] + 0.5 * np.maximum(harms[way] - harms[0], 0.0)
         np.testing.assert_allclose(costs[order, way], expected, rtol=1e-12, atol=1e-12)
-
-
-def test_options__episodes_begin_where_more_harm_than_by_full_braking_was_done() -> None:
-    model = choosing(starts=40, replay=0.99, n_envs=8)
-    start, full = model._worlds
-    assert len(full) == 40 and (full >= 0.0).all() and full.max() > 1.0
-    model.policy.beyond[:] = torch.arange(40) // 32  # in the last eight worlds
-    model._update(Mock(), 256)  # which brakes fully
-    assert model.policy.beyond.sum() <= 1.0
-    with torch.no_grad():  # a policy that always drives on
-        model.policy.average[-1].bias[-1] = 1e3
-    model.policy.beyond[:] = 0.0
-    model._update(Mock(), 256)
-    driven = np.flatnonzero(model.policy.beyond.numpy())
-    engine = model.engine.branch(start.take(driven))
-    while not engine.ended.all():
-        engine.step(np.ones((len(driven), 1)))
-    beyond = np.clip(engine.ledger.world_harm("total") - full[driven], 0.0, 100.0)
-    assert 0 < len(driven) <= 8
-    np.testing.assert_allclose(model.policy.beyond[driven], beyond, rtol=1e-12)
+    assert (costs[:, 1] > costs[:, 0]).any() and (costs[:, 1] < costs[:, 0]).any()
 
 
 def test_options__loss_by_hand_and_what_is_remembered_last() -> None:

@@ -67,7 +67,7 @@ def test_recipe__may_try_every_decision_of_a_round_otherwise_and_not_one_more() 
     with pytest.raises(InvalidInput, match=r"counterfactuals = 33: must be at most n_envs x n_steps = 32"):
         TINY_COUNTERFACTUAL.replace(counterfactuals=33)
     for changes, told in (
-        ({"starts": 7}, "starts = 7: must be at least n_envs = 8"),
+        ({"tried": 33, "memory": 99}, "tried = 33: must be at most n_envs x n_steps = 32"),
         ({"memory": 15}, "memory = 15: must be at least tried = 16"),
         ({"near": [], "fixed": [], "drawn": 0}, "near = .*: must hold a range where there are neither"),
         ({"reward": {"harm": 1.0, "shaping": 0.1}}, "reward.shaping = 0.1: must be 0: what is tried is played to"),

@@ -51,7 +51,6 @@ TINY_OPTIONS = load_recipe("options").replace(
     observation=None,
     n_envs=8,
     n_steps=4,
-    starts=100,
     tried=16,
     memory=40,  # fills up on the way
     gradient_steps=3,
