@@ -917,8 +917,7 @@ class OptionsModel(CounterfactualModel):
     def _try_actions(self, seen: Float32s, moments: Moment) -> tuple[Float32s, Ints, Floats]:
         """At some decisions: what is seen [B, F], numbers of the actions tried [B, C], and what each costs [B, C].
 
-        The first one is the one that the actor takes. What an action costs beyond full braking from here to the end
-        counts ``caution`` times more.
+        The first one is the one that the actor takes.
         """
         recipe, actor, learners = self.recipe, self.policy, len(self.engine.learners)
         observed, last = seen.reshape(-1, seen.shape[2]), recipe.network.choices - 1
@@ -935,9 +934,8 @@ class OptionsModel(CounterfactualModel):
         tried = np.clip(np.stack(numbers, axis=1), 0, last)
         holds = np.array(recipe.holds, np.int64)[torch.randint(len(recipe.holds), (len(rows),)).numpy()]
         each, back = np.unique(np.arange(len(rows))[:, None] * (last + 1) + tried, return_inverse=True)
-        row, number = np.append(each // (last + 1), np.arange(len(rows))), np.append(each % (last + 1), 0 * rows)
+        row, number = each // (last + 1), each % (last + 1)
         learner, steps, actions = rows[row] % learners, holds[row], actor.actions[number].astype(np.float64)
-        steps[len(each) :] = np.iinfo(np.int64).max  # full braking to the end
 
         def decide(now: Observations, some: Ints, done: int) -> Floats:
             wanted = actor.act(now.reshape(-1, now.shape[2])).astype(np.float64).reshape(now.shape[:2])
@@ -947,9 +945,7 @@ class OptionsModel(CounterfactualModel):
 
         engine = self.engine.branch(moments.take(rows[row] // learners))
         gained = play_on(engine, decide, recipe.gamma, at_least=max(recipe.holds))
-        every = -gained[np.arange(len(row)), learner]
-        costs = every[back].reshape(tried.shape)
-        costs += recipe.caution * np.maximum(costs - every[len(each) :, None], 0.0)
+        costs = -gained[np.arange(len(row)), learner][back].reshape(tried.shape)
         good = np.isfinite(costs).all(axis=1)
         return observed[rows[good]], tried[good], costs[good]
 

@@ -560,7 +560,6 @@ class OptionsRecipe(TrainingRecipe):
     drawn: Annotated[int, Field(ge=0, le=16)]
     holds: Annotated[tuple[Steps, ...], Field(strict=False, min_length=1, max_length=16)]
     largest_cost: Positive
-    caution: NonNegative
     guide: NonNegative
     memory: Annotated[int, Field(ge=1, le=500_000)]
     gradient_steps: Annotated[int, Field(ge=1, le=100_000)]
@@ -710,7 +709,6 @@ MEANINGS = {
     "fixed": "actions tried at each of these decisions, from -1 (full braking) to 1; the nearest of the choices is",
     "drawn": "how many more actions are tried there, any of the choices",
     "largest_cost": "an action that costs more than this beyond the best one counts as this much more",
-    "caution": "how much more harm beyond that of full braking, from the decision on, counts",
     "guide": "weight of the convex part of the loss, without which learning can stand still at the beginning",
     "memory": "how many decisions are learned from: the last ones at which the tried actions differ in cost",
     "log_every_updates": "updates between two rows of the progress table",

@@ -1109,6 +1109,8 @@ class StepShield:
         if possible is None:
             possible = worlds if self.uncertainty is None else self.uncertainty.members(worlds)
         members, vehicles, horizon_s = possible.n // worlds.n, self.vehicles, self.scenario.horizon_s
+        if members > 1 and self.cap is not None:
+            raise InvalidInput(f"shield: cap {self.cap!r} and {members} possible worlds: give one of the two")
         latest = possible.vehicles.latency_s[:, list(vehicles)].min(axis=1).max()
         if members > 1 and not latest < horizon_s:
             raise InvalidInput(
