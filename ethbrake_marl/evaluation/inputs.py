@@ -7,7 +7,6 @@ import json
 import platform
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from functools import partial
 from importlib.metadata import version
@@ -416,7 +415,8 @@ _TRAINED = 2_000  # worlds of a training that say where it took place
 def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario, vehicles: Sequence[int]) -> None:
     """Warn (``Unfamiliar``) where a trained policy drives in worlds beyond those that it was trained in.
 
-    These are drawn from the scenario in its manifest. Where that cannot be drawn here, nothing is said.
+    These are drawn from the scenario in its manifest. Where that cannot be drawn here, nothing is said. Of the channel
+    only what a world has of it is compared: latencies.
     """
     drives: dict[str, tuple[str, Policy, dict[str, None]]] = {}  # by hash: the first agent, vehicles in order
     for name, agent in agents.items():
@@ -425,30 +425,33 @@ def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scen
                 sha256 = policy.manifest.manifest_sha256
                 drives.setdefault(sha256, (name, policy, {}))[2][f"vehicle_{vehicle + 1}"] = None
     for name, policy, driven in drives.values():
-        with suppress(ValueError):
+        try:
             trained = Scenario.of_dump(policy.manifest.scenario)
-            found = [each for each in driven if each not in policy.manifest.learners] + _beyond(
-                trained, worlds, scenario
-            )
-            if found:
-                beyond = f"trained on {trained.name}, and not for what is here: {', '.join(found)}"
-                warnings.warn(f"{name}: {beyond}", Unfamiliar, stacklevel=1)
+            before = trained.sample(_TRAINED, 0).worlds
+        except ValueError:
+            continue
+        found = [each for each in driven if each not in policy.manifest.learners]
+        if not np.isclose(trained.time_step_s, scenario.time_step_s):
+            found.append("time_step_s")
+        found += [f"{worlds.N} vehicles"] if worlds.N != before.N else _beyond(before, worlds)
+        for i, script in scenario.scripts.items():
+            if str(trained.scripts.get(i, script)) != str(script):
+                found.append(f"{scenario.vehicle_names[i]} by {script}")
+        if found:
+            beyond = f"trained on {trained.name}, and not for what {scenario.name} has: {', '.join(found)}"
+            warnings.warn(f"{name}: {beyond}", Unfamiliar, stacklevel=2)
 
 
-def _beyond(trained: Scenario, worlds: Worlds, scenario: Scenario) -> list[str]:
-    """What lies beyond the worlds of a training: time step, number of vehicles, quantities."""
-    before = trained.sample(_TRAINED, 0).worlds
-    found = ["time_step_s"] if trained.time_step_s != scenario.time_step_s else []
-    if worlds.N != before.N:
-        return [*found, f"{worlds.N} vehicles"]
-    known, here = QUANTITY.of(before), QUANTITY.of(worlds)
+def _beyond(before: Worlds, worlds: Worlds) -> list[str]:
+    """The quantities that lie beyond those ``before``."""
+    found, known, here = [], QUANTITY.of(before), QUANTITY.of(worlds)
     for key, rule in here.items():
         if key not in known:
             found.append(key)
             continue
         values, seen = rule.of(worlds), rule.of(before)
         low, high = seen.min(axis=0), seen.max(axis=0)
-        margin = 0.01 * (high - low)
+        margin = 0.01 * (high - low) + 1e-9 * np.abs(high)
         share = ((values < low - margin) | (values > high + margin)).any(axis=1).mean()
         if share > _MOST_BEYOND:
             found.append(f"{key} in {100.0 * share:.0f} % of the worlds")

@@ -952,14 +952,20 @@ class ScenarioFields(FileModel):
     @classmethod
     def of_dump(cls, content: Mapping[str, Any]) -> Self:
         """That of which ``model_dump`` wrote every key, also those that nobody gave; raises ``ValueError``."""
-        usual = {key: field.default for key, field in cls.model_fields.items()}
+        usual = {key: (None, field.default) for key, field in cls.model_fields.items()}
 
         def given(part: Any) -> Any:
             if isinstance(part, Mapping):
-                return {k: given(v) for k, v in part.items() if v is not None and (k not in usual or v != usual[k])}
+                return {key: given(value) for key, value in part.items() if value is not None}
             return [given(each) for each in part] if isinstance(part, list | tuple) else part
 
-        return cls.model_validate(given(content))
+        def declared(scenario: Mapping[str, Any]) -> dict[str, Any]:
+            told = {key: given(value) for key, value in scenario.items() if value not in usual.get(key, ())}
+            if "mixture" in told:
+                told["mixture"] = [{**each, "scenario": declared(each["scenario"])} for each in told["mixture"]]
+            return told
+
+        return cls.model_validate(declared(content))
 
     @field_validator(
         *QUANTITY.alternatives, *QUANTITY.alternatives.values(), *QUANTITY.optional, "alert_s", mode="before"
