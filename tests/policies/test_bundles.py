@@ -436,7 +436,7 @@ def test_shipped_name__is_by_kind_scenario_and_count(
 def test_lineup__takes_what_ships(folder: Path) -> None:
     specs = ["ppo@shipped", "universal@shipped", "policy@shipped", "team@shipped", "ppo@shipped+episode"]
     lineup = make_lineup([*specs, "ppo@shipped/ppo-paper-distance"], SCENARIO)
-    shipped = "policy@shipped/ppo-paper-distance"
+    shipped = "policy@shipped/ppo"
     told = [spec.replace("policy@shipped", shipped).replace("team@shipped", shipped) for spec in lineup]
     assert [each.name for each in lineup.values()] == told
     assert isinstance(lineup["ppo@shipped+episode"], HybridAgent)
