@@ -155,8 +155,8 @@ def evaluate(
     """Let each agent drive every world once, from the alert to the episode's end.
 
     Vehicles that are not driven follow the scenario's scripts. A world's outcome depends neither on ``chunk`` nor
-    on the other worlds. One that cannot be advanced with one of the agents (a defect of the physics) is left out for
-    all of them, and stands in ``left_out``.
+    on the other worlds. One that cannot be advanced (a defect of the physics) is left out for all agents, and stands
+    in ``left_out``.
 
     Args:
         worlds: at the alert, or a sample of the scenario's list; None: its first ``episodes`` of ``seed``.
@@ -171,9 +171,9 @@ def evaluate(
         aftermath: look how far Vehicle 1 is shoved, what the paper's sum over samples is, and what registered harm
             metrics are; costs time.
 
-    Warns (``Unfamiliar``) where a policy drives in worlds beyond those that it was trained in. Raises
-    ``PhysicsError`` if no world is left; ``InvalidInput`` for worlds that do not fit the scenario or are not at
-    the alert, no agents, no vehicle to drive, a team of other vehicles, or a learner that nobody drives.
+    Warns (``Unfamiliar``) of policies beyond their training. Raises ``PhysicsError`` if no world is left;
+    ``InvalidInput`` for worlds that do not fit the scenario or are not at the alert, no agents, nobody to drive, a
+    team of other vehicles, or a learner that nobody drives.
 
     """
     scenario = load_scenario(scenario)

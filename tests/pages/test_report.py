@@ -162,7 +162,7 @@ def test_report__is_well_formed_and_says_everything(html: str, report: Report) -
     told = [
         "paper-random: 200 worlds, seed 7; d = ", "Training seed 5 Command ethbrake run", "numpy 2.4.6",
         "Hybrid PPO 59.74 % 5.6202", "62.3 %", report.rows[0].worlds_sha256, "from the alert to rest.",
-        "Full braking does ", " less harm by first impacts. In ",
+        "Full braking does ", " less harm by first impacts and ", " less by all. In ",
         "no command could have avoided a collision (proven). One million",
     ]  # fmt: skip
     for row in report.rows:

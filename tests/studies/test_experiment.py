@@ -22,10 +22,10 @@ from ethbrake_marl.studies.experiment import results_csv, telling_world
 )
 def test_telling_world__is_the_median_saving_among_harmful_worlds(before, after, row):
     harms = {"full_brake": before, "ppo": after}
-    evaluation = SimpleNamespace(
-        outcome=lambda name: SimpleNamespace(first_impact_harm=np.array(harms[name])), outcomes=harms
-    )
-    assert telling_world(evaluation) == row
+    by_count = {name: {"first": np.ones(4), "total": np.array(harm)} for name, harm in harms.items()}
+    outcome = {name: SimpleNamespace(world_harm=found.__getitem__) for name, found in by_count.items()}
+    evaluation = SimpleNamespace(outcome=outcome.__getitem__, outcomes=harms)
+    assert telling_world(evaluation, "total") == row
 
 
 def test_results_csv__an_interval_becomes_two_columns_and_nothing_an_empty_cell():
