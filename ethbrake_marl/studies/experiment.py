@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -17,7 +18,7 @@ import numpy as np
 
 from ethbrake_marl.agents import Agent, LearnedAgent
 from ethbrake_marl.defaults import DEFAULT, HarmCount
-from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, check_one_learner
+from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, Unfamiliar, check_one_learner
 from ethbrake_marl.evaluation import (
     TESTS,
     Evaluation,
@@ -236,7 +237,11 @@ def run_experiment(
         for other in others:  # the policy was trained on ``scenario`` alone
             part = other.sample(min(episodes, 2_000), list_seed)
             begin(f"the same policy on {other.name}")
-            driven = evaluate(part, _agents(trained.policy, other, harm_count, BESIDE), scenario=other, seed=list_seed)
+            with warnings.catch_warnings():  # of what the page says
+                warnings.simplefilter("ignore", Unfamiliar)
+                driven = evaluate(
+                    part, _agents(trained.policy, other, harm_count, BESIDE), scenario=other, seed=list_seed
+                )
             beside[other.name] = summarise(driven)
         begin("results and figures")
         per_world = run.path / "per_world.csv"
