@@ -59,8 +59,10 @@ def started(folder: Path) -> Iterator[Running]:
     ) as process:
         address = urlsplit(process.stdout.readline().strip())  # type: ignore[union-attr]
         assert (address.scheme, address.hostname, bool(address.port)) == ("http", "127.0.0.1", True)
-        yield Running(process, address.port or 0, address.path, folder)
-        process.kill()
+        try:
+            yield Running(process, address.port or 0, address.path, folder)
+        finally:  # also after a failure, which would wait for it for ever
+            process.kill()
 
 
 @pytest.fixture(scope="module")
