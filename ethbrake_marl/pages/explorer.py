@@ -737,6 +737,8 @@ def serve_explorer(
             h11_max_incomplete_event_size=16 * 1024,
         )
         listening.listen()
-        with suppress(KeyboardInterrupt):  # from the moment at which the address is told
+        server = uvicorn.Server(config)
+        # Noted from the moment at which the address is told: raised, it would be lost in a callback of an import.
+        with suppress(KeyboardInterrupt), server.capture_signals():
             ready(f"http://127.0.0.1:{chosen}/{token}/")
-            uvicorn.Server(config).run(sockets=[listening])
+            server.run(sockets=[listening])

@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
@@ -285,9 +285,14 @@ def test_ctrl_c_while_the_address_is_told_ends_it_too(explored: Explored, tmp_pa
     pytest.importorskip("uvicorn")
 
     def interrupted(address: str) -> None:
-        raise KeyboardInterrupt
+        with suppress(KeyboardInterrupt):  # as Python does in a callback
+            signal.raise_signal(signal.SIGINT)
 
+    again = threading.Timer(30.0, os.kill, (os.getpid(), signal.SIGINT))
+    again.start()
     serve_explorer(explored, tmp_path, 0, interrupted, seed=DEFAULT.LIST_SEED, world=0)
+    assert again.is_alive()
+    again.cancel()
 
 
 def test_long_questions_are_cut_off(client: Client, state: dict[str, Any]) -> None:
