@@ -56,11 +56,15 @@ def _intervals(uncertainty: str | None) -> Uncertainty | None:
 
 
 def _make_drivers(
-    agents: str, scenario: Scenario, harm_count: HarmCount = "first", uncertainty: str | None = None
-) -> dict[str, Driver]:
-    """Who is named on the command line, with commas between them; tells which policies ``@shipped`` stands for."""
-    specs, intervals = agents.split(","), _intervals(uncertainty)
-    lineup = evaluation.make_lineup(specs, scenario, harm_count=harm_count, uncertainty=intervals)
+    specs: Sequence[str],
+    scenario: Scenario,
+    harm_count: HarmCount = "first",
+    uncertainty: str | None = None,
+    **how: bool,
+) -> dict[str, Any]:
+    """Who is named on the command line, as ``make_lineup`` makes them; tells which policies ``@shipped`` stands for."""
+    intervals = _intervals(uncertainty)
+    lineup = evaluation.make_lineup(specs, scenario, harm_count=harm_count, uncertainty=intervals, **how)
     for spec, driver in lineup.items():
         if "@shipped" in spec and (meant := getattr(driver, "name", spec)) != spec:
             Out().note(f"{spec} is {meant}")
@@ -144,7 +148,7 @@ def evaluate_command(
     if shards is not None:
         number = DEFAULT.EPISODES if episodes is None else episodes
         list_seed = DEFAULT.LIST_SEED if seed is None else seed
-        lineup = _make_drivers(agents, chosen, harm_count, uncertainty)
+        lineup = _make_drivers(agents.split(","), chosen, harm_count, uncertainty)
         question = evaluation.Question(
             chosen, tuple(lineup), number, list_seed, harm_count, uncertainty, tuple(objectives)
         )
@@ -154,7 +158,7 @@ def evaluate_command(
     sample, drawn_by = evaluation.choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
     if by is not None:
         evaluation.Evaluation.check_group(sample.kinds, by)
-    lineup = _make_drivers(agents, chosen, harm_count, uncertainty)
+    lineup = _make_drivers(agents.split(","), chosen, harm_count, uncertainty)
     evaluation.check_agents(lineup, sample.worlds, chosen)
     found = evaluation.evaluate(
         sample,
@@ -368,7 +372,7 @@ def shield_command(
 
 def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> evaluation.ShieldModes:
     """The rows of these agents, with progress on stderr."""
-    lineup = evaluation.make_lineup(agents.split(","), task.scenario, harm_count=task.harm_count, bare=True)
+    lineup = _make_drivers(agents.split(","), task.scenario, task.harm_count, bare=True)
     n = sample.worlds.n
     return evaluation.compare_modes(
         lineup, sample.worlds, task, on_progress=lambda name, done: out.progress(name, done, n)
@@ -410,7 +414,7 @@ def record_command(
     out.check(output)
     evaluation.check_film(output.suffix.lower())
     chosen = _asked_task(scenario, vehicle, None).scenario
-    lineup = _make_drivers(agents, chosen, uncertainty=uncertainty)
+    lineup = _make_drivers(agents.split(","), chosen, uncertainty=uncertainty)
     worlds = chosen.sample(1, seed, first=world).worlds
     titled = {f"{name}: world {world} of {chosen.name}": agent for name, agent in lineup.items()}
     out.write(output, evaluation.film(worlds, titled, output.suffix.lower(), scenario=chosen), what="film")
@@ -502,11 +506,10 @@ def explore_command(
     It shows every agent's harm and motion at once. It listens on this machine alone, and its address holds a token that
     is new each time. Ctrl-C ends it.
     """
-    from ethbrake_marl.evaluation import make_agents
     from ethbrake_marl.pages.explorer import Explored, serve_explorer
 
     task = _asked_task(scenario, vehicle, settings, harm_count, alone=True)
-    explored = Explored(task, make_agents(agents.split(","), task.scenario, harm_count=harm_count))
+    explored = Explored(task, _make_drivers(agents.split(","), task.scenario, harm_count, alone=True))
 
     def ready(address: str) -> None:
         out.show(address)
@@ -541,7 +544,7 @@ def dataset_command(
     """
     chosen = _asked_task(scenario, vehicle, settings, harm_count).scenario
     evaluation.check_dataset(output, chosen, format, force=out.force)
-    lineup = _make_drivers(agents, chosen, harm_count, uncertainty)
+    lineup = _make_drivers(agents.split(","), chosen, harm_count, uncertainty)
     evaluation.check_agents(lineup, chosen.sample(1, seed).worlds, chosen)
     summary = evaluation.write_dataset(
         output,
@@ -596,7 +599,7 @@ def picture_criticality(
     """
     figures = _figures(out, output)
     chosen = _asked_task(scenario, None, settings, alone=True).scenario
-    lineup = evaluation.make_agents([agent], chosen, harm_count=harm_count)
+    lineup = _make_drivers([agent], chosen, harm_count, alone=True)
     found = evaluation.criticality_map(chosen, lineup, cells=cells, gap_range_m=gaps, on_progress=out.progress)
     _write_picture(out, output, figures.criticality_figure(found))
 
@@ -668,7 +671,7 @@ def picture_shield(
     figures = _figures(out, output)
     task = _asked_task(scenario, vehicle, settings, harm_count)
     worlds = task.scenario.sample(episodes, DEFAULT.LIST_SEED).worlds
-    lineup = evaluation.make_lineup(agents.split(","), task.scenario, harm_count=harm_count, bare=True)
+    lineup = _make_drivers(agents.split(","), task.scenario, harm_count, bare=True)
     curves = operating_curves(worlds, lineup, task, on_progress=lambda name: out.progress(name, episodes, episodes))
     left_out = next(iter(curves.values()))[0].left_out
     rest = f"; step shield, {harm_count} harm. Beside the points: what certificates may reach above the bound (m²/s²)."
@@ -725,15 +728,13 @@ def picture_robustness(
 
     The robust shield's price, and both shields where the truth differs. Prints the figures, too.
     """
-    from ethbrake_marl.agents import Agent
     from ethbrake_marl.shield import parse_uncertainty, robustness
 
     figures = _figures(out, output)
     intervals = parse_uncertainty(uncertainty)
     task = _asked_task(scenario, vehicle, settings, harm_count, alone=True)
     sample = task.scenario.sample(episodes, DEFAULT.LIST_SEED)
-    (policy,) = evaluation.make_lineup([agent], task.scenario, harm_count=harm_count, bare=True).values()
-    assert isinstance(policy, Agent)  # one vehicle learns
+    (policy,) = _make_drivers([agent], task.scenario, harm_count, bare=True).values()
     points = robustness(
         sample.worlds, policy, task, intervals, robust=robust,
         on_progress=lambda what, done: out.progress(what, done, episodes),

@@ -442,7 +442,8 @@ def _right(detail: ErrorDetails) -> str:
     if kind == "float_type":
         return "must be a number"
     if kind == "too_long":
-        return f"must have {detail['ctx']['max_length']} entries"
+        most = detail["ctx"]["max_length"]
+        return f"must have {most if most == 2 else f'at most {most}'} entries"  # 2: a pair
     if kind == "too_short":
         least = detail["ctx"]["min_length"]
         return "must not be empty" if least == 1 else f"must have at least {least} entries"
