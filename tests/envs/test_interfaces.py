@@ -122,11 +122,11 @@ def test_infos__hold_the_same_keys_in_every_step_and_the_page_names_them() -> No
 @pytest.mark.parametrize(("reward", "total"), [("harm", "world_first_impact_harm"), ("total-harm", "world_total_harm")])
 def test_infos__cost_is_the_harm_of_the_step_as_the_reward_counts_it(reward: str, total: str) -> None:
     environment = eb.EthBrakeEnv("paper-random", reward=reward)
-    for seed in range(2):
+    for seed, action in ((0, 0.3), (2, -0.8)):  # collisions in front, and in front and behind
         _, info = environment.reset(seed=seed)
         before, costs, over = info[total], [info["cost"]], False
         while not over:
-            _, _, terminated, truncated, info = environment.step(np.array([0.3], np.float32))
+            _, _, terminated, truncated, info = environment.step(np.array([action], np.float32))
             over = terminated or truncated
             costs.append(info["cost"])
         assert sum(costs) == near(info[total] - before)
