@@ -342,6 +342,11 @@ def hit_hard(episodes: Any) -> Any:
     return episodes.largest_speed_change_mps[:, 2] > 2.0
 
 
+def rear_ended(episodes: Any) -> Any:
+    """Whether Vehicle 3 hit Vehicle 2."""
+    return np.isin(np.arange(episodes.worlds.n), episodes.rows.world[episodes.rows.pair == 1])
+
+
 def evaluated(**options: Any) -> Any:
     agents = {name: eb.make_agent(name, scenario=PAPER) for name in ("full_brake", "e_v2x_bm", "ppo@shipped+step")}
     return eb.evaluate(SAMPLE, agents, scenario=PAPER, **options)
@@ -366,10 +371,12 @@ def test_measure__of_each_vehicle_stands_in_rows_frame_markdown_and_report() -> 
     eb.register_measure("squared", squared, unit="m2/s2")
     eb.register_measure("injury", injury, unit="1")
     eb.register_measure("change", changed(lambda episodes: episodes.largest_speed_change_mps), unit="m/s")
+    eb.register_measure("rear_ended", rear_ended, unit="1")
     found = evaluated()
     rows, braked = eb.summarise(found), found.outcome("full_brake")
     changes = np.stack([braked.metrics[f"change_{i}"] for i in (1, 2, 3)], axis=1)
     assert (((changes > 0.0).sum(axis=1) > 1) == braked.collided).all() and (changes >= 0.0).all()  # of both in a pair
+    assert ((changes[:, 2] > 0.0) == braked.metrics["rear_ended"]).all() and np.ptp(changes[:, 2]) > 0.0
     assert [*rows[0].metrics][:4] == ["squared", "injury_1", "injury_2", "injury_3"]
     assert rows[1].metrics["injury_2"] == mean(found.outcome("e_v2x_bm").metrics["injury_2"])
     told = rows[0].to_json()
