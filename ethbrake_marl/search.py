@@ -606,11 +606,11 @@ def profile_problem(
     """The problem of choosing the whole profiles of ``vehicles`` (indices from 0) so as to do the least harm.
 
     The first decision falls on the smallest latency of the ``deciders`` (default: ``vehicles``) or on the worlds' time,
-    whichever is later; one follows every ``time_step_s``. An obstacle ahead is written out as a vehicle in front
-    (``Worlds.with_obstacle``): all columns of the problem are those of that line. The other vehicles follow
-    ``others_mps2`` [n, N] (default: full braking; the columns of ``vehicles`` are ignored). Raises ``InvalidInput`` for
-    no vehicle, one given twice or not there, an unknown count, a command beyond capacity, a horizon before the first
-    decision, or worlds of which only some have an obstacle.
+    whichever is later; one follows every ``time_step_s``. Where any world has an obstacle ahead, it is written out as a
+    vehicle in front (``Worlds.with_obstacle``; in the others one that nobody reaches): all columns of the problem are
+    those of that line. The other vehicles follow ``others_mps2`` [n, N] (default: full braking; the columns of
+    ``vehicles`` are ignored). Raises ``InvalidInput`` for no vehicle, one given twice or not there, an unknown count, a
+    command beyond capacity, or a horizon before the first decision.
     """
     chosen = _checked_vehicles(vehicles, worlds.N)
     check_harm_count(harm_count)
@@ -623,10 +623,8 @@ def profile_problem(
     command[:, chosen] = 0.0
     obstacle = worlds.obstacle_ahead
     if obstacle.any():
-        if not obstacle.all():
-            raise InvalidInput("profiles: only some of the worlds have an obstacle ahead (obstacle_gap_m), not all")
-        return profile_problem(
-            worlds.with_obstacle(),
+        found = profile_problem(
+            worlds.with_post_ahead(np.full(worlds.n, horizon_s)).with_obstacle(),
             [i + 1 for i in chosen.tolist()],
             harm_count=harm_count,
             horizon_s=horizon_s,
@@ -634,6 +632,13 @@ def profile_problem(
             others_mps2=np.concatenate([np.zeros((len(command), 1)), command], axis=1),
             deciders=None if deciders is None else [i + 1 for i in deciders],
         )
+        if not obstacle.all():  # a world is searched as it is beside any others
+            free = np.flatnonzero(~obstacle)
+            found.identity[free] = profile_problem(
+                worlds.take(free), vehicles, harm_count=harm_count, horizon_s=horizon_s, time_step_s=time_step_s,
+                others_mps2=command[free], deciders=deciders,
+            ).identity  # fmt: skip
+        return found
     decide = _checked_vehicles(vehicles if deciders is None else deciders, worlds.N)
     first = worlds.first_decision_s(decide.tolist())
     if not (first < horizon_s).all():
