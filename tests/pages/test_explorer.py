@@ -173,9 +173,10 @@ def test_profile__of_an_agent_drives_as_the_agent(client: Client, state: dict[st
     assert (hand["first"], hand["total"], hand["impacts"]) == (policy["first"], policy["total"], policy["impacts"])
 
 
-def test_world__is_that_of_the_list(client: Client, scenario: Scenario) -> None:
-    told = client.ask("world", {"number": 12}).json["world"]
-    world = scenario.sample(1, DEFAULT.LIST_SEED, first=12).worlds
+@pytest.mark.parametrize("number", [12, 10**9])
+def test_world__is_that_of_the_list(client: Client, scenario: Scenario, number: int) -> None:
+    told = client.ask("world", {"number": number}).json["world"]
+    world = scenario.sample(1, DEFAULT.LIST_SEED, first=number).worlds
     assert told == Conditions.of(world) == Conditions.of(read_state(json.loads(json.dumps(told)), scenario))
 
 

@@ -116,9 +116,11 @@ def test_drawing__the_caption_is_text_of_the_page() -> None:
     figure = new_figure(6.0, 3.0)
     figure.subplots().plot([0.0, 1.0])
     text = " ".join(["One hundred worlds of the list of seed 7; gaps from 5 to 10 m, and the first-impact harm"] * 3)
+    letters = str(Part.drawing(figure, "Title", "Words.").html).count("<use")
     add_caption(figure, f"{text} Known.")
     html = str(Part.drawing(figure, "Title", "Words.", known="Known.").html)
     assert Page(html).text.replace("\n", " ").endswith(text) and "<!--" not in html
+    assert html.count("<use") == letters  # it is not drawn, too
     (taken,) = re.findall(r'viewBox="0 0 432 ([0-9.]+)"', html)
     assert float(taken) < 216.0 and figure.get_supxlabel().startswith("One hundred worlds")
 
