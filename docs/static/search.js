@@ -16,7 +16,7 @@ const LATER = {
   "reference/": 8,
   "tutorials/": 4,
 };
-const LAST = ["cli", "layout", "paper", "paper-figures", "paper-motion", "pettingzoo-listing", "physics-tests", "releasing", "reproduction", "tests"];
+const LAST = ["cli", "layout", "paper", "paper-figures", "paper-motion", "physics-tests", "releasing", "reproduction", "tests"];
 
 var Scorer = {
   objNameMatch: 11,

@@ -55,7 +55,7 @@ TEAM_CELLS = {(3, 3): 5.0, (4, 3): 1.25, (3, 5): 1.0, (4, 5): 0.75}  # by what t
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--worlds", type=int, default=1_000_000, help="of 'bound', all cells together, about")
     parser.add_argument("--joint-worlds", type=int, default=300_000, help="of 'joint', all cells together, about")
-    parser.add_argument("--interface-worlds", type=int, default=10_000, help="through each interface")
+    parser.add_argument("--interface-worlds", type=int, default=2_000, help="through each interface")
     parser.add_argument("--interfered", type=int, default=1_000, help="episodes with failing calls on each interface")
     parser.add_argument("--corner-worlds", type=int, default=60_000, help="of 'believed'")
     parser.add_argument("--range-worlds", type=int, default=1_200, help="of 'believed', from between the corners")
