@@ -46,9 +46,9 @@ def to_its_end(environment: Any) -> list[Any]:
     return shown
 
 
-def flashes(frame: Any) -> int:
-    """How many pixels have the colour of an impact."""
-    return int((frame == np.array(FLASH, np.uint8)).all(axis=2).sum())
+def flashes(frame: Any, colour: tuple[int, int, int] = FLASH) -> int:
+    """How many pixels have a colour, that of an impact unless another one is given."""
+    return int((frame == np.array(colour, np.uint8)).all(axis=2).sum())
 
 
 def test_frame__is_a_picture_of_the_state_alone_in_its_own_memory() -> None:
@@ -63,6 +63,16 @@ def test_frame__is_a_picture_of_the_state_alone_in_its_own_memory() -> None:
         before = again
         frame[:] = 0
         assert np.array_equal(environment.render(), again)
+
+
+@pytest.mark.parametrize(("sign", "colour"), [(1.0, (42, 127, 63)), (-1.0, (193, 18, 31))])
+def test_bar__is_as_long_as_the_share_of_the_capacity(sign: float, colour: tuple[int, int, int]) -> None:
+    drawn = []
+    for share in (0.0, 0.25, 0.5, 1.0):  # of Vehicle 2; Vehicle 1 brakes
+        environment = crash()
+        environment.step(np.full(1, sign * share, np.float32))
+        drawn.append(flashes(environment.render(), colour))
+    assert np.diff(drawn) / (drawn[3] - drawn[0]) == near([0.25, 0.25, 0.5], abs=0.02) and drawn[3] > drawn[0] + 500
 
 
 def test_impact__is_shown_where_it_happens_and_then_fades() -> None:
