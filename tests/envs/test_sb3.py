@@ -167,23 +167,24 @@ def test_horizon_is_end__hides_the_truncation_and_nothing_else(horizon_is_end: b
 
 @pytest.mark.parametrize("appended", ["number", "state"])
 def test_appended__stands_behind_the_own_observation_in_every_row(appended: Any) -> None:
-    plain = make_sb3_vec_env(FIVE, 3, seed=2, learners=PAIR)
-    more = make_sb3_vec_env(FIVE, 3, seed=2, learners=PAIR, appended=appended)
+    three = ["vehicle_2", "vehicle_3", "vehicle_5"]
+    plain = make_sb3_vec_env(FIVE, 3, seed=2, learners=three)
+    more = make_sb3_vec_env(FIVE, 3, seed=2, learners=three, appended=appended)
     own = plain.observation_space.shape[0]
     rows, seen = plain.reset(), more.reset()
     ended = 0
     for _ in range(90):
-        expected = np.tile([[0.0], [1.0]], (3, 1))
+        expected = np.tile([[0.0], [1.0], [2.0]], (3, 1))
         if appended == "state":
-            expected = full_state(more.engine.worlds, more.engine.scenario).repeat(2, axis=0)
+            expected = full_state(more.engine.worlds, more.engine.scenario).repeat(3, axis=0)
         np.testing.assert_array_equal(seen, np.hstack([rows, expected.astype(np.float32)]))
-        assert more.observation_space.contains(seen[0])
-        given = np.full((6, 1), -0.8, np.float32)
+        assert more.observation_space.contains(seen[2])
+        given = np.full((9, 1), -0.8, np.float32)
         (rows, _, _, plainly), (seen, _, dones, infos) = plain.step(given), more.step(given)
         for row in np.flatnonzero(dones):
             last = infos[row]["terminal_observation"]
             np.testing.assert_array_equal(last[:own], plainly[row]["terminal_observation"])
             assert last.shape == more.observation_space.shape
-            assert appended == "state" or last[own] == row % 2
+            assert appended == "state" or last[own] == row % 3
             ended += 1
     assert ended > 0
