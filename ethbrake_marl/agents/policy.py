@@ -22,7 +22,7 @@ from ethbrake_marl.engine import Memory, Script, checked_memory, map_memory, tak
 from ethbrake_marl.errors import AgentFailed, InvalidInput, describe_error, naming_extras
 from ethbrake_marl.observations import Observation, Observations, ObservationSpec, choose_observation, observe
 from ethbrake_marl.physics import Floats, Ints, Worlds
-from ethbrake_marl.scenario import Appended, Scenario, appending, observation_for, row_features
+from ethbrake_marl.scenario import Appended, Scenario, appending, load_scenario, observation_for, row_features
 
 # Policies of other libraries, each as one function: ``(observation, state) -> (action, state)``.
 
@@ -205,7 +205,7 @@ def policy_agent(
     policy: Any,
     *,
     name: str | None = None,
-    scenario: Scenario | None = None,
+    scenario: Scenario | str | None = None,
     observation: Observation | None = None,
     initial_state: Callable[[int], State] | None = None,
     clip: bool = False,
@@ -221,7 +221,7 @@ def policy_agent(
             by world, its observations normalised by its ``VecNormalize``), a torch module (called as it is, without
             gradients), an ONNX session, or the path of an ``.onnx`` file. Copies share it.
         name: in tables and messages; None: the name of the function or class.
-        scenario: the policy observes what learners of it do.
+        scenario: the policy observes what learners of it do; or its name.
         observation: what it observes instead, as ``choose_observation`` reads it; None: that of the scenario, or of the
             policy itself, or of the environment that a Stable-Baselines3 model has, or the usual one.
         initial_state: makes the memory of ``n`` episodes that begin: an array whose first axis is the world, or tuples
@@ -240,6 +240,7 @@ def policy_agent(
     5
 
     """
+    scenario = load_scenario(scenario) if isinstance(scenario, str) else scenario
     of_file = isinstance(policy, str | os.PathLike)
     named = name or (Path(policy).stem if of_file else str(getattr(policy, "__name__", type(policy).__name__)))
     trained = training_environment(policy, named)

@@ -174,7 +174,7 @@ OPTIONS: dict[str, Any] = {  # of parameters that bring no option of their own, 
     "settings": typer.Option(
         "--set", metavar="KEY=VALUE", help="Another value of the scenario, or of the recipe: mass_t=40. Repeatable."
     ),
-    "steps": typer.Option(help="Training steps (decisions).", show_default="the recipe's"),
+    "steps": typer.Option(help="Training steps (decisions), rounded up to whole updates.", show_default="the recipe's"),
     "agents": typer.Option(metavar="A,B,...", help="Who drives, with commas between them: `ethbrake agent list`."),
     "vehicle": typer.Option(help="Who is driven; other learners brake fully.", show_default="the learner"),
     "episodes": typer.Option(help="Worlds of the list."),

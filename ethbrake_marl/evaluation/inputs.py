@@ -224,7 +224,7 @@ def states_of(worlds: Worlds, scenario: Scenario) -> list[dict[str, float]]:
     fixed = {
         rule.column_of(i)
         for key, rule in QUANTITY.usual.items()
-        for i, (low, high) in enumerate(scenario.bounds(key, dry=True))
+        for i, (low, high) in enumerate(scenario.bounds(key, dry=bool(np.isfinite(worlds.friction).all())))
         if low == high
     }
     columns = {

@@ -653,10 +653,10 @@ class Limits:
             return ""
         return (
             f"the table of best known harm holds {listed.sum():,} of these {len(known):,} worlds, and not"
-            f" {missing:,} others ({100.0 * missing / len(known):.1f} %), whose best is not proven either. There the"
+            f" the other {missing:,} ({100.0 * missing / len(known):.1f} %), whose best is not proven either. There the"
             " best agent of this evaluation stands in: regrets are lower bounds, and no realised share is stated. A"
             " table is made for one list; a longer list, or one of another version, has other worlds (ethbrake"
-            " best-harm)"
+            " search best-harm)"
         )
 
 

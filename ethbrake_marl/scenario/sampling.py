@@ -894,7 +894,7 @@ class ScenarioFields(FileModel):
     table: Table | None = Field(
         default=None, exclude_if=not_, description="measured rows of which every world takes one; the rest is drawn"
     )
-    time_step_s: float = Field(default=0.1, ge=1e-4, allow_inf_nan=False, description="time between two decisions")
+    time_step_s: float = Field(default=0.1, ge=1e-3, allow_inf_nan=False, description="time between two decisions")
     horizon_s: float = Field(
         default=8.0, gt=0.0, le=3600.0, allow_inf_nan=False, description="time after which an episode is cut off"
     )

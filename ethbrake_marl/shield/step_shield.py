@@ -994,10 +994,6 @@ class StepShield:
     ) -> None:
         check_harm_count(harm_count)
         check_scenario(scenario, "shield")
-        if len({member.has_obstacle for member in scenario.members}) > 1:
-            raise InvalidInput(
-                f"shield: scenario {scenario.name!r}: only some of its scenarios have an obstacle ahead: take one"
-            )
         check_amount("allowance", allowance, "shield", " m2/s2")
         several = isinstance(vehicle, Sequence) and not isinstance(vehicle, str)
         each: tuple[Any, ...] = tuple(cast(Sequence[Any], vehicle)) if several else (vehicle,)

@@ -53,7 +53,7 @@ def test_trained_model__drives_as_in_its_own_librarys_rollout(model, seed):
         observation, more, terminated, truncated, _ = env.step(model.predict(observation, deterministic=True)[0])
         reward, over = reward + more, terminated or truncated
     worlds = SCENARIO.sample(1, seed, channel="training").worlds
-    agent = eb.policy_agent(model, name="sb3", scenario=SCENARIO)
+    agent = eb.policy_agent(model, name="sb3", scenario=SCENARIO.name)
     assert harms(agent, worlds)[0] == pytest.approx(-reward, rel=1e-5, abs=1e-5)
 
 

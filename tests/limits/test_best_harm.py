@@ -93,6 +93,13 @@ def test_best_harm__does_not_depend_on_batch_order_or_threads_but_on_the_seed(ta
     assert not np.array_equal(first_harm(WORLDS, budget=BUDGET, seed=1), table.best["first"].harm)
 
 
+def test_best_harm__an_obstacle_ahead_of_some_worlds_changes_nothing_in_the_others() -> None:
+    ahead = load_scenario("paper-random-obstacle").sample(3, seed=11).worlds
+    apart = [first_harm(worlds, budget=100) for worlds in (FEW, ahead)]
+    together = first_harm(Worlds.concatenate([FEW, ahead]), budget=100)
+    assert together.tolist() == np.concatenate(apart).tolist()
+
+
 def test_best_harm__starts_from_what_is_known_and_never_gets_worse(table: BestHarmTable) -> None:
     again = best_harm(SCENARIO, WORLDS, budget=100, threads=1, seed=2, known=table)
     for harm_count in HARM_COUNTS:

@@ -558,23 +558,3 @@ def test_shields_and_searches__take_a_mixture() -> None:
     plain = eb.evaluate(DELAYS.sample(20, 7), {"b": eb.make_agent("full_brake")}, scenario=DELAYS).outcome("b")
     shielded = eb.evaluate(DELAYS.sample(20, 7), agents, scenario=DELAYS).outcome("full_brake+step")
     assert (shielded.first_impact_harm <= plain.first_impact_harm + 1e-9).all()
-
-
-def test_mixture__an_obstacle_in_some_worlds_changes_nothing_in_the_others() -> None:
-    """Nor does what is searched in a world depend on the worlds beside it."""
-    mixture = mixed("paper-random", "paper-random-obstacle")
-    sample, names = mixture.sample(12, 7), ("e_v2x_bm", "best_harm:20", "full_brake+refined:profile", "coast+episode")
-
-    def driven(scenario: Scenario, worlds: Any, **options: Any) -> Any:
-        agents = {name: eb.make_agent(name, scenario=scenario, harm_count="total") for name in names}
-        return eb.evaluate(worlds, agents, scenario=scenario, seed=7, **options)
-
-    together, apart = driven(mixture, sample), driven(mixture, sample, chunk=1)
-    for member in map(load_scenario, ("paper-random", "paper-random-obstacle")):
-        rows = np.flatnonzero(sample.scenarios == member.name)
-        own = driven(member, member.sample(12, 7).take(rows))
-        for name in names:
-            harm = own.outcome(name).total_harm.tobytes()
-            assert [found.outcome(name).total_harm[rows].tobytes() for found in (together, apart)] == [harm, harm]
-    with pytest.raises(InvalidInput, match="scenario 'mixed': only some of its scenarios have an obstacle ahead"):
-        eb.shield(eb.parallel_env(mixture))
