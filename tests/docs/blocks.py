@@ -82,6 +82,7 @@ def agrees(shown: list[str], told: list[str]) -> bool:
 def missing_figures(table: str, told: str) -> list[str]:
     """Figures of a table, with their decimals, that no number of what was told is when it is rounded to as many."""
     numbers = {float(word) for word in re.findall(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?", told)}
+    table = re.sub(r"( %) \[(\S+), (\S+)\]", r"\1 [\2\1, \3\1]", table)  # an interval has the unit of what it is of
     figures = {(word, share) for word, share in re.findall(r"(?<![\w.])(\d+\.\d+)( %)?", table)}
     return sorted(
         word
