@@ -739,28 +739,30 @@ def shipped_policies() -> dict[str, Path]:
     return {path.parent.name: path.parent for path in sorted(_FOLDER.glob("*/policy"))}
 
 
-def shipped_name(kind: str, scenario: str | None, harm_count: HarmCount) -> str:
+def shipped_name(kind: str, scenario: Scenario | None, harm_count: HarmCount) -> str:
     """Name of the policy of this kind for ``scenario``, of those trained for ``harm_count`` if there is one.
 
-    ``universal`` is for all scenarios, ``ppo`` and ``sac`` are for the one that they were trained on, ``ppo-SCENARIO``
-    and ``sac-SCENARIO`` for that one; ``-total`` behind says that a policy was trained for total harm. ``policy`` is
-    the best of all kinds. Raises ``InvalidInput`` listing what ships.
+    ``universal`` is for all scenarios, ``universal-obstacle`` for all with an obstacle ahead; ``ppo`` and ``sac`` are
+    for the one that they were trained on, ``ppo-SCENARIO`` and ``sac-SCENARIO`` for that one; ``-total`` behind says
+    that a policy was trained for total harm. ``policy`` is the best of all kinds. Raises ``InvalidInput`` listing what
+    ships.
     """
-    names = shipped_policies()
+    names, here = shipped_policies(), None if scenario is None else scenario.name
     for each in _BEST_FIRST if kind == "policy" else ():
         with suppress(InvalidInput):
             return shipped_name(each, scenario, harm_count)
-    plain = [kind] if kind == "universal" or scenario is None else [f"{kind}-{scenario}", kind]
-    for stem in plain:
+    own = "obstacle" if scenario is not None and scenario.has_obstacle else None
+    place = own if kind == "universal" else here
+    for stem in [kind] if place is None else [f"{kind}-{place}", kind]:
         for name in (f"{stem}-total", stem) if harm_count == "total" else (stem,):
             if name in names and (
                 stem != kind
                 or kind == "universal"
                 or scenario is None
-                or load_shipped(name).manifest.scenario.get("name") == scenario
+                or load_shipped(name).manifest.scenario.get("name") == here
             ):
                 return name
-    wanted = kind if scenario is None or kind == "universal" else f"{kind} for scenario {scenario!r}"
+    wanted = kind if scenario is None or kind == "universal" else f"{kind} for scenario {here!r}"
     every = ", ".join(names) or "none"
     raise InvalidInput(
         f"shipped policy {wanted}: there is none; shipped are: {every}; each is driven as {kind}@{SHIPPED}/NAME,"
@@ -788,4 +790,4 @@ def load_named_policy(
         return load_policy(path)
     if slash:
         return load_shipped(name)
-    return load_shipped(shipped_name(kind, None if scenario is None else scenario.name, harm_count))
+    return load_shipped(shipped_name(kind, scenario, harm_count))

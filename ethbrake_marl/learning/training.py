@@ -1030,7 +1030,7 @@ class Training:
         if path != SHIPPED:
             return asked
         with suppress(InvalidInput):
-            return f"{asked}/{shipped_name(kind, self.scenario.name, self.recipe.reward.harm_count)}"
+            return f"{asked}/{shipped_name(kind, self.scenario, self.recipe.reward.harm_count)}"
         return None
 
     @property
@@ -1216,7 +1216,7 @@ def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
         )
     ships = path.partition("/")[0] == SHIPPED  # one policy for all learners
     agent: LearnedAgent | Team
-    if name == "universal" and path != SHIPPED:
+    if name == "universal" and path.partition("/universal")[0] != SHIPPED:
         raise InvalidInput(f"agent {spec!r}: must be universal@{SHIPPED}; for another policy: ppo@PATH or sac@PATH")
     if not ships and (name == "team" or (name != "universal" and RunDirectory(Path(path)).is_team)):
         agent = RunDirectory(Path(path)).load_team(settings.needed_scenario(), spec)
@@ -1225,7 +1225,7 @@ def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
     else:
         kind, known = "policy" if name == "team" else name, settings.scenario
         if path == SHIPPED:
-            path = f"{SHIPPED}/{shipped_name(kind, None if known is None else known.name, settings.harm_count)}"
+            path = f"{SHIPPED}/{shipped_name(kind, known, settings.harm_count)}"
         policy = load_named_policy(path, kind, known, settings.harm_count)
         agent = LearnedAgent(policy, name=spec if path == f"{SHIPPED}/{kind}" else f"{kind}@{path}")
     trained_by = policy.manifest.algorithm

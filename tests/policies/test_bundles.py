@@ -407,8 +407,8 @@ SCENARIO = eb.load_scenario("paper-random")
 
 @pytest.fixture
 def folder(policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A package in which four policies ship; they were trained on paper-random."""
-    for name in ("ppo", "ppo-total", "ppo-paper-distance", "universal"):
+    """A package in which five policies ship; they were trained on paper-random."""
+    for name in ("ppo", "ppo-total", "ppo-paper-distance", "universal", "universal-obstacle"):
         policy.save(tmp_path / name / "policy")
         (tmp_path / name / "card.md").write_text(f"# {name}\n")
     monkeypatch.setattr(bundle, "_FOLDER", tmp_path)
@@ -422,6 +422,8 @@ def folder(policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
         ("ppo", "paper-random", "total", "ppo-total"),
         ("ppo", "paper-distance", "total", "ppo-paper-distance"),  # better than none
         ("universal", "paper-delay-low", "first", "universal"),
+        ("universal", "paper-random-obstacle", "first", "universal-obstacle"),
+        ("policy", "paper-random-obstacle", "total", "universal-obstacle"),
         ("ppo", None, "total", "ppo-total"),
         ("policy", "paper-random", "total", "ppo-total"),
         ("policy", "paper-delay-low", "first", "universal"),
@@ -430,7 +432,7 @@ def folder(policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
 def test_shipped_name__is_by_kind_scenario_and_count(
     kind: str, scenario: str | None, harm_count: HarmCount, name: str, folder: Path
 ) -> None:
-    assert shipped_name(kind, scenario, harm_count) == name
+    assert shipped_name(kind, None if scenario is None else eb.load_scenario(scenario), harm_count) == name
 
 
 def test_lineup__takes_what_ships(folder: Path) -> None:
@@ -460,7 +462,7 @@ def test_shipped__one_for_each_of_the_three_tests_drives_alone_and_behind_its_sh
     test: str, harm_count: HarmCount
 ) -> None:
     scenario = eb.load_scenario(test)
-    name = shipped_name("ppo", test, harm_count)
+    name = shipped_name("ppo", scenario, harm_count)
     assert load_named_policy(f"shipped/{name}").manifest.scenario["name"] == test
     lineup = make_lineup(["ppo@shipped", "ppo@shipped+episode"], scenario, harm_count=harm_count)
     result = evaluate(scenario.sample(20, 7), lineup, scenario=scenario, seed=7)
@@ -503,7 +505,7 @@ def test_policy_shipped__drives_all_learners_of_a_level_of_cooperation(
 ) -> None:
     """At least as well as docs/levels.md says, by and large: level 3 collides no more often than level 2."""
     scenario = eb.load_scenario(level)
-    assert shipped_name("policy", level, "total") == f"counterfactual-{level}"
+    assert shipped_name("policy", scenario, "total") == f"counterfactual-{level}"
     assert load_named_policy(f"shipped/counterfactual-{level}").manifest.learners == tuple(
         scenario.vehicle_names[i] for i in scenario.learners
     )
@@ -518,7 +520,7 @@ def test_policy_shipped__drives_all_learners_of_a_level_of_cooperation(
 @pytest.mark.parametrize("harm_count", HARM_COUNTS)
 def test_shipped__counterfactual_does_less_harm_than_ppo(harm_count: HarmCount) -> None:
     """On worlds that are no training's: several networks and a gate, trained for this count."""
-    manifest = load_named_policy(f"shipped/{shipped_name('counterfactual', 'paper-random', harm_count)}").manifest
+    manifest = load_named_policy(f"shipped/{shipped_name('counterfactual', SCENARIO, harm_count)}").manifest
     assert manifest.reward["harm_count"] == harm_count and manifest.network.networks == 2
     specs = ["ppo@shipped", "counterfactual@shipped"]
     ppo, counterfactual = harms(SCENARIO.sample(600, 9), specs, SCENARIO, harm_count).values()
