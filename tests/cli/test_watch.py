@@ -122,6 +122,7 @@ def test_report__its_passports_can_be_replayed(ethbrake: Command) -> None:
     text = Path("r.html").read_text()
     passports = [each.partition('"')[0] for each in text.split('"passport":"')[1:]]
     assert len(passports) == len(set(passports)) == 24 and "minus episode mode" in text
+    assert "First-impact harm, which the shield bounds" in text
     for passport in (passports[0], passports[-1]):
         assert "bit for bit" in ethbrake("watch", "replay", passport).out
 

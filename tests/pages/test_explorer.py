@@ -30,7 +30,15 @@ from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_agents, make_lineup
 from ethbrake_marl.evaluation.measures import Conditions
 from ethbrake_marl.limits.limits import prove
-from ethbrake_marl.pages.explorer import MOST_BODY, Explored, explorer_page, read_state, save_state, serve_explorer
+from ethbrake_marl.pages.explorer import (
+    MOST_BODY,
+    Explored,
+    explorer_page,
+    read_state,
+    save_state,
+    serve_explorer,
+    slider_groups,
+)
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from tests.pages.conftest import AGENTS, HOST, PAGE, PORT, TOKEN, Client, Reply, check_alive, check_refused
 
@@ -171,6 +179,13 @@ def test_profile__of_an_agent_drives_as_the_agent(client: Client, state: dict[st
     commands = client.ask("profile", {"world": state, "agent": "ppo@shipped"}).json["commands"]
     *_, policy, hand = client.ask("answer", {"world": state, "profile": commands}).json["outcomes"]
     assert (hand["first"], hand["total"], hand["impacts"]) == (policy["first"], policy["total"], policy["impacts"])
+
+
+def test_sliders__are_named_by_vehicle_or_pair(scenario: Scenario) -> None:
+    groups = slider_groups(scenario, Conditions.of(scenario.sample(1, DEFAULT.LIST_SEED).worlds))
+    named = {group["field"]: group["names"] for group in groups}
+    assert (named["gaps_m"], named["restitution"]) == (["1 to 2", "2 to 3"], [""])
+    assert named["mass_t"] == ["Vehicle 1", "Vehicle 2", "Vehicle 3"]
 
 
 @pytest.mark.parametrize("number", [12, 10**9])
