@@ -136,7 +136,7 @@ def test_distance__by_hand(four: Evaluation) -> None:
 
 
 def test_distance__a_best_that_is_not_known_everywhere_realises_nothing(four: Evaluation) -> None:
-    with pytest.warns(IncompleteTable, match=r"holds 2 of these 4 worlds, and not 1 others \(25.0 %\)"):
+    with pytest.warns(IncompleteTable, match=r"holds 2 of these 4 worlds, and not the other 1 \(25.0 %\)"):
         full, agent = (row.to_json() for row in summarise(four))
     assert "(25.0 %)" in agent["best_known_warning"] and agent["best_known_warning"] == full["best_known_warning"]
     assert agent["known_best_share"] == full["known_best_share"] == 0.75
