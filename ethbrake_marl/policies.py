@@ -742,17 +742,18 @@ def shipped_policies() -> dict[str, Path]:
 def shipped_name(kind: str, scenario: Scenario | None, harm_count: HarmCount) -> str:
     """Name of the policy of this kind for ``scenario``, of those trained for ``harm_count`` if there is one.
 
-    ``universal`` is for all scenarios, ``universal-obstacle`` for all with an obstacle ahead; ``ppo`` and ``sac`` are
-    for the one that they were trained on, ``ppo-SCENARIO`` and ``sac-SCENARIO`` for that one; ``-total`` behind says
-    that a policy was trained for total harm. ``policy`` is the best of all kinds. Raises ``InvalidInput`` listing what
-    ships.
+    ``universal`` is for all scenarios, ``universal-obstacle`` for those of three vehicles with an obstacle ahead;
+    ``ppo`` and ``sac`` are for the one that they were trained on, ``ppo-SCENARIO`` and ``sac-SCENARIO`` for that one;
+    ``-total`` behind says that a policy was trained for total harm. ``policy`` is the best of all kinds. Raises
+    ``InvalidInput`` listing what ships.
     """
     names, here = shipped_policies(), None if scenario is None else scenario.name
     for each in _BEST_FIRST if kind == "policy" else ():
         with suppress(InvalidInput):
             return shipped_name(each, scenario, harm_count)
-    own = "obstacle" if scenario is not None and scenario.has_obstacle else None
-    place = own if kind == "universal" else here
+    place = here
+    if kind == "universal":  # in longer lines the one with an obstacle was far worse than ``universal``
+        place = "obstacle" if scenario is not None and scenario.has_obstacle and scenario.vehicles == 3 else None
     for stem in [kind] if place is None else [f"{kind}-{place}", kind]:
         for name in (f"{stem}-total", stem) if harm_count == "total" else (stem,):
             if name in names and (

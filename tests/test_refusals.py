@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from ethbrake_marl import errors
 from ethbrake_marl.cli.app import run_command
 
 WRITES = "REFUSALS_ARE_WRITTEN"
@@ -83,6 +84,7 @@ def answer(case: Case) -> str:
         assert not told, f"{code}: {told}"
     before = {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()}
     told = carry_out(case.done[-1], names)
+    assert told.startswith("ethbrake: ") or hasattr(errors, told.partition(":")[0]), told  # no defect is a refusal
     assert {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()} == before
     return told.replace(str(Path().resolve()), "HERE")
 

@@ -424,6 +424,7 @@ def folder(policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
         ("universal", "paper-delay-low", "first", "universal"),
         ("universal", "paper-random-obstacle", "first", "universal-obstacle"),
         ("policy", "paper-random-obstacle", "total", "universal-obstacle"),
+        ("universal", "cooperation-4-five", "total", "universal"),
         ("ppo", None, "total", "ppo-total"),
         ("policy", "paper-random", "total", "ppo-total"),
         ("policy", "paper-delay-low", "first", "universal"),

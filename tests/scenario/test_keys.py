@@ -120,6 +120,7 @@ def test_friction__of_some_members_of_a_mixture() -> None:
     assert set(braking[:, 1].tolist()) == {7.0, 9.81 * 0.4}
     told = QUANTITY.columns(worlds)  # no friction is told for all: then the capacities are what the road allows
     assert "friction" not in told and (told["braking_capacity_2_mps2"] == braking[:, 1]).all()
+    assert [state["braking_capacity_2_mps2"] for state in states_of(worlds, mixed)] == braking[:, 1].tolist()
 
 
 def test_friction__the_proof_reads_what_the_road_allows() -> None:
