@@ -48,9 +48,11 @@ from ethbrake_marl.physics import (
     columns,
     command_in_force,
     compiled,
+    force_at,
     hear_rows,
     leaving_out_failed,
     onset_s,
+    place_forces,
     place_obstacle,
     stands,
     step_end_s,
@@ -158,10 +160,10 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     column = columns(state)
     speed, command, previous, gap, harm = column.speed, column.command, column.previous, column.gap, column.harm
     braking, driving, latency, mass, limit = column.braking, column.driving, column.latency, column.mass, column.limit
-    P, obstacle = N - 1, column.obstacle
+    P, obstacle, brake_rate, release_rate = N - 1, column.obstacle, column.brake_rate, column.release_rate
     worst, worst_status = -1, FLAG.DONE
     at = 1 if state.shape[1] > obstacle else 0  # vehicle i stands in column at + i, behind an obstacle
-    table = np.zeros((ROW.OF_SEGMENT, N + at))
+    table = np.zeros((ROW.OF_BUILD_UP, N + at))
     for k in range(n):
         if clock[k, ENDED] == 1.0:
             for f in range(OUTCOME_ROWS):
@@ -185,7 +187,10 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
             table[ROW.LIMIT, at + i] = params[k, limit + i]
             table[ROW.ONSET, at + i] = onset_s(params[k, latency + i], time)
             state[k, previous + i] = state[k, command + i]
-            state[k, command + i] = command_in_force(wanted[k, i], params[k, latency + i], until)
+        place_forces(
+            table, state[k, command : command + N], params[k, brake_rate : brake_rate + N],
+            params[k, release_rate : release_rate + N],
+        )  # fmt: skip
         for p in range(P):
             table[ROW.GAP, at + p] = state[k, gap + p]
             table[ROW.HIT, at + p] = state[k, gap + P + p]
@@ -199,14 +204,15 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
             clock[k, ENDED] = 1.0
             clock[k, STEP] -= 1.0
             for i in range(N):
-                state[k, command + i] = state[k, previous + i]
                 reward[k, i] = 0.0
             continue
         state[k, column.time] = until
         at_rest = True
         for i in range(N):
             state[k, speed + i] = table[ROW.SPEED, at + i]
-            at_rest = at_rest and stands(table[ROW.SPEED, at + i], wanted[k, i])
+            in_force = force_at(table, at + i, command_in_force(wanted[k, i], params[k, latency + i], until))
+            state[k, command + i] = in_force
+            at_rest = at_rest and stands(table[ROW.SPEED, at + i], max(wanted[k, i], in_force))
         impacts, first_harm, total_harm = 0.0, 0.0, 0.0
         if at == 1 and state[k, obstacle] < math.inf:
             state[k, obstacle] = table[ROW.GAP, 0]

@@ -48,6 +48,7 @@ from ethbrake_marl.physics import (
     forecast_contacts,
     make_worlds,
     place_obstacle,
+    place_rates,
     stopping_distance,
 )
 
@@ -456,16 +457,19 @@ def _observe_contacts(
         of.vehicles,
         1 if state.shape[1] > of.obstacle else 0,
     )  # vehicle i stands in column at + i, behind an obstacle
-    line, table = np.zeros((ROW.OF_SEGMENT, N + at)), np.zeros((ROW.OF_SEGMENT, N + at))
+    line, table = np.zeros((ROW.OF_BUILD_UP, N + at)), np.zeros((ROW.OF_BUILD_UP, N + at))
     found, value = np.zeros((CONTACT.WIDTH, N + at)), np.zeros(_OF_COMMAND + _FAR)
     for k in range(out.shape[0]):
         for o in range(observers.shape[0]):
             i = observers[o]
             first, last = _place_known(line, state, params, k, i, at)
+            brake_rate, release_rate = of.brake_rate, of.release_rate
+            place_rates(table, params[k, brake_rate : brake_rate + N], params[k, release_rate : release_rate + N])
             for c in commands:
                 for j in range(N + at):
                     for row in (ROW.SPEED, ROW.COMMAND, ROW.MASS, ROW.LIMIT, ROW.ONSET, ROW.GAP, ROW.HIT):
                         table[row, j] = line[row, j]
+                    table[ROW.FORCE, j] = line[ROW.FORCE, j]
                 table[ROW.COMMAND, at + i] = 0.0
                 if c == 0:
                     table[ROW.COMMAND, at + i] = -params[k, of.braking + i]
@@ -508,6 +512,9 @@ def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, a
         if j == i or in_force == 0.0:
             table[ROW.ONSET, at + j] = max(params[k, own_part + j] - time, 0.0)
             table[ROW.COMMAND, at + j] = -params[k, braking + j] if known else 0.0
+        elif known and state[k, of.previous + j] > in_force and params[k, of.brake_rate + j] < math.inf:
+            table[ROW.COMMAND, at + j] = -params[k, braking + j]
+        table[ROW.FORCE, at + j] = in_force if known else 0.0
         if j < N - 1:
             table[ROW.GAP, at + j] = state[k, gap + j] if first <= j < last else BOUND.FAR_AWAY_M
             table[ROW.HIT, at + j] = state[k, gap + N - 1 + j]

@@ -32,6 +32,7 @@ from ethbrake_marl.physics import (
     follow_whole,
     grid_of,
     harm_so_far,
+    place_rates,
     restore,
     save,
     step_again,
@@ -440,6 +441,8 @@ class ProfileProblem(NamedTuple):
     latency: Floats  # [n, N]
     mass: Floats  # [n, N]
     limit: Floats  # [n, N]
+    brake_rate: Floats  # [n, N] m/s3
+    release_rate: Floats  # [n, N]
     identity: UInt64s  # [n]
 
     @property
@@ -654,9 +657,10 @@ def profile_problem(
     bounds = np.stack([-v.braking_capacity_mps2[:, chosen], v.driving_capacity_mps2[:, chosen]], axis=2)
     after, impacts = advance(worlds, command, until_s=first)
     start = [after.speeds_mps, after.gaps_m, after.pair_hit, impacts.first_impact_harm, impacts.total_harm]
+    start += [after.command_mps2] if v.build_up.any() else []
     return ProfileProblem(
         chosen, np.concatenate(start, axis=1), clock, np.ascontiguousarray(bounds), command, v.latency_s, v.mass_t,
-        v.speed_limit_mps, identities(worlds, command, clock, chosen),
+        v.speed_limit_mps, v.brake_rate_mps3, v.release_rate_mps3, identities(worlds, command, clock, chosen),
     )  # fmt: skip
 
 
@@ -674,13 +678,18 @@ def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -
         state[:, [column.time]],
         state[:, column.speed : column.command],
         state[:, column.gap : column.harm],
-        params[:, : column.own_latency],  # the news of others changes no harm
+        params[:, : column.brake_rate],  # the news of others changes no harm
         command,
         clock[:, [CLOCK.START, CLOCK.TIME_STEP, CLOCK.LAST_STEP, CLOCK.HORIZON]],
         who,
     ]
     rows = np.ascontiguousarray(np.concatenate(parts, axis=1) + 0.0, "<f8")  # + 0.0: one zero, not two
-    digests = [hashlib.blake2b(row.tobytes(), digest_size=8).digest() for row in rows]
+    slow = worlds.vehicles.build_up  # others have the names that they had before there were rates
+    forces = np.concatenate([state[:, column.command : column.previous], params[:, column.brake_rate : column.own_latency]], 1)
+    digests = [
+        hashlib.blake2b(row.tobytes() + (forces[k].tobytes() if slow[k] else b""), digest_size=8).digest()
+        for k, row in enumerate(rows)
+    ]
     return np.frombuffer(b"".join(digests), "<u8").astype(np.uint64)
 
 
@@ -746,10 +755,11 @@ Found = tuple[Profiles, dict[HarmCount, Floats]]
 def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> SearchWorld:
     """The surroundings of world k, with room to work in; ``random`` [n]: the states of all worlds' random numbers."""
     N = problem.mass.shape[1]
-    table = np.zeros((ROW.OF_EPISODE, N))
+    table = np.zeros((ROW.OF_BUILD_UP, N))
     for i in range(N):
         table[ROW.COMMAND, i], table[ROW.LATENCY, i] = problem.command[k, i], problem.latency[k, i]
         table[ROW.MASS, i], table[ROW.LIMIT, i] = problem.mass[k, i], problem.limit[k, i]
+    place_rates(table, problem.brake_rate[k], problem.release_rate[k])
     return SearchWorld(Episode(table, problem.clock[k].copy(), problem.vehicles), problem.bounds[k], random[k : k + 1])
 
 

@@ -170,6 +170,7 @@ class Ranges:
                 tells better than a message from before.
 
         """
+        worlds.refuse_build_up(":believed")
         vehicle, (n, N) = self.vehicle, worlds.speeds_mps.shape
         told, own, v = Told.to(worlds, vehicle), np.arange(N) == vehicle, worlds.vehicles
         given = {"mass_t": v.mass_t, "braking_capacity_mps2": v.braking_capacity_mps2,

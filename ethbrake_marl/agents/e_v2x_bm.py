@@ -46,10 +46,12 @@ from ethbrake_marl.physics import (
     Worlds,
     accelerate,
     advance,
+    builds_up,
     by_parts,
     compiled,
     move_apart,
     onset_s,
+    place_forces,
     place_obstacle,
     record_impacts,
     resolve_impacts,
@@ -397,8 +399,14 @@ def optimise_pairwise(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
     vehicle of a line have one pair; pairs further away (N > 3) are not looked at. Needs the gaps, speeds,
     capacities and latencies of the vehicle and its two neighbours, nothing else.
 
-    Raises ``InvalidInput`` if ``vehicle`` is not in the line or a vehicle moves backward.
+    Raises ``InvalidInput`` if ``vehicle`` is not in the line, a vehicle moves backward or brakes build up.
     """
+    worlds.refuse_build_up("E-V2X-BM's closed form")
+    return _closed_form(worlds, vehicle)
+
+
+def _closed_form(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
+    """The optimum were every acceleration there at once."""
     onset, capacity = _onset_s(worlds, vehicle), worlds.vehicles.braking_capacity_mps2
     at, out = np.empty((worlds.n, CANDIDATES)), np.empty((4, worlds.n))
     optimise_worlds(worlds.gaps_m, worlds.speeds_mps, capacity, onset, vehicle, at, out)
@@ -410,8 +418,10 @@ def pairwise_harm(worlds: Worlds, deceleration_mps2: ArrayLike) -> Floats:
     """Predicted harm of each pair on its own, [n, P] (m2/s2), under constant decelerations [n, N].
 
     Every vehicle coasts to its latency and then brakes to rest. The prediction of E-V2X-BM is the sum over the
-    controlled vehicle's pairs. Raises ``InvalidInput`` for a deceleration that is negative or not finite.
+    controlled vehicle's pairs. Raises ``InvalidInput`` for a deceleration that is negative or not finite, and where
+    brakes build up.
     """
+    worlds.refuse_build_up("E-V2X-BM's closed form")
     onset = _onset_s(worlds, 0)
     deceleration = np.array(np.broadcast_to(np.asarray(deceleration_mps2, np.float64), worlds.speeds_mps.shape))
     good = (deceleration >= 0.0) & np.isfinite(deceleration)
@@ -591,7 +601,7 @@ _DIGIT = 1_000.0  # impacts of a pair that are told apart
 class Line(NamedTuple):
     """One world as candidates run in it, in tables of ``physics.kernel``; an obstacle ahead stands in column 0."""
 
-    start: Floats  # [ROW.OF_SEGMENT, N or N + 1] with everybody's command but that of the controlled vehicle
+    start: Floats  # [ROW.OF_BUILD_UP, N or N + 1] with everybody's command but that of the controlled vehicle
     shared: Floats  # the same where that vehicle's command takes effect
     table: Floats  # room
     clock: Floats  # [3] length of a simulation, restitution, time from the start to ``shared``
@@ -605,12 +615,14 @@ class Line(NamedTuple):
 @compiled(apart=True)
 def make_line(
     gap: Floats, speed: Floats, hit: Bools, obstacle: float, obstacle_hit: bool, command: Floats, latency: Floats,
-    mass: Floats, limit: Floats, time: float, restitution: float, horizon: float, vehicle: int, total: bool,
+    mass: Floats, limit: Floats, in_force: Floats, brake_rate: Floats, release_rate: Floats, time: float,
+    restitution: float, horizon: float, vehicle: int, total: bool,
 ) -> Line:  # fmt: skip
     """One world at its ``time``, ready for ``share_start``; an ``obstacle`` that is finitely far is in it."""
     at = 1 if obstacle < math.inf else 0
     vehicles = speed.shape[0]
-    table = np.zeros((ROW.OF_SEGMENT, vehicles + at))
+    table = np.zeros((ROW.OF_BUILD_UP, vehicles + at))
+    place_forces(table, in_force, brake_rate, release_rate)
     if at == 1:
         place_obstacle(table, obstacle, 1.0 if obstacle_hit else 0.0)
         table[ROW.ONSET, 0] = onset_s(0.0, time)
@@ -694,6 +706,7 @@ def _copy_state(of: Floats, table: Floats) -> None:
     for i in range(vehicles):
         table[ROW.SPEED, i] = of[ROW.SPEED, i]
         table[ROW.ACTIVE, i] = of[ROW.ACTIVE, i]
+        table[ROW.FORCE, i] = of[ROW.FORCE, i]
     for p in range(vehicles - 1):
         table[ROW.GAP, p] = of[ROW.GAP, p]
         table[ROW.CONTACT_SPEED, p] = of[ROW.CONTACT_SPEED, p]
@@ -715,7 +728,7 @@ def copy_table(one: Floats, other: Floats) -> None:
 def will_stay_apart(table: Floats) -> bool:
     """Whether surely no pair has another impact, however long everybody's command goes on; False when not sure.
 
-    All commands are in effect, brake or coast, and nobody moves backward. Every vehicle then keeps the acceleration it
+    All commands are in full effect, brake or coast, and nobody moves backward. Every vehicle then keeps the acceleration it
     has (that of its body, where some rest against each other) until it stands. A pair of front ``f`` and rear ``r``
     with gap g, closing speed w and decelerations d has no impact where
 
@@ -728,6 +741,8 @@ def will_stay_apart(table: Floats) -> bool:
     vehicles, hardest = table.shape[1], 0.0
     for i in range(vehicles):
         if table[ROW.ACTIVE, i] == 0.0 or table[ROW.COMMAND, i] > 0.0 or table[ROW.SPEED, i] < 0.0:
+            return False
+        if builds_up(table) and table[ROW.FORCE, i] != table[ROW.COMMAND, i]:
             return False
         hardest = max(hardest, -table[ROW.COMMAND, i])
     for p in range(vehicles - 1):  # what surely meets is soon told
@@ -1087,7 +1102,7 @@ def optimise_coupled(
     braking = np.where(command < 0.0, -command, capacity)
     braking[:, vehicle] = capacity[:, vehicle]
     told = replace(worlds, vehicles=replace(worlds.vehicles, braking_capacity_mps2=braking))
-    best = optimise_pairwise(told, vehicle).deceleration_mps2
+    best = _closed_form(told, vehicle).deceleration_mps2  # where brakes build up, no more than a first guess
     command[:, vehicle] = -best
     _, impacts = advance(worlds, command, until_s=horizon_s)
     first = impacts.first_impact_harm.sum(axis=1) + impacts.obstacle_first_harm
@@ -1109,7 +1124,7 @@ def _minimise(
     lines = (
         worlds.gaps_m, worlds.speeds_mps, worlds.time_s, worlds.pair_hit, worlds.obstacle_gap_m, worlds.obstacle_hit,
         command, told.vehicles.braking_capacity_mps2, _onset_s(worlds, vehicle), v.latency_s, v.mass_t,
-        v.speed_limit_mps, v.restitution,
+        v.speed_limit_mps, worlds.command_mps2, v.brake_rate_mps3, v.release_rate_mps3, v.restitution,
     )  # fmt: skip
     question = hashlib.sha256(repr((vehicle, harm_count, horizon_s, worlds.speeds_mps.shape)).encode())
     for column in (rows, *lines):
@@ -1139,8 +1154,8 @@ def _minimise(
 @compiled
 def _search_worlds(
     gaps: Floats, speeds: Floats, time: Floats, hit: Bools, obstacle: Floats, obstacle_hit: Bools, command: Floats,
-    capacity: Floats, onset: Floats, latency: Floats, mass: Floats, limit: Floats, restitution: Floats, vehicle: int,
-    rows: Ints, total: bool, horizon: float, found: Floats, status: Ints,
+    capacity: Floats, onset: Floats, latency: Floats, mass: Floats, limit: Floats, in_force: Floats, brake_rate: Floats,
+    release_rate: Floats, restitution: Floats, vehicle: int, rows: Ints, total: bool, horizon: float, found: Floats, status: Ints,
 ) -> None:  # fmt: skip
     """Fill ``found`` [3, m] and ``status`` [m] for worlds ``rows`` [m]."""
     room, at, best = make_room(), np.empty(CANDIDATES), np.empty(3)
@@ -1148,7 +1163,7 @@ def _search_worlds(
         k = rows[m]
         line = make_line(
             gaps[k], speeds[k], hit[k], obstacle[k], obstacle_hit[k], command[k], latency[k], mass[k], limit[k],
-            time[k], restitution[k], horizon, vehicle, total,
+            in_force[k], brake_rate[k], release_rate[k], time[k], restitution[k], horizon, vehicle, total,
         )  # fmt: skip
         find_breakpoints(at, vehicle, gaps[k], speeds[k], capacity[k], onset[k])
         status[m] = search_line(line, room, at, capacity[k, vehicle], best)

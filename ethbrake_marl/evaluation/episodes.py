@@ -75,7 +75,8 @@ class EpisodeMotion:
     """One world from the alert to the end of its episode, driven by one agent."""
 
     world: Worlds  # n = 1, at the alert
-    pieces: Floats  # [k, 1 + N + 2 N] time (s), place of Vehicle 1 (m), gaps, speeds, accelerations where each begins
+    # [k, 1 + 4 N] time (s), place of Vehicle 1 (m), gaps, speeds, accelerations and jerks where each begins
+    pieces: Floats
     end_s: float
     impacts: ImpactRows  # in order of time; world is 0
     stepped_in_s: Floats  # beginnings of the decisions in which a shield replaced what was proposed
@@ -172,7 +173,7 @@ class _Follower(Tape):
                 way_m[k] += way
         w = self.worlds
         standing = np.concatenate(
-            [w.time_s[:, np.newaxis], np.zeros((w.n, 1)), w.gaps_m, w.speeds_mps, 0.0 * w.speeds_mps], axis=1
+            [w.time_s[:, np.newaxis], np.zeros((w.n, 1)), w.gaps_m, w.speeds_mps, np.zeros((w.n, 2 * w.N))], axis=1
         )
         return [np.concatenate(each) if each else standing[[k]] for k, each in enumerate(parts)]
 
@@ -189,12 +190,13 @@ def join_pieces(pieces: Floats, vehicles: int) -> Floats:
 
 
 def state_at(piece: Floats, time_s: float, vehicles: int) -> Floats:
-    """Place of Vehicle 1, gaps, speeds and accelerations [3 N] at a time of a piece [1 + 3 N]."""
+    """Place of Vehicle 1, gaps, speeds, accelerations and jerks [4 N] at a time of a piece [1 + 4 N]."""
     t, N = time_s - piece[0], vehicles
-    speeds, accelerations = piece[1 + N : 1 + 2 * N], piece[1 + 2 * N :]
-    way = (speeds + 0.5 * accelerations * t) * t
+    speeds, rates, jerks = (piece[1 + part * N : 1 + (part + 1) * N] for part in (1, 2, 3))
+    way = (speeds + 0.5 * (rates + jerks * t / 3.0) * t) * t
     gaps = piece[2 : 1 + N] + way[:-1] - way[1:]
-    return np.concatenate([[piece[1] + way[0]], gaps, speeds + accelerations * t, accelerations])
+    after = speeds + (rates + 0.5 * jerks * t) * t
+    return np.concatenate([[piece[1] + way[0]], gaps, after, rates + jerks * t, jerks])
 
 
 # One episode at fine time resolution: what a figure or a viewer draws.

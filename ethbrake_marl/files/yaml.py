@@ -276,7 +276,14 @@ class _Reader:
 # One clear message for whatever pydantic found: where, value, what would be right. No other file words its errors.
 
 # Ending of a key -> the unit in words.
-UNITS = {"s": "seconds", "m": "metres", "mps": "metres per second", "mps2": "metres per second squared", "t": "tonnes"}
+UNITS = {
+    "s": "seconds",
+    "m": "metres",
+    "mps": "metres per second",
+    "mps2": "metres per second squared",
+    "mps3": "metres per second cubed",
+    "t": "tonnes",
+}
 _RIGHT = {
     "finite_number": "must be a finite number",
     "int_type": "must be a whole number, written without a decimal point or an exponent",

@@ -689,6 +689,8 @@ def prove(worlds: Worlds, task: Task) -> Proof | Unproven:
 
 def unproven_because(worlds: Worlds, task: Task) -> str | None:
     """Why nothing is proven for the task in these worlds, as a clause; None when it is."""
+    if worlds.vehicles.build_up.any():
+        return "brakes build up; nothing is proven then"
     if not _is_team(task):
         return undecided_because(worlds, task)
     return _script_because(task, "harm is bounded")
@@ -697,6 +699,8 @@ def unproven_because(worlds: Worlds, task: Task) -> str | None:
 def undecided_because(worlds: Worlds, task: Task) -> str | None:
     """Why it is not decided in these worlds whether contact can be avoided, as a clause; None when it is."""
     scenario, names = task.scenario, task.scenario.vehicle_names
+    if worlds.vehicles.build_up.any():
+        return "brakes build up; nothing is proven then"
     if not task.vehicles or (len(task.vehicles) > 1 and set(task.vehicles) not in _DECIDED):
         return f"driven are: {task.names}; avoidability is proven for one vehicle"
     if scenario.vehicles != _VEHICLES:
@@ -707,7 +711,8 @@ def undecided_because(worlds: Worlds, task: Task) -> str | None:
     if because is not None:
         return because
     latency_s = worlds.vehicles.latency_s
-    way_m = stopping_distances(worlds.speeds_mps[:, 0], latency_s[:, 0], worlds.vehicles.braking_capacity_mps2[:, 0])
+    first = (each[:, 0] for each in (worlds.vehicles.braking_capacity_mps2, worlds.vehicles.brake_rate_mps3))
+    way_m = stopping_distances(worlds.speeds_mps[:, 0], latency_s[:, 0], *first)
     if not (way_m < worlds.obstacle_gap_m).all():
         return "vehicle_1 reaches the obstacle ahead by itself; nothing is proven then"
     if (latency_s[:, 0] > latency_s[:, _DRIVEN]).any():

@@ -391,11 +391,13 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
     the controlled one acts, a vehicle that moves backward, or an obstacle (``obstacle_gap_m``) that vehicle_1 could
     reach before any contact.
     """
+    worlds.refuse_build_up("avoidability")
     # An obstacle that Vehicle 1 cannot reach by braking fully changes nothing: only a push could bring it there, and
     # that is an impact already.
     check_whole_number("avoidability: vehicle", vehicle, 0, worlds.N - 1)
     own = np.maximum(worlds.vehicles.latency_s[:, 0] - worlds.time_s, 0.0)
-    way = stopping_distances(worlds.speeds_mps[:, 0], own, worlds.vehicles.braking_capacity_mps2[:, 0])
+    v = worlds.vehicles
+    way = stopping_distances(worlds.speeds_mps[:, 0], own, v.braking_capacity_mps2[:, 0], v.brake_rate_mps3[:, 0])
     _refuse(
         ~(way < worlds.obstacle_gap_m),
         worlds.obstacle_gap_m,
@@ -418,7 +420,6 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
         _refuse(latency[:, 0] > latency[:, 1], worlds.vehicles.latency_s[:, 0], "latency_s", 0, "not above vehicle_2's")
     for i in range(worlds.N):
         _refuse(~(worlds.speeds_mps[:, i] >= 0.0), worlds.speeds_mps[:, i], "speeds_mps", i, ">= 0")
-    v = worlds.vehicles
     onset = np.maximum(v.latency_s - worlds.time_s[:, None], 0.0)
     out = np.empty((worlds.n, RESULT_WIDTH))
     decide_worlds(
@@ -1486,6 +1487,7 @@ def _at_onset(
 
     And the pairs whose next impact counts, and which move forward, [n, P].
     """
+    worlds.refuse_build_up(where)
     start = np.maximum(worlds.vehicles.latency_s[:, vehicles].min(axis=1), worlds.time_s)
     if not (np.all(start <= horizon_s) and horizon_s < np.inf):
         raise InvalidInput(f"{where}: horizon_s {horizon_s!r}: must be finite and at least {start.max():g} s")
@@ -1932,7 +1934,7 @@ def _combined_bound_of_line(
     act from now on. ``pairs`` [n, 2] are the bounds of both pairs alone.
     """
     v = now.vehicles
-    stops = stopping_distances(now.speeds_mps[:, 0], onset[:, 0], v.braking_capacity_mps2[:, 0]) < now.obstacle_gap_m
+    stops = stopping_distances(now.speeds_mps[:, 0], onset[:, 0], v.braking_capacity_mps2[:, 0], v.brake_rate_mps3[:, 0]) < now.obstacle_gap_m
     rows = np.flatnonzero((onset[:, 0] <= 0.0) & counts[:, 0] & counts[:, 1] & stops & ~now.obstacle_hit)
     # The first three vehicles of these worlds, Vehicle 2 free to act at once.
     some = now.take(rows)

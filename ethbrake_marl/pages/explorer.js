@@ -192,7 +192,7 @@ class Explorer {
     const { world, outcomes, grid } = this.found;
     const best = this.bestKnown();
     const episodes = [...world.episodes, ...(this.best ? [{ ...best.episode }] : [])];
-    for (const episode of episodes) if (typeof episode.pieces === "string") episode.pieces = decodePieces(episode.pieces, this.data.vehicles);
+    for (const episode of episodes) if (typeof episode.pieces === "string") episode.pieces = decodePieces(episode.pieces, this.data.vehicles, episode.jerks);
     const shown = { ...world, episodes };
     if (!this.player) {
       const agents = [...this.data.agents, "by hand", "best known"];

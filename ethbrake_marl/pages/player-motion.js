@@ -1,14 +1,15 @@
 "use strict";
-// Exact motion: an episode is a list of pieces of constant acceleration, 1 + 3 N numbers each: the time at which it
-// begins, the place of Vehicle 1, the gaps, the speeds and the accelerations. Nothing here touches the page.
+// Exact motion: an episode is a list of pieces of constant jerk, 1 + 3 N numbers each: the time at which it begins, the
+// place of Vehicle 1, the gaps, the speeds and the accelerations; with N jerks more where brakes build up. Nothing here
+// touches the page.
 
 const BODY_M = 4.5; // drawn length; the physics knows none
 const FLASH_S = 0.3; // how long an impact is shown
 
-function decodePieces(text, vehicles) {
+function decodePieces(text, vehicles, jerks) {
   const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
   const view = new DataView(bytes.buffer);
-  const width = 1 + 3 * vehicles;
+  const width = 1 + (jerks ? 4 : 3) * vehicles;
   const pieces = [];
   for (let at = 0; at < bytes.length; at += 8 * width) {
     const n = (k) => view.getFloat64(at + 8 * k, true);
@@ -19,6 +20,7 @@ function decodePieces(text, vehicles) {
       gaps: some(2, vehicles - 1),
       speeds: some(1 + vehicles, vehicles),
       accelerations: some(1 + 2 * vehicles, vehicles),
+      jerks: jerks ? some(1 + 3 * vehicles, vehicles) : null,
     });
   }
   return pieces;
@@ -38,12 +40,13 @@ function lastBegun(list, time, timeOf) {
 
 function moveOn(piece, time) {
   const t = time - piece.time;
-  const ways = piece.speeds.map((v, i) => (v + 0.5 * piece.accelerations[i] * t) * t);
+  const jerkOf = (i) => (piece.jerks === null ? 0 : piece.jerks[i]);
+  const ways = piece.speeds.map((v, i) => (v + 0.5 * (piece.accelerations[i] + (jerkOf(i) * t) / 3) * t) * t);
   return {
     front: piece.front + ways[0],
     gaps: piece.gaps.map((gap, p) => Math.max(gap + ways[p] - ways[p + 1], 0)),
-    speeds: piece.speeds.map((v, i) => v + piece.accelerations[i] * t),
-    accelerations: piece.accelerations,
+    speeds: piece.speeds.map((v, i) => v + (piece.accelerations[i] + 0.5 * jerkOf(i) * t) * t),
+    accelerations: piece.accelerations.map((a, i) => a + jerkOf(i) * t),
   };
 }
 
@@ -103,7 +106,8 @@ function restOf(episode) {
   return last.speeds.every((v) => v === 0) ? last.time : episode.end;
 }
 
-// Curves as SVG paths, exact: gaps are quadratics, speeds straight lines, accelerations steps.
+// Curves as SVG paths, exact: gaps are quadratics, speeds straight lines, accelerations steps; where brakes build up
+// each is one degree higher.
 function curves(episode, until, x, y, vehicles) {
   const gaps = Array.from({ length: vehicles - 1 }, () => "");
   const speeds = Array.from({ length: vehicles }, () => "");
@@ -117,15 +121,22 @@ function curves(episode, until, x, y, vehicles) {
     const after = moveOn(piece, end);
     const go = k === 0 ? "M" : "L";
     gaps.forEach((_, p) => {
-      const middle = piece.gaps[p] + ((piece.speeds[p] - piece.speeds[p + 1]) * t) / 2;
       gaps[p] += `${go}${pair(piece.time, piece.gaps[p], y.gap)}`;
+      if (piece.jerks !== null) {
+        const early = piece.gaps[p] + ((piece.speeds[p] - piece.speeds[p + 1]) * t) / 3;
+        const late = after.gaps[p] - ((after.speeds[p] - after.speeds[p + 1]) * t) / 3;
+        gaps[p] += `C${pair(piece.time + t / 3, early, y.gap)} ${pair(end - t / 3, late, y.gap)} ${pair(end, after.gaps[p], y.gap)}`;
+        return;
+      }
+      const middle = piece.gaps[p] + ((piece.speeds[p] - piece.speeds[p + 1]) * t) / 2;
       gaps[p] += `Q${pair(piece.time + t / 2, middle, y.gap)} ${pair(end, after.gaps[p], y.gap)}`;
     });
     speeds.forEach((_, i) => {
       const v = piece.speeds[i];
-      speeds[i] += `${go}${pair(piece.time, v, y.speed)}L${pair(end, after.speeds[i], y.speed)}`;
       const a = piece.accelerations[i];
-      accelerations[i] += `${go}${pair(piece.time, a, y.acceleration)}L${pair(end, a, y.acceleration)}`;
+      const bend = piece.jerks === null ? "L" : `Q${pair(piece.time + t / 2, v + (a * t) / 2, y.speed)} `;
+      speeds[i] += `${go}${pair(piece.time, v, y.speed)}${bend}${pair(end, after.speeds[i], y.speed)}`;
+      accelerations[i] += `${go}${pair(piece.time, a, y.acceleration)}L${pair(end, after.accelerations[i], y.acceleration)}`;
     });
   });
   return { gap: gaps, speed: speeds, acceleration: accelerations };

@@ -26,7 +26,9 @@ from ethbrake_marl.physics.kernel import (
     ROW,
     advance_table,
     command_in_force,
+    force_at,
     onset_s,
+    place_forces,
     place_obstacle,
     solo_motion,
 )
@@ -131,6 +133,8 @@ class Columns(NamedTuple):
     latency: int  # N
     mass: int  # N
     limit: int  # N
+    brake_rate: int  # N
+    release_rate: int  # N
     own_latency: int  # the width without news by link; else N
     news: int  # N * N: from when on vehicle i acts on news of vehicle j
     messages: int  # the width without periodic messages
@@ -141,10 +145,10 @@ OBSTACLE_WIDTH = 5
 
 def _columns_of(vehicles: int) -> Columns:
     N, P = vehicles, vehicles - 1
-    gap, news = 1 + 3 * N, 1 + 6 * N
+    gap, news = 1 + 3 * N, 1 + 8 * N
     return Columns(
         N, 0, 1, 1 + N, 1 + 2 * N, gap, gap + P, gap + 2 * P, gap + 5 * P,
-        0, 1, 1 + N, 1 + 2 * N, 1 + 3 * N, 1 + 4 * N, 1 + 5 * N, news, news + N * N,
+        0, 1, 1 + N, 1 + 2 * N, 1 + 3 * N, 1 + 4 * N, 1 + 5 * N, 1 + 6 * N, 1 + 7 * N, news, news + N * N,
     )  # fmt: skip
 
 
@@ -162,7 +166,7 @@ class Packed(NamedTuple):
     """Worlds by rows."""
 
     state: Floats  # [n, S]
-    params: Floats  # [n, 1 + 5 N], [n, 1 + 6 N + N * N] or, with M columns of messages, [n, 1 + 6 N + N * N + M]
+    params: Floats  # [n, 1 + 7 N], [n, 1 + 8 N + N * N] or, with M columns of messages, [n, 1 + 8 N + N * N + M]
 
     @classmethod
     def of(cls, worlds: Worlds) -> Packed:
@@ -175,7 +179,7 @@ class Packed(NamedTuple):
         ]  # fmt: skip
         params = [
             v.restitution[:, np.newaxis], v.braking_capacity_mps2, v.driving_capacity_mps2, v.latency_s, v.mass_t,
-            v.speed_limit_mps,
+            v.speed_limit_mps, v.brake_rate_mps3, v.release_rate_mps3,
         ]  # fmt: skip
         if not v.is_known_at_once or worlds.messages.shape[1] > 0:
             params += [v.own_latency_s, v.known_from_s.reshape(n, N * N), worlds.messages]
@@ -235,13 +239,16 @@ class Packed(NamedTuple):
 
     def _vehicles(self) -> Vehicles:
         params, column = self.params, self.column
-        ends = (column.braking, column.driving, column.latency, column.mass, column.limit, column.own_latency)
-        braking, driving, latency, mass, limit = (params[:, begin:end].copy() for begin, end in pairwise(ends))
+        ends = (
+            column.braking, column.driving, column.latency, column.mass, column.limit, column.brake_rate,
+            column.release_rate, column.own_latency,
+        )  # fmt: skip
+        braking, driving, latency, mass, limit, *rates = (params[:, begin:end].copy() for begin, end in pairwise(ends))
         restitution = params[:, column.restitution].copy()
         if not self.has_news:
-            return Vehicles.at_once(braking, driving, latency, mass, limit, restitution)
+            return Vehicles.at_once(braking, driving, latency, mass, limit, restitution, *rates)
         own = params[:, column.own_latency : column.news].copy()
-        return Vehicles(braking, driving, latency, mass, limit, restitution, own, self.known_from_s)
+        return Vehicles(braking, driving, latency, mass, limit, restitution, *rates, own, self.known_from_s)
 
     @property
     def known_from_s(self) -> Floats:
@@ -270,7 +277,7 @@ def advance_worlds(
     gaps: Floats, speeds: Floats, time: Floats, hit: Bools, in_force: Floats, ahead: Floats, ahead_hit: Bools,
     first_harm: Floats, total_harm: Floats, count: Ints, ahead_first: Floats, ahead_total: Floats, ahead_count: Ints,
     command: Floats, until: Floats, braking: Floats, driving: Floats, latency: Floats, mass: Floats, limit: Floats,
-    restitution: Floats, failed: Ints, at: int, rows: Floats,
+    restitution: Floats, brake_rate: Floats, release_rate: Floats, failed: Ints, at: int, rows: Floats,
 ) -> tuple[int, bool]:  # fmt: skip
     """Advance every world to its ``until``, in place (the first seven arrays), and fill its harm (the next six).
 
@@ -280,7 +287,7 @@ def advance_worlds(
     and stays where it was; the others go on.
     """
     n, vehicles = speeds.shape
-    table = np.zeros((ROW.OF_SEGMENT, at + vehicles))
+    table = np.zeros((ROW.OF_BUILD_UP, at + vehicles))
     recorded = 0
     for k in range(n):
         duration = until[k] - time[k]
@@ -297,10 +304,10 @@ def advance_worlds(
             table[ROW.MASS, at + i] = mass[k, i]
             table[ROW.LIMIT, at + i] = limit[k, i]
             table[ROW.ONSET, at + i] = onset_s(latency[k, i], time[k])
-            in_force[k, i] = command_in_force(command[k, i], latency[k, i], until[k])
         for p in range(vehicles - 1):
             table[ROW.GAP, at + p] = gaps[k, p]
             table[ROW.HIT, at + p] = 1.0 if hit[k, p] else 0.0
+        place_forces(table, in_force[k], brake_rate[k], release_rate[k])
         recorded, status = advance_table(table, restitution[k], duration, time[k], k, rows, recorded)
         failed[k] = status
         if status != FLAG.DONE:
@@ -308,6 +315,7 @@ def advance_worlds(
         time[k] = until[k]
         for i in range(vehicles):
             speeds[k, i] = table[ROW.SPEED, at + i]
+            in_force[k, i] = force_at(table, at + i, command_in_force(command[k, i], latency[k, i], until[k]))
         for p in range(vehicles - 1):
             gaps[k, p] = table[ROW.GAP, at + p]
             hit[k, p] = table[ROW.HIT, at + p] == 1.0
@@ -359,7 +367,7 @@ def advance(
         arrays = (
             after.gaps_m, after.speeds_mps, after.time_s, after.pair_hit, after.command_mps2, after.obstacle_gap_m,
             after.obstacle_hit, *harm, command, until, v.braking_capacity_mps2, v.driving_capacity_mps2, v.latency_s,
-            v.mass_t, v.speed_limit_mps, v.restitution, failed,
+            v.mass_t, v.speed_limit_mps, v.restitution, v.brake_rate_mps3, v.release_rate_mps3, failed,
         )  # fmt: skip
         parts = by_parts(partial(_advance_part, arrays, at, capacity), worlds.n, threads)
         for part in parts:
@@ -586,6 +594,7 @@ def advance_sampled(
             f"advance_sampled: world {k} has an obstacle ahead (obstacle_gap_m = {worlds.obstacle_gap_m[k]:g}); the"
             " paper's fixed-step map knows none, use advance"
         )
+    worlds.refuse_build_up("advance_sampled")
     command = _shaped("command_mps2", command_mps2, worlds.speeds_mps.shape)
     until = _shaped("until_s", until_s, (worlds.n,))
     _refuse_bad(worlds, command, until, np.ones(worlds.n, np.bool_))

@@ -150,11 +150,27 @@ def stopping_distance(speed: float, latency_left: float, capacity: float) -> flo
 
 
 @compiled
-def stopping_distances(speed: Floats, latency_left: Floats, capacity: Floats) -> Floats:
-    """``stopping_distance`` of n vehicles, each [n]."""
+def ramped_stopping_distance(speed: float, latency_left: float, capacity: float, rate: float) -> float:
+    """``stopping_distance`` of brakes that build up from 0 at ``rate`` r (m/s3): with the capacity a it is
+
+    ``v tau + v a / (2 r) - a^3 / (24 r^2) + v^2 / (2 a)``, and ``v tau + 2/3 v sqrt(2 v / r)`` where the vehicle stands
+    before its brakes are full, ``v < a^2 / (2 r)``.
+    """
+    speed = max(speed, 0.0)
+    if math.isinf(rate):
+        return stopping_distance(speed, latency_left, capacity)
+    rise = capacity / rate
+    if speed < 0.5 * capacity * rise:
+        return speed * latency_left + 2.0 / 3.0 * speed * math.sqrt(2.0 * speed / rate)
+    return speed * latency_left + 0.5 * speed * rise - capacity * rise * rise / 24.0 + speed * speed / (2.0 * capacity)
+
+
+@compiled
+def stopping_distances(speed: Floats, latency_left: Floats, capacity: Floats, rate: Floats) -> Floats:
+    """``ramped_stopping_distance`` of n vehicles, each [n]."""
     distance = np.empty(len(speed))
     for k in range(len(speed)):
-        distance[k] = stopping_distance(speed[k], latency_left[k], capacity[k])
+        distance[k] = ramped_stopping_distance(speed[k], latency_left[k], capacity[k], rate[k])
     return distance
 
 
@@ -215,10 +231,25 @@ class _Rows(NamedTuple):
     # of an episode: per pair
     SUM_FIRST_HARM: int = 29  # harm since the episode began (m2/s2)
     SUM_TOTAL_HARM: int = 30
+    # of brakes that build up: per vehicle
+    FORCE: int = 31  # acceleration that its brakes or its engine call for now; it moves towards the command (m/s2)
+    BRAKE_RATE: int = 32  # how fast it falls, and rises (m/s3); infinite: at once
+    RELEASE_RATE: int = 33
+    BUILDS_UP: int = 34  # of the world, in column 0: 1 where some rate is finite
+    FORCE_RATE: int = 35  # at which FORCE moves in this piece (m/s3)
+    FORCE_TIME: int = 36  # until it reaches the command, or passes 0
+    FORCE_VALUE: int = 37  # there
+    JERK: int = 38
+    LOW_JERK: int = 39  # at which FORCE_LOW and FORCE_HIGH move
+    HIGH_JERK: int = 40
+    # per pooled block
+    BLOCK_LOW_JERK: int = 41
+    BLOCK_HIGH_JERK: int = 42
     # how many of them
     OF_IMPACT: int = 12  # rows of the table that an impact needs, a segment, an episode
     OF_SEGMENT: int = 28
     OF_EPISODE: int = 31
+    OF_BUILD_UP: int = 43  # of a segment or an episode in which brakes may build up
 
 
 ROW = _Rows()
@@ -423,6 +454,8 @@ def move_apart(table: Floats, duration: float) -> bool:
     Where both of a pair have constant accelerations, the contact time says it exactly. Else: speeds are monotone
     within a segment, so a pair closes by at most ``(max rear speed - min front speed) T``.
     """
+    if builds_up(table):
+        return move_apart_on_cubics(table, duration)
     vehicles = table.shape[1]
     slowest_in_front, front_steady = math.inf, 0.0
     for i in range(vehicles):
@@ -478,9 +511,14 @@ def to_next_impact(table: Floats, restitution: float, now: float, duration: floa
 @compiled(bare=True)
 def to_next_event(table: Floats, now: float, duration: float) -> tuple[bool, float]:
     """Move from ``now`` to the next event or to the end of the segment; False where a gap became impossible."""
-    accelerate(table)
-    passed = next_event(table, now, duration)
-    if not move(table, passed):
+    if builds_up(table):
+        passed = next_moving_event(table, now, duration, accelerate_moving(table))
+        sound = move_on_cubics(table, passed)
+    else:
+        accelerate(table)
+        passed = next_event(table, now, duration)
+        sound = move(table, passed)
+    if not sound:
         return False, now
     for i in range(table.shape[1]):
         if table[ROW.ONSET, i] - now <= passed:
@@ -579,6 +617,406 @@ def move_speeds(table: Floats, duration: float) -> None:
         first = last + 1
 
 
+# Brakes that build up: the force moves towards the command at a constant rate, so the motion is a cubic in time.
+#
+# What a vehicle's brakes or engine call for (FORCE) falls at BRAKE_RATE and rises at RELEASE_RATE until it is the
+# command; before the latency has elapsed the command is 0. It goes on while a vehicle stands, is held, or is struck.
+# Between events each vehicle, and each body of joined vehicles, has a constant jerk. Two more events bound a piece: the
+# force reaches the command or passes 0; and joined vehicles part, or a body that is held is so no more. A world in
+# which all rates are infinite never comes here.
+
+_PARTS_LATE_S = 1e-9  # joined vehicles part this much late, so that rounding cannot undo it: it costs 1e-26 m
+_PARTS_LATE_MPS2 = 1e-12  # and by no smaller a difference of accelerations
+
+
+@compiled
+def builds_up(table: Floats) -> bool:
+    """Whether the brakes of this world build up."""
+    return table.shape[0] > ROW.OF_EPISODE and table[ROW.BUILDS_UP, 0] == 1.0
+
+
+@compiled
+def first_return(value: float, rate: float, jerk: float) -> float:
+    """First time > 0 at which ``value + rate t + jerk t^2 / 2`` is 0; infinite: never. A start at 0 does not count."""
+    if value == 0.0:
+        return -2.0 * rate / jerk if rate * jerk < 0.0 else math.inf
+    if jerk == 0.0:
+        return -value / rate if value * rate < 0.0 else math.inf
+    squared = rate * rate - 2.0 * jerk * value
+    if squared < 0.0:
+        return math.inf
+    root = math.sqrt(squared)
+    both = -(rate + root) if rate >= 0.0 else root - rate
+    early = both / jerk
+    late = 2.0 * value / both if both != 0.0 else early
+    if early <= 0.0 or 0.0 < late < early:
+        early = late
+    return early if early > 0.0 else math.inf
+
+
+@compiled
+def gap_after(gap: float, closing: float, pressing: float, jerk: float, time: float) -> float:
+    """Gap after ``time`` of constant closing jerk: ``g - (w + (b + j t / 3) t / 2) t``. [m]"""
+    return gap - (closing + 0.5 * (pressing + jerk * time / 3.0) * time) * time
+
+
+@compiled
+def contact_within(gap: float, closing: float, pressing: float, jerk: float, end: float) -> tuple[float, float]:
+    """``contact`` of a pair whose closing acceleration changes at the rate ``jerk`` (m/s3), until ``end`` (s).
+
+    The closing speed ``w + b t + j t^2 / 2`` has at most two roots, between which the gap is monotone; the first stretch
+    at whose end the gap is not positive holds the contact. Newton's method finds it, kept inside by bisection.
+    """
+    if jerk == 0.0:
+        return contact(gap, closing, pressing)
+    first, second = -math.inf, -math.inf  # the turning points of the gap, in order
+    squared = pressing * pressing - 2.0 * jerk * closing
+    if squared > 0.0:
+        root = math.sqrt(squared)
+        both = -(pressing + root) if pressing >= 0.0 else root - pressing
+        one, other = both / jerk, 2.0 * closing / both
+        first, second = min(one, other), max(one, other)
+    elif jerk < 0.0:
+        return math.inf, 0.0
+    for stretch in range(2):
+        if jerk > 0.0:  # closing up to the first turning point, and from the second one on
+            low, high = (0.0, min(first, end)) if stretch == 0 else (max(second, 0.0), end)
+        else:
+            low, high = (max(first, 0.0), min(second, end)) if stretch == 0 else (0.0, 0.0)
+        if not low < high or gap_after(gap, closing, pressing, jerk, high) > 0.0:
+            continue
+        time = low
+        for _ in range(200):
+            beyond = gap_after(gap, closing, pressing, jerk, time)
+            if beyond > 0.0:
+                low = time
+            else:
+                high = time
+            speed = closing + (pressing + 0.5 * jerk * time) * time
+            after = time + beyond / speed if speed > 0.0 else math.inf
+            if not low < after < high:
+                after = 0.5 * (low + high)
+                if after <= low or after >= high:
+                    break
+            if after == time:
+                break
+            time = after
+        return time, max(closing + (pressing + 0.5 * jerk * time) * time, 0.0)
+    return math.inf, 0.0
+
+
+@compiled(bare=True)
+def plan_force(table: Floats, i: int, wanted: float) -> None:
+    """Where the force of vehicle ``i`` goes from now on, and when it is there: the command, or 0 on the way to it."""
+    force = table[ROW.FORCE, i]
+    rate = -table[ROW.BRAKE_RATE, i] if wanted < force else table[ROW.RELEASE_RATE, i]
+    table[ROW.FORCE_RATE, i] = 0.0
+    table[ROW.FORCE_TIME, i] = math.inf
+    if wanted == force:
+        return
+    if math.isinf(rate):
+        table[ROW.FORCE, i] = wanted
+        return
+    goal = 0.0 if (force < 0.0 < wanted) or (wanted < 0.0 < force) else wanted
+    table[ROW.FORCE_RATE, i] = rate
+    table[ROW.FORCE_TIME, i] = (goal - force) / rate
+    table[ROW.FORCE_VALUE, i] = goal
+
+
+@compiled
+def force_ranges(force: float, rate: float, speed: float, limit: float) -> tuple[float, float, float, float]:
+    """``force_range``, and the rates at which both ends move."""
+    if force < 0.0 or (force == 0.0 and rate < 0.0):
+        if speed > 0.0:
+            return force, force, rate, rate
+        if speed < 0.0:
+            return -force, -force, -rate, -rate
+        return force, -force, rate, -rate
+    if force > 0.0 or rate > 0.0:
+        if speed < limit:
+            return force, force, rate, rate
+        if speed == limit:
+            return 0.0, force, 0.0, rate
+    return 0.0, 0.0, 0.0, 0.0
+
+
+@compiled
+def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) -> tuple[float, float]:
+    """Acceleration and jerk of a free body whose forces range over a moving ``[low, high]``."""
+    if low > 0.0 or (low == 0.0 and low_jerk > 0.0):
+        return low, low_jerk
+    if high < 0.0 or (high == 0.0 and high_jerk < 0.0):
+        return high, high_jerk
+    return 0.0, 0.0
+
+
+@compiled(bare=True)
+def pool_moving(table: Floats, first: int, last: int) -> float:
+    """Accelerations and jerks of touching vehicles ``first..last`` of equal speed; the time until one of them parts.
+
+    The regression of ``pool``, but vehicles of equal acceleration are joined, and part by their jerks.
+    """
+    count = 0
+    for i in range(first, last + 1):
+        mass, heavy = table[ROW.MASS, i], table[ROW.MASS, i] == math.inf
+        table[ROW.BLOCK_MASS, count] = mass
+        table[ROW.BLOCK_LOW, count] = 0.0 if heavy else mass * table[ROW.FORCE_LOW, i]
+        table[ROW.BLOCK_HIGH, count] = 0.0 if heavy else mass * table[ROW.FORCE_HIGH, i]
+        table[ROW.BLOCK_LOW_JERK, count] = 0.0 if heavy else mass * table[ROW.LOW_JERK, i]
+        table[ROW.BLOCK_HIGH_JERK, count] = 0.0 if heavy else mass * table[ROW.HIGH_JERK, i]
+        table[ROW.BLOCK_FIRST, count] = i
+        top = count + first
+        settle_block(table, count, top)
+        while count > 0 and table[ROW.ACCELERATION, top] >= table[ROW.ACCELERATION, top - 1]:
+            count -= 1
+            top -= 1
+            for row in (ROW.BLOCK_MASS, ROW.BLOCK_LOW, ROW.BLOCK_HIGH, ROW.BLOCK_LOW_JERK, ROW.BLOCK_HIGH_JERK):
+                table[row, count] += table[row, count + 1]
+            settle_block(table, count, top)
+        count += 1
+    soonest, end = math.inf, last + 1
+    for k in range(count - 1, -1, -1):
+        head, value, jerk = int(table[ROW.BLOCK_FIRST, k]), table[ROW.ACCELERATION, k + first], table[ROW.JERK, k + first]
+        soonest = min(soonest, parting_s(table, head, end - 1, value, jerk))
+        for i in range(head, end):
+            table[ROW.ACCELERATION, i], table[ROW.JERK, i] = value, jerk
+            table[ROW.JOINED, i] = 1.0 if i < end - 1 else 0.0
+        end = head
+    return soonest
+
+
+@compiled(bare=True)
+def settle_block(table: Floats, block: int, out: int) -> None:
+    """Acceleration and jerk of a block, into column ``out``."""
+    mass = table[ROW.BLOCK_MASS, block]
+    table[ROW.ACCELERATION, out], table[ROW.JERK, out] = settle_moving(
+        table[ROW.BLOCK_LOW, block] / mass, table[ROW.BLOCK_HIGH, block] / mass,
+        table[ROW.BLOCK_LOW_JERK, block] / mass, table[ROW.BLOCK_HIGH_JERK, block] / mass,
+    )  # fmt: skip
+
+
+@compiled(bare=True)
+def parting_s(table: Floats, head: int, tail: int, value: float, jerk: float) -> float:
+    """Time until the block of vehicles ``head..tail`` is one no more.
+
+    A block that moves parts where the front ones of it alone would be faster than it; one that is held moves where its
+    front ones drive away or its rear ones would be pushed back.
+    """
+    soonest = math.inf
+    held = value == 0.0 and jerk == 0.0
+    forward = value > 0.0 or (value == 0.0 and jerk > 0.0)
+    mass, force, rate = 0.0, 0.0, 0.0
+    for i in range(head, tail + (1 if held else 0)):  # the front ones, up to i
+        if table[ROW.MASS, i] == math.inf:
+            mass = math.inf
+            continue
+        mass += table[ROW.MASS, i]
+        side = ROW.FORCE_LOW if held or forward else ROW.FORCE_HIGH
+        force += table[ROW.MASS, i] * table[side, i]
+        rate += table[ROW.MASS, i] * table[side + ROW.LOW_JERK - ROW.FORCE_LOW, i]
+        soonest = min(soonest, crossing_s(force / mass - value, rate / mass - jerk))
+    mass, force, rate = 0.0, 0.0, 0.0
+    for i in range(tail if held else head - 1, head - 1, -1):  # the rear ones, from i on
+        if table[ROW.MASS, i] == math.inf:
+            break
+        mass += table[ROW.MASS, i]
+        force += table[ROW.MASS, i] * table[ROW.FORCE_HIGH, i]
+        rate += table[ROW.MASS, i] * table[ROW.HIGH_JERK, i]
+        soonest = min(soonest, crossing_s(-force / mass, -rate / mass))
+    return soonest
+
+
+@compiled
+def crossing_s(below: float, rate: float) -> float:
+    """When a difference of accelerations that is not positive is surely positive; infinite: never. [m/s2, m/s3]"""
+    if rate <= 0.0:
+        return math.inf
+    return max(-below / rate, 0.0) + _PARTS_LATE_S + _PARTS_LATE_MPS2 / rate
+
+
+@compiled(bare=True)
+def accelerate_moving(table: Floats) -> float:
+    """``accelerate`` where brakes build up: accelerations and jerks; the time until touching vehicles part."""
+    vehicles = table.shape[1]
+    for i in range(vehicles):
+        plan_force(table, i, table[ROW.COMMAND, i] * table[ROW.ACTIVE, i])
+        low, high, low_jerk, high_jerk = force_ranges(
+            table[ROW.FORCE, i], table[ROW.FORCE_RATE, i], table[ROW.SPEED, i], table[ROW.LIMIT, i]
+        )
+        table[ROW.FORCE_LOW, i], table[ROW.FORCE_HIGH, i] = low, high
+        table[ROW.LOW_JERK, i], table[ROW.HIGH_JERK, i] = low_jerk, high_jerk
+    soonest, first = math.inf, 0
+    while first < vehicles:
+        last = first
+        while (
+            last < vehicles - 1 and table[ROW.GAP, last] <= 0.0 and table[ROW.SPEED, last] == table[ROW.SPEED, last + 1]
+        ):
+            last += 1
+        if last == first:
+            table[ROW.ACCELERATION, first], table[ROW.JERK, first] = settle_moving(
+                table[ROW.FORCE_LOW, first], table[ROW.FORCE_HIGH, first],
+                table[ROW.LOW_JERK, first], table[ROW.HIGH_JERK, first],
+            )  # fmt: skip
+            table[ROW.JOINED, first] = 0.0
+        else:
+            soonest = min(soonest, pool_moving(table, first, last))
+        first = last + 1
+    return soonest
+
+
+@compiled(bare=True)
+def next_moving_event(table: Floats, now: float, end: float, parting: float) -> float:
+    """``next_event`` where brakes build up."""
+    vehicles = table.shape[1]
+    soonest = min(end - now, parting)
+    for i in range(vehicles):
+        speed, rate, jerk = table[ROW.SPEED, i], table[ROW.ACCELERATION, i], table[ROW.JERK, i]
+        time, value = first_return(speed, rate, jerk), 0.0
+        if table[ROW.FORCE, i] > 0.0 or table[ROW.FORCE_RATE, i] > 0.0:
+            reach = first_return(speed - table[ROW.LIMIT, i], rate, jerk)
+            if reach < time:
+                time, value = reach, table[ROW.LIMIT, i]
+        table[ROW.SPEED_TIME, i] = time
+        table[ROW.SPEED_VALUE, i] = value
+        soonest = min(soonest, time, table[ROW.FORCE_TIME, i])
+        if table[ROW.ACTIVE, i] == 0.0:
+            soonest = min(soonest, table[ROW.ONSET, i] - now)
+    for p in range(vehicles - 1):
+        time, speed = math.inf, 0.0
+        if table[ROW.JOINED, p] == 0.0:
+            time, speed = contact_within(
+                table[ROW.GAP, p], table[ROW.SPEED, p + 1] - table[ROW.SPEED, p],
+                table[ROW.ACCELERATION, p + 1] - table[ROW.ACCELERATION, p],
+                table[ROW.JERK, p + 1] - table[ROW.JERK, p], soonest,
+            )  # fmt: skip
+        table[ROW.CONTACT_TIME, p] = time
+        table[ROW.CONTACT_SPEED, p] = speed
+        soonest = min(soonest, time)
+    return soonest
+
+
+@compiled(bare=True)
+def move_on_cubics(table: Floats, duration: float) -> bool:
+    """``move`` where brakes build up: gaps, speeds and forces."""
+    vehicles, sound = table.shape[1], True
+    for p in range(vehicles - 1):
+        if table[ROW.CONTACT_TIME, p] <= duration:
+            table[ROW.GAP, p] = 0.0
+            continue
+        table[ROW.CONTACT_TIME, p] = math.inf
+        table[ROW.CONTACT_SPEED, p] = 0.0
+        if table[ROW.JOINED, p] == 0.0:
+            after = gap_after(
+                table[ROW.GAP, p], table[ROW.SPEED, p + 1] - table[ROW.SPEED, p],
+                table[ROW.ACCELERATION, p + 1] - table[ROW.ACCELERATION, p],
+                table[ROW.JERK, p + 1] - table[ROW.JERK, p], duration,
+            )  # fmt: skip
+            sound = sound and after >= -BOUND.PENETRATION_M
+            table[ROW.GAP, p] = max(after, 0.0)
+    first = 0
+    while first < vehicles:
+        rate, jerk = table[ROW.ACCELERATION, first], table[ROW.JERK, first]
+        value = table[ROW.SPEED, first] + (rate + 0.5 * jerk * duration) * duration
+        last = first
+        if table[ROW.SPEED_TIME, first] <= duration:
+            value = table[ROW.SPEED_VALUE, first]
+        while table[ROW.JOINED, last] == 1.0:
+            last += 1
+            if table[ROW.SPEED_TIME, last] <= duration:
+                value = table[ROW.SPEED_VALUE, last]
+        if first > 0 and table[ROW.CONTACT_TIME, first - 1] <= duration:
+            value = table[ROW.SPEED, first - 1] + table[ROW.CONTACT_SPEED, first - 1]
+        for i in range(first, last + 1):
+            table[ROW.SPEED, i] = value
+        first = last + 1
+    for i in range(vehicles):
+        if table[ROW.FORCE_TIME, i] <= duration:
+            table[ROW.FORCE, i] = table[ROW.FORCE_VALUE, i]
+        else:
+            table[ROW.FORCE, i] += table[ROW.FORCE_RATE, i] * duration
+    return sound
+
+
+@compiled(bare=True)
+def move_apart_on_cubics(table: Floats, duration: float) -> bool:
+    """``move_apart`` where brakes build up: each vehicle from event to event on its own, and how near two can come."""
+    vehicles = table.shape[1]
+    slowest_in_front = math.inf
+    for i in range(vehicles):
+        speed = table[ROW.SPEED, i]
+        if speed < 0.0:
+            return False
+        limit, onset, way, now = table[ROW.LIMIT, i], table[ROW.ONSET, i], 0.0, 0.0
+        slowest, fastest, before = speed, speed, table[ROW.FORCE, i]
+        active = onset <= 0.0
+        while now < duration:
+            plan_force(table, i, table[ROW.COMMAND, i] if active else 0.0)
+            force, force_rate = table[ROW.FORCE, i], table[ROW.FORCE_RATE, i]
+            rate, jerk = settle_moving(*force_ranges(force, force_rate, speed, limit))
+            passed = min(duration - now, table[ROW.FORCE_TIME, i])
+            if not active:
+                passed = min(passed, onset - now)
+            reach, value = first_return(speed, rate, jerk), 0.0
+            if (force > 0.0 or force_rate > 0.0) and first_return(speed - limit, rate, jerk) < reach:
+                reach, value = first_return(speed - limit, rate, jerk), limit
+            passed = min(passed, reach)
+            way += (speed + 0.5 * (rate + jerk * passed / 3.0) * passed) * passed
+            speed = value if reach <= passed else speed + (rate + 0.5 * jerk * passed) * passed
+            reached = table[ROW.FORCE_TIME, i] <= passed
+            table[ROW.FORCE, i] = table[ROW.FORCE_VALUE, i] if reached else force + force_rate * passed
+            slowest, fastest = min(slowest, speed), max(fastest, speed)
+            if not active and onset - now <= passed:
+                active = True
+            now = duration if passed >= duration - now else now + passed
+        table[ROW.FORCE_VALUE, i] = table[ROW.FORCE, i]
+        table[ROW.FORCE, i] = before
+        table[ROW.SPEED_VALUE, i] = speed
+        table[ROW.WAY, i] = way
+        if i > 0:
+            closing = fastest - slowest_in_front
+            if closing > 0.0 and closing * duration >= table[ROW.GAP, i - 1]:
+                return False
+        slowest_in_front = slowest
+    for i in range(vehicles):
+        table[ROW.SPEED, i] = table[ROW.SPEED_VALUE, i]
+        table[ROW.FORCE, i] = table[ROW.FORCE_VALUE, i]
+    for p in range(vehicles - 1):
+        table[ROW.GAP, p] = max(table[ROW.GAP, p] + (table[ROW.WAY, p] - table[ROW.WAY, p + 1]), 0.0)
+    return True
+
+
+@compiled
+def place_rates(table: Floats, brake_rate: Floats, release_rate: Floats) -> None:
+    """Write the rates of the vehicles (m/s3), each [N], into a table [ROW.OF_BUILD_UP, N or N + 1].
+
+    Where all are infinite, the forces are not looked at.
+    """
+    at = table.shape[1] - brake_rate.shape[0]
+    table[ROW.BUILDS_UP, 0] = 0.0
+    for i in range(brake_rate.shape[0]):
+        if brake_rate[i] < math.inf or release_rate[i] < math.inf:
+            table[ROW.BUILDS_UP, 0] = 1.0
+        table[ROW.BRAKE_RATE, at + i] = brake_rate[i]
+        table[ROW.RELEASE_RATE, at + i] = release_rate[i]
+
+
+@compiled
+def place_forces(table: Floats, force: Floats, brake_rate: Floats, release_rate: Floats) -> None:
+    """Write forces (m/s2) and rates (m/s3) of the vehicles, each [N], into a table [ROW.OF_BUILD_UP, N or N + 1]."""
+    place_rates(table, brake_rate, release_rate)
+    for i in range(force.shape[0]):
+        table[ROW.FORCE, table.shape[1] - force.shape[0] + i] = force[i]
+
+
+@compiled
+def force_at(table: Floats, i: int, wanted: float) -> float:
+    """The force of vehicle ``i`` at the end of a segment; ``wanted`` is the command that acts there. [m/s2]"""
+    if not builds_up(table):
+        return wanted
+    force = table[ROW.FORCE, i]
+    return wanted if math.isinf(table[ROW.BRAKE_RATE if wanted < force else ROW.RELEASE_RATE, i]) else force
+
+
 # The obstacle ahead of Vehicle 1, for the kernels: one more vehicle in front, which stands and which nothing moves.
 #
 # Its mass is infinite. In the regression P of a cluster that touches it, and of touching vehicles that press against
@@ -608,7 +1046,8 @@ def place_obstacle(table: Floats, gap: float, hit: float) -> None:
 # ===  ===========================================================
 # C    controlled vehicles
 # K    phases, in order of time; ``ends[k]`` is the step in which phase k ends, the last one reaches the horizon
-# S    columns of a saved state: speeds N, gaps P, hit flags P, first-impact harm P, total harm P
+# S    columns of a saved state: speeds N, gaps P, hit flags P, first-impact harm P, total harm P; forces N where brakes
+#      of some world build up
 # ===  ===========================================================
 
 # rows of the table after those of a segment
@@ -650,7 +1089,7 @@ class Grid(NamedTuple):
 class Episode(NamedTuple):
     """One world as its profiles run."""
 
-    table: Floats  # [ROW.OF_EPISODE, N] with latencies, masses, speed limits and the other vehicles' commands
+    table: Floats  # [ROW.OF_BUILD_UP, N] with latencies, masses, speed limits and the other vehicles' commands
     clock: Floats  # [CLOCK.WIDTH]
     controlled: Ints  # [C] vehicles
 
@@ -715,7 +1154,8 @@ def command_in_force(command: float, latency_s: float, time_s: float) -> float:
 def at_rest(table: Floats) -> bool:
     """Whether the episode has ended: everything stands and no command would move it."""
     for i in range(table.shape[1]):  # noqa: SIM110  # all() is not compiled
-        if not stands(table[ROW.SPEED, i], table[ROW.COMMAND, i]):
+        command = table[ROW.COMMAND, i]
+        if not stands(table[ROW.SPEED, i], max(command, table[ROW.FORCE, i]) if builds_up(table) else command):
             return False
     return True
 
@@ -777,6 +1217,8 @@ def save(table: Floats, state: Floats) -> None:
         state[vehicles + pairs + p] = table[ROW.HIT, p]
         state[vehicles + 2 * pairs + p] = table[ROW.SUM_FIRST_HARM, p]
         state[vehicles + 3 * pairs + p] = table[ROW.SUM_TOTAL_HARM, p]
+    for i in range(state.shape[0] - vehicles - 4 * pairs):
+        state[vehicles + 4 * pairs + i] = table[ROW.FORCE, i]
 
 
 @compiled
@@ -791,6 +1233,8 @@ def restore(table: Floats, state: Floats) -> None:
         table[ROW.HIT, p] = state[vehicles + pairs + p]
         table[ROW.SUM_FIRST_HARM, p] = state[vehicles + 2 * pairs + p]
         table[ROW.SUM_TOTAL_HARM, p] = state[vehicles + 3 * pairs + p]
+    for i in range(state.shape[0] - vehicles - 4 * pairs):
+        table[ROW.FORCE, i] = state[vehicles + 4 * pairs + i]
 
 
 @compiled(apart=True)
@@ -841,9 +1285,9 @@ _CAPACITY = 64
 
 @compiled
 def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) -> int:
-    """Write down time from the start, gaps, speeds and accelerations at the beginning of each piece; their number.
+    """Write down time from the start, gaps, speeds, accelerations and jerks at the beginning of each piece; their number.
 
-    Those that do not fit into ``rows`` [capacity, 1 + P + 2 N] are only counted; minus their number where a contact
+    Those that do not fit into ``rows`` [capacity, 1 + P + 3 N] are only counted; minus their number where a contact
     was missed.
     """
     vehicles = table.shape[1]
@@ -854,7 +1298,10 @@ def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) ->
             continue
         if now >= duration:
             break
-        accelerate(table)
+        building = builds_up(table)
+        parting = accelerate_moving(table) if building else math.inf
+        if not building:
+            accelerate(table)
         if count < rows.shape[0]:
             rows[count, 0] = now
             for p in range(vehicles - 1):
@@ -862,9 +1309,10 @@ def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) ->
             for i in range(vehicles):
                 rows[count, vehicles + i] = table[ROW.SPEED, i]
                 rows[count, 2 * vehicles + i] = table[ROW.ACCELERATION, i]
+                rows[count, 3 * vehicles + i] = table[ROW.JERK, i] if building else 0.0
         count += 1
-        passed = next_event(table, now, duration)
-        if not move(table, passed):
+        passed = next_moving_event(table, now, duration, parting) if building else next_event(table, now, duration)
+        if not (move_on_cubics(table, passed) if building else move(table, passed)):
             return -count
         for i in range(vehicles):
             if table[ROW.ONSET, i] - now <= passed:
@@ -874,33 +1322,35 @@ def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) ->
 
 
 def segment_pieces(worlds: Worlds, command_mps2: Floats, until_s: Floats) -> list[Floats]:
-    """The motion of each world until a time, under one command: a row per piece of constant acceleration.
+    """The motion of each world until a time, under one command: a row per piece of constant jerk.
 
     Args:
         worlds: n, of N vehicles; they stay as they are.
         command_mps2: signed accelerations wanted, [n, N] m/s2.
         until_s: where the segments end, [n] s.
 
-    Returns for each world [k, 1 + N + 2 N]: the absolute time at which the piece begins (s), how far Vehicle 1 has come
-    since the segment began, the gaps (m), the speeds (m/s) and the accelerations (m/s2).
+    Returns for each world [k, 1 + N + 3 N]: the absolute time at which the piece begins (s), how far Vehicle 1 has come
+    since the segment began, the gaps (m), the speeds (m/s), the accelerations (m/s2) and the jerks (m/s3).
 
     """
     v, N, durations = worlds.vehicles, worlds.N, until_s - worlds.time_s
     front_gaps = worlds.with_post_ahead(durations).obstacle_gap_m  # says where Vehicle 1 is
     latencies, restitutions = v.latency_s, v.restitution
-    wanted = [*range(N + 1), *range(N + 2, 2 * N + 2), *range(2 * N + 3, 3 * N + 3)]  # all but the post's own
+    # all but the post's own
+    wanted = [*range(N + 1), *(part * (N + 1) + i for part in (1, 2, 3) for i in range(1, N + 1))]
     found = []
     for k in range(worlds.n):
         start = float(worlds.time_s[k])
-        table = np.zeros((ROW.OF_SEGMENT, N + 1))
+        table = np.zeros((ROW.OF_BUILD_UP, N + 1))
         place_obstacle(table, float(front_gaps[k]), 0.0)
         table[ROW.COMMAND, 1:], table[ROW.SPEED, 1:] = command_mps2[k], worlds.speeds_mps[k]
         table[ROW.MASS, 1:], table[ROW.LIMIT, 1:] = v.mass_t[k], v.speed_limit_mps[k]
         table[ROW.ONSET, 0], table[ROW.ONSET, 1:] = onset_s(0.0, start), latencies[k] - start
+        place_forces(table, worlds.command_mps2[k], v.brake_rate_mps3[k], v.release_rate_mps3[k])
         table[ROW.GAP, 1:N] = worlds.gaps_m[k]
         capacity = _CAPACITY
         while True:
-            rows = np.empty((capacity, 3 * (N + 1)))
+            rows = np.empty((capacity, 4 * (N + 1)))
             count = abs(_pieces(table.copy(), float(restitutions[k]), float(durations[k]), rows))
             if count <= capacity:
                 break
@@ -949,7 +1399,8 @@ def forecast(
     forecast_worlds(
         worlds.gaps_m, worlds.speeds_mps, worlds.time_s, worlds.pair_hit, ahead, worlds.obstacle_hit,
         np.ascontiguousarray(command_mps2), vehicle, np.ascontiguousarray(candidates_mps2), until_s, v.latency_s,
-        v.mass_t, v.speed_limit_mps, v.restitution, first, total, failed,
+        v.mass_t, v.speed_limit_mps, v.restitution, worlds.command_mps2, v.brake_rate_mps3, v.release_rate_mps3, first,
+        total, failed,
     )  # fmt: skip
     if failed.any():
         raise PhysicsError({k: f"a forecast could not reach {until_s:g} s" for k in np.flatnonzero(failed).tolist()})
@@ -960,7 +1411,7 @@ def forecast(
 def forecast_worlds(
     gaps: Floats, speeds: Floats, time: Floats, hit: Bools, ahead: Floats, ahead_hit: Bools, command: Floats,
     vehicle: int, candidates: Floats, until_s: float, latency: Floats, mass: Floats, limit: Floats, restitution: Floats,
-    first: Floats, total: Floats, failed: Bools,
+    in_force: Floats, brake_rate: Floats, release_rate: Floats, first: Floats, total: Floats, failed: Bools,
 ) -> None:  # fmt: skip
     """Fill ``first`` and ``total`` [n, K], and ``failed`` [n] where a check failed.
 
@@ -968,7 +1419,7 @@ def forecast_worlds(
     """
     n, vehicles = speeds.shape
     at = min(ahead.shape[0], 1)  # vehicle i stands in column at + i, behind an obstacle
-    table = np.zeros((ROW.OF_SEGMENT, at + vehicles))
+    table = np.zeros((ROW.OF_BUILD_UP, at + vehicles))
     no_rows = np.empty((0, LISTED.WIDTH))
     for k in range(n):
         duration = until_s - time[k]
@@ -987,6 +1438,7 @@ def forecast_worlds(
             for p in range(vehicles - 1):
                 table[ROW.GAP, at + p] = gaps[k, p]
                 table[ROW.HIT, at + p] = 1.0 if hit[k, p] else 0.0
+            place_forces(table, in_force[k], brake_rate[k], release_rate[k])
             if advance_table(table, restitution[k], duration, 0.0, k, no_rows, 0)[1] != FLAG.DONE:
                 failed[k] = True
                 break

@@ -50,6 +50,10 @@ class Vehicles:
     mass_t: Floats  # [n, N] > 0
     speed_limit_mps: Floats  # [n, N] driving stops here, > 0
     restitution: Floats  # [n] in [0, 1]
+    # [n, N] > 0, how fast the acceleration in force falls to a lower command, and rises to a higher one (m/s3);
+    # infinite: at once
+    brake_rate_mps3: Floats
+    release_rate_mps3: Floats
     own_latency_s: Floats  # [n, N] the vehicle's own part of its latency, which is what others are told of it
     # [n, N, N] from when on vehicle i acts on news of vehicle j; infinite: never. Never before latency_s of vehicle i,
     # and of itself (i is j) exactly from then on. Without a channel both of these share the memory of ``latency_s``
@@ -73,10 +77,16 @@ class Vehicles:
         mass_t: Floats,
         limit_mps: Floats,
         restitution: Floats,
+        brake_rate_mps3: Floats | None = None,
+        release_rate_mps3: Floats | None = None,
     ) -> Vehicles:
-        """Vehicles without a channel: latencies are all own, and all news is known from them on."""
+        """Vehicles without a channel: latencies are all own, and all news is known from them on.
+
+        Without rates the acceleration in force is the command at once.
+        """
         known = cls.known_at_once(latency_s)
-        return cls(braking_mps2, driving_mps2, latency_s, mass_t, limit_mps, restitution, latency_s, known)
+        rates = (np.full(mass_t.shape, np.inf) if r is None else r for r in (brake_rate_mps3, release_rate_mps3))
+        return cls(braking_mps2, driving_mps2, latency_s, mass_t, limit_mps, restitution, *rates, latency_s, known)
 
     @staticmethod
     def known_at_once(latency_s: Floats) -> Floats:
@@ -89,6 +99,12 @@ class Vehicles:
         view: Floats = np.ndarray((n, N, N), np.float64, latency, strides=(N * size, size, 0))
         view.flags.writeable = False
         return view
+
+    @property
+    def build_up(self) -> Bools:
+        """Worlds in which some vehicle's brakes build up: not every rate is infinite, [n]."""
+        rates = np.minimum(self.brake_rate_mps3, self.release_rate_mps3)
+        return np.asarray(np.isfinite(rates).any(axis=1))
 
     def hide_from(self, vehicle: int) -> Bools:
         """Worlds in which a channel hides something of the line from ``vehicle`` at its first decision, [n].
@@ -218,6 +234,15 @@ class Worlds:
             value = self.road[:, begin : begin + self.N]
         return value
 
+    def refuse_build_up(self, who: str) -> None:
+        """Raise ``InvalidInput`` where brakes of some world build up, which ``who`` has no exact answer for."""
+        slow = self.vehicles.build_up
+        if slow.any():
+            raise InvalidInput(
+                f"{who}: brakes of world {int(np.argmax(slow))} build up (brake_rate_mps3, release_rate_mps3), and"
+                " nothing exact is known for these; leave the rates out"
+            )
+
     def first_decision_s(self, deciders: Sequence[int]) -> Floats:
         """Time of the first decision, [n] s: the least latency of the ``deciders``, or the worlds' time if it is later.
 
@@ -250,6 +275,8 @@ class Worlds:
             ahead(math.inf, vehicles.mass_t),
             ahead(0.0, vehicles.speed_limit_mps),
             vehicles.restitution,
+            ahead(math.inf, vehicles.brake_rate_mps3),
+            ahead(math.inf, vehicles.release_rate_mps3),
         )
         return Worlds(
             written_out,
@@ -334,6 +361,8 @@ def make_worlds(
     mass_t: ArrayLike,
     restitution: ArrayLike,
     speed_limit_mps: ArrayLike = 40.0,
+    brake_rate_mps3: ArrayLike = np.inf,
+    release_rate_mps3: ArrayLike = np.inf,
     obstacle_gap_m: ArrayLike | None = None,
     friction: ArrayLike | None = None,
 ) -> Worlds:
@@ -348,6 +377,8 @@ def make_worlds(
         mass_t: to [n, N], t.
         restitution: of every impact, in [0, 1], to [n].
         speed_limit_mps: driving stops here, to [n, N], m/s.
+        brake_rate_mps3: how fast the acceleration in force falls to a lower command, to [n, N], m/s3; infinite: at once.
+        release_rate_mps3: how fast it rises to a higher one.
         obstacle_gap_m: distance to an obstacle ahead of Vehicle 1, to [n], m; None: there is none.
         friction: of the road, to [n]: capacities are at most ``friction * GRAVITY_MPS2``; None: as they are given.
 
@@ -368,6 +399,8 @@ def make_worlds(
         _full("mass_t", mass_t, (n, N), 0.0, np.inf, open_low=True),
         _full("speed_limit_mps", speed_limit_mps, (n, N), 0.0, np.inf, open_low=True),
         restitution_,
+        _full("brake_rate_mps3", brake_rate_mps3, (n, N), 0.0, np.inf, open_low=True, finite=False),
+        _full("release_rate_mps3", release_rate_mps3, (n, N), 0.0, np.inf, open_low=True, finite=False),
     )
     speeds = _full("speeds_mps", speeds, (n, N), 0.0, np.inf)
     if not np.all(speeds <= vehicles.speed_limit_mps):
@@ -392,17 +425,25 @@ def make_worlds(
 
 
 def _full(
-    name: str, value: ArrayLike, shape: tuple[int, ...], low: float, high: float, *, open_low: bool = False
+    name: str,
+    value: ArrayLike,
+    shape: tuple[int, ...],
+    low: float,
+    high: float,
+    *,
+    open_low: bool = False,
+    finite: bool = True,
 ) -> Floats:
-    """Broadcast ``value`` to ``shape`` in its own memory and check that it is finite and in range."""
+    """Broadcast ``value`` to ``shape`` in its own memory and check that it is in range, and ``finite`` unless it may not be."""
     given = np.asarray(value, dtype=np.float64)
     try:
         full = np.array(np.broadcast_to(given, shape), dtype=np.float64, order="C")
     except ValueError:
         raise InvalidInput(f"{name}: shape {given.shape} does not fit {shape}") from None
-    good = np.isfinite(full) & (full <= high) & ((full > low) if open_low else (full >= low))
+    good = (np.isfinite(full) if finite else ~np.isnan(full)) & (full <= high) & ((full > low) if open_low else (full >= low))
     if not good.all():
         at = tuple(int(k) for k in np.argwhere(~good)[0])
         bracket = "(" if open_low else "["
-        raise InvalidInput(f"{name}{list(at)} = {full[at]:g}: must be finite and in {bracket}{low:g}, {high:g}]")
+        finite_too = "finite and " if finite else ""
+        raise InvalidInput(f"{name}{list(at)} = {full[at]:g}: must be {finite_too}in {bracket}{low:g}, {high:g}]")
     return full

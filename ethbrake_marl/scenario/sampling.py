@@ -70,6 +70,7 @@ TYPES = (3,)  # the stream of the vehicles' types and loads
 MIXTURE = (4,)  # the stream of what each world of a mixture is drawn from
 LATER_LOSSES = (5,)  # the stream of a world's key, from which its later messages are lost or not
 SURROUNDINGS = (6,)  # the stream of friction, of the row of a table, and of the time before the alert
+BRAKES = (7,)  # the stream of the rates of brakes that build up, BLOCK numbers per vehicle
 OF_WORLD = 4  # numbers per world of the streams of obstacle, mixture, later losses and surroundings
 PER_TYPE = 4  # numbers per vehicle of the stream of types: type, load, and two that are free; one Philox counter
 ROW = (SURROUNDINGS, 1)  # the place of the number that chooses the row of a table
@@ -97,13 +98,13 @@ class QuantityRule:
     @property
     def symbol(self) -> str:
         """Of its unit."""
-        return {"mps": "m/s", "mps2": "m/s2"}.get(self.unit, self.unit)
+        return {"mps": "m/s", "mps2": "m/s2", "mps3": "m/s3"}.get(self.unit, self.unit)
 
     @property
     def label(self) -> str:
         """Its name in words, with its unit, as an axis has it: ``braking capacity (m/s²)``."""
         return self.name.removesuffix(f"_{self.unit}").replace("_", " ") + (
-            f" ({self.symbol.replace('s2', 's²')})" if self.unit else ""
+            f" ({self.symbol.replace('s2', 's²').replace('s3', 's³')})" if self.unit else ""
         )
 
     @property
@@ -159,7 +160,7 @@ class Quantities(NamedTuple):
 
     def of(self, worlds: Worlds) -> dict[str, QuantityRule]:
         """Those that these worlds have: the distance to an obstacle, and friction, only where there is such."""
-        return self.usual | {key: r for key, r in self.optional.items() if np.isfinite(getattr(worlds, key)).all()}
+        return self.usual | {key: r for key, r in self.optional.items() if np.isfinite(r.of(worlds)).all()}
 
     def columns(self, worlds: Worlds) -> dict[str, Floats]:
         """Every one of the worlds, each [n], named as in a table of initial states: ``gap_1_m``, ``mass_2_t``."""
@@ -246,14 +247,28 @@ _OPTIONAL = _by_name(
         "friction of the road: no capacity is above friction x 9.81 m/s2", "{uniform: [0.2, 0.9]}",
         stream=SURROUNDINGS,
     ),
+    QuantityRule(
+        "brake_rate_mps3", "mps3", "vehicle", 1e6, True, 0, "brake_rate_{}_mps3",
+        "how fast the deceleration of each vehicle builds up; without it at once", "12.65",
+        stream=BRAKES,
+    ),
+    QuantityRule(
+        "release_rate_mps3", "mps3", "vehicle", 1e6, True, 1, "release_rate_{}_mps3",
+        "how fast it falls again, and driving builds up; without it at once", "25",
+        stream=BRAKES,
+    ),
 )  # fmt: skip
 QUANTITY = Quantities(
     _USUAL, _OTHERWISE, _OPTIONAL,
     alternatives={"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps", "obstacle_gap_m": "obstacle_margin_m"},
-    of_a_type=("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "latency_s", "speed_limit_mps"),
+    of_a_type=(
+        "braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "latency_s", "speed_limit_mps", "brake_rate_mps3",
+        "release_rate_mps3",
+    ),
     needed=("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "latency_s"),
     declared={**_USUAL, **_OTHERWISE, **_OPTIONAL},
 )  # fmt: skip
+_ALSO = ("friction", "brake_rate_mps3", "release_rate_mps3")  # what is drawn where it is declared, and needs nothing else
 _MEANING = {key: rule.meaning for key, rule in QUANTITY.declared.items()}
 
 
@@ -728,6 +743,12 @@ class VehicleType(FileModel):
     mass_t: TypeQuantity | None = Field(default=None, description=_MEANING["mass_t"])
     latency_s: TypeQuantity | None = Field(default=None, description=_MEANING["latency_s"])
     speed_limit_mps: TypeQuantity | None = Field(default=None, description=_MEANING["speed_limit_mps"])
+    brake_rate_mps3: TypeQuantity | None = Field(
+        default=None, exclude_if=not_, description=_MEANING["brake_rate_mps3"]
+    )
+    release_rate_mps3: TypeQuantity | None = Field(
+        default=None, exclude_if=not_, description=_MEANING["release_rate_mps3"]
+    )
     v2x: Equipage | None = Field(default=None, exclude_if=not_, description="what it has of V2X; by default all")
 
     @field_validator(*QUANTITY.of_a_type)
@@ -924,6 +945,12 @@ class ScenarioFields(FileModel):
     obstacle_gap_m: Quantity | None = Field(default=None, description=_MEANING["obstacle_gap_m"])
     obstacle_margin_m: Quantity | None = Field(default=None, description=_MEANING["obstacle_margin_m"])
     friction: Quantity | None = Field(default=None, exclude_if=not_, description=_MEANING["friction"])
+    brake_rate_mps3: PerVehicle | None = Field(
+        default=None, exclude_if=not_, description=_MEANING["brake_rate_mps3"]
+    )
+    release_rate_mps3: PerVehicle | None = Field(
+        default=None, exclude_if=not_, description=_MEANING["release_rate_mps3"]
+    )
     alert_s: Quantity | None = Field(default=None, exclude_if=not_, description=_MEANING["alert_s"])
     early_impacts: Literal["keep", "reject"] = Field(
         default="keep", description="what happens to worlds with an impact before the first learner may act"
@@ -1128,8 +1155,13 @@ class ScenarioFields(FileModel):
         return any(member.has_friction for member in self.members) or self.declares("friction")
 
     def declares(self, field: str) -> bool:
-        """Whether it says what a quantity is: under its key, or in its table for every vehicle or pair."""
-        return getattr(self, field) is not None or _tabled({"table": self.table, "vehicles": self.vehicles}, field)
+        """Whether it says what a quantity is: under its key, by type, or in its table for every vehicle or pair."""
+        kinds = (self.vehicle_types or {}).values() if field in QUANTITY.of_a_type else ()
+        return (
+            getattr(self, field) is not None
+            or any(getattr(kind, field) is not None for kind in kinds)
+            or _tabled({"table": self.table, "vehicles": self.vehicles}, field)
+        )
 
     @property
     def table_entries(self) -> dict[Entry, TableColumn]:
@@ -1199,7 +1231,7 @@ class ScenarioFields(FileModel):
         """Upper bound of the distance to an obstacle that is declared by its margin."""
         found = on_road(world_quantities(self, _supports_of(self)))
         low, high = ({key: bounds[[row]] for key, bounds in found.items()} for row in (0, 1))
-        slowest = high | {"braking_capacity_mps2": low["braking_capacity_mps2"]}
+        slowest = high | {key: low[key] for key in ("braking_capacity_mps2", "brake_rate_mps3") if key in low}
         farthest = obstacle_gap(self, slowest, lambda key: np.array([support(self.quantities(key)[0])[1]]))
         assert farthest is not None
         return float(farthest[0])
@@ -1407,13 +1439,14 @@ def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]
     found = {key: declared(key) for key in QUANTITY.usual if other.get(key) is None}
     if scenario.alert_s is not None:
         found["latency_s"] = found["latency_s"] + declared("alert_s")
-    if scenario.declares("friction"):
-        found["friction"] = declared("friction")
+    for key in _ALSO:
+        if scenario.declares(key):
+            found[key] = declared(key)
     if scenario.line_speed_mps is not None:
         found["speeds_mps"] = declared("line_speed_mps") + declared("speed_deviations_mps")
     if scenario.time_gaps_s is not None:
         found["gaps_m"] = declared("time_gaps_s") * found["speeds_mps"][:, 1:]
-    return {key: found[key] for key in (*QUANTITY.usual, "friction") if key in found}
+    return {key: found[key] for key in (*QUANTITY.usual, *_ALSO) if key in found}
 
 
 def on_road(found: Mapping[str, Floats]) -> dict[str, Floats]:
@@ -1433,7 +1466,8 @@ def obstacle_gap(
     if scenario.obstacle_margin_m is None:
         return None
     speed, latency, capacity = (found[key][:, 0] for key in ("speeds_mps", "latency_s", "braking_capacity_mps2"))
-    return declared("obstacle_margin_m") + stopping_distances(speed, latency, capacity)
+    rate = found["brake_rate_mps3"][:, 0] if "brake_rate_mps3" in found else np.full(len(speed), np.inf)
+    return declared("obstacle_margin_m") + stopping_distances(speed, latency, capacity, rate)
 
 
 def drawn_quantities(
@@ -1448,7 +1482,7 @@ def drawn_quantities(
     def at(place: Place) -> Floats:
         of, column = place
         if of not in streams:
-            streams[of] = numbers(OF_WORLD, of)
+            streams[of] = numbers(BLOCK * scenario.vehicles if of == BRAKES else OF_WORLD, of)
         return streams[of][:, column]
 
     def drawn(key: str) -> Floats:
@@ -1610,7 +1644,9 @@ class _Naming:
 def _quantities(scenario: ScenarioFields) -> dict[str, QuantityRule]:
     """What a world of this scenario has."""
     there = {"obstacle_gap_m": scenario.has_obstacle, "friction": scenario.has_friction}
-    return QUANTITY.usual | {key: rule for key, rule in QUANTITY.optional.items() if there[key]}
+    return QUANTITY.usual | {
+        key: rule for key, rule in QUANTITY.optional.items() if there.get(key, scenario.declares(key))
+    }
 
 
 def _table_columns(rules: Mapping[str, QuantityRule], vehicles: int) -> dict[str, Entry]:
@@ -1777,6 +1813,7 @@ class Ranges:
         """
         n, vehicles = len(points), self.scenario.vehicles
         widths = {(): BLOCK * vehicles, TYPES: PER_TYPE * vehicles, OBSTACLE: OF_WORLD, SURROUNDINGS: OF_WORLD}
+        widths[BRAKES] = widths[()]
         streams = {of: np.full((n, width), _UNUSED) for of, width in widths.items()}
         for (of, column), u in zip(self.places, points.T, strict=True):
             streams[of][:, column] = u

@@ -59,6 +59,13 @@ def check_whole(scenario: ScenarioFields) -> None:
         tabled = [entry for entry in scenario.table_entries if entry[0] == key]
         whole = len(tabled) == QUANTITY.declared[key].count(scenario.vehicles)
         require(not whole, (key,), getattr(scenario, key), "the table says it for all; leave it out")
+    kinds = scenario.vehicle_types or {}
+    for key in set(QUANTITY.of_a_type) - set(QUANTITY.usual):
+        silent = [name for name, kind in kinds.items() if getattr(kind, key) is None]
+        right = f"type {''.join(silent[:1])} does not declare it: give it there, or here for every type that does not"
+        told = getattr(scenario, key) is not None
+        require(told or len(silent) in (0, len(kinds)), (key,), UNSHOWN, right)
+        require(not (told and kinds) or len(silent) > 0, (key,), UNSHOWN, "every type declares it; leave it out")
     for usual, other in QUANTITY.alternatives.items():
         given = [key for key in (usual, other) if getattr(scenario, key) is not None]
         columns = [column.name for (key, _), column in scenario.table_entries.items() if key == usual]

@@ -876,8 +876,9 @@ class BelievingHybrid(Believing):
         v, n = believed.vehicles, believed.n
         latency = np.maximum(v.latency_s - believed.time_s[:, np.newaxis], 0.0)
         vehicles = Vehicles.at_once(
-            v.braking_capacity_mps2, v.driving_capacity_mps2, latency, v.mass_t, v.speed_limit_mps, v.restitution
-        )
+            v.braking_capacity_mps2, v.driving_capacity_mps2, latency, v.mass_t, v.speed_limit_mps, v.restitution,
+            v.brake_rate_mps3, v.release_rate_mps3,
+        )  # fmt: skip
         return replace(
             believed, vehicles=vehicles, time_s=np.zeros(n), pair_hit=np.zeros_like(believed.pair_hit),
             obstacle_hit=np.zeros(n, np.bool_),

@@ -75,6 +75,7 @@ from ethbrake_marl.physics import (
     compiled,
     grid_of,
     harm_so_far,
+    place_rates,
     restore,
     save,
     step_again,
@@ -97,9 +98,10 @@ from ethbrake_marl.shield.uncertainty import MOST_CORNERS, Uncertainty, check_am
 # A world has M members, worlds that must all keep the bound: one without uncertainty, then nothing here costs more. K
 # of its vehicles are shielded; an action is a row [K], a plan [L, K] holds one for each decision.
 
-# rows of the lines: command of those that are not shielded (m/s2), latency (s), mass (t), speed limit (m/s), and the
-# harm that each vehicle may bear (m2/s2), a row that is missing where there is no such limit
-OF_COMMAND, OF_LATENCY, OF_MASS, OF_LIMIT, OF_CAP = range(5)
+# rows of the lines: command of those that are not shielded (m/s2), latency (s), mass (t), speed limit (m/s), rates at
+# which brakes build up and are released (m/s3), and the harm that each vehicle may bear (m2/s2), a row that is missing
+# where there is no such limit
+OF_COMMAND, OF_LATENCY, OF_MASS, OF_LIMIT, OF_BRAKE_RATE, OF_RELEASE_RATE, OF_CAP = range(7)
 
 
 class Members(NamedTuple):
@@ -123,9 +125,13 @@ def all_members(running: Running) -> Members:
         for i in range(N):
             lines[m, OF_COMMAND, i], lines[m, OF_LATENCY, i] = problem.command[m, i], problem.latency[m, i]
             lines[m, OF_MASS, i], lines[m, OF_LIMIT, i] = problem.mass[m, i], problem.limit[m, i]
+            lines[m, OF_BRAKE_RATE, i], lines[m, OF_RELEASE_RATE, i] = (
+                problem.brake_rate[m, i],
+                problem.release_rate[m, i],
+            )
             if running.caps.shape[1] > 0:
                 lines[m, OF_CAP, i] = running.caps[m, i]
-    table, critical = np.zeros((ROW.OF_EPISODE, N)), np.zeros(1, np.int64)
+    table, critical = np.zeros((ROW.OF_BUILD_UP, N)), np.zeros(1, np.int64)
     return Members(table, problem.clock, problem.bounds, lines, problem.vehicles, critical)
 
 
@@ -142,6 +148,7 @@ def enter(world: Members, m: int, state: Floats) -> None:
     for i in range(table.shape[1]):
         table[ROW.COMMAND, i], table[ROW.LATENCY, i] = lines[m, OF_COMMAND, i], lines[m, OF_LATENCY, i]
         table[ROW.MASS, i], table[ROW.LIMIT, i] = lines[m, OF_MASS, i], lines[m, OF_LIMIT, i]
+    place_rates(table, lines[m, OF_BRAKE_RATE], lines[m, OF_RELEASE_RATE])
     restore(table, state)
 
 

@@ -43,9 +43,11 @@ def check_scenario(scenario: object, where: str) -> None:
         raise InvalidInput(f"{where}: scenario = {scenario!r}: must be a Scenario; eb.load_scenario(name) loads one")
 
 
-OF_VEHICLES = ("braking_capacity_mps2", "driving_capacity_mps2", "latency_s", "mass_t")  # fields of ``Vehicles``
+OF_VEHICLES = (  # fields of ``Vehicles``
+    "braking_capacity_mps2", "driving_capacity_mps2", "latency_s", "mass_t", "brake_rate_mps3", "release_rate_mps3",
+)  # fmt: skip
 QUANTITIES = (*OF_VEHICLES, "speeds_mps", "gaps_m", "friction")
-POSITIVE = ("braking_capacity_mps2", "mass_t", "friction")  # must stay above 0
+POSITIVE = ("braking_capacity_mps2", "mass_t", "friction", "brake_rate_mps3", "release_rate_mps3")  # must stay above 0
 _OF_FRICTION = (0.0, 0.125, 0.25, 0.375, 0.625, 0.75, 0.875, 1.0)  # shares of its interval; told is 0.5
 MOST_CORNERS = 1024  # of one world: each costs as much as the world itself
 _FORM = f"must be quantity=half-width, for instance {DEFAULT.UNCERTAINTY_EXAMPLE}"
