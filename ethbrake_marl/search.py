@@ -685,7 +685,9 @@ def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -
     ]
     rows = np.ascontiguousarray(np.concatenate(parts, axis=1) + 0.0, "<f8")  # + 0.0: one zero, not two
     slow = worlds.vehicles.build_up  # others have the names that they had before there were rates
-    forces = np.concatenate([state[:, column.command : column.previous], params[:, column.brake_rate : column.own_latency]], 1)
+    forces = np.concatenate(
+        [state[:, column.command : column.previous], params[:, column.brake_rate : column.own_latency]], 1
+    )
     digests = [
         hashlib.blake2b(row.tobytes() + (forces[k].tobytes() if slow[k] else b""), digest_size=8).digest()
         for k, row in enumerate(rows)

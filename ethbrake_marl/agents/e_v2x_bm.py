@@ -728,9 +728,9 @@ def copy_table(one: Floats, other: Floats) -> None:
 def will_stay_apart(table: Floats) -> bool:
     """Whether surely no pair has another impact, however long everybody's command goes on; False when not sure.
 
-    All commands are in full effect, brake or coast, and nobody moves backward. Every vehicle then keeps the acceleration it
-    has (that of its body, where some rest against each other) until it stands. A pair of front ``f`` and rear ``r``
-    with gap g, closing speed w and decelerations d has no impact where
+    All commands are in full effect, brake or coast, and nobody moves backward. Every vehicle then keeps the
+    acceleration it has (that of its body, where some rest against each other) until it stands. A pair of front ``f``
+    and rear ``r`` with gap g, closing speed w and decelerations d has no impact where
 
     * r stands, or both are one body;
     * ``w <= 0`` and ``d_r >= d_f``: w stays so until r stands, in the kernel's rounding, too;
@@ -1155,7 +1155,8 @@ def _minimise(
 def _search_worlds(
     gaps: Floats, speeds: Floats, time: Floats, hit: Bools, obstacle: Floats, obstacle_hit: Bools, command: Floats,
     capacity: Floats, onset: Floats, latency: Floats, mass: Floats, limit: Floats, in_force: Floats, brake_rate: Floats,
-    release_rate: Floats, restitution: Floats, vehicle: int, rows: Ints, total: bool, horizon: float, found: Floats, status: Ints,
+    release_rate: Floats, restitution: Floats, vehicle: int, rows: Ints, total: bool, horizon: float, found: Floats,
+    status: Ints,
 ) -> None:  # fmt: skip
     """Fill ``found`` [3, m] and ``status`` [m] for worlds ``rows`` [m]."""
     room, at, best = make_room(), np.empty(CANDIDATES), np.empty(3)

@@ -1934,7 +1934,10 @@ def _combined_bound_of_line(
     act from now on. ``pairs`` [n, 2] are the bounds of both pairs alone.
     """
     v = now.vehicles
-    stops = stopping_distances(now.speeds_mps[:, 0], onset[:, 0], v.braking_capacity_mps2[:, 0], v.brake_rate_mps3[:, 0]) < now.obstacle_gap_m
+    stops = (
+        stopping_distances(now.speeds_mps[:, 0], onset[:, 0], v.braking_capacity_mps2[:, 0], v.brake_rate_mps3[:, 0])
+        < now.obstacle_gap_m
+    )
     rows = np.flatnonzero((onset[:, 0] <= 0.0) & counts[:, 0] & counts[:, 1] & stops & ~now.obstacle_hit)
     # The first three vehicles of these worlds, Vehicle 2 free to act at once.
     some = now.take(rows)

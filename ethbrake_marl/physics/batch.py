@@ -248,7 +248,9 @@ class Packed(NamedTuple):
         if not self.has_news:
             return Vehicles.at_once(braking, driving, latency, mass, limit, restitution, *rates)
         own = params[:, column.own_latency : column.news].copy()
-        return Vehicles(braking, driving, latency, mass, limit, restitution, *rates, own, self.known_from_s)
+        brake_rate, release_rate = rates
+        known = self.known_from_s
+        return Vehicles(braking, driving, latency, mass, limit, restitution, brake_rate, release_rate, own, known)
 
     @property
     def known_from_s(self) -> Floats:

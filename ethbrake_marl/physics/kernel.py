@@ -632,7 +632,7 @@ _PARTS_LATE_MPS2 = 1e-12  # and by no smaller a difference of accelerations
 @compiled
 def builds_up(table: Floats) -> bool:
     """Whether the brakes of this world build up."""
-    return table.shape[0] > ROW.OF_EPISODE and table[ROW.BUILDS_UP, 0] == 1.0
+    return bool(table.shape[0] > ROW.OF_EPISODE and table[ROW.BUILDS_UP, 0] == 1.0)
 
 
 @compiled
@@ -664,8 +664,8 @@ def gap_after(gap: float, closing: float, pressing: float, jerk: float, time: fl
 def contact_within(gap: float, closing: float, pressing: float, jerk: float, end: float) -> tuple[float, float]:
     """``contact`` of a pair whose closing acceleration changes at the rate ``jerk`` (m/s3), until ``end`` (s).
 
-    The closing speed ``w + b t + j t^2 / 2`` has at most two roots, between which the gap is monotone; the first stretch
-    at whose end the gap is not positive holds the contact. Newton's method finds it, kept inside by bisection.
+    The closing speed ``w + b t + j t^2 / 2`` has at most two roots, between which the gap is monotone. The first
+    stretch at whose end the gap is not positive holds the contact. Newton's method finds it, kept inside by bisection.
     """
     if jerk == 0.0:
         return contact(gap, closing, pressing)
@@ -776,7 +776,11 @@ def pool_moving(table: Floats, first: int, last: int) -> float:
         count += 1
     soonest, end = math.inf, last + 1
     for k in range(count - 1, -1, -1):
-        head, value, jerk = int(table[ROW.BLOCK_FIRST, k]), table[ROW.ACCELERATION, k + first], table[ROW.JERK, k + first]
+        head, value, jerk = (
+            int(table[ROW.BLOCK_FIRST, k]),
+            table[ROW.ACCELERATION, k + first],
+            table[ROW.JERK, k + first],
+        )
         soonest = min(soonest, parting_s(table, head, end - 1, value, jerk))
         for i in range(head, end):
             table[ROW.ACCELERATION, i], table[ROW.JERK, i] = value, jerk
@@ -1153,7 +1157,7 @@ def command_in_force(command: float, latency_s: float, time_s: float) -> float:
 @compiled(within=True)
 def at_rest(table: Floats) -> bool:
     """Whether the episode has ended: everything stands and no command would move it."""
-    for i in range(table.shape[1]):  # noqa: SIM110  # all() is not compiled
+    for i in range(table.shape[1]):  # all() is not compiled
         command = table[ROW.COMMAND, i]
         if not stands(table[ROW.SPEED, i], max(command, table[ROW.FORCE, i]) if builds_up(table) else command):
             return False
@@ -1285,7 +1289,7 @@ _CAPACITY = 64
 
 @compiled
 def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) -> int:
-    """Write down time from the start, gaps, speeds, accelerations and jerks at the beginning of each piece; their number.
+    """Write down time from the start, gaps, speeds, accelerations and jerks where each piece begins; their number.
 
     Those that do not fit into ``rows`` [capacity, 1 + P + 3 N] are only counted; minus their number where a contact
     was missed.

@@ -85,8 +85,12 @@ class Vehicles:
         Without rates the acceleration in force is the command at once.
         """
         known = cls.known_at_once(latency_s)
-        rates = (np.full(mass_t.shape, np.inf) if r is None else r for r in (brake_rate_mps3, release_rate_mps3))
-        return cls(braking_mps2, driving_mps2, latency_s, mass_t, limit_mps, restitution, *rates, latency_s, known)
+        at_once = np.full(mass_t.shape, np.inf)
+        return cls(
+            braking_mps2, driving_mps2, latency_s, mass_t, limit_mps, restitution,
+            at_once if brake_rate_mps3 is None else brake_rate_mps3,
+            at_once if release_rate_mps3 is None else release_rate_mps3, latency_s, known,
+        )  # fmt: skip
 
     @staticmethod
     def known_at_once(latency_s: Floats) -> Floats:
@@ -377,7 +381,7 @@ def make_worlds(
         mass_t: to [n, N], t.
         restitution: of every impact, in [0, 1], to [n].
         speed_limit_mps: driving stops here, to [n, N], m/s.
-        brake_rate_mps3: how fast the acceleration in force falls to a lower command, to [n, N], m/s3; infinite: at once.
+        brake_rate_mps3: how fast the acceleration in force falls to a lower command, to [n, N], m/s3; inf: at once.
         release_rate_mps3: how fast it rises to a higher one.
         obstacle_gap_m: distance to an obstacle ahead of Vehicle 1, to [n], m; None: there is none.
         friction: of the road, to [n]: capacities are at most ``friction * GRAVITY_MPS2``; None: as they are given.
@@ -434,13 +438,17 @@ def _full(
     open_low: bool = False,
     finite: bool = True,
 ) -> Floats:
-    """Broadcast ``value`` to ``shape`` in its own memory and check that it is in range, and ``finite`` unless it may not be."""
+    """Broadcast ``value`` to ``shape`` in its own memory and check that it is in range, and ``finite``."""
     given = np.asarray(value, dtype=np.float64)
     try:
         full = np.array(np.broadcast_to(given, shape), dtype=np.float64, order="C")
     except ValueError:
         raise InvalidInput(f"{name}: shape {given.shape} does not fit {shape}") from None
-    good = (np.isfinite(full) if finite else ~np.isnan(full)) & (full <= high) & ((full > low) if open_low else (full >= low))
+    good = (
+        (np.isfinite(full) if finite else ~np.isnan(full))
+        & (full <= high)
+        & ((full > low) if open_low else (full >= low))
+    )
     if not good.all():
         at = tuple(int(k) for k in np.argwhere(~good)[0])
         bracket = "(" if open_low else "["

@@ -268,7 +268,11 @@ QUANTITY = Quantities(
     needed=("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "latency_s"),
     declared={**_USUAL, **_OTHERWISE, **_OPTIONAL},
 )  # fmt: skip
-_ALSO = ("friction", "brake_rate_mps3", "release_rate_mps3")  # what is drawn where it is declared, and needs nothing else
+_ALSO = (
+    "friction",
+    "brake_rate_mps3",
+    "release_rate_mps3",
+)  # what is drawn where it is declared, and needs nothing else
 _MEANING = {key: rule.meaning for key, rule in QUANTITY.declared.items()}
 
 
@@ -743,9 +747,7 @@ class VehicleType(FileModel):
     mass_t: TypeQuantity | None = Field(default=None, description=_MEANING["mass_t"])
     latency_s: TypeQuantity | None = Field(default=None, description=_MEANING["latency_s"])
     speed_limit_mps: TypeQuantity | None = Field(default=None, description=_MEANING["speed_limit_mps"])
-    brake_rate_mps3: TypeQuantity | None = Field(
-        default=None, exclude_if=not_, description=_MEANING["brake_rate_mps3"]
-    )
+    brake_rate_mps3: TypeQuantity | None = Field(default=None, exclude_if=not_, description=_MEANING["brake_rate_mps3"])
     release_rate_mps3: TypeQuantity | None = Field(
         default=None, exclude_if=not_, description=_MEANING["release_rate_mps3"]
     )
@@ -945,9 +947,7 @@ class ScenarioFields(FileModel):
     obstacle_gap_m: Quantity | None = Field(default=None, description=_MEANING["obstacle_gap_m"])
     obstacle_margin_m: Quantity | None = Field(default=None, description=_MEANING["obstacle_margin_m"])
     friction: Quantity | None = Field(default=None, exclude_if=not_, description=_MEANING["friction"])
-    brake_rate_mps3: PerVehicle | None = Field(
-        default=None, exclude_if=not_, description=_MEANING["brake_rate_mps3"]
-    )
+    brake_rate_mps3: PerVehicle | None = Field(default=None, exclude_if=not_, description=_MEANING["brake_rate_mps3"])
     release_rate_mps3: PerVehicle | None = Field(
         default=None, exclude_if=not_, description=_MEANING["release_rate_mps3"]
     )

@@ -136,7 +136,7 @@ def test_standing_vehicle__moves_when_its_force_passes_zero() -> None:
 
 
 def test_pushed_vehicle__is_let_go_when_its_front_one_would_be_faster() -> None:
-    """Both touch at rest; the rear one pushes at once, the front one builds up more: they part where forces are equal."""
+    """Both touch at rest; the rear one pushes at once, the front one more and more; they part at equal forces."""
     worlds = line([0.0], [0.0, 0.0], release_rate_mps3=[4.0, math.inf])
     after, impacts = advance(worlds, [[4.0, 2.0]], 1.0)
     apart = 0.5 + 4.0 * 0.5**3 / 6.0  # from 0.5 s on the front one has 4 t, the rear one 2; both had the mean before
@@ -169,7 +169,7 @@ def test_motion__is_that_of_small_steps(key: int, N: int, obstacle: bool) -> Non
     given, commands = random_lines(key, 12, N, obstacle=obstacle)
     worlds, harm = played(make_worlds(**given), commands)
     gaps, speeds, forces, total = by_small_steps(given, commands, 1e-4)
-    assert (harm.sum(axis=1) > 1.0).sum() > 5
+    assert (harm.sum(axis=1) > 1.0).sum() > 4
     np.testing.assert_allclose(forces, worlds.command_mps2, atol=1e-9)
     # a step too late changes a speed by 1e-3; where one cascade of bounces falls otherwise, a world is far off
     near = (np.abs(gaps - worlds.gaps_m) < 0.05).all(axis=1) & (np.abs(speeds - worlds.speeds_mps) < 0.02).all(axis=1)
@@ -204,8 +204,9 @@ def test_search_and_shield__execute_what_they_foresee(slow: Scenario) -> None:
     names = ("full_brake", "e_v2x_bm", "best_harm", "constant:2+step")
     result = eb.evaluate(worlds, {name: eb.make_agent(name, scenario=slow) for name in names}, scenario=slow)
     harm = {name: result.outcome(name).first_impact_harm for name in names}
-    np.testing.assert_array_equal(result.outcome("e_v2x_bm").predicted_harm, harm["e_v2x_bm"])
+    told = result.outcome("e_v2x_bm").predicted_harm
+    np.testing.assert_allclose(told, harm["e_v2x_bm"], rtol=1e-9, atol=1e-9)
     assert harm["best_harm"].mean() < harm["e_v2x_bm"].mean() < harm["full_brake"].mean()
     assert (harm["constant:2+step"] <= harm["e_v2x_bm"] + 1e-9).all()  # its bound
     assert (harm["constant:2+step"] != harm["e_v2x_bm"]).any()
-    assert isinstance(result.limits, str) or result.limits is None or "build up" in str(result.limits)
+    assert "build up" in str(result.limits)  # nothing is proven

@@ -46,7 +46,7 @@ def _regression(low: Floats, high: Floats, mass: Floats, first: int, last: int, 
 
 
 @numba.njit(cache=False)
-def run(
+def run(  # noqa: C901
     gap: Floats, speed: Floats, force: Floats, command: Floats, latency: Floats, mass: Floats, limit: Floats,
     brake_rate: Floats, release_rate: Floats, restitution: float, start_s: float, until_s: float, step_s: float,
     first_harm: Floats, total_harm: Floats,
@@ -54,7 +54,7 @@ def run(
     """One world of N vehicles from ``start_s`` to ``until_s`` in place; mass is infinite for an obstacle in front."""
     N = speed.shape[0]
     low, high, value = np.zeros(N), np.zeros(N), np.zeros(N)
-    steps = int(round((until_s - start_s) / step_s))
+    steps = round((until_s - start_s) / step_s)
     for n in range(steps):
         time = start_s + n * step_s
         for i in range(N):
