@@ -9,7 +9,7 @@ from ethbrake_marl.limits.lower_bound import avoidability
 from ethbrake_marl.physics import Worlds, advance
 from ethbrake_marl.scenario import load_scenario
 from tests.limits.worlds import line, paper_line, random_profiles, wide_worlds, with_gap
-from tests.reference.avoidability_lp import avoidable_by_lp, default_horizon_s
+from tests.reference.avoidability_lp import avoidable_by_lp
 from tests.reference.play_profile import play_profile
 
 LINES = [(3, 1), (2, 1), (2, 0)]  # vehicles, controlled one
@@ -220,8 +220,7 @@ def test_exact_verdict__agrees_with_a_linear_programme_where_that_is_certain(
     worlds = drawn(n * times, vehicles, controlled, seed=31)
     exact, found = avoidability(worlds, controlled).avoidable, 0
     for k in range(worlds.n):
-        world = worlds.take([k])
-        linear = avoidable_by_lp(world, (controlled,), default_horizon_s(world, (controlled,)) / steps)
+        linear = avoidable_by_lp(worlds.take([k]), (controlled,), steps)
         assert linear.avoidable == exact[k] or not linear.certain, (k, linear.margin_m)
         found += linear.certain
     assert found > certain * worlds.n
