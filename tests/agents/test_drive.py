@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -14,8 +12,9 @@ from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate, follow_episodes, record_episode, worlds_sha256
 from ethbrake_marl.evaluation.episodes import Task, film_scenes, record_episodes
-from ethbrake_marl.physics import Floats, Worlds, advance
+from ethbrake_marl.physics import advance
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver
+from tests.fixtures.asked import Acts
 
 PAPER = eb.load_scenario("paper-random")
 PAIR = eb.load_scenario("cooperation-3-pair")
@@ -87,19 +86,16 @@ def test_drive__a_policy_as_a_role_does_what_it_does_when_it_is_driven():
     assert 0.0 < harm.mean() < drive(worlds, braking, driven, 1).ledger.world_harm("first").mean()
 
 
-class Swinging:
+@Acts
+def swings(worlds, vehicle):
     """Brakes the harder the later it is: every decision is another command."""
-
-    name = "swinging"
-
-    def act(self, worlds, vehicle):
-        return -worlds.vehicles.braking_capacity_mps2[:, vehicle] * (0.3 + 0.6 * np.sin(7.0 * worlds.time_s) ** 2)
+    return -worlds.vehicles.braking_capacity_mps2[:, vehicle] * (0.3 + 0.6 * np.sin(7.0 * worlds.time_s) ** 2)
 
 
 @pytest.fixture
 def swinging():
     """Lines whose first and last vehicle follow a script that decides within the steps of Vehicle 2."""
-    register_agent("swinging", lambda argument, settings: Swinging())
+    register_agent("swinging", lambda argument, settings: swings)
     roles = {"vehicle_1": "swinging", "vehicle_2": "learner", "vehicle_3": "swinging"}
     latency = [0.04, 0.5, {"uniform": [0.2, 0.9]}]
     return PAPER.replace(early_impacts="keep", roles=roles, latency_s=latency, gaps_m=4)
@@ -265,29 +261,3 @@ def test_agent_that_writes_into_worlds_or_itself__is_refused_by_name(
     found = evaluate(sample, agents, scenario=PAPER)
     full, kmh = (found.outcome(name).ledger.world_harm("first") for name in agents)
     assert np.array_equal(full, kmh)
-
-
-@pytest.mark.parametrize(
-    ("begun", "kept", "told"),
-    [
-        (lambda n: None, lambda m, n: np.zeros(n), "another form"),  # rows that begin anew would keep the old one
-        (lambda n: {"a": np.zeros(n)}, lambda m, n: m | {"b": np.zeros(n)}, "another form"),
-        (lambda n: np.zeros(n), lambda m, n: np.zeros(n, np.int64), "another form.*int64.*float64"),
-        (lambda n: np.zeros((n, 1)), lambda m, n: np.zeros((n, 2)), "another form"),
-        (lambda n: {"a": (np.zeros(n), {"b.c": np.zeros(n)})}, lambda m, n: m, "key 'b.c'; must be a name"),
-        (lambda n: {0: np.zeros(n)}, lambda m, n: m, "key 0; must be a name"),
-        (lambda n: np.array([[]] * n + [[1]], object)[:n], lambda m, n: m, "an array of objects"),
-    ],
-)
-def test_memory_of_another_form__is_refused_by_name(begun: Any, kept: Any, told: str) -> None:
-    class Remembers:
-        name = "mine"
-
-        def begin(self, alert: Worlds, vehicle: int, scripts: object) -> Any:
-            return begun(alert.n)
-
-        def act(self, worlds: Worlds, memory: Any, vehicle: int) -> tuple[Floats, Any]:
-            return np.zeros(worlds.n), kept(memory, worlds.n)
-
-    with pytest.raises(InvalidInput, match=f"agent 'mine' of vehicle_2.*{told}"):
-        evaluate(PAPER.sample(3, 3), {"mine": Remembers()}, scenario=PAPER)

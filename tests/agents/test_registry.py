@@ -20,7 +20,7 @@ from ethbrake_marl.agents import (
 )
 from ethbrake_marl.agents.registry import AgentSpec
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver
 from tests.fixtures.asked import Asked
@@ -166,13 +166,3 @@ def test_register_agent__makes_names_and_policies_known():
     assert {each[2] for each in seen} == {"total"} and "mine" in agent_names()
     with pytest.raises(AlreadyExists, match="agent 'mine' is registered already"):
         register_agent("mine", lambda argument, settings: make_agent("coast"))
-
-
-def test_registered__takes_a_policy_only_where_it_says_so():
-    register_agent("leads", lambda argument, settings: make_agent(f"constant:{argument}"))
-    told = r"leads takes no policy; register_agent\(..., takes_policy=True\) says"
-    with pytest.raises(InvalidInput, match=told):
-        make_agent("leads@anything")
-    with pytest.raises(InvalidInput, match=told):
-        roles = {"vehicle_1": "leads:3@anything", "vehicle_2": "learner"}
-        eb.parallel_env(SCENARIO.replace(early_impacts="keep", roles=roles))

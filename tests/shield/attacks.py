@@ -64,36 +64,6 @@ TEAMS = {  # by cooperation level and number of vehicles
 Adversary = Callable[[np.random.Generator, Engine, StepShield, int], Floats]  # ..., number of the step
 
 
-def random_actions(rng, engine, shield, k):
-    return rng.uniform(-1.0, 1.0, shape(shield))
-
-
-def extremes(rng, engine, shield, k):
-    return np.where((k + np.arange(shape(shield)[0])[:, np.newaxis]) % 2, 1.0, -np.ones(shape(shield)))
-
-
-def coast(rng, engine, shield, k):
-    return np.zeros(shape(shield))
-
-
-def full_drive(rng, engine, shield, k):
-    return np.ones(shape(shield))
-
-
-def slow_drift(rng, engine, shield, k):
-    """Random, held for several steps: whole profiles that differ from the plan."""
-    return np.random.default_rng(1_000 + k // 6).uniform(-1.0, 0.5, shape(shield))
-
-
-def bang_bang(rng, engine, shield, k):
-    return np.sign(np.random.default_rng([k // 4, shape(shield)[0]]).uniform(-1.0, 1.0, shape(shield)))
-
-
-def speechless(rng, engine, shield, k):
-    """No number half of the time; at random else."""
-    return np.where(rng.random(shape(shield)) < 0.5, np.nan, rng.uniform(-3.0, 3.0, shape(shield)))
-
-
 def worst_case(rng, engine, shield, k, candidates=8):
     """Of some candidates the accepted one that leaves the most harm: a search against the shield itself."""
     n, K = shape(shield)
@@ -130,8 +100,22 @@ def trained(rng, engine, shield, k):
     return np.clip(action + rng.normal(0.0, 0.05, action.shape), -1.0, 1.0)
 
 
-_TEAMS_TOO = (random_actions, extremes, coast, full_drive, slow_drift, bang_bang, speechless, worst_case, sleeper)
-TEAM_ADVERSARIES: dict[str, Adversary] = {f.__name__: f for f in _TEAMS_TOO}
+# Slow drift and bang-bang are held for several steps: whole profiles that differ from the plan.
+TEAM_ADVERSARIES: dict[str, Adversary] = {
+    "random_actions": lambda rng, engine, shield, k: rng.uniform(-1.0, 1.0, shape(shield)),
+    "extremes": lambda rng, engine, shield, k: np.where((np.indices(shape(shield))[0] + k) % 2, 1.0, -1.0),
+    "coast": lambda rng, engine, shield, k: np.zeros(shape(shield)),
+    "full_drive": lambda rng, engine, shield, k: np.ones(shape(shield)),
+    "slow_drift": lambda rng, engine, shield, k: np.random.default_rng(1_000 + k // 6).uniform(-1, 0.5, shape(shield)),
+    "bang_bang": lambda rng, engine, shield, k: np.sign(
+        np.random.default_rng([k // 4, shape(shield)[0]]).uniform(-1.0, 1.0, shape(shield))
+    ),
+    "speechless": lambda rng, engine, shield, k: np.where(  # no number half of the time; at random else
+        rng.random(shape(shield)) < 0.5, np.nan, rng.uniform(-3.0, 3.0, shape(shield))
+    ),
+    "worst_case": worst_case,
+    "sleeper": sleeper,
+}
 ADVERSARIES: dict[str, Adversary] = {**TEAM_ADVERSARIES, "trained": trained}
 
 
@@ -287,11 +271,6 @@ def search(
 Leak = Callable[[StepShield, Decision | None], None]  # changes the shield before a decision; the last one, or None
 
 
-def _with_problem(shield: StepShield, **arrays: np.ndarray) -> None:
-    running = shield.running
-    shield.running = running._replace(problem=running.problem._replace(**arrays))
-
-
 def _columns(running: Running, group: int) -> slice:
     """Columns of the state: 0 gaps, 1 hit flags, 2 first-impact harm, 3 total harm."""
     N = running.problem.mass.shape[1]
@@ -338,7 +317,9 @@ def belief(name: str, believed: Callable[[np.ndarray], np.ndarray]) -> Leak:
 
     def leak(shield, last):
         if last is None:
-            _with_problem(shield, **{name: believed(getattr(shield.running.problem, name).copy())})
+            problem = shield.running.problem
+            changed = problem._replace(**{name: believed(getattr(problem, name).copy())})
+            shield.running = shield.running._replace(problem=changed)
 
     return leak
 

@@ -72,7 +72,7 @@ class Unreliable:
 
 
 class Play:
-    """One interface, shielded: ``step`` makes a step with fresh proposals, ``bad`` are calls that must raise."""
+    """One interface, shielded: ``make`` begins it, ``step`` proposes afresh, ``bad`` are calls that must raise."""
 
     def __init__(self, seed: int, *, team: bool = False) -> None:
         self.rng, self.team, self.scenario = np.random.default_rng(seed), team, PAIR if team else ALONE
@@ -83,10 +83,12 @@ class Play:
         self.done: list[tuple[float, float]] = []  # of engines before this one
         self.make()
 
-    make: Any  # the interface, watch its engine, begin an episode; all without arguments
-    engine: Any
-    shield: Any
-    step: Any
+    def put(self, env: Any, shield: Any = None, **begin: int) -> None:
+        """Play this environment from now on, which is or has such a shield: watch its engine, begin an episode."""
+        self.env, at = env, env if shield is None else shield
+        self.engine, self.shield = lambda: at.attached.engine, lambda: at.attached.shield
+        self.watch()
+        env.reset(**begin)
 
     def between(self, env: Any) -> Any:
         """The environment, each of whose steps goes through ``how``."""
@@ -167,7 +169,6 @@ class Parallel(Play):
         policies: Any = {f"vehicle_{i + 1}": member for i, member in self.members.items()}
         policy = policies if self.team else policies["vehicle_2"]
         inner = self.between(parallel_env(self.scenario))
-        self.env = HybridShield(inner, policy, mode="step", cap="baseline" if self.team else None)
         last = list(policies)[-1]
         self.bad = [
             lambda: self.env.step({"vehicle_2": np.zeros(1), "vehicle_9": np.zeros(1)}),
@@ -178,9 +179,8 @@ class Parallel(Play):
             self.member_is("fails", lambda: self.env.step({})),
             self.member_is("misshapen", lambda: self.env.step({})),
         ]
-        self.engine, self.shield = lambda: self.env.unwrapped.engine, lambda: self.env.attached.shield
-        self.watch()
-        self.env.reset(seed=self.begin())
+        env = HybridShield(inner, policy, mode="step", cap="baseline" if self.team else None)
+        self.put(env, seed=self.begin())
 
     def step(self) -> None:
         if self.engine().ended[0]:
@@ -194,13 +194,10 @@ class Aec(Play):
     """PettingZoo AEC."""
 
     def make(self) -> None:
-        self.env = shielded_aec(self.between(parallel_env(self.scenario)), mode="step")
-        inner: Any = self.env
+        env = inner = shielded_aec(self.between(parallel_env(self.scenario)), mode="step")
         while not isinstance(inner, HybridShield):
             inner = inner.env
-        self.engine, self.shield = lambda: inner.unwrapped.engine, lambda: inner.attached.shield
-        self.watch()
-        self.env.reset(seed=self.begin())
+        self.put(env, inner, seed=self.begin())
 
     def step(self) -> None:
         if self.engine().ended[0]:
@@ -210,19 +207,7 @@ class Aec(Play):
             self.env.step(self.drawn(1).astype(np.float32))
 
 
-class Attached(Play):
-    """An interface of Gymnasium's form: what its shield is attached to holds the engine."""
-
-    env: Any
-
-    def put(self, env: Any, **begin: int) -> None:
-        self.env = env
-        self.engine, self.shield = lambda: env.attached.engine, lambda: env.attached.shield
-        self.watch()
-        env.reset(**begin)
-
-
-class Single(Attached):
+class Single(Play):
     """Gymnasium."""
 
     def make(self) -> None:
@@ -242,7 +227,7 @@ class Single(Attached):
         self.env.step(self.drawn(1))
 
 
-class Vector(Attached):
+class Vector(Play):
     """Gymnasium vector."""
 
     mode = "SameStep"
@@ -273,7 +258,7 @@ class NextStepVector(Vector):
     mode = "NextStep"
 
 
-class Sb3(Attached):
+class Sb3(Play):
     """Stable-Baselines3; of a team one row of each member and world."""
 
     def make(self) -> None:
@@ -444,10 +429,6 @@ def skip(frames: int, step: Callable[[Any], Any], actions: Any) -> Any:
     return told
 
 
-def changing(step: Callable[[Any], Any], actions: Any) -> Any:
-    return step(_scaled(actions, 0.5))
-
-
 def twice(step: Callable[[Any], Any], actions: Any) -> Any:
     step(_scaled(actions, 0.0))
     return step(actions)
@@ -467,9 +448,12 @@ class Swallowing:
 
 
 WRAPPERS: dict[str, Callable[[], Callable[..., Any]]] = {
-    "frame skip 2": lambda: partial(skip, 2), "frame skip 80": lambda: partial(skip, 80),
-    "changes actions": lambda: changing, "steps twice": lambda: twice, "swallows steps": Swallowing,
-}  # fmt: skip
+    "frame skip 2": lambda: partial(skip, 2),
+    "frame skip 80": lambda: partial(skip, 80),
+    "changes actions": lambda: lambda step, actions: step(_scaled(actions, 0.5)),
+    "steps twice": lambda: twice,
+    "swallows steps": Swallowing,
+}
 INSIDE = [name for name in PLAYS if "evaluation" not in name]  # the engine itself asks that one: nothing is in between
 
 

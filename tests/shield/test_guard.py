@@ -29,7 +29,7 @@ from ethbrake_marl.shield import (
     parse_uncertainty,
 )
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
-from tests.fixtures.asked import Asked
+from tests.fixtures.asked import Acts, Asked
 from tests.shield.attacks import above_later
 
 PAPER = load_scenario("paper-random")
@@ -177,23 +177,17 @@ def test_threads__no_episode_gets_above_its_bound():
     assert (engine.ledger.world_harm("first") <= shield.first_bound).all()
 
 
-class DrivesOff:
+@Acts
+def drives_off(worlds, vehicle):
     """Brakes until it stands, and then drives."""
-
-    name = "drives_off"
-
-    def act(self, worlds, vehicle):
-        v = worlds.vehicles
-        stands = worlds.speeds_mps[:, vehicle] == 0.0
-        return np.where(stands, v.driving_capacity_mps2[:, vehicle], -v.braking_capacity_mps2[:, vehicle])
+    v, stands = worlds.vehicles, worlds.speeds_mps[:, vehicle] == 0.0
+    return np.where(stands, v.driving_capacity_mps2[:, vehicle], -v.braking_capacity_mps2[:, vehicle])
 
 
 def test_world__that_goes_on_after_the_shields_own_end_is_braked_fully():
     worlds = PAPER.sample(40, 7).worlds
     slower = parse_uncertainty("braking_capacity_mps2=20%").draw(worlds, np.random.default_rng(0), corners=True)
-    engine = episode_engine(
-        worlds, ShieldedDriver(DrivesOff(), PAPER, told=slower, uncertainty="gaps_m=0.02"), PAPER, 1
-    )
+    engine = episode_engine(worlds, ShieldedDriver(drives_off, PAPER, told=slower, uncertainty="gaps_m=0.02"), PAPER, 1)
     braking, after = -worlds.vehicles.braking_capacity_mps2[:, 1], np.zeros(40, bool)
     while not engine.ended.all():
         over = engine.guarded.shield.running.finished & ~engine.ended
@@ -224,13 +218,10 @@ def harm(agent, harm_count="first", worlds=WORLDS):
     return drive(worlds, agent, PAPER, 1).ledger.world_harm(harm_count)
 
 
-class LateBrake:
+@Acts
+def late_brake(worlds, vehicle):
     """Coasts until 0.9 s, then brakes fully: no constant deceleration, so sometimes better than any."""
-
-    name = "late_brake"
-
-    def act(self, worlds, vehicle):
-        return np.where(worlds.time_s < 0.9, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle])
+    return np.where(worlds.time_s < 0.9, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle])
 
 
 def memory_of(agent):
@@ -239,9 +230,9 @@ def memory_of(agent):
 
 @pytest.mark.parametrize("harm_count", ["first", "total"])
 def test_episode__is_never_worse_than_either_part(harm_count):
-    hybrid = HybridAgent(LateBrake(), PAPER, harm_count=harm_count)
+    hybrid = HybridAgent(late_brake, PAPER, harm_count=harm_count)
     realised, memory = harm(hybrid, harm_count), memory_of(hybrid)
-    alone, baseline = harm(LateBrake(), harm_count), harm(make_agent("e_v2x_bm", harm_count=harm_count), harm_count)
+    alone, baseline = harm(late_brake, harm_count), harm(make_agent("e_v2x_bm", harm_count=harm_count), harm_count)
     assert (realised <= np.minimum(alone, baseline)).all()
     assert realised.tolist() == memory["predicted_harm"].tolist()
     assert memory["chosen_policy"].tolist() == (alone <= baseline).tolist()

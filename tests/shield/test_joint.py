@@ -22,6 +22,7 @@ from ethbrake_marl.shield.step_shield import (
     joint_constants,
     plan_harm,
 )
+from tests.fixtures.asked import Acts
 from tests.shield.attacks import TEAM_ADVERSARIES, TEAMS, attack, begun
 
 STEPS = 81
@@ -250,17 +251,14 @@ def test_drive_chunks__is_what_the_shielded_team_does_whatever_the_chunk(monkeyp
 
 
 def test_evaluation__later_rollouts_of_the_team_let_more_of_it_through():
-    class Late:
+    @Acts
+    def late(worlds, vehicle):
         """Coasts for 0.3 s, then brakes fully."""
-
-        name = "late"
-
-        def act(self, worlds, vehicle):
-            return np.where(worlds.time_s < 0.8, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle])
+        return np.where(worlds.time_s < 0.8, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle])
 
     worlds, replaced = PAIR.sample(60, 11).worlds, {}
     for later in (True, False):
-        team = ShieldedDriver(Team({1: Late(), 2: Late()}, "late"), PAIR, later_rollouts=later).on((1, 2))
+        team = ShieldedDriver(Team.of(late, (1, 2)), PAIR, later_rollouts=later).on((1, 2))
         episodes = drive(worlds, team, PAIR)
         assert (episodes.ledger.world_harm("first") <= episodes.guarded.shield.predicted_harm).all()
         replaced[later] = episodes.guarded.shield.interventions.sum()
