@@ -48,7 +48,6 @@ from tests.physics.segments import Scan, random_segments, scan
 from tests.physics.test_oracles import accelerations, at_once, exact_accelerations, in_steps, law_error_eps
 from tests.programmes import Cases, Told
 from tests.reference.tolerances import (
-    BORDERLINE_SHARE,
     BOUNCE_SERIES_EPS,
     CLUSTER_EPS,
     ENERGY_EPS,
@@ -239,13 +238,6 @@ def phantom() -> Figure:
 def wrong() -> Figure:
     """The same scan: time and closing speed of the first contact, final gaps and speeds where there is none."""
     return Figure(sum(s.wrong.size for s in scans()), 0, "the same segments")
-
-
-@gate("share of contacts that rounding decides")
-def borderline() -> Figure:
-    """Decided otherwise than by exact arithmetic, within the published blur."""
-    share = sum(s.borderline for s in scans()) / sum(s.pairs for s in scans())
-    return Figure(share, BORDERLINE_SHARE, "the same segments")
 
 
 CASCADE = 100  # impacts of a world; between an obstacle and a line they come ever faster, and rounding multiplies
