@@ -257,7 +257,3 @@ def test_agent_that_writes_into_worlds_or_itself__is_refused_by_name(
     with pytest.raises(InvalidInput, match=rf"agent '(kmh|other)' of vehicle_2: {told}"):
         evaluate(sample, agents, scenario=PAPER)
     assert worlds_sha256(sample.worlds, sample.index) == before and sample.worlds.gaps_m.flags.writeable
-    agents["kmh"] = _Writes("memory", state_free=False)  # which is its own
-    found = evaluate(sample, agents, scenario=PAPER)
-    full, kmh = (found.outcome(name).ledger.world_harm("first") for name in agents)
-    assert np.array_equal(full, kmh)

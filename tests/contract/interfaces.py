@@ -119,16 +119,9 @@ def unchanged(env: Any) -> Any:
 
 
 class Interface:
-    """One learner in each of n worlds; ended episodes are followed by the next of the stream."""
+    """One learner in each of n worlds, ``reset`` and ``step`` of rows; ended episodes are followed by the next ones."""
 
-    env: Any
     n = 1
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Array:
-        raise NotImplementedError
-
-    def step(self, action: Array) -> Turn:
-        raise NotImplementedError
 
     def drawn(self) -> list[dict[str, Any]]:
         """What each running world was drawn as."""

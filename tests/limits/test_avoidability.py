@@ -8,16 +8,11 @@ import pytest
 from ethbrake_marl.limits.lower_bound import avoidability
 from ethbrake_marl.physics import Worlds, advance
 from ethbrake_marl.scenario import load_scenario
-from tests.limits.worlds import line, paper_line, random_profiles, wide_worlds, with_gap
+from tests.limits.worlds import line, opening, paper_line, random_profiles, wide_worlds
 from tests.reference.avoidability_lp import avoidable_by_lp
 from tests.reference.play_profile import play_profile
 
 LINES = [(3, 1), (2, 1), (2, 0)]  # vehicles, controlled one
-
-
-def driving(gap):
-    """Vehicle 2 is 4 m/s faster than Vehicle 1, which may drive: 2 + 2 m/s2 apart, 16 / 8 = 2 m are needed."""
-    return line([gap], [10, 14], [5, 2], driving=[2, 0])
 
 
 # world, controlled vehicle -> margin and what it is short of
@@ -30,9 +25,10 @@ BY_HAND = {
     "weak brakes, the leader stands at 8 m": (line([40], [8, 20], [4, 4]), 1, -2.0, "front"),
     "a standing leader": (line([10], [0, 10], [4, 5]), 1, 0.0, ""),
     "a standing follower": (line([0], [0, 0], [4, 5]), 1, 0.0, ""),
-    "ahead of a follower, 2.5 m": (driving(2.5), 0, 0.5, ""),
-    "ahead of a follower, 2 m": (driving(2.0), 0, 0.0, ""),
-    "ahead of a follower, 1.5 m": (driving(1.5), 0, -0.5, "rear"),
+    # 4 m/s faster than Vehicle 1, 2 + 2 m/s2 apart: 16 / 8 = 2 m are needed.
+    "ahead of a follower, 2.5 m": (opening(2.5), 0, 0.5, ""),
+    "ahead of a follower, 2 m": (opening(2.0), 0, 0.0, ""),
+    "ahead of a follower, 1.5 m": (opening(1.5), 0, -0.5, "rear"),
     # Vehicle 3 needs 0.8 * 20 + 400 / 12 m; gaps and vehicle 1's way to rest give 2 m more, or less.
     "paper, 2 m left": (paper_line([10, 8], [20, 18, 20], [0, 0.5, 0.8]), 1, 2.0, ""),
     "paper, 5 m left": (paper_line([5, 9], [22, 18, 20], [0, 0.5, 0.8]), 1, 5.0, ""),
@@ -129,7 +125,8 @@ def at_the_edge(reason, pair, shift):
     rows = np.flatnonzero((verdict.reason == reason) & (verdict.margin_m > -20))
     assert rows.size > 500
     worlds = worlds.take(rows)
-    return with_gap(worlds, pair, worlds.gaps_m[:, pair] - verdict.margin_m[rows] + shift)
+    worlds.gaps_m[:, pair] += shift - verdict.margin_m[rows]
+    return worlds
 
 
 # Less than 1e-9 m between both neighbours counts as unavoidable; full braking may touch the front vehicle.

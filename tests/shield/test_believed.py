@@ -13,11 +13,11 @@ from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.shield import HybridShield, ShieldedDriver, ShieldedEnv, ShieldedVectorEnv, enclosure, shielded_aec
+from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, enclosure, shielded_aec
 from ethbrake_marl.shield.enclosure import Boxes, boxes_of
 from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from ethbrake_marl.shield.step_shield import BelievedShield
-from tests.shield.attacks import ABOVE, HEARD_LATE, INSIDE, LISTS, NEVER_HEARD, WAYS, Hostile, shielded
+from tests.shield.attacks import ABOVE, HEARD_LATE, INSIDE, LISTS, NEVER_HEARD, WAYS, shielded
 
 BASE = load_scenario("cooperation-2-paper").replace(early_impacts="keep")
 PERIODIC = BASE.replace(v2x={"preset": "blocked", "persistence": "periodic"})
@@ -28,12 +28,6 @@ def driven(agent: object, scenario: Scenario, n: int, seed: int = 7, vehicle: in
     episodes = drive(scenario.sample(n, seed).worlds, agent, scenario, vehicle)
     told = episodes.memories[vehicle] if episodes.guarded is None else episodes.guarded.told
     return episodes.ledger.world_harm("first"), told["predicted_harm"]
-
-
-def behind(way: str, scenario: Scenario, robust: str | None = None) -> ShieldedDriver:
-    """Who proposes so, behind a shield on what was received."""
-    mode = {"mode": "step"} if robust is None else {"mode": "robust", "robust": robust}
-    return ShieldedDriver(Hostile(way), scenario, believed=True, **mode)
 
 
 @pytest.mark.parametrize("name", LISTS)
@@ -74,7 +68,7 @@ def test_step__in_the_middle_promises_nothing_of_the_corners() -> None:
 @pytest.mark.parametrize("robust", [None, "corners", pytest.param("interior", marks=pytest.mark.slow)])
 def test_believed__where_everything_is_known_the_bound_is_that_of_the_best_constant(robust: str | None) -> None:
     n = 40 if robust == "interior" else 20
-    harm, bound = driven(behind("drive", BASE, robust), BASE, n)
+    harm, bound, _ = shielded("drive", BASE, n, 7, robust=robust)
     _, best = driven(make_agent("e_v2x_bm", scenario=BASE), BASE, n)
     if robust == "interior":  # an upper bound, which is not exact where impacts coincide
         assert (bound >= best - 1e-4).all() and np.isclose(bound, best, atol=1e-4).mean() > 0.9
@@ -107,7 +101,7 @@ def test_believed__no_world_depends_on_the_batch(spec: str) -> None:
 @pytest.mark.parametrize("robust", [None, "corners"])
 def test_believed__shields_other_lines(scenario: Scenario, robust: str | None) -> None:
     if robust is None or scenario.vehicles == 2:
-        assert np.isfinite(driven(behind("coast", scenario, robust), scenario, 4)).all()
+        assert np.isfinite(shielded("coast", scenario, 4, 7, robust=robust)[:2]).all()
 
 
 @pytest.mark.parametrize(
