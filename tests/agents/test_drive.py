@@ -7,12 +7,10 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents import LearnedAgent, Team, drive, make_agent, policy_agent, register_agent, script_agents
-from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate, follow_episodes, record_episode, worlds_sha256
 from ethbrake_marl.evaluation.episodes import Task, film_scenes, record_episodes
-from ethbrake_marl.physics import advance
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver
 from tests.fixtures.asked import Acts
 
@@ -65,7 +63,7 @@ def test_drive__an_agent_sees_what_a_learner_sees_from_the_first_decision_on():
         return np.full((len(observation), 1), -0.5, np.float32)
 
     drive(worlds, policy_agent(half, scenario=PAPER), PAPER, 1)
-    engine = Engine(PAPER, 20, learners=(1,), scripts=script_agents(PAPER, except_for=1), worlds=worlds)
+    engine = eb.Engine(PAPER, 20, learners=(1,), scripts=script_agents(PAPER, except_for=1), worlds=worlds)
     for each in seen[:3]:
         assert engine.observe(1).tobytes() == each
         engine.step(np.full((20, 1), -0.5))
@@ -108,7 +106,7 @@ def test_drive__shows_every_part_of_a_step_within_which_nobody_decides(swinging)
 
         def see(self, before, command_mps2, until_s):
             assert np.array_equal(before.gaps_m, self.now.gaps_m) or np.allclose(before.gaps_m, self.now.gaps_m)
-            self.now, impacts = advance(before, command_mps2, until_s=until_s)
+            self.now, impacts = eb.advance(before, command_mps2, until_s=until_s)
             self.harm += np.stack([impacts.first_impact_harm.sum(axis=1), impacts.total_harm.sum(axis=1)], axis=1)
 
     worlds = swinging.sample(30, 7).worlds
@@ -172,7 +170,7 @@ def test_evaluate__an_agent_alone_drives_every_learner_and_a_team_of_nobody_none
 
 def test_evaluate__several_learners_do_what_they_do_in_training(policy: eb.Policy) -> None:
     worlds = PAIR.sample(50, 3).worlds
-    engine = Engine(PAIR, 50, learners=(1, 2), scripts={0: make_agent("full_brake")}, worlds=worlds)
+    engine = eb.Engine(PAIR, 50, learners=(1, 2), scripts={0: make_agent("full_brake")}, worlds=worlds)
     while not engine.ended.all():
         engine.step({i: policy(engine.observe(i))[:, 0].astype(np.float64) for i in (1, 2)})
     outcome = evaluate(worlds, {"soft": LearnedAgent(policy)}, scenario=PAIR).outcome("soft")

@@ -17,11 +17,8 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 
+import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import Team, episode_engine
-from ethbrake_marl.envs.interfaces import EthBrakeVectorEnv, parallel_env
-from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from ethbrake_marl.errors import EthBrakeError
-from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import (
     HybridShield,
     MovingAtHorizon,
@@ -30,11 +27,10 @@ from ethbrake_marl.shield import (
     ShieldedVectorEnv,
     shielded_aec,
 )
-from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from tests.shield.attacks import line
 
 ROWS = 5  # worlds of the batched interfaces
-ALONE, PAIR = line(3), load_scenario("cooperation-3-pair")
+ALONE, PAIR = line(3), eb.load_scenario("cooperation-3-pair")
 NO_STATE = {"initial_state": {"gaps_m": [-1, 1], "speeds_mps": [1, 1, 1]}}
 
 
@@ -168,7 +164,7 @@ class Parallel(Play):
     def make(self) -> None:
         policies: Any = {f"vehicle_{i + 1}": member for i, member in self.members.items()}
         policy = policies if self.team else policies["vehicle_2"]
-        inner = self.between(parallel_env(self.scenario))
+        inner = self.between(eb.parallel_env(self.scenario))
         last = list(policies)[-1]
         self.bad = [
             lambda: self.env.step({"vehicle_2": np.zeros(1), "vehicle_9": np.zeros(1)}),
@@ -194,7 +190,7 @@ class Aec(Play):
     """PettingZoo AEC."""
 
     def make(self) -> None:
-        env = inner = shielded_aec(self.between(parallel_env(self.scenario)), mode="step")
+        env = inner = shielded_aec(self.between(eb.parallel_env(self.scenario)), mode="step")
         while not isinstance(inner, HybridShield):
             inner = inner.env
         self.put(env, inner, seed=self.begin())
@@ -233,7 +229,7 @@ class Vector(Play):
     mode = "SameStep"
 
     def make(self) -> None:
-        inner = self.between(EthBrakeVectorEnv(ROWS, self.scenario, autoreset_mode=self.mode))
+        inner = self.between(eb.EthBrakeVectorEnv(ROWS, self.scenario, autoreset_mode=self.mode))
         self.bad = [
             lambda: self.env.step(self.one_bad(ROWS, int(np.argmin(self.engine().ended)))),  # others are ignored
             lambda: self.env.step(np.zeros((ROWS + 1, 1))),
@@ -262,7 +258,7 @@ class Sb3(Play):
     """Stable-Baselines3; of a team one row of each member and world."""
 
     def make(self) -> None:
-        inner = make_sb3_vec_env(self.scenario, ROWS, seed=self.begin())
+        inner = eb.make_sb3_vec_env(self.scenario, ROWS, seed=self.begin())
         plain = inner.step_wait
 
         def step(actions: Any) -> Any:
@@ -276,7 +272,7 @@ class Sb3(Play):
             lambda: self.env.step(np.zeros((rows, 2))),
             self._options,
         ]
-        self.put(ShieldedVecEnv(inner))
+        self.put(eb.ShieldedVecEnv(inner))
 
     def _options(self) -> None:
         self.env.set_options(NO_STATE)
@@ -393,7 +389,7 @@ def disturbed(name: str, episodes: int, seed: int) -> Tally:
             play.step()  # begins the next episode
         kind, before, made = int(play.rng.integers(5)), play.known(), play.made()
         if kind == 0 and play.bad:
-            with contextlib.suppress(EthBrakeError, Failure):
+            with contextlib.suppress(eb.EthBrakeError, Failure):
                 play.bad[int(play.rng.integers(len(play.bad)))]()
                 broken += 1  # it did not raise
             refused += 1
@@ -464,7 +460,7 @@ def wrapped(name: str, wrapper: str, calls: int, seed: int) -> Tally:
     play.how = WRAPPERS[wrapper]()
     refused = broken = 0
     for _ in range(calls):
-        with contextlib.suppress(EthBrakeError):  # at the end of an episode also the plain one, "no episode is running"
+        with contextlib.suppress(eb.EthBrakeError):  # at the end also the plain "no episode is running"
             play.step()
             refused -= 1
         refused += 1

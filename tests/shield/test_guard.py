@@ -15,10 +15,7 @@ from gymnasium.wrappers import Autoreset
 import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import drive, episode_engine, make_agent
 from ethbrake_marl.engine import STEP, Engine
-from ethbrake_marl.envs.interfaces import EthBrakeVectorEnv, parallel_env
-from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
-from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import (
     HybridAgent,
     HybridShield,
@@ -28,11 +25,10 @@ from ethbrake_marl.shield import (
     ShieldedVectorEnv,
     parse_uncertainty,
 )
-from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from tests.fixtures.asked import Acts, Asked
 from tests.shield.attacks import above_later
 
-PAPER = load_scenario("paper-random")
+PAPER = eb.load_scenario("paper-random")
 WORLDS = PAPER.sample(300, 3).worlds
 DRIVE = np.array([1.0])
 
@@ -101,8 +97,8 @@ def test_last_step__is_compared_too_whatever_starts_the_next_episode(interface, 
     else:
         env = {
             "single": lambda: ShieldedEnv(gymnasium.make("EthBrake-v0").unwrapped),
-            "vector": lambda: ShieldedVectorEnv(EthBrakeVectorEnv(3, PAPER)),
-            "sb3": lambda: ShieldedVecEnv(make_sb3_vec_env(PAPER, 3)),
+            "vector": lambda: ShieldedVectorEnv(eb.EthBrakeVectorEnv(3, PAPER)),
+            "sb3": lambda: eb.ShieldedVecEnv(eb.make_sb3_vec_env(PAPER, 3)),
         }[interface]()
         env.reset()
         engine, step = env.attached.engine, lambda: env.step(DRIVE if interface == "single" else actions)
@@ -139,7 +135,7 @@ def test_autoreset__of_gymnasium_inside_is_left_alone():
 
 @pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
 def test_clone__between_proposal_and_step_goes_on_apart(clone):
-    env = ShieldedVecEnv(make_sb3_vec_env(PAPER, 4, seed=2))
+    env = eb.ShieldedVecEnv(eb.make_sb3_vec_env(PAPER, 4, seed=2))
     env.reset()
     env.step(np.ones((4, 1), np.float32))
     env.step_async(np.ones((4, 1), np.float32))
@@ -151,7 +147,7 @@ def test_clone__between_proposal_and_step_goes_on_apart(clone):
 
 
 def test_reset__in_between_brings_the_proposal_to_another_episode_and_its_bound_holds():
-    env = ShieldedVecEnv(make_sb3_vec_env(PAPER, 2))
+    env = eb.ShieldedVecEnv(eb.make_sb3_vec_env(PAPER, 2))
     env.reset()
     env.step_async(np.ones((2, 1), np.float32))
     env.venv.reset()
@@ -160,7 +156,7 @@ def test_reset__in_between_brings_the_proposal_to_another_episode_and_its_bound_
 
 
 def test_threads__no_episode_gets_above_its_bound():
-    env = ShieldedVectorEnv(EthBrakeVectorEnv(4, PAPER, autoreset_mode="NextStep"))
+    env = ShieldedVectorEnv(eb.EthBrakeVectorEnv(4, PAPER, autoreset_mode="NextStep"))
     env.reset(seed=0)
     trusted = []
 
@@ -253,7 +249,7 @@ def test_episode__of_some_rows_leaves_the_others_alone():
 
 
 def test_episode__applies_the_certified_strategy_whatever_is_proposed():
-    shielded = HybridShield(parallel_env(), make_agent("full_brake"), mode="episode")
+    shielded = HybridShield(eb.parallel_env(), make_agent("full_brake"), mode="episode")
     for seed in range(6):
         shielded.reset(seed=seed)
         while shielded.agents:
@@ -278,7 +274,7 @@ def test_policy_with_a_memory__is_asked_once_per_decision_whoever_proposes(setti
         return memory["steps"].tolist()
 
     policy = eb.policy_agent(remembering, initial_state=lambda n: np.zeros((n, 1)))
-    env = HybridShield(parallel_env(), policy, **settings)
+    env = HybridShield(eb.parallel_env(), policy, **settings)
     env.reset(seed=7)
     attached = env.attached
     assert asked() == [0]
@@ -308,7 +304,7 @@ class Counting:
 
 @pytest.mark.parametrize("believed", [False, True])
 def test_decide__changes_nothing_not_even_the_memory_of_a_policy_that_writes_into_it(believed):
-    env = HybridShield(parallel_env(), Counting(), mode="step", believed=believed)
+    env = HybridShield(eb.parallel_env(), Counting(), mode="step", believed=believed)
     env.reset(seed=4)
     attached, nothing = env.attached, np.full((1, 1), np.nan)
     told = [attached.guard.decide(attached.engine, attached.memory, nothing).proposed for _ in range(2)]

@@ -7,12 +7,9 @@ import copy
 import numpy as np
 import pytest
 
+import ethbrake_marl as eb
 from ethbrake_marl.agents.planner import Refined
-from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.agents.registry import drive, make_agent
-from ethbrake_marl.observations import ObservationSpec
-from ethbrake_marl.physics import make_worlds
-from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver, StepShield, parse_uncertainty
 from ethbrake_marl.shield.step_shield import REASONS, Backup, Proposer, begin_running, certify, plan_harm
@@ -25,12 +22,12 @@ pytestmark = pytest.mark.filterwarnings(
 )
 
 STEPS = 81
-PAPER = load_scenario("paper-random")
-PAIR = load_scenario("cooperation-3-pair")
+PAPER = eb.load_scenario("paper-random")
+PAIR = eb.load_scenario("cooperation-3-pair")
 WORLDS = PAPER.sample(60, 3).worlds
 
 # Three worlds of two vehicles: small enough to run uncompiled.
-TWO = Scenario(
+TWO = eb.Scenario(
     name="two",
     vehicles=2,
     gaps_m={"uniform": [3, 5]},
@@ -48,7 +45,7 @@ SMALL = TWO.sample(4, 1).worlds
 
 def two(speed=10.0, latency=0.0):
     """Vehicle 1 stands 15 m ahead of Vehicle 2, which brakes with at most 5 m/s2: it stops after 10 m."""
-    scenario = Scenario(
+    scenario = eb.Scenario(
         name="two", vehicles=2, gaps_m=15, speeds_mps=[0, speed], braking_capacity_mps2=5, driving_capacity_mps2=5,
         mass_t=1, latency_s=[0, latency], roles={"vehicle_1": "full_brake", "vehicle_2": "learner"},
     )  # fmt: skip
@@ -100,7 +97,7 @@ def test_by_hand__coasting_is_let_through_as_long_as_the_worst_corner_can_still_
 
 
 def test_by_hand__a_pair_counts_once_for_the_first_impact_and_each_time_for_the_total():
-    worlds = make_worlds(
+    worlds = eb.make_worlds(
         [[1.0]], [[0.0, 10.0]], braking_capacity_mps2=[[8.0, 1.0]], driving_capacity_mps2=0.0, latency_s=0.0,
         mass_t=1.0, restitution=0.5,
     )  # fmt: skip
@@ -317,7 +314,7 @@ ROLLED = PAPER.sample(120, 3).worlds
 class Weights:
     """A policy of fixed random weights on everything that is observed: it reacts to all, and drives badly."""
 
-    observation = ObservationSpec()
+    observation = eb.ObservationSpec()
 
     def __call__(self, observation):
         weights = np.random.default_rng(1).normal(0.0, 1.0, (observation.shape[1], 1))
@@ -341,7 +338,7 @@ class Remembering:
 @Acts
 def two_faced(worlds, vehicle):
     """Coasts when it is asked what it does, and does otherwise where it is tried out in some of its worlds."""
-    return np.zeros(worlds.n) if worlds.n == ROLLED.n else LearnedAgent(Weights()).act(worlds, vehicle)
+    return np.zeros(worlds.n) if worlds.n == ROLLED.n else eb.LearnedAgent(Weights()).act(worlds, vehicle)
 
 
 # 14 m are left, 10^2 / (2 * 3.5) = 14.29 m are needed: 2 * 3.5 * 0.2857 = 2 m2/s2
@@ -380,7 +377,7 @@ def driven(policy, **settings):
     return episodes.guarded, episodes.ledger.world_harm("first"), *map(np.array, zip(*told, strict=True))
 
 
-@pytest.mark.parametrize("policy", [LearnedAgent(Weights()), Remembering()], ids=["divisible", "remembering"])
+@pytest.mark.parametrize("policy", [eb.LearnedAgent(Weights()), Remembering()], ids=["divisible", "remembering"])
 def test_rollout__once_accepted_is_what_the_policy_then_does_and_the_bound_is_exact(policy):
     guarded, harm, reasons, _ = driven(policy)
     accepted = reasons == REASONS.index("policy rollout")
@@ -396,7 +393,7 @@ def test_rollout__once_accepted_is_what_the_policy_then_does_and_the_bound_is_ex
 def test_rollout__leaves_the_past_in_the_plan_what_was_applied(distrusted):
     weaker = parse_uncertainty("braking_capacity_mps2=20%").draw(ROLLED, np.random.default_rng(0))
     told = weaker if distrusted else None
-    guarded, _, reasons, applied = driven(LearnedAgent(Weights()), logging=True, told=told)
+    guarded, _, reasons, applied = driven(eb.LearnedAgent(Weights()), logging=True, told=told)
     shield, running = guarded.shield, ~np.isin(reasons, [-1, REASONS.index("ended")])
     assert (shield.distrusted == distrusted).all()
     assert (shield.backup.plan.T[: len(applied)] == applied)[running].all() and running[0].all()
@@ -417,7 +414,7 @@ def test_rollout__a_policy_that_does_otherwise_when_it_is_tried_out_gets_no_furt
 
 
 def test_later_rollouts__may_be_switched_off():
-    _, _, reasons, _ = driven(LearnedAgent(Weights()), later_rollouts=False)
+    _, _, reasons, _ = driven(eb.LearnedAgent(Weights()), later_rollouts=False)
     assert not (reasons == REASONS.index("policy rollout")).any()
 
 
