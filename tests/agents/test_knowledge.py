@@ -16,7 +16,6 @@ from ethbrake_marl.agents import Agent, Knowledge, Source, Team, Told, agent_ent
 from ethbrake_marl.agents.registry import find_entry
 from ethbrake_marl.engine import Engine, Memory, Script, ask_script, begin_script
 from ethbrake_marl.evaluation import make_lineup
-from ethbrake_marl.observations import choose_observation
 from ethbrake_marl.physics import Bools, Floats, Packed, Worlds
 from ethbrake_marl.physics.messages import CHANNEL, LINK, Messages, link_at, place_at, ring_at
 from ethbrake_marl.scenario.v2x import PRESETS
@@ -330,7 +329,7 @@ def test_own_sensors_and_messages__nor_where_an_obstacle_is_that_was_not_receive
 @pytest.mark.parametrize("channel", ["blocked", {"preset": "blocked", "persistence": "periodic"}], ids=str)
 def test_messages__contact_features_tell_nothing_that_was_not_received(channel, tmp_path):
     scenario = BLOCKED.replace(v2x=channel)
-    make_policy(choose_observation(["own", "contact"]), scenario.model_dump(mode="json")).save(tmp_path / "policy")
+    make_policy(eb.choose_observation(["own", "contact"]), scenario.model_dump(mode="json")).save(tmp_path / "policy")
     agent = agent_of(f"ppo@{tmp_path}", scenario)
     assert Knowledge.of(agent) == (MESSAGES,)
     assert changed_decisions(agent, scenario) == 0

@@ -15,7 +15,6 @@ from ethbrake_marl.actions import action_to_command
 from ethbrake_marl.agents import LearnedAgent, drive
 from ethbrake_marl.evaluation import policy_sha256
 from ethbrake_marl.observations import ObservationSpec, observe
-from ethbrake_marl.physics import make_worlds
 from ethbrake_marl.shield import ShieldedDriver
 from tests.fixtures.asked import Asked
 
@@ -210,7 +209,7 @@ def test_bundle__acts_in_fractions_of_the_own_capacity(policy: eb.Policy) -> Non
         def __call__(self, seen):
             return np.array([[-1.0], [-0.25], [0.0], [0.5]], np.float32)
 
-    worlds = make_worlds(
+    worlds = eb.make_worlds(
         [7.0, 7.0], np.tile([20.0, 18.0, 20.0], (4, 1)), braking_capacity_mps2=[6.0, 8.0, 6.0],
         driving_capacity_mps2=[1.0, 2.0, 3.0], latency_s=[0.0, 0.5, 0.8], mass_t=5.0, restitution=0.1,
     )  # fmt: skip

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import ethbrake_marl as eb
 from ethbrake_marl.limits.lower_bound import avoidability
-from ethbrake_marl.physics import Worlds, advance
-from ethbrake_marl.scenario import load_scenario
 from tests.limits.worlds import line, opening, paper_line, random_profiles, wide_worlds
 from tests.reference.avoidability_lp import avoidable_by_lp
 from tests.reference.play_profile import play_profile
@@ -50,7 +49,7 @@ def test_early__a_pair_that_meets_before_the_vehicle_may_act():
     front = line([1, 9], [10, 12, 9], [5, 8, 5], [1, 1, 2])  # 2 m lost in 1 s
     rear = line([9, 1], [10, 10, 12], [5, 8, 5], [1, 1, 2])
     brakes_in_time = line([9, 0.5], [10, 10, 12], [5, 8, 4], [1, 1, 0])  # 2 m/s at 4 m/s2: 0.5 m, a touch at 0.5 s
-    verdict = avoidability(Worlds.concatenate([front, rear, brakes_in_time]))
+    verdict = avoidability(eb.Worlds.concatenate([front, rear, brakes_in_time]))
     assert verdict.reason_name.tolist() == ["early", "early", ""]
     assert verdict.margin_m[:2] == pytest.approx([-1, -1])
 
@@ -95,7 +94,7 @@ def test_witness__is_the_largest_trajectory_behind_the_front_vehicle(
     ],
 )
 def test_unavoidable_share__of_the_paper_lists(name, low, high):
-    scenario = load_scenario(name)
+    scenario = eb.load_scenario(name)
     verdict = avoidability(scenario.sample(10_000, seed=7).worlds, scripts=scenario.scripts)
     assert low <= 1 - verdict.avoidable.mean() <= high
 
@@ -154,7 +153,7 @@ def apart(worlds):
 def test_early__is_what_happens_in_the_physics_before_the_latency(vehicles, controlled):
     worlds = apart(wide_worlds(20_000, vehicles, seed=23))
     until = worlds.vehicles.latency_s[:, controlled]
-    _, impacts = advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=until)
+    _, impacts = eb.advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=until)
     early = avoidability(worlds, controlled).reason == 1
     assert 0.01 < early.mean() < 0.5
     assert np.array_equal(early, impacts.count.sum(axis=1) > 0)
@@ -163,7 +162,7 @@ def test_early__is_what_happens_in_the_physics_before_the_latency(vehicles, cont
 @pytest.mark.parametrize("profiles", [8, pytest.param(250, marks=pytest.mark.long)])
 def test_unavoidable__no_random_profile_avoids_collision(profiles):
     played, rng = 0, np.random.default_rng(profiles)
-    lists = [load_scenario(name).sample(1500, seed=7).worlds for name in ("paper-random", "paper-random-early")]
+    lists = [eb.load_scenario(name).sample(1500, seed=7).worlds for name in ("paper-random", "paper-random-early")]
     for worlds in (*lists, wide_worlds(4000, 3, seed=24)):
         worlds = apart(worlds)
         worlds = worlds.take(~avoidability(worlds).avoidable)
@@ -174,8 +173,8 @@ def test_unavoidable__no_random_profile_avoids_collision(profiles):
 
 
 def test_later_states__give_the_same_verdict_and_a_witness_from_there():
-    worlds = load_scenario("paper-random").sample(3000, seed=3).worlds
-    later, _ = advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=0.4)
+    worlds = eb.load_scenario("paper-random").sample(3000, seed=3).worlds
+    later, _ = eb.advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=0.4)
     at_alert, from_there = avoidability(worlds), avoidability(later)
     assert np.array_equal(at_alert.reason, from_there.reason)
     assert np.abs(at_alert.margin_m - from_there.margin_m).max() < 1e-11
@@ -203,8 +202,8 @@ def drawn(n, vehicles, controlled, seed):
     if vehicles == 2:
         return worlds.take(np.flatnonzero(reason != 1)[:n])
     rows = np.concatenate([np.flatnonzero(reason == code)[: n // 4 + 1] for code in (0, 2, 3)])
-    paper = load_scenario("paper-random-early").sample(n - 3 * (n // 4), seed=seed).worlds
-    return Worlds.concatenate([worlds.take(rows), paper])
+    paper = eb.load_scenario("paper-random-early").sample(n - 3 * (n // 4), seed=seed).worlds
+    return eb.Worlds.concatenate([worlds.take(rows), paper])
 
 
 @pytest.mark.parametrize(("vehicles", "controlled", "n"), [(3, 1, 32), (2, 1, 8), (2, 0, 8)])

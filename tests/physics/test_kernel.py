@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import drive, fixed_commands, script_agents
-from ethbrake_marl.physics import Worlds
 from ethbrake_marl.physics.kernel import Decisions, contact, drift, force_range, settle, solo_motion, speed_event
-from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.search import Profiles, profile_problem
 
 NEVER = (math.inf, 0.0)
@@ -104,7 +103,7 @@ class Phases:
     def __init__(self, commands: np.ndarray, length: int) -> None:
         self.commands, self.length = commands, length
 
-    def act(self, worlds: Worlds, vehicle: int) -> np.ndarray:
+    def act(self, worlds: eb.Worlds, vehicle: int) -> np.ndarray:
         started = worlds.vehicles.latency_s[:, vehicle]
         phase = np.maximum(Decisions(started, 0.1).latest(worlds.time_s), 0) // self.length
         return self.commands[np.arange(worlds.n), np.minimum(phase, self.commands.shape[1] - 1)]
@@ -113,7 +112,7 @@ class Phases:
 @pytest.mark.parametrize("name", ["paper-random", "paper-random-obstacle", "stress-wide"])
 @pytest.mark.parametrize("length", [1, 7])
 def test_profiles__step_by_step_realise_what_the_engine_does_to_the_bit(name, length):
-    scenario = load_scenario(name)
+    scenario = eb.load_scenario(name)
     worlds, vehicle = scenario.sample(40, 11).worlds, scenario.learners[0]
     shares = np.random.default_rng(length).uniform(-1.0, 0.3, (worlds.n, 100 // length))
     commands = shares * worlds.vehicles.braking_capacity_mps2[:, [vehicle]]
