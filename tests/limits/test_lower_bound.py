@@ -45,6 +45,7 @@ from ethbrake_marl.limits.lower_bound import (
     widest_flight,
 )
 from ethbrake_marl.physics import Worlds, advance, make_worlds
+from ethbrake_marl.physics.kernel import solo_motion
 from ethbrake_marl.scenario import Task, load_scenario
 from ethbrake_marl.search import profile_problem
 from tests.limits.worlds import REGIONS, line, moved_profiles, opening, random_profiles, wide_worlds, worlds_of
@@ -426,12 +427,6 @@ def played(worlds, rng):
         now = after
 
 
-def full_braking(v, a, onset, time):
-    """Way and speed of one that coasts until its onset, then brakes to rest."""
-    braking = min(max(time - onset, 0.0), v / a)
-    return v * (min(time, onset) + braking) - 0.5 * a * braking * braking, v - a * braking
-
-
 def test_played_meetings__lie_within_the_bounds_of_every_cell_that_holds_them():
     worlds, checked, earlier = pairs(400, seed=3), 0, 0
     v = worlds.vehicles
@@ -440,8 +435,8 @@ def test_played_meetings__lie_within_the_bounds_of_every_cell_that_holds_them():
         since, power = row[LINE.ONSET_R], row[LINE.A_R] + v.driving_capacity_mps2[world, 2]
         if time > since + row[LINE.V_R] / row[LINE.A_R]:
             continue  # the one that brakes fully stands by then
-        way, speed = full_braking(row[LINE.V_R], row[LINE.A_R], since, time)
-        way_l, _ = full_braking(worlds.speeds_mps[world, 0], v.braking_capacity_mps2[world, 0], 0.0, time)
+        speed, way, _ = solo_motion(row[LINE.V_R], -row[LINE.A_R], since, math.inf, time)
+        _, way_l, _ = solo_motion(worlds.speeds_mps[world, 0], -v.braking_capacity_mps2[world, 0], 0.0, math.inf, time)
         further = max(FAR_M + way_l - there.gaps_m[0, 0] + row[LINE.GAP_R] - way, 0.0)
         faster = there.speeds_mps[0, 2] - speed
         for reach in (power, math.inf):

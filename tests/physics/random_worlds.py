@@ -43,13 +43,11 @@ class Draws:
     def uniform(self, low: float, high: float, shape: tuple[int, ...]) -> Floats:
         """Multiples of 2^-53 in [0, 1), scaled."""
         words = np.asarray(self._words.random_raw(int(np.prod(shape))), np.uint64).reshape(shape)
-        unit: Floats = (words >> np.uint64(11)).astype(np.float64) * 2.0**-53
-        return low + (high - low) * unit
+        return low + (high - low) * ((words >> np.uint64(11)).astype(np.float64) * 2.0**-53)
 
     def choice(self, values: list[float], shape: tuple[int, ...]) -> Floats:
         """One of ``values`` each."""
-        index = (self.uniform(0.0, len(values), shape)).astype(np.int64)
-        return np.asarray(values)[index]
+        return np.asarray(values)[self.uniform(0.0, len(values), shape).astype(np.int64)]
 
 
 def driving_lines(key: int, n: int, N: int, *, drive: bool = True) -> Batch:
@@ -214,8 +212,7 @@ def momentum_eps(before: Worlds, after: Worlds) -> Floats:
 def energy_rise_eps(before: Worlds, after: Worlds) -> Floats:
     """Rise of kinetic energy (over ground) in eps of the energy before, [n]; negative where energy was lost."""
     mass = before.vehicles.mass_t.astype(Wide)
-    was = (mass * before.speeds_mps.astype(Wide) ** 2).sum(axis=1)
-    now = (mass * after.speeds_mps.astype(Wide) ** 2).sum(axis=1)
+    was, now = ((mass * worlds.speeds_mps.astype(Wide) ** 2).sum(axis=1) for worlds in (before, after))
     return np.asarray((now - was) / np.where(was > 0, was, 1) / EPS, np.float64)
 
 

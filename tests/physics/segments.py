@@ -187,10 +187,8 @@ def _wrong_contacts(
 
 def _wrong_gaps(segments: Segments, after: Worlds) -> NDArray[np.bool_]:
     """Worlds whose final gaps or speeds differ from the closed form (only for worlds without contact)."""
-    motion = solo(segments)
-    end = np.broadcast_to(segments.duration[:, None], segments.worlds.gaps_m.shape)
-    expected = _gap(motion, segments.worlds.gaps_m, end)[0]
-    speed = motion.at(np.broadcast_to(segments.duration[:, None], motion.speed.shape))[1]
+    motion, gaps, end = solo(segments), segments.worlds.gaps_m, segments.duration[:, None]
+    expected, speed = _gap(motion, gaps, np.broadcast_to(end, gaps.shape))[0], motion.at(end)[1]
     return np.any(np.abs(after.gaps_m - expected) > GAP_M, axis=1) | np.any(
         np.abs(after.speeds_mps - speed) > GAP_M, axis=1
     )

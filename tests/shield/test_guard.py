@@ -39,6 +39,13 @@ def shielded(scenario=PAPER, policy=None, **settings):
     return env
 
 
+STATE = {  # columns in which something else happens
+    "first-impact harm": lambda column: column.harm,
+    "total harm": lambda column: column.harm + column.vehicles - 1,
+    "speed": lambda column: column.speed,
+}
+
+
 class Cheating(Engine):
     """An engine in which something else happens than was predicted, in each step or in an episode's last one only."""
 
@@ -48,15 +55,10 @@ class Cheating(Engine):
         before = self.ended
         step = super()._advance(columns)
         rows = self.ended & ~before if self.last_only else ~before
-        column = self.packed.column
         if self.what == "a step":
             self._clock[rows, STEP] += 1.0
-        elif self.what == "first-impact harm":
-            self._state[rows, column.harm] += 1e-12
-        elif self.what == "total harm":
-            self._state[rows, column.harm + column.vehicles - 1] += 1e-12
         else:
-            self._state[rows, column.speed] += 1e-12
+            self._state[rows, STATE[self.what](self.packed.column)] += 1e-12
         return step
 
 
@@ -83,10 +85,7 @@ def test_step__what_is_not_certified_is_refused_and_the_worlds_stay_as_they_are(
     assert env.attached.shield is shield and not shield.distrusted.any()
 
 
-LAST = [name for name in CHEATS if name != "a step"]
-
-
-@pytest.mark.parametrize("what", LAST)
+@pytest.mark.parametrize("what", STATE)
 @pytest.mark.parametrize("interface", ["single", "vector", "sb3", "evaluation"])
 def test_last_step__is_compared_too_whatever_starts_the_next_episode(interface, what):
     actions = np.ones((3, 1), np.float32)
