@@ -195,8 +195,7 @@ def test_evaluate__one_agent_remembers_each_learner_apart_and_predicts_for_nobod
 
 def test_e_v2x_bm__takes_the_other_learners_to_brake_fully():
     worlds = PAIR.sample(30, 7).worlds
-    team = Team.of(make_agent("e_v2x_bm"), (1, 2))
-    both = drive(worlds, team, PAIR).memories[1]
+    both = drive(worlds, Team.of(make_agent("e_v2x_bm"), (1, 2)), PAIR).memories[1]
     alone = drive(worlds, make_agent("e_v2x_bm"), PAIR.with_learners(["vehicle_2"]), 1).memories[1]
     assert both["deceleration_mps2"].tolist() == alone["deceleration_mps2"].tolist()
 
@@ -226,7 +225,6 @@ class _Writes:
         return -worlds.vehicles.braking_capacity_mps2[:, vehicle], memory
 
 
-KEPT = ("name", "plan")  # an attribute that there is, and a new one
 WRAPPED = {
     "alone": lambda agent: agent,
     "episode": lambda agent: HybridAgent(agent, PAPER),
@@ -242,7 +240,7 @@ WRAPPED = {
         *((when, r"(begin|act) on .*read-only") for when in ("begin", "act", "vehicles")),
         *(
             (name, rf"keeps something in its attribute '{name}'; one that remembers has begin\(alert, ")
-            for name in KEPT
+            for name in ("name", "plan")  # an attribute that there is, and a new one
         ),
     ],
 )

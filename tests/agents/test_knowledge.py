@@ -21,6 +21,7 @@ from ethbrake_marl.physics.messages import CHANNEL, LINK, Messages, link_at, pla
 from ethbrake_marl.scenario.v2x import PRESETS
 from ethbrake_marl.shield import ShieldedDriver, parse_uncertainty
 from ethbrake_marl.shield.step_shield import Proposer, proposed_action, seen_columns
+from tests.fixtures.asked import Acts
 from tests.fixtures.policies import make_policy
 
 
@@ -227,16 +228,7 @@ CHANNELS = [
 HIDING = [channel for channel in CHANNELS if channel not in ("paper", "clear", "nominal")]
 
 
-class Silent:
-    """An agent of the user's own that says nothing."""
-
-    name = "silent"
-
-    def act(self, worlds, vehicle):
-        return np.zeros(worlds.n)
-
-
-class Leaking(Silent):
+class Leaking:
     """Says it knows messages, and decides on who is behind it, what others have heard, or what it will never hear."""
 
     name, knows = "leaking", "messages"
@@ -294,8 +286,9 @@ def test_knowledge__every_agent_states_it(spec, knows):
 def test_knowledge__of_an_agent_of_the_users_own_and_of_a_team():
     team = Team({1: agent_of("ppo@shipped/ppo"), 2: agent_of("full_brake")}, "both")
     assert Knowledge.of(team) == (SENSORS, MESSAGES) and Knowledge.of(Team({}, "scripts")).text == "–"
-    assert Knowledge.of(Silent()).text == "not stated" and not Knowledge.of(Silent()).sees_through
-    assert Knowledge.of(Silent(), also=MODEL) == (MODEL, Source.UNSTATED)
+    silent = Acts(lambda worlds, vehicle: np.zeros(worlds.n))
+    assert Knowledge.of(silent).text == "not stated" and not Knowledge.of(silent).sees_through
+    assert Knowledge.of(silent, also=MODEL) == (MODEL, Source.UNSTATED)
     assert Knowledge.of(Leaking()) == (MESSAGES,)
 
 

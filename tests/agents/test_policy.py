@@ -197,8 +197,7 @@ def test_file__makes_an_agent_alone_and_behind_every_shield(tmp_path: Path, arou
     file = tmp_path / "My+File.py"
     file.write_text(FILE)
     agent = eb.make_agent(f"{file}:harder:0.5{around}", scenario=SCENARIO)
-    same = shielded(eb.policy_agent(brake), around)
-    assert harms(agent).tolist() == harms(same).tolist()
+    assert harms(agent).tolist() == harms(shielded(eb.policy_agent(brake), around)).tolist()
     assert harms(eb.make_agent(f"{file}:make_agent")).tolist() == harms(eb.policy_agent(brake)).tolist()
 
 

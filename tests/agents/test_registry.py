@@ -26,7 +26,6 @@ from ethbrake_marl.shield import HybridAgent, ShieldedDriver
 from tests.fixtures.asked import Asked
 
 SCENARIO = eb.load_scenario("paper-random")
-ALL = ["full_brake", "coast", "constant:3.5", "copy_leader", "gentlest_front", "e_v2x_bm", "e_v2x_bm:pairwise"]
 
 
 def asked(spec: str, worlds: Worlds, vehicle: int = 1, **settings) -> Floats:
@@ -115,7 +114,9 @@ def test_e_v2x_bm__drives_by_its_optimum_of_the_count_and_horizon_it_was_given()
     assert np.array_equal(asked("e_v2x_bm", worlds, scenario=short), asked("e_v2x_bm", worlds, horizon_s=4.0))
 
 
-@pytest.mark.parametrize("spec", ALL)
+@pytest.mark.parametrize(
+    "spec", ["full_brake", "coast", "constant:3.5", "copy_leader", "gentlest_front", "e_v2x_bm", "e_v2x_bm:pairwise"]
+)
 def test_agents__new_episodes_change_their_rows_only_and_agents_can_be_pickled(spec):
     worlds, fresh = SCENARIO.sample(6, 31).worlds, SCENARIO.sample(2, 32).worlds
     agent = Asked(make_agent(spec)).begin(worlds, 1)

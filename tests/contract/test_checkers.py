@@ -34,9 +34,11 @@ def _every_warning_is_an_error(monkeypatch: pytest.MonkeyPatch) -> Iterator[None
 
 
 ANY_START = PAPER.replace(early_impacts="keep")
-LINES = [*LEVELS.values(), *(line(vehicles) for vehicles in (2, 6)), line(10, "nominal", 8)]
 SETTINGS: dict[str, dict[str, Any]] = {
-    **{scenario.name: {"scenario": scenario} for scenario in [*SCENARIOS.values(), *LINES]},
+    **{
+        scenario.name: {"scenario": scenario}
+        for scenario in [*SCENARIOS.values(), *LEVELS.values(), line(2), line(6), line(10, "nominal", 8)]
+    },
     "nobody learns": {"scenario": ANY_START, "learners": []},
     "two learn": {"scenario": ANY_START, "learners": ["vehicle_2", "vehicle_3"]},
     "learners alone": {"scenario": LEVELS["cooperation-3-pair"], "agents": "learners"},

@@ -242,7 +242,6 @@ def test_engine__worlds_that_are_given_may_have_an_obstacle_or_none_whatever_the
 # ---------------------------------------------------------------- snapshots
 
 SCENARIO = eb.load_scenario("paper-random")
-PERIODIC = {"preset": "congested", "persistence": "periodic"}
 SHAPED = eb.RewardParams(harm=0.05, shaping=0.1, shaping_discount=0.99, terminal=0.5)
 
 
@@ -270,7 +269,12 @@ def with_script(script: str) -> eb.Scenario:
         (SCENARIO.with_learners(["vehicle_2", "vehicle_3"]), SHAPED),
         (eb.load_scenario("cooperation-4-congested"), SHAPED),
         (eb.load_scenario("stress-wide"), "total-harm"),
-        (eb.load_scenario("cooperation-2-paper").replace(early_impacts="keep", v2x=PERIODIC), "harm"),
+        (
+            eb.load_scenario("cooperation-2-paper").replace(
+                early_impacts="keep", v2x={"preset": "congested", "persistence": "periodic"}
+            ),
+            "harm",
+        ),
         (with_script("gentlest_front"), "harm"),
         (with_script("e_v2x_bm:pairwise"), "harm"),
         (with_script("planner:20"), "harm"),

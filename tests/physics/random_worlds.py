@@ -132,8 +132,7 @@ def thrown_lines(key: int, n: int, N: int) -> Batch:
         restitution=draws.choice([0.0, 0.1, 0.3, 0.6], (n,)),
         obstacle_gap_m=draws.uniform(10.0, 40.0, (n,)),
     )
-    command = np.maximum(draws.uniform(-12.0, 4.0, (n, N)), -capacity)
-    return Batch(worlds, command)
+    return Batch(worlds, np.maximum(draws.uniform(-12.0, 4.0, (n, N)), -capacity))
 
 
 # ---------------------------------------------------------------- whole runs, in one piece and in several

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -196,6 +196,14 @@ def plain_engine(scenario: eb.Scenario, worlds: Worlds) -> eb.Engine:
     """Without a shield."""
     scripts = {i: make_agent(spec) for i, spec in scenario.scripts.items()}
     return eb.Engine(scenario, worlds.n, learners=scenario.learners, scripts=scripts, worlds=worlds)
+
+
+def all_infos(env: Any, actions: Any, **reset: Any) -> list[Any]:
+    """All that an episode of a parallel environment tells, from its reset on, if the same is proposed in each step."""
+    infos = [env.reset(**reset)[1]]
+    while env.agents:
+        infos.append(env.step(actions)[-1])
+    return infos
 
 
 def above_later(proposer: str, worlds: int) -> tuple[float, float]:

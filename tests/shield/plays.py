@@ -318,8 +318,6 @@ PLAYS: dict[str, Callable[[int], Play]] = {
 
 # ---------------------------------------------------------------- played, disturbed, wrapped
 
-LINES = (50, 200, 800)  # an interrupt comes at one of the first so many lines of a call, if it has so many
-
 
 class Tally(NamedTuple):
     """What happened."""
@@ -400,7 +398,8 @@ def disturbed(name: str, episodes: int, seed: int) -> Tally:
             play.raises, refused = None, refused + 1
         elif kind == 2:
             try:
-                with interrupt_at(int(play.rng.integers(1, play.rng.choice(LINES)))):
+                # at one of the first so many lines of a call, if it has so many
+                with interrupt_at(int(play.rng.integers(1, play.rng.choice((50, 200, 800))))):
                     play.step()
             except KeyboardInterrupt:
                 interrupted += 1

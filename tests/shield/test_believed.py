@@ -13,7 +13,7 @@ from ethbrake_marl.physics import Floats
 from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, enclosure, shielded_aec
 from ethbrake_marl.shield.enclosure import Boxes, boxes_of
 from ethbrake_marl.shield.step_shield import BelievedShield
-from tests.shield.attacks import ABOVE, HEARD_LATE, INSIDE, LISTS, NEVER_HEARD, WAYS, shielded
+from tests.shield.attacks import ABOVE, HEARD_LATE, INSIDE, LISTS, NEVER_HEARD, WAYS, all_infos, shielded
 
 BASE = eb.load_scenario("cooperation-2-paper").replace(early_impacts="keep")
 PERIODIC = BASE.replace(v2x={"preset": "blocked", "persistence": "periodic"})
@@ -137,17 +137,10 @@ def test_believed__bounds_nothing_where_its_vehicle_had_an_impact_before_the_fir
 
 
 # On the interfaces.
-START = {"options": {"listed_world": {"seed": 7, "number": 3}}}
-
-
 def told_in(env: Any, world: int = 3, action: float = 0.0) -> list[dict[str, Any]]:
     """All that a parallel shield told of an episode in which one action is proposed, in that world of list 7."""
-    _, infos = env.reset(options={"listed_world": {"seed": 7, "number": world}})
-    told = [infos["vehicle_2"]["shield"]]
-    while env.agents:
-        *_, infos = env.step({"vehicle_2": np.array([action])})
-        told.append(infos["vehicle_2"]["shield"])
-    return told
+    infos = all_infos(env, {"vehicle_2": [action]}, options={"listed_world": {"seed": 7, "number": world}})
+    return [each["vehicle_2"]["shield"] for each in infos]
 
 
 @pytest.mark.parametrize("mode", ["step", "robust"])
@@ -175,7 +168,7 @@ def test_every_interface__decides_alike_and_says_that_the_bound_is_of_the_belief
     assert start["bound_harm"] == np.inf and np.isfinite(told[0]["bound_harm"]) and set(start) == set(told[0])
     assert all(each["believed"] and not each["trusted"] for each in told)
     for env in (single, aec, vector):
-        env.reset(**START)
+        env.reset(options={"listed_world": {"seed": 7, "number": 3}})
     for wanted in told:
         *_, info = single.step(np.array([0.5], np.float32))
         *_, infos = vector.step(np.array([[0.5]], np.float32))

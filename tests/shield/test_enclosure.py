@@ -260,7 +260,6 @@ def test_shield__coasting_stays_within_the_bound_in_every_world_of_the_box():
 
 # Where a world drawn from a box leaves the enclosure: its states, not only its harm.
 ROOM = 1e-7  # for what two ways to compute a state differ by
-MOST = 20_000  # states of paths
 
 
 def follow_paths(cell):
@@ -269,7 +268,7 @@ def follow_paths(cell):
     stack, motion, found, whole = new_stack(N, cell.drive.shape[0]), new_motion(N, cell.drive.shape[0]), {}, True
     stack.forms[0, :N], stack.forms[0, N : N + P], stack.size[0] = cell.speed, cell.gap, 1
     worst, out = -np.inf, np.zeros(cell.drive.shape[0])
-    while stack.size[0] > 0 and sum(map(len, found.values())) < MOST:
+    while stack.size[0] > 0 and sum(map(len, found.values())) < 20_000:
         stack.size[0] -= 1
         top = stack.size[0]
         here = Path(stack.forms[top].copy(), stack.touch[top].copy(), stack.marks[top].copy())

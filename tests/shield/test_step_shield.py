@@ -23,7 +23,6 @@ pytestmark = pytest.mark.filterwarnings(
 
 STEPS = 81
 PAPER = eb.load_scenario("paper-random")
-PAIR = eb.load_scenario("cooperation-3-pair")
 WORLDS = PAPER.sample(60, 3).worlds
 
 # Three worlds of two vehicles: small enough to run uncompiled.
@@ -67,15 +66,6 @@ def reason(decision):
     return REASONS[decision.reason[0]]
 
 
-def waits(running, backup):
-    """Decisions about coasting until it is let through no longer."""
-    decisions = []
-    while not decisions or not decisions[-1].intervened[0]:
-        decisions.append(certify(running, np.zeros(1), backup, backup.harm))
-        running, backup = decisions[-1].after, decisions[-1].backup
-    return decisions
-
-
 @pytest.mark.parametrize(
     ("latency", "uncertainty", "steps"),
     [
@@ -90,7 +80,11 @@ def waits(running, backup):
 def test_by_hand__coasting_is_let_through_as_long_as_the_worst_corner_can_still_stop(latency, uncertainty, steps):
     running, backup = start(two(latency=latency)[1], braking(), uncertainty)
     assert backup.harm[0] == pytest.approx(0.0, abs=1e-9)
-    *let, last = waits(running, backup)
+    decisions = []
+    while not decisions or not decisions[-1].intervened[0]:
+        decisions.append(certify(running, np.zeros(1), backup, backup.harm))
+        running, backup = decisions[-1].after, decisions[-1].backup
+    *let, last = decisions
     assert (len(let), reason(last), last.applied[0]) == (steps, "no certificate", -1.0)
     if steps == 5:  # one step more: 1 m too far, so an impact at sqrt(2 * 5 * 1) m/s
         assert last.margin[0] == pytest.approx(-10.0, abs=1e-9)
@@ -139,8 +133,8 @@ def test_budget__above_the_plan_lets_more_through_but_never_more_than_that():
         decision = certify(running, np.ones(1), backup, budget)
         running, backup = decision.after, decision.backup
         assert backup.harm[0] <= budget[0]
-    realised = running.states[0, 4]  # two vehicles: speeds 2, gap, hit, first-impact harm
-    assert realised == backup.harm[0] > budget[0] - 20.0
+    # two vehicles: speeds 2, gap, hit, first-impact harm
+    assert running.states[0, 4] == backup.harm[0] > budget[0] - 20.0
 
 
 @pytest.mark.parametrize(("value", "instead"), [(np.nan, -0.8), (-7.0, -1.0), (-np.inf, -1.0)])
@@ -195,7 +189,11 @@ def test_allowance__keeps_what_it_grants_and_no_more():
 
 @pytest.mark.parametrize(
     ("scenario", "settings"),
-    [(PAPER, {}), (PAIR, {"cap": "baseline"}), (line(3), {"uncertainty": parse_uncertainty("gaps_m.pair_1=0.5")})],
+    [
+        (PAPER, {}),
+        (eb.load_scenario("cooperation-3-pair"), {"cap": "baseline"}),
+        (line(3), {"uncertainty": parse_uncertainty("gaps_m.pair_1=0.5")}),
+    ],
     ids=["one", "team", "robust"],
 )
 def test_begin__of_some_rows_leaves_the_others_alone(scenario, settings):
