@@ -223,6 +223,11 @@ class Single(Play):
         self.env.step(self.drawn(1))
 
 
+def one_bad(rows: int, row: int) -> np.ndarray:
+    """Actions of which one is no number."""
+    return np.where(np.arange(rows)[:, np.newaxis] == row, np.nan, 0.0)
+
+
 class Vector(Play):
     """Gymnasium vector."""
 
@@ -231,18 +236,12 @@ class Vector(Play):
     def make(self) -> None:
         inner = self.between(eb.EthBrakeVectorEnv(ROWS, self.scenario, autoreset_mode=self.mode))
         self.bad = [
-            lambda: self.env.step(self.one_bad(ROWS, int(np.argmin(self.engine().ended)))),  # others are ignored
+            lambda: self.env.step(one_bad(ROWS, int(np.argmin(self.engine().ended)))),  # others are ignored
             lambda: self.env.step(np.zeros((ROWS + 1, 1))),
             lambda: self.env.step(np.full((ROWS, 1), 1.0 + 1j)),
             lambda: self.env.reset(seed=-1),
         ]
         self.put(ShieldedVectorEnv(inner), seed=self.begin())
-
-    @staticmethod
-    def one_bad(rows: int, row: int) -> np.ndarray:
-        actions = np.zeros((rows, 1))
-        actions[row] = np.nan
-        return actions
 
     def step(self) -> None:
         self.env.step(self.drawn(ROWS, 1).astype(np.float32))
@@ -268,7 +267,7 @@ class Sb3(Play):
         inner.step_wait = lambda: self.how(step, inner._actions)
         rows = inner.num_envs
         self.bad = [
-            lambda: self.env.step(Vector.one_bad(rows, int(self.rng.integers(rows)))),
+            lambda: self.env.step(one_bad(rows, int(self.rng.integers(rows)))),
             lambda: self.env.step(np.zeros((rows, 2))),
             self._options,
         ]
