@@ -111,8 +111,7 @@ def test_memory__belongs_to_each_episode_and_goes_with_its_world(make):
         agent.act(WORLDS, 1)
     agent.begin(WORLDS.take([4]), 1, np.array([4]))  # one episode is renewed
     part = agent.take(np.array([3, 4]))
-    share = np.where(np.arange(12) == 4, 0.0, 0.3)
-    assert agent.act(WORLDS, 1) == pytest.approx(-share * capacity)
+    assert agent.act(WORLDS, 1) == pytest.approx(-np.where(np.arange(12) == 4, 0.0, 0.3) * capacity)
     assert part.act(WORLDS.take([3, 4]), 1) == pytest.approx([-0.3 * capacity[3], 0.0])  # left as it was
     assert harms(make()).tolist() == harms(eb.policy_agent(ramp, initial_state=no_memory)).tolist()
 
