@@ -38,13 +38,12 @@ TESTS = ("contract", "envs", "physics", "golden", "scenario", "agents", "evaluat
 CALM = "ignore::DeprecationWarning"  # that something will go from another package is what other versions differ in
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"of {', '.join(KINDS)}; default: all")
-    parser.add_argument(
-        "--python", action="append", help="or a version that uv finds; may be given often; default: this"
-    )
-    parser.add_argument("--tests", nargs="+", default=[f"tests/{folder}" for folder in TESTS])
-    parser.add_argument("--ci", action="store_true", help="the light core with every Python found, the rest with this")
+OPTIONS = {
+    "kinds": {"nargs": "*", "metavar": "KIND", "help": f"of {', '.join(KINDS)}; default: all"},
+    "--python": {"action": "append", "help": "or a version that uv finds; may be given often; default: this"},
+    "--tests": {"nargs": "+", "default": [f"tests/{folder}" for folder in TESTS]},
+    "--ci": {"action": "store_true", "help": "the light core with every Python found, the rest with this"},
+}
 
 
 def cases(given: argparse.Namespace) -> Cases:

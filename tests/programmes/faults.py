@@ -408,14 +408,14 @@ def preload() -> None:
         importlib.import_module(name)
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    """What the command line may say."""
-    parser.add_argument("what", choices=("mutants", "bugs"))
-    parser.add_argument("--folders", default=",".join(folders()), help="comma list; default: all")
-    parser.add_argument("--sample", type=int, default=40, help="mutants of each folder")
-    parser.add_argument("--seed", type=int, default=0, help="of the sample")
-    parser.add_argument("--jobs", type=int, default=2, help="processes")
-    parser.add_argument("--journal", type=Path, help="verdicts are noted here, and taken from here")
+OPTIONS = {
+    "what": {"choices": ("mutants", "bugs")},
+    "--folders": {"default": ",".join(folders()), "help": "comma list; default: all"},
+    "--sample": {"type": int, "default": 40, "help": "mutants of each folder"},
+    "--seed": {"type": int, "default": 0, "help": "of the sample"},
+    "--jobs": {"type": int, "default": 2, "help": "processes"},
+    "--journal": {"type": Path, "help": "verdicts are noted here, and taken from here"},
+}
 
 
 def cases(given: argparse.Namespace) -> Cases:

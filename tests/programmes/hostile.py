@@ -247,9 +247,7 @@ KINDS: dict[str, Generator] = {
 # ---------------------------------------------------------------- the attack
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--sample", type=int, help="so many cases of each category")
-    parser.add_argument("--seed", type=int, default=0)
+OPTIONS = {"--sample": {"type": int, "help": "so many cases of each category"}, "--seed": {"type": int, "default": 0}}
 
 
 def by_category(kind: str, seed: int) -> dict[str, list[Case]]:

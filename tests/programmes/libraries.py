@@ -278,10 +278,11 @@ def cpu_seconds() -> float:
 # ---------------------------------------------------------------- here
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--ci", action="store_true", help="only the libraries that are cheap to install")
-    parser.add_argument("--limit", type=float, default=900.0, help="seconds for one way")
-    parser.add_argument("--write", action="store_true", help="write the rows into docs/results/libraries.json")
+OPTIONS = {
+    "--ci": {"action": "store_true", "help": "only the libraries that are cheap to install"},
+    "--limit": {"type": float, "default": 900.0, "help": "seconds for one way"},
+    "--write": {"action": "store_true", "help": "write the rows into docs/results/libraries.json"},
+}
 
 
 def cases(given: argparse.Namespace) -> Cases:

@@ -136,8 +136,7 @@ KINDS: tuple[Callable[[], dict[str, str]], ...] = (lists, physics, episodes, sea
 TELL = "from tests.programmes import machines; machines.tell()"
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--sample", action="store_true", help="without the settings that compile everything anew")
+OPTIONS = {"--sample": {"action": "store_true", "help": "without the settings that compile everything anew"}}
 
 
 def cases(given: argparse.Namespace) -> Cases:

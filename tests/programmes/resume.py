@@ -140,10 +140,11 @@ def torn_writes(kills: int, folder: Path, rng: random.Random) -> Told:
     return Told(usable == kills, f"{usable}/{kills} kills while writing leave a usable one")
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--torn", type=int, default=40)
-    parser.add_argument("--seed", type=int, default=0)
+OPTIONS = {
+    "--kills": {"type": int, "default": 20},
+    "--torn": {"type": int, "default": 40},
+    "--seed": {"type": int, "default": 0},
+}
 
 
 def cases(given: argparse.Namespace) -> Cases:

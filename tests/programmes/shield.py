@@ -52,18 +52,19 @@ SLOW = {"worst_case": 0.14}  # and of those, a search in every step
 TEAM_CELLS = {(3, 3): 5.0, (4, 3): 1.25, (3, 5): 1.0, (4, 5): 0.75}  # by what they cost
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--worlds", type=int, default=1_000_000, help="of 'bound', all cells together, about")
-    parser.add_argument("--joint-worlds", type=int, default=300_000, help="of 'joint', all cells together, about")
-    parser.add_argument("--interface-worlds", type=int, default=2_000, help="through each interface")
-    parser.add_argument("--interfered", type=int, default=1_000, help="episodes with failing calls on each interface")
-    parser.add_argument("--corner-worlds", type=int, default=60_000, help="of 'believed'")
-    parser.add_argument("--range-worlds", type=int, default=1_200, help="of 'believed', from between the corners")
-    parser.add_argument("--restarts", type=int, default=1_000, help="of the search")
-    parser.add_argument("--intervals", default="gaps_m=0.5", help="of 'inside'")
-    parser.add_argument("--boxes", type=int, default=20, help="of 'inside'")
-    parser.add_argument("--draws", type=int, default=50_000, help="worlds out of each box")
-    parser.add_argument("--seed", type=int, default=1)
+OPTIONS = {
+    "--worlds": {"type": int, "default": 1_000_000, "help": "of 'bound', all cells together, about"},
+    "--joint-worlds": {"type": int, "default": 300_000, "help": "of 'joint', all cells together, about"},
+    "--interface-worlds": {"type": int, "default": 2_000, "help": "through each interface"},
+    "--interfered": {"type": int, "default": 1_000, "help": "episodes with failing calls on each interface"},
+    "--corner-worlds": {"type": int, "default": 60_000, "help": "of 'believed'"},
+    "--range-worlds": {"type": int, "default": 1_200, "help": "of 'believed', from between the corners"},
+    "--restarts": {"type": int, "default": 1_000, "help": "of the search"},
+    "--intervals": {"default": "gaps_m=0.5", "help": "of 'inside'"},
+    "--boxes": {"type": int, "default": 20, "help": "of 'inside'"},
+    "--draws": {"type": int, "default": 50_000, "help": "worlds out of each box"},
+    "--seed": {"type": int, "default": 1},
+}
 
 
 def cases(given: argparse.Namespace) -> Cases:

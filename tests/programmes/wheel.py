@@ -28,9 +28,10 @@ SHIPPED = "ppo@shipped,ppo@shipped+episode"
 NEEDS_TRAIN = "-m pip install 'ethbrake-marl[train]'"
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--output", type=Path, default=ROOT / "dist", help="folder of what is built")
-    parser.add_argument("--environment", type=Path, help="to install into, instead of a new one; its packages stay")
+OPTIONS = {
+    "--output": {"type": Path, "default": ROOT / "dist", "help": "folder of what is built"},
+    "--environment": {"type": Path, "help": "to install into, instead of a new one; its packages stay"},
+}
 
 
 def cases(given: argparse.Namespace) -> Cases:
