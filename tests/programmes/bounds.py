@@ -25,8 +25,19 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
-from tests.programmes import KEPT, ROOT, Cases, Told
-from tests.programmes.environments import TORCH, NotInstalled, call_uv, find_uv, install_torch, new_environment, watched
+from tests.programmes import (
+    KEPT,
+    ROOT,
+    TORCH,
+    Cases,
+    NotInstalled,
+    Told,
+    call_uv,
+    find_uv,
+    install_torch,
+    new_environment,
+    watched,
+)
 from tests.programmes.wheel import calls, run
 
 RESOLUTIONS = {"lowest": "lowest-direct", "highest": "highest"}

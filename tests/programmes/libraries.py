@@ -29,8 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tests.docs.site import load
-from tests.programmes import KEPT, ROOT, Cases, Told
-from tests.programmes.environments import NotInstalled, ready_python, watched
+from tests.programmes import KEPT, ROOT, Cases, NotInstalled, Told, ready_python, watched
 
 PAGE, HOWTO = ROOT / "docs" / "other-libraries.md", ROOT / "docs" / "howto-train.md"
 MEASURED = load("results")
