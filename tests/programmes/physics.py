@@ -77,12 +77,7 @@ GATES: dict[str, Callable[[], Figure]] = {}
 
 def gate(name: str) -> Callable[[Callable[[], Figure]], Callable[[], Figure]]:
     """Enter a function into the programme under a name."""
-
-    def enter(measure: Callable[[], Figure]) -> Callable[[], Figure]:
-        GATES[name] = measure
-        return measure
-
-    return enter
+    return partial(GATES.setdefault, name)
 
 
 def measured(measure: Callable[[], Figure]) -> Told:
