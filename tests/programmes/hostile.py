@@ -35,8 +35,18 @@ from ethbrake_marl.policies import load_policy
 from tests.programmes import Cases, Told
 from tests.programmes.archives import COMMAND, good_bytes, table_cases
 from tests.programmes.cage import HERE, INSIDE, NASTY, OUTSIDE, PRECIOUS, REFUSED, Build, Case, Generator, judge, write
-from tests.programmes.folders import EVALUATE, MANIFEST, WEIGHTS, bundle, bundle_cases, run_cases, stopped
-from tests.programmes.texts import SPECS, text_cases, texts
+from tests.programmes.files import (
+    EVALUATE,
+    MANIFEST,
+    SPECS,
+    WEIGHTS,
+    bundle,
+    bundle_cases,
+    run_cases,
+    stopped,
+    text_cases,
+    texts,
+)
 
 # ---------------------------------------------------------------- places: what may stand where a file is expected
 
