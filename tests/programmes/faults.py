@@ -58,7 +58,7 @@ PRELOADED = (
     "hypothesis", "numba", "numpy", "pytest", "torch", "stable_baselines3", "scipy.stats", "scipy.optimize", "pydantic",
     "matplotlib.pyplot", "gymnasium", "pettingzoo", "yaml", "rich", "typer", "tensorboard.compat.proto.event_pb2",
 )  # fmt: skip
-OPTIONS = (
+PYTEST = (
     "-q", "-m", "not long", "-p", "no:cacheprovider", "-p", "no:randomly", "--rootdir=.",
     "-W", "ignore::pytest.PytestAssertRewriteWarning",  # of what is loaded before
 )  # fmt: skip
@@ -565,7 +565,7 @@ def _run(self: Copy, pipe: int, tests: list[str], compiled: bool, own_kernels: b
         compiling.digest_of_sources = cache(lambda source: self.digests.get(str(source), ""))
     plugin = Listener(tests, None if compiled else EACH_S, pipe)
     files = list(dict.fromkeys(test.partition("::")[0] for test in tests))
-    status = int(pytest.main([*OPTIONS, *([] if every else ["-x"]), *files], plugins=[plugin]))
+    status = int(pytest.main([*PYTEST, *([] if every else ["-x"]), *files], plugins=[plugin]))
     if status in (3, 4):  # pytest itself failed, or could not begin: the fault is met by whoever imports the package
         os.write(pipe, f"(exit status {status} of pytest)\n".encode())
 
