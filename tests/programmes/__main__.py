@@ -23,12 +23,8 @@ FOLDER = Path(__file__).parent
 
 def programmes() -> dict[str, str]:
     """The first line of each programme, by its name."""
-    found = {}
-    for file in sorted(FOLDER.glob("*.py")):
-        text = file.read_text("utf-8")
-        if "\ndef cases(" in text:
-            found[file.stem] = text.removeprefix('"""').partition("\n")[0].removesuffix('"""')
-    return found
+    texts = {file.stem: file.read_text("utf-8") for file in sorted(FOLDER.glob("*.py"))}
+    return {name: text.partition("\n")[0].strip('"') for name, text in texts.items() if "\ndef cases(" in text}
 
 
 def main(words: list[str]) -> int:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator
 from functools import partial
 from itertools import product
 from typing import Any
@@ -198,7 +197,8 @@ def inside(robust: str, given: argparse.Namespace) -> Told:
         decisions += int((~shield.running.finished).sum())
         shield.decide(np.zeros(boxes))
     took, above, excess, harm = time.process_time() - begun, 0, -np.inf, 0.0
-    for k, n in product(range(boxes), list(batches(given.draws))):
+    draws = [min(BATCH, given.draws - first) for first in range(0, given.draws, BATCH)]
+    for k, n in product(range(boxes), draws):
         truth = uncertainty.draw(told.take(np.full(n, k)), rng)
         plan = np.repeat(shield.backup.plan[k : k + 1], n, axis=0)
         realised = plan_harm(begin_running(profile_problem(truth, [1], horizon_s=scenario.horizon_s)), plan)
@@ -211,10 +211,6 @@ def inside(robust: str, given: argparse.Namespace) -> Told:
         f" harm {harm / (boxes * given.draws):.2f}, replaced {shield.interventions.sum() / decisions:.0%},"
         f" {1e3 * took / decisions:.2f} ms per decision",
     )
-
-
-def batches(draws: int) -> Iterator[int]:
-    yield from (min(BATCH, draws - first) for first in range(0, draws, BATCH))
 
 
 def beyond_horizon(proposer: str) -> Told:
