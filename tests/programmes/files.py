@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import string
@@ -148,13 +149,7 @@ Change = Callable[[random.Random, str], "str | bytes"]
 
 def lines_of(text: str) -> list[str]:
     """The lines that give a key at the top level, with those that belong to it."""
-    parts: list[str] = []
-    for line in text.splitlines():
-        if line.startswith(" "):
-            parts[-1] += "\n" + line
-        else:
-            parts.append(line)
-    return parts
+    return re.split(r"\n(?! )", text.removesuffix("\n"))
 
 
 def joined(parts: list[str]) -> str:
@@ -486,10 +481,11 @@ MANIFEST, WEIGHTS = "manifest.json", "weights.safetensors"
 EVALUATE = ("evaluate", "--episodes", "2", "--agents", "ppo@policy")
 
 
-def _hashed_anew(rng: random.Random, folder: Path) -> None:
-    edited(rng, folder / MANIFEST)
+def _signed(folder: Path, **changes: str) -> None:
+    """A manifest with some changes, and its hash anew."""
     content = json.loads((folder / MANIFEST).read_text())
     if isinstance(content, dict):
+        content |= changes
         content["manifest_sha256"] = content_sha256(content)
     (folder / MANIFEST).write_text(json.dumps(content))
 
@@ -505,10 +501,7 @@ def _header(folder: Path, change: Callable[[dict[str, Any]], Any]) -> None:
 
 def _weights(folder: Path, data: bytes) -> None:
     (folder / WEIGHTS).write_bytes(data)
-    content = json.loads((folder / MANIFEST).read_text())
-    content["weights_sha256"] = hashlib.sha256(data).hexdigest()
-    content["manifest_sha256"] = content_sha256(content)
-    (folder / MANIFEST).write_text(json.dumps(content))
+    _signed(folder, weights_sha256=hashlib.sha256(data).hexdigest())
 
 
 def _tensor(rng: random.Random, header: dict[str, Any]) -> dict[str, Any]:
@@ -577,23 +570,27 @@ BUNDLES: dict[str, Spoil] = {
 
 def bundle_cases(rng: random.Random) -> Iterator[Case]:
     """Bundles: 15 of each category, 60 of those that may be in order."""
-    uncertain: dict[str, Spoil] = {"manifest edited and hashed anew": _hashed_anew, "damaged": damaged_file}
+    uncertain: dict[str, Spoil] = {
+        "manifest edited and hashed anew": lambda r, f: (edited(r, f / MANIFEST), _signed(f)),
+        "damaged": damaged_file,
+    }
     for certain, changes in ((True, BUNDLES), (False, uncertain)):
         for category, change in changes.items():
             for _ in range(15 if certain else 60):
-                build = partial(_changed_bundle, change, rng.random())
+                build = partial(_changed, bundle, change, rng.random())
                 yield Case(category, EVALUATE, build, certain=certain, reader=partial(load_policy, "policy"))
 
 
-def bundle(folder: Path) -> None:
+def bundle(folder: Path) -> Path:
     """A bundle that is in order, and may be changed."""
     shutil.copytree(shipped_policies()["ppo"] / "policy", folder / "policy", copy_function=shutil.copyfile)
     (folder / "policy").chmod(0o755)
+    return folder / "policy"
 
 
-def _changed_bundle(change: Spoil, seed: float, folder: Path) -> None:
-    bundle(folder)
-    change(random.Random(seed), folder / "policy")
+def _changed(begin: Callable[[Path], Path], change: Spoil, seed: float, folder: Path) -> None:
+    """What ``begin`` makes, changed."""
+    change(random.Random(seed), begin(folder))
 
 
 # ---------------------------------------------------------------- run folders
@@ -656,14 +653,10 @@ def listed_anew(checkpoint: Path) -> None:
     path.write_text(json.dumps(listing))
 
 
-def _of_checkpoint(name: str, change: Spoil) -> Spoil:
-    """Spoil a file of the newest checkpoint, and list it anew."""
-
-    def changed(rng: random.Random, run: Path) -> None:
-        change(rng, newest(run) / name)
-        listed_anew(newest(run))
-
-    return changed
+def _of_checkpoint(name: str, change: Spoil, rng: random.Random, run: Path) -> None:
+    """Change a file of the newest checkpoint, and list it anew."""
+    change(rng, newest(run) / name)
+    listed_anew(newest(run))
 
 
 def _arrays(rng: random.Random, path: Path) -> None:
@@ -739,22 +732,13 @@ def _text_of_table(rng: random.Random, path: Path) -> None:
     )
 
 
-def _outside(path: Path) -> Path:
-    """What no run may touch."""
-    return path.parents[1] / OUTSIDE
-
-
-def _link(name: str, target: str) -> Spoil:
+def _link(name: str, target: str, rng: random.Random, run: Path) -> None:
     """A link out of the run in the place of something in it."""
-
-    def change(rng: random.Random, run: Path) -> None:
-        path = run / name
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        path.unlink(missing_ok=True)
-        path.symlink_to(_outside(run) / target)
-
-    return change
+    path = run / name
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    path.unlink(missing_ok=True)
+    path.symlink_to(run.parents[1] / OUTSIDE / target)
 
 
 def _pipe(rng: random.Random, run: Path) -> None:
@@ -810,20 +794,20 @@ CHANGES: dict[str, tuple[tuple[str, ...], int, bool, Spoil]] = {
     "something more": (("ppo",), 24, False, _more),
     "files exchanged": (("ppo", "sac"), 25, False, _swapped),
     "a pipe for a file": (("ppo", "sac"), 25, False, _pipe),
-    "checkpoints: link outside": (("ppo",), 1, True, _link("checkpoints", "")),
-    "tensorboard: link outside": (("ppo",), 1, True, _link("tensorboard", "")),
-    "run.lock: link outside": (("ppo",), 1, True, _link("run.lock", PRECIOUS)),
-    "progress.csv: link outside": (("ppo",), 1, False, _link("progress.csv", PRECIOUS)),
-    "config.json: link outside": (("ppo",), 1, True, _link("config.json", PRECIOUS)),
-    "team.json: link outside": (("ppo",), 1, False, _link("team.json", PRECIOUS)),
-    "policy: link outside": (("ppo",), 1, False, _link("policy", "")),
-    "events: link outside": (("ppo",), 1, False, _link("tensorboard/events.out.tfevents.1.x", PRECIOUS)),
+    "checkpoints: link outside": (("ppo",), 1, True, partial(_link, "checkpoints", "")),
+    "tensorboard: link outside": (("ppo",), 1, True, partial(_link, "tensorboard", "")),
+    "run.lock: link outside": (("ppo",), 1, True, partial(_link, "run.lock", PRECIOUS)),
+    "progress.csv: link outside": (("ppo",), 1, False, partial(_link, "progress.csv", PRECIOUS)),
+    "config.json: link outside": (("ppo",), 1, True, partial(_link, "config.json", PRECIOUS)),
+    "team.json: link outside": (("ppo",), 1, False, partial(_link, "team.json", PRECIOUS)),
+    "policy: link outside": (("ppo",), 1, False, partial(_link, "policy", "")),
+    "events: link outside": (("ppo",), 1, False, partial(_link, "tensorboard/events.out.tfevents.1.x", PRECIOUS)),
     "progress.csv damaged": (("ppo",), 10, False, lambda r, f: _text_of_table(r, f / "progress.csv")),
-    "checkpoint: state.json edited": (("ppo", "sac"), 90, False, _of_checkpoint("state.json", edited)),
-    "checkpoint: state.json is no JSON": (("ppo",), 17, False, _of_checkpoint("state.json", no_json)),
-    "checkpoint: arrays changed": (("ppo", "sac"), 60, False, _of_checkpoint("arrays.safetensors", _arrays)),
-    "checkpoint: replay changed": (("sac",), 20, False, _of_checkpoint("x", _npy)),
-    "checkpoint: table changed": (("ppo",), 15, False, _of_checkpoint("progress.csv", _text_of_table)),
+    "checkpoint: state.json edited": (("ppo", "sac"), 90, False, partial(_of_checkpoint, "state.json", edited)),
+    "checkpoint: state.json is no JSON": (("ppo",), 17, False, partial(_of_checkpoint, "state.json", no_json)),
+    "checkpoint: arrays changed": (("ppo", "sac"), 60, False, partial(_of_checkpoint, "arrays.safetensors", _arrays)),
+    "checkpoint: replay changed": (("sac",), 20, False, partial(_of_checkpoint, "x", _npy)),
+    "checkpoint: table changed": (("ppo",), 15, False, partial(_of_checkpoint, "progress.csv", _text_of_table)),
     "checkpoint: listing edited": (("ppo", "sac"), 40, False, lambda r, f: edited(r, newest(f) / "checkpoint.json")),
     "checkpoint: listing is no JSON": (("ppo",), 17, False, lambda r, f: no_json(r, newest(f) / "checkpoint.json")),
     "checkpoint: files damaged": (("ppo", "sac"), 70, False, lambda r, f: damaged_file(r, newest(f))),
@@ -844,11 +828,10 @@ def run_cases(kind: str, rng: random.Random) -> Iterator[Case]:
     for category, (algorithms, count, certain, change) in CHANGES.items():
         if category.startswith("checkpoint: ") == (kind == "checkpoint"):
             for algorithm in [each for each in algorithms for _ in range(count)]:
-                build = partial(_changed_run, algorithm, change, rng.random())
+                build = partial(_changed, partial(_run, algorithm), change, rng.random())
                 name = category.removeprefix("checkpoint: ")
                 yield Case(name, ("train", "resume", RUN), build, certain=certain, may_change=(RUN,))
 
 
-def _changed_run(algorithm: str, change: Spoil, seed: float, folder: Path) -> None:
-    shutil.copytree(stopped(algorithm), folder / RUN)
-    change(random.Random(seed), folder / RUN)
+def _run(algorithm: str, folder: Path) -> Path:
+    return shutil.copytree(stopped(algorithm), folder / RUN)
