@@ -36,9 +36,9 @@ LONGEST_S = 3600.0
 
 
 def write_sweep(folder: Path, jobs: int) -> Path:
-    (folder / "tiny.yaml").write_text(yaml.safe_dump(RECIPE))
-    grid = {"scenario": "paper-random", "recipe": str(folder / "tiny.yaml"), "seed": {"count": jobs}}
-    path = folder / "sweep.yaml"
+    recipe, path = folder / "tiny.yaml", folder / "sweep.yaml"
+    recipe.write_text(yaml.safe_dump(RECIPE))
+    grid = {"scenario": "paper-random", "recipe": str(recipe), "seed": {"count": jobs}}
     path.write_text(yaml.safe_dump({"grid": grid}))
     return path
 

@@ -90,25 +90,24 @@ def cases(given: argparse.Namespace) -> Cases:
 
 
 def attacks(given: argparse.Namespace) -> Cases:
-    """Every adversary of one learner, and of teams; no two cases share a world."""
-    first, seed = 0, given.seed
-    one = list(product(CELLS, ("first", "total"), ADVERSARIES))
-    whole = sum(CELLS[N] * SLOW.get(name, 1.0) for N, _, name in one)
-    for N, count, name in one:
-        worlds = max(1, round(given.worlds * CELLS[N] * SLOW.get(name, 1.0) / whole))
+    """Every adversary of one learner, and of teams, each with its share of the worlds; no two cases share a world."""
+    one, teams = [], []
+    for N, count, name in product(CELLS, ("first", "total"), ADVERSARIES):
         case = {"harm_count": count, "adversary": ADVERSARIES[name]}
-        yield f"bound: N = {N}, {count}, {name}", partial(attacked, line(N), worlds, first, seed, case)
-        first += worlds
-    teams = list(product(TEAM_CELLS, ("first", "total"), ("all", "one"), TEAM_ADVERSARIES))
-    whole = sum(TEAM_CELLS[which] for which, *_ in teams)
-    for k, (which, count, hostile, name) in enumerate(teams):
-        worlds = max(1, round(given.joint_worlds * TEAM_CELLS[which] / whole))
-        case = {"harm_count": count, "hostile": hostile, "adversary": TEAM_ADVERSARIES[name]}
-        case["cap"] = (None, "baseline")[k % 2]
-        scenario = load_scenario(TEAMS[which])
-        told = f"joint: level {which[0]}, N = {which[1]}, {count}, {hostile} hostile, {name}, cap {case['cap']}"
-        yield told, partial(attacked, scenario, worlds, first, seed, case)
-        first += worlds
+        one.append((f"bound: N = {N}, {count}, {name}", CELLS[N] * SLOW.get(name, 1.0), line(N), case))
+    every_team = product(TEAM_CELLS, ("first", "total"), ("all", "one"), TEAM_ADVERSARIES)
+    for k, (which, count, hostile, name) in enumerate(every_team):
+        cap = (None, "baseline")[k % 2]
+        case = {"harm_count": count, "hostile": hostile, "adversary": TEAM_ADVERSARIES[name], "cap": cap}
+        told = f"joint: level {which[0]}, N = {which[1]}, {count}, {hostile} hostile, {name}, cap {cap}"
+        teams.append((told, TEAM_CELLS[which], load_scenario(TEAMS[which]), case))
+    first = 0
+    for all_worlds, cells in ((given.worlds, one), (given.joint_worlds, teams)):
+        whole = sum(share for _, share, *_ in cells)
+        for told, share, scenario, case in cells:
+            worlds = max(1, round(all_worlds * share / whole))
+            yield told, partial(attacked, scenario, worlds, first, given.seed, case)
+            first += worlds
 
 
 def attacked(scenario: Any, worlds: int, first: int, seed: int, case: dict[str, Any]) -> Told:
