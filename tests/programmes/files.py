@@ -602,14 +602,16 @@ SMALL: dict[str, Any] = {
     "network": {"policy": [4], "value": [4]},
     "evaluation": {"every_updates": 2, "worlds": 2, "seed": 7},
 }
-PPO = {**SMALL, "n_steps": 8, "n_epochs": 1, "total_steps": 256, "checkpoint_every_updates": 2}
-SAC = {
-    **SMALL,
-    "buffer_size": 64,
-    "learning_starts": 8,
-    "total_steps": 64,
-    "checkpoint_every_updates": 4,
-    "log_every_updates": 2,
+SETTINGS = {
+    "ppo": {**SMALL, "n_steps": 8, "n_epochs": 1, "total_steps": 256, "checkpoint_every_updates": 2},
+    "sac": {
+        **SMALL,
+        "buffer_size": 64,
+        "learning_starts": 8,
+        "total_steps": 64,
+        "checkpoint_every_updates": 4,
+        "log_every_updates": 2,
+    },
 }
 
 
@@ -626,8 +628,7 @@ def stopped(algorithm: str) -> Path:
             signal.raise_signal(signal.SIGINT)
         return {"first_impact_harm": 1.0, "total_harm": 1.0}
 
-    settings = PPO if algorithm == "ppo" else SAC
-    recipe = load_recipe(algorithm).replace(**settings)
+    recipe = load_recipe(algorithm).replace(**SETTINGS[algorithm])
     train(recipe, load_scenario("paper-random"), folder, measure=lambda training: measure)
     assert json.loads((folder / "run.json").read_text())["status"] == "interrupted"
     return folder

@@ -81,11 +81,6 @@ def _socket(path: Path) -> None:
         server.bind(path.name)
 
 
-def _giant(path: Path) -> None:
-    with path.open("wb") as file:
-        file.truncate(10 << 30)
-
-
 def _loop(path: Path) -> None:
     path.symlink_to(path.name + "2")
     (path.parent / (path.name + "2")).symlink_to(path.name)
@@ -113,7 +108,7 @@ PLACES: dict[str, Callable[[Path], object]] = {
     "links in a loop": _loop,
     "a link to a folder": partial(_link, "."),
     "a link to a folder elsewhere": _outside,
-    "ten gigabytes of nothing": _giant,
+    "ten gigabytes of nothing": lambda path: (path.touch(), os.truncate(path, 10 << 30)),
     "an empty file": Path.touch,
     **{f"a link to {device}": partial(_link, device) for device in DEVICES},
 }

@@ -156,19 +156,15 @@ def test_proofs__refuse_compiled_functions():
     assert done.returncode == 1 and "compilation must be switched off" in done.stderr
 
 
-def nothing(folder: Path) -> None:
-    """Build nothing."""
-
-
 @pytest.mark.parametrize(
     ("case", "fault"),
     [
         (Case("x", ("nonsense",), lambda folder: (folder / "../../x").touch()), "left beside its folder: x"),
         (Case("x", ("--version",), lambda folder: None), "was not refused"),
-        (Case("x", ("nonsense",), nothing, reader=lambda: os.mkdir("/tmp/x-of-a-test")), "would have changed"),
-        (Case("x", ("nonsense",), nothing, reader=lambda: os.system("true")), "executed: os.system"),
-        (Case("x", ("nonsense",), nothing, reader=lambda: 1), "python: no error"),
-        (Case("x", ("nonsense",), nothing, reader=lambda: Path("new").touch()), "changed: inside/new"),
+        (Case("x", ("nonsense",), Path.resolve, reader=lambda: os.mkdir("/tmp/x-of-a-test")), "would have changed"),
+        (Case("x", ("nonsense",), Path.resolve, reader=lambda: os.system("true")), "executed: os.system"),
+        (Case("x", ("nonsense",), Path.resolve, reader=lambda: 1), "python: no error"),
+        (Case("x", ("nonsense",), Path.resolve, reader=lambda: Path("new").touch()), "changed: inside/new"),
     ],
 )
 def test_judge__tells_what_breaks_a_rule(case, fault, tmp_path):
