@@ -36,7 +36,7 @@ from tests.learning.tiny import (
     files_of,
     watch_steps,
 )
-from tests.programmes.folders import CHANGES, listed_anew, newest
+from tests.programmes.files import CHANGES, listed_anew, newest
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
