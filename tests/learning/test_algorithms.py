@@ -285,10 +285,6 @@ def test_widened__puts_every_feature_where_it_is_observed_now() -> None:
     assert (first[:, 0] == 0.0).all()
     assert (first[:, 1:] == shipped.tensors["policy.0.weight"][:, ::-1]).all()
     assert "value.0.weight" not in widened(shipped, turned)
-    with pytest.raises(InvalidInput, match=r"observation: lacks rear_1.known, .* which the policy"):
-        widened(shipped, Training.of(SHIPPED.replace(observation=["own", "front_1", "contact"]), SCENARIO))
-    with pytest.raises(InvalidInput, match=r"policy_hidden is \(64, 64\), but \(128, 128\) in the policy"):
-        widened(shipped, Training.of(SHIPPED.replace(network={"policy": [64, 64]}), SCENARIO))
 
 
 OWN = {"reward": {"harm": 1.0, "harm_count": "total", "objective": "own", "terminal": 0.5}}
@@ -465,12 +461,6 @@ def test_imitation__draws_from_the_stream_of_its_own_seed() -> None:
         model._imitate(pupil, shown, seed)
         taught.append(pupil.act(shown.seen).tolist())
     assert taught[0] == taught[1] != taught[2]
-
-
-def test_training__from_several_networks_is_refused(mixture: eb.Policy, tmp_path: Path) -> None:
-    mixture.save(tmp_path / "first")
-    with pytest.raises(InvalidInput, match="start: has 3 networks; give a policy of one"):
-        train(TINY_MODES.replace(start=f"counterfactual@{tmp_path / 'first'}"), SCENARIO, tmp_path / "again")
 
 
 def test_training__says_that_there_is_no_other_mode(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from ethbrake_marl.files.yaml import parse_yaml, read_yaml
 from ethbrake_marl.learning import RunDirectory, Training, TrainingRecipe, algorithm_names, load_recipe
 from ethbrake_marl.learning.training import LearningRate
 from ethbrake_marl.policies import NetworkSpec
-from tests.learning.tiny import TINY_COUNTERFACTUAL, TINY_OPTIONS, TINY_PPO
+from tests.learning.tiny import TINY_COUNTERFACTUAL, TINY_PPO
 
 SHIPPED = TrainingRecipe.shipped()
 PAPERS = {
@@ -60,20 +60,6 @@ def test_learning_rate__cosine_by_hand() -> None:
     assert [rate.at(x) for x in (1.0, 0.5, 0.0)] == pytest.approx([5e-4, 3e-4, 1e-4])
     assert rate.at(0.75) == pytest.approx(1e-4 + 4e-4 * (1.0 + 0.5**0.5) / 2.0)
     assert rate.at(-0.1) == pytest.approx(1e-4)  # the last rollout may overshoot the end; the rate must not rise again
-
-
-def test_recipe__may_try_every_decision_of_a_round_otherwise_and_not_one_more() -> None:
-    assert TINY_COUNTERFACTUAL.replace(counterfactuals=32).counterfactuals == 8 * 4
-    with pytest.raises(InvalidInput, match=r"counterfactuals = 33: must be at most n_envs x n_steps = 32"):
-        TINY_COUNTERFACTUAL.replace(counterfactuals=33)
-    for changes, told in (
-        ({"tried": 33, "memory": 99}, "tried = 33: must be at most n_envs x n_steps = 32"),
-        ({"memory": 15}, "memory = 15: must be at least tried = 16"),
-        ({"near": [], "fixed": [], "drawn": 0}, "near = .*: must hold a range where there are neither"),
-        ({"reward": {"harm": 1.0, "shaping": 0.1}}, "reward.shaping = 0.1: must be 0: what is tried is played to"),
-    ):
-        with pytest.raises(InvalidInput, match=told):
-            TINY_OPTIONS.replace(**changes)
 
 
 def test_recipe__tells_only_the_keys_that_it_has_so_that_older_trainings_stay_the_same() -> None:

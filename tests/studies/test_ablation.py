@@ -15,7 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from ethbrake_marl.agents.registry import Team, make_agent
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.errors import InvalidInput, Progress
+from ethbrake_marl.errors import Progress
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.episodes import Passport
 from ethbrake_marl.figures import ablation_figures, signed_ticks
@@ -25,7 +25,6 @@ from ethbrake_marl.limits.limits import best_harm, chunks_left
 from ethbrake_marl.policies import load_policy
 from ethbrake_marl.scenario import Sample, load_scenario, scenario_path
 from ethbrake_marl.shield.guard import Shielded
-from ethbrake_marl.studies import ablation as module
 from ethbrake_marl.studies.ablation import (
     FIGURES,
     LADDER,
@@ -96,42 +95,6 @@ def test_common_worlds__gaps_and_speeds_are_the_same_at_every_level():
     for sample in samples:
         np.testing.assert_array_equal(sample.worlds.gaps_m, samples[0].worlds.gaps_m)
         np.testing.assert_array_equal(sample.worlds.speeds_mps, samples[0].worlds.speeds_mps)
-
-
-PAPER = load_scenario("cooperation-2-paper")
-
-
-@pytest.mark.parametrize(
-    ("changes", "what"),
-    [
-        ({"gaps_m": 7}, "gaps_m"),
-        (
-            {"mass_t": [4.5, 5.5, 6]},
-            r"mass_t differs from that of 'cooperation-2-paper' \(4.5, 5.5, 6; there 4.5, 5.5, 5.9\)",
-        ),
-        ({"braking_capacity_mps2": 6}, "braking_capacity_mps2"),
-        ({"driving_capacity_mps2": 6}, "driving_capacity_mps2"),
-        ({"restitution": 0.2}, "restitution"),
-        ({"speed_limit_mps": 30}, "speed_limit_mps"),
-        ({"time_step_s": 0.05}, "time_step_s"),
-        ({"horizon_s": 9}, r"horizon_s differs .* \(9; there 8\)"),
-        ({"latency_s": [0, 0.5, 0.9]}, "latency_s"),
-        ({"observation": ["own"]}, "observation differs from that of .cooperation-2-paper."),
-    ],
-)
-def test_common_worlds__other_physics_are_refused(changes, what):
-    other = PAPER.replace(name="mine", roles={"vehicle_3": "learner"}, **changes)
-    with pytest.raises(InvalidInput, match=f"level 'mine': its {what}"):
-        common_worlds([Level(PAPER), Level(other)], 5, 7)
-
-
-def test_common_worlds__news_roles_objectives_and_an_obstacle_may_differ():
-    roles = {"vehicle_1": "learner", "vehicle_3": "coast"}
-    free = PAPER.replace(name="mine", roles=roles, objective="own", obstacle_gap_m=42, v2x="blocked")
-    late = PAPER.replace(name="late", v2x="blocked")
-    assert len(common_worlds([Level(PAPER), Level(free), Level(late)], 5, 7)) == 3
-    with pytest.raises(InvalidInput, match="level 'late': its latency_s differs from that of 'mine'"):
-        common_worlds([Level(PAPER), Level(free), Level(late.replace(latency_s=[0, 0.5, 0.9]))], 5, 7)
 
 
 def test_ablate__writes_tables_and_figures(finished_ablation: Path) -> None:
@@ -273,8 +236,6 @@ def test_plan__one_learner_is_trained_alone_several_by_their_scheme_and_turns(ti
     assert [own.scheme for *_, own in planned(recipe.replace(scheme="shared"), None)] == [None, "shared"]
     (*_, alone), (*_, pair) = planned(recipe.replace(scheme="independent", turns=2), None)
     assert (alone.turns, pair.turns) == (None, 2)
-    with pytest.raises(InvalidInput, match="turns"):
-        planned(recipe.replace(scheme="independent", turns=5), "shared")
 
 
 @pytest.mark.slow
@@ -557,18 +518,13 @@ def test_lengthened__vehicle_i_is_like_vehicle_i_minus_2_in_lists_and_objectives
     assert line.objective == ("own", "total", "social:45", "total", "social:45")
 
 
-def test_drive_longer__full_braking_gains_nothing_on_itself_and_wrong_lines_are_told_before_one_is_driven(monkeypatch):
+def test_drive_longer__full_braking_gains_nothing_on_itself():
     question, braking = LineQuestion(PAIR, (3, 4), 20, 7, "total", 3, 50), make_agent("full_brake")
     found = question.drive([braking])
     told = [(one["vehicles"], one["decrease"], one["worse_off"], one["share"]) for one in found]
     assert told == [(3, 0.0, 0.0, 0.0), (4, 0.0, 0.0, 0.0)]
     three = evaluate(PAIR.sample(20, 7), {"b": braking}, scenario=PAIR).outcome("b").total_harm
     assert found[0]["reached"] == pytest.approx(three.mean(), rel=1e-12)
-    monkeypatch.setattr(module, "evaluate", lambda *_, **__: pytest.fail("driven"))
-    weighted = replace(question, scenario=PAIR.replace(name="mine", objective="weighted:1,2,3"))
-    for wrong, what in ((weighted, "mine-n4"), (replace(question, vehicles=(3, 3)), "3, 3: each length once")):
-        with pytest.raises(InvalidInput, match=what):
-            wrong.drive([braking])
 
 
 @pytest.fixture(scope="module")
