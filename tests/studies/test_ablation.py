@@ -172,50 +172,6 @@ def test_ablate__goes_on_where_it_was_stopped_to_the_same_result(
     assert content(folder) == content(finished_ablation)
 
 
-def test_ablate__states_the_cost_first_and_makes_nothing(copied: Path, tiny_total, tmp_path, capsys) -> None:
-    damaged = next((copied / "optimum").glob("*/*.npz"))
-    damaged.write_bytes(b"no table")
-    before = (copied / "ablation.json").stat().st_mtime_ns
-    nothing = "to do: 0 trainings, 0 decisions: 0 s; joint optima"
-    for folder, options, *told in (
-        (copied, [], nothing, f"{damaged}: is damaged; its worlds are searched again"),
-        (copied, ["--seeds", "3"], "to do: 2 trainings, 512 decisions at"),
-        (tmp_path / "new", ["--seeds", "1"], "to do: 2 trainings, 512 decisions at"),
-    ):
-        assert ablate(folder, tiny_total, *options, "--cost") == 0
-        err = capsys.readouterr().err
-        assert [each for each in told if each not in err] == []
-    assert (copied / "ablation.json").stat().st_mtime_ns == before and not (tmp_path / "new").exists()
-
-
-@pytest.mark.parametrize(
-    ("file", "text", "what"),
-    [
-        ("run.json", "{", "run.json: is damaged"),
-        ("config.json", "[]", "config.json: is damaged"),
-        ("run.json", None, "is no training"),
-        ("team.json", "{}", "team.json"),
-        ("policy/manifest.json", "{}", "manifest.json"),
-    ],
-)
-def test_ablate__a_damaged_training_is_named_before_anything_is_searched(copied, tiny_total, capsys, file, text, what):
-    shutil.rmtree(copied / "optimum")
-    shutil.rmtree(copied / "trainings" / "cooperation-3-pair-tiny-shared-seed0")
-    damaged = copied / "trainings" / "cooperation-3-congested-tiny-shared-seed1" / file
-    damaged.unlink()
-    if text is not None:
-        damaged.write_text(text)
-    assert ablate(copied, tiny_total) == 2 and what in capsys.readouterr().err
-    assert not (copied / "optimum").exists() and len(list((copied / "trainings").iterdir())) == 3
-
-
-def test_ablate__another_training_in_the_folder_is_refused(copied: Path, tiny_total: Path, capsys) -> None:
-    (copied / "settings.json").unlink()
-    assert ablate(copied, tiny_total, "--steps", "4096") == 2
-    told = "holds another training (here other: recipe total_steps); give another folder"
-    assert told in capsys.readouterr().err
-
-
 def planned(recipe: TrainingRecipe, scheme: Scheme | None) -> list[tuple[str, TrainingJob, TrainingRecipe]]:
     """Algorithm, training and its recipe, level by level."""
     levels = tuple(read_levels(["cooperation-2-paper", "cooperation-3-pair"]))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import re
 import shutil
 import signal
 import subprocess
@@ -147,17 +145,6 @@ def test_another_file__of_some_of_its_jobs_has_their_rows_alone(again, small_swe
     write_yaml(file, {"grid": {**small_sweep["grid"], "seed": [5]}})
     assert sweep(file, folder) == 0 and len(journal(folder)) == 4
     assert read(folder / TABLE) == [row for row in before if row["seed"] == "5"]
-
-
-def test_dry_run__prints_jobs_and_cost_and_makes_nothing(again, tmp_path: Path, capsys) -> None:
-    file, folder = again
-    assert sweep(file, tmp_path / "new", "--dry-run") == 0
-    told = capsys.readouterr()
-    lines = told.out.splitlines()
-    assert len(lines) == 4 and re.fullmatch("new +paper-random-tiny-seed3-.* gamma=0.9", lines[0])
-    assert "to do: 4 jobs, 1,024 decisions: about" in told.err and not (tmp_path / "new").exists()
-    assert sweep(file, folder, "--dry-run", "--json") == 0
-    assert {job["state"] for job in json.loads(capsys.readouterr().out)["jobs"]} == {"finished"}
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered:RuntimeWarning")  # an error in this process alone

@@ -6,7 +6,6 @@ import json
 import shutil
 import signal
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -181,52 +180,3 @@ def test_same_command__exports_again_over_its_own_recipe_alone(finished_tuning, 
     export.write_text(text[1:])
     assert tune(file, tmp_path / "all" / "out", "--export", str(export)) == 2
     assert "best.yaml: is there already" in capsys.readouterr().err
-
-
-def other_versions(folder: Path) -> None:
-    """The folder of the tuning as another torch left it."""
-    record = json.loads((folder / "tuning.json").read_text())
-    record["versions"]["torch"] = "1.0"
-    (folder / "tuning.json").write_text(json.dumps(record))
-
-
-def in_journal(old: str, new: str) -> Callable[[Path], None]:
-    """Damage of the journal."""
-
-    def damage(folder: Path) -> None:
-        journal = folder / "study.journal"
-        assert old in journal.read_text()
-        journal.write_text(journal.read_text().replace(old, new))
-
-    return damage
-
-
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        (other_versions, "holds a tuning with other settings (versions torch 1.0, here 2."),
-        (in_journal('{"op_code":0', '{"op_kode":0'), "cannot be used"),
-        (in_journal('{"op_code":0', "\x00"), "cannot be used"),
-        (in_journal('"results":"[', '"results":"{'), "trial 0 is damaged"),
-        (in_journal('"results":"[', '"results":7,"x":"['), "cannot be used"),
-    ],
-)
-def test_folder__of_other_versions_or_damaged_is_refused_in_one_line(
-    finished_tuning, write_tuning, tmp_path, capsys, change, reason
-):
-    folder = tmp_path / "out"
-    shutil.copytree(finished_tuning, folder)
-    change(folder)
-    assert tune(write_tuning(), folder) == 2
-    told = capsys.readouterr().err
-    assert reason in told and "numpy" not in told and len(told.splitlines()) == 1
-
-
-def test_dry_run__prints_space_and_cost_and_makes_nothing(write_tuning, tmp_path, capsys):
-    assert tune(write_tuning(), tmp_path / "new", "--dry-run", "--jobs", "2") == 0
-    told = capsys.readouterr()
-    assert told.out.splitlines()[1] == "n_epochs  from 1 to 4, whole  (the recipe has 2)"
-    assert f"{TRIALS} trials of 512 decisions: about" in told.err and not (tmp_path / "new").exists()
-    assert tune(write_tuning(), tmp_path / "new", "--dry-run", "--json") == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["own_values"]["n_epochs"] == 2 and found["core_s_per_trial"] > 0.0
