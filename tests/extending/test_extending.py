@@ -17,17 +17,13 @@ import pytest
 import yaml
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.cli.app import app, run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.measures import REGISTERED
 from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.harm import declared_objectives
-from ethbrake_marl.learning.runs import train
-from ethbrake_marl.learning.training import TrainingRecipe, load_recipe
 from ethbrake_marl.observations import observe
 from ethbrake_marl.pages.report import Report
-from ethbrake_marl.policies import load_policy
 from ethbrake_marl.rewards import TERMS, StepOutcome, reward_params
 from ethbrake_marl.scenario import new_scenario_text, scenario_json_schema
 from ethbrake_marl.scenario.v2x import CHANNELS
@@ -121,21 +117,21 @@ def test_parts__of_the_users_file_train_and_are_evaluated(mine: Any, tmp_path: P
     reward = {"harm": 1.0, "calm": 0.5, "hurry": 0.01}
     content = {**TINY_PPO.model_dump(mode="json"), "name": "mine", "observation": LISTED, "reward": reward}
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump({**content, "total_steps": 1024}))
-    recipe = load_recipe(tmp_path / "mine.yaml")
+    recipe = eb.load_recipe(tmp_path / "mine.yaml")
     scenario = PAPER.replace(objective="front-first", v2x="rural", horizon_s=20, early_impacts="keep")
-    result = train(recipe, scenario, tmp_path / "run")
-    policy = load_policy(result.directory)
+    result = eb.train(recipe, scenario, tmp_path / "run")
+    policy = eb.load_policy(result.directory)
     manifest = policy.manifest
     assert manifest.observation.features[-3:] == ("rear_1.known", "urgency", "rear_1.load")
     assert (recipe.reward.terms, manifest.reward["terms"]) == ({"calm": 0.5, "hurry": 0.01},) * 2
     assert manifest.scenario["v2x"]["preset"] == "rural"
-    told = {"mine": LearnedAgent(policy, "mine"), "shipped": eb.make_agent("ppo@shipped", scenario=PAPER)}
+    told = {"mine": eb.LearnedAgent(policy, "mine"), "shipped": eb.make_agent("ppo@shipped", scenario=PAPER)}
     harm = eb.evaluate(scenario.sample(10, 7), told, scenario=scenario).outcome("mine").first_impact_harm
     assert harm.mean() == near(min(entry["first_impact_harm"] for entry in result.evaluations))
 
     eb.register_feature("mine", steady, unit="1", scale=2.0, low=-1.0, high=1.0)  # others may be added,
     other = scenario.replace(observation=["mine", "own"])  # and the scenario may declare another observation
-    agent = {"mine": LearnedAgent(load_policy(result.directory))}
+    agent = {"mine": eb.LearnedAgent(eb.load_policy(result.directory))}
     again = eb.evaluate(other.sample(10, 7), agent, scenario=other)
     assert again.outcome("mine").first_impact_harm.tolist() == harm.tolist()
     assert [part.name for part in manifest.observation.registered] == ["urgency", "load"]
@@ -268,7 +264,7 @@ def test_objective__is_paid_by_hand_and_stands_in_tables(mine: Any) -> None:
 
 def test_schemas__know_what_is_registered(mine: Any) -> None:
     schema = scenario_json_schema()
-    parts, weights = schema["properties"], TrainingRecipe.json_schema()["$defs"]["RewardParams"]["properties"]
+    parts, weights = schema["properties"], eb.TrainingRecipe.json_schema()["$defs"]["RewardParams"]["properties"]
     assert {"urgency", "front_1.load", "own"} <= set(parts["observation"]["items"]["anyOf"][0]["enum"])
     assert "rural" in json.dumps([parts["v2x"], schema.get("$defs", {})])
     assert "front-first" in json.dumps(parts["objective"])

@@ -15,7 +15,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.learning import RunDirectory, Training, TrainingRecipe, load_recipe, train
 from ethbrake_marl.learning.runs import make_model
 from ethbrake_marl.policies import PolicyTeam, load_policy
-from tests.learning.tiny import TINY_PPO, Answer, files_of, watch_steps
+from tests.learning.tiny import TINY_PPO, Answer, files_of, harm_beside_full_braking, watch_steps
 
 PAIR = eb.load_scenario("cooperation-3-pair")
 ALONE = eb.load_scenario("cooperation-2-paper")
@@ -148,7 +148,4 @@ LEARNS = load_recipe("cooperation-ppo").replace(
 @pytest.mark.parametrize("scheme", ["shared", "independent", "centralised"])
 def test_scheme__learns_to_beat_full_braking(scheme: Any, tmp_path: Path) -> None:
     train(LEARNS, PAIR, tmp_path / "run", scheme=scheme)
-    agents = {"full_brake": eb.make_agent("full_brake"), "team": RunDirectory(tmp_path / "run").load_team(PAIR)}
-    result = eb.evaluate(PAIR.sample(1000, 7), agents, scenario=PAIR)
-    harm = {name: result.outcome(name).first_impact_harm.mean() for name in agents}
-    assert harm["team"] < 0.9 * harm["full_brake"]
+    assert harm_beside_full_braking(f"team@{tmp_path / 'run'}") < 0.9

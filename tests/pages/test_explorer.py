@@ -17,7 +17,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterat
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 import numpy as np
 import pytest
@@ -161,16 +161,15 @@ COMMAND = [sys.executable, "-m", "ethbrake_marl", "watch", "explore", "--no-brow
 
 class Running(NamedTuple):
     process: subprocess.Popen[str]
-    port: int
-    path: str  # of the page, token included
+    address: SplitResult  # of the page, token included
     folder: Path
 
 
 @contextmanager
-def started(folder: Path) -> Iterator[Running]:
+def started(folder: Path, *more: str, agents: str = "full_brake,coast") -> Iterator[Running]:
     pytest.importorskip("uvicorn", reason="no uvicorn: pip install 'ethbrake-marl[explore]'")
     with subprocess.Popen(
-        [*COMMAND, "--agents", "full_brake,coast", "--folder", str(folder)],
+        [*COMMAND, "--agents", agents, "--folder", str(folder), *more],
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -179,7 +178,7 @@ def started(folder: Path) -> Iterator[Running]:
         address = urlsplit(process.stdout.readline().strip())  # type: ignore[union-attr]
         assert (address.scheme, address.hostname, bool(address.port)) == ("http", "127.0.0.1", True)
         try:
-            yield Running(process, address.port or 0, address.path, folder)
+            yield Running(process, address, folder)
         finally:  # also after a failure, which would wait for it for ever
             process.kill()
 
@@ -191,7 +190,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
 
 
 def ask(running: Running, method: str, path: str, body: object = None) -> tuple[int, bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", running.port)
+    connection = http.client.HTTPConnection(running.address.netloc)
     connection.request(method, path, None if body is None else json.dumps(body), {"content-type": "application/json"})
     reply = connection.getresponse()
     told = reply.read()
@@ -348,13 +347,13 @@ def test_page__shows_hostile_names_as_text(scenario: Scenario, state: dict[str, 
 
 
 def test_server__answers_and_saves(running: Running) -> None:
-    status, page = ask(running, "GET", running.path)
+    status, page = ask(running, "GET", running.address.path)
     assert status == 200 and b"Explorer: paper-random" in page
     assert ask(running, "GET", "/")[0] == 403
-    status, told = ask(running, "POST", running.path + "world", {"number": 3})
-    state = json.loads(told)["world"]
-    assert status == 200 and len(state["gaps_m"]) == 2
-    assert ask(running, "POST", running.path + "save", {"world": state, "name": "three", "kind": "csv"})[0] == 200
+    status, told = ask(running, "POST", running.address.path + "world", {"number": 3})
+    question = {"world": json.loads(told)["world"], "name": "three", "kind": "csv"}
+    assert status == 200 and len(question["world"]["gaps_m"]) == 2
+    assert ask(running, "POST", running.address.path + "save", question)[0] == 200
     assert [each.name for each in running.folder.iterdir()] == ["three.csv"]
 
 
@@ -380,7 +379,7 @@ GARBAGE = [
 
 @pytest.mark.parametrize("garbage", GARBAGE, ids=lambda each: ascii(each[:20]))
 def test_server__outlives_garbage(running: Running, garbage: bytes) -> None:
-    with socket.create_connection(("127.0.0.1", running.port), timeout=20) as stream:
+    with socket.create_connection(("127.0.0.1", running.address.port), timeout=20) as stream:
         try:
             stream.sendall(garbage)
             stream.shutdown(socket.SHUT_WR)
@@ -388,12 +387,12 @@ def test_server__outlives_garbage(running: Running, garbage: bytes) -> None:
         except OSError:  # it hung up first
             told = b""
     assert b" 200 " not in told
-    assert ask(running, "POST", running.path + "world", {"number": 1})[0] == 200
+    assert ask(running, "POST", running.address.path + "world", {"number": 1})[0] == 200
 
 
 def test_server__listens_on_this_machine_alone(running: Running) -> None:
     listening = [line.split()[1] for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
-    port = f":{running.port:04X}"
+    port = f":{running.address.port:04X}"
     assert [each for each in listening if each.endswith(port)][:1] == [f"0100007F{port}"]
     assert "00000000" + port not in listening
 
@@ -401,7 +400,7 @@ def test_server__listens_on_this_machine_alone(running: Running) -> None:
 def test_server__ends_at_ctrl_c(tmp_path: Path) -> None:
     """A server of its own: which of this file's tests comes last is for the runner to say."""
     with started(tmp_path / "new") as running:
-        with socket.create_connection(("127.0.0.1", running.port)):  # somebody is still there
+        with socket.create_connection(("127.0.0.1", running.address.port)):  # somebody is still there
             running.process.send_signal(signal.SIGINT)
             assert running.process.wait(timeout=60) == 0
         assert running.process.stderr is not None

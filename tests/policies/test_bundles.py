@@ -31,7 +31,6 @@ from ethbrake_marl.policies import (
     shipped_name,
     shipped_policies,
 )
-from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield import HybridAgent
 from tests.docs.site import load
 
@@ -94,12 +93,18 @@ def _header(change: Callable[[dict[str, Any]], None]) -> Spoil:
     return _weights(rewrite)
 
 
-def _link(name: str) -> Spoil:
+def _instead(name: str, make: Callable[[Path], object]) -> Spoil:
+    """Make something else in the place of a file, which is moved out of the folder."""
+
     def spoil(folder: Path) -> None:
-        moved = (folder / name).rename(folder.parent / f"moved-{name}")
-        (folder / name).symlink_to(moved)
+        (folder / name).rename(folder.parent / f"moved-{name}")
+        make(folder / name)
 
     return spoil
+
+
+def _link(path: Path) -> None:
+    path.symlink_to(path.parents[1] / f"moved-{path.name}")
 
 
 def _last_digit_of(name: str) -> Spoil:
@@ -113,20 +118,8 @@ def _last_digit_of(name: str) -> Spoil:
     return spoil
 
 
-def _pipe(folder: Path) -> None:
-    (folder / "manifest.json").unlink()
-    os.mkfifo(folder / "manifest.json")
-
-
-def _folder_instead(folder: Path) -> None:
-    (folder / "weights.safetensors").unlink()
-    (folder / "weights.safetensors").mkdir()
-
-
-def _endless_device(folder: Path) -> None:
+def _endless_device(path: Path) -> None:
     """A file that never ends: a device where that may be made, else a huge file without blocks."""
-    path = folder / "weights.safetensors"
-    path.unlink()
     try:
         os.mknod(path, 0o600 | stat.S_IFCHR, os.makedev(1, 5))
     except PermissionError:
@@ -146,10 +139,13 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "no_manifest": (lambda f: (f / "manifest.json").unlink(), r"manifest.json: is missing"),
     "no_weights": (lambda f: (f / "weights.safetensors").unlink(), r"weights.safetensors: is missing"),
     "extra_file": (lambda f: (f / "policy.pkl").write_bytes(pickle.dumps(_Payload())), r"policy.pkl: does not belong"),
-    "manifest_link": (_link("manifest.json"), r"manifest.json: is a symbolic link"),
-    "weights_link": (_link("weights.safetensors"), r"weights.safetensors: is a symbolic link"),
-    "pipe": (_pipe, r"manifest.json: is not a plain file"),
-    "folder_for_file": (_folder_instead, r"weights.safetensors: (is not a plain file|cannot be read)"),
+    "manifest_link": (_instead("manifest.json", _link), r"manifest.json: is a symbolic link"),
+    "weights_link": (_instead("weights.safetensors", _link), r"weights.safetensors: is a symbolic link"),
+    "pipe": (_instead("manifest.json", os.mkfifo), r"manifest.json: is not a plain file"),
+    "folder_for_file": (
+        _instead("weights.safetensors", Path.mkdir),
+        r"weights.safetensors: (is not a plain file|cannot be read)",
+    ),
     "empty_manifest": (_manifest(lambda _: b""), r"manifest.json: "),
     "not_utf8": (_manifest(lambda data: data.replace(b"ppo", b"\xff\xfe")), r"manifest.json: 'utf-8' codec"),
     "list_manifest": (_manifest(lambda _: b"[]"), r"manifest.json: must be a mapping"),
@@ -236,7 +232,10 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
         lambda f: _replace(f / "weights.safetensors", lambda d: d[:-3] + bytes([d[-3] ^ 1]) + d[-2:]),
         r"weights.safetensors: SHA-256 is [0-9a-f]{64}, the manifest says",
     ),
-    "endless_device": (_endless_device, r"weights.safetensors: (is not a plain file|larger than)"),
+    "endless_device": (
+        _instead("weights.safetensors", _endless_device),
+        r"weights.safetensors: (is not a plain file|larger than)",
+    ),
     "sparse_giant": (lambda f: os.truncate(f / "weights.safetensors", 1 << 40), r"weights.safetensors: larger than"),
     "other_case": (lambda f: (f / "manifest.json").rename(f / "Manifest.json"), r"manifest.json: is missing"),
     "hidden_file": (lambda f: (f / ".weights.py").write_text("raise SystemExit"), r".weights.py: does not belong"),
@@ -443,7 +442,9 @@ def test_shipped_policies__each_that_ships_is_small_and_has_a_card() -> None:
     for name, path in shipped_policies().items():
         manifest = load_named_policy(f"shipped/{name}").manifest
         trained = eb.load_scenario(str(manifest.scenario["name"]))
-        assert manifest.steps > 0 and scenario_sha256(Scenario.of_dump(manifest.scenario)) == scenario_sha256(trained)
+        assert manifest.steps > 0 and scenario_sha256(eb.Scenario.of_dump(manifest.scenario)) == scenario_sha256(
+            trained
+        )
         assert sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) < 1_000_000
         assert (path / "card.md").read_text("utf-8").startswith("# ")
 

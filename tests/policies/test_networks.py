@@ -15,7 +15,6 @@ from torch import nn
 
 import ethbrake_marl as eb
 from ethbrake_marl.observations import observe
-from ethbrake_marl.physics import advance
 from ethbrake_marl.policies import Actor, NetworkSpec, Policy, dense, squash
 
 
@@ -190,7 +189,7 @@ def test_onnx__asks_for_the_same_acceleration_in_10_000_states(
     worlds = SCENARIO.replace(driving_capacity_mps2={"uniform": [1, 3]}).sample(10_000, 5).worlds
     rng = np.random.default_rng(0)
     command = -rng.uniform(0.0, 1.0, worlds.speeds_mps.shape) * worlds.vehicles.braking_capacity_mps2
-    worlds, _ = advance(worlds, command, until_s=rng.uniform(0.0, 6.0, worlds.n))
+    worlds, _ = eb.advance(worlds, command, until_s=rng.uniform(0.0, 6.0, worlds.n))
     seen, expected = observe(worlds, 1, ours.observation), eb.LearnedAgent(ours).act(worlds, 1)
     action, acceleration = onnx_of(ours).run(["action", "acceleration_mps2"], {"observation": seen})
     assert np.ptp(expected) > 4.0 and (expected > 0.5).any()

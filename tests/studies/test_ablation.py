@@ -13,16 +13,13 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from ethbrake_marl.agents.registry import Team, make_agent
+import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.errors import Progress
-from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.episodes import Passport
 from ethbrake_marl.figures import ablation_figures, signed_ticks
 from ethbrake_marl.learning import runs as learning_train
 from ethbrake_marl.learning.training import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.limits.limits import best_harm, chunks_left
-from ethbrake_marl.policies import load_policy
 from ethbrake_marl.scenario import Sample, load_scenario, scenario_path
 from ethbrake_marl.shield.guard import Shielded
 from ethbrake_marl.studies.ablation import (
@@ -244,7 +241,7 @@ def test_generalise__prints_a_table_or_json(run: Path, capsys) -> None:
     rows = json.loads(capsys.readouterr().out)
     assert [row["vehicles"] for row in rows] == [3, 6] and {row["kind"] for row in rows} == {"generalise"}
     assert len({row["worlds_sha256"] for row in rows}) == 2 == len({row["scenario_sha256"] for row in rows})
-    assert rows[0]["policy_sha256"] == [load_policy(run).manifest.manifest_sha256]
+    assert rows[0]["policy_sha256"] == [eb.load_policy(run).manifest.manifest_sha256]
     assert rows[1]["best_known"] <= rows[1]["full_brake"] * 10 and rows[1]["share_interval"] is not None
     assert generalise(run) == 0
     out = capsys.readouterr().out
@@ -358,7 +355,7 @@ NAMES = ("cooperation-1-front", "cooperation-2-paper", "cooperation-3-pair", "co
 def answer(level: Level, budget: int, agent: str = "full_brake") -> LevelOptimum:
     worlds = level.scenario.sample(LINES, 7).worlds
     table = best_harm(level.scenario, worlds, budget=budget, threads=1)
-    return LevelOptimum(level, worlds, table, (Team.of(make_agent(agent), level.scenario.learners),))
+    return LevelOptimum(level, worlds, table, (eb.Team.of(eb.make_agent(agent), level.scenario.learners),))
 
 
 @pytest.fixture(scope="module")
@@ -372,7 +369,7 @@ def answers() -> dict[str, LevelOptimum]:
 def test_best_known__is_one_for_levels_that_ask_one_question(answers):
     front, paper = (best_known(answers[name], list(answers.values())) for name in NAMES[:2])
     scenario = answers[NAMES[0]].level.scenario
-    policy = evaluate(answers[NAMES[0]].worlds, {"e": make_agent("e_v2x_bm")}, scenario=scenario).outcome("e")
+    policy = eb.evaluate(answers[NAMES[0]].worlds, {"e": eb.make_agent("e_v2x_bm")}, scenario=scenario).outcome("e")
     for count, harm in paper.items():
         np.testing.assert_array_equal(front[count], harm)
         assert (harm <= np.minimum(answers[NAMES[1]].searched.best[count].harm, policy.ledger.world_harm(count))).all()
@@ -437,7 +434,7 @@ def test_questions__each_is_searched_once_and_what_is_kept_is_not_searched_again
     assert all_left() == [(5, [])] * 3
     told = []
     search_all(plan, samples, 1, told.append)
-    assert told == [Progress(f"joint optimum of {name}", 5, 5) for name in (NAMES[0], *NAMES[2:])]
+    assert told == [eb.Progress(f"joint optimum of {name}", 5, 5) for name in (NAMES[0], *NAMES[2:])]
     assert all_left() == [(0, [])] * 3 and left(replace(plan, budget=11), *asked[0][:2]) == (5, [])
     fewer = questions(replace(plan, search_episodes=4), samples)[0]
     assert left(plan, *fewer[:2]) == (4, [])
@@ -452,7 +449,7 @@ def test_measure__all_brake_fully_whatever_their_roles():
     plan = Plan((Level(braking), Level(coasting)), (), 1, 1, 20, 7, 5, 10, Path("unused"))
     first, second = measure(plan)
     worlds = coasting.sample(20, 7)
-    told = evaluate(worlds, {"b": make_agent("full_brake")}, scenario=braking, vehicle="vehicle_2").outcome("b")
+    told = eb.evaluate(worlds, {"b": eb.make_agent("full_brake")}, scenario=braking, vehicle="vehicle_2").outcome("b")
     np.testing.assert_allclose(second.full_brake.world["total"][0], told.total_harm, rtol=1e-12, atol=1e-12)
     np.testing.assert_array_equal(first.reached.world["total"], second.full_brake.world["total"])
     assert second.reached.world["total"].mean() > 2.0 * told.total_harm.mean()
@@ -475,11 +472,11 @@ def test_lengthened__vehicle_i_is_like_vehicle_i_minus_2_in_lists_and_objectives
 
 
 def test_drive_longer__full_braking_gains_nothing_on_itself():
-    question, braking = LineQuestion(PAIR, (3, 4), 20, 7, "total", 3, 50), make_agent("full_brake")
+    question, braking = LineQuestion(PAIR, (3, 4), 20, 7, "total", 3, 50), eb.make_agent("full_brake")
     found = question.drive([braking])
     told = [(one["vehicles"], one["decrease"], one["worse_off"], one["share"]) for one in found]
     assert told == [(3, 0.0, 0.0, 0.0), (4, 0.0, 0.0, 0.0)]
-    three = evaluate(PAIR.sample(20, 7), {"b": braking}, scenario=PAIR).outcome("b").total_harm
+    three = eb.evaluate(PAIR.sample(20, 7), {"b": braking}, scenario=PAIR).outcome("b").total_harm
     assert found[0]["reached"] == pytest.approx(three.mean(), rel=1e-12)
 
 
@@ -519,7 +516,7 @@ def test_generalise__runs_that_are_not_seeds_of_one_training_are_refused(run: Pa
 def changed(run: Path, folder: Path, scenario: Mapping[str, object] = {}, recipe: Mapping[str, object] = {}) -> Path:
     """A run of another policy, with some other values in its scenario or recipe."""
     shutil.copytree(run, folder)
-    policy = load_policy(run)
+    policy = eb.load_policy(run)
     tensors = {name: tensor + np.float32(0.01) for name, tensor in policy.tensors.items()}
     other = another(policy, tensors, scenario={**policy.manifest.scenario, **scenario})
     other.save(folder / "policy", replace=True)

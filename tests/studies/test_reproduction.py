@@ -12,15 +12,13 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from ethbrake_marl.evaluation import evaluate
+import ethbrake_marl as eb
 from ethbrake_marl.evaluation.episodes import Passport
 from ethbrake_marl.evaluation.measures import PAPER_ROWS, PaperRow
 from ethbrake_marl.evaluation.statistics import rate
 from ethbrake_marl.figures import SeedCurve, estimates_figure
 from ethbrake_marl.files.sheet import Estimate, Sheet
 from ethbrake_marl.files.yaml import Override
-from ethbrake_marl.learning.training import load_recipe
-from ethbrake_marl.policies import load_shipped
 from ethbrake_marl.studies import reproduction
 from ethbrake_marl.studies.reproduction import (
     FULL_BRAKE,
@@ -183,7 +181,7 @@ def printed(table: str, agent: str) -> PaperRow:
 def beside(reading, worlds: int) -> Beside:
     scenario = reading.scenario("paper-random")
     agents = lineup(scenario, FULL_BRAKE)
-    evaluation = evaluate(scenario.sample(worlds, 7), agents, scenario=scenario, aftermath=False)
+    evaluation = eb.evaluate(scenario.sample(worlds, 7), agents, scenario=scenario, aftermath=False)
     return Beside(reading.name, evaluation, {"Non-E": (NAMES[FULL_BRAKE],), "Hybrid PPO": (NAMES[FULL_BRAKE],)})
 
 
@@ -283,7 +281,7 @@ def test_hybrid__is_driven_anew_once_its_policy_was_trained(
 ) -> None:
     first, again = (reproduction._drive_hybrid("paper-random", settings, READINGS[0]) for _ in range(2))
     assert again is first
-    monkeypatch.setattr(reproduction, "unconverged_policy", lambda _: (load_shipped("ppo"), "trained since"))
+    monkeypatch.setattr(reproduction, "unconverged_policy", lambda _: (eb.load_shipped("ppo"), "trained since"))
     assert reproduction._drive_hybrid("paper-random", settings, READINGS[0]) is not first
 
 
@@ -399,7 +397,7 @@ def test_groups__fit_their_recipes_and_every_item_names_groups_that_exist() -> N
     for group in found.values():
         for name, (asked, recipe) in group.trained.items():
             assert recipe.name == name and recipe.total_steps == asked.decisions
-            stated = load_recipe(asked.recipe)
+            stated = eb.load_recipe(asked.recipe)
             if asked.recipe.endswith("-paper"):  # the paper's table stays as it is
                 for key in ("gamma", "batch_size", "network"):
                     assert getattr(recipe, key) == getattr(stated, key)
@@ -431,7 +429,7 @@ def test_returns__of_a_shaped_reward_say_nothing_between_delays_so_its_harm_is_c
     worse = course([[-9.0] * 20, [-8.99] * 20], [[90.0] * 20, [80.0] * 20])
     better = course([[-10.0] * 20, [-9.99] * 20], [[10.0] * 20, [8.0] * 20])  # of lower returns
     for recipe, outcome, told in (("ppo", "agrees", "minus its harm"), ("ppo-paper", "differs", "ppo-paper")):
-        assert bool(load_recipe(recipe).reward.shaping) == (recipe == "ppo")
+        assert bool(eb.load_recipe(recipe).reward.shaping) == (recipe == "ppo")
         verdict = reproduction._higher_when_low({"high": {recipe: worse}, "low": {recipe: better}})
         assert (verdict.outcome, told in verdict.because) == (outcome, True)
 

@@ -16,12 +16,11 @@ import pytest
 import yaml
 from jsonschema import Draft202012Validator
 
+import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import read_yaml
-from ethbrake_marl.learning.runs import train
 from ethbrake_marl.learning.training import Training, load_recipe
-from ethbrake_marl.policies import load_policy
 from ethbrake_marl.studies.sweep import SweepFile, SweepPlan, TuningFile, TuningPlan
 from tests.cli.conftest import rows_of as read
 from tests.studies.conftest import Write, study, write_yaml
@@ -88,7 +87,7 @@ def test_table__has_a_row_for_every_job_in_the_order_of_the_file(finished_sweep,
     assert all(one["status"] == "finished" and one["wall_s"] > 0.0 for one in entries)
     for row in rows:
         (run,) = (finished_sweep / "runs").glob(f"paper-random-tiny-seed{row['seed']}-{row['hash'][:16]}")
-        assert row["policy_sha256"] == load_policy(run).manifest.manifest_sha256
+        assert row["policy_sha256"] == eb.load_policy(run).manifest.manifest_sha256
         assert (row["steps"], row["total_steps"], row["scheme"]) == ("256", "256", "single")
     assert not (finished_sweep / "failures.csv").exists() and not list((finished_sweep / "logs").iterdir())
 
@@ -96,7 +95,7 @@ def test_table__has_a_row_for_every_job_in_the_order_of_the_file(finished_sweep,
 def test_job__is_the_training_that_train_makes(finished_sweep, tiny, tmp_path):
     row = read(finished_sweep / TABLE)[0]
     recipe = load_recipe(str(tiny)).replace(gamma=0.9)
-    alone = train(recipe, "paper-random", tmp_path / "alone", seed=3, on_progress=None)
+    alone = eb.train(recipe, "paper-random", tmp_path / "alone", seed=3, on_progress=None)
     assert alone.training.identity == row["hash"]
     assert alone.policy.manifest.manifest_sha256 == row["policy_sha256"]
     least = min(alone.evaluations, key=lambda one: one["first_impact_harm"])

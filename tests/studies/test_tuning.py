@@ -11,8 +11,7 @@ from typing import Any
 
 import pytest
 
-from ethbrake_marl.learning.runs import train
-from ethbrake_marl.learning.training import TrainingRecipe, load_recipe
+import ethbrake_marl as eb
 from ethbrake_marl.studies.sweep import TuningPlan
 from tests.cli.conftest import rows_of as read
 from tests.studies.conftest import TRIALS, study, write_yaml
@@ -58,7 +57,7 @@ def test_identity__is_that_of_all_that_changes_a_trial(write_tuning):
 @pytest.mark.parametrize("name", ["tuning-quick", "tuning-ppo"])
 def test_shipped_spaces__are_in_order_and_hold_their_recipe(name):
     plan, text = TuningPlan.read(DOCS / f"{name}.yaml"), (DOCS / f"{name}.yaml").read_text("utf-8")
-    assert plan.own_values() is not None and plan.file.recipe in TrainingRecipe.shipped()
+    assert plan.own_values() is not None and plan.file.recipe in eb.TrainingRecipe.shipped()
     assert text in (DOCS / "tuning.md").read_text("utf-8") or name != "tuning-quick"
 
 
@@ -102,7 +101,7 @@ def test_export__is_a_recipe_that_trains_the_best_trial_again_to_the_bit(finishe
     rows = [row for row in read(finished_tuning / TABLE) if row["state"] == "finished"]
     best = min(rows, key=lambda row: float(row["first_impact_harm"]))
     file = finished_tuning.parent / "best.yaml"
-    again = train(load_recipe(file), "paper-random", tmp_path / "again", on_progress=None)
+    again = eb.train(eb.load_recipe(file), "paper-random", tmp_path / "again", on_progress=None)
     assert again.policy.manifest.manifest_sha256 == best["policy_sha256"]
     assert min(each["first_impact_harm"] for each in again.evaluations) == float(best["first_impact_harm"])
     text = file.read_text()
