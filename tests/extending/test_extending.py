@@ -96,11 +96,6 @@ def changed(function: Any, told: str = "Another one.") -> Any:
     return function
 
 
-def steady(worlds: Any, vehicle: int) -> Any:
-    """Always one."""
-    return np.ones(worlds.n)
-
-
 def one(step: StepOutcome) -> Any:
     """One for all."""
     return np.ones(len(step.time_s))
@@ -129,8 +124,10 @@ def test_parts__of_the_users_file_train_and_are_evaluated(mine: Any, tmp_path: P
     harm = eb.evaluate(scenario.sample(10, 7), told, scenario=scenario).outcome("mine").first_impact_harm
     assert harm.mean() == near(min(entry["first_impact_harm"] for entry in result.evaluations))
 
-    eb.register_feature("mine", steady, unit="1", scale=2.0, low=-1.0, high=1.0)  # others may be added,
-    other = scenario.replace(observation=["mine", "own"])  # and the scenario may declare another observation
+    # Others may be added, and the scenario may declare another observation.
+    steady = changed(lambda worlds, vehicle: np.ones(worlds.n))
+    eb.register_feature("mine", steady, unit="1", scale=2.0, low=-1.0, high=1.0)
+    other = scenario.replace(observation=["mine", "own"])
     agent = {"mine": eb.LearnedAgent(eb.load_policy(result.directory))}
     again = eb.evaluate(other.sample(10, 7), agent, scenario=other)
     assert again.outcome("mine").first_impact_harm.tolist() == harm.tolist()
@@ -281,26 +278,6 @@ def squared(episodes: Any) -> Any:
     return np.bincount(rows.world, rows.closing_speed_mps**2, minlength=episodes.worlds.n)
 
 
-def injury(episodes: Any) -> Any:
-    """Probability of a severe injury by each vehicle's largest change of speed, struck at the front."""
-    return 1.0 / (1.0 + np.exp(4.457 - 0.177 * episodes.largest_speed_change_mps))
-
-
-def change_of_vehicle_3(episodes: Any) -> Any:
-    """Largest change of speed of Vehicle 3 in one impact."""
-    return episodes.largest_speed_change_mps[:, 2]
-
-
-def hit_hard(episodes: Any) -> Any:
-    """Whether Vehicle 3 was hit hard."""
-    return episodes.largest_speed_change_mps[:, 2] > 2.0
-
-
-def rear_ended(episodes: Any) -> Any:
-    """Whether Vehicle 3 hit Vehicle 2."""
-    return np.isin(np.arange(episodes.worlds.n), episodes.rows.world[episodes.rows.pair == 1])
-
-
 def evaluated(**options: Any) -> Any:
     agents = {name: eb.make_agent(name, scenario=PAPER) for name in ("full_brake", "e_v2x_bm", "ppo@shipped+step")}
     return eb.evaluate(SAMPLE, agents, scenario=PAPER, **options)
@@ -323,9 +300,11 @@ def test_measure__sees_every_impact_whatever_the_chunk_and_changes_nothing_else(
 
 def test_measure__of_each_vehicle_stands_in_rows_frame_markdown_and_report() -> None:
     eb.register_measure("squared", squared, unit="m2/s2")
+    injury = changed(lambda episodes: 1.0 / (1.0 + np.exp(4.457 - 0.177 * episodes.largest_speed_change_mps)))
     eb.register_measure("injury", injury, unit="1")
     eb.register_measure("change", changed(lambda episodes: episodes.largest_speed_change_mps), unit="m/s")
-    eb.register_measure("rear_ended", rear_ended, unit="1")
+    struck = changed(lambda each: np.isin(np.arange(each.worlds.n), each.rows.world[each.rows.pair == 1]))
+    eb.register_measure("rear_ended", struck, unit="1")  # whether Vehicle 3 hit Vehicle 2
     found = evaluated()
     rows, braked = eb.summarise(found), found.outcome("full_brake")
     changes = np.stack([braked.metrics[f"change_{i}"] for i in (1, 2, 3)], axis=1)
@@ -347,8 +326,9 @@ def test_measure__one_function_and_it_stands_in_every_output(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    eb.register_measure("change_of_rear", change_of_vehicle_3, unit="m/s")
-    eb.register_measure("hit_hard", hit_hard, unit="1")
+    rear = changed(lambda episodes: episodes.largest_speed_change_mps[:, 2])
+    eb.register_measure("change_of_rear", rear, unit="m/s")
+    eb.register_measure("hit_hard", changed(lambda episodes: rear(episodes) > 2.0), unit="1")
     names, agents = ("metric_change_of_rear", "metric_hit_hard"), ["--agents", "full_brake,coast", "--seed", "7"]
 
     def told(*words: str) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from jsonschema import Draft202012Validator
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import ethbrake_marl as eb
@@ -128,3 +129,9 @@ def harm_beside_full_braking(spec: str) -> float:
     found = eb.evaluate(scenario.sample(1000, 7), agents, scenario=scenario)
     braking, trained = (found.outcome(name).first_impact_harm.mean() for name in agents)
     return float(trained / braking)
+
+
+def marked(schema: dict[str, Any], content: Any) -> set[str]:
+    """The places where an editor that has this schema marks a mistake; empty: the whole file."""
+    Draft202012Validator.check_schema(schema)
+    return {".".join(map(str, error.absolute_path)) for error in Draft202012Validator(schema).iter_errors(content)}

@@ -52,18 +52,26 @@ def test_dense__numbers_by_hand() -> None:
     assert y.tolist() == [[25.0, 20.0], [19.0, 18.0]]
 
 
-@pytest.mark.parametrize(("output", "expected"), [("clip", [1.0, -0.5, -1.0]), ("tanh", np.tanh([3.0, -0.5, -4.0]))])
-def test_actor__relu_then_output_by_hand(output: str, expected: list[float]) -> None:
+@pytest.mark.parametrize(
+    ("output", "last", "expected", "tensors"),
+    [
+        ("clip", [[1.0, -2.0]], [1.0, -0.5, -1.0, 0.0], 9),
+        ("tanh", [[1.0, -2.0]], np.tanh([3.0, -0.5, -4.0, 0.0]), 10),
+        # of five actions from -1 to 1 that of the highest score, and the lowest of equal ones; without a critic
+        ("choice", [[0.0, 0.0], [1.0, 0.0], [0.0, 3.0], [2.0, 0.0], [2.0, 0.0]], [0.5, 0.0, 0.0, -1.0], 4),
+    ],
+)
+def test_actor__relu_then_output_by_hand(output: str, last: Any, expected: Any, tensors: int) -> None:
     spec = NetworkSpec(
-        observation_size=1, action_size=1, policy_hidden=(2,), value_hidden=(1,), activation="relu", output=output
-    )
-    tensors = {row.name: np.zeros(row.shape, np.float32) for row in spec.tensors}
-    tensors["policy.0.weight"][:, 0] = [1.0, -1.0]  # hidden: max(x, 0), max(-x, 0)
-    tensors["policy.output.weight"][0] = [1.0, -2.0]
-    action = Actor(spec, tensors)(
-        np.array([[3.0], [0.25], [2.0]], np.float32) * np.array([[1.0], [-1.0], [-1.0]], "f4")
-    )
+        observation_size=1, action_size=1, policy_hidden=(2,), value_hidden=() if output == "choice" else (1,),
+        activation="relu", output=output, choices=5 if output == "choice" else None,
+    )  # fmt: skip
+    weights = {row.name: np.zeros(row.shape, np.float32) for row in spec.tensors}
+    weights["policy.0.weight"][:, 0] = [1.0, -1.0]  # hidden: max(x, 0), max(-x, 0)
+    weights["policy.output.weight"][:] = last
+    action = Actor(spec, weights)(np.array([[3.0], [-0.25], [-2.0], [0.0]], np.float32))
     np.testing.assert_allclose(action[:, 0], expected, rtol=1e-6)
+    assert len(weights) == tensors
 
 
 @pytest.mark.parametrize(
@@ -116,20 +124,6 @@ def test_squash__is_the_rounded_hyperbolic_tangent() -> None:
     spacing = np.spacing(np.abs(exact).astype(np.float32)).astype(np.float64)
     assert (np.abs(actual - exact) <= 0.5001 * spacing).all()
     assert actual[0, -2:].tolist() == [1.0, -1.0]
-
-
-def test_choice__is_the_action_of_the_highest_score_and_the_lowest_of_equal_ones() -> None:
-    spec = NetworkSpec(
-        observation_size=1, action_size=1, policy_hidden=(2,), value_hidden=(), activation="relu", output="choice",
-        choices=5,
-    )  # fmt: skip
-    tensors = {row.name: np.zeros(row.shape, np.float32) for row in spec.tensors}
-    assert list(tensors) == ["policy.0.weight", "policy.0.bias", "policy.output.weight", "policy.output.bias"]
-    tensors["policy.0.weight"][:, 0] = [1.0, -1.0]  # hidden: max(x, 0), max(-x, 0)
-    tensors["policy.output.weight"][:, 0] = [0.0, 1.0, 0.0, 2.0, 2.0]
-    tensors["policy.output.weight"][:, 1] = [0.0, 0.0, 3.0, 0.0, 0.0]
-    action = Actor(spec, tensors)(np.array([[1.0], [0.0], [-1.0]], np.float32))
-    assert action.tolist() == [[0.5], [-1.0], [0.0]]
 
 
 RandomTensors = Callable[[NetworkSpec], dict[str, np.ndarray]]
