@@ -150,22 +150,6 @@ def test_own_algorithm__under_vec_normalize_is_refused_as_no_bundle_holds_its_st
         train(recipe_file(tmp_path), SCENARIO, tmp_path / "run")
 
 
-@pytest.mark.usefixtures("mine")
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"n_stepz": 3}, r"mine.yaml, line \d+: n_stepz.*did you mean n_steps"),
-        ({"n_steps": 2.5}, r"mine.yaml, line \d+: n_steps = 2.5: must be a whole number"),
-        ({"algorithm": "a3c"}, r"algorithm = a3c: must be one of ppo, sac, counterfactual, options, a2c"),
-        ({"scheme": "independent"}, "scheme independent: recipe 'mine' is for A2C; it needs one for PPO"),
-    ],
-)
-def test_own_algorithm__its_class_checks_the_recipe(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
-    with pytest.raises(InvalidInput, match=message):
-        train(recipe_file(tmp_path, **changes), "cooperation-3-pair", tmp_path / "run")
-    assert load_recipe(recipe_file(tmp_path)).rounds == 8
-
-
 SEEN, ACTION = Box(-10.0, 10.0, (27,), np.float32), Box(-1.0, 1.0, (1,), np.float32)
 
 

@@ -12,7 +12,6 @@ import pytest
 import torch
 
 import ethbrake_marl as eb
-from ethbrake_marl.errors import InvalidInput
 from tests.docs.site import load
 from tests.learning.tiny import harm_beside_full_braking
 
@@ -198,14 +197,3 @@ def test_clone__drives_as_the_network_itself(clone: ModuleType, tmp_path: Path) 
     with torch.no_grad():
         theirs = network(seen[:50]).clamp(-1.0, 1.0).numpy()
     assert np.allclose(policy(seen[:50].numpy()), theirs, atol=1e-5)
-
-
-def test_clone__refuses_what_it_cannot_clone(clone: ModuleType, tmp_path: Path) -> None:
-    (tmp_path / "no.parquet").write_text("no")
-    eb.write_dataset(tmp_path / "two.parquet", {"b": eb.make_agent("full_brake")}, scenario=PAIR, episodes=1)
-    for name, told in (("no", "is no dataset of `ethbrake watch dataset`"), ("two", "holds 2 learners, one is needed")):
-        with pytest.raises(InvalidInput, match=told):
-            clone.train(tmp_path / f"{name}.parquet", 0, tmp_path / "clone")
-    assert not (tmp_path / "clone").exists()
-    with pytest.raises(InvalidInput, match="say which clone drives"):
-        eb.make_agent(f"{TRAIN / 'clone.py'}:make_agent", scenario=PAPER)

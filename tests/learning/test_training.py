@@ -88,18 +88,6 @@ def test_training__words_and_defaults_that_are_spelt_out_change_nothing(change: 
     assert Training.of(TINY_PPO.replace(**WORDS), SCENARIO.replace(**WORDS)).identity == TRAINING.identity
 
 
-@pytest.mark.parametrize(
-    "other",
-    [
-        Training.of(TINY_PPO.replace(seed=1), SCENARIO),
-        Training.of(TINY_PPO, SCENARIO.replace(gaps_m=7)),
-        Training.of(TINY_PPO, SCENARIO.replace(name="mine")),
-    ],
-)
-def test_training__everything_else_makes_another(other: Training) -> None:
-    assert other.identity != TRAINING.identity
-
-
 def test_run__force_replaces_a_run_and_all_that_it_held(tmp_path: Path) -> None:
     run = RunDirectory(tmp_path / "runs" / "first").create({"seeds": {"training": 3}})
     assert json.loads(run.config.read_text()) == {"seeds": {"training": 3}}

@@ -25,7 +25,7 @@ import pytest
 from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.defaults import DEFAULT
-from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_agents, make_lineup
 from ethbrake_marl.evaluation.measures import Conditions
@@ -520,11 +520,6 @@ def test_save__never_replaces_and_never_follows_and_tells_that_its_folder_went(c
     shutil.rmtree(folder)
     reply = client.ask("save", question)
     assert reply.status == 500 and reply.json["error"].startswith("cannot be written")
-
-
-def test_explored__takes_one_driven_vehicle(scenario: Scenario) -> None:
-    with pytest.raises(InvalidInput, match="2 vehicles are driven; it takes exactly one"):
-        Explored(Task(scenario, (1, 2)), make_agents(["full_brake"], scenario))
 
 
 HEADERS: list[dict[str, str | None]] = [

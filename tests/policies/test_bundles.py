@@ -334,6 +334,8 @@ def test_bundle__round_trip_is_exact_and_always_of_the_same_bytes(policy: Policy
     assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["manifest.json", "weights.safetensors"]
     for file in ("manifest.json", "weights.safetensors"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "run" / "policy" / file).read_bytes()
+    network = json.loads((tmp_path / "a" / "manifest.json").read_text())["network"]
+    assert not {"networks", "gate_hidden"} & network.keys()  # of which earlier versions of the package know nothing
     assert not any(name.startswith("value") for name in shipped.tensors)
     assert shipped.manifest.scenario == policy.manifest.scenario
 
@@ -376,20 +378,6 @@ def test_load_policy__refuses_a_damaged_bundle_and_runs_and_opens_nothing_else(
 def test_damaged_bundles__are_as_many_as_the_page_says() -> None:
     page = Path(__file__).resolve().parents[2] / "docs" / "policy-bundles.md"
     assert f"{len(SPOILED)} damaged and malicious bundles" in " ".join(page.read_text("utf-8").split())
-
-
-def test_bundle__of_one_network_is_written_as_ever_and_of_several_as_version_3(
-    policy: Policy, mixture: Policy, tmp_path: Path
-) -> None:
-    """Earlier versions of the package, which know no gate, go on reading the first."""
-    written = []
-    for each, name in ((policy, "one"), (mixture, "three")):
-        each.save(tmp_path / name)
-        written.append(json.loads((tmp_path / name / "manifest.json").read_text()))
-    one, three = written
-    assert one["format_version"] == 2 and not {"networks", "gate_hidden"} & one["network"].keys()
-    assert (three["format_version"], three["network"]["networks"], three["network"]["gate_hidden"]) == (3, 3, [6])
-    assert load_policy(tmp_path / "three").manifest == mixture.manifest
 
 
 SCENARIO = eb.load_scenario("paper-random")

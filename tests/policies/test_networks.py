@@ -156,6 +156,7 @@ def test_mixture__acts_as_the_network_that_the_gate_chooses_the_first_of_equal_s
 @pytest.mark.parametrize("around", ["+episode", "+step", "+refined", "+refined:profile"])
 def test_mixture__drives_shielded_and_refined(around: str, mixture: Policy, tmp_path: Path) -> None:
     mixture.save(tmp_path / "mixture")
+    assert eb.load_policy(tmp_path / "mixture").manifest == mixture.manifest
     spec = f"counterfactual@{tmp_path / 'mixture'}"
     agents = {name: eb.make_agent(name, scenario=SCENARIO) for name in (spec, spec + around)}
     found = eb.evaluate(SCENARIO.sample(4, seed=7).worlds, agents, scenario=SCENARIO)

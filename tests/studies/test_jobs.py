@@ -97,7 +97,7 @@ def test_killed_writer__what_it_left_goes(tmp_path: Path) -> None:
         assert [file.name for file in tmp_path.iterdir() if file.name != ".lock"] == []
 
 
-class Pretended:
+class Pretended(Inside):
     """Two workers that end jobs in reverse; jobs of ``lost`` lose theirs so often, ``wrong`` ones fail for good."""
 
     def __init__(
@@ -131,9 +131,6 @@ class Pretended:
 
     def interrupt(self) -> None:
         self.interrupted = True
-
-    def close(self) -> None:
-        pass
 
 
 def calls(number: int) -> list[Job]:
