@@ -119,10 +119,10 @@ def test_label__of_anybody_can_be_drawn(text: str) -> None:
     assert figure._repr_png_().startswith(b"\x89PNG\r\n\x1a\n")
 
 
-def test_series_style__neighbours_differ_in_more_than_colour() -> None:
-    for k in range(len(COLOURS) - 1):
-        one, other = series_style(k), series_style(k + 1)
-        assert all(one[name] != other[name] for name in ("color", "marker", "linestyle"))
+@pytest.mark.parametrize("k", range(len(COLOURS) - 1))
+def test_series_style__neighbours_differ_in_more_than_colour(k: int) -> None:
+    one, other = series_style(k), series_style(k + 1)
+    assert all(one[name] != other[name] for name in ("color", "marker", "linestyle"))
 
 
 # ---------------------------------------------------------------- of a scenario

@@ -254,6 +254,8 @@ def test_training__starts_from_nothing_where_no_policy_ships_and_says_so(tmp_pat
     assert json.loads((tmp_path / "run" / "run.json").read_text())["start"] == result.training.begins == told
     assert notes[0] == f"begins with {told}"
     assert result.policy.tensors["policy.output.bias"] == pytest.approx(-0.9, abs=1e-3)
+    seen = np.random.default_rng(0).uniform(0, 1, (50, result.policy.observation.size)).astype(np.float32)
+    np.testing.assert_allclose(result.policy(seen), -0.9, atol=0.1)
     fits = Training.of(SHIPPED, SCENARIO), Training.of(SHIPPED, "paper-random-obstacle")
     assert [each.begins for each in fits] == ["ppo@shipped/ppo", "ppo@shipped/ppo-paper-random-obstacle"]
     assert (Training.of("quick", SCENARIO).begins, Training.of("ppo", SCENARIO).begins) == ("random weights", None)
@@ -327,14 +329,6 @@ def test_training__gets_better_from_scratch(recipe: Any, tmp_path: Path) -> None
     result = train(recipe, SCENARIO, tmp_path / "run")
     first, last = (result.evaluations[k]["first_impact_harm"] for k in (0, -1))
     assert last < 0.7 * first
-
-
-def test_training__begins_near_an_action(tmp_path: Path) -> None:
-    """Where the recipe says so: -0.9 is nearly full braking."""
-    recipe = TINY_COUNTERFACTUAL.replace(network={"policy": [8], "initial_action": -0.9}, **STILL)
-    policy = train(recipe, SCENARIO, tmp_path / "run", measure=None).policy
-    seen = np.random.default_rng(0).uniform(0, 1, (50, policy.manifest.network.observation_size)).astype(np.float32)
-    np.testing.assert_allclose(policy(seen), -0.9, atol=0.1)
 
 
 def test_training__numbers_that_are_not_finite_stop_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -103,10 +103,10 @@ def test_drawing__has_text_as_outlines_and_the_colours_of_the_page() -> None:
     assert re.findall(r"--series-\d: (#\w+)", css)[:7] == [colour.lower() for colour in COLOURS]
 
 
-def test_drawing__its_label_is_text() -> None:
-    for text in HOSTILE[:24]:
-        svg = inline_svg(b'<svg xmlns="http://www.w3.org/2000/svg"/>', text)[0]
-        assert [tag for tag, _ in Page(str(svg)).tags] == ["svg"]
+@pytest.mark.parametrize("text", HOSTILE[:24])
+def test_drawing__its_label_is_text(text: str) -> None:
+    svg = inline_svg(b'<svg xmlns="http://www.w3.org/2000/svg"/>', text)[0]
+    assert [tag for tag, _ in Page(str(svg)).tags] == ["svg"]
 
 
 def test_drawing__the_caption_is_text_of_the_page() -> None:

@@ -426,15 +426,13 @@ def test_lineup__takes_what_ships(folder: Path) -> None:
     assert acts == [acts[0]] * 4  # four copies of one policy ship here
 
 
-def test_shipped_policies__each_that_ships_is_small_and_has_a_card() -> None:
-    for name, path in shipped_policies().items():
-        manifest = load_named_policy(f"shipped/{name}").manifest
-        trained = eb.load_scenario(str(manifest.scenario["name"]))
-        assert manifest.steps > 0 and scenario_sha256(eb.Scenario.of_dump(manifest.scenario)) == scenario_sha256(
-            trained
-        )
-        assert sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) < 1_000_000
-        assert (path / "card.md").read_text("utf-8").startswith("# ")
+@pytest.mark.parametrize(("name", "path"), shipped_policies().items())
+def test_shipped_policies__each_that_ships_is_small_and_has_a_card(name: str, path: Path) -> None:
+    manifest = load_named_policy(f"shipped/{name}").manifest
+    trained = eb.load_scenario(str(manifest.scenario["name"]))
+    assert scenario_sha256(eb.Scenario.of_dump(manifest.scenario)) == scenario_sha256(trained) and manifest.steps > 0
+    assert sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) < 1_000_000
+    assert (path / "card.md").read_text("utf-8").startswith("# ")
 
 
 @pytest.mark.parametrize("harm_count", HARM_COUNTS)
