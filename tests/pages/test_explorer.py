@@ -492,9 +492,7 @@ def test_body__that_is_no_question_is_refused(client: Client, body: bytes) -> No
 
 @pytest.mark.parametrize(("key", "value"), STATES, ids=lambda each: ascii(each)[:30])
 def test_state__that_is_none_is_refused_by_its_key(client: Client, state, folder: Path, key: str, value: Any) -> None:
-    changed = {**state, key: value}
-    if value is MISSING:
-        del changed[key]
+    changed = {name: each for name, each in {**state, key: value}.items() if each is not MISSING}
     reply = client.ask("save", {"world": changed, **GOOD["save"]})
     check_refused(reply, 400)
     assert list(folder.iterdir()) == [] and (value is not MISSING or key in reply.json["error"])
