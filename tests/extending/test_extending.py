@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import csv
-import importlib
 import json
 import re
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -83,11 +80,10 @@ eb.register_measure("worst", worst, unit="m/s")
 
 
 @pytest.fixture
-def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def mine(tmp_path: Path) -> None:
+    """The parts of the user's file are registered."""
     (tmp_path / "my_parts.py").write_text(MINE)
-    monkeypatch.syspath_prepend(tmp_path)
-    yield importlib.import_module("my_parts")
-    sys.modules.pop("my_parts")
+    eb.load_plugin(tmp_path / "my_parts.py")
 
 
 def changed(function: Any, told: str = "Another one.") -> Any:
@@ -108,7 +104,8 @@ def engine_of(worlds: int = 3, **settings: Any) -> eb.Engine:
 # ---------------------------------------------------------------- trainings
 
 
-def test_parts__of_the_users_file_train_and_are_evaluated(mine: Any, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("mine")
+def test_parts__of_the_users_file_train_and_are_evaluated(tmp_path: Path) -> None:
     reward = {"harm": 1.0, "calm": 0.5, "hurry": 0.01}
     content = {**TINY_PPO.model_dump(mode="json"), "name": "mine", "observation": LISTED, "reward": reward}
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump({**content, "total_steps": 1024}))
@@ -137,7 +134,8 @@ def test_parts__of_the_users_file_train_and_are_evaluated(mine: Any, tmp_path: P
 # ---------------------------------------------------------------- features and terms
 
 
-def test_interfaces__observe_and_pay_the_same_and_infos_tell_the_terms(mine: Any) -> None:
+@pytest.mark.usefixtures("mine")
+def test_interfaces__observe_and_pay_the_same_and_infos_tell_the_terms() -> None:
     reward = {"harm": 0.0, "calm": 1.0, "hurry": 0.5}
     told = []
     for make in BARE.values():
@@ -159,13 +157,14 @@ def test_interfaces__observe_and_pay_the_same_and_infos_tell_the_terms(mine: Any
     assert columns["reward_calm"][0] == infos["vehicle_2"]["reward_calm"]
 
 
-def test_columns__are_those_of_the_whole_observation_and_of_the_functions(mine: Any) -> None:
+@pytest.mark.usefixtures("mine")
+def test_columns__are_those_of_the_whole_observation_and_of_the_functions() -> None:
     worlds = PAPER.sample(50, 3).worlds
     whole = observe(worlds, 1, eb.ObservationSpec())
     names = [feature.name for feature in eb.ObservationSpec().features]
     seen = observe(worlds, 1, eb.choose_observation(["rear_1.gap", "urgency", "own", "front_1.load"]))
     assert seen[:, [0, *range(2, 9)]].tobytes() == whole[:, [names.index("rear_1.gap"), *range(7)]].tobytes()
-    assert seen[:, 1] == near(np.clip(mine.urgency(worlds, 1) / 10.0, 0.0, 4.0), rel=1e-6)
+    assert seen[:, 1] == near(worlds.speeds_mps[:, 1] / (1.0 + worlds.gaps_m[:, 0]) / 10.0, rel=1e-6)
     known, mass = whole[:, names.index("front_1.known")] == 1.0, worlds.vehicles.mass_t
     assert seen[:, 9] == near(np.where(known, mass[:, 0] / mass[:, 1], 1.0), rel=1e-6)
     assert (observe(worlds, 0, eb.choose_observation(["front_1.load"])) == 1.0).all()  # nobody is there
@@ -233,7 +232,8 @@ def test_term__counts_in_running_worlds_only() -> None:
 # ---------------------------------------------------------------- presets, objectives, schemas
 
 
-def test_preset__is_drawn_like_the_mapping_that_it_stands_for(mine: Any, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("mine")
+def test_preset__is_drawn_like_the_mapping_that_it_stands_for(tmp_path: Path) -> None:
     rural, spelt = (PAPER.replace(v2x=v2x, horizon_s=20, early_impacts="keep") for v2x in ("rural", RURAL))
     assert rural.v2x.channel == spelt.v2x.channel != CHANNELS["nominal"]
     latencies = [scenario.sample(20, 3).worlds.vehicles.latency_s.tobytes() for scenario in (rural, spelt)]
@@ -245,7 +245,8 @@ def test_preset__is_drawn_like_the_mapping_that_it_stands_for(mine: Any, tmp_pat
     assert rural.replace(v2x="wired").v2x.channel.timing == "fixed"
 
 
-def test_objective__is_paid_by_hand_and_stands_in_tables(mine: Any) -> None:
+@pytest.mark.usefixtures("mine")
+def test_objective__is_paid_by_hand_and_stands_in_tables() -> None:
     found = eb.evaluate(SAMPLE, {"coast": eb.make_agent("coast")}, scenario=PAPER.replace(objective="front-first"))
     (row,) = (row for row in found.rescore() if (row.objective, row.harm_count) == ("front-first", "total"))
     borne = found.outcome("coast").ledger.vehicle_harm("total").mean(axis=0)
@@ -259,7 +260,8 @@ def test_objective__is_paid_by_hand_and_stands_in_tables(mine: Any) -> None:
     assert harm[:, 0].all() and total == near(-(harm[:, :1] + harm))
 
 
-def test_schemas__know_what_is_registered(mine: Any) -> None:
+@pytest.mark.usefixtures("mine")
+def test_schemas__know_what_is_registered() -> None:
     schema = scenario_json_schema()
     parts, weights = schema["properties"], eb.TrainingRecipe.json_schema()["$defs"]["RewardParams"]["properties"]
     assert {"urgency", "front_1.load", "own"} <= set(parts["observation"]["items"]["anyOf"][0]["enum"])

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import copy
-import importlib
 import itertools
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -63,12 +62,10 @@ from tests.learning.tiny import (
 
 
 @pytest.fixture
-def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """An algorithm of a user's file, imported."""
+def mine(tmp_path: Path) -> None:
+    """An algorithm of a user's file is registered."""
     (tmp_path / "my_algorithm.py").write_text(A2C)
-    monkeypatch.syspath_prepend(tmp_path)
-    yield importlib.import_module("my_algorithm").A2c
-    sys.modules.pop("my_algorithm")
+    eb.load_plugin(tmp_path / "my_algorithm.py")
 
 
 A2C = '''
@@ -141,11 +138,13 @@ def test_own_algorithm__trains_resumes_bit_for_bit_and_is_evaluated(
     assert harms[0] == harms[1] == pytest.approx(min(e["first_impact_harm"] for e in result.evaluations))
 
 
+@pytest.mark.usefixtures("mine")
 def test_own_algorithm__under_vec_normalize_is_refused_as_no_bundle_holds_its_statistics(
-    mine: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    build = mine.build
-    monkeypatch.setattr(mine, "build", lambda self, training, rows: build(self, training, VecNormalize(rows)))
+    kind = type(load_recipe(recipe_file(tmp_path)).make_algorithm())
+    build = kind.build
+    monkeypatch.setattr(kind, "build", lambda self, training, rows: build(self, training, VecNormalize(rows)))
     with pytest.raises(InvalidInput, match="'a2c': its model is trained under VecNormalize, whose statistics are no"):
         train(recipe_file(tmp_path), SCENARIO, tmp_path / "run")
 
