@@ -134,13 +134,8 @@ def write_sweep(tmp_path: Path) -> Write:
 
 @pytest.fixture
 def write_tuning(tmp_path: Path, small_tuning: dict[str, Any]) -> Write:
-    """Writes the file of the small tuning, with changes; "-" leaves a key out."""
-
-    def write(**changes: Any) -> Path:
-        content = {key: value for key, value in {**small_tuning, **changes}.items() if value != "-"}
-        return write_yaml(tmp_path / "tuning.yaml", content)
-
-    return write
+    """Writes the file of the small tuning, with changes."""
+    return lambda **changes: write_yaml(tmp_path / "tuning.yaml", {**small_tuning, **changes})
 
 
 @pytest.fixture

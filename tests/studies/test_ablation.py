@@ -62,13 +62,6 @@ def ablate(folder: Path, recipe: Path, *options: object) -> int:
     return study("ablate", "--output", folder, "--recipes", recipe, *ABLATE, *options)
 
 
-@pytest.fixture
-def copied(finished_ablation: Path, tmp_path: Path) -> Path:
-    """A copy of the small ablation, to be changed."""
-    shutil.copytree(finished_ablation, tmp_path / "copy")
-    return tmp_path / "copy"
-
-
 def test_read_levels__the_standard_set_is_a_ladder_and_its_worse_channels():
     levels = read_levels([*STANDARD, "cooperation-3-congested"])
     assert [level.name for level in levels if level.clear is None] == list(LADDER)
@@ -112,8 +105,9 @@ def test_ablate__writes_tables_and_figures(finished_ablation: Path) -> None:
 
 
 @pytest.mark.slow
-def test_ablate__the_shield_goes_around_what_was_trained(finished_ablation, copied, tiny_total, capsys) -> None:
+def test_ablate__the_shield_goes_around_what_was_trained(finished_ablation, tmp_path, tiny_total, capsys) -> None:
     """The trainings of the other ablation are used, in a copy without its settings."""
+    copied = Path(shutil.copytree(finished_ablation, tmp_path / "copy"))
     (copied / "settings.json").unlink()
     assert ablate(copied, tiny_total, "--shield", "step") == 0
     assert "to do: 0 trainings" in capsys.readouterr().err

@@ -81,7 +81,7 @@ def test_example__of_the_page_is_in_order():
     assert (DOCS / "sweep-example.yaml").read_text("utf-8") in (DOCS / "scaling.md").read_text("utf-8")
 
 
-def test_table__has_a_row_for_every_job_in_the_order_of_the_file(finished_sweep, small_sweep):
+def test_table__has_a_row_for_every_job_in_the_order_of_the_file(finished_sweep):
     rows = read(finished_sweep / TABLE)
     assert [(row["seed"], row["set.gamma"]) for row in rows] == [
         ("3", "0.9"), ("3", "0.99"), ("5", "0.9"), ("5", "0.99")

@@ -14,7 +14,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.studies.sweep import TuningPlan
 from tests.cli.conftest import rows_of as read
-from tests.studies.conftest import TRIALS, study, write_yaml
+from tests.studies.conftest import TRIALS, study
 from tests.studies.counting import PROGRAM, ROOT, end_when
 
 DOCS = ROOT / "docs"
@@ -170,9 +170,9 @@ def test_trial__that_diverges_is_failed_with_its_reason_and_the_others_go_on(wri
     assert "the recipe's own values are not in the space" in capsys.readouterr().err and not export.exists()
 
 
-def test_same_command__exports_again_over_its_own_recipe_alone(finished_tuning, small_tuning, tmp_path, capsys) -> None:
+def test_same_command__exports_again_over_its_own_recipe_alone(finished_tuning, tmp_path, capsys) -> None:
     shutil.copytree(finished_tuning.parent, tmp_path / "all")
-    file, export = write_yaml(tmp_path / "tuning.yaml", small_tuning), tmp_path / "all" / "best.yaml"
+    file, export = tmp_path / "all" / "tuning.yaml", tmp_path / "all" / "best.yaml"
     text = export.read_text()
     assert "Settings of" in text and tune(file, tmp_path / "all" / "out", "--export", str(export)) == 0
     assert export.read_text() == text
