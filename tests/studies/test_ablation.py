@@ -20,6 +20,7 @@ from ethbrake_marl.figures import ablation_figures, signed_ticks
 from ethbrake_marl.learning import runs as learning_train
 from ethbrake_marl.learning.training import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.limits.limits import best_harm, chunks_left
+from ethbrake_marl.policies import shipped_policies
 from ethbrake_marl.scenario import Sample, load_scenario, scenario_path
 from ethbrake_marl.shield.guard import Shielded
 from ethbrake_marl.studies.ablation import (
@@ -230,7 +231,8 @@ def generalise(*runs: Path, more: Sequence[str] = ()) -> int:
     return run_command(["study", "generalise", *words, *more])
 
 
-def test_generalise__prints_a_table_or_json(run: Path, tmp_path: Path, capsys) -> None:
+def test_generalise__prints_a_table_or_json(tmp_path: Path, capsys) -> None:
+    run = shipped_policies()["counterfactual-cooperation-3-pair"]
     assert generalise(run, more=["--search-episodes", "2", "--budget", "20", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
     assert [row["vehicles"] for row in rows] == [3, 6] and {row["kind"] for row in rows} == {"generalise"}
@@ -475,12 +477,3 @@ def test_drive_longer__full_braking_gains_nothing_on_itself():
     assert told == [(3, 0.0, 0.0, 0.0), (4, 0.0, 0.0, 0.0)]
     three = eb.evaluate(PAIR.sample(20, 7), {"b": braking}, scenario=PAIR).outcome("b").total_harm
     assert found[0]["reached"] == pytest.approx(three.mean(), rel=1e-12)
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory, tiny_total) -> Path:
-    """The run of a policy that Vehicles 2 and 3 share; not to be changed."""
-    folder = tmp_path_factory.mktemp("runs") / "run"
-    words = ["train", "--scenario", "cooperation-3-pair", "--recipe", str(tiny_total), "--steps", "64"]
-    assert run_command([*words, "--output", str(folder)]) == 0
-    return folder

@@ -47,8 +47,8 @@ def test_mean_of_lists__half_widths_add_as_squares():
     assert mean_of_lists([Estimate(0.2, None)]) == Estimate(0.2, None)
 
 
-def test_entry__tells_what_an_evaluation_gives(suite, entries):
-    entry = read_entry(entries / "coast.json")
+def test_entry__tells_what_an_evaluation_gives(suites, entries):
+    entry, suite = read_entry(entries / "coast.json"), load_suite("tiny", suites)
     assert entry.lists_driven == 3 and entry.overall == entry.mean_of_driven
     for each in suite.lists:
         sample, told, count = each.sample(), entry.lists[each.name], each.content.harm_count
