@@ -251,12 +251,22 @@ def test_dataset__is_written_and_told(ethbrake: Command, packages: list[str], wo
     assert found is not None and list(found.groups()) in ([], [str(Path().absolute())])
 
 
-@pytest.mark.parametrize("name", ["a.parquet", "brakes-v0"])
-def test_dataset__without_the_extra_says_the_line_that_installs_it(ethbrake: Command, name: str, monkeypatch) -> None:
-    for package in ("pyarrow", "minari"):
-        monkeypatch.setitem(sys.modules, package, None)
-    answer = ethbrake("watch", "dataset", "--episodes", "2", "--output", name)
-    check_refused(answer, f"{sys.executable} -m pip install 'ethbrake-marl[data]'\n")
+@pytest.mark.parametrize(
+    ("package", "extra", "line"),
+    [
+        ("pyarrow", "data", "watch dataset --episodes 2 --output a.parquet"),
+        ("minari", "data", "watch dataset --episodes 2 --output brakes-v0"),
+        ("pyarrow", "data", "evaluate --agents coast --episodes 2 --per-world worlds.parquet"),
+        ("imageio_ffmpeg", "render", "watch record --agents coast --output film.mp4"),
+        ("onnx", "export", "agent export shipped/ppo --onnx policy.onnx"),
+    ],
+)
+def test_file__of_an_extra_that_is_missing_says_the_line_that_installs_it(
+    ethbrake: Command, package: str, extra: str, line: str, monkeypatch
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    missing = f"needs the package {package}, which is not installed: {sys.executable} -m pip install"
+    check_refused(ethbrake(*line.split()), f"{missing} 'ethbrake-marl[{extra}]'\n")
     assert list(Path().iterdir()) == []
 
 

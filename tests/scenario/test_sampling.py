@@ -286,7 +286,7 @@ def test_margin__is_an_obstacle_for_everybody() -> None:
 # ---------------------------------------------------------------- worlds that are given
 
 HEADER = "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps"
-FULL = {key: 6 for key in QUANTITY.needed} | {"gaps_m": 7, "speeds_mps": 20, "latency_s": 0, "restitution": 0}
+FULL = {key: 6 for key in QUANTITY.usual} | {"gaps_m": 7, "latency_s": 0, "restitution": 0, "obstacle_gap_m": 30}
 
 
 def read(folder: Path, text: str, scenario: Scenario = PAPER) -> Worlds:
@@ -346,7 +346,11 @@ def test_table__equals_the_same_worlds_sampled() -> None:
             {"obstacle_gap_m": 51.5, "braking_capacity_mps2": [4, 4, 4]},
         ),
         (build(gaps_m=7, speeds_mps=20, obstacle_gap_m=42), {}, {"obstacle_gap_m": 42}),
-        (ALL_RANDOM, {**FULL, "speed_limit_mps": 40, "obstacle_gap_m": 30}, {"obstacle_gap_m": 30, "braking_capacity_mps2": [6, 6, 6]}),
+        (
+            ALL_RANDOM,
+            {**FULL, "speed_limit_mps": 40, "obstacle_gap_m": 30},
+            {"obstacle_gap_m": 30, "braking_capacity_mps2": [6, 6, 6]},
+        ),
     ],
 )
 def test_initial_state__the_scenario_fills_in_fixed_fields(
