@@ -36,15 +36,6 @@ PROGRAM = "import sys; from ethbrake_marl.cli.app import run_command; sys.exit(r
 LIST = ("evaluate", "--agents", "full_brake", "--episodes", "2300", "--seed", "11")
 
 
-def test_evaluate__json_is_pure_and_complete_and_follows_from_the_seed(ethbrake: Command) -> None:
-    first, again, other = (ethbrake("evaluate", "--episodes", "20", "--seed", seed, "--json").out for seed in "112")
-    assert first == again != other
-    rows = json.loads(first)
-    told = [(row["agent"], "predicted_harm" in row, row["episodes"], row["parameters"]["seed"]) for row in rows]
-    agents = {"full_brake": False, "e_v2x_bm": True, "e_v2x_bm:pairwise": True}
-    assert told == [(agent, predicts, 20, 1) for agent, predicts in agents.items()]
-
-
 def test_evaluate__the_harm_count_is_what_agents_lower(ethbrake: Command) -> None:
     arguments = ("evaluate", "--episodes", "200", "--agents", "e_v2x_bm", "--json", "--harm-count")
     (first,), (total,) = (told_json(ethbrake(*arguments, count)) for count in ("first", "total"))

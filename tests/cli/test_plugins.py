@@ -14,7 +14,6 @@ import pytest
 import yaml
 
 from ethbrake_marl.cli.app import app, whole_command
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files import plugins
 from ethbrake_marl.learning.training import Training, load_recipe
 from ethbrake_marl.scenario import load_scenario, new_scenario_text
@@ -161,18 +160,6 @@ def test_resume__needs_the_same_plugins_and_says_how_to_go_on(ethbrake, tmp_path
     refuse("plugins must be a list of name, source and sha256", moved)
     (stopped / "config.json").write_text(config)
     refuse("this training has finished", moved)
-
-
-def test_same_file_again__changes_nothing_and_a_twin_or_a_changed_file_is_refused(ethbrake, tmp_path, parts):
-    twin = tmp_path / "twin.py"
-    twin.write_text("import ethbrake_marl as eb\neb.register_agent('gentle', print)\n")
-    assert ethbrake("agent", "list", "--plugin", parts, "--plugin", parts).status == 0
-    answer = ethbrake("agent", "list", "--plugin", twin)
-    check_refused(answer, f"plug-in '{twin}', line 2: agent 'gentle' is registered already")
-    parts.write_text(PLUGIN + "# changed\n")
-    check_refused(ethbrake("agent", "list", "--plugin", parts), "was changed since it was loaded")
-    with pytest.raises(InvalidInput, match="was changed since it was loaded"):
-        plugins.load_the_same(plugins.loaded_plugins())
 
 
 def test_option__stands_on_every_command_and_before_it(ethbrake, parts):
