@@ -477,8 +477,7 @@ def test_mixture__what_stands_beside_holds_for_every_member() -> None:
 
 
 def test_mixture__its_file_may_name_a_file_beside_it_and_its_members_may_be_written_out(tmp_path: Path) -> None:
-    own = PAPER.replace(name="own", title="")
-    (tmp_path / "own.yaml").write_text(json.dumps(own.declared()))
+    (tmp_path / "own.yaml").write_text(json.dumps(PAPER.replace(name="own", title="").declared()))
     (tmp_path / "mine.yaml").write_text("name: mine\nmixture: [{scenario: own.yaml}, {scenario: paper-random-early}]\n")
     assert [each.name for each in load_scenario(tmp_path / "mine.yaml").members] == ["own", "paper-random-early"]
     line = "gaps_m: 7, speeds_mps: 20, braking_capacity_mps2: 9, driving_capacity_mps2: 5, latency_s: 0.5, mass_t: 1"

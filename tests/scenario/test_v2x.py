@@ -160,8 +160,7 @@ def test_full_state__has_the_latency_that_the_channel_has_drawn():
 
 def test_observe__writing_the_papers_news_out_by_link_changes_no_bit():
     plain = PAPER.sample(50, 7).worlds
-    rows = Packed.of(plain)
-    told = rows.widened(obstacle=False, news=True).worlds()
+    told = Packed.of(plain).widened(obstacle=False, news=True).worlds()
     for time in (0.0, 0.3, 0.6, 1.0):
         for i in range(3):
             now = (replace(w, time_s=np.full(50, time)) for w in (plain, told))
@@ -238,8 +237,7 @@ def periodic(preset: str = "nominal", base: Scenario = BASE, **changes: object) 
 
 
 def first_only(scenario: Scenario) -> Scenario:
-    given = scenario.v2x.model_dump(exclude_none=True)
-    return scenario.replace(v2x={**given, "persistence": "first"})
+    return scenario.replace(v2x={**scenario.v2x.model_dump(exclude_none=True), "persistence": "first"})
 
 
 def engine_of(scenario: Scenario, n: int = 6, first: int = 0) -> Engine:
