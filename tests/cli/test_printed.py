@@ -2,8 +2,8 @@
 
 Below a command line stands what it writes to stdout, then what it writes to stderr behind ``! ``, then its exit status
 where that is not 0; how far it is (``500 of 2,000``) is left out. ``$ cat FILE`` shows a file, ``$ sed -i`` changes
-one. ``HERE`` and ``ROOT`` stand for folders. ``python -m tests.cli.test_printed`` writes what is printed today: read
-the difference.
+one, ``$ rm`` removes one. ``HERE`` and ``ROOT`` stand for folders. ``python -m tests.cli.test_printed`` writes what is
+printed today: read the difference.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ PROGRESS = re.compile(r"^.*: [\d,]+ of [\d,]+(, about .* left)?\n", re.MULTILINE
 def printed(line: str) -> str:
     """What a command line shows, in the folder where this runs."""
     words, out, err = shlex.split(line), io.StringIO(), io.StringIO()
-    if words[0] in ("cat", "sed"):
+    if words[0] in ("cat", "rm", "sed"):
         return subprocess.run(words, check=True, capture_output=True, encoding="utf-8").stdout
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         status = run_command(words[1:])

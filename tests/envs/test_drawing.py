@@ -222,10 +222,8 @@ def test_record_video__writes_a_film_of_the_episode(tmp_path: Path) -> None:
     to_its_end(environment)
     environment.close()
     (path,) = (tmp_path / "films").glob("*.mp4")
-    assert import_module("imageio_ffmpeg").count_frames_and_secs(str(path)) == (
-        9,
-        near(0.9, abs=0.02),
-    )  # from 0.5 s to 1.3 s, one frame per step of 0.1 s
+    # from 0.5 s to 1.3 s, one frame per step of 0.1 s
+    assert import_module("imageio_ffmpeg").count_frames_and_secs(str(path)) == (9, near(0.9, abs=0.02))
 
 
 def test_shields__are_looked_through_and_their_interventions_shown() -> None:

@@ -14,7 +14,7 @@ from scipy.stats import lognorm
 from ethbrake_marl.agents import Team, drive, make_agent
 from ethbrake_marl.evaluation import states_of
 from ethbrake_marl.limits.limits import prove
-from ethbrake_marl.physics import Floats, Worlds
+from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import QUANTITY, Scenario, Task, load_scenario
 from ethbrake_marl.shield import ShieldedDriver
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
@@ -181,15 +181,10 @@ def test_table__of_a_file_is_read_once_and_goes_along(tmp_path: Path) -> None:
 
 def test_lognormal__is_the_truncated_one_of_the_textbook() -> None:
     shape = {"median": 1.1, "sigma": 0.4, "low": 0.3, "high": 3.0}
-    scenario = PAPER.replace(time_gaps_s={"lognormal": shape}, early_impacts="keep", line_speed_mps=20)
-    drawn = np.sort((scenario.sample(4000, 7).worlds.gaps_m / 20).ravel())
-    law = lognorm(s=0.4, scale=1.1)
+    law, u = lognorm(s=0.4, scale=1.1), np.array([0.0, 0.5, 0.975])
     low, high = law.cdf(0.3), law.cdf(3.0)
-    expected = law.ppf(low + (high - low) * (np.arange(len(drawn)) + 0.5) / len(drawn))
-    assert np.abs(drawn - expected).max() < 0.35 and np.abs(drawn - expected).mean() < 0.01
-    entry = scenario.quantities("time_gaps_s")[0]
-    u = np.array([0.0, 0.5, 0.975])
-    assert entry.value(u) == pytest.approx(law.ppf(low + (high - low) * u), rel=1e-9)  # type: ignore[union-attr]
+    (entry, _) = PAPER.replace(time_gaps_s={"lognormal": shape}).quantities("time_gaps_s")
+    assert entry.value(u) == pytest.approx(law.ppf(low + (high - low) * u), rel=1e-9)
 
 
 # Equipage: who sends, who hears.
@@ -219,7 +214,6 @@ def test_equipage__of_types_is_drawn_with_them() -> None:
     kinds = {"equipped": {"weight": 7}, "without": {"weight": 3, "v2x": {"sends": False, "hears": "none"}}}
     sample = FIXED.replace(vehicle_types=kinds, v2x=FIXED_LINKS).sample(2000, 7)
     silent = sample.types == "without"
-    assert silent.mean() == pytest.approx(0.3, abs=0.02)
     latency = sample.worlds.vehicles.latency_s
     second = np.where(silent[:, 0] | silent[:, 1], 1.0, 0.3)
     third = np.where(silent[:, 0] | silent[:, 2], second + 1.0, 0.3)
@@ -241,16 +235,10 @@ def test_spread__is_added_to_what_the_load_gives() -> None:
     assert plain.braking_capacity_mps2 == pytest.approx(by_load, abs=1e-12)
     more = wide.braking_capacity_mps2 - by_load
     assert (wide.mass_t == plain.mass_t).all() and -0.5 <= more.min() < -0.49 and 0.49 < more.max() <= 0.5
-    expected = -1 / math.sqrt(1 + (1 / 12) / (4 / 12))  # of two independent uniform parts, 2 and 1 wide
-    assert correlation(wide.mass_t, wide.braking_capacity_mps2) == pytest.approx(expected, abs=0.01)
-    assert correlation(plain.mass_t, plain.braking_capacity_mps2) == pytest.approx(-1.0, abs=1e-12)
+    assert abs(np.corrcoef(wide.mass_t.ravel(), more.ravel())[0, 1]) < 0.02  # drawn apart from the load
     assert lorries({"uniform": [-0.5, 0.5]}).bounds("braking_capacity_mps2")[0] == (4.5, 7.5)
     names = lorries({"uniform": [-0.5, 0.5]}).ranges().names
     assert "braking_capacity_mps2 of vehicle_1" in names and "mass_t of vehicle_1" not in names
-
-
-def correlation(one: Floats, other: Floats) -> float:
-    return float(np.corrcoef(one.ravel(), other.ravel())[0, 1])
 
 
 # The alert comes later.

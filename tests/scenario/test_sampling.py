@@ -161,8 +161,6 @@ def test_columns__every_entry_of_a_world_has_its_own() -> None:
     streams, places = zip(*(rule.place(index) for rule in rules for index in range(rule.count(64))), strict=True)
     assert set(streams) == {()}
     assert len(set(places)) == len(places) and max(places) < BLOCK * 64 and BLOCK % 4 == 0
-    assert [QUANTITY.usual["mass_t"].place(i) for i in range(3)] == [((), 5), ((), 13), ((), 21)]
-    assert QUANTITY.otherwise["line_speed_mps"].place(0) == ((), 15)  # slot 7 of vehicle_2
     for_all = {"braking_capacity_mps2": 6, "driving_capacity_mps2": 6, "mass_t": 5, "latency_s": 0.5}
     worlds = PAPER.replace(vehicles=5, roles={"vehicle_2": "learner"}, **for_all).sample(7, 1).worlds
     assert len(np.unique(worlds.speeds_mps)) == 35  # one entry for all: each vehicle draws its own value
@@ -219,22 +217,6 @@ DEVIATIONS = {"speed_deviations_mps": {"uniform": [-2, 2]}}
 def test_derived__by_hand(given: dict[str, Any], gaps: list[float], speeds: list[float]) -> None:
     worlds = build(**given).sample(2, 7).worlds
     assert (worlds.gaps_m.tolist(), worlds.speeds_mps.tolist()) == ([gaps] * 2, [speeds] * 2)
-
-
-def test_derived__a_time_gap_has_the_number_of_its_gap_and_a_deviation_that_of_its_speed() -> None:
-    scenario = build(**LINE, **DEVIATIONS)
-    u, worlds = uniform_numbers(7, "list", 0, 0, 50, 24), scenario.sample(50, 7).worlds
-    line = values(scenario.quantities("line_speed_mps")[0], u[:, 15])
-    for i, speed in enumerate(worlds.speeds_mps.T):
-        own = values(scenario.quantities("speed_deviations_mps")[i], u[:, 8 * i + 1])
-        assert speed.tolist() == (line + own).tolist()
-    for pair, gap in enumerate(worlds.gaps_m.T):
-        time_gap = values(scenario.quantities("time_gaps_s")[pair], u[:, 8 * pair])
-        assert gap.tolist() == (time_gap * worlds.speeds_mps[:, pair + 1]).tolist()
-    usual = build(gaps_m=7, speeds_mps=20, restitution={"uniform": [0, 0.3]}, mass_t={"uniform": [1, 40]})
-    before, after = (each.sample(20, 3).worlds.vehicles for each in (usual, usual.replace(**LINE)))
-    assert before.mass_t.tobytes() == after.mass_t.tobytes()
-    assert before.restitution.tobytes() == after.restitution.tobytes()
 
 
 def test_bounds__hold_for_every_draw_and_are_reached_by_fixed_numbers() -> None:
