@@ -99,7 +99,7 @@ def test_columns__tell_two_learners_step_by_step() -> None:
     env = eb.parallel_env(scenario=PAIR, reward={"harm": 1.0, "jerk": 0.1})
     row = 0
     for world in range(5):
-        seen, infos = env.reset(options={"listed_world": {"seed": 7, "number": world}})
+        seen, infos = env.reset(seed=0, options={"listed_world": {"seed": 7, "number": world}})
         decision = 0
         while env.agents:
             told: dict[str, Any] = {name: column[row] for name, column in columns.items()}
