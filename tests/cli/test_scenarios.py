@@ -86,25 +86,17 @@ def test_validate__drives_scripts_and_tells_what_refuses_them(ethbrake: Command,
         restore(before)
 
 
-@pytest.mark.parametrize("name", ["mixture-universal", "cooperation-4-congested", "long"])
-def test_validate_and_explain__stay_short(ethbrake: Command, scenario_file, name: str) -> None:
-    path: str | Path = name
-    if name == "long":  # of which each vehicle draws alone
-        path = scenario_file("\nvehicles: 3\n", "\nvehicles: 40\n")
-        text = path.read_text().replace("full_brake\n", "copy_leader\n", 3).replace("reject", "keep")
-        each = ", ".join(f"{{uniform: [4, {5 + 0.1 * i:g}]}}" for i in range(40))
-        for key in ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t"):
-            text = re.sub(rf"(?m)^{key}: .*$", f"{key}: [{each}]", text)
-        text = re.sub(r"(?m)^latency_s: .*$", "latency_s: 0.4", text).replace(
-            "vehicle_1: copy_leader", "vehicle_1: coast"
-        )
-        path.write_text(text)
-    told = ethbrake("scenario", "validate", path)
-    assert told.status == 0, told.err
-    lines = told.out.splitlines()
-    assert len(lines) <= 24 and max(map(len, lines)) <= 80
-    sentences = told_json(ethbrake("scenario", "explain", path, "--json"))["sentences"]
-    assert len(sentences) <= 20 and len(ethbrake("scenario", "explain", path).out.splitlines()) <= 40
+def test_validate_and_explain__stay_short_where_each_vehicle_draws_alone(ethbrake: Command, tmp_path: Path) -> None:
+    each = [{"uniform": [4, 5 + 0.1 * i]} for i in range(40)]
+    drawn = dict.fromkeys(("braking_capacity_mps2", "driving_capacity_mps2", "mass_t"), each)
+    roles = {"vehicle_1": "coast", "vehicle_2": "learner", "vehicle_3": "copy_leader"}
+    usual = {"vehicles": 40, "latency_s": 0.4, "early_impacts": "keep", "roles": roles}
+    declared = {**load_scenario("paper-random").declared(), "name": "long", **usual, **drawn}
+    (tmp_path / "long.yaml").write_text(json.dumps(declared))
+    lines = ethbrake("scenario", "validate", tmp_path / "long.yaml").out.splitlines()
+    assert 0 < len(lines) <= 24 and max(map(len, lines)) <= 80
+    sentences = told_json(ethbrake("scenario", "explain", tmp_path / "long.yaml", "--json"))["sentences"]
+    assert len(sentences) <= 20 and len(ethbrake("scenario", "explain", tmp_path / "long.yaml").out.splitlines()) <= 40
 
 
 def test_explain__tells_every_quantity_that_is_declared(ethbrake: Command) -> None:
