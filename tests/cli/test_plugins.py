@@ -115,8 +115,6 @@ def test_one_file__adds_agent_term_feature_and_preset_and_is_seen_in_the_report(
         "evaluate", *named, "--scenario", scenario, "--episodes", "20", "--agents", f"gentle,gentle:0.2+step,ppo@{run}"
     )
     assert driven.status == 0 and "gentle:0.2+step" in driven.out
-    again()
-    check_refused(ethbrake("evaluate", "--episodes", "20", "--agents", "gentle"), "unknown agent 'gentle'")
 
 
 def test_agents_from_a_file__drive_on_the_command_line_behind_a_shield(ethbrake, parts):
