@@ -25,11 +25,6 @@ FLASH = (255, 214, 10)
 COAST = np.zeros(1, np.float32)
 
 
-@pytest.fixture(autouse=True)
-def _no_display(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-
-
 def crash(mode: str | None = "rgb_array", **changes: Any) -> Any:
     environment = gymnasium.make("EthBrake-v0", scenario=CRASH.replace(**changes), render_mode=mode)
     environment.reset(seed=0)

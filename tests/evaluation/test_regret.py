@@ -222,14 +222,11 @@ def test_limits__of_the_first_500_worlds_of_the_papers_random_test(name: str, un
     scenario = load_scenario(name)
     agents = {spec: make_agent(spec) for spec in ("full_brake", "e_v2x_bm")}
     result = evaluate(scenario.sample(500, 7), agents, scenario=scenario, seed=7, aftermath=False)
-    found, proof = result.regrets, result.regrets.limits.proof
-    rows = summarise(result)
+    proof, rows = result.regrets.limits.proof, summarise(result)
     assert [row["unavoidable_rate"].value for row in rows] == [unavoidable / 500] * 2
     for driven in result.outcomes.values():
         assert driven.collided[proof.impact].all()  # nobody avoids what is proven
         assert (driven.first_impact_harm >= proof.harm - 1e-9).all()
-        assert all((found.regret(driven, count) >= 0.0).all() for count in ("first", "total"))
-    assert not (proof.avoidable & proof.impact).any() and (found.first_impact_harm >= proof.harm - 1e-9).all()
     full, best = (row["avoidable_collision_rate"].value for row in rows)
     assert best < 0.02 < full
 
