@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Iterator
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -47,16 +46,6 @@ eb.register_preset("hilly", {"preset": "nominal", "lost": 0.3})
 eb.register_agent("gentle", make_gentle, about="brakes with a constant share")
 assert make_gentle.__annotations__ == {"argument": str}  # a plug-in means what Python says it means
 '''
-
-
-@pytest.fixture(autouse=True)
-def new_process() -> Iterator[None]:
-    """Each test begins as a process that has loaded nothing, and leaves nothing."""
-    before = tables()
-    plugins._RUN.clear()
-    plugins._LOADED.clear()
-    yield
-    restore(before)
 
 
 @pytest.fixture

@@ -18,7 +18,6 @@ from ethbrake_marl.learning.training import TrainingRecipe, load_recipe, read_se
 from ethbrake_marl.scenario import QUANTITY, Scenario, list_scenarios, load_scenario, parse_yaml
 from ethbrake_marl.search import ProfileProblem
 from tests.cli.conftest import Answer, Command, check_refused, rows_of, told_json
-from tests.fixtures.registered import restore, tables
 
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIAL = (ROOT / "docs" / "tutorials" / "first-ten-minutes.md").read_text("utf-8")
@@ -59,7 +58,7 @@ for name in ("own_calm", "own_greedy", "own_fails"):
 
 
 def test_validate__drives_scripts_and_tells_what_refuses_them(ethbrake: Command, scenario_file, tmp_path) -> None:
-    plugin, before = tmp_path / "scripts.py", tables()
+    plugin = tmp_path / "scripts.py"
     plugin.write_text(SCRIPTS)
 
     def tried(script: str, *more: str) -> Answer:
@@ -67,23 +66,20 @@ def test_validate__drives_scripts_and_tells_what_refuses_them(ethbrake: Command,
         path.write_text(path.read_text().replace("early_impacts: reject", "early_impacts: keep"))
         return ethbrake("scenario", "validate", path, "--plugin", plugin, *more)
 
-    try:
-        calm = told_json(tried("own_calm", "--json"))
-        assert calm["not_state_free"] == {"vehicle_3": "own_calm"} and not calm["commands_out_of_range"]
-        assert {"e_v2x_bm", "best_harm", "+step", "search best-harm"} < calm["refused_by"].keys()
-        assert "command is not fixed at the alert" in calm["refused_by"]["+step"]
-        assert told_json(tried("copy_leader", "--json"))["refused_by"].keys() == {
-            "+robust:interior",
-            "early_impacts: reject",
-        }
-        greedy = tried("own_greedy")
-        (many,) = re.findall(r"vehicle_3 asks for more than it can in (\d+) of 200 worlds", greedy.out)
-        fast = load_scenario("paper-random").sample(200, 7).worlds.speeds_mps[:, 0]
-        braked = fast - 0.8 * 6.0  # when Vehicle 3 may act
-        assert greedy.status == 2 and greedy.out.startswith("NOT OK") and int(many) == (braked > 16.0).sum() > 0
-        check_refused(tried("own_fails"), "of vehicle_3: act on 200 worlds at 1.", "ZeroDivisionError: no gap")
-    finally:
-        restore(before)
+    calm = told_json(tried("own_calm", "--json"))
+    assert calm["not_state_free"] == {"vehicle_3": "own_calm"} and not calm["commands_out_of_range"]
+    assert {"e_v2x_bm", "best_harm", "+step", "search best-harm"} < calm["refused_by"].keys()
+    assert "command is not fixed at the alert" in calm["refused_by"]["+step"]
+    assert told_json(tried("copy_leader", "--json"))["refused_by"].keys() == {
+        "+robust:interior",
+        "early_impacts: reject",
+    }
+    greedy = tried("own_greedy")
+    (many,) = re.findall(r"vehicle_3 asks for more than it can in (\d+) of 200 worlds", greedy.out)
+    fast = load_scenario("paper-random").sample(200, 7).worlds.speeds_mps[:, 0]
+    braked = fast - 0.8 * 6.0  # when Vehicle 3 may act
+    assert greedy.status == 2 and greedy.out.startswith("NOT OK") and int(many) == (braked > 16.0).sum() > 0
+    check_refused(tried("own_fails"), "of vehicle_3: act on 200 worlds at 1.", "ZeroDivisionError: no gap")
 
 
 def test_validate_and_explain__stay_short_where_each_vehicle_draws_alone(ethbrake: Command, tmp_path: Path) -> None:
