@@ -40,8 +40,6 @@ from ethbrake_marl.scenario.schema import changed_content
 from ethbrake_marl.scenario.v2x import PRESETS
 from tests.contract.interfaces import LEVELS
 
-SHIPPED = [entry.path for entry in list_scenarios()]
-each_shipped = pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 PAGE, MIXTURES = (
     (Path(__file__).resolve().parents[2] / "docs" / name).read_text("utf-8")
     for name in ("scenarios.md", "types-and-mixtures.md")
@@ -189,7 +187,7 @@ def not_used(scenario: Scenario) -> set[str]:
     return {*gaps, *speeds, *obstacle, *(key for key in chosen if getattr(scenario, key) is None)}
 
 
-@each_shipped
+@pytest.mark.parametrize("path", [entry.path for entry in list_scenarios()], ids=lambda path: path.stem)
 def test_shipped__reads_back_by_name_path_and_folder_and_a_new_file_is_based_on_it(path: Path) -> None:
     scenario, folder = load_scenario(path.stem), path.parent.name
     text = "\n".join(f"{key}: {flow_text(value)}" for key, value in scenario.declared().items())
