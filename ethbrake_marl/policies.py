@@ -80,7 +80,7 @@ class NetworkSpec(FileModel):
     value_hidden: PerhapsHidden
     activation: Activation
     output: Literal["clip", "tanh", "choice"]
-    choices: Annotated[int, Field(ge=2, le=4096, exclude_if=lambda choices: choices is None)] | None = None
+    choices: Annotated[int | None, Field(ge=2, le=4096, exclude_if=lambda choices: choices is None)] = None
     networks: Annotated[int, Field(ge=1, le=16, exclude_if=lambda networks: networks == 1)] = 1
     gate_hidden: Annotated[PerhapsHidden, Field(exclude_if=not_)] = ()
 
@@ -492,14 +492,16 @@ class Policy:
         """Whether the files of a bundle stand in ``folder``; they are not read."""
         return all((folder / name).is_file() for name in (MANIFEST, WEIGHTS))
 
-    def save(self, folder: Path, *, replace: bool = False) -> None:
+    def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
         """Write it as the new folder ``folder``, completely or not at all; raises ``AlreadyExists``.
 
         With ``replace`` a folder that is there goes once the new one is written.
         """
-        with new_folder(folder, replace=replace) as partial:
+        own = content_sha256(self.manifest.model_dump(mode="json"))  # an older version may have written keys that go
+        manifest = self.manifest.model_copy(update={"manifest_sha256": own})
+        with new_folder(Path(folder), replace=replace) as partial:
             write_file(partial / WEIGHTS, _serialise(self.tensors))
-            write_file(partial / MANIFEST, self.manifest.model_dump_json(indent=2).encode() + b"\n")
+            write_file(partial / MANIFEST, manifest.model_dump_json(indent=2).encode() + b"\n")
 
     def to_onnx(self) -> bytes:
         """The ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
@@ -703,9 +705,9 @@ class PolicyTeam:
         """Decisions of learners after which they were taken."""
         return next(iter(self.drivers.values())).steps
 
-    def save(self, folder: Path, *, replace: bool = False) -> None:
+    def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
         """Write a folder ``vehicle_i/`` for each learner with its bundle, as ``Policy.save`` writes one."""
-        with new_folder(folder, replace=replace) as partial:
+        with new_folder(Path(folder), replace=replace) as partial:
             for name, policy in self.drivers.items():
                 policy.save(partial / name)
 

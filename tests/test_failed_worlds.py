@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.engine import Engine
+from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import FailedWorld, PhysicsError
 from ethbrake_marl.physics import advance, forecast, leaving_out_failed
 from ethbrake_marl.scenario import Scenario, load_scenario
@@ -70,8 +69,7 @@ def test_error__lists_a_few_and_counts_the_rest_and_travels_between_processes():
 
 
 def engine(n=3, seed=5):
-    scripts = {i: make_agent("full_brake") for i in (0, 2)}
-    return Engine(PAPER, n, learners=(1,), scripts=scripts, seed=seed)
+    return make_engine(PAPER, n, seed=seed)
 
 
 def break_row(running, k):
@@ -126,8 +124,7 @@ def test_stream__a_world_that_never_reaches_its_first_decision_gives_its_place_t
 
 
 def test_shield__a_proposal_that_cannot_be_advanced_is_not_certified():
-    worlds = PAPER.sample(3, 7).worlds
-    running = begin_running(profile_problem(worlds, [1]))
+    running = begin_running(profile_problem(PAPER.sample(3, 7).worlds, [1]))
     plan = np.full((3, 81), -1.0)
     states = running.states.copy()
     states[1, :5] = [10.0, 20.0, 16.0, 0.5, -1.0]

@@ -28,27 +28,6 @@ ALL = load_scenario("cooperation-4-all")
 NEAR = ALL.replace(obstacle_gap_m={"uniform": [10, 45]})  # within the way of full braking in many worlds
 
 
-def test_sample__an_obstacle_leaves_all_other_draws_alone_and_has_its_own_for_each_world() -> None:
-    pair, near = load_scenario("cooperation-3-pair").sample(50, 7).worlds, NEAR.sample(50, 7).worlds
-    for name in ("gaps_m", "speeds_mps"):
-        assert getattr(near, name).tobytes() == getattr(pair, name).tobytes()
-    assert np.isinf(pair.obstacle_gap_m).all() and not pair.obstacle_hit.any()
-    gap = near.obstacle_gap_m
-    assert 10.0 <= gap.min() < 15.0 and 40.0 < gap.max() <= 45.0
-    assert NEAR.sample(1, 7, first=31).worlds.obstacle_gap_m[0] == gap[31]
-    assert (NEAR.sample(50, 7, channel="training").worlds.obstacle_gap_m != gap).all()
-    assert ALL.with_learners(["vehicle_2"]).learners == (1,)
-
-
-def test_initial_state__may_place_the_obstacle_where_the_scenario_has_one() -> None:
-    state = {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
-    assert ALL.worlds_from_state(state).obstacle_gap_m.tolist() == [42.0]
-    assert NEAR.worlds_from_state({**state, "obstacle_gap_m": 30}).obstacle_gap_m.tolist() == [30.0]
-    columns = {"gap_1_m": [7, 8], "gap_2_m": [7, 8], "speed_1_mps": [20, 19], "speed_2_mps": 2 * [18]}
-    table = NEAR.worlds_from_table({**columns, "speed_3_mps": [20, 20], "obstacle_gap_m": [30, 35]})
-    assert table.obstacle_gap_m.tolist() == [30.0, 35.0]
-
-
 def test_profiles__are_followed_with_the_obstacle_as_the_engine_drives_them() -> None:
     worlds = NEAR.sample(30, 7).worlds
     problem = profile_problem(worlds, [0, 1, 2], horizon_s=NEAR.horizon_s)

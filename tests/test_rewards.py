@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import WithoutEffect
@@ -120,14 +119,6 @@ def test_settings__are_those_of_the_page() -> None:
     }
     assert terms_of(reward_params("paper"), *STRUCK).keys() == {"collision", "risk", "jerk", "terminal"}
     assert reward_params({"harm": 2, "jerk": 0.5}) == RewardParams(harm=2.0, jerk=0.5)
-
-
-@pytest.mark.parametrize(
-    "bad", [{"harm": -1.0}, {"harm": math.nan}, {"ham": 1.0}, {"harm_count": "all"}, {"shaping_discount": 1.5}]
-)
-def test_settings__that_cannot_be_are_refused(bad: dict[str, Any]) -> None:
-    with pytest.raises(ValidationError):
-        RewardParams(**bad)
 
 
 @pytest.mark.parametrize(

@@ -45,8 +45,7 @@ def examples() -> Iterator[Any]:
 
 
 def test_table__lists_each_name_once_and_each_can_be_imported() -> None:
-    text = (ROOT / "ethbrake_marl" / "__init__.py").read_text("utf-8")
-    names = re.findall(r"\b(\w+) as \1\b", text)
+    names = re.findall(r"\b(\w+) as \1\b", (ROOT / "ethbrake_marl" / "__init__.py").read_text("utf-8"))
     assert sorted(names) == sorted(PUBLIC) and set(PUBLIC) <= set(dir(eb))
 
 

@@ -19,7 +19,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.programmes.environments import NotInstalled, ready_python, watched
+from tests.programmes import NotInstalled, ready_python, watched
 
 Work = Callable[[], int]  # does some work and says how many worlds it advanced by a step
 

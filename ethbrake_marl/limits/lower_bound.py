@@ -409,8 +409,8 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
         raise InvalidInput("avoidability: vehicle_1 controlled, with an obstacle ahead (obstacle_gap_m): not decided")
     if (worlds.N, vehicle) not in ((3, 1), (2, 0), (2, 1)):
         raise InvalidInput(
-            f"avoidability: vehicle_{vehicle + 1} of {worlds.N} vehicles; it is decided exactly for vehicle_2 of 3 and"
-            " for either vehicle of 2, otherwise use avoidable_by_lp"
+            f"avoidability: vehicle_{vehicle + 1} of {worlds.N} vehicles; it is decided for vehicle_2 of 3 and for"
+            " either vehicle of 2"
         )
     for index, script in (scripts or {}).items():
         if index != vehicle and script != "full_brake":

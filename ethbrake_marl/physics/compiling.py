@@ -395,7 +395,7 @@ def by_parts(work: Callable[[slice], Result], n: int, threads: int) -> list[Resu
 # The C library and numpy choose their own exp, log and pow by processor, with other last bits on each. These take the
 # same IEEE operations in the same order everywhere, so the worlds of a list are the same bits on any machine. Each
 # error bound is the largest error that a comparison with 40 digits found, rounded up
-# (tests/physics/test_elementary.py).
+# (tests/physics/test_compiling.py).
 
 PER_LN2 = 1.4426950408889634
 _LN2_HIGH = 0.693147180369123816490  # its last 32 bits are 0: times a whole number below 2^32 it is exact

@@ -7,20 +7,18 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents import Odometer, Ranges, Told, drive, make_agent, script_agents
-from ethbrake_marl.engine import Engine
-from ethbrake_marl.physics import Worlds
 
 BASE = eb.load_scenario("cooperation-2-paper").replace(early_impacts="keep")
 DEAF = {"preset": "paper", "hears": "front"}
 PERIODIC = {"preset": "blocked", "persistence": "periodic"}
 
 
-def engine_of(scenario: eb.Scenario, n: int = 40, vehicle: int = 1, seed: int = 7) -> Engine:
+def engine_of(scenario: eb.Scenario, n: int = 40, vehicle: int = 1, seed: int = 7) -> eb.Engine:
     scripts = script_agents(scenario, except_for=vehicle)
-    return Engine(scenario, n, learners=[vehicle], scripts=scripts, worlds=scenario.sample(n, seed).worlds)
+    return eb.Engine(scenario, n, learners=[vehicle], scripts=scripts, worlds=scenario.sample(n, seed).worlds)
 
 
-def believed(engine: Engine, vehicle: int = 1, odometer: Odometer | None = None) -> Worlds:
+def believed(engine: eb.Engine, vehicle: int = 1, odometer: Odometer | None = None) -> eb.Worlds:
     worlds, scenario = engine.worlds, engine.scenario
     way = worlds.speeds_mps[:, vehicle] * worlds.time_s if odometer is None else odometer.way_m
     return Ranges.of(scenario, vehicle).believe(worlds, way)

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents import LearnedAgent, Team, drive, make_agent, policy_agent, register_agent, script_agents
-from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate, follow_episodes, record_episode, worlds_sha256
 from ethbrake_marl.evaluation.episodes import Task, film_scenes, record_episodes
-from ethbrake_marl.physics import Floats, Worlds, advance
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver
+from tests.fixtures.asked import Acts
 
 PAPER = eb.load_scenario("paper-random")
 PAIR = eb.load_scenario("cooperation-3-pair")
@@ -66,7 +63,7 @@ def test_drive__an_agent_sees_what_a_learner_sees_from_the_first_decision_on():
         return np.full((len(observation), 1), -0.5, np.float32)
 
     drive(worlds, policy_agent(half, scenario=PAPER), PAPER, 1)
-    engine = Engine(PAPER, 20, learners=(1,), scripts=script_agents(PAPER, except_for=1), worlds=worlds)
+    engine = eb.Engine(PAPER, 20, learners=(1,), scripts=script_agents(PAPER, except_for=1), worlds=worlds)
     for each in seen[:3]:
         assert engine.observe(1).tobytes() == each
         engine.step(np.full((20, 1), -0.5))
@@ -87,19 +84,16 @@ def test_drive__a_policy_as_a_role_does_what_it_does_when_it_is_driven():
     assert 0.0 < harm.mean() < drive(worlds, braking, driven, 1).ledger.world_harm("first").mean()
 
 
-class Swinging:
+@Acts
+def swings(worlds, vehicle):
     """Brakes the harder the later it is: every decision is another command."""
-
-    name = "swinging"
-
-    def act(self, worlds, vehicle):
-        return -worlds.vehicles.braking_capacity_mps2[:, vehicle] * (0.3 + 0.6 * np.sin(7.0 * worlds.time_s) ** 2)
+    return -worlds.vehicles.braking_capacity_mps2[:, vehicle] * (0.3 + 0.6 * np.sin(7.0 * worlds.time_s) ** 2)
 
 
 @pytest.fixture
 def swinging():
     """Lines whose first and last vehicle follow a script that decides within the steps of Vehicle 2."""
-    register_agent("swinging", lambda argument, settings: Swinging())
+    register_agent("swinging", lambda argument, settings: swings)
     roles = {"vehicle_1": "swinging", "vehicle_2": "learner", "vehicle_3": "swinging"}
     latency = [0.04, 0.5, {"uniform": [0.2, 0.9]}]
     return PAPER.replace(early_impacts="keep", roles=roles, latency_s=latency, gaps_m=4)
@@ -112,7 +106,7 @@ def test_drive__shows_every_part_of_a_step_within_which_nobody_decides(swinging)
 
         def see(self, before, command_mps2, until_s):
             assert np.array_equal(before.gaps_m, self.now.gaps_m) or np.allclose(before.gaps_m, self.now.gaps_m)
-            self.now, impacts = advance(before, command_mps2, until_s=until_s)
+            self.now, impacts = eb.advance(before, command_mps2, until_s=until_s)
             self.harm += np.stack([impacts.first_impact_harm.sum(axis=1), impacts.total_harm.sum(axis=1)], axis=1)
 
     worlds = swinging.sample(30, 7).worlds
@@ -176,7 +170,7 @@ def test_evaluate__an_agent_alone_drives_every_learner_and_a_team_of_nobody_none
 
 def test_evaluate__several_learners_do_what_they_do_in_training(policy: eb.Policy) -> None:
     worlds = PAIR.sample(50, 3).worlds
-    engine = Engine(PAIR, 50, learners=(1, 2), scripts={0: make_agent("full_brake")}, worlds=worlds)
+    engine = eb.Engine(PAIR, 50, learners=(1, 2), scripts={0: make_agent("full_brake")}, worlds=worlds)
     while not engine.ended.all():
         engine.step({i: policy(engine.observe(i))[:, 0].astype(np.float64) for i in (1, 2)})
     outcome = evaluate(worlds, {"soft": LearnedAgent(policy)}, scenario=PAIR).outcome("soft")
@@ -201,8 +195,7 @@ def test_evaluate__one_agent_remembers_each_learner_apart_and_predicts_for_nobod
 
 def test_e_v2x_bm__takes_the_other_learners_to_brake_fully():
     worlds = PAIR.sample(30, 7).worlds
-    team = Team.of(make_agent("e_v2x_bm"), (1, 2))
-    both = drive(worlds, team, PAIR).memories[1]
+    both = drive(worlds, Team.of(make_agent("e_v2x_bm"), (1, 2)), PAIR).memories[1]
     alone = drive(worlds, make_agent("e_v2x_bm"), PAIR.with_learners(["vehicle_2"]), 1).memories[1]
     assert both["deceleration_mps2"].tolist() == alone["deceleration_mps2"].tolist()
 
@@ -232,7 +225,6 @@ class _Writes:
         return -worlds.vehicles.braking_capacity_mps2[:, vehicle], memory
 
 
-KEPT = ("name", "plan")  # an attribute that there is, and a new one
 WRAPPED = {
     "alone": lambda agent: agent,
     "episode": lambda agent: HybridAgent(agent, PAPER),
@@ -248,7 +240,7 @@ WRAPPED = {
         *((when, r"(begin|act) on .*read-only") for when in ("begin", "act", "vehicles")),
         *(
             (name, rf"keeps something in its attribute '{name}'; one that remembers has begin\(alert, ")
-            for name in KEPT
+            for name in ("name", "plan")  # an attribute that there is, and a new one
         ),
     ],
 )
@@ -261,33 +253,3 @@ def test_agent_that_writes_into_worlds_or_itself__is_refused_by_name(
     with pytest.raises(InvalidInput, match=rf"agent '(kmh|other)' of vehicle_2: {told}"):
         evaluate(sample, agents, scenario=PAPER)
     assert worlds_sha256(sample.worlds, sample.index) == before and sample.worlds.gaps_m.flags.writeable
-    agents["kmh"] = _Writes("memory", state_free=False)  # which is its own
-    found = evaluate(sample, agents, scenario=PAPER)
-    full, kmh = (found.outcome(name).ledger.world_harm("first") for name in agents)
-    assert np.array_equal(full, kmh)
-
-
-@pytest.mark.parametrize(
-    ("begun", "kept", "told"),
-    [
-        (lambda n: None, lambda m, n: np.zeros(n), "another form"),  # rows that begin anew would keep the old one
-        (lambda n: {"a": np.zeros(n)}, lambda m, n: m | {"b": np.zeros(n)}, "another form"),
-        (lambda n: np.zeros(n), lambda m, n: np.zeros(n, np.int64), "another form.*int64.*float64"),
-        (lambda n: np.zeros((n, 1)), lambda m, n: np.zeros((n, 2)), "another form"),
-        (lambda n: {"a": (np.zeros(n), {"b.c": np.zeros(n)})}, lambda m, n: m, "key 'b.c'; must be a name"),
-        (lambda n: {0: np.zeros(n)}, lambda m, n: m, "key 0; must be a name"),
-        (lambda n: np.array([[]] * n + [[1]], object)[:n], lambda m, n: m, "an array of objects"),
-    ],
-)
-def test_memory_of_another_form__is_refused_by_name(begun: Any, kept: Any, told: str) -> None:
-    class Remembers:
-        name = "mine"
-
-        def begin(self, alert: Worlds, vehicle: int, scripts: object) -> Any:
-            return begun(alert.n)
-
-        def act(self, worlds: Worlds, memory: Any, vehicle: int) -> tuple[Floats, Any]:
-            return np.zeros(worlds.n), kept(memory, worlds.n)
-
-    with pytest.raises(InvalidInput, match=f"agent 'mine' of vehicle_2.*{told}"):
-        evaluate(PAPER.sample(3, 3), {"mine": Remembers()}, scenario=PAPER)

@@ -59,35 +59,26 @@ def harm_of_pairs(worlds: Worlds, vehicle: int, deceleration: Floats) -> tuple[F
     return padded[:, vehicle], padded[:, vehicle + 1]
 
 
-# gap, v_l, a_l, onset_l, v_f, a_f, onset_f -> squared closing speed
+# Function, and what it makes of which numbers.
 BY_HAND = {
-    "A: leader brakes, follower coasts": ((8, 10, 4, 0, 10, 5, 5), 64.0),  # gap falls by 2 t^2: t = 2
-    "A': leader at rest, follower coasts": ((10, 4, 4, 0, 6, 5, 5), 36.0),  # 2 m to rest, 12 m at 6 m/s: t = 2
-    "B: both brake": ((9, 20, 4, 0, 22, 2, 0), 40.0),  # 2^2 + 2 * 2 * 9
-    "C: leader at rest, follower brakes": ((10, 4, 4, 0, 10, 2, 0), 52.0),  # 100 - 2 * 2 * 12
-    "both coast": ((4, 10, 5, 3, 12, 5, 4), 4.0),  # 4 m at 2 m/s: t = 2
-    "follower brakes, leader still coasts": ((3, 10, 5, 9, 14, 2, 0), 4.0),  # 16 - 2 * 2 * 3
-    "follower brakes first, both brake": ((4.5, 10, 6, 1, 13, 2, 0), 21.0),  # at 1 s: gap 2.5, w = 1; 1 + 2 * 4 * 2.5
-    "touch": ((4, 10, 5, 9, 14, 2, 0), 0.0),  # 16 - 2 * 2 * 4
-    "just spared at rest": ((12, 4, 4, 0, 10, 50 / 14, 0), 0.0),
-    "opening": ((4, 12, 2, 0, 10, 5, 0), 0.0),
-    "nobody brakes, opening": ((4, 12, 0, 0, 10, 0, 0), 0.0),
-    "standing follower": ((4, 12, 2, 0, 0, 5, 0), 0.0),
-    "standing leader, no brakes": ((5, 0, 2, 0, 3, 0, 0), 9.0),
-    "touching and opening, then caught": ((0, 12, 4, 0, 10, 1, 9), 4.0),  # w = -2: closes again at +2
-    "pressed together": ((0, 10, 4, 0, 10, 1, 9), 0.0),
-}
-
-
-@pytest.mark.parametrize("case", BY_HAND)
-def test_closing_speed__by_hand(case):
-    pair, expected = BY_HAND[case]
-    assert closing_speed_squared(*map(float, pair)) == pytest.approx(expected, abs=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("pair", "expected"),
-    [
+    closing_speed_squared: [  # gap, v_l, a_l, onset_l, v_f, a_f, onset_f
+        ((8, 10, 4, 0, 10, 5, 5), 64.0),  # A: leader brakes, follower coasts; gap falls by 2 t^2: t = 2
+        ((10, 4, 4, 0, 6, 5, 5), 36.0),  # A': leader at rest, follower coasts; 2 m to rest, 12 m at 6 m/s: t = 2
+        ((9, 20, 4, 0, 22, 2, 0), 40.0),  # B: both brake; 2^2 + 2 * 2 * 9
+        ((10, 4, 4, 0, 10, 2, 0), 52.0),  # C: leader at rest, follower brakes; 100 - 2 * 2 * 12
+        ((4, 10, 5, 3, 12, 5, 4), 4.0),  # both coast: 4 m at 2 m/s: t = 2
+        ((3, 10, 5, 9, 14, 2, 0), 4.0),  # follower brakes, leader still coasts: 16 - 2 * 2 * 3
+        ((4.5, 10, 6, 1, 13, 2, 0), 21.0),  # follower brakes first, both brake: at 1 s: gap 2.5, w = 1; 1 + 2 * 4 * 2.5
+        ((4, 10, 5, 9, 14, 2, 0), 0.0),  # touch: 16 - 2 * 2 * 4
+        ((12, 4, 4, 0, 10, 50 / 14, 0), 0.0),  # just spared at rest
+        ((4, 12, 2, 0, 10, 5, 0), 0.0),  # opening
+        ((4, 12, 0, 0, 10, 0, 0), 0.0),  # nobody brakes, opening
+        ((4, 12, 2, 0, 0, 5, 0), 0.0),  # standing follower
+        ((5, 0, 2, 0, 3, 0, 0), 9.0),  # standing leader, no brakes
+        ((0, 12, 4, 0, 10, 1, 9), 4.0),  # touching and opening, then caught: w = -2: closes again at +2
+        ((0, 10, 4, 0, 10, 1, 9), 0.0),  # pressed together
+    ],
+    least_to_spare_front: [  # gap, v_l, a_l, onset_l, v_f, onset_f
         ((12, 4, 4, 0, 10, 0), 100 / 28),  # 14 m to stop from 10 m/s
         ((10, 20, 5, 0, 10, 0), 0.5 * 100 / 50),  # 50 m
         ((2, 30, 3, 0, 33, 0), 3 + 9 / 4),  # would stop first, but grazes while both move
@@ -96,14 +87,7 @@ def test_closing_speed__by_hand(case):
         ((8, 10, 4, 0, 10, 5), math.inf),  # they meet before the follower may brake
         ((1, 10, 4, 0, 0, 5), 0.0),
     ],
-)
-def test_least_to_spare_front__by_hand(pair, expected):
-    assert least_to_spare_front(*map(float, pair)) == pytest.approx(expected, rel=1e-14)
-
-
-@pytest.mark.parametrize(
-    ("pair", "expected"),
-    [
+    most_to_spare_rear: [  # gap, v_l, onset_l, v_f, a_f, onset_f
         ((5, 10, 0, 10, 5, 0), 10.0),  # the follower needs 10 m, the leader may stop in 5
         ((11, 10, 0, 10, 5, 0), math.inf),  # the follower stops within the gap
         ((2, 30, 0, 33, 3, 0), 0.75),  # grazing: 9 = 2 (3 - a) 2
@@ -115,9 +99,15 @@ def test_least_to_spare_front__by_hand(pair, expected):
         ((5, 0, 0, 10, 5, 0), -math.inf),  # and within
         ((0, 10, 0, 10, 5, 0.5), math.inf),  # pressed together: no impact
     ],
+}
+
+
+@pytest.mark.parametrize(
+    ("function", "given", "expected"), [(function, *case) for function, cases in BY_HAND.items() for case in cases]
 )
-def test_most_to_spare_rear__by_hand(pair, expected):
-    assert most_to_spare_rear(*map(float, pair)) == pytest.approx(expected, rel=1e-14)
+def test_closed_form__by_hand(function, given, expected):
+    tolerance = {"abs": 1e-12} if function is closing_speed_squared else {"rel": 1e-14}
+    assert function(*map(float, given)) == pytest.approx(expected, **tolerance)
 
 
 @pytest.mark.parametrize(("exact_zeros", "at_s"), [(False, 0.0), (True, 0.0), (False, 0.2)])

@@ -16,12 +16,12 @@ from ethbrake_marl.agents import Agent, Knowledge, Source, Team, Told, agent_ent
 from ethbrake_marl.agents.registry import find_entry
 from ethbrake_marl.engine import Engine, Memory, Script, ask_script, begin_script
 from ethbrake_marl.evaluation import make_lineup
-from ethbrake_marl.observations import choose_observation
 from ethbrake_marl.physics import Bools, Floats, Packed, Worlds
 from ethbrake_marl.physics.messages import CHANNEL, LINK, Messages, link_at, place_at, ring_at
 from ethbrake_marl.scenario.v2x import PRESETS
 from ethbrake_marl.shield import ShieldedDriver, parse_uncertainty
 from ethbrake_marl.shield.step_shield import Proposer, proposed_action, seen_columns
+from tests.fixtures.asked import Acts
 from tests.fixtures.policies import make_policy
 
 
@@ -228,16 +228,7 @@ CHANNELS = [
 HIDING = [channel for channel in CHANNELS if channel not in ("paper", "clear", "nominal")]
 
 
-class Silent:
-    """An agent of the user's own that says nothing."""
-
-    name = "silent"
-
-    def act(self, worlds, vehicle):
-        return np.zeros(worlds.n)
-
-
-class Leaking(Silent):
+class Leaking:
     """Says it knows messages, and decides on who is behind it, what others have heard, or what it will never hear."""
 
     name, knows = "leaking", "messages"
@@ -295,8 +286,9 @@ def test_knowledge__every_agent_states_it(spec, knows):
 def test_knowledge__of_an_agent_of_the_users_own_and_of_a_team():
     team = Team({1: agent_of("ppo@shipped/ppo"), 2: agent_of("full_brake")}, "both")
     assert Knowledge.of(team) == (SENSORS, MESSAGES) and Knowledge.of(Team({}, "scripts")).text == "–"
-    assert Knowledge.of(Silent()).text == "not stated" and not Knowledge.of(Silent()).sees_through
-    assert Knowledge.of(Silent(), also=MODEL) == (MODEL, Source.UNSTATED)
+    silent = Acts(lambda worlds, vehicle: np.zeros(worlds.n))
+    assert Knowledge.of(silent).text == "not stated" and not Knowledge.of(silent).sees_through
+    assert Knowledge.of(silent, also=MODEL) == (MODEL, Source.UNSTATED)
     assert Knowledge.of(Leaking()) == (MESSAGES,)
 
 
@@ -330,7 +322,7 @@ def test_own_sensors_and_messages__nor_where_an_obstacle_is_that_was_not_receive
 @pytest.mark.parametrize("channel", ["blocked", {"preset": "blocked", "persistence": "periodic"}], ids=str)
 def test_messages__contact_features_tell_nothing_that_was_not_received(channel, tmp_path):
     scenario = BLOCKED.replace(v2x=channel)
-    make_policy(choose_observation(["own", "contact"]), scenario.model_dump(mode="json")).save(tmp_path / "policy")
+    make_policy(eb.choose_observation(["own", "contact"]), scenario.model_dump(mode="json")).save(tmp_path / "policy")
     agent = agent_of(f"ppo@{tmp_path}", scenario)
     assert Knowledge.of(agent) == (MESSAGES,)
     assert changed_decisions(agent, scenario) == 0

@@ -11,17 +11,15 @@ from typing import Any
 
 import pytest
 
-from ethbrake_marl.evaluation import Evaluation, evaluate, summarise
+import ethbrake_marl as eb
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.figures import harm_against_total_gap
 from ethbrake_marl.pages.page import Part
 from ethbrake_marl.pages.report import Report
-from ethbrake_marl.scenario import load_scenario
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 AGENTS = ("full_brake", "e_v2x_bm", "constant:3+step", "ppo@shipped")
 REFUSED = "the server responded with a status of 400"  # which some tests ask the explorer for
-PAPER = load_scenario("paper-random")
+PAPER = eb.load_scenario("paper-random")
 
 
 @pytest.fixture(scope="module")
@@ -73,17 +71,17 @@ def wait_until(page: Any, condition: str) -> None:
 
 
 @pytest.fixture(scope="session")
-def compared() -> Evaluation:
+def compared() -> eb.Evaluation:
     """Four agents in 120 worlds, one of them behind a shield."""
-    return evaluate(PAPER.sample(120, 7), make_lineup(AGENTS, PAPER), scenario=PAPER, seed=7)
+    return eb.evaluate(PAPER.sample(120, 7), make_lineup(AGENTS, PAPER), scenario=PAPER, seed=7)
 
 
 @pytest.fixture(scope="session")
-def report_file(compared: Evaluation, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def report_file(compared: eb.Evaluation, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of ``compared``."""
-    figure = Part.drawing(harm_against_total_gap(compared), "Harm against the gap", "Mean harm by gap.")
+    figure = Part.drawing(eb.harm_against_total_gap(compared), "Harm against the gap", "Mean harm by gap.")
     report = Report(
-        "paper-random: four agents", summarise(compared), compared, figures=[figure],
+        "paper-random: four agents", eb.summarise(compared), compared, figures=[figure],
         summary="A report for the tests.", settings={"Seed": 7}, versions={"numpy": "2"},
     )  # fmt: skip
     path = tmp_path_factory.mktemp("report") / "report.html"

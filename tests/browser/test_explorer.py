@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 import itertools
-import os
 import re
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 
+import ethbrake_marl as eb
 from ethbrake_marl.defaults import DEFAULT
-from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_agents, make_lineup
 from ethbrake_marl.pages.explorer import Explored, HandDriven, outcome, read_profile
-from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from tests.browser.conftest import PAPER, wait_until
+from tests.pages.test_explorer import Running, started
 
 pytestmark = pytest.mark.slow  # what the server answers is tried without a browser, too
 
-ROOT = Path(__file__).resolve().parents[2]
 AGENTS = ("full_brake", "e_v2x_bm", "ppo@shipped", "ppo@shipped+step")
 EXPLORER = "document.body.explorer"
 IDLE = f"!!{EXPLORER}.found && !{EXPLORER}.busy && !{EXPLORER}.wanted"
@@ -31,29 +27,16 @@ Harms = dict[str, tuple[int, float, float]]  # impacts, first-impact and total h
 WORLD = PAPER.sample(1, DEFAULT.LIST_SEED, first=1).worlds  # with which the page begins
 
 
-class Served(NamedTuple):
-    address: str
-    folder: Path
-
-
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    pytest.importorskip("uvicorn", reason="no uvicorn: pip install 'ethbrake-marl[explore]'")
-    folder = tmp_path_factory.mktemp("explored")
-    command = [sys.executable, "-m", "ethbrake_marl", "watch", "explore", "--agents", ",".join(AGENTS)]
-    with subprocess.Popen(
-        [*command, "--world", "1", "--folder", str(folder), "--no-browser"],
-        env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
-    ) as process:  # fmt: skip
-        assert process.stdout is not None
-        yield Served(process.stdout.readline().strip(), folder)
-        process.kill()
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    with started(tmp_path_factory.mktemp("explored"), "--world", "1", agents=",".join(AGENTS)) as server:
+        yield server
 
 
 @pytest.fixture
-def page(open_page: Callable[..., Any], served: Served) -> Any:
+def page(open_page: Callable[..., Any], served: Running) -> Any:
     """The page with its first answer."""
-    opened = open_page(served.address)
+    opened = open_page(served.address.geturl())
     wait_until(opened, IDLE)
     return opened
 
@@ -67,11 +50,11 @@ def harms(page: Any) -> Harms:
     return {name: (int(impacts), first, total) for name, impacts, first, total in page.evaluate(script)}
 
 
-def check_harms(page: Any, *evaluated: tuple[Worlds, Scenario]) -> None:
+def check_harms(page: Any, *evaluated: tuple[eb.Worlds, Scenario]) -> None:
     """What stands in the table is what the agents do in each of these worlds of the scenario, or of a saved one."""
     shown = {name: value for name, value in harms(page).items() if name in AGENTS}
     for worlds, scenario in evaluated:
-        found = evaluate(worlds, make_lineup(AGENTS, PAPER), scenario=scenario, aftermath=False).outcomes.items()
+        found = eb.evaluate(worlds, make_lineup(AGENTS, PAPER), scenario=scenario, aftermath=False).outcomes.items()
         assert shown == {
             name: (int(each.impacts[0]), float(each.first_impact_harm[0]), float(each.total_harm[0]))
             for name, each in found
@@ -189,7 +172,7 @@ def test_profile__is_changed_by_keys(page: Any) -> None:
     assert harms(page)["by hand"] != before
 
 
-def test_save__reads_back_to_the_same_harm_and_says_what_cannot_be(page: Any, served: Served) -> None:
+def test_save__reads_back_to_the_same_harm_and_says_what_cannot_be(page: Any, served: Running) -> None:
     page.get_by_label("Speed, Vehicle 3 in m/s", exact=True).fill("24.3")
     wait_until(page, IDLE)
     name, said = page.get_by_label("Name", exact=True), "document.querySelector('[data-part=saved]').textContent"
@@ -245,7 +228,7 @@ def test_page__is_worked_by_keys_alone(page: Any) -> None:
     assert {"number", "from", "rival", "editor", "player live ready", "name"} <= reached
 
 
-def test_other_page__cannot_reach_the_server(browser: Any, served: Served, tmp_path: Path) -> None:
+def test_other_page__cannot_reach_the_server(browser: Any, served: Running, tmp_path: Path) -> None:
     """A page of somebody else's that even knows the address gets nothing, and changes nothing."""
     page = browser.new_context().new_page()
     other = tmp_path / "other.html"
@@ -256,6 +239,6 @@ def test_other_page__cannot_reach_the_server(browser: Any, served: Served, tmp_p
         " body: '{}'}).then((reply) => reply.type === 'opaque' ? 'opaque' : 'read', () => 'refused')))"
     )
     before = sorted(each.name for each in served.folder.iterdir())
-    blind, seeing = page.evaluate(script, served.address)
+    blind, seeing = page.evaluate(script, served.address.geturl())
     assert (blind in ("opaque", "refused"), seeing) == (True, "refused")
     assert sorted(each.name for each in served.folder.iterdir()) == before

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.evaluation import Evaluation, evaluate, record_episode, summarise
+import ethbrake_marl as eb
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.pages.report import Report
 from ethbrake_marl.studies.reproduction import Reproduction
@@ -41,8 +40,8 @@ def write_report(path: Path, names: tuple[str, ...], **settings: Any) -> Path:
     """A report of agents by these names in few worlds."""
     specs = [f"constant:{k}.5" for k in range(1, len(names) + 1)]
     agents = dict(zip(names, make_lineup(specs, PAPER).values(), strict=True))
-    found = evaluate(PAPER.sample(12, 7), agents, scenario=PAPER, seed=7)
-    Report("t", summarise(found), found, focus=names[0], **settings).driven(agents).write(path)
+    found = eb.evaluate(PAPER.sample(12, 7), agents, scenario=PAPER, seed=7)
+    Report("t", eb.summarise(found), found, focus=names[0], **settings).driven(agents).write(path)
     return path
 
 
@@ -152,7 +151,7 @@ def counts(page: Any) -> list[tuple[int, float, float]]:
 
 
 def test_player__ends_with_the_ledger_in_fifty_worlds_and_counts_never_fall(
-    report_page: Any, compared: Evaluation
+    report_page: Any, compared: eb.Evaluation
 ) -> None:
     row_of = {int(number): row for row, number in enumerate(compared.index)}
     for shown in ((0, 1, 2), (1, 2, 3)):
@@ -187,9 +186,9 @@ def test_player__scrubs_and_its_picture_changes(report_page: Any) -> None:
     assert report_page.evaluate(f"Math.abs({PLAYER}.time / {PLAYER}.until - 0.5) < 0.1")
 
 
-def test_player__places_are_those_of_the_recorded_episode(report_page: Any, compared: Evaluation) -> None:
+def test_player__places_are_those_of_the_recorded_episode(report_page: Any, compared: eb.Evaluation) -> None:
     row = compared.index.tolist().index(report_page.evaluate(f"{PLAYER}.data.worlds[0].number"))
-    record = record_episode(compared.worlds.take([row]), make_agent("full_brake"), scenario=PAPER)
+    record = eb.record_episode(compared.worlds.take([row]), eb.make_agent("full_brake"), scenario=PAPER)
     report_page.evaluate(f"{PLAYER}.shown = [0]; {PLAYER}.build()")
     for k in range(0, len(record.time_s), 7):
         state = report_page.evaluate(f"stateAt({PLAYER}.episodes()[0], {float(record.time_s[k])!r})")

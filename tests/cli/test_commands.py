@@ -64,29 +64,6 @@ def test_default_command__has_its_options_on_the_page_of_its_group_and_behind_it
     assert ethbrake("doctor", "check", "--json").out == ethbrake("doctor", "--json").out
 
 
-@pytest.mark.parametrize(
-    ("line", "fragments"),
-    [
-        ("evaluate --episodes many", ["--episodes"]),
-        ("evaluate --harm-count both", ["--harm-count", "both", "first", "total"]),
-        ("evaluate --frobnicate", ["--frobnicate"]),
-        ("search falsify --agent coast --measure hram", ["hram"]),
-        ("search falsify --agent coast --budget 0", ["--budget"]),
-        ("watch explore --no-browser --port 65536", ["65535"]),
-        ("benchmark v2", ["--agent", "see: ethbrake benchmark drive --help"]),
-        ("scenario show", ["NAME|PATH", "see: ethbrake scenario show --help"]),
-        ("", ["Missing command", "see: ethbrake --help"]),
-        (f"evaluate --agents ppo@{5000 * 'a'}", ["cannot be read", "File name too long"]),
-        (f"evaluate --per-world {300 * 'a'}.csv", ["cannot be written", "File name too long"]),
-        (f"train --name {300 * 'a'}", ["up to 128"]),
-    ],
-)
-def test_wrong_option__is_one_line_whatever_library_finds_it(
-    ethbrake: Command, line: str, fragments: list[str]
-) -> None:
-    check_refused(ethbrake(*line.split()), *fragments)
-
-
 def test_help__tells_the_parts_of_the_package_without_importing_them() -> None:
     assert command.part_names() == command.PARTS
 

@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import sys
-from collections.abc import Iterator
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -14,7 +13,6 @@ import pytest
 import yaml
 
 from ethbrake_marl.cli.app import app, whole_command
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files import plugins
 from ethbrake_marl.learning.training import Training, load_recipe
 from ethbrake_marl.scenario import load_scenario, new_scenario_text
@@ -48,16 +46,6 @@ eb.register_preset("hilly", {"preset": "nominal", "lost": 0.3})
 eb.register_agent("gentle", make_gentle, about="brakes with a constant share")
 assert make_gentle.__annotations__ == {"argument": str}  # a plug-in means what Python says it means
 '''
-
-
-@pytest.fixture(autouse=True)
-def new_process() -> Iterator[None]:
-    """Each test begins as a process that has loaded nothing, and leaves nothing."""
-    before = tables()
-    plugins._RUN.clear()
-    plugins._LOADED.clear()
-    yield
-    restore(before)
 
 
 @pytest.fixture
@@ -116,8 +104,6 @@ def test_one_file__adds_agent_term_feature_and_preset_and_is_seen_in_the_report(
         "evaluate", *named, "--scenario", scenario, "--episodes", "20", "--agents", f"gentle,gentle:0.2+step,ppo@{run}"
     )
     assert driven.status == 0 and "gentle:0.2+step" in driven.out
-    again()
-    check_refused(ethbrake("evaluate", "--episodes", "20", "--agents", "gentle"), "unknown agent 'gentle'")
 
 
 def test_agents_from_a_file__drive_on_the_command_line_behind_a_shield(ethbrake, parts):
@@ -161,18 +147,6 @@ def test_resume__needs_the_same_plugins_and_says_how_to_go_on(ethbrake, tmp_path
     refuse("plugins must be a list of name, source and sha256", moved)
     (stopped / "config.json").write_text(config)
     refuse("this training has finished", moved)
-
-
-def test_same_file_again__changes_nothing_and_a_twin_or_a_changed_file_is_refused(ethbrake, tmp_path, parts):
-    twin = tmp_path / "twin.py"
-    twin.write_text("import ethbrake_marl as eb\neb.register_agent('gentle', print)\n")
-    assert ethbrake("agent", "list", "--plugin", parts, "--plugin", parts).status == 0
-    answer = ethbrake("agent", "list", "--plugin", twin)
-    check_refused(answer, f"plug-in '{twin}', line 2: agent 'gentle' is registered already")
-    parts.write_text(PLUGIN + "# changed\n")
-    check_refused(ethbrake("agent", "list", "--plugin", parts), "was changed since it was loaded")
-    with pytest.raises(InvalidInput, match="was changed since it was loaded"):
-        plugins.load_the_same(plugins.loaded_plugins())
 
 
 def test_option__stands_on_every_command_and_before_it(ethbrake, parts):

@@ -1,8 +1,9 @@
 """What commands print, byte for byte, as listed in ``tests/cli/printed/*.txt``: each list is one story in one folder.
 
 Below a command line stands what it writes to stdout, then what it writes to stderr behind ``! ``, then its exit status
-where that is not 0; how far it is (``500 of 2,000``) is left out. ``$ cat FILE`` shows a file. ``HERE`` and ``ROOT``
-stand for folders. ``python -m tests.cli.test_printed`` writes what is printed today: read the difference.
+where that is not 0; how far it is (``500 of 2,000``) is left out. ``$ cat FILE`` shows a file, ``$ sed -i`` changes
+one, ``$ rm`` removes one. ``HERE`` and ``ROOT`` stand for folders. ``python -m tests.cli.test_printed`` writes what is
+printed today: read the difference.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import io
 import os
 import re
 import shlex
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -28,8 +30,8 @@ PROGRESS = re.compile(r"^.*: [\d,]+ of [\d,]+(, about .* left)?\n", re.MULTILINE
 def printed(line: str) -> str:
     """What a command line shows, in the folder where this runs."""
     words, out, err = shlex.split(line), io.StringIO(), io.StringIO()
-    if words[0] == "cat":
-        return Path(words[1]).read_text("utf-8")
+    if words[0] in ("cat", "rm", "sed"):
+        return subprocess.run(words, check=True, capture_output=True, encoding="utf-8").stdout
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         status = run_command(words[1:])
     told = "".join(f"! {each}\n" for each in PROGRESS.sub("", err.getvalue()).splitlines())

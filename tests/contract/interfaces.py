@@ -11,19 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.registry import make_agent
+import ethbrake_marl as eb
 from ethbrake_marl.envs.interfaces import EthBrakeEnv, EthBrakeParallelEnv, EthBrakeVectorEnv, in_turns
-from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from ethbrake_marl.physics import Worlds
-from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario
-from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv
-from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 
 Array = NDArray[Any]
 Wrap = Callable[[Any], Any]
 
-PAPER = load_scenario("paper-random")
-FIVE = Scenario(
+PAPER = eb.load_scenario("paper-random")
+FIVE = eb.Scenario(
     name="five",
     vehicles=5,
     gaps_m={"uniform": [3, 12]},
@@ -43,7 +38,7 @@ FIVE = Scenario(
 )
 # Vehicle 1 brakes with 6 m/s2 from 20 m/s; Vehicle 2 may act after 0.5 s. Coasting, it closes 3 m in 1 s and hits with
 # w = 6 m/s: harm 36, of which masses 1 and 3 give Vehicle 1 three quarters (27) and Vehicle 2 the rest (9).
-CRASH = Scenario(
+CRASH = eb.Scenario(
     name="crash",
     vehicles=2,
     gaps_m=3,
@@ -57,7 +52,7 @@ CRASH = Scenario(
 )
 
 # Far apart and nearly at rest: Vehicle 2, from 5.7 m/s with 6 m/s2 after 0.5 s, rests at 1.45 s, in its 10th step.
-REST = Scenario(
+REST = eb.Scenario(
     name="rest",
     vehicles=2,
     gaps_m=50,
@@ -69,13 +64,13 @@ REST = Scenario(
 )
 SCENARIOS = {"paper-random": PAPER, "five": FIVE}
 LEVELS = {
-    entry.name: load_scenario(entry.name) for entry in list_scenarios() if entry.path.parent.name == "cooperation"
+    entry.name: eb.load_scenario(entry.name) for entry in eb.list_scenarios() if entry.path.parent.name == "cooperation"
 }
 
 
-def line(vehicles: int, v2x: str = "congested", horizon_s: int = 12) -> Scenario:
+def line(vehicles: int, v2x: str = "congested", horizon_s: int = 12) -> eb.Scenario:
     """All learn, an obstacle ahead, over a channel; each for itself and a little for the others."""
-    return Scenario(
+    return eb.Scenario(
         name=f"line-{vehicles}-{v2x}", vehicles=vehicles, gaps_m={"uniform": [5, 10]}, speeds_mps={"uniform": [18, 22]},
         braking_capacity_mps2={"uniform": [5, 9]}, driving_capacity_mps2=3, mass_t={"uniform": [1, 8]},
         latency_s=[0] + [0.3] * (vehicles - 1), horizon_s=horizon_s, v2x=v2x, objective="social:30",
@@ -119,16 +114,9 @@ def unchanged(env: Any) -> Any:
 
 
 class Interface:
-    """One learner in each of n worlds; ended episodes are followed by the next of the stream."""
+    """One learner in each of n worlds, ``reset`` and ``step`` of rows; ended episodes are followed by the next ones."""
 
-    env: Any
     n = 1
-
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Array:
-        raise NotImplementedError
-
-    def step(self, action: Array) -> Turn:
-        raise NotImplementedError
 
     def drawn(self) -> list[dict[str, Any]]:
         """What each running world was drawn as."""
@@ -143,7 +131,7 @@ class Interface:
 
 
 class Parallel(Interface):
-    def __init__(self, scenario: Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
+    def __init__(self, scenario: eb.Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
         self.env = wrap(EthBrakeParallelEnv(scenario, **settings))
         self.agent = self.env.possible_agents[self.env.unwrapped.engine.learners[0]]
         self.space = self.env.observation_space(self.agent)
@@ -158,7 +146,7 @@ class Parallel(Interface):
 class InTurn(Parallel):
     """PettingZoo's other interface: one agent after the other."""
 
-    def __init__(self, scenario: Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
+    def __init__(self, scenario: eb.Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
         super().__init__(scenario, n, wrap, **settings)
         self.env = in_turns(self.env)
 
@@ -176,7 +164,7 @@ class InTurn(Parallel):
 
 
 class Single(Interface):
-    def __init__(self, scenario: Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
+    def __init__(self, scenario: eb.Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
         self.env = wrap(EthBrakeEnv(scenario, **settings))
         self.space = self.env.observation_space
 
@@ -196,7 +184,7 @@ class Batch(Interface):
 
 
 class Vector(Batch):
-    def __init__(self, scenario: Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
+    def __init__(self, scenario: eb.Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
         self.env, self.n = wrap(EthBrakeVectorEnv(n, scenario, autoreset_mode="SameStep", **settings)), n
         self.space = self.env.single_observation_space
 
@@ -213,8 +201,8 @@ class Vector(Batch):
 
 
 class Sb3(Batch):
-    def __init__(self, scenario: Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
-        self.env, self.n = wrap(make_sb3_vec_env(scenario, n, seed=None, **settings)), n
+    def __init__(self, scenario: eb.Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
+        self.env, self.n = wrap(eb.make_sb3_vec_env(scenario, n, seed=None, **settings)), n
         self.space = self.env.observation_space
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Array:
@@ -241,13 +229,13 @@ BARE: dict[str, Callable[..., Interface]] = {
     "sb3": Sb3,
 }
 STEP: dict[str, Callable[..., Interface]] = {
-    "shielded parallel": partial(Parallel, wrap=partial(HybridShield, mode="step")),
-    "shielded in turn": partial(InTurn, wrap=partial(HybridShield, mode="step")),
-    "shielded single": partial(Single, wrap=ShieldedEnv),
-    "shielded vector": partial(Vector, wrap=ShieldedVectorEnv),
-    "shielded sb3": partial(Sb3, wrap=ShieldedVecEnv),
+    "shielded parallel": partial(Parallel, wrap=partial(eb.HybridShield, mode="step")),
+    "shielded in turn": partial(InTurn, wrap=partial(eb.HybridShield, mode="step")),
+    "shielded single": partial(Single, wrap=eb.ShieldedEnv),
+    "shielded vector": partial(Vector, wrap=eb.ShieldedVectorEnv),
+    "shielded sb3": partial(Sb3, wrap=eb.ShieldedVecEnv),
 }
-EPISODE = partial(HybridShield, policy=make_agent("full_brake"), mode="episode")  # what is proposed is not asked
+EPISODE = partial(eb.HybridShield, policy=eb.make_agent("full_brake"), mode="episode")  # what is proposed is not asked
 SHIELDED = {**STEP, "episode parallel": partial(Parallel, wrap=EPISODE)}
 INTERFACES = {**BARE, **SHIELDED}
 BATCHED = [name for name in INTERFACES if name.endswith(("vector", "sb3"))]
@@ -264,7 +252,7 @@ def actions(seed: int, steps: int, n: int) -> Array:
     return np.clip(drawn, -1.0, 1.0).astype(np.float32)
 
 
-def digest(name: str, scenario: Scenario, seed: int, steps: int = 160, n: int | None = None) -> str:
+def digest(name: str, scenario: eb.Scenario, seed: int, steps: int = 160, n: int | None = None) -> str:
     """Hash of everything that a fresh environment returns in ``steps`` steps: several whole episodes."""
     interface = INTERFACES[name](scenario, rows_of(name) if n is None else n)
     hash_ = hashlib.sha256(interface.reset(seed).tobytes())
@@ -282,7 +270,7 @@ def all_digests() -> dict[str, str]:
     }
 
 
-def initial_state(worlds: Worlds, row: int) -> dict[str, Any]:
+def initial_state(worlds: eb.Worlds, row: int) -> dict[str, Any]:
     """The option ``initial_state`` that describes one world at t = 0 completely."""
     vehicles = worlds.vehicles
     names = ("braking_capacity_mps2", "driving_capacity_mps2", "latency_s", "mass_t", "speed_limit_mps", "restitution")

@@ -16,11 +16,9 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.env_util import make_vec_env
 
-from ethbrake_marl.agents.registry import make_agent
+import ethbrake_marl as eb
 from ethbrake_marl.envs.drawing import HEIGHT, WIDTH, Viewer
 from ethbrake_marl.envs.interfaces import EthBrakeEnv, UnknownResetOption, env, parallel_env
-from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from ethbrake_marl.shield import HybridShield, ShieldedEnv, shielded_aec
 from tests.contract.interfaces import FIVE, LEVELS, PAPER, REST, SCENARIOS, line
 
 
@@ -36,21 +34,23 @@ def _every_warning_is_an_error(monkeypatch: pytest.MonkeyPatch) -> Iterator[None
 
 
 ANY_START = PAPER.replace(early_impacts="keep")
-LINES = [*LEVELS.values(), *(line(vehicles) for vehicles in (2, 6)), line(10, "nominal", 8)]
 SETTINGS: dict[str, dict[str, Any]] = {
-    **{scenario.name: {"scenario": scenario} for scenario in [*SCENARIOS.values(), *LINES]},
+    **{
+        scenario.name: {"scenario": scenario}
+        for scenario in [*SCENARIOS.values(), *LEVELS.values(), line(2), line(6), line(10, "nominal", 8)]
+    },
     "nobody learns": {"scenario": ANY_START, "learners": []},
     "two learn": {"scenario": ANY_START, "learners": ["vehicle_2", "vehicle_3"]},
     "learners alone": {"scenario": LEVELS["cooperation-3-pair"], "agents": "learners"},
     **{mode: {"scenario": REST, "render_mode": mode} for mode in Viewer.METADATA["render_modes"][1:]},
 }
-STEP, EPISODE = {}, {"mode": "episode", "policy": make_agent("full_brake")}
+STEP, EPISODE = {}, {"mode": "episode", "policy": eb.make_agent("full_brake")}
 MAKERS: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
     **{name: (partial(parallel_env, **given), partial(env, **given)) for name, given in SETTINGS.items()},
     **{
         f"shielded, {mode}": (
-            lambda given=given: HybridShield(parallel_env(), **given),
-            lambda given=given: shielded_aec(parallel_env(), **given),
+            lambda given=given: eb.HybridShield(parallel_env(), **given),
+            lambda given=given: eb.shielded_aec(parallel_env(), **given),
         )
         for mode, given in (("step", STEP), ("episode", EPISODE))
     },
@@ -77,8 +77,8 @@ def test_gymnasium_and_stable_baselines3__checkers_pass(scenario: Any) -> None:
 
 
 def test_gymnasium_and_stable_baselines3__checkers_pass_behind_the_shield() -> None:
-    check_env(ShieldedEnv(EthBrakeEnv()), skip_render_check=True)
-    sb3_check_env(ShieldedEnv(EthBrakeEnv()))
+    check_env(eb.ShieldedEnv(EthBrakeEnv()), skip_render_check=True)
+    sb3_check_env(eb.ShieldedEnv(EthBrakeEnv()))
 
 
 @pytest.mark.filterwarnings("ignore:.*:UserWarning")
@@ -90,7 +90,7 @@ def test_pettingzoo__render_test_passes() -> None:
 
 @pytest.mark.parametrize("learners", [["vehicle_2", "vehicle_3"]])
 def test_stable_baselines3__learns_on_the_vec_env(learners: list[str]) -> None:
-    vec_env = make_sb3_vec_env(FIVE, 4, learners=learners)
+    vec_env = eb.make_sb3_vec_env(FIVE, 4, learners=learners)
     model = PPO("MlpPolicy", vec_env, n_steps=32, batch_size=32, n_epochs=1, seed=3, device="cpu")
     model.learn(768)
     assert model.ep_info_buffer[0]["l"] > 0

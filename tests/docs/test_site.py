@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import re
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -16,7 +13,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.learning.training import TrainingRecipe, load_recipe
 from ethbrake_marl.policies import shipped_policies
-from ethbrake_marl.scenario import list_scenarios, new_scenario_text, scenario_json_schema
+from ethbrake_marl.scenario import list_scenarios, new_scenario_text
 from tests.docs.site import DOCS, load
 
 ROOT = DOCS.parent
@@ -163,27 +160,23 @@ def test_version__is_the_same_wherever_it_stands() -> None:
 
 
 @pytest.mark.parametrize(
-    ("file", "schema", "text"),
+    ("command", "file"),
     [
-        ("scenarios/scenario.schema.json", scenario_json_schema, new_scenario_text),
-        ("train/recipe.schema.json", TrainingRecipe.json_schema, lambda name: load_recipe("ppo").new_text(name)),
+        ("scenario schema", "scenarios/scenario"),
+        ("recipe schema", "train/recipe"),
+        ("study sweep --schema", "docs/sweep"),
+        ("study tune --schema", "docs/tuning"),
     ],
 )
-def test_schema__that_ships_is_the_one_that_the_command_prints(
-    file: str, schema: Callable[[], dict[str, Any]], text: Callable[[str], str]
-) -> None:
-    assert (ROOT / file).read_text("utf-8") == json.dumps(schema(), indent=2) + "\n"
-    assert f"# yaml-language-server: $schema={Path(file).name}\n" in text("mine")
-
-
-@pytest.mark.parametrize(("command", "file"), [("sweep", "sweep"), ("tune", "tuning")])
-def test_schema__of_sweeps_and_tunings_is_printed_by_the_command_and_named_by_the_examples(
+def test_schema__that_ships_is_printed_by_the_command_and_named_by_templates_and_examples(
     command: str, file: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run_command(["study", command, "--schema"]) == 0
-    assert (ROOT / "docs" / f"{file}.schema.json").read_text("utf-8") == capsys.readouterr().out
-    for example in (ROOT / "docs").glob(f"{file}-*.yaml"):
-        assert example.read_text("utf-8").startswith(f"# yaml-language-server: $schema={file}.schema.json\n")
+    assert run_command(command.split()) == 0
+    assert (ROOT / f"{file}.schema.json").read_text("utf-8") == capsys.readouterr().out
+    texts = {"scenarios": [new_scenario_text("mine")], "train": [load_recipe("ppo").new_text("mine")]}
+    texts["docs"] = [each.read_text("utf-8") for each in ROOT.glob(f"{file}-*.yaml")]
+    named = f"# yaml-language-server: $schema={Path(file).name}.schema.json\n"
+    assert [text for text in texts[Path(file).parent.name] if named not in text] == []
 
 
 def test_schemas__are_no_scenario_and_no_recipe() -> None:

@@ -54,8 +54,7 @@ def test_price__is_nothing_where_everything_is_known():
 
 
 def test_price__is_paired_by_world_and_told_of_both_counts():
-    channel = {"sensors-only": {"preset": "sensors-only"}}
-    found = price.drive(BASE, 30, channel)
+    found = price.drive(BASE, 30, {"sensors-only": {"preset": "sensors-only"}})
     over = BASE.replace(v2x="sensors-only")
     harm = {
         spec: drive(over.sample(30, 7).worlds, make_agent(spec, scenario=over), over, 1).ledger

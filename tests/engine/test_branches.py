@@ -97,52 +97,57 @@ def test_branch__row_that_cannot_be_advanced_tells_nothing() -> None:
     assert np.isnan(gained).tolist() == [False, True, False]
 
 
-@pytest.mark.parametrize("script", ["planner:8", "e_v2x_bm", "ppo@shipped"])
-def test_branch__of_a_script_that_remembers_is_what_the_engine_does(script: str) -> None:
+SCRIPTS = ("planner:8", "e_v2x_bm", "ppo@shipped")
+
+
+def scripted(script: str) -> tuple[Engine, Any]:
+    """An engine whose Vehicle 3 follows this script, and what is done in each step."""
     roles = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": script}
     latency = [0.1, 0.4, {"uniform": [0.2, 0.7]}]
     scenario = eb.load_scenario("paper-random").replace(early_impacts="keep", roles=roles, latency_s=latency)
-    engine = make_engine(scenario, 3, seed=3)
+    return make_engine(scenario, 3, seed=3), np.full((3, 1), -0.5)
+
+
+def shielded(options: dict[str, Any]) -> tuple[Engine, Any]:
+    """One with a shield around a policy that brakes harder with every step: its memory alone tells it how hard."""
+    policy = eb.policy_agent(
+        lambda seen, state: (-np.minimum(state, 10.0) / 10.0, state + 1.0), initial_state=lambda n: np.zeros((n, 1))
+    )
+    env = eb.shield(eb.make_sb3_vec_env("paper-random", 5, seed=2), policy, **options)
+    env.reset()
+    return env.unwrapped.engine, {}
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_first_moments__are_where_the_episodes_begin(script: str) -> None:
+    engine, _ = scripted(script)
     _, start = engine.first_moments(3)
     assert all(np.array_equal(a, b) for a, b in zip(start[:4], engine.moment()[:4], strict=True))
-    for _ in range(4):
-        engine.step(np.full((3, 1), -0.4))
-    rows = np.array([2, 0, 2])
-    new = engine.branch(engine.moment().take(rows))
-    for each in (engine, new):
-        while not each.ended.all():
-            each.step(np.full((3, 1), -0.6))
-    assert new.ledger.total_harm.tolist() == engine.ledger.total_harm[rows].tolist()
-    assert new.worlds.gaps_m.tolist() == engine.worlds.gaps_m[rows].tolist()
-
-
-def ramp(seen: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Brakes harder with every step: what it does depends on its memory alone."""
-    return -np.minimum(state, 10.0) / 10.0, state + 1.0
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"believed": True}, {"mode": "episode"}, {"mode": "robust", "uncertainty": "gaps_m=0.5"}], ids=str
+    ("make", "given"),
+    [
+        *((scripted, script) for script in SCRIPTS),
+        *((shielded, options) for options in ({}, {"believed": True}, {"mode": "episode"})),
+        (shielded, {"mode": "robust", "uncertainty": "gaps_m=0.5"}),
+    ],
+    ids=lambda each: getattr(each, "__name__", str(each)),
 )
-def test_branch__under_a_shield_around_a_policy_with_a_memory_is_what_the_engine_does(options: dict[str, Any]) -> None:
-    policy = eb.policy_agent(ramp, initial_state=lambda n: np.zeros((n, 1)), name="ramp")
-    env = eb.shield(eb.make_sb3_vec_env("paper-random", 5, seed=2), policy, **options)
-    env.reset()
-    engine = env.unwrapped.engine
+def test_branch__of_what_remembers_is_what_the_engine_does(make: Any, given: Any) -> None:
+    engine, actions = make(given)
     for _ in range(4):
-        engine.step({})
-    rows = np.array([4, 0, 0, 3])
-    kept = engine.moment()
-    harms = []
+        engine.step(actions)
+    rows, kept, found = np.array([2, 0, 2]), engine.moment(), []
     for again in range(2):  # before the engine goes on, and after it
         new = engine.branch(kept.take(rows))
         while not new.ended.all():
-            new.step({})
-        harms.append(new.ledger.total_harm.tolist())
+            new.step(actions)
+        found.append((new.ledger.total_harm.tolist(), new.worlds.gaps_m.tolist()))
         while again == 0 and not engine.ended.all():
-            engine.step({})
-    assert harms == [engine.ledger.total_harm[rows].tolist()] * 2
-    assert engine.ledger.total_harm.any()
+            engine.step(actions)
+    harm = engine.ledger.total_harm
+    assert harm.any() and found == [(harm[rows].tolist(), engine.worlds.gaps_m[rows].tolist())] * 2
 
 
 def test_branch__ends_where_nothing_can_change_any_more(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,21 +8,16 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.engine import Engine, Stream
 from ethbrake_marl.envs.interfaces import make_engine
-from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics import Worlds, advance
-from ethbrake_marl.rewards import RewardParams
-from ethbrake_marl.scenario import Scenario, load_scenario
 
-PAPER = load_scenario("paper-random").replace(early_impacts="keep")
+PAPER = eb.load_scenario("paper-random").replace(early_impacts="keep")
 
 
 def engine(n: int = 2, third: Any = None, first: Any = None) -> Engine:
-    scripts = {0: first or make_agent("full_brake"), 2: third or make_agent("constant:5")}
+    scripts = {0: first or eb.make_agent("full_brake"), 2: third or eb.make_agent("constant:5")}
     return Engine(PAPER, n, learners=(1,), scripts=scripts, seed=0)
 
 
@@ -80,9 +75,9 @@ def test_start__that_fails_leaves_the_running_episodes_and_the_stream_alone(star
 
 
 def test_stream__gives_every_world_of_its_list_once_and_in_order_across_its_blocks() -> None:
-    scripts = {0: make_agent("full_brake"), 2: make_agent("constant:5")}
+    scripts = {0: eb.make_agent("full_brake"), 2: eb.make_agent("constant:5")}
     stream = Stream(PAPER, [1], scripts, seed=4)
-    taken = Worlds.concatenate([stream.take(count).alert for count in (1000, 100, 3000, 50)])
+    taken = eb.Worlds.concatenate([stream.take(count).alert for count in (1000, 100, 3000, 50)])
     expected = PAPER.sample(4150, 4, channel="training").worlds
     assert (taken.gaps_m == expected.gaps_m).all() and (taken.speeds_mps == expected.speeds_mps).all()
 
@@ -92,7 +87,7 @@ def test_stream__gives_every_world_of_its_list_once_and_in_order_across_its_bloc
 )
 def test_horizon__is_reached_after_as_many_steps_as_fit(horizon_s: float, latency_s: float, steps: int) -> None:
     scenario = PAPER.replace(horizon_s=horizon_s, latency_s=[0, latency_s, latency_s], gaps_m=100, speeds_mps=30)
-    running = Engine(scenario, 1, learners=(1,), scripts={0: make_agent("coast"), 2: make_agent("coast")})
+    running = Engine(scenario, 1, learners=(1,), scripts={0: eb.make_agent("coast"), 2: eb.make_agent("coast")})
     ended = [bool(running.step(np.zeros((1, 1))).truncated[0]) for _ in range(steps)]
     assert ended == [False] * (steps - 1) + [True] and running.worlds.time_s.tolist() == [horizon_s]
 
@@ -139,7 +134,7 @@ def decisions_before(end_s: float) -> int:
 @pytest.mark.parametrize("learners", [(1,), (2,), (1, 2), ()])
 def test_script__decides_on_its_own_grid_whoever_learns(learners: tuple[int, ...]) -> None:
     worlds = OWN_GRID.sample(5, 3).worlds
-    others = {i: make_agent("full_brake") for i in (1, 2) if i not in learners}
+    others = {i: eb.make_agent("full_brake") for i in (1, 2) if i not in learners}
     running = Engine(OWN_GRID, 5, learners=learners, scripts={0: Counting(), **others}, worlds=worlds)
     paid = 0.0
     while not running.ended.all():
@@ -150,7 +145,7 @@ def test_script__decides_on_its_own_grid_whoever_learns(learners: tuple[int, ...
         made = decisions_before(end_s)
         assert running.memories[0]["made"][row] == made
         assert running.memories[0]["asked_s"][row, :made] == pytest.approx(0.03 + 0.1 * np.arange(made), abs=1e-9)
-    scripts = {0: Counting(), 1: make_agent("full_brake"), 2: make_agent("full_brake")}
+    scripts = {0: Counting(), 1: eb.make_agent("full_brake"), 2: eb.make_agent("full_brake")}
     alone = Engine(OWN_GRID, 5, learners=(), scripts=scripts, deciders=(0,), worlds=worlds)
     while not alone.ended.all():
         alone.step({})
@@ -158,7 +153,7 @@ def test_script__decides_on_its_own_grid_whoever_learns(learners: tuple[int, ...
 
 
 def test_script__of_which_a_row_is_renewed_remembers_the_others_as_they_were() -> None:
-    running = Engine(OWN_GRID, 4, learners=(1,), scripts={0: Counting(), 2: make_agent("full_brake")}, seed=1)
+    running = Engine(OWN_GRID, 4, learners=(1,), scripts={0: Counting(), 2: eb.make_agent("full_brake")}, seed=1)
     for _ in range(4):
         running.step(np.zeros((4, 1)))
     made, wanted, packed = running.memories[0]["made"], running.wanted_mps2.copy(), running.packed.state.copy()
@@ -172,8 +167,8 @@ def test_script__of_which_a_row_is_renewed_remembers_the_others_as_they_were() -
 
 def test_script__that_never_changes_its_mind_changes_no_bit() -> None:
     runs = []
-    for third in (Counting(adds=0.0), make_agent("constant:5")):
-        running = Engine(OWN_GRID, 20, learners=(1,), scripts={0: make_agent("full_brake"), 2: third}, seed=5)
+    for third in (Counting(adds=0.0), eb.make_agent("constant:5")):
+        running = Engine(OWN_GRID, 20, learners=(1,), scripts={0: eb.make_agent("full_brake"), 2: third}, seed=5)
         rng = np.random.default_rng(0)
         runs.append([running.step(rng.uniform(-1.0, 1.0, (20, 1))).reward for _ in range(20)])
         runs[-1] += [running.worlds.gaps_m, running.worlds.speeds_mps, running.ledger.total_harm]
@@ -182,8 +177,8 @@ def test_script__that_never_changes_its_mind_changes_no_bit() -> None:
 
 def test_jerk__of_a_learner_is_counted_over_the_step_though_a_script_decides_within_it() -> None:
     runs = []
-    for first in (Counting(), make_agent("full_brake")):
-        scripts = {0: first, 2: make_agent("full_brake")}
+    for first in (Counting(), eb.make_agent("full_brake")):
+        scripts = {0: first, 2: eb.make_agent("full_brake")}
         running = Engine(OWN_GRID, 3, learners=(1,), scripts=scripts, reward={"harm": 0.0, "jerk": 1.0}, seed=5)
         runs.append([running.step(np.full((3, 1), action)).further["jerk"][:, 1] for action in (-1.0, 0.5, -0.3, 1.0)])
     assert np.array_equal(*runs) and np.any(runs[0])
@@ -191,7 +186,7 @@ def test_jerk__of_a_learner_is_counted_over_the_step_though_a_script_decides_wit
 
 # ---------------------------------------------------------------- an obstacle ahead of Vehicle 1
 
-ALL = load_scenario("cooperation-4-all")
+ALL = eb.load_scenario("cooperation-4-all")
 NEAR = ALL.replace(obstacle_gap_m={"uniform": [10, 45]})  # within the way of full braking in many worlds
 
 
@@ -203,7 +198,7 @@ def test_engine__steps_as_advance_does_and_its_ledger_counts_the_obstacle() -> N
         going_on = ~running.ended
         step = running.step(rng.uniform(-1.0, -0.8, (60, 3)))
         until = np.where(going_on, running.worlds.time_s, worlds.time_s)
-        worlds, impacts = advance(worlds, running.wanted_mps2, until_s=until)
+        worlds, impacts = eb.advance(worlds, running.wanted_mps2, until_s=until)
         ledger, rewards = ledger.add(impacts), rewards + step.reward[:, 0]
     assert np.array_equal(running.worlds.obstacle_gap_m, worlds.obstacle_gap_m)
     assert np.array_equal(running.worlds.obstacle_hit, worlds.obstacle_hit)
@@ -231,8 +226,8 @@ def test_infos__tell_the_same_shares_as_the_ledger() -> None:
 
 
 def test_engine__worlds_that_are_given_may_have_an_obstacle_or_none_whatever_the_scenario_says() -> None:
-    plain = load_scenario("cooperation-3-pair")
-    given = Worlds.concatenate([NEAR.sample(2, 1).worlds, plain.sample(2, 1).worlds])
+    plain = eb.load_scenario("cooperation-3-pair")
+    given = eb.Worlds.concatenate([NEAR.sample(2, 1).worlds, plain.sample(2, 1).worlds])
     for scenario in (plain, ALL.with_learners([1, 2])):
         running = make_engine(scenario, 4, seed=1)
         running.reset(worlds=given)
@@ -246,9 +241,8 @@ def test_engine__worlds_that_are_given_may_have_an_obstacle_or_none_whatever_the
 
 # ---------------------------------------------------------------- snapshots
 
-SCENARIO = load_scenario("paper-random")
-PERIODIC = {"preset": "congested", "persistence": "periodic"}
-SHAPED = RewardParams(harm=0.05, shaping=0.1, shaping_discount=0.99, terminal=0.5)
+SCENARIO = eb.load_scenario("paper-random")
+SHAPED = eb.RewardParams(harm=0.05, shaping=0.1, shaping_discount=0.99, terminal=0.5)
 
 
 def steps_of(running: Engine, rng: np.random.Generator, steps: int) -> list[np.ndarray]:
@@ -262,7 +256,7 @@ def steps_of(running: Engine, rng: np.random.Generator, steps: int) -> list[np.n
     return seen
 
 
-def with_script(script: str) -> Scenario:
+def with_script(script: str) -> eb.Scenario:
     roles = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": script}
     return SCENARIO.replace(roles=roles, early_impacts="keep")
 
@@ -273,16 +267,21 @@ def with_script(script: str) -> Scenario:
         (SCENARIO, SHAPED),
         (SCENARIO, "paper"),
         (SCENARIO.with_learners(["vehicle_2", "vehicle_3"]), SHAPED),
-        (load_scenario("cooperation-4-congested"), SHAPED),
-        (load_scenario("stress-wide"), "total-harm"),
-        (load_scenario("cooperation-2-paper").replace(early_impacts="keep", v2x=PERIODIC), "harm"),
+        (eb.load_scenario("cooperation-4-congested"), SHAPED),
+        (eb.load_scenario("stress-wide"), "total-harm"),
+        (
+            eb.load_scenario("cooperation-2-paper").replace(
+                early_impacts="keep", v2x={"preset": "congested", "persistence": "periodic"}
+            ),
+            "harm",
+        ),
         (with_script("gentlest_front"), "harm"),
         (with_script("e_v2x_bm:pairwise"), "harm"),
         (with_script("planner:20"), "harm"),
     ],
 )
 @pytest.mark.parametrize("before", [0, 45])
-def test_restore__the_next_steps_are_the_same_to_the_bit(scenario: Scenario, reward: Any, before: int) -> None:
+def test_restore__the_next_steps_are_the_same_to_the_bit(scenario: eb.Scenario, reward: Any, before: int) -> None:
     first = make_engine(scenario, 6, reward=reward, seed=3)
     rng = np.random.default_rng(0)
     steps_of(first, rng, before)
@@ -304,7 +303,7 @@ def test_restore__the_next_steps_are_the_same_to_the_bit(scenario: Scenario, rew
 
 
 def test_restore__of_a_vec_env_returns_and_lengths_of_running_episodes_go_on() -> None:
-    first, second = (make_sb3_vec_env(SCENARIO, 6, seed=seed) for seed in (3, 8))
+    first, second = (eb.make_sb3_vec_env(SCENARIO, 6, seed=seed) for seed in (3, 8))
     first.reset()
     actions = np.random.default_rng(1).uniform(-1.0, 1.0, (120, 6, 1)).astype(np.float32)
     for action in actions[:30]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import re
 import shlex
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,8 @@ from PIL import Image, ImageSequence
 
 from ethbrake_marl.agents.registry import Team, drive, make_agent
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.errors import InvalidInput, MissingExtra
-from ethbrake_marl.evaluation import Evaluation, episodes, record_episode
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation import Evaluation, record_episode
 from ethbrake_marl.evaluation.episodes import (
     MOST_CHARACTERS,
     EpisodeMotion,
@@ -272,12 +271,6 @@ def test_film__as_mp4_plays_in_real_time(tmp_path: Path) -> None:
     path.write_bytes(film_bytes({"a": COASTING}, ".mp4"))
     frames, seconds = library.count_frames_and_secs(str(path))
     assert frames == len(COASTING) and seconds == pytest.approx(len(COASTING) / 25, abs=0.02)
-
-
-def test_film__as_mp4_without_its_library_says_what_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(MissingExtra, match=r"pip install 'ethbrake-marl\[render\]'"):
-        episodes.check_film(".mp4")
 
 
 def test_film__as_svg_moves_every_vehicle_as_its_scenes_say() -> None:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.evaluation.measures import Tally, measures
@@ -67,42 +66,29 @@ def test_tally__is_the_same_bits_in_any_shards_and_blocks(asked, tally: Tally, s
 @pytest.mark.slow
 def test_tally__is_the_same_bits_from_two_processes(paper_random: Scenario) -> None:
     asked = Question(paper_random, ("full_brake", "e_v2x_bm"), 3_000, 5).ask()
-    alone = evaluate_shards(asked, shards=1)
-    assert evaluate_shards(asked, shards=3, jobs=2) == alone
+    assert evaluate_shards(asked, shards=3, jobs=2) == evaluate_shards(asked, shards=1)
 
 
-def test_rows__are_those_of_evaluate_on_the_same_worlds(asked, tally: Tally, paper_random: Scenario) -> None:
-    sample = paper_random.sample(N, 11)
-    evaluation = evaluate(sample, make_lineup(AGENTS, paper_random), scenario=paper_random, seed=11, chunk=777)
-    sharded, whole = asked.summarise(tally), summarise(evaluation)
-    for one, other in zip(sharded, whole, strict=True):
-        assert one.collision_rate.value == other.collision_rate.value
-        assert one.collision_rate.interval == pytest.approx(other.collision_rate.interval, abs=4e-4)
+@pytest.mark.parametrize(("n", "seed", "known"), [(N, 11, False), (1_100, 7, True)])  # whether a table holds them
+def test_rows__are_those_of_evaluate_on_the_same_worlds(paper_random: Scenario, n: int, seed: int, known: bool) -> None:
+    asked = Question(paper_random, AGENTS, n, seed, objectives=("own",)).ask()
+    tally, lineup = evaluate_shards(asked, shards=2), make_lineup(AGENTS, paper_random)
+    evaluation = evaluate(paper_random.sample(n, seed), lineup, scenario=paper_random, seed=seed, chunk=777)
+    for one, other in zip(asked.summarise(tally), summarise(evaluation), strict=True):
+        assert one.collision_rate.interval == pytest.approx(other.collision_rate.interval, abs=1.32 / n)
         for measure in measures(()):
-            if not (measure.limits or measure.name.endswith("_rate")):
-                assert one[measure.name] == other[measure.name], measure.name  # to the last bit: both are exact sums
+            told, expected = one[measure.name], other[measure.name]
+            if measure.limits and not known:
+                assert told is None, measure.name
+            elif measure.name.endswith("_rate"):
+                assert told.value == expected.value, measure.name
+            else:
+                assert told == expected, measure.name  # to the last bit: both are exact sums
         names = ("collisions", "horizon_ends", "knows", "hidden_share", "episodes", "policy_share", "beside_paper",
-                 "scenario_sha256")  # fmt: skip
-        for name in names:
-            assert getattr(one, name) == getattr(other, name), name
-        assert one.parameters == other.parameters
-        assert one["mean_regret_first"] is None  # no table holds the worlds of seed 11
+                 "scenario_sha256", "parameters")  # fmt: skip
+        assert [getattr(one, name) for name in names] == [getattr(other, name) for name in names]
+        assert not known or one.below_best_known == other.below_best_known
     assert tally.rescore(["own"], 3) == evaluation.rescore(["own"])
-
-
-def test_regret__where_a_table_holds_every_world(paper_random: Scenario) -> None:
-    question = Question(paper_random, ("full_brake", "e_v2x_bm:pairwise"), 1_100, 7)
-    asked = question.ask()
-    found = asked.summarise(evaluate_shards(asked, shards=2))
-    sample = paper_random.sample(1_100, 7)
-    lineup = make_lineup(question.agents, paper_random)
-    whole = summarise(evaluate(sample, lineup, scenario=paper_random, seed=7))
-    for one, other in zip(found, whole, strict=True):
-        for measure in measures(()):
-            if measure.limits and not measure.name.endswith("_rate"):
-                assert one[measure.name] == other[measure.name] != None, measure.name  # noqa: E711
-        assert one["unavoidable_rate"].value == other["unavoidable_rate"].value
-        assert one.below_best_known == other.below_best_known
 
 
 @pytest.fixture
@@ -134,20 +120,6 @@ def test_a_list_of_which_every_world_fails__is_refused(failing, paper_random: Sc
 
 def test_tally__comes_back_from_json_as_it_was(tally: Tally) -> None:
     assert Tally.from_json(json.loads(json.dumps(tally.to_json()))) == tally
-    whole = tally.to_json()
-    agent = {"counts": {}, "moments": {"total_harm": [N, "0x1", "0x0"]}, "products": {}}
-    short = {**agent, "moments": {"first_impact_harm": [3, "0x0", "0x0"], "total_harm": [N, "0x0", "0x0"]}}
-    wrong = [{"worlds": -1}, {"agents": {"x": {}}}, {"agents": {"x": agent}}, {"agents": {"x": short}}]
-    wrong += [{"left_out": [[0, 7, 3, None]]}, {"ranges": {"gaps_m": [1]}}, {"worlds": 10**30}]
-    for bad in ({}, [], None, *({**whole, **change} for change in wrong)):
-        with pytest.raises(InvalidInput, match="no tally"):
-            Tally.from_json(bad)
-
-
-def test_worlds_hash__tells_another_list(paper_random: Scenario, tally: Tally) -> None:
-    for scenario, seed in ((paper_random, 12), (load_scenario("paper-random-early"), 11)):
-        other = Question(scenario, ("full_brake",), N, seed).ask()
-        assert evaluate_shards(other, shards=1).worlds_hash != tally.worlds_hash
 
 
 def test_shard_bounds__are_whole_leaves(paper_random: Scenario) -> None:
@@ -155,12 +127,6 @@ def test_shard_bounds__are_whole_leaves(paper_random: Scenario) -> None:
         bounds = Question(paper_random, AGENTS, episodes, 7).bounds(shards)
         assert bounds[0][0] == 0 and bounds[-1] == (bounds[-1][0] if last is None else last, episodes)
         assert all(one[1] == other[0] and one[1] % 1_000 == 0 for one, other in pairwise(bounds))
-
-
-def test_a_shard__refuses_another_version_than_it_was_asked_about(asked) -> None:
-    other = replace(asked, identity={**asked.identity, "versions": {"numba": "0"}})
-    with pytest.raises(InvalidInput, match="versions changed"):
-        other.answer(0, 1_000)
 
 
 @pytest.mark.long

@@ -147,12 +147,6 @@ def test_estimate__at_the_size_of_our_lists_has_the_bootstrap_interval(found, da
     assert (low, high) == pytest.approx(tuple(boot.confidence_interval), abs=0.06 * (high - low))
 
 
-def test_estimate__does_not_depend_on_the_order_of_the_worlds() -> None:
-    other = HARM[::-1].copy()
-    assert mean(HARM) == mean(other)
-    assert paired_difference(HARM, other) == paired_difference(other[::-1].copy(), HARM[::-1].copy())
-
-
 def test_json__of_an_estimate_has_its_interval_as_a_list_and_null_for_what_does_not_exist() -> None:
     assert Estimate(2.0, (1.0, 3.0)).to_json() == {"value": 2.0, "interval": [1.0, 3.0]}
     told = Estimate.side_by_side({"harm": Estimate(2.0, (1.0, 3.0)), "alone": Estimate(4.0, None), "absent": None})

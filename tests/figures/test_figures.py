@@ -10,7 +10,7 @@ import pytest
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
-from ethbrake_marl.agents.registry import make_agent
+import ethbrake_marl as eb
 from ethbrake_marl.evaluation import EpisodeRecord, Evaluation, curves as module, evaluate, record_episode, summarise
 from ethbrake_marl.evaluation.curves import avoidability_boundary, criticality_map, deceleration_curve, regimes_of
 from ethbrake_marl.evaluation.statistics import mean
@@ -35,11 +35,10 @@ from ethbrake_marl.figures import (
     worlds_figure,
 )
 from ethbrake_marl.limits.limits import Limits, Proof, known_limits
-from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from tests.physics.random_worlds import line
 
-BRAKE = {"full_brake": make_agent("full_brake")}
+BRAKE = {"full_brake": eb.make_agent("full_brake")}
 DISTANCE = load_scenario("paper-distance")
 POINTS = [
     {"steps": 0.0, "first_impact_harm": 30.0, "total_harm": 33.0, "collision_rate": 1.0},
@@ -56,7 +55,7 @@ def legend(figure: Figure) -> list[str]:
     return [text.get_text() for each in figure.legends for text in each.get_texts()]
 
 
-def world(gap_1: float, gap_2: float) -> Worlds:
+def world(gap_1: float, gap_2: float) -> eb.Worlds:
     """A world of paper-distance."""
     columns = {"gap_1_m": [gap_1], "gap_2_m": [gap_2], "speed_1_mps": [20.0], "speed_2_mps": [18.0]}
     return DISTANCE.worlds_from_table({**columns, "speed_3_mps": [20.0]})
@@ -120,10 +119,10 @@ def test_label__of_anybody_can_be_drawn(text: str) -> None:
     assert figure._repr_png_().startswith(b"\x89PNG\r\n\x1a\n")
 
 
-def test_series_style__neighbours_differ_in_more_than_colour() -> None:
-    for k in range(len(COLOURS) - 1):
-        one, other = series_style(k), series_style(k + 1)
-        assert all(one[name] != other[name] for name in ("color", "marker", "linestyle"))
+@pytest.mark.parametrize("k", range(len(COLOURS) - 1))
+def test_series_style__neighbours_differ_in_more_than_colour(k: int) -> None:
+    one, other = series_style(k), series_style(k + 1)
+    assert all(one[name] != other[name] for name in ("color", "marker", "linestyle"))
 
 
 # ---------------------------------------------------------------- of a scenario
@@ -338,7 +337,7 @@ def test_curve__its_values_are_the_closed_form_and_the_simulation() -> None:
     at = curve.deceleration_mps2
     assert (curve.predicted.min(), at[np.argmin(curve.predicted)]) == pytest.approx((4.03447, 5.17021), abs=1e-5)
     for k in (3, 9):
-        agent = {"x": make_agent(f"constant:{float(at[k])!r}")}
+        agent = {"x": eb.make_agent(f"constant:{float(at[k])!r}")}
         driven = evaluate(world(7.0, 7.0), agent, scenario=DISTANCE).outcome("x")
         assert curve.first_impact_harm[k] == pytest.approx(driven.first_impact_harm[0], rel=1e-9)
         assert curve.total_harm[k] == pytest.approx(driven.total_harm[0], rel=1e-9)

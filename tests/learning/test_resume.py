@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import json
 import random
@@ -12,17 +11,17 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import safetensors.numpy
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, Progress
-from ethbrake_marl.learning import Training, TrainResult, resume, runs, train
+from ethbrake_marl.learning import RunDirectory, Training, TrainResult, resume, runs, train
 from ethbrake_marl.policies import Trained
 from tests.learning.tiny import (
     MODES,
@@ -34,9 +33,10 @@ from tests.learning.tiny import (
     Answer,
     ctrl_c_in,
     files_of,
+    scalars,
     watch_steps,
 )
-from tests.programmes.folders import CHANGES, listed_anew, newest
+from tests.programmes.files import CHANGES, listed_anew, newest
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
@@ -81,13 +81,9 @@ CLOCKS = ("time/fps", "time/time_elapsed")
 
 def told_by(run: Path) -> tuple[list[dict[str, str]], dict[str, list[tuple[int, float]]]]:
     """The progress table and the events, without their clocks."""
-    rows = csv.DictReader((run / "progress.csv").read_text().splitlines())
-    events = EventAccumulator(str(run / "tensorboard"), size_guidance={"scalars": 0})
-    events.Reload()
-    tags = set(events.Tags()["scalars"]) - set(CLOCKS)
     return (
-        [{name: value for name, value in row.items() if name not in CLOCKS} for row in rows],
-        {tag: [(e.step, e.value) for e in events.Scalars(tag)] for tag in tags},
+        [{name: value for name, value in row.items() if name not in CLOCKS} for row in RunDirectory(run).rows()],
+        {tag: told for tag, told in scalars(run / "tensorboard").items() if tag not in CLOCKS},
     )
 
 
@@ -233,21 +229,18 @@ def test_resume__after_kill_9_the_weights_are_the_same(name: str, whole: Whole, 
 @pytest.mark.parametrize(
     ("file", "damage"),
     [
-        ("checkpoint.json", lambda data: data[: len(data) // 2]),
-        ("checkpoint.json", None),
-        ("state.json", lambda data: data[: len(data) // 2] + b"\x07" + data[len(data) // 2 + 1 :]),
-        ("arrays.safetensors", lambda data: data[: len(data) // 2]),
-        pytest.param("policy/weights.safetensors", None, marks=pytest.mark.slow),
+        ("checkpoint.json", lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])),
+        ("checkpoint.json", Path.unlink),
+        ("state.json", lambda path: path.write_bytes(path.read_bytes()[:200] + b"\x07" + path.read_bytes()[201:])),
+        ("arrays.safetensors", lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])),
+        pytest.param("policy/weights.safetensors", Path.unlink, marks=pytest.mark.slow),
     ],
 )
 def test_resume__a_damaged_checkpoint_is_found_and_the_one_before_is_used(
-    file: str, damage: Callable[[bytes], bytes] | None, whole: Whole, run: Path
+    file: str, damage: Callable[[Path], object], whole: Whole, run: Path
 ) -> None:
-    path, notes = newest(run) / file, []
-    if damage is None:
-        path.unlink()
-    else:
-        path.write_bytes(damage(path.read_bytes()))
+    notes: list[str] = []
+    damage(newest(run) / file)
     told = f"a damaged checkpoint was left aside: {newest(run)}"
     resume(run, measure=measure, on_progress=lambda p: notes.append(p.note) if p.note else None)
     assert len(notes) == 1 and notes[0].startswith(told)
@@ -263,13 +256,9 @@ def test_resume__without_any_checkpoint_it_starts_again(whole: Whole, run: Path)
     assert not (run / ".ethbrake-left.partial").exists()
 
 
-def test_resume__of_a_finished_training_or_with_other_versions_is_refused(
-    whole: Whole, run: Path, monkeypatch: pytest.MonkeyPatch
+def test_resume__with_other_versions_is_refused_unless_it_is_asked_for(
+    run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(InvalidInput, match="this training has finished; measure what it has learned with"):
-        resume(whole("ppo")[0])
-    with pytest.raises(InvalidInput, match=r"has finished; .* --scenario cooperation-3-pair --agents team@.*/turns$"):
-        resume(whole("turns")[0])
     monkeypatch.setattr(runs, "installed_versions", lambda: {"torch": "99.0"})
     with pytest.raises(InvalidInput, match=r"was trained with ethbrake-marl .*: the numbers would differ"):
         resume(run)
@@ -277,21 +266,27 @@ def test_resume__of_a_finished_training_or_with_other_versions_is_refused(
     assert resume(run, other_versions=True).status == "finished"
 
 
+WORDS = {"title": "Words change no training"}
+
+
 @pytest.mark.parametrize(
-    ("part", "change"), [("recipe", {"gamma": 0.9}), ("recipe", {"seed": 5}), ("scenario", {"horizon_s": 9.0})]
+    ("changes", "same"),
+    [
+        ({"recipe": {"gamma": 0.9}}, False),
+        ({"recipe": {"seed": 5}}, False),
+        ({"scenario": {"horizon_s": 9.0}}, False),
+        ({"recipe": WORDS, "scenario": WORDS}, True),
+    ],
 )
-def test_resume__an_edited_configuration_is_another_training(part: str, change: dict[str, Any], run: Path) -> None:
+def test_resume__an_edited_configuration_is_another_training(
+    changes: dict[str, dict[str, Any]], same: bool, run: Path
+) -> None:
     config = json.loads((run / "config.json").read_text())
-    (run / "config.json").write_text(json.dumps({**config, part: config[part] | change}))
-    with pytest.raises(InvalidInput, match=r"config.json: was changed after the checkpoint step_\d+ of this training"):
-        resume(run, measure=measure)
-
-
-def test_resume__an_edited_title_is_no_other_training(run: Path) -> None:
-    config = json.loads((run / "config.json").read_text())
-    words = {part: config[part] | {"title": "Words change no training"} for part in ("recipe", "scenario")}
-    (run / "config.json").write_text(json.dumps(config | words))
-    assert resume(run, measure=measure).status == "finished"
+    edited = {part: config[part] | change for part, change in changes.items()}
+    (run / "config.json").write_text(json.dumps(config | edited))
+    told = r"config.json: was changed after the checkpoint step_\d+ of this training"
+    with nullcontext() if same else pytest.raises(InvalidInput, match=told):
+        assert resume(run, measure=measure).status == "finished"
 
 
 def test_resume__one_process_at_a_time(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:

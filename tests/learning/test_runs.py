@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import random
@@ -17,7 +16,6 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
 import ethbrake_marl as eb
@@ -25,7 +23,7 @@ from ethbrake_marl.errors import AlreadyExists, Progress
 from ethbrake_marl.evaluation import evaluate, measures as outcomes, summarise
 from ethbrake_marl.files.store import new_folder, write_file
 from ethbrake_marl.harm import objective_harm, objectives_of
-from ethbrake_marl.learning import Training, TrainingRecipe, load_recipe, resume, runs
+from ethbrake_marl.learning import RunDirectory, Training, TrainingRecipe, load_recipe, resume, runs
 from ethbrake_marl.learning.runs import (
     Course,
     EventFile,
@@ -37,7 +35,7 @@ from ethbrake_marl.learning.runs import (
     misleading_return,
 )
 from ethbrake_marl.policies import Policy, load_policy, read_trained
-from tests.learning.tiny import TINY_PPO, TINY_SAC, Answer, ctrl_c_in, files_of, watch_steps
+from tests.learning.tiny import TINY_PPO, TINY_SAC, Answer, ctrl_c_in, files_of, scalars, watch_steps
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of those who read event files
 SCENARIO = eb.load_scenario("paper-random")
@@ -49,10 +47,6 @@ train = partial(runs.train, measure=None)
 
 def status_of(run: Path) -> dict[str, Any]:
     return json.loads((run / "run.json").read_text())
-
-
-def rows_of(run: Path) -> list[dict[str, str]]:
-    return list(csv.DictReader((run / "progress.csv").read_text().splitlines()))
 
 
 def test_train__leaves_a_complete_folder(tmp_path: Path) -> None:
@@ -72,7 +66,7 @@ def test_train__leaves_a_complete_folder(tmp_path: Path) -> None:
     assert config["versions"]["torch"] in torch.__version__
     expected = {"status": "finished", "steps": 3072, "policy": "policy", "checkpoints": [], "alarms": []}
     assert status_of(run).items() >= expected.items()
-    rows = rows_of(run)
+    rows = RunDirectory(run).rows()
     told = [(int(row["steps"]), row["eval/mean_weight"] != "") for row in rows]
     assert told == list(zip(steps, [True, False, True, True], strict=True))
     last = {name: float(rows[-1][name]) for name in rows[-1] if name.startswith(("eval/mean", "rollout/"))}
@@ -108,7 +102,10 @@ def test_train__ctrl_c_stops_after_the_update_in_progress_and_a_second_one_at_on
         train(TINY, SCENARIO, twice, steps=100 * UPDATE)
     assert [status_of(run)["status"] for run in (once, twice)] == ["interrupted"] * 2
     assert [load_policy(run).manifest.steps for run in (once, twice)] == [2 * UPDATE, UPDATE]
-    assert (len(rows_of(once)), signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == (2, *before)
+    assert (len(RunDirectory(once).rows()), signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == (
+        2,
+        *before,
+    )
 
 
 def planted(*harms: float) -> Callable[[Training], Callable[[Policy], dict[str, float]]]:
@@ -123,7 +120,7 @@ def test_train__a_collapse_raises_an_alarm_and_by_default_goes_on(tmp_path: Path
     (alarm,) = result.alarms
     assert (result.status, result.updates) == ("finished", 8) and "training is lost" in alarm
     assert [progress.note for progress in said if progress.note] == [f"alarm: {alarm}"]
-    alarms = [row["eval/alarm"] for row in rows_of(tmp_path / "run") if row["eval/alarm"]]
+    alarms = [row["eval/alarm"] for row in RunDirectory(tmp_path / "run").rows() if row["eval/alarm"]]
     assert alarms == ["0", "0", "0", "1", "0"]
 
 
@@ -252,7 +249,7 @@ def test_train__keeps_and_tells_what_the_learners_objectives_make_of_the_harm(tm
     scenario = SCENARIO.with_learners(["vehicle_2", "vehicle_3"]).replace(objective=objectives)
     recipe = TINY.replace(total_steps=6 * 128, evaluation={"every_updates": 1, "worlds": 10, "seed": 7})
     result = runs.train(recipe, scenario, tmp_path / "run", on_progress=None)
-    rows = [row for row in rows_of(tmp_path / "run") if row["eval/objective"]]
+    rows = [row for row in RunDirectory(tmp_path / "run").rows() if row["eval/objective"]]
     best = min(result.evaluations, key=lambda each: each["objective"])
     kept = load_policy(tmp_path / "run" / "policy")
     assert len(rows) == len(result.evaluations) > 3 and kept.manifest.steps == best["steps"]
@@ -420,13 +417,6 @@ def test_progress_table__columns_are_sorted_and_later_ones_are_filled_in(tmp_pat
     assert (tmp_path / "progress.csv").read_text() == "steps,eval/z,train/a,train/b\n10,,1,0.5\n20,,2,\n30,3.25,4,\n"
 
 
-def scalars(folder: Path, tag: str) -> list[tuple[int, float]]:
-    """(step, value) as TensorBoard reads them."""
-    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
-    events.Reload()
-    return [(event.step, event.value) for event in events.Scalars(tag)] if tag in events.Tags()["scalars"] else []
-
-
 def write_one(folder: Path, step: int) -> None:
     """A file with one row, as one stretch of a training leaves it."""
     file = EventFile(folder)
@@ -443,7 +433,7 @@ def test_order__is_that_of_their_beginning_even_where_the_clock_stands_still_or_
         monkeypatch.setattr(os, "getpid", lambda pid=1000 - step: pid)
         write_one(tmp_path, step)
     monkeypatch.undo()
-    assert scalars(tmp_path, "loss") == [(step, step / 2) for step in range(1, 13)]
+    assert scalars(tmp_path)["loss"] == [(step, step / 2) for step in range(1, 13)]
     assert [path.name for path in sorted(tmp_path.iterdir())][::11] == [
         "events.out.tfevents.0000000001",
         "events.out.tfevents.0000000012",
@@ -455,7 +445,7 @@ def test_order__goes_on_after_files_that_are_named_by_the_clock(tmp_path: Path) 
     write_one(tmp_path, 1)
     first, second = sorted(tmp_path.iterdir())
     assert int(second.name.rpartition(".")[2]) == int(first.name.split(".")[3]) + 1
-    assert scalars(tmp_path, "loss") == [(1, 0.5)]
+    assert scalars(tmp_path)["loss"] == [(1, 0.5)]
 
 
 def test_file__holds_every_number_at_once_and_can_be_cut_between_two_rows(tmp_path: Path) -> None:
@@ -464,9 +454,9 @@ def test_file__holds_every_number_at_once_and_can_be_cut_between_two_rows(tmp_pa
     for step in (1, 2):
         file.write({"loss": np.float32(step), "count": step, "csv only": 1}, told, step)
         sizes.append(event_sizes(tmp_path))  # before it is closed
-    assert scalars(tmp_path, "loss") == [(1, 1.0), (2, 2.0)]
+    assert scalars(tmp_path)["loss"] == [(1, 1.0), (2, 2.0)]
     file.close()
     write_one(tmp_path, 3)
     cut_back(tmp_path, sizes[0])
-    assert scalars(tmp_path, "loss") == scalars(tmp_path, "count") == [(1, 1.0)]
-    assert scalars(tmp_path, "csv only") == [] and len(list(tmp_path.iterdir())) == 1
+    assert scalars(tmp_path)["loss"] == scalars(tmp_path)["count"] == [(1, 1.0)]
+    assert "csv only" not in scalars(tmp_path) and len(list(tmp_path.iterdir())) == 1

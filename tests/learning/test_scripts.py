@@ -12,8 +12,8 @@ import pytest
 import torch
 
 import ethbrake_marl as eb
-from ethbrake_marl.errors import InvalidInput
 from tests.docs.site import load
+from tests.learning.tiny import harm_beside_full_braking
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning", "ignore::FutureWarning")
 TRAIN = Path(__file__).resolve().parents[2] / "train"
@@ -21,14 +21,6 @@ PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-
 RECIPE = eb.load_recipe("cooperation-ppo").replace(
     n_envs=16, n_steps=16, batch_size=128, network={"policy": [16, 16], "value": [16, 16]}
 )
-
-
-def harm_beside_full_braking(run: Path) -> float:
-    """Mean harm of what was trained, in that of full braking, in 1,000 worlds."""
-    agents = {name: eb.make_agent(name, scenario=PAIR) for name in ("full_brake", f"team@{run}")}
-    found = eb.evaluate(PAIR.sample(1000, 7), agents, scenario=PAIR)
-    braking, trained = (found.outcome(name).first_impact_harm.mean() for name in agents)
-    return float(trained / braking)
 
 
 @pytest.mark.parametrize(
@@ -121,7 +113,7 @@ def test_mappo__leaves_a_policy_that_acts_as_benchmarls_own_does(mappo: ModuleTy
 @pytest.mark.long
 def test_mappo__learns_to_beat_full_braking(mappo: ModuleType, tmp_path: Path) -> None:
     mappo.train_mappo(eb.load_recipe("cooperation-ppo").replace(total_steps=300_000), PAIR, tmp_path / "run")
-    assert harm_beside_full_braking(tmp_path / "run") < 0.9
+    assert harm_beside_full_braking(f"team@{tmp_path / 'run'}") < 0.9
 
 
 @pytest.fixture
@@ -167,9 +159,7 @@ def test_supersuit__tells_which_episodes_the_horizon_cut_off(
 @pytest.mark.long
 def test_supersuit__learns_to_beat_full_braking(supersuit: ModuleType, tmp_path: Path) -> None:
     supersuit.train(PAIR, 200_000, 0, tmp_path / "run")
-    agents = {"full_brake": eb.make_agent("full_brake"), "ppo": eb.LearnedAgent(eb.load_policy(tmp_path / "run"))}
-    found = eb.evaluate(PAIR.sample(1000, 7), agents, scenario=PAIR)
-    assert found.outcome("ppo").first_impact_harm.mean() < 0.9 * found.outcome("full_brake").first_impact_harm.mean()
+    assert harm_beside_full_braking(f"ppo@{tmp_path / 'run'}") < 0.9
 
 
 @pytest.fixture
@@ -207,14 +197,3 @@ def test_clone__drives_as_the_network_itself(clone: ModuleType, tmp_path: Path) 
     with torch.no_grad():
         theirs = network(seen[:50]).clamp(-1.0, 1.0).numpy()
     assert np.allclose(policy(seen[:50].numpy()), theirs, atol=1e-5)
-
-
-def test_clone__refuses_what_it_cannot_clone(clone: ModuleType, tmp_path: Path) -> None:
-    (tmp_path / "no.parquet").write_text("no")
-    eb.write_dataset(tmp_path / "two.parquet", {"b": eb.make_agent("full_brake")}, scenario=PAIR, episodes=1)
-    for name, told in (("no", "is no dataset of `ethbrake watch dataset`"), ("two", "holds 2 learners, one is needed")):
-        with pytest.raises(InvalidInput, match=told):
-            clone.train(tmp_path / f"{name}.parquet", 0, tmp_path / "clone")
-    assert not (tmp_path / "clone").exists()
-    with pytest.raises(InvalidInput, match="say which clone drives"):
-        eb.make_agent(f"{TRAIN / 'clone.py'}:make_agent", scenario=PAPER)

@@ -12,12 +12,10 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import make_single_agent
-from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.learning import RunDirectory, Training, TrainingRecipe, load_recipe, train
 from ethbrake_marl.learning.runs import make_model
 from ethbrake_marl.policies import PolicyTeam, load_policy
-from tests.learning.tiny import TINY_PPO, Answer, files_of, watch_steps
+from tests.learning.tiny import TINY_PPO, Answer, files_of, harm_beside_full_braking, watch_steps
 
 PAIR = eb.load_scenario("cooperation-3-pair")
 ALONE = eb.load_scenario("cooperation-2-paper")
@@ -129,64 +127,6 @@ def test_centralised__the_critic_sees_the_line_and_the_actor_does_not() -> None:
     assert (policy.predict_values(seen) != policy.predict_values(elsewhere)).all()
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("team") / "run"
-    train(TINY, PAIR, folder, scheme="independent", steps=256)
-    return folder
-
-
-FOUR = PAIR.replace(
-    vehicles=4, braking_capacity_mps2=6, driving_capacity_mps2=6, mass_t=5, latency_s=0.5,
-    roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "learner", "vehicle_4": "full_brake"},
-)  # fmt: skip
-
-
-def test_load_team__drives_the_learners_that_the_scenario_has(trained: Path) -> None:
-    assert sorted(RunDirectory(trained).load_team(PAIR.with_learners(["vehicle_3"])).drivers) == [2]
-    for call, told in (
-        (lambda: RunDirectory(trained).load_team(FOUR), r"a line of 3 vehicles, .* 'cooperation-3-pair' has 4"),
-        (lambda: RunDirectory(trained).load_team(PAIR.with_learners([])), r"scenario .* has nobody to drive"),
-        (lambda: load_policy(trained), r"has a policy of its own; name one, for instance .*vehicle_2"),
-        (lambda: make_single_agent(f"team@{trained}", scenario=PAIR), "is a team, one agent is needed here"),
-    ):
-        with pytest.raises(InvalidInput, match=told):
-            call()
-
-
-def replaced(old: str, new: str) -> Any:
-    """Write something else into the file that says who drives what."""
-    return lambda file: file.write_text(file.read_text().replace(old, new))
-
-
-def without_a_driver(file: Path) -> None:
-    content = json.loads(file.read_text())
-    file.write_text(json.dumps(content | {"drivers": {"vehicle_3": content["drivers"]["vehicle_3"]}}))
-
-
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (lambda t: t.write_text("{"), r"team.json: is not JSON \(.*\); right is, for instance, {\"scheme\""),
-        (lambda t: t.write_text("[]"), "team.json: must be a mapping"),
-        (lambda t: t.write_text("{}"), r"scheme: missing; right is, for instance, {\"scheme\""),
-        (replaced("policy/vehicle_3", "../policy"), 'vehicle_3 = "../policy": must be policy/vehicle_3'),
-        (replaced("policy/vehicle_3", "policy/vehicle_2"), "must be policy/vehicle_3 under scheme ind"),
-        (replaced('"independent"', '"shared"'), "vehicle_2 = policy/vehicle_2: must be policy under scheme"),
-        (replaced('"vehicles": 3', '"vehicles": 2'), "= vehicle_3: must be one of vehicle_1 to vehicle_2"),
-        (replaced('"independent"', '"together"'), "scheme = together: must be single, shared, independent"),
-        (without_a_driver, "must be two vehicles or more under scheme independent"),
-        (lambda t: (t.parent / "policy" / "vehicle_3" / "weights.safetensors").unlink(), "s: is missing"),
-        (lambda t: (t.parent / "policy" / "vehicle_3" / "manifest.json").write_text("{}"), "manifest.json: "),
-    ],
-)  # fmt: skip
-def test_load_team__a_damaged_folder_is_refused(damage: Any, message: str, trained: Path, tmp_path: Path) -> None:
-    shutil.copytree(trained, tmp_path / "run")
-    damage(tmp_path / "run" / "team.json")
-    with pytest.raises(CorruptBundle, match=message):
-        RunDirectory(tmp_path / "run").load_team(PAIR)
-
-
 @pytest.mark.long
 def test_cooperation__two_learners_avoid_what_can_be_avoided(tmp_path: Path) -> None:
     """Contact cannot be avoided in 65 % of these worlds; PPO's pairs collided in every one (docs/levels.md)."""
@@ -208,7 +148,4 @@ LEARNS = load_recipe("cooperation-ppo").replace(
 @pytest.mark.parametrize("scheme", ["shared", "independent", "centralised"])
 def test_scheme__learns_to_beat_full_braking(scheme: Any, tmp_path: Path) -> None:
     train(LEARNS, PAIR, tmp_path / "run", scheme=scheme)
-    agents = {"full_brake": eb.make_agent("full_brake"), "team": RunDirectory(tmp_path / "run").load_team(PAIR)}
-    result = eb.evaluate(PAIR.sample(1000, 7), agents, scenario=PAIR)
-    harm = {name: result.outcome(name).first_impact_harm.mean() for name in agents}
-    assert harm["team"] < 0.9 * harm["full_brake"]
+    assert harm_beside_full_braking(f"team@{tmp_path / 'run'}") < 0.9

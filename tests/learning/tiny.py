@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from jsonschema import Draft202012Validator
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
+import ethbrake_marl as eb
 from ethbrake_marl.learning import runs
-from ethbrake_marl.learning.training import load_recipe
 
-TINY_PPO = load_recipe("ppo").replace(
+TINY_PPO = eb.load_recipe("ppo").replace(
     n_envs=8,
     n_steps=16,
     batch_size=64,
@@ -24,7 +25,7 @@ TINY_PPO = load_recipe("ppo").replace(
     evaluation={"every_updates": 3, "worlds": 10, "seed": 7},
     checkpoint_every_updates=2,
 )
-TINY_SAC = load_recipe("sac").replace(
+TINY_SAC = eb.load_recipe("sac").replace(
     total_steps=64 * 8,
     n_envs=8,
     batch_size=32,
@@ -35,7 +36,7 @@ TINY_SAC = load_recipe("sac").replace(
     checkpoint_every_updates=12,
     log_every_updates=10,
 )
-TINY_COUNTERFACTUAL = load_recipe("counterfactual").replace(
+TINY_COUNTERFACTUAL = eb.load_recipe("counterfactual").replace(
     start=None,
     observation=None,
     n_envs=8,
@@ -47,7 +48,7 @@ TINY_COUNTERFACTUAL = load_recipe("counterfactual").replace(
     evaluation={"every_updates": 4, "worlds": 10, "seed": 7},
     checkpoint_every_updates=3,
 )
-TINY_OPTIONS = load_recipe("options").replace(
+TINY_OPTIONS = eb.load_recipe("options").replace(
     observation=None,
     n_envs=8,
     n_steps=4,
@@ -82,15 +83,15 @@ Answer = tuple[Any, ...]
 def watch_steps(monkeypatch: pytest.MonkeyPatch, watch: Callable[[int, Answer], Answer]) -> None:
     """Let the environment's answer to every step pass through ``watch(number of the step, answer)``."""
 
-    class Watched(EthBrakeVecEnv):
+    class Watched(eb.EthBrakeVecEnv):
         count = 0
 
         def step_wait(self) -> Answer:
             self.count += 1
             return watch(self.count, super().step_wait())
 
-    def make(*args: Any, **kwargs: Any) -> EthBrakeVecEnv:
-        environment = make_sb3_vec_env(*args, **kwargs)
+    def make(*args: Any, **kwargs: Any) -> eb.EthBrakeVecEnv:
+        environment = eb.make_sb3_vec_env(*args, **kwargs)
         environment.__class__ = Watched
         return environment
 
@@ -112,3 +113,25 @@ def files_of(run: Path) -> dict[str, bytes]:
     """Name and content of all that a run has kept of its policies, and of who drives what."""
     files = [*run.glob("policy*/**/*.*"), *run.glob("team.json")]
     return {str(path.relative_to(run)): path.read_bytes() for path in files}
+
+
+def scalars(folder: Path) -> dict[str, list[tuple[int, float]]]:
+    """(step, value) of every tag, as TensorBoard reads them."""
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
+    events.Reload()
+    return {tag: [(event.step, event.value) for event in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
+
+
+def harm_beside_full_braking(spec: str) -> float:
+    """Mean harm of this agent, in that of full braking, in 1,000 worlds of two learners."""
+    scenario = eb.load_scenario("cooperation-3-pair")
+    agents = {name: eb.make_agent(name, scenario=scenario) for name in ("full_brake", spec)}
+    found = eb.evaluate(scenario.sample(1000, 7), agents, scenario=scenario)
+    braking, trained = (found.outcome(name).first_impact_harm.mean() for name in agents)
+    return float(trained / braking)
+
+
+def marked(schema: dict[str, Any], content: Any) -> set[str]:
+    """The places where an editor that has this schema marks a mistake; empty: the whole file."""
+    Draft202012Validator.check_schema(schema)
+    return {".".join(map(str, error.absolute_path)) for error in Draft202012Validator(schema).iter_errors(content)}

@@ -5,19 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import ethbrake_marl as eb
 from ethbrake_marl.limits.lower_bound import avoidability
-from ethbrake_marl.physics import Worlds, advance
-from ethbrake_marl.scenario import load_scenario
-from tests.limits.worlds import line, paper_line, random_profiles, wide_worlds, with_gap
-from tests.reference.avoidability_lp import avoidable_by_lp, default_horizon_s
+from tests.limits.worlds import line, opening, paper_line, random_profiles, wide_worlds
+from tests.reference.avoidability_lp import avoidable_by_lp
 from tests.reference.play_profile import play_profile
 
 LINES = [(3, 1), (2, 1), (2, 0)]  # vehicles, controlled one
-
-
-def driving(gap):
-    """Vehicle 2 is 4 m/s faster than Vehicle 1, which may drive: 2 + 2 m/s2 apart, 16 / 8 = 2 m are needed."""
-    return line([gap], [10, 14], [5, 2], driving=[2, 0])
 
 
 # world, controlled vehicle -> margin and what it is short of
@@ -30,9 +24,10 @@ BY_HAND = {
     "weak brakes, the leader stands at 8 m": (line([40], [8, 20], [4, 4]), 1, -2.0, "front"),
     "a standing leader": (line([10], [0, 10], [4, 5]), 1, 0.0, ""),
     "a standing follower": (line([0], [0, 0], [4, 5]), 1, 0.0, ""),
-    "ahead of a follower, 2.5 m": (driving(2.5), 0, 0.5, ""),
-    "ahead of a follower, 2 m": (driving(2.0), 0, 0.0, ""),
-    "ahead of a follower, 1.5 m": (driving(1.5), 0, -0.5, "rear"),
+    # 4 m/s faster than Vehicle 1, 2 + 2 m/s2 apart: 16 / 8 = 2 m are needed.
+    "ahead of a follower, 2.5 m": (opening(2.5), 0, 0.5, ""),
+    "ahead of a follower, 2 m": (opening(2.0), 0, 0.0, ""),
+    "ahead of a follower, 1.5 m": (opening(1.5), 0, -0.5, "rear"),
     # Vehicle 3 needs 0.8 * 20 + 400 / 12 m; gaps and vehicle 1's way to rest give 2 m more, or less.
     "paper, 2 m left": (paper_line([10, 8], [20, 18, 20], [0, 0.5, 0.8]), 1, 2.0, ""),
     "paper, 5 m left": (paper_line([5, 9], [22, 18, 20], [0, 0.5, 0.8]), 1, 5.0, ""),
@@ -54,7 +49,7 @@ def test_early__a_pair_that_meets_before_the_vehicle_may_act():
     front = line([1, 9], [10, 12, 9], [5, 8, 5], [1, 1, 2])  # 2 m lost in 1 s
     rear = line([9, 1], [10, 10, 12], [5, 8, 5], [1, 1, 2])
     brakes_in_time = line([9, 0.5], [10, 10, 12], [5, 8, 4], [1, 1, 0])  # 2 m/s at 4 m/s2: 0.5 m, a touch at 0.5 s
-    verdict = avoidability(Worlds.concatenate([front, rear, brakes_in_time]))
+    verdict = avoidability(eb.Worlds.concatenate([front, rear, brakes_in_time]))
     assert verdict.reason_name.tolist() == ["early", "early", ""]
     assert verdict.margin_m[:2] == pytest.approx([-1, -1])
 
@@ -99,7 +94,7 @@ def test_witness__is_the_largest_trajectory_behind_the_front_vehicle(
     ],
 )
 def test_unavoidable_share__of_the_paper_lists(name, low, high):
-    scenario = load_scenario(name)
+    scenario = eb.load_scenario(name)
     verdict = avoidability(scenario.sample(10_000, seed=7).worlds, scripts=scenario.scripts)
     assert low <= 1 - verdict.avoidable.mean() <= high
 
@@ -129,7 +124,8 @@ def at_the_edge(reason, pair, shift):
     rows = np.flatnonzero((verdict.reason == reason) & (verdict.margin_m > -20))
     assert rows.size > 500
     worlds = worlds.take(rows)
-    return with_gap(worlds, pair, worlds.gaps_m[:, pair] - verdict.margin_m[rows] + shift)
+    worlds.gaps_m[:, pair] += shift - verdict.margin_m[rows]
+    return worlds
 
 
 # Less than 1e-9 m between both neighbours counts as unavoidable; full braking may touch the front vehicle.
@@ -157,7 +153,7 @@ def apart(worlds):
 def test_early__is_what_happens_in_the_physics_before_the_latency(vehicles, controlled):
     worlds = apart(wide_worlds(20_000, vehicles, seed=23))
     until = worlds.vehicles.latency_s[:, controlled]
-    _, impacts = advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=until)
+    _, impacts = eb.advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=until)
     early = avoidability(worlds, controlled).reason == 1
     assert 0.01 < early.mean() < 0.5
     assert np.array_equal(early, impacts.count.sum(axis=1) > 0)
@@ -166,7 +162,7 @@ def test_early__is_what_happens_in_the_physics_before_the_latency(vehicles, cont
 @pytest.mark.parametrize("profiles", [8, pytest.param(250, marks=pytest.mark.long)])
 def test_unavoidable__no_random_profile_avoids_collision(profiles):
     played, rng = 0, np.random.default_rng(profiles)
-    lists = [load_scenario(name).sample(1500, seed=7).worlds for name in ("paper-random", "paper-random-early")]
+    lists = [eb.load_scenario(name).sample(1500, seed=7).worlds for name in ("paper-random", "paper-random-early")]
     for worlds in (*lists, wide_worlds(4000, 3, seed=24)):
         worlds = apart(worlds)
         worlds = worlds.take(~avoidability(worlds).avoidable)
@@ -177,8 +173,8 @@ def test_unavoidable__no_random_profile_avoids_collision(profiles):
 
 
 def test_later_states__give_the_same_verdict_and_a_witness_from_there():
-    worlds = load_scenario("paper-random").sample(3000, seed=3).worlds
-    later, _ = advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=0.4)
+    worlds = eb.load_scenario("paper-random").sample(3000, seed=3).worlds
+    later, _ = eb.advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=0.4)
     at_alert, from_there = avoidability(worlds), avoidability(later)
     assert np.array_equal(at_alert.reason, from_there.reason)
     assert np.abs(at_alert.margin_m - from_there.margin_m).max() < 1e-11
@@ -206,8 +202,8 @@ def drawn(n, vehicles, controlled, seed):
     if vehicles == 2:
         return worlds.take(np.flatnonzero(reason != 1)[:n])
     rows = np.concatenate([np.flatnonzero(reason == code)[: n // 4 + 1] for code in (0, 2, 3)])
-    paper = load_scenario("paper-random-early").sample(n - 3 * (n // 4), seed=seed).worlds
-    return Worlds.concatenate([worlds.take(rows), paper])
+    paper = eb.load_scenario("paper-random-early").sample(n - 3 * (n // 4), seed=seed).worlds
+    return eb.Worlds.concatenate([worlds.take(rows), paper])
 
 
 @pytest.mark.parametrize(("vehicles", "controlled", "n"), [(3, 1, 32), (2, 1, 8), (2, 0, 8)])
@@ -220,8 +216,7 @@ def test_exact_verdict__agrees_with_a_linear_programme_where_that_is_certain(
     worlds = drawn(n * times, vehicles, controlled, seed=31)
     exact, found = avoidability(worlds, controlled).avoidable, 0
     for k in range(worlds.n):
-        world = worlds.take([k])
-        linear = avoidable_by_lp(world, (controlled,), default_horizon_s(world, (controlled,)) / steps)
+        linear = avoidable_by_lp(worlds.take([k]), (controlled,), steps)
         assert linear.avoidable == exact[k] or not linear.certain, (k, linear.margin_m)
         found += linear.certain
     assert found > certain * worlds.n

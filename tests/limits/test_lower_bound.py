@@ -45,20 +45,16 @@ from ethbrake_marl.limits.lower_bound import (
     widest_flight,
 )
 from ethbrake_marl.physics import Worlds, advance, make_worlds
+from ethbrake_marl.physics.kernel import solo_motion
 from ethbrake_marl.scenario import Task, load_scenario
 from ethbrake_marl.search import profile_problem
-from tests.limits.worlds import REGIONS, line, moved_profiles, random_profiles, wide_worlds, worlds_of
+from tests.limits.worlds import REGIONS, line, moved_profiles, opening, random_profiles, wide_worlds, worlds_of
 from tests.reference.play_profile import play_profile
 
 
 def play(worlds, switch, command):
     _, ledger = play_profile(worlds, 1, np.array([switch]), np.array([command]))
     return ledger.world_harm("first")[0]
-
-
-def opening(gap):
-    """Vehicle 1 drives away from a faster one that brakes less: 16 - 2 * (2 + 2) * gap."""
-    return line([gap], [10, 14], [5, 2], driving=[2, 0])
 
 
 # world, controlled vehicle -> squared closing speed that no profile undercuts
@@ -69,6 +65,7 @@ PAIR_BY_HAND = {
     "the leader brakes harder and is faster: 2 * 2 * 1": (line([1], [20, 18], [6, 4], driving=4), 1, 4),
     "a touch": (line([4], [20, 24], [4, 6], driving=4), 1, 0),
     "far away": (line([90], [20, 24], [4, 6], driving=4), 1, 0),
+    # 16 - 2 * (2 + 2) * gap
     **{f"drives away from {gap} m": (opening(gap), 0, harm) for gap, harm in ((1.5, 4), (2, 0), (3, 0))},
 }
 
@@ -172,9 +169,7 @@ def searched_harm(worlds, harm_count, rounds, seed):
 def searched_worlds(n, seed):
     paper = [load_scenario(name).sample(n, seed=9).worlds for name in ("paper-random", "paper-delay-high")]
     standing = wide_worlds(3 * n, 3, seed + 2, strong=True)
-    speeds = standing.speeds_mps.copy()
-    speeds[:, 1] = 0
-    speeds[:, 2] = np.minimum(speeds[:, 2], 4)
+    speeds = np.minimum(standing.speeds_mps, [np.inf, 0.0, 4.0])
     standing = replace(standing, speeds_mps=speeds, gaps_m=0.2 * standing.gaps_m)
     return Worlds.concatenate([*paper, wide_worlds(3 * n, 3, seed, strong=True), wide_worlds(n, 3, seed + 1), standing])
 
@@ -207,6 +202,8 @@ def test_bound__is_never_above_a_searched_profile_in_any_region(region, n, budge
 
 # What a first meeting leaves, and what the command in force costs.
 
+PLANS = empty_plan(), empty_plan()
+
 
 def state(**given):
     """A state at the onset, all else 0; no obstacle."""
@@ -237,23 +234,22 @@ def outer_gap(at, time):
 
 def follows(kind, at, time, closing):
     """The least squared closing speed at the other pair after such a meeting."""
-    return after(kind, at, time, time, closing, time, 0.0, empty_plan(), empty_plan())
+    return after(kind, at, time, time, closing, time, 0.0, *PLANS)
 
 
 def test_gentlest_meeting__is_driven_and_falls_with_the_time():
-    plan, other = empty_plan(), empty_plan()
     met = 0
     for at in random_states(300, seed=43):
         for kind, meet in ((FRONT_FIRST, meet_front), (REAR_FIRST, meet_rear)):
-            coming = meet(at, np.inf if kind == FRONT_FIRST else 99.0, plan, other)
-            times = np.array([meet(at, parameter, plan, other) for parameter in np.linspace(0, 3, 13)])
+            coming = meet(at, np.inf if kind == FRONT_FIRST else 99.0, *PLANS)
+            times = np.array([meet(at, parameter, *PLANS) for parameter in np.linspace(0, 3, 13)])
             times = np.sort(times[np.isfinite(times) & (times >= coming)])
             found = np.array([gentlest(kind, at, time) for time in times]).reshape(-1, 2)
             met += times.size > 1
             assert np.all(np.diff(found[:, 0]) < 1e-5)
             for time, (_, parameter) in zip(times, found, strict=True):
                 if np.isfinite(parameter):
-                    assert meet(at, parameter, plan, other) == pytest.approx(time, abs=1e-5)
+                    assert meet(at, parameter, *PLANS) == pytest.approx(time, abs=1e-5)
     assert met > 200
 
 
@@ -297,7 +293,6 @@ def test_after__is_nearly_attained_by_bouncing_off(name):
     assert other * (1 - 1e-4) <= found <= other * (1 + 1e-12)
 
 
-PLANS = empty_plan(), empty_plan()
 ROOM = *PLANS, np.empty((CELLS, HEAP_WIDTH))
 PUSHED = dict(V_L=10, A_L=5, FRONT_SHARE=0.5)
 HELD = dict(V_L=10, A_L=8, V_F=20, A_F=4, U_F=2, LIMIT_F=40, V_R=30, A_R=4, FRONT_SHARE=0.9, GAP_R=100 - 121 / 14)
@@ -354,9 +349,9 @@ def test_widest_flight__is_attained_by_braking_to_the_top_of_the_gap_and_driving
 
 def test_obstacle__takes_the_centre_of_mass_from_the_proof():
     at = state(GAP_R=4, V_L=10, A_L=5, V_F=12, A_F=7, U_F=7, LIMIT_F=40, V_R=20, A_R=6, FRONT_SHARE=0.5)
-    free = after_front(at, 0.0, 0.0, 2.0, 0.0, 0.0, empty_plan(), empty_plan())
+    free = after_front(at, 0.0, 0.0, 2.0, 0.0, 0.0, *PLANS)
     at[LINE.OBSTACLE] = 11
-    assert after_front(at, 0.0, 0.0, 2.0, 0.0, 0.0, empty_plan(), empty_plan()) < free
+    assert after_front(at, 0.0, 0.0, 2.0, 0.0, 0.0, *PLANS) < free
 
 
 def test_command_in_force__the_way_to_meet_gently_is_the_wrong_one_after_it():
@@ -378,15 +373,11 @@ def test_command_in_force__the_way_to_meet_gently_is_the_wrong_one_after_it():
 @pytest.mark.parametrize(("share", "press", "reach"), [(0.2, 13, 14), (0.45, 13, 14), (0.55, 13, 14), (0.78, 13, 9)])
 def test_lead__is_what_a_flight_gains_less_the_command_it_costs(share, press, reach):
     # Every flight, tried: brake for s, then drive until the partner is met again. The last one brakes less than it.
-    opening = 0.3
-    best = -math.inf
-    for s in np.linspace(0.0, 0.5, 501):
-        if opening * s + 0.5 * (reach - press) * s * s < 0.0:
-            break
-        gap, relative = opening * s + 0.5 * (reach - press) * s * s, -(opening + (reach - press) * s)
-        met = (-relative + math.sqrt(relative**2 + 2 * press * gap)) / press
-        best = max(best, share * (relative + press * met) - reach * s * (1.0 - share))
-    found = lead(share, press, reach, opening, 0.0, 50.0, 0.0)
+    opens, s = 0.3, np.linspace(0.0, 0.5, 501)
+    gap, relative = opens * s + 0.5 * (reach - press) * s * s, -(opens + (reach - press) * s)
+    met = (-relative + np.sqrt(relative**2 + 2 * press * np.maximum(gap, 0.0))) / press
+    best = np.max((share * (relative + press * met) - reach * s * (1.0 - share))[gap >= 0.0])
+    found = lead(share, press, reach, opens, 0.0, 50.0, 0.0)
     assert found >= best - 1e-9
     assert found == pytest.approx(best, abs=2e-3)
 
@@ -436,12 +427,6 @@ def played(worlds, rng):
         now = after
 
 
-def full_braking(v, a, onset, time):
-    """Way and speed of one that coasts until its onset, then brakes to rest."""
-    braking = min(max(time - onset, 0.0), v / a)
-    return v * (min(time, onset) + braking) - 0.5 * a * braking * braking, v - a * braking
-
-
 def test_played_meetings__lie_within_the_bounds_of_every_cell_that_holds_them():
     worlds, checked, earlier = pairs(400, seed=3), 0, 0
     v = worlds.vehicles
@@ -450,8 +435,8 @@ def test_played_meetings__lie_within_the_bounds_of_every_cell_that_holds_them():
         since, power = row[LINE.ONSET_R], row[LINE.A_R] + v.driving_capacity_mps2[world, 2]
         if time > since + row[LINE.V_R] / row[LINE.A_R]:
             continue  # the one that brakes fully stands by then
-        way, speed = full_braking(row[LINE.V_R], row[LINE.A_R], since, time)
-        way_l, _ = full_braking(worlds.speeds_mps[world, 0], v.braking_capacity_mps2[world, 0], 0.0, time)
+        speed, way, _ = solo_motion(row[LINE.V_R], -row[LINE.A_R], since, math.inf, time)
+        _, way_l, _ = solo_motion(worlds.speeds_mps[world, 0], -v.braking_capacity_mps2[world, 0], 0.0, math.inf, time)
         further = max(FAR_M + way_l - there.gaps_m[0, 0] + row[LINE.GAP_R] - way, 0.0)
         faster = there.speeds_mps[0, 2] - speed
         for reach in (power, math.inf):

@@ -125,8 +125,7 @@ def test_bound__does_not_depend_on_the_batch_or_the_order_of_the_vehicles():
 
 
 def searched(problem, harm_count, budget):
-    given = problem.constant(problem.even_grid(5))
-    return problem.search(given, budget=budget)[1][harm_count]
+    return problem.search(problem.constant(problem.even_grid(5)), budget=budget)[1][harm_count]
 
 
 def at_random(problem, rng, phases=8):

@@ -25,6 +25,11 @@ def paper_line(gaps, speeds, latency):
     return line(gaps, speeds, [6, 7, 6], latency, driving=[6, 7, 6], mass=[4.5, 5.5, 5.9])
 
 
+def opening(gap):
+    """Vehicle 1 drives away from one that is 4 m/s faster and brakes less."""
+    return line([gap], [10, 14], [5, 2], driving=[2, 0])
+
+
 def wide_worlds(n: int, vehicles: int, seed: int, *, zeros: float = 0.03, strong: bool = False) -> Worlds:
     """Lines with any capacities, low speed limits, standing vehicles, exact zeros; Vehicle 1 brakes at 0.
 
@@ -54,13 +59,6 @@ def wide_worlds(n: int, vehicles: int, seed: int, *, zeros: float = 0.03, strong
         restitution=rng.uniform(0, 0.5, n),
         speed_limit_mps=np.maximum(speeds + above, 1e-3),
     )
-
-
-def with_gap(worlds: Worlds, pair: int, gap: Floats) -> Worlds:
-    """The same worlds with another gap."""
-    gaps = worlds.gaps_m.copy()
-    gaps[:, pair] = gap
-    return replace(worlds, gaps_m=gaps)
 
 
 def random_profiles(worlds: Worlds, vehicle: int, rng: np.random.Generator, pieces: int = 5) -> tuple[Floats, Floats]:
@@ -122,9 +120,9 @@ def of(column, low, high):
     """The numbers of ``plain``, but those of one vehicle."""
 
     def draw(name, line, rng):
-        values = line[name].copy()
-        values[:, min(column, values.shape[1] - 1)] = rng.uniform(low, high, len(values))
-        return values
+        values = line[name]
+        mine = np.arange(values.shape[1]) == min(column, values.shape[1] - 1)
+        return np.where(mine, rng.uniform(low, high, (len(values), 1)), values)
 
     return draw
 
@@ -139,18 +137,17 @@ def masses(name, line, rng):
     return 10 ** rng.uniform(-1.3, 2, line[name].shape)
 
 
-def first_late(name, line, rng):
-    """Vehicle 1 reacts by up to 2 s later."""
-    return line[name] + rng.uniform(0, 2, (len(line[name]), 1)) * (np.arange(line[name].shape[1]) == 0)
-
-
 REGIONS = {
     "plain": {},
     "masses 0.05 to 100 t": {"mass": masses},
     "masses 0.05 to 100 t, restitution to 1": {"mass": masses, "restitution": drawn(0, 1)},
     "restitution to 1": {"restitution": drawn(0, 1)},
     "restitution near 1": {"restitution": drawn(0.9, 1)},
-    "late leader": {"latency": first_late},
+    "late leader": {  # by up to 2 s
+        "latency": lambda name, line, rng: (
+            line[name] + rng.uniform(0, 2, (len(line[name]), 1)) * (np.arange(line[name].shape[1]) == 0)
+        )
+    },
     "any latency": {"latency": drawn(0, 1.5)},
     "rear reacts first": {  # of those behind Vehicle 1 the last one
         "latency": lambda name, line, rng: np.concatenate([line[name][:, :1], line[name][:, :0:-1]], axis=1)

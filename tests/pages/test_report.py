@@ -11,16 +11,13 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from ethbrake_marl.agents.registry import make_agent
+import ethbrake_marl as eb
 from ethbrake_marl.errors import AlreadyExists, plain_text
-from ethbrake_marl.evaluation import Evaluation, evaluate, summarise
 from ethbrake_marl.figures import COLOURS, add_caption, inline_svg, new_figure
 from ethbrake_marl.files.sheet import Column, Sheet, Shown
 from ethbrake_marl.pages import page as pages
 from ethbrake_marl.pages.page import Part, Section, read_file
 from ethbrake_marl.pages.report import Report, choose_shown, worst_rows
-from ethbrake_marl.physics import Worlds
-from ethbrake_marl.scenario import Scenario
 from tests.fixtures.pictures import draw_nothing
 from tests.pages.hostile import HOSTILE, UNSEEN, Page
 
@@ -106,10 +103,10 @@ def test_drawing__has_text_as_outlines_and_the_colours_of_the_page() -> None:
     assert re.findall(r"--series-\d: (#\w+)", css)[:7] == [colour.lower() for colour in COLOURS]
 
 
-def test_drawing__its_label_is_text() -> None:
-    for text in HOSTILE[:24]:
-        svg = inline_svg(b'<svg xmlns="http://www.w3.org/2000/svg"/>', text)[0]
-        assert [tag for tag, _ in Page(str(svg)).tags] == ["svg"]
+@pytest.mark.parametrize("text", HOSTILE[:24])
+def test_drawing__its_label_is_text(text: str) -> None:
+    svg = inline_svg(b'<svg xmlns="http://www.w3.org/2000/svg"/>', text)[0]
+    assert [tag for tag, _ in Page(str(svg)).tags] == ["svg"]
 
 
 def test_drawing__the_caption_is_text_of_the_page() -> None:
@@ -128,19 +125,19 @@ def test_drawing__the_caption_is_text_of_the_page() -> None:
 EXTERNAL = re.compile(r"""(https?:)?//|@import|<(link|iframe|object|embed|base)\b""", re.IGNORECASE)
 
 
-COASTING = {"coast": make_agent("coast")}
+COASTING = {"coast": eb.make_agent("coast")}
 
 
 @pytest.fixture(scope="module")
-def report(evaluation: Evaluation) -> Report:
-    agents = {name: make_agent(name) for name in ("full_brake", "constant:4.5")}
+def report(evaluation: eb.Evaluation) -> Report:
+    agents = {name: eb.make_agent(name) for name in ("full_brake", "constant:4.5")}
     part = replace(evaluation, outcomes={name: evaluation.outcome(name) for name in agents})
     return Report(
         title="PPO on paper-random",
-        rows=summarise(part),
+        rows=eb.summarise(part),
         evaluation=part,
         figures=[Part.drawing(new_figure(4.0, 3.0), "Learning curve", "Harm over steps.")],
-        tests=[("paper-other", "Another test.", summarise(evaluation))],
+        tests=[("paper-other", "Another test.", eb.summarise(evaluation))],
         summary="One million steps.",
         settings={"Training seed": 5, "Command": "ethbrake run"},
         versions={"numpy": "2.4.6"},
@@ -192,24 +189,24 @@ def episode_data(html: str) -> dict:
     return json.loads(text)
 
 
-def test_report__says_who_did_not_repeat_itself(pair: Scenario, html: str) -> None:
+def test_report__says_who_did_not_repeat_itself(pair: eb.Scenario, html: str) -> None:
     class Fickle:
         name, drives = "fickle", iter(range(100))
 
-        def begin(self, alert: Worlds, vehicle: int, scripts: object) -> np.ndarray:
+        def begin(self, alert: eb.Worlds, vehicle: int, scripts: object) -> np.ndarray:
             return np.full(alert.n, -float(next(self.drives)) / 2.0)
 
-        def act(self, worlds: Worlds, memory: np.ndarray, vehicle: int) -> tuple[np.ndarray, np.ndarray]:
+        def act(self, worlds: eb.Worlds, memory: np.ndarray, vehicle: int) -> tuple[np.ndarray, np.ndarray]:
             return memory, memory
 
-    result = evaluate(pair.sample(3, 0), {"fickle": Fickle()}, scenario=pair)
-    text = Report("t", summarise(result), result).driven({"fickle": Fickle()}).html
+    result = eb.evaluate(pair.sample(3, 0), {"fickle": Fickle()}, scenario=pair)
+    text = Report("t", eb.summarise(result), result).driven({"fickle": Fickle()}).html
     assert "fickle did not repeat itself in 3 worlds of these" in text
     assert "did not repeat itself" not in html
 
 
 def test_chosen__begin_with_those_of_the_largest_regret_and_say_whose_harm_it_is(
-    report: Report, pair: Scenario
+    report: Report, pair: eb.Scenario
 ) -> None:
     chosen = choose_shown(report.evaluation, "constant:4.5")
     assert list(chosen)[:10] == worst_rows(report.evaluation, "constant:4.5").tolist()
@@ -221,7 +218,7 @@ def test_chosen__begin_with_those_of_the_largest_regret_and_say_whose_harm_it_is
         first, total = outcome.first_impact_harm[row], outcome.total_harm[row]
         assert each.why == f"constant:4.5: harm {first:.2f} first-impact, {total:.2f} total"
     worlds = pair.replace(gaps_m={"uniform": [0.5, 9.0]}).sample(40, 0)
-    result = evaluate(worlds, COASTING, scenario=pair)
+    result = eb.evaluate(worlds, COASTING, scenario=pair)
     harm = result.outcome("coast").total_harm
     assert harm[worst_rows(result, "coast")].tolist() == sorted(harm, reverse=True)[:10]
 
@@ -229,14 +226,16 @@ def test_chosen__begin_with_those_of_the_largest_regret_and_say_whose_harm_it_is
 @pytest.mark.parametrize(
     "first", [pytest.param(k, marks=pytest.mark.slow if k else ()) for k in range(0, len(HOSTILE), 24)]
 )
-def test_report__hostile_names_are_text_everywhere(pair: Scenario, first: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_report__hostile_names_are_text_everywhere(
+    pair: eb.Scenario, first: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     if first:  # one page with its figures is enough: these hold names as outlines only
         draw_nothing(monkeypatch)
     names = [text[:200] for text in HOSTILE[first : first + 24]]
-    agents = {name: make_agent("constant:4") for name in names}
-    result = evaluate(pair.sample(3, 0), agents, scenario=pair)
+    agents = {name: eb.make_agent("constant:4") for name in names}
+    result = eb.evaluate(pair.sample(3, 0), agents, scenario=pair)
     words, told = " ".join(names), {name: name for name in names}
-    given = Report(words, summarise(result), result, focus=names[0], summary=words, settings=told, versions=told)
+    given = Report(words, eb.summarise(result), result, focus=names[0], summary=words, settings=told, versions=told)
     html = given.driven(agents).html
     found = Page(html)
     assert found.open == [] and not set(html) & UNSEEN and html.count("<script") == 2
@@ -307,10 +306,10 @@ ALLOWED = set(
 )
 
 
-def test_report__leaves_out_what_has_no_value_and_says_where_the_horizon_cut_episodes_off(pair: Scenario) -> None:
+def test_report__leaves_out_what_has_no_value_and_says_where_the_horizon_cut_episodes_off(pair: eb.Scenario) -> None:
     short = pair.replace(horizon_s=1.0)
-    result = evaluate(short.sample(2, 0), COASTING, scenario=short)
-    text = Page(Report("t", summarise(result), result).driven(COASTING).html).text
+    result = eb.evaluate(short.sample(2, 0), COASTING, scenario=short)
+    text = Page(Report("t", eb.summarise(result), result).driven(COASTING).html).text
     assert "left out: Decrease, first-impact; Decrease, total; Predicted harm" in text
     assert text.count("Decrease, total") == text.count("Predicted harm") == 1
     assert "First-impact harm" in text and "Squared closing speed" in text
@@ -321,9 +320,9 @@ def test_report__leaves_out_what_has_no_value_and_says_where_the_horizon_cut_epi
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_write_report__overwrites_only_by_force(tmp_path: Path, pair: Scenario) -> None:
-    found, path = evaluate(pair.sample(2, 0), COASTING, scenario=pair), tmp_path / "report.html"
-    mine = Report("Mine", summarise(found), found)
+def test_write_report__overwrites_only_by_force(tmp_path: Path, pair: eb.Scenario) -> None:
+    found, path = eb.evaluate(pair.sample(2, 0), COASTING, scenario=pair), tmp_path / "report.html"
+    mine = Report("Mine", eb.summarise(found), found)
     mine.write(path)
     with pytest.raises(AlreadyExists):
         mine.write(path)
@@ -332,9 +331,9 @@ def test_write_report__overwrites_only_by_force(tmp_path: Path, pair: Scenario) 
     assert "<h1>Other</h1>" in path.read_text("utf-8")
 
 
-def test_report__counts_a_cascade_whole_but_draws_its_last_impact(pair: Scenario) -> None:
+def test_report__counts_a_cascade_whole_but_draws_its_last_impact(pair: eb.Scenario) -> None:
     bouncy = pair.replace(restitution=0.8)
-    result = evaluate(bouncy.sample(1, 0), COASTING, scenario=bouncy)
-    (episode,) = episode_data(Report("t", summarise(result), result).driven(COASTING).html)["worlds"][0]["episodes"]
+    result = eb.evaluate(bouncy.sample(1, 0), COASTING, scenario=bouncy)
+    (episode,) = episode_data(Report("t", eb.summarise(result), result).driven(COASTING).html)["worlds"][0]["episodes"]
     assert episode["impacts"][-1][4] == result.outcome("coast").impacts[0] > len(episode["impacts"]) - 1
     assert np.diff([impact[4] for impact in episode["impacts"]]).min() > 0

@@ -68,11 +68,13 @@ def press(rng: np.random.Generator, N: int) -> Iterator[Case]:
     mass = MASSES[rng.integers(len(MASSES))][:N]
     line = Line((), (), (), (), (), (), Fraction(RESTITUTIONS[rng.integers(len(RESTITUTIONS))]))
     for k in range(N):
-        command = Fraction(COMMANDS[rng.integers(len(COMMANDS))])
-        latency = eighths(rng, 0, 8) if rng.random() < 0.5 else Fraction(0)
-        limit = Fraction(int(rng.choice([16, 16, 20])))
+        own = {
+            "command": Fraction(COMMANDS[rng.integers(len(COMMANDS))]),
+            "latency": eighths(rng, 0, 8) if rng.random() < 0.5 else Fraction(0),
+            "limit": Fraction(int(rng.choice([16, 16, 20]))),
+        }
         gap = eighths(rng, 0, 8) if rng.random() < 0.2 else Fraction(0)
-        line = append(line, start, command, latency, Fraction(mass[k]), limit, gap=gap if k else None)
+        line = append(line, gap, speeds=start, mass=Fraction(mass[k]), **own)
     outcome = run(line, Fraction(4))
     kinds = ("held", "standstill", "released", "limit", "impact")
     if outcome is not None and outcome.kinds["joined"] and any(outcome.kinds[kind] for kind in kinds):
@@ -101,20 +103,24 @@ def attempt(rng: np.random.Generator, N: int) -> Iterator[Case]:
 def add_vehicle(rng: np.random.Generator, line: Line, mass: Fraction, contact: Fraction) -> Line | None:
     """``line`` with one more vehicle that meets the last one at time ``contact``, or None where that cannot be."""
     speed, limit = eighths(rng, 0, 200), Fraction(int(rng.integers(10, 40)))
-    latency = eighths(rng, 0, 8) if rng.random() < 0.6 else Fraction(0)
-    command = Fraction(COMMANDS[rng.integers(len(COMMANDS))])
-    own = (min(speed, limit), command, latency, mass, limit)
+    own = {
+        "speeds": min(speed, limit),
+        "limit": limit,
+        "latency": eighths(rng, 0, 8) if rng.random() < 0.6 else Fraction(0),
+        "command": Fraction(COMMANDS[rng.integers(len(COMMANDS))]),
+        "mass": mass,
+    }
     if not line.speeds:
-        return append(line, *own)
+        return append(line, FAR, **own)
     if rng.random() < 0.07:  # a touch: as fast as the vehicle before it at the contact, and slowing down
-        own = (own[0], Fraction(-8), Fraction(0), *own[3:])
-        far = run(append(line, *own, gap=FAR), contact)
-        speed = own[0] if far is None else own[0] + far.speeds[-2] - far.speeds[-1]
-        own = (min(max(speed, Fraction(0)), limit), *own[1:])
-    far = run(append(line, *own, gap=FAR), contact)
+        own |= {"command": Fraction(-8), "latency": Fraction(0)}
+        far = run(append(line, FAR, **own), contact)
+        if far is not None:
+            own["speeds"] = min(max(own["speeds"] + far.speeds[-2] - far.speeds[-1], Fraction(0)), limit)
+    far = run(append(line, FAR, **own), contact)
     if far is None or far.gaps[-1] >= FAR:
         return None
-    placed = append(line, *own, gap=FAR - far.gaps[-1])
+    placed = append(line, FAR - far.gaps[-1], **own)
     met = run(placed, contact)
     early = run(placed, contact - Fraction(1, 64)) if contact > 0 else met
     pair = len(placed.gaps) - 1
@@ -123,18 +129,10 @@ def add_vehicle(rng: np.random.Generator, line: Line, mass: Fraction, contact: F
     return placed if met.gaps[-1] == 0 and (contact == 0 or early.gaps[-1] > 0) else None
 
 
-def append(line: Line, speed: Fraction, command: Fraction, latency: Fraction, mass: Fraction, limit: Fraction,
-           gap: Fraction | None = None) -> Line:  # fmt: skip
-    """``line`` with one more vehicle behind."""
-    return replace(
-        line,
-        gaps=line.gaps if gap is None else (*line.gaps, gap),
-        speeds=(*line.speeds, speed),
-        command=(*line.command, command),
-        latency=(*line.latency, latency),
-        mass=(*line.mass, mass),
-        limit=(*line.limit, limit),
-    )
+def append(line: Line, gap: Fraction, **own: Fraction) -> Line:
+    """``line`` with one more vehicle behind, by a gap where it is not the first."""
+    columns = {name: (*getattr(line, name), value) for name, value in own.items()}
+    return replace(line, gaps=(*line.gaps, gap) if line.speeds else (), **columns)
 
 
 def run(line: Line, until: Fraction) -> Outcome | None:
@@ -153,17 +151,16 @@ def eighths(rng: np.random.Generator, low: int, high: int) -> Fraction:
 
 def worlds_of(lines: Sequence[Line]) -> Worlds:
     """The lines as one batch; their numbers must be doubles."""
-    rows = {
-        name: [floats(getattr(line, name)) for line in lines] for name in ("gaps", "speeds", "latency", "mass", "limit")
-    }
+    names = ("gaps", "speeds", "latency", "mass", "limit")
+    gaps, speeds, latency, mass, limit = ([floats(getattr(line, name)) for line in lines] for name in names)
     return make_worlds(
-        rows["gaps"],
-        rows["speeds"],
+        gaps,
+        speeds,
         braking_capacity_mps2=CAPACITY_MPS2,
         driving_capacity_mps2=CAPACITY_MPS2,
-        latency_s=rows["latency"],
-        mass_t=rows["mass"],
-        speed_limit_mps=rows["limit"],
+        latency_s=latency,
+        mass_t=mass,
+        speed_limit_mps=limit,
         restitution=[float(line.restitution) for line in lines],
     )
 

@@ -43,13 +43,11 @@ class Draws:
     def uniform(self, low: float, high: float, shape: tuple[int, ...]) -> Floats:
         """Multiples of 2^-53 in [0, 1), scaled."""
         words = np.asarray(self._words.random_raw(int(np.prod(shape))), np.uint64).reshape(shape)
-        unit: Floats = (words >> np.uint64(11)).astype(np.float64) * 2.0**-53
-        return low + (high - low) * unit
+        return low + (high - low) * ((words >> np.uint64(11)).astype(np.float64) * 2.0**-53)
 
     def choice(self, values: list[float], shape: tuple[int, ...]) -> Floats:
         """One of ``values`` each."""
-        index = (self.uniform(0.0, len(values), shape)).astype(np.int64)
-        return np.asarray(values)[index]
+        return np.asarray(values)[self.uniform(0.0, len(values), shape).astype(np.int64)]
 
 
 def driving_lines(key: int, n: int, N: int, *, drive: bool = True) -> Batch:
@@ -134,8 +132,7 @@ def thrown_lines(key: int, n: int, N: int) -> Batch:
         restitution=draws.choice([0.0, 0.1, 0.3, 0.6], (n,)),
         obstacle_gap_m=draws.uniform(10.0, 40.0, (n,)),
     )
-    command = np.maximum(draws.uniform(-12.0, 4.0, (n, N)), -capacity)
-    return Batch(worlds, command)
+    return Batch(worlds, np.maximum(draws.uniform(-12.0, 4.0, (n, N)), -capacity))
 
 
 # ---------------------------------------------------------------- whole runs, in one piece and in several
@@ -155,51 +152,42 @@ def state_bytes(worlds: Worlds, impacts: Impacts) -> tuple[bytes, ...]:
     return tuple(column.tobytes() for column in columns)
 
 
-def relative_changes(mine: Worlds, theirs: Worlds, total_harm: Floats, other_harm: Floats) -> Floats:
-    """Largest change of a world's gaps, speeds and harm, relative to at least 100 m, 30 m/s, 900 m2/s2, [n]."""
-    worst = np.zeros(mine.n)
-    parts = ((mine.gaps_m, theirs.gaps_m, 100.0), (mine.speeds_mps, theirs.speeds_mps, 30.0))
-    for one, other, size in (*parts, (total_harm, other_harm, 900.0)):
-        scale = np.maximum(np.abs(other).max(axis=1), size)
-        worst = np.maximum(worst, np.abs(one - other).max(axis=1) / scale)
-    return worst
-
-
 class Split(NamedTuple):
-    """What cutting a run at random times changed; arrays [n]."""
+    """In what a run differs from another one; arrays [n]."""
 
-    error: Floats  # relative_changes
+    error: Floats  # largest change of gaps, speeds and harm, relative to at least 100 m, 30 m/s, 900 m2/s2
     few: Bools  # at most FEW_IMPACTS impacts
     other: Bools  # some pair has another number of impacts
+
+
+def changed(mine: Worlds, total_harm: Floats, count: Floats, whole: Worlds, impacts: Impacts) -> Split:
+    """In what worlds with this harm and so many impacts of each pair differ from whole runs."""
+    worst = np.zeros(mine.n)
+    parts = ((mine.gaps_m, whole.gaps_m, 100.0), (mine.speeds_mps, whole.speeds_mps, 30.0))
+    for one, other, size in (*parts, (total_harm, impacts.total_harm, 900.0)):
+        scale = np.maximum(np.abs(other).max(axis=1), size)
+        worst = np.maximum(worst, np.abs(one - other).max(axis=1) / scale)
+    return Split(worst, impacts.count.sum(axis=1) <= FEW_IMPACTS, (count != impacts.count).any(axis=1))
 
 
 def split_errors(N: int, n: int, cuts: int, key: int) -> Split:
     """Whole runs against the same runs cut at random times."""
     batch = driving_lines(key, n, N)
-    whole, impacts = once(batch)
     edges = np.sort(np.random.default_rng(cuts).uniform(0.0, HORIZON_S, (cuts, n)), axis=0)
-    edges[-1], world, total, count = HORIZON_S, batch.worlds, np.zeros(whole.gaps_m.shape), np.zeros(whole.gaps_m.shape)
+    edges[-1], world, total, count = HORIZON_S, batch.worlds, np.zeros((n, N - 1)), np.zeros((n, N - 1))
     for edge in edges:
         world, part = advance(world, batch.command, until_s=edge)
         total, count = total + part.total_harm, count + part.count
-    error = relative_changes(world, whole, total, impacts.total_harm)
-    return Split(error, _few(impacts), (count != impacts.count).any(axis=1))
+    return changed(world, total, count, *once(batch))
 
 
 def last_digit_errors(N: int, n: int, key: int) -> Split:
     """The same runs, uncut, against those whose initial gaps have another last digit: what doubles can know at all."""
     batch = driving_lines(key, n, N)
-    whole, impacts = once(batch)
     gaps = batch.worlds.gaps_m
     moved = replace(batch.worlds, gaps_m=np.where(gaps > 0.0, np.nextafter(gaps, np.inf), gaps))
-    other, changed = once(Batch(moved, batch.command))
-    error = relative_changes(other, whole, changed.total_harm, impacts.total_harm)
-    return Split(error, _few(impacts), (changed.count != impacts.count).any(axis=1))
-
-
-def _few(impacts: Impacts) -> Bools:
-    few: Bools = impacts.count.sum(axis=1) <= FEW_IMPACTS
-    return few
+    other, impacts = once(Batch(moved, batch.command))
+    return changed(other, impacts.total_harm, impacts.count, *once(batch))
 
 
 # ---------------------------------------------------------------- measured errors of an impact, in eps
@@ -223,8 +211,7 @@ def momentum_eps(before: Worlds, after: Worlds) -> Floats:
 def energy_rise_eps(before: Worlds, after: Worlds) -> Floats:
     """Rise of kinetic energy (over ground) in eps of the energy before, [n]; negative where energy was lost."""
     mass = before.vehicles.mass_t.astype(Wide)
-    was = (mass * before.speeds_mps.astype(Wide) ** 2).sum(axis=1)
-    now = (mass * after.speeds_mps.astype(Wide) ** 2).sum(axis=1)
+    was, now = ((mass * worlds.speeds_mps.astype(Wide) ** 2).sum(axis=1) for worlds in (before, after))
     return np.asarray((now - was) / np.where(was > 0, was, 1) / EPS, np.float64)
 
 

@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.physics import Bools, Floats, ImpactRows, Ints, Worlds, advance, make_worlds
 from ethbrake_marl.physics.kernel import BOUND
-from tests.physics.exact_simulator import Outcome, line_of, simulate
+from tests.physics.exact_simulator import line_of, simulate
 from tests.reference.tolerances import DISCRIMINANT_EPS, END_EPS, EPS, GAP_M
 
 CAPACITY_MPS2 = 9.0
-A_LITTLE_S = 1e-8  # by which a borderline segment is made longer
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,6 @@ class Scan:
     pairs: int
     contacts: int
     in_doubt: int
-    borderline: int  # decided otherwise than exact arithmetic, within the tolerances
     missed: Ints  # worlds
     phantom: Ints  # worlds
     wrong: Ints  # worlds whose first contact has another time or speed, or whose gaps differ
@@ -149,29 +147,24 @@ def _piece(motion: Solo, gaps: Floats, begin: Floats, finish: Floats, blur: Floa
 
 def scan(segments: Segments) -> Scan:
     """Compare the kernel with the closed form, and where that is in doubt with exact arithmetic."""
-    meeting = meetings(segments)
+    meeting, n = meetings(segments), segments.worlds.n
     after, impacts = advance(segments.worlds, segments.command, segments.duration, record=True)
     rows = impacts.rows
-    assert rows is not None
-    n = segments.worlds.n
     hit_world, first_row = np.unique(rows.world, return_index=True)
-    hits = np.zeros(n, bool)
-    hits[hit_world] = True
-    doubt = meeting.doubt.any(axis=1)
-    expected = np.isfinite(meeting.time).any(axis=1)
-    clear = ~doubt
-    wrong = _wrong_contacts(segments, meeting, rows, hit_world, first_row, clear & expected)
-    wrong |= clear & ~expected & ~hits & _wrong_gaps(segments, after)
-    missed, phantom = clear & expected & ~hits, clear & hits & ~expected
-    borderline = 0
+    hits = np.isin(np.arange(n), hit_world)
+    doubt, expected = meeting.doubt.any(axis=1), np.isfinite(meeting.time).any(axis=1)
+    missed, phantom = ~doubt & expected & ~hits, ~doubt & hits & ~expected
+    wrong = _wrong_contacts(segments, meeting, rows, hit_world, first_row, ~doubt & expected)
+    wrong |= ~doubt & ~expected & ~hits & _wrong_gaps(segments, after)
+    columns = np.stack([rows.time_s, rows.pair, rows.closing_speed_mps], axis=1)
     for k in np.flatnonzero(doubt):
-        mine = rows.world == k if rows.world.size < 1000 else np.arange(*np.searchsorted(rows.world, [k, k + 1]))
-        verdict = _exact_verdict(segments, int(k), rows, mine)
-        borderline += verdict == "borderline"
-        missed[k], phantom[k], wrong[k] = verdict == "missed", verdict == "phantom", verdict == "wrong"
+        line, until = line_of(segments.worlds, segments.command[k].tolist(), k), Fraction(float(segments.duration[k]))
+        exact = [[float(x) for x in hit[:3]] for hit in simulate(line, until, bits=160).hits]
+        found = columns[slice(*np.searchsorted(rows.world, [k, k + 1]))]
+        missed[k], phantom[k] = len(found) < len(exact), len(found) > len(exact)
+        wrong[k] = len(found) == len(exact) and np.any(np.abs(found - np.reshape(exact, (-1, 3))) > 1e-6)
     pairs = n * (segments.worlds.N - 1)
-    flat = (np.flatnonzero(found) for found in (missed, phantom, wrong))
-    return Scan(pairs, int(hits.sum()), int(doubt.sum()), borderline, *flat)
+    return Scan(pairs, int(hits.sum()), int(doubt.sum()), *map(np.flatnonzero, (missed, phantom, wrong)))
 
 
 def _wrong_contacts(
@@ -184,8 +177,7 @@ def _wrong_contacts(
     v = segments.worlds.speeds_mps.max(axis=1) + CAPACITY_MPS2 * segments.duration
     close = np.sort(meeting.time, axis=1)[:, :2]
     alone = ~(close[:, -1] <= close[:, 0] + 1e-9) if close.shape[1] == 2 else np.ones(pair.size, bool)
-    bad = np.zeros(pair.size, bool)
-    closing = rows.closing_speed_mps[row]
+    bad, closing = np.zeros(pair.size, bool), rows.closing_speed_mps[row]
     off = np.abs(rows.time_s[row] - time[world]) > 1e-6 * np.minimum(1.0, 1e-2 / np.maximum(closing, 1e-9)) + 1e-9
     off |= np.abs(closing**2 - squared[world]) > 100 * EPS * v[world] ** 2 + 1e-12 * squared[world]
     off |= alone[world] & (rows.pair[row] != pair[world])
@@ -195,53 +187,11 @@ def _wrong_contacts(
 
 def _wrong_gaps(segments: Segments, after: Worlds) -> NDArray[np.bool_]:
     """Worlds whose final gaps or speeds differ from the closed form (only for worlds without contact)."""
-    motion = solo(segments)
-    end = np.broadcast_to(segments.duration[:, None], segments.worlds.gaps_m.shape)
-    expected = _gap(motion, segments.worlds.gaps_m, end)[0]
-    speed = motion.at(np.broadcast_to(segments.duration[:, None], motion.speed.shape))[1]
+    motion, gaps, end = solo(segments), segments.worlds.gaps_m, segments.duration[:, None]
+    expected, speed = _gap(motion, gaps, np.broadcast_to(end, gaps.shape))[0], motion.at(end)[1]
     return np.any(np.abs(after.gaps_m - expected) > GAP_M, axis=1) | np.any(
         np.abs(after.speeds_mps - speed) > GAP_M, axis=1
     )
-
-
-def _exact_verdict(segments: Segments, k: int, rows: ImpactRows, mine: Ints) -> str:
-    """ "same", "borderline", "missed", "phantom" or "wrong" for world k, by exact arithmetic."""
-    line = line_of(segments.worlds, segments.command[k].tolist(), k)
-    until = Fraction(float(segments.duration[k]))
-    exact = simulate(line, until, bits=160)
-    kernel = list(zip(rows.time_s[mine], rows.pair[mine], rows.closing_speed_mps[mine], strict=True))
-    if len(kernel) == len(exact.hits):
-        near = all(
-            abs(t - float(hit.time)) <= 1e-6 and p == hit.pair and abs(c - float(hit.closing)) <= 1e-6
-            for (t, p, c), hit in zip(kernel, exact.hits, strict=True)
-        )
-        return "same" if near else "wrong"
-    if _borderline(segments, k, kernel, exact, until):
-        return "borderline"
-    return "missed" if len(kernel) < len(exact.hits) else "phantom"
-
-
-def _borderline(
-    segments: Segments, k: int, kernel: list[tuple[float, int, float]], exact: Outcome, until: Fraction
-) -> bool:
-    """Whether two counts of hits may differ by rounding: a touch, or a contact at the very end of the segment."""
-    if len(kernel) < len(exact.hits):
-        odd = exact.hits[len(kernel)]
-        time, pair, closing = float(odd.time), odd.pair, float(odd.closing)
-    else:
-        time, pair, closing = kernel[len(exact.hits)]
-    v = float(segments.worlds.speeds_mps[k].max()) + CAPACITY_MPS2 * float(until)
-    reach = float(segments.worlds.gaps_m[k].max()) + v * float(until)
-    if closing**2 - BOUND.TOUCH_SPEED_MPS**2 <= DISCRIMINANT_EPS * EPS * (v**2 + 2.0 * CAPACITY_MPS2 * reach):
-        return True
-    if time < float(until) - A_LITTLE_S:
-        return False
-    longer = until + 2 * Fraction(A_LITTLE_S)
-    if len(kernel) > len(exact.hits):
-        line = line_of(segments.worlds, segments.command[k].tolist(), k)
-        return any(hit.pair == pair for hit in simulate(line, longer, bits=160).hits)
-    _, impacts = advance(segments.worlds.take([k]), segments.command[[k]], float(longer))
-    return bool(impacts.count[0, pair] > 0)
 
 
 # ---------------------------------------------------------------- random segments

@@ -3,111 +3,92 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 
+import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import drive, fixed_commands, script_agents
-from ethbrake_marl.physics import Worlds
 from ethbrake_marl.physics.kernel import Decisions, contact, drift, force_range, settle, solo_motion, speed_event
-from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.search import Profiles, profile_problem
 
 NEVER = (math.inf, 0.0)
 CHANGES = math.nan  # an acceleration that is not constant all along
 
-
-@pytest.mark.parametrize(
-    ("gap", "closing", "pressing", "expected"),
-    [
-        (6.0, 8.0, 0.0, (0.75, 8.0)),
-        (8.0, 3.0, 1.0, (2.0, 5.0)),  # D = 9 + 16
-        (4.0, 0.0, 2.0, (2.0, 4.0)),
-        (4.0, -2.0, 4.0, (2.0, 6.0)),  # opens at first: D = 4 + 32
-        (4.0, 4.0, -2.0, (2.0, 0.0)),  # D = 0: a touch
-        (4.0, 4.0, math.nextafter(-2.0, -9.0), NEVER),
-        (4.0, 0.0, 0.0, NEVER),
-        (4.0, -1.0, 0.0, NEVER),
-        (4.0, 0.0, -1.0, NEVER),
+# Function, and what it makes of which numbers.
+BY_HAND: dict[Callable[..., Any], list[tuple[tuple[float, ...], Any]]] = {
+    contact: [  # gap, closing, pressing: the first root, and its closing speed
+        ((6.0, 8.0, 0.0), (0.75, 8.0)),
+        ((8.0, 3.0, 1.0), (2.0, 5.0)),  # D = 9 + 16
+        ((4.0, 0.0, 2.0), (2.0, 4.0)),
+        ((4.0, -2.0, 4.0), (2.0, 6.0)),  # opens at first: D = 4 + 32
+        ((4.0, 4.0, -2.0), (2.0, 0.0)),  # D = 0: a touch
+        ((4.0, 4.0, math.nextafter(-2.0, -9.0)), NEVER),
+        ((4.0, 0.0, 0.0), NEVER),
+        ((4.0, -1.0, 0.0), NEVER),
+        ((4.0, 0.0, -1.0), NEVER),
     ],
-)
-def test_contact__is_the_first_root_and_its_closing_speed(gap, closing, pressing, expected):
-    assert contact(gap, closing, pressing) == expected
-
-
-def test_drift__is_the_quadratic_of_the_gap():
-    assert drift(9.0, 2.0, 4.0, 1.5) == 9.0 - 3.0 - 4.5
-
-
-@pytest.mark.parametrize(
-    ("speed", "acceleration", "command", "limit", "expected"),
-    [
-        (4.0, -2.0, -2.0, 9.0, (2.0, 0.0)),
-        (-4.0, 2.0, -2.0, 9.0, (2.0, 0.0)),
-        (4.0, 2.0, 2.0, 10.0, (3.0, 10.0)),
-        (12.0, -2.0, 2.0, 10.0, (1.0, 10.0)),  # faster than its limit, held back: it drives again from 10 m/s on
-        (4.0, -2.0, 2.0, 10.0, (2.0, 0.0)),  # drives, but is dragged
-        (4.0, -2.0, 2.0, 1e-300, (2.0, 0.0)),  # both at one instant: it stands
-        (4.0, 2.0, 0.0, 6.0, NEVER),  # pushed without driving: no limit
-        (10.0, 2.0, 2.0, 10.0, NEVER),
-        (0.0, -2.0, -2.0, 9.0, NEVER),
-        (0.0, 2.0, 0.0, 9.0, NEVER),
-        (4.0, 0.0, 2.0, 9.0, NEVER),
+    drift: [((9.0, 2.0, 4.0, 1.5), 9.0 - 3.0 - 4.5)],  # the quadratic of the gap
+    speed_event: [  # speed, acceleration, command, limit: standstill, or the limit of a driver
+        ((4.0, -2.0, -2.0, 9.0), (2.0, 0.0)),
+        ((-4.0, 2.0, -2.0, 9.0), (2.0, 0.0)),
+        ((4.0, 2.0, 2.0, 10.0), (3.0, 10.0)),
+        ((12.0, -2.0, 2.0, 10.0), (1.0, 10.0)),  # faster than its limit, held back: it drives again from 10 m/s on
+        ((4.0, -2.0, 2.0, 10.0), (2.0, 0.0)),  # drives, but is dragged
+        ((4.0, -2.0, 2.0, 1e-300), (2.0, 0.0)),  # both at one instant: it stands
+        ((4.0, 2.0, 0.0, 6.0), NEVER),  # pushed without driving: no limit
+        ((10.0, 2.0, 2.0, 10.0), NEVER),
+        ((0.0, -2.0, -2.0, 9.0), NEVER),
+        ((0.0, 2.0, 0.0, 9.0), NEVER),
+        ((4.0, 0.0, 2.0, 9.0), NEVER),
     ],
-)
-def test_speed_event__is_standstill_or_the_limit_of_a_driver(speed, acceleration, command, limit, expected):
-    assert speed_event(speed, acceleration, command, limit) == expected
-
-
-@pytest.mark.parametrize(
-    ("speed", "command", "expected"),
-    [
-        (4.0, -3.0, (-3.0, -3.0)),
-        (-4.0, -3.0, (3.0, 3.0)),
-        (0.0, -3.0, (-3.0, 3.0)),
-        (4.0, 3.0, (3.0, 3.0)),
-        (9.0, 3.0, (0.0, 3.0)),
-        (9.5, 3.0, (0.0, 0.0)),
-        (-4.0, 3.0, (3.0, 3.0)),
-        (4.0, 0.0, (0.0, 0.0)),
-        (9.0, 0.0, (0.0, 0.0)),
+    force_range: [  # speed, command, limit: a range at standstill and at the limit only
+        ((4.0, -3.0, 9.0), (-3.0, -3.0)),
+        ((-4.0, -3.0, 9.0), (3.0, 3.0)),
+        ((0.0, -3.0, 9.0), (-3.0, 3.0)),
+        ((4.0, 3.0, 9.0), (3.0, 3.0)),
+        ((9.0, 3.0, 9.0), (0.0, 3.0)),
+        ((9.5, 3.0, 9.0), (0.0, 0.0)),
+        ((-4.0, 3.0, 9.0), (3.0, 3.0)),
+        ((4.0, 0.0, 9.0), (0.0, 0.0)),
+        ((9.0, 0.0, 9.0), (0.0, 0.0)),
     ],
-)
-def test_force_range__is_a_range_at_standstill_and_at_the_limit_only(speed, command, expected):
-    assert force_range(speed, command, 9.0) == expected
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "expected"),
-    [(2.0, 3.0, 2.0), (-3.0, -2.0, -2.0), (-1.0, 2.0, 0.0), (0.0, 3.0, 0.0), (-3.0, 0.0, 0.0)],
-)
-def test_settle__is_the_value_nearest_to_rest(low, high, expected):
-    assert settle(low, high) == expected
-
-
-@pytest.mark.parametrize(
-    ("speed", "command", "onset", "duration", "expected"),
-    [
-        (8.0, -2.0, 0.0, 1.0, (6.0, 7.0, -2.0)),
-        (8.0, -2.0, -0.5, 1.0, (6.0, 7.0, -2.0)),
-        (8.0, -2.0, 0.5, 1.5, (6.0, 11.0, CHANGES)),  # coasts 4 m
-        (8.0, -2.0, 1.0, 1.0, (8.0, 8.0, 0.0)),  # takes effect at the very end
-        (8.0, -2.0, 2.0, 1.0, (8.0, 8.0, 0.0)),
-        (8.0, 0.0, 0.5, 1.0, (8.0, 8.0, 0.0)),
-        (8.0, 0.0, 0.0, 1.0, (8.0, 8.0, 0.0)),
-        (4.0, -4.0, 0.0, 2.0, (0.0, 2.0, CHANGES)),
-        (4.0, -4.0, 0.0, 1.0, (0.0, 2.0, CHANGES)),  # an event at the end belongs to the segment
-        (1.0, -4.0, 0.0, 1.0, (0.0, 0.125, CHANGES)),
-        (0.0, -4.0, 0.0, 1.0, (0.0, 0.0, 0.0)),  # the brakes hold
-        (8.0, 2.0, 0.0, 0.5, (9.0, 4.25, 2.0)),
-        (8.0, 2.0, 0.0, 1.0, (10.0, 9.0, CHANGES)),
-        (8.0, 2.0, 0.0, 3.0, (10.0, 29.0, CHANGES)),
-        (10.0, 2.0, 0.0, 1.0, (10.0, 10.0, 0.0)),
-        (12.0, 2.0, 0.0, 1.0, (12.0, 12.0, 0.0)),
+    settle: [  # low, high: the value nearest to rest
+        ((2.0, 3.0), 2.0),
+        ((-3.0, -2.0), -2.0),
+        ((-1.0, 2.0), 0.0),
+        ((0.0, 3.0), 0.0),
+        ((-3.0, 0.0), 0.0),
     ],
+    solo_motion: [  # speed, command, onset, limit, duration: speed, way, and whether the acceleration was constant
+        ((8.0, -2.0, 0.0, 10.0, 1.0), (6.0, 7.0, -2.0)),
+        ((8.0, -2.0, -0.5, 10.0, 1.0), (6.0, 7.0, -2.0)),
+        ((8.0, -2.0, 0.5, 10.0, 1.5), (6.0, 11.0, CHANGES)),  # coasts 4 m
+        ((8.0, -2.0, 1.0, 10.0, 1.0), (8.0, 8.0, 0.0)),  # takes effect at the very end
+        ((8.0, -2.0, 2.0, 10.0, 1.0), (8.0, 8.0, 0.0)),
+        ((8.0, 0.0, 0.5, 10.0, 1.0), (8.0, 8.0, 0.0)),
+        ((8.0, 0.0, 0.0, 10.0, 1.0), (8.0, 8.0, 0.0)),
+        ((4.0, -4.0, 0.0, 10.0, 2.0), (0.0, 2.0, CHANGES)),
+        ((4.0, -4.0, 0.0, 10.0, 1.0), (0.0, 2.0, CHANGES)),  # an event at the end belongs to the segment
+        ((1.0, -4.0, 0.0, 10.0, 1.0), (0.0, 0.125, CHANGES)),
+        ((0.0, -4.0, 0.0, 10.0, 1.0), (0.0, 0.0, 0.0)),  # the brakes hold
+        ((8.0, 2.0, 0.0, 10.0, 0.5), (9.0, 4.25, 2.0)),
+        ((8.0, 2.0, 0.0, 10.0, 1.0), (10.0, 9.0, CHANGES)),
+        ((8.0, 2.0, 0.0, 10.0, 3.0), (10.0, 29.0, CHANGES)),
+        ((10.0, 2.0, 0.0, 10.0, 1.0), (10.0, 10.0, 0.0)),
+        ((12.0, 2.0, 0.0, 10.0, 1.0), (12.0, 12.0, 0.0)),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("function", "given", "expected"),
+    [pytest.param(of, *case, id=f"{of.__name__}{case[0]}") for of, cases in BY_HAND.items() for case in cases],
 )
-def test_solo_motion__speed_way_and_whether_the_acceleration_was_constant(speed, command, onset, duration, expected):
-    np.testing.assert_array_equal(solo_motion(speed, command, onset, 10.0, duration), expected)
+def test_closed_form__by_hand(function: Callable[..., Any], given: tuple[float, ...], expected: Any) -> None:
+    np.testing.assert_array_equal(function(*given), expected)
 
 
 # ---------------------------------------------------------------- one step of an episode
@@ -122,7 +103,7 @@ class Phases:
     def __init__(self, commands: np.ndarray, length: int) -> None:
         self.commands, self.length = commands, length
 
-    def act(self, worlds: Worlds, vehicle: int) -> np.ndarray:
+    def act(self, worlds: eb.Worlds, vehicle: int) -> np.ndarray:
         started = worlds.vehicles.latency_s[:, vehicle]
         phase = np.maximum(Decisions(started, 0.1).latest(worlds.time_s), 0) // self.length
         return self.commands[np.arange(worlds.n), np.minimum(phase, self.commands.shape[1] - 1)]
@@ -131,7 +112,7 @@ class Phases:
 @pytest.mark.parametrize("name", ["paper-random", "paper-random-obstacle", "stress-wide"])
 @pytest.mark.parametrize("length", [1, 7])
 def test_profiles__step_by_step_realise_what_the_engine_does_to_the_bit(name, length):
-    scenario = load_scenario(name)
+    scenario = eb.load_scenario(name)
     worlds, vehicle = scenario.sample(40, 11).worlds, scenario.learners[0]
     shares = np.random.default_rng(length).uniform(-1.0, 0.3, (worlds.n, 100 // length))
     commands = shares * worlds.vehicles.braking_capacity_mps2[:, [vehicle]]

@@ -141,18 +141,6 @@ def test_detection__a_contact_between_samples_is_missed() -> None:
 # ---------------------------------------------------------------- the reach of a sample: a millionth of a step
 
 
-@pytest.mark.parametrize("time", [1e-6, 1.0 + 0.5e-6, 1.0 - 0.5e-6])  # beyond: `refusals/physics.txt`
-def test_sample__reaches_a_millionth_of_a_step_to_both_sides(time: float) -> None:
-    worlds = replace(line([9.0], [4.0, 4.0]), time_s=np.array([time]))
-    assert advance_sampled(worlds, 0.0, until_s=2.0, step_s=1.0)[0].time_s.tolist() == [2.0]
-
-
-@pytest.mark.parametrize(("latency", "until", "time"), [(1e-6, 0.0, 0.0), (2e-6, 1e-6, 2e-6), (2e-6, 0.9e-6, 0.9e-6)])
-def test_first_sample__reaches_a_millionth_of_a_step_before_it(latency: float, until: float, time: float) -> None:
-    after, _ = advance_sampled(line([9.0], [4.0, 4.0], latency_s=[0.0, latency]), 0.0, until_s=until, step_s=1.0)
-    assert after.time_s.tolist() == [time]
-
-
 @pytest.mark.parametrize("until", [math.nextafter(0.75, 0.0), 0.75, math.nextafter(0.75, 9.0)])
 def test_first_sample__is_a_time_that_rounding_parts_from_it(until: float) -> None:
     worlds = line([9.0], [4.0, 8.0], latency_s=[0.0, 0.75], braking_capacity_mps2=8.0)
@@ -163,18 +151,37 @@ def test_first_sample__is_a_time_that_rounding_parts_from_it(until: float) -> No
         assert each.command_mps2.tolist() == [[-8.0, -8.0]] and each.gaps_m.tolist() == after.gaps_m.tolist()
 
 
-@pytest.mark.parametrize(
-    ("latency", "step", "acts"),
-    [(1e-6, 1.0, True), (math.nextafter(1e-6, 1.0), 1.0, False), (0.5e-6, 0.5, True), (0.8e-6, 0.5, False)],
-)
-def test_latency__within_a_millionth_of_a_step_after_a_sample_is_over_at_it(
-    latency: float, step: float, acts: bool
+# The line, its command, the step, the end, and columns of the state then.
+REACH: list[tuple[Worlds, float, float, float, dict[str, Any]]] = [
+    # a sample reaches to both sides (beyond: `refusals/physics.txt`), the first one to before it
+    *(
+        (replace(line([9.0], [4.0, 4.0]), time_s=np.array([time])), 0.0, 1.0, 2.0, {"time_s": 2.0})
+        for time in (1e-6, 1.0 + 0.5e-6, 1.0 - 0.5e-6)
+    ),
+    *(
+        (line([9.0], [4.0, 4.0], latency_s=[0.0, latency]), 0.0, 1.0, until, {"time_s": time})
+        for latency, until, time in ((1e-6, 0.0, 0.0), (2e-6, 1e-6, 2e-6), (2e-6, 0.9e-6, 0.9e-6))
+    ),
+    # a latency that ends so little after a sample is over at it
+    *(
+        (line([99.0], [8.0, 8.0], latency_s=[latency, 0.0]), -2.0, step, until, state)
+        for latency, step, acts in (
+            (1e-6, 1.0, True), (math.nextafter(1e-6, 1.0), 1.0, False), (0.5e-6, 0.5, True), (0.8e-6, 0.5, False)
+        )
+        for until, state in (
+            (0.0, {"command_mps2": [-2.0 * acts, -2.0]}),
+            (step, {"speeds_mps": [8.0 - 2.0 * step * acts, 8.0 - 2.0 * step]}),
+        )
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("worlds", "command", "step", "until", "state"), REACH, ids=range(len(REACH)))
+def test_sample__reaches_a_millionth_of_a_step(
+    worlds: Worlds, command: float, step: float, until: float, state: dict[str, Any]
 ) -> None:
-    worlds = line([99.0], [8.0, 8.0], latency_s=[latency, 0.0])
-    now, _ = advance_sampled(worlds, -2.0, until_s=0.0, step_s=step)
-    after, _ = advance_sampled(worlds, -2.0, until_s=step, step_s=step)
-    assert now.command_mps2.tolist() == [[-2.0 if acts else 0.0, -2.0]]
-    assert after.speeds_mps.tolist() == [[8.0 - 2.0 * step if acts else 8.0, 8.0 - 2.0 * step]]
+    after, _ = advance_sampled(worlds, command, until_s=until, step_s=step)
+    assert {key: getattr(after, key).tolist() for key in state} == {key: [value] for key, value in state.items()}
 
 
 @pytest.mark.parametrize("step", [0.1, 0.02, 0.003, 0.001])

@@ -15,7 +15,6 @@ from torch import nn
 
 import ethbrake_marl as eb
 from ethbrake_marl.observations import observe
-from ethbrake_marl.physics import advance
 from ethbrake_marl.policies import Actor, NetworkSpec, Policy, dense, squash
 
 
@@ -53,18 +52,26 @@ def test_dense__numbers_by_hand() -> None:
     assert y.tolist() == [[25.0, 20.0], [19.0, 18.0]]
 
 
-@pytest.mark.parametrize(("output", "expected"), [("clip", [1.0, -0.5, -1.0]), ("tanh", np.tanh([3.0, -0.5, -4.0]))])
-def test_actor__relu_then_output_by_hand(output: str, expected: list[float]) -> None:
+@pytest.mark.parametrize(
+    ("output", "last", "expected", "tensors"),
+    [
+        ("clip", [[1.0, -2.0]], [1.0, -0.5, -1.0, 0.0], 9),
+        ("tanh", [[1.0, -2.0]], np.tanh([3.0, -0.5, -4.0, 0.0]), 10),
+        # of five actions from -1 to 1 that of the highest score, and the lowest of equal ones; without a critic
+        ("choice", [[0.0, 0.0], [1.0, 0.0], [0.0, 3.0], [2.0, 0.0], [2.0, 0.0]], [0.5, 0.0, 0.0, -1.0], 4),
+    ],
+)
+def test_actor__relu_then_output_by_hand(output: str, last: Any, expected: Any, tensors: int) -> None:
     spec = NetworkSpec(
-        observation_size=1, action_size=1, policy_hidden=(2,), value_hidden=(1,), activation="relu", output=output
-    )
-    tensors = {row.name: np.zeros(row.shape, np.float32) for row in spec.tensors}
-    tensors["policy.0.weight"][:, 0] = [1.0, -1.0]  # hidden: max(x, 0), max(-x, 0)
-    tensors["policy.output.weight"][0] = [1.0, -2.0]
-    action = Actor(spec, tensors)(
-        np.array([[3.0], [0.25], [2.0]], np.float32) * np.array([[1.0], [-1.0], [-1.0]], "f4")
-    )
+        observation_size=1, action_size=1, policy_hidden=(2,), value_hidden=() if output == "choice" else (1,),
+        activation="relu", output=output, choices=5 if output == "choice" else None,
+    )  # fmt: skip
+    weights = {row.name: np.zeros(row.shape, np.float32) for row in spec.tensors}
+    weights["policy.0.weight"][:, 0] = [1.0, -1.0]  # hidden: max(x, 0), max(-x, 0)
+    weights["policy.output.weight"][:] = last
+    action = Actor(spec, weights)(np.array([[3.0], [-0.25], [-2.0], [0.0]], np.float32))
     np.testing.assert_allclose(action[:, 0], expected, rtol=1e-6)
+    assert len(weights) == tensors
 
 
 @pytest.mark.parametrize(
@@ -119,20 +126,6 @@ def test_squash__is_the_rounded_hyperbolic_tangent() -> None:
     assert actual[0, -2:].tolist() == [1.0, -1.0]
 
 
-def test_choice__is_the_action_of_the_highest_score_and_the_lowest_of_equal_ones() -> None:
-    spec = NetworkSpec(
-        observation_size=1, action_size=1, policy_hidden=(2,), value_hidden=(), activation="relu", output="choice",
-        choices=5,
-    )  # fmt: skip
-    tensors = {row.name: np.zeros(row.shape, np.float32) for row in spec.tensors}
-    assert list(tensors) == ["policy.0.weight", "policy.0.bias", "policy.output.weight", "policy.output.bias"]
-    tensors["policy.0.weight"][:, 0] = [1.0, -1.0]  # hidden: max(x, 0), max(-x, 0)
-    tensors["policy.output.weight"][:, 0] = [0.0, 1.0, 0.0, 2.0, 2.0]
-    tensors["policy.output.weight"][:, 1] = [0.0, 0.0, 3.0, 0.0, 0.0]
-    action = Actor(spec, tensors)(np.array([[1.0], [0.0], [-1.0]], np.float32))
-    assert action.tolist() == [[0.5], [-1.0], [0.0]]
-
-
 RandomTensors = Callable[[NetworkSpec], dict[str, np.ndarray]]
 SCENARIO = eb.load_scenario("paper-random")
 
@@ -163,6 +156,7 @@ def test_mixture__acts_as_the_network_that_the_gate_chooses_the_first_of_equal_s
 @pytest.mark.parametrize("around", ["+episode", "+step", "+refined", "+refined:profile"])
 def test_mixture__drives_shielded_and_refined(around: str, mixture: Policy, tmp_path: Path) -> None:
     mixture.save(tmp_path / "mixture")
+    assert eb.load_policy(tmp_path / "mixture").manifest == mixture.manifest
     spec = f"counterfactual@{tmp_path / 'mixture'}"
     agents = {name: eb.make_agent(name, scenario=SCENARIO) for name in (spec, spec + around)}
     found = eb.evaluate(SCENARIO.sample(4, seed=7).worlds, agents, scenario=SCENARIO)
@@ -190,7 +184,7 @@ def test_onnx__asks_for_the_same_acceleration_in_10_000_states(
     worlds = SCENARIO.replace(driving_capacity_mps2={"uniform": [1, 3]}).sample(10_000, 5).worlds
     rng = np.random.default_rng(0)
     command = -rng.uniform(0.0, 1.0, worlds.speeds_mps.shape) * worlds.vehicles.braking_capacity_mps2
-    worlds, _ = advance(worlds, command, until_s=rng.uniform(0.0, 6.0, worlds.n))
+    worlds, _ = eb.advance(worlds, command, until_s=rng.uniform(0.0, 6.0, worlds.n))
     seen, expected = observe(worlds, 1, ours.observation), eb.LearnedAgent(ours).act(worlds, 1)
     action, acceleration = onnx_of(ours).run(["action", "acceleration_mps2"], {"observation": seen})
     assert np.ptp(expected) > 4.0 and (expected > 0.5).any()

@@ -1,9 +1,9 @@
 """The programmes: what asks more than a test may take, ``python -m tests.programmes [NAME [options]]``.
 
 Without a name they are listed. Each is a module of this folder with a function ``cases(given)``, which yields a name
-and what is called for it, and where it has options of its own a function ``options(parser)``. What is called gives
-``Told``: whether it was good (None: it was not tried, or claims nothing), and one line of text. An ``AssertionError``
-is not good.
+and what is called for it, and where it has options of its own a table ``OPTIONS`` of what ``add_argument`` is told of
+each. What is called gives ``Told``: whether it was good (None: it was not tried, or claims nothing), and one line of
+text. An ``AssertionError`` is not good.
 """
 
 from __future__ import annotations
@@ -23,12 +23,8 @@ FOLDER = Path(__file__).parent
 
 def programmes() -> dict[str, str]:
     """The first line of each programme, by its name."""
-    found = {}
-    for file in sorted(FOLDER.glob("*.py")):
-        text = file.read_text("utf-8")
-        if "\ndef cases(" in text:
-            found[file.stem] = text.removeprefix('"""').partition("\n")[0].removesuffix('"""')
-    return found
+    texts = {file.stem: file.read_text("utf-8") for file in sorted(FOLDER.glob("*.py"))}
+    return {name: text.partition("\n")[0].strip('"') for name, text in texts.items() if "\ndef cases(" in text}
 
 
 def main(words: list[str]) -> int:
@@ -45,8 +41,8 @@ def main(words: list[str]) -> int:
     parser.add_argument("--only", default="", metavar="TEXT", help="cases whose name contains this, and no other")
     parser.add_argument("--within", type=float, default=math.inf, metavar="SECONDS", help="begin no case after them")
     parser.add_argument("--list", action="store_true", help="the names of the cases, and run none")
-    if hasattr(programme, "options"):
-        programme.options(parser)
+    for option, how in getattr(programme, "OPTIONS", {}).items():
+        parser.add_argument(option, **how)
     given = parser.parse_args(words[1:])
     given.until = time.monotonic() + given.within  # a case may look at it
     ended: list[bool | None] = []

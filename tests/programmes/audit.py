@@ -15,8 +15,6 @@ from typing import NamedTuple
 
 from tests.programmes import ROOT, Cases, Told
 
-PINS = ROOT / "constraints.txt"
-
 # Family of a licence -> the words that name it. One that is none of these, the GPL without an alternative for instance,
 # is told and fails.
 FAMILIES = {
@@ -63,7 +61,7 @@ def _family(words: str) -> str:
 
 def packages() -> list[Package]:
     """Every package of constraints.txt, in its order."""
-    pins = re.findall(r"^([A-Za-z0-9._-]+)==(\S+)", PINS.read_text("utf-8"), re.MULTILINE)
+    pins = re.findall(r"^([A-Za-z0-9._-]+)==(\S+)", (ROOT / "constraints.txt").read_text("utf-8"), re.MULTILINE)
     found = []
     for name, pinned in pins:
         try:

@@ -25,8 +25,19 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
-from tests.programmes import KEPT, ROOT, Cases, Told
-from tests.programmes.environments import TORCH, NotInstalled, call_uv, find_uv, install_torch, new_environment, watched
+from tests.programmes import (
+    KEPT,
+    ROOT,
+    TORCH,
+    Cases,
+    NotInstalled,
+    Told,
+    call_uv,
+    find_uv,
+    install_torch,
+    new_environment,
+    watched,
+)
 from tests.programmes.wheel import calls, run
 
 RESOLUTIONS = {"lowest": "lowest-direct", "highest": "highest"}
@@ -38,13 +49,12 @@ TESTS = ("contract", "envs", "physics", "golden", "scenario", "agents", "evaluat
 CALM = "ignore::DeprecationWarning"  # that something will go from another package is what other versions differ in
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"of {', '.join(KINDS)}; default: all")
-    parser.add_argument(
-        "--python", action="append", help="or a version that uv finds; may be given often; default: this"
-    )
-    parser.add_argument("--tests", nargs="+", default=[f"tests/{folder}" for folder in TESTS])
-    parser.add_argument("--ci", action="store_true", help="the light core with every Python found, the rest with this")
+OPTIONS = {
+    "kinds": {"nargs": "*", "metavar": "KIND", "help": f"of {', '.join(KINDS)}; default: all"},
+    "--python": {"action": "append", "help": "or a version that uv finds; may be given often; default: this"},
+    "--tests": {"nargs": "+", "default": [f"tests/{folder}" for folder in TESTS]},
+    "--ci": {"action": "store_true", "help": "the light core with every Python found, the rest with this"},
+}
 
 
 def cases(given: argparse.Namespace) -> Cases:

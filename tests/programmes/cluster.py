@@ -36,9 +36,9 @@ LONGEST_S = 3600.0
 
 
 def write_sweep(folder: Path, jobs: int) -> Path:
-    (folder / "tiny.yaml").write_text(yaml.safe_dump(RECIPE))
-    grid = {"scenario": "paper-random", "recipe": str(folder / "tiny.yaml"), "seed": {"count": jobs}}
-    path = folder / "sweep.yaml"
+    recipe, path = folder / "tiny.yaml", folder / "sweep.yaml"
+    recipe.write_text(yaml.safe_dump(RECIPE))
+    grid = {"scenario": "paper-random", "recipe": str(recipe), "seed": {"count": jobs}}
     path.write_text(yaml.safe_dump({"grid": grid}))
     return path
 
@@ -102,11 +102,12 @@ def run(folder: Path, given: argparse.Namespace) -> Told:
     )
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--jobs", type=int, default=200)
-    parser.add_argument("--share", type=float, default=0.2)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--work", choices=list(WORK), default="counting")
+OPTIONS = {
+    "--jobs": {"type": int, "default": 200},
+    "--share": {"type": float, "default": 0.2},
+    "--seed": {"type": int, "default": 0},
+    "--work": {"choices": list(WORK), "default": "counting"},
+}
 
 
 def cases(given: argparse.Namespace) -> Cases:

@@ -6,8 +6,12 @@
 A *mutant* changes one node of the syntax tree: an operator of arithmetic or comparison, a constant, a sign, a condition
 negated, a statement removed, min and max swapped. The *planted bugs* are those of ``bugs.yaml``: errors that people
 make in such code. A fault is written into a copy of the repository, never into the working tree. There the tests run
-that call the changed function (``calls.py``), the likely and quick ones first, until one fails. What is compiled is
-tried without compilation before. A fault is found by a failed test, or where the tests do not end.
+that call the changed function, the likely and quick ones first, until one fails. What is compiled is tried without
+compilation before. A fault is found by a failed test, or where the tests do not end.
+
+Which test calls which function is recorded once for a tree. As a plugin of pytest (``-p tests.programmes.faults``, with
+``CALLS`` naming a folder) this file writes, for each process, what every test called and how long it took. Compiled
+functions are not seen being called: whoever mentions their name stands for them.
 
 ``--journal`` notes each verdict, and takes those noted before as they are.
 """
@@ -22,11 +26,16 @@ import importlib
 import json
 import os
 import random
+import re
 import resource
 import shutil
 import signal
+import subprocess
 import sys
-from collections.abc import Iterator
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -39,8 +48,9 @@ import pytest
 import yaml
 
 from tests.programmes import ROOT, Cases, Told
-from tests.programmes.calls import PACKAGE, Callers, Function, record
 
+PACKAGE = ROOT / "ethbrake_marl"
+KEPT = ROOT / ".pytest_cache" / "calls"
 BUGS = Path(__file__).with_name("bugs.yaml")
 COPIES = ROOT / ".pytest_cache" / "copies"
 PARTS = ("ethbrake_marl", "tests", "scenarios", "train", "docs", "README.md", "pyproject.toml", "Makefile")
@@ -48,7 +58,7 @@ PRELOADED = (
     "hypothesis", "numba", "numpy", "pytest", "torch", "stable_baselines3", "scipy.stats", "scipy.optimize", "pydantic",
     "matplotlib.pyplot", "gymnasium", "pettingzoo", "yaml", "rich", "typer", "tensorboard.compat.proto.event_pb2",
 )  # fmt: skip
-OPTIONS = (
+PYTEST = (
     "-q", "-m", "not long", "-p", "no:cacheprovider", "-p", "no:randomly", "--rootdir=.",
     "-W", "ignore::pytest.PytestAssertRewriteWarning",  # of what is loaded before
 )  # fmt: skip
@@ -59,6 +69,190 @@ EACH_S = 2.0  # of a test without compilation: what takes longer is left to the 
 INTERPRETED_S = 40.0  # of all of them
 COMPILING_S = 240.0  # beyond the budget: to compile what was changed, and to be slower than usual
 MOST_MEMORY_BYTES = 10 * 2**30
+
+
+# ---------------------------------------------------------------- recording
+
+
+class Recorder:
+    """Notes calls of Python functions; one thread after another may be inside."""
+
+    def __init__(self, file: Path) -> None:
+        self.file, self.calls, self.inside = file, set[Any](), str(PACKAGE) + os.sep
+        self.of_fixture: dict[Any, set[str]] = {}
+        self.tests: dict[str, tuple[float, list[str]]] = {}
+
+    def __call__(self, frame: Any, event: str, arg: object) -> None:
+        self.calls.add(frame.f_code)
+
+    def taken(self) -> set[str]:
+        """Functions called since the last time, as ``file:qualname``."""
+        calls, self.calls = self.calls, set()
+        return {
+            f"{code.co_filename.removeprefix(self.inside)}:{code.co_qualname.partition('.<locals>.<')[0]}"
+            for code in calls
+            if code.co_filename.startswith(self.inside)
+        }
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_fixture_setup(self, fixturedef: Any) -> Iterator[None]:
+        """What a fixture calls, whoever asked for it first."""
+        before = self.taken()
+        try:
+            return (yield)
+        finally:
+            self.of_fixture[fixturedef] = self.taken()
+            self.calls_of_test |= before
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item: Any) -> Iterator[Any]:
+        """All calls of one test."""
+        self.calls_of_test: set[str] = set()
+        self.taken()
+        begun = time.process_time()
+        sys.settrace(self)
+        threading.settrace(self)
+        try:
+            return (yield)
+        finally:
+            sys.settrace(None)
+            called = self.calls_of_test | self.taken()
+            for definitions in item._fixtureinfo.name2fixturedefs.values():
+                for definition in definitions:
+                    called |= self.of_fixture.get(definition, set())
+            self.tests[item.nodeid] = time.process_time() - begun, sorted(called)
+
+    def pytest_sessionfinish(self) -> None:
+        """Write what this process saw."""
+        if self.tests:
+            self.file.write_text(json.dumps(self.tests), "utf-8")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Record, if somebody asks for it."""
+    if folder := os.environ.get("CALLS"):
+        config.pluginmanager.register(Recorder(Path(folder) / f"{os.environ.get('PYTEST_XDIST_WORKER', 'main')}.json"))
+
+
+def record(jobs: int, *more: str) -> dict[str, tuple[float, list[str]]]:
+    """Test -> its processor time and the functions it calls; from the last record, if no file has changed since."""
+    files = sorted([*PACKAGE.rglob("*.py"), *(ROOT / "tests").rglob("*.py")])
+    digest = hashlib.sha256(b"".join(file.read_bytes() for file in files))
+    folder = KEPT / digest.hexdigest()[:16]
+    if not (folder / "done").exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        command = [sys.executable, "-m", "pytest", "-q", "-p", "tests.programmes.faults", "-n", str(jobs), *more]
+        done = subprocess.run(command, cwd=ROOT, env={**os.environ, "CALLS": str(folder)}, check=False)
+        if done.returncode not in (0, 1):
+            raise RuntimeError(f"the suite did not run: exit status {done.returncode}")
+        (folder / "done").touch()
+    return {test: found for file in folder.glob("*.json") for test, found in json.loads(file.read_text()).items()}
+
+
+# ---------------------------------------------------------------- functions of a file
+
+
+class Function(NamedTuple):
+    """A function, a class or a module of the package."""
+
+    key: str  # file:qualname, as calls are noted; the module itself is ``file:<module>``
+    first: int
+    last: int
+    callable: bool  # no class and no module
+    compiled: bool
+    words: frozenset[str]  # names and attributes that its body mentions
+
+
+def functions_of(file: Path) -> list[Function]:
+    """What a file defines: the module first, then what stands in it, each before its parts."""
+    tree, place = ast.parse(file.read_text("utf-8")), file.relative_to(PACKAGE).as_posix()
+    last = len(file.read_text("utf-8").splitlines())
+    found = [Function(f"{place}:<module>", 1, last, False, False, frozenset())]
+
+    def walk(node: ast.AST, prefix: str, compiled: bool) -> None:
+        for child in ast.iter_child_nodes(node):
+            if not isinstance(child, ast.FunctionDef | ast.ClassDef):
+                walk(child, prefix, compiled)
+                continue
+            name, inside = prefix + child.name, isinstance(child, ast.FunctionDef)
+            marked = compiled or any("compiled" in ast.unparse(each) for each in child.decorator_list)
+            words = {getattr(n, "id", None) or getattr(n, "attr", "") for n in ast.walk(child)}
+            first = min([child.lineno, *(each.lineno for each in child.decorator_list)])
+            last_line = child.end_lineno or first
+            found.append(Function(f"{place}:{name}", first, last_line, inside, marked, frozenset(words)))
+            walk(child, f"{name}.<locals>." if inside else f"{name}.", marked)
+
+    walk(tree, "", False)
+    return found
+
+
+class Callers:
+    """The tests of a tree, by what they call."""
+
+    def __init__(self, recorded: dict[str, tuple[float, list[str]]]) -> None:
+        self.cpu_s = {test: seconds for test, (seconds, _) in recorded.items()}
+        self.callers = defaultdict[str, set[str]](set)
+        for test, (_, called) in recorded.items():
+            for key in called:
+                self.callers[key].add(test)
+        self.functions = {f.key: f for file in sorted(PACKAGE.rglob("*.py")) for f in functions_of(file)}
+
+    def at(self, file: Path, line: int) -> Function:
+        """The innermost function around a line."""
+        place = file.relative_to(PACKAGE).as_posix() + ":"
+        around = [f for f in self.functions.values() if f.key.startswith(place) and f.first <= line <= f.last]
+        return min(around, key=lambda f: f.last - f.first)
+
+    def of(self, function: Function, words: Iterable[str] = ()) -> set[str]:
+        """Tests that call a function; if none is seen to, those of who mentions its name.
+
+        Outside of functions, those of who mentions one of the ``words`` that get a value there, or the class.
+        """
+        found = set(self.callers.get(function.key, ())) if function.callable else set()
+        frontier = {function.key.rpartition(":")[2].rpartition(".")[2], *(() if function.callable else words)}
+        known: set[str] = set()
+        while not found and frontier - known:
+            known |= frontier
+            mentioning = [f for f in self.functions.values() if f.words & frontier]
+            for f in mentioning:
+                found |= self.callers.get(f.key, set())
+            frontier = {f.key.rpartition(":")[2].rpartition(".")[2] for f in mentioning}
+        return found
+
+    def ordered(
+        self, function: Function, words: Iterable[str], topic: str, budget_s: float, most_files: int
+    ) -> list[str]:
+        """Tests that may notice a change of a function: likely and quick ones first, as many as the time allows.
+
+        Likely are those of its module, those that are named by a word of the ``topic``, and those of its folder.
+        """
+        found = self.of(function, words)
+        room = "tests/" + function.key.rpartition(":")[0].removesuffix(".py").partition("/")[0]
+        module = "/test_" + function.key.rpartition(":")[0].rpartition("/")[2] + "::"
+
+        subjects = set(re.findall("[a-z]{6,}", topic.lower()))
+
+        def rank(test: str) -> tuple[bool, bool, bool, float]:
+            return (
+                module not in test,
+                not any(subject in test for subject in subjects),
+                not test.startswith((room + "/", room.replace("tests/", "tests/test_"))),
+                self.cpu_s[test],
+            )
+
+        chosen: list[str] = []
+        files: set[str] = set()
+        spent = 0.0
+        near = {test for test in self.cpu_s if test.startswith(room + "/")} - found
+        if function.compiled:  # whose callers are not known by sight
+            found, near = found | near, set()
+        for test in [*sorted(found, key=rank), *sorted(near, key=rank)]:
+            file = test.partition("::")[0]
+            if spent + self.cpu_s[test] <= budget_s and (file in files or len(files) < most_files):
+                chosen.append(test)
+                files.add(file)
+                spent += self.cpu_s[test]
+        return chosen
 
 
 # ---------------------------------------------------------------- faults
@@ -96,6 +290,7 @@ BOUNDARY: dict[type[ast.cmpop], type[ast.cmpop]] = {
 SWAPPED = {"min": "max", "max": "min", "np.maximum": "np.minimum", "np.minimum": "np.maximum"}
 REMOVABLE = (ast.Assign, ast.AugAssign, ast.Expr, ast.Continue, ast.Break, ast.Raise)
 NOT_CODE = ("annotation", "returns", "decorator_list", "bases", "type_params")
+NO_CODE = (ast.Import, ast.ImportFrom, ast.JoinedStr, ast.arg)
 
 
 class Change(NamedTuple):
@@ -141,17 +336,12 @@ def changes(node: ast.AST, words: tuple[str, ...] = ()) -> Iterator[Change]:
         yield Change(node.test, "condition negated", ast.UnaryOp(ast.Not(), node.test), words)
     for name, value in ast.iter_fields(node):
         for child in value if isinstance(value, list) else [value]:
-            if not isinstance(child, ast.AST) or name in NOT_CODE or _is_text(child):
-                continue
-            if isinstance(child, ast.Import | ast.ImportFrom | ast.JoinedStr | ast.arg):
+            is_text = isinstance(child, ast.Expr) and isinstance(child.value, ast.Constant)
+            if name in NOT_CODE or not isinstance(child, ast.AST) or isinstance(child, NO_CODE) or is_text:
                 continue
             if name in ("body", "orelse") and isinstance(child, REMOVABLE):
                 yield Change(child, "removed", None, words)
             yield from changes(child, words)
-
-
-def _is_text(node: ast.AST) -> bool:
-    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
 
 
 def _of_expression(node: ast.expr) -> Iterator[tuple[str, ast.expr]]:
@@ -239,10 +429,7 @@ class Listener:
         if report.failed:
             os.write(self.pipe, f"{report.nodeid}\n".encode())
 
-    def pytest_collectreport(self, report: Any) -> None:
-        """A file of tests that cannot even be read."""
-        if report.failed:
-            os.write(self.pipe, f"{report.nodeid}\n".encode())
+    pytest_collectreport = pytest_runtest_logreport  # a file of tests that cannot even be read
 
 
 def _too_slow(*_: object) -> None:
@@ -265,8 +452,7 @@ class Copy:
         self.tests = Callers(record(jobs))
         self.red_anyway: dict[bool, set[str]] = {True: set(), False: set()}  # compiled or not -> tests
         self.green: dict[bool, set[str]] = {True: set(), False: set()}  # those known to pass without a fault
-        self.digests: dict[str, str] = {}
-        self.digests = json.loads(self.ask(_digests))
+        self.digests: dict[str, str] = json.loads(self.ask(_digests))
 
     @contextmanager
     def changed(self, fault: Fault) -> Iterator[None]:
@@ -379,7 +565,7 @@ def _run(self: Copy, pipe: int, tests: list[str], compiled: bool, own_kernels: b
         compiling.digest_of_sources = cache(lambda source: self.digests.get(str(source), ""))
     plugin = Listener(tests, None if compiled else EACH_S, pipe)
     files = list(dict.fromkeys(test.partition("::")[0] for test in tests))
-    status = int(pytest.main([*OPTIONS, *([] if every else ["-x"]), *files], plugins=[plugin]))
+    status = int(pytest.main([*PYTEST, *([] if every else ["-x"]), *files], plugins=[plugin]))
     if status in (3, 4):  # pytest itself failed, or could not begin: the fault is met by whoever imports the package
         os.write(pipe, f"(exit status {status} of pytest)\n".encode())
 
@@ -408,14 +594,14 @@ def preload() -> None:
         importlib.import_module(name)
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    """What the command line may say."""
-    parser.add_argument("what", choices=("mutants", "bugs"))
-    parser.add_argument("--folders", default=",".join(folders()), help="comma list; default: all")
-    parser.add_argument("--sample", type=int, default=40, help="mutants of each folder")
-    parser.add_argument("--seed", type=int, default=0, help="of the sample")
-    parser.add_argument("--jobs", type=int, default=2, help="processes")
-    parser.add_argument("--journal", type=Path, help="verdicts are noted here, and taken from here")
+OPTIONS = {
+    "what": {"choices": ("mutants", "bugs")},
+    "--folders": {"default": ",".join(folders()), "help": "comma list; default: all"},
+    "--sample": {"type": int, "default": 40, "help": "mutants of each folder"},
+    "--seed": {"type": int, "default": 0, "help": "of the sample"},
+    "--jobs": {"type": int, "default": 2, "help": "processes"},
+    "--journal": {"type": Path, "help": "verdicts are noted here, and taken from here"},
+}
 
 
 def cases(given: argparse.Namespace) -> Cases:

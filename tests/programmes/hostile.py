@@ -35,8 +35,18 @@ from ethbrake_marl.policies import load_policy
 from tests.programmes import Cases, Told
 from tests.programmes.archives import COMMAND, good_bytes, table_cases
 from tests.programmes.cage import HERE, INSIDE, NASTY, OUTSIDE, PRECIOUS, REFUSED, Build, Case, Generator, judge, write
-from tests.programmes.folders import EVALUATE, MANIFEST, WEIGHTS, bundle, bundle_cases, run_cases, stopped
-from tests.programmes.texts import SPECS, text_cases, texts
+from tests.programmes.files import (
+    EVALUATE,
+    MANIFEST,
+    SPECS,
+    WEIGHTS,
+    bundle,
+    bundle_cases,
+    run_cases,
+    stopped,
+    text_cases,
+    texts,
+)
 
 # ---------------------------------------------------------------- places: what may stand where a file is expected
 
@@ -71,11 +81,6 @@ def _socket(path: Path) -> None:
         server.bind(path.name)
 
 
-def _giant(path: Path) -> None:
-    with path.open("wb") as file:
-        file.truncate(10 << 30)
-
-
 def _loop(path: Path) -> None:
     path.symlink_to(path.name + "2")
     (path.parent / (path.name + "2")).symlink_to(path.name)
@@ -103,7 +108,7 @@ PLACES: dict[str, Callable[[Path], object]] = {
     "links in a loop": _loop,
     "a link to a folder": partial(_link, "."),
     "a link to a folder elsewhere": _outside,
-    "ten gigabytes of nothing": _giant,
+    "ten gigabytes of nothing": lambda path: (path.touch(), os.truncate(path, 10 << 30)),
     "an empty file": Path.touch,
     **{f"a link to {device}": partial(_link, device) for device in DEVICES},
 }
@@ -247,9 +252,7 @@ KINDS: dict[str, Generator] = {
 # ---------------------------------------------------------------- the attack
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--sample", type=int, help="so many cases of each category")
-    parser.add_argument("--seed", type=int, default=0)
+OPTIONS = {"--sample": {"type": int, "help": "so many cases of each category"}, "--seed": {"type": int, "default": 0}}
 
 
 def by_category(kind: str, seed: int) -> dict[str, list[Case]]:

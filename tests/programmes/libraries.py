@@ -29,8 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tests.docs.site import load
-from tests.programmes import KEPT, ROOT, Cases, Told
-from tests.programmes.environments import NotInstalled, ready_python, watched
+from tests.programmes import KEPT, ROOT, Cases, NotInstalled, Told, ready_python, watched
 
 PAGE, HOWTO = ROOT / "docs" / "other-libraries.md", ROOT / "docs" / "howto-train.md"
 MEASURED = load("results")
@@ -84,25 +83,23 @@ def ways() -> list[Way]:
 # ---------------------------------------------------------------- what becomes of a block: an agent, or a policy
 
 
-def deterministic(call: Callable[[Any], Any]) -> Any:
+def deterministic(policy: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """What a policy of TorchRL does, without exploration."""
     import torch
     from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        return call(torch)
+    def act(seen: Any) -> Any:
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            return policy(torch.tensor(seen))
+
+    return act
 
 
 def of_torchrl(names: dict[str, Any]) -> Any:
     from tensordict import TensorDict
 
-    def torchrl(seen: Any) -> Any:
-        return deterministic(
-            lambda torch: actor(TensorDict({"observation": torch.tensor(seen)}, [len(seen)]))["action"]
-        )
-
     actor = names.get("actor")
-    return actor and torchrl
+    return actor and deterministic(lambda seen: actor(TensorDict({"observation": seen}, [len(seen)]))["action"])
 
 
 def of_benchmarl(names: dict[str, Any]) -> Any:
@@ -114,13 +111,10 @@ def of_benchmarl(names: dict[str, Any]) -> Any:
     policy = names["experiment"].group_policies["learners"]
 
     def benchmarl(seen: Any) -> Any:
-        def ask(torch: Any) -> Any:
-            each = TensorDict({"observation": torch.tensor(seen)[:, None]}, [len(seen), 1])
-            return policy(TensorDict({"learners": each}, [len(seen)]))["learners", "action"][:, 0]
+        each = TensorDict({"observation": seen[:, None]}, [len(seen), 1])
+        return policy(TensorDict({"learners": each}, [len(seen)]))["learners", "action"][:, 0]
 
-        return deterministic(ask)
-
-    return benchmarl
+    return deterministic(benchmarl)
 
 
 def of_zoo(names: dict[str, Any]) -> Any:
@@ -245,8 +239,7 @@ def harm_of_howto() -> dict[str, dict[str, float]]:
     for trained, harms in names["harm"].items():
         full, theirs = harms.values()
         assert theirs < full or trained == "mappo", f"{trained}: {theirs:.2f} does not beat full braking, {full:.2f}"
-    found: dict[str, dict[str, float]] = names["harm"]
-    return found
+    return names["harm"]
 
 
 def tell_howto() -> None:
@@ -278,10 +271,11 @@ def cpu_seconds() -> float:
 # ---------------------------------------------------------------- here
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--ci", action="store_true", help="only the libraries that are cheap to install")
-    parser.add_argument("--limit", type=float, default=900.0, help="seconds for one way")
-    parser.add_argument("--write", action="store_true", help="write the rows into docs/results/libraries.json")
+OPTIONS = {
+    "--ci": {"action": "store_true", "help": "only the libraries that are cheap to install"},
+    "--limit": {"type": float, "default": 900.0, "help": "seconds for one way"},
+    "--write": {"action": "store_true", "help": "write the rows into docs/results/libraries.json"},
+}
 
 
 def cases(given: argparse.Namespace) -> Cases:

@@ -11,8 +11,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import os
-import subprocess
+import math
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -20,7 +19,17 @@ from typing import Any
 
 import numpy as np
 
-from tests.programmes import ROOT, Cases, Told
+from ethbrake_marl import make_sb3_vec_env
+from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
+from ethbrake_marl.evaluation.results import Question
+from ethbrake_marl.evaluation.statistics import mean_over_seeds
+from ethbrake_marl.harm import injury_probability
+from ethbrake_marl.limits.limits import best_harm
+from ethbrake_marl.limits.lower_bound import lower_bound
+from ethbrake_marl.policies import load_shipped, shipped_policies
+from ethbrake_marl.scenario import list_scenarios, load_scenario
+from tests.golden.test_golden import SHIELDS, decisions_hash, figures, sampled
+from tests.programmes import Cases, Told, watched
 
 SETTINGS: dict[str, dict[str, str]] = {
     "numpy without AVX-512": {"NPY_DISABLE_CPU_FEATURES": "X86_V4"},
@@ -49,22 +58,15 @@ def digest(*columns: Any) -> str:
 
 
 def lists() -> dict[str, str]:
-    from ethbrake_marl.scenario import list_scenarios
-    from tests.golden.test_golden import sampled
-
     return {f"list {entry.name}": json.dumps(sampled(entry.name)) for entry in list_scenarios()}
 
 
 def physics() -> dict[str, str]:
-    from tests.golden.test_golden import figures
-
     return {"physics": str(figures("few")["sha256"])}
 
 
 def episodes() -> dict[str, str]:
     """Observations and rewards of random actions, with every term and an angle as objective."""
-    from ethbrake_marl import make_sb3_vec_env
-
     reward = {"harm": 1.0, "risk": 1.0, "jerk": 1e-5, "collision": 1.0, "shaping": 1.0, "objective": "social:37"}
     found = {}
     for name in HARD:
@@ -78,11 +80,6 @@ def episodes() -> dict[str, str]:
 
 
 def searches() -> dict[str, str]:
-    from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
-    from ethbrake_marl.limits.limits import best_harm
-    from ethbrake_marl.limits.lower_bound import lower_bound
-    from ethbrake_marl.scenario import load_scenario
-
     found = {}
     for name in HARD:
         scenario = load_scenario(name)
@@ -90,23 +87,15 @@ def searches() -> dict[str, str]:
         found[f"e_v2x_bm {name}"] = digest(*optimise_coupled(worlds, 1, harm_count="total"))
         best = best_harm(scenario, worlds, counts=("total",), budget=200, threads=1).best["total"]
         found[f"search {name}"] = digest(best.harm, *best.profiles)
-        bound = lower_bound(worlds, 1, harm_count="total")
-        found[f"bound {name}"] = digest(bound.harm)
+        found[f"bound {name}"] = digest(lower_bound(worlds, 1, harm_count="total").harm)
     return found
 
 
 def shields() -> dict[str, str]:
-    from tests.golden.test_golden import SHIELDS, decisions_hash
-
     return {f"shield {name}": decisions_hash(make()[0], 10) for name, make in SHIELDS.items()}
 
 
 def tallies() -> dict[str, str]:
-    from ethbrake_marl.evaluation.results import Question
-    from ethbrake_marl.evaluation.statistics import mean_over_seeds
-    from ethbrake_marl.harm import injury_probability
-    from ethbrake_marl.scenario import load_scenario
-
     found = {}
     for name in HARD[:2]:
         asked = Question(load_scenario(name), ("full_brake", "e_v2x_bm", "universal@shipped"), 200, 11, "total").ask()
@@ -120,8 +109,6 @@ def tallies() -> dict[str, str]:
 
 
 def actions() -> dict[str, str]:
-    from ethbrake_marl.policies import load_shipped, shipped_policies
-
     rng, found = np.random.default_rng(0), {}
     for name in shipped_policies():
         policy = load_shipped(name)
@@ -136,8 +123,7 @@ KINDS: tuple[Callable[[], dict[str, str]], ...] = (lists, physics, episodes, sea
 TELL = "from tests.programmes import machines; machines.tell()"
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--sample", action="store_true", help="without the settings that compile everything anew")
+OPTIONS = {"--sample": {"action": "store_true", "help": "without the settings that compile everything anew"}}
 
 
 def cases(given: argparse.Namespace) -> Cases:
@@ -161,8 +147,6 @@ def tell() -> None:
 
 def measured(setting: dict[str, str]) -> dict[str, str]:
     """All hashes, computed in a process of its own."""
-    variables = os.environ | {"PYTHONPATH": str(ROOT)} | setting
-    done = subprocess.run([sys.executable, "-c", TELL], env=variables, capture_output=True, text=True)
-    assert done.returncode == 0, f"exit status {done.returncode}\n{done.stdout}{done.stderr}"
-    found: dict[str, str] = json.loads(done.stdout)
-    return found
+    status, told = watched([sys.executable, "-c", TELL], math.inf, **setting)
+    assert status == 0, f"exit status {status}\n{told}"
+    return json.loads(told.splitlines()[-1])

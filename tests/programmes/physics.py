@@ -48,7 +48,6 @@ from tests.physics.segments import Scan, random_segments, scan
 from tests.physics.test_oracles import accelerations, at_once, exact_accelerations, in_steps, law_error_eps
 from tests.programmes import Cases, Told
 from tests.reference.tolerances import (
-    BORDERLINE_SHARE,
     BOUNCE_SERIES_EPS,
     CLUSTER_EPS,
     ENERGY_EPS,
@@ -77,12 +76,7 @@ GATES: dict[str, Callable[[], Figure]] = {}
 
 def gate(name: str) -> Callable[[Callable[[], Figure]], Callable[[], Figure]]:
     """Enter a function into the programme under a name."""
-
-    def enter(measure: Callable[[], Figure]) -> Callable[[], Figure]:
-        GATES[name] = measure
-        return measure
-
-    return enter
+    return partial(GATES.setdefault, name)
 
 
 def measured(measure: Callable[[], Figure]) -> Told:
@@ -241,13 +235,6 @@ def wrong() -> Figure:
     return Figure(sum(s.wrong.size for s in scans()), 0, "the same segments")
 
 
-@gate("share of contacts that rounding decides")
-def borderline() -> Figure:
-    """Decided otherwise than by exact arithmetic, within the published blur."""
-    share = sum(s.borderline for s in scans()) / sum(s.pairs for s in scans())
-    return Figure(share, BORDERLINE_SHARE, "the same segments")
-
-
 CASCADE = 100  # impacts of a world; between an obstacle and a line they come ever faster, and rounding multiplies
 OTHER_CASCADES = 1e-3  # share of worlds in which it may change the order of impacts after so many
 
@@ -275,7 +262,6 @@ def differences(obstacle: bool) -> tuple[Floats, int, int]:
         batch = place_ahead(driving_lines(183, n, N), 184) if obstacle else driving_lines(81, n, N)
         end, impacts = advance(batch.worlds, batch.command, HORIZON_S, record=True)
         rows = impacts.rows
-        assert rows is not None
         columns = np.stack([rows.pair, rows.time_s, rows.closing_speed_mps], axis=1)
         for k in range(n):
             command = batch.command[k].tolist()
@@ -503,15 +489,13 @@ def bounces() -> Figure:
     """Against the geometric sum of flights, for e from 0.05 to 0.99."""
     worst = 0.0
     for e in np.linspace(0.05, 0.99, 95):
-        wall = touching_lines(0, 1, 2).worlds
-        wall = replace(wall, speeds_mps=np.array([[0.0, 8.0]]))
+        wall = replace(touching_lines(0, 1, 2).worlds, speeds_mps=np.array([[0.0, 8.0]]))
         vehicles = replace(wall.vehicles, mass_t=np.array([[2.0**50, 1.0]]), restitution=np.array([e]))
         _, impacts = advance(replace(wall, vehicles=vehicles), [-8.0, 4.0], 2_000.0, record=True)
         closing = [8.0]
         while closing[-1] >= 0.05:
             closing.append(closing[-1] * e)
         flights = sum(2.0 * w / 4.0 for w in closing[1:])
-        assert impacts.rows is not None
         if impacts.count[0, 0] != len(closing):
             return Figure(np.nan, 0, f"e = {e}: {impacts.count[0, 0]} impacts instead of {len(closing)}")
         worst = max(worst, abs(float(impacts.rows.time_s[-1]) / flights - 1.0))

@@ -2,7 +2,8 @@
 
 Every statement is a function that raises ``AssertionError`` where the solver does not prove it. It is about real
 numbers, for all values that its assumptions allow. Compilation must be switched off (``NUMBA_DISABLE_JIT=1``), so that
-the functions run as Python.
+the functions run as Python: on symbols, along every path that their comparisons can take. What is proven of them is
+proven of the code; rounding is not part of it.
 """
 
 from __future__ import annotations
@@ -11,14 +12,16 @@ import argparse
 import inspect
 import itertools
 import math
+import operator
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from functools import partial
+from fractions import Fraction
+from functools import partial, partialmethod
 from itertools import product
 from types import ModuleType
 from typing import Any, NamedTuple
+from unittest import mock
 
 import numpy as np
 import z3
@@ -26,17 +29,162 @@ import z3
 from ethbrake_marl.physics import kernel
 from ethbrake_marl.shield import step_shield
 from tests.programmes import Cases, Told
-from tests.programmes.symbolic import (
-    Condition,
-    Ended,
-    Symbol,
-    SymbolicMath,
-    exact,
-    holds_always,
-    is_infinite,
-    paths,
-    symbols,
-)
+
+# ---------------------------------------------------------------- symbolic execution
+
+PATIENCE_MS = 60_000  # of the solver, for one question
+_PATH: list[Path] = []  # the one that is being run
+
+
+class Path:
+    """One way through a function: what it has decided, and what is known along it."""
+
+    def __init__(self, known: list[Any], decided: list[bool]) -> None:
+        self.known = list(known)
+        self.decided = decided
+        self.next = 0
+        self.left: list[list[bool]] = []  # other ways that branch off here
+        self.roots = 0
+
+    def decide(self, condition: Any) -> bool:
+        """Whether a condition holds on this path; where both are possible, the other way is kept for later."""
+        if self.next < len(self.decided):
+            holds = self.decided[self.next]
+        else:
+            holds = possible([*self.known, condition])
+            if holds and possible([*self.known, z3.Not(condition)]):
+                self.left.append([*self.decided, False])
+            self.decided.append(holds)
+        self.next += 1
+        self.known.append(condition if holds else z3.Not(condition))
+        return holds
+
+
+class Condition:
+    """A comparison of symbols, which decides when it is asked."""
+
+    def __init__(self, expression: Any) -> None:
+        self.expression = expression
+
+    def __bool__(self) -> bool:
+        return _PATH[-1].decide(self.expression)
+
+
+class Symbol:
+    """A real number that is not known; infinity is above and minus infinity below every one."""
+
+    def __init__(self, expression: Any) -> None:
+        self.expression = expression
+
+    def _computed(self, how: Callable[[Any, Any], Any], other: Any) -> Any:
+        if is_infinite(other) and how in (operator.add, operator.sub):
+            return how(0.0, other)
+        return Symbol(how(self.expression, exact(other)))
+
+    def _reflected(self, how: Callable[[Any, Any], Any], other: Any) -> Symbol:
+        return Symbol(how(exact(other), self.expression))
+
+    def _compared(self, how: Callable[[Any, Any], Any], other: Any) -> Any:
+        return how(0.0, other) if is_infinite(other) else Condition(how(self.expression, exact(other)))
+
+    __add__ = partialmethod(_computed, operator.add)
+    __sub__ = partialmethod(_computed, operator.sub)
+    __mul__ = partialmethod(_computed, operator.mul)
+    __truediv__ = partialmethod(_computed, operator.truediv)
+    __radd__ = partialmethod(_reflected, operator.add)
+    __rsub__ = partialmethod(_reflected, operator.sub)
+    __rmul__ = partialmethod(_reflected, operator.mul)
+    __rtruediv__ = partialmethod(_reflected, operator.truediv)
+    __lt__ = partialmethod(_compared, operator.lt)
+    __le__ = partialmethod(_compared, operator.le)
+    __gt__ = partialmethod(_compared, operator.gt)
+    __ge__ = partialmethod(_compared, operator.ge)
+    __eq__ = partialmethod(_compared, operator.eq)
+    __ne__ = partialmethod(_compared, operator.ne)
+
+    def __neg__(self) -> Symbol:
+        return Symbol(-self.expression)
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+class SymbolicMath:
+    """What the package's functions ask of ``math``, for symbols."""
+
+    inf, nan = math.inf, math.nan
+
+    @staticmethod
+    def sqrt(value: Any) -> Symbol:
+        """The root: a new symbol, not negative, whose square is the value, which must not be negative here."""
+        path, square = _PATH[-1], exact(value)
+        if not holds_always(path.known, square >= 0):
+            raise AssertionError(f"the root of what may be negative: {square}")
+        path.roots += 1
+        root = z3.Real(f"root_{path.roots}")
+        path.known += [root >= 0, root * root == square]
+        return Symbol(root)
+
+    @staticmethod
+    def isnan(value: Any) -> bool:
+        """A symbol is a number."""
+        return not isinstance(value, Symbol) and math.isnan(value)
+
+
+class Ended(NamedTuple):
+    """The end of one path."""
+
+    known: list[Any]
+    result: Any
+
+
+def is_infinite(value: Any) -> bool:
+    """Whether a value is no symbol, and infinite."""
+    return isinstance(value, float) and math.isinf(value)
+
+
+def exact(value: Any) -> Any:
+    """A symbol's expression; of a number its exact value."""
+    if isinstance(value, Symbol):
+        return value.expression
+    if isinstance(value, float | int):
+        number = Fraction(value)
+        return z3.Q(number.numerator, number.denominator)
+    return value
+
+
+def symbols(names: str) -> list[Symbol]:
+    """One symbol for each name."""
+    return [Symbol(z3.Real(name)) for name in names.split()]
+
+
+def paths(function: Callable[[], Any], known: list[Any]) -> Iterator[Ended]:
+    """Every path through ``function``, under what is ``known`` of its symbols."""
+    waiting: list[list[bool]] = [[]]
+    while waiting:
+        path = Path(known, waiting.pop())
+        _PATH.append(path)
+        try:
+            result = function()
+        finally:
+            _PATH.pop()
+        waiting += path.left
+        yield Ended(path.known, result)
+
+
+def possible(statements: list[Any]) -> bool:
+    """Whether they can hold together; what the solver cannot tell counts as possible."""
+    solver = z3.Solver()
+    solver.set("timeout", PATIENCE_MS)
+    solver.add(*statements)
+    return solver.check() != z3.unsat
+
+
+def holds_always(known: list[Any], statement: Any) -> bool:
+    """Whether a statement follows from what is known; what the solver cannot tell does not."""
+    return not possible([*known, z3.Not(statement)])
+
+
+# ---------------------------------------------------------------- statements
 
 Statement = Callable[[], int]  # the number of paths it was proven along
 STATEMENTS: dict[str, Statement] = {}
@@ -48,12 +196,7 @@ TEAM_DECISIONS = ((0, 2), (1, 1))  # ... about two shielded vehicles
 
 def states(text: str) -> Callable[[Statement], Statement]:
     """Register a statement."""
-
-    def register(statement: Statement) -> Statement:
-        STATEMENTS[text] = statement
-        return statement
-
-    return register
+    return partial(STATEMENTS.setdefault, text)
 
 
 def prove(end: Ended, statement: Any, what: str, *assumed: Any) -> None:
@@ -317,15 +460,8 @@ def _run(module: ModuleType, function: Callable[[], Any], known: list[Any], line
     names = ("take_steps", "worst_so_far", "worst_of_plan", "best_constant") if line else ()
     if line and len(line.proposed) > 1:
         names = (*names, "better_plan")
-    before = {name: getattr(module, name) for name in (*names, "math")}
-    try:
-        module.math = SymbolicMath  # type: ignore[attr-defined]
-        for name in names:
-            setattr(module, name, getattr(line, name))
+    with mock.patch.multiple(module, math=SymbolicMath, **{name: getattr(line, name) for name in names}):
         yield from paths(function, known)
-    finally:
-        for name, value in before.items():
-            setattr(module, name, value)
 
 
 # ---------------------------------------------------------------- bugs
@@ -419,28 +555,17 @@ BUGS = {
 }  # fmt: skip
 
 
-@contextmanager
-def planted(bug: Bug) -> Iterator[None]:
-    """The module with the bug in it."""
-    before = getattr(bug.module, bug.function)
-    source = inspect.getsource(before)
-    assert source.count(bug.old) == 1, (
-        f"{bug.function}: {bug.old!r} stands there {source.count(bug.old)} times, not once"
-    )
-    try:
-        exec(compile(source.replace(bug.old, bug.new), bug.function, "exec"), vars(bug.module))
-        yield
-    finally:
-        setattr(bug.module, bug.function, before)
-
-
 def proven(statement: Statement) -> Told:
     return Told(True, f"along {statement()} paths")
 
 
 def unproven(bug: Bug) -> Told:
     """Whether the bug matters: its statement must not be proven any more."""
-    with planted(bug):
+    source = inspect.getsource(getattr(bug.module, bug.function))
+    times = source.count(bug.old)
+    assert times == 1, f"{bug.function}: {bug.old!r} stands there {times} times, not once"
+    with mock.patch.object(bug.module, bug.function):
+        exec(compile(source.replace(bug.old, bug.new), bug.function, "exec"), vars(bug.module))
         try:
             bug.breaks()
         except AssertionError as error:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator
 from functools import partial
 from itertools import product
 from typing import Any
@@ -52,18 +51,19 @@ SLOW = {"worst_case": 0.14}  # and of those, a search in every step
 TEAM_CELLS = {(3, 3): 5.0, (4, 3): 1.25, (3, 5): 1.0, (4, 5): 0.75}  # by what they cost
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--worlds", type=int, default=1_000_000, help="of 'bound', all cells together, about")
-    parser.add_argument("--joint-worlds", type=int, default=300_000, help="of 'joint', all cells together, about")
-    parser.add_argument("--interface-worlds", type=int, default=2_000, help="through each interface")
-    parser.add_argument("--interfered", type=int, default=1_000, help="episodes with failing calls on each interface")
-    parser.add_argument("--corner-worlds", type=int, default=60_000, help="of 'believed'")
-    parser.add_argument("--range-worlds", type=int, default=1_200, help="of 'believed', from between the corners")
-    parser.add_argument("--restarts", type=int, default=1_000, help="of the search")
-    parser.add_argument("--intervals", default="gaps_m=0.5", help="of 'inside'")
-    parser.add_argument("--boxes", type=int, default=20, help="of 'inside'")
-    parser.add_argument("--draws", type=int, default=50_000, help="worlds out of each box")
-    parser.add_argument("--seed", type=int, default=1)
+OPTIONS = {
+    "--worlds": {"type": int, "default": 1_000_000, "help": "of 'bound', all cells together, about"},
+    "--joint-worlds": {"type": int, "default": 300_000, "help": "of 'joint', all cells together, about"},
+    "--interface-worlds": {"type": int, "default": 2_000, "help": "through each interface"},
+    "--interfered": {"type": int, "default": 1_000, "help": "episodes with failing calls on each interface"},
+    "--corner-worlds": {"type": int, "default": 60_000, "help": "of 'believed'"},
+    "--range-worlds": {"type": int, "default": 1_200, "help": "of 'believed', from between the corners"},
+    "--restarts": {"type": int, "default": 1_000, "help": "of the search"},
+    "--intervals": {"default": "gaps_m=0.5", "help": "of 'inside'"},
+    "--boxes": {"type": int, "default": 20, "help": "of 'inside'"},
+    "--draws": {"type": int, "default": 50_000, "help": "worlds out of each box"},
+    "--seed": {"type": int, "default": 1},
+}
 
 
 def cases(given: argparse.Namespace) -> Cases:
@@ -90,25 +90,24 @@ def cases(given: argparse.Namespace) -> Cases:
 
 
 def attacks(given: argparse.Namespace) -> Cases:
-    """Every adversary of one learner, and of teams; no two cases share a world."""
-    first, seed = 0, given.seed
-    one = list(product(CELLS, ("first", "total"), ADVERSARIES))
-    whole = sum(CELLS[N] * SLOW.get(name, 1.0) for N, _, name in one)
-    for N, count, name in one:
-        worlds = max(1, round(given.worlds * CELLS[N] * SLOW.get(name, 1.0) / whole))
+    """Every adversary of one learner, and of teams, each with its share of the worlds; no two cases share a world."""
+    one, teams = [], []
+    for N, count, name in product(CELLS, ("first", "total"), ADVERSARIES):
         case = {"harm_count": count, "adversary": ADVERSARIES[name]}
-        yield f"bound: N = {N}, {count}, {name}", partial(attacked, line(N), worlds, first, seed, case)
-        first += worlds
-    teams = list(product(TEAM_CELLS, ("first", "total"), ("all", "one"), TEAM_ADVERSARIES))
-    whole = sum(TEAM_CELLS[which] for which, *_ in teams)
-    for k, (which, count, hostile, name) in enumerate(teams):
-        worlds = max(1, round(given.joint_worlds * TEAM_CELLS[which] / whole))
-        case = {"harm_count": count, "hostile": hostile, "adversary": TEAM_ADVERSARIES[name]}
-        case["cap"] = (None, "baseline")[k % 2]
-        scenario = load_scenario(TEAMS[which])
-        told = f"joint: level {which[0]}, N = {which[1]}, {count}, {hostile} hostile, {name}, cap {case['cap']}"
-        yield told, partial(attacked, scenario, worlds, first, seed, case)
-        first += worlds
+        one.append((f"bound: N = {N}, {count}, {name}", CELLS[N] * SLOW.get(name, 1.0), line(N), case))
+    every_team = product(TEAM_CELLS, ("first", "total"), ("all", "one"), TEAM_ADVERSARIES)
+    for k, (which, count, hostile, name) in enumerate(every_team):
+        cap = (None, "baseline")[k % 2]
+        case = {"harm_count": count, "hostile": hostile, "adversary": TEAM_ADVERSARIES[name], "cap": cap}
+        told = f"joint: level {which[0]}, N = {which[1]}, {count}, {hostile} hostile, {name}, cap {cap}"
+        teams.append((told, TEAM_CELLS[which], load_scenario(TEAMS[which]), case))
+    first = 0
+    for all_worlds, cells in ((given.worlds, one), (given.joint_worlds, teams)):
+        whole = sum(share for _, share, *_ in cells)
+        for told, share, scenario, case in cells:
+            worlds = max(1, round(all_worlds * share / whole))
+            yield told, partial(attacked, scenario, worlds, first, given.seed, case)
+            first += worlds
 
 
 def attacked(scenario: Any, worlds: int, first: int, seed: int, case: dict[str, Any]) -> Told:
@@ -197,7 +196,8 @@ def inside(robust: str, given: argparse.Namespace) -> Told:
         decisions += int((~shield.running.finished).sum())
         shield.decide(np.zeros(boxes))
     took, above, excess, harm = time.process_time() - begun, 0, -np.inf, 0.0
-    for k, n in product(range(boxes), list(batches(given.draws))):
+    draws = [min(BATCH, given.draws - first) for first in range(0, given.draws, BATCH)]
+    for k, n in product(range(boxes), draws):
         truth = uncertainty.draw(told.take(np.full(n, k)), rng)
         plan = np.repeat(shield.backup.plan[k : k + 1], n, axis=0)
         realised = plan_harm(begin_running(profile_problem(truth, [1], horizon_s=scenario.horizon_s)), plan)
@@ -210,10 +210,6 @@ def inside(robust: str, given: argparse.Namespace) -> Told:
         f" harm {harm / (boxes * given.draws):.2f}, replaced {shield.interventions.sum() / decisions:.0%},"
         f" {1e3 * took / decisions:.2f} ms per decision",
     )
-
-
-def batches(draws: int) -> Iterator[int]:
-    yield from (min(BATCH, draws - first) for first in range(0, draws, BATCH))
 
 
 def beyond_horizon(proposer: str) -> Told:

@@ -12,7 +12,6 @@ import hashlib
 import os
 import re
 import subprocess
-import sys
 import tempfile
 import venv
 from collections.abc import Iterator
@@ -20,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.programmes import ROOT, Cases, Told
+from tests.programmes import ROOT, Cases, Told, find_uv
 
 LIMIT_MB = 650
 NOT_OURS = ("pip", "setuptools", "pkg_resources", "wheel", "_distutils_hack")  # what an empty environment begins with
@@ -28,21 +27,18 @@ SHIPPED = "ppo@shipped,ppo@shipped+episode"
 NEEDS_TRAIN = "-m pip install 'ethbrake-marl[train]'"
 
 
-def options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--output", type=Path, default=ROOT / "dist", help="folder of what is built")
-    parser.add_argument("--environment", type=Path, help="to install into, instead of a new one; its packages stay")
+OPTIONS = {"--output": {"type": Path, "default": ROOT / "dist", "help": "folder of what is built"}}
 
 
 def cases(given: argparse.Namespace) -> Cases:
     yield "built twice: wheel and sdist", partial(built_twice, given.output)
     with tempfile.TemporaryDirectory(prefix="ethbrake-wheel-") as folder:
-        yield from light(Path(folder), given.environment)
+        yield from light(Path(folder))
 
 
 def build(folder: Path) -> dict[str, bytes]:
     """Build wheel and sdist into ``folder``, by uv; every file's content by its name."""
-    uv = Path(sys.executable).with_name("uv")
-    subprocess.run([str(uv), "build", "--quiet", "--out-dir", str(folder), str(ROOT)], check=True)
+    subprocess.run([find_uv(), "build", "--quiet", "--out-dir", str(folder), str(ROOT)], check=True)
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.suffix in (".whl", ".gz")}
 
 
@@ -97,7 +93,6 @@ ABSENT = "assert not {'torch', 'stable_baselines3', 'tensorboard'} & set(sys.mod
 def readme_example() -> Call:
     """The first Python program of the README."""
     found = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)
-    assert found is not None
     return Call(("python", "-c", found[1]))
 
 
@@ -120,16 +115,14 @@ def run(call: Call, environment: Path, folder: Path) -> Told:
     return Told(good, "" if good else f"status {done.returncode}; {done.stdout[-500:]}{done.stderr[-1500:]}")
 
 
-def light(folder: Path, environment: Path | None) -> Cases:
+def light(folder: Path) -> Cases:
     """Install the wheel, weigh it, try everything; then the sdist."""
-    there = environment.absolute() if environment else folder / "environment"
+    there = folder / "environment"
     files: set[tuple[str, str]] = set()
 
     def size() -> Told:
-        if not (there / "bin" / "python").exists():
-            venv.create(there, with_pip=True)
-        for each in ("built", "work"):
-            (folder / each).mkdir()
+        venv.create(there, with_pip=True)
+        (folder / "work").mkdir()
         build(folder / "built")
         files.update(install(there, *folder.glob("built/*.whl")))
         found = installed_mb(there)

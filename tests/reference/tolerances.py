@@ -25,9 +25,7 @@ EXACT_RUN = 1e-9  # m, m/s, s: every impact and the end of a run of 6 s against 
 RESTING_MPS2 = 1e-9  # accelerations of touching vehicles against the exact law, measured over 1/64 s
 BOUNCE_SERIES_EPS = 1e4  # relative duration of a series of up to 506 bounces: 20 eps each
 
-# A contact is decided by the sign of ``D - touch^2`` and by its time against the segment's end. The kernel may decide
-# otherwise than exact arithmetic only where these come closer to zero than the following; there it must agree with a
-# segment that is a little longer.
+# A contact is decided by the sign of ``D - touch^2`` and by its time against the segment's end. Where these come closer
+# to zero than the following, the closed form in doubles says nothing, and exact arithmetic decides.
 DISCRIMINANT_EPS = 32.0  # of the scale w^2 + 2 |b| g, or of squared speeds and |b| ways where events lie before
 END_EPS = 64.0  # of the way the pair's vehicles make in the segment, plus the gap; for the gap at the segment's end
-BORDERLINE_SHARE = 0.0  # share of random segments in which that happens (measured: none in 13.6 million)

@@ -1,7 +1,8 @@
-"""Keys as engineers think of them: friction, tables, lognormal, equipage, spread, alert; outcomes by hand."""
+"""Keys as engineers think of them, outcomes by hand; refusals: ``refusals/keys.txt``."""
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,9 @@ import pytest
 from scipy.stats import lognorm
 
 from ethbrake_marl.agents import Team, drive, make_agent
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import states_of
 from ethbrake_marl.limits.limits import prove
-from ethbrake_marl.physics import Floats, Worlds
+from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import QUANTITY, Scenario, Task, load_scenario
 from ethbrake_marl.shield import ShieldedDriver
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
@@ -28,11 +28,6 @@ def final(scenario: Scenario, worlds: Worlds | None = None) -> Worlds:
     """The worlds once everybody has braked fully, or as its script says."""
     worlds = scenario.sample(1, 7).worlds if worlds is None else worlds
     return drive(worlds, Team.of(make_agent("full_brake"), list(scenario.learners)), scenario).final
-
-
-def refused(scenario: Scenario | dict[str, Any], message: str, **changes: Any) -> None:
-    with pytest.raises(InvalidInput, match=message):
-        scenario.replace(**changes) if isinstance(scenario, Scenario) else Scenario(**scenario, **changes)
 
 
 # Friction: stopping ways are v^2 / (2 min(capacity, 9.81 mu)).
@@ -70,14 +65,10 @@ def test_friction__is_one_number_for_the_whole_line_and_moves_nothing_else() -> 
     assert wet.ranges().names[-1] == "friction"
 
 
-def test_friction__of_a_margin_and_of_a_constant_script() -> None:
+def test_friction__of_a_margin() -> None:
     short = FIXED.replace(friction=0.3, obstacle_margin_m=1.7)
     assert short.sample(1, 7).worlds.obstacle_gap_m[0] == pytest.approx(1.7 + 400 / (2 * 2.943), abs=1e-9)
     assert short.farthest_obstacle_m == pytest.approx(1.7 + 400 / (2 * 2.943), abs=1e-9)
-    refused(FIXED, r"above this vehicle's braking_capacity_mps2, 2.943 m/s2",
-            friction={"uniform": [0.3, 0.9]}, roles={"vehicle_1": "constant:5", "vehicle_2": "learner"})  # fmt: skip
-    refused(FIXED, r"friction = 0: must be finite and in \(0, 2\]", friction=0)
-    refused(FIXED, "friction = null: must be a number or a distribution", friction=None)
 
 
 def test_friction__a_table_of_initial_states_gives_the_same_worlds() -> None:
@@ -103,12 +94,6 @@ def test_friction__its_uncertainty_moves_all_capacities_together() -> None:
     shares, dry = [0, 0.125, 0.25, 0.375, 0.625, 0.75, 0.875, 1], ([4, 7, 6], [4, 7, 12])
     expected = [[4, 5.886, 5.886]] + [np.minimum(d, 9.81 * (0.4 + 0.4 * share)) for d in dry for share in shares]
     assert members.vehicles.braking_capacity_mps2 == pytest.approx(np.array(expected), abs=1e-12)
-    with pytest.raises(InvalidInput, match="friction is one number for the whole line"):
-        parse_uncertainty("friction.vehicle_2=0.1")
-    with pytest.raises(InvalidInput, match=r"friction=0\.1: friction is not known in every world"):
-        parse_uncertainty("friction=0.1").members(FIXED.sample(1, 7).worlds)
-    with pytest.raises(InvalidInput, match=r"0\.6 in world 0 may be as low as -0\.4; it must stay above 0"):
-        parse_uncertainty("friction=1").members(worlds)
 
 
 def test_friction__of_some_members_of_a_mixture() -> None:
@@ -146,9 +131,14 @@ def test_friction__no_truth_of_its_box_is_distrusted_and_no_corner_is_above_the_
 # A table: one row for each world, the rest drawn.
 
 
+def without(scenario: Scenario, *keys: str) -> dict[str, Any]:
+    """What a scenario declares, but these keys."""
+    return {key: value for key, value in scenario.declared().items() if key not in keys}
+
+
 def tabled(**changes: Any) -> Scenario:
-    given = {key: value for key, value in PAPER.declared().items() if key not in ("gaps_m", "speeds_mps")}
-    return Scenario(**{**given, "gaps_m": 9.0, "speeds_mps": {"uniform": [18, 22]}, "table": TABLE, **changes})
+    given = {"gaps_m": 9.0, "speeds_mps": {"uniform": [18, 22]}, "table": TABLE, **changes}
+    return Scenario(**without(PAPER, *given), **given)
 
 
 def test_table__rows_are_never_torn_and_the_rest_is_drawn_as_without_it() -> None:
@@ -167,8 +157,6 @@ def test_table__a_world_by_hand() -> None:
     worlds = one.sample(3, 7).worlds
     assert worlds.gaps_m.tolist() == [[12.0, 40.0]] * 3 and worlds.vehicles.mass_t[:, 2].tolist() == [30.0] * 3
     assert final(one).gaps_m[0] == pytest.approx([12 + 400 / 12 - 400 / 14, 40 + 400 / 14 - 400 / 12], abs=1e-9)
-    with pytest.raises(InvalidInput, match="draws nothing"):
-        one.ranges()
     assert tabled().ranges().names[-1] == "row of the table"
     assert tabled().bounds("gaps_m") == ((5.0, 7.0), (9.0, 9.0))
     assert tabled().middle_world().gaps_m[0].tolist() == [6.0, 9.0]
@@ -176,46 +164,16 @@ def test_table__a_world_by_hand() -> None:
 
 def test_table__of_a_file_is_read_once_and_goes_along(tmp_path: Path) -> None:
     whole = {"gap_1_m": 5.5, "gap_2_m": 6.5, "speed_1_mps": 20, "speed_2_mps": 19, "speed_3_mps": 18, "count": 3}
-    lines = [",".join(whole), *(",".join(str(value + k) for value in whole.values()) for k in range(1200))]
-    (tmp_path / "rows.csv").write_text("\n".join(lines) + "\n")
-    keys = {**PAPER.declared(), "name": "mine", "early_impacts": "keep"}
-    del keys["gaps_m"], keys["speeds_mps"]
-    columns = "[gap_1_m, gap_2_m, speed_1_mps, speed_2_mps, speed_3_mps]"
-    text = "\n".join(f"{key}: {value if not isinstance(value, str) else repr(value)}" for key, value in keys.items())
-    (tmp_path / "mine.yaml").write_text(f"{text}\ntable: {{file: rows.csv, columns: {columns}, weights: count}}\n")
-    with pytest.raises(InvalidInput, match=r"table.rows\[181\]\[2\] = 201: speed_1_mps must be finite and in"):
-        load_scenario(tmp_path / "mine.yaml")
-    (tmp_path / "rows.csv").write_text("\n".join(lines[:15]) + "\n\n")
+    lines = [",".join(whole), *(",".join(str(value + k) for value in whole.values()) for k in range(14))]
+    (tmp_path / "rows.csv").write_text("\n".join(lines) + "\n\n")
+    table = {"file": "rows.csv", "columns": [*whole][:5], "weights": "count"}
+    declared = {**without(PAPER, "gaps_m", "speeds_mps"), "name": "mine", "early_impacts": "keep"}
+    (tmp_path / "mine.yaml").write_text(json.dumps({**declared, "table": table}))
     mine = load_scenario(tmp_path / "mine.yaml")
     (tmp_path / "rows.csv").unlink()
     again = Scenario(**mine.declared()).replace(horizon_s=9)
-    assert again.table is not None and len(again.table.rows or ()) == 14 and again.table.weights == (*range(3, 17),)
+    assert (len(again.table.rows), again.table.weights) == (14, (*range(3, 17),))
     assert (again.sample(50, 7).worlds.gaps_m == mine.sample(50, 7).worlds.gaps_m).all()
-
-
-@pytest.mark.parametrize(
-    ("table", "message"),
-    [
-        ({**TABLE, "columns": ["gap_1_m", "gap_9_m"]}, "gap_9_m: unknown column; did you mean gap_2_m"),
-        ({**TABLE, "columns": ["gap_1_m", "gap_1_m"]}, "each column can be given once"),
-        ({**TABLE, "rows": [[5.0]]}, r"rows\[0\]: has 1 numbers; there are 2 columns"),
-        ({**TABLE, "rows": [[5.0, -1.0]]}, "speed_2_mps must be finite and in"),
-        ({**TABLE, "weights": [1, 1]}, "must be one for each of 3 rows"),
-        ({**TABLE, "file": "other.csv"}, "give either a file or rows, not both"),
-        ({**TABLE, "weights": "count"}, "files are read where they stand in a file"),
-        ({"file": "rows.csv", "columns": ["gap_1_m"]}, "files are read where they stand in a file"),
-        ({"columns": ["gap_1_m", "gap_2_m"], "rows": [[5, 6]]}, "gaps_m.*the table says it for all; leave it out"),
-    ],
-)
-def test_table__what_is_wrong_is_named(table: dict[str, Any], message: str) -> None:
-    with pytest.raises(InvalidInput, match=message):
-        tabled(table=table)
-
-
-def test_table__its_file_stays_in_the_folder_and_is_named_where_it_is_wrong(tmp_path: Path) -> None:
-    for file, message in (("../rows.csv", "must be a path from the scenario's folder on"), ("no.csv", "no.csv")):
-        with pytest.raises(InvalidInput, match=message):
-            load_scenario({**PAPER.declared(), "table": {"file": file}})
 
 
 # Lognormal: the logarithm is normal.
@@ -223,29 +181,10 @@ def test_table__its_file_stays_in_the_folder_and_is_named_where_it_is_wrong(tmp_
 
 def test_lognormal__is_the_truncated_one_of_the_textbook() -> None:
     shape = {"median": 1.1, "sigma": 0.4, "low": 0.3, "high": 3.0}
-    scenario = PAPER.replace(time_gaps_s={"lognormal": shape}, early_impacts="keep", line_speed_mps=20)
-    drawn = np.sort((scenario.sample(4000, 7).worlds.gaps_m / 20).ravel())
-    law = lognorm(s=0.4, scale=1.1)
+    law, u = lognorm(s=0.4, scale=1.1), np.array([0.0, 0.5, 0.975])
     low, high = law.cdf(0.3), law.cdf(3.0)
-    expected = law.ppf(low + (high - low) * (np.arange(len(drawn)) + 0.5) / len(drawn))
-    assert np.abs(drawn - expected).max() < 0.35 and np.abs(drawn - expected).mean() < 0.01
-    entry = scenario.quantities("time_gaps_s")[0]
-    u = np.array([0.0, 0.5, 0.975])
-    assert entry.value(u) == pytest.approx(law.ppf(low + (high - low) * u), rel=1e-9)  # type: ignore[union-attr]
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"median": 0.0}, "median and low must be above 0"),
-        ({"sigma": 0.0}, "sigma must be above 0"),
-        ({"low": 3.0, "high": 3.0}, "low must be below high"),
-        ({"low": 1e3, "high": 2e3}, "must hold at least 1e-06"),
-    ],
-)
-def test_lognormal__what_is_none_is_refused(changes: dict[str, float], message: str) -> None:
-    shape = {"median": 7.0, "sigma": 0.4, "low": 3.0, "high": 30.0, **changes}
-    refused(PAPER, message, gaps_m={"lognormal": shape})
+    (entry, _) = PAPER.replace(time_gaps_s={"lognormal": shape}).quantities("time_gaps_s")
+    assert entry.value(u) == pytest.approx(law.ppf(low + (high - low) * u), rel=1e-9)
 
 
 # Equipage: who sends, who hears.
@@ -273,27 +212,12 @@ def test_equipage__reactions_by_hand(vehicles: dict[str, Any], latency: list[flo
 
 def test_equipage__of_types_is_drawn_with_them() -> None:
     kinds = {"equipped": {"weight": 7}, "without": {"weight": 3, "v2x": {"sends": False, "hears": "none"}}}
-    line = FIXED.replace(vehicle_types=kinds, v2x=FIXED_LINKS)
-    sample = line.sample(2000, 7)
-    assert sample.types is not None
+    sample = FIXED.replace(vehicle_types=kinds, v2x=FIXED_LINKS).sample(2000, 7)
     silent = sample.types == "without"
-    assert silent.mean() == pytest.approx(0.3, abs=0.02)
     latency = sample.worlds.vehicles.latency_s
     second = np.where(silent[:, 0] | silent[:, 1], 1.0, 0.3)
     third = np.where(silent[:, 0] | silent[:, 2], second + 1.0, 0.3)
     assert (latency[:, 1] == second).all() and np.abs(latency[:, 2] - third).max() < 1e-12
-    with pytest.raises(InvalidInput, match="the scenario draws what each vehicle knows when"):
-        line.worlds_from_state({"gaps_m": [7, 7], "speeds_mps": [20, 20, 20]})
-
-
-def test_equipage__where_it_would_do_nothing_is_refused() -> None:
-    silent = {"sends": False, "hears": "none"}
-    refused(PAPER, "preset paper has no generated messages; leave it out", v2x={"vehicles": {"vehicle_2": silent}})
-    refused(PAPER, "has no messages that a type could lack", vehicle_types={"car": {"v2x": silent}})
-    refused(PAPER, "unknown vehicle; this scenario has", v2x={**FIXED_LINKS, "vehicles": {"vehicle_4": silent}})
-    blind = {**FIXED_LINKS, "vehicles": {"vehicle_2": silent}, "senses": "none"}
-    del blind["sensing_s"]
-    refused(PAPER, "vehicle_2 may have no news until inf", v2x=blind)
 
 
 # Spread around what the load gives.
@@ -302,8 +226,7 @@ def test_equipage__where_it_would_do_nothing_is_refused() -> None:
 def lorries(spread: Any) -> Scenario:
     capacity = {"with_load": [7, 5], **({} if spread is None else {"spread": spread})}
     kinds = {"lorry": {"mass_t": {"with_load": [10, 40]}, "braking_capacity_mps2": capacity}}
-    given = {key: value for key, value in FIXED.declared().items() if key not in ("mass_t", "braking_capacity_mps2")}
-    return Scenario(**given, vehicle_types=kinds)
+    return Scenario(**without(FIXED, "mass_t", "braking_capacity_mps2"), vehicle_types=kinds)
 
 
 def test_spread__is_added_to_what_the_load_gives() -> None:
@@ -312,20 +235,10 @@ def test_spread__is_added_to_what_the_load_gives() -> None:
     assert plain.braking_capacity_mps2 == pytest.approx(by_load, abs=1e-12)
     more = wide.braking_capacity_mps2 - by_load
     assert (wide.mass_t == plain.mass_t).all() and -0.5 <= more.min() < -0.49 and 0.49 < more.max() <= 0.5
-    expected = -1 / math.sqrt(1 + (1 / 12) / (4 / 12))  # of two independent uniform parts, 2 and 1 wide
-    assert correlation(wide.mass_t, wide.braking_capacity_mps2) == pytest.approx(expected, abs=0.01)
-    assert correlation(plain.mass_t, plain.braking_capacity_mps2) == pytest.approx(-1.0, abs=1e-12)
+    assert abs(np.corrcoef(wide.mass_t.ravel(), more.ravel())[0, 1]) < 0.02  # drawn apart from the load
     assert lorries({"uniform": [-0.5, 0.5]}).bounds("braking_capacity_mps2")[0] == (4.5, 7.5)
-    with pytest.raises(InvalidInput, match=r"braking_capacity_mps2.*must be finite and in \(0, 100\]"):
-        lorries({"uniform": [-5, 0]})
-    with pytest.raises(InvalidInput, match=r"spread = 0\.3: must be a distribution around 0"):
-        lorries(0.3)
     names = lorries({"uniform": [-0.5, 0.5]}).ranges().names
     assert "braking_capacity_mps2 of vehicle_1" in names and "mass_t of vehicle_1" not in names
-
-
-def correlation(one: Floats, other: Floats) -> float:
-    return float(np.corrcoef(one.ravel(), other.ravel())[0, 1])
 
 
 # The alert comes later.
@@ -335,14 +248,8 @@ def test_alert__everybody_goes_on_until_then() -> None:
     late = FIXED.replace(alert_s=2, speeds_mps=[20, 18, 20], latency_s=[0, 0.5, 0.8])
     assert late.sample(1, 7).worlds.vehicles.latency_s.tolist() == [[2.0, 2.5, 2.8]]
     now = late.replace(gaps_m=[40 + 2 * 2, 40 - 2 * 2])
-    at_once = Scenario(**{key: value for key, value in now.declared().items() if key != "alert_s"})
-    assert final(late).gaps_m == pytest.approx(final(at_once).gaps_m, abs=1e-9)
+    assert final(late).gaps_m == pytest.approx(final(Scenario(**without(now, "alert_s"))).gaps_m, abs=1e-9)
     drawn = FIXED.replace(alert_s={"uniform": [1, 5]})
     latency = drawn.sample(100, 7).worlds.vehicles.latency_s
     assert (latency == latency[:, :1]).all() and 1 <= latency.min() < 1.2 and 4.8 < latency.max() <= 5
     assert drawn.bounds("latency_s") == ((1.0, 5.0),) * 3 and drawn.ranges().names == ("alert_s",)
-
-
-def test_alert__what_it_cannot_go_with_is_refused() -> None:
-    refused(FIXED, "only without messages one by one", alert_s=2, v2x="nominal")
-    refused(FIXED, r"alert_s = 40: with latency_s a vehicle may act as late as 40 s", alert_s=40)

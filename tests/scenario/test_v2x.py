@@ -14,7 +14,7 @@ from ethbrake_marl.engine import Engine
 from ethbrake_marl.envs.interfaces import make_engine, parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.evaluation.inputs import worlds_sha256
-from ethbrake_marl.observations import choose_observation, observe
+from ethbrake_marl.observations import observe
 from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.physics.batch import Packed
 from ethbrake_marl.physics.kernel import CLOCK
@@ -25,7 +25,6 @@ from ethbrake_marl.search import identities
 from tests.agents.test_knowledge import alter_unreceived
 
 PAPER = load_scenario("paper-random")
-MESSAGES = [name for name in PRESETS if CHANNELS[name].timing == "messages"]
 
 
 def channel_of(name: str, **changes: object) -> Scenario:
@@ -47,16 +46,6 @@ def test_burst_periods__at_the_bounds_by_hand():
     assert burst_periods(u, 0.5, 0.5).tolist() == [0, 1, 1, 2, 2, 3, 0]
     assert burst_periods(u, 0.0, 0.5).tolist() == [0] * 7
     assert burst_periods(np.array([0.0]), 0.5, 1.0).tolist() == [1]
-
-
-def test_with_news__news_of_the_emergency_comes_by_radio_or_by_sight():
-    u = np.full((1, 9 * PER_LINK), 0.5)
-    u.reshape(9, PER_LINK)[2 * 3 + 0, 2] = 0.0  # the link from vehicle_1 to vehicle_3 is lost, if any
-    for lost, third in ((0.0, [0.6, 0.6, 0.6]), (0.1, [np.inf, pytest.approx(1.35), pytest.approx(1.35)])):
-        v2x = V2X.model_validate({"preset": "nominal", "link_latency_s": 0.4, "lost": lost})
-        told = v2x.with_news(vehicles([0.0, 0.1, 0.6]), u, everybody(3))
-        assert told.latency_s.tolist() == [[0.0, 0.4, third[1]]]  # by sight it takes 0.95 s more
-        assert told.known_from_s[0].tolist() == [[0.0, 0.4, 0.4], [0.4, 0.4, 0.4], third]
 
 
 def slow_news(channel: Channel, own_s: list[float], links: np.ndarray) -> tuple[list[float], np.ndarray]:
@@ -96,6 +85,7 @@ def slow_news(channel: Channel, own_s: list[float], links: np.ndarray) -> tuple[
 def test_with_news__is_what_a_loop_over_the_links_gives(given):
     v2x, rng = V2X.model_validate(given), np.random.default_rng(6)
     u, own = rng.random((40, 16 * PER_LINK)), rng.choice([0.0, 0.2, 0.7, 1.5], (40, 4))
+    u[0, 2::PER_LINK] = 0.0  # every link is lost, if any
     told = v2x.with_news(vehicles(own, 40), u, everybody(4))
     for k in range(40):
         latency, known = slow_news(v2x.channel, own[k].tolist(), u[k].reshape(4, 4, PER_LINK))
@@ -138,21 +128,6 @@ def test_v2x__says_whether_it_differs_from_the_paper_and_whether_chance_decides(
     assert (v2x.by_link, v2x.drawn) == (by_link, drawn)
 
 
-@pytest.mark.parametrize("name", MESSAGES)
-def test_sample__a_world_alone_has_the_same_news_and_the_line_of_the_paper(name):
-    scenario = channel_of(name)
-    many, alone = scenario.sample(30, 7).worlds, scenario.sample(1, 7, first=17).worlds
-    assert many.vehicles.known_from_s[17].tobytes() == alone.vehicles.known_from_s[0].tobytes()
-    assert many.vehicles.latency_s[17].tobytes() == alone.vehicles.latency_s[0].tobytes()
-    same = PAPER.replace(early_impacts="keep").sample(30, 7).worlds
-    assert many.gaps_m.tobytes() == same.gaps_m.tobytes() and many.speeds_mps.tobytes() == same.speeds_mps.tobytes()
-    other = scenario.sample(30, 7, channel="training").worlds
-    assert (many.vehicles.known_from_s[:, 1] != other.vehicles.known_from_s[:, 1]).all()
-    for k in range(3):  # of itself a vehicle knows from its latency on, whatever the channel does
-        assert many.vehicles.known_from_s[:, k, k].tobytes() == many.vehicles.latency_s[:, k].tobytes()
-    assert (many.vehicles.own_latency_s == 0.0).all()
-
-
 def test_observe__tells_own_parts_of_latencies_and_nothing_that_the_channel_has_drawn():
     # Vehicle 2 knows Vehicle 3 from 0.4 s on; Vehicle 3's own part is 0.5 s, Vehicle 1's message reaches it at 0.9 s.
     scenario = PAPER.replace(v2x="congested", latency_s=[0, 0.1, 0.5], early_impacts="keep")
@@ -176,8 +151,7 @@ def test_full_state__has_the_latency_that_the_channel_has_drawn():
 
 def test_observe__writing_the_papers_news_out_by_link_changes_no_bit():
     plain = PAPER.sample(50, 7).worlds
-    rows = Packed.of(plain)
-    told = rows.widened(obstacle=False, news=True).worlds()
+    told = Packed.of(plain).widened(obstacle=False, news=True).worlds()
     for time in (0.0, 0.3, 0.6, 1.0):
         for i in range(3):
             now = (replace(w, time_s=np.full(50, time)) for w in (plain, told))
@@ -254,23 +228,19 @@ def periodic(preset: str = "nominal", base: Scenario = BASE, **changes: object) 
 
 
 def first_only(scenario: Scenario) -> Scenario:
-    given = scenario.v2x.model_dump(exclude_none=True)
-    return scenario.replace(v2x={**given, "persistence": "first"})
+    return scenario.replace(v2x={**scenario.v2x.model_dump(exclude_none=True), "persistence": "first"})
 
 
-def engine_of(scenario: Scenario, n: int = 6, seed: int = 7, rows: object = None) -> Engine:
-    worlds = scenario.sample(n, seed).worlds
-    if rows is not None:
-        worlds = worlds.take(rows)
-    learners = list(scenario.learners)
-    scripts = script_agents(scenario, except_for=learners)
-    return Engine(scenario, worlds.n, learners=learners, scripts=scripts, worlds=worlds)
+def engine_of(scenario: Scenario, n: int = 6, first: int = 0) -> Engine:
+    worlds = scenario.sample(n, 7, first=first).worlds
+    scripts = script_agents(scenario, except_for=scenario.learners)
+    return Engine(scenario, n, learners=scenario.learners, scripts=scripts, worlds=worlds)
 
 
-def driven(engine: Engine, steps: int, action: float = -0.6) -> list[np.ndarray]:
+def driven(engine: Engine, steps: int) -> list[np.ndarray]:
     seen = [engine.observe_all(np.arange(engine.scenario.vehicles))]
     for _ in range(steps):
-        engine.step(np.full((engine.n, len(engine.learners)), action))
+        engine.step(np.full((engine.n, len(engine.learners)), -0.6))
         seen.append(engine.observe_all(np.arange(engine.scenario.vehicles)))
     return seen
 
@@ -302,11 +272,16 @@ def test_periodic__in_sight_what_is_seen_is_what_first_shows() -> None:
         np.testing.assert_array_equal(one[:, 1], other[:, 1])
 
 
+def delayed(gaps_m: list[float]) -> Engine:
+    """All at 20 m/s; every message is 0.2 s on its way, and who is behind is not in sight."""
+    base = BASE.replace(gaps_m=gaps_m, speeds_mps=[20.0, 20.0, 20.0])
+    return engine_of(periodic("paper", base, link_latency_s=0.2, senses="front", sensing_s=[5.0, 5.0]), n=1)
+
+
 def test_fixed_delay_without_loss__by_hand() -> None:
     # One message every 0.1 s from the alert on, 0.2 s on its way, decisions at 0.5, 0.6, ...: each carries the sample
     # of the moment at which it is sent, so whatever is known is 0.2 s old. Vehicle 1 brakes with 6 from the alert on.
-    base = BASE.replace(gaps_m=[8.0, 8.0], speeds_mps=[20.0, 20.0, 20.0])
-    engine = engine_of(periodic("paper", base, link_latency_s=0.2, senses="front", sensing_s=[5.0, 5.0]), n=1)
+    engine = delayed([8.0, 8.0])
     for step in range(6):
         time = 0.5 + 0.1 * step
         told = Messages.of(engine.worlds).newest_told(1)
@@ -321,8 +296,7 @@ def test_fixed_delay_without_loss__by_hand() -> None:
 
 def test_estimate__moves_on_with_the_command_of_then() -> None:
     # Vehicle 3 begins to brake at 0.8 s; at 0.9 s Vehicle 2 knows it as it was at 0.7 s, coasting, at 1 s as at 0.8 s.
-    base = BASE.replace(gaps_m=[8.0, 9.0], speeds_mps=[20.0, 20.0, 20.0])
-    engine = engine_of(periodic("paper", base, link_latency_s=0.2, senses="front", sensing_s=[5.0, 5.0]), n=1)
+    engine = delayed([8.0, 9.0])
     for _ in range(4):
         engine.step(np.zeros((1, 1)))
     assert engine.worlds.time_s[0] == pytest.approx(0.9)
@@ -334,11 +308,8 @@ def test_estimate__moves_on_with_the_command_of_then() -> None:
 @pytest.mark.parametrize(("p", "r"), [(0.05, 0.5), (0.2, 0.2), (0.3, 0.7)])
 def test_losses__go_on_with_the_share_and_the_bursts_of_the_channel(p: float, r: float) -> None:
     # Of messages 0.1 s apart the newest that arrived is sent m periods ago where the last m were lost.
-    base = BASE.replace(horizon_s=30.0)
-    scenario = periodic(
-        base=base, loss_begins=p, loss_ends=r, radio_s=0.0, senses="front", sensing_s=[7.0, 7.0], lost=0.0
-    )
-    engine = engine_of(scenario, n=4000)
+    channel = {"loss_begins": p, "loss_ends": r, "lost": 0.0, "radio_s": 0.0, "senses": "front", "sensing_s": [7, 7]}
+    engine = engine_of(periodic(base=BASE.replace(horizon_s=30.0), **channel), n=4000)
     for _ in range(30):
         engine.step(np.full((4000, 1), -1.0))
     lost = np.rint((ages_in(engine.worlds)[:, 2, 0] - 0.4) / 0.1)  # sent 0.3 to 0.4 s ago, sampled 0.4
@@ -362,7 +333,7 @@ def test_periodic__a_world_alone_hears_what_it_hears_in_a_batch(vehicles: int) -
         roles={"vehicle_2": "learner"},
     )  # fmt: skip
     scenario = periodic("congested", base)
-    whole, alone = driven(engine_of(scenario, 9), 12), driven(engine_of(scenario, 9, rows=[4]), 12)
+    whole, alone = driven(engine_of(scenario, 9), 12), driven(engine_of(scenario, 1, first=4), 12)
     for one, other in zip(whole, alone, strict=True):
         np.testing.assert_array_equal(one[4], other[0])
 
@@ -381,10 +352,8 @@ def test_obstacle__is_known_as_it_was_told_and_stands_where_it_stands() -> None:
 
 
 def test_age__is_a_feature_that_grows_between_messages() -> None:
-    scenario = periodic("blocked", senses="front", sensing_s=[5.0, 5.0], lost=0.0, base=BASE.replace(horizon_s=30.0))
-    spec = choose_observation(AGED)
-    scripts = script_agents(scenario, except_for=1)
-    engine = Engine(scenario, 30, learners=[1], scripts=scripts, worlds=scenario.sample(30, 7).worlds, observation=spec)
+    base = BASE.replace(horizon_s=30.0, observation=AGED)
+    engine = engine_of(periodic("blocked", base, senses="front", sensing_s=[5.0, 5.0], lost=0.0), 30)
     ages = []
     for _ in range(20):
         seen, told = engine.observe(1), ages_in(engine.worlds)[:, 1]
@@ -427,13 +396,7 @@ def test_interfaces__see_the_same() -> None:
 
 
 def test_mixture__its_scenarios_share_the_persistence() -> None:
-    members = [
-        {"scenario": {**load_scenario(name).declared(), "v2x": v2x}}
-        for name, v2x in (
-            ("paper-random", {"preset": "nominal", "persistence": "periodic"}),
-            ("paper-random-brake-only", {"preset": "blocked", "persistence": "periodic"}),
-        )
-    ]
-    mixed = Scenario(name="mixed", mixture=members)
+    members = [periodic(preset, BASE.replace(name=preset)) for preset in ("nominal", "blocked")]
+    mixed = Scenario(name="mixed", mixture=[{"scenario": member} for member in members])
     assert Messages.of(mixed.sample(30, 3).worlds).periodic.all()
     driven(engine_of(mixed), 5)

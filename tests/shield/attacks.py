@@ -11,17 +11,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import drive, make_agent
-from ethbrake_marl.engine import Engine
 from ethbrake_marl.physics import Floats, Worlds, advance
 from ethbrake_marl.physics.kernel import CLOCK
-from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.shield import ShieldedDriver, StepShield
-from ethbrake_marl.shield.step_shield import Decision, Running, certify, seen_columns
+from ethbrake_marl.shield.step_shield import Decision, certify, seen_columns
 
 # ---------------------------------------------------------------- lines
 
@@ -37,9 +36,9 @@ _ROLES = {
 }
 
 
-def line(N: int, restitution: float = 0.3) -> Scenario:
+def line(N: int, restitution: float = 0.3) -> eb.Scenario:
     """Random lines of N vehicles, e from 0 to ``restitution``; the learner may also drive."""
-    return Scenario(
+    return eb.Scenario(
         name=f"line-{N}",
         vehicles=N,
         gaps_m={"uniform": [2, 12]},
@@ -61,37 +60,7 @@ TEAMS = {  # by cooperation level and number of vehicles
 
 # ---------------------------------------------------------------- adversaries: what all learners propose, [n, K]
 
-Adversary = Callable[[np.random.Generator, Engine, StepShield, int], Floats]  # ..., number of the step
-
-
-def random_actions(rng, engine, shield, k):
-    return rng.uniform(-1.0, 1.0, shape(shield))
-
-
-def extremes(rng, engine, shield, k):
-    return np.where((k + np.arange(shape(shield)[0])[:, np.newaxis]) % 2, 1.0, -np.ones(shape(shield)))
-
-
-def coast(rng, engine, shield, k):
-    return np.zeros(shape(shield))
-
-
-def full_drive(rng, engine, shield, k):
-    return np.ones(shape(shield))
-
-
-def slow_drift(rng, engine, shield, k):
-    """Random, held for several steps: whole profiles that differ from the plan."""
-    return np.random.default_rng(1_000 + k // 6).uniform(-1.0, 0.5, shape(shield))
-
-
-def bang_bang(rng, engine, shield, k):
-    return np.sign(np.random.default_rng([k // 4, shape(shield)[0]]).uniform(-1.0, 1.0, shape(shield)))
-
-
-def speechless(rng, engine, shield, k):
-    """No number half of the time; at random else."""
-    return np.where(rng.random(shape(shield)) < 0.5, np.nan, rng.uniform(-3.0, 3.0, shape(shield)))
+Adversary = Callable[[np.random.Generator, eb.Engine, StepShield, int], Floats]  # ..., number of the step
 
 
 def worst_case(rng, engine, shield, k, candidates=8):
@@ -130,8 +99,22 @@ def trained(rng, engine, shield, k):
     return np.clip(action + rng.normal(0.0, 0.05, action.shape), -1.0, 1.0)
 
 
-_TEAMS_TOO = (random_actions, extremes, coast, full_drive, slow_drift, bang_bang, speechless, worst_case, sleeper)
-TEAM_ADVERSARIES: dict[str, Adversary] = {f.__name__: f for f in _TEAMS_TOO}
+# Slow drift and bang-bang are held for several steps: whole profiles that differ from the plan.
+TEAM_ADVERSARIES: dict[str, Adversary] = {
+    "random_actions": lambda rng, engine, shield, k: rng.uniform(-1.0, 1.0, shape(shield)),
+    "extremes": lambda rng, engine, shield, k: np.where((np.indices(shape(shield))[0] + k) % 2, 1.0, -1.0),
+    "coast": lambda rng, engine, shield, k: np.zeros(shape(shield)),
+    "full_drive": lambda rng, engine, shield, k: np.ones(shape(shield)),
+    "slow_drift": lambda rng, engine, shield, k: np.random.default_rng(1_000 + k // 6).uniform(-1, 0.5, shape(shield)),
+    "bang_bang": lambda rng, engine, shield, k: np.sign(
+        np.random.default_rng([k // 4, shape(shield)[0]]).uniform(-1.0, 1.0, shape(shield))
+    ),
+    "speechless": lambda rng, engine, shield, k: np.where(  # no number half of the time; at random else
+        rng.random(shape(shield)) < 0.5, np.nan, rng.uniform(-3.0, 3.0, shape(shield))
+    ),
+    "worst_case": worst_case,
+    "sleeper": sleeper,
+}
 ADVERSARIES: dict[str, Adversary] = {**TEAM_ADVERSARIES, "trained": trained}
 
 
@@ -167,7 +150,7 @@ class Attack(NamedTuple):
 
 
 def attack(
-    scenario: Scenario, worlds: Worlds, adversary: Adversary, *, hostile="all", harm_count="first", allowance=0.0,
+    scenario: eb.Scenario, worlds: Worlds, adversary: Adversary, *, hostile="all", harm_count="first", allowance=0.0,
     cap=None, leak: Leak | None = None, seed=0,
 ) -> Attack:  # fmt: skip
     """Let the hostile learners propose in every step: ``all``, or ``one``, another one from world to world.
@@ -201,7 +184,7 @@ def attack(
     return Attack(realised, first_bound, shield.bound, accepted, rises, over, decisions)
 
 
-def begun(scenario: Scenario, worlds: Worlds, **settings) -> StepShield:
+def begun(scenario: eb.Scenario, worlds: Worlds, **settings) -> StepShield:
     """A shield of all learners in its episodes."""
     learners = scenario.learners
     shield = StepShield(scenario, learners[0] if len(learners) == 1 else learners, **settings)
@@ -209,10 +192,18 @@ def begun(scenario: Scenario, worlds: Worlds, **settings) -> StepShield:
     return shield
 
 
-def plain_engine(scenario: Scenario, worlds: Worlds) -> Engine:
+def plain_engine(scenario: eb.Scenario, worlds: Worlds) -> eb.Engine:
     """Without a shield."""
     scripts = {i: make_agent(spec) for i, spec in scenario.scripts.items()}
-    return Engine(scenario, worlds.n, learners=scenario.learners, scripts=scripts, worlds=worlds)
+    return eb.Engine(scenario, worlds.n, learners=scenario.learners, scripts=scripts, worlds=worlds)
+
+
+def all_infos(env: Any, actions: Any, **reset: Any) -> list[Any]:
+    """All that an episode of a parallel environment tells, from its reset on, if the same is proposed in each step."""
+    infos = [env.reset(**reset)[1]]
+    while env.agents:
+        infos.append(env.step(actions)[-1])
+    return infos
 
 
 def above_later(proposer: str, worlds: int) -> tuple[float, float]:
@@ -220,7 +211,7 @@ def above_later(proposer: str, worlds: int) -> tuple[float, float]:
 
     From the horizon on everybody brakes fully.
     """
-    scenario = load_scenario("paper-random").replace(horizon_s=3.0)
+    scenario = eb.load_scenario("paper-random").replace(horizon_s=3.0)
     episodes = drive(scenario.sample(worlds, 7).worlds, ShieldedDriver(make_agent(proposer), scenario), scenario, 1)
     final, bound = episodes.final, episodes.guarded.shield.predicted_harm
     _, impacts = advance(final, -final.vehicles.braking_capacity_mps2, until_s=np.full(worlds, 8.0))
@@ -287,25 +278,15 @@ def search(
 Leak = Callable[[StepShield, Decision | None], None]  # changes the shield before a decision; the last one, or None
 
 
-def _with_problem(shield: StepShield, **arrays: np.ndarray) -> None:
-    running = shield.running
-    shield.running = running._replace(problem=running.problem._replace(**arrays))
+def _of_pairs(change: Callable[[StepShield, np.ndarray], None]) -> Leak:
+    """A leak that changes the state of pairs [n, 4, pairs]: 0 gap, 1 hit flag, 2 first-impact harm, 3 total harm."""
 
+    def leak(shield, last):
+        states, N = shield.running.states.copy(), shield.running.problem.mass.shape[1]
+        change(shield, states[:, N : N + 4 * (N - 1)].reshape(-1, 4, N - 1))
+        shield.running = shield.running._replace(states=states)
 
-def _columns(running: Running, group: int) -> slice:
-    """Columns of the state: 0 gaps, 1 hit flags, 2 first-impact harm, 3 total harm."""
-    N = running.problem.mass.shape[1]
-    return slice(N + group * (N - 1), N + (group + 1) * (N - 1))
-
-
-def _states(shield: StepShield, group: int) -> np.ndarray:
-    return shield.running.states[:, _columns(shield.running, group)].copy()
-
-
-def _with_states(shield: StepShield, group: int, values: np.ndarray | float) -> None:
-    states = shield.running.states.copy()
-    states[:, _columns(shield.running, group)] = values
-    shield.running = shield.running._replace(states=states)
+    return leak
 
 
 def budget_may_rise(percent: float) -> Leak:
@@ -315,22 +296,23 @@ def budget_may_rise(percent: float) -> Leak:
     return leak
 
 
-def harm_forgotten(shield: StepShield, last: Decision | None) -> None:
-    for group in (2, 3):
-        _with_states(shield, group, _states(shield, group) * 0.99)
+@_of_pairs
+def harm_forgotten(shield: StepShield, pairs: np.ndarray) -> None:
+    pairs[:, 2:] *= 0.99
 
 
-def impacts_late(shield: StepShield, last: Decision | None) -> None:
+@_of_pairs
+def impacts_late(shield: StepShield, pairs: np.ndarray) -> None:
     """What was done in the last step is counted two steps later only."""
-    for group in (2, 3):
-        now, before = _states(shield, group), getattr(shield, f"late{group}", None)
-        setattr(shield, f"late{group}", now)
-        _with_states(shield, group, now if before is None else before)
+    now = pairs[:, 2:].copy()
+    pairs[:, 2:] = getattr(shield, "late", now)
+    shield.late = now
 
 
-def hits_assumed(shield: StepShield, last: Decision | None) -> None:
+@_of_pairs
+def hits_assumed(shield: StepShield, pairs: np.ndarray) -> None:
     """A pair that is close counts as hit before: its first impact costs nothing."""
-    _with_states(shield, 1, np.maximum(_states(shield, 1), _states(shield, 0) < 0.5))
+    pairs[:, 1] = np.maximum(pairs[:, 1], pairs[:, 0] < 0.5)
 
 
 def belief(name: str, believed: Callable[[np.ndarray], np.ndarray]) -> Leak:
@@ -338,7 +320,9 @@ def belief(name: str, believed: Callable[[np.ndarray], np.ndarray]) -> Leak:
 
     def leak(shield, last):
         if last is None:
-            _with_problem(shield, **{name: believed(getattr(shield.running.problem, name).copy())})
+            problem = shield.running.problem
+            changed = problem._replace(**{name: believed(getattr(problem, name).copy())})
+            shield.running = shield.running._replace(problem=changed)
 
     return leak
 
@@ -348,14 +332,11 @@ def half_restitution(clock: np.ndarray) -> np.ndarray:
     return clock
 
 
-def far_pairs_forgotten(shield: StepShield, last: Decision | None) -> None:
+@_of_pairs
+def far_pairs_forgotten(shield: StepShield, pairs: np.ndarray) -> None:
     """Harm of pairs that the shielded vehicle is no part of does not count."""
-    vehicle, N = shield.vehicle, shield.running.problem.mass.shape[1]
-    far = [p for p in range(N - 1) if vehicle not in (p, p + 1)]
-    for group in (2, 3):
-        harm = _states(shield, group)
-        harm[:, far] = 0.0
-        _with_states(shield, group, harm)
+    pair = np.arange(pairs.shape[2])
+    pairs[:, 2:, (pair != shield.vehicle) & (pair + 1 != shield.vehicle)] = 0.0
 
 
 def plan_rounded(shield: StepShield, last: Decision | None) -> None:
@@ -363,10 +344,11 @@ def plan_rounded(shield: StepShield, last: Decision | None) -> None:
     shield.backup = shield.backup._replace(plan=np.round(shield.backup.plan, 2))
 
 
-def gaps_blurred(shield: StepShield, last: Decision | None) -> None:
+@_of_pairs
+def gaps_blurred(shield: StepShield, pairs: np.ndarray) -> None:
     """Gaps are believed 1 cm longer than they are, from the third step on."""
-    if last is not None and int(shield.running.steps.max()) == 3:
-        _with_states(shield, 0, _states(shield, 0) + 0.01)
+    if int(shield.running.steps.max()) == 3:
+        pairs[:, 0] += 0.01
 
 
 LEAKS: dict[str, Leak] = {
@@ -392,7 +374,7 @@ LEAKS: dict[str, Leak] = {
 WAYS = ("coast", "drive", "chance")
 ABOVE = 1e-6  # m2/s2; what is told is moved on with rounding
 
-_BASE = load_scenario("cooperation-2-paper").replace(early_impacts="keep")
+_BASE = eb.load_scenario("cooperation-2-paper").replace(early_impacts="keep")
 NEVER_HEARD = _BASE.replace(
     gaps_m=[{"choice": [5.13, 9.71]}, {"choice": [5.37, 9.58]}],
     speeds_mps=[{"choice": [18.23, 21.87]}, {"choice": [18.11, 21.93]}, {"choice": [18.41, 22.19]}],
@@ -434,7 +416,7 @@ class Hostile:
 
 
 def shielded(
-    way: str, scenario: Scenario, n: int, seed: int, *, robust: str | None = "corners"
+    way: str, scenario: eb.Scenario, n: int, seed: int, *, robust: str | None = "corners"
 ) -> tuple[Floats, Floats, int]:
     """Harm realised and first bound of ``n`` worlds [n] m2/s2, and how many proposals were replaced."""
     mode = {"mode": "step"} if robust is None else {"mode": "robust", "robust": robust}

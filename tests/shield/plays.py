@@ -17,11 +17,8 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 
+import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import Team, episode_engine
-from ethbrake_marl.envs.interfaces import EthBrakeVectorEnv, parallel_env
-from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from ethbrake_marl.errors import EthBrakeError
-from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import (
     HybridShield,
     MovingAtHorizon,
@@ -30,11 +27,10 @@ from ethbrake_marl.shield import (
     ShieldedVectorEnv,
     shielded_aec,
 )
-from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from tests.shield.attacks import line
 
 ROWS = 5  # worlds of the batched interfaces
-ALONE, PAIR = line(3), load_scenario("cooperation-3-pair")
+ALONE, PAIR = line(3), eb.load_scenario("cooperation-3-pair")
 NO_STATE = {"initial_state": {"gaps_m": [-1, 1], "speeds_mps": [1, 1, 1]}}
 
 
@@ -72,7 +68,7 @@ class Unreliable:
 
 
 class Play:
-    """One interface, shielded: ``step`` makes a step with fresh proposals, ``bad`` are calls that must raise."""
+    """One interface, shielded: ``make`` begins it, ``step`` proposes afresh, ``bad`` are calls that must raise."""
 
     def __init__(self, seed: int, *, team: bool = False) -> None:
         self.rng, self.team, self.scenario = np.random.default_rng(seed), team, PAIR if team else ALONE
@@ -83,10 +79,12 @@ class Play:
         self.done: list[tuple[float, float]] = []  # of engines before this one
         self.make()
 
-    make: Any  # the interface, watch its engine, begin an episode; all without arguments
-    engine: Any
-    shield: Any
-    step: Any
+    def put(self, env: Any, shield: Any = None, **begin: int) -> None:
+        """Play this environment from now on, which is or has such a shield: watch its engine, begin an episode."""
+        self.env, at = env, env if shield is None else shield
+        self.engine, self.shield = lambda: at.attached.engine, lambda: at.attached.shield
+        self.watch()
+        env.reset(**begin)
 
     def between(self, env: Any) -> Any:
         """The environment, each of whose steps goes through ``how``."""
@@ -166,8 +164,7 @@ class Parallel(Play):
     def make(self) -> None:
         policies: Any = {f"vehicle_{i + 1}": member for i, member in self.members.items()}
         policy = policies if self.team else policies["vehicle_2"]
-        inner = self.between(parallel_env(self.scenario))
-        self.env = HybridShield(inner, policy, mode="step", cap="baseline" if self.team else None)
+        inner = self.between(eb.parallel_env(self.scenario))
         last = list(policies)[-1]
         self.bad = [
             lambda: self.env.step({"vehicle_2": np.zeros(1), "vehicle_9": np.zeros(1)}),
@@ -178,9 +175,8 @@ class Parallel(Play):
             self.member_is("fails", lambda: self.env.step({})),
             self.member_is("misshapen", lambda: self.env.step({})),
         ]
-        self.engine, self.shield = lambda: self.env.unwrapped.engine, lambda: self.env.attached.shield
-        self.watch()
-        self.env.reset(seed=self.begin())
+        env = HybridShield(inner, policy, mode="step", cap="baseline" if self.team else None)
+        self.put(env, seed=self.begin())
 
     def step(self) -> None:
         if self.engine().ended[0]:
@@ -194,13 +190,10 @@ class Aec(Play):
     """PettingZoo AEC."""
 
     def make(self) -> None:
-        self.env = shielded_aec(self.between(parallel_env(self.scenario)), mode="step")
-        inner: Any = self.env
+        env = inner = shielded_aec(self.between(eb.parallel_env(self.scenario)), mode="step")
         while not isinstance(inner, HybridShield):
             inner = inner.env
-        self.engine, self.shield = lambda: inner.unwrapped.engine, lambda: inner.attached.shield
-        self.watch()
-        self.env.reset(seed=self.begin())
+        self.put(env, inner, seed=self.begin())
 
     def step(self) -> None:
         if self.engine().ended[0]:
@@ -210,19 +203,7 @@ class Aec(Play):
             self.env.step(self.drawn(1).astype(np.float32))
 
 
-class Attached(Play):
-    """An interface of Gymnasium's form: what its shield is attached to holds the engine."""
-
-    env: Any
-
-    def put(self, env: Any, **begin: int) -> None:
-        self.env = env
-        self.engine, self.shield = lambda: env.attached.engine, lambda: env.attached.shield
-        self.watch()
-        env.reset(**begin)
-
-
-class Single(Attached):
+class Single(Play):
     """Gymnasium."""
 
     def make(self) -> None:
@@ -242,26 +223,25 @@ class Single(Attached):
         self.env.step(self.drawn(1))
 
 
-class Vector(Attached):
+def one_bad(rows: int, row: int) -> np.ndarray:
+    """Actions of which one is no number."""
+    return np.where(np.arange(rows)[:, np.newaxis] == row, np.nan, 0.0)
+
+
+class Vector(Play):
     """Gymnasium vector."""
 
     mode = "SameStep"
 
     def make(self) -> None:
-        inner = self.between(EthBrakeVectorEnv(ROWS, self.scenario, autoreset_mode=self.mode))
+        inner = self.between(eb.EthBrakeVectorEnv(ROWS, self.scenario, autoreset_mode=self.mode))
         self.bad = [
-            lambda: self.env.step(self.one_bad(ROWS, int(np.argmin(self.engine().ended)))),  # others are ignored
+            lambda: self.env.step(one_bad(ROWS, int(np.argmin(self.engine().ended)))),  # others are ignored
             lambda: self.env.step(np.zeros((ROWS + 1, 1))),
             lambda: self.env.step(np.full((ROWS, 1), 1.0 + 1j)),
             lambda: self.env.reset(seed=-1),
         ]
         self.put(ShieldedVectorEnv(inner), seed=self.begin())
-
-    @staticmethod
-    def one_bad(rows: int, row: int) -> np.ndarray:
-        actions = np.zeros((rows, 1))
-        actions[row] = np.nan
-        return actions
 
     def step(self) -> None:
         self.env.step(self.drawn(ROWS, 1).astype(np.float32))
@@ -273,11 +253,11 @@ class NextStepVector(Vector):
     mode = "NextStep"
 
 
-class Sb3(Attached):
+class Sb3(Play):
     """Stable-Baselines3; of a team one row of each member and world."""
 
     def make(self) -> None:
-        inner = make_sb3_vec_env(self.scenario, ROWS, seed=self.begin())
+        inner = eb.make_sb3_vec_env(self.scenario, ROWS, seed=self.begin())
         plain = inner.step_wait
 
         def step(actions: Any) -> Any:
@@ -287,11 +267,11 @@ class Sb3(Attached):
         inner.step_wait = lambda: self.how(step, inner._actions)
         rows = inner.num_envs
         self.bad = [
-            lambda: self.env.step(Vector.one_bad(rows, int(self.rng.integers(rows)))),
+            lambda: self.env.step(one_bad(rows, int(self.rng.integers(rows)))),
             lambda: self.env.step(np.zeros((rows, 2))),
             self._options,
         ]
-        self.put(ShieldedVecEnv(inner))
+        self.put(eb.ShieldedVecEnv(inner))
 
     def _options(self) -> None:
         self.env.set_options(NO_STATE)
@@ -336,8 +316,6 @@ PLAYS: dict[str, Callable[[int], Play]] = {
 
 
 # ---------------------------------------------------------------- played, disturbed, wrapped
-
-LINES = (50, 200, 800)  # an interrupt comes at one of the first so many lines of a call, if it has so many
 
 
 class Tally(NamedTuple):
@@ -408,7 +386,7 @@ def disturbed(name: str, episodes: int, seed: int) -> Tally:
             play.step()  # begins the next episode
         kind, before, made = int(play.rng.integers(5)), play.known(), play.made()
         if kind == 0 and play.bad:
-            with contextlib.suppress(EthBrakeError, Failure):
+            with contextlib.suppress(eb.EthBrakeError, Failure):
                 play.bad[int(play.rng.integers(len(play.bad)))]()
                 broken += 1  # it did not raise
             refused += 1
@@ -419,7 +397,8 @@ def disturbed(name: str, episodes: int, seed: int) -> Tally:
             play.raises, refused = None, refused + 1
         elif kind == 2:
             try:
-                with interrupt_at(int(play.rng.integers(1, play.rng.choice(LINES)))):
+                # at one of the first so many lines of a call, if it has so many
+                with interrupt_at(int(play.rng.integers(1, play.rng.choice((50, 200, 800))))):
                     play.step()
             except KeyboardInterrupt:
                 interrupted += 1
@@ -444,10 +423,6 @@ def skip(frames: int, step: Callable[[Any], Any], actions: Any) -> Any:
     return told
 
 
-def changing(step: Callable[[Any], Any], actions: Any) -> Any:
-    return step(_scaled(actions, 0.5))
-
-
 def twice(step: Callable[[Any], Any], actions: Any) -> Any:
     step(_scaled(actions, 0.0))
     return step(actions)
@@ -467,9 +442,12 @@ class Swallowing:
 
 
 WRAPPERS: dict[str, Callable[[], Callable[..., Any]]] = {
-    "frame skip 2": lambda: partial(skip, 2), "frame skip 80": lambda: partial(skip, 80),
-    "changes actions": lambda: changing, "steps twice": lambda: twice, "swallows steps": Swallowing,
-}  # fmt: skip
+    "frame skip 2": lambda: partial(skip, 2),
+    "frame skip 80": lambda: partial(skip, 80),
+    "changes actions": lambda: lambda step, actions: step(_scaled(actions, 0.5)),
+    "steps twice": lambda: twice,
+    "swallows steps": Swallowing,
+}
 INSIDE = [name for name in PLAYS if "evaluation" not in name]  # the engine itself asks that one: nothing is in between
 
 
@@ -480,7 +458,7 @@ def wrapped(name: str, wrapper: str, calls: int, seed: int) -> Tally:
     play.how = WRAPPERS[wrapper]()
     refused = broken = 0
     for _ in range(calls):
-        with contextlib.suppress(EthBrakeError):  # at the end of an episode also the plain one, "no episode is running"
+        with contextlib.suppress(eb.EthBrakeError):  # at the end also the plain "no episode is running"
             play.step()
             refused -= 1
         refused += 1

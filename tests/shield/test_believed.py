@@ -7,33 +7,23 @@ from typing import Any
 import numpy as np
 import pytest
 
+import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import drive, make_agent
-from ethbrake_marl.envs.interfaces import EthBrakeEnv, EthBrakeVectorEnv, parallel_env
-from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.physics import Floats
-from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.shield import HybridShield, ShieldedDriver, ShieldedEnv, ShieldedVectorEnv, enclosure, shielded_aec
+from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, enclosure, shielded_aec
 from ethbrake_marl.shield.enclosure import Boxes, boxes_of
-from ethbrake_marl.shield.sb3 import ShieldedVecEnv
 from ethbrake_marl.shield.step_shield import BelievedShield
-from tests.shield.attacks import ABOVE, HEARD_LATE, INSIDE, LISTS, NEVER_HEARD, WAYS, Hostile, shielded
+from tests.shield.attacks import ABOVE, HEARD_LATE, INSIDE, LISTS, NEVER_HEARD, WAYS, all_infos, shielded
 
-BASE = load_scenario("cooperation-2-paper").replace(early_impacts="keep")
+BASE = eb.load_scenario("cooperation-2-paper").replace(early_impacts="keep")
 PERIODIC = BASE.replace(v2x={"preset": "blocked", "persistence": "periodic"})
 
 
-def driven(agent: object, scenario: Scenario, n: int, seed: int = 7, vehicle: int = 1) -> tuple[Floats, Floats]:
+def driven(agent: object, scenario: eb.Scenario, n: int, seed: int = 7, vehicle: int = 1) -> tuple[Floats, Floats]:
     """Harm realised, and the first bound, [n] each."""
     episodes = drive(scenario.sample(n, seed).worlds, agent, scenario, vehicle)
     told = episodes.memories[vehicle] if episodes.guarded is None else episodes.guarded.told
     return episodes.ledger.world_harm("first"), told["predicted_harm"]
-
-
-def behind(way: str, scenario: Scenario, robust: str | None = None) -> ShieldedDriver:
-    """Who proposes so, behind a shield on what was received."""
-    mode = {"mode": "step"} if robust is None else {"mode": "robust", "robust": robust}
-    return ShieldedDriver(Hostile(way), scenario, believed=True, **mode)
 
 
 @pytest.mark.parametrize("name", LISTS)
@@ -74,7 +64,7 @@ def test_step__in_the_middle_promises_nothing_of_the_corners() -> None:
 @pytest.mark.parametrize("robust", [None, "corners", pytest.param("interior", marks=pytest.mark.slow)])
 def test_believed__where_everything_is_known_the_bound_is_that_of_the_best_constant(robust: str | None) -> None:
     n = 40 if robust == "interior" else 20
-    harm, bound = driven(behind("drive", BASE, robust), BASE, n)
+    harm, bound, _ = shielded("drive", BASE, n, 7, robust=robust)
     _, best = driven(make_agent("e_v2x_bm", scenario=BASE), BASE, n)
     if robust == "interior":  # an upper bound, which is not exact where impacts coincide
         assert (bound >= best - 1e-4).all() and np.isclose(bound, best, atol=1e-4).mean() > 0.9
@@ -94,20 +84,20 @@ def test_believed__no_world_depends_on_the_batch(spec: str) -> None:
 @pytest.mark.parametrize(
     "scenario",
     [
-        load_scenario("paper-random").replace(
+        eb.load_scenario("paper-random").replace(
             vehicles=2, braking_capacity_mps2=6.0, driving_capacity_mps2=6.0, mass_t=5.0, latency_s=0.1,
             roles={"vehicle_2": "learner"}, v2x={"preset": "nominal", "persistence": "periodic"}, horizon_s=10.0,
         ),
-        load_scenario("cooperation-4-all").with_learners(["vehicle_2"]).replace(
+        eb.load_scenario("cooperation-4-all").with_learners(["vehicle_2"]).replace(
             early_impacts="keep", v2x=PERIODIC.v2x.model_dump(exclude_none=True)
         ),
     ],
     ids=["two vehicles", "an obstacle"],
 )  # fmt: skip
 @pytest.mark.parametrize("robust", [None, "corners"])
-def test_believed__shields_other_lines(scenario: Scenario, robust: str | None) -> None:
+def test_believed__shields_other_lines(scenario: eb.Scenario, robust: str | None) -> None:
     if robust is None or scenario.vehicles == 2:
-        assert np.isfinite(driven(behind("coast", scenario, robust), scenario, 4)).all()
+        assert np.isfinite(shielded("coast", scenario, 4, 7, robust=robust)[:2]).all()
 
 
 @pytest.mark.parametrize(
@@ -129,7 +119,7 @@ def test_believed__the_script_of_the_driven_vehicle_itself_does_not_count(spec: 
 
 
 def test_believed__latencies_that_are_over_are_not_waited_for_again() -> None:
-    late = Scenario(
+    late = eb.Scenario(
         name="late", vehicles=2, gaps_m=15, speeds_mps=[0, 10], braking_capacity_mps2=5, driving_capacity_mps2=5,
         mass_t=1, latency_s=[0, 0.6], roles={"vehicle_1": "full_brake", "vehicle_2": "learner"},
     )  # fmt: skip
@@ -142,28 +132,21 @@ def test_believed__bounds_nothing_where_its_vehicle_had_an_impact_before_the_fir
     agents = {spec: make_agent(spec, scenario=late) for spec in ("coast+step", "coast+step:believed")}
     harm, bound = driven(agents["coast+step:believed"], late, 60)
     assert 0 < np.isinf(bound).sum() < 10 and (harm <= bound + ABOVE).all()
-    known, received = summarise(evaluate(late.sample(60, 7), agents, scenario=late))
+    known, received = eb.summarise(eb.evaluate(late.sample(60, 7), agents, scenario=late))
     assert known["predicted_harm"] is not None and received["predicted_harm"] is None  # no mean of what is not finite
 
 
 # On the interfaces.
-START = {"options": {"listed_world": {"seed": 7, "number": 3}}}
-
-
 def told_in(env: Any, world: int = 3, action: float = 0.0) -> list[dict[str, Any]]:
     """All that a parallel shield told of an episode in which one action is proposed, in that world of list 7."""
-    _, infos = env.reset(options={"listed_world": {"seed": 7, "number": world}})
-    told = [infos["vehicle_2"]["shield"]]
-    while env.agents:
-        *_, infos = env.step({"vehicle_2": np.array([action])})
-        told.append(infos["vehicle_2"]["shield"])
-    return told
+    infos = all_infos(env, {"vehicle_2": [action]}, options={"listed_world": {"seed": 7, "number": world}})
+    return [each["vehicle_2"]["shield"] for each in infos]
 
 
 @pytest.mark.parametrize("mode", ["step", "robust"])
-@pytest.mark.parametrize("scenario", [PERIODIC, HEARD_LATE, load_scenario("cooperation-2-blocked")], ids=str)
-def test_parallel__does_what_the_agent_of_evaluations_does(scenario: Scenario, mode: str) -> None:
-    env = HybridShield(parallel_env(scenario), mode=mode, believed=True)
+@pytest.mark.parametrize("scenario", [PERIODIC, HEARD_LATE, eb.load_scenario("cooperation-2-blocked")], ids=str)
+def test_parallel__does_what_the_agent_of_evaluations_does(scenario: eb.Scenario, mode: str) -> None:
+    env = HybridShield(eb.parallel_env(scenario), mode=mode, believed=True)
     for world in range(1 if mode == "robust" else 2):
         told = told_in(env, world)
         agent = make_agent(f"coast+{mode}:believed", scenario=scenario)
@@ -178,14 +161,14 @@ def test_parallel__does_what_the_agent_of_evaluations_does(scenario: Scenario, m
 
 
 def test_every_interface__decides_alike_and_says_that_the_bound_is_of_the_belief() -> None:
-    single = ShieldedEnv(EthBrakeEnv(PERIODIC), believed=True)
-    aec = shielded_aec(parallel_env(PERIODIC), mode="step", believed=True)
-    vector = ShieldedVectorEnv(EthBrakeVectorEnv(num_envs=1, scenario=PERIODIC), believed=True)
-    start, *told = told_in(HybridShield(parallel_env(PERIODIC), mode="step", believed=True), action=0.5)
+    single = ShieldedEnv(eb.EthBrakeEnv(PERIODIC), believed=True)
+    aec = shielded_aec(eb.parallel_env(PERIODIC), mode="step", believed=True)
+    vector = ShieldedVectorEnv(eb.EthBrakeVectorEnv(num_envs=1, scenario=PERIODIC), believed=True)
+    start, *told = told_in(HybridShield(eb.parallel_env(PERIODIC), mode="step", believed=True), action=0.5)
     assert start["bound_harm"] == np.inf and np.isfinite(told[0]["bound_harm"]) and set(start) == set(told[0])
     assert all(each["believed"] and not each["trusted"] for each in told)
     for env in (single, aec, vector):
-        env.reset(**START)
+        env.reset(options={"listed_world": {"seed": 7, "number": 3}})
     for wanted in told:
         *_, info = single.step(np.array([0.5], np.float32))
         *_, infos = vector.step(np.array([[0.5]], np.float32))
@@ -201,8 +184,8 @@ def test_every_interface__decides_alike_and_says_that_the_bound_is_of_the_belief
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: ShieldedVectorEnv(EthBrakeVectorEnv(num_envs=2, scenario=PERIODIC), mode="robust", believed=True),
-        lambda: ShieldedVecEnv(make_sb3_vec_env(PERIODIC, 2, seed=5), mode="robust", believed=True),
+        lambda: ShieldedVectorEnv(eb.EthBrakeVectorEnv(num_envs=2, scenario=PERIODIC), mode="robust", believed=True),
+        lambda: eb.ShieldedVecEnv(eb.make_sb3_vec_env(PERIODIC, 2, seed=5), mode="robust", believed=True),
     ],
     ids=["vector", "sb3"],
 )

@@ -7,9 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import drive, fixed_commands, make_agent, script_agents
-from ethbrake_marl.physics import Worlds, advance
-from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield import ShieldedDriver, StepShield, enclosure, parse_uncertainty
 from ethbrake_marl.shield.enclosure import (
@@ -41,7 +40,7 @@ from ethbrake_marl.shield.uncertainty import Uncertainty
 from tests.shield.test_uncertainty import STANDING
 
 STEPS = 81
-PAPER = load_scenario("paper-random")
+PAPER = eb.load_scenario("paper-random")
 EARLY = PAPER.replace(early_impacts="keep")
 
 UNUSUAL = {
@@ -59,8 +58,8 @@ UNUSUAL = {
 class Case(NamedTuple):
     """A box around worlds."""
 
-    scenario: Scenario
-    worlds: Worlds
+    scenario: eb.Scenario
+    worlds: eb.Worlds
     uncertainty: Uncertainty
     boxes: enclosure.Boxes
 
@@ -261,7 +260,6 @@ def test_shield__coasting_stays_within_the_bound_in_every_world_of_the_box():
 
 # Where a world drawn from a box leaves the enclosure: its states, not only its harm.
 ROOM = 1e-7  # for what two ways to compute a state differ by
-MOST = 20_000  # states of paths
 
 
 def follow_paths(cell):
@@ -270,7 +268,7 @@ def follow_paths(cell):
     stack, motion, found, whole = new_stack(N, cell.drive.shape[0]), new_motion(N, cell.drive.shape[0]), {}, True
     stack.forms[0, :N], stack.forms[0, N : N + P], stack.size[0] = cell.speed, cell.gap, 1
     worst, out = -np.inf, np.zeros(cell.drive.shape[0])
-    while stack.size[0] > 0 and sum(map(len, found.values())) < MOST:
+    while stack.size[0] > 0 and sum(map(len, found.values())) < 20_000:
         stack.size[0] -= 1
         top = stack.size[0]
         here = Path(stack.forms[top].copy(), stack.touch[top].copy(), stack.marks[top].copy())
@@ -290,7 +288,7 @@ def follow_paths(cell):
     return found, whole and stack.size[0] == 0
 
 
-def realised(scenario, truth: Worlds, vehicle: int, plan, times):
+def realised(scenario, truth: eb.Worlds, vehicle: int, plan, times):
     """Worlds at each of the times (s after their first decision) under the plan, and their harm so far."""
     command = fixed_commands(script_agents(scenario, except_for=vehicle), truth, "test", vehicle=vehicle).copy()
     first = np.maximum(truth.vehicles.latency_s[:, vehicle], truth.time_s)
@@ -300,7 +298,7 @@ def realised(scenario, truth: Worlds, vehicle: int, plan, times):
         action = plan[min(int(middle / scenario.time_step_s), len(plan) - 1)] if middle > 0.0 else 0.0
         capacity = v.braking_capacity_mps2 if action < 0.0 else v.driving_capacity_mps2
         command[:, vehicle] = action * capacity[:, vehicle]
-        truth, impacts = advance(truth, command, until_s=np.maximum(first + at, truth.time_s))
+        truth, impacts = eb.advance(truth, command, until_s=np.maximum(first + at, truth.time_s))
         harm = harm + impacts.first_impact_harm
         yield truth, harm.sum(axis=1)
 
@@ -338,7 +336,7 @@ def outside(case: Case, plan, draws: int, rng) -> tuple[int, int, list[str]]:
     return looked, touching, found
 
 
-def encloses(cell, path: Path, now: Worlds, harm, k: int, at) -> bool:
+def encloses(cell, path: Path, now: eb.Worlds, harm, k: int, at) -> bool:
     """Whether world ``k``, at ``at`` [K] in its box, may have gone this path so far."""
     N, P = now.N, now.N - 1
     if not (path.marks[:P] == now.pair_hit[k]).all():

@@ -13,7 +13,7 @@ from ethbrake_marl.shield import ShieldedDriver
 from ethbrake_marl.shield.evidence import MODES, TRUTHS, operating_curves, review, robustness
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 from tests.failing_worlds import plant, without
-from tests.shield.test_step_shield import Wavering
+from tests.shield.test_step_shield import wavering
 
 SCENARIO = load_scenario("paper-random")
 TASK = Task(SCENARIO, (1,))
@@ -129,18 +129,18 @@ def test_review__tells_the_harm_of_the_engine_also_where_the_bound_is_not_it(mod
     worlds = WORLDS.take(np.arange(40))
     other = parse_uncertainty("braking_capacity_mps2=20%").draw(worlds, np.random.default_rng(0))
     settings = {"told": other} if mode == "distrusted" else {"uncertainty": "gaps_m=0.5"}
-    episodes = logged(Wavering(), worlds, **settings)
+    episodes = logged(wavering, worlds, **settings)
     harm, shield = episodes.ledger.world_harm("first"), episodes.guarded.shield
     assert abs(shield.bound - harm).max() > 1.0
-    found = review(shield, Wavering(), worlds)
+    found = review(shield, wavering, worlds)
     assert found.realised.tolist() == harm[found.world].tolist()
     assert found.trusted.tolist() == (~shield.distrusted[found.world]).tolist()
     assert found.trusted.all() == (mode == "robust")
 
 
 def test_review__is_of_the_last_batch_and_of_its_worlds_alone():
-    smaller, driver = WORLDS.take(np.arange(30, 50)), ShieldedDriver(Wavering(), SCENARIO, logging=True)
+    smaller, driver = WORLDS.take(np.arange(30, 50)), ShieldedDriver(wavering, SCENARIO, logging=True)
     logged(None, driver=driver)
-    again, fresh = logged(None, smaller, driver), logged(Wavering(), smaller)
-    found = [review(episodes.guarded.shield, Wavering(), smaller) for episodes in (again, fresh)]
+    again, fresh = logged(None, smaller, driver), logged(wavering, smaller)
+    found = [review(episodes.guarded.shield, wavering, smaller) for episodes in (again, fresh)]
     assert all(told.tolist() == expected.tolist() for told, expected in zip(*found, strict=True))

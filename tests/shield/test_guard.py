@@ -15,10 +15,7 @@ from gymnasium.wrappers import Autoreset
 import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import drive, episode_engine, make_agent
 from ethbrake_marl.engine import STEP, Engine
-from ethbrake_marl.envs.interfaces import EthBrakeVectorEnv, parallel_env
-from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
-from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.shield import (
     HybridAgent,
     HybridShield,
@@ -28,11 +25,10 @@ from ethbrake_marl.shield import (
     ShieldedVectorEnv,
     parse_uncertainty,
 )
-from ethbrake_marl.shield.sb3 import ShieldedVecEnv
-from tests.fixtures.asked import Asked
+from tests.fixtures.asked import Acts, Asked
 from tests.shield.attacks import above_later
 
-PAPER = load_scenario("paper-random")
+PAPER = eb.load_scenario("paper-random")
 WORLDS = PAPER.sample(300, 3).worlds
 DRIVE = np.array([1.0])
 
@@ -41,6 +37,13 @@ def shielded(scenario=PAPER, policy=None, **settings):
     env = ShieldedEnv(gymnasium.make("EthBrake-v0", scenario=scenario).unwrapped, policy, **settings)
     env.reset(seed=0)
     return env
+
+
+STATE = {  # columns in which something else happens
+    "first-impact harm": lambda column: column.harm,
+    "total harm": lambda column: column.harm + column.vehicles - 1,
+    "speed": lambda column: column.speed,
+}
 
 
 class Cheating(Engine):
@@ -52,15 +55,10 @@ class Cheating(Engine):
         before = self.ended
         step = super()._advance(columns)
         rows = self.ended & ~before if self.last_only else ~before
-        column = self.packed.column
         if self.what == "a step":
             self._clock[rows, STEP] += 1.0
-        elif self.what == "first-impact harm":
-            self._state[rows, column.harm] += 1e-12
-        elif self.what == "total harm":
-            self._state[rows, column.harm + column.vehicles - 1] += 1e-12
         else:
-            self._state[rows, column.speed] += 1e-12
+            self._state[rows, STATE[self.what](self.packed.column)] += 1e-12
         return step
 
 
@@ -87,10 +85,7 @@ def test_step__what_is_not_certified_is_refused_and_the_worlds_stay_as_they_are(
     assert env.attached.shield is shield and not shield.distrusted.any()
 
 
-LAST = [name for name in CHEATS if name != "a step"]
-
-
-@pytest.mark.parametrize("what", LAST)
+@pytest.mark.parametrize("what", STATE)
 @pytest.mark.parametrize("interface", ["single", "vector", "sb3", "evaluation"])
 def test_last_step__is_compared_too_whatever_starts_the_next_episode(interface, what):
     actions = np.ones((3, 1), np.float32)
@@ -101,8 +96,8 @@ def test_last_step__is_compared_too_whatever_starts_the_next_episode(interface, 
     else:
         env = {
             "single": lambda: ShieldedEnv(gymnasium.make("EthBrake-v0").unwrapped),
-            "vector": lambda: ShieldedVectorEnv(EthBrakeVectorEnv(3, PAPER)),
-            "sb3": lambda: ShieldedVecEnv(make_sb3_vec_env(PAPER, 3)),
+            "vector": lambda: ShieldedVectorEnv(eb.EthBrakeVectorEnv(3, PAPER)),
+            "sb3": lambda: eb.ShieldedVecEnv(eb.make_sb3_vec_env(PAPER, 3)),
         }[interface]()
         env.reset()
         engine, step = env.attached.engine, lambda: env.step(DRIVE if interface == "single" else actions)
@@ -139,7 +134,7 @@ def test_autoreset__of_gymnasium_inside_is_left_alone():
 
 @pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
 def test_clone__between_proposal_and_step_goes_on_apart(clone):
-    env = ShieldedVecEnv(make_sb3_vec_env(PAPER, 4, seed=2))
+    env = eb.ShieldedVecEnv(eb.make_sb3_vec_env(PAPER, 4, seed=2))
     env.reset()
     env.step(np.ones((4, 1), np.float32))
     env.step_async(np.ones((4, 1), np.float32))
@@ -151,7 +146,7 @@ def test_clone__between_proposal_and_step_goes_on_apart(clone):
 
 
 def test_reset__in_between_brings_the_proposal_to_another_episode_and_its_bound_holds():
-    env = ShieldedVecEnv(make_sb3_vec_env(PAPER, 2))
+    env = eb.ShieldedVecEnv(eb.make_sb3_vec_env(PAPER, 2))
     env.reset()
     env.step_async(np.ones((2, 1), np.float32))
     env.venv.reset()
@@ -160,7 +155,7 @@ def test_reset__in_between_brings_the_proposal_to_another_episode_and_its_bound_
 
 
 def test_threads__no_episode_gets_above_its_bound():
-    env = ShieldedVectorEnv(EthBrakeVectorEnv(4, PAPER, autoreset_mode="NextStep"))
+    env = ShieldedVectorEnv(eb.EthBrakeVectorEnv(4, PAPER, autoreset_mode="NextStep"))
     env.reset(seed=0)
     trusted = []
 
@@ -177,23 +172,17 @@ def test_threads__no_episode_gets_above_its_bound():
     assert (engine.ledger.world_harm("first") <= shield.first_bound).all()
 
 
-class DrivesOff:
+@Acts
+def drives_off(worlds, vehicle):
     """Brakes until it stands, and then drives."""
-
-    name = "drives_off"
-
-    def act(self, worlds, vehicle):
-        v = worlds.vehicles
-        stands = worlds.speeds_mps[:, vehicle] == 0.0
-        return np.where(stands, v.driving_capacity_mps2[:, vehicle], -v.braking_capacity_mps2[:, vehicle])
+    v, stands = worlds.vehicles, worlds.speeds_mps[:, vehicle] == 0.0
+    return np.where(stands, v.driving_capacity_mps2[:, vehicle], -v.braking_capacity_mps2[:, vehicle])
 
 
 def test_world__that_goes_on_after_the_shields_own_end_is_braked_fully():
     worlds = PAPER.sample(40, 7).worlds
     slower = parse_uncertainty("braking_capacity_mps2=20%").draw(worlds, np.random.default_rng(0), corners=True)
-    engine = episode_engine(
-        worlds, ShieldedDriver(DrivesOff(), PAPER, told=slower, uncertainty="gaps_m=0.02"), PAPER, 1
-    )
+    engine = episode_engine(worlds, ShieldedDriver(drives_off, PAPER, told=slower, uncertainty="gaps_m=0.02"), PAPER, 1)
     braking, after = -worlds.vehicles.braking_capacity_mps2[:, 1], np.zeros(40, bool)
     while not engine.ended.all():
         over = engine.guarded.shield.running.finished & ~engine.ended
@@ -224,13 +213,10 @@ def harm(agent, harm_count="first", worlds=WORLDS):
     return drive(worlds, agent, PAPER, 1).ledger.world_harm(harm_count)
 
 
-class LateBrake:
+@Acts
+def late_brake(worlds, vehicle):
     """Coasts until 0.9 s, then brakes fully: no constant deceleration, so sometimes better than any."""
-
-    name = "late_brake"
-
-    def act(self, worlds, vehicle):
-        return np.where(worlds.time_s < 0.9, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle])
+    return np.where(worlds.time_s < 0.9, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle])
 
 
 def memory_of(agent):
@@ -239,9 +225,9 @@ def memory_of(agent):
 
 @pytest.mark.parametrize("harm_count", ["first", "total"])
 def test_episode__is_never_worse_than_either_part(harm_count):
-    hybrid = HybridAgent(LateBrake(), PAPER, harm_count=harm_count)
+    hybrid = HybridAgent(late_brake, PAPER, harm_count=harm_count)
     realised, memory = harm(hybrid, harm_count), memory_of(hybrid)
-    alone, baseline = harm(LateBrake(), harm_count), harm(make_agent("e_v2x_bm", harm_count=harm_count), harm_count)
+    alone, baseline = harm(late_brake, harm_count), harm(make_agent("e_v2x_bm", harm_count=harm_count), harm_count)
     assert (realised <= np.minimum(alone, baseline)).all()
     assert realised.tolist() == memory["predicted_harm"].tolist()
     assert memory["chosen_policy"].tolist() == (alone <= baseline).tolist()
@@ -262,7 +248,7 @@ def test_episode__of_some_rows_leaves_the_others_alone():
 
 
 def test_episode__applies_the_certified_strategy_whatever_is_proposed():
-    shielded = HybridShield(parallel_env(), make_agent("full_brake"), mode="episode")
+    shielded = HybridShield(eb.parallel_env(), make_agent("full_brake"), mode="episode")
     for seed in range(6):
         shielded.reset(seed=seed)
         while shielded.agents:
@@ -287,7 +273,7 @@ def test_policy_with_a_memory__is_asked_once_per_decision_whoever_proposes(setti
         return memory["steps"].tolist()
 
     policy = eb.policy_agent(remembering, initial_state=lambda n: np.zeros((n, 1)))
-    env = HybridShield(parallel_env(), policy, **settings)
+    env = HybridShield(eb.parallel_env(), policy, **settings)
     env.reset(seed=7)
     attached = env.attached
     assert asked() == [0]
@@ -317,7 +303,7 @@ class Counting:
 
 @pytest.mark.parametrize("believed", [False, True])
 def test_decide__changes_nothing_not_even_the_memory_of_a_policy_that_writes_into_it(believed):
-    env = HybridShield(parallel_env(), Counting(), mode="step", believed=believed)
+    env = HybridShield(eb.parallel_env(), Counting(), mode="step", believed=believed)
     env.reset(seed=4)
     attached, nothing = env.attached, np.full((1, 1), np.nan)
     told = [attached.guard.decide(attached.engine, attached.memory, nothing).proposed for _ in range(2)]

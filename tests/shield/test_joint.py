@@ -22,7 +22,8 @@ from ethbrake_marl.shield.step_shield import (
     joint_constants,
     plan_harm,
 )
-from tests.shield.attacks import TEAM_ADVERSARIES, TEAMS, attack, begun
+from tests.fixtures.asked import Acts
+from tests.shield.attacks import TEAM_ADVERSARIES, TEAMS, all_infos, attack, begun
 
 STEPS = 81
 PAIR, PAPER = load_scenario("cooperation-3-pair"), load_scenario("paper-random")
@@ -157,8 +158,7 @@ def test_team__whose_rollout_keeps_the_bound_is_left_alone():
         shield.begin(worlds, np.arange(30), team)
         drives = shield.alone_harm <= shield.first_bound
         command = [team[i].act(worlds, i) / worlds.vehicles.braking_capacity_mps2[:, i] for i in (1, 2)]
-        decision = shield.decide(np.stack(command, axis=1))
-        assert not decision.intervened[drives].any() and drives.any()
+        assert not shield.decide(np.stack(command, axis=1)).intervened[drives].any() and drives.any()
         assert (shield.first_bound <= without.first_bound).all()
 
 
@@ -182,14 +182,6 @@ def test_surprise__of_one_world_hands_the_whole_team_to_the_fallback():
 # Behind the interfaces.
 
 
-def played(env, actions, **reset):
-    """All that an episode of a parallel environment tells, from its reset on."""
-    infos = [env.reset(**reset)[1]]
-    while env.agents:
-        infos.append(env.step(actions)[-1])
-    return infos
-
-
 def test_parallel__a_team_proposes_where_nobody_does_and_one_may_be_left_out():
     front_alone = {"vehicle_2": make_agent("full_brake"), "vehicle_3": make_agent("coast")}
     brake = make_agent("full_brake")
@@ -209,7 +201,7 @@ def test_shares__at_the_end_are_what_the_ledger_says(scenario, settings):
     env = HybridShield(parallel_env(scenario), mode="step", **settings)
     differed = 0
     for seed in range(4):
-        infos = played(env, {agent: [0.6] for agent in env.shielded}, seed=seed)
+        infos = all_infos(env, {agent: [0.6] for agent in env.shielded}, seed=seed)
         ledger, count = env.unwrapped.engine.ledger, settings.get("harm_count", "first")
         borne = ledger.vehicle_harm(count)[0]
         for agent in env.shielded:
@@ -250,17 +242,14 @@ def test_drive_chunks__is_what_the_shielded_team_does_whatever_the_chunk(monkeyp
 
 
 def test_evaluation__later_rollouts_of_the_team_let_more_of_it_through():
-    class Late:
+    @Acts
+    def late(worlds, vehicle):
         """Coasts for 0.3 s, then brakes fully."""
-
-        name = "late"
-
-        def act(self, worlds, vehicle):
-            return np.where(worlds.time_s < 0.8, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle])
+        return np.where(worlds.time_s < 0.8, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle])
 
     worlds, replaced = PAIR.sample(60, 11).worlds, {}
     for later in (True, False):
-        team = ShieldedDriver(Team({1: Late(), 2: Late()}, "late"), PAIR, later_rollouts=later).on((1, 2))
+        team = ShieldedDriver(Team.of(late, (1, 2)), PAIR, later_rollouts=later).on((1, 2))
         episodes = drive(worlds, team, PAIR)
         assert (episodes.ledger.world_harm("first") <= episodes.guarded.shield.predicted_harm).all()
         replaced[later] = episodes.guarded.shield.interventions.sum()

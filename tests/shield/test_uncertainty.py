@@ -70,15 +70,12 @@ def test_draw__is_inside_the_box_or_at_a_corner():
     assert drawn <= every
 
 
-@pytest.mark.parametrize("heard", [False, True])
-def test_draw__of_a_latency_is_of_the_own_part_and_the_news_or_over_a_channel_of_the_reaction_alone(heard):
-    vehicles = WORLD.vehicles
-    if heard:
-        vehicles = replace(vehicles, known_from_s=vehicles.known_from_s + 0.5)
-    drawn = (
-        parse_uncertainty("latency_s=0.1").draw(replace(WORLD, vehicles=vehicles), np.random.default_rng(3)).vehicles
-    )
-    if heard:
+@pytest.mark.parametrize("heard_s", [0.0, 0.5])
+def test_draw__of_a_latency_is_of_the_own_part_and_the_news_or_over_a_channel_of_the_reaction_alone(heard_s):
+    vehicles = replace(WORLD.vehicles, known_from_s=WORLD.vehicles.known_from_s + heard_s)
+    told, rng = replace(WORLD, vehicles=vehicles), np.random.default_rng(3)
+    drawn = parse_uncertainty("latency_s=0.1").draw(told, rng).vehicles
+    if heard_s:
         assert drawn.known_from_s.tolist() == vehicles.known_from_s.tolist()
         assert drawn.own_latency_s.tolist() == vehicles.own_latency_s.tolist()
     else:

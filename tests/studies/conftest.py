@@ -14,7 +14,7 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.limits.limits import search_list
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies import jobs
-from ethbrake_marl.studies.benchmark import Suite, load_suite
+from ethbrake_marl.studies.benchmark import load_suite
 from ethbrake_marl.studies.reproduction import Reproduction
 from tests.docs.site import load
 from tests.fixtures.pictures import draw_nothing
@@ -134,13 +134,8 @@ def write_sweep(tmp_path: Path) -> Write:
 
 @pytest.fixture
 def write_tuning(tmp_path: Path, small_tuning: dict[str, Any]) -> Write:
-    """Writes the file of the small tuning, with changes; "-" leaves a key out."""
-
-    def write(**changes: Any) -> Path:
-        content = {key: value for key, value in {**small_tuning, **changes}.items() if value != "-"}
-        return write_yaml(tmp_path / "tuning.yaml", content)
-
-    return write
+    """Writes the file of the small tuning, with changes."""
+    return lambda **changes: write_yaml(tmp_path / "tuning.yaml", {**small_tuning, **changes})
 
 
 @pytest.fixture
@@ -160,12 +155,6 @@ def suites(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("suites")
     freezing.freeze_suite("tiny", lists, folder)
     return folder
-
-
-@pytest.fixture
-def suite(suites: Path) -> Suite:
-    """The suite ``tiny``."""
-    return load_suite("tiny", suites)
 
 
 @pytest.fixture(scope="session")

@@ -6,9 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ethbrake_marl.evaluation import evaluate, summarise
+import ethbrake_marl as eb
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies.experiment import results_csv, telling_world
 
 
@@ -29,8 +28,10 @@ def test_telling_world__is_the_median_saving_among_harmful_worlds(before, after,
 
 
 def test_results_csv__an_interval_becomes_two_columns_and_nothing_an_empty_cell():
-    scenario = load_scenario("paper-random")
-    rows = summarise(evaluate(scenario.sample(3, 1), make_lineup(["coast", "e_v2x_bm"], scenario), scenario=scenario))
+    scenario = eb.load_scenario("paper-random")
+    rows = eb.summarise(
+        eb.evaluate(scenario.sample(3, 1), make_lineup(["coast", "e_v2x_bm"], scenario), scenario=scenario)
+    )
     head, coast, bm = csv.reader(results_csv(rows).splitlines())
     column = {name: k for k, name in enumerate(head)}
     assert "parameters" not in column

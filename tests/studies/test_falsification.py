@@ -10,10 +10,9 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.defaults import HARM_COUNTS, MeasureName
 from ethbrake_marl.physics import Bools, Floats, Worlds
-from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies.falsification import APART, Measure, Scored, far_apart, search
 
-SCENARIO = load_scenario("paper-random")
+SCENARIO = eb.load_scenario("paper-random")
 
 
 def measured(name: MeasureName, **agents: Any) -> Measure:
@@ -45,7 +44,7 @@ def test_falsify__the_bound_of_the_shield_holds_where_it_is_tightest(harm_count:
 
 
 def test_ranges__cover_what_a_scenario_draws_and_refused_worlds_do_not_count() -> None:
-    ranges, wide = SCENARIO.ranges(), load_scenario("stress-wide").ranges()
+    ranges, wide = SCENARIO.ranges(), eb.load_scenario("stress-wide").ranges()
     sample, accepted = ranges.sample(np.full((1, 5), 0.5))
     assert len(ranges.names) == 5 and accepted.all()
     assert sample.worlds.gaps_m.tolist() == [[7.5, 7.5]] and sample.worlds.speeds_mps.tolist() == [[20.0, 20.0, 20.0]]
@@ -57,7 +56,7 @@ def test_ranges__cover_what_a_scenario_draws_and_refused_worlds_do_not_count() -
 )
 def test_ranges__points_are_as_likely_as_a_list(name: str) -> None:
     """Worlds of even points have the means of a list, in every quantity."""
-    scenario = load_scenario(name).replace(early_impacts="keep")
+    scenario = eb.load_scenario(name).replace(early_impacts="keep")
     ranges = scenario.ranges()
     points = np.random.default_rng(0).random((5_000, len(ranges.names)))
     found, listed = ranges.sample(points)[0].worlds, scenario.sample(5_000, 7).worlds

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import operator
 import os
 import pickle
@@ -21,7 +20,7 @@ from unittest.mock import ANY, Mock
 import numpy as np
 import pytest
 
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, check_whole_number
+from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.evaluation.measures import Tally
 from ethbrake_marl.evaluation.results import Question
 from ethbrake_marl.scenario import Scenario
@@ -49,15 +48,10 @@ def folder_of(path: Path, **changes: Any) -> JobFolder:
 
 def do(folder: JobFolder, *numbers: int, workers: Any = 1) -> list[str]:
     """Run ``number + 1`` for each, and give the names of those that ended well."""
-    found: list[str] = []
-
-    def note(attempt: Attempt) -> None:
-        if attempt.answer.value is not None:
-            found.append(attempt.job.name)
-
+    told = Mock()
     with folder.work():
-        folder.run([Job(str(number), operator.add, (number, 1)) for number in numbers], workers, note)
-    return found
+        folder.run([Job(str(number), operator.add, (number, 1)) for number in numbers], workers, told)
+    return [call.args[0].job.name for call in told.call_args_list if call.args[0].answer.value is not None]
 
 
 @pytest.mark.parametrize("workers", [1, Inside(1)])
@@ -92,36 +86,13 @@ def test_damaged_lines__are_counted_and_the_next_line_is_whole(tmp_path: Path, d
     assert folder.kept() == ({**kept, "7": 8}, 1)
 
 
-def test_folder_of_something_else__is_left_alone_and_what_may_stand_there_may(tmp_path: Path) -> None:
-    (tmp_path / "mine").write_text("expected")
-    assert folder_of(tmp_path).check()
-    (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(AlreadyExists, match="holds no sums"):
-        do(folder_of(tmp_path), 3)
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["mine", "thesis.tex"]
-
-
 def test_killed_writer__what_it_left_goes(tmp_path: Path) -> None:
     tmp_path.joinpath(".ethbrake-x.partial").write_text("half")
     with JobFolder(tmp_path, "sums").work():
         assert [file.name for file in tmp_path.iterdir() if file.name != ".lock"] == []
 
 
-def test_another_question__is_refused_with_what_differs_and_the_record_of_the_first_call_stays(tmp_path: Path) -> None:
-    do(folder_of(tmp_path), 3)
-    before = {file: file.read_bytes() for file in tmp_path.iterdir()}
-    assert json.loads(before[tmp_path / "question.json"])["owner"] == "me"
-    assert not JobFolder(tmp_path, "sums", QUESTION, more={"owner": "you"}).check()
-    other = folder_of(tmp_path, seed=2, levels=[1], versions={"numpy": "2", "torch": "3"})
-    told = r"holds sums with other settings \(seed 1, here 2; levels; versions torch 2, here 3\)"
-    with pytest.raises(InvalidInput, match=told):
-        do(other, 4)
-    with pytest.raises(AlreadyExists, match=r"no folder of a sweep: question\.json of another command is there; give"):
-        JobFolder(tmp_path, "a sweep").check()
-    assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
-
-
-class Pretended:
+class Pretended(Inside):
     """Two workers that end jobs in reverse; jobs of ``lost`` lose theirs so often, ``wrong`` ones fail for good."""
 
     def __init__(
@@ -155,9 +126,6 @@ class Pretended:
 
     def interrupt(self) -> None:
         self.interrupted = True
-
-    def close(self) -> None:
-        pass
 
 
 def calls(number: int) -> list[Job]:

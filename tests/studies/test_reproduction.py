@@ -11,18 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from pydantic import ValidationError
 
-from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.evaluation import evaluate
+import ethbrake_marl as eb
 from ethbrake_marl.evaluation.episodes import Passport
 from ethbrake_marl.evaluation.measures import PAPER_ROWS, PaperRow
 from ethbrake_marl.evaluation.statistics import rate
 from ethbrake_marl.figures import SeedCurve, estimates_figure
 from ethbrake_marl.files.sheet import Estimate, Sheet
 from ethbrake_marl.files.yaml import Override
-from ethbrake_marl.learning.training import load_recipe
-from ethbrake_marl.policies import load_shipped
 from ethbrake_marl.studies import reproduction
 from ethbrake_marl.studies.reproduction import (
     FULL_BRAKE,
@@ -60,6 +56,7 @@ from ethbrake_marl.studies.reproduction import (
 )
 from tests.learning.tiny import TINY_PPO
 from tests.pages.hostile import Page
+from tests.studies.conftest import check_snapshot
 
 HOSTILE = "<script>alert('x')</script>\"|*_\u202e"
 
@@ -87,41 +84,46 @@ LEAST_FEW, LEAST = ("worlds", rate(63, 100)), ("worlds", rate(6_256, 10_000))
 
 
 @pytest.mark.parametrize(
-    ("printed", "ours", "how", "outcome"),
+    ("printed", "ours", "how", "outcome", "because"),
     [
-        (11.4, around(10.0, 1.0), {}, "agrees"),  # two lists may be sqrt 2 apart
-        (11.5, around(10.0, 1.0), {}, "differs"),
-        (8.6, around(10.0, 1.0), {}, "agrees"),
-        (11.4, around(10.0, 2.0), {}, "undecided"),  # chance 2.8: it shows nothing
-        (10.1, around(10.0, 2.0), {}, "agrees"),  # within the tolerance all the same
-        (13.0, around(10.0, 2.0), {}, "differs"),
-        (0.95, around(0.945, 0.001), {}, "agrees"),  # within the tolerance of the printed number
-        (0.97, around(0.945, 0.001), {}, "differs"),
-        (0.617, MANY, {"least": LEAST}, "differs"),  # a bound within chance of the printed number proves nothing
-        (0.5974, FEW, {"least": LEAST_FEW}, "undecided"),
-        (0.5974, MANY, {"least": LEAST}, "cannot agree"),
+        (11.4, around(10.0, 1.0), {}, "agrees", None),  # two lists may be sqrt 2 apart
+        (11.5, around(10.0, 1.0), {}, "differs", None),
+        (8.6, around(10.0, 1.0), {}, "agrees", None),
+        # chance 2.8: it shows nothing
+        (11.4, around(10.0, 2.0), {}, "undecided", "ours 10.00 [8.00, 12.00], printed 11.400: too few worlds to tell"),
+        (10.1, around(10.0, 2.0), {}, "agrees", None),  # within the tolerance all the same
+        (13.0, around(10.0, 2.0), {}, "differs", None),
+        (0.95, around(0.945, 0.001), {}, "agrees", None),  # within the tolerance of the printed number
+        (0.97, around(0.945, 0.001), {}, "differs", None),
+        (0.617, MANY, {"least": LEAST}, "differs", None),  # a bound within chance of the printed number proves nothing
+        (0.5974, FEW, {"least": LEAST_FEW}, "undecided", None),
+        (
+            0.5974,
+            MANY,
+            {"least": LEAST, "show": PERCENT},
+            "cannot agree",
+            "worlds: at least 62.6 % [61.6, 63.5], whoever drives; ours 65.0 % [64.1, 65.9], printed 59.74 %",
+        ),
+        (
+            33.6,
+            around(24.2, 0.3),
+            {"others": {"at 0.2 s": around(33.4, 0.3), "total": around(25.0, 0.3)}},
+            "differs",
+            "ours 24.20 [23.90, 24.50], printed 33.600 (-28.0 %);"
+            " nearest: at 0.2 s, 33.40 [33.10, 33.70], which agrees",
+        ),
+        (
+            33.6,
+            around(24.2, 0.3),
+            {"others": {"total": around(20.0, 0.3)}},
+            "differs",
+            "ours 24.20 [23.90, 24.50], printed 33.600 (-28.0 %); no other reading here comes nearer",
+        ),
     ],
 )
-def test_compare_number__follows_from_chance_tolerance_and_bound(printed, ours, how, outcome) -> None:
-    assert compare_number("harm", printed, ours, **how).outcome == outcome
-
-
-def test_compare_number__says_why_and_names_the_nearest_other_reading() -> None:
-    ours, near = around(24.2, 0.3), around(33.4, 0.3)
-    others = {"at 0.2 s": near, "total": around(25.0, 0.3)}
-    told = [
-        compare_number("harm", 33.6, ours, others=others),
-        compare_number("harm", 33.6, ours, others={"total": around(20.0, 0.3)}),
-        compare_number("harm", 11.4, around(10.0, 2.0)),
-        compare_number("collisions", 0.5974, MANY, show=PERCENT, least=("worlds that no command saves", LEAST[1])),
-    ]
-    assert [each.because for each in told] == [
-        "ours 24.20 [23.90, 24.50], printed 33.600 (-28.0 %); nearest: at 0.2 s, 33.40 [33.10, 33.70], which agrees",
-        "ours 24.20 [23.90, 24.50], printed 33.600 (-28.0 %); no other reading here comes nearer",
-        "ours 10.00 [8.00, 12.00], printed 11.400: too few worlds to tell",
-        "worlds that no command saves: at least 62.6 % [61.6, 63.5], whoever drives;"
-        " ours 65.0 % [64.1, 65.9], printed 59.74 %",
-    ]
+def test_compare_number__follows_from_chance_tolerance_and_bound(printed, ours, how, outcome, because) -> None:
+    verdict = compare_number("harm", printed, ours, **how)
+    assert (verdict.outcome, because or verdict.because) == (outcome, verdict.because)
 
 
 A, B, ZERO = Less("a", around(-3.0, 1.0)), Less("b", around(-2.0, 1.5)), Less("z", around(0.0, 0.0))
@@ -137,25 +139,23 @@ NEITHER = replace(ZERO, neither=True)
         ([Less("b", Estimate(0.5, None))], False, "differs", "not so: b, 0.50"),
         ([A, Less("b", around(-1.0, 1.5))], False, "undecided", "holds in 1 of 2; not shown: b, -1.00 [-2.50, 0.50]"),
         ([Less("a", around(3.0, 1.0)), Less("b", around(-1.0, 1.5))], False, "differs", None),
-        ([A, NEITHER], False, "agrees", None),
+        ([A, NEITHER], False, "agrees", "holds in 1 of 1 (both are 0 in z); the nearest is a, -3.00 [-4.00, -2.00]"),
         ([NEITHER], False, "agrees", "nothing to undercut: both are 0 in z"),
         ([ZERO], True, "agrees", None),
         ([ZERO], False, "differs", None),
         ([Less("a", around(0.0, 0.1))], True, "undecided", None),
-        ([A, Less("b", around(1.0, 0.5), least=around(0.4, 0.1))], False, "cannot agree", None),
+        (
+            [A, Less("b", around(1.0, 0.5), least=around(0.4, 0.1))],
+            False,
+            "cannot agree",
+            "holds in 1 of 2; the harm proven to be the least is above it in: b by 0.40 [0.30, 0.50]",
+        ),
         ([Less("b", around(1.0, 0.5), least=around(0.1, 0.2))], False, "differs", None),
     ],
 )
 def test_judge_statement__holds_where_every_interval_is_below_zero(parts, or_equal, outcome, because) -> None:
     verdict = judge_statement("lower", parts, or_equal=or_equal)
     assert (verdict.outcome, because or verdict.because) == (outcome, verdict.because)
-
-
-def test_judge_statement__names_what_is_proven_and_what_is_left_out() -> None:
-    proven = Less("b", around(1.0, 0.5), least=around(0.4, 0.1))
-    one, other = (judge_statement("lower", [A, part]).because for part in (proven, NEITHER))
-    assert one.endswith("the harm proven to be the least is above it in: b by 0.40 [0.30, 0.50]")
-    assert other.startswith("holds in 1 of 1 (both are 0 in z")
 
 
 @pytest.mark.parametrize(
@@ -185,7 +185,7 @@ def printed(table: str, agent: str) -> PaperRow:
 def beside(reading, worlds: int) -> Beside:
     scenario = reading.scenario("paper-random")
     agents = lineup(scenario, FULL_BRAKE)
-    evaluation = evaluate(scenario.sample(worlds, 7), agents, scenario=scenario, aftermath=False)
+    evaluation = eb.evaluate(scenario.sample(worlds, 7), agents, scenario=scenario, aftermath=False)
     return Beside(reading.name, evaluation, {"Non-E": (NAMES[FULL_BRAKE],), "Hybrid PPO": (NAMES[FULL_BRAKE],)})
 
 
@@ -265,14 +265,6 @@ def test_make__keeps_what_is_there_and_makes_it_again_by_force_or_for_other_sett
         assert len(calls) == number
     replace(settings, episodes=30).open_folder(force=True)
     assert read_results(settings.folder) == []
-    foreign, link = settings.folder.parent / "mine", settings.folder.parent / "link"
-    foreign.mkdir()
-    (foreign / "thesis.txt").write_text("text")
-    link.symlink_to(foreign)
-    with pytest.raises(AlreadyExists, match="holds no reproduction"):
-        replace(settings, folder=foreign).open_folder(force=True).check()
-    with pytest.raises(InvalidInput, match="no plain folder"):
-        replace(settings, folder=link).open_folder()
 
 
 def test_trajectories__of_the_scenarios_have_no_impact_under_the_policies(made_of: dict[str, Made]) -> None:
@@ -293,14 +285,14 @@ def test_hybrid__is_driven_anew_once_its_policy_was_trained(
 ) -> None:
     first, again = (reproduction._drive_hybrid("paper-random", settings, READINGS[0]) for _ in range(2))
     assert again is first
-    monkeypatch.setattr(reproduction, "unconverged_policy", lambda _: (load_shipped("ppo"), "trained since"))
+    monkeypatch.setattr(reproduction, "unconverged_policy", lambda _: (eb.load_shipped("ppo"), "trained since"))
     assert reproduction._drive_hybrid("paper-random", settings, READINGS[0]) is not first
 
 
-def drawn(stem: str = "a-figure") -> dict[Drawn, Figure]:
+def drawn() -> dict[Drawn, Figure]:
     line = {0.0: Estimate(1.0, None), 1.0: Estimate(2.0, (1.0, 3.0))}
     figure = estimates_figure({"panel": {"line": line}}, x_label="x", y_label="y", caption="c")
-    return {Drawn(stem, "A figure", "What it shows."): figure}
+    return {Drawn("a-figure", "A figure", "What it shows."): figure}
 
 
 def hidden(folder: Path) -> list[Path]:
@@ -320,20 +312,19 @@ def test_reproduce__writes_figures_data_results_docs_and_one_page(settings: Repr
     assert json.loads((tmp_path / "page.json").read_text("utf-8")) == [each.in_words() for each in results]
     assert file.read_text("utf-8") == docs_page(read_results(settings.folder))
     assert (tmp_path / "figures" / "reproduction-a-figure.svg").is_file()
-    with pytest.raises(InvalidInput, match=r"must end in \.md"):
-        replace(settings, docs=tmp_path / "page.html")
 
 
-def test_page__tells_everything_that_a_result_holds(settings: Reproduction) -> None:
-    told = replace(
-        made(), tables=(Sheet("A table", ("Who", HARM), (("PPO", Estimate(1.5, (1.25, 1.75))),), "Of 24 worlds."),)
-    )
-    (result,), _ = settings.make([planted("gaps", lambda s: told)])
-    page = Page((settings.folder / "index.html").read_text("utf-8"))
+def test_pages__tell_everything_that_a_result_holds(settings: Reproduction) -> None:
+    """Their texts are those of the snapshot, also of a result of earlier versions, which tells no worlds."""
+    sheet = Sheet("A table", ("Who", HARM), (("PPO", Estimate(1.5, (1.25, 1.75))),), "Of 24 worlds.")
+    own = replace(settings, machine="a CPU, load 3.1, numpy 2.4.6")
+    (result,), _ = own.make([planted("gaps", lambda s: replace(made(), tables=(sheet,)))])
+    content = {name: value for name, value in asdict(result).items() if name != "episodes"}
+    earlier = Page(render_page(own.folder, [checked_result(content, "result.json", "gaps")]))
+    page = Page((own.folder / "index.html").read_text("utf-8"))
+    texts = "\n\n".join([page.text, earlier.text, docs_page([result])])
+    check_snapshot("reproduction.txt", texts.replace(result.made_utc[:10], "(today)"))
     assert page.open == []
-    for text in ("A table", "PPO 1.50 [1.25, 1.75]", "Of 24 worlds.", "What it is.", "label", "Comparisons: 1"):
-        assert text in page.text
-    assert result.verdict.because in page.text and "stated in the paper (told)" in page.text
     links = [attributes["href"] for tag, attributes in page.tags if tag == "a"]
     assert "./gaps/data.csv" in links and links.count("#a-title") == 1
     around = [attributes.get("class") for tag, attributes in page.tags if tag == "div"]
@@ -351,84 +342,6 @@ def test_reproduce__an_interruption_leaves_whole_files_and_goes_on(settings: Rep
     assert hidden(settings.folder) == []
     results, _ = settings.make([planted("harm-delays", stop), planted("gaps", lambda s: made())])
     assert [each.name for each in results] == ["harm-delays", "gaps"]
-
-
-@pytest.mark.parametrize("stem", ["../../etc/passwd", "a b", "A", "", "x" * 65, "<svg>", "/tmp/x"])
-def test_figures__a_stem_that_is_no_plain_name_is_refused(settings: Reproduction, stem: str) -> None:
-    with pytest.raises(ValidationError, match="for Drawn"):
-        drawn(stem)
-    settings.make([planted("gaps", lambda s: made())])
-    file = settings.folder / "gaps" / "result.json"
-    content = json.loads(file.read_text())
-    content["figures"] = [{"stem": stem, "title": "t", "text": "t"}]
-    file.write_text(json.dumps(content))
-    with pytest.raises(InvalidInput, match="figures: 0: stem: is not what a reproduction writes"):
-        settings.make([planted("harm-delays", lambda s: made())])
-
-
-NONE_OF_OURS = (
-    "<script>alert(1)</script>",
-    '<g onload="alert(1)"/>',
-    '<g style="onload: alert(1)"/>',
-    '<use href="#x"/>',
-    '<use xmlns:l="http://www.w3.org/1999/xlink" l:href="https://example.org/x.svg#x"/>',
-    '<path fill="url(https://example.org/x)"/>',
-    '<path style="fill: URL(https://example.org/x)"/>',
-    "<foreignObject/>",
-    '<g xmlns="http://www.w3.org/1999/xhtml"/>',
-    "<g>",
-    "<g>" * 20_000 + "</g>" * 20_000,
-)
-
-
-def test_page__a_figure_that_is_none_of_ours_is_refused(settings: Reproduction) -> None:
-    results, _ = settings.make([planted("gaps", lambda s: made(figures=drawn()))])
-    file = settings.folder / "gaps" / "a-figure.svg"
-    for inside in NONE_OF_OURS:
-        file.write_text(f'<svg xmlns="http://www.w3.org/2000/svg">{inside}</svg>')
-        with pytest.raises(InvalidInput, match=r"a-figure\.svg: is not a figure as it was drawn"):
-            render_page(settings.folder, results)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"tables": "x"},
-        {"tables": [{"title": "t", "head": ["h"], "rows": [[[1]]], "note": ""}]},
-        {"tables": [{"title": "t", "head": ["h"], "rows": [[["a"]], []], "note": ""}]},
-        {"tables": [{"title": "", "head": [], "rows": [], "note": ""}]},
-        {"verdict": {}},
-        {"figures": [1]},
-        {"figures": [{"stem": 7, "title": "t", "text": "t"}]},
-        {"name": None},
-        {"name": "../elsewhere"},
-        {"name": "random-table"},
-        {"data": ["../../x.csv"]},
-        {"verdict": {"what": "all", "outcome": "agrees", "because": "of 25 comparisons 25 agree"}},
-        {"comparisons": [{"what": "w", "outcome": "<b>great</b>", "because": ""}]},
-        {"comparisons": []},
-        {"comparisons": [{"what": "w"}]},
-        {"notes": ["a", None]},
-    ],
-)
-def test_results__a_damaged_one_is_named(settings: Reproduction, change) -> None:
-    settings.make([planted("gaps", lambda s: made())])
-    file = settings.folder / "gaps" / "result.json"
-    file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
-    with pytest.raises(InvalidInput, match=r"result\.json: [\w: ]+: is not what a reproduction writes"):
-        read_results(settings.folder)
-
-
-def test_pages__say_command_machine_and_how_little_was_made(settings: Reproduction) -> None:
-    results, _ = replace(settings, machine="a CPU, load 3.1, numpy 2.4.6").make([planted("gaps", lambda s: made())])
-    page = Page((settings.folder / "index.html").read_text("utf-8"))
-    for text in (page.text, docs_page(results)):
-        assert "1 of the 10 items" in text and "ethbrake reproduce gaps --quick --episodes 24" in text
-        assert f"({results[0].made_utc[:10]}, a CPU, numpy 2.4.6; " in text
-        assert "At most 24 worlds of each list are driven here; the paper has 10,000." in text
-    content = {name: value for name, value in asdict(results[0]).items() if name != "episodes"}
-    page = Page(render_page(settings.folder, [checked_result(content, "result.json", "gaps")]))
-    assert "worlds of each list" not in page.text and "reproduce gaps --quick (" in page.text
 
 
 TINY = TINY_PPO.replace(total_steps=128 * 8, evaluation={"every_updates": 1, "worlds": 5, "seed": 7})
@@ -477,7 +390,7 @@ def test_groups__fit_their_recipes_and_every_item_names_groups_that_exist() -> N
     for group in found.values():
         for name, (asked, recipe) in group.trained.items():
             assert recipe.name == name and recipe.total_steps == asked.decisions
-            stated = load_recipe(asked.recipe)
+            stated = eb.load_recipe(asked.recipe)
             if asked.recipe.endswith("-paper"):  # the paper's table stays as it is
                 for key in ("gamma", "batch_size", "network"):
                     assert getattr(recipe, key) == getattr(stated, key)
@@ -509,7 +422,7 @@ def test_returns__of_a_shaped_reward_say_nothing_between_delays_so_its_harm_is_c
     worse = course([[-9.0] * 20, [-8.99] * 20], [[90.0] * 20, [80.0] * 20])
     better = course([[-10.0] * 20, [-9.99] * 20], [[10.0] * 20, [8.0] * 20])  # of lower returns
     for recipe, outcome, told in (("ppo", "agrees", "minus its harm"), ("ppo-paper", "differs", "ppo-paper")):
-        assert bool(load_recipe(recipe).reward.shaping) == (recipe == "ppo")
+        assert bool(eb.load_recipe(recipe).reward.shaping) == (recipe == "ppo")
         verdict = reproduction._higher_when_low({"high": {recipe: worse}, "low": {recipe: better}})
         assert (verdict.outcome, told in verdict.because) == (outcome, True)
 

@@ -6,17 +6,15 @@ import json
 import shutil
 import signal
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from ethbrake_marl.learning.runs import train
-from ethbrake_marl.learning.training import TrainingRecipe, load_recipe
+import ethbrake_marl as eb
 from ethbrake_marl.studies.sweep import TuningPlan
 from tests.cli.conftest import rows_of as read
-from tests.studies.conftest import TRIALS, study, write_yaml
+from tests.studies.conftest import TRIALS, study
 from tests.studies.counting import PROGRAM, ROOT, end_when
 
 DOCS = ROOT / "docs"
@@ -59,7 +57,7 @@ def test_identity__is_that_of_all_that_changes_a_trial(write_tuning):
 @pytest.mark.parametrize("name", ["tuning-quick", "tuning-ppo"])
 def test_shipped_spaces__are_in_order_and_hold_their_recipe(name):
     plan, text = TuningPlan.read(DOCS / f"{name}.yaml"), (DOCS / f"{name}.yaml").read_text("utf-8")
-    assert plan.own_values() is not None and plan.file.recipe in TrainingRecipe.shipped()
+    assert plan.own_values() is not None and plan.file.recipe in eb.TrainingRecipe.shipped()
     assert text in (DOCS / "tuning.md").read_text("utf-8") or name != "tuning-quick"
 
 
@@ -103,7 +101,7 @@ def test_export__is_a_recipe_that_trains_the_best_trial_again_to_the_bit(finishe
     rows = [row for row in read(finished_tuning / TABLE) if row["state"] == "finished"]
     best = min(rows, key=lambda row: float(row["first_impact_harm"]))
     file = finished_tuning.parent / "best.yaml"
-    again = train(load_recipe(file), "paper-random", tmp_path / "again", on_progress=None)
+    again = eb.train(eb.load_recipe(file), "paper-random", tmp_path / "again", on_progress=None)
     assert again.policy.manifest.manifest_sha256 == best["policy_sha256"]
     assert min(each["first_impact_harm"] for each in again.evaluations) == float(best["first_impact_harm"])
     text = file.read_text()
@@ -172,61 +170,12 @@ def test_trial__that_diverges_is_failed_with_its_reason_and_the_others_go_on(wri
     assert "the recipe's own values are not in the space" in capsys.readouterr().err and not export.exists()
 
 
-def test_same_command__exports_again_over_its_own_recipe_alone(finished_tuning, small_tuning, tmp_path, capsys) -> None:
+def test_same_command__exports_again_over_its_own_recipe_alone(finished_tuning, tmp_path, capsys) -> None:
     shutil.copytree(finished_tuning.parent, tmp_path / "all")
-    file, export = write_yaml(tmp_path / "tuning.yaml", small_tuning), tmp_path / "all" / "best.yaml"
+    file, export = tmp_path / "all" / "tuning.yaml", tmp_path / "all" / "best.yaml"
     text = export.read_text()
     assert "Settings of" in text and tune(file, tmp_path / "all" / "out", "--export", str(export)) == 0
     assert export.read_text() == text
     export.write_text(text[1:])
     assert tune(file, tmp_path / "all" / "out", "--export", str(export)) == 2
     assert "best.yaml: is there already" in capsys.readouterr().err
-
-
-def other_versions(folder: Path) -> None:
-    """The folder of the tuning as another torch left it."""
-    record = json.loads((folder / "tuning.json").read_text())
-    record["versions"]["torch"] = "1.0"
-    (folder / "tuning.json").write_text(json.dumps(record))
-
-
-def in_journal(old: str, new: str) -> Callable[[Path], None]:
-    """Damage of the journal."""
-
-    def damage(folder: Path) -> None:
-        journal = folder / "study.journal"
-        assert old in journal.read_text()
-        journal.write_text(journal.read_text().replace(old, new))
-
-    return damage
-
-
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        (other_versions, "holds a tuning with other settings (versions torch 1.0, here 2."),
-        (in_journal('{"op_code":0', '{"op_kode":0'), "cannot be used"),
-        (in_journal('{"op_code":0', "\x00"), "cannot be used"),
-        (in_journal('"results":"[', '"results":"{'), "trial 0 is damaged"),
-        (in_journal('"results":"[', '"results":7,"x":"['), "cannot be used"),
-    ],
-)
-def test_folder__of_other_versions_or_damaged_is_refused_in_one_line(
-    finished_tuning, write_tuning, tmp_path, capsys, change, reason
-):
-    folder = tmp_path / "out"
-    shutil.copytree(finished_tuning, folder)
-    change(folder)
-    assert tune(write_tuning(), folder) == 2
-    told = capsys.readouterr().err
-    assert reason in told and "numpy" not in told and len(told.splitlines()) == 1
-
-
-def test_dry_run__prints_space_and_cost_and_makes_nothing(write_tuning, tmp_path, capsys):
-    assert tune(write_tuning(), tmp_path / "new", "--dry-run", "--jobs", "2") == 0
-    told = capsys.readouterr()
-    assert told.out.splitlines()[1] == "n_epochs  from 1 to 4, whole  (the recipe has 2)"
-    assert f"{TRIALS} trials of 512 decisions: about" in told.err and not (tmp_path / "new").exists()
-    assert tune(write_tuning(), tmp_path / "new", "--dry-run", "--json") == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["own_values"]["n_epochs"] == 2 and found["core_s_per_trial"] > 0.0
