@@ -79,11 +79,17 @@ def _arrays_sha256(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _arrays(value: Any) -> dict[str, np.ndarray]:
-    """The arrays of a dataclass and of those inside it, by name; not one without columns: messages that none sends."""
+    """The arrays of a dataclass and of those inside it, by name; not those that say nothing.
+
+    These are messages that none sends, which have no columns, and rates of brakes that are there at once.
+    """
     found: dict[str, np.ndarray] = {}
     for field in fields(value):
         part = getattr(value, field.name)
-        found |= _arrays(part) if is_dataclass(part) else {} if part.shape[1:] == (0,) else {field.name: part}
+        if is_dataclass(part):
+            found |= _arrays(part)
+        elif part.shape[1:] != (0,) and not (field.name.endswith("_rate_mps3") and np.isinf(part).all()):
+            found[field.name] = part
     return found
 
 
