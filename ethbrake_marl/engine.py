@@ -46,7 +46,6 @@ from ethbrake_marl.physics import (
     advance,
     advance_table,
     columns,
-    command_in_force,
     compiled,
     force_at,
     hear_rows,
@@ -210,7 +209,7 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         at_rest = True
         for i in range(N):
             state[k, speed + i] = table[ROW.SPEED, at + i]
-            in_force = force_at(table, at + i, command_in_force(wanted[k, i], params[k, latency + i], until))
+            in_force = force_at(table, at + i, wanted[k, i], params[k, latency + i], until)
             state[k, command + i] = in_force
             at_rest = at_rest and stands(table[ROW.SPEED, at + i], max(wanted[k, i], in_force))
         impacts, first_harm, total_harm = 0.0, 0.0, 0.0

@@ -59,11 +59,14 @@ class ShovedFront:
 
     @classmethod
     def of(cls, worlds: Worlds, task: Task) -> ShovedFront | None:
-        """What watches these worlds (at the alert); None where Vehicle 1 is driven, or its script needs the state."""
+        """What watches these worlds (at the alert).
+
+        None where Vehicle 1 is driven, its script needs the state, or brakes build up.
+        """
         script = None if 0 in task.vehicles else task.scenario.scripts.get(0)
         vehicles = worlds.vehicles
         command = None if script is None else ScriptSpec.parse(script).command(vehicles.braking_capacity_mps2[:, 0])
-        if command is None:
+        if command is None or vehicles.build_up.any():
             return None
         columns = (worlds.speeds_mps[:, 0], command, vehicles.latency_s[:, 0], vehicles.speed_limit_mps[:, 0])
         speed, command, latency, limit = (np.array(column, np.float64)[:, np.newaxis] for column in columns)
@@ -103,11 +106,12 @@ class SampledHarm:
 
     @classmethod
     def of(cls, worlds: Worlds, task: Task) -> SampledHarm | None:
-        """What watches these worlds (at the alert); None with an obstacle, or if others decide than Vehicle 2.
+        """What watches these worlds (at the alert).
 
-        The map knows no obstacle, and its samples are the decisions of Vehicle 2.
+        None with an obstacle or brakes that build up, which the map does not know, or if others decide than Vehicle 2,
+        whose decisions are its samples.
         """
-        if task.vehicles != (VEHICLE_2,) or worlds.obstacle_ahead.any():
+        if task.vehicles != (VEHICLE_2,) or worlds.obstacle_ahead.any() or worlds.vehicles.build_up.any():
             return None
         if not all(map(is_state_free, script_agents(task.scenario, except_for=VEHICLE_2).values())):
             return None

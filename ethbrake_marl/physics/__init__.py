@@ -38,7 +38,6 @@ from ethbrake_marl.physics.kernel import (
     advance_table as advance_table,
     at_rest as at_rest,
     builds_up as builds_up,
-    command_in_force as command_in_force,
     contact as contact,
     follow as follow,
     follow_whole as follow_whole,

@@ -25,7 +25,6 @@ from ethbrake_marl.physics.kernel import (
     LISTED,
     ROW,
     advance_table,
-    command_in_force,
     force_at,
     onset_s,
     place_forces,
@@ -317,7 +316,7 @@ def advance_worlds(
         time[k] = until[k]
         for i in range(vehicles):
             speeds[k, i] = table[ROW.SPEED, at + i]
-            in_force[k, i] = force_at(table, at + i, command_in_force(command[k, i], latency[k, i], until[k]))
+            in_force[k, i] = force_at(table, at + i, command[k, i], latency[k, i], until[k])
         for p in range(vehicles - 1):
             gaps[k, p] = table[ROW.GAP, at + p]
             hit[k, p] = table[ROW.HIT, at + p] == 1.0

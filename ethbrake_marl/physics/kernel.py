@@ -709,14 +709,13 @@ def contact_within(gap: float, closing: float, pressing: float, jerk: float, end
 def plan_force(table: Floats, i: int, wanted: float) -> None:
     """Where the force of vehicle ``i`` goes from now on, and when it is there: the command, or 0 on the way to it."""
     force = table[ROW.FORCE, i]
-    rate = -table[ROW.BRAKE_RATE, i] if wanted < force else table[ROW.RELEASE_RATE, i]
+    force = force_now(force, wanted, table[ROW.BRAKE_RATE, i], table[ROW.RELEASE_RATE, i])
+    table[ROW.FORCE, i] = force
     table[ROW.FORCE_RATE, i] = 0.0
     table[ROW.FORCE_TIME, i] = math.inf
     if wanted == force:
         return
-    if math.isinf(rate):
-        table[ROW.FORCE, i] = wanted
-        return
+    rate = -table[ROW.BRAKE_RATE, i] if wanted < force else table[ROW.RELEASE_RATE, i]
     goal = 0.0 if (force < 0.0 < wanted) or (wanted < 0.0 < force) else wanted
     table[ROW.FORCE_RATE, i] = rate
     table[ROW.FORCE_TIME, i] = (goal - force) / rate
@@ -1013,12 +1012,18 @@ def place_forces(table: Floats, force: Floats, brake_rate: Floats, release_rate:
 
 
 @compiled
-def force_at(table: Floats, i: int, wanted: float) -> float:
-    """The force of vehicle ``i`` at the end of a segment; ``wanted`` is the command that acts there. [m/s2]"""
+def force_at(table: Floats, i: int, command: float, latency_s: float, time_s: float) -> float:
+    """The force of vehicle ``i`` at ``time_s``, the end of a segment; no command acts before its latency. [m/s2]"""
+    wanted = command if latency_s <= time_s else 0.0
     if not builds_up(table):
         return wanted
-    force = table[ROW.FORCE, i]
-    return wanted if math.isinf(table[ROW.BRAKE_RATE if wanted < force else ROW.RELEASE_RATE, i]) else force
+    return force_now(table[ROW.FORCE, i], wanted, table[ROW.BRAKE_RATE, i], table[ROW.RELEASE_RATE, i])
+
+
+@compiled
+def force_now(force: float, wanted: float, brake_rate: float, release_rate: float) -> float:
+    """The force at the moment at which another command begins to act: it jumps only at an infinite rate. [m/s2]"""
+    return wanted if math.isinf(brake_rate if wanted < force else release_rate) else force
 
 
 # The obstacle ahead of Vehicle 1, for the kernels: one more vehicle in front, which stands and which nothing moves.
@@ -1040,7 +1045,7 @@ def place_obstacle(table: Floats, gap: float, hit: float) -> None:
 # The step of an episode, compiled: onset of the commands, motion, harm, rest, and the times of the decisions.
 #
 # Search and shield advance an episode by ``step_episode``. The engine, whose loop keeps its worlds in rows, is made of
-# the same rules (``step_end_s``, ``onset_s``, ``command_in_force``, ``stands``) around the same ``advance_table``, so
+# the same rules (``step_end_s``, ``onset_s``, ``force_at``, ``stands``) around the same ``advance_table``, so
 # all three agree to the bit (decision 0025). Search and shield copy one world at a time into the table of
 # ``physics.kernel``, which is longer here by the rows below.
 #
@@ -1146,12 +1151,6 @@ def onset_s(latency_s: float, time_s: float) -> float:
 def stands(speed_mps: float, command_mps2: float) -> bool:
     """Whether a vehicle stands and its command would not move it."""
     return speed_mps == 0.0 and command_mps2 <= 0.0
-
-
-@compiled
-def command_in_force(command: float, latency_s: float, time_s: float) -> float:
-    """The command that acts at a time: none before the vehicle's latency has elapsed (m/s2)."""
-    return command if latency_s <= time_s else 0.0
 
 
 @compiled(within=True)

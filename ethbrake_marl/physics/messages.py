@@ -31,8 +31,10 @@ from ethbrake_marl.physics.kernel import (
     LISTED,
     ROW,
     advance_table,
-    command_in_force,
+    force_at,
+    force_now,
     onset_s,
+    place_forces,
     place_obstacle,
     solo_motion,
 )
@@ -209,14 +211,14 @@ def hear_rows(
     """
     column = columns(moving)
     N, head = column.vehicles, column.messages
-    table = np.zeros((ROW.OF_SEGMENT, N + 1))
+    table = np.zeros((ROW.OF_BUILD_UP, N + 1))
     no_rows = np.empty((0, LISTED.WIDTH))
     for k in range(moving.shape[0]):
         if params[k, head + CHANNEL.PERIOD] == 0.0:
             continue
         told = params[k, head:]
         if told[CHANNEL.TAKEN] == 0.0:
-            _start(moving[k], told, column, wanted[k], params[k, column.latency :])
+            _start(moving[k], params[k], column, wanted[k])
         while moving[k, column.time] < until_s[k]:
             left = math.ceil((decision_s[k] - moving[k, column.time]) / time_step_s - 1e-6) - 1.0
             end = decision_s[k] - max(left, 0.0) * time_step_s
@@ -232,16 +234,19 @@ def hear_rows(
 
 
 @compiled
-def _start(state: Floats, told: Floats, column: Columns, wanted: Floats, latency: Floats) -> None:
+def _start(state: Floats, params: Floats, column: Columns, wanted: Floats) -> None:
     """Places and the first sample, at the alert."""
-    N, obstacle, gap = column.vehicles, column.obstacle, column.gap
-    place = place_at(N)
+    N, obstacle, gap, force = column.vehicles, column.obstacle, column.gap, column.command
+    told, place = params[column.messages :], place_at(N)
     told[place] = 0.0
     told[CHANNEL.OBSTACLE_PLACE] = state[obstacle] if state.shape[0] > obstacle else math.inf
     for p in range(N - 1):
         told[place + p + 1] = told[place + p] - state[gap + p]
     for i in range(N):
-        state[column.command + i] = command_in_force(wanted[i], latency[i], state[column.time])
+        acts = params[column.latency + i] <= state[column.time]
+        state[force + i] = force_now(
+            state[force + i], wanted[i] if acts else 0.0, params[column.brake_rate + i], params[column.release_rate + i]
+        )
     _sample(state, told, column)
     _receive(state[column.time], told, N)
 
@@ -263,6 +268,10 @@ def _move(
         table[ROW.MASS, i + 1] = params[column.mass + i]
         table[ROW.LIMIT, i + 1] = params[column.limit + i]
         table[ROW.ONSET, i + 1] = onset_s(params[latency + i], time)
+    place_forces(
+        table, state[command : command + N], params[column.brake_rate : column.release_rate],
+        params[column.release_rate : column.own_latency],
+    )  # fmt: skip
     for p in range(N - 1):
         table[ROW.GAP, p + 1] = state[gap + p]
         table[ROW.HIT, p + 1] = state[gap + N - 1 + p]
@@ -273,7 +282,7 @@ def _move(
     state[column.time] = end
     for i in range(N):
         state[speed + i] = table[ROW.SPEED, i + 1]
-        state[command + i] = command_in_force(wanted[i], params[latency + i], end)
+        state[command + i] = force_at(table, i + 1, wanted[i], params[latency + i], end)
     for p in range(N - 1):
         state[gap + p] = table[ROW.GAP, p + 1]
         state[gap + N - 1 + p] = table[ROW.HIT, p + 1]

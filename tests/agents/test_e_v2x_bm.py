@@ -188,14 +188,16 @@ def kinds(vehicles: int) -> Iterator[tuple[str, Worlds, dict[str, object]]]:
     yield "others", worlds, {"others_mps2": others, "horizon_s": 6.3}
     yield "later", later.take(forward), {"others_mps2": others[forward], "horizon_s": 5.0}
     yield "obstacle", replace(worlds, obstacle_gap_m=obstacle), {"harm_count": "total"}
+    slow = replace(worlds.vehicles, brake_rate_mps3=rng.uniform(3, 40, braking.shape))
+    yield "build-up", replace(worlds, vehicles=slow, obstacle_gap_m=obstacle), {"others_mps2": others}
 
 
 def line_of(worlds: Worlds, k: int, vehicle: int, command: Floats, *, total: bool = False) -> Line:
     v = worlds.vehicles
     made = make_line(
         worlds.gaps_m[k], worlds.speeds_mps[k], worlds.pair_hit[k], worlds.obstacle_gap_m[k], worlds.obstacle_hit[k],
-        command[k], v.latency_s[k], v.mass_t[k], v.speed_limit_mps[k], worlds.time_s[k], v.restitution[k], 7.0,
-        vehicle, total,
+        command[k], v.latency_s[k], v.mass_t[k], v.speed_limit_mps[k], worlds.command_mps2[k], v.brake_rate_mps3[k],
+        v.release_rate_mps3[k], worlds.time_s[k], v.restitution[k], 7.0, vehicle, total,
     )  # fmt: skip
     assert share_start(made) == FLAG.DONE
     return made
@@ -209,7 +211,7 @@ def harms(made: Line, decelerations: Floats, bound: float = math.inf) -> Samples
 
 
 @pytest.mark.parametrize("vehicles", [2, 3, 5, 10, 18])  # NumPy adds up a row of 8 or more pairs in another order
-@pytest.mark.parametrize("kind", ["alert", "others", "later", "obstacle"])
+@pytest.mark.parametrize("kind", ["alert", "others", "later", "obstacle", "build-up"])
 def test_simulate__does_the_harm_of_advance(kind, vehicles):
     ((_, worlds, options),) = (each for each in kinds(vehicles) if each[0] == kind)
     command = options.get("others_mps2", -worlds.vehicles.braking_capacity_mps2).copy()
