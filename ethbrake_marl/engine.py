@@ -142,14 +142,14 @@ class Step(NamedTuple):
 @compiled
 def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to functions costs more than the work
     state: Floats, params: Floats, clock: Floats, actions: Floats, learners: Ints, settings: Floats, no_rows: Floats,
-    wanted: Floats, reward: Floats, outcome: Floats,
+    builds_up: bool, wanted: Floats, reward: Floats, outcome: Floats,
 ) -> tuple[int, int]:  # fmt: skip
     """Advance every running world by one step, in place (state, clock, wanted); fills the last two arrays.
 
     ``actions`` [n, L] become the learners' commands in ``wanted`` [n, N]; nothing is moved if one of them is not in
     [-1, 1]. A world that cannot be advanced stays where it was; its episode is cut off there, without a reward, and
-    marked in ``outcome``. Returns a world and what went wrong there (BAD_ACTION, or the status of one that could not be
-    advanced), or (-1, DONE).
+    marked in ``outcome``. Without ``builds_up`` no world's brakes do. Returns a world and what went wrong there
+    (BAD_ACTION, or the status of one that could not be advanced), or (-1, DONE).
     """
     n, N = wanted.shape
     for k in range(n):
@@ -162,7 +162,7 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     P, obstacle, brake_rate, release_rate = N - 1, column.obstacle, column.brake_rate, column.release_rate
     worst, worst_status = -1, FLAG.DONE
     at = 1 if state.shape[1] > obstacle else 0  # vehicle i stands in column at + i, behind an obstacle
-    table = np.zeros((ROW.OF_BUILD_UP, N + at))
+    table = np.zeros((ROW.OF_BUILD_UP if builds_up else ROW.OF_SEGMENT, N + at))
     for k in range(n):
         if clock[k, ENDED] == 1.0:
             for f in range(OUTCOME_ROWS):
@@ -186,10 +186,11 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
             table[ROW.LIMIT, at + i] = params[k, limit + i]
             table[ROW.ONSET, at + i] = onset_s(params[k, latency + i], time)
             state[k, previous + i] = state[k, command + i]
-        place_forces(
-            table, state[k, command : command + N], params[k, brake_rate : brake_rate + N],
-            params[k, release_rate : release_rate + N],
-        )  # fmt: skip
+        if builds_up:
+            place_forces(
+                table, state[k, command : command + N], params[k, brake_rate : brake_rate + N],
+                params[k, release_rate : release_rate + N],
+            )  # fmt: skip
         for p in range(P):
             table[ROW.GAP, at + p] = state[k, gap + p]
             table[ROW.HIT, at + p] = state[k, gap + P + p]
@@ -209,9 +210,11 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         at_rest = True
         for i in range(N):
             state[k, speed + i] = table[ROW.SPEED, at + i]
-            in_force = force_at(table, at + i, wanted[k, i], params[k, latency + i], until)
-            state[k, command + i] = in_force
-            at_rest = at_rest and stands(table[ROW.SPEED, at + i], max(wanted[k, i], in_force))
+            at_rest = at_rest and stands(table[ROW.SPEED, at + i], wanted[k, i])
+            state[k, command + i] = wanted[k, i] if params[k, latency + i] <= until else 0.0
+            if builds_up:
+                state[k, command + i] = force_at(table, at + i, wanted[k, i], params[k, latency + i], until)
+                at_rest = at_rest and state[k, command + i] <= 0.0
         impacts, first_harm, total_harm = 0.0, 0.0, 0.0
         if at == 1 and state[k, obstacle] < math.inf:
             state[k, obstacle] = table[ROW.GAP, 0]
@@ -839,6 +842,7 @@ class Engine:
     _potential: Floats  # [n, N]
     _obstacle: bool  # the rows have columns of an obstacle
     _by_link: bool  # ... of news by link
+    _builds_up: bool  # brakes of some world may build up
     _plan: Plan  # of what a vehicle observes
 
     def __init__(
@@ -971,6 +975,7 @@ class Engine:
         new._stream, new.roster = stream, Roster(self.n, stream.seed, first, worlds)
         new._obstacle = self.scenario.has_obstacle or start.packed.has_obstacle
         new._by_link = self.scenario.by_link or start.packed.has_news
+        new._builds_up = self.scenario.builds_up or start.packed.builds_up
         new._state, new._params = (array.copy() for array in new._kept(start.packed))
         new._clock, new._wanted = start.clock.copy(), start.wanted.copy()
         new._potential = np.zeros(start.wanted.shape)
@@ -1082,7 +1087,7 @@ class Engine:
     def _step_worlds(self, columns: Floats, reward: Floats, outcome: Floats) -> int:
         _, status = step_worlds(
             self._state, self._params, self._clock, columns, self._learner_index, self._settings, _NO_ROWS,
-            self._wanted, reward, outcome,
+            self._builds_up, self._wanted, reward, outcome,
         )  # fmt: skip
         return status
 
@@ -1188,8 +1193,8 @@ class Engine:
         reward, outcome = np.empty(self._wanted.shape), np.empty((OUTCOME_ROWS, self.n))
         state, params = self._state.copy(), self._params.copy()
         step_worlds(
-            state, params, clock, columns, self._learner_index[: columns.shape[1]], settings, _NO_ROWS, self._wanted,
-            reward, outcome,
+            state, params, clock, columns, self._learner_index[: columns.shape[1]], settings, _NO_ROWS,
+            self._builds_up, self._wanted, reward, outcome,
         )  # fmt: skip
         if self.packed.has_messages:
             time_s = state[:, self.packed.column.time]
@@ -1258,6 +1263,7 @@ class Engine:
         memories = {vehicle: checked_memory(_unflat(arrays, f"script.{vehicle}"), self.n) for vehicle in self.memories}
         for name in RUNNING:
             setattr(self, name, np.array(arrays[name.lstrip("_")], np.float64))
+        self._builds_up = self.scenario.builds_up or self.packed.builds_up
         seed, taken = (int(number) for number in arrays["stream"])
         self._stream.restart(seed, taken)
         self.roster = Roster(self.n, seed, None)  # a snapshot does not keep the numbers of running episodes
@@ -1289,6 +1295,7 @@ class Engine:
         new.roster = Roster(new.n, self.seed, None)
         new.roster.warns = False
         new._state, new._params, new._clock, new._wanted = (array.copy() for array in moment[:4])
+        new._builds_up = self.scenario.builds_up or new.packed.builds_up
         new._potential = np.zeros(moment.wanted.shape)
         return new
 

@@ -654,7 +654,7 @@ def share_start(line: Line) -> int:
         if resolve_impacts(table, clock[RESTITUTION]):
             record_impacts(table, now, 0, line.no_rows, 0)
             continue
-        sound, now = to_next_event(table, now, clock[DURATION])
+        sound, now = to_next_event(table, now, clock[DURATION], builds_up(table))
         if not sound:
             return FLAG.PENETRATED
     return FLAG.STUCK
@@ -685,12 +685,13 @@ def _simulate_one(line: Line, command: float, bound: float) -> int:
     table, duration = line.table, line.clock[DURATION]
     table[ROW.COMMAND, line.controlled] = command
     _copy_state(line.start, table)
-    if move_apart(table, duration):
+    building = builds_up(table)
+    if move_apart(table, duration, building):
         return FLAG.DONE
     _copy_state(line.shared, table)
     now = line.clock[SHARED_S]
     for _ in range(BOUND.MOST_EVENTS):
-        status, now = to_next_impact(table, line.clock[RESTITUTION], now, duration)
+        status, now = to_next_impact(table, line.clock[RESTITUTION], now, duration, building)
         if status != FLAG.IMPACT:
             return status
         record_impacts(table, now, 0, line.no_rows, 0)

@@ -206,6 +206,12 @@ class Packed(NamedTuple):
         """Whether the rows have columns of periodic messages."""
         return bool(self.params.shape[1] > self.column.messages)
 
+    @property
+    def builds_up(self) -> bool:
+        """Whether brakes of some world build up."""
+        column = self.column
+        return bool(np.isfinite(self.params[:, column.brake_rate : column.own_latency]).any())
+
     def widened(self, obstacle: bool, news: bool) -> Packed:
         """The rows with columns of an obstacle, and of news by link, where that is wanted.
 

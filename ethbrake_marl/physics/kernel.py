@@ -406,16 +406,35 @@ def advance_table(
     Harm of the segment is in rows FIRST_HARM, TOTAL_HARM and COUNT. ``rows`` [capacity, LISTED.WIDTH] receives the
     impacts that fit, those beyond are only counted.
     """
+    if builds_up(table):
+        return advance_on_cubics(table, restitution, duration, start_s, world, rows, recorded)
+    return _advance(table, restitution, duration, start_s, world, rows, recorded, False)
+
+
+@compiled(apart=True, bare=True)
+def advance_on_cubics(
+    table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int
+) -> tuple[int, int]:
+    """``advance_table`` where brakes build up."""
+    return _advance(table, restitution, duration, start_s, world, rows, recorded, True)
+
+
+@compiled(bare=True)
+def _advance(
+    table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int,
+    building: bool,
+) -> tuple[int, int]:  # fmt: skip
+    """``advance_table``; as ``building`` is a constant where it is called, only one of both motions is compiled."""
     for p in range(table.shape[1] - 1):
         table[ROW.FIRST_HARM, p] = 0.0
         table[ROW.TOTAL_HARM, p] = 0.0
         table[ROW.COUNT, p] = 0.0
-    if move_apart(table, duration):
+    if move_apart(table, duration, building):
         return recorded, FLAG.DONE
     start_events(table)
     now = 0.0
     for _ in range(BOUND.MOST_EVENTS):
-        status, now = to_next_impact(table, restitution, now, duration)
+        status, now = to_next_impact(table, restitution, now, duration, building)
         if status != FLAG.IMPACT:
             return recorded, status
         recorded = record_impacts(table, start_s + now, world, rows, recorded)
@@ -448,13 +467,14 @@ def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recor
 
 
 @compiled(bare=True)
-def move_apart(table: Floats, duration: float) -> bool:
+def move_apart(table: Floats, duration: float, building: bool) -> bool:
     """Move a world whose vehicles surely stay apart; leave it and return False when that is not sure.
 
     Where both of a pair have constant accelerations, the contact time says it exactly. Else: speeds are monotone
-    within a segment, so a pair closes by at most ``(max rear speed - min front speed) T``.
+    within a segment, so a pair closes by at most ``(max rear speed - min front speed) T``. ``building``: brakes build
+    up, see ``builds_up``.
     """
-    if builds_up(table):
+    if building:
         return move_apart_on_cubics(table, duration)
     vehicles = table.shape[1]
     slowest_in_front, front_steady = math.inf, 0.0
@@ -492,7 +512,7 @@ def start_events(table: Floats) -> None:
 
 
 @compiled(bare=True)
-def to_next_impact(table: Floats, restitution: float, now: float, duration: float) -> tuple[int, float]:
+def to_next_impact(table: Floats, restitution: float, now: float, duration: float, building: bool) -> tuple[int, float]:
     """Move from ``now`` event by event up to and through the next round of impacts, or to the end of the segment.
 
     Returns IMPACT (call again), DONE, or what went wrong; and the time reached.
@@ -502,16 +522,16 @@ def to_next_impact(table: Floats, restitution: float, now: float, duration: floa
             return FLAG.IMPACT, now
         if now >= duration:
             return FLAG.DONE, now
-        sound, now = to_next_event(table, now, duration)
+        sound, now = to_next_event(table, now, duration, building)
         if not sound:
             return FLAG.PENETRATED, now
     return FLAG.STUCK, now
 
 
 @compiled(bare=True)
-def to_next_event(table: Floats, now: float, duration: float) -> tuple[bool, float]:
+def to_next_event(table: Floats, now: float, duration: float, building: bool) -> tuple[bool, float]:
     """Move from ``now`` to the next event or to the end of the segment; False where a gap became impossible."""
-    if builds_up(table):
+    if building:
         passed = next_moving_event(table, now, duration, accelerate_moving(table))
         sound = move_on_cubics(table, passed)
     else:
@@ -629,7 +649,7 @@ _PARTS_LATE_S = 1e-9  # joined vehicles part this much late, so that rounding ca
 _PARTS_LATE_MPS2 = 1e-12  # and by no smaller a difference of accelerations
 
 
-@compiled
+@compiled(bare=True)
 def builds_up(table: Floats) -> bool:
     """Whether the brakes of this world build up."""
     return bool(table.shape[0] > ROW.OF_EPISODE and table[ROW.BUILDS_UP, 0] == 1.0)
@@ -749,7 +769,7 @@ def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) ->
     return 0.0, 0.0
 
 
-@compiled(bare=True)
+@compiled(apart=True, bare=True)
 def pool_moving(table: Floats, first: int, last: int) -> float:
     """Accelerations and jerks of touching vehicles ``first..last`` of equal speed; the time until one of them parts.
 
@@ -837,7 +857,7 @@ def crossing_s(below: float, rate: float) -> float:
     return max(-below / rate, 0.0) + _PARTS_LATE_S + _PARTS_LATE_MPS2 / rate
 
 
-@compiled(bare=True)
+@compiled(apart=True, bare=True)
 def accelerate_moving(table: Floats) -> float:
     """``accelerate`` where brakes build up: accelerations and jerks; the time until touching vehicles part."""
     vehicles = table.shape[1]
@@ -867,7 +887,7 @@ def accelerate_moving(table: Floats) -> float:
     return soonest
 
 
-@compiled(bare=True)
+@compiled(apart=True, bare=True)
 def next_moving_event(table: Floats, now: float, end: float, parting: float) -> float:
     """``next_event`` where brakes build up."""
     vehicles = table.shape[1]
@@ -898,24 +918,24 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
     return soonest
 
 
-@compiled(bare=True)
+@compiled(apart=True, bare=True)
 def move_on_cubics(table: Floats, duration: float) -> bool:
     """``move`` where brakes build up: gaps, speeds and forces."""
     vehicles, sound = table.shape[1], True
     for p in range(vehicles - 1):
         if table[ROW.CONTACT_TIME, p] <= duration:
             table[ROW.GAP, p] = 0.0
-            continue
-        table[ROW.CONTACT_TIME, p] = math.inf
-        table[ROW.CONTACT_SPEED, p] = 0.0
-        if table[ROW.JOINED, p] == 0.0:
-            after = gap_after(
-                table[ROW.GAP, p], table[ROW.SPEED, p + 1] - table[ROW.SPEED, p],
-                table[ROW.ACCELERATION, p + 1] - table[ROW.ACCELERATION, p],
-                table[ROW.JERK, p + 1] - table[ROW.JERK, p], duration,
-            )  # fmt: skip
-            sound = sound and after >= -BOUND.PENETRATION_M
-            table[ROW.GAP, p] = max(after, 0.0)
+        else:
+            table[ROW.CONTACT_TIME, p] = math.inf
+            table[ROW.CONTACT_SPEED, p] = 0.0
+            if table[ROW.JOINED, p] == 0.0:
+                after = gap_after(
+                    table[ROW.GAP, p], table[ROW.SPEED, p + 1] - table[ROW.SPEED, p],
+                    table[ROW.ACCELERATION, p + 1] - table[ROW.ACCELERATION, p],
+                    table[ROW.JERK, p + 1] - table[ROW.JERK, p], duration,
+                )  # fmt: skip
+                sound = sound and after >= -BOUND.PENETRATION_M
+                table[ROW.GAP, p] = max(after, 0.0)
     first = 0
     while first < vehicles:
         rate, jerk = table[ROW.ACCELERATION, first], table[ROW.JERK, first]
@@ -940,7 +960,7 @@ def move_on_cubics(table: Floats, duration: float) -> bool:
     return sound
 
 
-@compiled(bare=True)
+@compiled(apart=True, bare=True)
 def move_apart_on_cubics(table: Floats, duration: float) -> bool:
     """``move_apart`` where brakes build up: each vehicle from event to event on its own, and how near two can come."""
     vehicles = table.shape[1]
@@ -952,6 +972,22 @@ def move_apart_on_cubics(table: Floats, duration: float) -> bool:
         limit, onset, way, now = table[ROW.LIMIT, i], table[ROW.ONSET, i], 0.0, 0.0
         slowest, fastest, before = speed, speed, table[ROW.FORCE, i]
         active = onset <= 0.0
+        if active and before <= 0.0 and table[ROW.COMMAND, i] <= 0.0:  # it only brakes: one ramp, then a constant
+            plan_force(table, i, table[ROW.COMMAND, i])
+            force, force_rate = table[ROW.FORCE, i], table[ROW.FORCE_RATE, i]
+            rising = min(table[ROW.FORCE_TIME, i], duration)
+            held = duration - rising
+            after = force + force_rate * rising if rising < table[ROW.FORCE_TIME, i] else table[ROW.FORCE_VALUE, i]
+            after = after if force_rate != 0.0 else force
+            between = speed + (force + 0.5 * force_rate * rising) * rising
+            end = between + after * held
+            if end > 0.0 or speed == 0.0:
+                if speed > 0.0:
+                    way = (speed + 0.5 * (force + force_rate * rising / 3.0) * rising) * rising
+                    way += (between + 0.5 * after * held) * held
+                    speed = slowest = end
+                table[ROW.FORCE, i] = after
+                now = duration
         while now < duration:
             plan_force(table, i, table[ROW.COMMAND, i] if active else 0.0)
             force, force_rate = table[ROW.FORCE, i], table[ROW.FORCE_RATE, i]
@@ -988,30 +1024,32 @@ def move_apart_on_cubics(table: Floats, duration: float) -> bool:
     return True
 
 
-@compiled
+@compiled(bare=True)
 def place_rates(table: Floats, brake_rate: Floats, release_rate: Floats) -> None:
     """Write the rates of the vehicles (m/s3), each [N], into a table [ROW.OF_BUILD_UP, N or N + 1].
 
     Where all are infinite, the forces are not looked at.
     """
-    at = table.shape[1] - brake_rate.shape[0]
-    table[ROW.BUILDS_UP, 0] = 0.0
+    at, least = table.shape[1] - brake_rate.shape[0], math.inf
     for i in range(brake_rate.shape[0]):
-        if brake_rate[i] < math.inf or release_rate[i] < math.inf:
-            table[ROW.BUILDS_UP, 0] = 1.0
-        table[ROW.BRAKE_RATE, at + i] = brake_rate[i]
-        table[ROW.RELEASE_RATE, at + i] = release_rate[i]
+        least = min(least, brake_rate[i], release_rate[i])
+    table[ROW.BUILDS_UP, 0] = 1.0 if least < math.inf else 0.0
+    if least < math.inf:
+        for i in range(brake_rate.shape[0]):
+            table[ROW.BRAKE_RATE, at + i] = brake_rate[i]
+            table[ROW.RELEASE_RATE, at + i] = release_rate[i]
 
 
-@compiled
+@compiled(bare=True)
 def place_forces(table: Floats, force: Floats, brake_rate: Floats, release_rate: Floats) -> None:
     """Write forces (m/s2) and rates (m/s3) of the vehicles, each [N], into a table [ROW.OF_BUILD_UP, N or N + 1]."""
     place_rates(table, brake_rate, release_rate)
-    for i in range(force.shape[0]):
-        table[ROW.FORCE, table.shape[1] - force.shape[0] + i] = force[i]
+    if table[ROW.BUILDS_UP, 0] == 1.0:
+        for i in range(force.shape[0]):
+            table[ROW.FORCE, table.shape[1] - force.shape[0] + i] = force[i]
 
 
-@compiled
+@compiled(bare=True)
 def force_at(table: Floats, i: int, command: float, latency_s: float, time_s: float) -> float:
     """The force of vehicle ``i`` at ``time_s``, the end of a segment; no command acts before its latency. [m/s2]"""
     wanted = command if latency_s <= time_s else 0.0
@@ -1477,12 +1515,13 @@ def forecast_contacts(table: Floats, restitution: float, duration: float, found:
         table[ROW.FIRST_HARM, p] = 0.0
         table[ROW.TOTAL_HARM, p] = 0.0
         table[ROW.COUNT, p] = 0.0
-    if move_apart(table, duration):
+    building = builds_up(table)
+    if move_apart(table, duration, building):
         return FLAG.DONE
     start_events(table)
     no_rows, now = table[:0], 0.0
     for _ in range(BOUND.MOST_EVENTS):
-        status, now = to_next_impact(table, restitution, now, duration)
+        status, now = to_next_impact(table, restitution, now, duration, building)
         if status != FLAG.IMPACT:
             return status
         for p in range(table.shape[1] - 1):

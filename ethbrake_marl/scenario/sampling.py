@@ -1154,6 +1154,12 @@ class ScenarioFields(FileModel):
         """Whether the road is known, in some member of a mixture at least."""
         return any(member.has_friction for member in self.members) or self.declares("friction")
 
+    @property
+    def builds_up(self) -> bool:
+        """Whether brakes may build up, in some member of a mixture at least."""
+        own = self.declares("brake_rate_mps3") or self.declares("release_rate_mps3")
+        return own or any(member.builds_up for member in self.members)
+
     def declares(self, field: str) -> bool:
         """Whether it says what a quantity is: under its key, by type, or in its table for every vehicle or pair."""
         kinds = (self.vehicle_types or {}).values() if field in QUANTITY.of_a_type else ()
@@ -1850,7 +1856,7 @@ def _of_types(scenario: ScenarioFields) -> dict[str, Place]:
         return {}
     places: dict[str, Place] = {}
     for i, vehicle in enumerate(scenario.vehicle_names):
-        possible = [scenario.possible_quantities(key)[i] for key in QUANTITY.of_a_type]
+        possible = [scenario.possible_quantities(key)[i] for key in QUANTITY.of_a_type if scenario.declares(key)]
         if any(len(each) > 1 for each in possible):
             places[f"{vehicle} type"] = (TYPES, PER_TYPE * i)
         if any(isinstance(entry, WithLoad) for each in possible for entry in each.values()):

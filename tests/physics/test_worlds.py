@@ -172,16 +172,17 @@ def test_packed__gives_back_every_bit_in_its_own_memory_widened_or_not(n: int, N
 
 def test_packed__columns_follow_each_other_without_a_hole() -> None:
     # 3 vehicles, 2 pairs: time | speeds 3 | commands 3 | before 3 | gaps 2 | hit 2 | first 2 | total 2 | count 2
-    # and restitution | braking 3 | driving 3 | latency 3 | mass 3 | limit 3 | own latency 3 | news 9
+    # and restitution | braking 3 | driving 3 | latency 3 | mass 3 | limit 3 | brake rate 3 | release rate 3 |
+    # own latency 3 | news 9
     rows = Packed.of(line([5.0, 6.0], [9.0, 9.0, 9.0]))
-    assert places(rows.state) == rows.column == (3, 0, 1, 4, 7, 10, 12, 14, 20, 0, 1, 4, 7, 10, 13, 16, 19, 28)
-    assert (rows.state.shape, rows.params.shape) == ((1, 20), (1, 16))
+    assert places(rows.state) == rows.column == (3, 0, 1, 4, 7, 10, 12, 14, 20, 0, 1, 4, 7, 10, 13, 16, 19, 22, 25, 34)
+    assert (rows.state.shape, rows.params.shape) == ((1, 20), (1, 22))
     wide = rows.widened(obstacle=True, news=True)
-    assert (wide.state.shape, wide.params.shape) == ((1, 25), (1, 28))
+    assert (wide.state.shape, wide.params.shape) == ((1, 25), (1, 34))
 
 
 def test_packed__ledger_is_that_of_the_columns_of_harm_in_its_own_memory() -> None:
-    rows = Packed(np.arange(25.0)[None], np.empty((1, 16)))
+    rows = Packed(np.arange(25.0)[None], np.empty((1, 22)))
     first, total, count, *of_obstacle = rows.ledger()
     rows.state[:] = 5.0
     assert (first.tolist(), total.tolist(), count.tolist()) == ([[14.0, 15.0]], [[16.0, 17.0]], [[18, 19]])
