@@ -656,8 +656,8 @@ def profile_problem(
     )
     bounds = np.stack([-v.braking_capacity_mps2[:, chosen], v.driving_capacity_mps2[:, chosen]], axis=2)
     after, impacts = advance(worlds, command, until_s=first)
-    start = [after.speeds_mps, after.gaps_m, after.pair_hit, impacts.first_impact_harm, impacts.total_harm]
-    start += [after.command_mps2] if v.build_up.any() else []
+    harm = [impacts.first_impact_harm, impacts.total_harm]
+    start = [after.speeds_mps, after.gaps_m, after.pair_hit, *harm, after.command_mps2]
     return ProfileProblem(
         chosen, np.concatenate(start, axis=1), clock, np.ascontiguousarray(bounds), command, v.latency_s, v.mass_t,
         v.speed_limit_mps, v.brake_rate_mps3, v.release_rate_mps3, identities(worlds, command, clock, chosen),

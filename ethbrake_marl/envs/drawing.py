@@ -605,7 +605,7 @@ class Motion:
                     front_m=fronts[k],
                     gaps_m=moved.gaps_m[k],
                     speeds_mps=moved.speeds_mps[k],
-                    command_mps2=np.where(latency <= time, command[0], 0.0),
+                    command_mps2=moved.command_mps2[k],
                     braking_mps2=world.vehicles.braking_capacity_mps2[0],
                     driving_mps2=world.vehicles.driving_capacity_mps2[0],
                     latency_s=latency,
@@ -649,7 +649,10 @@ class Trace:
         # stops later is taken to push the ones ahead so far.
         behind = np.concatenate([np.zeros((n, 1)), np.cumsum(alert.gaps_m, axis=1)], axis=1)
         reaction = alert.speeds_mps * np.minimum(v.latency_s, _LATE_S)
-        way = reaction + alert.speeds_mps**2 / (2.0 * v.braking_capacity_mps2)
+        rising = (
+            alert.speeds_mps * v.braking_capacity_mps2 / (2.0 * v.brake_rate_mps3)
+        )  # at most, while brakes build up
+        way = reaction + rising + alert.speeds_mps**2 / (2.0 * v.braking_capacity_mps2)
         left = -behind[:, -1] - alert.N * BODY_M - _BEHIND_M
         right = np.minimum((way - behind).max(axis=1), alert.obstacle_gap_m) + _AHEAD_M
         new = Motion(

@@ -215,7 +215,8 @@ def _drawn_again(engine: Engine, numbers: Ints) -> Sample:
     rows = np.flatnonzero(engine.roster.numbers >= 0)
     running, drawn = engine.worlds.vehicles.take(rows), sample.worlds.vehicles
     same = np.ones(len(rows), np.bool_)
-    for name in ("mass_t", "braking_capacity_mps2", "driving_capacity_mps2", "latency_s"):
+    rates = ("brake_rate_mps3", "release_rate_mps3")
+    for name in ("mass_t", "braking_capacity_mps2", "driving_capacity_mps2", "latency_s", *rates):
         same &= (getattr(running, name) == getattr(drawn, name)).all(axis=1)
     if not same.all():
         k = int(rows[np.argmin(same)])

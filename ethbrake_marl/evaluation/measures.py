@@ -527,6 +527,8 @@ _SYMBOLS = {
     "restitution": ("e", ""),
     "obstacle_gap_m": ("obstacle at", "m"),
     "friction": ("friction", ""),
+    "brake_rate_mps3": ("brake rate", "m/s³"),
+    "release_rate_mps3": ("release rate", "m/s³"),
 }
 _STAY = "\u00a0"  # a blank at which no line is broken
 

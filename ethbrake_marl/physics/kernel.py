@@ -1093,8 +1093,8 @@ def place_obstacle(table: Floats, gap: float, hit: float) -> None:
 # ===  ===========================================================
 # C    controlled vehicles
 # K    phases, in order of time; ``ends[k]`` is the step in which phase k ends, the last one reaches the horizon
-# S    columns of a saved state: speeds N, gaps P, hit flags P, first-impact harm P, total harm P; forces N where brakes
-#      of some world build up
+# S    columns of a saved state: speeds N, gaps P, hit flags P, first-impact harm P, total harm P, forces N (which mean
+#      nothing where no brakes build up)
 # ===  ===========================================================
 
 # rows of the table after those of a segment
@@ -1258,7 +1258,7 @@ def save(table: Floats, state: Floats) -> None:
         state[vehicles + pairs + p] = table[ROW.HIT, p]
         state[vehicles + 2 * pairs + p] = table[ROW.SUM_FIRST_HARM, p]
         state[vehicles + 3 * pairs + p] = table[ROW.SUM_TOTAL_HARM, p]
-    for i in range(state.shape[0] - vehicles - 4 * pairs):
+    for i in range(vehicles):
         state[vehicles + 4 * pairs + i] = table[ROW.FORCE, i]
 
 
@@ -1274,7 +1274,7 @@ def restore(table: Floats, state: Floats) -> None:
         table[ROW.HIT, p] = state[vehicles + pairs + p]
         table[ROW.SUM_FIRST_HARM, p] = state[vehicles + 2 * pairs + p]
         table[ROW.SUM_TOTAL_HARM, p] = state[vehicles + 3 * pairs + p]
-    for i in range(state.shape[0] - vehicles - 4 * pairs):
+    for i in range(vehicles):
         table[ROW.FORCE, i] = state[vehicles + 4 * pairs + i]
 
 

@@ -143,6 +143,8 @@ class QuantityRule:
         values: Floats = getattr(worlds.vehicles if of_vehicles else worlds, self.name)
         if of_vehicles and np.isfinite(worlds.friction).all():
             values = worlds.dry(self.name)
+        if self.stream == BRAKES:  # as high as a rate can be declared: at once
+            values = np.minimum(values, self.high)
         return values.reshape(worlds.n, -1)
 
 
@@ -159,8 +161,14 @@ class Quantities(NamedTuple):
     declared: dict[str, QuantityRule]  # every key that declares one
 
     def of(self, worlds: Worlds) -> dict[str, QuantityRule]:
-        """Those that these worlds have: the distance to an obstacle, and friction, only where there is such."""
-        return self.usual | {key: r for key, r in self.optional.items() if np.isfinite(r.of(worlds)).all()}
+        """Those that these worlds have: the distance to an obstacle, and friction, only where all have such.
+
+        Rates of brakes are told of all where some build up.
+        """
+        there = {key: np.isfinite(getattr(worlds, key)).all() for key in ("obstacle_gap_m", "friction")}
+        return self.usual | {
+            key: r for key, r in self.optional.items() if there.get(key, worlds.vehicles.build_up.any())
+        }
 
     def columns(self, worlds: Worlds) -> dict[str, Floats]:
         """Every one of the worlds, each [n], named as in a table of initial states: ``gap_1_m``, ``mass_2_t``."""

@@ -532,7 +532,7 @@ class Running(NamedTuple):
     """
 
     problem: ProfileProblem  # parameters, commands of the others, grid of decisions; K vehicles; n * M rows
-    states: Floats  # [n * M, S] of ``physics.kernel``: speeds, gaps, hit flags, both harms so far
+    states: Floats  # [n * M, S] of ``physics.kernel``: speeds, gaps, hit flags, both harms so far, forces
     steps: Ints  # [n] number of the decision
     ended: Bools  # [n * M]
     caps: Floats = np.zeros((0, 0))  # [n * M, N] most harm that each vehicle may bear (m2/s2); [0, 0]: any
@@ -734,8 +734,8 @@ def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
 
 def difference(predicted: Floats, seen: Floats) -> str:
     """The first number in which a world as seen [S] is not as predicted [S], in words; "nothing" where all are."""
-    vehicles = (len(predicted) + 4) // 5
-    for column in np.flatnonzero(~(seen == predicted)).tolist():
+    vehicles = (len(predicted) + 4) // 6
+    for column in np.flatnonzero(~(seen == predicted[: len(seen)])).tolist():
         if column < vehicles:
             what, unit = f"speed of vehicle {column + 1} of the line", " m/s"
         else:
@@ -870,10 +870,9 @@ def _later_plan(
         plan[going, episodes.steps[going]] = action[going]
         with renumbered(rows):
             episodes = certify(episodes, action, Backup(plan, nothing, no_constants(plan)), nothing).after
-        columns = episodes.states.shape[1]  # N + 4 (N - 1), the last ones harm under both counts
-        pairs = (columns - 1) // 5
-        last = columns if episodes.problem.clock[0, CLOCK.HARM_IS_TOTAL] == 1.0 else columns - pairs
-        so_far = episodes.states[:, last - pairs : last].sum(axis=1)
+        N = episodes.problem.mass.shape[1]
+        harm = 4 * N - 3 if episodes.problem.clock[0, CLOCK.HARM_IS_TOTAL] == 1.0 else 3 * N - 2
+        so_far = episodes.states[:, harm : harm + N - 1].sum(axis=1)
         episodes = episodes._replace(ended=episodes.ended | (so_far > most))
         if episodes.ended.all():
             return plan
@@ -882,12 +881,11 @@ def _later_plan(
         for c, vehicle in enumerate(policies):
             column = action if action.ndim == 1 else action[:, c]
             commands[:, vehicle] = action_to_command(column, seen.vehicles, vehicle)
-        time = episodes.time_s
-        seen = replace(
-            worlds_at(seen, episodes.states),
-            time_s=time,
-            command_mps2=np.where(seen.vehicles.latency_s <= time[:, np.newaxis], commands, 0.0),
-        )
+        time, vehicles = episodes.time_s, seen.vehicles
+        at_once = np.isinf(vehicles.brake_rate_mps3) & np.isinf(vehicles.release_rate_mps3)
+        acts = np.where(vehicles.latency_s <= time[:, np.newaxis], commands, 0.0)
+        in_force = np.where(at_once, acts, episodes.states[:, -seen.N :])
+        seen = replace(worlds_at(seen, episodes.states), time_s=time, command_mps2=in_force)
         with renumbered(rows):
             proposed, memories = proposed_actions(policies, memories, seen)
         action = proposed.reshape(first.shape)
@@ -1275,7 +1273,7 @@ class StepShield:
         """
         running, boxes = self.running, self.boxes
         assert running is not None
-        columns, N = seen.shape[1], (running.states.shape[1] + 4) // 5
+        columns, N = seen.shape[1], running.problem.mass.shape[1]
         if running.members == 1:
             return np.asarray((seen == running.states[:, :columns]).all(axis=1), np.bool_)
         predicted = running.states.reshape(running.n, running.members, -1)
@@ -1368,9 +1366,8 @@ def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
     running, old = shield.running, before.running
     assert running is not None and old is not None
     at, plan, width = running.rows_of(rows), shield.backup.plan[rows].copy(), before.backup.plan.shape[1]
-    harms = 2 * ((running.states.shape[1] - 1) // 5)  # columns, the last ones
-    states = running.states.copy()
-    states[at, -harms:] = old.states[at, -harms:]
+    N, states = running.problem.mass.shape[1], running.states.copy()
+    states[at, 3 * N - 2 : 5 * N - 4] = old.states[at, 3 * N - 2 : 5 * N - 4]  # harm
     shield.running = running._replace(states=states)
     column = np.arange(width) + old.steps[rows, np.newaxis]
     rest = np.take_along_axis(before.backup.plan[rows], np.minimum(column, width - 1), axis=1)
@@ -1547,7 +1544,7 @@ class BelievedShield:
         if running is None:
             return np.zeros(told.known.shape, np.bool_)
         n, N = told.known.shape
-        whole = (running.states.shape[1] + 4) // 5  # vehicles of the columns, an obstacle ahead included
+        whole = running.problem.mass.shape[1]  # vehicles of the columns, an obstacle ahead included
         gaps = running.states.reshape(n, running.members, -1)[:, :, whole : 2 * whole - 1]
         touching: Bools = np.any(gaps == 0.0, axis=1)
         pressed = np.zeros((n, whole), np.bool_)
@@ -1561,8 +1558,8 @@ class BelievedShield:
         """Write down which vehicles met in some member since the last decision."""
         running = self.shield.running
         assert running is not None
-        pairs = (running.states.shape[1] - 1) // 5
-        totals = running.states[:, -pairs:].reshape(worlds.n, running.members, pairs)
+        pairs = running.problem.mass.shape[1] - 1
+        totals = running.states[:, 4 * pairs + 1 : 5 * pairs + 1].reshape(worlds.n, running.members, pairs)
         if self._totals.shape == totals.shape:
             met: Bools = np.any(totals > self._totals, axis=1)
             for p in range(pairs):
@@ -1575,7 +1572,7 @@ class BelievedShield:
         assert self.shield.running is not None
         seen, wrong = seen_columns(Packed.of(believed)), np.zeros(believed.n, np.bool_)
         first = (seen.shape[1] + 4) // 5 - believed.N  # 1: an obstacle ahead is vehicle 0 of the columns
-        foretold = self.shield.running.states.reshape(believed.n, self.shield.running.members, -1)
+        foretold = self.shield.running.states[:, : seen.shape[1]].reshape(believed.n, self.shield.running.members, -1)
         outside: Bools = (seen < foretold.min(axis=1) - SURPRISE) | (seen > foretold.max(axis=1) + SURPRISE)
         for i in range(believed.N):
             wrong |= heard[:, i] & outside[:, first + i]

@@ -165,7 +165,7 @@ class Uncertainty:
                 continue
             if not np.isfinite(every).all():
                 raise InvalidInput(
-                    f"uncertainty: {interval}: friction is not known in every world; declare it in the scenario"
+                    f"uncertainty: {interval}: {name} is not known in every world; declare it in the scenario"
                 )
             if interval.place is not None and interval.place >= every.shape[1]:
                 raise InvalidInput(f"uncertainty: {interval}: the line has only {every.shape[1]} of these")
@@ -218,6 +218,8 @@ def parse_uncertainty(text: str) -> Uncertainty:
 
 def _values(worlds: Worlds, quantity: str) -> Floats:
     """What was told, [n, N], [n, P] or, of the road, [n, 1]; capacities as they are on a dry road."""
+    if quantity.endswith("_rate_mps3"):
+        return np.asarray(getattr(worlds.vehicles, quantity), np.float64)
     return QUANTITY.declared[quantity].of(worlds)
 
 

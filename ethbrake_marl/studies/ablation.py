@@ -62,7 +62,10 @@ Json = dict[str, Any]
 
 _LINE = ("vehicles", "time_step_s", "horizon_s")
 _WORLD = ("gaps_m", "speeds_mps")
-_VEHICLE = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "speed_limit_mps", "restitution")
+_VEHICLE = (
+    "braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "speed_limit_mps", "restitution", "brake_rate_mps3",
+    "release_rate_mps3",
+)  # fmt: skip
 _MAY_DIFFER = "roles, objective, obstacle_gap_m, v2x and, where v2x differs, latency_s"
 _BUT_CHANNEL = {"name", "title", "description", "source", "v2x"}
 
