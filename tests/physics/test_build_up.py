@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.agents import make_agent
+from ethbrake_marl.agents.registry import drive
+from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds, stopping_distances
-from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.scenario import QUANTITY, Scenario, Task, load_scenario
+from ethbrake_marl.shield.guard import put_shield
+from ethbrake_marl.shield.uncertainty import parse_uncertainty
 from tests.physics.random_worlds import Draws, line
 from tests.reference.small_steps import run
 
@@ -210,3 +217,33 @@ def test_search_and_shield__execute_what_they_foresee(slow: Scenario) -> None:
     assert (harm["constant:2+step"] <= harm["e_v2x_bm"] + 1e-9).all()  # its bound
     assert (harm["constant:2+step"] != harm["e_v2x_bm"]).any()
     assert "build up" in str(result.limits)  # nothing is proven
+
+
+def test_shield__of_a_mixture_in_which_some_worlds_build_up(slow: Scenario, tmp_path: Path) -> None:
+    keys = "\n".join(f"{key}: {flow_text(value)}" for key, value in slow.replace(name="slow").declared().items())
+    (tmp_path / "slow.yaml").write_text(keys)
+    members = "[{scenario: slow.yaml}, {scenario: paper-random}]"
+    (tmp_path / "some.yaml").write_text(f"name: some\nmixture: {members}\n")
+    some = load_scenario(tmp_path / "some.yaml")
+    told = QUANTITY.columns(some.sample(20, seed=1).worlds)
+    assert set(told["brake_rate_2_mps3"]) == {12.65, 1e6}  # told of all, the highest rate for at once
+    env = eb.shield(eb.EthBrakeVectorEnv(2, scenario=some))
+    env.reset(seed=0)
+    draws, ends = Draws(4), np.zeros(2)
+    for _ in range(120):  # one begins anew beside a running one
+        _, rewards, terminated, truncated, _ = env.step(draws.uniform(-1.0, 1.0, (2, 1)).astype(np.float32))
+        ends += terminated | truncated
+        assert np.isfinite(rewards).all()
+    assert (ends > 1).all()
+
+
+def test_robust_shield__trusts_a_longer_line_inside_its_box() -> None:
+    five = load_scenario("cooperation-2-five").replace(brake_rate_mps3=15, release_rate_mps3=25)
+    told = five.sample(20, seed=7).worlds
+    shift = Draws(2).uniform(-0.4, 0.4, (20, 4)) * [1.0, 0.0, 0.0, 0.0]
+    task = Task(five, five.learners, "first")
+    uncertain = parse_uncertainty("gaps_m.pair_1=0.5")
+    shielded = put_shield(make_agent("full_brake"), task, mode="robust", uncertainty=uncertain, told=told)
+    driven = drive(replace(told, gaps_m=told.gaps_m + shift), shielded, five)
+    assert driven.guarded.shield.distrusted.sum() == 0
+    assert driven.ledger.world_harm("first").sum() > 0.0
