@@ -972,22 +972,6 @@ def move_apart_on_cubics(table: Floats, duration: float) -> bool:
         limit, onset, way, now = table[ROW.LIMIT, i], table[ROW.ONSET, i], 0.0, 0.0
         slowest, fastest, before = speed, speed, table[ROW.FORCE, i]
         active = onset <= 0.0
-        if active and before <= 0.0 and table[ROW.COMMAND, i] <= 0.0:  # it only brakes: one ramp, then a constant
-            plan_force(table, i, table[ROW.COMMAND, i])
-            force, force_rate = table[ROW.FORCE, i], table[ROW.FORCE_RATE, i]
-            rising = min(table[ROW.FORCE_TIME, i], duration)
-            held = duration - rising
-            after = force + force_rate * rising if rising < table[ROW.FORCE_TIME, i] else table[ROW.FORCE_VALUE, i]
-            after = after if force_rate != 0.0 else force
-            between = speed + (force + 0.5 * force_rate * rising) * rising
-            end = between + after * held
-            if end > 0.0 or speed == 0.0:
-                if speed > 0.0:
-                    way = (speed + 0.5 * (force + force_rate * rising / 3.0) * rising) * rising
-                    way += (between + 0.5 * after * held) * held
-                    speed = slowest = end
-                table[ROW.FORCE, i] = after
-                now = duration
         while now < duration:
             plan_force(table, i, table[ROW.COMMAND, i] if active else 0.0)
             force, force_rate = table[ROW.FORCE, i], table[ROW.FORCE_RATE, i]
