@@ -531,7 +531,7 @@ def to_next_impact(table: Floats, restitution: float, now: float, duration: floa
 @compiled(bare=True)
 def to_next_event(table: Floats, now: float, duration: float, building: bool) -> tuple[bool, float]:
     """Move from ``now`` to the next event or to the end of the segment; False where a gap became impossible."""
-    if building:
+    if building and not built_up(table):
         passed = next_moving_event(table, now, duration, accelerate_moving(table))
         sound = move_on_cubics(table, passed)
     else:
@@ -653,6 +653,15 @@ _PARTS_LATE_MPS2 = 1e-12  # and by no smaller a difference of accelerations
 def builds_up(table: Floats) -> bool:
     """Whether the brakes of this world build up."""
     return bool(table.shape[0] > ROW.OF_EPISODE and table[ROW.BUILDS_UP, 0] == 1.0)
+
+
+@compiled(bare=True)
+def built_up(table: Floats) -> bool:
+    """Whether every force is the command in effect, so that until the next onset the motion is that of ``move``."""
+    for i in range(table.shape[1]):
+        if table[ROW.FORCE, i] != table[ROW.COMMAND, i] * table[ROW.ACTIVE, i]:
+            return False
+    return True
 
 
 @compiled
@@ -893,25 +902,31 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
     vehicles = table.shape[1]
     soonest = min(end - now, parting)
     for i in range(vehicles):
-        speed, rate, jerk = table[ROW.SPEED, i], table[ROW.ACCELERATION, i], table[ROW.JERK, i]
-        time, value = first_return(speed, rate, jerk), 0.0
-        if table[ROW.FORCE, i] > 0.0 or table[ROW.FORCE_RATE, i] > 0.0:
-            reach = first_return(speed - table[ROW.LIMIT, i], rate, jerk)
-            if reach < time:
-                time, value = reach, table[ROW.LIMIT, i]
-        table[ROW.SPEED_TIME, i] = time
-        table[ROW.SPEED_VALUE, i] = value
-        soonest = min(soonest, time, table[ROW.FORCE_TIME, i])
+        soonest = min(soonest, table[ROW.FORCE_TIME, i])
         if table[ROW.ACTIVE, i] == 0.0:
             soonest = min(soonest, table[ROW.ONSET, i] - now)
+    for i in range(vehicles):
+        speed, rate, jerk, limit = table[ROW.SPEED, i], table[ROW.ACCELERATION, i], table[ROW.JERK, i], table[ROW.LIMIT, i]
+        most = (abs(rate) + abs(jerk) * soonest) * soonest  # by so much the speed can change
+        time, value = math.inf, 0.0
+        if most >= abs(speed):
+            time = first_return(speed, rate, jerk)
+        if most >= abs(speed - limit) and (table[ROW.FORCE, i] > 0.0 or table[ROW.FORCE_RATE, i] > 0.0):
+            reach = first_return(speed - limit, rate, jerk)
+            if reach < time:
+                time, value = reach, limit
+        table[ROW.SPEED_TIME, i] = time
+        table[ROW.SPEED_VALUE, i] = value
+        soonest = min(soonest, time)
     for p in range(vehicles - 1):
         time, speed = math.inf, 0.0
         if table[ROW.JOINED, p] == 0.0:
-            time, speed = contact_within(
-                table[ROW.GAP, p], table[ROW.SPEED, p + 1] - table[ROW.SPEED, p],
-                table[ROW.ACCELERATION, p + 1] - table[ROW.ACCELERATION, p],
-                table[ROW.JERK, p + 1] - table[ROW.JERK, p], soonest,
-            )  # fmt: skip
+            gap, closing = table[ROW.GAP, p], table[ROW.SPEED, p + 1] - table[ROW.SPEED, p]
+            pressing = table[ROW.ACCELERATION, p + 1] - table[ROW.ACCELERATION, p]
+            jerk = table[ROW.JERK, p + 1] - table[ROW.JERK, p]
+            most = max(closing, 0.0) + (max(pressing, 0.0) + max(jerk, 0.0) * soonest) * soonest
+            if most * soonest >= gap:  # else it cannot close in this piece
+                time, speed = contact_within(gap, closing, pressing, jerk, soonest)
         table[ROW.CONTACT_TIME, p] = time
         table[ROW.CONTACT_SPEED, p] = speed
         soonest = min(soonest, time)
@@ -969,32 +984,16 @@ def move_apart_on_cubics(table: Floats, duration: float) -> bool:
         speed = table[ROW.SPEED, i]
         if speed < 0.0:
             return False
-        limit, onset, way, now = table[ROW.LIMIT, i], table[ROW.ONSET, i], 0.0, 0.0
-        slowest, fastest, before = speed, speed, table[ROW.FORCE, i]
-        active = onset <= 0.0
-        while now < duration:
-            plan_force(table, i, table[ROW.COMMAND, i] if active else 0.0)
-            force, force_rate = table[ROW.FORCE, i], table[ROW.FORCE_RATE, i]
-            rate, jerk = settle_moving(*force_ranges(force, force_rate, speed, limit))
-            passed = min(duration - now, table[ROW.FORCE_TIME, i])
-            if not active:
-                passed = min(passed, onset - now)
-            reach, value = first_return(speed, rate, jerk), 0.0
-            if (force > 0.0 or force_rate > 0.0) and first_return(speed - limit, rate, jerk) < reach:
-                reach, value = first_return(speed - limit, rate, jerk), limit
-            passed = min(passed, reach)
-            way += (speed + 0.5 * (rate + jerk * passed / 3.0) * passed) * passed
-            speed = value if reach <= passed else speed + (rate + 0.5 * jerk * passed) * passed
-            reached = table[ROW.FORCE_TIME, i] <= passed
-            table[ROW.FORCE, i] = table[ROW.FORCE_VALUE, i] if reached else force + force_rate * passed
-            slowest, fastest = min(slowest, speed), max(fastest, speed)
-            if not active and onset - now <= passed:
-                active = True
-            now = duration if passed >= duration - now else now + passed
+        onset, before = table[ROW.ONSET, i], table[ROW.FORCE, i]
+        table[ROW.WAY, i], table[ROW.SPEED_VALUE, i] = 0.0, speed
+        slowest, fastest = speed, speed
+        if onset > 0.0:
+            slowest, fastest = move_alone(table, i, 0.0, min(onset, duration))
+        if onset < duration:
+            low, high = move_alone(table, i, table[ROW.COMMAND, i], duration - max(onset, 0.0))
+            slowest, fastest = min(slowest, low), max(fastest, high)
         table[ROW.FORCE_VALUE, i] = table[ROW.FORCE, i]
         table[ROW.FORCE, i] = before
-        table[ROW.SPEED_VALUE, i] = speed
-        table[ROW.WAY, i] = way
         if i > 0:
             closing = fastest - slowest_in_front
             if closing > 0.0 and closing * duration >= table[ROW.GAP, i - 1]:
@@ -1006,6 +1005,55 @@ def move_apart_on_cubics(table: Floats, duration: float) -> bool:
     for p in range(vehicles - 1):
         table[ROW.GAP, p] = max(table[ROW.GAP, p] + (table[ROW.WAY, p] - table[ROW.WAY, p + 1]), 0.0)
     return True
+
+
+@compiled(bare=True)
+def move_alone(table: Floats, i: int, wanted: float, duration: float) -> tuple[float, float]:
+    """Move vehicle ``i`` under one command, from SPEED_VALUE on, and add its WAY; its lowest and its highest speed."""
+    speed = table[ROW.SPEED_VALUE, i]
+    force = force_now(table[ROW.FORCE, i], wanted, table[ROW.BRAKE_RATE, i], table[ROW.RELEASE_RATE, i])
+    rate, building = 0.0, 0.0  # at which the force moves towards the command, and for how long
+    if wanted != force:
+        rate = -table[ROW.BRAKE_RATE, i] if wanted < force else table[ROW.RELEASE_RATE, i]
+        building = duration if abs(rate * duration) < abs(wanted - force) else (wanted - force) / rate
+    built = wanted if building < duration else force + rate * duration
+    if speed == 0.0 and force <= 0.0 and built <= 0.0:
+        table[ROW.FORCE, i] = built
+        return 0.0, 0.0
+    between = speed + (force + 0.5 * rate * building) * building
+    after = between + built * (duration - building)
+    turning = speed - 0.5 * force * force / rate if force * built < 0.0 else speed  # where the force passes 0
+    slowest, fastest = min(min(speed, between), min(after, turning)), max(max(speed, between), max(after, turning))
+    if slowest <= 0.0 or fastest >= table[ROW.LIMIT, i]:
+        return move_alone_by_events(table, i, wanted, duration)
+    table[ROW.WAY, i] += (speed + 0.5 * (force + rate * building / 3.0) * building) * building
+    table[ROW.WAY, i] += (between + 0.5 * built * (duration - building)) * (duration - building)
+    table[ROW.FORCE, i], table[ROW.SPEED_VALUE, i] = built, after
+    return slowest, fastest
+
+
+@compiled(apart=True, bare=True)
+def move_alone_by_events(table: Floats, i: int, wanted: float, duration: float) -> tuple[float, float]:
+    """``move_alone`` where the vehicle may come to rest, or to its speed limit."""
+    speed, limit, now = table[ROW.SPEED_VALUE, i], table[ROW.LIMIT, i], 0.0
+    slowest, fastest = speed, speed
+    while now < duration:
+        plan_force(table, i, wanted)
+        force, rate = table[ROW.FORCE, i], table[ROW.FORCE_RATE, i]
+        acceleration, jerk = settle_moving(*force_ranges(force, rate, speed, limit))
+        passed = min(duration - now, table[ROW.FORCE_TIME, i])
+        reach, value = first_return(speed, acceleration, jerk), 0.0
+        if (force > 0.0 or rate > 0.0) and first_return(speed - limit, acceleration, jerk) < reach:
+            reach, value = first_return(speed - limit, acceleration, jerk), limit
+        passed = min(passed, reach)
+        table[ROW.WAY, i] += (speed + 0.5 * (acceleration + jerk * passed / 3.0) * passed) * passed
+        speed = value if reach <= passed else speed + (acceleration + 0.5 * jerk * passed) * passed
+        there = table[ROW.FORCE_TIME, i] <= passed
+        table[ROW.FORCE, i] = table[ROW.FORCE_VALUE, i] if there else force + rate * passed
+        slowest, fastest = min(slowest, speed), max(fastest, speed)
+        now = duration if passed >= duration - now else now + passed
+    table[ROW.SPEED_VALUE, i] = speed
+    return slowest, fastest
 
 
 @compiled(bare=True)
