@@ -205,10 +205,39 @@ def age(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
     return np.where(np.isfinite(told), told, 0.0)
 
 
-_AGE = Feature(
-    "age", "s", 1.0, 0.0, 8.0, "time since the sample that was last told of it; 0 where the present is known"
-)
-FEATURES: dict[str, RegisteredFeature] = {"age": RegisteredFeature(_AGE, age, "neighbour", 0.0, (0.0, 0.0, 0.0))}
+def build_up_time(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> Floats:
+    """Time in which the brakes of the neighbour, or the own ones, build up from 0 to full, [n] s; 0: at once."""
+    i, v = vehicle if neighbour is None else neighbour, worlds.vehicles
+    return v.braking_capacity_mps2[:, i] / v.brake_rate_mps3[:, i]
+
+
+def release_time(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> Floats:
+    """Time in which they are released again, [n] s; 0: at once."""
+    i, v = vehicle if neighbour is None else neighbour, worlds.vehicles
+    return v.braking_capacity_mps2[:, i] / v.release_rate_mps3[:, i]
+
+
+def _single(name: str, high: float, function: Callable[..., Floats], of: Of, meaning: str) -> RegisteredFeature:
+    return RegisteredFeature(Feature(name, "s", 1.0, 0.0, high, meaning), function, of, 0.0, (0.0, 0.0, 0.0))
+
+
+FEATURES: dict[str, RegisteredFeature] = {
+    "age": _single(
+        "age", 8.0, age, "neighbour", "time since the sample that was last told of it; 0 where the present is known"
+    ),
+    "build_up_time": _single(
+        "build_up_time", 4.0, build_up_time, "neighbour", "time in which its brakes build up from 0 to full; 0: at once"
+    ),
+    "release_time": _single(
+        "release_time", 4.0, release_time, "neighbour", "time in which its full brakes are released; 0: at once"
+    ),
+    "own_build_up_time": _single(
+        "own_build_up_time", 4.0, build_up_time, "own", "time in which own brakes build up from 0 to full; 0: at once"
+    ),
+    "own_release_time": _single(
+        "own_release_time", 4.0, release_time, "own", "time in which own full brakes are released; 0: at once"
+    ),
+}
 
 
 def listed_features(listed: object) -> tuple[str, ...]:

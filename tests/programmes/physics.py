@@ -19,7 +19,7 @@ import numpy as np
 
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.harm import split
-from ethbrake_marl.physics import Floats, Impacts, Worlds, advance
+from ethbrake_marl.physics import Floats, Impacts, Worlds, advance, make_worlds
 from tests.golden.test_golden import GOLDEN, figures
 from tests.physics.exact_simulator import line_of, simulate
 from tests.physics.manufacture import Case, manufactured, pressed, stored
@@ -45,6 +45,7 @@ from tests.physics.random_worlds import (
     touching_lines,
 )
 from tests.physics.segments import Scan, random_segments, scan
+from tests.physics.test_build_up import by_small_steps, played, random_lines
 from tests.physics.test_oracles import accelerations, at_once, exact_accelerations, in_steps, law_error_eps
 from tests.programmes import Cases, Told
 from tests.reference.tolerances import (
@@ -84,9 +85,36 @@ def measured(measure: Callable[[], Figure]) -> Told:
     return Told(value <= threshold, f"{value:.3g} <= {threshold:.3g}, {of}")
 
 
+OPTIONS = {"--small-step-worlds": {"type": int, "default": 10_000, "help": "of 'brakes that build up'"}}
+
+
 def cases(given: argparse.Namespace) -> Cases:
     for name, measure in GATES.items():
         yield name, partial(measured, measure)
+    each = max(1, given.small_step_worlds // 8)
+    for N, obstacle in product((2, 3, 5, 8), (False, True)):
+        told = f"brakes that build up, N = {N}{', obstacle' * obstacle}"
+        yield told, partial(measured, partial(small_steps, N, obstacle, each))
+
+
+# ---------------------------------------------------------------- brakes that build up
+
+
+def small_steps(N: int, obstacle: bool, worlds: int) -> Figure:
+    """How many worlds are not where small steps of time lead, of those in which a step twice as long leads there, too.
+
+    The others, a few, are cascades of bounces in which a step more or less changes their order.
+    """
+    given, commands = random_lines(100 + 2 * N + obstacle, worlds, N, obstacle=obstacle)
+    after, harm = played(make_worlds(**given), commands)
+    found = [np.concatenate(by_small_steps(given, commands, step_s), axis=1) for step_s in (1e-5, 2e-5)]
+    exact = np.concatenate([after.gaps_m, after.speeds_mps, after.command_mps2, harm], axis=1)
+    scale = 1.0 + np.abs(exact)
+    settled = (np.abs(found[0] - found[1]) < 2e-3 * scale).all(axis=1)
+    off = np.where(settled[:, np.newaxis], np.abs(exact - found[0]) / scale, 0.0)
+    assert settled.mean() > 0.75
+    wrong = int((off.max(axis=1) > 4e-3).sum())
+    return Figure(wrong, 0, f"{worlds:,} worlds, {int((~settled).sum())} not settled, largest error {off.max():.1e}")
 
 
 # ---------------------------------------------------------------- worlds made backwards, impacts, motion between them

@@ -1,6 +1,7 @@
 """Trying to break the step shield: no realised harm may be above the bound at the alert.
 
 bound         random worlds against every adversary of ``tests/shield/attacks.py``, both counts, N = 3 and 5, e to 0.3
+build-up      the same with brakes that build up, at rates from 5 to 60 m/s3
 joint         teams of hostile learners at cooperation levels 3 and 4, N = 3 and 5; harm must be the last bound
 interfaces    worlds through every shielded interface, alone and with a team
 interference  refused calls, exceptions and interrupts at random lines on every interface, and wrappers in between
@@ -48,11 +49,13 @@ CHUNK = 2_000  # worlds attacked at once
 BATCH = 50_000  # worlds driven at once by what was applied
 CELLS = {3: 3.0, 5: 1.0}  # how many of the worlds each number of vehicles gets: lines of five take five times as long
 SLOW = {"worst_case": 0.14}  # and of those, a search in every step
+RATES = {"brake_rate_mps3": {"uniform": [5, 40]}, "release_rate_mps3": {"uniform": [5, 60]}}
 TEAM_CELLS = {(3, 3): 5.0, (4, 3): 1.25, (3, 5): 1.0, (4, 5): 0.75}  # by what they cost
 
 
 OPTIONS = {
     "--worlds": {"type": int, "default": 1_000_000, "help": "of 'bound', all cells together, about"},
+    "--build-up-worlds": {"type": int, "default": 1_000_000, "help": "of 'build-up', all cells together, about"},
     "--joint-worlds": {"type": int, "default": 300_000, "help": "of 'joint', all cells together, about"},
     "--interface-worlds": {"type": int, "default": 2_000, "help": "through each interface"},
     "--interfered": {"type": int, "default": 1_000, "help": "episodes with failing calls on each interface"},
@@ -91,10 +94,11 @@ def cases(given: argparse.Namespace) -> Cases:
 
 def attacks(given: argparse.Namespace) -> Cases:
     """Every adversary of one learner, and of teams, each with its share of the worlds; no two cases share a world."""
-    one, teams = [], []
+    one, rates, teams = [], [], []
     for N, count, name in product(CELLS, ("first", "total"), ADVERSARIES):
-        case = {"harm_count": count, "adversary": ADVERSARIES[name]}
-        one.append((f"bound: N = {N}, {count}, {name}", CELLS[N] * SLOW.get(name, 1.0), line(N), case))
+        case, share = {"harm_count": count, "adversary": ADVERSARIES[name]}, CELLS[N] * SLOW.get(name, 1.0)
+        one.append((f"bound: N = {N}, {count}, {name}", share, line(N), case))
+        rates.append((f"build-up: N = {N}, {count}, {name}", share, line(N).replace(**RATES), case))
     every_team = product(TEAM_CELLS, ("first", "total"), ("all", "one"), TEAM_ADVERSARIES)
     for k, (which, count, hostile, name) in enumerate(every_team):
         cap = (None, "baseline")[k % 2]
@@ -102,7 +106,7 @@ def attacks(given: argparse.Namespace) -> Cases:
         told = f"joint: level {which[0]}, N = {which[1]}, {count}, {hostile} hostile, {name}, cap {cap}"
         teams.append((told, TEAM_CELLS[which], load_scenario(TEAMS[which]), case))
     first = 0
-    for all_worlds, cells in ((given.worlds, one), (given.joint_worlds, teams)):
+    for all_worlds, cells in ((given.worlds, one), (given.build_up_worlds, rates), (given.joint_worlds, teams)):
         whole = sum(share for _, share, *_ in cells)
         for told, share, scenario, case in cells:
             worlds = max(1, round(all_worlds * share / whole))
