@@ -12,11 +12,10 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.actions import action_to_command, command_to_action
-from ethbrake_marl.agents import Agent, Knowledge, Source, Team, Told, agent_entries, parse_spec, script_agents
-from ethbrake_marl.agents.registry import find_entry
-from ethbrake_marl.engine import Engine, Memory, Script, ask_script, begin_script
+from ethbrake_marl.agents import Knowledge, Source, Told, agent_entries, find_entry, parse_spec, script_agents
+from ethbrake_marl.engine import Memory, Script, ask_script, begin_script
 from ethbrake_marl.evaluation import make_lineup
-from ethbrake_marl.physics import Bools, Floats, Packed, Worlds
+from ethbrake_marl.physics import Bools, Floats, Packed
 from ethbrake_marl.physics.messages import CHANNEL, LINK, Messages, link_at, place_at, ring_at
 from ethbrake_marl.scenario.v2x import PRESETS
 from ethbrake_marl.shield import ShieldedDriver, parse_uncertainty
@@ -26,7 +25,13 @@ from tests.fixtures.policies import make_policy
 
 
 def changed_decisions(
-    agent: Agent, scenario: eb.Scenario, *, vehicle: int | None = None, n: int = 100, decisions: int = 8, seed: int = 11
+    agent: eb.Agent,
+    scenario: eb.Scenario,
+    *,
+    vehicle: int | None = None,
+    n: int = 100,
+    decisions: int = 8,
+    seed: int = 11,
 ) -> int:
     """How many decisions change when all is altered that has not reached the vehicle by then: 0 for an honest agent.
 
@@ -50,7 +55,7 @@ def changed_decisions(
     scripts = script_agents(scenario, except_for=vehicle)
     if isinstance(agent, ShieldedDriver):
         agent = Hosted(agent)
-    engine = Engine(scenario, n, learners=[vehicle], scripts=scripts, worlds=alert)
+    engine = eb.Engine(scenario, n, learners=[vehicle], scripts=scripts, worlds=alert)
     seen = (alert, alter_unreceived(alert, vehicle, rng))
     knowing, wondering = (begin_script(agent, at_alert, vehicle, scripts) for at_alert in seen)
     changed = 0
@@ -72,7 +77,7 @@ class Hosted:
     def __init__(self, driver: ShieldedDriver) -> None:
         self.driver, self.policy = driver, driver.policy
 
-    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+    def begin(self, alert: eb.Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         options, scenario = self.driver.options, self.driver.scenario
         if options.believed:
             shield = options.believed_shield(scenario, vehicle, scripts)
@@ -82,7 +87,7 @@ class Hosted:
             shield.begin(alert, np.arange(alert.n), {vehicle: self.policy})
         return np.array([shield] * alert.n), begin_script(self.policy, alert, vehicle, scripts)
 
-    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+    def act(self, worlds: eb.Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
         (shield, *_), policy = memory
         proposed, policy = proposed_action(self.policy, worlds, policy, vehicle)
         proposer = Proposer({vehicle: self.policy}, {vehicle: policy}, worlds)
@@ -95,7 +100,7 @@ class Hosted:
         return action_to_command(applied, worlds.vehicles, vehicle), (memory[0], policy)
 
 
-def alter_unreceived(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> Worlds:
+def alter_unreceived(worlds: eb.Worlds, vehicle: int, rng: np.random.Generator) -> eb.Worlds:
     """The same worlds with random numbers for all that has not reached ``vehicle`` by now, the future included."""
     vehicles, now = worlds.vehicles, worlds.time_s[:, np.newaxis]
     n, N = worlds.speeds_mps.shape
@@ -151,7 +156,7 @@ def _altered_news(now: Floats, shape: tuple[int, ...], vehicle: int, rng: np.ran
     return np.where(never, np.inf, since + rng.uniform(0.01, 2.0, shape))
 
 
-def _alter_messages(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> Floats:
+def _alter_messages(worlds: eb.Worlds, vehicle: int, rng: np.random.Generator) -> Floats:
     """The columns of messages with all altered that is unheard: chance, what is on its way, what others know."""
     columns, N = worlds.messages.copy(), worlds.N
     if not columns.shape[1]:
@@ -244,7 +249,7 @@ class Leaking:
         return np.where(seen, -1.0, -0.5) * worlds.vehicles.braking_capacity_mps2[:, vehicle]
 
 
-def agent_of(spec: str, scenario: eb.Scenario = PAPER) -> Agent:
+def agent_of(spec: str, scenario: eb.Scenario = PAPER) -> eb.Agent:
     uncertainty = parse_uncertainty("gaps_m=0.5") if parse_spec(spec).shield in ("robust", "robust:interior") else None
     return make_lineup([spec], scenario, uncertainty=uncertainty)[spec]
 
@@ -284,8 +289,8 @@ def test_knowledge__every_agent_states_it(spec, knows):
 
 
 def test_knowledge__of_an_agent_of_the_users_own_and_of_a_team():
-    team = Team({1: agent_of("ppo@shipped/ppo"), 2: agent_of("full_brake")}, "both")
-    assert Knowledge.of(team) == (SENSORS, MESSAGES) and Knowledge.of(Team({}, "scripts")).text == "–"
+    team = eb.Team({1: agent_of("ppo@shipped/ppo"), 2: agent_of("full_brake")}, "both")
+    assert Knowledge.of(team) == (SENSORS, MESSAGES) and Knowledge.of(eb.Team({}, "scripts")).text == "–"
     silent = Acts(lambda worlds, vehicle: np.zeros(worlds.n))
     assert Knowledge.of(silent).text == "not stated" and not Knowledge.of(silent).sees_through
     assert Knowledge.of(silent, also=MODEL) == (MODEL, Source.UNSTATED)

@@ -14,8 +14,7 @@ import pytest
 
 from ethbrake_marl.envs.interfaces import UnknownResetOption
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.scenario.sampling import QUANTITY
+from ethbrake_marl.scenario import QUANTITY, Scenario, load_scenario
 from tests.contract.interfaces import (
     BARE,
     BATCHED,

@@ -14,8 +14,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.envs.drawing import BODY_M, HEIGHT, WIDTH, Trace, View, follow
-from ethbrake_marl.envs.interfaces import env, parallel_env
-from ethbrake_marl.errors import InvalidInput, MissingExtra
+from ethbrake_marl.errors import InvalidInput
 from tests.contract.interfaces import CRASH, REST
 
 near = pytest.approx
@@ -88,7 +87,7 @@ def test_step_frames__show_an_impact_inside_a_step_from_its_moment_on() -> None:
 
 
 def test_scene__has_the_numbers_of_the_infos_and_the_places_of_the_physics() -> None:
-    environment = parallel_env("paper-random")
+    environment = eb.parallel_env("paper-random")
     trace, engine = Trace(environment.engine, whole=True), environment.engine
     environment.reset(seed=7)
     infos: dict[str, Any] = {}
@@ -159,7 +158,7 @@ harm 0.00 m2/s2 by first impacts, 0.00 in total
 
 
 def test_ansi__says_it_in_words() -> None:
-    obstacle = parallel_env("paper-random-obstacle", render_mode="ansi")
+    obstacle = eb.parallel_env("paper-random-obstacle", render_mode="ansi")
     obstacle.reset(seed=0)
     assert (to_its_end(crash("ansi"))[-1][1], obstacle.render()) == (CRASHED, AHEAD)
 
@@ -204,15 +203,15 @@ def test_human__shows_each_step_in_real_time_and_says_what_it_needs(monkeypatch:
     assert pygame.display.get_surface() is None
     monkeypatch.setenv("SDL_VIDEODRIVER", "nothing")
     with pytest.raises(InvalidInput, match=r"no window can be opened here .*; 'rgb_array' needs no display"):
-        parallel_env(render_mode="human").reset(seed=0)
+        eb.parallel_env(render_mode="human").reset(seed=0)
     monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(MissingExtra, match=r"^[^\n]*pip install 'ethbrake-marl\[render\]'[^\n]*$"):
-        parallel_env(render_mode="human")
+    with pytest.raises(eb.MissingExtra, match=r"^[^\n]*pip install 'ethbrake-marl\[render\]'[^\n]*$"):
+        eb.parallel_env(render_mode="human")
 
 
 def test_metadata__plays_in_real_time() -> None:
     slow = CRASH.replace(time_step_s=0.05)
-    for environment in (eb.EthBrakeEnv(slow), parallel_env(slow), env(scenario=slow)):
+    for environment in (eb.EthBrakeEnv(slow), eb.parallel_env(slow), eb.env(scenario=slow)):
         assert (environment.metadata["render_modes"], environment.metadata["render_fps"]) == (MODES, 20)
     assert eb.EthBrakeVectorEnv(2).metadata["render_modes"] == ["rgb_array", "ansi"]
 
@@ -232,8 +231,8 @@ def test_shields__are_looked_through_and_their_interventions_shown() -> None:
     scenario = eb.load_scenario("paper-random")
     single = eb.ShieldedEnv(eb.EthBrakeEnv(scenario, render_mode="ansi"))
     rows = eb.ShieldedVectorEnv(eb.EthBrakeVectorEnv(2, scenario, render_mode="ansi"))
-    parallel = eb.HybridShield(parallel_env(scenario, render_mode="ansi"))
-    hybrid = eb.HybridShield(parallel_env(scenario, render_mode="ansi"), eb.make_agent("coast"), mode="episode")
+    parallel = eb.HybridShield(eb.parallel_env(scenario, render_mode="ansi"))
+    hybrid = eb.HybridShield(eb.parallel_env(scenario, render_mode="ansi"), eb.make_agent("coast"), mode="episode")
     given = ((single, [1.0]), (rows, np.full((2, 1), 1.0)), (parallel, {"vehicle_2": [1.0]}), (hybrid, {}))
     for environment, action in given:
         environment.reset(seed=7)

@@ -20,11 +20,10 @@ from pettingzoo.utils.conversions import aec_to_parallel
 
 import ethbrake_marl as eb
 from ethbrake_marl import ethbrake_v0
-from ethbrake_marl.envs.interfaces import EthBrakeParallelEnv, action_box, env, feature_box, parallel_env, raw_env
-from ethbrake_marl.envs.registration import GYMNASIUM_ID, PETTINGZOO_ID, register_environments
-from ethbrake_marl.observations import Feature, ObservationSpec
-from ethbrake_marl.physics import make_worlds
-from ethbrake_marl.scenario import Scenario, full_state, load_scenario, state_features
+from ethbrake_marl.envs import action_box, env, feature_box, register_environments
+from ethbrake_marl.envs.registration import GYMNASIUM_ID, PETTINGZOO_ID
+from ethbrake_marl.observations import Feature
+from ethbrake_marl.scenario import full_state, state_features
 from tests.contract.interfaces import CRASH, FIVE, PAPER, REST, actions, initial_state
 
 near = pytest.approx
@@ -33,8 +32,8 @@ EPISODES, INFOS = ((ROOT / "docs" / f"{name}.md").read_text("utf-8") for name in
 COAST, BRAKE = np.zeros(1, np.float32), np.full(1, -1.0, np.float32)
 
 
-def started(*args: Any, seed: int = 0, **settings: Any) -> EthBrakeParallelEnv:
-    environment = parallel_env(*args, **settings)
+def started(*args: Any, seed: int = 0, **settings: Any) -> eb.EthBrakeParallelEnv:
+    environment = eb.parallel_env(*args, **settings)
     environment.reset(seed=seed)
     return environment
 
@@ -44,7 +43,7 @@ def started(*args: Any, seed: int = 0, **settings: Any) -> EthBrakeParallelEnv:
 
 def test_agents__are_all_vehicles_until_the_collective_end() -> None:
     environment, names = started(REST), ["vehicle_1", "vehicle_2"]
-    assert (environment.possible_agents, parallel_env(REST).agents) == (names, [])
+    assert (environment.possible_agents, eb.parallel_env(REST).agents) == (names, [])
     for k in range(10):
         assert environment.agents == names
         results = environment.step({"vehicle_2": BRAKE})
@@ -60,7 +59,7 @@ def test_agents__are_all_vehicles_until_the_collective_end() -> None:
 def test_reset__starts_at_the_first_moment_a_learner_may_act_and_else_at_the_alert() -> None:
     assert started(CRASH).engine.worlds.time_s == [0.5]
     assert started(CRASH.replace(obstacle_gap_m=30), learners=["vehicle_1"]).engine.worlds.time_s == [0.0]
-    observations, infos = parallel_env(FIVE, learners=["vehicle_5", "vehicle_4"]).reset(seed=0)
+    observations, infos = eb.parallel_env(FIVE, learners=["vehicle_5", "vehicle_4"]).reset(seed=0)
     assert {info["time_s"] for info in infos.values()} == {0.51}
     assert list(observations) == [f"vehicle_{i}" for i in range(1, 6)]
     nobody = started("paper-random", learners=[])  # also where early impacts are rejected
@@ -144,7 +143,7 @@ def test_rewards__the_papers_terms_are_named_before_their_weights() -> None:
 
 def test_rewards__do_not_tell_the_harm_before_the_first_decision() -> None:
     # 1 m apart, braking against coasting: they meet at sqrt(2/6) s with w = 6 t, harm 12, before 0.6 s.
-    environment = parallel_env(CRASH.replace(gaps_m=1, latency_s=[0, 0.6], horizon_s=3, early_impacts="keep"))
+    environment = eb.parallel_env(CRASH.replace(gaps_m=1, latency_s=[0, 0.6], horizon_s=3, early_impacts="keep"))
     _, infos = environment.reset(seed=0)
     assert infos["vehicle_2"]["world_first_impact_harm"] == near(12.0)
     told = 0.0
@@ -170,7 +169,7 @@ def test_state__is_what_a_person_would_write_down() -> None:
 
 def test_state__is_clipped_to_its_bounds() -> None:
     capacities = {"braking_capacity_mps2": 60, "driving_capacity_mps2": 60}
-    worlds = make_worlds(500.0, [90.0] * 3, **capacities, latency_s=9, mass_t=400, restitution=1, speed_limit_mps=90)
+    worlds = eb.make_worlds(500.0, [90.0] * 3, **capacities, latency_s=9, mass_t=400, restitution=1, speed_limit_mps=90)
     state = full_state(worlds, PAPER)[0]
     assert state in feature_box(state_features(PAPER)) and (state[0], state[21]) == (4.0, 10.0)
 
@@ -182,7 +181,7 @@ def test_boxes__have_the_features_bounds() -> None:
 
 
 def test_learners_only__are_the_agents_and_nothing_else_changes() -> None:
-    whole, learners = parallel_env("cooperation-3-pair"), parallel_env("cooperation-3-pair", agents="learners")
+    whole, learners = eb.parallel_env("cooperation-3-pair"), eb.parallel_env("cooperation-3-pair", agents="learners")
     assert learners.possible_agents == ["vehicle_2", "vehicle_3"]
     assert set(learners.observation_spaces) == set(learners.action_spaces) == set(learners.possible_agents)
     told, every = learners.reset(seed=4), whole.reset(seed=4)
@@ -196,7 +195,7 @@ def test_learners_only__are_the_agents_and_nothing_else_changes() -> None:
 
 
 def test_max_cycles__truncates_unless_the_episode_is_over_before() -> None:
-    environment = parallel_env(max_cycles=3)
+    environment = eb.parallel_env(max_cycles=3)
     for _ in range(2):
         environment.reset(seed=0)
         assert [environment.step({"vehicle_2": [0.0]})[3]["vehicle_2"] for _ in range(3)] == [False, False, True]
@@ -211,7 +210,7 @@ def test_supersuit__frame_skip_draws_from_the_seed_of_the_reset() -> None:
     supersuit = pytest.importorskip("supersuit")
 
     def played() -> list[float]:
-        env = supersuit.frame_skip_v0(parallel_env(scenario="cooperation-3-pair", agents="learners"), (1, 4))
+        env = supersuit.frame_skip_v0(eb.parallel_env(scenario="cooperation-3-pair", agents="learners"), (1, 4))
         env.reset(seed=5)
         times = []
         while env.agents:
@@ -225,9 +224,9 @@ def test_supersuit__frame_skip_draws_from_the_seed_of_the_reset() -> None:
 # ---------------------------------------------------------------- PettingZoo: one agent after the other
 
 
-@pytest.mark.parametrize("make", [env, raw_env])
+@pytest.mark.parametrize("make", [env, eb.raw_env])
 def test_aec__plays_the_same_episode_in_turns(make: Any) -> None:
-    together, in_turn = parallel_env(FIVE), make(scenario=FIVE)
+    together, in_turn = eb.parallel_env(FIVE), make(scenario=FIVE)
     together.reset(seed=3), in_turn.reset(seed=3)
     for action in actions(3, 200, 1):
         for agent in together.agents:
@@ -239,7 +238,7 @@ def test_aec__plays_the_same_episode_in_turns(make: Any) -> None:
         assert np.array_equal(in_turn.state(), together.state())
         if not together.agents:
             break
-    assert isinstance(aec_to_parallel(in_turn), EthBrakeParallelEnv)
+    assert isinstance(aec_to_parallel(in_turn), eb.EthBrakeParallelEnv)
 
 
 # ---------------------------------------------------------------- Gymnasium: one world
@@ -260,8 +259,8 @@ def test_seed__of_an_unseeded_environment_can_be_read_and_that_of_the_users_stre
     "settings",
     [
         {"scenario": REST, "reward": "paper"},
-        {"scenario": json.loads(json.dumps(load_scenario("paper-random").declared()))},
-        {"observation": ObservationSpec(2, 0)},
+        {"scenario": json.loads(json.dumps(eb.load_scenario("paper-random").declared()))},
+        {"observation": eb.ObservationSpec(2, 0)},
         {"observation": eb.choose_observation(["own", "front_1.gap"])},
         {"scenario": FIVE, "reward": eb.RewardParams(harm=0.5, terminal=2.0), "learners": ["vehicle_3"]},
     ],
@@ -342,7 +341,7 @@ def test_step__is_that_of_gymnasiums_own_vector_environment(mode: str, n: int) -
 def test_describe_worlds__tells_given_ones_until_others_take_their_places() -> None:
     start = {"gaps_m": [7, 8], "speeds_mps": [20, 18, 20], "mass_t": [1, 2, 3], "braking_capacity_mps2": 6}
     start |= {"driving_capacity_mps2": 1, "latency_s": [0, 0.5, 0.8], "speed_limit_mps": 40}
-    mixed = load_scenario("realistic-mixed")
+    mixed = eb.load_scenario("realistic-mixed")
     environment = eb.EthBrakeVectorEnv(num_envs=2, scenario=mixed)
     environment.reset(seed=3, options={"initial_state": start})
     told = environment.describe_worlds()
@@ -400,11 +399,11 @@ def test_registration__by_id_twice_and_with_the_projects_name() -> None:
     named, usual = gymnasium.make("ethbrake/EthBrake-v0"), gymnasium.make("EthBrake-v0")
     assert type(named.unwrapped) is type(usual.unwrapped) is eb.EthBrakeEnv
     assert gymnasium.make_vec("ethbrake/EthBrake-v0", num_envs=2).reset(seed=1)[0].shape[0] == 2
-    assert isinstance(pettingzoo.make("parallel", "ethbrake/ethbrake-v0", learners=[2]), EthBrakeParallelEnv)
+    assert isinstance(pettingzoo.make("parallel", "ethbrake/ethbrake-v0", learners=[2]), eb.EthBrakeParallelEnv)
     in_turn = pettingzoo.make("aec", "ethbrake/ethbrake-v0")
-    assert isinstance(in_turn, pettingzoo.AECEnv) and isinstance(in_turn.unwrapped, EthBrakeParallelEnv)
-    assert (str(env()), parallel_env.metadata["name"]) == ("ethbrake_v0", "ethbrake_v0")
-    assert parallel_env.metadata["is_parallelizable"] is True
+    assert isinstance(in_turn, pettingzoo.AECEnv) and isinstance(in_turn.unwrapped, eb.EthBrakeParallelEnv)
+    assert (str(env()), eb.parallel_env.metadata["name"]) == ("ethbrake_v0", "ethbrake_v0")
+    assert eb.parallel_env.metadata["is_parallelizable"] is True
     assert ethbrake_v0.parallel_env is eb.parallel_env and {"env", "raw_env"} <= set(dir(ethbrake_v0))
 
 
@@ -433,7 +432,7 @@ def test_pages__their_examples_run() -> None:
 
 
 @pytest.mark.parametrize("scenario", [PAPER, FIVE], ids=lambda scenario: scenario.name)
-def test_state__has_its_features_and_owns_its_memory(scenario: Scenario) -> None:
+def test_state__has_its_features_and_owns_its_memory(scenario: eb.Scenario) -> None:
     worlds, N = scenario.sample(3, 0).worlds, scenario.vehicles
     names = [feature.name for feature in state_features(scenario)]
     assert len(set(names)) == len(names) == 7 * N + 2 * (N - 1) + 1

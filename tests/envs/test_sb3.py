@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from stable_baselines3.common.monitor import Monitor
 
-from ethbrake_marl.envs.interfaces import EthBrakeEnv, parallel_env
-from ethbrake_marl.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
+from ethbrake_marl.envs import EthBrakeEnv, EthBrakeVecEnv, make_sb3_vec_env, parallel_env
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import full_state
 from tests.contract.interfaces import CRASH, FIVE, PAPER, actions, initial_state, line

@@ -11,14 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents import make_agent, optimise_coupled
-from ethbrake_marl.agents.planner import BestHarm
-from ethbrake_marl.agents.registry import drive
+from ethbrake_marl.agents import BestHarm, drive, make_agent, optimise_coupled
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
-from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.evaluation.measures import TESTS
+from ethbrake_marl.evaluation import TESTS, make_lineup
 from ethbrake_marl.limits.limits import (
     LEFT_OUT,
     TABLES,

@@ -9,13 +9,12 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate, measures, rollout, summarise, write_per_world
 from ethbrake_marl.figures import harm_in_parts
-from ethbrake_marl.limits import limits, lower_bound
-from ethbrake_marl.limits.limits import Unproven, known_limits, prove
+from ethbrake_marl.limits import Unproven, known_limits, limits, lower_bound, prove
 from ethbrake_marl.limits.lower_bound import team_bound
 from ethbrake_marl.pages.report import avoidable_section, worst_section
 from ethbrake_marl.scenario import Scenario, Task, load_scenario

@@ -22,14 +22,12 @@ from urllib.parse import SplitResult, urlsplit
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
+from ethbrake_marl.agents import optimise_coupled
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.errors import AlreadyExists
-from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.inputs import make_agents, make_lineup
-from ethbrake_marl.evaluation.measures import Conditions
-from ethbrake_marl.limits.limits import prove
+from ethbrake_marl.evaluation import Conditions, evaluate, make_agents, make_lineup
+from ethbrake_marl.limits import prove
 from ethbrake_marl.pages.explorer import (
     MOST_BODY,
     Explored,

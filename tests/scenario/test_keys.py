@@ -13,11 +13,10 @@ from scipy.stats import lognorm
 
 from ethbrake_marl.agents import Team, drive, make_agent
 from ethbrake_marl.evaluation import states_of
-from ethbrake_marl.limits.limits import prove
+from ethbrake_marl.limits import prove
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import QUANTITY, Scenario, Task, load_scenario
-from ethbrake_marl.shield import ShieldedDriver
-from ethbrake_marl.shield.uncertainty import parse_uncertainty
+from ethbrake_marl.shield import ShieldedDriver, parse_uncertainty
 
 PAPER = load_scenario("paper-random")
 FIXED = PAPER.replace(gaps_m=40, speeds_mps=20, latency_s=0, early_impacts="keep", horizon_s=30)

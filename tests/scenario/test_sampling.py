@@ -13,10 +13,9 @@ from hypothesis import given, strategies as st
 from scipy import stats
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.inputs import worlds_sha256
-from ethbrake_marl.learning.training import Training
-from ethbrake_marl.physics import Vehicles, Worlds
-from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.evaluation import worlds_sha256
+from ethbrake_marl.learning import Training
+from ethbrake_marl.physics import Vehicles
 from ethbrake_marl.scenario.sampling import (
     BLOCK,
     QUANTITY,
@@ -31,7 +30,7 @@ from ethbrake_marl.scenario.sampling import (
 from ethbrake_marl.scenario.v2x import PRESETS
 
 near = pytest.approx
-PAPER = load_scenario("paper-random")
+PAPER = eb.load_scenario("paper-random")
 ALMOST_ONE = 1.0 - 2.0**-53
 
 # ---------------------------------------------------------------- distributions
@@ -86,7 +85,7 @@ def test_normal__has_the_quantiles_of_the_truncated_normal(shape: tuple[float, f
 
 # ---------------------------------------------------------------- worlds and their numbers
 
-ALL_RANDOM = Scenario(
+ALL_RANDOM = eb.Scenario(
     name="all-random",
     gaps_m={"uniform": [5, 10]},
     speeds_mps={"normal": {"mean": 20, "sd": 1, "low": 18, "high": 22}},
@@ -98,26 +97,26 @@ ALL_RANDOM = Scenario(
     restitution={"uniform": [0, 0.3]},
     obstacle_gap_m={"uniform": [10, 45]},
 )
-MIXED, DELAYS = load_scenario("realistic-mixed"), load_scenario("mixture-delays")
+MIXED, DELAYS = eb.load_scenario("realistic-mixed"), eb.load_scenario("mixture-delays")
 
 
-def closing_pair(gap_m: object, **changes: Any) -> Scenario:
+def closing_pair(gap_m: object, **changes: Any) -> eb.Scenario:
     """Two vehicles at 20 m/s; the front one brakes at 6 m/s2, the rear one may act at 1 s: 3 m closer by then."""
     usual = {"gaps_m": gap_m, "braking_capacity_mps2": 6, "latency_s": [0, 1], "early_impacts": "reject"}
     return build(**{"name": "closing-pair", "vehicles": 2, "speeds_mps": 20, **usual, **changes})
 
 
-def build(**given: Any) -> Scenario:
+def build(**given: Any) -> eb.Scenario:
     rest = {"braking_capacity_mps2": [6, 7, 6], "driving_capacity_mps2": 6, "mass_t": 5, "latency_s": [0, 0.5, 0.8]}
-    return Scenario(**{"name": "given", **rest, **given})
+    return eb.Scenario(**{"name": "given", **rest, **given})
 
 
-def quantity(worlds: Worlds, field: str) -> np.ndarray:
+def quantity(worlds: eb.Worlds, field: str) -> np.ndarray:
     return getattr(worlds, field) if hasattr(worlds, field) else getattr(worlds.vehicles, field)
 
 
-def bits(worlds: Worlds) -> dict[str, bytes]:
-    return {field.name: quantity(worlds, field.name).tobytes() for field in [*fields(Worlds)[1:], *fields(Vehicles)]}
+def bits(worlds: eb.Worlds) -> dict[str, bytes]:
+    return {field.name: quantity(worlds, field.name).tobytes() for field in [*fields(eb.Worlds)[1:], *fields(Vehicles)]}
 
 
 def test_uniform_numbers__are_those_of_numpys_own_generator() -> None:
@@ -135,7 +134,7 @@ NEWS = [PAPER.replace(name=preset, v2x=preset, early_impacts="keep") for preset 
     [ALL_RANDOM, closing_pair({"uniform": [1, 5]}), MIXED, DELAYS, *NEWS],
     ids=lambda scenario: scenario.name,
 )
-def test_world_k__is_the_same_alone_and_in_any_list(scenario: Scenario) -> None:
+def test_world_k__is_the_same_alone_and_in_any_list(scenario: eb.Scenario) -> None:
     whole = scenario.sample(40, 11)
     assert whole.index.tolist() == list(range(40))
     for first, n in (*((k, 1) for k in range(40)), (20, 15)):
@@ -236,13 +235,13 @@ def test_replace__the_new_way_takes_the_place_of_the_old_one() -> None:
     assert scenario.replace(speeds_mps=20).declared().keys() & {"line_speed_mps", "speed_deviations_mps"} == set()
     assert scenario.replace(line_speed_mps=20).bounds("speeds_mps") == ((18.0, 22.0),) * 3
     assert scenario.replace(gaps_m=7, speeds_mps=20).replace(**LINE).bounds("speeds_mps") == ((10.0, 38.0),) * 3
-    assert Scenario(**scenario.declared()) == scenario
+    assert eb.Scenario(**scenario.declared()) == scenario
     margin = build(gaps_m=7, speeds_mps=20, obstacle_margin_m=1.5)
     assert margin.replace(obstacle_gap_m=42).obstacle_margin_m is None
     assert margin.replace(obstacle_gap_m=42).replace(obstacle_margin_m=1).obstacle_gap_m is None
 
 
-def ahead(**given: Any) -> Scenario:
+def ahead(**given: Any) -> eb.Scenario:
     """An obstacle ahead of Vehicle 1, which may brake with 5 m/s2 after 0.5 s: from 20 m/s it stops after 50 m."""
     usual = {"gaps_m": 7, "speeds_mps": [20, 18, 20], "braking_capacity_mps2": [5, 7, 6], "latency_s": [0.5, 0.5, 0.8]}
     return build(**{**usual, **given})
@@ -271,7 +270,7 @@ HEADER = "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps"
 FULL = {key: 6 for key in QUANTITY.usual} | {"gaps_m": 7, "latency_s": 0, "restitution": 0, "obstacle_gap_m": 30}
 
 
-def read(folder: Path, text: str, scenario: Scenario = PAPER) -> Worlds:
+def read(folder: Path, text: str, scenario: eb.Scenario = PAPER) -> eb.Worlds:
     (folder / "worlds.csv").write_text(text, encoding="utf-8")
     return scenario.read_worlds(folder / "worlds.csv")
 
@@ -318,7 +317,7 @@ def test_table__equals_the_same_worlds_sampled() -> None:
     [
         (PAPER, {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}, {"gaps_m": [7, 7], "restitution": 0.1}),
         (PAPER, {"gaps_m": 7, "speeds_mps": np.full(3, 20), "restitution": 0.0}, {"restitution": 0, "gaps_m": [7, 7]}),
-        (load_scenario("paper-scenario-1"), {}, {"gaps_m": [10, 8], "speeds_mps": [20, 18, 20]}),
+        (eb.load_scenario("paper-scenario-1"), {}, {"gaps_m": [10, 8], "speeds_mps": [20, 18, 20]}),
         (build(time_gaps_s=[0.5, 1], line_speed_mps=20), {"speeds_mps": [30, 20, 10]}, {"gaps_m": [10, 10]}),
         (build(time_gaps_s=[0.5, 1], line_speed_mps=20), {"speeds_mps": 20, "gaps_m": [7, 8]}, {"gaps_m": [7, 8]}),
         (build(time_gaps_s=[0.5, 1], speeds_mps=[0, 1, 2]), {}, {"gaps_m": [0.5, 2]}),
@@ -336,7 +335,7 @@ def test_table__equals_the_same_worlds_sampled() -> None:
     ],
 )
 def test_initial_state__the_scenario_fills_in_fixed_fields(
-    scenario: Scenario, state: dict[str, Any], told: dict[str, Any]
+    scenario: eb.Scenario, state: dict[str, Any], told: dict[str, Any]
 ) -> None:
     worlds = scenario.worlds_from_state(state)
     usual = {} if "braking_capacity_mps2" in told else {"braking_capacity_mps2": [6, 7, 6]}
@@ -354,9 +353,9 @@ KINDS = {
 N = 20_000
 
 
-def typed(**given: Any) -> Scenario:
+def typed(**given: Any) -> eb.Scenario:
     rest = {"gaps_m": 30, "speeds_mps": 20, "driving_capacity_mps2": 3, "latency_s": 0.2}
-    return Scenario(**{"name": "typed", **rest, "vehicle_types": KINDS, **given})
+    return eb.Scenario(**{"name": "typed", **rest, "vehicle_types": KINDS, **given})
 
 
 def test_types__of_each_place() -> None:
@@ -411,8 +410,8 @@ def test_types__of_refused_worlds_are_drawn_again() -> None:
 MEMBERS = ("paper-delay-low", "paper-delay-middle", "paper-delay-high")
 
 
-def mixed(*members: str, **beside: object) -> Scenario:
-    return load_scenario({"name": "mixed", "mixture": [{"scenario": name} for name in members], **beside})
+def mixed(*members: str, **beside: object) -> eb.Scenario:
+    return eb.load_scenario({"name": "mixed", "mixture": [{"scenario": name} for name in members], **beside})
 
 
 @pytest.mark.parametrize("channel", ["list", "training"])
@@ -426,11 +425,11 @@ def mixed(*members: str, **beside: object) -> Scenario:
     ],
     ids=range(4),
 )
-def test_mixture__world_k_is_that_of_its_member(mixture: Scenario, channel: Any) -> None:
+def test_mixture__world_k_is_that_of_its_member(mixture: eb.Scenario, channel: Any) -> None:
     sample = mixture.sample(300, 7, channel=channel)
     assert set(sample.scenarios) == {member.name for member in mixture.members}
     for member in mixture.members:
-        own = load_scenario(member.name).sample(300, 7, channel=channel)
+        own = eb.load_scenario(member.name).sample(300, 7, channel=channel)
         rows = np.flatnonzero(sample.scenarios == member.name)
         told = sample.worlds.take(rows), own.worlds.take(rows)
         assert worlds_sha256(told[0], rows) == worlds_sha256(told[1], rows)
@@ -461,12 +460,12 @@ def test_mixture__what_stands_beside_holds_for_every_member() -> None:
 def test_mixture__its_file_may_name_a_file_beside_it_and_its_members_may_be_written_out(tmp_path: Path) -> None:
     (tmp_path / "own.yaml").write_text(json.dumps(PAPER.replace(name="own", title="").declared()))
     (tmp_path / "mine.yaml").write_text("name: mine\nmixture: [{scenario: own.yaml}, {scenario: paper-random-early}]\n")
-    assert [each.name for each in load_scenario(tmp_path / "mine.yaml").members] == ["own", "paper-random-early"]
+    assert [each.name for each in eb.load_scenario(tmp_path / "mine.yaml").members] == ["own", "paper-random-early"]
     line = "gaps_m: 7, speeds_mps: 20, braking_capacity_mps2: 9, driving_capacity_mps2: 5, latency_s: 0.5, mass_t: 1"
     text = f"name: mine\nvehicles: 5\nmixture:\n  - scenario: {{name: a, {line}}}\n  - scenario: {{name: b, {line}}}\n"
     (tmp_path / "mine.yaml").write_text(text)
-    assert [member.vehicles for member in load_scenario(tmp_path / "mine.yaml").members] == [5, 5]
-    assert Scenario(name="x", mixture=[{"scenario": PAPER}]).vehicles == 3
+    assert [member.vehicles for member in eb.load_scenario(tmp_path / "mine.yaml").members] == [5, 5]
+    assert eb.Scenario(name="x", mixture=[{"scenario": PAPER}]).vehicles == 3
 
 
 def test_results__tell_scenario_and_types_agree_with_the_members_and_can_be_grouped() -> None:
@@ -476,7 +475,7 @@ def test_results__tell_scenario_and_types_agree_with_the_members_and_can_be_grou
     assert found.to_frame("columns")["scenario"].tolist() == sample.scenarios.tolist() * 2
     groups = eb.summarise_by(found, "scenario")
     for name in MEMBERS:
-        member, rows = load_scenario(name), np.flatnonzero(sample.scenarios == name)
+        member, rows = eb.load_scenario(name), np.flatnonzero(sample.scenarios == name)
         own = eb.evaluate(member.sample(120, 7).take(rows), agents, scenario=member, seed=7)
         assert (own.outcome("e_v2x_bm").total_harm == found.outcome("e_v2x_bm").total_harm[rows]).all()
         assert [row.total_harm for row in groups[name]] == [row.total_harm for row in eb.summarise(own)]

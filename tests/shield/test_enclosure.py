@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import drive, fixed_commands, make_agent, script_agents
+from ethbrake_marl.agents import drive, fixed_commands, script_agents
 from ethbrake_marl.search import profile_problem
-from ethbrake_marl.shield import ShieldedDriver, StepShield, enclosure, parse_uncertainty
+from ethbrake_marl.shield import ShieldedDriver, StepShield, Uncertainty, enclosure, parse_uncertainty
 from ethbrake_marl.shield.enclosure import (
     CLOSING,
     HARDEST,
@@ -36,7 +36,6 @@ from ethbrake_marl.shield.enclosure import (
     wait,
 )
 from ethbrake_marl.shield.step_shield import begin_running, plan_harm
-from ethbrake_marl.shield.uncertainty import Uncertainty
 from tests.shield.test_uncertainty import STANDING
 
 STEPS = 81
@@ -226,7 +225,9 @@ def test_engine__with_an_uncertain_own_latency_no_world_of_the_box_is_distrusted
     scenario = PAPER.replace(gaps_m=[60, 25], speeds_mps=[20, 20, 21], latency_s=[0, 0.3, 0.8])
     told = scenario.sample(1, 3).worlds.take(np.zeros(4, np.int64))
     uncertainty = parse_uncertainty("latency_s.vehicle_2=0.15")
-    driver = ShieldedDriver(make_agent("constant:3"), scenario, uncertainty=uncertainty, robust="interior", told=told)
+    driver = ShieldedDriver(
+        eb.make_agent("constant:3"), scenario, uncertainty=uncertainty, robust="interior", told=told
+    )
     episodes = drive(uncertainty.draw(told, np.random.default_rng(1)), driver, scenario, 1)
     shield = episodes.guarded.shield
     assert not shield.distrusted.any()

@@ -5,13 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.registry import drive, make_agent
+from ethbrake_marl.agents import drive, make_agent
 from ethbrake_marl.figures import operating_figure, robustness_figure
-from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.scenario.schema import Task
-from ethbrake_marl.shield import ShieldedDriver
-from ethbrake_marl.shield.evidence import MODES, TRUTHS, operating_curves, review, robustness
-from ethbrake_marl.shield.uncertainty import parse_uncertainty
+from ethbrake_marl.scenario import Task, load_scenario
+from ethbrake_marl.shield import ShieldedDriver, operating_curves, parse_uncertainty, review, robustness
+from ethbrake_marl.shield.evidence import MODES, TRUTHS
 from tests.failing_worlds import plant, without
 from tests.shield.test_step_shield import wavering
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.registry import Team, drive, make_agent
-from ethbrake_marl.envs.interfaces import parallel_env
+from ethbrake_marl.agents import Team, drive, make_agent
+from ethbrake_marl.envs import parallel_env
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from ethbrake_marl.search import profile_problem
-from ethbrake_marl.shield import HybridShield, ShieldedDriver, StepShield, guard as behind_module
-from ethbrake_marl.shield.guard import Shielded
+from ethbrake_marl.shield import HybridShield, Shielded, ShieldedDriver, StepShield, guard as behind_module
 from ethbrake_marl.shield.step_shield import (
     REASONS,
     Backup,

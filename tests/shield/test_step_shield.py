@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.planner import Refined
-from ethbrake_marl.agents.registry import drive, make_agent
+from ethbrake_marl.agents import Refined, drive
 from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver, StepShield, parse_uncertainty
 from ethbrake_marl.shield.step_shield import REASONS, Backup, Proposer, begin_running, certify, plan_harm
@@ -257,7 +256,7 @@ def test_horizon__settles_says_what_the_plan_comes_to_in_the_engine():
     scenario = PAPER.replace(horizon_s=4.2)
     shield = StepShield(scenario, 1)
     shield.begin(worlds, np.arange(60))
-    episodes = drive(worlds, ShieldedDriver(make_agent("e_v2x_bm"), scenario), scenario, 1)
+    episodes = drive(worlds, ShieldedDriver(eb.make_agent("e_v2x_bm"), scenario), scenario, 1)
     rests = (episodes.final.speeds_mps == 0.0).all(axis=1)
     assert rests.tolist() == shield.settles.tolist() and 0 < rests.sum() < 60
 
@@ -282,7 +281,7 @@ def test_agent__is_never_worse_than_the_episode_mode_nor_than_its_prediction(har
 
 
 def test_agent__a_policy_that_keeps_the_bound_is_left_alone():
-    shield = drive(WORLDS, ShieldedDriver(make_agent("e_v2x_bm"), PAPER), PAPER, 1).guarded.shield
+    shield = drive(WORLDS, ShieldedDriver(eb.make_agent("e_v2x_bm"), PAPER), PAPER, 1).guarded.shield
     fine = shield.alone_harm <= shield.first_bound
     assert fine.mean() > 0.9 and shield.chosen_policy[fine].all()
 
@@ -354,7 +353,7 @@ def test_rollout__certifies_by_hand_what_plan_and_constants_do_not(proposed, pol
     scenario, worlds = two()
     shield = begun(scenario, worlds)
     shield.backup = Backup(np.full_like(shield.backup.plan, -0.7), np.zeros(1), np.zeros(0))
-    proposer = None if policy is None else Proposer({1: make_agent(policy)}, {1: None}, worlds)
+    proposer = None if policy is None else Proposer({1: eb.make_agent(policy)}, {1: None}, worlds)
     decision = shield.decide(np.full(1, proposed), proposer=proposer)
     assert (reason(decision), decision.applied[0], decision.bound[0]) == (why, plan[0], 0.0)
     assert shield.backup.plan[0, :2].tolist() == plan and decision.margin[0] == pytest.approx(margin)
