@@ -1,7 +1,5 @@
 """Believed worlds by hand, and the agents that drive by them: nothing of what was not received, all of what was."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

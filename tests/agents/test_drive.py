@@ -1,7 +1,5 @@
 """Whole episodes: who drives what, what each is told and sees, and that nobody writes into what belongs to all."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

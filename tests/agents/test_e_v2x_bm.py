@@ -1,7 +1,5 @@
 """E-V2X-BM: its closed form by hand and against the physics, and the coupled search that is no worse than a grid."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Iterator

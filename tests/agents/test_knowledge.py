@@ -1,7 +1,5 @@
 """What agents say they know, and whether that is all they use."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Agents that search: never worse than what they began with, as they predicted, and each world by itself."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

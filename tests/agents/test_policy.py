@@ -1,7 +1,5 @@
 """Policies of bundles and of other libraries drive as agents: alone, refined and behind every shield."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

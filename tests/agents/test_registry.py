@@ -1,7 +1,5 @@
 """Agents by name: one registry, one grammar, what each asks for, and what can be put around whom."""
 
-from __future__ import annotations
-
 import pickle
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The explorer in a real browser: sliders, the engine's numbers, a profile drawn, files that read back, keys, sizes."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from collections.abc import Callable, Iterator

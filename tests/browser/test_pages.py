@@ -1,7 +1,5 @@
 """Pages in a real browser: no sideways scroll, light and dark, print, no script, and a player that shows the ledger."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """All interfaces behind one small class, so that one suite judges them all, and small scenarios for it."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The libraries' own checkers, with every warning an error. A badge: ``test_contract`` is the real suite."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Iterator
 from functools import partial

@@ -1,7 +1,5 @@
 """What every interface promises, bare and behind the shield, stricter than the libraries' own checkers."""
 
-from __future__ import annotations
-
 import copy
 import json
 import multiprocessing

@@ -1,7 +1,5 @@
 """Branches: the same moment played on in several ways, against the engine itself and against a slow replay."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The engine: episodes that start at the alert, scripts on their own grid, failures that change nothing, snapshots."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the environments draw: pictures, words and windows of the running worlds."""
 
-from __future__ import annotations
-
 import sys
 from importlib import import_module
 from importlib.util import find_spec

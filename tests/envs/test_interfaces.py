@@ -1,7 +1,5 @@
 """What is special to one interface of PettingZoo or Gymnasium; what all promise stands in ``tests/contract``."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """What is special to Stable-Baselines3's interface; what all promise stands in ``tests/contract``."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

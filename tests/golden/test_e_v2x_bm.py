@@ -1,7 +1,5 @@
 """Golden values of the E-V2X-BM closed form: five settings with a1 = a3 = 6 and a2 <= 7 m/s2."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

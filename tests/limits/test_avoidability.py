@@ -1,7 +1,5 @@
 """Avoidability: margins by hand, witnesses and counter-examples in the exact physics, and a linear programme."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

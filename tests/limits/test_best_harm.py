@@ -1,7 +1,5 @@
 """Best known harm: the search, profiles to start from, tables and their files, the agent and the command."""
 
-from __future__ import annotations
-
 import json
 import random
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The limits of a list: found once for everything that tells of an evaluation, and what a task may ask."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 from unittest.mock import Mock

@@ -1,7 +1,5 @@
 """The proven lower bound: by hand, what its proof rests on, and no profile below it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The lower bound of several controlled vehicles: by hand, against the bound of one, and against joint profiles."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Lines for the limits: one by hand, random ones far beyond the paper's ranges, and many unlike regions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

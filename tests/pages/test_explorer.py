@@ -1,7 +1,5 @@
 """The explorer: it answers what an evaluation gives, saves what reads back, and tells strangers nothing."""
 
-from __future__ import annotations
-
 import asyncio
 import http.client
 import json

@@ -3,8 +3,6 @@
 The worlds are the same doubles on any machine and with any version of numpy.
 """
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from itertools import pairwise
 from typing import Any, NamedTuple

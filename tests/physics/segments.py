@@ -6,8 +6,6 @@ Where that is too close to call in doubles (a graze, a contact at the very end, 
 world is *in doubt* and goes to the exact simulator.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise

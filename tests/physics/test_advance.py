@@ -1,7 +1,5 @@
 """The exact advance: numbers by hand, where doubles end, threads, and forecasts by the same physics."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import math

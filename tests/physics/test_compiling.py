@@ -1,7 +1,5 @@
 """How kernels are compiled, the elementary functions that they share, and work in parts on threads."""
 
-from __future__ import annotations
-
 import ast
 import math
 import re

@@ -1,7 +1,5 @@
 """What always holds, and what must not matter, with the tolerances of ``tests/reference/tolerances.py``."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from fractions import Fraction
 

@@ -1,7 +1,5 @@
 """The kernel: the closed forms of its events by hand, and one step of an episode for engine, search and shield."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """The exact advance against other programs: rational arithmetic, and closed forms."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 from fractions import Fraction

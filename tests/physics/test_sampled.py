@@ -1,7 +1,5 @@
 """The paper's fixed-step map: steps computed by hand, the equations written out once more, its edges and its limit."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Building, selecting, joining and packing worlds: nothing is lost, nothing is shared."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Keys as engineers think of them, outcomes by hand; refusals: ``refusals/keys.txt``."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Worlds that are drawn, derived or given; refusals: ``refusals/worlds.txt``, the worlds themselves: ``golden``."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import fields, replace
 from pathlib import Path

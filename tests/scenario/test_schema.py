@@ -3,8 +3,6 @@
 The names of the shipped ones stand in ``cli/printed/scenarios.txt``, their worlds in ``golden``.
 """
 
-from __future__ import annotations
-
 import copy
 import json
 import pickle

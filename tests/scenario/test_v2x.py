@@ -1,7 +1,5 @@
 """Who hears of whom, and when: distributions against their formulas, the news by hand, and nothing that leaks."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -5,14 +5,12 @@ lines; ``wrapped(interface, wrapper, calls, seed)`` steps with a wrapper between
 by a watcher of its own from the engine's ledger, of every episode that ended, and compared with the bound at the alert.
 """
 
-from __future__ import annotations
-
 import contextlib
 import sys
 import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import gymnasium
 import numpy as np
@@ -328,7 +326,7 @@ class Tally(NamedTuple):
     broken: int  # times that bound, plan, trust or place in the episode were not as they should be after that
 
     @classmethod
-    def of(cls, play: Play, refused: int = 0, interrupted: int = 0, broken: int = 0) -> Tally:
+    def of(cls, play: Play, refused: int = 0, interrupted: int = 0, broken: int = 0) -> Self:
         ended = play.ended()
         return cls(len(ended), sum(harm > bound + 1e-9 for harm, bound in ended), refused, interrupted, broken)
 

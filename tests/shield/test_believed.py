@@ -1,7 +1,5 @@
 """Shields over believed worlds: the bound where the world is a corner of what is open, and what they are without it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

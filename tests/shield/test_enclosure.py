@@ -1,7 +1,5 @@
 """Interior mode: the bound holds for every world of the box, by hand and against worlds drawn from it."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

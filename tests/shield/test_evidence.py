@@ -1,7 +1,5 @@
 """The evidence on shields: operating curves, the price of not knowing, and what interventions were good for."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

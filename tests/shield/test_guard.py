@@ -1,7 +1,5 @@
 """The guard in the engine: what it does is what was certified, to the last step, and what fails changes nothing."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import pickle

@@ -1,7 +1,5 @@
 """The joint shield: several shielded vehicles of one line, decided together."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The step shield: one decision by hand, and in the engine, where bounds hold and nothing fails silently."""
 
-from __future__ import annotations
-
 import copy
 
 import numpy as np

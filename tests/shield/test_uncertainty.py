@@ -1,7 +1,5 @@
 """Intervals, the members that stand for them, and robust mode, whose bound holds in every member."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

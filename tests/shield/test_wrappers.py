@@ -1,7 +1,5 @@
 """The shield on every interface: what it tells, takes off the reward, lets go of, and that nothing interferes."""
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 import pytest
