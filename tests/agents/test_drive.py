@@ -93,8 +93,7 @@ def swinging():
     """Lines whose first and last vehicle follow a script that decides within the steps of Vehicle 2."""
     register_agent("swinging", lambda argument, settings: swings)
     roles = {"vehicle_1": "swinging", "vehicle_2": "learner", "vehicle_3": "swinging"}
-    latency = [0.04, 0.5, {"uniform": [0.2, 0.9]}]
-    return PAPER.replace(early_impacts="keep", roles=roles, latency_s=latency, gaps_m=4)
+    return PAPER.replace(early_impacts="keep", roles=roles, latency_s=[0.04, 0.5, {"uniform": [0.2, 0.9]}], gaps_m=4)
 
 
 def test_drive__shows_every_part_of_a_step_within_which_nobody_decides(swinging):
@@ -121,8 +120,7 @@ def test_record__motion_and_dataset_follow_scripts_that_decide_within_a_step(swi
     agent = make_agent("constant:3")
     outcome = evaluate(sample, {"it": agent}, scenario=swinging).outcome("it")
     motions = follow_episodes(sample.worlds, agent, swinging)
-    task = Task(swinging, 7, eb.RewardParams(), eb.observation_for(swinging))
-    recording = record_episodes(sample, agent, "it", task)
+    recording = record_episodes(sample, agent, "it", Task(swinging, 7, eb.RewardParams(), eb.observation_for(swinging)))
     assert outcome.sampled_harm is None  # its samples are the decisions of Vehicle 2 alone
     for k, motion in enumerate(motions):
         record = record_episode(sample.worlds.take([k]), agent, scenario=swinging)

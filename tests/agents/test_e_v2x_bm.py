@@ -135,8 +135,7 @@ def test_optimum__is_not_above_a_fine_grid_and_is_attained(vehicles, vehicle):
     assert np.all(best.harm <= grid + 1e-9)
     assert 0.2 < np.mean(best.harm > 0) < 0.9
     assert np.all((best.deceleration_mps2 >= 0) & (best.deceleration_mps2 <= capacity))
-    attained = np.add(*harm_of_pairs(worlds, vehicle, best.deceleration_mps2))
-    assert np.array_equal(attained, best.harm)
+    assert np.array_equal(np.add(*harm_of_pairs(worlds, vehicle, best.deceleration_mps2)), best.harm)
 
 
 def test_optimum__takes_the_middle_of_a_flat_minimum():
@@ -325,8 +324,7 @@ def test_coupled__is_not_worse_than_an_even_grid(n, vehicles, vehicle, rear_mps2
     others[:, -1] = rear_mps2
     grid = -worlds.vehicles.braking_capacity_mps2[:, [vehicle]] * np.linspace(0.0, 1.0, points)
     for count, harms in zip(("first", "total"), forecast(worlds, others, vehicle, grid, 8.0), strict=True):
-        found = optimise_coupled(worlds, vehicle, others_mps2=others, harm_count=count).harm
-        excess = found - harms.min(axis=1)
+        excess = optimise_coupled(worlds, vehicle, others_mps2=others, harm_count=count).harm - harms.min(axis=1)
         assert excess.max() <= 1e-9
         assert (np.mean(excess) < 0.0) == (vehicles != 2)  # narrowing finds more; of one pair an end is best
 
@@ -359,8 +357,7 @@ def test_coupled__threads_batch_and_what_was_searched_before_change_no_bit(monke
         searches.clear()
     total, other = optimise_coupled(worlds, 1, harm_count="total"), optimise_coupled(worlds, 1, horizon_s=4.0)
     assert len(searches) == 6 and (total.harm != found[1].harm).any() and (other.harm != found[1].harm).any()
-    alone = optimise_coupled(worlds.take([7]), 1)
-    assert [column[0] for column in alone] == [column[7] for column in found[1]]
+    assert [column[0] for column in optimise_coupled(worlds.take([7]), 1)] == [column[7] for column in found[1]]
 
 
 def test_coupled__stays_off_the_edge_of_a_jump():

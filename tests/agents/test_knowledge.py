@@ -133,13 +133,12 @@ def alter_unreceived(worlds: eb.Worlds, vehicle: int, rng: np.random.Generator) 
     beside = [pair for pair in (vehicle - 1, vehicle) if 0 <= pair < N - 1]
     hit[:, beside] &= unknown[:, far[beside]]  # an own impact with somebody who is known is felt
     gaps = other(worlds.gaps_m, 2.0, 15.0, stale[:, far])
-    hidden = unknown[:, 0] & np.isfinite(worlds.obstacle_gap_m)
     return replace(
         worlds,
         vehicles=changed,
         messages=_alter_messages(worlds, vehicle, rng),
         gaps_m=gaps,
-        obstacle_gap_m=other(worlds.obstacle_gap_m, 5.0, 80.0, hidden),
+        obstacle_gap_m=other(worlds.obstacle_gap_m, 5.0, 80.0, unknown[:, 0] & np.isfinite(worlds.obstacle_gap_m)),
         speeds_mps=other(worlds.speeds_mps, 5.0, 30.0, stale),
         command_mps2=other(worlds.command_mps2, -6.0, 6.0, stale),
         pair_hit=worlds.pair_hit ^ (hit & (now > 0.0)),  # at the alert nobody has hit anything
@@ -150,8 +149,7 @@ def _altered_news(now: Floats, shape: tuple[int, ...], vehicle: int, rng: np.ran
     """When who is known of by whom, [n, N, N] s; often never. Of what this vehicle waits for, not before now."""
     since = np.zeros((len(now), shape[1], 1))
     since[:, vehicle] = now
-    never = rng.random(shape) < 0.25
-    return np.where(never, np.inf, since + rng.uniform(0.01, 2.0, shape))
+    return np.where(rng.random(shape) < 0.25, np.inf, since + rng.uniform(0.01, 2.0, shape))
 
 
 def _alter_messages(worlds: eb.Worlds, vehicle: int, rng: np.random.Generator) -> Floats:
@@ -165,8 +163,7 @@ def _alter_messages(worlds: eb.Worlds, vehicle: int, rng: np.random.Generator) -
     columns[:, place_at(N) :] += rng.uniform(0.5, 3.0, columns[:, place_at(N) :].shape)
     links = columns[:, link_at(0, 0, N) : ring_at(N)].reshape(-1, N, N, LINK.WIDTH)
     heard = (worlds.vehicles.known_from_s[:, vehicle] <= worlds.time_s[:, np.newaxis])[..., np.newaxis]
-    told = np.arange(LINK.WIDTH) >= LINK.TOLD_S
-    links[:, vehicle] = np.where(heard & told, kept, links[:, vehicle])
+    links[:, vehicle] = np.where(heard & (np.arange(LINK.WIDTH) >= LINK.TOLD_S), kept, links[:, vehicle])
     columns[:, place_at(N) + vehicle] = own
     return columns
 

@@ -87,8 +87,7 @@ SEARCHES = {
 @pytest.mark.parametrize("search_of", SEARCHES.values(), ids=SEARCHES)
 def test_search__a_world_does_not_depend_on_its_batch(search_of):
     worlds, rows = WORLDS.take(np.arange(20)), np.array([17, 1])
-    whole = harm(search_of(), worlds=worlds)
-    assert harm(search_of(), worlds=worlds.take(rows)).tolist() == whole[rows].tolist()
+    assert harm(search_of(), worlds=worlds.take(rows)).tolist() == harm(search_of(), worlds=worlds)[rows].tolist()
 
 
 @pytest.mark.parametrize("search_of", SEARCHES.values(), ids=SEARCHES)
@@ -130,8 +129,7 @@ def test_search__of_any_line_obstacle_and_step_keeps_what_it_predicted(spec, nam
 
 @pytest.mark.parametrize("spec", ["planner:30", "best_harm:100"])
 def test_search__in_a_role_decides_when_its_scenario_does(spec):
-    roles = {"vehicle_2": spec, "vehicle_3": "learner"}
-    role = SCENARIO.replace(early_impacts="keep", roles=roles, time_step_s=0.2)
+    role = SCENARIO.replace(early_impacts="keep", roles={"vehicle_2": spec, "vehicle_3": "learner"}, time_step_s=0.2)
     assert script_agents(role)[1]._outlook.time_step_s == 0.2
 
 

@@ -246,8 +246,7 @@ def rows_of(name: str) -> int:
 
 def actions(seed: int, steps: int, n: int) -> Array:
     """Random actions [steps, n, 1], the same ones for the same seed; mostly braking, so that episodes end."""
-    drawn = np.random.default_rng(seed).normal(-0.8, 0.6, (steps, n, 1))
-    return np.clip(drawn, -1.0, 1.0).astype(np.float32)
+    return np.clip(np.random.default_rng(seed).normal(-0.8, 0.6, (steps, n, 1)), -1.0, 1.0).astype(np.float32)
 
 
 def digest(name: str, scenario: eb.Scenario, seed: int, steps: int = 160, n: int | None = None) -> str:

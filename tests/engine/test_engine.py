@@ -73,8 +73,7 @@ def test_start__that_fails_leaves_the_running_episodes_and_the_stream_alone(star
 
 
 def test_stream__gives_every_world_of_its_list_once_and_in_order_across_its_blocks() -> None:
-    scripts = {0: eb.make_agent("full_brake"), 2: eb.make_agent("constant:5")}
-    stream = Stream(PAPER, [1], scripts, seed=4)
+    stream = Stream(PAPER, [1], {0: eb.make_agent("full_brake"), 2: eb.make_agent("constant:5")}, seed=4)
     taken = eb.Worlds.concatenate([stream.take(count).alert for count in (1000, 100, 3000, 50)])
     expected = PAPER.sample(4150, 4, channel="training").worlds
     assert (taken.gaps_m == expected.gaps_m).all() and (taken.speeds_mps == expected.speeds_mps).all()
@@ -225,10 +224,9 @@ def test_infos__tell_the_same_shares_as_the_ledger() -> None:
 
 def test_engine__worlds_that_are_given_may_have_an_obstacle_or_none_whatever_the_scenario_says() -> None:
     plain = eb.load_scenario("cooperation-3-pair")
-    given = eb.Worlds.concatenate([NEAR.sample(2, 1).worlds, plain.sample(2, 1).worlds])
     for scenario in (plain, ALL.with_learners([1, 2])):
         running = make_engine(scenario, 4, seed=1)
-        running.reset(worlds=given)
+        running.reset(worlds=eb.Worlds.concatenate([NEAR.sample(2, 1).worlds, plain.sample(2, 1).worlds]))
         for _ in range(30):
             running.step(np.zeros((4, 2)))
         assert np.isfinite(running.worlds.obstacle_gap_m).tolist() == [True, True, False, False]

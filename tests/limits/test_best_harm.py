@@ -85,8 +85,7 @@ def test_best_harm__does_not_depend_on_batch_order_or_threads_but_on_the_seed(ta
 def test_best_harm__an_obstacle_ahead_of_some_worlds_changes_nothing_in_the_others() -> None:
     ahead = load_scenario("paper-random-obstacle").sample(3, seed=11).worlds
     apart = [first_harm(worlds, budget=100) for worlds in (FEW, ahead)]
-    together = first_harm(Worlds.concatenate([FEW, ahead]), budget=100)
-    assert together.tolist() == np.concatenate(apart).tolist()
+    assert first_harm(Worlds.concatenate([FEW, ahead]), budget=100).tolist() == np.concatenate(apart).tolist()
 
 
 def test_best_harm__starts_from_what_is_known_and_never_gets_worse(table: BestHarmTable) -> None:
@@ -128,8 +127,7 @@ def test_stored_profile__driven_in_the_engine_does_the_stored_harm_bit_for_bit(
 
 
 def test_best_harm_agent__searches_a_world_that_no_table_holds() -> None:
-    agent = make_lineup(["best_harm:300"], SCENARIO)["best_harm:300"]
-    episodes = drive(FEW, agent, SCENARIO, 1)
+    episodes = drive(FEW, make_lineup(["best_harm:300"], SCENARIO)["best_harm:300"], SCENARIO, 1)
     told = episodes.memories[1]
     assert told["searched"].all()
     assert np.array_equal(episodes.ledger.world_harm("first"), told["predicted_harm"])
@@ -270,8 +268,7 @@ def test_profiles__of_both_kinds_are_needed_and_harmless_worlds_are_found() -> N
     worlds, least = SCENARIO.sample(60, seed=7).worlds, {}
     for there in ((True, False), (False, True), (True, True)):
         problem, profiles = of_worlds(worlds, 1, front=there[0], rear=there[1])
-        each = [problem.follow(profiles.take(slice(k, None, KEPT)))[0] for k in range(KEPT)]
-        least[there] = np.min(each, axis=0)
+        least[there] = np.min([problem.follow(profiles.take(slice(k, None, KEPT)))[0] for k in range(KEPT)], axis=0)
     front, rear, both = least.values()
     assert np.array_equal(both, np.minimum(front, rear))
     assert np.any(front < rear) and np.any(rear < front)

@@ -84,8 +84,7 @@ def test_prove__bounds_the_harm_of_other_teams_without_a_verdict_on_contact(name
     sample = scenario.sample(30, 7)
     found = known_limits(sample.worlds, Task(scenario, vehicles))
     assert found.proof.avoidable is None and found.proof.contact is None
-    bound = team_bound(sample.worlds, vehicles, horizon_s=8.0, time_step_s=0.1)
-    assert np.array_equal(found.proof.harm, bound.harm)
+    assert np.array_equal(found.proof.harm, team_bound(sample.worlds, vehicles, horizon_s=8.0, time_step_s=0.1).harm)
     assert not found.known.any()
     assert (found.proof.harm > 0).any() == (name != "cooperation-4-all")
 

@@ -194,8 +194,7 @@ def test_bound__is_never_above_a_searched_profile_in_any_region(region, n, budge
     assert np.all(any_time <= decided)
     for bound, harm_count, step in ((decided, "first", 0.1), (decided, "total", 0.1), (any_time, "first", 0.025)):
         problem = profile_problem(worlds, [1], harm_count=harm_count, horizon_s=60.0, time_step_s=step)
-        found = problem.search(problem.constant(problem.even_grid(9)), budget=budget)[1]
-        assert np.all(bound <= found[harm_count])
+        assert np.all(bound <= problem.search(problem.constant(problem.even_grid(9)), budget=budget)[1][harm_count])
 
 
 # What a first meeting leaves, and what the command in force costs.

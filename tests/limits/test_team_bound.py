@@ -55,8 +55,7 @@ def test_bound__of_a_line_that_learns_whole_is_above_0_where_vehicle_2_cannot_st
     assert found.obstacle[0] == found.pairs[0, 0] == 0 and 50 < found.combined[0] == found.harm[0]
     assert found.harm[0] <= searched(profile_problem(worlds, (0, 1), horizon_s=HORIZON_S), "first", 2000)[0] < 80
     assert team_bound(worlds, (0, 1), horizon_s=2.0).harm[0] == 0
-    wider = replace(worlds, obstacle_gap_m=np.array([62.0]))
-    assert team_bound(wider, (0, 1), horizon_s=HORIZON_S).harm[0] == 0
+    assert team_bound(replace(worlds, obstacle_gap_m=np.array([62.0])), (0, 1), horizon_s=HORIZON_S).harm[0] == 0
 
 
 @pytest.mark.parametrize("vehicle", [0, 1])
@@ -175,8 +174,7 @@ def test_bound__is_never_above_a_joint_profile(region):
 def test_bound__is_never_above_a_joint_profile_of_any_line(kind, k):
     N, vehicles, obstacle = LINES[kind]
     region = ("plain", "any latency", "masses 0.05 to 100 t, restitution to 1", "weak brakes behind")[k]
-    worlds = worlds_of(region, 6, N, 70 + k, obstacle)
-    check(worlds, vehicles, budget=100, draws=2, seed=k, steps=STEPS[k % 3 :][:1])
+    check(worlds_of(region, 6, N, 70 + k, obstacle), vehicles, budget=100, draws=2, seed=k, steps=STEPS[k % 3 :][:1])
 
 
 @pytest.mark.long

@@ -52,10 +52,9 @@ def driving_lines(key: int, n: int, N: int, *, drive: bool = True) -> Batch:
     """Lines that brake, coast and (with ``drive``) accelerate, some of them from touching or from rest."""
     draws = Draws(key)
     gaps = draws.uniform(0.2, 10.0, (n, N - 1)) * draws.choice([1.0] * 9 + [0.0], (n, N - 1))
-    speeds = draws.uniform(5.0, 25.0, (n, N)) * draws.choice([1.0] * 19 + [0.0], (n, N))
     worlds = make_worlds(
         gaps,
-        speeds,
+        draws.uniform(5.0, 25.0, (n, N)) * draws.choice([1.0] * 19 + [0.0], (n, N)),
         braking_capacity_mps2=CAPACITY_MPS2,
         driving_capacity_mps2=CAPACITY_MPS2,
         latency_s=draws.uniform(0.0, 1.0, (n, N)),
@@ -251,8 +250,7 @@ class Watched:
         bend = np.abs(a.speeds_mps - 2.0 * b.speeds_mps + c.speeds_mps).max(axis=1)
         steady: Bools = (bend < STEADY_MPS) & (self.impacts[-1] == 0)
         opening = [w.speeds_mps[:, :-1] - w.speeds_mps[:, 1:] for w in (a, b, c)]
-        span = (c.time_s - a.time_s)[:, None]
-        unclipped = a.gaps_m + span * (opening[0] + 4.0 * opening[1] + opening[2]) / 6.0
+        unclipped = a.gaps_m + (c.time_s - a.time_s)[:, None] * (opening[0] + 4.0 * opening[1] + opening[2]) / 6.0
         self.worst = max(self.worst, float(np.abs(unclipped - c.gaps_m)[steady].max()), float(-unclipped[steady].min()))
         self.checked += int(steady.sum())
 

@@ -222,8 +222,7 @@ def test_scan__finds_what_is_planted(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_graze__counts_from_the_touch_speed_on(excess: float, count: int) -> None:
     # the smallest gap would be -excess: D = 2 |b| excess = 4 excess; an impact when it exceeds (1e-5 m/s)^2
-    worlds = line([4.0 - excess], [10.0, 14.0])
-    assert advance(worlds, [0.0, -2.0], 3.0)[1].count.tolist() == [[count]]
+    assert advance(line([4.0 - excess], [10.0, 14.0]), [0.0, -2.0], 3.0)[1].count.tolist() == [[count]]
 
 
 def test_contact_time__is_right_to_the_last_digits_where_the_textbook_root_is_not() -> None:

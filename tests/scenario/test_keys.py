@@ -80,9 +80,8 @@ def test_friction__a_table_of_initial_states_gives_the_same_worlds() -> None:
 
 
 def state_of(worlds: Worlds) -> dict[str, Any]:
-    dry = worlds.dry("braking_capacity_mps2")[0].tolist()
     return {"gaps_m": worlds.gaps_m[0].tolist(), "speeds_mps": worlds.speeds_mps[0].tolist(),
-            "braking_capacity_mps2": dry}  # fmt: skip
+            "braking_capacity_mps2": worlds.dry("braking_capacity_mps2")[0].tolist()}  # fmt: skip
 
 
 def test_friction__its_uncertainty_moves_all_capacities_together() -> None:

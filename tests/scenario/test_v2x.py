@@ -166,8 +166,7 @@ def test_observe__what_is_not_known_changes_no_bit(name, obstacle, latency):
     for time in (0.0, 0.5, 0.8, 1.0, 1.5):
         worlds, _ = eb.advance(start, -3.0, until_s=time)
         for i in [1] if obstacle else range(3):  # from the ends the way to it goes over gaps that are altered
-            other = alter_unreceived(worlds, i, rng)
-            assert observe(worlds, i, spec).tobytes() == observe(other, i, spec).tobytes()
+            assert observe(worlds, i, spec).tobytes() == observe(alter_unreceived(worlds, i, rng), i, spec).tobytes()
         unknown = worlds.vehicles.known_from_s[:, 1][:, [0, 2, 0]] > time
         assert (observe(worlds, 1, spec)[:, at] == ~unknown[:, : len(at)]).all()
         seen += int(unknown.sum())
@@ -208,8 +207,7 @@ def test_identities__do_not_depend_on_the_news():
     worlds = PAPER.sample(5, 7).worlds
     clock, command = np.zeros((5, CLOCK.WIDTH)), -worlds.vehicles.braking_capacity_mps2
     late = replace(worlds.vehicles, known_from_s=worlds.vehicles.known_from_s + 1.0)
-    by_link = replace(worlds, vehicles=late)
-    plain, told = (identities(w, command, clock, np.array([1])) for w in (worlds, by_link))
+    plain, told = (identities(w, command, clock, np.array([1])) for w in (worlds, replace(worlds, vehicles=late)))
     assert plain.tolist() == told.tolist() and len(set(plain.tolist())) == 5
 
 

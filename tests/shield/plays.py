@@ -125,8 +125,7 @@ class Play:
     def astray(self) -> int:
         """1 where the shield is not where the engine is, or trusts it no longer."""
         shield, engine = self.shield(), self.engine()
-        there = (shield.running.steps == engine.steps)[~engine.ended].all()
-        return int(not there or shield.distrusted.any())
+        return int(not (shield.running.steps == engine.steps)[~engine.ended].all() or shield.distrusted.any())
 
     def member_is(self, how: str, asked: Callable[[], Any]) -> Callable[[], None]:
         """A call in which one member fails so, while the others are well."""
@@ -173,8 +172,7 @@ class Parallel(Play):
             self.member_is("fails", lambda: self.env.step({})),
             self.member_is("misshapen", lambda: self.env.step({})),
         ]
-        env = HybridShield(inner, policy, mode="step", cap="baseline" if self.team else None)
-        self.put(env, seed=self.begin())
+        self.put(HybridShield(inner, policy, mode="step", cap="baseline" if self.team else None), seed=self.begin())
 
     def step(self) -> None:
         if self.engine().ended[0]:

@@ -133,8 +133,7 @@ def test_forms__enclose_what_they_stand_for(name):
     ],
 )
 def test_by_hand__two_vehicles_the_bound_up_to_the_horizon_is_that_of_the_least_gap(text, horizon, cells, harm, more):
-    found = bound_of(boxed(text, STANDING, horizon_s=horizon), np.full(STEPS, -1.0), cells)
-    assert harm - 1e-9 <= found <= harm + more
+    assert harm - 1e-9 <= bound_of(boxed(text, STANDING, horizon_s=horizon), np.full(STEPS, -1.0), cells) <= harm + more
 
 
 def test_by_hand__a_drive_that_a_speed_limit_may_end_gives_any_part_of_its_way():

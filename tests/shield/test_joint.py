@@ -143,8 +143,7 @@ def test_bound_at_the_alert__is_at_most_full_braking_and_any_single_constant():
     braked = plan_harm(joint.running, np.full((40, STEPS, 2), -1.0))
     assert (joint.first_bound <= braked).all() and joint.first_bound.mean() < 0.8 * braked.mean()
     for vehicle in (1, 2):
-        alone = begun(PAIR.with_learners([vehicle]), worlds)
-        assert (joint.first_bound <= alone.first_bound + 1e-6).all()
+        assert (joint.first_bound <= begun(PAIR.with_learners([vehicle]), worlds).first_bound + 1e-6).all()
 
 
 def test_team__whose_rollout_keeps_the_bound_is_left_alone():
@@ -246,8 +245,7 @@ def test_evaluation__later_rollouts_of_the_team_let_more_of_it_through():
 
     worlds, replaced = PAIR.sample(60, 11).worlds, {}
     for later in (True, False):
-        team = ShieldedDriver(Team.of(late, (1, 2)), PAIR, later_rollouts=later).on((1, 2))
-        episodes = drive(worlds, team, PAIR)
+        episodes = drive(worlds, ShieldedDriver(Team.of(late, (1, 2)), PAIR, later_rollouts=later).on((1, 2)), PAIR)
         assert (episodes.ledger.world_harm("first") <= episodes.guarded.shield.predicted_harm).all()
         replaced[later] = episodes.guarded.shield.interventions.sum()
     assert replaced[True] < replaced[False]

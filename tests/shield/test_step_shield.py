@@ -378,16 +378,14 @@ def test_rollout__once_accepted_is_what_the_policy_then_does_and_the_bound_is_ex
     accepted = reasons == REASONS.index("policy rollout")
     assert accepted.sum() > 3
     later = np.cumsum(accepted, axis=0) - accepted > 0  # after the first accepted rollout of that world
-    allowed = [-1, REASONS.index("same as plan"), REASONS.index("ended")]
-    assert np.isin(reasons[later], allowed).all()
+    assert np.isin(reasons[later], [-1, REASONS.index("same as plan"), REASONS.index("ended")]).all()
     assert harm.tolist() == guarded.shield.bound.tolist()
     assert (harm <= guarded.shield.predicted_harm).all() and not guarded.shield.distrusted.any()
 
 
 @pytest.mark.parametrize("distrusted", [False, True])
 def test_rollout__leaves_the_past_in_the_plan_what_was_applied(distrusted):
-    weaker = parse_uncertainty("braking_capacity_mps2=20%").draw(ROLLED, np.random.default_rng(0))
-    told = weaker if distrusted else None
+    told = parse_uncertainty("braking_capacity_mps2=20%").draw(ROLLED, np.random.default_rng(0)) if distrusted else None
     guarded, _, reasons, applied = driven(eb.LearnedAgent(Weights()), logging=True, told=told)
     shield, running = guarded.shield, ~np.isin(reasons, [-1, REASONS.index("ended")])
     assert (shield.distrusted == distrusted).all()
