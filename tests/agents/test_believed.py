@@ -108,6 +108,5 @@ def test_believing__knows_of_the_obstacle_what_it_was_told(v2x: object) -> None:
     heard = told.known[:, 0]
     assert heard.sum() > 20
     np.testing.assert_allclose(told.obstacle_m[heard], (now.obstacle_gap_m + now.gaps_m[:, 0])[heard], atol=1e-9)
-    assert np.isinf(told.obstacle_m[~heard]).all()
-    assert np.isfinite(believed(engine).obstacle_gap_m).all()
+    assert np.isinf(told.obstacle_m[~heard]).all() and np.isfinite(believed(engine).obstacle_gap_m).all()
     drive(scenario.sample(5, 3).worlds, make_agent("e_v2x_bm:believed", scenario=scenario), scenario, 1)

@@ -377,8 +377,7 @@ def test_agents__new_episodes_change_their_rows_only_and_agents_can_be_pickled(s
 def test_agent_names__are_those_that_ship_and_are_listed(capsys):
     scripts = ("coast", "constant", "copy_leader", "e_v2x_bm", "full_brake", "gentlest_front", "planner")
     names = (*scripts, "best_harm", "ppo", "sac", "counterfactual", "options", "policy", "universal", "team")
-    assert agent_names() == tuple(sorted(names))
-    assert run_command(["agent", "list"]) == 0
+    assert agent_names() == tuple(sorted(names)) and run_command(["agent", "list"]) == 0
     table = capsys.readouterr().out
     assert [name for name in (*names, "+refined", "+episode", "+step", "+robust") if name not in table] == []
     for entry in agent_entries():

@@ -120,8 +120,7 @@ def test_closing_speed__equals_the_first_impact_of_the_event_exact_physics(exact
     first, simulated = impacts.rows.first, np.zeros(worlds.n)
     simulated[impacts.rows.world[first]] = impacts.rows.closing_speed_mps[first] ** 2
     closed = pairwise_harm(worlds, deceleration)[:, 0]
-    assert 0.3 < np.mean(closed > 0) < 0.7
-    assert np.abs(closed - simulated).max() < 1e-9
+    assert 0.3 < np.mean(closed > 0) < 0.7 and np.abs(closed - simulated).max() < 1e-9
 
 
 @pytest.mark.parametrize(("vehicles", "vehicle"), [(3, 1), (2, 0), (2, 1), (5, 2)])
@@ -132,8 +131,7 @@ def test_optimum__is_not_above_a_fine_grid_and_is_attained(vehicles, vehicle):
     grid = np.full(worlds.n, np.inf)
     for share in np.linspace(0, 1, 501):
         grid = np.minimum(grid, np.add(*harm_of_pairs(worlds, vehicle, share * capacity)))
-    assert np.all(best.harm <= grid + 1e-9)
-    assert 0.2 < np.mean(best.harm > 0) < 0.9
+    assert np.all(best.harm <= grid + 1e-9) and 0.2 < np.mean(best.harm > 0) < 0.9
     assert np.all((best.deceleration_mps2 >= 0) & (best.deceleration_mps2 <= capacity))
     assert np.array_equal(np.add(*harm_of_pairs(worlds, vehicle, best.deceleration_mps2)), best.harm)
 
@@ -151,10 +149,8 @@ def test_optimum__takes_the_middle_of_a_flat_minimum():
     )
     best = optimise_pairwise(worlds, 1)
     # The rear one stops in 14.4 m, so vehicle 2 may stop in 9.4 m: 7.66 m/s2.
-    assert best.spares_rear_mps2[0] == pytest.approx(72 / 9.4)
-    assert best.spares_front_mps2[0] == math.inf
-    assert best.harm[0] == 4.0
-    assert best.deceleration_mps2[0] == pytest.approx(36 / 9.4)
+    assert best.spares_rear_mps2[0] == pytest.approx(72 / 9.4) and best.spares_front_mps2[0] == math.inf
+    assert best.harm[0] == 4.0 and best.deceleration_mps2[0] == pytest.approx(36 / 9.4)
 
 
 def line_worlds(n: int, vehicles: int, seed: int) -> Worlds:
@@ -243,8 +239,7 @@ def test_simulate__gives_up_at_a_bound_and_tells_no_less():
         bound = float(np.median(whole.harm))
         cut, below = harms(made[1], at, bound), whole.harm < bound
         assert np.array_equal(cut.harm[below], whole.harm[below])
-        assert np.array_equal(cut.other[below], whole.other[below])
-        assert np.all(cut.harm[~below] >= bound)
+        assert np.array_equal(cut.other[below], whole.other[below]) and np.all(cut.harm[~below] >= bound)
         given_up += int((cut.other[~below] < whole.other[~below]).sum())
     assert given_up > 0
 
@@ -336,8 +331,7 @@ def test_coupled__takes_the_middle_of_a_collision_free_interval(rear_mps2):
     others = -gentle.vehicles.braking_capacity_mps2
     closed, best = optimise_pairwise(gentle, 1), optimise_coupled(worlds, 1, others_mps2=others)
     free = closed.harm == 0
-    assert 10 < free.sum() < 190
-    assert np.array_equal(best.deceleration_mps2[free], closed.deceleration_mps2[free])
+    assert 10 < free.sum() < 190 and np.array_equal(best.deceleration_mps2[free], closed.deceleration_mps2[free])
     assert np.array_equal(best.harm == 0, free)
 
 
@@ -389,8 +383,7 @@ def test_coupled__follows_the_others_commands():
         restitution=0,
     )
     best = optimise_coupled(worlds, 1, others_mps2=np.zeros((1, 3)), horizon_s=30.0)
-    assert best.total_harm[0] == 0.0
-    assert best.deceleration_mps2[0] == pytest.approx(0.0, abs=10 * 2 / 30**2)
+    assert best.total_harm[0] == 0.0 and best.deceleration_mps2[0] == pytest.approx(0.0, abs=10 * 2 / 30**2)
 
 
 def test_coupled__finds_a_kink_to_nine_digits():

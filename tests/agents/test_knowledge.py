@@ -288,8 +288,7 @@ def test_knowledge__of_an_agent_of_the_users_own_and_of_a_team():
     assert Knowledge.of(team) == (SENSORS, MESSAGES) and Knowledge.of(eb.Team({}, "scripts")).text == "–"
     silent = Acts(lambda worlds, vehicle: np.zeros(worlds.n))
     assert Knowledge.of(silent).text == "not stated" and not Knowledge.of(silent).sees_through
-    assert Knowledge.of(silent, also=MODEL) == (MODEL, Source.UNSTATED)
-    assert Knowledge.of(Leaking()) == (MESSAGES,)
+    assert Knowledge.of(silent, also=MODEL) == (MODEL, Source.UNSTATED) and Knowledge.of(Leaking()) == (MESSAGES,)
 
 
 @pytest.mark.parametrize(
@@ -324,8 +323,7 @@ def test_messages__contact_features_tell_nothing_that_was_not_received(channel, 
     scenario = BLOCKED.replace(v2x=channel)
     make_policy(eb.choose_observation(["own", "contact"]), scenario.model_dump(mode="json")).save(tmp_path / "policy")
     agent = agent_of(f"ppo@{tmp_path}", scenario)
-    assert Knowledge.of(agent) == (MESSAGES,)
-    assert changed_decisions(agent, scenario) == 0
+    assert Knowledge.of(agent) == (MESSAGES,) and changed_decisions(agent, scenario) == 0
 
 
 @pytest.mark.parametrize(("reads", "vehicle"), [("behind", 1), ("others", 1), ("never", 2)])

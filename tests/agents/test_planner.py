@@ -160,8 +160,7 @@ def test_changes__keep_their_sizes_and_hold():
         size, hold = SIZES[k % 3], HOLDS[k // 3 % 3]
         assert 0.5 * size < np.abs(change).max() <= size
         assert (change[:hold] == change[0]).all() and change[hold] != change[0]
-    assert table[:4].tolist() == changes(0, 4).tolist()
-    assert table.tolist() != changes(1, 18).tolist()
+    assert table[:4].tolist() == changes(0, 4).tolist() and table.tolist() != changes(1, 18).tolist()
 
 
 def test_deviated__stays_within_the_capacities():
@@ -175,8 +174,7 @@ def test_deviated__stays_within_the_capacities():
 def test_profile__does_as_well_as_the_slow_one():
     """With 500 candidates at most a hundredth more harm than the closed-loop search, which takes far longer."""
     slow, fast = (agent_of(f"ppo@shipped+refined{way}") for way in ("", ":profile"))
-    assert fast.name == "ppo@shipped+refined:profile"
-    assert harm(fast).mean() < 1.01 * harm(slow).mean()
+    assert fast.name == "ppo@shipped+refined:profile" and harm(fast).mean() < 1.01 * harm(slow).mean()
 
 
 def test_refine__is_a_function_of_the_world_and_the_seed(monkeypatch):

@@ -69,8 +69,7 @@ def test_bar__is_as_long_as_the_share_of_the_capacity(sign: float, colour: tuple
 
 def test_impact__is_shown_where_it_happens_and_then_fades() -> None:
     seen = {time: flashes(frame) for time, frame in to_its_end(crash())}  # coasting, an impact at 1 s with 6 m/s
-    assert [time for time, count in seen.items() if count and time < 0.999] == []
-    assert seen[1.0] > 50
+    assert [time for time, count in seen.items() if count and time < 0.999] == [] and seen[1.0] > 50
 
 
 def test_step_frames__show_an_impact_inside_a_step_from_its_moment_on() -> None:
@@ -100,8 +99,7 @@ def test_scene__has_the_numbers_of_the_infos_and_the_places_of_the_physics() -> 
     assert (last.time_s, last.ended) == (worlds.time_s[0], True)
     harms = [told["world_first_impact_harm"], told["world_total_harm"]]
     assert [last.first_harm, last.total_harm] == near(harms, abs=1e-9)
-    assert last.gaps_m == near(worlds.gaps_m[0], abs=1e-9)
-    assert last.speeds_mps == near(worlds.speeds_mps[0], abs=1e-9)
+    assert last.gaps_m == near(worlds.gaps_m[0], abs=1e-9) and last.speeds_mps == near(worlds.speeds_mps[0], abs=1e-9)
     assert shown[0].front_m[0] == near(record.positions_m[record.time_s.searchsorted(0.5), 0])
     assert -np.diff(last.front_m) == near(last.gaps_m + BODY_M)
     for scene in shown:
@@ -129,8 +127,7 @@ def test_list__has_the_beginning_and_each_step_once(make: Any) -> None:
     for _ in range(3):
         environment.step(COAST)
     frames = environment.render()
-    assert [frame.shape for frame in frames] == [SHAPE] * 4
-    assert environment.render() == []
+    assert [frame.shape for frame in frames] == [SHAPE] * 4 and environment.render() == []
     environment.step(COAST)
     assert len(environment.render()) == 1
     environment.reset(seed=0)
@@ -195,8 +192,7 @@ def test_human__shows_each_step_in_real_time_and_says_what_it_needs(monkeypatch:
     before = pygame.time.get_ticks()
     environment.step(COAST)
     assert pygame.time.get_ticks() - before >= 80  # it waits for a step of 0.1 s
-    assert pygame.display.get_surface().get_size() == (WIDTH, HEIGHT)
-    assert environment.render() is None
+    assert pygame.display.get_surface().get_size() == (WIDTH, HEIGHT) and environment.render() is None
     environment.close()
     assert pygame.display.get_surface() is None
     monkeypatch.setenv("SDL_VIDEODRIVER", "nothing")
@@ -237,5 +233,4 @@ def test_shields__are_looked_through_and_their_interventions_shown() -> None:
         assert environment is not single or "shield" not in single.render()
         environment.step(action)
     assert [each.render().splitlines()[-1] for each in (single, parallel)] == ["shield: stepped in"] * 2
-    assert rows.render()[0] == single.render()
-    assert "shield: stepped in" in hybrid.render()
+    assert rows.render()[0] == single.render() and "shield: stepped in" in hybrid.render()

@@ -137,8 +137,7 @@ def test_infos__cost_is_the_harm_of_the_step_as_the_reward_counts_it(reward: str
             _, _, terminated, truncated, info = environment.step(np.array([action], np.float32))
             over = terminated or truncated
             costs.append(info["cost"])
-        assert sum(costs) == near(info[total] - before)
-        assert info["reward_harm"] == -info["cost"]
+        assert sum(costs) == near(info[total] - before) and info["reward_harm"] == -info["cost"]
 
 
 def test_rewards__the_papers_terms_are_named_before_their_weights() -> None:
@@ -259,8 +258,7 @@ def test_seed__of_an_unseeded_environment_can_be_read_and_that_of_the_users_stre
     environment = eb.EthBrakeEnv()
     environment.np_random = np.random.default_rng(7)
     info = environment.reset()[1]
-    assert (info["world_seed"], info["world"]) == (0, 1)
-    assert environment.np_random.integers(10**6) == 944_904
+    assert (info["world_seed"], info["world"]) == (0, 1) and environment.np_random.integers(10**6) == 944_904
 
 
 @pytest.mark.parametrize(

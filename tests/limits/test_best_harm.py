@@ -62,8 +62,7 @@ def test_follow__hits_a_standing_car_with_the_closing_speed_computed_by_hand() -
     assert first == pytest.approx([400.0 - 2 * 5 * 20])
     # 0.5 s of braking, then coasting: v^2 = 17.5^2 at the wall
     half = Profiles(np.array([[5, 80]]), np.array([[[-5.0], [0.0]]]))
-    assert problem.follow(half)[0] == pytest.approx([17.5**2])
-    assert total[0] >= first[0]
+    assert problem.follow(half)[0] == pytest.approx([17.5**2]) and total[0] >= first[0]
     _, found = problem.search(problem.constant(np.array([[[2.0]]])), budget=2000)  # cannot beat full braking
     assert found["first"] == pytest.approx([200.0], abs=1e-3)
 
@@ -134,8 +133,7 @@ def test_stored_profile__driven_in_the_engine_does_the_stored_harm_bit_for_bit(
 def test_best_harm_agent__searches_a_world_that_no_table_holds() -> None:
     episodes = drive(FEW, make_lineup(["best_harm:300"], SCENARIO)["best_harm:300"], SCENARIO, 1)
     told = episodes.memories[1]
-    assert told["searched"].all()
-    assert np.array_equal(episodes.ledger.world_harm("first"), told["predicted_harm"])
+    assert told["searched"].all() and np.array_equal(episodes.ledger.world_harm("first"), told["predicted_harm"])
     assert (told["predicted_harm"] <= optimise_coupled(FEW, 1).harm + 1e-7).all()
 
 
@@ -194,8 +192,7 @@ def test_search_list__goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pyte
 def test_search_list__leaves_a_world_out_that_cannot_be_advanced(tmp_path: Path) -> None:
     sample = planted_list(SCENARIO, 5, 11, [1, 3])
     found = search_list(SCENARIO, sample, budget=100, threads=1, chunks=tmp_path)
-    assert sorted(found.header[LEFT_OUT]) == ["1", "3"]
-    assert "a contact was missed" in found.header[LEFT_OUT]["3"]
+    assert sorted(found.header[LEFT_OUT]) == ["1", "3"] and "a contact was missed" in found.header[LEFT_OUT]["3"]
     alone = best_harm(SCENARIO, sample.worlds.take(without(5, [1, 3])), budget=100, threads=1)
     assert np.array_equal(found.identity, alone.identity)
     assert np.array_equal(found.best["total"].harm, alone.best["total"].harm)
@@ -265,8 +262,7 @@ def test_search__of_a_hundred_candidates_is_near_the_proven_bound(name: str, abo
     worlds = scenario.sample(60, seed=7).worlds
     bound = lower_bound(worlds, time_step_s=scenario.time_step_s).harm
     found = best_harm(scenario, worlds, counts=["first"], budget=100, threads=1).best["first"].harm
-    assert np.all(found >= bound)
-    assert 0 < found.mean() < above * bound.mean()
+    assert np.all(found >= bound) and 0 < found.mean() < above * bound.mean()
 
 
 def test_profiles__of_both_kinds_are_needed_and_harmless_worlds_are_found() -> None:
@@ -374,8 +370,7 @@ def test_evaluate__whose_limits_nobody_asks_for_finds_none(
     found = evaluate(pair.sample(2, 0), {"coast": make_agent("coast")}, scenario=pair)
     calls["known_limits"].assert_not_called()
     write_per_world(tmp_path / "out.csv", found)
-    assert (len(summarise(found)), found.regrets) == (1, None)
-    assert found.conditions["no_limits_because"]
+    assert (len(summarise(found)), found.regrets) == (1, None) and found.conditions["no_limits_because"]
     calls["known_limits"].assert_called_once()
     assert found.limits is found.limits
 
@@ -414,8 +409,7 @@ def test_prove__bounds_the_harm_of_other_teams_without_a_verdict_on_contact(name
     found = known_limits(sample.worlds, Task(scenario, vehicles))
     assert found.proof.avoidable is None and found.proof.contact is None
     assert np.array_equal(found.proof.harm, team_bound(sample.worlds, vehicles, horizon_s=8.0, time_step_s=0.1).harm)
-    assert not found.known.any()
-    assert (found.proof.harm > 0).any() == (name != "cooperation-4-all")
+    assert not found.known.any() and (found.proof.harm > 0).any() == (name != "cooperation-4-all")
 
 
 def test_evaluation__of_a_team_tells_the_proven_harm_where_contact_is_not_decided(tmp_path: Path) -> None:

@@ -74,8 +74,7 @@ PAIR_BY_HAND = {
 def test_pair__by_hand_less_what_rounding_can_do_which_is_next_to_nothing(name):
     worlds, vehicle, harm = PAIR_BY_HAND[name]
     bound, outward = lower_bound(worlds, vehicle), rounding(worlds, vehicle)[0]
-    assert 0.0 < outward < 2e-8
-    assert bound.harm[0] == pytest.approx(max(harm - outward, 0.0), rel=1e-12, abs=1e-12)
+    assert 0.0 < outward < 2e-8 and bound.harm[0] == pytest.approx(max(harm - outward, 0.0), rel=1e-12, abs=1e-12)
     assert bound.harm[0] == (bound.front_pair if vehicle else bound.rear_pair)[0]
     assert bound.impact_proven[0] == (harm > 0)
 
@@ -101,8 +100,7 @@ def test_bound__is_never_above_what_its_own_optimum_realises_in_steps(vehicle, s
         ledger = ledger.add(impacts)
     harm = ledger.world_harm("first")
     attained = (harm > 0) & (harm - bound < 1e-6)
-    assert attained.sum() > 500
-    assert np.all(bound <= harm)
+    assert attained.sum() > 500 and np.all(bound <= harm)
     # Most of what is subtracted is not needed, and all of it is little.
     assert np.max(np.abs(harm - outward - bound)[attained]) < 0.1 * outward.max() < 1e-8
 
@@ -117,8 +115,7 @@ def test_both_pairs__add_up():
 def test_early__impacts_before_the_latency_are_certain():
     worlds = line([1, 50], [10, 12, 12], [5, 5, 5], latency=[1, 1, 1])  # both coast: 2 m/s
     bound = lower_bound(worlds)
-    assert avoidability(worlds).reason_name[0] == "early"
-    assert bound.early[0] == pytest.approx(4)
+    assert avoidability(worlds).reason_name[0] == "early" and bound.early[0] == pytest.approx(4)
     assert bound.front_pair[0] == 0  # hit: a further impact of this pair does not count first
     assert lower_bound(worlds, harm_count="total").early[0] == pytest.approx(4)
 
@@ -377,8 +374,7 @@ def test_lead__is_what_a_flight_gains_less_the_command_it_costs(share, press, re
     met = (-relative + np.sqrt(relative**2 + 2 * press * np.maximum(gap, 0.0))) / press
     best = np.max((share * (relative + press * met) - reach * s * (1.0 - share))[gap >= 0.0])
     found = lead(share, press, reach, opens, 0.0, 50.0, 0.0)
-    assert found >= best - 1e-9
-    assert found == pytest.approx(best, abs=2e-3)
+    assert found >= best - 1e-9 and found == pytest.approx(best, abs=2e-3)
 
 
 # One stands 5 m ahead, the other comes from 100 m behind; 60 m ahead it may come in time.
@@ -471,8 +467,7 @@ def test_a_standing_vehicle__may_wait_before_it_drives():
 def test_combined__is_claimed_only_where_contact_is_unavoidable_and_not_early():
     worlds = wide_worlds(1500, 3, seed=46, strong=True)
     reason, bound = avoidability(worlds).reason, lower_bound(worlds, harm_count="total", horizon_s=200.0)
-    assert np.all(bound.combined[reason < 2] == 0)
-    assert np.mean(bound.combined[reason >= 2] > 0) > 0.5
+    assert np.all(bound.combined[reason < 2] == 0) and np.mean(bound.combined[reason >= 2] > 0) > 0.5
     assert np.all(bound.harm[reason == 0] == 0)
 
 
@@ -495,8 +490,7 @@ def test_decisions__leave_less_room_than_any_time():
     worlds = scenario.sample(100, seed=7).worlds
     any_time, decided = lower_bound(worlds), lower_bound(worlds, time_step_s=scenario.time_step_s)
     often = lower_bound(worlds, time_step_s=1e-3)
-    assert np.all(any_time.harm <= decided.harm)
-    assert decided.harm.mean() > 1.02 * any_time.harm.mean()
+    assert np.all(any_time.harm <= decided.harm) and decided.harm.mean() > 1.02 * any_time.harm.mean()
     assert often.harm.mean() < 1.01 * any_time.harm.mean()
 
 

@@ -146,8 +146,7 @@ def test_with_obstacle__writes_it_out_in_front() -> None:
         "obstacle_gap_m": np.inf,
         "obstacle_hit": False,
     }
-    assert {name: found[name] for name in expected} == expected
-    assert worlds.vehicles.known_from_s.shape == (1, 3, 3)
+    assert {name: found[name] for name in expected} == expected and worlds.vehicles.known_from_s.shape == (1, 3, 3)
 
 
 # ---------------------------------------------------------------- rows

@@ -51,8 +51,7 @@ def normal(mean: float, sd: float, low: float, high: float) -> Normal:
     ids=lambda value: type(value).__name__,
 )  # fmt: skip
 def test_distribution__by_hand(quantity: Any, u: list[float], drawn: Any, bounds: tuple[float, float]) -> None:
-    assert values(quantity, np.array(u)).tolist() == drawn
-    assert support(quantity) == bounds
+    assert values(quantity, np.array(u)).tolist() == drawn and support(quantity) == bounds
 
 
 @given(st.floats(0, 1e4), st.floats(0, 1e4), st.lists(st.floats(1e-6, 1e6), min_size=1, max_size=9))
@@ -253,8 +252,7 @@ def test_margin__is_an_obstacle_for_everybody() -> None:
     scenario = ahead(obstacle_margin_m=1.5)
     assert scenario.sample(2, 7).worlds.obstacle_gap_m.tolist() == [51.5] * 2
     assert [each.has_obstacle for each in (scenario, ahead(obstacle_gap_m=42), ahead())] == [True, True, False]
-    assert scenario.with_learners(["vehicle_1"]).learners == (0,)
-    assert eb.observation_for(scenario).obstacle
+    assert scenario.with_learners(["vehicle_1"]).learners == (0,) and eb.observation_for(scenario).obstacle
 
 
 # ---------------------------------------------------------------- worlds that are given
@@ -282,8 +280,7 @@ def test_csv__optional_columns_in_any_order_with_a_byte_order_mark(tmp_path: Pat
     text = f"\ufefflatency_2_s,restitution,mass_3_t,speed_limit_1_mps,{HEADER}\n0.2,0.3,6,30,10,8,20,18,20\n"
     vehicles = read(tmp_path, text, PAPER.replace(mass_t=[4.5, 5.5, {"uniform": [5, 6]}])).vehicles
     assert (vehicles.latency_s.tolist(), vehicles.restitution.tolist()) == ([[0.0, 0.2, 0.8]], [0.3])
-    assert vehicles.mass_t.tolist() == [[4.5, 5.5, 6.0]]
-    assert vehicles.speed_limit_mps.tolist() == [[30.0, 40.0, 40.0]]
+    assert vehicles.mass_t.tolist() == [[4.5, 5.5, 6.0]] and vehicles.speed_limit_mps.tolist() == [[30.0, 40.0, 40.0]]
 
 
 @pytest.mark.parametrize("end", ["", "\n", "\n\n", "\r\n\r\n"])
@@ -332,8 +329,7 @@ def test_initial_state__the_scenario_fills_in_fixed_fields(
 ) -> None:
     worlds = scenario.worlds_from_state(state)
     usual = {} if "braking_capacity_mps2" in told else {"braking_capacity_mps2": [6, 7, 6]}
-    assert worlds.n == 1
-    assert {name: quantity(worlds, name)[0].tolist() for name in told | usual} == told | usual
+    assert worlds.n == 1 and {name: quantity(worlds, name)[0].tolist() for name in told | usual} == told | usual
 
 
 # ---------------------------------------------------------------- types of vehicles
@@ -626,8 +622,7 @@ def test_table__a_world_by_hand() -> None:
     worlds = one.sample(3, 7).worlds
     assert worlds.gaps_m.tolist() == [[12.0, 40.0]] * 3 and worlds.vehicles.mass_t[:, 2].tolist() == [30.0] * 3
     assert final(one).gaps_m[0] == pytest.approx([12 + 400 / 12 - 400 / 14, 40 + 400 / 14 - 400 / 12], abs=1e-9)
-    assert tabled().ranges().names[-1] == "row of the table"
-    assert tabled().bounds("gaps_m") == ((5.0, 7.0), (9.0, 9.0))
+    assert tabled().ranges().names[-1] == "row of the table" and tabled().bounds("gaps_m") == ((5.0, 7.0), (9.0, 9.0))
     assert tabled().middle_world().gaps_m[0].tolist() == [6.0, 9.0]
 
 

@@ -40,8 +40,7 @@ def test_burst_periods__at_the_bounds_by_hand():
     # p = r = 0.5: P(k >= 1) = 1/2, P(k >= 2) = 1/4, P(k >= 3) = 1/8; all exact in binary.
     u = np.array([0.5, 0.4999, 0.25, 0.2499, 0.125, 0.1249, 0.99])
     assert burst_periods(u, 0.5, 0.5).tolist() == [0, 1, 1, 2, 2, 3, 0]
-    assert burst_periods(u, 0.0, 0.5).tolist() == [0] * 7
-    assert burst_periods(np.array([0.0]), 0.5, 1.0).tolist() == [1]
+    assert burst_periods(u, 0.0, 0.5).tolist() == [0] * 7 and burst_periods(np.array([0.0]), 0.5, 1.0).tolist() == [1]
 
 
 def slow_news(channel: Channel, own_s: list[float], links: np.ndarray) -> tuple[list[float], np.ndarray]:

@@ -140,18 +140,6 @@ def test_constant__gives_a_certificate_where_the_plan_gives_none():
     assert without.intervened[0] and without.applied[0] == plan[0, 0]
 
 
-def test_budget__above_the_plan_lets_more_through_but_never_more_than_that():
-    running, backup = start(two(15.0)[1], braking())
-    assert backup.harm[0] == pytest.approx(225.0 - 150.0)
-    budget = backup.harm + 20.0
-    while not running.ended[0]:
-        decision = certify(running, np.ones(1), backup, budget)
-        running, backup = decision.after, decision.backup
-        assert backup.harm[0] <= budget[0]
-    # two vehicles: speeds 2, gap, hit, first-impact harm
-    assert running.states[0, 4] == backup.harm[0] > budget[0] - 20.0
-
-
 @pytest.mark.parametrize(("value", "instead"), [(np.nan, -0.8), (-7.0, -1.0), (-np.inf, -1.0)])
 def test_proposal__that_is_no_number_is_replaced_and_beyond_the_range_is_clipped_before_it_is_certified(value, instead):
     running, backup = start(two(15.0)[1], braking(-0.8))
@@ -161,26 +149,34 @@ def test_proposal__that_is_no_number_is_replaced_and_beyond_the_range_is_clipped
     assert decision.intervened[0] == np.isnan(value) == (reason(decision) == "not a number")
 
 
-@pytest.mark.parametrize("name", ["random_actions", "extremes"])
-def test_attack__of_few_worlds_small_enough_to_run_uncompiled(name):
-    found = attack(TWO, SMALL, ADVERSARIES[name])
-    assert (found.bound > 0.0).any() and found.rises == 0
-    assert (found.realised <= found.bound).all()
-    assert found.realised.tolist() == found.last_bound.tolist()
-
-
-@pytest.mark.parametrize("name", ADVERSARIES)
-@pytest.mark.parametrize(("N", "harm_count"), [(3, "first"), (5, "total")])
-def test_attack__no_adversary_gets_above_the_bound(name, N, harm_count):
-    found = attack(line(N), line(N).sample(24, 11).worlds, ADVERSARIES[name], harm_count=harm_count)
-    assert (found.realised <= found.bound).all() and found.rises == 0
-    assert found.realised.tolist() == found.last_bound.tolist()
+@pytest.mark.parametrize(
+    ("scenario", "n", "harm_count", "settings", "name"),
+    [
+        *((TWO, 4, "first", {}, name) for name in ("random_actions", "extremes")),  # small enough to run uncompiled
+        *((line(3), 24, "first", {}, name) for name in ADVERSARIES),
+        *((line(5), 24, "total", {}, name) for name in ADVERSARIES),
+        *(
+            (eb.load_scenario(TEAMS[level, N]), 4 if N == 3 else 2, harm_count, {"hostile": hostile, "cap": cap}, name)
+            for level, N in ((3, 3), (4, 3), (3, 5))
+            for harm_count, cap in (("first", "baseline"), ("total", None))
+            for hostile in ("all", "one")
+            for name in TEAM_ADVERSARIES
+        ),
+    ],
+    ids=str,
+)
+def test_attack__realises_the_last_bound_to_the_bit_and_neither_bound_nor_caps_are_broken(
+    scenario, n, harm_count, settings, name
+):
+    found = attack(scenario, scenario.sample(n, 5).worlds, ADVERSARIES[name], harm_count=harm_count, seed=1, **settings)
+    assert found.realised.tolist() == found.last_bound.tolist() and (found.bound > 0.0).any()
+    assert (found.realised <= found.bound).all() and (found.rises, found.over_cap) == (0, 0)
+    assert found.accepted.any() or not settings or name == "full_drive"
 
 
 def test_search__finds_no_way_past_the_shield_but_many_without_it():
     found = search(60, 5)
-    assert (found.above, found.excess) == (0, 0.0)
-    assert found.loose > 0.5
+    assert (found.above, found.excess) == (0, 0.0) and found.loose > 0.5
 
 
 @pytest.mark.parametrize("name", [name for name in LEAKS if "further off" not in name])  # that one takes longer lines
@@ -198,7 +194,7 @@ def test_trained_adversary__does_more_harm_under_the_shield_than_chance_does() -
 def test_allowance__keeps_what_it_grants_and_no_more():
     worlds = line(3).sample(60, 13).worlds
     strict, loose = (attack(line(3), worlds, ADVERSARIES["slow_drift"], allowance=a) for a in (0.0, 30.0))
-    assert (loose.realised <= loose.bound + 30.0 + 1e-9).all()
+    assert (loose.realised <= loose.bound + 30.0 + 1e-9).all() and (loose.realised > loose.bound).any()
     assert loose.realised.mean() > strict.realised.mean() + 1.0
 
 
@@ -515,21 +511,6 @@ def test_caps__reject_what_only_moves_harm_to_another_vehicle_also_in_a_later_ro
     for each, refused in ((running, False), (capped, True)):
         found = certify_rollouts(each, proposed, np.arange(1), budget, backup.plan, team)
         assert found.intervened.tolist() == [[refused, refused]] and found.margin.min() > 0.0
-
-
-@pytest.mark.parametrize(("level", "N"), [(3, 3), (4, 3), (3, 5)])
-@pytest.mark.parametrize("harm_count", ["first", "total"])
-@pytest.mark.parametrize("name", TEAM_ADVERSARIES)
-def test_attack__realises_the_last_bound_to_the_bit_and_neither_bound_nor_caps_are_broken(name, level, N, harm_count):
-    scenario, cap = eb.load_scenario(TEAMS[level, N]), "baseline" if harm_count == "first" else None
-    for hostile in ("all", "one"):
-        found = attack(
-            scenario, scenario.sample(4 if N == 3 else 2, 5).worlds, TEAM_ADVERSARIES[name], hostile=hostile, seed=1,
-            harm_count=harm_count, cap=cap,
-        )  # fmt: skip
-        assert found.realised.tolist() == found.last_bound.tolist()
-        assert (found.realised <= found.bound).all() and (found.rises, found.over_cap) == (0, 0)
-        assert found.accepted.any() or name == "full_drive"
 
 
 def test_one_vehicle_in_a_list__is_the_single_shield_bit_for_bit():
