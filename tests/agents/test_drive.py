@@ -360,18 +360,26 @@ def test_e_v2x_bm__drives_by_its_optimum_of_the_count_and_horizon_it_was_given()
 
 
 @pytest.mark.parametrize(
-    "spec", ["full_brake", "coast", "constant:3.5", "copy_leader", "gentlest_front", "e_v2x_bm", "e_v2x_bm:pairwise"]
+    "spec",
+    [
+        *("full_brake", "coast", "constant:3.5", "copy_leader", "gentlest_front", "e_v2x_bm", "e_v2x_bm:pairwise"),
+        *("planner:20", "best_harm:20", "constant:5+refined", "constant:5+refined:profile", "full_brake+refined:10"),
+        *("full_brake+episode", "ppo@shipped+episode"),
+    ],
 )
-def test_agents__new_episodes_change_their_rows_only_and_agents_can_be_pickled(spec):
-    worlds, fresh = SCENARIO.sample(6, 31).worlds, SCENARIO.sample(2, 32).worlds
-    agent = Asked(make_agent(spec)).begin(worlds, 1)
-    before = agent.act(worlds, 1)
-    agent.begin(fresh, 1, np.array([4, 1]))
+def test_agents__every_row_is_its_own_new_episodes_change_theirs_alone_and_agents_can_be_pickled(spec):
+    worlds, fresh, rows, new = SCENARIO.sample(20, 3).worlds, SCENARIO.sample(2, 32).worlds, [17, 1], np.array([4, 0])
+    agent = Asked(make_agent(spec, scenario=SCENARIO)).begin(worlds, 1)
+    part, before = agent.take(rows), Asked(agent.agent, memory=agent.memory).act(worlds, 1)
+    assert part.act(worlds.take(rows), 1).tolist() == before[rows].tolist()
+    whole, some = (drive(each, agent.agent, SCENARIO, 1).ledger.total_harm for each in (worlds, worlds.take(rows)))
+    assert some.tolist() == whole[rows].tolist()
+    agent.begin(fresh, 1, new)
+    before[new] = asked(spec, fresh, scenario=SCENARIO)
     again = Asked(pickle.loads(pickle.dumps(agent.agent)), memory=agent.memory)
-    for after in (again.act(worlds, 1), agent.act(worlds, 1)):
-        assert after[[0, 2, 3, 5]].tolist() == before[[0, 2, 3, 5]].tolist()
-        assert after[[4, 1]].tolist() == asked(spec, fresh).tolist()
-    assert again.name == spec
+    for each in (again, agent):
+        assert each.act(worlds.assign(new, fresh), 1).tolist() == before.tolist()
+    assert again.name == spec.removesuffix(":20" if "best" in spec else "")  # a budget is no part of that name
 
 
 def test_agent_names__are_those_that_ship_and_are_listed(capsys):

@@ -76,30 +76,6 @@ def test_planner__is_told_what_the_others_do(make):
 
 
 GENTLE = SCENARIO.replace(roles={"vehicle_1": "constant:3", "vehicle_2": "learner", "vehicle_3": "coast"})
-SEARCHES = {
-    "planner": lambda: Planner("20"),
-    "refined": slowly,
-    "profile": quickly,
-    "again": lambda: agent_of("full_brake+refined:10"),
-}
-
-
-@pytest.mark.parametrize("search_of", SEARCHES.values(), ids=SEARCHES)
-def test_search__a_world_does_not_depend_on_its_batch(search_of):
-    worlds, rows = WORLDS.take(np.arange(20)), np.array([17, 1])
-    assert harm(search_of(), worlds=worlds.take(rows)).tolist() == harm(search_of(), worlds=worlds)[rows].tolist()
-
-
-@pytest.mark.parametrize("search_of", SEARCHES.values(), ids=SEARCHES)
-def test_search__new_episodes_change_their_rows_only_and_take_goes_on_in_some(search_of):
-    worlds = WORLDS.take(np.arange(20))
-    agent = Asked(search_of()).begin(worlds, 1)
-    before, rows = agent.predicted_harm.copy(), np.array([5, 12])
-    least, most = before.argmin(), before.argmax()
-    assert agent.take(rows).act(worlds.take(rows), 1).tolist() == agent.act(worlds, 1)[rows].tolist()
-    agent.begin(worlds.take([most]), 1, np.array([least]))
-    assert agent.predicted_harm[least] == before[most] > before[least]
-    assert np.delete(agent.predicted_harm, least).tolist() == np.delete(before, least).tolist()
 
 
 @pytest.mark.parametrize(

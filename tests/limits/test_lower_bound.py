@@ -223,11 +223,6 @@ def random_states(n, seed):
     return [state(**{name: column[k] for name, column in drawn.items()}) for k in range(n)]
 
 
-def outer_gap(at, time):
-    """Gap between the outer two vehicles, both left alone."""
-    return at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, time)[1] - follower(at, time)[1]
-
-
 def follows(kind, at, time, closing):
     """The least squared closing speed at the other pair after such a meeting."""
     return after(kind, at, time, time, closing, time, 0.0, *PLANS)
@@ -252,9 +247,10 @@ def test_gentlest_meeting__is_driven_and_falls_with_the_time():
 def test_what_follows__falls_with_the_closing_speed_and_rises_with_the_time():
     some = 0
     for at in random_states(300, seed=44):
-        stand = at[LINE.V_L] / at[LINE.A_L]
+        stand, apart = at[LINE.V_L] / at[LINE.A_L], at[LINE.GAP_L] + at[LINE.GAP_R]
         for kind in (FRONT_FIRST, REAR_FIRST):
-            times = [t for t in (0.1, 0.4, 0.8, 1.6) if outer_gap(at, t) > 0 and (kind == REAR_FIRST or t < stand)]
+            times = [t for t in (0.1, 0.4, 0.8, 1.6) if leader(at, t)[1] - follower(at, t)[1] > -apart]  # the outer two
+            times = [t for t in times if kind == REAR_FIRST or t < stand]
             if not times:
                 continue
             harm = np.array([[follows(kind, at, t, w) for w in (0, 0.5, 1, 2, 4)] for t in times])
@@ -393,17 +389,6 @@ def test_first_meeting__of_the_rear_is_impossible_where_the_leader_must_be_met_b
 STEP_S, FAR_M = 0.2, 1e4
 
 
-def pairs(n, seed):
-    """Lines of three whose leader is out of reach."""
-    rng = np.random.default_rng(seed)
-    latency = np.stack([np.zeros(n), np.zeros(n), rng.uniform(0, 1, n)], axis=1)
-    return make_worlds(
-        np.stack([np.full(n, FAR_M), rng.uniform(0.2, 8, n)], axis=1), rng.uniform(15, 25, (n, 3)),
-        braking_capacity_mps2=rng.uniform(2, 9, (n, 3)), driving_capacity_mps2=rng.uniform(0, 8, (n, 3)),
-        latency_s=latency, mass_t=1, restitution=0, speed_limit_mps=rng.uniform(25, 60, (n, 3)),
-    )  # fmt: skip
-
-
 def played(worlds, rng):
     """First meetings under joint commands that are mostly extreme: world, time, closing speed, and the state there."""
     v, now = worlds.vehicles, worlds
@@ -423,7 +408,13 @@ def played(worlds, rng):
 
 
 def test_played_meetings__lie_within_the_bounds_of_every_cell_that_holds_them():
-    worlds, checked, earlier = pairs(400, seed=3), 0, 0
+    rng, checked, earlier, n = np.random.default_rng(3), 0, 0, 400
+    latency = np.stack([np.zeros(n), np.zeros(n), rng.uniform(0, 1, n)], axis=1)
+    worlds = make_worlds(  # lines of three whose leader is out of reach
+        np.stack([np.full(n, FAR_M), rng.uniform(0.2, 8, n)], axis=1), rng.uniform(15, 25, (n, 3)),
+        braking_capacity_mps2=rng.uniform(2, 9, (n, 3)), driving_capacity_mps2=rng.uniform(0, 8, (n, 3)),
+        latency_s=latency, mass_t=1, restitution=0, speed_limit_mps=rng.uniform(25, 60, (n, 3)),
+    )  # fmt: skip
     v = worlds.vehicles
     for world, time, closing, there in played(worlds, np.random.default_rng(4)):
         row = onset_states(worlds.take([world]), 1, None)[0]

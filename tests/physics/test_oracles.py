@@ -15,7 +15,7 @@ from ethbrake_marl.physics.kernel import contact
 from tests.physics.exact_simulator import Hit, Line, line_of, regression, simulate, square_root
 from tests.physics.manufacture import Case, floats, manufactured, pressed, stored, worlds_of
 from tests.physics.random_worlds import HORIZON_S, driving_lines, line, place_ahead, touching_lines
-from tests.physics.segments import Scan, meetings, random_segments, scan
+from tests.physics.segments import meetings, random_segments, scan
 from tests.reference.tolerances import CLUSTER_EPS, CONTACT_TIME_EPS, EPS
 
 # ---------------------------------------------------------------- rational arithmetic, contact times to 160 bits
@@ -185,15 +185,11 @@ def test_oracle__the_min_max_formula_is_the_best_decreasing_fit(vehicles) -> Non
 # ---------------------------------------------------------------- closed forms: no contact is missed, none is invented
 
 
-def clean(found: Scan) -> None:
-    """Nothing missed, invented or misplaced; and the scan said something."""
-    assert (found.missed.tolist(), found.phantom.tolist(), found.wrong.tolist()) == ([], [], [])
-    assert found.contacts > 0.1 * found.pairs / 4 and found.in_doubt > 0
-
-
 @pytest.mark.parametrize(("N", "n"), [(2, 60_000), (3, 10_000), (5, 5_000)])
 def test_contacts__none_missed_and_none_invented(N: int, n: int) -> None:
-    clean(scan(random_segments(np.random.default_rng([5, N]), n, N)))
+    found = scan(random_segments(np.random.default_rng([5, N]), n, N))
+    assert (found.missed.tolist(), found.phantom.tolist(), found.wrong.tolist()) == ([], [], [])
+    assert found.contacts > 0.1 * found.pairs / 4 and found.in_doubt > 0
 
 
 def test_scan__finds_what_is_planted(monkeypatch: pytest.MonkeyPatch) -> None:

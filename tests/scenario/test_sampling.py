@@ -545,12 +545,8 @@ def test_friction__a_table_of_initial_states_gives_the_same_worlds() -> None:
     again = wet.worlds_from_table({name: [state[name] for state in states] for name in states[0]})
     assert (again.road == worlds.road).all()
     assert (again.vehicles.braking_capacity_mps2 == worlds.vehicles.braking_capacity_mps2).all()
-    assert wet.worlds_from_state({name: 0.5 for name in ("friction",)} | state_of(worlds)).friction.tolist() == [0.5]
-
-
-def state_of(worlds: Worlds) -> dict[str, Any]:
-    return {"gaps_m": worlds.gaps_m[0].tolist(), "speeds_mps": worlds.speeds_mps[0].tolist(),
-            "braking_capacity_mps2": worlds.dry("braking_capacity_mps2")[0].tolist()}  # fmt: skip
+    state = {"friction": 0.5, "gaps_m": 7, "speeds_mps": 20, "braking_capacity_mps2": 6}
+    assert wet.worlds_from_state(state).friction.tolist() == [0.5]
 
 
 def test_friction__its_uncertainty_moves_all_capacities_together() -> None:

@@ -236,14 +236,6 @@ def test_episode__the_pairwise_bound_is_exceeded_in_the_same_physics():
     assert (harm(hybrid) > memory_of(hybrid)["bound_harm"] + 1.0).mean() > 0.3
 
 
-def test_episode__of_some_rows_leaves_the_others_alone():
-    hybrid = Asked(HybridAgent(make_agent("full_brake"), PAPER)).begin(WORLDS, 1)
-    expected = hybrid.bound_harm.copy()
-    hybrid.begin(WORLDS.take([7]), 1, np.array([2]))
-    expected[2] = expected[7]
-    assert hybrid.bound_harm.tolist() == expected.tolist()
-
-
 def test_episode__applies_the_certified_strategy_whatever_is_proposed():
     shielded = HybridShield(eb.parallel_env(), make_agent("full_brake"), mode="episode")
     for seed in range(6):
