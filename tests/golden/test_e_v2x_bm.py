@@ -63,11 +63,3 @@ def test_closed_form__one_call_gives_the_same_bits_as_five():
     for k, world in enumerate(worlds):
         for column, own in zip(from_batch, optimise_pairwise(world, 1), strict=True):
             np.testing.assert_array_equal(column[k], own[0])
-
-
-def test_golden_interval__its_ends_touch_and_its_outside_hits():
-    world = paper_world((10, 8), (20, 18, 20), 0.5, 0.8)
-    found = optimise_pairwise(world, 1)
-    low, high = found.spares_front_mps2[0], found.spares_rear_mps2[0]
-    for a, hits in [(low - 1e-6, [True, False]), (low, [False] * 2), (high, [False] * 2), (high + 1e-6, [False, True])]:
-        assert np.array_equal(pairwise_harm(world, [6, a, 6])[0] > 0, hits)

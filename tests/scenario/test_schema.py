@@ -160,13 +160,13 @@ PAPER = {
 @pytest.mark.parametrize("name", PAPER)
 def test_paper_scenarios__have_the_papers_values(name: str) -> None:
     scenario = eb.load_scenario(name)
-    declared = scenario.declared()
-    assert tuple(declared[key] for key in ("gaps_m", "speeds_mps", "latency_s")) == PAPER[name]
-    assert declared["braking_capacity_mps2"] == declared["driving_capacity_mps2"] == [6, 7, 6]
-    assert declared["mass_t"] == [4.5, 5.5, 5.9]
-    assert (scenario.vehicles, scenario.restitution, scenario.early_impacts) == (3, 0.1, "reject")
-    assert (scenario.time_step_s, scenario.horizon_s, scenario.speed_limit_mps) == (0.1, 8.0, 40.0)
-    assert (scenario.learners, scenario.scripts) == ((1,), {0: "full_brake", 2: "full_brake"})
+    told = scenario.model_dump() | scenario.declared() | {"learners": scenario.learners, "scripts": scenario.scripts}
+    expected = dict(zip(("gaps_m", "speeds_mps", "latency_s"), PAPER[name], strict=True)) | {
+        "braking_capacity_mps2": [6, 7, 6], "driving_capacity_mps2": [6, 7, 6], "mass_t": [4.5, 5.5, 5.9],
+        "vehicles": 3, "restitution": 0.1, "early_impacts": "reject", "time_step_s": 0.1, "horizon_s": 8.0,
+        "speed_limit_mps": 40.0, "learners": (1,), "scripts": {0: "full_brake", 2: "full_brake"},
+    }  # fmt: skip
+    assert {key: told[key] for key in expected} == expected
 
 
 def not_used(scenario: eb.Scenario) -> set[str]:
