@@ -377,8 +377,7 @@ def test_agents__every_row_is_its_own_new_episodes_change_theirs_alone_and_agent
     agent.begin(fresh, 1, new)
     before[new] = asked(spec, fresh, scenario=SCENARIO)
     again = Asked(pickle.loads(pickle.dumps(agent.agent)), memory=agent.memory)
-    for each in (again, agent):
-        assert each.act(worlds.assign(new, fresh), 1).tolist() == before.tolist()
+    assert all(each.act(worlds.assign(new, fresh), 1).tolist() == before.tolist() for each in (again, agent))
     assert again.name == spec.removesuffix(":20" if "best" in spec else "")  # a budget is no part of that name
 
 
@@ -388,8 +387,7 @@ def test_agent_names__are_those_that_ship_and_are_listed(capsys):
     assert agent_names() == tuple(sorted(names)) and run_command(["agent", "list"]) == 0
     table = capsys.readouterr().out
     assert [name for name in (*names, "+refined", "+episode", "+step", "+robust") if name not in table] == []
-    for entry in agent_entries():
-        assert callable(entry.load()) and entry.about and entry.knows
+    assert all(callable(entry.load()) and entry.about and entry.knows for entry in agent_entries())
 
 
 def test_register_agent__makes_names_and_policies_known():

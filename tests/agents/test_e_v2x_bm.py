@@ -89,6 +89,7 @@ BY_HAND = {
         ((5, 10, 0, 10, 5, 0), 10.0),  # the follower needs 10 m, the leader may stop in 5
         ((11, 10, 0, 10, 5, 0), math.inf),  # the follower stops within the gap
         ((2, 30, 0, 33, 3, 0), 0.75),  # grazing: 9 = 2 (3 - a) 2
+        ((17.5, 10, 1, 20, 5, 0), 4.0),  # braking first, 10 m away and at 15 m/s after 1 s: 22.5 m = 10 m + 100 / (2 a)
         ((1, 10, 0, 14, 2, 0), -math.inf),  # even a coasting leader is hit
         ((4, 10, 3, 12, 5, 4), -math.inf),  # they meet while both coast
         ((3, 10, 9, 14, 2, 0), -math.inf),  # hit before it may brake

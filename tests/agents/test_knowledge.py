@@ -23,13 +23,7 @@ from tests.fixtures.policies import make_policy
 
 
 def changed_decisions(
-    agent: eb.Agent,
-    scenario: eb.Scenario,
-    *,
-    vehicle: int | None = None,
-    n: int = 100,
-    decisions: int = 8,
-    seed: int = 11,
+    agent: eb.Agent, scenario: eb.Scenario, *, vehicle: int = 1, n: int = 100, decisions: int = 8, seed: int = 11
 ) -> int:
     """How many decisions change when all is altered that has not reached the vehicle by then: 0 for an honest agent.
 
@@ -40,14 +34,12 @@ def changed_decisions(
     Args:
         agent: any; it is left as it is.
         scenario: whose worlds.
-        vehicle: the driven one, from 0, beside which other learners brake fully; None: the scenario's only learner.
+        vehicle: the driven one, from 0, beside which other learners brake fully.
         n: number of worlds; more find rarer leaks.
         decisions: in each world.
         seed: of the list, and of the random numbers.
 
     """
-    if vehicle is None:
-        (vehicle,) = scenario.learners
     scenario = scenario.with_learners([vehicle])
     rng, alert = np.random.default_rng(seed), scenario.sample(n, seed).worlds
     scripts = script_agents(scenario, except_for=vehicle)
@@ -338,9 +330,8 @@ def test_believed_model__a_planted_leak_is_found(spec, leak, monkeypatch):
 
     def leaking(worlds, vehicle):
         told = honest(worlds, vehicle)
-        if leak == "known":
-            return told._replace(known=np.ones_like(told.known))
-        return told._replace(speed_mps=worlds.speeds_mps.copy())
+        all_of_it = {"known": np.ones_like(told.known), "speed_mps": worlds.speeds_mps.copy()}
+        return told._replace(**{leak: all_of_it[leak]})
 
     scenario = BLOCKED.replace(v2x={"preset": "blocked", "persistence": "periodic"})
     monkeypatch.setattr(Told, "to", leaking)

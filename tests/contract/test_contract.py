@@ -244,8 +244,7 @@ def test_refusal__changes_nothing(name: str, ask: Callable[[Interface], Any], me
     list(play(interface, 5, steps=10)), list(play(untouched, 5, steps=10))
     with pytest.raises(InvalidInput, match=message):
         ask(interface)
-    for action in actions(8, 5, interface.n):
-        assert interface.step(action).bits() == untouched.step(action).bits()
+    assert all(interface.step(action).bits() == untouched.step(action).bits() for action in actions(8, 5, interface.n))
     assert np.array_equal(interface.reset(), untouched.reset())
 
 

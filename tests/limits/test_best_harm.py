@@ -94,8 +94,7 @@ def test_best_harm__an_obstacle_ahead_of_some_worlds_changes_nothing_in_the_othe
 
 def test_best_harm__starts_from_what_is_known_and_never_gets_worse(table: BestHarmTable) -> None:
     again = best_harm(SCENARIO, WORLDS, budget=100, threads=1, seed=2, known=table)
-    for harm_count in HARM_COUNTS:
-        assert (again.best[harm_count].harm <= table.best[harm_count].harm + 1e-6).all()
+    assert all((again.best[harm_count].harm <= table.best[harm_count].harm + 1e-6).all() for harm_count in HARM_COUNTS)
     assert again.header["after"]["budget"] == BUDGET
 
 

@@ -425,8 +425,7 @@ def test_played_meetings__lie_within_the_bounds_of_every_cell_that_holds_them():
         _, way_l, _ = solo_motion(worlds.speeds_mps[world, 0], -v.braking_capacity_mps2[world, 0], 0.0, math.inf, time)
         further = max(FAR_M + way_l - there.gaps_m[0, 0] + row[LINE.GAP_R] - way, 0.0)
         faster = there.speeds_mps[0, 2] - speed
-        for reach in (power, math.inf):
-            assert faster >= gained(further - 1e-6, time, since, reach) - 1e-3
+        assert all(faster >= gained(further - 1e-6, time, since, reach) - 1e-3 for reach in (power, math.inf))
         for before, later, near, far in ((0, 0, 1, 1), (0.5, 0.5, 0.5, 1.5), (1, 0.2, 0, 3), (0, 1, 0.9, 1)):
             early, late = (1 - before) * time, (1 + later) * time
             cell = early, late, max(near * further - 1e-6, 0.0), far * further + 1e-6
@@ -642,8 +641,7 @@ def check(worlds, vehicles, budget, draws, seed, steps=STEPS):
             bound = team_bound(worlds, vehicles, harm_count=harm_count, horizon_s=HORIZON_S, time_step_s=told)
             problem = profile_problem(worlds, vehicles, harm_count=harm_count, horizon_s=HORIZON_S, time_step_s=step)
             assert np.all(bound.harm <= searched(problem, harm_count, budget))
-            for _ in range(draws):
-                assert np.all(bound.harm <= at_random(problem, rng)[harm_count == "total"])
+            assert all(np.all(bound.harm <= at_random(problem, rng)[harm_count == "total"]) for _ in range(draws))
 
 
 LINES = {  # vehicles, the controlled ones, where an obstacle stands

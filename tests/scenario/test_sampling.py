@@ -132,8 +132,7 @@ def test_world_k__is_the_same_alone_and_in_any_list(scenario: eb.Scenario) -> No
     for first, n in (*((k, 1) for k in range(40)), (20, 15)):
         part, rows = scenario.sample(n, 11, first=first), np.arange(first, first + n)
         assert bits(part.worlds) == bits(whole.worlds.take(rows)) and part.index.tolist() == rows.tolist()
-        for name, kinds in whole.kinds.items():
-            assert part.kinds[name].tolist() == kinds[rows].tolist()
+        assert all(part.kinds[name].tolist() == kinds[rows].tolist() for name, kinds in whole.kinds.items())
     other, training = scenario.sample(40, 12), scenario.sample(40, 11, channel="training")
     for name, kinds in whole.kinds.items():
         assert (other.kinds[name] != kinds).any() and (training.kinds[name] != kinds).any()
@@ -524,8 +523,7 @@ def test_friction__is_one_number_for_the_whole_line_and_moves_nothing_else() -> 
         own = getattr(dry.vehicles, name)
         assert (getattr(worlds.vehicles, name) == np.minimum(own, 9.81 * friction[:, np.newaxis])).all()
         assert (worlds.dry(name) == own).all()
-    for name in ("gaps_m", "speeds_mps"):
-        assert (getattr(worlds, name) == getattr(dry, name)).all()
+    assert all((getattr(worlds, name) == getattr(dry, name)).all() for name in ("gaps_m", "speeds_mps"))
     assert wet.bounds("braking_capacity_mps2") == ((9.81 * 0.2, 6.0), (9.81 * 0.2, 7.0), (9.81 * 0.2, 6.0))
     assert wet.bounds("braking_capacity_mps2", dry=True) == ((6.0, 6.0), (7.0, 7.0), (6.0, 6.0))
     assert wet.ranges().names[-1] == "friction"

@@ -159,8 +159,7 @@ def test_bound__is_at_least_the_harm_of_every_world_drawn_from_the_box(name):
     (changed, text), rng = UNUSUAL[name], np.random.default_rng(5)
     for first in range(2):
         case = boxed(text, first=first, **changed)
-        for plan in plans(rng):
-            assert harm_inside(*case[:3], plan, 25).max() <= bound_of(case, plan, 5) < np.inf
+        assert all(harm_inside(*case[:3], plan, 25).max() <= bound_of(case, plan, 5) < np.inf for plan in plans(rng))
 
 
 # an impact, and then: bounces while they brake to a stop; a pair pressed together, a push beyond a speed limit, a drive

@@ -249,19 +249,33 @@ def test_episode__applies_the_certified_strategy_whatever_is_proposed():
         assert realised == pytest.approx(min(told["policy_harm"], told["bound_harm"]), abs=1e-9)
 
 
+class Counting:
+    """Brakes harder with every decision that it was asked for: a memory that it writes into."""
+
+    name = "counting"
+
+    def begin(self, alert, vehicle, scripts):
+        return {"steps": np.zeros(alert.n)}
+
+    def act(self, worlds, memory, vehicle):
+        memory["steps"] += 1.0
+        return -np.minimum(0.3 * memory["steps"], 7.0), memory
+
+
+def remembering(observation, state):
+    state += 1.0  # a memory that no decision which is not carried out must move
+    return -np.minimum(state - 1.0, 10.0) / 10.0, state
+
+
+@pytest.mark.parametrize("policy", [eb.policy_agent(remembering, initial_state=lambda n: np.zeros((n, 1))), Counting()])
 @pytest.mark.parametrize(
     "settings", [{"mode": "episode"}, {"mode": "step"}, {"mode": "step", "believed": True}], ids=str
 )
-def test_policy_with_a_memory__is_asked_once_per_decision_whoever_proposes(settings):
-    def remembering(observation, state):
-        state += 1.0  # a memory that no decision which is not carried out must move
-        return -np.minimum(state - 1.0, 10.0) / 10.0, state
-
+def test_policy_with_a_memory__is_asked_once_per_decision_whoever_proposes(settings, policy):
     def asked():
         memory = attached.memory.shield["policy"] if settings["mode"] == "episode" else attached.memory.policies[1]
         return memory["steps"].tolist()
 
-    policy = eb.policy_agent(remembering, initial_state=lambda n: np.zeros((n, 1)))
     env = HybridShield(eb.parallel_env(), policy, **settings)
     env.reset(seed=7)
     attached = env.attached
