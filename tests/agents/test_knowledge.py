@@ -1,4 +1,4 @@
-"""What agents say they know, and whether that is all they use."""
+"""What agents say they know, whether that is all they use, and the worlds that they believe in."""
 
 import itertools
 import re
@@ -10,7 +10,19 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.actions import action_to_command, command_to_action
-from ethbrake_marl.agents import Knowledge, Source, Told, agent_entries, find_entry, parse_spec, script_agents
+from ethbrake_marl.agents import (
+    Knowledge,
+    Odometer,
+    Ranges,
+    Source,
+    Told,
+    agent_entries,
+    drive,
+    find_entry,
+    make_agent,
+    parse_spec,
+    script_agents,
+)
 from ethbrake_marl.engine import Memory, Script, ask_script, begin_script
 from ethbrake_marl.evaluation import make_lineup
 from ethbrake_marl.physics import Bools, Floats, Packed
@@ -374,3 +386,111 @@ def test_hidden__only_where_news_or_a_reaction_is_late(v2x, least, most):
         latency[1, 2] += 0.5
         late = replace(vehicles, latency_s=latency)
         assert np.flatnonzero(late.hide_from(1)).tolist() == [1] and not late.hide_from(2).any()
+
+
+# ---------------------------------------------------------------- believed worlds by hand, and who drives by them
+
+BASE = eb.load_scenario("cooperation-2-paper").replace(early_impacts="keep")
+DEAF = {"preset": "paper", "hears": "front"}
+PERIODIC = {"preset": "blocked", "persistence": "periodic"}
+
+
+def engine_of(scenario: eb.Scenario, n: int = 40, vehicle: int = 1, seed: int = 7) -> eb.Engine:
+    scripts = script_agents(scenario, except_for=vehicle)
+    return eb.Engine(scenario, n, learners=[vehicle], scripts=scripts, worlds=scenario.sample(n, seed).worlds)
+
+
+def believed(engine: eb.Engine, vehicle: int = 1, odometer: Odometer | None = None) -> eb.Worlds:
+    worlds, scenario = engine.worlds, engine.scenario
+    way = worlds.speeds_mps[:, vehicle] * worlds.time_s if odometer is None else odometer.way_m
+    return Ranges.of(scenario, vehicle).believe(worlds, way)
+
+
+def test_believed__is_the_world_where_everything_is_known_and_who_believes_drives_as_who_sees() -> None:
+    engine, told = engine_of(BASE), ("gaps_m", "speeds_mps", "pair_hit", "time_s")
+    for _ in range(10):
+        now, taken = engine.worlds, believed(engine)
+        for name in told:
+            np.testing.assert_array_equal(getattr(taken, name), getattr(now, name))
+        np.testing.assert_array_equal(taken.vehicles.mass_t, now.vehicles.mass_t)
+        waiting = now.vehicles.latency_s > now.time_s[:, np.newaxis]
+        np.testing.assert_array_equal(taken.vehicles.latency_s[waiting], now.vehicles.latency_s[waiting])
+        engine.step(np.full((40, 1), -0.5))
+    agents, worlds = (
+        [make_agent(f"e_v2x_bm{way}", scenario=BASE) for way in ("", ":believed")],
+        BASE.sample(40, 7).worlds,
+    )
+    harm, believing = (drive(worlds, agent, BASE, 1).ledger.world_harm("first") for agent in agents)
+    np.testing.assert_allclose(believing, harm, atol=1e-4)
+
+
+def test_believed__who_is_not_known_is_in_the_middle_of_the_ranges_and_follows_its_script() -> None:
+    # Vehicle 3 is never heard: at the alert 7.5 m behind, at 20 m/s; it coasts to 0.8 s, then brakes with 6. At 1 s it
+    # has made 20 m less 0.5 * 6 * 0.2^2 = 0.12 m, and Vehicle 2, with 20 m/s and no command, 20 m.
+    scenario = BASE.replace(
+        v2x=DEAF, gaps_m=[7.0, {"uniform": [5, 10]}], speeds_mps=[20.0, 20.0, {"uniform": [18, 22]}]
+    )
+    engine = engine_of(scenario)
+    for _ in range(5):
+        engine.step(np.zeros((40, 1)))
+    taken = believed(engine)
+    np.testing.assert_allclose(engine.worlds.time_s, 1.0)
+    free = ~engine.worlds.pair_hit[:, 0] & (engine.worlds.speeds_mps[:, 1] == 20.0)
+    assert free.sum() > 20
+    np.testing.assert_allclose(taken.gaps_m[free, 1], 7.5 + 0.12)
+    np.testing.assert_allclose(taken.speeds_mps[:, 2], 20.0 - 6.0 * 0.2)
+    np.testing.assert_array_equal(taken.gaps_m[:, 0], engine.worlds.gaps_m[:, 0])
+    assert (taken.command_mps2[:, 2] == -6.0).all() and not taken.pair_hit[:, 1].any()
+
+
+def test_believed__an_old_message_is_moved_on_by_the_script_to_the_truth() -> None:
+    channel = {
+        "preset": "paper",
+        "link_latency_s": 0.2,
+        "persistence": "periodic",
+        "senses": "front",
+        "sensing_s": [5, 5],
+    }
+    engine = engine_of(BASE.replace(v2x=channel))
+    odometer = Odometer.begun(engine.scenario.sample(40, 7).worlds, 1)
+    for _ in range(12):
+        now, told = engine.worlds, Told.to(engine.worlds, 1)
+        assert told.known.all() and (told.at_s[:, [0, 2]] < now.time_s[:, np.newaxis] - 0.19).all()
+        odometer = odometer.look(now, 1)
+        taken = believed(engine, odometer=odometer)
+        free = ~now.pair_hit.any(axis=1)
+        np.testing.assert_allclose(taken.gaps_m[free], now.gaps_m[free], atol=1e-9)
+        np.testing.assert_allclose(taken.speeds_mps[free], now.speeds_mps[free], atol=1e-9)
+        engine.step(np.full((40, 1), -0.85))
+    assert free.sum() > 3
+
+
+@pytest.mark.parametrize(
+    ("vehicles", "v2x"),
+    [*((3, v2x) for v2x in (DEAF, PERIODIC, "blocked", "sensors-only")), (2, PERIODIC), (5, PERIODIC), (5, "blocked")],
+)
+def test_believing__drives_every_line_and_no_world_depends_on_the_batch(vehicles: int, v2x: object) -> None:
+    scenario = eb.load_scenario("paper-random").replace(
+        vehicles=vehicles, braking_capacity_mps2=6.0, driving_capacity_mps2=6.0, mass_t=5.0, latency_s=0.1, v2x=v2x,
+        roles={"vehicle_2": "learner"}, horizon_s=12.0,
+    )  # fmt: skip
+    worlds = scenario.sample(6, 3).worlds
+    for spec in ("e_v2x_bm:believed", "planner:8:believed"):
+        agent = make_agent(spec, scenario=scenario)  # the same again for a batch of another size
+        whole, alone = drive(worlds, agent, scenario, 1), drive(worlds.take([4]), agent, scenario, 1)
+        assert whole.ledger.world_harm("first")[4] == alone.ledger.world_harm("first")[0]
+        np.testing.assert_array_equal(whole.final.speeds_mps[4], alone.final.speeds_mps[0])
+
+
+@pytest.mark.parametrize("v2x", ["paper", PERIODIC])
+def test_believing__knows_of_the_obstacle_what_it_was_told(v2x: object) -> None:
+    scenario = eb.load_scenario("cooperation-4-all").replace(early_impacts="keep", v2x=v2x).with_learners(["vehicle_2"])
+    engine = engine_of(scenario)
+    for _ in range(15):
+        engine.step(np.full((40, 1), -0.9))
+    told, now = Told.to(engine.worlds, 1), engine.worlds
+    heard = told.known[:, 0]
+    assert heard.sum() > 20
+    np.testing.assert_allclose(told.obstacle_m[heard], (now.obstacle_gap_m + now.gaps_m[:, 0])[heard], atol=1e-9)
+    assert np.isinf(told.obstacle_m[~heard]).all() and np.isfinite(believed(engine).obstacle_gap_m).all()
+    drive(scenario.sample(5, 3).worlds, make_agent("e_v2x_bm:believed", scenario=scenario), scenario, 1)
