@@ -1,25 +1,42 @@
-"""Whole episodes: who drives what, what each is told and sees, and that nobody writes into what belongs to all."""
+"""Agents by name, and whole episodes: who drives what, what each is told and sees, and whose memory is whose."""
 
-from __future__ import annotations
+import pickle
 
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import LearnedAgent, Team, drive, make_agent, policy_agent, register_agent, script_agents
+from ethbrake_marl.agents import (
+    LearnedAgent,
+    Refined,
+    Team,
+    agent_entries,
+    agent_names,
+    drive,
+    make_agent,
+    optimise_coupled,
+    optimise_pairwise,
+    parse_spec,
+    policy_agent,
+    register_agent,
+    script_agents,
+)
+from ethbrake_marl.agents.registry import AgentSpec
+from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.envs.interfaces import make_engine
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation import evaluate, follow_episodes, record_episode, worlds_sha256
 from ethbrake_marl.evaluation.episodes import Task, film_scenes, record_episodes
+from ethbrake_marl.physics import Floats, Worlds, advance
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver
-from tests.fixtures.asked import Acts
+from tests.fixtures.asked import Acts, Asked
 
-PAPER = eb.load_scenario("paper-random")
+SCENARIO = eb.load_scenario("paper-random")
 PAIR = eb.load_scenario("cooperation-3-pair")
 
 
 def with_role(role, vehicle="vehicle_3"):
-    return PAPER.replace(roles={**PAPER.roles, vehicle: role}, early_impacts="keep")
+    return SCENARIO.replace(roles={**SCENARIO.roles, vehicle: role}, early_impacts="keep")
 
 
 @pytest.mark.parametrize("spec", ["e_v2x_bm", "e_v2x_bm+episode"])
@@ -37,9 +54,9 @@ def test_e_v2x_bm__predicts_and_beats_constants_whatever_script_the_others_follo
 
 def test_e_v2x_bm__knows_who_drives_in_the_engines_of_all_interfaces():
     roles = {"vehicle_1": "learner", "vehicle_2": "e_v2x_bm", "vehicle_3": "constant:3"}
-    scenario = PAPER.replace(roles=roles, early_impacts="keep", obstacle_gap_m=60)
+    scenario = SCENARIO.replace(roles=roles, early_impacts="keep", obstacle_gap_m=60)
     engine, alert = make_engine(scenario, 4, seed=3), scenario.sample(4, 3, channel="training").worlds
-    agent, braking = make_agent("e_v2x_bm"), script_agents(PAPER, except_for=1)
+    agent, braking = make_agent("e_v2x_bm"), script_agents(SCENARIO, except_for=1)
     told, papers, alone = (agent.begin(alert, 1, scripts) for scripts in (script_agents(scenario), braking, {}))
     assert engine.memories[1]["deceleration_mps2"].tolist() == told["deceleration_mps2"].tolist()
     assert told["deceleration_mps2"].tolist() != alone["deceleration_mps2"].tolist()
@@ -56,14 +73,14 @@ def test_drive__a_scripted_vehicle_that_is_driven_follows_its_script_in_nobodys_
 
 
 def test_drive__an_agent_sees_what_a_learner_sees_from_the_first_decision_on():
-    worlds, seen = PAPER.sample(20, 7).worlds, []
+    worlds, seen = SCENARIO.sample(20, 7).worlds, []
 
     def half(observation):
         seen.append(observation.tobytes())
         return np.full((len(observation), 1), -0.5, np.float32)
 
-    drive(worlds, policy_agent(half, scenario=PAPER), PAPER, 1)
-    engine = eb.Engine(PAPER, 20, learners=(1,), scripts=script_agents(PAPER, except_for=1), worlds=worlds)
+    drive(worlds, policy_agent(half, scenario=SCENARIO), SCENARIO, 1)
+    engine = eb.Engine(SCENARIO, 20, learners=(1,), scripts=script_agents(SCENARIO, except_for=1), worlds=worlds)
     for each in seen[:3]:
         assert engine.observe(1).tobytes() == each
         engine.step(np.full((20, 1), -0.5))
@@ -71,7 +88,7 @@ def test_drive__an_agent_sees_what_a_learner_sees_from_the_first_decision_on():
 
 def test_drive__a_policy_as_a_role_does_what_it_does_when_it_is_driven():
     def with_roles(**roles):
-        return PAPER.replace(early_impacts="keep", roles={"vehicle_1": "full_brake", **roles})
+        return SCENARIO.replace(early_impacts="keep", roles={"vehicle_1": "full_brake", **roles})
 
     universal, braking = make_agent("universal@shipped"), make_agent("full_brake")
     driven = with_roles(vehicle_2="learner", vehicle_3="full_brake")
@@ -95,8 +112,7 @@ def swinging():
     """Lines whose first and last vehicle follow a script that decides within the steps of Vehicle 2."""
     register_agent("swinging", lambda argument, settings: swings)
     roles = {"vehicle_1": "swinging", "vehicle_2": "learner", "vehicle_3": "swinging"}
-    latency = [0.04, 0.5, {"uniform": [0.2, 0.9]}]
-    return PAPER.replace(early_impacts="keep", roles=roles, latency_s=latency, gaps_m=4)
+    return SCENARIO.replace(early_impacts="keep", roles=roles, latency_s=[0.04, 0.5, {"uniform": [0.2, 0.9]}], gaps_m=4)
 
 
 def test_drive__shows_every_part_of_a_step_within_which_nobody_decides(swinging):
@@ -123,8 +139,7 @@ def test_record__motion_and_dataset_follow_scripts_that_decide_within_a_step(swi
     agent = make_agent("constant:3")
     outcome = evaluate(sample, {"it": agent}, scenario=swinging).outcome("it")
     motions = follow_episodes(sample.worlds, agent, swinging)
-    task = Task(swinging, 7, eb.RewardParams(), eb.observation_for(swinging))
-    recording = record_episodes(sample, agent, "it", task)
+    recording = record_episodes(sample, agent, "it", Task(swinging, 7, eb.RewardParams(), eb.observation_for(swinging)))
     assert outcome.sampled_harm is None  # its samples are the decisions of Vehicle 2 alone
     for k, motion in enumerate(motions):
         record = record_episode(sample.worlds.take([k]), agent, scenario=swinging)
@@ -139,9 +154,9 @@ def test_record__motion_and_dataset_follow_scripts_that_decide_within_a_step(swi
 
 
 def test_team__of_one_drives_as_the_agent_alone():
-    sample, agent = PAPER.sample(40, 7), make_agent("e_v2x_bm")
-    result = evaluate(sample, {"alone": agent, "team": Team({1: agent}, "team")}, scenario=PAPER)
-    named = evaluate(sample, {"alone": agent}, scenario=PAPER, vehicle="vehicle_2")
+    sample, agent = SCENARIO.sample(40, 7), make_agent("e_v2x_bm")
+    result = evaluate(sample, {"alone": agent, "team": Team({1: agent}, "team")}, scenario=SCENARIO)
+    named = evaluate(sample, {"alone": agent}, scenario=SCENARIO, vehicle="vehicle_2")
     outcomes = result.outcome("alone"), result.outcome("team"), named.outcome("alone")
     assert len({(each.final.gaps_m.tobytes(), each.predicted_harm.tobytes()) for each in outcomes}) == 1
     assert result.vehicle == named.vehicle == 1
@@ -156,7 +171,7 @@ def test_evaluate__an_agent_alone_drives_every_learner_and_a_team_of_nobody_none
         evaluate(scenario.sample(60, 7), drivers, scenario=scenario, vehicle=vehicle)
         for scenario, drivers, vehicle in (
             (PAIR, agents, None),
-            (PAPER, {"alone": brake, "unlike": gentle}, None),
+            (SCENARIO, {"alone": brake, "unlike": gentle}, None),
             (level, scripted, None),
             (level, {"scripts": brake}, 1),
         )
@@ -227,8 +242,8 @@ class _Writes:
 
 WRAPPED = {
     "alone": lambda agent: agent,
-    "episode": lambda agent: HybridAgent(agent, PAPER),
-    "step": lambda agent: ShieldedDriver(agent, PAPER),
+    "episode": lambda agent: HybridAgent(agent, SCENARIO),
+    "step": lambda agent: ShieldedDriver(agent, SCENARIO),
 }
 
 
@@ -247,9 +262,146 @@ WRAPPED = {
 def test_agent_that_writes_into_worlds_or_itself__is_refused_by_name(
     around: str, when: str, told: str, state_free: bool
 ) -> None:
-    sample = PAPER.sample(20, 3)
+    sample = SCENARIO.sample(20, 3)
     before = worlds_sha256(sample.worlds, sample.index)
     agents = {"full_brake": make_agent("full_brake"), "kmh": WRAPPED[around](_Writes(when, state_free=state_free))}
     with pytest.raises(InvalidInput, match=rf"agent '(kmh|other)' of vehicle_2: {told}"):
-        evaluate(sample, agents, scenario=PAPER)
+        evaluate(sample, agents, scenario=SCENARIO)
     assert worlds_sha256(sample.worlds, sample.index) == before and sample.worlds.gaps_m.flags.writeable
+
+
+# ---------------------------------------------------------------- the registry: one grammar, what each asks for
+
+
+def asked(spec: str, worlds: Worlds, vehicle: int = 1, **settings) -> Floats:
+    return Asked(make_agent(spec, **settings)).begin(worlds, vehicle).act(worlds, vehicle)
+
+
+@pytest.mark.parametrize(
+    ("spec", "parts"),
+    [
+        ("full_brake", AgentSpec("full_brake", None, None, ())),
+        ("constant:-5+step", AgentSpec("constant", "-5", None, ("step",))),
+        ("ppo@shipped+refined+step", AgentSpec("ppo", None, "shipped", ("refined", "step"))),
+        ("ppo@runs/a+b:c@d+episode:pairwise", AgentSpec("ppo", None, "runs/a+b:c@d", ("episode:pairwise",))),
+        ("ppo@runs/my+step/", AgentSpec("ppo", None, "runs/my+step/", ())),
+        ("mine:x@path+robust", AgentSpec("mine", "x", "path", ("robust",))),
+        ("mine:a+b", AgentSpec("mine", "a+b", None, ())),
+    ],
+)
+def test_spec__is_taken_apart_and_written_again(spec, parts):
+    assert parse_spec(spec) == parts and str(parts) == spec
+
+
+@pytest.mark.parametrize(
+    ("spec", "kind"),
+    [
+        ("full_brake+step", ShieldedDriver),
+        ("constant:-5+step", ShieldedDriver),
+        ("planner:8+episode", HybridAgent),
+        ("best_harm:20+refined", Refined),
+        ("e_v2x_bm+refined+episode", HybridAgent),
+        ("gentlest_front+robust", ShieldedDriver),
+        ("ppo@shipped+refined+step", ShieldedDriver),
+        ("full_brake+refined:10+episode", HybridAgent),
+        ("full_brake+refined:10+step", ShieldedDriver),
+        ("full_brake+refined:profile+step", ShieldedDriver),
+    ],
+)
+def test_shields__go_around_any_agent_and_hold(spec, kind):
+    agents = {spec: make_agent(spec, scenario=SCENARIO, harm_count="total", uncertainty="gaps_m=0.2")}
+    assert isinstance(agents[spec], kind)
+    outcome = eb.evaluate(SCENARIO.sample(3, 5), agents, scenario=SCENARIO).outcome(spec)
+    assert (outcome.total_harm <= outcome.predicted_harm + 1e-9).all()
+
+
+@pytest.mark.parametrize(
+    ("spec", "capacity", "expected"),
+    [
+        ("full_brake", 7, -7.0),
+        ("coast", 7, 0.0),
+        ("constant:3.5", 7, -3.5),
+        ("constant:-2", 7, 2.0),
+        ("copy_leader", 7, -6.0),
+        ("copy_leader", 4, -4.0),  # no harder than its own brakes
+    ],
+)
+def test_scripts__ask_for_their_acceleration(spec, capacity, expected):
+    worlds = SCENARIO.replace(braking_capacity_mps2=[6, capacity, 6]).sample(3, 7).worlds
+    assert asked(spec, worlds).tolist() == [expected] * 3
+
+
+def test_gentlest_front__spares_the_front_vehicle_and_nothing_gentler_does():
+    worlds = SCENARIO.sample(300, 31).worlds
+    command = -worlds.vehicles.braking_capacity_mps2
+    command[:, 1] = asked("gentlest_front", worlds)
+    reachable = command[:, 1] > -7.0
+    assert 100 < reachable.sum() < 300
+    alone = worlds.take(reachable)
+    alone.gaps_m[:, 1] = 1000.0  # nobody behind
+    _, impacts = advance(alone, command[reachable], until_s=20.0)
+    assert impacts.count.sum() == 0
+    command[:, 1] += 1e-4
+    _, impacts = advance(alone, command[reachable], until_s=20.0)
+    assert np.all(impacts.count[:, 0] >= 1)
+
+
+def test_e_v2x_bm__drives_by_its_optimum_of_the_count_and_horizon_it_was_given():
+    worlds = SCENARIO.sample(40, 31).worlds
+    pairwise, closed = Asked(make_agent("e_v2x_bm:pairwise")).begin(worlds, 1), optimise_pairwise(worlds, 1)
+    assert np.array_equal(pairwise.predicted_harm, closed.harm)
+    assert np.array_equal(pairwise.act(worlds, 1), -closed.deceleration_mps2)
+    for settings in ({"harm_count": "first"}, {"harm_count": "total"}, {"horizon_s": 1.5}):
+        assert np.array_equal(asked("e_v2x_bm", worlds, **settings), -optimise_coupled(worlds, 1, **settings)[0])
+        other = {"harm_count": "first", "horizon_s": 4.0}
+        assert not np.array_equal(asked("e_v2x_bm", worlds, **settings), asked("e_v2x_bm", worlds, **other))
+    short = SCENARIO.replace(horizon_s=4)  # whose horizon is the agent's
+    assert np.array_equal(asked("e_v2x_bm", worlds, scenario=short), asked("e_v2x_bm", worlds, horizon_s=4.0))
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        *("full_brake", "coast", "constant:3.5", "copy_leader", "gentlest_front", "e_v2x_bm", "e_v2x_bm:pairwise"),
+        *("planner:20", "best_harm:20", "constant:5+refined", "constant:5+refined:profile", "full_brake+refined:10"),
+        *("full_brake+episode", "ppo@shipped+episode"),
+    ],
+)
+def test_agents__every_row_is_its_own_new_episodes_change_theirs_alone_and_agents_can_be_pickled(spec):
+    worlds, fresh, rows, new = SCENARIO.sample(20, 3).worlds, SCENARIO.sample(2, 32).worlds, [17, 1], np.array([4, 0])
+    agent = Asked(make_agent(spec, scenario=SCENARIO)).begin(worlds, 1)
+    part, before = agent.take(rows), Asked(agent.agent, memory=agent.memory).act(worlds, 1)
+    assert part.act(worlds.take(rows), 1).tolist() == before[rows].tolist()
+    whole, some = (drive(each, agent.agent, SCENARIO, 1).ledger.total_harm for each in (worlds, worlds.take(rows)))
+    assert some.tolist() == whole[rows].tolist()
+    agent.begin(fresh, 1, new)
+    before[new] = asked(spec, fresh, scenario=SCENARIO)
+    again = Asked(pickle.loads(pickle.dumps(agent.agent)), memory=agent.memory)
+    assert all(each.act(worlds.assign(new, fresh), 1).tolist() == before.tolist() for each in (again, agent))
+    assert again.name == spec.removesuffix(":20" if "best" in spec else "")  # a budget is no part of that name
+
+
+def test_agent_names__are_those_that_ship_and_are_listed(capsys):
+    scripts = ("coast", "constant", "copy_leader", "e_v2x_bm", "full_brake", "gentlest_front", "planner")
+    names = (*scripts, "best_harm", "ppo", "sac", "counterfactual", "options", "policy", "universal", "team")
+    assert agent_names() == tuple(sorted(names)) and run_command(["agent", "list"]) == 0
+    table = capsys.readouterr().out
+    assert [name for name in (*names, "+refined", "+episode", "+step", "+robust") if name not in table] == []
+    assert all(callable(entry.load()) and entry.about and entry.knows for entry in agent_entries())
+
+
+def test_register_agent__makes_names_and_policies_known():
+    seen = []
+
+    def factory(argument, settings):
+        seen.append((argument, settings.policy, settings.harm_count))
+        return make_agent("coast")
+
+    register_agent("mine", factory, takes_policy=True)
+    register_agent("mine", factory, takes_policy=True)  # the same again changes nothing
+    for spec in ("mine", "mine:x", "mine@my-run", "mine:x@C:/runs/my run@2"):
+        make_agent(spec, harm_count="total")
+    assert [each[:2] for each in seen] == [(None, None), ("x", None), (None, "my-run"), ("x", "C:/runs/my run@2")]
+    assert {each[2] for each in seen} == {"total"} and "mine" in agent_names()
+    with pytest.raises(AlreadyExists, match="agent 'mine' is registered already"):
+        register_agent("mine", lambda argument, settings: make_agent("coast"))

@@ -1,7 +1,5 @@
 """E-V2X-BM: its closed form by hand and against the physics, and the coupled search that is no worse than a grid."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Iterator
@@ -91,6 +89,7 @@ BY_HAND = {
         ((5, 10, 0, 10, 5, 0), 10.0),  # the follower needs 10 m, the leader may stop in 5
         ((11, 10, 0, 10, 5, 0), math.inf),  # the follower stops within the gap
         ((2, 30, 0, 33, 3, 0), 0.75),  # grazing: 9 = 2 (3 - a) 2
+        ((17.5, 10, 1, 20, 5, 0), 4.0),  # braking first, 10 m away and at 15 m/s after 1 s: 22.5 m = 10 m + 100 / (2 a)
         ((1, 10, 0, 14, 2, 0), -math.inf),  # even a coasting leader is hit
         ((4, 10, 3, 12, 5, 4), -math.inf),  # they meet while both coast
         ((3, 10, 9, 14, 2, 0), -math.inf),  # hit before it may brake
@@ -122,8 +121,7 @@ def test_closing_speed__equals_the_first_impact_of_the_event_exact_physics(exact
     first, simulated = impacts.rows.first, np.zeros(worlds.n)
     simulated[impacts.rows.world[first]] = impacts.rows.closing_speed_mps[first] ** 2
     closed = pairwise_harm(worlds, deceleration)[:, 0]
-    assert 0.3 < np.mean(closed > 0) < 0.7
-    assert np.abs(closed - simulated).max() < 1e-9
+    assert 0.3 < np.mean(closed > 0) < 0.7 and np.abs(closed - simulated).max() < 1e-9
 
 
 @pytest.mark.parametrize(("vehicles", "vehicle"), [(3, 1), (2, 0), (2, 1), (5, 2)])
@@ -134,11 +132,9 @@ def test_optimum__is_not_above_a_fine_grid_and_is_attained(vehicles, vehicle):
     grid = np.full(worlds.n, np.inf)
     for share in np.linspace(0, 1, 501):
         grid = np.minimum(grid, np.add(*harm_of_pairs(worlds, vehicle, share * capacity)))
-    assert np.all(best.harm <= grid + 1e-9)
-    assert 0.2 < np.mean(best.harm > 0) < 0.9
+    assert np.all(best.harm <= grid + 1e-9) and 0.2 < np.mean(best.harm > 0) < 0.9
     assert np.all((best.deceleration_mps2 >= 0) & (best.deceleration_mps2 <= capacity))
-    attained = np.add(*harm_of_pairs(worlds, vehicle, best.deceleration_mps2))
-    assert np.array_equal(attained, best.harm)
+    assert np.array_equal(np.add(*harm_of_pairs(worlds, vehicle, best.deceleration_mps2)), best.harm)
 
 
 def test_optimum__takes_the_middle_of_a_flat_minimum():
@@ -154,10 +150,8 @@ def test_optimum__takes_the_middle_of_a_flat_minimum():
     )
     best = optimise_pairwise(worlds, 1)
     # The rear one stops in 14.4 m, so vehicle 2 may stop in 9.4 m: 7.66 m/s2.
-    assert best.spares_rear_mps2[0] == pytest.approx(72 / 9.4)
-    assert best.spares_front_mps2[0] == math.inf
-    assert best.harm[0] == 4.0
-    assert best.deceleration_mps2[0] == pytest.approx(36 / 9.4)
+    assert best.spares_rear_mps2[0] == pytest.approx(72 / 9.4) and best.spares_front_mps2[0] == math.inf
+    assert best.harm[0] == 4.0 and best.deceleration_mps2[0] == pytest.approx(36 / 9.4)
 
 
 def line_worlds(n: int, vehicles: int, seed: int) -> Worlds:
@@ -246,8 +240,7 @@ def test_simulate__gives_up_at_a_bound_and_tells_no_less():
         bound = float(np.median(whole.harm))
         cut, below = harms(made[1], at, bound), whole.harm < bound
         assert np.array_equal(cut.harm[below], whole.harm[below])
-        assert np.array_equal(cut.other[below], whole.other[below])
-        assert np.all(cut.harm[~below] >= bound)
+        assert np.array_equal(cut.other[below], whole.other[below]) and np.all(cut.harm[~below] >= bound)
         given_up += int((cut.other[~below] < whole.other[~below]).sum())
     assert given_up > 0
 
@@ -327,8 +320,7 @@ def test_coupled__is_not_worse_than_an_even_grid(n, vehicles, vehicle, rear_mps2
     others[:, -1] = rear_mps2
     grid = -worlds.vehicles.braking_capacity_mps2[:, [vehicle]] * np.linspace(0.0, 1.0, points)
     for count, harms in zip(("first", "total"), forecast(worlds, others, vehicle, grid, 8.0), strict=True):
-        found = optimise_coupled(worlds, vehicle, others_mps2=others, harm_count=count).harm
-        excess = found - harms.min(axis=1)
+        excess = optimise_coupled(worlds, vehicle, others_mps2=others, harm_count=count).harm - harms.min(axis=1)
         assert excess.max() <= 1e-9
         assert (np.mean(excess) < 0.0) == (vehicles != 2)  # narrowing finds more; of one pair an end is best
 
@@ -340,8 +332,7 @@ def test_coupled__takes_the_middle_of_a_collision_free_interval(rear_mps2):
     others = -gentle.vehicles.braking_capacity_mps2
     closed, best = optimise_pairwise(gentle, 1), optimise_coupled(worlds, 1, others_mps2=others)
     free = closed.harm == 0
-    assert 10 < free.sum() < 190
-    assert np.array_equal(best.deceleration_mps2[free], closed.deceleration_mps2[free])
+    assert 10 < free.sum() < 190 and np.array_equal(best.deceleration_mps2[free], closed.deceleration_mps2[free])
     assert np.array_equal(best.harm == 0, free)
 
 
@@ -361,8 +352,7 @@ def test_coupled__threads_batch_and_what_was_searched_before_change_no_bit(monke
         searches.clear()
     total, other = optimise_coupled(worlds, 1, harm_count="total"), optimise_coupled(worlds, 1, horizon_s=4.0)
     assert len(searches) == 6 and (total.harm != found[1].harm).any() and (other.harm != found[1].harm).any()
-    alone = optimise_coupled(worlds.take([7]), 1)
-    assert [column[0] for column in alone] == [column[7] for column in found[1]]
+    assert [column[0] for column in optimise_coupled(worlds.take([7]), 1)] == [column[7] for column in found[1]]
 
 
 def test_coupled__stays_off_the_edge_of_a_jump():
@@ -394,8 +384,7 @@ def test_coupled__follows_the_others_commands():
         restitution=0,
     )
     best = optimise_coupled(worlds, 1, others_mps2=np.zeros((1, 3)), horizon_s=30.0)
-    assert best.total_harm[0] == 0.0
-    assert best.deceleration_mps2[0] == pytest.approx(0.0, abs=10 * 2 / 30**2)
+    assert best.total_harm[0] == 0.0 and best.deceleration_mps2[0] == pytest.approx(0.0, abs=10 * 2 / 30**2)
 
 
 def test_coupled__finds_a_kink_to_nine_digits():

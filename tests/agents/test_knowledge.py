@@ -1,6 +1,4 @@
-"""What agents say they know, and whether that is all they use."""
-
-from __future__ import annotations
+"""What agents say they know, whether that is all they use, and the worlds that they believe in."""
 
 import itertools
 import re
@@ -12,11 +10,22 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.actions import action_to_command, command_to_action
-from ethbrake_marl.agents import Agent, Knowledge, Source, Team, Told, agent_entries, parse_spec, script_agents
-from ethbrake_marl.agents.registry import find_entry
-from ethbrake_marl.engine import Engine, Memory, Script, ask_script, begin_script
+from ethbrake_marl.agents import (
+    Knowledge,
+    Odometer,
+    Ranges,
+    Source,
+    Told,
+    agent_entries,
+    drive,
+    find_entry,
+    make_agent,
+    parse_spec,
+    script_agents,
+)
+from ethbrake_marl.engine import Memory, Script, ask_script, begin_script
 from ethbrake_marl.evaluation import make_lineup
-from ethbrake_marl.physics import Bools, Floats, Packed, Worlds
+from ethbrake_marl.physics import Bools, Floats, Packed
 from ethbrake_marl.physics.messages import CHANNEL, LINK, Messages, link_at, place_at, ring_at
 from ethbrake_marl.scenario.v2x import PRESETS
 from ethbrake_marl.shield import ShieldedDriver, parse_uncertainty
@@ -26,7 +35,7 @@ from tests.fixtures.policies import make_policy
 
 
 def changed_decisions(
-    agent: Agent, scenario: eb.Scenario, *, vehicle: int | None = None, n: int = 100, decisions: int = 8, seed: int = 11
+    agent: eb.Agent, scenario: eb.Scenario, *, vehicle: int = 1, n: int = 100, decisions: int = 8, seed: int = 11
 ) -> int:
     """How many decisions change when all is altered that has not reached the vehicle by then: 0 for an honest agent.
 
@@ -37,20 +46,18 @@ def changed_decisions(
     Args:
         agent: any; it is left as it is.
         scenario: whose worlds.
-        vehicle: the driven one, from 0, beside which other learners brake fully; None: the scenario's only learner.
+        vehicle: the driven one, from 0, beside which other learners brake fully.
         n: number of worlds; more find rarer leaks.
         decisions: in each world.
         seed: of the list, and of the random numbers.
 
     """
-    if vehicle is None:
-        (vehicle,) = scenario.learners
     scenario = scenario.with_learners([vehicle])
     rng, alert = np.random.default_rng(seed), scenario.sample(n, seed).worlds
     scripts = script_agents(scenario, except_for=vehicle)
     if isinstance(agent, ShieldedDriver):
         agent = Hosted(agent)
-    engine = Engine(scenario, n, learners=[vehicle], scripts=scripts, worlds=alert)
+    engine = eb.Engine(scenario, n, learners=[vehicle], scripts=scripts, worlds=alert)
     seen = (alert, alter_unreceived(alert, vehicle, rng))
     knowing, wondering = (begin_script(agent, at_alert, vehicle, scripts) for at_alert in seen)
     changed = 0
@@ -72,7 +79,7 @@ class Hosted:
     def __init__(self, driver: ShieldedDriver) -> None:
         self.driver, self.policy = driver, driver.policy
 
-    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
+    def begin(self, alert: eb.Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         options, scenario = self.driver.options, self.driver.scenario
         if options.believed:
             shield = options.believed_shield(scenario, vehicle, scripts)
@@ -82,7 +89,7 @@ class Hosted:
             shield.begin(alert, np.arange(alert.n), {vehicle: self.policy})
         return np.array([shield] * alert.n), begin_script(self.policy, alert, vehicle, scripts)
 
-    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
+    def act(self, worlds: eb.Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
         (shield, *_), policy = memory
         proposed, policy = proposed_action(self.policy, worlds, policy, vehicle)
         proposer = Proposer({vehicle: self.policy}, {vehicle: policy}, worlds)
@@ -95,7 +102,7 @@ class Hosted:
         return action_to_command(applied, worlds.vehicles, vehicle), (memory[0], policy)
 
 
-def alter_unreceived(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> Worlds:
+def alter_unreceived(worlds: eb.Worlds, vehicle: int, rng: np.random.Generator) -> eb.Worlds:
     """The same worlds with random numbers for all that has not reached ``vehicle`` by now, the future included."""
     vehicles, now = worlds.vehicles, worlds.time_s[:, np.newaxis]
     n, N = worlds.speeds_mps.shape
@@ -130,13 +137,12 @@ def alter_unreceived(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> 
     beside = [pair for pair in (vehicle - 1, vehicle) if 0 <= pair < N - 1]
     hit[:, beside] &= unknown[:, far[beside]]  # an own impact with somebody who is known is felt
     gaps = other(worlds.gaps_m, 2.0, 15.0, stale[:, far])
-    hidden = unknown[:, 0] & np.isfinite(worlds.obstacle_gap_m)
     return replace(
         worlds,
         vehicles=changed,
         messages=_alter_messages(worlds, vehicle, rng),
         gaps_m=gaps,
-        obstacle_gap_m=other(worlds.obstacle_gap_m, 5.0, 80.0, hidden),
+        obstacle_gap_m=other(worlds.obstacle_gap_m, 5.0, 80.0, unknown[:, 0] & np.isfinite(worlds.obstacle_gap_m)),
         speeds_mps=other(worlds.speeds_mps, 5.0, 30.0, stale),
         command_mps2=other(worlds.command_mps2, -6.0, 6.0, stale),
         pair_hit=worlds.pair_hit ^ (hit & (now > 0.0)),  # at the alert nobody has hit anything
@@ -147,11 +153,10 @@ def _altered_news(now: Floats, shape: tuple[int, ...], vehicle: int, rng: np.ran
     """When who is known of by whom, [n, N, N] s; often never. Of what this vehicle waits for, not before now."""
     since = np.zeros((len(now), shape[1], 1))
     since[:, vehicle] = now
-    never = rng.random(shape) < 0.25
-    return np.where(never, np.inf, since + rng.uniform(0.01, 2.0, shape))
+    return np.where(rng.random(shape) < 0.25, np.inf, since + rng.uniform(0.01, 2.0, shape))
 
 
-def _alter_messages(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> Floats:
+def _alter_messages(worlds: eb.Worlds, vehicle: int, rng: np.random.Generator) -> Floats:
     """The columns of messages with all altered that is unheard: chance, what is on its way, what others know."""
     columns, N = worlds.messages.copy(), worlds.N
     if not columns.shape[1]:
@@ -162,8 +167,7 @@ def _alter_messages(worlds: Worlds, vehicle: int, rng: np.random.Generator) -> F
     columns[:, place_at(N) :] += rng.uniform(0.5, 3.0, columns[:, place_at(N) :].shape)
     links = columns[:, link_at(0, 0, N) : ring_at(N)].reshape(-1, N, N, LINK.WIDTH)
     heard = (worlds.vehicles.known_from_s[:, vehicle] <= worlds.time_s[:, np.newaxis])[..., np.newaxis]
-    told = np.arange(LINK.WIDTH) >= LINK.TOLD_S
-    links[:, vehicle] = np.where(heard & told, kept, links[:, vehicle])
+    links[:, vehicle] = np.where(heard & (np.arange(LINK.WIDTH) >= LINK.TOLD_S), kept, links[:, vehicle])
     columns[:, place_at(N) + vehicle] = own
     return columns
 
@@ -244,7 +248,7 @@ class Leaking:
         return np.where(seen, -1.0, -0.5) * worlds.vehicles.braking_capacity_mps2[:, vehicle]
 
 
-def agent_of(spec: str, scenario: eb.Scenario = PAPER) -> Agent:
+def agent_of(spec: str, scenario: eb.Scenario = PAPER) -> eb.Agent:
     uncertainty = parse_uncertainty("gaps_m=0.5") if parse_spec(spec).shield in ("robust", "robust:interior") else None
     return make_lineup([spec], scenario, uncertainty=uncertainty)[spec]
 
@@ -284,12 +288,11 @@ def test_knowledge__every_agent_states_it(spec, knows):
 
 
 def test_knowledge__of_an_agent_of_the_users_own_and_of_a_team():
-    team = Team({1: agent_of("ppo@shipped/ppo"), 2: agent_of("full_brake")}, "both")
-    assert Knowledge.of(team) == (SENSORS, MESSAGES) and Knowledge.of(Team({}, "scripts")).text == "–"
+    team = eb.Team({1: agent_of("ppo@shipped/ppo"), 2: agent_of("full_brake")}, "both")
+    assert Knowledge.of(team) == (SENSORS, MESSAGES) and Knowledge.of(eb.Team({}, "scripts")).text == "–"
     silent = Acts(lambda worlds, vehicle: np.zeros(worlds.n))
     assert Knowledge.of(silent).text == "not stated" and not Knowledge.of(silent).sees_through
-    assert Knowledge.of(silent, also=MODEL) == (MODEL, Source.UNSTATED)
-    assert Knowledge.of(Leaking()) == (MESSAGES,)
+    assert Knowledge.of(silent, also=MODEL) == (MODEL, Source.UNSTATED) and Knowledge.of(Leaking()) == (MESSAGES,)
 
 
 @pytest.mark.parametrize(
@@ -324,8 +327,7 @@ def test_messages__contact_features_tell_nothing_that_was_not_received(channel, 
     scenario = BLOCKED.replace(v2x=channel)
     make_policy(eb.choose_observation(["own", "contact"]), scenario.model_dump(mode="json")).save(tmp_path / "policy")
     agent = agent_of(f"ppo@{tmp_path}", scenario)
-    assert Knowledge.of(agent) == (MESSAGES,)
-    assert changed_decisions(agent, scenario) == 0
+    assert Knowledge.of(agent) == (MESSAGES,) and changed_decisions(agent, scenario) == 0
 
 
 @pytest.mark.parametrize(("reads", "vehicle"), [("behind", 1), ("others", 1), ("never", 2)])
@@ -340,9 +342,8 @@ def test_believed_model__a_planted_leak_is_found(spec, leak, monkeypatch):
 
     def leaking(worlds, vehicle):
         told = honest(worlds, vehicle)
-        if leak == "known":
-            return told._replace(known=np.ones_like(told.known))
-        return told._replace(speed_mps=worlds.speeds_mps.copy())
+        all_of_it = {"known": np.ones_like(told.known), "speed_mps": worlds.speeds_mps.copy()}
+        return told._replace(**{leak: all_of_it[leak]})
 
     scenario = BLOCKED.replace(v2x={"preset": "blocked", "persistence": "periodic"})
     monkeypatch.setattr(Told, "to", leaking)
@@ -385,3 +386,111 @@ def test_hidden__only_where_news_or_a_reaction_is_late(v2x, least, most):
         latency[1, 2] += 0.5
         late = replace(vehicles, latency_s=latency)
         assert np.flatnonzero(late.hide_from(1)).tolist() == [1] and not late.hide_from(2).any()
+
+
+# ---------------------------------------------------------------- believed worlds by hand, and who drives by them
+
+BASE = eb.load_scenario("cooperation-2-paper").replace(early_impacts="keep")
+DEAF = {"preset": "paper", "hears": "front"}
+PERIODIC = {"preset": "blocked", "persistence": "periodic"}
+
+
+def engine_of(scenario: eb.Scenario, n: int = 40, vehicle: int = 1, seed: int = 7) -> eb.Engine:
+    scripts = script_agents(scenario, except_for=vehicle)
+    return eb.Engine(scenario, n, learners=[vehicle], scripts=scripts, worlds=scenario.sample(n, seed).worlds)
+
+
+def believed(engine: eb.Engine, vehicle: int = 1, odometer: Odometer | None = None) -> eb.Worlds:
+    worlds, scenario = engine.worlds, engine.scenario
+    way = worlds.speeds_mps[:, vehicle] * worlds.time_s if odometer is None else odometer.way_m
+    return Ranges.of(scenario, vehicle).believe(worlds, way)
+
+
+def test_believed__is_the_world_where_everything_is_known_and_who_believes_drives_as_who_sees() -> None:
+    engine, told = engine_of(BASE), ("gaps_m", "speeds_mps", "pair_hit", "time_s")
+    for _ in range(10):
+        now, taken = engine.worlds, believed(engine)
+        for name in told:
+            np.testing.assert_array_equal(getattr(taken, name), getattr(now, name))
+        np.testing.assert_array_equal(taken.vehicles.mass_t, now.vehicles.mass_t)
+        waiting = now.vehicles.latency_s > now.time_s[:, np.newaxis]
+        np.testing.assert_array_equal(taken.vehicles.latency_s[waiting], now.vehicles.latency_s[waiting])
+        engine.step(np.full((40, 1), -0.5))
+    agents, worlds = (
+        [make_agent(f"e_v2x_bm{way}", scenario=BASE) for way in ("", ":believed")],
+        BASE.sample(40, 7).worlds,
+    )
+    harm, believing = (drive(worlds, agent, BASE, 1).ledger.world_harm("first") for agent in agents)
+    np.testing.assert_allclose(believing, harm, atol=1e-4)
+
+
+def test_believed__who_is_not_known_is_in_the_middle_of_the_ranges_and_follows_its_script() -> None:
+    # Vehicle 3 is never heard: at the alert 7.5 m behind, at 20 m/s; it coasts to 0.8 s, then brakes with 6. At 1 s it
+    # has made 20 m less 0.5 * 6 * 0.2^2 = 0.12 m, and Vehicle 2, with 20 m/s and no command, 20 m.
+    scenario = BASE.replace(
+        v2x=DEAF, gaps_m=[7.0, {"uniform": [5, 10]}], speeds_mps=[20.0, 20.0, {"uniform": [18, 22]}]
+    )
+    engine = engine_of(scenario)
+    for _ in range(5):
+        engine.step(np.zeros((40, 1)))
+    taken = believed(engine)
+    np.testing.assert_allclose(engine.worlds.time_s, 1.0)
+    free = ~engine.worlds.pair_hit[:, 0] & (engine.worlds.speeds_mps[:, 1] == 20.0)
+    assert free.sum() > 20
+    np.testing.assert_allclose(taken.gaps_m[free, 1], 7.5 + 0.12)
+    np.testing.assert_allclose(taken.speeds_mps[:, 2], 20.0 - 6.0 * 0.2)
+    np.testing.assert_array_equal(taken.gaps_m[:, 0], engine.worlds.gaps_m[:, 0])
+    assert (taken.command_mps2[:, 2] == -6.0).all() and not taken.pair_hit[:, 1].any()
+
+
+def test_believed__an_old_message_is_moved_on_by_the_script_to_the_truth() -> None:
+    channel = {
+        "preset": "paper",
+        "link_latency_s": 0.2,
+        "persistence": "periodic",
+        "senses": "front",
+        "sensing_s": [5, 5],
+    }
+    engine = engine_of(BASE.replace(v2x=channel))
+    odometer = Odometer.begun(engine.scenario.sample(40, 7).worlds, 1)
+    for _ in range(12):
+        now, told = engine.worlds, Told.to(engine.worlds, 1)
+        assert told.known.all() and (told.at_s[:, [0, 2]] < now.time_s[:, np.newaxis] - 0.19).all()
+        odometer = odometer.look(now, 1)
+        taken = believed(engine, odometer=odometer)
+        free = ~now.pair_hit.any(axis=1)
+        np.testing.assert_allclose(taken.gaps_m[free], now.gaps_m[free], atol=1e-9)
+        np.testing.assert_allclose(taken.speeds_mps[free], now.speeds_mps[free], atol=1e-9)
+        engine.step(np.full((40, 1), -0.85))
+    assert free.sum() > 3
+
+
+@pytest.mark.parametrize(
+    ("vehicles", "v2x"),
+    [*((3, v2x) for v2x in (DEAF, PERIODIC, "blocked", "sensors-only")), (2, PERIODIC), (5, PERIODIC), (5, "blocked")],
+)
+def test_believing__drives_every_line_and_no_world_depends_on_the_batch(vehicles: int, v2x: object) -> None:
+    scenario = eb.load_scenario("paper-random").replace(
+        vehicles=vehicles, braking_capacity_mps2=6.0, driving_capacity_mps2=6.0, mass_t=5.0, latency_s=0.1, v2x=v2x,
+        roles={"vehicle_2": "learner"}, horizon_s=12.0,
+    )  # fmt: skip
+    worlds = scenario.sample(6, 3).worlds
+    for spec in ("e_v2x_bm:believed", "planner:8:believed"):
+        agent = make_agent(spec, scenario=scenario)  # the same again for a batch of another size
+        whole, alone = drive(worlds, agent, scenario, 1), drive(worlds.take([4]), agent, scenario, 1)
+        assert whole.ledger.world_harm("first")[4] == alone.ledger.world_harm("first")[0]
+        np.testing.assert_array_equal(whole.final.speeds_mps[4], alone.final.speeds_mps[0])
+
+
+@pytest.mark.parametrize("v2x", ["paper", PERIODIC])
+def test_believing__knows_of_the_obstacle_what_it_was_told(v2x: object) -> None:
+    scenario = eb.load_scenario("cooperation-4-all").replace(early_impacts="keep", v2x=v2x).with_learners(["vehicle_2"])
+    engine = engine_of(scenario)
+    for _ in range(15):
+        engine.step(np.full((40, 1), -0.9))
+    told, now = Told.to(engine.worlds, 1), engine.worlds
+    heard = told.known[:, 0]
+    assert heard.sum() > 20
+    np.testing.assert_allclose(told.obstacle_m[heard], (now.obstacle_gap_m + now.gaps_m[:, 0])[heard], atol=1e-9)
+    assert np.isinf(told.obstacle_m[~heard]).all() and np.isfinite(believed(engine).obstacle_gap_m).all()
+    drive(scenario.sample(5, 3).worlds, make_agent("e_v2x_bm:believed", scenario=scenario), scenario, 1)

@@ -1,7 +1,5 @@
 """Policies of bundles and of other libraries drive as agents: alone, refined and behind every shield."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -78,8 +76,7 @@ def test_onnx__path_and_session_drive_as_the_policy_does(tmp_path: Path):
     expected = harms(eb.LearnedAgent(policy))
     for given in (path, onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])):
         assert harms(eb.policy_agent(given)) == pytest.approx(expected, rel=1e-5, abs=1e-5)
-    assert eb.policy_agent(path).name == "shipped"
-    assert harms(eb.policy_agent(policy)).tolist() == expected.tolist()
+    assert eb.policy_agent(path).name == "shipped" and harms(eb.policy_agent(policy)).tolist() == expected.tolist()
 
 
 def ramp(observation, state):

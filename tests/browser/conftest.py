@@ -1,7 +1,5 @@
 """Debian's or the machine's own Chromium, driven by Playwright; skipped, and said so, where either is missing."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable, Iterator

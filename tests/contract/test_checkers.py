@@ -1,9 +1,7 @@
 """The libraries' own checkers, with every warning an error. A badge: ``test_contract`` is the real suite."""
 
-from __future__ import annotations
-
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -18,21 +16,15 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import ethbrake_marl as eb
 from ethbrake_marl.envs.drawing import HEIGHT, WIDTH, Viewer
-from ethbrake_marl.envs.interfaces import EthBrakeEnv, UnknownResetOption, env, parallel_env
+from ethbrake_marl.envs.interfaces import EthBrakeEnv, env, parallel_env
 from tests.contract.interfaces import FIVE, LEVELS, PAPER, REST, SCENARIOS, line
 
-
-@pytest.fixture(autouse=True)
-def _every_warning_is_an_error(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")  # Gymnasium's checker renders in every mode, in a window, too
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        # PettingZoo's checkers pass {"options": 1} on purpose; asking for a warning here is our own rule.
-        warnings.filterwarnings("ignore", "reset: unknown option options, ignored", UnknownResetOption)
-        warnings.filterwarnings("ignore", ".*is different from the unwrapped version")  # a shield is: that is its use
-        yield
-
-
+pytestmark = pytest.mark.filterwarnings(
+    "error",
+    # PettingZoo's checkers pass {"options": 1} on purpose; asking for a warning here is our own rule.
+    "ignore:reset. unknown option options, ignored:ethbrake_marl.envs.interfaces.UnknownResetOption",
+    "ignore:.*is different from the unwrapped version",  # a shield is: that is its use
+)
 ANY_START = PAPER.replace(early_impacts="keep")
 SETTINGS: dict[str, dict[str, Any]] = {
     **{
@@ -81,18 +73,15 @@ def test_gymnasium_and_stable_baselines3__checkers_pass_behind_the_shield() -> N
     sb3_check_env(eb.ShieldedEnv(EthBrakeEnv()))
 
 
-@pytest.mark.filterwarnings("ignore:.*:UserWarning")
 def test_pettingzoo__render_test_passes() -> None:
     pytest.importorskip("pygame", reason="needs the extra: pip install 'ethbrake-marl[render]'")
     warnings.simplefilter("ignore", UserWarning)
     render_test(lambda render_mode: env(scenario=REST, render_mode=render_mode))
 
 
-@pytest.mark.parametrize("learners", [["vehicle_2", "vehicle_3"]])
-def test_stable_baselines3__learns_on_the_vec_env(learners: list[str]) -> None:
-    vec_env = eb.make_sb3_vec_env(FIVE, 4, learners=learners)
-    model = PPO("MlpPolicy", vec_env, n_steps=32, batch_size=32, n_epochs=1, seed=3, device="cpu")
-    model.learn(768)
+def test_stable_baselines3__learns_on_the_vec_env() -> None:
+    vec_env = eb.make_sb3_vec_env(FIVE, 4, learners=["vehicle_2", "vehicle_3"])
+    model = PPO("MlpPolicy", vec_env, n_steps=32, batch_size=32, n_epochs=1, seed=3, device="cpu").learn(768)
     assert model.ep_info_buffer[0]["l"] > 0
 
 

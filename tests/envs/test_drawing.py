@@ -1,7 +1,5 @@
 """What the environments draw: pictures, words and windows of the running worlds."""
 
-from __future__ import annotations
-
 import sys
 from importlib import import_module
 from importlib.util import find_spec
@@ -14,8 +12,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.envs.drawing import BODY_M, HEIGHT, WIDTH, Trace, View, follow
-from ethbrake_marl.envs.interfaces import env, parallel_env
-from ethbrake_marl.errors import InvalidInput, MissingExtra
+from ethbrake_marl.errors import InvalidInput
 from tests.contract.interfaces import CRASH, REST
 
 near = pytest.approx
@@ -72,8 +69,7 @@ def test_bar__is_as_long_as_the_share_of_the_capacity(sign: float, colour: tuple
 
 def test_impact__is_shown_where_it_happens_and_then_fades() -> None:
     seen = {time: flashes(frame) for time, frame in to_its_end(crash())}  # coasting, an impact at 1 s with 6 m/s
-    assert [time for time, count in seen.items() if count and time < 0.999] == []
-    assert seen[1.0] > 50
+    assert [time for time, count in seen.items() if count and time < 0.999] == [] and seen[1.0] > 50
 
 
 def test_step_frames__show_an_impact_inside_a_step_from_its_moment_on() -> None:
@@ -88,7 +84,7 @@ def test_step_frames__show_an_impact_inside_a_step_from_its_moment_on() -> None:
 
 
 def test_scene__has_the_numbers_of_the_infos_and_the_places_of_the_physics() -> None:
-    environment = parallel_env("paper-random")
+    environment = eb.parallel_env("paper-random")
     trace, engine = Trace(environment.engine, whole=True), environment.engine
     environment.reset(seed=7)
     infos: dict[str, Any] = {}
@@ -103,8 +99,7 @@ def test_scene__has_the_numbers_of_the_infos_and_the_places_of_the_physics() -> 
     assert (last.time_s, last.ended) == (worlds.time_s[0], True)
     harms = [told["world_first_impact_harm"], told["world_total_harm"]]
     assert [last.first_harm, last.total_harm] == near(harms, abs=1e-9)
-    assert last.gaps_m == near(worlds.gaps_m[0], abs=1e-9)
-    assert last.speeds_mps == near(worlds.speeds_mps[0], abs=1e-9)
+    assert last.gaps_m == near(worlds.gaps_m[0], abs=1e-9) and last.speeds_mps == near(worlds.speeds_mps[0], abs=1e-9)
     assert shown[0].front_m[0] == near(record.positions_m[record.time_s.searchsorted(0.5), 0])
     assert -np.diff(last.front_m) == near(last.gaps_m + BODY_M)
     for scene in shown:
@@ -132,8 +127,7 @@ def test_list__has_the_beginning_and_each_step_once(make: Any) -> None:
     for _ in range(3):
         environment.step(COAST)
     frames = environment.render()
-    assert [frame.shape for frame in frames] == [SHAPE] * 4
-    assert environment.render() == []
+    assert [frame.shape for frame in frames] == [SHAPE] * 4 and environment.render() == []
     environment.step(COAST)
     assert len(environment.render()) == 1
     environment.reset(seed=0)
@@ -159,7 +153,7 @@ harm 0.00 m2/s2 by first impacts, 0.00 in total
 
 
 def test_ansi__says_it_in_words() -> None:
-    obstacle = parallel_env("paper-random-obstacle", render_mode="ansi")
+    obstacle = eb.parallel_env("paper-random-obstacle", render_mode="ansi")
     obstacle.reset(seed=0)
     assert (to_its_end(crash("ansi"))[-1][1], obstacle.render()) == (CRASHED, AHEAD)
 
@@ -198,21 +192,20 @@ def test_human__shows_each_step_in_real_time_and_says_what_it_needs(monkeypatch:
     before = pygame.time.get_ticks()
     environment.step(COAST)
     assert pygame.time.get_ticks() - before >= 80  # it waits for a step of 0.1 s
-    assert pygame.display.get_surface().get_size() == (WIDTH, HEIGHT)
-    assert environment.render() is None
+    assert pygame.display.get_surface().get_size() == (WIDTH, HEIGHT) and environment.render() is None
     environment.close()
     assert pygame.display.get_surface() is None
     monkeypatch.setenv("SDL_VIDEODRIVER", "nothing")
     with pytest.raises(InvalidInput, match=r"no window can be opened here .*; 'rgb_array' needs no display"):
-        parallel_env(render_mode="human").reset(seed=0)
+        eb.parallel_env(render_mode="human").reset(seed=0)
     monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(MissingExtra, match=r"^[^\n]*pip install 'ethbrake-marl\[render\]'[^\n]*$"):
-        parallel_env(render_mode="human")
+    with pytest.raises(eb.MissingExtra, match=r"^[^\n]*pip install 'ethbrake-marl\[render\]'[^\n]*$"):
+        eb.parallel_env(render_mode="human")
 
 
 def test_metadata__plays_in_real_time() -> None:
     slow = CRASH.replace(time_step_s=0.05)
-    for environment in (eb.EthBrakeEnv(slow), parallel_env(slow), env(scenario=slow)):
+    for environment in (eb.EthBrakeEnv(slow), eb.parallel_env(slow), eb.env(scenario=slow)):
         assert (environment.metadata["render_modes"], environment.metadata["render_fps"]) == (MODES, 20)
     assert eb.EthBrakeVectorEnv(2).metadata["render_modes"] == ["rgb_array", "ansi"]
 
@@ -232,13 +225,12 @@ def test_shields__are_looked_through_and_their_interventions_shown() -> None:
     scenario = eb.load_scenario("paper-random")
     single = eb.ShieldedEnv(eb.EthBrakeEnv(scenario, render_mode="ansi"))
     rows = eb.ShieldedVectorEnv(eb.EthBrakeVectorEnv(2, scenario, render_mode="ansi"))
-    parallel = eb.HybridShield(parallel_env(scenario, render_mode="ansi"))
-    hybrid = eb.HybridShield(parallel_env(scenario, render_mode="ansi"), eb.make_agent("coast"), mode="episode")
+    parallel = eb.HybridShield(eb.parallel_env(scenario, render_mode="ansi"))
+    hybrid = eb.HybridShield(eb.parallel_env(scenario, render_mode="ansi"), eb.make_agent("coast"), mode="episode")
     given = ((single, [1.0]), (rows, np.full((2, 1), 1.0)), (parallel, {"vehicle_2": [1.0]}), (hybrid, {}))
     for environment, action in given:
         environment.reset(seed=7)
         assert environment is not single or "shield" not in single.render()
         environment.step(action)
     assert [each.render().splitlines()[-1] for each in (single, parallel)] == ["shield: stepped in"] * 2
-    assert rows.render()[0] == single.render()
-    assert "shield: stepped in" in hybrid.render()
+    assert rows.render()[0] == single.render() and "shield: stepped in" in hybrid.render()

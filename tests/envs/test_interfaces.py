@@ -1,6 +1,4 @@
-"""What is special to one interface of PettingZoo or Gymnasium; what all promise stands in ``tests/contract``."""
-
-from __future__ import annotations
+"""What is special to one interface; what all promise stands in ``tests/contract``."""
 
 import json
 import os
@@ -17,15 +15,25 @@ import pettingzoo
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from pettingzoo.utils.conversions import aec_to_parallel
+from stable_baselines3.common.monitor import Monitor
 
 import ethbrake_marl as eb
 from ethbrake_marl import ethbrake_v0
-from ethbrake_marl.envs.interfaces import EthBrakeParallelEnv, action_box, env, feature_box, parallel_env, raw_env
-from ethbrake_marl.envs.registration import GYMNASIUM_ID, PETTINGZOO_ID, register_environments
-from ethbrake_marl.observations import Feature, ObservationSpec
-from ethbrake_marl.physics import make_worlds
-from ethbrake_marl.scenario import Scenario, full_state, load_scenario, state_features
-from tests.contract.interfaces import CRASH, FIVE, PAPER, REST, actions, initial_state
+from ethbrake_marl.envs import (
+    EthBrakeEnv,
+    EthBrakeVecEnv,
+    action_box,
+    env,
+    feature_box,
+    make_sb3_vec_env,
+    parallel_env,
+    register_environments,
+)
+from ethbrake_marl.envs.registration import GYMNASIUM_ID, PETTINGZOO_ID
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.observations import Feature
+from ethbrake_marl.scenario import full_state, state_features
+from tests.contract.interfaces import CRASH, FIVE, PAPER, REST, actions, initial_state, line
 
 near = pytest.approx
 ROOT = Path(__file__).resolve().parents[2]
@@ -33,8 +41,8 @@ EPISODES, INFOS = ((ROOT / "docs" / f"{name}.md").read_text("utf-8") for name in
 COAST, BRAKE = np.zeros(1, np.float32), np.full(1, -1.0, np.float32)
 
 
-def started(*args: Any, seed: int = 0, **settings: Any) -> EthBrakeParallelEnv:
-    environment = parallel_env(*args, **settings)
+def started(*args: Any, seed: int = 0, **settings: Any) -> eb.EthBrakeParallelEnv:
+    environment = eb.parallel_env(*args, **settings)
     environment.reset(seed=seed)
     return environment
 
@@ -44,7 +52,7 @@ def started(*args: Any, seed: int = 0, **settings: Any) -> EthBrakeParallelEnv:
 
 def test_agents__are_all_vehicles_until_the_collective_end() -> None:
     environment, names = started(REST), ["vehicle_1", "vehicle_2"]
-    assert (environment.possible_agents, parallel_env(REST).agents) == (names, [])
+    assert (environment.possible_agents, eb.parallel_env(REST).agents) == (names, [])
     for k in range(10):
         assert environment.agents == names
         results = environment.step({"vehicle_2": BRAKE})
@@ -60,7 +68,7 @@ def test_agents__are_all_vehicles_until_the_collective_end() -> None:
 def test_reset__starts_at_the_first_moment_a_learner_may_act_and_else_at_the_alert() -> None:
     assert started(CRASH).engine.worlds.time_s == [0.5]
     assert started(CRASH.replace(obstacle_gap_m=30), learners=["vehicle_1"]).engine.worlds.time_s == [0.0]
-    observations, infos = parallel_env(FIVE, learners=["vehicle_5", "vehicle_4"]).reset(seed=0)
+    observations, infos = eb.parallel_env(FIVE, learners=["vehicle_5", "vehicle_4"]).reset(seed=0)
     assert {info["time_s"] for info in infos.values()} == {0.51}
     assert list(observations) == [f"vehicle_{i}" for i in range(1, 6)]
     nobody = started("paper-random", learners=[])  # also where early impacts are rejected
@@ -129,8 +137,7 @@ def test_infos__cost_is_the_harm_of_the_step_as_the_reward_counts_it(reward: str
             _, _, terminated, truncated, info = environment.step(np.array([action], np.float32))
             over = terminated or truncated
             costs.append(info["cost"])
-        assert sum(costs) == near(info[total] - before)
-        assert info["reward_harm"] == -info["cost"]
+        assert sum(costs) == near(info[total] - before) and info["reward_harm"] == -info["cost"]
 
 
 def test_rewards__the_papers_terms_are_named_before_their_weights() -> None:
@@ -144,7 +151,7 @@ def test_rewards__the_papers_terms_are_named_before_their_weights() -> None:
 
 def test_rewards__do_not_tell_the_harm_before_the_first_decision() -> None:
     # 1 m apart, braking against coasting: they meet at sqrt(2/6) s with w = 6 t, harm 12, before 0.6 s.
-    environment = parallel_env(CRASH.replace(gaps_m=1, latency_s=[0, 0.6], horizon_s=3, early_impacts="keep"))
+    environment = eb.parallel_env(CRASH.replace(gaps_m=1, latency_s=[0, 0.6], horizon_s=3, early_impacts="keep"))
     _, infos = environment.reset(seed=0)
     assert infos["vehicle_2"]["world_first_impact_harm"] == near(12.0)
     told = 0.0
@@ -170,7 +177,7 @@ def test_state__is_what_a_person_would_write_down() -> None:
 
 def test_state__is_clipped_to_its_bounds() -> None:
     capacities = {"braking_capacity_mps2": 60, "driving_capacity_mps2": 60}
-    worlds = make_worlds(500.0, [90.0] * 3, **capacities, latency_s=9, mass_t=400, restitution=1, speed_limit_mps=90)
+    worlds = eb.make_worlds(500.0, [90.0] * 3, **capacities, latency_s=9, mass_t=400, restitution=1, speed_limit_mps=90)
     state = full_state(worlds, PAPER)[0]
     assert state in feature_box(state_features(PAPER)) and (state[0], state[21]) == (4.0, 10.0)
 
@@ -182,7 +189,7 @@ def test_boxes__have_the_features_bounds() -> None:
 
 
 def test_learners_only__are_the_agents_and_nothing_else_changes() -> None:
-    whole, learners = parallel_env("cooperation-3-pair"), parallel_env("cooperation-3-pair", agents="learners")
+    whole, learners = eb.parallel_env("cooperation-3-pair"), eb.parallel_env("cooperation-3-pair", agents="learners")
     assert learners.possible_agents == ["vehicle_2", "vehicle_3"]
     assert set(learners.observation_spaces) == set(learners.action_spaces) == set(learners.possible_agents)
     told, every = learners.reset(seed=4), whole.reset(seed=4)
@@ -196,7 +203,7 @@ def test_learners_only__are_the_agents_and_nothing_else_changes() -> None:
 
 
 def test_max_cycles__truncates_unless_the_episode_is_over_before() -> None:
-    environment = parallel_env(max_cycles=3)
+    environment = eb.parallel_env(max_cycles=3)
     for _ in range(2):
         environment.reset(seed=0)
         assert [environment.step({"vehicle_2": [0.0]})[3]["vehicle_2"] for _ in range(3)] == [False, False, True]
@@ -211,12 +218,11 @@ def test_supersuit__frame_skip_draws_from_the_seed_of_the_reset() -> None:
     supersuit = pytest.importorskip("supersuit")
 
     def played() -> list[float]:
-        env = supersuit.frame_skip_v0(parallel_env(scenario="cooperation-3-pair", agents="learners"), (1, 4))
+        env = supersuit.frame_skip_v0(eb.parallel_env(scenario="cooperation-3-pair", agents="learners"), (1, 4))
         env.reset(seed=5)
         times = []
         while env.agents:
-            infos = env.step({agent: BRAKE for agent in env.agents})[4]
-            times.append(infos["vehicle_2"]["time_s"])
+            times.append(env.step({agent: BRAKE for agent in env.agents})[4]["vehicle_2"]["time_s"])
         return times
 
     assert played() == played() and len(set(np.diff(played()).round(6))) > 1
@@ -225,9 +231,9 @@ def test_supersuit__frame_skip_draws_from_the_seed_of_the_reset() -> None:
 # ---------------------------------------------------------------- PettingZoo: one agent after the other
 
 
-@pytest.mark.parametrize("make", [env, raw_env])
+@pytest.mark.parametrize("make", [env, eb.raw_env])
 def test_aec__plays_the_same_episode_in_turns(make: Any) -> None:
-    together, in_turn = parallel_env(FIVE), make(scenario=FIVE)
+    together, in_turn = eb.parallel_env(FIVE), make(scenario=FIVE)
     together.reset(seed=3), in_turn.reset(seed=3)
     for action in actions(3, 200, 1):
         for agent in together.agents:
@@ -239,7 +245,7 @@ def test_aec__plays_the_same_episode_in_turns(make: Any) -> None:
         assert np.array_equal(in_turn.state(), together.state())
         if not together.agents:
             break
-    assert isinstance(aec_to_parallel(in_turn), EthBrakeParallelEnv)
+    assert isinstance(aec_to_parallel(in_turn), eb.EthBrakeParallelEnv)
 
 
 # ---------------------------------------------------------------- Gymnasium: one world
@@ -252,16 +258,15 @@ def test_seed__of_an_unseeded_environment_can_be_read_and_that_of_the_users_stre
     environment = eb.EthBrakeEnv()
     environment.np_random = np.random.default_rng(7)
     info = environment.reset()[1]
-    assert (info["world_seed"], info["world"]) == (0, 1)
-    assert environment.np_random.integers(10**6) == 944_904
+    assert (info["world_seed"], info["world"]) == (0, 1) and environment.np_random.integers(10**6) == 944_904
 
 
 @pytest.mark.parametrize(
     "settings",
     [
         {"scenario": REST, "reward": "paper"},
-        {"scenario": json.loads(json.dumps(load_scenario("paper-random").declared()))},
-        {"observation": ObservationSpec(2, 0)},
+        {"scenario": json.loads(json.dumps(eb.load_scenario("paper-random").declared()))},
+        {"observation": eb.ObservationSpec(2, 0)},
         {"observation": eb.choose_observation(["own", "front_1.gap"])},
         {"scenario": FIVE, "reward": eb.RewardParams(harm=0.5, terminal=2.0), "learners": ["vehicle_3"]},
     ],
@@ -342,7 +347,7 @@ def test_step__is_that_of_gymnasiums_own_vector_environment(mode: str, n: int) -
 def test_describe_worlds__tells_given_ones_until_others_take_their_places() -> None:
     start = {"gaps_m": [7, 8], "speeds_mps": [20, 18, 20], "mass_t": [1, 2, 3], "braking_capacity_mps2": 6}
     start |= {"driving_capacity_mps2": 1, "latency_s": [0, 0.5, 0.8], "speed_limit_mps": 40}
-    mixed = load_scenario("realistic-mixed")
+    mixed = eb.load_scenario("realistic-mixed")
     environment = eb.EthBrakeVectorEnv(num_envs=2, scenario=mixed)
     environment.reset(seed=3, options={"initial_state": start})
     told = environment.describe_worlds()
@@ -400,11 +405,11 @@ def test_registration__by_id_twice_and_with_the_projects_name() -> None:
     named, usual = gymnasium.make("ethbrake/EthBrake-v0"), gymnasium.make("EthBrake-v0")
     assert type(named.unwrapped) is type(usual.unwrapped) is eb.EthBrakeEnv
     assert gymnasium.make_vec("ethbrake/EthBrake-v0", num_envs=2).reset(seed=1)[0].shape[0] == 2
-    assert isinstance(pettingzoo.make("parallel", "ethbrake/ethbrake-v0", learners=[2]), EthBrakeParallelEnv)
+    assert isinstance(pettingzoo.make("parallel", "ethbrake/ethbrake-v0", learners=[2]), eb.EthBrakeParallelEnv)
     in_turn = pettingzoo.make("aec", "ethbrake/ethbrake-v0")
-    assert isinstance(in_turn, pettingzoo.AECEnv) and isinstance(in_turn.unwrapped, EthBrakeParallelEnv)
-    assert (str(env()), parallel_env.metadata["name"]) == ("ethbrake_v0", "ethbrake_v0")
-    assert parallel_env.metadata["is_parallelizable"] is True
+    assert isinstance(in_turn, pettingzoo.AECEnv) and isinstance(in_turn.unwrapped, eb.EthBrakeParallelEnv)
+    assert (str(env()), eb.parallel_env.metadata["name"]) == ("ethbrake_v0", "ethbrake_v0")
+    assert eb.parallel_env.metadata["is_parallelizable"] is True
     assert ethbrake_v0.parallel_env is eb.parallel_env and {"env", "raw_env"} <= set(dir(ethbrake_v0))
 
 
@@ -433,7 +438,7 @@ def test_pages__their_examples_run() -> None:
 
 
 @pytest.mark.parametrize("scenario", [PAPER, FIVE], ids=lambda scenario: scenario.name)
-def test_state__has_its_features_and_owns_its_memory(scenario: Scenario) -> None:
+def test_state__has_its_features_and_owns_its_memory(scenario: eb.Scenario) -> None:
     worlds, N = scenario.sample(3, 0).worlds, scenario.vehicles
     names = [feature.name for feature in state_features(scenario)]
     assert len(set(names)) == len(names) == 7 * N + 2 * (N - 1) + 1
@@ -446,3 +451,160 @@ def test_state__has_its_features_and_owns_its_memory(scenario: Scenario) -> None
     kept = state.copy()
     environment.step({environment.possible_agents[environment.engine.learners[0]]: BRAKE})
     assert np.array_equal(state, kept) and state.dtype == np.float32
+
+
+# ---------------------------------------------------------------- Stable-Baselines3
+
+PAIR = ["vehicle_2", "vehicle_3"]
+
+
+def begun(*args: Any, **settings: Any) -> EthBrakeVecEnv:
+    env = make_sb3_vec_env(*args, **settings)
+    env.reset()
+    return env
+
+
+def test_episode__returns_and_lengths_start_again_with_each_one_and_with_a_reset() -> None:
+    env, episodes = begun(CRASH, 1), []
+    for k in range(33):
+        if k == 25:
+            env.reset()
+        _, reward, _, infos = env.step(np.full((1, 1), 0.0 if k < 16 else -1.0, np.float32))
+        episodes += [info["episode"] for info in infos if "episode" in info]
+    assert reward.dtype == np.float32
+    assert episodes == [{"r": near(harm), "l": 8, "t": 0.0} for harm in (-36.0, -36.0, 0.0, 0.0)]
+
+
+def test_rows__are_learners_within_worlds() -> None:
+    n, seed = 3, 5
+    env = make_sb3_vec_env(FIVE, n, seed=seed, learners=PAIR, step_infos=True)
+    plain = begun(FIVE, n, seed=seed, learners=PAIR)
+    start = env.reset()
+    worlds = FIVE.with_learners(PAIR).sample(n, seed, channel="training").worlds
+    alone = [parallel_env(FIVE, learners=PAIR) for _ in range(n)]
+    for k, single in enumerate(alone):
+        given = single.reset(seed=seed, options={"initial_state": initial_state(worlds, k)})[0]
+        assert np.array_equal(start[2 * k : 2 * k + 2], [given[agent] for agent in PAIR])
+    running = set(range(n))
+    for action in actions(3, 100, 2 * n):
+        observation, reward, done, infos = env.step(action)
+        assert not np.shares_memory(observation, start) and observation.flags.c_contiguous
+        infos_of_plain = plain.step(action)[3]
+        for k in sorted(running):
+            rows = [2 * k, 2 * k + 1]
+            given = alone[k].step(dict(zip(PAIR, action[rows], strict=True)))
+            ended = given[2]["vehicle_1"] or given[3]["vehicle_1"]
+            assert done[rows].tolist() == [ended] * 2
+            assert [np.float32(given[1][agent]) for agent in PAIR] == reward[rows].tolist()
+            seen = [infos[row]["terminal_observation"] for row in rows] if ended else observation[rows]
+            assert np.array_equal(seen, [given[0][agent] for agent in PAIR])
+            for row, agent in zip(rows, PAIR, strict=True):
+                told = {**given[4][agent], "world": k, "world_seed": seed}  # alone they were given
+                assert {name: infos[row][name] for name in told} == told
+                assert infos_of_plain[row].keys() == (infos[row].keys() if ended else set())
+            running -= {k} if ended else set()
+    assert not running
+
+
+def test_seed__is_used_by_the_next_reset_only_and_none_is_fresh_entropy() -> None:
+    env = make_sb3_vec_env(PAPER, 2, seed=8)
+    first, second = env.reset(), env.reset()
+    assert np.array_equal(first[0], EthBrakeEnv(PAPER).reset(seed=8)[0]) and not np.array_equal(first, second)
+    assert env.seed(8) == [8, 8]
+    assert np.array_equal(env.reset(), first) and np.array_equal(env.reset(), second)
+    assert env.seed(None) != env.seed(None)
+
+
+def test_set_options__gives_each_world_its_own_start_once_and_fails_one_reset_only() -> None:
+    env = make_sb3_vec_env(CRASH.replace(obstacle_gap_m=30), 2, learners=["vehicle_1", "vehicle_2"])
+    far, near_, bad = ({"initial_state": {"gaps_m": gap, "speeds_mps": 10}} for gap in (40, 4, -1))
+    env.set_options([far, far, near_, near_])
+    env.reset()
+    assert env.engine.worlds.speeds_mps.tolist() == [[10.0, 10.0]] * 2
+    assert env.engine.worlds.gaps_m[:, 0].tolist() == [40.0, 4.0]
+    env.set_options([bad] * 4)
+    with pytest.raises(InvalidInput, match=r"gaps_m\[0\] = -1"):
+        env.reset()
+    assert env.engine.worlds.gaps_m[:, 0].tolist() == [40.0, 4.0]
+    env.reset()
+    assert env.engine.worlds.gaps_m[:, 0].tolist() == [3.0, 3.0]
+    env.set_options([{"listed_world": {"seed": 7, "number": 40}}] * 4)
+    with pytest.warns(UserWarning, match="unknown option listed_world, ignored; known: initial_state"):
+        env.reset()
+
+
+def test_reset_infos__belong_to_the_running_episodes_and_tell_the_news_of_each_learner() -> None:
+    env = begun(CRASH.replace(latency_s=[0, {"uniform": [0.3, 0.6]}]), 2)
+    starts = [set(), set()]
+    for _ in range(30):
+        done = env.step(np.zeros((2, 1), np.float32))[2]
+        for row in range(2):
+            starts[row].add(env.reset_infos[row]["time_s"])
+            assert not done[row] or env.reset_infos[row]["time_s"] == env.engine.worlds.time_s[row]
+    assert min(len(seen) for seen in starts) >= 4  # an episode takes 7 to 10 steps
+    env = begun(line(4), 3, seed=5)
+    known = env.engine.packed.known_from_s
+    told = [info["known_from_s"].tolist() for info in env.reset_infos]
+    assert told == [known[k, i].tolist() for k in range(3) for i in range(4)]
+
+
+def test_attributes__belong_to_the_whole_batch() -> None:
+    env = make_sb3_vec_env(CRASH, 3)
+    assert isinstance(env, EthBrakeVecEnv) and env.get_attr("render_mode") == [None] * 3
+    assert [engine is env.engine for engine in env.get_attr("engine", indices=[0, 2])] == [True, True]
+    env.set_attr("label", 7)
+    assert (env.get_attr("label"), env.env_method("seed", 4)) == ([7] * 3, [[4] * 3] * 3)
+    assert (env.has_attr("engine"), env.has_attr("nothing")) == (True, False)
+    assert env.env_is_wrapped(Monitor) == [False] * 3
+
+
+def test_video__shows_every_world_of_the_batch() -> None:
+    env = make_sb3_vec_env("paper-random", 3, render_mode="rgb_array")
+    env.reset()
+    env.step(np.zeros((3, 1)))
+    assert env.metadata["render_fps"] == 10 and [image.shape for image in env.get_images()] == [(304, 800, 3)] * 3
+    assert (env.render() != 0).any()
+
+
+def test_step_async__keeps_its_own_copy_of_the_actions() -> None:
+    env, untouched = begun(PAPER, 2), begun(PAPER, 2)
+    action = np.full((1, 2), -0.5, np.float32)  # lying: the only row of a batch of columns
+    env.step_async(action)
+    action[:] = np.nan
+    assert np.array_equal(env.step_wait()[0], untouched.step(np.full((2, 1), -0.5, np.float32))[0])
+
+
+@pytest.mark.parametrize("horizon_is_end", [False, True])
+def test_horizon_is_end__hides_the_truncation_and_nothing_else(horizon_is_end: bool) -> None:
+    env = begun(PAPER, 3, seed=4, horizon_is_end=horizon_is_end)
+    cut = []
+    for _ in range(75):  # 0.5 s to 8 s
+        _, _, done, infos = env.step(np.ones((3, 1), np.float32))  # drives on, so that the horizon cuts the episode off
+        cut += [info["TimeLimit.truncated"] for info in infos if info]
+    assert done.all() and cut == [not horizon_is_end] * 3
+    assert all(info["terminal_observation"].shape == (27,) for info in infos)
+
+
+@pytest.mark.parametrize("appended", ["number", "state"])
+def test_appended__stands_behind_the_own_observation_in_every_row(appended: Any) -> None:
+    three = ["vehicle_2", "vehicle_3", "vehicle_5"]
+    plain = make_sb3_vec_env(FIVE, 3, seed=2, learners=three)
+    more = make_sb3_vec_env(FIVE, 3, seed=2, learners=three, appended=appended)
+    own = plain.observation_space.shape[0]
+    rows, seen = plain.reset(), more.reset()
+    ended = 0
+    for _ in range(90):
+        expected = np.tile([[0.0], [1.0], [2.0]], (3, 1))
+        if appended == "state":
+            expected = full_state(more.engine.worlds, more.engine.scenario).repeat(3, axis=0)
+        np.testing.assert_array_equal(seen, np.hstack([rows, expected.astype(np.float32)]))
+        assert more.observation_space.contains(seen[2])
+        given = np.full((9, 1), -0.8, np.float32)
+        (rows, _, _, plainly), (seen, _, dones, infos) = plain.step(given), more.step(given)
+        for row in np.flatnonzero(dones):
+            last = infos[row]["terminal_observation"]
+            np.testing.assert_array_equal(last[:own], plainly[row]["terminal_observation"])
+            assert last.shape == more.observation_space.shape
+            assert appended == "state" or last[own] == row % 3
+            ended += 1
+    assert ended > 0

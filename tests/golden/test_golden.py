@@ -4,8 +4,6 @@
 changes only with the physics or the order of its floating point operations; the sums beside it tell which of the two.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from pathlib import Path

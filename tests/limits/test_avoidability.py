@@ -1,7 +1,5 @@
 """Avoidability: margins by hand, witnesses and counter-examples in the exact physics, and a linear programme."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -50,8 +48,7 @@ def test_early__a_pair_that_meets_before_the_vehicle_may_act():
     rear = line([9, 1], [10, 10, 12], [5, 8, 5], [1, 1, 2])
     brakes_in_time = line([9, 0.5], [10, 10, 12], [5, 8, 4], [1, 1, 0])  # 2 m/s at 4 m/s2: 0.5 m, a touch at 0.5 s
     verdict = avoidability(eb.Worlds.concatenate([front, rear, brakes_in_time]))
-    assert verdict.reason_name.tolist() == ["early", "early", ""]
-    assert verdict.margin_m[:2] == pytest.approx([-1, -1])
+    assert verdict.reason_name.tolist() == ["early", "early", ""] and verdict.margin_m[:2] == pytest.approx([-1, -1])
 
 
 # Room, own speed and so on chosen for round numbers; vehicle 3 stands far behind and never matters.
@@ -110,8 +107,7 @@ def impacts_of_witnesses(worlds, verdict, controlled=1):
 def test_witness__has_no_impact_in_the_physics(vehicles, controlled):
     worlds = wide_worlds(20_000, vehicles, seed=21)
     verdict = avoidability(worlds, controlled)
-    assert 0.2 < verdict.avoidable.mean() < 0.9
-    assert impacts_of_witnesses(worlds, verdict, controlled) == 0
+    assert 0.2 < verdict.avoidable.mean() < 0.9 and impacts_of_witnesses(worlds, verdict, controlled) == 0
     assert np.isnan(verdict.switch_s[~verdict.avoidable]).all()
     assert np.isnan(verdict.command_mps2[~verdict.avoidable]).all()
 
@@ -155,8 +151,7 @@ def test_early__is_what_happens_in_the_physics_before_the_latency(vehicles, cont
     until = worlds.vehicles.latency_s[:, controlled]
     _, impacts = eb.advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=until)
     early = avoidability(worlds, controlled).reason == 1
-    assert 0.01 < early.mean() < 0.5
-    assert np.array_equal(early, impacts.count.sum(axis=1) > 0)
+    assert 0.01 < early.mean() < 0.5 and np.array_equal(early, impacts.count.sum(axis=1) > 0)
 
 
 @pytest.mark.parametrize("profiles", [8, pytest.param(250, marks=pytest.mark.long)])

@@ -1,24 +1,23 @@
-"""Best known harm: the search, profiles to start from, tables and their files, the agent and the command."""
+"""Best known harm: search, profiles, tables, agent and command; and what is proven beside it, once and on demand."""
 
-from __future__ import annotations
-
+import csv
 import json
 import random
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents import make_agent, optimise_coupled
-from ethbrake_marl.agents.planner import BestHarm
-from ethbrake_marl.agents.registry import drive
+from ethbrake_marl.agents import BestHarm, drive, make_agent, optimise_coupled
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
-from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.evaluation.measures import TESTS
+from ethbrake_marl.evaluation import TESTS, evaluate, make_lineup, measures, rollout, summarise, write_per_world
+from ethbrake_marl.figures import harm_in_parts
+from ethbrake_marl.limits import Unproven, known_limits, limits, lower_bound as bounding, prove
 from ethbrake_marl.limits.limits import (
     LEFT_OUT,
     TABLES,
@@ -30,7 +29,8 @@ from ethbrake_marl.limits.limits import (
     shipped_tables,
     task_problem,
 )
-from ethbrake_marl.limits.lower_bound import KEPT, extreme_profiles, lower_bound, onset_states
+from ethbrake_marl.limits.lower_bound import KEPT, extreme_profiles, lower_bound, onset_states, team_bound
+from ethbrake_marl.pages.report import avoidable_section, worst_section
 from ethbrake_marl.physics import Floats, Worlds, advance
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from ethbrake_marl.search import Profiles, profile_problem
@@ -62,8 +62,7 @@ def test_follow__hits_a_standing_car_with_the_closing_speed_computed_by_hand() -
     assert first == pytest.approx([400.0 - 2 * 5 * 20])
     # 0.5 s of braking, then coasting: v^2 = 17.5^2 at the wall
     half = Profiles(np.array([[5, 80]]), np.array([[[-5.0], [0.0]]]))
-    assert problem.follow(half)[0] == pytest.approx([17.5**2])
-    assert total[0] >= first[0]
+    assert problem.follow(half)[0] == pytest.approx([17.5**2]) and total[0] >= first[0]
     _, found = problem.search(problem.constant(np.array([[[2.0]]])), budget=2000)  # cannot beat full braking
     assert found["first"] == pytest.approx([200.0], abs=1e-3)
 
@@ -90,14 +89,12 @@ def test_best_harm__does_not_depend_on_batch_order_or_threads_but_on_the_seed(ta
 def test_best_harm__an_obstacle_ahead_of_some_worlds_changes_nothing_in_the_others() -> None:
     ahead = load_scenario("paper-random-obstacle").sample(3, seed=11).worlds
     apart = [first_harm(worlds, budget=100) for worlds in (FEW, ahead)]
-    together = first_harm(Worlds.concatenate([FEW, ahead]), budget=100)
-    assert together.tolist() == np.concatenate(apart).tolist()
+    assert first_harm(Worlds.concatenate([FEW, ahead]), budget=100).tolist() == np.concatenate(apart).tolist()
 
 
 def test_best_harm__starts_from_what_is_known_and_never_gets_worse(table: BestHarmTable) -> None:
     again = best_harm(SCENARIO, WORLDS, budget=100, threads=1, seed=2, known=table)
-    for harm_count in HARM_COUNTS:
-        assert (again.best[harm_count].harm <= table.best[harm_count].harm + 1e-6).all()
+    assert all((again.best[harm_count].harm <= table.best[harm_count].harm + 1e-6).all() for harm_count in HARM_COUNTS)
     assert again.header["after"]["budget"] == BUDGET
 
 
@@ -133,11 +130,9 @@ def test_stored_profile__driven_in_the_engine_does_the_stored_harm_bit_for_bit(
 
 
 def test_best_harm_agent__searches_a_world_that_no_table_holds() -> None:
-    agent = make_lineup(["best_harm:300"], SCENARIO)["best_harm:300"]
-    episodes = drive(FEW, agent, SCENARIO, 1)
+    episodes = drive(FEW, make_lineup(["best_harm:300"], SCENARIO)["best_harm:300"], SCENARIO, 1)
     told = episodes.memories[1]
-    assert told["searched"].all()
-    assert np.array_equal(episodes.ledger.world_harm("first"), told["predicted_harm"])
+    assert told["searched"].all() and np.array_equal(episodes.ledger.world_harm("first"), told["predicted_harm"])
     assert (told["predicted_harm"] <= optimise_coupled(FEW, 1).harm + 1e-7).all()
 
 
@@ -196,8 +191,7 @@ def test_search_list__goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pyte
 def test_search_list__leaves_a_world_out_that_cannot_be_advanced(tmp_path: Path) -> None:
     sample = planted_list(SCENARIO, 5, 11, [1, 3])
     found = search_list(SCENARIO, sample, budget=100, threads=1, chunks=tmp_path)
-    assert sorted(found.header[LEFT_OUT]) == ["1", "3"]
-    assert "a contact was missed" in found.header[LEFT_OUT]["3"]
+    assert sorted(found.header[LEFT_OUT]) == ["1", "3"] and "a contact was missed" in found.header[LEFT_OUT]["3"]
     alone = best_harm(SCENARIO, sample.worlds.take(without(5, [1, 3])), budget=100, threads=1)
     assert np.array_equal(found.identity, alone.identity)
     assert np.array_equal(found.best["total"].harm, alone.best["total"].harm)
@@ -267,16 +261,14 @@ def test_search__of_a_hundred_candidates_is_near_the_proven_bound(name: str, abo
     worlds = scenario.sample(60, seed=7).worlds
     bound = lower_bound(worlds, time_step_s=scenario.time_step_s).harm
     found = best_harm(scenario, worlds, counts=["first"], budget=100, threads=1).best["first"].harm
-    assert np.all(found >= bound)
-    assert 0 < found.mean() < above * bound.mean()
+    assert np.all(found >= bound) and 0 < found.mean() < above * bound.mean()
 
 
 def test_profiles__of_both_kinds_are_needed_and_harmless_worlds_are_found() -> None:
     worlds, least = SCENARIO.sample(60, seed=7).worlds, {}
     for there in ((True, False), (False, True), (True, True)):
         problem, profiles = of_worlds(worlds, 1, front=there[0], rear=there[1])
-        each = [problem.follow(profiles.take(slice(k, None, KEPT)))[0] for k in range(KEPT)]
-        least[there] = np.min(each, axis=0)
+        least[there] = np.min([problem.follow(profiles.take(slice(k, None, KEPT)))[0] for k in range(KEPT)], axis=0)
     front, rear, both = least.values()
     assert np.array_equal(both, np.minimum(front, rear))
     assert np.any(front < rear) and np.any(rear < front)
@@ -346,3 +338,93 @@ def test_best_harm_command__takes_what_agents_do_better(tmp_path: Path) -> None:
         assert after.header["lowered_by"]["planner:60"][count] >= changed.sum()
         assert count == "first" or changed.sum() >= 1
         assert problem.follow(after.best[count].profiles)[k].tolist() == harm.tolist()
+
+
+# ---------------------------------------------------------------- the limits of an evaluation: proven and best known
+
+LISTED = SCENARIO.sample(50, 7).worlds
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, Mock]:
+    """What computes each part of the limits, and evaluates, and counts how often it did."""
+    found: dict[str, Mock] = {}
+    for place, name in (
+        (limits, "avoidability"), (bounding, "avoidability"), (limits, "lower_bound"), (limits, "best_known"),
+        (measures, "known_limits"), (rollout, "evaluate_list"),
+    ):  # fmt: skip
+        monkeypatch.setattr(place, name, found.setdefault(name, Mock(wraps=getattr(place, name))))
+    return found
+
+
+def test_evaluate__finds_the_limits_once_for_table_csv_and_json(calls: dict[str, Mock], tmp_path: Path) -> None:
+    lines = ["--episodes", "20", "--per-world", str(tmp_path / "worlds.csv"), "--json"]
+    assert run_command(["evaluate", "--agents", "full_brake,coast", *lines]) == 0
+    assert {name: part.call_count for name, part in calls.items()} == dict.fromkeys(calls, 1)
+
+
+def test_evaluate__whose_limits_nobody_asks_for_finds_none(
+    calls: dict[str, Mock], pair: Scenario, tmp_path: Path
+) -> None:
+    found = evaluate(pair.sample(2, 0), {"coast": make_agent("coast")}, scenario=pair)
+    calls["known_limits"].assert_not_called()
+    write_per_world(tmp_path / "out.csv", found)
+    assert (len(summarise(found)), found.regrets) == (1, None) and found.conditions["no_limits_because"]
+    calls["known_limits"].assert_called_once()
+    assert found.limits is found.limits
+
+
+def test_known_limits__are_the_proof_and_the_best_known() -> None:
+    task = Task(SCENARIO, (1,))
+    found, proof = known_limits(LISTED, task), prove(LISTED, task)
+    assert found.known.all()
+    assert (found.first_impact_harm[proof.avoidable] == 0.0).all() and not (proof.impact & proof.avoidable).any()
+    assert (np.minimum(found.first_impact_harm, found.total_harm) >= proof.harm - 1e-9).all()
+
+
+def test_known_limits__say_why_nothing_is_proven() -> None:
+    coasts = load_scenario("cooperation-3-pair").replace(roles={"vehicle_1": "coast", "vehicle_2": "learner"})
+    for task, why in (
+        (Task(SCENARIO, ()), "driven are: none; avoidability is proven for one vehicle"),
+        (Task(coasts, (1, 2)), "vehicle_1 follows coast; harm is bounded where it follows full_brake"),
+    ):
+        assert known_limits(LISTED, task) == Unproven(why)
+
+
+def test_prove__decides_contact_of_vehicles_2_and_3_as_of_vehicle_2_alone() -> None:
+    scenario = load_scenario("cooperation-3-pair")
+    alone, both = prove(LISTED, Task(scenario, (1,))), prove(LISTED, Task(scenario, (2, 1)))
+    assert np.array_equal(alone.avoidable, both.avoidable) and np.array_equal(alone.reason, both.reason)
+    assert 0.99 * alone.harm.mean() < both.harm.mean() <= alone.harm.mean()
+
+
+@pytest.mark.parametrize(
+    ("name", "vehicles"),
+    [("cooperation-4-all", (0, 1, 2)), ("cooperation-3-five", (1, 2, 3, 4)), ("cooperation-2-five", (1,))],
+)
+def test_prove__bounds_the_harm_of_other_teams_without_a_verdict_on_contact(name: str, vehicles: tuple[int]) -> None:
+    scenario = load_scenario(name)
+    sample = scenario.sample(30, 7)
+    found = known_limits(sample.worlds, Task(scenario, vehicles))
+    assert found.proof.avoidable is None and found.proof.contact is None
+    assert np.array_equal(found.proof.harm, team_bound(sample.worlds, vehicles, horizon_s=8.0, time_step_s=0.1).harm)
+    assert not found.known.any() and (found.proof.harm > 0).any() == (name != "cooperation-4-all")
+
+
+def test_evaluation__of_a_team_tells_the_proven_harm_where_contact_is_not_decided(tmp_path: Path) -> None:
+    scenario = load_scenario("cooperation-3-five")
+    agents = {name: make_agent(name) for name in ("full_brake", "coast")}
+    found = evaluate(scenario.sample(20, 7), agents, scenario=scenario)
+    rows = summarise(found)
+    told, text = rows[0], rows.limit_line()
+    assert (told["unavoidable_rate"], told.between, told["avoidable_collision_rate"]) == (None, None, None)
+    assert 0 < told["proven_harm"].value < told["best_known_first_impact_harm"].value
+    assert told["impact_proven_rate"] is not None and told.known_best_share == 0.0
+    assert "no joint command avoids an impact (proven)" in text and "avoids contact" not in text
+    write_per_world(tmp_path / "out.csv", found)
+    with (tmp_path / "out.csv").open(newline="") as lines:
+        cells = next(csv.DictReader(lines))
+    assert cells["avoidable"] == cells["unavoidable_reason"] == "" and float(cells["proven_harm"]) >= 0
+    assert avoidable_section(found).title and worst_section(found, "coast", ()).title
+    with pytest.raises(InvalidInput, match="where contact can be avoided is not decided"):
+        harm_in_parts(found)

@@ -1,9 +1,8 @@
-"""The proven lower bound: by hand, what its proof rests on, and no profile below it."""
-
-from __future__ import annotations
+"""The proven lower bounds, of one vehicle and of several: by hand, what the proof rests on, and no profile below."""
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -42,12 +41,13 @@ from ethbrake_marl.limits.lower_bound import (
     rounding,
     slowed_by_rear,
     soft_behind,
+    team_bound,
     widest_flight,
 )
-from ethbrake_marl.physics import Worlds, advance, make_worlds
+from ethbrake_marl.physics import Vehicles, Worlds, advance, make_worlds
 from ethbrake_marl.physics.kernel import solo_motion
 from ethbrake_marl.scenario import Task, load_scenario
-from ethbrake_marl.search import profile_problem
+from ethbrake_marl.search import Profiles, profile_problem
 from tests.limits.worlds import REGIONS, line, moved_profiles, opening, random_profiles, wide_worlds, worlds_of
 from tests.reference.play_profile import play_profile
 
@@ -74,8 +74,7 @@ PAIR_BY_HAND = {
 def test_pair__by_hand_less_what_rounding_can_do_which_is_next_to_nothing(name):
     worlds, vehicle, harm = PAIR_BY_HAND[name]
     bound, outward = lower_bound(worlds, vehicle), rounding(worlds, vehicle)[0]
-    assert 0.0 < outward < 2e-8
-    assert bound.harm[0] == pytest.approx(max(harm - outward, 0.0), rel=1e-12, abs=1e-12)
+    assert 0.0 < outward < 2e-8 and bound.harm[0] == pytest.approx(max(harm - outward, 0.0), rel=1e-12, abs=1e-12)
     assert bound.harm[0] == (bound.front_pair if vehicle else bound.rear_pair)[0]
     assert bound.impact_proven[0] == (harm > 0)
 
@@ -101,8 +100,7 @@ def test_bound__is_never_above_what_its_own_optimum_realises_in_steps(vehicle, s
         ledger = ledger.add(impacts)
     harm = ledger.world_harm("first")
     attained = (harm > 0) & (harm - bound < 1e-6)
-    assert attained.sum() > 500
-    assert np.all(bound <= harm)
+    assert attained.sum() > 500 and np.all(bound <= harm)
     # Most of what is subtracted is not needed, and all of it is little.
     assert np.max(np.abs(harm - outward - bound)[attained]) < 0.1 * outward.max() < 1e-8
 
@@ -117,8 +115,7 @@ def test_both_pairs__add_up():
 def test_early__impacts_before_the_latency_are_certain():
     worlds = line([1, 50], [10, 12, 12], [5, 5, 5], latency=[1, 1, 1])  # both coast: 2 m/s
     bound = lower_bound(worlds)
-    assert avoidability(worlds).reason_name[0] == "early"
-    assert bound.early[0] == pytest.approx(4)
+    assert avoidability(worlds).reason_name[0] == "early" and bound.early[0] == pytest.approx(4)
     assert bound.front_pair[0] == 0  # hit: a further impact of this pair does not count first
     assert lower_bound(worlds, harm_count="total").early[0] == pytest.approx(4)
 
@@ -196,8 +193,7 @@ def test_bound__is_never_above_a_searched_profile_in_any_region(region, n, budge
     assert np.all(any_time <= decided)
     for bound, harm_count, step in ((decided, "first", 0.1), (decided, "total", 0.1), (any_time, "first", 0.025)):
         problem = profile_problem(worlds, [1], harm_count=harm_count, horizon_s=60.0, time_step_s=step)
-        found = problem.search(problem.constant(problem.even_grid(9)), budget=budget)[1]
-        assert np.all(bound <= found[harm_count])
+        assert np.all(bound <= problem.search(problem.constant(problem.even_grid(9)), budget=budget)[1][harm_count])
 
 
 # What a first meeting leaves, and what the command in force costs.
@@ -227,11 +223,6 @@ def random_states(n, seed):
     return [state(**{name: column[k] for name, column in drawn.items()}) for k in range(n)]
 
 
-def outer_gap(at, time):
-    """Gap between the outer two vehicles, both left alone."""
-    return at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, time)[1] - follower(at, time)[1]
-
-
 def follows(kind, at, time, closing):
     """The least squared closing speed at the other pair after such a meeting."""
     return after(kind, at, time, time, closing, time, 0.0, *PLANS)
@@ -256,9 +247,10 @@ def test_gentlest_meeting__is_driven_and_falls_with_the_time():
 def test_what_follows__falls_with_the_closing_speed_and_rises_with_the_time():
     some = 0
     for at in random_states(300, seed=44):
-        stand = at[LINE.V_L] / at[LINE.A_L]
+        stand, apart = at[LINE.V_L] / at[LINE.A_L], at[LINE.GAP_L] + at[LINE.GAP_R]
         for kind in (FRONT_FIRST, REAR_FIRST):
-            times = [t for t in (0.1, 0.4, 0.8, 1.6) if outer_gap(at, t) > 0 and (kind == REAR_FIRST or t < stand)]
+            times = [t for t in (0.1, 0.4, 0.8, 1.6) if leader(at, t)[1] - follower(at, t)[1] > -apart]  # the outer two
+            times = [t for t in times if kind == REAR_FIRST or t < stand]
             if not times:
                 continue
             harm = np.array([[follows(kind, at, t, w) for w in (0, 0.5, 1, 2, 4)] for t in times])
@@ -378,8 +370,7 @@ def test_lead__is_what_a_flight_gains_less_the_command_it_costs(share, press, re
     met = (-relative + np.sqrt(relative**2 + 2 * press * np.maximum(gap, 0.0))) / press
     best = np.max((share * (relative + press * met) - reach * s * (1.0 - share))[gap >= 0.0])
     found = lead(share, press, reach, opens, 0.0, 50.0, 0.0)
-    assert found >= best - 1e-9
-    assert found == pytest.approx(best, abs=2e-3)
+    assert found >= best - 1e-9 and found == pytest.approx(best, abs=2e-3)
 
 
 # One stands 5 m ahead, the other comes from 100 m behind; 60 m ahead it may come in time.
@@ -396,17 +387,6 @@ def test_first_meeting__of_the_rear_is_impossible_where_the_leader_must_be_met_b
 
 # First meetings with a rear vehicle that does as it likes: every one that is played lies within what is bounded.
 STEP_S, FAR_M = 0.2, 1e4
-
-
-def pairs(n, seed):
-    """Lines of three whose leader is out of reach."""
-    rng = np.random.default_rng(seed)
-    latency = np.stack([np.zeros(n), np.zeros(n), rng.uniform(0, 1, n)], axis=1)
-    return make_worlds(
-        np.stack([np.full(n, FAR_M), rng.uniform(0.2, 8, n)], axis=1), rng.uniform(15, 25, (n, 3)),
-        braking_capacity_mps2=rng.uniform(2, 9, (n, 3)), driving_capacity_mps2=rng.uniform(0, 8, (n, 3)),
-        latency_s=latency, mass_t=1, restitution=0, speed_limit_mps=rng.uniform(25, 60, (n, 3)),
-    )  # fmt: skip
 
 
 def played(worlds, rng):
@@ -428,7 +408,13 @@ def played(worlds, rng):
 
 
 def test_played_meetings__lie_within_the_bounds_of_every_cell_that_holds_them():
-    worlds, checked, earlier = pairs(400, seed=3), 0, 0
+    rng, checked, earlier, n = np.random.default_rng(3), 0, 0, 400
+    latency = np.stack([np.zeros(n), np.zeros(n), rng.uniform(0, 1, n)], axis=1)
+    worlds = make_worlds(  # lines of three whose leader is out of reach
+        np.stack([np.full(n, FAR_M), rng.uniform(0.2, 8, n)], axis=1), rng.uniform(15, 25, (n, 3)),
+        braking_capacity_mps2=rng.uniform(2, 9, (n, 3)), driving_capacity_mps2=rng.uniform(0, 8, (n, 3)),
+        latency_s=latency, mass_t=1, restitution=0, speed_limit_mps=rng.uniform(25, 60, (n, 3)),
+    )  # fmt: skip
     v = worlds.vehicles
     for world, time, closing, there in played(worlds, np.random.default_rng(4)):
         row = onset_states(worlds.take([world]), 1, None)[0]
@@ -439,8 +425,7 @@ def test_played_meetings__lie_within_the_bounds_of_every_cell_that_holds_them():
         _, way_l, _ = solo_motion(worlds.speeds_mps[world, 0], -v.braking_capacity_mps2[world, 0], 0.0, math.inf, time)
         further = max(FAR_M + way_l - there.gaps_m[0, 0] + row[LINE.GAP_R] - way, 0.0)
         faster = there.speeds_mps[0, 2] - speed
-        for reach in (power, math.inf):
-            assert faster >= gained(further - 1e-6, time, since, reach) - 1e-3
+        assert all(faster >= gained(further - 1e-6, time, since, reach) - 1e-3 for reach in (power, math.inf))
         for before, later, near, far in ((0, 0, 1, 1), (0.5, 0.5, 0.5, 1.5), (1, 0.2, 0, 3), (0, 1, 0.9, 1)):
             early, late = (1 - before) * time, (1 + later) * time
             cell = early, late, max(near * further - 1e-6, 0.0), far * further + 1e-6
@@ -472,8 +457,7 @@ def test_a_standing_vehicle__may_wait_before_it_drives():
 def test_combined__is_claimed_only_where_contact_is_unavoidable_and_not_early():
     worlds = wide_worlds(1500, 3, seed=46, strong=True)
     reason, bound = avoidability(worlds).reason, lower_bound(worlds, harm_count="total", horizon_s=200.0)
-    assert np.all(bound.combined[reason < 2] == 0)
-    assert np.mean(bound.combined[reason >= 2] > 0) > 0.5
+    assert np.all(bound.combined[reason < 2] == 0) and np.mean(bound.combined[reason >= 2] > 0) > 0.5
     assert np.all(bound.harm[reason == 0] == 0)
 
 
@@ -496,8 +480,7 @@ def test_decisions__leave_less_room_than_any_time():
     worlds = scenario.sample(100, seed=7).worlds
     any_time, decided = lower_bound(worlds), lower_bound(worlds, time_step_s=scenario.time_step_s)
     often = lower_bound(worlds, time_step_s=1e-3)
-    assert np.all(any_time.harm <= decided.harm)
-    assert decided.harm.mean() > 1.02 * any_time.harm.mean()
+    assert np.all(any_time.harm <= decided.harm) and decided.harm.mean() > 1.02 * any_time.harm.mean()
     assert often.harm.mean() < 1.01 * any_time.harm.mean()
 
 
@@ -522,3 +505,177 @@ def test_lower_bound__who_stands_at_the_leader_is_struck_together_with_it(time_s
     harm = play(worlds, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
     assert harm == pytest.approx(20.0**2 - 2 * 6 * 20)
     assert 0.0 < lower_bound(worlds, horizon_s=60.0, time_step_s=time_step_s).harm[0] <= harm
+
+
+# ---------------------------------------------------------------- several controlled vehicles: joint profiles
+
+HORIZON_S = 60.0
+STEPS = ((0.1, 0.1), (None, 0.025), (0.02, 0.02))  # what the bound is told, and when the searched profiles change
+world = partial(line, mass=1, limit=60.0)
+PAIR = load_scenario("cooperation-3-pair")
+
+
+# world, controlled vehicles, harm of their bound
+BY_HAND = {
+    # w^2 - 2 u d, before the follower may act
+    "the leader drives away": (world([5], [10, 20], 5, [0, 1], driving=[2, 0]), (0, 1), 100 - 2 * 2 * 5),
+    "early: the leader brakes instead": (world([5], [10, 20], 5, [0, 1], driving=[2, 0]), (1,), 10**2 + 2 * 5 * 5),
+    # w = -2: driving would make the gap shrink sooner, at sqrt(2 (8 - 4) 4)
+    "the leader brakes harder and drew ahead": (world([4], [20, 18], [8, 4]), (1,), 2 * 4 * 4),
+    "the leader coasts for 1 s, the follower brakes at once": (world([8], [10, 14], 6, [1, 0]), (1,), 0),
+}
+
+
+@pytest.mark.parametrize("name", BY_HAND)
+def test_pair__by_hand(name):
+    worlds, vehicles, harm = BY_HAND[name]
+    assert team_bound(worlds, vehicles).harm[0] == pytest.approx(harm)
+
+
+def test_pair__of_a_leader_that_brakes_late_counts_what_the_follower_must_make_up():
+    late = world([2], [10, 14], [6, 3], [1, 0])
+    _, impacts = advance(late, -late.vehicles.braking_capacity_mps2, until_s=20.0)
+    assert 0 < team_bound(late, (1,), horizon_s=20).harm[0] <= impacts.first_impact_harm.sum()
+
+
+def test_pairs__of_a_line_add_up_and_the_obstacle_too():
+    worlds = world([2, 50, 3], [30, 40, 10, 20], [5, 5, 5, 5], obstacle=10)
+    found = team_bound(worlds, (0, 1, 2, 3))  # without drive the leaders coast
+    assert found.pairs[0] == pytest.approx([100 - 2 * 5 * 2, 0, 100 - 2 * 5 * 3])
+    assert found.obstacle[0] == pytest.approx(30**2 - 2 * 5 * 10)
+    assert found.harm[0] == pytest.approx(found.pairs[0, 1:].sum() + max(found.obstacle[0] + 80, found.combined[0]))
+
+
+def test_bound__of_a_line_that_learns_whole_is_above_0_where_vehicle_2_cannot_stop_before_the_obstacle():
+    worlds = world([5], [20, 20], [5, 3], driving=[5, 5], obstacle=41)  # it needs 66.7 m, and has 46
+    found = team_bound(worlds, (0, 1), horizon_s=HORIZON_S)
+    assert found.obstacle[0] == found.pairs[0, 0] == 0 and 50 < found.combined[0] == found.harm[0]
+    assert found.harm[0] <= searched(profile_problem(worlds, (0, 1), horizon_s=HORIZON_S), "first", 2000)[0] < 80
+    assert team_bound(worlds, (0, 1), horizon_s=2.0).harm[0] == 0
+    assert team_bound(replace(worlds, obstacle_gap_m=np.array([62.0])), (0, 1), horizon_s=HORIZON_S).harm[0] == 0
+
+
+@pytest.mark.parametrize("vehicle", [0, 1])
+def test_bound_of_one_vehicle_of_two__is_that_of_lower_bound(vehicle):
+    pair = worlds_of("plain", 300, 2, seed=5)
+    assert np.allclose(team_bound(pair, [vehicle]).harm, lower_bound(pair, vehicle).harm, rtol=1e-9, atol=1e-8)
+
+
+def test_bound__of_the_paper_line_is_hardly_below_that_of_vehicle_2_alone_and_0_where_that_one_keeps_apart():
+    worlds = PAIR.sample(150, seed=5).worlds
+    alone = lower_bound(worlds, 1, time_step_s=0.1).harm
+    both, any_time = (team_bound(worlds, (1, 2), time_step_s=step) for step in (0.1, None))
+    assert 0.995 * alone.mean() < both.harm.mean() < alone.mean()
+    assert np.all(any_time.harm <= both.harm) and both.impact_proven.mean() > 0.5
+    assert np.all(any_time.harm[avoidability(worlds, 1).avoidable] == 0)
+
+
+def test_bound__never_rises_with_more_vehicles_that_are_free():
+    worlds = worlds_of("plain", 60, 4, seed=3)
+    bounds = [team_bound(worlds, chosen, horizon_s=HORIZON_S) for chosen in ((3,), (2, 3), (1, 2, 3), (0, 1, 2, 3))]
+    assert np.all(np.diff([bound.early + bound.pairs.sum(axis=1) for bound in bounds], axis=0) <= 1e-6)
+
+
+def test_bound__grants_vehicle_3_what_it_may_gain_by_coming_earlier():
+    worlds = worlds_of("weak brakes behind", 200, 3, seed=3)
+    scripted, free = (team_bound(worlds, chosen, horizon_s=HORIZON_S).combined for chosen in ((1,), (1, 2)))
+    assert np.all(free <= 1.01 * scripted + 0.01) and (free < scripted - 1e-3).mean() > 0.02
+
+
+def test_bound__grants_vehicle_3_the_pushes_of_those_behind():
+    worlds = worlds_of("weak brakes behind", 200, 4, seed=3)
+    v = worlds.vehicles
+    parts = (v.braking_capacity_mps2, v.driving_capacity_mps2, v.latency_s, v.mass_t, v.speed_limit_mps)
+    three = replace(
+        worlds, gaps_m=worlds.gaps_m[:, :2], speeds_mps=worlds.speeds_mps[:, :3], pair_hit=worlds.pair_hit[:, :2],
+        vehicles=Vehicles.at_once(*(part[:, :3] for part in parts), v.restitution),
+    )  # fmt: skip
+    found = [team_bound(some, (1,), horizon_s=HORIZON_S) for some in (three, worlds)]
+    same = found[1].early == 0  # nobody is pushed before Vehicle 2 may act
+    alone, pushed = (bound.combined[same] for bound in found)
+    assert np.all(pushed <= 1.01 * alone + 0.01) and (pushed < alone - 1e-3).mean() > 0.02
+
+
+@pytest.mark.parametrize(("region", "knows"), [("rear reacts first", False), ("plain", True)])
+def test_bound__knows_the_decisions_of_vehicle_2_only_where_it_is_the_first_to_act(region, knows):
+    worlds = worlds_of(region, 200, 3, seed=3)
+    free, told = (team_bound(worlds, (1, 2), horizon_s=HORIZON_S, time_step_s=step).combined for step in (None, 0.3))
+    assert np.all(free <= told) and (free > 0).any() and (free < told).any() == knows
+
+
+def test_bound__counts_nothing_after_the_horizon_nor_a_pair_that_was_hit_before():
+    worlds = PAIR.sample(200, seed=7).worlds
+    near, usual = (team_bound(worlds, (1, 2), horizon_s=end).harm for end in (1.2, 8.0))
+    assert np.all(near <= usual) and near.mean() < 0.3 * usual.mean()
+    hit = replace(worlds, pair_hit=np.ones_like(worlds.pair_hit))
+    assert np.all(team_bound(hit, (1, 2)).harm == 0)
+    assert np.all(team_bound(hit, (1, 2), harm_count="total").harm == team_bound(worlds, (1, 2)).harm)
+
+
+def test_bound__does_not_depend_on_the_batch_or_the_order_of_the_vehicles():
+    worlds = load_scenario("cooperation-3-congested").sample(40, seed=7).worlds
+    whole = team_bound(worlds, (2, 1), time_step_s=0.1).harm
+    assert np.array_equal(whole[[7]], team_bound(worlds.take([7]), (1, 2), time_step_s=0.1).harm)
+
+
+def searched(problem, harm_count, budget):
+    return problem.search(problem.constant(problem.even_grid(5)), budget=budget)[1][harm_count]
+
+
+def at_random(problem, rng, phases=8):
+    """First-impact and total harm [n] of joint profiles whose commands are mostly extreme."""
+    n, controlled = problem.n, len(problem.vehicles)
+    ends = np.sort(np.minimum(rng.geometric(rng.choice([0.02, 0.1, 0.3]), (n, phases)), problem.last_step[:, None]))
+    ends[:, -1] = problem.last_step
+    share = rng.uniform(0, 1, (n, phases, controlled))
+    share = np.where(rng.random(share.shape) < 0.7, np.round(share), share)
+    low, high = problem.bounds[:, None, :, 0], problem.bounds[:, None, :, 1]
+    return problem.follow(Profiles(ends, np.clip(low + (high - low) * share, low, high)))
+
+
+def check(worlds, vehicles, budget, draws, seed, steps=STEPS):
+    """No joint profile, searched or drawn, does less harm than the bound."""
+    rng = np.random.default_rng(seed)
+    for told, step in steps:
+        for harm_count in ("first", "total"):
+            bound = team_bound(worlds, vehicles, harm_count=harm_count, horizon_s=HORIZON_S, time_step_s=told)
+            problem = profile_problem(worlds, vehicles, harm_count=harm_count, horizon_s=HORIZON_S, time_step_s=step)
+            assert np.all(bound.harm <= searched(problem, harm_count, budget))
+            assert all(np.all(bound.harm <= at_random(problem, rng)[harm_count == "total"]) for _ in range(draws))
+
+
+LINES = {  # vehicles, the controlled ones, where an obstacle stands
+    "three, both that follow": (3, (1, 2), None),
+    "two, the rear one": (2, (1,), None),
+    "two, both": (2, (0, 1), None),
+    "three, the middle one, pushed by nobody": (3, (1,), None),
+    "two, both, with an obstacle": (2, (0, 1), (-3.0, 4.0)),
+    "two, the front one, with an obstacle": (2, (0,), (-3.0, 4.0)),
+    "three, with a far obstacle": (3, (1, 2), (0.0, 10.0)),
+    "three, all, with an obstacle": (3, (0, 1, 2), (-3.0, 3.0)),
+    "three, with an obstacle that is reached": (3, (1, 2), (-10.0, 2.0)),
+    "five, all that follow": (5, (1, 2, 3, 4), None),
+    "five, every other": (5, (0, 2, 4), None),
+    "five, the second": (5, (1,), None),
+}
+
+
+@pytest.mark.parametrize("region", REGIONS)
+def test_bound__is_never_above_a_joint_profile(region):
+    check(worlds_of(region, 8, 3, seed=61), (1, 2), budget=100, draws=3, seed=62)
+
+
+@pytest.mark.parametrize("kind", LINES)
+@pytest.mark.parametrize("k", range(4))
+def test_bound__is_never_above_a_joint_profile_of_any_line(kind, k):
+    N, vehicles, obstacle = LINES[kind]
+    region = ("plain", "any latency", "masses 0.05 to 100 t, restitution to 1", "weak brakes behind")[k]
+    check(worlds_of(region, 6, N, 70 + k, obstacle), vehicles, budget=100, draws=2, seed=k, steps=STEPS[k % 3 :][:1])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", LINES)
+@pytest.mark.parametrize("region", REGIONS)
+def test_bound__is_never_above_a_longer_joint_search(region, kind):
+    N, vehicles, obstacle = LINES[kind]
+    check(worlds_of(region, 50, N, 80, obstacle), vehicles, budget=1000, draws=10, seed=81)

@@ -1,7 +1,5 @@
 """Lines for the limits: one by hand, random ones far beyond the paper's ranges, and many unlike regions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -185,7 +183,6 @@ def worlds_of(region, n, N, seed, obstacle=None):
         given[name] = draw(name, given, rng)
     v, a = given["speeds"][:, 0], given["braking"][:, 0]
     stops = v * given["latency"][:, 0] + v * v / (2 * a)
-    place = None if obstacle is None else np.maximum(stops + rng.uniform(*obstacle, n), 0.01)
     return make_worlds(
         given["gaps"],
         given["speeds"],
@@ -195,5 +192,5 @@ def worlds_of(region, n, N, seed, obstacle=None):
         mass_t=given["mass"],
         restitution=given["restitution"],
         speed_limit_mps=np.maximum(given["limit"], given["speeds"] + 1e-3),
-        obstacle_gap_m=place,
+        obstacle_gap_m=None if obstacle is None else np.maximum(stops + rng.uniform(*obstacle, n), 0.01),
     )

@@ -1,7 +1,5 @@
 """Names and values that somebody may have meant badly, and what a page looks like to a parser."""
 
-from __future__ import annotations
-
 from html.parser import HTMLParser
 
 HOSTILE = (

@@ -1,7 +1,5 @@
 """The explorer: it answers what an evaluation gives, saves what reads back, and tells strangers nothing."""
 
-from __future__ import annotations
-
 import asyncio
 import http.client
 import json
@@ -22,14 +20,12 @@ from urllib.parse import SplitResult, urlsplit
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
+from ethbrake_marl.agents import optimise_coupled
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.errors import AlreadyExists
-from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.inputs import make_agents, make_lineup
-from ethbrake_marl.evaluation.measures import Conditions
-from ethbrake_marl.limits.limits import prove
+from ethbrake_marl.evaluation import Conditions, evaluate, make_agents, make_lineup
+from ethbrake_marl.limits import prove
 from ethbrake_marl.pages.explorer import (
     MOST_BODY,
     Explored,
@@ -386,8 +382,7 @@ def test_server__outlives_garbage(running: Running, garbage: bytes) -> None:
             told = stream.recv(4_096)
         except OSError:  # it hung up first
             told = b""
-    assert b" 200 " not in told
-    assert ask(running, "POST", running.address.path + "world", {"number": 1})[0] == 200
+    assert b" 200 " not in told and ask(running, "POST", running.address.path + "world", {"number": 1})[0] == 200
 
 
 def test_server__listens_on_this_machine_alone(running: Running) -> None:
@@ -403,8 +398,7 @@ def test_server__ends_at_ctrl_c(tmp_path: Path) -> None:
         with socket.create_connection(("127.0.0.1", running.address.port)):  # somebody is still there
             running.process.send_signal(signal.SIGINT)
             assert running.process.wait(timeout=60) == 0
-        assert running.process.stderr is not None
-        assert running.process.stderr.read().splitlines()[-1] == "ended"
+        assert running.process.stderr is not None and running.process.stderr.read().splitlines()[-1] == "ended"
 
 
 def test_ctrl_c_while_the_address_is_told_ends_it_too(explored: Explored, tmp_path: Path) -> None:

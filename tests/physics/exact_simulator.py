@@ -7,8 +7,6 @@ given, takes the root to that many significant binary digits (and then keeps eve
 digits, lest they grow without end).
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ Lines of many vehicles are rare finds (a chain of impacts soon leaves the grid),
 in ``tests/golden/manufactured_worlds.json``; ``python -m tests.physics.manufacture`` writes it anew.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -3,8 +3,6 @@
 The worlds are the same doubles on any machine and with any version of numpy.
 """
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -54,10 +52,9 @@ def driving_lines(key: int, n: int, N: int, *, drive: bool = True) -> Batch:
     """Lines that brake, coast and (with ``drive``) accelerate, some of them from touching or from rest."""
     draws = Draws(key)
     gaps = draws.uniform(0.2, 10.0, (n, N - 1)) * draws.choice([1.0] * 9 + [0.0], (n, N - 1))
-    speeds = draws.uniform(5.0, 25.0, (n, N)) * draws.choice([1.0] * 19 + [0.0], (n, N))
     worlds = make_worlds(
         gaps,
-        speeds,
+        draws.uniform(5.0, 25.0, (n, N)) * draws.choice([1.0] * 19 + [0.0], (n, N)),
         braking_capacity_mps2=CAPACITY_MPS2,
         driving_capacity_mps2=CAPACITY_MPS2,
         latency_s=draws.uniform(0.0, 1.0, (n, N)),
@@ -240,23 +237,21 @@ class Watched:
 
     def __init__(self, key: int, n: int, N: int, *, drive: bool, steps: int = 300, horizon_s: float = 6.0) -> None:
         self.start, self.command = driving_lines(key, n, N, drive=drive)
-        self.states, self.impacts, self.worst, self.checked = [self.start], [], 0.0, 0
-        edges = np.linspace(0.0, horizon_s, 2 * steps + 1)
-        for a, b in zip(edges[1::2], edges[2::2], strict=True):
-            middle, first = advance(self.states[-1], self.command, until_s=a)
-            end, second = advance(middle, self.command, until_s=b)
-            self.impacts.append((first.count + second.count).sum(axis=1))
-            self._check_gaps(self.states[-1], middle, end)
-            self.states.append(end)
-
-    def _check_gaps(self, a: Worlds, b: Worlds, c: Worlds) -> None:
-        bend = np.abs(a.speeds_mps - 2.0 * b.speeds_mps + c.speeds_mps).max(axis=1)
-        steady: Bools = (bend < STEADY_MPS) & (self.impacts[-1] == 0)
-        opening = [w.speeds_mps[:, :-1] - w.speeds_mps[:, 1:] for w in (a, b, c)]
-        span = (c.time_s - a.time_s)[:, None]
-        unclipped = a.gaps_m + span * (opening[0] + 4.0 * opening[1] + opening[2]) / 6.0
-        self.worst = max(self.worst, float(np.abs(unclipped - c.gaps_m)[steady].max()), float(-unclipped[steady].min()))
-        self.checked += int(steady.sum())
+        edges, worlds, counts = np.linspace(0.0, horizon_s, 2 * steps + 1), [self.start], []
+        for edge in edges[1:]:
+            after, impacts = advance(worlds[-1], self.command, until_s=edge)
+            worlds.append(after)
+            counts.append(impacts.count.sum(axis=1))
+        self.states, self.impacts = worlds[::2], np.add(counts[::2], counts[1::2])  # [steps, n]
+        gaps, speeds, hit = (np.stack([getattr(w, f) for w in worlds]) for f in ("gaps_m", "speeds_mps", "pair_hit"))
+        self.before, middle, self.after, self.hit = speeds[:-1:2], speeds[1::2], speeds[2::2], hit[2::2]
+        bend = np.abs(self.before - 2.0 * middle + self.after).max(axis=2)
+        steady: Bools = (bend < STEADY_MPS) & (self.impacts == 0)
+        mean = (self.before + 4.0 * middle + self.after) / 6.0
+        span = (edges[2::2] - edges[:-1:2])[:, None, None]
+        unclipped = (gaps[:-1:2] + span * (mean[..., :-1] - mean[..., 1:]))[steady]
+        self.worst = max(float(np.abs(unclipped - gaps[2::2][steady]).max()), float(-unclipped.min()))
+        self.checked = int(steady.sum())
 
     def energy_rises(self) -> int:
         """Steps in which the energy of a line that nobody drives rose: by more than ENERGY_EPS for each impact."""
@@ -265,13 +260,8 @@ class Watched:
 
     def unexplained_negative_speeds(self) -> int:
         """Negative speeds that no bounce-back explains, or that brakes do not bring towards 0."""
-        found = 0
-        for (a, b), impacts in zip(pairwise(self.states), self.impacts, strict=True):
-            back = b.speeds_mps < 0.0
-            bounced = np.zeros(back.shape, bool)
-            bounced[:, :-1] |= b.pair_hit
-            bounced[:, 1:] |= b.pair_hit
-            bounced &= b.vehicles.restitution[:, None] > 0.0
-            sinking = (impacts == 0)[:, None] & (b.speeds_mps < a.speeds_mps - STEADY_MPS)
-            found += int((back & (~bounced | sinking)).sum())
-        return found
+        apart = np.zeros((*self.impacts.shape, 1), bool)
+        struck = np.concatenate([self.hit, apart], axis=2) | np.concatenate([apart, self.hit], axis=2)
+        bounced = struck & (self.start.vehicles.restitution[:, None] > 0.0)
+        sinking = (self.impacts == 0)[..., None] & (self.after < self.before - STEADY_MPS)
+        return int(((self.after < 0.0) & (~bounced | sinking)).sum())

@@ -6,11 +6,8 @@ Where that is too close to call in doubles (a graze, a contact at the very end, 
 world is *in doubt* and goes to the exact simulator.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,53 +90,42 @@ def solo(segments: Segments) -> Solo:
 
 
 def meetings(segments: Segments) -> Meeting:
-    """First contact of every pair, each pair for itself."""
+    """First contact of every pair, each pair for itself: the first of its pieces in which the gap is closed."""
     motion, gaps = solo(segments), segments.worlds.gaps_m
     end = np.broadcast_to(segments.duration[:, None], gaps.shape)
-    marks = [np.zeros_like(gaps), end.copy()]
-    for side in (slice(None, -1), slice(1, None)):
-        marks += [np.clip(motion.onset[:, side], 0.0, end), np.clip(motion.ends[:, side], 0.0, end)]
-    marks = list(np.sort(np.stack(marks), axis=0))
+    sides = [when[:, side] for when in (motion.onset, motion.ends) for side in (slice(None, -1), slice(1, None))]
+    marks = np.sort(np.stack([0.0 * gaps, end, *(np.clip(side, 0.0, end) for side in sides)]), axis=0)
+    begin, finish, length = marks[:-1], marks[1:], np.diff(marks, axis=0)  # of the pieces of constant accelerations
     fastest = np.maximum(motion.speed, motion.final)
     fastest = np.maximum(fastest[:, :-1], fastest[:, 1:]) + CAPACITY_MPS2 * EPS
     reach = gaps + fastest * end
-    blur = DISCRIMINANT_EPS * EPS * (fastest**2 + 2.0 * CAPACITY_MPS2 * reach)
-    result = Meeting(np.full(gaps.shape, np.inf), np.zeros(gaps.shape), gaps.copy(), np.zeros(gaps.shape, bool))
-    for begin, finish in pairwise(marks):
-        _piece(motion, gaps, begin, finish, blur, result)
-    near_end = (np.abs(_gap(motion, gaps, end)[0]) <= END_EPS * EPS * reach) & ~(result.time < 0.999 * end)
-    touching = (gaps == 0.0) & (motion.speed[:, 1:] >= motion.speed[:, :-1])
-    return Meeting(result.time, result.squared, result.least, result.doubt | near_end | touching)
-
-
-def _gap(motion: Solo, gaps: Floats, time: Floats) -> tuple[Floats, Floats, Floats]:
-    """Gap, closing speed and closing acceleration of every pair just after ``time`` [n, P]."""
-    front = [x[:, :-1] for x in motion.at(np.concatenate([time, time[:, -1:]], axis=1))]
-    rear = [x[:, 1:] for x in motion.at(np.concatenate([time[:, :1], time], axis=1))]
-    return gaps + (front[0] - rear[0]), rear[1] - front[1], rear[2] - front[2]
-
-
-def _piece(motion: Solo, gaps: Floats, begin: Floats, finish: Floats, blur: Floats, result: Meeting) -> None:
-    """Update ``result`` by the piece of constant accelerations between two times [n, P]."""
+    gentle = DISCRIMINANT_EPS * EPS * (fastest**2 + 2.0 * CAPACITY_MPS2 * reach) + BOUND.TOUCH_SPEED_MPS**2
     gap, closing, _ = _gap(motion, gaps, begin)
-    pressing = _gap(motion, gaps, 0.5 * (begin + finish))[2]
-    length = finish - begin
-    last = _gap(motion, gaps, finish)[0]
-    still_apart = np.isinf(result.time)
+    last, pressing = _gap(motion, gaps, finish)[0], _gap(motion, gaps, 0.5 * (begin + finish))[2]
     turning = np.divide(closing, -pressing, out=np.full(gap.shape, np.inf), where=pressing < 0.0)
-    turns = (closing > 0.0) & (turning < length)
-    squared = closing**2 + 2.0 * pressing * gap
-    lowest = np.where(turns, gap - 0.5 * closing * np.where(turns, turning, 0.0), np.minimum(gap, last))
-    meets = still_apart & (length > 0.0) & ((last <= 0.0) | (turns & (squared >= 0.0)))
+    turns, squared = (closing > 0.0) & (turning < length), closing**2 + 2.0 * pressing * gap
+    meets = (length > 0.0) & ((last <= 0.0) | (turns & (squared >= 0.0)))
+    still_apart = np.cumsum(meets, axis=0) - meets == 0  # as the piece begins
+    meets &= still_apart
     root = np.sqrt(np.maximum(squared, 0.0))
     with np.errstate(divide="ignore", invalid="ignore"):
         passed = np.where(closing > 0.0, 2.0 * gap / (closing + root), (root - closing) / pressing)
-    result.time[meets] = (begin + passed)[meets]
-    result.squared[meets] = squared[meets]
-    grazes = turns & (np.abs(squared) <= blur + BOUND.TOUCH_SPEED_MPS**2)
-    gentle = meets & (squared <= blur + BOUND.TOUCH_SPEED_MPS**2)
-    result.doubt[still_apart & (length > 0.0) & (grazes | gentle)] = True
-    np.minimum(result.least, np.where(still_apart, lowest, np.inf), out=result.least)
+    time = np.where(meets, begin + passed, np.inf).min(axis=0)
+    lowest = np.where(turns, gap - 0.5 * closing * np.where(turns, turning, 0.0), np.minimum(gap, last))
+    grazes = (turns & (np.abs(squared) <= gentle)) | (meets & (squared <= gentle))
+    doubt = (still_apart & (length > 0.0) & grazes).any(axis=0)
+    doubt |= (np.abs(last[-1]) <= END_EPS * EPS * reach) & ~(time < 0.999 * end)
+    doubt |= (gaps == 0.0) & (motion.speed[:, 1:] >= motion.speed[:, :-1])
+    return Meeting(
+        time, np.where(meets, squared, 0.0).sum(axis=0), np.where(still_apart, lowest, np.inf).min(axis=0), doubt
+    )
+
+
+def _gap(motion: Solo, gaps: Floats, time: Floats) -> tuple[Floats, Floats, Floats]:
+    """Gap, closing speed and closing acceleration of every pair just after ``time`` [..., n, P]."""
+    front = [x[..., :-1] for x in motion.at(np.concatenate([time, time[..., -1:]], axis=-1))]
+    rear = [x[..., 1:] for x in motion.at(np.concatenate([time[..., :1], time], axis=-1))]
+    return gaps + (front[0] - rear[0]), rear[1] - front[1], rear[2] - front[2]
 
 
 # ---------------------------------------------------------------- the comparison

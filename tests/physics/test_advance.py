@@ -1,7 +1,5 @@
 """The exact advance: numbers by hand, where doubles end, threads, and forecasts by the same physics."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import math
@@ -212,8 +210,7 @@ CASES: dict[str, tuple[Worlds, Any, float, Events, dict[str, Any]]] = {
 @pytest.mark.parametrize("name", CASES)
 def test_advance__by_hand(name: str, cut: bool) -> None:
     worlds, command, end, expected, state = CASES[name]
-    times = np.arange(0.25, end, 0.25).tolist() if cut else []
-    after, parts = run(worlds, command, *times, end)
+    after, parts = run(worlds, command, *(np.arange(0.25, end, 0.25).tolist() if cut else []), end)
     assert events(parts) == expected
     assert {name: getattr(after, name).tolist() for name in state} == {name: [value] for name, value in state.items()}
 

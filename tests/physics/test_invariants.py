@@ -1,9 +1,6 @@
 """What always holds, and what must not matter, with the tolerances of ``tests/reference/tolerances.py``."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -31,16 +28,7 @@ from tests.physics.random_worlds import (
     thrown_lines,
     touching_lines,
 )
-from tests.reference.tolerances import (
-    ENERGY_EPS,
-    EPS,
-    GAP_M,
-    MOMENTUM_EPS,
-    RESTITUTION_EPS,
-    SMALLEST,
-    SPLIT,
-    SPLIT_CASCADE,
-)
+from tests.reference.tolerances import ENERGY_EPS, GAP_M, MOMENTUM_EPS, RESTITUTION_EPS, SMALLEST, SPLIT, SPLIT_CASCADE
 
 SPEED = st.just(0.0) | st.floats(SMALLEST, 40.0)
 MASS = st.floats(1e-2, 1e4)
@@ -51,20 +39,13 @@ MASS = st.floats(1e-2, 1e4)
 @settings(max_examples=400)
 @given(SPEED, SPEED, MASS, MASS, st.floats(0.0, 1.0))
 def test_impact__of_two_conserves_momentum_and_obeys_restitution(front, rear, m_front, m_rear, e):
-    after, impacts = advance(line([0.0], (front, rear), mass_t=(m_front, m_rear), restitution=e), 0.0, 0.0)
-    before, now = [Fraction(front), Fraction(rear)], [Fraction(float(v)) for v in after.speeds_mps[0]]
-    mass = [Fraction(m_front), Fraction(m_rear)]
+    before = line([0.0], (front, rear), mass_t=(m_front, m_rear), restitution=e)
+    after, impacts = advance(before, 0.0, 0.0)
     if rear <= front:
-        assert now == before and impacts.count[0, 0] == 0
+        assert after.speeds_mps.tolist() == [[front, rear]] and impacts.count[0, 0] == 0
         return
-    scale = sum(m * max(abs(v), abs(u)) for m, v, u in zip(mass, before, now, strict=True))
-    assert abs(sum(m * (u - v) for m, v, u in zip(mass, before, now, strict=True))) <= MOMENTUM_EPS * EPS * scale
-    closing = before[1] - before[0]
-    bounce = Fraction(e) if rear - front >= 0.05 else 0
-    assert abs(now[0] - now[1] - bounce * closing) <= RESTITUTION_EPS * EPS * max(map(abs, [*before, *now]))
-    energy = [sum(m * v * v for m, v in zip(mass, speeds, strict=True)) for speeds in (before, now)]
-    assert energy[1] <= energy[0] * (1 + Fraction(ENERGY_EPS * EPS))
-    assert impacts.count[0, 0] == (rear - front > 1e-5)
+    assert momentum_eps(before, after)[0] <= MOMENTUM_EPS and energy_rise_eps(before, after)[0] <= ENERGY_EPS
+    assert restitution_eps(before, after)[0] <= RESTITUTION_EPS and impacts.count[0, 0] == (rear - front > 1e-5)
     assert impacts.total_harm[0, 0] == ((rear - front) ** 2 if rear - front > 1e-5 else 0.0)
 
 
@@ -73,8 +54,7 @@ def test_impact__of_two_conserves_momentum_and_obeys_restitution(front, rear, m_
 def test_impact__of_a_whole_cluster_conserves_momentum_and_loses_energy(N, ratio):
     before, command = touching_lines(31, 20_000 // N, N, heaviest_ratio=ratio)
     after, impacts = advance(before, command, 0.0)
-    assert impacts.count.sum() > 3_000
-    assert np.max(momentum_eps(before, after) / rounds(impacts)) <= MOMENTUM_EPS
+    assert impacts.count.sum() > 3_000 and np.max(momentum_eps(before, after) / rounds(impacts)) <= MOMENTUM_EPS
     assert np.max(energy_rise_eps(before, after) / rounds(impacts)) <= ENERGY_EPS
     if N == 2:
         assert np.max(restitution_eps(before, after)) <= RESTITUTION_EPS
@@ -150,8 +130,7 @@ def test_nearly_joined__lines_of_any_length_come_to_an_order(N, n, obstacle):
 def test_thrown_lines__against_an_obstacle_come_to_their_end(N, n):
     worlds, command = thrown_lines(93, n, N)
     after, impacts = advance(worlds, command, until_s=8.0)
-    assert np.isfinite(after.speeds_mps).all()
-    assert (impacts.obstacle_count > 0).mean() > 0.3
+    assert np.isfinite(after.speeds_mps).all() and (impacts.obstacle_count > 0).mean() > 0.3
 
 
 # ---------------------------------------------------------------- motion
@@ -193,14 +172,12 @@ def test_resting__members_of_a_block_keep_the_same_bits():
 def test_split__changes_nothing_beyond_rounding(N, cuts):
     error, few, other = split_errors(N, 4_000 // N, cuts, 61)
     assert few.any() and not other.any()
-    assert np.max(error[few], initial=0.0) <= SPLIT
-    assert np.max(error[~few], initial=0.0) <= SPLIT_CASCADE
+    assert np.max(error[few], initial=0.0) <= SPLIT and np.max(error[~few], initial=0.0) <= SPLIT_CASCADE
 
 
 def test_split__of_cascades_changes_no_more_than_ten_times_what_the_last_digit_of_a_gap_changes():
     cut, digit = split_errors(20, 400, 7, 61), last_digit_errors(20, 400, 61)
-    assert (~cut.few).sum() > 100
-    assert cut.error[~cut.few].max() <= 10.0 * digit.error[~digit.few].max()
+    assert (~cut.few).sum() > 100 and cut.error[~cut.few].max() <= 10.0 * digit.error[~digit.few].max()
 
 
 # ---------------------------------------------------------------- the origin, the batch, units and neighbours

@@ -1,7 +1,5 @@
 """The kernel: the closed forms of its events by hand, and one step of an episode for engine, search and shield."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any
@@ -13,6 +11,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import drive, fixed_commands, script_agents
 from ethbrake_marl.physics.kernel import Decisions, contact, drift, force_range, settle, solo_motion, speed_event
 from ethbrake_marl.search import Profiles, profile_problem
+from tests.fixtures.asked import Acts
 
 NEVER = (math.inf, 0.0)
 CHANGES = math.nan  # an acceleration that is not constant all along
@@ -94,21 +93,6 @@ def test_closed_form__by_hand(function: Callable[..., Any], given: tuple[float, 
 # ---------------------------------------------------------------- one step of an episode
 
 
-class Phases:
-    """Drives profiles of equal phases on the grid of decisions."""
-
-    state_free = False
-    name = "phases"
-
-    def __init__(self, commands: np.ndarray, length: int) -> None:
-        self.commands, self.length = commands, length
-
-    def act(self, worlds: eb.Worlds, vehicle: int) -> np.ndarray:
-        started = worlds.vehicles.latency_s[:, vehicle]
-        phase = np.maximum(Decisions(started, 0.1).latest(worlds.time_s), 0) // self.length
-        return self.commands[np.arange(worlds.n), np.minimum(phase, self.commands.shape[1] - 1)]
-
-
 @pytest.mark.parametrize("name", ["paper-random", "paper-random-obstacle", "stress-wide"])
 @pytest.mark.parametrize("length", [1, 7])
 def test_profiles__step_by_step_realise_what_the_engine_does_to_the_bit(name, length):
@@ -122,7 +106,14 @@ def test_profiles__step_by_step_realise_what_the_engine_does_to_the_bit(name, le
     ends = np.minimum((np.arange(commands.shape[1]) + 1) * length, problem.last_step[:, np.newaxis])
     ends[:, -1] = problem.last_step
     found = problem.follow(Profiles(ends, commands[:, :, np.newaxis]))
-    ledger = drive(worlds, Phases(commands, length), scenario, vehicle).ledger
+
+    @Acts
+    def phases(worlds: eb.Worlds, vehicle: int) -> np.ndarray:
+        """Each command for ``length`` decisions."""
+        decision = Decisions(worlds.vehicles.latency_s[:, vehicle], 0.1).latest(worlds.time_s)
+        return commands[np.arange(worlds.n), np.minimum(np.maximum(decision, 0) // length, commands.shape[1] - 1)]
+
+    ledger = drive(worlds, phases, scenario, vehicle).ledger
     np.testing.assert_array_equal(found, [ledger.world_harm("first"), ledger.world_harm("total")])
 
 

@@ -1,7 +1,5 @@
 """Building, selecting, joining and packing worlds: nothing is lost, nothing is shared."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from typing import Any
 
@@ -120,8 +118,7 @@ def test_take__selects_every_column_and_copies(rows: Any) -> None:
 
 def test_concatenate__is_the_inverse_of_take() -> None:
     worlds = numbered(5)
-    joined = Worlds.concatenate([worlds.take([0, 1]), worlds.take([2]), worlds.take([3, 4])])
-    assert_same(joined, columns(worlds))
+    assert_same(Worlds.concatenate([worlds.take([0, 1]), worlds.take([2]), worlds.take([3, 4])]), columns(worlds))
 
 
 def test_assign__replaces_rows_and_leaves_the_given_worlds_alone() -> None:
@@ -149,8 +146,7 @@ def test_with_obstacle__writes_it_out_in_front() -> None:
         "obstacle_gap_m": np.inf,
         "obstacle_hit": False,
     }
-    assert {name: found[name] for name in expected} == expected
-    assert worlds.vehicles.known_from_s.shape == (1, 3, 3)
+    assert {name: found[name] for name in expected} == expected and worlds.vehicles.known_from_s.shape == (1, 3, 3)
 
 
 # ---------------------------------------------------------------- rows
@@ -160,8 +156,7 @@ def test_with_obstacle__writes_it_out_in_front() -> None:
 @pytest.mark.parametrize(("n", "N"), [(1, 2), (1, 3), (40, 3), (7, 6)])
 def test_packed__gives_back_every_bit_in_its_own_memory_widened_or_not(n: int, N: int, told: bool) -> None:
     given = numbered(n, N=N, told=told)
-    plain = replace(given, obstacle_gap_m=np.full(n, np.inf), obstacle_hit=np.zeros(n, bool))
-    for worlds in (given, plain):
+    for worlds in (given, replace(given, obstacle_gap_m=np.full(n, np.inf), obstacle_hit=np.zeros(n, bool))):
         rows = Packed.of(worlds)
         assert (rows.has_news, rows.has_obstacle) == (told, worlds is given)
         back, wide = rows.worlds(), rows.widened(obstacle=True, news=True).worlds()

@@ -11,8 +11,6 @@ finds the largest smallest gap ``m``:
 vehicle with another one in front must stand at the horizon. docs/avoidability.md derives the tolerance.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple

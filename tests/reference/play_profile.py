@@ -1,7 +1,5 @@
 """Piecewise-constant commands of one vehicle, played in the exact physics."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ethbrake_marl.harm import Ledger, empty_ledger

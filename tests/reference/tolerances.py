@@ -4,8 +4,6 @@
 vehicles may need several at one instant. Sums run over the vehicles of a cluster, ``v`` is before it and ``v+`` after.
 """
 
-from __future__ import annotations
-
 EPS = 2.0**-52
 SMALLEST = 1e-200  # relative tolerances hold for quantities that are 0 or at least this: products do not underflow
 

@@ -1,8 +1,7 @@
-"""Worlds that are drawn, derived or given; refusals: ``refusals/worlds.txt``, the worlds themselves: ``golden``."""
-
-from __future__ import annotations
+"""Worlds that are drawn, derived or given, by every key; refusals: ``worlds.txt``, ``keys.txt``; worlds: ``golden``."""
 
 import json
+import math
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -13,25 +12,18 @@ from hypothesis import given, strategies as st
 from scipy import stats
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.inputs import worlds_sha256
-from ethbrake_marl.learning.training import Training
+from ethbrake_marl.agents import Team, drive, make_agent
+from ethbrake_marl.evaluation import states_of, worlds_sha256
+from ethbrake_marl.learning import Training
+from ethbrake_marl.limits import prove
 from ethbrake_marl.physics import Vehicles, Worlds
-from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.scenario.sampling import (
-    BLOCK,
-    QUANTITY,
-    Choice,
-    LogUniform,
-    Normal,
-    Uniform,
-    support,
-    uniform_numbers,
-    values,
-)
+from ethbrake_marl.scenario import QUANTITY, Scenario, Task, load_scenario
+from ethbrake_marl.scenario.sampling import BLOCK, Choice, LogUniform, Normal, Uniform, support, uniform_numbers, values
 from ethbrake_marl.scenario.v2x import PRESETS
+from ethbrake_marl.shield import ShieldedDriver, parse_uncertainty
 
 near = pytest.approx
-PAPER = load_scenario("paper-random")
+PAPER = eb.load_scenario("paper-random")
 ALMOST_ONE = 1.0 - 2.0**-53
 
 # ---------------------------------------------------------------- distributions
@@ -59,8 +51,7 @@ def normal(mean: float, sd: float, low: float, high: float) -> Normal:
     ids=lambda value: type(value).__name__,
 )  # fmt: skip
 def test_distribution__by_hand(quantity: Any, u: list[float], drawn: Any, bounds: tuple[float, float]) -> None:
-    assert values(quantity, np.array(u)).tolist() == drawn
-    assert support(quantity) == bounds
+    assert values(quantity, np.array(u)).tolist() == drawn and support(quantity) == bounds
 
 
 @given(st.floats(0, 1e4), st.floats(0, 1e4), st.lists(st.floats(1e-6, 1e6), min_size=1, max_size=9))
@@ -86,7 +77,7 @@ def test_normal__has_the_quantiles_of_the_truncated_normal(shape: tuple[float, f
 
 # ---------------------------------------------------------------- worlds and their numbers
 
-ALL_RANDOM = Scenario(
+ALL_RANDOM = eb.Scenario(
     name="all-random",
     gaps_m={"uniform": [5, 10]},
     speeds_mps={"normal": {"mean": 20, "sd": 1, "low": 18, "high": 22}},
@@ -98,26 +89,26 @@ ALL_RANDOM = Scenario(
     restitution={"uniform": [0, 0.3]},
     obstacle_gap_m={"uniform": [10, 45]},
 )
-MIXED, DELAYS = load_scenario("realistic-mixed"), load_scenario("mixture-delays")
+MIXED, DELAYS = eb.load_scenario("realistic-mixed"), eb.load_scenario("mixture-delays")
 
 
-def closing_pair(gap_m: object, **changes: Any) -> Scenario:
+def closing_pair(gap_m: object, **changes: Any) -> eb.Scenario:
     """Two vehicles at 20 m/s; the front one brakes at 6 m/s2, the rear one may act at 1 s: 3 m closer by then."""
     usual = {"gaps_m": gap_m, "braking_capacity_mps2": 6, "latency_s": [0, 1], "early_impacts": "reject"}
     return build(**{"name": "closing-pair", "vehicles": 2, "speeds_mps": 20, **usual, **changes})
 
 
-def build(**given: Any) -> Scenario:
+def build(**given: Any) -> eb.Scenario:
     rest = {"braking_capacity_mps2": [6, 7, 6], "driving_capacity_mps2": 6, "mass_t": 5, "latency_s": [0, 0.5, 0.8]}
-    return Scenario(**{"name": "given", **rest, **given})
+    return eb.Scenario(**{"name": "given", **rest, **given})
 
 
-def quantity(worlds: Worlds, field: str) -> np.ndarray:
+def quantity(worlds: eb.Worlds, field: str) -> np.ndarray:
     return getattr(worlds, field) if hasattr(worlds, field) else getattr(worlds.vehicles, field)
 
 
-def bits(worlds: Worlds) -> dict[str, bytes]:
-    return {field.name: quantity(worlds, field.name).tobytes() for field in [*fields(Worlds)[1:], *fields(Vehicles)]}
+def bits(worlds: eb.Worlds) -> dict[str, bytes]:
+    return {field.name: quantity(worlds, field.name).tobytes() for field in [*fields(eb.Worlds)[1:], *fields(Vehicles)]}
 
 
 def test_uniform_numbers__are_those_of_numpys_own_generator() -> None:
@@ -135,14 +126,13 @@ NEWS = [PAPER.replace(name=preset, v2x=preset, early_impacts="keep") for preset 
     [ALL_RANDOM, closing_pair({"uniform": [1, 5]}), MIXED, DELAYS, *NEWS],
     ids=lambda scenario: scenario.name,
 )
-def test_world_k__is_the_same_alone_and_in_any_list(scenario: Scenario) -> None:
+def test_world_k__is_the_same_alone_and_in_any_list(scenario: eb.Scenario) -> None:
     whole = scenario.sample(40, 11)
     assert whole.index.tolist() == list(range(40))
     for first, n in (*((k, 1) for k in range(40)), (20, 15)):
         part, rows = scenario.sample(n, 11, first=first), np.arange(first, first + n)
         assert bits(part.worlds) == bits(whole.worlds.take(rows)) and part.index.tolist() == rows.tolist()
-        for name, kinds in whole.kinds.items():
-            assert part.kinds[name].tolist() == kinds[rows].tolist()
+        assert all(part.kinds[name].tolist() == kinds[rows].tolist() for name, kinds in whole.kinds.items())
     other, training = scenario.sample(40, 12), scenario.sample(40, 11, channel="training")
     for name, kinds in whole.kinds.items():
         assert (other.kinds[name] != kinds).any() and (training.kinds[name] != kinds).any()
@@ -236,13 +226,13 @@ def test_replace__the_new_way_takes_the_place_of_the_old_one() -> None:
     assert scenario.replace(speeds_mps=20).declared().keys() & {"line_speed_mps", "speed_deviations_mps"} == set()
     assert scenario.replace(line_speed_mps=20).bounds("speeds_mps") == ((18.0, 22.0),) * 3
     assert scenario.replace(gaps_m=7, speeds_mps=20).replace(**LINE).bounds("speeds_mps") == ((10.0, 38.0),) * 3
-    assert Scenario(**scenario.declared()) == scenario
+    assert eb.Scenario(**scenario.declared()) == scenario
     margin = build(gaps_m=7, speeds_mps=20, obstacle_margin_m=1.5)
     assert margin.replace(obstacle_gap_m=42).obstacle_margin_m is None
     assert margin.replace(obstacle_gap_m=42).replace(obstacle_margin_m=1).obstacle_gap_m is None
 
 
-def ahead(**given: Any) -> Scenario:
+def ahead(**given: Any) -> eb.Scenario:
     """An obstacle ahead of Vehicle 1, which may brake with 5 m/s2 after 0.5 s: from 20 m/s it stops after 50 m."""
     usual = {"gaps_m": 7, "speeds_mps": [20, 18, 20], "braking_capacity_mps2": [5, 7, 6], "latency_s": [0.5, 0.5, 0.8]}
     return build(**{**usual, **given})
@@ -261,8 +251,7 @@ def test_margin__is_an_obstacle_for_everybody() -> None:
     scenario = ahead(obstacle_margin_m=1.5)
     assert scenario.sample(2, 7).worlds.obstacle_gap_m.tolist() == [51.5] * 2
     assert [each.has_obstacle for each in (scenario, ahead(obstacle_gap_m=42), ahead())] == [True, True, False]
-    assert scenario.with_learners(["vehicle_1"]).learners == (0,)
-    assert eb.observation_for(scenario).obstacle
+    assert scenario.with_learners(["vehicle_1"]).learners == (0,) and eb.observation_for(scenario).obstacle
 
 
 # ---------------------------------------------------------------- worlds that are given
@@ -271,7 +260,7 @@ HEADER = "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps"
 FULL = {key: 6 for key in QUANTITY.usual} | {"gaps_m": 7, "latency_s": 0, "restitution": 0, "obstacle_gap_m": 30}
 
 
-def read(folder: Path, text: str, scenario: Scenario = PAPER) -> Worlds:
+def read(folder: Path, text: str, scenario: eb.Scenario = PAPER) -> eb.Worlds:
     (folder / "worlds.csv").write_text(text, encoding="utf-8")
     return scenario.read_worlds(folder / "worlds.csv")
 
@@ -290,8 +279,7 @@ def test_csv__optional_columns_in_any_order_with_a_byte_order_mark(tmp_path: Pat
     text = f"\ufefflatency_2_s,restitution,mass_3_t,speed_limit_1_mps,{HEADER}\n0.2,0.3,6,30,10,8,20,18,20\n"
     vehicles = read(tmp_path, text, PAPER.replace(mass_t=[4.5, 5.5, {"uniform": [5, 6]}])).vehicles
     assert (vehicles.latency_s.tolist(), vehicles.restitution.tolist()) == ([[0.0, 0.2, 0.8]], [0.3])
-    assert vehicles.mass_t.tolist() == [[4.5, 5.5, 6.0]]
-    assert vehicles.speed_limit_mps.tolist() == [[30.0, 40.0, 40.0]]
+    assert vehicles.mass_t.tolist() == [[4.5, 5.5, 6.0]] and vehicles.speed_limit_mps.tolist() == [[30.0, 40.0, 40.0]]
 
 
 @pytest.mark.parametrize("end", ["", "\n", "\n\n", "\r\n\r\n"])
@@ -318,7 +306,7 @@ def test_table__equals_the_same_worlds_sampled() -> None:
     [
         (PAPER, {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}, {"gaps_m": [7, 7], "restitution": 0.1}),
         (PAPER, {"gaps_m": 7, "speeds_mps": np.full(3, 20), "restitution": 0.0}, {"restitution": 0, "gaps_m": [7, 7]}),
-        (load_scenario("paper-scenario-1"), {}, {"gaps_m": [10, 8], "speeds_mps": [20, 18, 20]}),
+        (eb.load_scenario("paper-scenario-1"), {}, {"gaps_m": [10, 8], "speeds_mps": [20, 18, 20]}),
         (build(time_gaps_s=[0.5, 1], line_speed_mps=20), {"speeds_mps": [30, 20, 10]}, {"gaps_m": [10, 10]}),
         (build(time_gaps_s=[0.5, 1], line_speed_mps=20), {"speeds_mps": 20, "gaps_m": [7, 8]}, {"gaps_m": [7, 8]}),
         (build(time_gaps_s=[0.5, 1], speeds_mps=[0, 1, 2]), {}, {"gaps_m": [0.5, 2]}),
@@ -336,12 +324,11 @@ def test_table__equals_the_same_worlds_sampled() -> None:
     ],
 )
 def test_initial_state__the_scenario_fills_in_fixed_fields(
-    scenario: Scenario, state: dict[str, Any], told: dict[str, Any]
+    scenario: eb.Scenario, state: dict[str, Any], told: dict[str, Any]
 ) -> None:
     worlds = scenario.worlds_from_state(state)
     usual = {} if "braking_capacity_mps2" in told else {"braking_capacity_mps2": [6, 7, 6]}
-    assert worlds.n == 1
-    assert {name: quantity(worlds, name)[0].tolist() for name in told | usual} == told | usual
+    assert worlds.n == 1 and {name: quantity(worlds, name)[0].tolist() for name in told | usual} == told | usual
 
 
 # ---------------------------------------------------------------- types of vehicles
@@ -354,9 +341,9 @@ KINDS = {
 N = 20_000
 
 
-def typed(**given: Any) -> Scenario:
+def typed(**given: Any) -> eb.Scenario:
     rest = {"gaps_m": 30, "speeds_mps": 20, "driving_capacity_mps2": 3, "latency_s": 0.2}
-    return Scenario(**{"name": "typed", **rest, "vehicle_types": KINDS, **given})
+    return eb.Scenario(**{"name": "typed", **rest, "vehicle_types": KINDS, **given})
 
 
 def test_types__of_each_place() -> None:
@@ -411,8 +398,8 @@ def test_types__of_refused_worlds_are_drawn_again() -> None:
 MEMBERS = ("paper-delay-low", "paper-delay-middle", "paper-delay-high")
 
 
-def mixed(*members: str, **beside: object) -> Scenario:
-    return load_scenario({"name": "mixed", "mixture": [{"scenario": name} for name in members], **beside})
+def mixed(*members: str, **beside: object) -> eb.Scenario:
+    return eb.load_scenario({"name": "mixed", "mixture": [{"scenario": name} for name in members], **beside})
 
 
 @pytest.mark.parametrize("channel", ["list", "training"])
@@ -426,11 +413,11 @@ def mixed(*members: str, **beside: object) -> Scenario:
     ],
     ids=range(4),
 )
-def test_mixture__world_k_is_that_of_its_member(mixture: Scenario, channel: Any) -> None:
+def test_mixture__world_k_is_that_of_its_member(mixture: eb.Scenario, channel: Any) -> None:
     sample = mixture.sample(300, 7, channel=channel)
     assert set(sample.scenarios) == {member.name for member in mixture.members}
     for member in mixture.members:
-        own = load_scenario(member.name).sample(300, 7, channel=channel)
+        own = eb.load_scenario(member.name).sample(300, 7, channel=channel)
         rows = np.flatnonzero(sample.scenarios == member.name)
         told = sample.worlds.take(rows), own.worlds.take(rows)
         assert worlds_sha256(told[0], rows) == worlds_sha256(told[1], rows)
@@ -461,12 +448,12 @@ def test_mixture__what_stands_beside_holds_for_every_member() -> None:
 def test_mixture__its_file_may_name_a_file_beside_it_and_its_members_may_be_written_out(tmp_path: Path) -> None:
     (tmp_path / "own.yaml").write_text(json.dumps(PAPER.replace(name="own", title="").declared()))
     (tmp_path / "mine.yaml").write_text("name: mine\nmixture: [{scenario: own.yaml}, {scenario: paper-random-early}]\n")
-    assert [each.name for each in load_scenario(tmp_path / "mine.yaml").members] == ["own", "paper-random-early"]
+    assert [each.name for each in eb.load_scenario(tmp_path / "mine.yaml").members] == ["own", "paper-random-early"]
     line = "gaps_m: 7, speeds_mps: 20, braking_capacity_mps2: 9, driving_capacity_mps2: 5, latency_s: 0.5, mass_t: 1"
     text = f"name: mine\nvehicles: 5\nmixture:\n  - scenario: {{name: a, {line}}}\n  - scenario: {{name: b, {line}}}\n"
     (tmp_path / "mine.yaml").write_text(text)
-    assert [member.vehicles for member in load_scenario(tmp_path / "mine.yaml").members] == [5, 5]
-    assert Scenario(name="x", mixture=[{"scenario": PAPER}]).vehicles == 3
+    assert [member.vehicles for member in eb.load_scenario(tmp_path / "mine.yaml").members] == [5, 5]
+    assert eb.Scenario(name="x", mixture=[{"scenario": PAPER}]).vehicles == 3
 
 
 def test_results__tell_scenario_and_types_agree_with_the_members_and_can_be_grouped() -> None:
@@ -476,7 +463,7 @@ def test_results__tell_scenario_and_types_agree_with_the_members_and_can_be_grou
     assert found.to_frame("columns")["scenario"].tolist() == sample.scenarios.tolist() * 2
     groups = eb.summarise_by(found, "scenario")
     for name in MEMBERS:
-        member, rows = load_scenario(name), np.flatnonzero(sample.scenarios == name)
+        member, rows = eb.load_scenario(name), np.flatnonzero(sample.scenarios == name)
         own = eb.evaluate(member.sample(120, 7).take(rows), agents, scenario=member, seed=7)
         assert (own.outcome("e_v2x_bm").total_harm == found.outcome("e_v2x_bm").total_harm[rows]).all()
         assert [row.total_harm for row in groups[name]] == [row.total_harm for row in eb.summarise(own)]
@@ -494,3 +481,233 @@ def test_shields_and_searches__take_a_mixture() -> None:
     plain = eb.evaluate(DELAYS.sample(20, 7), {"b": eb.make_agent("full_brake")}, scenario=DELAYS).outcome("b")
     shielded = eb.evaluate(DELAYS.sample(20, 7), agents, scenario=DELAYS).outcome("full_brake+step")
     assert (shielded.first_impact_harm <= plain.first_impact_harm + 1e-9).all()
+
+
+# ---------------------------------------------------------------- keys as engineers think of them, outcomes by hand
+
+FIXED = PAPER.replace(gaps_m=40, speeds_mps=20, latency_s=0, early_impacts="keep", horizon_s=30)
+TABLE = {"columns": ["gap_1_m", "speed_2_mps"], "rows": [[5.0, 18.0], [6.0, 19.0], [7.0, 20.0]]}
+
+
+def final(scenario: Scenario, worlds: Worlds | None = None) -> Worlds:
+    """The worlds once everybody has braked fully, or as its script says."""
+    worlds = scenario.sample(1, 7).worlds if worlds is None else worlds
+    return drive(worlds, Team.of(make_agent("full_brake"), list(scenario.learners)), scenario).final
+
+
+# Friction: stopping ways are v^2 / (2 min(capacity, 9.81 mu)).
+
+
+@pytest.mark.parametrize(
+    ("friction", "capacity", "gaps"),
+    [
+        # 4 < 5.886 < 7: 50, 33.979, 33.979 m
+        (0.6, [4.0, 7.0, 7.0], [40 + 50 - 400 / 11.772, 40.0]),
+        # all 2.943: the same way of 67.96 m for all
+        (0.3, [4.0, 7.0, 7.0], [40.0, 40.0]),
+        # dry enough: 50, 28.571, 33.333 m
+        (1.0, [4.0, 7.0, 6.0], [40 + 50 - 400 / 14, 40 + 400 / 14 - 400 / 12]),
+    ],
+)
+def test_friction__gaps_at_rest_by_hand(friction: float, capacity: list[float], gaps: list[float]) -> None:
+    found = final(FIXED.replace(friction=friction, braking_capacity_mps2=capacity))
+    assert found.gaps_m[0] == pytest.approx(gaps, abs=1e-9)
+
+
+def test_friction__is_one_number_for_the_whole_line_and_moves_nothing_else() -> None:
+    wet = PAPER.replace(friction={"uniform": [0.2, 0.9]}, early_impacts="keep")
+    worlds, dry = wet.sample(200, 7).worlds, PAPER.replace(early_impacts="keep").sample(200, 7).worlds
+    friction = worlds.friction
+    assert 0.2 <= friction.min() < 0.22 and 0.88 < friction.max() <= 0.9
+    for name in ("braking_capacity_mps2", "driving_capacity_mps2"):
+        own = getattr(dry.vehicles, name)
+        assert (getattr(worlds.vehicles, name) == np.minimum(own, 9.81 * friction[:, np.newaxis])).all()
+        assert (worlds.dry(name) == own).all()
+    assert all((getattr(worlds, name) == getattr(dry, name)).all() for name in ("gaps_m", "speeds_mps"))
+    assert wet.bounds("braking_capacity_mps2") == ((9.81 * 0.2, 6.0), (9.81 * 0.2, 7.0), (9.81 * 0.2, 6.0))
+    assert wet.bounds("braking_capacity_mps2", dry=True) == ((6.0, 6.0), (7.0, 7.0), (6.0, 6.0))
+    assert wet.ranges().names[-1] == "friction"
+
+
+def test_friction__of_a_margin() -> None:
+    short = FIXED.replace(friction=0.3, obstacle_margin_m=1.7)
+    assert short.sample(1, 7).worlds.obstacle_gap_m[0] == pytest.approx(1.7 + 400 / (2 * 2.943), abs=1e-9)
+    assert short.farthest_obstacle_m == pytest.approx(1.7 + 400 / (2 * 2.943), abs=1e-9)
+
+
+def test_friction__a_table_of_initial_states_gives_the_same_worlds() -> None:
+    wet = PAPER.replace(friction={"uniform": [0.2, 0.9]}, braking_capacity_mps2={"uniform": [3, 9]})
+    worlds = wet.sample(50, 3).worlds
+    states = states_of(worlds, wet)
+    assert list(states[0])[-1] == "friction" and "braking_capacity_2_mps2" in states[0]
+    again = wet.worlds_from_table({name: [state[name] for state in states] for name in states[0]})
+    assert (again.road == worlds.road).all()
+    assert (again.vehicles.braking_capacity_mps2 == worlds.vehicles.braking_capacity_mps2).all()
+    state = {"friction": 0.5, "gaps_m": 7, "speeds_mps": 20, "braking_capacity_mps2": 6}
+    assert wet.worlds_from_state(state).friction.tolist() == [0.5]
+
+
+def test_friction__its_uncertainty_moves_all_capacities_together() -> None:
+    worlds = FIXED.replace(friction=0.6, braking_capacity_mps2=[4, 7, 9]).sample(1, 7).worlds
+    members = parse_uncertainty("friction=0.2,braking_capacity_mps2.vehicle_3=3").members(worlds)
+    shares, dry = [0, 0.125, 0.25, 0.375, 0.625, 0.75, 0.875, 1], ([4, 7, 6], [4, 7, 12])
+    expected = [[4, 5.886, 5.886]] + [np.minimum(d, 9.81 * (0.4 + 0.4 * share)) for d in dry for share in shares]
+    assert members.vehicles.braking_capacity_mps2 == pytest.approx(np.array(expected), abs=1e-12)
+
+
+def test_friction__of_some_members_of_a_mixture() -> None:
+    wet = PAPER.replace(name="wet", friction=0.4).declared()
+    mixed = Scenario(name="road", mixture=[{"scenario": PAPER}, {"scenario": wet}])
+    worlds = mixed.sample(40, 7).worlds
+    assert set(worlds.friction.tolist()) == {0.4, math.inf}
+    braking = worlds.vehicles.braking_capacity_mps2
+    assert set(braking[:, 1].tolist()) == {7.0, 9.81 * 0.4}
+    told = QUANTITY.columns(worlds)  # no friction is told for all: then the capacities are what the road allows
+    assert "friction" not in told and (told["braking_capacity_2_mps2"] == braking[:, 1]).all()
+    assert [state["braking_capacity_2_mps2"] for state in states_of(worlds, mixed)] == braking[:, 1].tolist()
+
+
+def test_friction__the_proof_reads_what_the_road_allows() -> None:
+    near = FIXED.replace(gaps_m=30, braking_capacity_mps2=[9, 7, 6], latency_s=[0, 0.5, 0.8])
+    proofs = {mu: prove(near.replace(friction=mu).sample(1, 7).worlds, Task(near, (1,))) for mu in (0.3, 1.0)}
+    assert proofs[0.3].avoidable.tolist() == [True] == proofs[1.0].avoidable.tolist()
+    apart = FIXED.replace(gaps_m=[4, 40], latency_s=[0, 0.5, 0.5])  # 20 x 0.5 = 10 m are lost where all brake alike
+    assert final(apart.replace(friction=0.3)).pair_hit[0].tolist() == [True, False]
+
+
+def test_friction__no_truth_of_its_box_is_distrusted_and_no_corner_is_above_the_bound() -> None:
+    wet = load_scenario("engineering-wet-road").replace(time_gaps_s={"uniform": [0.2, 0.9]})
+    told, rng = wet.sample(60, 7).worlds, np.random.default_rng(0)
+    uncertainty = parse_uncertainty("friction=0.1")
+    for corners, spec in ((True, "coast"), (True, "full_brake"), (False, "full_brake")):
+        shield = ShieldedDriver(make_agent(spec), wet, told=told, uncertainty=uncertainty)
+        found = drive(uncertainty.draw(told, rng, corners=corners), shield, wet, 1)
+        assert not found.guarded.shield.distrusted.any()
+        harm = found.ledger.world_harm("first")
+        assert not corners or (harm <= found.guarded.shield.predicted_harm + 1e-9).all()
+
+
+# A table: one row for each world, the rest drawn.
+
+
+def without(scenario: Scenario, *keys: str) -> dict[str, Any]:
+    """What a scenario declares, but these keys."""
+    return {key: value for key, value in scenario.declared().items() if key not in keys}
+
+
+def tabled(**changes: Any) -> Scenario:
+    given = {"gaps_m": 9.0, "speeds_mps": {"uniform": [18, 22]}, "table": TABLE, **changes}
+    return Scenario(**without(PAPER, *given), **given)
+
+
+def test_table__rows_are_never_torn_and_the_rest_is_drawn_as_without_it() -> None:
+    found = tabled().sample(600, 7).worlds
+    rows = np.stack([found.gaps_m[:, 0], found.speeds_mps[:, 1]], axis=1)
+    kinds, counts = np.unique(rows, axis=0, return_counts=True)
+    assert kinds.tolist() == TABLE["rows"] and (np.abs(counts - 200) < 60).all()
+    assert (found.gaps_m[:, 1] == 9.0).all()
+    alone = tabled(table={**TABLE, "weights": [1, 1, 8]}).sample(600, 7).worlds
+    assert (alone.speeds_mps[:, [0, 2]] == found.speeds_mps[:, [0, 2]]).all()  # early impacts: none here
+    assert np.mean(alone.gaps_m[:, 0] == 7.0) == pytest.approx(0.8, abs=0.05)
+
+
+def test_table__a_world_by_hand() -> None:
+    one = Scenario(**{**FIXED.declared(), "table": {"columns": ["gap_1_m", "mass_3_t"], "rows": [[12, 30]]}})
+    worlds = one.sample(3, 7).worlds
+    assert worlds.gaps_m.tolist() == [[12.0, 40.0]] * 3 and worlds.vehicles.mass_t[:, 2].tolist() == [30.0] * 3
+    assert final(one).gaps_m[0] == pytest.approx([12 + 400 / 12 - 400 / 14, 40 + 400 / 14 - 400 / 12], abs=1e-9)
+    assert tabled().ranges().names[-1] == "row of the table" and tabled().bounds("gaps_m") == ((5.0, 7.0), (9.0, 9.0))
+    assert tabled().middle_world().gaps_m[0].tolist() == [6.0, 9.0]
+
+
+def test_table__of_a_file_is_read_once_and_goes_along(tmp_path: Path) -> None:
+    whole = {"gap_1_m": 5.5, "gap_2_m": 6.5, "speed_1_mps": 20, "speed_2_mps": 19, "speed_3_mps": 18, "count": 3}
+    lines = [",".join(whole), *(",".join(str(value + k) for value in whole.values()) for k in range(14))]
+    (tmp_path / "rows.csv").write_text("\n".join(lines) + "\n\n")
+    table = {"file": "rows.csv", "columns": [*whole][:5], "weights": "count"}
+    declared = {**without(PAPER, "gaps_m", "speeds_mps"), "name": "mine", "early_impacts": "keep"}
+    (tmp_path / "mine.yaml").write_text(json.dumps({**declared, "table": table}))
+    mine = load_scenario(tmp_path / "mine.yaml")
+    (tmp_path / "rows.csv").unlink()
+    again = Scenario(**mine.declared()).replace(horizon_s=9)
+    assert (len(again.table.rows), again.table.weights) == (14, (*range(3, 17),))
+    assert (again.sample(50, 7).worlds.gaps_m == mine.sample(50, 7).worlds.gaps_m).all()
+
+
+# Lognormal: the logarithm is normal.
+
+
+def test_lognormal__is_the_truncated_one_of_the_textbook() -> None:
+    shape = {"median": 1.1, "sigma": 0.4, "low": 0.3, "high": 3.0}
+    law, u = stats.lognorm(s=0.4, scale=1.1), np.array([0.0, 0.5, 0.975])
+    low, high = law.cdf(0.3), law.cdf(3.0)
+    (entry, _) = PAPER.replace(time_gaps_s={"lognormal": shape}).quantities("time_gaps_s")
+    assert entry.value(u) == pytest.approx(law.ppf(low + (high - low) * u), rel=1e-9)
+
+
+# Equipage: who sends, who hears.
+
+FIXED_LINKS = {"preset": "nominal", "link_latency_s": 0.3, "sensing_s": [1.0, 1.0]}
+
+
+@pytest.mark.parametrize(
+    ("vehicles", "latency", "known_of_2_by_3"),
+    [
+        ({}, [0.0, 0.3, 0.3], 0.3),
+        ({"vehicle_1": {"sends": False}}, [0.0, 1.0, 2.0], 2.0),  # one sees it brake, the other one that
+        ({"vehicle_3": {"sends": False, "hears": "none"}}, [0.0, 0.3, 1.3], 1.3),
+        ({"vehicle_2": {"sends": False, "hears": "front"}}, [0.0, 0.3, 0.3], 1.0),
+    ],
+)
+def test_equipage__reactions_by_hand(vehicles: dict[str, Any], latency: list[float], known_of_2_by_3: float) -> None:
+    v2x = {**FIXED_LINKS, **({"vehicles": vehicles} if vehicles else {})}
+    found = FIXED.replace(v2x=v2x).sample(1, 7).worlds.vehicles
+    assert found.latency_s[0] == pytest.approx(latency, abs=1e-12)
+    assert found.known_from_s[0, 2, 1] == pytest.approx(known_of_2_by_3, abs=1e-12)
+    if "vehicle_2" in vehicles:
+        assert found.known_from_s[0, 1, 2] == pytest.approx(1.0, abs=1e-12)  # of vehicle_3 it sees only
+
+
+def test_equipage__of_types_is_drawn_with_them() -> None:
+    kinds = {"equipped": {"weight": 7}, "without": {"weight": 3, "v2x": {"sends": False, "hears": "none"}}}
+    sample = FIXED.replace(vehicle_types=kinds, v2x=FIXED_LINKS).sample(2000, 7)
+    silent = sample.types == "without"
+    latency = sample.worlds.vehicles.latency_s
+    second = np.where(silent[:, 0] | silent[:, 1], 1.0, 0.3)
+    third = np.where(silent[:, 0] | silent[:, 2], second + 1.0, 0.3)
+    assert (latency[:, 1] == second).all() and np.abs(latency[:, 2] - third).max() < 1e-12
+
+
+# Spread around what the load gives.
+
+
+def lorries(spread: Any) -> Scenario:
+    capacity = {"with_load": [7, 5], **({} if spread is None else {"spread": spread})}
+    kinds = {"lorry": {"mass_t": {"with_load": [10, 40]}, "braking_capacity_mps2": capacity}}
+    return Scenario(**without(FIXED, "mass_t", "braking_capacity_mps2"), vehicle_types=kinds)
+
+
+def test_spread__is_added_to_what_the_load_gives() -> None:
+    plain, wide = (lorries(spread).sample(3000, 7).worlds.vehicles for spread in (None, {"uniform": [-0.5, 0.5]}))
+    by_load = 7 - 2 * (plain.mass_t - 10) / 30
+    assert plain.braking_capacity_mps2 == pytest.approx(by_load, abs=1e-12)
+    more = wide.braking_capacity_mps2 - by_load
+    assert (wide.mass_t == plain.mass_t).all() and -0.5 <= more.min() < -0.49 and 0.49 < more.max() <= 0.5
+    assert abs(np.corrcoef(wide.mass_t.ravel(), more.ravel())[0, 1]) < 0.02  # drawn apart from the load
+    assert lorries({"uniform": [-0.5, 0.5]}).bounds("braking_capacity_mps2")[0] == (4.5, 7.5)
+    names = lorries({"uniform": [-0.5, 0.5]}).ranges().names
+    assert "braking_capacity_mps2 of vehicle_1" in names and "mass_t of vehicle_1" not in names
+
+
+# The alert comes later.
+
+
+def test_alert__everybody_goes_on_until_then() -> None:
+    late = FIXED.replace(alert_s=2, speeds_mps=[20, 18, 20], latency_s=[0, 0.5, 0.8])
+    assert late.sample(1, 7).worlds.vehicles.latency_s.tolist() == [[2.0, 2.5, 2.8]]
+    now = late.replace(gaps_m=[40 + 2 * 2, 40 - 2 * 2])
+    assert final(late).gaps_m == pytest.approx(final(Scenario(**without(now, "alert_s"))).gaps_m, abs=1e-9)
+    drawn = FIXED.replace(alert_s={"uniform": [1, 5]})
+    latency = drawn.sample(100, 7).worlds.vehicles.latency_s
+    assert (latency == latency[:, :1]).all() and 1 <= latency.min() < 1.2 and 4.8 < latency.max() <= 5
+    assert drawn.bounds("latency_s") == ((1.0, 5.0),) * 3 and drawn.ranges().names == ("alert_s",)

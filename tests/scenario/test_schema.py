@@ -3,8 +3,6 @@
 The names of the shipped ones stand in ``cli/printed/scenarios.txt``, their worlds in ``golden``.
 """
 
-from __future__ import annotations
-
 import copy
 import json
 import pickle
@@ -17,25 +15,22 @@ import pytest
 from jsonschema import Draft202012Validator
 from pydantic import ValidationError
 
+import ethbrake_marl as eb
 from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import load_runnable, scenario_sha256
 from ethbrake_marl.files.yaml import flow_text, read_yaml
 from ethbrake_marl.harm import empty_ledger
-from ethbrake_marl.learning.training import TrainingRecipe
-from ethbrake_marl.physics import advance
 from ethbrake_marl.scenario import (
-    Scenario,
+    QUANTITY,
+    ScriptSpec,
     Uniform,
-    list_scenarios,
-    load_scenario,
     new_scenario_text,
     parse_yaml,
     scenario_json_schema,
     schema as shipped_files,
     shipped_folder,
 )
-from ethbrake_marl.scenario.sampling import QUANTITY, ScriptSpec
 from ethbrake_marl.scenario.schema import changed_content
 from ethbrake_marl.scenario.v2x import PRESETS
 from tests.contract.interfaces import LEVELS
@@ -55,8 +50,8 @@ GIVEN = {
 }
 
 
-def build(**changes: object) -> Scenario:
-    return Scenario(**{**GIVEN, **changes})
+def build(**changes: object) -> eb.Scenario:
+    return eb.Scenario(**{**GIVEN, **changes})
 
 
 # ---------------------------------------------------------------- one scenario
@@ -82,9 +77,9 @@ TYPED = {"vehicle_types": {"car": {"weight": 3}, "truck": {"mass_t": {"with_load
     ],
 )
 def test_scenario__is_the_same_as_a_copy_as_declared_and_as_json_and_told_by_its_hash(changes: Any) -> None:
-    scenario = load_scenario("mixture-delays") if changes is None else build(**changes)
-    again = [copy.deepcopy(scenario), pickle.loads(pickle.dumps(scenario)), Scenario(**scenario.declared())]
-    again.append(Scenario.model_validate_json(json.dumps(scenario.declared())))
+    scenario = eb.load_scenario("mixture-delays") if changes is None else build(**changes)
+    again = [copy.deepcopy(scenario), pickle.loads(pickle.dumps(scenario)), eb.Scenario(**scenario.declared())]
+    again.append(eb.Scenario.model_validate_json(json.dumps(scenario.declared())))
     for each in again:
         assert each == scenario and scenario_sha256(each) == scenario_sha256(scenario)
         assert [member.name for member in each.members] == [member.name for member in scenario.members]
@@ -105,7 +100,7 @@ def test_replace__changes_one_field_and_checks_again() -> None:
     numpys = build(speeds_mps=np.array([20, 18, 20]), restitution=np.float64(0.3))
     assert (numpys.speeds_mps, numpys.restitution) == ((20.0, 18.0, 20.0), 0.3)
     same = {key: 5 for key in ("speeds_mps", "braking_capacity_mps2", "driving_capacity_mps2", "mass_t")}
-    scenario = Scenario(name="any", gaps_m=7, latency_s=0.1, **same)
+    scenario = eb.Scenario(name="any", gaps_m=7, latency_s=0.1, **same)
     assert (scenario.replace(vehicles=5).sample(1, 0).worlds.N, scenario.replace(vehicles=5).learners) == (5, (1,))
     assert scenario.replace(vehicles=2).roles == {"vehicle_1": "full_brake", "vehicle_2": "learner"}
 
@@ -121,8 +116,7 @@ def test_roles__left_out_or_no_longer_learning_brake_fully() -> None:
     for scenario in (build(roles={"vehicle_3": "learner"}), build().with_learners(["vehicle_3"])):
         assert scenario.roles == {"vehicle_1": "full_brake", "vehicle_2": "full_brake", "vehicle_3": "learner"}
         assert (scenario.learners, scenario.scripts) == ((2,), {0: "full_brake", 1: "full_brake"})
-    assert build().with_learners([]).learners == ()
-    assert type(build().model_dump()["roles"]) is dict
+    assert build().with_learners([]).learners == () and type(build().model_dump()["roles"]) is dict
 
 
 @pytest.mark.parametrize(
@@ -165,20 +159,20 @@ PAPER = {
 
 @pytest.mark.parametrize("name", PAPER)
 def test_paper_scenarios__have_the_papers_values(name: str) -> None:
-    scenario = load_scenario(name)
-    declared = scenario.declared()
-    assert tuple(declared[key] for key in ("gaps_m", "speeds_mps", "latency_s")) == PAPER[name]
-    assert declared["braking_capacity_mps2"] == declared["driving_capacity_mps2"] == [6, 7, 6]
-    assert declared["mass_t"] == [4.5, 5.5, 5.9]
-    assert (scenario.vehicles, scenario.restitution, scenario.early_impacts) == (3, 0.1, "reject")
-    assert (scenario.time_step_s, scenario.horizon_s, scenario.speed_limit_mps) == (0.1, 8.0, 40.0)
-    assert (scenario.learners, scenario.scripts) == ((1,), {0: "full_brake", 2: "full_brake"})
+    scenario = eb.load_scenario(name)
+    told = scenario.model_dump() | scenario.declared() | {"learners": scenario.learners, "scripts": scenario.scripts}
+    expected = dict(zip(("gaps_m", "speeds_mps", "latency_s"), PAPER[name], strict=True)) | {
+        "braking_capacity_mps2": [6, 7, 6], "driving_capacity_mps2": [6, 7, 6], "mass_t": [4.5, 5.5, 5.9],
+        "vehicles": 3, "restitution": 0.1, "early_impacts": "reject", "time_step_s": 0.1, "horizon_s": 8.0,
+        "speed_limit_mps": 40.0, "learners": (1,), "scripts": {0: "full_brake", 2: "full_brake"},
+    }  # fmt: skip
+    assert {key: told[key] for key in expected} == expected
 
 
-def not_used(scenario: Scenario) -> set[str]:
+def not_used(scenario: eb.Scenario) -> set[str]:
     """The keys of the ways to declare gaps, speeds and an obstacle that it does not use; what it does not choose."""
     if scenario.members:
-        return set(Scenario.model_fields) - {"name", "title", "description", "source", "mixture"}
+        return set(eb.Scenario.model_fields) - {"name", "title", "description", "source", "mixture"}
     gaps = {key for key in ("gaps_m", "time_gaps_s") if getattr(scenario, key) is None}
     speeds = {key for key in ("speeds_mps", "line_speed_mps") if getattr(scenario, key) is None}
     speeds |= {"speed_deviations_mps"} if scenario.line_speed_mps is None else set()
@@ -188,19 +182,19 @@ def not_used(scenario: Scenario) -> set[str]:
     return {*gaps, *speeds, *obstacle, *(key for key in chosen if getattr(scenario, key) is None)}
 
 
-@pytest.mark.parametrize("path", [entry.path for entry in list_scenarios()], ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", [entry.path for entry in eb.list_scenarios()], ids=lambda path: path.stem)
 def test_shipped__reads_back_by_name_path_and_folder_and_a_new_file_is_based_on_it(path: Path) -> None:
-    scenario, folder = load_scenario(path.stem), path.parent.name
+    scenario, folder = eb.load_scenario(path.stem), path.parent.name
     text = "\n".join(f"{key}: {flow_text(value)}" for key, value in scenario.declared().items())
     short = f"{folder}/{path.stem.removeprefix(f'{folder}-')}"
-    assert load_scenario(path) == load_scenario(short) == Scenario.from_document(parse_yaml(text)) == scenario
+    assert eb.load_scenario(path) == eb.load_scenario(short) == eb.Scenario.from_document(parse_yaml(text)) == scenario
     assert scenario.sample(3, 0).worlds.n == 3
     assert scenario.title and scenario.description and scenario.source
     text = new_scenario_text("mine", based_on=path.stem)
-    own, new = {"name", "title", "description", "source"}, load_scenario(parse_yaml(text).content)
+    own, new = {"name", "title", "description", "source"}, eb.load_scenario(parse_yaml(text).content)
     assert new.model_dump(exclude=own) == scenario.model_dump(exclude=own) and new.name == "mine"
-    assert all(re.search(rf"^# .*\n(# )?{key}:", text, re.MULTILINE) for key in Scenario.model_fields)
-    assert {key for key in Scenario.model_fields if f"\n# {key}:" in text} == not_used(scenario)
+    assert all(re.search(rf"^# .*\n(# )?{key}:", text, re.MULTILINE) for key in eb.Scenario.model_fields)
+    assert {key for key in eb.Scenario.model_fields if f"\n# {key}:" in text} == not_used(scenario)
     assert not re.search(r"[ \t]$", text, re.MULTILINE)
     editor = Draft202012Validator(scenario_json_schema())
     for content in (read_yaml(path).content, parse_yaml(text).content):
@@ -215,8 +209,8 @@ def test_path__of_the_users_own_file_goes_before_a_shipped_one(
     Path(folder).mkdir(exist_ok=True)
     path = Path(folder, f"wide{suffix}")
     path.write_text(new_scenario_text("wide"))
-    assert load_scenario(path) == load_scenario(str(path)) and load_scenario(path).name == "wide"
-    assert load_scenario("stress-wide").name == "stress-wide"
+    assert eb.load_scenario(path) == eb.load_scenario(str(path)) and eb.load_scenario(path).name == "wide"
+    assert eb.load_scenario("stress-wide").name == "stress-wide"
 
 
 def test_path__a_name_that_nobody_has_is_that_of_a_file_without_its_ending(
@@ -225,17 +219,17 @@ def test_path__a_name_that_nobody_has_is_that_of_a_file_without_its_ending(
     monkeypatch.chdir(tmp_path)
     Path("my/folder").mkdir(parents=True)
     for file in ("mine.yaml", "my/folder/mine.yaml", "my/folder/bad.yaml", "paper-random.yaml"):
-        declared = {**load_scenario("paper-random").declared(), "name": Path(file).stem, "title": file}
+        declared = {**eb.load_scenario("paper-random").declared(), "name": Path(file).stem, "title": file}
         bad = {"roles": {"vehicle_3": "brak"}} if "bad" in file else {}
         Path(file).write_text(json.dumps({**declared, "early_impacts": "keep", **bad}))
     Path("my/folder/mixed.yaml").write_text("name: mixed\nmixture: [{scenario: mine}, {scenario: paper-random}]\n")
     for name in ("mine", "./mine", "my/folder/mine", Path("my/folder/mine")):
-        assert load_scenario(name).title == f"{Path(name)}.yaml"
-    assert load_scenario("paper-random").title != "paper-random.yaml"  # the shipped one, whatever lies here
+        assert eb.load_scenario(name).title == f"{Path(name)}.yaml"
+    assert eb.load_scenario("paper-random").title != "paper-random.yaml"  # the shipped one, whatever lies here
     with pytest.raises(InvalidInput, match=r"^my/folder/bad.yaml, line 1: roles.vehicle_3 = brak: unknown agent"):
         load_runnable("my/folder/bad")
     Path("mine.yaml").unlink()
-    own, shipped = load_scenario("my/folder/mixed").members  # looked for beside the mixture
+    own, shipped = eb.load_scenario("my/folder/mixed").members  # looked for beside the mixture
     assert (own.early_impacts, shipped.early_impacts) == ("keep", "reject")
 
 
@@ -244,7 +238,7 @@ def test_path__a_name_that_nobody_has_is_that_of_a_file_without_its_ending(
     [("paper-random-brake-only", "driving_capacity_mps2"), ("paper-random-obstacle", "obstacle_margin_m")],
 )
 def test_variants__differ_from_the_random_test_in_one_key(name: str, key: str) -> None:
-    plain, variant = load_scenario("paper-random"), load_scenario(name)
+    plain, variant = eb.load_scenario("paper-random"), eb.load_scenario(name)
     told, other = (each.model_dump(exclude={"name", "title", "description", "source"}) for each in (plain, variant))
     assert {field for field in told if told[field] != other[field]} == {key}
 
@@ -256,7 +250,7 @@ def test_level_4__has_the_lines_of_level_3_and_full_braking_never_meets_its_obst
     worlds = {"3": level_3.sample(2_000, 7).worlds, "4": level_4.sample(2_000, 7).worlds}
     ledgers = {}
     for key, at_alert in worlds.items():
-        _, impacts = advance(at_alert, -at_alert.vehicles.braking_capacity_mps2, until_s=8.0)
+        _, impacts = eb.advance(at_alert, -at_alert.vehicles.braking_capacity_mps2, until_s=8.0)
         ledgers[key] = empty_ledger(at_alert).add(impacts)
     assert not ledgers["4"].obstacle_count.any() and ledgers["3"].collided.sum() > 1_000
     for harm_count in HARM_COUNTS:
@@ -273,7 +267,7 @@ def test_folder__of_an_installed_package_is_inside_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     monkeypatch.setattr(shipped_files, "_PACKAGE", tmp_path / "ethbrake_marl")
-    name, find = {"scenarios": ("scenarios", shipped_folder), "recipes": ("train", TrainingRecipe.shipped)}[kind]
+    name, find = {"scenarios": ("scenarios", shipped_folder), "recipes": ("train", eb.TrainingRecipe.shipped)}[kind]
     with pytest.raises(InvalidInput, match=rf"the shipped {kind} are missing: .*reinstall"):
         find()
     installed = tmp_path / "ethbrake_marl" / "_data" / name
@@ -287,7 +281,7 @@ def test_folder__of_an_installed_package_is_inside_it(
 
 def test_json_schema__names_every_field_asks_for_one_of_two_ways_and_knows_no_null() -> None:
     schema = json.loads(json.dumps(scenario_json_schema()))
-    assert set(schema["properties"]) == set(Scenario.model_fields)
+    assert set(schema["properties"]) == set(eb.Scenario.model_fields)
     assert (schema["additionalProperties"], schema["required"]) == (False, ["name"])
     assert schema["if"] == {
         "not": {"anyOf": [{"required": ["mixture"]}, {"required": ["table"]}]}
@@ -322,7 +316,7 @@ def written(key: str, x: float, inside: float) -> list[dict[str, Any]]:
 def in_range(content: dict[str, Any]) -> bool:
     """Whether the reader finds every number in its range, whatever it says of keys that limit each other."""
     try:
-        Scenario(**content)
+        eb.Scenario(**content)
     except InvalidInput as error:
         return re.search(r"must be (finite and )?in |low must be above 0", str(error)) is None
     return True
@@ -343,7 +337,7 @@ def test_json_schema__a_number_is_in_range_exactly_where_the_reader_says_so(key:
 
 def test_page__its_examples_are_valid_scenarios() -> None:
     examples = re.findall(r"^```yaml\n(name:.*?)^```$", PAGE + MIXTURES, re.MULTILINE | re.DOTALL)
-    assert [Scenario.from_document(parse_yaml(text)).sample(10, 0).worlds.n for text in examples] == [10, 10]
+    assert [eb.Scenario.from_document(parse_yaml(text)).sample(10, 0).worlds.n for text in examples] == [10, 10]
 
 
 @pytest.mark.parametrize(
@@ -359,5 +353,5 @@ def test_page__its_examples_are_valid_scenarios() -> None:
 def test_page__shows_what_answers_a_mistake(old: str, new: str) -> None:
     text = (shipped_folder() / "paper" / "paper-random.yaml").read_text()
     with pytest.raises(InvalidInput) as caught:
-        Scenario.from_document(parse_yaml(text.replace(old, new), "my.yaml"))
+        eb.Scenario.from_document(parse_yaml(text.replace(old, new), "my.yaml"))
     assert old in text and f"\n{caught.value}\n" in PAGE

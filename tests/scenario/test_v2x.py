@@ -1,7 +1,5 @@
 """Who hears of whom, and when: distributions against their formulas, the news by hand, and nothing that leaks."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -9,31 +7,29 @@ import gymnasium
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.registry import script_agents
-from ethbrake_marl.engine import Engine
-from ethbrake_marl.envs.interfaces import make_engine, parallel_env
-from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-from ethbrake_marl.evaluation.inputs import worlds_sha256
+import ethbrake_marl as eb
+from ethbrake_marl.agents import script_agents
+from ethbrake_marl.envs import make_engine
+from ethbrake_marl.evaluation import worlds_sha256
 from ethbrake_marl.observations import observe
-from ethbrake_marl.physics import advance, make_worlds
 from ethbrake_marl.physics.batch import Packed
 from ethbrake_marl.physics.kernel import CLOCK
 from ethbrake_marl.physics.messages import CHANNEL, Messages, chance
-from ethbrake_marl.scenario import Scenario, full_state, load_scenario, observation_for, state_features
-from ethbrake_marl.scenario.v2x import CHANNELS, PER_LINK, PRESETS, V2X, Channel, Equipage, Equipped, burst_periods
+from ethbrake_marl.scenario import CHANNELS, full_state, state_features
+from ethbrake_marl.scenario.v2x import PER_LINK, PRESETS, V2X, Channel, Equipage, Equipped, burst_periods
 from ethbrake_marl.search import identities
 from tests.agents.test_knowledge import alter_unreceived
 
-PAPER = load_scenario("paper-random")
+PAPER = eb.load_scenario("paper-random")
 
 
-def channel_of(name: str, **changes: object) -> Scenario:
+def channel_of(name: str, **changes: object) -> eb.Scenario:
     return PAPER.replace(v2x={"preset": name, **changes}, latency_s=0, early_impacts="keep")
 
 
 def vehicles(latency_s, n=1):
     given = {"braking_capacity_mps2": 6, "driving_capacity_mps2": 6, "mass_t": 5, "restitution": 0.1}
-    return make_worlds(5.0, np.full((n, np.shape(latency_s)[-1]), 20.0), latency_s=latency_s, **given).vehicles
+    return eb.make_worlds(5.0, np.full((n, np.shape(latency_s)[-1]), 20.0), latency_s=latency_s, **given).vehicles
 
 
 def everybody(vehicles: int) -> Equipped:
@@ -44,8 +40,7 @@ def test_burst_periods__at_the_bounds_by_hand():
     # p = r = 0.5: P(k >= 1) = 1/2, P(k >= 2) = 1/4, P(k >= 3) = 1/8; all exact in binary.
     u = np.array([0.5, 0.4999, 0.25, 0.2499, 0.125, 0.1249, 0.99])
     assert burst_periods(u, 0.5, 0.5).tolist() == [0, 1, 1, 2, 2, 3, 0]
-    assert burst_periods(u, 0.0, 0.5).tolist() == [0] * 7
-    assert burst_periods(np.array([0.0]), 0.5, 1.0).tolist() == [1]
+    assert burst_periods(u, 0.0, 0.5).tolist() == [0] * 7 and burst_periods(np.array([0.0]), 0.5, 1.0).tolist() == [1]
 
 
 def slow_news(channel: Channel, own_s: list[float], links: np.ndarray) -> tuple[list[float], np.ndarray]:
@@ -135,7 +130,7 @@ def test_observe__tells_own_parts_of_latencies_and_nothing_that_the_channel_has_
     worlds.vehicles.latency_s[0] = [0.0, 0.4, 0.9]
     worlds.vehicles.known_from_s[0] = [[0.0, 0.8, 0.8], [0.4, 0.4, 0.4], [0.9, 0.9, 0.9]]
     assert worlds.vehicles.own_latency_s.tolist() == [[0.0, 0.1, 0.5]]
-    spec = observation_for(scenario)
+    spec = eb.observation_for(scenario)
     at = [f.name for f in spec.features].index("rear_1.latency_left")
     for time, own_left, rear_left in ((0.0, 0.1, 0.0), (0.4, 0.0, 0.1), (0.6, 0.0, 0.0), (0.95, 0.0, 0.0)):
         seen = observe(replace(worlds, time_s=np.full(1, time)), 1, spec)[0]
@@ -155,7 +150,7 @@ def test_observe__writing_the_papers_news_out_by_link_changes_no_bit():
     for time in (0.0, 0.3, 0.6, 1.0):
         for i in range(3):
             now = (replace(w, time_s=np.full(50, time)) for w in (plain, told))
-            one, other = (observe(w, i, observation_for(PAPER)) for w in now)
+            one, other = (observe(w, i, eb.observation_for(PAPER)) for w in now)
             assert one.tobytes() == other.tobytes()
 
 
@@ -165,13 +160,12 @@ def test_observe__writing_the_papers_news_out_by_link_changes_no_bit():
 def test_observe__what_is_not_known_changes_no_bit(name, obstacle, latency):
     scenario = channel_of(name).replace(latency_s=latency)
     scenario = scenario.replace(obstacle_gap_m={"uniform": [30, 50]}) if obstacle else scenario
-    start, spec, rng, seen = scenario.sample(400, 5).worlds, observation_for(scenario), np.random.default_rng(1), 0
+    start, spec, rng, seen = scenario.sample(400, 5).worlds, eb.observation_for(scenario), np.random.default_rng(1), 0
     at = [7, 17] + [k for k, feature in enumerate(spec.features) if feature.name == "obstacle.known"]
     for time in (0.0, 0.5, 0.8, 1.0, 1.5):
-        worlds, _ = advance(start, -3.0, until_s=time)
+        worlds, _ = eb.advance(start, -3.0, until_s=time)
         for i in [1] if obstacle else range(3):  # from the ends the way to it goes over gaps that are altered
-            other = alter_unreceived(worlds, i, rng)
-            assert observe(worlds, i, spec).tobytes() == observe(other, i, spec).tobytes()
+            assert observe(worlds, i, spec).tobytes() == observe(alter_unreceived(worlds, i, rng), i, spec).tobytes()
         unknown = worlds.vehicles.known_from_s[:, 1][:, [0, 2, 0]] > time
         assert (observe(worlds, 1, spec)[:, at] == ~unknown[:, : len(at)]).all()
         seen += int(unknown.sum())
@@ -212,32 +206,31 @@ def test_identities__do_not_depend_on_the_news():
     worlds = PAPER.sample(5, 7).worlds
     clock, command = np.zeros((5, CLOCK.WIDTH)), -worlds.vehicles.braking_capacity_mps2
     late = replace(worlds.vehicles, known_from_s=worlds.vehicles.known_from_s + 1.0)
-    by_link = replace(worlds, vehicles=late)
-    plain, told = (identities(w, command, clock, np.array([1])) for w in (worlds, by_link))
+    plain, told = (identities(w, command, clock, np.array([1])) for w in (worlds, replace(worlds, vehicles=late)))
     assert plain.tolist() == told.tolist() and len(set(plain.tolist())) == 5
 
 
 # ---------------------------------------------------------------- messages that go on
 
-BASE = load_scenario("cooperation-2-paper").replace(early_impacts="keep")
+BASE = eb.load_scenario("cooperation-2-paper").replace(early_impacts="keep")
 AGED = ["own", "front_1", "rear_1", "front_1.age", "rear_1.age"]
 
 
-def periodic(preset: str = "nominal", base: Scenario = BASE, **changes: object) -> Scenario:
+def periodic(preset: str = "nominal", base: eb.Scenario = BASE, **changes: object) -> eb.Scenario:
     return base.replace(v2x={"preset": preset, "persistence": "periodic", **changes})
 
 
-def first_only(scenario: Scenario) -> Scenario:
+def first_only(scenario: eb.Scenario) -> eb.Scenario:
     return scenario.replace(v2x={**scenario.v2x.model_dump(exclude_none=True), "persistence": "first"})
 
 
-def engine_of(scenario: Scenario, n: int = 6, first: int = 0) -> Engine:
+def engine_of(scenario: eb.Scenario, n: int = 6, first: int = 0) -> eb.Engine:
     worlds = scenario.sample(n, 7, first=first).worlds
     scripts = script_agents(scenario, except_for=scenario.learners)
-    return Engine(scenario, n, learners=scenario.learners, scripts=scripts, worlds=worlds)
+    return eb.Engine(scenario, n, learners=scenario.learners, scripts=scripts, worlds=worlds)
 
 
-def driven(engine: Engine, steps: int) -> list[np.ndarray]:
+def driven(engine: eb.Engine, steps: int) -> list[np.ndarray]:
     seen = [engine.observe_all(np.arange(engine.scenario.vehicles))]
     for _ in range(steps):
         engine.step(np.full((engine.n, len(engine.learners)), -0.6))
@@ -272,7 +265,7 @@ def test_periodic__in_sight_what_is_seen_is_what_first_shows() -> None:
         np.testing.assert_array_equal(one[:, 1], other[:, 1])
 
 
-def delayed(gaps_m: list[float]) -> Engine:
+def delayed(gaps_m: list[float]) -> eb.Engine:
     """All at 20 m/s; every message is 0.2 s on its way, and who is behind is not in sight."""
     base = BASE.replace(gaps_m=gaps_m, speeds_mps=[20.0, 20.0, 20.0])
     return engine_of(periodic("paper", base, link_latency_s=0.2, senses="front", sensing_s=[5.0, 5.0]), n=1)
@@ -328,7 +321,7 @@ def test_chance__is_uniform_and_of_its_own_for_every_link_and_message() -> None:
 
 @pytest.mark.parametrize("vehicles", [2, 3, 6])
 def test_periodic__a_world_alone_hears_what_it_hears_in_a_batch(vehicles: int) -> None:
-    base = load_scenario("paper-random").replace(
+    base = eb.load_scenario("paper-random").replace(
         vehicles=vehicles, braking_capacity_mps2=6.0, driving_capacity_mps2=6.0, mass_t=5.0, latency_s=0.1,
         roles={"vehicle_2": "learner"},
     )  # fmt: skip
@@ -339,7 +332,7 @@ def test_periodic__a_world_alone_hears_what_it_hears_in_a_batch(vehicles: int) -
 
 
 def test_obstacle__is_known_as_it_was_told_and_stands_where_it_stands() -> None:
-    base = load_scenario("cooperation-4-all").replace(early_impacts="keep")
+    base = eb.load_scenario("cooperation-4-all").replace(early_impacts="keep")
     engine = engine_of(periodic("nominal", base, senses="front", sensing_s=[5.0, 5.0]), n=20)
     at = [feature.name for feature in engine.observation.features].index("obstacle.gap")
     for _ in range(10):
@@ -373,7 +366,7 @@ def test_age__reads_0_over_a_channel_whose_news_stays_present() -> None:
 
 def test_interfaces__see_the_same() -> None:
     scenario = periodic("congested", base=BASE.replace(observation=AGED))
-    env = parallel_env(scenario=scenario)
+    env = eb.parallel_env(scenario=scenario)
     seen, infos = env.reset(seed=5)
     engine = env.unwrapped.engine
     assert Messages.of(engine.worlds).periodic.all() and not (engine.worlds.messages[:, CHANNEL.KEY] == 0.0).any()
@@ -384,10 +377,10 @@ def test_interfaces__see_the_same() -> None:
             seen, *_, infos = env.step({"vehicle_2": np.array([-0.5], np.float32)})
     np.testing.assert_array_equal(seen["vehicle_2"], engine.observe(1)[0])
     np.testing.assert_array_equal(infos["vehicle_2"]["age_s"], ages_in(engine.worlds)[0, 1])
-    assert "known_from_s" not in parallel_env(PAPER).reset(seed=5)[1]["vehicle_2"]
+    assert "known_from_s" not in eb.parallel_env(PAPER).reset(seed=5)[1]["vehicle_2"]
     _, told = gymnasium.make_vec("EthBrake-v0", num_envs=3, scenario=scenario).reset(seed=5)
     assert told["age_s"].shape == (3, 3) and (told["age_s"][:, 1] == 0.0).all()
-    vec = make_sb3_vec_env(scenario, 3, seed=5)
+    vec = eb.make_sb3_vec_env(scenario, 3, seed=5)
     alike = vec.reset()
     for _ in range(90):  # through an automatic reset
         alike, _, _, _ = vec.step(np.full((3, 1), -0.5, np.float32))
@@ -397,6 +390,6 @@ def test_interfaces__see_the_same() -> None:
 
 def test_mixture__its_scenarios_share_the_persistence() -> None:
     members = [periodic(preset, BASE.replace(name=preset)) for preset in ("nominal", "blocked")]
-    mixed = Scenario(name="mixed", mixture=[{"scenario": member} for member in members])
+    mixed = eb.Scenario(name="mixed", mixture=[{"scenario": member} for member in members])
     assert Messages.of(mixed.sample(30, 3).worlds).periodic.all()
     driven(engine_of(mixed), 5)

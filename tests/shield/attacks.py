@@ -6,8 +6,6 @@ search must find harm above the bound through each. (Why not "came within 1 % of
 last bound to the bit, so that is reached by proposing nothing but the plan.)
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -61,6 +59,7 @@ TEAMS = {  # by cooperation level and number of vehicles
 # ---------------------------------------------------------------- adversaries: what all learners propose, [n, K]
 
 Adversary = Callable[[np.random.Generator, eb.Engine, StepShield, int], Floats]  # ..., number of the step
+Leak = Callable[[StepShield, Decision | None], None]  # changes the shield before a decision; the last one, or None
 
 
 def worst_case(rng, engine, shield, k, candidates=8):
@@ -274,8 +273,6 @@ def search(
 
 
 # ---------------------------------------------------------------- leaks
-
-Leak = Callable[[StepShield, Decision | None], None]  # changes the shield before a decision; the last one, or None
 
 
 def _of_pairs(change: Callable[[StepShield, np.ndarray], None]) -> Leak:

@@ -5,14 +5,12 @@ lines; ``wrapped(interface, wrapper, calls, seed)`` steps with a wrapper between
 by a watcher of its own from the engine's ledger, of every episode that ended, and compared with the bound at the alert.
 """
 
-from __future__ import annotations
-
 import contextlib
 import sys
 import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import gymnasium
 import numpy as np
@@ -127,8 +125,7 @@ class Play:
     def astray(self) -> int:
         """1 where the shield is not where the engine is, or trusts it no longer."""
         shield, engine = self.shield(), self.engine()
-        there = (shield.running.steps == engine.steps)[~engine.ended].all()
-        return int(not there or shield.distrusted.any())
+        return int(not (shield.running.steps == engine.steps)[~engine.ended].all() or shield.distrusted.any())
 
     def member_is(self, how: str, asked: Callable[[], Any]) -> Callable[[], None]:
         """A call in which one member fails so, while the others are well."""
@@ -175,8 +172,7 @@ class Parallel(Play):
             self.member_is("fails", lambda: self.env.step({})),
             self.member_is("misshapen", lambda: self.env.step({})),
         ]
-        env = HybridShield(inner, policy, mode="step", cap="baseline" if self.team else None)
-        self.put(env, seed=self.begin())
+        self.put(HybridShield(inner, policy, mode="step", cap="baseline" if self.team else None), seed=self.begin())
 
     def step(self) -> None:
         if self.engine().ended[0]:
@@ -328,7 +324,7 @@ class Tally(NamedTuple):
     broken: int  # times that bound, plan, trust or place in the episode were not as they should be after that
 
     @classmethod
-    def of(cls, play: Play, refused: int = 0, interrupted: int = 0, broken: int = 0) -> Tally:
+    def of(cls, play: Play, refused: int = 0, interrupted: int = 0, broken: int = 0) -> Self:
         ended = play.ended()
         return cls(len(ended), sum(harm > bound + 1e-9 for harm, bound in ended), refused, interrupted, broken)
 

@@ -1,16 +1,14 @@
 """Interior mode: the bound holds for every world of the box, by hand and against worlds drawn from it."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import drive, fixed_commands, make_agent, script_agents
+from ethbrake_marl.agents import drive, fixed_commands, script_agents
 from ethbrake_marl.search import profile_problem
-from ethbrake_marl.shield import ShieldedDriver, StepShield, enclosure, parse_uncertainty
+from ethbrake_marl.shield import ShieldedDriver, StepShield, Uncertainty, enclosure, parse_uncertainty
 from ethbrake_marl.shield.enclosure import (
     CLOSING,
     HARDEST,
@@ -36,7 +34,6 @@ from ethbrake_marl.shield.enclosure import (
     wait,
 )
 from ethbrake_marl.shield.step_shield import begin_running, plan_harm
-from ethbrake_marl.shield.uncertainty import Uncertainty
 from tests.shield.test_uncertainty import STANDING
 
 STEPS = 81
@@ -136,8 +133,7 @@ def test_forms__enclose_what_they_stand_for(name):
     ],
 )
 def test_by_hand__two_vehicles_the_bound_up_to_the_horizon_is_that_of_the_least_gap(text, horizon, cells, harm, more):
-    found = bound_of(boxed(text, STANDING, horizon_s=horizon), np.full(STEPS, -1.0), cells)
-    assert harm - 1e-9 <= found <= harm + more
+    assert harm - 1e-9 <= bound_of(boxed(text, STANDING, horizon_s=horizon), np.full(STEPS, -1.0), cells) <= harm + more
 
 
 def test_by_hand__a_drive_that_a_speed_limit_may_end_gives_any_part_of_its_way():
@@ -163,8 +159,7 @@ def test_bound__is_at_least_the_harm_of_every_world_drawn_from_the_box(name):
     (changed, text), rng = UNUSUAL[name], np.random.default_rng(5)
     for first in range(2):
         case = boxed(text, first=first, **changed)
-        for plan in plans(rng):
-            assert harm_inside(*case[:3], plan, 25).max() <= bound_of(case, plan, 5) < np.inf
+        assert all(harm_inside(*case[:3], plan, 25).max() <= bound_of(case, plan, 5) < np.inf for plan in plans(rng))
 
 
 # an impact, and then: bounces while they brake to a stop; a pair pressed together, a push beyond a speed limit, a drive
@@ -226,11 +221,12 @@ def test_engine__with_an_uncertain_own_latency_no_world_of_the_box_is_distrusted
     scenario = PAPER.replace(gaps_m=[60, 25], speeds_mps=[20, 20, 21], latency_s=[0, 0.3, 0.8])
     told = scenario.sample(1, 3).worlds.take(np.zeros(4, np.int64))
     uncertainty = parse_uncertainty("latency_s.vehicle_2=0.15")
-    driver = ShieldedDriver(make_agent("constant:3"), scenario, uncertainty=uncertainty, robust="interior", told=told)
+    driver = ShieldedDriver(
+        eb.make_agent("constant:3"), scenario, uncertainty=uncertainty, robust="interior", told=told
+    )
     episodes = drive(uncertainty.draw(told, np.random.default_rng(1)), driver, scenario, 1)
     shield = episodes.guarded.shield
-    assert not shield.distrusted.any()
-    assert (episodes.ledger.world_harm("first") <= shield.predicted_harm + 1e-9).all()
+    assert not shield.distrusted.any() and (episodes.ledger.world_harm("first") <= shield.predicted_harm + 1e-9).all()
 
 
 def test_bound__more_parts_never_make_it_worse():

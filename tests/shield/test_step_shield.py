@@ -1,6 +1,4 @@
-"""The step shield: one decision by hand, and in the engine, where bounds hold and nothing fails silently."""
-
-from __future__ import annotations
+"""The step shield, of one vehicle and of several: decisions by hand, and in the engine, where bounds hold."""
 
 import copy
 
@@ -8,13 +6,30 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.planner import Refined
-from ethbrake_marl.agents.registry import drive, make_agent
+from ethbrake_marl.agents import Refined, drive
+from ethbrake_marl.scenario import Task
 from ethbrake_marl.search import profile_problem
-from ethbrake_marl.shield import HybridAgent, ShieldedDriver, StepShield, parse_uncertainty
-from ethbrake_marl.shield.step_shield import REASONS, Backup, Proposer, begin_running, certify, plan_harm
+from ethbrake_marl.shield import (
+    HybridAgent,
+    Shielded,
+    ShieldedDriver,
+    StepShield,
+    guard as behind_module,
+    parse_uncertainty,
+)
+from ethbrake_marl.shield.step_shield import (
+    REASONS,
+    Backup,
+    Proposer,
+    begin_running,
+    certify,
+    certify_rollouts,
+    ends_under,
+    joint_constants,
+    plan_harm,
+)
 from tests.fixtures.asked import Acts
-from tests.shield.attacks import ADVERSARIES, LEAKS, attack, begun, line, search
+from tests.shield.attacks import ADVERSARIES, LEAKS, TEAM_ADVERSARIES, TEAMS, all_infos, attack, begun, line, search
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::RuntimeWarning",  # uncompiled, a division by 0 warns
@@ -51,15 +66,15 @@ def two(speed=10.0, latency=0.0):
     return scenario, scenario.sample(1, 0).worlds
 
 
-def start(worlds, plan, uncertainty="gaps_m=0", vehicle=1, **settings):
+def start(worlds, plan, uncertainty="gaps_m=0", **settings):
     members = parse_uncertainty(uncertainty).members(worlds)
-    running = begin_running(profile_problem(members, [vehicle], **settings), members.n // worlds.n)
+    running = begin_running(profile_problem(members, [1], **settings), members.n // worlds.n)
     return running, Backup(plan, plan_harm(running, plan))
 
 
-def braking(action=-1.0):
-    """A plan of one world."""
-    return np.full((1, STEPS), action)
+def braking(action=-1.0, *vehicles):
+    """A plan of one world; for several vehicles if it is told how many."""
+    return np.full((1, STEPS, *vehicles), action)
 
 
 def reason(decision):
@@ -125,18 +140,6 @@ def test_constant__gives_a_certificate_where_the_plan_gives_none():
     assert without.intervened[0] and without.applied[0] == plan[0, 0]
 
 
-def test_budget__above_the_plan_lets_more_through_but_never_more_than_that():
-    running, backup = start(two(15.0)[1], braking())
-    assert backup.harm[0] == pytest.approx(225.0 - 150.0)
-    budget = backup.harm + 20.0
-    while not running.ended[0]:
-        decision = certify(running, np.ones(1), backup, budget)
-        running, backup = decision.after, decision.backup
-        assert backup.harm[0] <= budget[0]
-    # two vehicles: speeds 2, gap, hit, first-impact harm
-    assert running.states[0, 4] == backup.harm[0] > budget[0] - 20.0
-
-
 @pytest.mark.parametrize(("value", "instead"), [(np.nan, -0.8), (-7.0, -1.0), (-np.inf, -1.0)])
 def test_proposal__that_is_no_number_is_replaced_and_beyond_the_range_is_clipped_before_it_is_certified(value, instead):
     running, backup = start(two(15.0)[1], braking(-0.8))
@@ -146,26 +149,34 @@ def test_proposal__that_is_no_number_is_replaced_and_beyond_the_range_is_clipped
     assert decision.intervened[0] == np.isnan(value) == (reason(decision) == "not a number")
 
 
-@pytest.mark.parametrize("name", ["random_actions", "extremes"])
-def test_attack__of_few_worlds_small_enough_to_run_uncompiled(name):
-    found = attack(TWO, SMALL, ADVERSARIES[name])
-    assert (found.bound > 0.0).any() and found.rises == 0
-    assert (found.realised <= found.bound).all()
-    assert found.realised.tolist() == found.last_bound.tolist()
-
-
-@pytest.mark.parametrize("name", ADVERSARIES)
-@pytest.mark.parametrize(("N", "harm_count"), [(3, "first"), (5, "total")])
-def test_attack__no_adversary_gets_above_the_bound(name, N, harm_count):
-    found = attack(line(N), line(N).sample(24, 11).worlds, ADVERSARIES[name], harm_count=harm_count)
-    assert (found.realised <= found.bound).all() and found.rises == 0
-    assert found.realised.tolist() == found.last_bound.tolist()
+@pytest.mark.parametrize(
+    ("scenario", "n", "harm_count", "settings", "name"),
+    [
+        *((TWO, 4, "first", {}, name) for name in ("random_actions", "extremes")),  # small enough to run uncompiled
+        *((line(3), 24, "first", {}, name) for name in ADVERSARIES),
+        *((line(5), 24, "total", {}, name) for name in ADVERSARIES),
+        *(
+            (eb.load_scenario(TEAMS[level, N]), 4 if N == 3 else 2, harm_count, {"hostile": hostile, "cap": cap}, name)
+            for level, N in ((3, 3), (4, 3), (3, 5))
+            for harm_count, cap in (("first", "baseline"), ("total", None))
+            for hostile in ("all", "one")
+            for name in TEAM_ADVERSARIES
+        ),
+    ],
+    ids=str,
+)
+def test_attack__realises_the_last_bound_to_the_bit_and_neither_bound_nor_caps_are_broken(
+    scenario, n, harm_count, settings, name
+):
+    found = attack(scenario, scenario.sample(n, 5).worlds, ADVERSARIES[name], harm_count=harm_count, seed=1, **settings)
+    assert found.realised.tolist() == found.last_bound.tolist() and (found.bound > 0.0).any()
+    assert (found.realised <= found.bound).all() and (found.rises, found.over_cap) == (0, 0)
+    assert found.accepted.any() or not settings or name == "full_drive"
 
 
 def test_search__finds_no_way_past_the_shield_but_many_without_it():
     found = search(60, 5)
-    assert (found.above, found.excess) == (0, 0.0)
-    assert found.loose > 0.5
+    assert (found.above, found.excess) == (0, 0.0) and found.loose > 0.5
 
 
 @pytest.mark.parametrize("name", [name for name in LEAKS if "further off" not in name])  # that one takes longer lines
@@ -183,7 +194,7 @@ def test_trained_adversary__does_more_harm_under_the_shield_than_chance_does() -
 def test_allowance__keeps_what_it_grants_and_no_more():
     worlds = line(3).sample(60, 13).worlds
     strict, loose = (attack(line(3), worlds, ADVERSARIES["slow_drift"], allowance=a) for a in (0.0, 30.0))
-    assert (loose.realised <= loose.bound + 30.0 + 1e-9).all()
+    assert (loose.realised <= loose.bound + 30.0 + 1e-9).all() and (loose.realised > loose.bound).any()
     assert loose.realised.mean() > strict.realised.mean() + 1.0
 
 
@@ -257,7 +268,7 @@ def test_horizon__settles_says_what_the_plan_comes_to_in_the_engine():
     scenario = PAPER.replace(horizon_s=4.2)
     shield = StepShield(scenario, 1)
     shield.begin(worlds, np.arange(60))
-    episodes = drive(worlds, ShieldedDriver(make_agent("e_v2x_bm"), scenario), scenario, 1)
+    episodes = drive(worlds, ShieldedDriver(eb.make_agent("e_v2x_bm"), scenario), scenario, 1)
     rests = (episodes.final.speeds_mps == 0.0).all(axis=1)
     assert rests.tolist() == shield.settles.tolist() and 0 < rests.sum() < 60
 
@@ -282,7 +293,7 @@ def test_agent__is_never_worse_than_the_episode_mode_nor_than_its_prediction(har
 
 
 def test_agent__a_policy_that_keeps_the_bound_is_left_alone():
-    shield = drive(WORLDS, ShieldedDriver(make_agent("e_v2x_bm"), PAPER), PAPER, 1).guarded.shield
+    shield = drive(WORLDS, ShieldedDriver(eb.make_agent("e_v2x_bm"), PAPER), PAPER, 1).guarded.shield
     fine = shield.alone_harm <= shield.first_bound
     assert fine.mean() > 0.9 and shield.chosen_policy[fine].all()
 
@@ -354,7 +365,7 @@ def test_rollout__certifies_by_hand_what_plan_and_constants_do_not(proposed, pol
     scenario, worlds = two()
     shield = begun(scenario, worlds)
     shield.backup = Backup(np.full_like(shield.backup.plan, -0.7), np.zeros(1), np.zeros(0))
-    proposer = None if policy is None else Proposer({1: make_agent(policy)}, {1: None}, worlds)
+    proposer = None if policy is None else Proposer({1: eb.make_agent(policy)}, {1: None}, worlds)
     decision = shield.decide(np.full(1, proposed), proposer=proposer)
     assert (reason(decision), decision.applied[0], decision.bound[0]) == (why, plan[0], 0.0)
     assert shield.backup.plan[0, :2].tolist() == plan and decision.margin[0] == pytest.approx(margin)
@@ -381,16 +392,14 @@ def test_rollout__once_accepted_is_what_the_policy_then_does_and_the_bound_is_ex
     accepted = reasons == REASONS.index("policy rollout")
     assert accepted.sum() > 3
     later = np.cumsum(accepted, axis=0) - accepted > 0  # after the first accepted rollout of that world
-    allowed = [-1, REASONS.index("same as plan"), REASONS.index("ended")]
-    assert np.isin(reasons[later], allowed).all()
+    assert np.isin(reasons[later], [-1, REASONS.index("same as plan"), REASONS.index("ended")]).all()
     assert harm.tolist() == guarded.shield.bound.tolist()
     assert (harm <= guarded.shield.predicted_harm).all() and not guarded.shield.distrusted.any()
 
 
 @pytest.mark.parametrize("distrusted", [False, True])
 def test_rollout__leaves_the_past_in_the_plan_what_was_applied(distrusted):
-    weaker = parse_uncertainty("braking_capacity_mps2=20%").draw(ROLLED, np.random.default_rng(0))
-    told = weaker if distrusted else None
+    told = parse_uncertainty("braking_capacity_mps2=20%").draw(ROLLED, np.random.default_rng(0)) if distrusted else None
     guarded, _, reasons, applied = driven(eb.LearnedAgent(Weights()), logging=True, told=told)
     shield, running = guarded.shield, ~np.isin(reasons, [-1, REASONS.index("ended")])
     assert (shield.distrusted == distrusted).all()
@@ -420,3 +429,213 @@ def test_rollout__also_of_a_refined_policy_that_cannot_be_divided():
     driver = ShieldedDriver(Refined(Remembering(), PAPER, tries=2), PAPER)
     episodes = drive(WORLDS.take(np.arange(20)), driver, PAPER, 1)
     assert episodes.ledger.world_harm("first").tolist() == episodes.guarded.shield.bound.tolist()
+
+
+# ---------------------------------------------------------------- several shielded vehicles, decided together
+
+PAIR = eb.load_scenario("cooperation-3-pair")
+
+
+def three(**changes):
+    """Vehicle 1 stands; 10 m and 10 m behind it two vehicles come at 5 and 10 m/s that brake with at most 5 m/s2."""
+    given = {
+        "name": "three", "vehicles": 3, "gaps_m": [10, 10], "speeds_mps": [0, 5, 10], "braking_capacity_mps2": 5,
+        "driving_capacity_mps2": 5, "mass_t": [1, 1, 3], "latency_s": 0,
+        "roles": {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "learner"},
+    }  # fmt: skip
+    return eb.Scenario(**{**given, **changes}).sample(1, 0).worlds
+
+
+def start_pair(worlds, plan):
+    running = begin_running(profile_problem(worlds, (1, 2)))
+    return running, Backup(plan, plan_harm(running, plan), np.zeros((0, 2)))
+
+
+def told(decision):
+    return [REASONS[each] for each in decision.reason[0]]
+
+
+def test_by_hand__of_two_proposals_the_harmless_one_is_accepted_the_other_replaced():
+    # Braking fully they stop after 2.5 m and 10 m; Vehicle 3 then stands 2.5 m behind Vehicle 2.
+    running, backup = start_pair(three(gaps_m=[2.6, 10]), braking(-1.0, 2))
+    assert backup.harm.tolist() == [0.0]
+    # Vehicle 2 has 0.1 m to spare, Vehicle 3 2.5 m: 0.1 s of coasting costs 0.5 m and 1 m.
+    decision = certify(running, np.zeros((1, 2)), backup, backup.harm)
+    assert decision.applied.tolist() == [[-1.0, 0.0]] and decision.intervened.tolist() == [[True, False]]
+    assert told(decision) == ["no certificate", "plan remains"] and decision.bound.tolist() == [0.0]
+    assert decision.margin[0, 0] < 0.0 == decision.margin[0, 1]
+    assert decision.backup.plan[0, :2].tolist() == [[-1.0, 0.0], [-1.0, -1.0]]
+
+
+def test_by_hand__proposals_that_are_harmless_alone_and_collide_together_go_to_the_front_one():
+    # Vehicle 2 may brake sooner than planned, or Vehicle 3 later, but not both: 12 m/s need 14.4 m to stop.
+    plan = braking(-1.0, 2)
+    plan[0, :4, 0] = 0.0  # coasts 2 m first, then stops after 2.5 m, 0.4 m before Vehicle 1
+    running, backup = start_pair(three(gaps_m=[4.9, 12.0], speeds_mps=[0, 5, 12]), plan)
+    assert backup.harm.tolist() == [0.0]  # Vehicle 3 stops 12 + 4.5 - 14.4 = 2.1 m behind
+    for each in ([[-1.0, -1.0]], [[0.0, 0.4]]):
+        assert not certify(running, np.array(each), backup, backup.harm).intervened.any()
+    several = np.array([[-1.0, 0.4]])  # 0.65 m sooner, and 1.69 m later
+    assert plan_harm(certify(running, several, backup, np.full(1, 1e9)).after, plan)[0] > 0.0
+    decision = certify(running, several, backup, backup.harm)
+    assert told(decision) == ["plan remains", "no certificate"] and decision.applied[0].tolist() == [-1.0, -1.0]
+
+
+def test_by_hand__what_one_of_two_makes_better_is_in_the_bound_at_once():
+    plan = braking(-1.0, 2)
+    plan[0, 0, 1] = -0.5  # Vehicle 3 runs into Vehicle 2, and brakes too little at first
+    running, backup = start_pair(three(gaps_m=[2.6, 10], speeds_mps=[0, 5, 11]), plan)
+    decision = certify(running, np.array([[1.0, -1.0]]), backup, backup.harm)
+    assert decision.intervened.tolist() == [[True, False]]  # Vehicle 2 has 0.1 m to spare
+    assert decision.bound.tolist() == plan_harm(decision.after, decision.backup.plan).tolist()
+    assert decision.bound[0] < backup.harm[0] - 1.0
+
+
+def test_by_hand__who_says_no_number_keeps_the_plan_and_the_other_is_clipped():
+    running, backup = start_pair(three(), braking(-0.9, 2))
+    decision = certify(running, np.array([[np.nan, -7.0]]), backup, backup.harm)
+    assert told(decision) == ["not a number", "plan remains"]
+    assert decision.applied.tolist() == [[-0.9, -1.0]] and decision.intervened.tolist() == [[True, False]]
+
+
+def test_caps__reject_what_only_moves_harm_to_another_vehicle_also_in_a_later_rollout():
+    worlds = three(gaps_m=[3.0, 10.0], speeds_mps=[0, 5, 16])
+    running, backup = start_pair(worlds, braking(-1.0, 2))
+    assert backup.harm[0] > 0.0  # Vehicle 3 runs into Vehicle 2, which stands before Vehicle 1
+    proposed, budget = np.array([[0.0, -1.0]]), backup.harm + 50.0
+    assert not certify(running, proposed, backup, budget).intervened.any()
+    capped = running._replace(caps=ends_under(running, backup.plan)[1])
+    decision = certify(capped, proposed, backup, budget)
+    assert decision.intervened.tolist() == [[True, False]] and decision.applied[0, 0] == -1.0
+    team = Proposer(dict.fromkeys((1, 2), eb.make_agent("full_brake")), {1: None, 2: None}, worlds)
+    for each, refused in ((running, False), (capped, True)):
+        found = certify_rollouts(each, proposed, np.arange(1), budget, backup.plan, team)
+        assert found.intervened.tolist() == [[refused, refused]] and found.margin.min() > 0.0
+
+
+def test_one_vehicle_in_a_list__is_the_single_shield_bit_for_bit():
+    worlds, rng = PAPER.sample(20, 4).worlds, np.random.default_rng(4)
+    single, listed = StepShield(PAPER, 1), StepShield(PAPER, [1])
+    for shield in (single, listed):
+        shield.begin(worlds, np.arange(20))
+    held = single.backup
+    listed.backup = Backup(held.plan[:, :, np.newaxis], held.harm, held.constants[:, np.newaxis])
+    while not single.running.finished.all():
+        proposed = rng.uniform(-1.2, 1.2, 20)
+        one, other = single.decide(proposed), listed.decide(proposed[:, np.newaxis])
+        for name in ("applied", "reason", "margin", "bound"):
+            assert getattr(one, name).tolist() == getattr(other, name).reshape(20).tolist()
+
+
+def test_bound_at_the_alert__is_at_most_full_braking_and_any_single_constant():
+    worlds = PAIR.sample(40, 8).worlds
+    joint = begun(PAIR, worlds)
+    braked = plan_harm(joint.running, np.full((40, STEPS, 2), -1.0))
+    assert (joint.first_bound <= braked).all() and joint.first_bound.mean() < 0.8 * braked.mean()
+    for vehicle in (1, 2):
+        assert (joint.first_bound <= begun(PAIR.with_learners([vehicle]), worlds).first_bound + 1e-6).all()
+
+
+def test_team__whose_rollout_keeps_the_bound_is_left_alone():
+    worlds = PAIR.sample(30, 2).worlds
+    without = begun(PAIR, worlds)
+    for name in ("full_brake", "constant:5"):
+        shield, team = StepShield(PAIR, (1, 2)), {i: eb.make_agent(name) for i in (1, 2)}
+        shield.begin(worlds, np.arange(30), team)
+        drives = shield.alone_harm <= shield.first_bound
+        command = [team[i].act(worlds, i) / worlds.vehicles.braking_capacity_mps2[:, i] for i in (1, 2)]
+        assert not shield.decide(np.stack(command, axis=1)).intervened[drives].any() and drives.any()
+        assert (shield.first_bound <= without.first_bound).all()
+
+
+def test_constants__hold_all_alike_and_ladders_each_once():
+    constants = joint_constants(3)
+    assert len({tuple(row) for row in constants.tolist()}) == len(constants) == 31
+    assert constants.min() == -1.0 and constants.max() == 0.0
+
+
+def test_surprise__of_one_world_hands_the_whole_team_to_the_fallback():
+    scenario = eb.load_scenario(TEAMS[4, 3])
+    shield = begun(scenario, scenario.sample(3, 1).worlds)
+    seen = shield.running.states.copy()
+    seen[1, 1] -= 0.5  # a vehicle is slower than it can be
+    decision = shield.decide(np.ones((3, 3)), seen=seen)
+    assert shield.distrusted.tolist() == [False, True, False]
+    assert [REASONS[each] for each in decision.reason[1]] == ["assumption broken"] * 3
+    assert decision.intervened[1].all() and (decision.applied[1] <= 0.0).all()
+
+
+# Behind the interfaces.
+
+
+def test_parallel__a_team_proposes_where_nobody_does_and_one_may_be_left_out():
+    front_alone = {"vehicle_2": eb.make_agent("full_brake"), "vehicle_3": eb.make_agent("coast")}
+    brake = eb.make_agent("full_brake")
+    for policy, given, proposed in (
+        (front_alone, {"vehicle_3": [0.5]}, [-1.0, 0.5]), (brake, {}, [-1.0, -1.0]),
+        (eb.Team.of(brake, (1, 2)), {}, [-1.0, -1.0]),
+    ):  # fmt: skip
+        env = eb.HybridShield(eb.parallel_env("cooperation-3-pair"), policy, mode="step")
+        env.reset(seed=1)
+        *_, infos = env.step(given)
+        assert [infos[agent]["shield"]["proposed_action"] for agent in env.shielded] == proposed
+
+
+@pytest.mark.parametrize("settings", [{"shares": True}, {"cap": "baseline"}, {"shares": True, "harm_count": "total"}])
+@pytest.mark.parametrize("scenario", ["cooperation-4-all", "paper-random"])
+def test_shares__at_the_end_are_what_the_ledger_says(scenario, settings):
+    env = eb.HybridShield(eb.parallel_env(scenario), mode="step", **settings)
+    differed = 0
+    for seed in range(4):
+        infos = all_infos(env, {agent: [0.6] for agent in env.shielded}, seed=seed)
+        ledger, count = env.unwrapped.engine.ledger, settings.get("harm_count", "first")
+        borne = ledger.vehicle_harm(count)[0]
+        for agent in env.shielded:
+            first, *_, last = told = [each[agent]["shield"] for each in infos]
+            bounds = [each["bound_harm"] for each in told]  # common to all, and never rising
+            assert bounds == [each[env.shielded[0]]["shield"]["bound_harm"] for each in infos]
+            assert bounds == sorted(bounds, reverse=True) and bounds[-1] == ledger.world_harm(count)[0]
+            assert all(each["proposed_action"] == 0.6 and each["trusted"] for each in told[1:])
+            assert set(first) == set(last) and last["own_harm"] == borne[int(agent[-1]) - 1]
+            assert last["baseline_own_harm"] == first["own_harm"] == first["baseline_own_harm"]
+            assert last["own_harm"] <= last["baseline_own_harm"] or "cap" not in settings
+            differed += last["own_harm"] != last["baseline_own_harm"]
+    assert differed > 0
+
+
+# In evaluations.
+
+
+def test_drive_chunks__is_what_the_shielded_team_does_whatever_the_chunk(monkeypatch):
+    worlds, task = PAIR.sample(12, 7).worlds, Task(PAIR, (1, 2), "total")
+    team = ShieldedDriver(eb.Team.of(eb.make_agent("coast"), (1, 2)), PAIR, harm_count="total", logging=True)
+    for _ in range(2):  # a second batch begins anew
+        episodes = drive(worlds, team.on((1, 2)), PAIR)
+        ledger, shield = episodes.ledger, episodes.guarded.shield
+        whole = Shielded.driven(eb.make_agent("coast"), worlds, task)
+        assert whole.harm.tolist() == ledger.world_harm("total").tolist() == shield.bound.tolist()
+        assert whole.vehicle_harm.tolist() == ledger.vehicle_harm("total").tolist() == shield.shares().tolist()
+        assert whole.bound.tolist() == shield.predicted_harm.tolist() and (whole.harm <= whole.bound).all()
+        assert whole.baseline.tolist() == shield.baseline_shares.tolist() and not shield.distrusted.any()
+    logged = np.zeros((12, 2), np.int64)
+    np.add.at(logged, tuple(np.transpose([(entry.world, entry.vehicle - 1) for entry in shield.log])), 1)
+    assert whole.replaced.tolist() == logged.tolist() and (logged.sum(axis=0) > 0).all()
+    assert (whole.replaced <= whole.decisions[:, np.newaxis]).all()
+    monkeypatch.setattr(behind_module, "CHUNK", 5)
+    parts = Shielded.driven(eb.make_agent("coast"), worlds, task)
+    assert all(np.array_equal(*columns) for columns in zip(whole, parts, strict=True))
+    assert Shielded.stack([whole, parts]).replaced.shape == (2, 12, 2)
+
+
+def test_evaluation__later_rollouts_of_the_team_let_more_of_it_through():
+    @Acts
+    def late(worlds, vehicle):
+        """Coasts for 0.3 s, then brakes fully."""
+        return np.where(worlds.time_s < 0.8, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle])
+
+    worlds, replaced = PAIR.sample(60, 11).worlds, {}
+    for later in (True, False):
+        episodes = drive(worlds, ShieldedDriver(eb.Team.of(late, (1, 2)), PAIR, later_rollouts=later).on((1, 2)), PAIR)
+        assert (episodes.ledger.world_harm("first") <= episodes.guarded.shield.predicted_harm).all()
+        replaced[later] = episodes.guarded.shield.interventions.sum()
+    assert replaced[True] < replaced[False]

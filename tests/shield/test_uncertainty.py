@@ -1,7 +1,5 @@
 """Intervals, the members that stand for them, and robust mode, whose bound holds in every member."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -118,17 +116,6 @@ def test_every_member__realises_at_most_the_bound_to_the_bit(N, harm_count, who)
         assert not shield.distrusted.any()
         tight += int((harm > 0.9 * shield.bound).sum())
     assert tight > 0  # the bound is not out of reach
-
-
-def test_every_member__is_bounded_by_the_same_actions():
-    """What is applied in the world as told leaves the harm of each corner below the bound, too."""
-    scenario = line(3)
-    shield = begun(scenario, scenario.sample(8, 5).worlds, uncertainty=parse_uncertainty(EVERY[3]))
-    rng, first, start = np.random.default_rng(0), shield.first_bound.copy(), shield.running
-    while not shield.running.finished.all():
-        shield.decide(rng.uniform(-1.0, 1.0, 8))
-    assert plan_harm(start, shield.backup.plan).tolist() == shield.bound.tolist()
-    assert (shield.bound <= first).all() and (first > 0.0).any()
 
 
 @pytest.mark.parametrize(("harm_count", "robust"), [("first", "corners"), ("total", "corners"), ("first", "interior")])

@@ -1,7 +1,5 @@
 """The shield on every interface: what it tells, takes off the reward, lets go of, and that nothing interferes."""
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 import pytest
@@ -78,8 +76,7 @@ def test_interfaces__have_every_mode_and_the_penalty_and_tell_the_bound_after_a_
                 assert start.keys() == step.keys() and step["mode"] == mode.partition(":")[0]
         assert all(each["bound_harm"] > 0.0 == each["proposed_action"] and not each["intervened"] for each in starts)
         paid.append(np.array(rewards).reshape(3, -1))
-    assert np.any(intervened)
-    assert paid[0] - paid[1] == pytest.approx(7.0 * np.array(intervened), abs=1e-5)
+    assert np.any(intervened) and paid[0] - paid[1] == pytest.approx(7.0 * np.array(intervened), abs=1e-5)
 
 
 def test_policy__proposes_where_nobody_does_and_is_replaced_where_it_says_no_number():
