@@ -658,10 +658,10 @@ def builds_up(table: Floats) -> bool:
 @compiled(bare=True)
 def built_up(table: Floats) -> bool:
     """Whether every force is the command in effect, so that until the next onset the motion is that of ``move``."""
+    there = True
     for i in range(table.shape[1]):
-        if table[ROW.FORCE, i] != table[ROW.COMMAND, i] * table[ROW.ACTIVE, i]:
-            return False
-    return True
+        there = there and table[ROW.FORCE, i] == table[ROW.COMMAND, i] * table[ROW.ACTIVE, i]
+    return there
 
 
 @compiled
@@ -906,7 +906,12 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
         if table[ROW.ACTIVE, i] == 0.0:
             soonest = min(soonest, table[ROW.ONSET, i] - now)
     for i in range(vehicles):
-        speed, rate, jerk, limit = table[ROW.SPEED, i], table[ROW.ACCELERATION, i], table[ROW.JERK, i], table[ROW.LIMIT, i]
+        speed, rate, jerk, limit = (
+            table[ROW.SPEED, i],
+            table[ROW.ACCELERATION, i],
+            table[ROW.JERK, i],
+            table[ROW.LIMIT, i],
+        )
         most = (abs(rate) + abs(jerk) * soonest) * soonest  # by so much the speed can change
         time, value = math.inf, 0.0
         if most >= abs(speed):

@@ -14,7 +14,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents import make_agent
 from ethbrake_marl.agents.registry import drive
 from ethbrake_marl.files.yaml import flow_text
-from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds, stopping_distances
+from ethbrake_marl.physics import Floats, Ints, Worlds, advance, make_worlds, stopping_distances
 from ethbrake_marl.scenario import QUANTITY, Scenario, Task, load_scenario
 from ethbrake_marl.shield.guard import put_shield
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
@@ -52,15 +52,16 @@ def random_lines(key: int, n: int, N: int, *, obstacle: bool = False) -> tuple[d
     return given, [np.where(share < 0.0, -share * low, share * high) for share in shares]
 
 
-def played(worlds: Worlds, commands: list[Floats]) -> tuple[Worlds, Floats]:
-    """The worlds at the last switch, and the total harm of each pair, the obstacle first where there is one."""
-    harm = np.zeros(worlds.gaps_m.shape)
+def played(worlds: Worlds, commands: list[Floats]) -> tuple[Worlds, Floats, Ints]:
+    """The worlds at the last switch, the total harm of each pair (an obstacle's first), and the number of impacts."""
+    harm, count = np.zeros(worlds.gaps_m.shape), np.zeros(worlds.n, np.int64)
     ahead = np.zeros((worlds.n, 1))
     for command, until in zip(commands, SWITCHES_S[1:], strict=True):
         worlds, impacts = advance(worlds, command, until_s=until)
         harm += impacts.total_harm
         ahead[:, 0] += impacts.obstacle_total_harm
-    return worlds, np.concatenate([ahead, harm], axis=1) if worlds.obstacle_ahead.any() else harm
+        count += impacts.count.sum(axis=1) + impacts.obstacle_count
+    return worlds, np.concatenate([ahead, harm], axis=1) if worlds.obstacle_ahead.any() else harm, count
 
 
 def by_small_steps(given: dict[str, Floats], commands: list[Floats], step_s: float) -> tuple[Floats, ...]:
@@ -163,7 +164,7 @@ def test_rates_too_high_to_matter__leave_the_motion_as_it_is() -> None:
     given, commands = random_lines(5, 40, 3)
     at_once = make_worlds(**given | {"brake_rate_mps3": np.inf, "release_rate_mps3": np.inf})
     nearly = make_worlds(**given | {"brake_rate_mps3": 1e9, "release_rate_mps3": 1e9})
-    (one, harm), (other, same) = played(at_once, commands), played(nearly, commands)
+    (one, harm, _), (other, same, _) = played(at_once, commands), played(nearly, commands)
     np.testing.assert_allclose(other.speeds_mps, one.speeds_mps, atol=1e-5)
     np.testing.assert_allclose(same, harm, rtol=1e-5, atol=1e-5)
 
@@ -174,7 +175,7 @@ def test_rates_too_high_to_matter__leave_the_motion_as_it_is() -> None:
 @pytest.mark.parametrize(("key", "N", "obstacle"), [(1, 2, False), (2, 3, True), (3, 5, False)])
 def test_motion__is_that_of_small_steps(key: int, N: int, obstacle: bool) -> None:
     given, commands = random_lines(key, 12, N, obstacle=obstacle)
-    worlds, harm = played(make_worlds(**given), commands)
+    worlds, harm, _ = played(make_worlds(**given), commands)
     gaps, speeds, forces, total = by_small_steps(given, commands, 1e-4)
     assert (harm.sum(axis=1) > 1.0).sum() > 4
     np.testing.assert_allclose(forces, worlds.command_mps2, atol=1e-9)
@@ -187,9 +188,9 @@ def test_motion__is_that_of_small_steps(key: int, N: int, obstacle: bool) -> Non
 def test_world__has_the_same_bits_in_any_batch_and_split_the_same_motion() -> None:
     given, commands = random_lines(9, 30, 4, obstacle=True)
     worlds = make_worlds(**given)
-    whole, harm = played(worlds, commands)
+    whole, harm, _ = played(worlds, commands)
     for k in (0, 7, 29):
-        alone, own = played(worlds.take([k]), [each[[k]] for each in commands])
+        alone, own, _ = played(worlds.take([k]), [each[[k]] for each in commands])
         assert alone.gaps_m.tobytes() == whole.gaps_m[[k]].tobytes() and own.tobytes() == harm[[k]].tobytes()
     half = [advance(advance(worlds, commands[0], until_s=0.3)[0], commands[0], until_s=0.75)[0]]
     straight, _ = advance(worlds, commands[0], until_s=0.75)
