@@ -1,11 +1,12 @@
-"""``ethbrake doctor``: what it finds wrong, what it compiles, and the table of speeds (measured in tests/studies)."""
-
-from __future__ import annotations
+"""``ethbrake doctor``: what it finds wrong, what it compiles, what it measures. No speed is asserted."""
 
 import dataclasses
+import math
 import re
+import time
 from unittest.mock import Mock, call
 
+import numba
 import numpy as np
 import pytest
 from packaging.requirements import Requirement
@@ -14,9 +15,21 @@ from ethbrake_marl import physics, scenario
 from ethbrake_marl.agents import e_v2x_bm
 from ethbrake_marl.cli import doctor
 from ethbrake_marl.cli.doctor import Check, diagnose
+from ethbrake_marl.envs import make_engine
 from ethbrake_marl.kernel_store import cache_folder
-from ethbrake_marl.studies import speed
-from ethbrake_marl.studies.speed import Benchmark, Speed, this_machine
+from ethbrake_marl.physics import advance, make_worlds
+from ethbrake_marl.studies import speed, speed as benchmark
+from ethbrake_marl.studies.speed import (
+    BENCHMARKS,
+    Benchmark,
+    Effort,
+    Speed,
+    brake_apart,
+    braking,
+    measure,
+    rates,
+    this_machine,
+)
 from tests.cli.conftest import Command, told_json
 
 
@@ -143,3 +156,68 @@ def test_speed__prints_a_table_and_the_machine_or_json(ethbrake: Command, monkey
     assert (told["figures"][0]["value"], told["figures"][0]["relative"]) == (9_876_543.0, 1.0)
     assert told["machine"]["cores"] >= 1 and told["machine"]["processor"] and "speed: 1 of 3" in answer.err
     assert [each.call_args_list for each in look] == [[call(speed.FULL), call(speed.QUICK)]] * 3
+
+
+# ---------------------------------------------------------------- speed
+
+
+SHORT = Effort(1, 1e-6)
+
+
+def test_rates__are_work_per_processor_second_without_the_first_round(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, durations = [0.0], iter([9.0, 0.25, 0.25, 1.0])  # the first round, two calls, one call
+
+    def work() -> int:
+        clock[0] += next(durations)
+        return 10
+
+    monkeypatch.setattr(time, "process_time", lambda: clock[0])
+    assert rates(work, Effort(2, 0.5)).tolist() == [10.0, 40.0]
+
+
+def test_measure__sets_world_steps_against_the_first_figure(monkeypatch: pytest.MonkeyPatch) -> None:
+    def figure(unit: str, *values: float) -> Benchmark:
+        return Benchmark("x", "y", unit, 5, None, lambda effort: np.array(values))
+
+    figures = (figure("world-steps/s", 7.0, 8.0, 9.0), figure("s", 4.0), figure("world-steps/s", 1.0, 2.0, 2.0))
+    monkeypatch.setattr(benchmark, "BENCHMARKS", figures)
+    found = measure()
+    assert [speed.relative for speed in found] == [1.0, None, 0.25]
+    assert [(speed.lowest, speed.value, speed.highest) for speed in found] == [(7, 8, 9), (4, 4, 4), (1, 2, 2)]
+
+
+def test_braking__counts_world_steps_to_rest() -> None:
+    worlds = make_engine(benchmark.SCENARIO, 5, seed=benchmark.SEED).worlds
+    command = -worlds.vehicles.braking_capacity_mps2
+    steps = 0
+    while worlds.speeds_mps.any():
+        worlds, steps = advance(worlds, command, 0.1)[0], steps + 1
+    assert braking(5, 1.0)() == 5 * steps and steps > 20
+
+
+def test_until_rest__ends_where_nothing_ever_rests() -> None:
+    physical = dict.fromkeys(("driving_capacity_mps2", "latency_s", "restitution"), 0.0)
+    coasting = make_worlds(10.0, [20.0, 20.0], braking_capacity_mps2=6.0, mass_t=1.0, **physical)
+    assert benchmark.until_rest(coasting, np.zeros((1, 2)))() == benchmark.MOST_STEPS
+
+
+def test_calibration__brakes_by_half_a_metre_per_second_and_starts_again() -> None:
+    speeds, ways = np.full((2, 3), 20.0), np.zeros((2, 3))
+    assert brake_apart(speeds, ways, 2) == 4
+    assert (speeds == 19.0).all() and ways == pytest.approx(0.05 * (39.5 + 38.5))
+    brake_apart(speeds, ways, 38)
+    assert (speeds == 20.0).all()
+
+
+@pytest.mark.parametrize(
+    "each", [pytest.param(each, marks=pytest.mark.slow if each.unit == "s" else ()) for each in BENCHMARKS]
+)
+def test_benchmarks__each_measures_something(each: Benchmark) -> None:
+    speed = each.measure(SHORT)
+    assert each.workload and each.worlds >= 1 and 0.0 < speed.lowest == speed.value == speed.highest < math.inf
+
+
+def test_machine__is_named_in_words() -> None:
+    machine = this_machine()
+    parts = (machine.processor, f"{machine.cores_usable} of {machine.cores} cores", f"numba {numba.__version__}")
+    assert machine.processor and all(part in str(machine) for part in parts)

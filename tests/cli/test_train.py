@@ -1,7 +1,6 @@
 """``ethbrake run``, ``train`` with ``resume`` and ``curves``, ``agent export``, on trainings of a few small updates."""
 
-from __future__ import annotations
-
+import csv
 import inspect
 import json
 import shutil
@@ -9,13 +8,16 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
+import numpy as np
 import onnx
 import pytest
 import yaml
 
+import ethbrake_marl as eb
 from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.cli.command import Out
 from ethbrake_marl.evaluation import evaluate, summarise
@@ -25,7 +27,7 @@ from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.policies import load_policy
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies import experiment
-from ethbrake_marl.studies.experiment import run_folder, write_figures
+from ethbrake_marl.studies.experiment import results_csv, run_folder, telling_world, write_figures
 from tests.cli.conftest import TINY_RECIPE, Answer, Command, check_refused, rows_of, told_json
 
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "ppo", "hybrid"]
@@ -313,3 +315,37 @@ def test_export__writes_onnx(ethbrake: Command, finished_run: Path, tmp_path: Pa
     assert [output.name for output in graph.output] == ["action", "acceleration_mps2"]
     monkeypatch.setitem(sys.modules, "onnx", None)  # not installed: the output is looked at before that is
     check_refused(ethbrake(*line), "is there already")
+
+
+# ---------------------------------------------------------------- parts of a report
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "row"),
+    [
+        ([9.0, 0.0, 5.0, 7.0], [1.0, 0.0, 4.0, 2.0], 3),  # savings 8, -, 1, 5
+        ([4.0, 3.0], [0.0, 0.0], 1),  # of two, the smaller saving
+        ([0.0, 0.0], [0.0, 5.0], 0),  # full braking harms nobody
+    ],
+)
+def test_telling_world__is_the_median_saving_among_harmful_worlds(before, after, row):
+    harms = {"full_brake": before, "ppo": after}
+    by_count = {name: {"first": np.ones(4), "total": np.array(harm)} for name, harm in harms.items()}
+    outcome = {name: SimpleNamespace(world_harm=found.__getitem__) for name, found in by_count.items()}
+    evaluation = SimpleNamespace(outcome=outcome.__getitem__, outcomes=harms)
+    assert telling_world(evaluation, "total") == row
+
+
+def test_results_csv__an_interval_becomes_two_columns_and_nothing_an_empty_cell():
+    scenario = eb.load_scenario("paper-random")
+    rows = eb.summarise(
+        eb.evaluate(scenario.sample(3, 1), make_lineup(["coast", "e_v2x_bm"], scenario), scenario=scenario)
+    )
+    head, coast, bm = csv.reader(results_csv(rows).splitlines())
+    column = {name: k for k, name in enumerate(head)}
+    assert "parameters" not in column
+    assert float(coast[column["first_impact_harm_low"]]) == rows[0].first_impact_harm.interval[0]
+    assert float(coast[column["first_impact_harm_high"]]) == rows[0].first_impact_harm.interval[1]
+    assert coast[column["predicted_harm"]] == ""
+    assert float(bm[column["predicted_harm"]]) == rows[1]["predicted_harm"].value
+    assert coast[column["harm_decrease_first"]] == ""  # full braking was not evaluated

@@ -14,18 +14,26 @@ import pytest
 from ethbrake_marl.agents.e_v2x_bm import optimise_pairwise, pairwise_harm
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.scenario import load_scenario
-from tests.docs.blocks import (
+from tests.docs.printed import (
+    BLOCKS,
+    EXACT,
+    MEASURED,
+    PICTURES,
     ROOT,
+    TABLES,
+    How,
     Shown,
     agrees,
     commands_of,
+    how,
     missing_figures,
     pages,
     pictures,
     printed_blocks,
+    results,
     tables_of_figures,
+    where_rows,
 )
-from tests.docs.printed import BLOCKS, EXACT, MEASURED, PICTURES, TABLES, How, how, results, where_rows
 from tests.docs.site import DOCS, load
 from tests.programmes.libraries import harm_of_howto
 

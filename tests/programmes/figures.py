@@ -21,17 +21,23 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from tests.docs.blocks import (
+from tests.docs.printed import (
+    BLOCKS,
+    NIGHTLY,
+    PICTURES,
     ROOT,
+    TABLES,
+    How,
     Shown,
     agrees,
     commands_of,
+    how,
     missing_figures,
     pictures,
     printed_blocks,
+    results,
     tables_of_figures,
 )
-from tests.docs.printed import BLOCKS, NIGHTLY, PICTURES, TABLES, How, how, results
 from tests.programmes import Cases, Told
 
 PROGRESS = re.compile(r": [\d,]+ of [\d,]+$|^compiling ")
