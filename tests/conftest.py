@@ -1,7 +1,5 @@
 """What holds for every test: one thread, no display, the same examples in every run."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import functools

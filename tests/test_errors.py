@@ -1,7 +1,5 @@
 """What a message may hold: one line, of bounded length, that commands no terminal."""
 
-from __future__ import annotations
-
 import pytest
 from rich.text import Text
 

@@ -1,7 +1,5 @@
 """Worlds that cannot be advanced: every layer names them by the rows of its own batch, and the others go on."""
 
-from __future__ import annotations
-
 import pickle
 from dataclasses import replace
 

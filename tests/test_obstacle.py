@@ -1,7 +1,5 @@
 """An obstacle ahead of Vehicle 1, from the scenario to the results: every module counts it, and counts it alike."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

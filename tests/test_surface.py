@@ -1,7 +1,5 @@
 """The public names of the package: each listed once, shown by an example that runs, and described."""
 
-from __future__ import annotations
-
 import ast
 import doctest
 import inspect

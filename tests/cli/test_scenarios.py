@@ -1,7 +1,5 @@
 """``ethbrake scenario`` and ``ethbrake recipe``, ``--set``, and the pages that show them."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

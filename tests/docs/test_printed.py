@@ -1,7 +1,5 @@
 """Everything that the pages show as printed has its place where it is compared; what is quick is compared here."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The documentation site, as far as it can be looked at without Sphinx; `make docs` builds it."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Statistics: exact sums, intervals of rates, means and ratios, and what is told over seeds."""
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
 from typing import Any

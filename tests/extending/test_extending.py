@@ -1,7 +1,5 @@
 """Parts of the user's own: trained with, evaluated, told in every output; refusals: ``refusals/extending.txt``."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

@@ -1,7 +1,5 @@
 """Figures: the curves of a list and of a training, criticality maps, trajectories; drawn from the very numbers."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Algorithms: one of the user's own, how weights become ours, and learning from counterfactuals, modes, options."""
 
-from __future__ import annotations
-
 import copy
 import itertools
 import json

@@ -1,7 +1,5 @@
 """A training that was stopped, killed or damaged goes on to the same bits, or is refused and left as it is."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import random

@@ -1,7 +1,5 @@
 """A training from its first decision to its last: what it leaves, tells and measures, when it stops, and its files."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

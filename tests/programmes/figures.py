@@ -5,9 +5,6 @@ numbers that its commands tell. What is compared by `make test`, and what by not
 search or one machine's speed, is said in tests/docs/printed.py and docs/tests.md.
 """
 
-from __future__ import annotations
-
-import argparse
 import os
 import re
 import shlex
@@ -38,7 +35,7 @@ from tests.docs.printed import (
     results,
     tables_of_figures,
 )
-from tests.programmes import Cases, Told
+from tests.programmes import Cases, Given, Told
 
 PROGRESS = re.compile(r": [\d,]+ of [\d,]+$|^compiling ")
 
@@ -122,6 +119,6 @@ def compare(kind: str, shown: Shown, place: How) -> Told:
     return Told(not found, "\n        ".join(f"{each:.200}" for each in found) or "the same")
 
 
-def cases(given: argparse.Namespace) -> Cases:
+def cases(given: Given) -> Cases:
     for kind, shown, place in nightly():
         yield f"{shown.page}: {shown.begin:.70}", partial(compare, kind, shown, place)

@@ -5,8 +5,6 @@ the wrong YAML, each value exchanged for others, and what ``hostile.yaml`` lists
 run folders are damaged in ways of their own.
 """
 
-from __future__ import annotations
-
 import atexit
 import hashlib
 import json

@@ -6,9 +6,6 @@ the actions of policies. First as this machine does, then in one process for eac
 numpy, the C library, OpenBLAS or numba behave as on an older processor.
 """
 
-from __future__ import annotations
-
-import argparse
 import hashlib
 import json
 import math
@@ -29,7 +26,7 @@ from ethbrake_marl.limits.lower_bound import lower_bound
 from ethbrake_marl.policies import load_shipped, shipped_policies
 from ethbrake_marl.scenario import list_scenarios, load_scenario
 from tests.golden.test_golden import SHIELDS, decisions_hash, figures, sampled
-from tests.programmes import Cases, Told, watched
+from tests.programmes import Cases, Given, Told, watched
 
 SETTINGS: dict[str, dict[str, str]] = {
     "numpy without AVX-512": {"NPY_DISABLE_CPU_FEATURES": "X86_V4"},
@@ -126,7 +123,7 @@ TELL = "from tests.programmes import machines; machines.tell()"
 OPTIONS = {"--sample": {"action": "store_true", "help": "without the settings that compile everything anew"}}
 
 
-def cases(given: argparse.Namespace) -> Cases:
+def cases(given: Given) -> Cases:
     here: dict[str, str] = {}
 
     def differing(setting: dict[str, str]) -> Told:

@@ -3,9 +3,6 @@
 The claims of ``tests/physics``, with the tolerances of ``tests/reference/tolerances.py``, on many more worlds.
 """
 
-from __future__ import annotations
-
-import argparse
 import json
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -46,7 +43,7 @@ from tests.physics.random_worlds import (
 )
 from tests.physics.segments import Scan, random_segments, scan
 from tests.physics.test_oracles import accelerations, at_once, exact_accelerations, in_steps, law_error_eps
-from tests.programmes import Cases, Told
+from tests.programmes import Cases, Given, Told
 from tests.reference.tolerances import (
     BOUNCE_SERIES_EPS,
     CLUSTER_EPS,
@@ -84,7 +81,7 @@ def measured(measure: Callable[[], Figure]) -> Told:
     return Told(value <= threshold, f"{value:.3g} <= {threshold:.3g}, {of}")
 
 
-def cases(given: argparse.Namespace) -> Cases:
+def cases(given: Given) -> Cases:
     for name, measure in GATES.items():
         yield name, partial(measured, measure)
 

@@ -1,8 +1,5 @@
 """Resuming: processes that train are killed (-9) at random moments, and must lose nothing."""
 
-from __future__ import annotations
-
-import argparse
 import hashlib
 import multiprocessing
 import random
@@ -15,7 +12,7 @@ from pathlib import Path
 from ethbrake_marl.learning.runs import newest_usable, resume, train
 from ethbrake_marl.learning.training import TrainingRecipe, load_recipe
 from ethbrake_marl.scenario import load_scenario
-from tests.programmes import Cases, Told
+from tests.programmes import Cases, Given, Told
 
 SOON_S = 300.0
 
@@ -147,7 +144,7 @@ OPTIONS = {
 }
 
 
-def cases(given: argparse.Namespace) -> Cases:
+def cases(given: Given) -> Cases:
     with tempfile.TemporaryDirectory() as scratch:
         for what in ("ppo", "sac", "independent"):
             (Path(scratch) / what).mkdir()

@@ -1,7 +1,5 @@
 """The programmes: their runner, what they say on the pages, samples of long ones, the hostile one's cage, faults."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re

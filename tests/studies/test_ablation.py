@@ -1,7 +1,5 @@
 """``study ablate`` and ``generalise``: levels, trainings, joint optima, what is compared and shown, longer lines."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """The benchmark: scores by hand, entries and the leaderboard of a small suite, and suite v2 with its frozen bits."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,14 +1,12 @@
 """Planted weaknesses are found, and sooner than at random."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.defaults import HARM_COUNTS, MeasureName
+from ethbrake_marl.defaults import HARM_COUNTS, HarmCount, MeasureName
 from ethbrake_marl.physics import Bools, Floats, Worlds
 from ethbrake_marl.studies.falsification import APART, Measure, Scored, far_apart, search
 
@@ -36,7 +34,7 @@ def test_falsify__keeps_nothing_where_nothing_is_wrong() -> None:
 
 
 @pytest.mark.parametrize("harm_count", HARM_COUNTS)
-def test_falsify__the_bound_of_the_shield_holds_where_it_is_tightest(harm_count: eb.HarmCount) -> None:
+def test_falsify__the_bound_of_the_shield_holds_where_it_is_tightest(harm_count: HarmCount) -> None:
     measure = Measure.of("bound", "coast+step", None, SCENARIO, harm_count)
     found = measure.falsify(256, 1)
     assert max(world.score for world in found.worlds) <= 1e-9 and found.sample.worlds.n > 3

@@ -1,7 +1,5 @@
 """The paper made again: verdicts that follow from numbers, its items, and the folder and pages of a reproduction."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping
