@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.engine import Engine
+import ethbrake_marl as eb
 from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import WithoutEffect
 from ethbrake_marl.harm import (
@@ -25,7 +24,6 @@ from ethbrake_marl.harm import (
 )
 from ethbrake_marl.physics import Floats, Impacts, Worlds, advance, forecast, make_worlds
 from ethbrake_marl.rewards import REWARDS, RewardParams, StepOutcome, reward_params
-from ethbrake_marl.scenario import Scenario, load_scenario
 from tests.contract.interfaces import CRASH, REST
 from tests.physics.random_worlds import driving_lines, line
 from tests.reference.tolerances import EPS
@@ -120,7 +118,7 @@ def test_ledger__the_harm_of_the_obstacle_is_that_of_vehicle_1_alone() -> None:
 
 # ---------------------------------------------------------------- objectives
 
-PAPER = load_scenario("paper-random")
+PAPER = eb.load_scenario("paper-random")
 EACH = [*STANDARD, "social:30", "social:90", "weighted:1,4,2"]
 
 
@@ -157,10 +155,10 @@ def test_objective_harm__by_hand(objective: Any, harm_count: str, expected: list
     assert list(told) == [name] and told[name].tolist() == found.tolist()
 
 
-def played(reward: Any, scenario: Scenario = PAPER, n: int = 60) -> tuple[Floats, Engine]:
+def played(reward: Any, scenario: eb.Scenario = PAPER, n: int = 60) -> tuple[Floats, eb.Engine]:
     """The sum of rewards of each vehicle, and the engine at the end."""
-    scripts = {i: make_agent(script) for i, script in scenario.scripts.items()}
-    engine = Engine(scenario, n, learners=scenario.learners, scripts=scripts, reward=reward, seed=4)
+    scripts = {i: eb.make_agent(script) for i, script in scenario.scripts.items()}
+    engine = eb.Engine(scenario, n, learners=scenario.learners, scripts=scripts, reward=reward, seed=4)
     action, total = np.random.default_rng(2).uniform(-1.0, 0.0, (n, len(scenario.learners))), 0.0
     while not engine.ended.all():
         total += engine.step(action).reward
@@ -197,7 +195,7 @@ def test_reward__weight_and_other_terms_stay_what_they_are() -> None:
 def test_objective__round_trips_with_its_scenario() -> None:
     for objective in (*EACH, ["own", "social:45", "total"]):
         scenario = PAPER.replace(objective=objective)
-        assert Scenario(**scenario.declared()) == scenario
+        assert eb.Scenario(**scenario.declared()) == scenario
     assert parse_objective("social:45").angle_deg == 45.0
     assert reward_params("harm").objective is None
 
@@ -206,7 +204,7 @@ def test_objective__round_trips_with_its_scenario() -> None:
 
 
 near = pytest.approx
-PAPER = load_scenario("paper-random")
+PAPER = eb.load_scenario("paper-random")
 
 
 def sigmoid(x: float) -> float:
@@ -317,7 +315,7 @@ def test_settings__are_those_of_the_page() -> None:
     ids=["crash", "safe at the horizon", "at rest"],
 )
 def test_terminal__is_paid_at_rest_and_at_the_horizon_after_no_collision_and_once(
-    scenario: Scenario, action: float, paid: int | None, truncated: int | None
+    scenario: eb.Scenario, action: float, paid: int | None, truncated: int | None
 ) -> None:
     engine = make_engine(scenario, 1, reward=RewardParams(harm=0.0, terminal=3.0))
     results = [engine.step(np.full((1, 1), action)) for _ in range(11)]
@@ -374,7 +372,7 @@ def potential_in_rounds(worlds: Worlds, rounds: int) -> np.ndarray:
 
 
 def test_potential__of_two_learners_lets_each_choose_given_the_other_twice_round() -> None:
-    worlds = load_scenario("cooperation-3-pair").sample(300, seed=3).worlds
+    worlds = eb.load_scenario("cooperation-3-pair").sample(300, seed=3).worlds
     braking, shares = worlds.vehicles.braking_capacity_mps2, np.linspace(0.0, 1.0, 9)
     found = RewardParams().potential(worlds, (0, 1), 8.0)
     assert found == near(potential_in_rounds(worlds, 2), abs=1e-12)
@@ -390,7 +388,7 @@ def test_potential__of_two_learners_lets_each_choose_given_the_other_twice_round
 
 
 def test_reward__without_harm_says_that_the_scenarios_objective_changes_nothing() -> None:
-    own = load_scenario("cooperation-3-pair").replace(objective="own")
+    own = eb.load_scenario("cooperation-3-pair").replace(objective="own")
     with pytest.warns(WithoutEffect, match="the scenario's objective, own, changes nothing"):
         paid = make_engine(own, 2, reward="paper", seed=1)
     assert paid.reward.objective is None

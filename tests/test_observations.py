@@ -8,17 +8,14 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl import observations
-from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.observations import FORECAST_S, GROUPS, ObservationSpec, choose_observation, observe
-from ethbrake_marl.physics import Worlds, advance, make_worlds
-from ethbrake_marl.scenario import load_scenario, observation_for
 from tests.fixtures.policies import make_policy
 from tests.physics.random_worlds import line
 
 near = pytest.approx
 SPEC = ObservationSpec(front=2, rear=1)
-START = make_worlds(
+START = eb.make_worlds(
     [[8.0, 6.0, 10.0]],
     [[20.0, 18.0, 22.0, 10.0]],
     braking_capacity_mps2=[6.0, 7.0, 5.0, 8.0],
@@ -28,10 +25,10 @@ START = make_worlds(
     restitution=0.1,
 )
 COMMAND = [-6.0, 0.0, -5.0, 0.0]
-WORLDS = advance(START, COMMAND, until_s=0.5)[0]
+WORLDS = eb.advance(START, COMMAND, until_s=0.5)[0]
 
 
-def by_name(vehicle: int, worlds: Worlds = WORLDS, spec: ObservationSpec = SPEC) -> dict[str, float]:
+def by_name(vehicle: int, worlds: eb.Worlds = WORLDS, spec: ObservationSpec = SPEC) -> dict[str, float]:
     return dict(zip([f.name for f in spec.features], observe(worlds, vehicle, spec)[0].tolist(), strict=True))
 
 
@@ -79,14 +76,14 @@ def test_observe__what_is_not_known_or_not_there_reads_zero() -> None:
 
 
 def test_observe__hit_flag_belongs_to_the_pair_on_that_side() -> None:
-    struck, _ = advance(WORLDS, COMMAND, until_s=2.0)
+    struck, _ = eb.advance(WORLDS, COMMAND, until_s=2.0)
     assert struck.pair_hit.tolist() == [[True, False, False]]
     hits = [[value for name, value in by_name(i, struck).items() if name.endswith(".hit")] for i in (1, 2)]
     assert hits == [[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]  # of front_1, front_2 and rear_1
 
 
 def test_observe__is_clipped_to_the_stated_bounds() -> None:
-    far = make_worlds([1e6], [1.0, 1e4], braking_capacity_mps2=100.0, driving_capacity_mps2=100.0, latency_s=0.0,
+    far = eb.make_worlds([1e6], [1.0, 1e4], braking_capacity_mps2=100.0, driving_capacity_mps2=100.0, latency_s=0.0,
                       mass_t=1e5, restitution=1.0, speed_limit_mps=1e5)  # fmt: skip
     seen = observe(far, 1, SPEC)[0]
     low, high = (np.array([getattr(f, side) for f in SPEC.features], np.float32) for side in ("low", "high"))
@@ -96,14 +93,15 @@ def test_observe__is_clipped_to_the_stated_bounds() -> None:
 @pytest.mark.parametrize(("speed", "reads"), [(0.0, 0.0), (0.1, 0.5), (0.2, 2.0), (20.0, 2.0)])
 def test_observe__without_room_the_fitting_deceleration_is_that_of_one_millimetre(speed: float, reads: float) -> None:
     # v^2 / (2 * 0.001 m) = 500 v^2 m/s2, scale 10 and clipped at 2: 0.1 m/s reads 5 / 10.
-    touching = make_worlds([0.0], [0.0, speed], braking_capacity_mps2=6, driving_capacity_mps2=1, latency_s=0, mass_t=1,
-                           restitution=0)  # fmt: skip
+    touching = eb.make_worlds(
+        [0.0], [0.0, speed], braking_capacity_mps2=6, driving_capacity_mps2=1, latency_s=0, mass_t=1, restitution=0
+    )
     assert by_name(1, touching, ObservationSpec(1, 0))["front_1.fitting_deceleration"] == near(reads, rel=1e-6)
 
 
 def test_observation_for__adds_place_and_obstacle_only_where_there_is_one() -> None:
-    assert observation_for(load_scenario("paper-random")) == ObservationSpec(1, 1)
-    spec = observation_for(load_scenario("cooperation-4-all"))
+    assert eb.observation_for(eb.load_scenario("paper-random")) == ObservationSpec(1, 1)
+    spec = eb.observation_for(eb.load_scenario("cooperation-4-all"))
     assert spec == ObservationSpec(1, 1, role=True, obstacle=True)
     assert [f.name for f in spec.features] == [f.name for f in ObservationSpec().features] + [
         "role.vehicles_ahead", "role.vehicles_behind", "obstacle.known", "obstacle.gap", "obstacle.hit",
@@ -114,14 +112,14 @@ def test_observation_for__adds_place_and_obstacle_only_where_there_is_one() -> N
 
 def test_observe__place_and_obstacle_by_hand() -> None:
     spec = ObservationSpec(0, 0, role=True, obstacle=True)
-    start = make_worlds(
+    start = eb.make_worlds(
         [[8.0, 6.0, 10.0]], [[20.0, 18.0, 22.0, 10.0]], braking_capacity_mps2=8.0, driving_capacity_mps2=1.0,
         latency_s=[0.0, 0.5, 1.0, 1.0], mass_t=1.0, restitution=0.1, obstacle_gap_m=42.0,
     )  # fmt: skip
     names = ("known", "gap", "hit", "stopping_margin", "fitting_deceleration")
-    later, struck = (advance(start, 0.0, until_s=time)[0] for time in (1.0, 2.2))
+    later, struck = (eb.advance(start, 0.0, until_s=time)[0] for time in (1.0, 2.2))
 
-    def obstacle(vehicle: int, worlds: Worlds) -> list[float]:
+    def obstacle(vehicle: int, worlds: eb.Worlds) -> list[float]:
         seen = by_name(vehicle, worlds, spec)
         return [seen[f"obstacle.{name}"] for name in names]
 
@@ -156,7 +154,7 @@ LINE = {"braking_capacity_mps2": [6.0, 7.0, 6.0], "driving_capacity_mps2": 3.0, 
 def test_contact__by_hand():
     """The middle one coasts behind one that brakes at 4 m/s2: 2 t + 2 t^2 = 3 m, closing at sqrt(4 + 2 * 4 * 3)."""
     worlds = line([3.0, 30.0], [20.0, 22.0, 20.0], **{**LINE, "braking_capacity_mps2": [4.0, 7.0, 6.0]})
-    seen = seen_by(advance(worlds, [-4.0, 0.0, -6.0], duration_s=0.0)[0], 1)
+    seen = seen_by(eb.advance(worlds, [-4.0, 0.0, -6.0], duration_s=0.0)[0], 1)
     contact_s = (-2.0 + math.sqrt(4.0 + 2 * 4.0 * 3.0)) / 4.0
     by_hand = {
         "coast_front_time": contact_s,
@@ -176,7 +174,7 @@ def expected(worlds, vehicle, own_mps2, others_mps2, step_s=STEP_S):
     """The same of one forecast, from the impacts that ``advance`` records."""
     command = others_mps2.copy()
     command[:, vehicle] = own_mps2
-    impacts = advance(worlds, command, duration_s=FORECAST_S, record=True)[1]
+    impacts = eb.advance(worlds, command, duration_s=FORECAST_S, record=True)[1]
     rows = impacts.rows
     told = {
         "first_impact_harm": impacts.first_impact_harm.sum(axis=1) + impacts.obstacle_first_harm,
@@ -210,7 +208,7 @@ def test_contact__is_what_advance_records(until_s):
     start = SCENARIO.sample(60, 3).worlds
     v = start.vehicles
     command = np.column_stack([-v.braking_capacity_mps2[:, 0], np.full(60, -4.0), -v.braking_capacity_mps2[:, 2]])
-    worlds, _ = advance(start, command, until_s=until_s)
+    worlds, _ = eb.advance(start, command, until_s=until_s)
     assert worlds.pair_hit.any() == (until_s > 1.0)  # a pair that has met may meet again
     check(worlds, 1, command)
     check(worlds, 1, command, step_s=0.04)
@@ -218,16 +216,16 @@ def test_contact__is_what_advance_records(until_s):
 
 def test_contact__others_go_on_as_they_are_seen_and_brake_fully_where_nothing_is_seen_yet():
     command = np.tile([-3.0, 0.0, -2.0], (40, 1))
-    early, _ = advance(SCENARIO.sample(40, 3).worlds, command, until_s=0.5)
+    early, _ = eb.advance(SCENARIO.sample(40, 3).worlds, command, until_s=0.5)
     assert (early.command_mps2[:, 2] == 0.0).all()  # its latency of 0.8 s has not elapsed
     check(early, 1, np.column_stack([command[:, :2], -early.vehicles.braking_capacity_mps2[:, 2]]))
-    check(advance(early, command, until_s=1.0)[0], 1, command)
+    check(eb.advance(early, command, until_s=1.0)[0], 1, command)
 
 
 def test_contact__sees_the_obstacle_and_vehicle_1_meets_it_in_front():
     start = eb.load_scenario("cooperation-4-all").sample(40, 5).worlds
     others = -start.vehicles.braking_capacity_mps2
-    worlds, _ = advance(start, others, until_s=1.0)
+    worlds, _ = eb.advance(start, others, until_s=1.0)
     for vehicle in (0, 1):
         check(worlds, vehicle, others)
     near = line([8.0, 40.0], [20.0, 18.0, 15.0], obstacle_gap_m=20.0, **LINE)
@@ -245,7 +243,7 @@ def test_contact__at_the_alert_shows_nobody_behind_a_latency():
 
 def test_contact__hides_whom_no_news_has_come_from_whatever_they_do():
     scenario = SCENARIO.replace(v2x="blocked", horizon_s=20, early_impacts="keep")
-    worlds = advance(scenario.sample(300, 1).worlds, np.zeros((300, 3)), until_s=0.6)[0]
+    worlds = eb.advance(scenario.sample(300, 1).worlds, np.zeros((300, 3)), until_s=0.6)[0]
     news = worlds.vehicles.known_from_s[:, 1] <= 0.6
     seen = seen_by(worlds, 1)
     assert news[:, 0].any() and not news[:, 0].all() and not news[:, 2].all()
@@ -259,7 +257,7 @@ def test_contact__hides_whom_no_news_has_come_from_whatever_they_do():
 
 
 def test_contact__of_some_commands_only_is_the_same():
-    worlds = advance(SCENARIO.sample(20, 3).worlds, np.zeros((20, 3)), until_s=0.8)[0]
+    worlds = eb.advance(SCENARIO.sample(20, 3).worlds, np.zeros((20, 3)), until_s=0.8)[0]
     some = ["contact.brake_rear_fraction", "own.speed", "contact.drive_total_harm"]
     whole = dict(zip([f.name for f in CONTACT.features], observe(worlds, 1, CONTACT).T, strict=True))
     picked = observe(worlds, 1, choose_observation(some, STEP_S))
@@ -269,7 +267,7 @@ def test_contact__of_some_commands_only_is_the_same():
 def test_contact__leaves_other_features_alone_in_every_interface():
     groups = ["own", "front_1", "rear_1", "contact"]
     declared = SCENARIO.replace(observation=groups)
-    assert observation_for(declared) == ObservationSpec(contact=True, time_step_s=0.1)
+    assert eb.observation_for(declared) == ObservationSpec(contact=True, time_step_s=0.1)
     seen, wider, listed = (
         eb.make_sb3_vec_env(scenario, 6, seed=3, **options).reset()
         for scenario, options in ((SCENARIO, {}), (declared, {}), (SCENARIO, {"observation": groups}))
@@ -284,7 +282,7 @@ def test_policy__observes_contacts_at_the_steps_of_its_training(group):
     spec = choose_observation(["own", group])
     policy = make_policy(spec, SCENARIO.replace(time_step_s=0.05).model_dump(mode="json"))
     assert policy.observation == choose_observation(["own", group], 0.05)
-    outcome = eb.evaluate(SCENARIO.sample(5, 7), {"mine": LearnedAgent(policy)}, scenario=SCENARIO).outcome("mine")
+    outcome = eb.evaluate(SCENARIO.sample(5, 7), {"mine": eb.LearnedAgent(policy)}, scenario=SCENARIO).outcome("mine")
     assert np.isfinite(outcome.total_harm).all()
     assert choose_observation(["own"], 0.1).time_step_s is None  # nothing that depends on it
 
@@ -302,7 +300,7 @@ def test_contact__failed_forecast_names_its_world(monkeypatch):
 def test_contact_far__tells_what_the_others_cut_off():
     """The times up to 10 s, and the square roots of the harms, of the same forecasts; the others stay as they are."""
     wide = eb.load_scenario("stress-wide").sample(300, 3).worlds
-    worlds = advance(wide, np.zeros((300, 3)), until_s=0.4)[0]
+    worlds = eb.advance(wide, np.zeros((300, 3)), until_s=0.4)[0]
     both = choose_observation(["own", "contact", "contact_far"], STEP_S)
     seen = dict(zip([f.name for f in both.features], observe(worlds, 1, both).T, strict=True))
     alone = observe(worlds, 1, choose_observation(["contact_far"], STEP_S))

@@ -9,7 +9,6 @@ import yaml
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.learning.training import TrainingRecipe, load_recipe
 from ethbrake_marl.policies import shipped_policies
 from ethbrake_marl.scenario import list_scenarios, new_scenario_text
 from tests.docs.site import DOCS, load
@@ -171,7 +170,7 @@ def test_schema__that_ships_is_printed_by_the_command_and_named_by_templates_and
 ) -> None:
     assert run_command(command.split()) == 0
     assert (ROOT / f"{file}.schema.json").read_text("utf-8") == capsys.readouterr().out
-    texts = {"scenarios": [new_scenario_text("mine")], "train": [load_recipe("ppo").new_text("mine")]}
+    texts = {"scenarios": [new_scenario_text("mine")], "train": [eb.load_recipe("ppo").new_text("mine")]}
     texts["docs"] = [each.read_text("utf-8") for each in ROOT.glob(f"{file}-*.yaml")]
     named = f"# yaml-language-server: $schema={Path(file).name}.schema.json\n"
     assert [text for text in texts[Path(file).parent.name] if named not in text] == []
@@ -179,7 +178,7 @@ def test_schema__that_ships_is_printed_by_the_command_and_named_by_templates_and
 
 def test_schemas__are_no_scenario_and_no_recipe() -> None:
     assert all(
-        path.suffix == ".yaml" for path in (*TrainingRecipe.shipped().values(), *(e.path for e in list_scenarios()))
+        path.suffix == ".yaml" for path in (*eb.TrainingRecipe.shipped().values(), *(e.path for e in list_scenarios()))
     )
 
 

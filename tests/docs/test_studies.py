@@ -12,16 +12,15 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
+import ethbrake_marl as eb
 from ethbrake_marl.agents import optimise_pairwise
 from ethbrake_marl.agents.registry import drive, make_agent
-from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.evaluation.measures import PAPER_NOTE, PAPER_ROWS
 from ethbrake_marl.figures import picture_bytes
 from ethbrake_marl.harm import KINDS, scored
 from ethbrake_marl.learning.training import Scheme
 from ethbrake_marl.limits.limits import best_known
-from ethbrake_marl.physics import advance
 from ethbrake_marl.scenario import Task, load_scenario
 from ethbrake_marl.studies import reproduction
 from ethbrake_marl.studies.benchmark import read_entry
@@ -125,7 +124,7 @@ def test_scaling__its_lines_are_the_same_every_time_and_apart_in_their_first_ste
     worlds, again = scaling.make_lines(40, vehicles), scaling.make_lines(40, vehicles)
     assert worlds.speeds_mps.shape == (40, vehicles)
     assert (worlds.gaps_m == again.gaps_m).all() and (worlds.speeds_mps == again.speeds_mps).all()
-    after, impacts = advance(worlds, -worlds.vehicles.braking_capacity_mps2, 0.1)
+    after, impacts = eb.advance(worlds, -worlds.vehicles.braking_capacity_mps2, 0.1)
     assert impacts.count.sum() == 0 and (after.gaps_m > 0.0).all()
 
 
@@ -195,14 +194,14 @@ def test_paper__harms_at_three_delays_are_as_printed(spec: str) -> None:
     for told, delay in zip(row[1:], ("low", "middle", "high"), strict=True):
         scenario = load_scenario(f"paper-delay-{delay}")
         worlds = scenario.worlds_from_table(state)
-        outcome = evaluate(worlds, make_lineup([spec], scenario), scenario=scenario).outcome(spec)
+        outcome = eb.evaluate(worlds, make_lineup([spec], scenario), scenario=scenario).outcome(spec)
         harms = f"{outcome.first_impact_harm.mean():.2f}, {outcome.total_harm.mean():.2f}"
         assert told == harms.replace("0.00", "0")
 
 
 def test_paper__full_braking_over_the_total_distance_is_as_printed() -> None:
     scenario = load_scenario("paper-distance")
-    result = evaluate(scenario.sample(5_000, 7), make_lineup(["full_brake"], scenario), scenario=scenario)
+    result = eb.evaluate(scenario.sample(5_000, 7), make_lineup(["full_brake"], scenario), scenario=scenario)
     groups = np.digitize(result.worlds.gaps_m.sum(axis=1), (12.0, 14.0, 16.0, 18.0))
     harm = result.outcome("full_brake").first_impact_harm
     told = MEASURED["harm-over-total-distance"].rows[0]

@@ -40,7 +40,6 @@ from ethbrake_marl.evaluation.episodes import (
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.rewards import reward_params
-from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.shield import ShieldedDriver
 from tests.contract.interfaces import CRASH, FIVE, PAPER
 from tests.pages.hostile import HOSTILE
@@ -51,7 +50,7 @@ BRAKE = make_agent("full_brake")
 # ---------------------------------------------------------------- records
 
 
-def test_record__one_impact_by_hand(pair: Scenario) -> None:
+def test_record__one_impact_by_hand(pair: eb.Scenario) -> None:
     record = record_episode(pair.sample(1, 0).worlds, BRAKE, scenario=pair)
     impacts, time = record.impacts, record.time_s
     assert (impacts.first.tolist(), [*impacts.time_s], [*impacts.closing_speed_mps]) == (
@@ -73,7 +72,7 @@ class Countdown:
         return np.where(worlds.time_s < 1.05, -1.0, -5.0)
 
 
-def test_record__a_command_is_in_force_from_the_latency_and_its_decision_on(pair: Scenario) -> None:
+def test_record__a_command_is_in_force_from_the_latency_and_its_decision_on(pair: eb.Scenario) -> None:
     record = record_episode(pair.sample(1, 0).worlds, Countdown(), scenario=pair)
     expected = np.select([record.time_s < 0.5, record.time_s < 1.1 - 1e-9], [0.0, -1.0], -5.0)
     assert record.command_mps2[:, 1].tolist() == expected.tolist() and set(expected) == {0.0, -1.0, -5.0}
@@ -107,7 +106,7 @@ def test_record__samples_are_as_fine_as_asked_and_never_change_the_motion(
     np.testing.assert_allclose(record.positions_m[common], coarse.positions_m[shared], atol=1e-10)
 
 
-def test_record__an_impact_at_the_very_alert_is_there(pair: Scenario) -> None:
+def test_record__an_impact_at_the_very_alert_is_there(pair: eb.Scenario) -> None:
     at_once = pair.replace(latency_s=[0.0, 0.0])
     world = at_once.worlds_from_state({"gaps_m": [0.0], "speeds_mps": [18.0, 20.0]})
     record = record_episode(world, BRAKE, scenario=at_once)
@@ -116,7 +115,7 @@ def test_record__an_impact_at_the_very_alert_is_there(pair: Scenario) -> None:
 
 
 def test_record__a_vehicle_pushed_above_its_speed_limit_goes_on() -> None:
-    scenario = Scenario(
+    scenario = eb.Scenario(
         name="pushed", vehicles=2, gaps_m=5, speeds_mps=[20, 25], braking_capacity_mps2=6, driving_capacity_mps2=3,
         mass_t=[1.5, 10], latency_s=[0, 0.5], speed_limit_mps=[20, 30], time_step_s=1.0,
         roles={"vehicle_1": "coast", "vehicle_2": "learner"},
@@ -141,8 +140,8 @@ def at(motion: EpisodeMotion, time_s: float) -> Floats:
     [("paper-random", "constant:4.5"), ("paper-random", "ppo@shipped"), ("paper-random-obstacle", "full_brake"),
      ("pair", "full_brake")],
 )  # fmt: skip
-def test_motion__is_exact_at_every_moment(name: str, spec: str, pair: Scenario) -> None:
-    scenario = pair if name == "pair" else load_scenario(name)
+def test_motion__is_exact_at_every_moment(name: str, spec: str, pair: eb.Scenario) -> None:
+    scenario = pair if name == "pair" else eb.load_scenario(name)
     worlds, agent = scenario.sample(3, 7).worlds, make_agent(spec, scenario=scenario)
     for k, motion in enumerate(follow_episodes(worlds, agent, scenario)):
         record, N = record_episode(worlds.take([k]), agent, scenario=scenario), worlds.N
@@ -160,14 +159,14 @@ def test_motion__counts_what_the_evaluation_counts(evaluation: Evaluation) -> No
     assert [(*each.harm, len(each.impacts.time_s), each.end_s) for each in motions] == list(expected)[:60]
 
 
-def test_motion__tells_where_a_shield_stepped_in(paper_random: Scenario) -> None:
+def test_motion__tells_where_a_shield_stepped_in(paper_random: eb.Scenario) -> None:
     agent = make_agent("constant:3+episode", scenario=paper_random)
     times = [each.stepped_in_s for each in follow_episodes(paper_random.sample(4, 7).worlds, agent, paper_random)]
     assert any(each.size for each in times) and min(np.concatenate(times)) >= 0.5  # Vehicle 2 acts from then on
 
 
 def test_motion__tells_where_the_shield_of_a_team_stepped_in_as_its_log_does() -> None:
-    scenario = load_scenario("cooperation-3-pair")
+    scenario = eb.load_scenario("cooperation-3-pair")
     worlds = scenario.sample(6, 7).worlds
     team = ShieldedDriver(Team.of(make_agent("constant:3"), (1, 2)), scenario, logging=True).on((1, 2))
     log = drive(worlds, team, scenario).guarded.shield.log
@@ -177,7 +176,7 @@ def test_motion__tells_where_the_shield_of_a_team_stepped_in_as_its_log_does() -
     assert list(map(len, told)) == [each.stepped_in_s.size for each in motions] and sum(map(len, told)) > 10
 
 
-def test_motion__cascade_of_bounces_stays_small_and_ends_right(pair: Scenario) -> None:
+def test_motion__cascade_of_bounces_stays_small_and_ends_right(pair: eb.Scenario) -> None:
     bouncy = pair.replace(restitution=0.9)
     (motion,) = follow_episodes(bouncy.sample(1, 0).worlds, make_agent("coast"), bouncy)
     assert len(motion.impacts.time_s) > 10 and (np.diff(motion.pieces[:, 0]) > 0.0).all()
@@ -190,7 +189,7 @@ SAFE = re.compile(r"[A-Za-z0-9:.,_@+/=%-]+")
 
 
 @pytest.fixture(scope="module")
-def passport(paper_random: Scenario) -> Passport:
+def passport(paper_random: eb.Scenario) -> Passport:
     (motion,) = follow_episodes(paper_random.sample(1, 7).worlds, BRAKE, paper_random)
     return Passport.of(motion, paper_random, "full_brake", seed=7, number=0)
 
@@ -254,7 +253,7 @@ def test_film_scenes__are_evenly_spaced_from_the_alert_to_the_end() -> None:
     assert hit[0] == pytest.approx(1.0, abs=0.0401) and COASTING[-1].total_harm == pytest.approx(36.0)
 
 
-def test_film_scenes__are_those_of_the_recorded_episode(paper_random: Scenario) -> None:
+def test_film_scenes__are_those_of_the_recorded_episode(paper_random: eb.Scenario) -> None:
     world, agent = paper_random.sample(1, seed=7).worlds, make_agent("e_v2x_bm")
     record = record_episode(world, agent, scenario=paper_random)
     shown = film_scenes(world, agent, scenario=paper_random)
@@ -321,7 +320,7 @@ DOCS = Path(__file__).resolve().parents[2] / "docs" / "datasets.md"
 BRAKING = {"full_brake": BRAKE}
 
 
-def record(spec: str = "full_brake", scenario: Scenario = PAPER, n: int = 12, reward: Any = "harm") -> Recording:
+def record(spec: str = "full_brake", scenario: eb.Scenario = PAPER, n: int = 12, reward: Any = "harm") -> Recording:
     task = Task(scenario, 7, reward_params(reward), eb.observation_for(scenario))
     ((name, driver),) = make_lineup([spec], scenario).items()
     return record_episodes(scenario.sample(n, 7), driver, name, task)
@@ -360,7 +359,7 @@ def test_record__on_the_edge_of_an_impact_takes_the_rounding_that_keeps_the_harm
 @pytest.mark.parametrize(
     "scenario", [PAPER, FIVE, PAIR, eb.load_scenario("paper-random-obstacle")], ids=lambda s: s.name
 )
-def test_record__knows_where_every_vehicle_is_and_when_each_episode_ends(scenario: Scenario) -> None:
+def test_record__knows_where_every_vehicle_is_and_when_each_episode_ends(scenario: eb.Scenario) -> None:
     found, worlds = record(scenario=scenario), scenario.sample(12, 7).worlds
     final = eb.evaluate(worlds, BRAKING, scenario=scenario).outcome("full_brake").final
     # Vehicle 1 brakes from the alert on by its full capacity b: v t - b t^2 / 2 until the first decision.
@@ -481,7 +480,7 @@ def test_spec__survives_json_and_makes_the_same_environment() -> None:
     ids=["paper", "five", "linked"],
 )
 def test_replay__gives_the_recorded_bits(
-    scenario: Scenario, agents: str, reward: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scenario: eb.Scenario, agents: str, reward: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     minari = pytest.importorskip("minari")
     pytest.importorskip("h5py")

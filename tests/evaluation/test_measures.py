@@ -16,7 +16,6 @@ import pytest
 from rich.console import Console
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import IncompleteTable
 from ethbrake_marl.evaluation import Evaluation, Outcome, SummaryTable, evaluate, measures, summarise, write_per_world
@@ -27,13 +26,12 @@ from ethbrake_marl.harm import STANDARD, Ledger, declared_objectives
 from ethbrake_marl.limits import limits as limits_module
 from ethbrake_marl.limits.limits import BestHarmTable, Unproven, known_limits, shipped_tables, unproven_because
 from ethbrake_marl.pages.report import Report
-from ethbrake_marl.physics import Worlds
 from ethbrake_marl.physics.batch import Impacts
 from ethbrake_marl.scenario import Scenario, Task, list_scenarios, load_scenario
 from ethbrake_marl.studies.experiment import results_csv
 
 SILENT = pytest.mark.filterwarnings("ignore::ethbrake_marl.errors.IncompleteTable")
-BRAKE = {"full_brake": make_agent("full_brake")}
+BRAKE = {"full_brake": eb.make_agent("full_brake")}
 
 # ---------------------------------------------------------------- the summary
 
@@ -94,7 +92,7 @@ def test_summarise__keys_and_values_are_those_of_the_worlds(evaluation: Evaluati
 
 
 def test_summarise__without_full_braking_there_is_no_decrease_and_of_one_world_no_interval(pair: Scenario) -> None:
-    (row,) = summarise(evaluate(pair.sample(1, 0), {"coast": make_agent("coast")}, scenario=pair))
+    (row,) = summarise(evaluate(pair.sample(1, 0), {"coast": eb.make_agent("coast")}, scenario=pair))
     told = row.to_json()
     names = ("harm_decrease_first", "harm_decrease_total", "total_harm_difference")
     names += ("harm_decrease_first_interval", "first_impact_harm_interval")
@@ -140,7 +138,7 @@ def test_table__has_every_figure_and_the_papers_rows_in_80_columns_and_in_markdo
 
 
 def test_table__of_another_line_has_no_limit_and_none_of_the_papers_rows_and_names_are_text(pair: Scenario) -> None:
-    agents = {"full_brake": BRAKE["full_brake"], "ppo@[red]x|b": make_agent("coast")}
+    agents = {"full_brake": BRAKE["full_brake"], "ppo@[red]x|b": eb.make_agent("coast")}
     rows = summarise(evaluate(pair.sample(2, 0), agents, scenario=pair))
     text = printed(rows, 160)
     assert text.count("Decrease") == 2 and "≥" not in text and "ppo@[red]x|b" in text
@@ -151,7 +149,7 @@ def test_table__of_another_line_has_no_limit_and_none_of_the_papers_rows_and_nam
 
 def test_html__escapes_hostile_names_and_shows_every_agent_with_its_figures() -> None:
     scenario = load_scenario("paper-random").replace(title="<img src=x onerror=alert(1)>", description="a & b \u202e")
-    agents = {**BRAKE, "<script>a\u202eb\x1b[2J": make_agent("coast")}
+    agents = {**BRAKE, "<script>a\u202eb\x1b[2J": eb.make_agent("coast")}
     evaluation = evaluate(scenario.sample(50, seed=7), agents, scenario=scenario, seed=7)
     rows = summarise(evaluation)
     for value in (evaluation, rows, scenario):
@@ -169,7 +167,7 @@ def test_html__escapes_hostile_names_and_shows_every_agent_with_its_figures() ->
 def test_repr__says_what_it_is_and_is_short_whatever_it_holds(evaluation: Evaluation) -> None:
     scenario, outcome, policy = evaluation.scenario, evaluation.outcome("full_brake"), eb.load_shipped("ppo")
     worlds = evaluation.worlds
-    many = {f"{k}{200 * 'x'}": make_agent("coast") for k in range(30)}
+    many = {f"{k}{200 * 'x'}": eb.make_agent("coast") for k in range(30)}
     record = eb.record_episode(worlds.take([0]), BRAKE["full_brake"], scenario=scenario)
     begins = [
         (evaluation, "Evaluation('paper-random', 200 worlds of seed 7, vehicle_2 driven by 'full_brake'"),
@@ -434,11 +432,11 @@ def first_worlds(evaluation: Evaluation, n: int, **harms: tuple[list[float], lis
 def four(evaluation: Evaluation, monkeypatch: pytest.MonkeyPatch) -> Evaluation:
     """An evaluation of full_brake and another agent in the four worlds."""
 
-    def bound(worlds: Worlds, vehicle: int, **settings: Any) -> SimpleNamespace:
+    def bound(worlds: eb.Worlds, vehicle: int, **settings: Any) -> SimpleNamespace:
         contact = SimpleNamespace(avoidable=AVOIDABLE[: worlds.n], reason_name=REASON[: worlds.n])
         return SimpleNamespace(harm=PROVEN[: worlds.n], contact=contact)
 
-    def best(worlds: Worlds, task: Task) -> dict[str, np.ndarray]:
+    def best(worlds: eb.Worlds, task: Task) -> dict[str, np.ndarray]:
         return {count: harm[: worlds.n] for count, harm in TABLE.items()}
 
     monkeypatch.setattr(limits_module, "lower_bound", bound)
@@ -527,7 +525,7 @@ def test_distance__a_best_that_is_not_known_everywhere_realises_nothing(four: Ev
 def test_limits__of_a_list_longer_than_its_table_are_told_in_a_warning_and_of_no_table_are_not(
     seeds: tuple[int, ...], share: float | None, paper_random: Scenario
 ) -> None:
-    worlds, partly = Worlds.concatenate([paper_random.sample(8, seed).worlds for seed in seeds]), len(seeds) > 1
+    worlds, partly = eb.Worlds.concatenate([paper_random.sample(8, seed).worlds for seed in seeds]), len(seeds) > 1
     found = evaluate(worlds, BRAKE, scenario=paper_random, aftermath=False)
     with pytest.warns(IncompleteTable) if partly else nullcontext():
         (row,) = summarise(found)
@@ -588,7 +586,7 @@ def test_limits__of_another_line_up_are_null_with_the_reason(pair: Scenario, tmp
 @pytest.mark.parametrize(("name", "unavoidable"), [("paper-random", 309), ("paper-random-early", 272)])
 def test_limits__of_the_first_500_worlds_of_the_papers_random_test(name: str, unavoidable: int) -> None:
     scenario = load_scenario(name)
-    agents = {spec: make_agent(spec) for spec in ("full_brake", "e_v2x_bm")}
+    agents = {spec: eb.make_agent(spec) for spec in ("full_brake", "e_v2x_bm")}
     result = evaluate(scenario.sample(500, 7), agents, scenario=scenario, seed=7, aftermath=False)
     proof, rows = result.regrets.limits.proof, summarise(result)
     assert [row["unavoidable_rate"].value for row in rows] == [unavoidable / 500] * 2

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import PhysicsError, Unfamiliar
 from ethbrake_marl.evaluation import Evaluation, Outcome, evaluate, record_episode, summarise, write_per_world
@@ -29,7 +28,7 @@ from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from ethbrake_marl.studies.jobs import evaluate_shards
 from tests.failing_worlds import planted_list, without
 
-BRAKE = {"full_brake": make_agent("full_brake")}
+BRAKE = {"full_brake": eb.make_agent("full_brake")}
 PAPER = load_scenario("paper-random")
 ROLES = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "full_brake"}
 
@@ -74,7 +73,7 @@ def test_evaluate__full_braking_on_the_papers_random_test() -> None:
 
 def test_evaluate__takes_names_for_scenario_agents_and_worlds_and_prints_a_table() -> None:
     named = evaluate(scenario="paper-random", agents="full_brake,coast", episodes=4)
-    agents = {name: make_agent(name) for name in ("full_brake", "coast")}
+    agents = {name: eb.make_agent(name) for name in ("full_brake", "coast")}
     given = evaluate(PAPER.sample(4, seed=7), agents, scenario=PAPER, seed=7)
     for name in agents:
         assert_same(named.outcome(name), given.outcome(name))
@@ -86,7 +85,7 @@ def test_evaluate__takes_names_for_scenario_agents_and_worlds_and_prints_a_table
 
 def test_evaluate__applies_commands_unrounded() -> None:
     # -3.52 / 7 * 7 is not -3.52 in floating point: a way through the action would show here.
-    agents = {"c": make_agent("constant:3.52")}
+    agents = {"c": eb.make_agent("constant:3.52")}
     assert evaluate(PAPER.sample(1, 0), agents, scenario=PAPER).outcome("c").final.command_mps2[0, 1] == -3.52
 
 
@@ -94,7 +93,7 @@ def test_evaluate__applies_commands_unrounded() -> None:
 def test_evaluate__does_not_depend_on_the_chunk_nor_on_the_worlds_behind(
     evaluation: Evaluation, gap_agent: Any, chunk: int, n: int
 ) -> None:
-    rows, agents = np.arange(n), {"gap": gap_agent, "constant:4.5": make_agent("constant:4.5")}
+    rows, agents = np.arange(n), {"gap": gap_agent, "constant:4.5": eb.make_agent("constant:4.5")}
     seen: list[tuple[str, int]] = []
     chunked = evaluate(
         evaluation.worlds.take(rows), agents, scenario=evaluation.scenario, chunk=chunk,
@@ -122,7 +121,7 @@ def test_evaluate__an_episode_that_the_horizon_cuts_is_reported_so(pair: Scenari
 @pytest.mark.parametrize("named", [{"vehicle": 2}, {"vehicle": "vehicle_3"}, {}])
 def test_evaluate__drives_the_vehicle_that_is_named(named: dict[str, Any]) -> None:
     third = PAPER.with_learners(["vehicle_3"])
-    result = evaluate(PAPER.sample(5, 0), {"coast": make_agent("coast")}, scenario=third, **named)
+    result = evaluate(PAPER.sample(5, 0), {"coast": eb.make_agent("coast")}, scenario=third, **named)
     commands = result.outcome("coast").final.command_mps2
     assert result.vehicle == 2 and (commands[:, 2] == 0.0).all() and (commands[:, 1] == -7.0).all()
 
@@ -159,7 +158,7 @@ PAIR_SHOVED = 20.0 * IMPACT_S - 3.0 * IMPACT_S**2 + 18.315**2 / 12.0 - 20.0**2 /
     ],
 )  # fmt: skip
 def test_aftermath__by_hand(scenario: Scenario, spec: str, shoved: float | None, sampled: float | None) -> None:
-    result = evaluate(scenario.sample(1, 7), {spec: make_agent(spec)}, scenario=scenario, seed=7)
+    result = evaluate(scenario.sample(1, 7), {spec: eb.make_agent(spec)}, scenario=scenario, seed=7)
     outcome = result.outcome(spec)
     for found, expected in ((outcome.shoved_m, shoved), (outcome.sampled_harm, sampled)):
         assert found is None if expected is None else found == pytest.approx([expected], abs=1e-9)
@@ -244,7 +243,7 @@ def test_left_out__worlds_are_named_and_left_out_for_all_agents(found: Evaluatio
 
 def test_left_out__the_other_worlds_are_as_if_those_were_not_in_the_list(found: Evaluation) -> None:
     well = PAPER.sample(N, SEED).worlds.take(without(N, [3, 7, 10]))
-    alone = evaluate(well, {"e_v2x_bm": make_agent("e_v2x_bm")}, scenario=PAPER)
+    alone = evaluate(well, {"e_v2x_bm": eb.make_agent("e_v2x_bm")}, scenario=PAPER)
     assert_same(found.outcome("e_v2x_bm"), alone.outcome("e_v2x_bm"))
     assert alone.left_out == () and alone.complete() is alone
 
@@ -305,11 +304,11 @@ def test_scenario_sha256__values_count_and_words_do_not() -> None:
 )
 def test_policy_sha256__is_found_inside_what_is_around_it(spec: str, policy: str | None) -> None:
     expected = policy and eb.load_shipped(policy).manifest.manifest_sha256
-    assert policy_sha256(make_agent(spec, scenario=PAPER)) == expected
+    assert policy_sha256(eb.make_agent(spec, scenario=PAPER)) == expected
 
 
 def test_results__say_worlds_scenario_policy_and_versions() -> None:
-    agents = {**BRAKE, "ppo": make_agent("ppo@shipped", scenario=PAPER)}
+    agents = {**BRAKE, "ppo": eb.make_agent("ppo@shipped", scenario=PAPER)}
     result = evaluate(SAMPLE, agents, scenario=PAPER, seed=7, chunk=25, aftermath=False)
     braking, learned = (row.to_json() for row in summarise(result))
     assert {key: learned[key] for key in ABOUT} == {key: braking[key] for key in ABOUT} == ABOUT
