@@ -9,12 +9,9 @@ from ethbrake_marl.errors import (
     AlreadyExists,
     CorruptBundle,
     InvalidInput,
-    PhysicsError,
     UnknownName,
-    count_of,
     one_line,
     plain_text,
-    unknown_name,
 )
 
 
@@ -32,21 +29,6 @@ def test_message__keeps_beginning_and_end_of_what_is_long(long: str) -> None:
     assert len(text) <= LINE_LIMIT and text.isprintable()
 
 
-OWN = "one of your own needs eb.register_... first, or --plugin FILE.py (docs/extending.md)"
-
-
-@pytest.mark.parametrize(
-    ("name", "known", "told"),
-    [
-        ("mine", [], f"known: none; {OWN}"),
-        ("mine", ["coast"], f"known: coast; {OWN}"),
-        ("cost", ["coast"], "did you mean 'coast'?"),
-    ],
-)
-def test_unknown_name__reminds_of_the_plug_in_where_nothing_is_close(name: str, known: list[str], told: str) -> None:
-    assert str(unknown_name("agent", name, known, may_be_own=True)) == f"unknown agent '{name}'; {told}"
-
-
 @pytest.mark.parametrize("text", ["plain", "\x1b[2J", "x" * 5000, "a" * LINE_LIMIT])
 def test_one_line__is_the_same_the_second_time(text: str) -> None:
     once = one_line(text)
@@ -60,8 +42,3 @@ def test_terminal__every_way_to_it_is_clean(capsys: pytest.CaptureFixture[str]) 
     captured = capsys.readouterr()
     assert captured.err == "runs/\\x1b[2J\\nx\n"
     assert captured.out == "# \\u202egnp\n\n[/] ppo@\\x1b[31m :smile:\n6\N{NO-BREAK SPACE}m/s²\n"
-
-
-def test_count_of__one_is_no_plural():
-    assert [count_of(n, "world") for n in (0, 1, 2, 10_000)] == ["0 worlds", "1 world", "2 worlds", "10,000 worlds"]
-    assert str(PhysicsError(dict.fromkeys(range(6), "broke"))).endswith("; and 1 more world")

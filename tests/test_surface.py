@@ -55,13 +55,6 @@ def test_every_name__is_used_by_the_file_that_mypy_reads() -> None:
     assert f"--strict ethbrake_marl {file.relative_to(ROOT)}" in (ROOT / "Makefile").read_text("utf-8")
 
 
-def test_unknown_name__suggests_the_nearest() -> None:
-    with pytest.raises(AttributeError, match=r"no attribute 'evalute'; did you mean 'evaluate'\?"):
-        eb.evalute  # type: ignore[attr-defined]  # noqa: B018
-    with pytest.raises(AttributeError, match=r"no attribute 'zzzzzz'$"):
-        eb.zzzzzz  # type: ignore[attr-defined]  # noqa: B018
-
-
 def test_examples__every_public_class_has_one_and_it_is_run() -> None:
     run = {param.values[0].name.rpartition(".")[2] for param in examples()}
     assert [name for name, value in CLASSES.items() if ">>> " not in own_docstring(value)] == []

@@ -17,19 +17,9 @@ from ethbrake_marl.cli import doctor
 from ethbrake_marl.cli.doctor import Check, diagnose
 from ethbrake_marl.envs import make_engine
 from ethbrake_marl.kernel_store import cache_folder
-from ethbrake_marl.physics import advance, make_worlds
+from ethbrake_marl.physics import advance
 from ethbrake_marl.studies import speed, speed as benchmark
-from ethbrake_marl.studies.speed import (
-    BENCHMARKS,
-    Benchmark,
-    Effort,
-    Speed,
-    brake_apart,
-    braking,
-    measure,
-    rates,
-    this_machine,
-)
+from ethbrake_marl.studies.speed import BENCHMARKS, Benchmark, Effort, Speed, braking, measure, rates, this_machine
 from tests.cli.conftest import Command, told_json
 
 
@@ -67,12 +57,6 @@ def test_dependencies__too_old_missing_and_untested_ones_are_told(monkeypatch) -
     assert found("no-such-extra") == (True, "is not installed; the extra train brings it")
     ok, told = found("scipy")
     assert ok and "(tested with 1.0)" in told
-
-
-def test_dependencies__each_stands_with_the_extra_that_brings_it() -> None:
-    extra_of = {requirement.name: extra for extra, requirement in doctor._requirements()}
-    names = ("numpy", "numba", "torch", "benchmarl", "onnx", "ray", "pytest")
-    assert [extra_of.get(name) for name in names] == ["", "", "train", "marl", "export", "cluster", None]
 
 
 def test_checks__other_physics_another_optimum_and_a_damaged_folder_are_findings(monkeypatch) -> None:
@@ -193,20 +177,6 @@ def test_braking__counts_world_steps_to_rest() -> None:
     while worlds.speeds_mps.any():
         worlds, steps = advance(worlds, command, 0.1)[0], steps + 1
     assert braking(5, 1.0)() == 5 * steps and steps > 20
-
-
-def test_until_rest__ends_where_nothing_ever_rests() -> None:
-    physical = dict.fromkeys(("driving_capacity_mps2", "latency_s", "restitution"), 0.0)
-    coasting = make_worlds(10.0, [20.0, 20.0], braking_capacity_mps2=6.0, mass_t=1.0, **physical)
-    assert benchmark.until_rest(coasting, np.zeros((1, 2)))() == benchmark.MOST_STEPS
-
-
-def test_calibration__brakes_by_half_a_metre_per_second_and_starts_again() -> None:
-    speeds, ways = np.full((2, 3), 20.0), np.zeros((2, 3))
-    assert brake_apart(speeds, ways, 2) == 4
-    assert (speeds == 19.0).all() and ways == pytest.approx(0.05 * (39.5 + 38.5))
-    brake_apart(speeds, ways, 38)
-    assert (speeds == 20.0).all()
 
 
 @pytest.mark.parametrize(

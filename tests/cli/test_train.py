@@ -22,7 +22,7 @@ from ethbrake_marl.cli.command import Out
 from ethbrake_marl.evaluation.inputs import make_lineup, scenario_sha256, worlds_sha256
 from ethbrake_marl.figures import learning_curve
 from ethbrake_marl.studies import experiment
-from ethbrake_marl.studies.experiment import results_csv, run_folder, telling_world, write_figures
+from ethbrake_marl.studies.experiment import results_csv, telling_world, write_figures
 from tests.cli.conftest import TINY_RECIPE, Answer, Command, check_refused, rows_of, told_json
 
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "ppo", "hybrid"]
@@ -204,15 +204,6 @@ def test_existing_run__is_refused_and_left_alone(ethbrake, tiny_recipe, finished
     before = {path: path.read_bytes() for path in finished_run.rglob("*") if path.is_file()}
     check_refused(ethbrake(command, "--recipe", tiny_recipe, "--output", finished_run), str(finished_run), "force")
     assert {path: path.read_bytes() for path in finished_run.rglob("*") if path.is_file()} == before
-
-
-def test_run_folder__by_default_says_scenario_recipe_and_seed() -> None:
-    recipe = eb.load_recipe("ppo")
-    folders = [run_folder(SCENARIO, recipe, **given) for given in ({}, {"seed": 4}, {"name": "mine"})]
-    assert [str(path) for path in folders] == [
-        "runs/paper-random-ppo-seed0", "runs/paper-random-ppo-seed4", "runs/mine"
-    ]  # fmt: skip
-    assert run_folder(SCENARIO, recipe, output=Path("/elsewhere/x")) == Path("/elsewhere/x")
 
 
 def test_train__names_its_folder_and_ends_at_the_number_that_it_announces(ethbrake, tiny_recipe, tmp_path, monkeypatch):

@@ -16,11 +16,11 @@ import pytest
 from scipy.stats import ttest_ind
 
 from ethbrake_marl.agents import registry
-from ethbrake_marl.agents.registry import Entry, Team, agent_names, make_agent
+from ethbrake_marl.agents.registry import Entry, Team, make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.episodes import Passport, follow_episodes
-from ethbrake_marl.evaluation.inputs import LADDER, NamedWorlds, check_agents, choose_worlds, make_lineup
+from ethbrake_marl.evaluation.inputs import NamedWorlds, check_agents, make_lineup
 from ethbrake_marl.evaluation.results import compare_results, read_result
 from ethbrake_marl.evaluation.statistics import mean, paired_difference, unpaired_difference
 from ethbrake_marl.files import plugins
@@ -93,13 +93,6 @@ def test_evaluate__one_agent_that_cannot_drive_is_refused_before_another_works(e
 # Lists of agents and worlds
 
 
-def test_lineup__keeps_order_and_specs_and_the_ladder_is_every_rung() -> None:
-    lineup = list(make_lineup(["ladder", "constant:5", "e_v2x_bm:pairwise:believed"], SCENARIO))
-    rungs = [spec for spec in LADDER if spec.partition(":")[0] in agent_names()]
-    assert lineup == [*rungs, "constant:5", "e_v2x_bm:pairwise:believed"]
-    assert lineup[:6] == ["coast", "copy_leader", "full_brake", "gentlest_front", "e_v2x_bm:pairwise", "e_v2x_bm"]
-
-
 @pytest.mark.parametrize(("shield", "bound"), [("episode", "coupled"), ("episode:pairwise", "pairwise")])
 def test_lineup__the_hybrids_bound_and_count_are_as_asked(shield: str, bound: str) -> None:
     (agent,) = make_lineup([f"ppo@shipped+{shield}"], SCENARIO, harm_count="total").values()
@@ -125,12 +118,6 @@ def test_check_agents__a_constant_above_the_capacity_of_any_world_is_refused_and
     between = (capacity[0] + capacity.min()) / 2  # the first world could, another could not
     with pytest.raises(InvalidInput, match="above the braking capacity"):
         check_agents(make_lineup([f"constant:{between}"], scenario), worlds, scenario)
-
-
-def test_worlds__are_the_list_of_the_seed() -> None:
-    (few, seed), (many, default) = choose_worlds(SCENARIO, episodes=5, seed=9), choose_worlds(SCENARIO)
-    assert (few.worlds.n, seed, many.worlds.n, default) == (5, 9, 10_000, 7)
-    assert np.array_equal(few.worlds.gaps_m, SCENARIO.sample(5, 9).worlds.gaps_m)
 
 
 # Evaluations in parts

@@ -1,6 +1,5 @@
 """Single episodes: recorded, as exact motion, as a passport, as a film; and datasets of them, Parquet and Minari."""
 
-import io
 import json
 import re
 import shlex
@@ -14,8 +13,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from gymnasium.envs.registration import EnvSpec
-from PIL import Image, ImageSequence
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import Team, drive, make_agent
@@ -30,7 +27,6 @@ from ethbrake_marl.evaluation.episodes import (
     Recording,
     Task,
     decision_columns,
-    env_spec,
     film_bytes,
     film_scenes,
     follow_episodes,
@@ -246,13 +242,6 @@ README = Path(__file__).resolve().parents[2] / "README.md"
 COASTING = film_scenes(CRASH.sample(1, seed=0).worlds, make_agent("coast"), scenario=CRASH)
 
 
-def test_film_scenes__are_evenly_spaced_from_the_alert_to_the_end() -> None:
-    assert [scene.time_s for scene in COASTING] == pytest.approx([*(np.arange(33) / 25), 1.3])
-    assert [scene.ended for scene in COASTING] == [False] * 33 + [True]
-    hit = [scene.time_s for scene in COASTING if scene.total_harm > 0.0]
-    assert hit[0] == pytest.approx(1.0, abs=0.0401) and COASTING[-1].total_harm == pytest.approx(36.0)
-
-
 def test_film_scenes__are_those_of_the_recorded_episode(paper_random: eb.Scenario) -> None:
     world, agent = paper_random.sample(1, seed=7).worlds, make_agent("e_v2x_bm")
     record = record_episode(world, agent, scenario=paper_random)
@@ -261,13 +250,6 @@ def test_film_scenes__are_those_of_the_recorded_episode(paper_random: eb.Scenari
         gaps = [np.interp(scene.time_s, record.time_s, record.gaps_m[:, p]) for p in range(2)]
         assert scene.gaps_m == pytest.approx(gaps, abs=0.01)
     assert shown[-1].first_harm == pytest.approx(float(record.ledger.world_harm("first")[0]))
-
-
-def test_film__as_gif_plays_in_real_time_and_ends_with_the_longest() -> None:
-    short = COASTING[:14]
-    shown = Image.open(io.BytesIO(film_bytes({"a": short, "b": short[:3]}, ".gif", fps=10)))
-    assert (shown.n_frames, shown.size) == (14, (800, 608))
-    assert [frame.info["duration"] for frame in ImageSequence.Iterator(shown)] == [100] * 14
 
 
 def test_film__a_title_of_any_length_and_kind_stays_left_of_the_clock() -> None:
@@ -461,13 +443,6 @@ def test_file__appears_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.M
 
 
 # ---------------------------------------------------------------- Minari
-
-
-def test_spec__survives_json_and_makes_the_same_environment() -> None:
-    spec, reward = eb.choose_observation(["own", "front_1.gap"]), reward_params({"harm": 2.0, "jerk": 0.5})
-    env: Any = EnvSpec.from_json(env_spec(Task(FIVE, 7, reward, spec)).to_json()).make().unwrapped
-    found = (env.engine.scenario, env.engine.observation, env.learner, env.engine.reward)
-    assert found == (FIVE, spec, 3, reward)
 
 
 @pytest.mark.parametrize(

@@ -20,9 +20,9 @@ from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import IncompleteTable
 from ethbrake_marl.evaluation import Evaluation, Outcome, SummaryTable, evaluate, measures, summarise, write_per_world
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.evaluation.measures import KNOWN_OF_WORLDS, PAPER_ROWS, Between, proven_of_table, shipped_bounds
+from ethbrake_marl.evaluation.measures import KNOWN_OF_WORLDS, PAPER_ROWS, proven_of_table, shipped_bounds
 from ethbrake_marl.evaluation.results import read_harms
-from ethbrake_marl.harm import STANDARD, Ledger, declared_objectives
+from ethbrake_marl.harm import STANDARD, Ledger
 from ethbrake_marl.limits import limits as limits_module
 from ethbrake_marl.limits.limits import BestHarmTable, Unproven, known_limits, shipped_tables, unproven_because
 from ethbrake_marl.pages.report import Report
@@ -164,27 +164,6 @@ def test_html__escapes_hostile_names_and_shows_every_agent_with_its_figures() ->
     assert repr(evaluation).isprintable()
 
 
-def test_repr__says_what_it_is_and_is_short_whatever_it_holds(evaluation: Evaluation) -> None:
-    scenario, outcome, policy = evaluation.scenario, evaluation.outcome("full_brake"), eb.load_shipped("ppo")
-    worlds = evaluation.worlds
-    many = {f"{k}{200 * 'x'}": eb.make_agent("coast") for k in range(30)}
-    record = eb.record_episode(worlds.take([0]), BRAKE["full_brake"], scenario=scenario)
-    begins = [
-        (evaluation, "Evaluation('paper-random', 200 worlds of seed 7, vehicle_2 driven by 'full_brake'"),
-        (evaluate(worlds.take([0]), many, scenario=scenario, aftermath=False), "Evaluation('paper-random', 1 world"),
-        (scenario.sample(5000, seed=7), "Sample(Worlds(5,000 worlds of 3 vehicles: gaps "),
-        (worlds.take(np.zeros(0, int)), "Worlds(0 worlds of 3 vehicles: gaps none m"),
-        (worlds.vehicles, "Vehicles("),
-        (record, "EpisodeRecord("),
-        (outcome, "Outcome("),
-        (outcome.ledger, "Ledger("),
-        (policy, "Policy('ppo', 27 observations, "),
-    ]
-    for value, begin in begins:
-        assert repr(value).startswith(begin) and len(repr(value)) <= 400
-    assert f"{outcome.total_harm.mean():.2f} total" in repr(outcome)
-
-
 # ---------------------------------------------------------------- the paper's rows
 
 
@@ -298,11 +277,6 @@ def test_rescored__one_impact_by_hand_in_json_and_as_columns(pair: Scenario, tmp
     ]
     assert more[0]["own_total_2"] == more[0]["total_harm_2"]
     assert float(more[1]["weighted:1,3_total_1"]) == pytest.approx(weighted)
-
-
-def test_declared_objectives__standard_stands_for_several() -> None:
-    assert declared_objectives(["standard", "weighted:1,2"], 2) == [*STANDARD, "weighted:1,2"]
-    assert declared_objectives([], 2) == []
 
 
 # ---------------------------------------------------------------- one row per agent and world
@@ -603,17 +577,6 @@ def test_limits__of_the_first_500_worlds_of_the_papers_random_test(name: str, un
 def shipped(name: str, **header: Any) -> BestHarmTable:
     (table,) = (table for table in shipped_tables() if table.header["scenario"] == name)
     return replace(table, header={**table.header, **header})
-
-
-def test_between__by_hand() -> None:
-    nan = np.nan
-    contact, impact = np.array([0, 1, 1, 1, 1], bool), np.array([0, 1, 0, 0, 0], bool)
-    first, total = np.array([0, 9, 1e-4, 6, nan]), np.array([0, 9, 2e-4, 8, nan])
-    found = Between.of(contact, impact, first, total)
-    assert (found.rate, found.harmless_rate) == (0.6, 0.5)
-    assert (found.mean_first, found.mean_total) == pytest.approx((3.00005, 4.0001))
-    nobody = Between.of(contact, contact, first, total)
-    assert (nobody.rate, nobody.mean_first, nobody.harmless_rate) == (0.0, None, None)
 
 
 def test_shipped__stress_wide_has_a_loose_proof_and_says_so() -> None:

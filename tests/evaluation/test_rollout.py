@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Callable
 from dataclasses import fields, replace
 from importlib.metadata import version
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -286,13 +285,6 @@ def test_worlds_sha256__tells_every_bit_and_not_how_it_lies_in_memory(monkeypatc
     assert worlds_sha256(replace(copied, gaps_m=np.asfortranarray(copied.gaps_m)), index) == own
 
 
-def test_scenario_sha256__values_count_and_words_do_not() -> None:
-    own = scenario_sha256(PAPER)
-    assert scenario_sha256(PAPER.replace(name="mine", title="t", description="d", source="s")) == own
-    others = [PAPER.replace(restitution=0.2), PAPER.replace(horizon_s=9.0), PAPER.with_learners(["vehicle_3"])]
-    assert len({own, *map(scenario_sha256, others)}) == 4
-
-
 @pytest.mark.parametrize(
     ("spec", "policy"),
     [
@@ -374,13 +366,6 @@ def test_policy__that_drives_where_it_was_trained_is_not_warned_of() -> None:
         for name in ("stress-wide", "paper-random-obstacle"):
             evaluate(None, "universal@shipped", scenario=name, episodes=200)
         evaluate(None, "team@shipped", scenario="cooperation-3-pair", episodes=100)
-
-
-def test_scenario__comes_back_whole_from_its_dump() -> None:
-    """Also where a type declares what is the default of all others."""
-    types = {"car": {}, "truck": {"speed_limit_mps": 40.0}}
-    for each in (PAPER.replace(speed_limit_mps=30.0, vehicle_types=types, types=["car", "car", "truck"]), PAPER):
-        assert scenario_sha256(Scenario.of_dump(each.model_dump(mode="json"))) == scenario_sha256(each)
 
 
 # ---------------------------------------------------------------- a list in shards
@@ -487,13 +472,6 @@ def test_a_list_of_which_every_world_fails__is_refused(failing, paper_random: Sc
 
 def test_tally__comes_back_from_json_as_it_was(tally: Tally) -> None:
     assert Tally.from_json(json.loads(json.dumps(tally.to_json()))) == tally
-
-
-def test_shard_bounds__are_whole_leaves(paper_random: Scenario) -> None:
-    for episodes, shards, last in ((10_300, 7, 9_000), (10_300, 1, 0), (500, 7, 0), (10**8, 97, None)):
-        bounds = Question(paper_random, AGENTS, episodes, 7).bounds(shards)
-        assert bounds[0][0] == 0 and bounds[-1] == (bounds[-1][0] if last is None else last, episodes)
-        assert all(one[1] == other[0] and one[1] % 1_000 == 0 for one, other in pairwise(bounds))
 
 
 @pytest.mark.long

@@ -18,10 +18,8 @@ from ethbrake_marl.evaluation.statistics import (
     interquartile_mean,
     mean,
     mean_over_seeds,
-    paired_difference,
     rate,
     relative_decrease,
-    root,
     share_over_seeds,
 )
 from ethbrake_marl.files.sheet import Estimate
@@ -68,18 +66,9 @@ def test_difference_and_ratio__are_those_of_the_pairs() -> None:
     assert Moments.of(x).ratio_error(Moments.of(y), both) == pytest.approx(expected, rel=1e-10)
 
 
-def test_root__of_what_no_float_holds() -> None:
-    assert (root(10**800, 10**200), root(0, 3)) == (pytest.approx(1e300), 0.0)
-
-
 # ---------------------------------------------------------------- rates
 
 Z_SQUARED = 3.8414588  # of the normal quantile at 97.5 %
-
-
-@pytest.mark.parametrize(("exact", "interval"), [(False, (0.2365931, 0.7634069)), (True, (0.1870860, 0.8129140))])
-def test_rate__five_of_ten_is_the_textbook_interval_of_wilson_and_of_clopper_and_pearson(exact, interval) -> None:
-    assert rate(5, 10, exact=exact) == Estimate(0.5, pytest.approx(interval, abs=1e-7))
 
 
 @pytest.mark.parametrize("count", [1, 10, 10_000, 10**8])
@@ -98,31 +87,6 @@ def test_rate__the_ends_of_an_exact_one_have_the_tails_that_they_must(successes:
 
 
 # ---------------------------------------------------------------- means, differences and ratios
-
-T_4, T_1 = 2.7764451, 12.7062047  # 97.5 % quantiles of Student's t with 4 and 1 degrees of freedom
-HALF_5 = T_4 * math.sqrt(2.5 / 5.0)  # the variance of 1..5 is 2.5
-
-
-@pytest.mark.parametrize(
-    ("found", "expected"),
-    [
-        (mean(np.arange(1.0, 6.0)), Estimate(3.0, (3.0 - HALF_5, 3.0 + HALF_5))),
-        (mean(np.array([7.0])), Estimate(7.0, None)),
-        (paired_difference(np.array([-2.0, 8.0, 48.0]), np.array([0.0, 10.0, 50.0])), Estimate(-2.0, (-2.0, -2.0))),
-        # ratio 0.75; residuals -0.5 and 0.5, s = sqrt(0.5), standard error sqrt(0.5) / (sqrt(2) * 2) = 0.25
-        (
-            relative_decrease(np.array([1.0, 2.0]), np.array([2.0, 2.0])),
-            Estimate(0.25, (0.25 - 0.25 * T_1, 0.25 + 0.25 * T_1)),
-        ),
-        (relative_decrease(np.array([1.0, 0.0]), np.zeros(2)), None),
-    ],
-)
-def test_estimate__by_hand(found: Estimate | None, expected: Estimate | None) -> None:
-    assert (found is None) == (expected is None)
-    if found is not None:
-        assert found.value == expected.value and found.interval == (
-            expected.interval and pytest.approx(expected.interval, abs=1e-6)
-        )
 
 
 RNG = np.random.default_rng(3)
@@ -143,15 +107,6 @@ def test_estimate__at_the_size_of_our_lists_has_the_bootstrap_interval(found, da
     boot = bootstrap(data, statistic, paired=len(data) > 1, n_resamples=1000, method="percentile", rng=4)
     low, high = found.interval
     assert (low, high) == pytest.approx(tuple(boot.confidence_interval), abs=0.06 * (high - low))
-
-
-def test_json__of_an_estimate_has_its_interval_as_a_list_and_null_for_what_does_not_exist() -> None:
-    assert Estimate(2.0, (1.0, 3.0)).to_json() == {"value": 2.0, "interval": [1.0, 3.0]}
-    told = Estimate.side_by_side({"harm": Estimate(2.0, (1.0, 3.0)), "alone": Estimate(4.0, None), "absent": None})
-    assert list(told.items()) == [
-        ("harm", 2.0), ("harm_interval", [1.0, 3.0]), ("alone", 4.0), ("alone_interval", None),
-        ("absent", None), ("absent_interval", None),
-    ]  # fmt: skip
 
 
 # ---------------------------------------------------------------- over seeds

@@ -13,17 +13,8 @@ import ethbrake_marl as eb
 from ethbrake_marl.files.yaml import parse_yaml, read_yaml
 from ethbrake_marl.learning import RunDirectory, Training, TrainingRecipe, algorithm_names, load_recipe, train
 from ethbrake_marl.learning.runs import make_model
-from ethbrake_marl.learning.training import LearningRate
 from ethbrake_marl.policies import NetworkSpec, PolicyTeam, load_policy
-from tests.learning.tiny import (
-    TINY_COUNTERFACTUAL,
-    TINY_PPO,
-    Answer,
-    files_of,
-    harm_beside_full_braking,
-    marked,
-    watch_steps,
-)
+from tests.learning.tiny import TINY_PPO, Answer, files_of, harm_beside_full_braking, marked, watch_steps
 
 PAIR = eb.load_scenario("cooperation-3-pair")
 ALONE = eb.load_scenario("cooperation-2-paper")
@@ -59,13 +50,6 @@ def test_train__takes_names_and_files_and_measuring_changes_nothing(tmp_path: Pa
     train(TINY, ALONE, tmp_path / "unmeasured", steps=128, measure=None)
     last = "policy-last/weights.safetensors"
     assert files_of(tmp_path / "named")[last] == files_of(tmp_path / "unmeasured")[last]
-
-
-def test_scheme__of_a_recipe_and_who_drives_what() -> None:
-    assert Training.of(TINY, PAIR, scheme="centralised").scheme == "centralised"
-    assert Training.of(TINY, PAIR).who_drives() == "scheme shared: policy drives vehicle_2, vehicle_3"
-    told = "scheme independent: policy/vehicle_2 drives vehicle_2; policy/vehicle_3 drives vehicle_3"
-    assert Training.of(TINY, PAIR, scheme="independent").who_drives() == told
 
 
 def history(recipe: TrainingRecipe, folder: Path) -> list[dict[str, str]]:
@@ -199,19 +183,6 @@ def test_recipe__that_ships_comes_back_from_its_json_and_its_template_and_passes
         recipe.algorithm == "ppo"
     ):  # expects nothing beyond the horizon, but for the paper's, whose values are the paper's
         assert recipe.horizon_is_end == (name != "ppo-paper")
-
-
-def test_learning_rate__cosine_by_hand() -> None:
-    rate = LearningRate(start=5e-4, end=1e-4)
-    assert [rate.at(x) for x in (1.0, 0.5, 0.0)] == pytest.approx([5e-4, 3e-4, 1e-4])
-    assert rate.at(0.75) == pytest.approx(1e-4 + 4e-4 * (1.0 + 0.5**0.5) / 2.0)
-    assert rate.at(-0.1) == pytest.approx(1e-4)  # the last rollout may overshoot the end; the rate must not rise again
-
-
-def test_recipe__tells_only_the_keys_that_it_has_so_that_older_trainings_stay_the_same() -> None:
-    told = TINY_COUNTERFACTUAL.model_dump(mode="json")
-    assert not {"focus", "modes"} & told.keys() and "initial_action" not in told["network"]
-    assert TINY_COUNTERFACTUAL.replace(focus=0.75).model_dump(mode="json")["focus"] == 0.75
 
 
 @pytest.mark.parametrize("algorithm", algorithm_names())

@@ -30,7 +30,6 @@ from ethbrake_marl.policies import (
     NetworkSpec,
     Policy,
     content_sha256,
-    dense,
     load_named_policy,
     load_policy,
     shipped_name,
@@ -45,36 +44,6 @@ RandomTensors = Callable[[NetworkSpec], dict[str, np.ndarray]]
 
 def _observations(n: int, size: int) -> np.ndarray:
     return np.random.default_rng(1).uniform(-2.0, 2.0, (n, size)).astype(np.float32)
-
-
-def test_tensors__of_the_papers_network_has_the_tables_tensors() -> None:
-    shapes = {row.name: row.shape for row in eb.load_recipe("ppo-paper").network_spec(27).tensors}
-    assert shapes == {
-        "policy.0.weight": (256, 27),
-        "policy.0.bias": (256,),
-        "policy.1.weight": (256, 256),
-        "policy.1.bias": (256,),
-        "policy.output.weight": (1, 256),
-        "policy.output.bias": (1,),
-        "policy.log_std": (1,),
-        "value.0.weight": (256, 27),
-        "value.0.bias": (256,),
-        "value.1.weight": (256, 256),
-        "value.1.bias": (256,),
-        "value.2.weight": (128, 256),
-        "value.2.bias": (128,),
-        "value.output.weight": (1, 128),
-        "value.output.bias": (1,),
-    }
-
-
-def test_dense__numbers_by_hand() -> None:
-    weight = np.array([[1, 2, 3, 4, 5], [0, 0, 0, 0, -1]], np.float32)
-    bias = np.array([10, 20], np.float32)
-    x = np.array([[1, 0], [1, 0], [1, 0], [1, 0], [1, 2]], np.float32)
-    y = np.empty((2, 2), np.float32)
-    dense(weight, bias, x, y)
-    assert y.tolist() == [[25.0, 20.0], [19.0, 18.0]]
 
 
 @pytest.mark.parametrize(

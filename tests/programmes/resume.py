@@ -42,7 +42,7 @@ RECIPES: dict[str, eb.TrainingRecipe] = {
     "writing": SAC.replace(checkpoint_every_updates=5, total_steps=4000 * 16, evaluation=PPO.evaluation.model_dump()),
 }
 
-FORK = multiprocessing.get_context("fork")  # a fresh interpreter needs seconds; test_resume.py kills some of those
+FORK = multiprocessing.get_context("fork")  # a fresh interpreter needs seconds; tests/learning kills some of those
 
 
 def work(what: str, run: Path) -> None:
