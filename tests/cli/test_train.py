@@ -1,6 +1,5 @@
 """``ethbrake run``, ``train`` with ``resume`` and ``curves``, ``agent export``, on trainings of a few small updates."""
 
-import csv
 import inspect
 import json
 import shutil
@@ -22,7 +21,7 @@ from ethbrake_marl.cli.command import Out
 from ethbrake_marl.evaluation.inputs import make_lineup, scenario_sha256, worlds_sha256
 from ethbrake_marl.figures import learning_curve
 from ethbrake_marl.studies import experiment
-from ethbrake_marl.studies.experiment import results_csv, telling_world, write_figures
+from ethbrake_marl.studies.experiment import telling_world, write_figures
 from tests.cli.conftest import TINY_RECIPE, Answer, Command, check_refused, rows_of, told_json
 
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "ppo", "hybrid"]
@@ -320,18 +319,3 @@ def test_telling_world__is_the_median_saving_among_harmful_worlds(before, after,
     outcome = {name: SimpleNamespace(world_harm=found.__getitem__) for name, found in by_count.items()}
     evaluation = SimpleNamespace(outcome=outcome.__getitem__, outcomes=harms)
     assert telling_world(evaluation, "total") == row
-
-
-def test_results_csv__an_interval_becomes_two_columns_and_nothing_an_empty_cell():
-    scenario = eb.load_scenario("paper-random")
-    rows = eb.summarise(
-        eb.evaluate(scenario.sample(3, 1), make_lineup(["coast", "e_v2x_bm"], scenario), scenario=scenario)
-    )
-    head, coast, bm = csv.reader(results_csv(rows).splitlines())
-    column = {name: k for k, name in enumerate(head)}
-    assert "parameters" not in column
-    assert float(coast[column["first_impact_harm_low"]]) == rows[0].first_impact_harm.interval[0]
-    assert float(coast[column["first_impact_harm_high"]]) == rows[0].first_impact_harm.interval[1]
-    assert coast[column["predicted_harm"]] == ""
-    assert float(bm[column["predicted_harm"]]) == rows[1]["predicted_harm"].value
-    assert coast[column["harm_decrease_first"]] == ""  # full braking was not evaluated

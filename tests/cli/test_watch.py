@@ -27,7 +27,6 @@ from ethbrake_marl.files import plugins
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.policies import shipped_policies
 from ethbrake_marl.scenario import Scenario, load_scenario, new_scenario_text
-from ethbrake_marl.shield import HybridAgent
 from tests.cli.conftest import Command, check_refused, rows_of, told_json
 from tests.failing_worlds import plant
 from tests.fixtures.pictures import EMPTY
@@ -91,12 +90,6 @@ def test_evaluate__one_agent_that_cannot_drive_is_refused_before_another_works(e
 
 
 # Lists of agents and worlds
-
-
-@pytest.mark.parametrize(("shield", "bound"), [("episode", "coupled"), ("episode:pairwise", "pairwise")])
-def test_lineup__the_hybrids_bound_and_count_are_as_asked(shield: str, bound: str) -> None:
-    (agent,) = make_lineup([f"ppo@shipped+{shield}"], SCENARIO, harm_count="total").values()
-    assert isinstance(agent, HybridAgent) and (agent.bound, agent.harm_count) == (bound, "total")
 
 
 def test_lineup__a_team_goes_behind_the_step_shield_and_no_other(monkeypatch) -> None:

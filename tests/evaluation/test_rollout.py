@@ -82,12 +82,6 @@ def test_evaluate__takes_names_for_scenario_agents_and_worlds_and_prints_a_table
     assert f"{table[0].total_harm.value:.2f}" in str(table)
 
 
-def test_evaluate__applies_commands_unrounded() -> None:
-    # -3.52 / 7 * 7 is not -3.52 in floating point: a way through the action would show here.
-    agents = {"c": eb.make_agent("constant:3.52")}
-    assert evaluate(PAPER.sample(1, 0), agents, scenario=PAPER).outcome("c").final.command_mps2[0, 1] == -3.52
-
-
 @pytest.mark.parametrize(("chunk", "n"), [(1, 12), (7, 200), (199, 200)])
 def test_evaluate__does_not_depend_on_the_chunk_nor_on_the_worlds_behind(
     evaluation: Evaluation, gap_agent: Any, chunk: int, n: int
@@ -102,12 +96,6 @@ def test_evaluate__does_not_depend_on_the_chunk_nor_on_the_worlds_behind(
     for name in agents:
         assert_same(chunked.outcome(name), evaluation.outcome(name), rows)
     assert seen == [(name, end) for name in agents for end in [*range(chunk, n, chunk), n]]
-
-
-def test_evaluate__notes_the_place_of_each_world_in_its_list() -> None:
-    sample = PAPER.sample(4, 7, first=10)
-    assert evaluate(sample, BRAKE, scenario=PAPER).index.tolist() == [10, 11, 12, 13]
-    assert evaluate(sample.worlds, BRAKE, scenario=PAPER).index.tolist() == [0, 1, 2, 3]
 
 
 def test_evaluate__an_episode_that_the_horizon_cuts_is_reported_so(pair: Scenario) -> None:

@@ -1,7 +1,6 @@
 """Figures: the curves of a list and of a training, criticality maps, trajectories; drawn from the very numbers."""
 
 import re
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
 from ethbrake_marl.evaluation import EpisodeRecord, Evaluation, curves as module, evaluate, record_episode, summarise
-from ethbrake_marl.evaluation.curves import avoidability_boundary, criticality_map, deceleration_curve, regimes_of
+from ethbrake_marl.evaluation.curves import avoidability_boundary, criticality_map, deceleration_curve
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.figures import (
     BODY_M,
@@ -34,7 +33,6 @@ from ethbrake_marl.figures import (
 )
 from ethbrake_marl.limits.limits import Limits, Proof, known_limits
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
-from tests.physics.random_worlds import line
 
 BRAKE = {"full_brake": eb.make_agent("full_brake")}
 DISTANCE = load_scenario("paper-distance")
@@ -266,23 +264,6 @@ def test_criticality_figure__draws_harm_and_boundary_and_names_both_sides() -> N
 
 
 # ---------------------------------------------------------------- decelerations
-
-
-# By hand; the leader brakes from its onset, the follower from its own.
-@pytest.mark.parametrize(
-    ("gap", "speeds", "latency", "decelerations", "expected"),
-    [
-        (1.0, (20.0, 20.0), (0.0, 1.0), (6.0, 6.0), "A"),  # sqrt(2 / 6) = 0.577 s, before 1 s
-        (10.0, (3.0, 10.0), (0.0, 2.0), (6.0, 6.0), "A'"),  # the leader stands at 0.5 s, 5.75 m ahead; hit at 1.075 s
-        (10.0, (3.0, 10.0), (0.0, 0.5), (6.0, 2.0), "C"),  # the same leader; stopping takes 25 m of the 5.75 m
-        (10.0, (3.0, 10.0), (0.0, 0.5), (6.0, 10.0), "none"),  # and here 5 m
-        (1.0, (20.0, 20.0), (0.0, 0.5), (6.0, 6.0), "B"),  # 0.25 m left at 0.5 s, 3 m/s closing for good
-        (1.0, (5.0, 10.0), (1.0, 0.0), (6.0, 2.0), "early"),  # 5 t - t^2 = 1 at 0.21 s, before 1 s
-    ],
-)
-def test_regimes__by_hand(gap: float, speeds: Any, latency: Any, decelerations: Any, expected: str) -> None:
-    worlds = line([[gap]], [speeds], latency_s=latency, mass_t=5.0, restitution=0.1)
-    assert regimes_of(worlds, 0, np.array([decelerations])).tolist() == [expected]
 
 
 def test_curve__its_values_are_the_closed_form_and_the_simulation() -> None:

@@ -54,14 +54,6 @@ def digest(*columns: Any) -> str:
     return found.hexdigest()[:16]
 
 
-def lists() -> dict[str, str]:
-    return {f"list {entry.name}": json.dumps(sampled(entry.name)) for entry in list_scenarios()}
-
-
-def physics() -> dict[str, str]:
-    return {"physics": str(figures("few")["sha256"])}
-
-
 def episodes() -> dict[str, str]:
     """Observations and rewards of random actions, with every term and an angle as objective."""
     reward = {"harm": 1.0, "risk": 1.0, "jerk": 1e-5, "collision": 1.0, "shaping": 1.0, "objective": "social:37"}
@@ -88,10 +80,6 @@ def searches() -> dict[str, str]:
     return found
 
 
-def shields() -> dict[str, str]:
-    return {f"shield {name}": decisions_hash(make()[0], 10) for name, make in SHIELDS.items()}
-
-
 def tallies() -> dict[str, str]:
     found = {}
     for name in HARD[:2]:
@@ -114,7 +102,15 @@ def actions() -> dict[str, str]:
     return found
 
 
-KINDS: tuple[Callable[[], dict[str, str]], ...] = (lists, physics, episodes, searches, shields, tallies, actions)
+KINDS: tuple[Callable[[], dict[str, str]], ...] = (
+    lambda: {f"list {entry.name}": json.dumps(sampled(entry.name)) for entry in list_scenarios()},
+    lambda: {"physics": str(figures("few")["sha256"])},
+    episodes,
+    searches,
+    lambda: {f"shield {name}": decisions_hash(make()[0], 10) for name, make in SHIELDS.items()},
+    tallies,
+    actions,
+)
 
 
 TELL = "from tests.programmes import machines; machines.tell()"

@@ -47,7 +47,6 @@ from ethbrake_marl.studies.reproduction import (
     render_page,
     rows_table,
     stated,
-    summarise_verdicts,
     write_docs,
 )
 from tests.learning.tiny import TINY_PPO
@@ -152,23 +151,6 @@ NEITHER = replace(ZERO, neither=True)
 def test_judge_statement__holds_where_every_interval_is_below_zero(parts, or_equal, outcome, because) -> None:
     verdict = judge_statement("lower", parts, or_equal=or_equal)
     assert (verdict.outcome, because or verdict.because) == (outcome, verdict.because)
-
-
-@pytest.mark.parametrize(
-    ("outcomes", "worst"),
-    [
-        (("agrees", "agrees"), "agrees"),
-        (("agrees", "differs"), "differs"),
-        (("differs", "cannot agree", "agrees"), "cannot agree"),
-        (("agrees", "not run"), "not run"),
-        (("not run", "undecided", "agrees"), "undecided"),
-    ],
-)
-def test_summarise_verdicts__tells_the_worst_and_counts(outcomes, worst) -> None:
-    found = summarise_verdicts([Verdict(f"w{k}", outcome, f"b{k}") for k, outcome in enumerate(outcomes)])
-    first = outcomes.index(worst)
-    assert found.outcome == worst and found.because.startswith(f"of {len(outcomes)} comparisons ")
-    assert found.because.endswith(f"; w{first}: b{first}") and summarise_verdicts([]).outcome == "not run"
 
 
 AS_STATED, AT_200_MS = READINGS
