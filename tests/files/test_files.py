@@ -1,4 +1,4 @@
-"""Plain files that are read and replaced, YAML, one table written in five ways; refusals: ``refusals/files.txt``."""
+"""Plain files that are read and replaced, and YAML; refusals: ``refusals/files.txt``."""
 
 import math
 import os
@@ -150,6 +150,3 @@ PLAIN = st.recursive(
 @given(PLAIN)
 def test_flow_text__reads_back_equal(value):
     assert parse_yaml(flow_text({"value": value})).content == {"value": value}
-
-
-# ---------------------------------------------------------------- sheets
