@@ -1,7 +1,5 @@
 """What holds for every test: one thread, no display, the same examples in every run."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import functools
@@ -17,12 +15,9 @@ from hypothesis import settings
 from ethbrake_marl.files import yaml
 
 # Before the first numerical import: each pool reads its variable once.
-for _pool in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-    os.environ[_pool] = "1"
-os.environ["MPLBACKEND"] = "Agg"
-os.environ["SDL_VIDEODRIVER"] = "dummy"
-os.environ["SDL_AUDIODRIVER"] = "dummy"
-os.environ["PYGAME_HIDE_SUPPORT_PROMPT"] = "1"
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1") | {
+    "MPLBACKEND": "Agg", "SDL_VIDEODRIVER": "dummy", "SDL_AUDIODRIVER": "dummy", "PYGAME_HIDE_SUPPORT_PROMPT": "1",
+}  # fmt: skip
 
 pytest_plugins = [f"tests.fixtures.{name}" for name in ("evaluation", "pictures", "policies", "registered")]
 

@@ -1,7 +1,5 @@
 """A user's file that uses every public name: `make lint` gives it to mypy, tests/test_surface.py reads its names."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, assert_type
 

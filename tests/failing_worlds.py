@@ -1,7 +1,5 @@
 """A planted world that the physics cannot advance: a stand-in for defects of the kernel that are not known yet."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

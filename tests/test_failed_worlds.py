@@ -1,8 +1,5 @@
 """Worlds that cannot be advanced: every layer names them by the rows of its own batch, and the others go on."""
 
-from __future__ import annotations
-
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -59,13 +56,6 @@ def test_mixed_batches__name_them_by_the_rows_of_the_whole(worlds):
     )
     assert sorted(failed) == PLANTED and rows.tolist() == without(N, PLANTED).tolist()
     assert well.n == len(rows)
-
-
-def test_error__lists_a_few_and_counts_the_rest_and_travels_between_processes():
-    error = PhysicsError({k: "broke" for k in range(8)})
-    assert str(error).startswith("world 0: broke; world 1: broke;") and str(error).endswith("and 3 more worlds")
-    copy = pickle.loads(pickle.dumps(error))
-    assert (copy.worlds, str(copy)) == (error.worlds, str(error))
 
 
 def engine(n=3, seed=5):

@@ -1,6 +1,4 @@
-"""Harm: shares by mass, a ledger of both counts, injury, and whose harm counts under each objective."""
-
-from __future__ import annotations
+"""Harm: shares by mass, ledger, injury, objectives; and reward terms by hand, shaping as a difference of potentials."""
 
 import math
 from fractions import Fraction
@@ -10,24 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.engine import Engine
-from ethbrake_marl.harm import (
-    STANDARD,
-    Ledger,
-    empty_ledger,
-    injury_probability,
-    objective_harm,
-    objectives_of,
-    parse_objective,
-    scored,
-    split,
-)
-from ethbrake_marl.physics import Floats, advance
-from ethbrake_marl.physics.batch import Impacts
-from ethbrake_marl.rewards import RewardParams, reward_params
-from ethbrake_marl.scenario import Scenario, load_scenario
-from tests.physics.random_worlds import driving_lines, line
+import ethbrake_marl as eb
+from ethbrake_marl.envs.interfaces import make_engine
+from ethbrake_marl.errors import WithoutEffect
+from ethbrake_marl.harm import STANDARD, Ledger, empty_ledger, objective_harm, objectives_of, split
+from ethbrake_marl.physics import Floats, Impacts, Worlds, advance, forecast, make_worlds
+from ethbrake_marl.rewards import RewardParams, StepOutcome
+from tests.contract.interfaces import CRASH, REST
+from tests.physics.random_worlds import driving_lines
 from tests.reference.tolerances import EPS
 
 # ---------------------------------------------------------------- shares
@@ -45,24 +33,6 @@ def test_split__shares_add_up_to_the_last_bit_and_are_inverse_to_the_masses(mass
         rounding = 4.0 * EPS * squared * max(mass[p : p + 2])
         assert front * mass[p] == pytest.approx(rear * mass[p + 1], rel=0, abs=rounding)
     assert split(np.array([harm]), np.array([mass])).sum() == pytest.approx(sum(harm), rel=1e-14)
-
-
-@pytest.mark.parametrize(
-    ("harm", "mass", "expected"),
-    [
-        ([16.0, 0.0], [1.0, 3.0, 1.0], [12.0, 4.0, 0.0]),
-        ([16.0, 0.0], [3.0, 1.0, 1.0], [4.0, 12.0, 0.0]),
-        ([0.0, 16.0], [1.0, 3.0, 1.0], [0.0, 4.0, 12.0]),
-        ([16.0, 8.0], [1.0, 3.0, 1.0], [12.0, 4.0 + 2.0, 6.0]),
-    ],
-)
-def test_split__the_lighter_one_bears_more_as_in_the_paper(harm, mass, expected) -> None:
-    assert split(np.array([harm]), np.array([mass])).tolist() == [expected]
-
-
-def test_injury_probability__matches_its_formula() -> None:
-    assert injury_probability(np.array([0.0]), "front")[0] == pytest.approx(1 / (1 + np.exp(4.457)))
-    assert injury_probability(np.array([-10.0]), "rear")[0] == pytest.approx(1 / (1 + np.exp(4.888 - 1.77)))
 
 
 # ---------------------------------------------------------------- the ledger
@@ -95,72 +65,16 @@ def test_ledger__is_the_sum_of_the_recorded_impacts_to_the_last_bit(N: int) -> N
     assert ledger.world_harm("total") == pytest.approx(ledger.vehicle_harm("total").sum(axis=1), rel=1e-14)
 
 
-def test_ledger__the_two_counts_differ_by_the_later_impacts() -> None:
-    # 8, 4, 2 m/s against a heavy holding wall, in two segments
-    world = line([0.0], [0.0, 8.0], mass_t=[2.0**50, 1.0], restitution=0.5)
-    ledger = empty_ledger(world)
-    for until in (1.0, 3.25):
-        world, impacts = advance(world, [-16.0, 4.0], until_s=until)
-        ledger = ledger.add(impacts)
-    assert (ledger.pair_harm("first").tolist(), ledger.count.tolist()) == ([[64.0]], [[3]])
-    assert ledger.world_harm("total") == pytest.approx([64.0 + 16.0 + 4.0])
-    assert ledger.collided.tolist() == [True] and ledger.vehicle_harm("first").sum() == 64.0
-
-
-def test_ledger__the_harm_of_the_obstacle_is_that_of_vehicle_1_alone() -> None:
-    # 6 m/s into the obstacle, 8 and 10 m/s behind, all touching, e = 0: one round, all at rest
-    world = line([0.0, 0.0], [6.0, 8.0, 10.0], obstacle_gap_m=0.0)
-    ledger = empty_ledger(world).add(advance(world, 0.0, 0.0)[1])
-    assert ledger.obstacle_harm("first").tolist() == ledger.obstacle_harm("total").tolist() == [36.0]
-    assert ledger.pair_harm("total").tolist() == [[4.0, 4.0]] and ledger.world_harm("total").tolist() == [44.0]
-    assert ledger.vehicle_harm("first").tolist() == ledger.vehicle_harm("total").tolist() == [[38.0, 4.0, 2.0]]
-    alone = line([50.0], [20.0, 0.0], obstacle_gap_m=10.0)
-    assert empty_ledger(alone).add(advance(alone, 0.0, 1.0)[1]).collided.tolist() == [True]
-
-
 # ---------------------------------------------------------------- objectives
 
-PAPER = load_scenario("paper-random")
+PAPER = eb.load_scenario("paper-random")
 EACH = [*STANDARD, "social:30", "social:90", "weighted:1,4,2"]
 
 
-def ledger() -> Ledger:
-    """Pair 1 met with 12 m2/s2 (masses 1, 2), pair 2 with 9 (masses 2, 1); a second, harder impact of pair 2."""
-    first, total = np.array([[12.0, 9.0]]), np.array([[12.0, 30.0]])
-    return Ledger(first, total, np.array([[1, 2]]), *Impacts.no_obstacle(1), np.array([[1.0, 2.0, 1.0]]))
-
-
-# Shares by mass: pair 1 gives 12 * 2/3 = 8 and 4, pair 2 gives 9 * 1/3 = 3 and 6; so H = (8, 7, 6), 21 in all.
-# In the total count pair 2 gives 10 and 20: H = (8, 14, 20).
-@pytest.mark.parametrize(
-    ("objective", "harm_count", "expected"),
-    [
-        ("total", "first", [21.0, 21.0, 21.0]),
-        ("own", "first", [8.0, 7.0, 6.0]),
-        ("social:0", "first", [8.0, 7.0, 6.0]),
-        ("social:90", "first", [13.0, 14.0, 15.0]),
-        ("social:45", "first", [21.0 / math.sqrt(2.0)] * 3),
-        ("social:30", "first", [h * math.cos(math.pi / 6) + (21 - h) * 0.5 for h in (8.0, 7.0, 6.0)]),
-        ("maximin", "first", [8.0, 8.0, 8.0]),
-        ("mass-weighted", "first", [3 * (8 + 2 * 7 + 6) / 4] * 3),
-        ("weighted:1,4,2", "first", [3 * (8 + 4 * 7 + 2 * 6) / 7] * 3),
-        ("weighted:1e6, 1e-6,1e6", "first", [3 * (8 + 6) / 2] * 3),
-        (("total", "own", "maximin"), "first", [21.0, 7.0, 8.0]),
-        (("total", "own", "maximin"), "total", [42.0, 14.0, 20.0]),
-    ],
-)
-def test_objective_harm__by_hand(objective: Any, harm_count: str, expected: list[float]) -> None:
-    found = objective_harm(ledger(), harm_count, objectives_of(objective, 3))
-    assert found == pytest.approx(np.array([expected]), rel=1e-11)
-    name = objective if isinstance(objective, str) else ", ".join(objective)
-    told = scored(ledger(), harm_count, [objective])
-    assert list(told) == [name] and told[name].tolist() == found.tolist()
-
-
-def played(reward: Any, scenario: Scenario = PAPER, n: int = 60) -> tuple[Floats, Engine]:
+def played(reward: Any, scenario: eb.Scenario = PAPER, n: int = 60) -> tuple[Floats, eb.Engine]:
     """The sum of rewards of each vehicle, and the engine at the end."""
-    scripts = {i: make_agent(script) for i, script in scenario.scripts.items()}
-    engine = Engine(scenario, n, learners=scenario.learners, scripts=scripts, reward=reward, seed=4)
+    scripts = {i: eb.make_agent(script) for i, script in scenario.scripts.items()}
+    engine = eb.Engine(scenario, n, learners=scenario.learners, scripts=scripts, reward=reward, seed=4)
     action, total = np.random.default_rng(2).uniform(-1.0, 0.0, (n, len(scenario.learners))), 0.0
     while not engine.ended.all():
         total += engine.step(action).reward
@@ -194,9 +108,180 @@ def test_reward__weight_and_other_terms_stay_what_they_are() -> None:
     assert without.tolist() == np.repeat(safe[:, np.newaxis] * 1.0, 3, axis=1).tolist()
 
 
-def test_objective__round_trips_with_its_scenario() -> None:
-    for objective in (*EACH, ["own", "social:45", "total"]):
-        scenario = PAPER.replace(objective=objective)
-        assert Scenario(**scenario.declared()) == scenario
-    assert parse_objective("social:45").angle_deg == 45.0
-    assert reward_params("harm").objective is None
+# ---------------------------------------------------------------- reward terms
+
+
+near = pytest.approx
+PAPER = eb.load_scenario("paper-random")
+
+
+def sigmoid(x: float) -> float:
+    return 1.0 / (1.0 + math.exp(-x))
+
+
+def terms_of(
+    params: RewardParams, before: Worlds, after: Worlds, impacts: Impacts, safe: bool = False, **harms: Any
+) -> dict[str, np.ndarray]:
+    """Unweighted terms of one step of 0.5 s, each [n, N]; all but shaping."""
+    facts = {"first_impact_harm": impacts.first_impact_harm.sum(axis=1), "total_harm": impacts.total_harm.sum(axis=1)}
+    motion = after.gaps_m, after.speeds_mps, after.command_mps2, before.command_mps2
+    v, end = after.vehicles, np.full(after.n, safe)
+    constants = v.braking_capacity_mps2, v.driving_capacity_mps2, v.latency_s, v.mass_t
+    harm_of_count = (facts | harms).values()
+    step = StepOutcome(*harm_of_count, end, *motion, 0.5, after.time_s, *constants, np.array([1]))
+    harm = step.first_impact_harm if params.harm_count == "first" else step.total_harm
+    shared = params.shared(harm, step.safe_end.astype(np.float64))
+    spread = {name: np.repeat(term[:, np.newaxis], after.N, axis=1) for name, term in shared.items()}
+    return spread | step.built_in(params.moving, params)
+
+
+def moved(gaps_m: list[float], speeds_mps: list[float], seconds: float, command: Any = 0.0) -> Any:
+    """A line before and after, and its impacts: e = 0.5, equal masses."""
+    usual = {"braking_capacity_mps2": 10.0, "driving_capacity_mps2": 10.0, "latency_s": 0.0, "mass_t": 1.0}
+    before = make_worlds([gaps_m], [speeds_mps], restitution=0.5, **usual)
+    return before, *advance(before, command, seconds)
+
+
+# Vehicle 2 strikes Vehicle 1 at 10 m/s; Vehicle 3 falls back.
+STRUCK = moved([1.0, 5.0], [10.0, 20.0, 4.0], 0.5, [0.0, 0.0, -2.0])
+
+
+@pytest.mark.parametrize(
+    ("params", "safe", "name", "told"),
+    [
+        ({}, False, "harm", [-100.0] * 3),
+        ({"harm": 0.0, "jerk": 1.0}, False, "jerk", [0.0, 0.0, -16.0]),
+        ({"harm": 0.0, "terminal": 3.0}, False, "terminal", [0.0] * 3),
+        ({"harm": 0.0, "terminal": 3.0}, True, "terminal", [1.0] * 3),
+        ({"harm": 0.0, "collision": 1.0, "k_energy": 0.5}, False, "collision", [-50.0] * 3),
+    ],
+)
+def test_term__of_a_step_by_hand(params: dict[str, float], safe: bool, name: str, told: list[float]) -> None:
+    reward = RewardParams(**params)
+    found = terms_of(reward, *STRUCK, safe)
+    assert {each: term.tolist() for each, term in found.items()} == {name: [told]}
+    weight = max(value for key, value in {"harm": 1.0, **params}.items() if key != "k_energy")
+    assert reward.weighted_sum(found, (1, 3)).tolist() == [[weight * value for value in told]]
+
+
+@pytest.mark.parametrize(("count", "harm"), [("first", [-100.0, 0.0]), ("total", [-130.0, -7.0])])
+def test_collision__counts_every_impact_whatever_the_harm_counts(count: Any, harm: list[float]) -> None:
+    two = STRUCK[0].take([0, 0]), STRUCK[1].take([0, 0]), STRUCK[2]
+    harms = {"first_impact_harm": np.array([100.0, 0.0]), "total_harm": np.array([130.0, 7.0])}
+    told = terms_of(RewardParams(harm=1.0, harm_count=count, collision=1.0, k_energy=0.5), *two, **harms)
+    assert (told["collision"][:, 0].tolist(), told["harm"][:, 0].tolist()) == ([-65.0, -3.5], harm)
+
+
+# After STRUCK gap 1 is 0 + 5 m/s * 0.4 s = 2 m, opening; gap 2 is 5 + 2 + 0.4 * 12.5 - (2 - 0.25) = 10.25 m, opening.
+OPENING = -sigmoid(0.5 * (3.0 - 2.0)), -sigmoid(0.5 * (3.0 - 10.25))
+
+
+@pytest.mark.parametrize(
+    ("line", "gaps", "settings", "told"),
+    [
+        (STRUCK, [2.0, 10.25], {"distance_slope_per_m": 0.5}, [OPENING[0], sum(OPENING), OPENING[1]]),
+        # Closing pairs add the time to collision, to the safety buffer of 1 m: slow ones too.
+        (
+            moved([7.0], [0.0, 4.0], 0.5),
+            [5.0],
+            {"ttc_scale_s": 2.0},
+            [-sigmoid(-((5.0 - 1.0) / 4.0) / 2.0) - sigmoid(3.0 - 5.0)] * 2,
+        ),
+        (
+            moved([7.0], [0.0, 0.5], 2.0),
+            [6.0],
+            {"ttc_scale_s": 10.0},
+            [-sigmoid(-((6.0 - 1.0) / 0.5) / 10.0) - sigmoid(3.0 - 6.0)] * 2,
+        ),
+        (moved([3.0], [0.0, 4.0], 0.625), [0.5], {}, [-0.5 - sigmoid(3.0 - 0.5)] * 2),  # within the buffer: most urgent
+    ],
+)
+def test_risk__by_hand(line: Any, gaps: list[float], settings: dict[str, float], told: list[float]) -> None:
+    found = terms_of(RewardParams(harm=0.0, risk=1.0, **settings), *line)
+    assert line[1].gaps_m[0] == near(gaps) and found["risk"][0] == near(told)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "action", "paid", "truncated"),
+    [(CRASH, 0.0, None, 7), (CRASH, -1.0, 7, 7), (REST, -1.0, 9, None)],
+    ids=["crash", "safe at the horizon", "at rest"],
+)
+def test_terminal__is_paid_at_rest_and_at_the_horizon_after_no_collision_and_once(
+    scenario: eb.Scenario, action: float, paid: int | None, truncated: int | None
+) -> None:
+    engine = make_engine(scenario, 1, reward=RewardParams(harm=0.0, terminal=3.0))
+    results = [engine.step(np.full((1, 1), action)) for _ in range(11)]
+    assert [bool(result.truncated[0]) for result in results] == [k == truncated for k in range(11)]
+    assert [result.reward[0].tolist() for result in results] == [[3.0 * (k == paid)] * 2 for k in range(11)]
+    assert [result.shared["terminal"][0] for result in results] == [float(k == paid) for k in range(11)]
+
+
+@pytest.mark.parametrize("discount", [1.0, 0.9])
+def test_shaping__sums_to_minus_the_first_potential_whatever_is_done(discount: float) -> None:
+    reward = RewardParams(harm=0.0, shaping=1.0, shaping_discount=discount)
+    engine = make_engine(PAPER, 50, reward=reward)
+    command = -engine.worlds.vehicles.braking_capacity_mps2
+    candidates = command[:, 1:2] * np.linspace(0.0, 1.0, 9)
+    least = forecast(engine.worlds, command, 1, candidates, PAPER.horizon_s)[0].min(axis=1)
+    rng = np.random.default_rng(5)
+    total, factor = np.zeros(50), 1.0
+    while not engine.ended.all():
+        result = engine.step(rng.uniform(-1.0, 0.0, (50, 1)))
+        total += factor * result.reward[:, 1]
+        factor *= discount
+        assert (result.reward[:, [0, 2]] == 0.0).all()
+    assert (least > 0).sum() > 20 and total == near(least, abs=1e-9)
+
+
+def test_shaping__of_an_episode_after_autoreset_begins_with_the_potential_of_its_own_world() -> None:
+    reward = RewardParams(harm=0.0, shaping=1.0)
+    engine, rng = make_engine(PAPER, 6, reward=reward), np.random.default_rng(5)
+    begun, gained, compared = reward.potential(engine.worlds, (1,), PAPER.horizon_s), np.zeros(6), 0
+    while compared < 30:
+        result = engine.step(rng.uniform(-1.0, 0.0, (6, 1)))
+        gained += result.reward[:, 1]
+        rows = np.flatnonzero(result.ended)
+        assert gained[rows] == near(-begun[rows], abs=1e-9)
+        engine.renew(rows)
+        compared += (begun[rows] < 0.0).sum()
+        begun[rows] = reward.potential(engine.worlds, (1,), PAPER.horizon_s)[rows]
+        gained[rows] = 0.0
+
+
+def potential_in_rounds(worlds: Worlds, rounds: int) -> np.ndarray:
+    """Of learners 0 and 1, who choose one after the other, this often."""
+    braking = worlds.vehicles.braking_capacity_mps2
+    command, best = -braking.copy(), np.empty(worlds.n)
+    for vehicle in (0, 1) * rounds:
+        harms = []
+        for share in range(9):
+            tried = command.copy()
+            tried[:, vehicle] = -braking[:, vehicle] * (share / 8.0)
+            harms.append(forecast(worlds, tried, vehicle, tried[:, [vehicle]], 8.0)[0][:, 0])
+        command[:, vehicle] = -braking[:, vehicle] * (np.array(harms).argmin(axis=0) / 8.0)
+        best = np.array(harms).min(axis=0)
+    return -best
+
+
+def test_potential__of_two_learners_lets_each_choose_given_the_other_twice_round() -> None:
+    worlds = eb.load_scenario("cooperation-3-pair").sample(300, seed=3).worlds
+    braking, shares = worlds.vehicles.braking_capacity_mps2, np.linspace(0.0, 1.0, 9)
+    found = RewardParams().potential(worlds, (0, 1), 8.0)
+    assert found == near(potential_in_rounds(worlds, 2), abs=1e-12)
+    assert (potential_in_rounds(worlds, 1) < found - 1.0).any()
+    alone, pair = -RewardParams().potential(worlds, (1,), 8.0), -found
+    every = np.empty((worlds.n, 9))  # least harm by Vehicle 2, for each choice of Vehicle 1
+    for c, share in enumerate(shares):
+        command = -braking.copy()
+        command[:, 0] *= share
+        every[:, c] = forecast(worlds, command, 1, -braking[:, 1:2] * shares, 8.0)[0].min(axis=1)
+    assert (every.min(axis=1) <= pair).all() and (pair <= alone).all()
+    assert (alone > 1.0).sum() > 100 and pair.mean() < 0.1 * alone.mean()  # Vehicle 1 simply does not brake
+
+
+def test_reward__without_harm_says_that_the_scenarios_objective_changes_nothing() -> None:
+    own = eb.load_scenario("cooperation-3-pair").replace(objective="own")
+    with pytest.warns(WithoutEffect, match="the scenario's objective, own, changes nothing"):
+        paid = make_engine(own, 2, reward="paper", seed=1)
+    assert paid.reward.objective is None
+    make_engine(own, 2, reward={"harm": 1.0, "risk": 0.1}, seed=1)

@@ -1,7 +1,5 @@
 """The package imports one way, without a circle, stays light, and its core needs no extra."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re

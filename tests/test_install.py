@@ -1,7 +1,5 @@
 """`.ci/install` with a python and a uv that only write down what they were asked."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

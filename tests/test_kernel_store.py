@@ -1,7 +1,5 @@
 """Compiled kernels are kept by content: found wherever the package lies, and never stale, damaged or another's."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import os

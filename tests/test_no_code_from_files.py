@@ -4,8 +4,6 @@
 of a stranger's files. What ruff has no rule for is looked for here.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

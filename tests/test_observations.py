@@ -1,129 +1,192 @@
-"""Observations: every feature by name against hand-computed values."""
+"""Observations: every feature by name against hand-computed values; forecasts of contact against recorded impacts."""
 
-from __future__ import annotations
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from ethbrake_marl.observations import ObservationSpec, observe
-from ethbrake_marl.physics import Worlds, advance, make_worlds
-from ethbrake_marl.scenario import load_scenario, observation_for
+import ethbrake_marl as eb
+from ethbrake_marl import observations
+from ethbrake_marl.errors import PhysicsError
+from ethbrake_marl.observations import FORECAST_S, GROUPS, ObservationSpec, choose_observation, observe
+from tests.fixtures.policies import make_policy
+from tests.physics.random_worlds import line
 
 near = pytest.approx
 SPEC = ObservationSpec(front=2, rear=1)
-START = make_worlds(
-    [[8.0, 6.0, 10.0]],
-    [[20.0, 18.0, 22.0, 10.0]],
-    braking_capacity_mps2=[6.0, 7.0, 5.0, 8.0],
-    driving_capacity_mps2=[1.0, 2.0, 3.0, 4.0],
-    latency_s=[0.0, 0.5, 0.25, 1.0],
-    mass_t=[4.5, 5.5, 5.9, 7.0],
-    restitution=0.1,
-)
-COMMAND = [-6.0, 0.0, -5.0, 0.0]
-WORLDS = advance(START, COMMAND, until_s=0.5)[0]
-
-
-def by_name(vehicle: int, worlds: Worlds = WORLDS, spec: ObservationSpec = SPEC) -> dict[str, float]:
-    return dict(zip([f.name for f in spec.features], observe(worlds, vehicle, spec)[0].tolist(), strict=True))
-
-
-def test_observe__own_features_and_neighbours_by_hand() -> None:
-    v1, v2, v3, v4 = 17.0, 18.0, 22.0 - 1.25, 10.0
-    x1, x3 = 20 * 0.5 - 6 * 0.125, 22 * 0.5 - 5 * 0.25**2 / 2
-    gap1, gap2, gap3 = 8 + x1 - 9, 6 + 9 - x3, 10 + x3 - 5
-    own, front, rear = v3**2 / 10, v1**2 / 12, v4 * 0.5 + v4**2 / 16
-    expected = {
-        "own.speed": v3 / 20,
-        "own.acceleration": -0.5,
-        "own.braking_capacity": 0.5,
-        "own.driving_capacity": 0.3,
-        "own.mass": 0.59,
-        "own.latency_left": 0.0,
-        "own.restitution": 0.1,
-        **{f"{neighbour}.known": 1.0 for neighbour in ("front_1", "front_2", "rear_1")},
-        "front_1.gap": gap2 / 10,
-        "front_2.gap": (gap1 + gap2) / 10,
-        "rear_1.gap": gap3 / 10,
-        "front_1.closing_speed": (v3 - v2) / 10,
-        "front_2.closing_speed": (v3 - v1) / 10,
-        "rear_1.closing_speed": (v4 - v3) / 10,
-        "front_2.acceleration": -0.6,
-        "front_1.braking_capacity": 0.7,
-        "rear_1.mass": 0.7,
-        "rear_1.latency_left": 0.5,
-        "front_1.hit": 0.0,
-        "rear_1.hit": 0.0,
-        "front_2.stopping_margin": (gap1 + gap2 + front - own) / 10,
-        "rear_1.stopping_margin": (gap3 + own - rear) / 10,
-        "front_2.fitting_deceleration": v3**2 / (2 * (gap1 + gap2 + front)) / 10,
-        "rear_1.fitting_deceleration": 2.0,  # no deceleration of its own lets the rear one touch: clipped
-    }
-    seen = by_name(2)
-    assert {name: seen[name] for name in expected} == near(expected, rel=1e-5)
-    assert len(seen) == SPEC.size
-
-
-def test_observe__what_is_not_known_or_not_there_reads_zero() -> None:
-    uninformed, first = by_name(3), by_name(0)
-    assert {value for name, value in uninformed.items() if not name.startswith("own.")} == {0.0}
-    assert {value for name, value in first.items() if name.startswith("front_")} == {0.0}
-    assert first["rear_1.known"] == 1.0
-
-
-def test_observe__hit_flag_belongs_to_the_pair_on_that_side() -> None:
-    struck, _ = advance(WORLDS, COMMAND, until_s=2.0)
-    assert struck.pair_hit.tolist() == [[True, False, False]]
-    hits = [[value for name, value in by_name(i, struck).items() if name.endswith(".hit")] for i in (1, 2)]
-    assert hits == [[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]  # of front_1, front_2 and rear_1
 
 
 def test_observe__is_clipped_to_the_stated_bounds() -> None:
-    far = make_worlds([1e6], [1.0, 1e4], braking_capacity_mps2=100.0, driving_capacity_mps2=100.0, latency_s=0.0,
+    far = eb.make_worlds([1e6], [1.0, 1e4], braking_capacity_mps2=100.0, driving_capacity_mps2=100.0, latency_s=0.0,
                       mass_t=1e5, restitution=1.0, speed_limit_mps=1e5)  # fmt: skip
     seen = observe(far, 1, SPEC)[0]
     low, high = (np.array([getattr(f, side) for f in SPEC.features], np.float32) for side in ("low", "high"))
     assert (seen >= low).all() and (seen <= high).all() and (seen == high).sum() >= 5
 
 
-@pytest.mark.parametrize(("speed", "reads"), [(0.0, 0.0), (0.1, 0.5), (0.2, 2.0), (20.0, 2.0)])
-def test_observe__without_room_the_fitting_deceleration_is_that_of_one_millimetre(speed: float, reads: float) -> None:
-    # v^2 / (2 * 0.001 m) = 500 v^2 m/s2, scale 10 and clipped at 2: 0.1 m/s reads 5 / 10.
-    touching = make_worlds([0.0], [0.0, speed], braking_capacity_mps2=6, driving_capacity_mps2=1, latency_s=0, mass_t=1,
-                           restitution=0)  # fmt: skip
-    assert by_name(1, touching, ObservationSpec(1, 0))["front_1.fitting_deceleration"] == near(reads, rel=1e-6)
+# ---------------------------------------------------------------- contact features
 
 
-def test_observation_for__adds_place_and_obstacle_only_where_there_is_one() -> None:
-    assert observation_for(load_scenario("paper-random")) == ObservationSpec(1, 1)
-    spec = observation_for(load_scenario("cooperation-4-all"))
-    assert spec == ObservationSpec(1, 1, role=True, obstacle=True)
-    assert [f.name for f in spec.features] == [f.name for f in ObservationSpec().features] + [
-        "role.vehicles_ahead", "role.vehicles_behind", "obstacle.known", "obstacle.gap", "obstacle.hit",
-        "obstacle.stopping_margin", "obstacle.fitting_deceleration",
-    ]  # fmt: skip
-    assert spec.size == len({f.name for f in spec.features}) == 34
+SCENARIO = eb.load_scenario("paper-random")
+STEP_S = 0.1
+CONTACT = choose_observation(["contact"], STEP_S)
 
 
-def test_observe__place_and_obstacle_by_hand() -> None:
-    spec = ObservationSpec(0, 0, role=True, obstacle=True)
-    start = make_worlds(
-        [[8.0, 6.0, 10.0]], [[20.0, 18.0, 22.0, 10.0]], braking_capacity_mps2=8.0, driving_capacity_mps2=1.0,
-        latency_s=[0.0, 0.5, 1.0, 1.0], mass_t=1.0, restitution=0.1, obstacle_gap_m=42.0,
-    )  # fmt: skip
-    names = ("known", "gap", "hit", "stopping_margin", "fitting_deceleration")
-    later, struck = (advance(start, 0.0, until_s=time)[0] for time in (1.0, 2.2))
+def seen_by(worlds, vehicle, spec=CONTACT):
+    """The features of one vehicle by name, before scaling, [n] each."""
+    values = observe(worlds, vehicle, spec)
+    return {f.name.removeprefix("contact."): values[:, c] * f.scale for c, f in enumerate(spec.features)}
 
-    def obstacle(vehicle: int, worlds: Worlds) -> list[float]:
-        seen = by_name(vehicle, worlds, spec)
-        return [seen[f"obstacle.{name}"] for name in names]
 
-    assert obstacle(0, start) == near([1.0, 4.2, 0.0, (42.0 - 400 / 16) / 10, 400 / 84 / 10])
-    assert obstacle(1, start) == obstacle(0, WORLDS) == [0.0] * 5  # not known yet; nothing ahead
-    seen = [by_name(i, later, spec) for i in range(4)]
-    assert [s["role.vehicles_ahead"] for s in seen] == [0.0, 1.0, 2.0, 2.0]
-    assert [s["role.vehicles_behind"] for s in seen] == [2.0, 2.0, 1.0, 0.0]
-    # all have coasted for 1 s: Vehicle 3 was 8 + 6 m behind Vehicle 1 and drove 22 m, Vehicle 1 has 22 m left
-    assert obstacle(0, later)[1] == near(2.2)
-    assert obstacle(2, later)[1:4] == near([(42 + 14 - 22) / 10, 0.0, (34 - 22**2 / 16) / 10])
-    assert obstacle(3, struck)[2] == 1.0
+LINE = {"braking_capacity_mps2": [6.0, 7.0, 6.0], "driving_capacity_mps2": 3.0, "latency_s": 0.0, "restitution": 0.1}
+
+
+def expected(worlds, vehicle, own_mps2, others_mps2, step_s=STEP_S):
+    """The same of one forecast, from the impacts that ``advance`` records."""
+    command = others_mps2.copy()
+    command[:, vehicle] = own_mps2
+    impacts = eb.advance(worlds, command, duration_s=FORECAST_S, record=True)[1]
+    rows = impacts.rows
+    told = {
+        "first_impact_harm": impacts.first_impact_harm.sum(axis=1) + impacts.obstacle_first_harm,
+        "total_harm": impacts.total_harm.sum(axis=1) + impacts.obstacle_total_harm,
+    }
+    for side, pair in (("front", vehicle - 1), ("rear", vehicle)):
+        world, first = np.unique(rows.world[rows.pair == pair], return_index=True)
+        time, closing, met = np.full(worlds.n, FORECAST_S), np.zeros(worlds.n), np.isin(np.arange(worlds.n), world)
+        time[world] = rows.time_s[rows.pair == pair][first] - worlds.time_s[world]
+        closing[world] = rows.closing_speed_mps[rows.pair == pair][first]
+        whole = np.maximum(np.ceil(time / step_s) - 1, 0)
+        fraction = np.where(met, time / step_s - whole, 0.0)
+        parts = {"time": time, "closing_speed": closing, "fraction": fraction, "steps": whole}
+        told |= {f"{side}_{name}": values for name, values in parts.items()}
+    return told
+
+
+def check(worlds, vehicle, others_mps2, step_s=STEP_S):
+    spec = choose_observation(["contact"], step_s)
+    seen, v = seen_by(worlds, vehicle, spec), worlds.vehicles
+    own = {"brake": -v.braking_capacity_mps2[:, vehicle], "coast": 0.0, "drive": v.driving_capacity_mps2[:, vehicle]}
+    bounds = {f.name.removeprefix("contact."): (f.low * f.scale, f.high * f.scale) for f in spec.features}
+    for command, own_mps2 in own.items():
+        for name, wanted in expected(worlds, vehicle, own_mps2, others_mps2, step_s).items():
+            full = f"{command}_{name}"
+            np.testing.assert_allclose(seen[full], np.clip(wanted, *bounds[full]), rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("until_s", [0.8, 1.3, 2.1])
+def test_contact__is_what_advance_records(until_s):
+    start = SCENARIO.sample(60, 3).worlds
+    v = start.vehicles
+    command = np.column_stack([-v.braking_capacity_mps2[:, 0], np.full(60, -4.0), -v.braking_capacity_mps2[:, 2]])
+    worlds, _ = eb.advance(start, command, until_s=until_s)
+    assert worlds.pair_hit.any() == (until_s > 1.0)  # a pair that has met may meet again
+    check(worlds, 1, command)
+    check(worlds, 1, command, step_s=0.04)
+
+
+def test_contact__others_go_on_as_they_are_seen_and_brake_fully_where_nothing_is_seen_yet():
+    command = np.tile([-3.0, 0.0, -2.0], (40, 1))
+    early, _ = eb.advance(SCENARIO.sample(40, 3).worlds, command, until_s=0.5)
+    assert (early.command_mps2[:, 2] == 0.0).all()  # its latency of 0.8 s has not elapsed
+    check(early, 1, np.column_stack([command[:, :2], -early.vehicles.braking_capacity_mps2[:, 2]]))
+    check(eb.advance(early, command, until_s=1.0)[0], 1, command)
+
+
+def test_contact__sees_the_obstacle_and_vehicle_1_meets_it_in_front():
+    start = eb.load_scenario("cooperation-4-all").sample(40, 5).worlds
+    others = -start.vehicles.braking_capacity_mps2
+    worlds, _ = eb.advance(start, others, until_s=1.0)
+    for vehicle in (0, 1):
+        check(worlds, vehicle, others)
+    near = line([8.0, 40.0], [20.0, 18.0, 15.0], obstacle_gap_m=20.0, **LINE)
+    front = seen_by(near, 0)
+    assert front["brake_front_time"][0] == pytest.approx((20 - math.sqrt(400 - 240)) / 6, rel=1e-5)
+    assert front["brake_front_closing_speed"][0] == pytest.approx(math.sqrt(160.0), rel=1e-5)
+
+
+def test_contact__at_the_alert_shows_nobody_behind_a_latency():
+    before = line([7.0, 7.0], [20.0, 18.0, 20.0], **{**LINE, "latency_s": [0.0, 0.5, 0.8]})
+    first, middle, last = (seen_by(before, vehicle) for vehicle in range(3))
+    assert not any(values.any() for each in (middle, last) for values in each.values())
+    assert (first["brake_front_time"] == 0.0).all() and (first["brake_rear_time"] > 0.0).all()
+
+
+def test_contact__hides_whom_no_news_has_come_from_whatever_they_do():
+    scenario = SCENARIO.replace(v2x="blocked", horizon_s=20, early_impacts="keep")
+    worlds = eb.advance(scenario.sample(300, 1).worlds, np.zeros((300, 3)), until_s=0.6)[0]
+    news = worlds.vehicles.known_from_s[:, 1] <= 0.6
+    seen = seen_by(worlds, 1)
+    assert news[:, 0].any() and not news[:, 0].all() and not news[:, 2].all()
+    assert ((seen["coast_front_time"] > 0.0) == news[:, 0]).all()
+    assert ((seen["coast_rear_time"] > 0.0) == news[:, 2]).all()
+    alone = ~news[:, 0] & ~news[:, 2]
+    assert (seen["drive_total_harm"][alone] == 0.0).all() and alone.any()
+    changed = replace(worlds, speeds_mps=worlds.speeds_mps.copy())
+    changed.speeds_mps[~news[:, 2], 2] = 39.0
+    assert observe(changed, 1, CONTACT)[~news[:, 2]].tobytes() == observe(worlds, 1, CONTACT)[~news[:, 2]].tobytes()
+
+
+def test_contact__of_some_commands_only_is_the_same():
+    worlds = eb.advance(SCENARIO.sample(20, 3).worlds, np.zeros((20, 3)), until_s=0.8)[0]
+    some = ["contact.brake_rear_fraction", "own.speed", "contact.drive_total_harm"]
+    whole = dict(zip([f.name for f in CONTACT.features], observe(worlds, 1, CONTACT).T, strict=True))
+    picked = observe(worlds, 1, choose_observation(some, STEP_S))
+    assert picked[:, 0].tobytes() == whole[some[0]].tobytes() and picked[:, 2].tobytes() == whole[some[2]].tobytes()
+
+
+def test_contact__leaves_other_features_alone_in_every_interface():
+    groups = ["own", "front_1", "rear_1", "contact"]
+    declared = SCENARIO.replace(observation=groups)
+    assert eb.observation_for(declared) == ObservationSpec(contact=True, time_step_s=0.1)
+    seen, wider, listed = (
+        eb.make_sb3_vec_env(scenario, 6, seed=3, **options).reset()
+        for scenario, options in ((SCENARIO, {}), (declared, {}), (SCENARIO, {"observation": groups}))
+    )
+    assert wider.shape == (6, 27 + len(GROUPS.contact)) and wider[:, :27].tobytes() == seen.tobytes()
+    parallel = eb.parallel_env(scenario=declared).reset(seed=3)[0]["vehicle_2"]
+    assert parallel.tobytes() == wider[0].tobytes() and listed.tobytes() == wider.tobytes()
+
+
+@pytest.mark.parametrize("group", ["contact", "contact_far"])
+def test_policy__observes_contacts_at_the_steps_of_its_training(group):
+    spec = choose_observation(["own", group])
+    policy = make_policy(spec, SCENARIO.replace(time_step_s=0.05).model_dump(mode="json"))
+    assert policy.observation == choose_observation(["own", group], 0.05)
+    outcome = eb.evaluate(SCENARIO.sample(5, 7), {"mine": eb.LearnedAgent(policy)}, scenario=SCENARIO).outcome("mine")
+    assert np.isfinite(outcome.total_harm).all()
+    assert choose_observation(["own"], 0.1).time_step_s is None  # nothing that depends on it
+
+
+def test_contact__failed_forecast_names_its_world(monkeypatch):
+    def fail(*arguments):
+        arguments[-1][1] = True
+
+    monkeypatch.setattr(observations, "_observe_contacts", fail)
+    worlds = SCENARIO.sample(3, 1).worlds
+    with pytest.raises(PhysicsError, match="world 1: a forecast of contacts could not look 10 s ahead"):
+        observe(worlds, 1, CONTACT)
+
+
+def test_contact_far__tells_what_the_others_cut_off():
+    """The times up to 10 s, and the square roots of the harms, of the same forecasts; the others stay as they are."""
+    wide = eb.load_scenario("stress-wide").sample(300, 3).worlds
+    worlds = eb.advance(wide, np.zeros((300, 3)), until_s=0.4)[0]
+    both = choose_observation(["own", "contact", "contact_far"], STEP_S)
+    seen = dict(zip([f.name for f in both.features], observe(worlds, 1, both).T, strict=True))
+    alone = observe(worlds, 1, choose_observation(["contact_far"], STEP_S))
+    assert alone.shape == (300, 12) and alone.tobytes() == observe(worlds, 1, both)[:, -12:].tobytes()
+    for name, values in zip([f.name for f in CONTACT.features], observe(worlds, 1, CONTACT).T, strict=True):
+        assert values.tobytes() == seen[name].tobytes()
+    hard = 0
+    for command in ("brake", "coast", "drive"):
+        for time in ("front_time", "rear_time"):
+            found, cut = seen[f"contact_far.{command}_{time}"] * 5.0, seen[f"contact.{command}_{time}"] * 2.0
+            np.testing.assert_allclose(np.minimum(found, 4.0), cut, rtol=1e-6)
+            assert (found <= 10.0).all()
+        for far, near in (("first_impact_speed", "first_impact_harm"), ("total_speed", "total_harm")):
+            found, cut = (seen[f"contact_far.{command}_{far}"] * 10.0) ** 2, seen[f"contact.{command}_{near}"] * 50.0
+            np.testing.assert_allclose(np.minimum(found, 200.0), cut, rtol=1e-5, atol=1e-4)
+            hard += int((found > 200.0).sum())
+    assert hard > 30

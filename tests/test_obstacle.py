@@ -1,7 +1,5 @@
 """An obstacle ahead of Vehicle 1, from the scenario to the results: every module counts it, and counts it alike."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 
@@ -11,14 +9,10 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
 from ethbrake_marl.agents.registry import drive, make_agent
-from ethbrake_marl.engine import Engine
-from ethbrake_marl.evaluation.episodes import record_episode
 from ethbrake_marl.evaluation.results import write_per_world
-from ethbrake_marl.figures import trajectories
 from ethbrake_marl.harm import empty_ledger
 from ethbrake_marl.limits.limits import best_harm, task_problem
 from ethbrake_marl.limits.lower_bound import avoidability, lower_bound
-from ethbrake_marl.physics import advance
 from ethbrake_marl.policies import ObservationSchema
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from ethbrake_marl.search import profile_problem
@@ -34,7 +28,7 @@ def test_profiles__are_followed_with_the_obstacle_as_the_engine_drives_them() ->
     commands = np.broadcast_to(np.array([-3.0, -2.5, -6.0]), (30, 1, 3))
     found = problem.follow(problem.constant(commands))
     scripts = {i: make_agent(spec) for i, spec in enumerate(("constant:3", "constant:2.5", "full_brake"))}
-    engine = Engine(NEAR, 30, learners=(), scripts=scripts, deciders=(0, 1, 2), worlds=worlds)
+    engine = eb.Engine(NEAR, 30, learners=(), scripts=scripts, deciders=(0, 1, 2), worlds=worlds)
     while not engine.ended.all():
         engine.step({})
     np.testing.assert_array_equal(found, [engine.ledger.world_harm("first"), engine.ledger.world_harm("total")])
@@ -50,7 +44,7 @@ def test_coupled__vehicle_1_stops_short_of_the_obstacle_if_it_can() -> None:
     harms = []
     for a in (*np.linspace(0.0, 6.0, 25), found.deceleration_mps2):
         command[:, 0] = -a
-        harms.append(empty_ledger(worlds).add(advance(worlds, command, until_s=8.0)[1]).world_harm("total"))
+        harms.append(empty_ledger(worlds).add(eb.advance(worlds, command, until_s=8.0)[1]).world_harm("total"))
     assert harms[-1].tolist() == found.harm.tolist() and (found.harm <= np.min(harms, axis=0)).all()
 
 
@@ -97,12 +91,12 @@ def test_per_world__the_table_tells_the_obstacles_part(near_one: Scenario, tmp_p
 
 
 def test_record__positions_end_at_the_obstacle_and_the_figure_draws_it(near_one: Scenario) -> None:
-    record = record_episode(near_one.sample(1, 7).worlds, make_agent("coast"), scenario=near_one)
+    record = eb.record_episode(near_one.sample(1, 7).worlds, make_agent("coast"), scenario=near_one)
     gap = float(record.initial.obstacle_gap_m[0])
     assert record.positions_m[:, 0].max() == pytest.approx(gap, abs=1e-9) and (record.positions_m <= gap + 1e-9).all()
     struck = record.impacts.pair == -1
     assert struck.any() and record.impacts.closing_speed_mps[struck][0] ** 2 == record.ledger.obstacle_first_harm[0]
-    assert "obstacle" in trajectories({"coast": record}).axes[0].get_legend_handles_labels()[1]
+    assert "obstacle" in eb.trajectories({"coast": record}).axes[0].get_legend_handles_labels()[1]
 
 
 @pytest.mark.parametrize("vehicle", [0, 1])

@@ -7,8 +7,6 @@ A case runs in an empty folder, which stands as ``HERE`` in answers; what it wro
 unchanged. ``python -m tests.test_refusals`` writes the answers of today into the lists: read the difference.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

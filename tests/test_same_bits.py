@@ -4,8 +4,6 @@ The C library, numpy and scipy choose their exponentials, powers and matrix prod
 calls of them is listed here, each with why it may stay; ``make test-machines`` tries recorded results on others.
 """
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The public names of the package: each listed once, shown by an example that runs, and described."""
 
-from __future__ import annotations
-
 import ast
 import doctest
 import inspect
@@ -55,13 +53,6 @@ def test_every_name__is_used_by_the_file_that_mypy_reads() -> None:
     used = {n.attr for n in nodes if isinstance(n, ast.Attribute) and getattr(n.value, "id", "") == "eb"}
     assert set(eb.__all__) - used == set()
     assert f"--strict ethbrake_marl {file.relative_to(ROOT)}" in (ROOT / "Makefile").read_text("utf-8")
-
-
-def test_unknown_name__suggests_the_nearest() -> None:
-    with pytest.raises(AttributeError, match=r"no attribute 'evalute'; did you mean 'evaluate'\?"):
-        eb.evalute  # type: ignore[attr-defined]  # noqa: B018
-    with pytest.raises(AttributeError, match=r"no attribute 'zzzzzz'$"):
-        eb.zzzzzz  # type: ignore[attr-defined]  # noqa: B018
 
 
 def test_examples__every_public_class_has_one_and_it_is_run() -> None:

@@ -1,11 +1,12 @@
-"""``ethbrake doctor``: what it finds wrong, what it compiles, and the table of speeds (measured in tests/studies)."""
-
-from __future__ import annotations
+"""``ethbrake doctor``: what it finds wrong, what it compiles, what it measures. No speed is asserted."""
 
 import dataclasses
+import math
 import re
+import time
 from unittest.mock import Mock, call
 
+import numba
 import numpy as np
 import pytest
 from packaging.requirements import Requirement
@@ -14,9 +15,11 @@ from ethbrake_marl import physics, scenario
 from ethbrake_marl.agents import e_v2x_bm
 from ethbrake_marl.cli import doctor
 from ethbrake_marl.cli.doctor import Check, diagnose
+from ethbrake_marl.envs import make_engine
 from ethbrake_marl.kernel_store import cache_folder
-from ethbrake_marl.studies import speed
-from ethbrake_marl.studies.speed import Benchmark, Speed, this_machine
+from ethbrake_marl.physics import advance
+from ethbrake_marl.studies import speed, speed as benchmark
+from ethbrake_marl.studies.speed import BENCHMARKS, Benchmark, Effort, Speed, braking, measure, rates, this_machine
 from tests.cli.conftest import Command, told_json
 
 
@@ -54,12 +57,6 @@ def test_dependencies__too_old_missing_and_untested_ones_are_told(monkeypatch) -
     assert found("no-such-extra") == (True, "is not installed; the extra train brings it")
     ok, told = found("scipy")
     assert ok and "(tested with 1.0)" in told
-
-
-def test_dependencies__each_stands_with_the_extra_that_brings_it() -> None:
-    extra_of = {requirement.name: extra for extra, requirement in doctor._requirements()}
-    names = ("numpy", "numba", "torch", "benchmarl", "onnx", "ray", "pytest")
-    assert [extra_of.get(name) for name in names] == ["", "", "train", "marl", "export", "cluster", None]
 
 
 def test_checks__other_physics_another_optimum_and_a_damaged_folder_are_findings(monkeypatch) -> None:
@@ -143,3 +140,54 @@ def test_speed__prints_a_table_and_the_machine_or_json(ethbrake: Command, monkey
     assert (told["figures"][0]["value"], told["figures"][0]["relative"]) == (9_876_543.0, 1.0)
     assert told["machine"]["cores"] >= 1 and told["machine"]["processor"] and "speed: 1 of 3" in answer.err
     assert [each.call_args_list for each in look] == [[call(speed.FULL), call(speed.QUICK)]] * 3
+
+
+# ---------------------------------------------------------------- speed
+
+
+SHORT = Effort(1, 1e-6)
+
+
+def test_rates__are_work_per_processor_second_without_the_first_round(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, durations = [0.0], iter([9.0, 0.25, 0.25, 1.0])  # the first round, two calls, one call
+
+    def work() -> int:
+        clock[0] += next(durations)
+        return 10
+
+    monkeypatch.setattr(time, "process_time", lambda: clock[0])
+    assert rates(work, Effort(2, 0.5)).tolist() == [10.0, 40.0]
+
+
+def test_measure__sets_world_steps_against_the_first_figure(monkeypatch: pytest.MonkeyPatch) -> None:
+    def figure(unit: str, *values: float) -> Benchmark:
+        return Benchmark("x", "y", unit, 5, None, lambda effort: np.array(values))
+
+    figures = (figure("world-steps/s", 7.0, 8.0, 9.0), figure("s", 4.0), figure("world-steps/s", 1.0, 2.0, 2.0))
+    monkeypatch.setattr(benchmark, "BENCHMARKS", figures)
+    found = measure()
+    assert [speed.relative for speed in found] == [1.0, None, 0.25]
+    assert [(speed.lowest, speed.value, speed.highest) for speed in found] == [(7, 8, 9), (4, 4, 4), (1, 2, 2)]
+
+
+def test_braking__counts_world_steps_to_rest() -> None:
+    worlds = make_engine(benchmark.SCENARIO, 5, seed=benchmark.SEED).worlds
+    command = -worlds.vehicles.braking_capacity_mps2
+    steps = 0
+    while worlds.speeds_mps.any():
+        worlds, steps = advance(worlds, command, 0.1)[0], steps + 1
+    assert braking(5, 1.0)() == 5 * steps and steps > 20
+
+
+@pytest.mark.parametrize(
+    "each", [pytest.param(each, marks=pytest.mark.slow if each.unit == "s" else ()) for each in BENCHMARKS]
+)
+def test_benchmarks__each_measures_something(each: Benchmark) -> None:
+    speed = each.measure(SHORT)
+    assert each.workload and each.worlds >= 1 and 0.0 < speed.lowest == speed.value == speed.highest < math.inf
+
+
+def test_machine__is_named_in_words() -> None:
+    machine = this_machine()
+    parts = (machine.processor, f"{machine.cores_usable} of {machine.cores} cores", f"numba {numba.__version__}")
+    assert machine.processor and all(part in str(machine) for part in parts)

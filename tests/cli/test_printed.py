@@ -6,8 +6,6 @@ one, ``$ rm`` removes one. ``HERE`` and ``ROOT`` stand for folders. ``python -m 
 printed today: read the difference.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

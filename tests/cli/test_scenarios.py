@@ -1,7 +1,5 @@
 """``ethbrake scenario`` and ``ethbrake recipe``, ``--set``, and the pages that show them."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re
@@ -13,8 +11,8 @@ import pytest
 
 from ethbrake_marl.cli import scenario as module
 from ethbrake_marl.evaluation.inputs import load_runnable
-from ethbrake_marl.files.yaml import Override, flow_text
-from ethbrake_marl.learning.training import TrainingRecipe, load_recipe, read_settings
+from ethbrake_marl.files.yaml import flow_text
+from ethbrake_marl.learning.training import TrainingRecipe, load_recipe
 from ethbrake_marl.scenario import QUANTITY, Scenario, list_scenarios, load_scenario, parse_yaml
 from ethbrake_marl.search import ProfileProblem
 from tests.cli.conftest import Answer, Command, check_refused, rows_of, told_json
@@ -146,43 +144,6 @@ def test_new_recipe__has_every_key_with_a_comment_and_the_same_values(based_on: 
     for key in type(base).model_fields:
         (number,) = (k for k, line in enumerate(lines) if line.removeprefix("# ").startswith(f"{key}:"))
         assert lines[number - 1].startswith("# "), key
-
-
-def test_settings__are_typed_by_the_rules_of_yaml_and_go_into_mappings_and_lists() -> None:
-    texts = ["a=1", "b=0.5", "c=true", "d=x", "e={uniform: [1, 2]}", "f.g.h=null", "i='1'"]
-    assert Override.put({}, Override.parse(texts)) == {
-        "a": 1, "b": 0.5, "c": True, "d": "x", "e": {"uniform": [1, 2]}, "f": {"g": {"h": None}}, "i": "1",
-    }  # fmt: skip
-    content = {"a": {"b": [1, 2], "c": 3}, "d": 4}
-    assert Override.put(content, Override.parse(["a.b.1=5", "a.e=6"])) == {"a": {"b": [1, 5], "c": 3, "e": 6}}
-    assert content == {"a": {"b": [1, 2], "c": 3}, "d": 4}
-
-
-def test_settings__belong_to_the_recipe_or_the_scenario() -> None:
-    given = read_settings(["gamma=0.9", "scenario.mass_t=40", "recipe.seed=3"], [load_recipe("ppo")])
-    assert [[each.key for each in part] for part in (given.recipe, given.scenario)] == [["gamma", "seed"], ["mass_t"]]
-
-
-def test_settings_of_a_recipe__are_checked_and_a_pair_is_kept_together() -> None:
-    base, told = load_recipe("ppo"), list[str]()
-    changed = read_settings(["learning_rate.start=0.002", "network.policy=[8]"], [base]).change(base)
-    parts = {"learning_rate": {"start": 0.002}, "network": {"policy": [8]}}
-    whole = base.model_dump(mode="json")
-    assert changed == base.replace(**{part: whole[part] | change for part, change in parts.items()})
-    assert read_settings(["gamma=0.9"], [base]).change(base, told.append).gamma == 0.9
-    read_settings(["gamma=0.9", "reward.shaping_discount=0.9"], [base]).change(base, told.append)
-    (note,) = told
-    assert "note: gamma = 0.9, but reward.shaping_discount stays 0.995" in note
-
-
-def test_settings_of_a_scenario__change_what_they_name() -> None:
-    def load(*texts: str) -> Scenario:
-        return load_runnable("paper-random", read_settings(texts).scenario)
-
-    assert load("restitution=0.3").bounds("restitution") == ((0.3, 0.3),)
-    assert load("roles.vehicle_3=coast").scripts[2] == "coast" and load("roles.vehicle_3=coast").learners == (1,)
-    assert load("gaps_m.uniform.1=12").bounds("gaps_m")[0][1] == 12.0
-    assert load("v2x.preset=blocked").v2x.preset == "blocked"
 
 
 def test_set__is_noted_in_a_training(ethbrake: Command, tiny_recipe: Path, tmp_path: Path) -> None:

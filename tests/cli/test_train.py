@@ -1,7 +1,5 @@
 """``ethbrake run``, ``train`` with ``resume`` and ``curves``, ``agent export``, on trainings of a few small updates."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import shutil
@@ -9,27 +7,25 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
+import numpy as np
 import onnx
 import pytest
 import yaml
 
-from ethbrake_marl.agents.policy import LearnedAgent
+import ethbrake_marl as eb
 from ethbrake_marl.cli.command import Out
-from ethbrake_marl.evaluation import evaluate, summarise
 from ethbrake_marl.evaluation.inputs import make_lineup, scenario_sha256, worlds_sha256
 from ethbrake_marl.figures import learning_curve
-from ethbrake_marl.learning.training import load_recipe
-from ethbrake_marl.policies import load_policy
-from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies import experiment
-from ethbrake_marl.studies.experiment import run_folder, write_figures
+from ethbrake_marl.studies.experiment import telling_world, write_figures
 from tests.cli.conftest import TINY_RECIPE, Answer, Command, check_refused, rows_of, told_json
 
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "ppo", "hybrid"]
-SCENARIO = load_scenario("paper-random")
+SCENARIO = eb.load_scenario("paper-random")
 
 
 def status_of(folder: Path, *names: str) -> tuple[Any, ...]:
@@ -90,9 +86,9 @@ def test_run__the_other_two_tests_stand_beside_the_main_one(finished_run: Path) 
     assert page.count(">Vehicle 1 shoved (m)</th>") == 3
     assert page.count(">Sampled harm</th>") == 2  # nobody samples where an obstacle stands ahead
     for test, row in zip(tests, rows[::4], strict=True):
-        scenario = load_scenario(test)
-        result = evaluate(scenario.sample(60, 7), make_lineup(["full_brake"], scenario), scenario=scenario, seed=7)
-        assert row["total_harm"] == summarise(result)[0].total_harm.value
+        scenario = eb.load_scenario(test)
+        result = eb.evaluate(scenario.sample(60, 7), make_lineup(["full_brake"], scenario), scenario=scenario, seed=7)
+        assert row["total_harm"] == eb.summarise(result)[0].total_harm.value
 
 
 def test_run__its_policy_evaluates_to_the_same_figures_afterwards(ethbrake: Command, finished_run: Path) -> None:
@@ -128,13 +124,13 @@ def test_run__vehicle_chooses_among_several_learners(ethbrake, tiny_recipe, scen
 
 def test_run__the_learning_curve_has_the_lines_of_its_references(monkeypatch, finished_run, tmp_path) -> None:
     specs = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise"]
-    agents = {**make_lineup(specs, SCENARIO), "ppo": LearnedAgent(load_policy(finished_run), "ppo")}
-    result = evaluate(SCENARIO.sample(5, 7), agents, scenario=SCENARIO, seed=7)
+    agents = {**make_lineup(specs, SCENARIO), "ppo": eb.LearnedAgent(eb.load_policy(finished_run), "ppo")}
+    result = eb.evaluate(SCENARIO.sample(5, 7), agents, scenario=SCENARIO, seed=7)
     drawn = []
     monkeypatch.setattr(experiment, "learning_curve", lambda *a, **k: drawn.append(learning_curve(*a, **k)) or drawn[0])
     monkeypatch.setattr(experiment, "write_picture", lambda *given, **settings: None)
     course = [{"steps": 0.0, "first_impact_harm": 30.0, "total_harm": 33.0, "collision_rate": 1.0}]
-    write_figures(tmp_path, result, summarise(result), course=course, course_caption="", agents=agents)
+    write_figures(tmp_path, result, eb.summarise(result), course=course, course_caption="", agents=agents)
     labels = [text.get_text() for text in drawn[0].legends[0].get_texts()]
     assert labels == ["policy", "full_brake", "e_v2x_bm"]
 
@@ -209,15 +205,6 @@ def test_existing_run__is_refused_and_left_alone(ethbrake, tiny_recipe, finished
     assert {path: path.read_bytes() for path in finished_run.rglob("*") if path.is_file()} == before
 
 
-def test_run_folder__by_default_says_scenario_recipe_and_seed() -> None:
-    recipe = load_recipe("ppo")
-    folders = [run_folder(SCENARIO, recipe, **given) for given in ({}, {"seed": 4}, {"name": "mine"})]
-    assert [str(path) for path in folders] == [
-        "runs/paper-random-ppo-seed0", "runs/paper-random-ppo-seed4", "runs/mine"
-    ]  # fmt: skip
-    assert run_folder(SCENARIO, recipe, output=Path("/elsewhere/x")) == Path("/elsewhere/x")
-
-
 def test_train__names_its_folder_and_ends_at_the_number_that_it_announces(ethbrake, tiny_recipe, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     answer = ethbrake("train", "--recipe", tiny_recipe, "--seed", "5", "--steps", "200", "--json")
@@ -279,7 +266,7 @@ def test_curves__one_command_trains_draws_and_goes_on(ethbrake, tiny_recipe, tin
     fixed = SCENARIO.sample(10, 7)
     assert (summary["kind"], summary["scenario_sha256"]) == ("learning-curves", scenario_sha256(SCENARIO))
     assert told["worlds_sha256"] == worlds_sha256(fixed.worlds, fixed.index)
-    policies = [load_policy(folder / f"tiny-seed{seed}").manifest.manifest_sha256 for seed in (0, 1)]
+    policies = [eb.load_policy(folder / f"tiny-seed{seed}").manifest.manifest_sha256 for seed in (0, 1)]
     assert told["policy_sha256"] == policies
 
 
@@ -313,3 +300,22 @@ def test_export__writes_onnx(ethbrake: Command, finished_run: Path, tmp_path: Pa
     assert [output.name for output in graph.output] == ["action", "acceleration_mps2"]
     monkeypatch.setitem(sys.modules, "onnx", None)  # not installed: the output is looked at before that is
     check_refused(ethbrake(*line), "is there already")
+
+
+# ---------------------------------------------------------------- parts of a report
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "row"),
+    [
+        ([9.0, 0.0, 5.0, 7.0], [1.0, 0.0, 4.0, 2.0], 3),  # savings 8, -, 1, 5
+        ([4.0, 3.0], [0.0, 0.0], 1),  # of two, the smaller saving
+        ([0.0, 0.0], [0.0, 5.0], 0),  # full braking harms nobody
+    ],
+)
+def test_telling_world__is_the_median_saving_among_harmful_worlds(before, after, row):
+    harms = {"full_brake": before, "ppo": after}
+    by_count = {name: {"first": np.ones(4), "total": np.array(harm)} for name, harm in harms.items()}
+    outcome = {name: SimpleNamespace(world_harm=found.__getitem__) for name, found in by_count.items()}
+    evaluation = SimpleNamespace(outcome=outcome.__getitem__, outcomes=harms)
+    assert telling_world(evaluation, "total") == row

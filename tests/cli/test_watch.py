@@ -1,24 +1,239 @@
-"""``ethbrake watch``, ``search falsify``, ``shield`` and ``reproduce``: files that they write, and what they run."""
+"""``ethbrake evaluate``, ``compare``, ``watch``, ``search falsify``, ``shield``, ``reproduce``: what they leave."""
 
-from __future__ import annotations
-
+import hashlib
 import json
+import os
 import re
+import shutil
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from scipy.stats import ttest_ind
 
-from ethbrake_marl.agents.registry import make_agent
+from ethbrake_marl.agents import registry
+from ethbrake_marl.agents.registry import Entry, Team, make_agent
+from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.episodes import Passport, follow_episodes
-from ethbrake_marl.evaluation.inputs import NamedWorlds
+from ethbrake_marl.evaluation.inputs import NamedWorlds, check_agents, make_lineup
+from ethbrake_marl.evaluation.results import compare_results, read_result
+from ethbrake_marl.evaluation.statistics import mean, paired_difference, unpaired_difference
+from ethbrake_marl.files import plugins
+from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.policies import shipped_policies
 from ethbrake_marl.scenario import Scenario, load_scenario, new_scenario_text
-from tests.cli.conftest import Command, check_refused, told_json
+from tests.cli.conftest import Command, check_refused, rows_of, told_json
 from tests.failing_worlds import plant
 from tests.fixtures.pictures import EMPTY
 from tests.pages.hostile import HOSTILE, UNSEEN
+from tests.studies.counting import journal
+
+ROOT = Path(__file__).resolve().parents[2]
+SCENARIO = load_scenario("paper-random")
+PROGRAM = "import sys; from ethbrake_marl.cli.app import run_command; sys.exit(run_command(sys.argv[1:]))"
+LIST = ("evaluate", "--agents", "full_brake", "--episodes", "2300", "--seed", "11")
+
+
+def test_evaluate__the_harm_count_is_what_agents_lower(ethbrake: Command) -> None:
+    arguments = ("evaluate", "--episodes", "200", "--agents", "e_v2x_bm", "--json", "--harm-count")
+    (first,), (total,) = (told_json(ethbrake(*arguments, count)) for count in ("first", "total"))
+    assert total["total_harm"] < first["total_harm"] and total["first_impact_harm"] > first["first_impact_harm"]
+
+
+def test_evaluate__a_world_computed_by_hand(ethbrake: Command, tmp_path: Path) -> None:
+    # Vehicle 2 at 10 m/s coasts 5 m in its 0.5 s and brakes the last 3 m with 7 m/s2 towards a standing Vehicle 1:
+    # closing speed squared 10^2 - 2 * 7 * 3 = 58. Vehicle 3 stands 5 km behind. In the second world nobody moves.
+    worlds, out = tmp_path / "worlds.csv", tmp_path / "out.csv"
+    worlds.write_text(
+        "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps,restitution\n8,5000,0,10,0,0\n8,5000,0,0,0,0\n"
+    )
+    words = ("--initial-states", worlds, "--agents", "full_brake", "--per-world", out, "--json")
+    (row,) = told_json(ethbrake("evaluate", *words))
+    told = row["episodes"], row["collision_rate"], row["first_impact_harm"]
+    assert told == (2, 0.5, pytest.approx(29.0, rel=1e-12))
+    columns = ("total_harm", "collided", "impacts", "final_gap_1_m")
+    hit, still = ([float(each[name]) for name in columns] for each in rows_of(out))
+    assert hit[:3] == [pytest.approx(58.0, rel=1e-12), 1.0, 1.0] and still == [0.0, 0.0, 0.0, 8.0]
+
+
+def test_by__writes_every_group_down(ethbrake: Command, tmp_path: Path) -> None:
+    out = tmp_path / "w.csv"
+    command = ("evaluate", "--scenario", "mixture-delays", "--agents", "full_brake,coast", "--episodes", "30")
+    assert ethbrake(*command, "--by", "scenario", "--per-world", out).status == 0
+    found = [row["groups"] for row in json.loads((tmp_path / "w.csv.json").read_text())]
+    sizes = {"paper-delay-high": 11, "paper-delay-low": 8, "paper-delay-middle": 11}
+    assert [{name: (each["episodes"], each["agent"]) for name, each in groups.items()} for groups in found] == [
+        {name: (size, agent) for name, size in sizes.items()} for agent in ("full_brake", "coast")
+    ]
+    assert sum(row["scenario"] == "paper-delay-low" for row in rows_of(out)) == 16
+
+
+def test_evaluate__a_damaged_bundle_is_refused_by_file_whatever_is_around_it(ethbrake, tmp_path) -> None:
+    shutil.copytree(shipped_policies()["ppo"] / "policy", tmp_path / "policy")
+    weights = tmp_path / "policy" / "weights.safetensors"
+    data = weights.read_bytes()
+    weights.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+    for around in ("", "+episode", "+step", "+refined"):
+        spec = f"ppo@{tmp_path / 'policy'}{around}"
+        check_refused(ethbrake("evaluate", "--episodes", "5", "--agents", spec), str(weights), "SHA-256")
+
+
+def test_evaluate__one_agent_that_cannot_drive_is_refused_before_another_works(ethbrake, monkeypatch) -> None:
+    monkeypatch.setattr("ethbrake_marl.evaluation.evaluate", lambda *args, **kwargs: pytest.fail("worked"))
+    refused = ethbrake("evaluate", "--agents", "e_v2x_bm,constant:99", "--episodes", "5")
+    check_refused(refused, "agent 'constant:99': above the braking capacity 7 m/s2")
+
+
+# Lists of agents and worlds
+
+
+def test_lineup__a_team_goes_behind_the_step_shield_and_no_other(monkeypatch) -> None:
+    scenario, team = load_scenario("cooperation-3-pair"), Team.of(make_agent("coast"), [1, 2])
+    monkeypatch.setitem(registry._ENTRIES, "team", Entry("team@RUN", "", (), lambda argument, settings: team))
+    assert sorted(make_lineup(["team@run+step"], scenario)["team@run+step"].drivers) == [1, 2]
+    with pytest.raises(InvalidInput, match=r"'team@run\+robust': is a team, and \+robust is for one driven vehicle"):
+        make_lineup(["team@run+robust"], scenario)
+
+
+def test_check_agents__a_constant_above_the_capacity_of_any_world_is_refused_and_nobody_is_changed() -> None:
+    scenario = SCENARIO.replace(braking_capacity_mps2={"uniform": [5, 7]})
+    worlds = scenario.sample(500, 7).worlds
+    lineup = make_lineup(["e_v2x_bm", "constant:5", "gentlest_front"], scenario)
+    before = dict(vars(lineup["e_v2x_bm"]))
+    check_agents(lineup, worlds, scenario)
+    assert vars(lineup["e_v2x_bm"]) == before
+    capacity = worlds.vehicles.braking_capacity_mps2[:, 1]
+    between = (capacity[0] + capacity.min()) / 2  # the first world could, another could not
+    with pytest.raises(InvalidInput, match="above the braking capacity"):
+        check_agents(make_lineup([f"constant:{between}"], scenario), worlds, scenario)
+
+
+# Evaluations in parts
+
+
+def test_shards__print_the_same_in_any_parts_and_the_figures_of_one_piece(ethbrake: Command) -> None:
+    three, one = (ethbrake(*LIST, "--shards", number, "--json") for number in "31")
+    assert three.out == one.out
+    for sharded, row in zip(told_json(one), told_json(ethbrake(*LIST, "--json")), strict=True):
+        assert (sharded["kind"], sharded["intervals"]["rates"]) == ("evaluate-shards", "Clopper-Pearson")
+        for name in ("first_impact_harm", "total_harm_interval", "collision_rate", "sampled_harm", "parameters"):
+            assert sharded[name] == row[name], name
+        assert sharded["vehicle_harm"]["total_harm_1"] > 0.0
+
+
+@pytest.mark.long
+def test_shards__on_ray_answer_the_same(ethbrake: Command, tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    found = ethbrake(*LIST, "--shards", "3", "--ray", "local", "--output", tmp_path / "kept", "--json")
+    assert found.status == 0 and found.out == ethbrake(*LIST, "--shards", "3", "--json").out
+    assert [line["status"] for line in journal(tmp_path / "kept")] == ["finished"] * 3
+
+
+# Two results
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results on the same worlds; d is b as another policy of the name coast left it; not to be changed."""
+    folder = tmp_path_factory.mktemp("results")
+    for name, agents in (("a", "full_brake,coast"), ("b", "full_brake,e_v2x_bm")):
+        options = ("--agents", agents, "--episodes", "40", "--per-world", str(folder / f"{name}.csv"))
+        assert run_command(["evaluate", *options]) == 0
+    content = json.loads((folder / "b.csv.json").read_text().replace('"agent": "e_v2x_bm"', '"agent": "coast"'))
+    data = (folder / "b.csv").read_text().replace("\ne_v2x_bm,", "\ncoast,")
+    (folder / "d.csv").write_text(data)
+    beside = {"file": "d.csv", "sha256": hashlib.sha256(data.encode()).hexdigest()}
+    (folder / "d.csv.json").write_text(json.dumps([row | {"per_world": beside} for row in content]))
+    alone = [{key: value for key, value in row.items() if key != "per_world"} for row in content]
+    (folder / "alone.json").write_text(json.dumps(alone))
+    return folder
+
+
+def test_compare__difference_is_paired_by_world_where_every_world_is_there(results: Path) -> None:
+    first = read_result(results / "a.csv.json")
+    paired, apart = (compare_results(first, read_result(results / name)) for name in ("d.csv.json", "alone.json"))
+    columns = [
+        np.array([float(row["total_harm"]) for row in rows_of(results / f"{name}.csv") if row["agent"] == "coast"])
+        for name in "da"
+    ]
+    assert paired.differences[1].harms["total_harm"] == paired_difference(*columns)
+    assert paired.differences[0].harms == dict.fromkeys(("first_impact_harm", "total_harm"), Estimate(0.0, (0.0, 0.0)))
+    both = [found.differences[1].harms["total_harm"].value for found in (paired, apart)]
+    assert both[0] == pytest.approx(both[1])
+    assert [found.to_json()["intervals"] for found in (paired, apart)] == ["paired", "unpaired"]
+    assert "alone.json has none" in str(apart.unpaired_because)
+
+
+def test_compare__unpaired_interval_is_welchs() -> None:
+    draw = np.random.default_rng(3)
+    one, other = draw.normal(5.0, 2.0, 30), draw.normal(4.0, 1.0, 50)
+    found = unpaired_difference(mean(one), 30, mean(other), 50)
+    expected = ttest_ind(one, other, equal_var=False).confidence_interval(0.95)
+    assert found.interval == pytest.approx(tuple(expected), rel=1e-12)
+
+
+def test_compare__a_run_its_report_and_shields_are_results_too(ethbrake, finished_run: Path, tmp_path: Path) -> None:
+    results = finished_run / "results.json"
+    told = told_json(ethbrake("compare", results, results, "--json"))
+    assert told["intervals"] == "paired" and {each["agent"]: each["policy"] for each in told["agents"]}["ppo"] == "same"
+    assert all(each["total_harm_difference_interval"] == [0.0, 0.0] for each in told["agents"])
+    tests = ethbrake("compare", results, finished_run / "other_tests.json")
+    check_refused(tests, "each test needs a file of its own")
+    page = (finished_run / "report.html").read_text()
+    assert all(json.loads(results.read_text())[0][name] in page for name in ("worlds_sha256", "scenario_sha256"))
+    for count in ("first", "total"):
+        line = ("shield", "--agents", "full_brake", "--episodes", "5", "--harm-count", count, "--json")
+        (tmp_path / f"{count}.json").write_text(ethbrake(*line).out)
+    told = told_json(ethbrake("compare", tmp_path / "first.json", tmp_path / "first.json", "--json"))
+    found = {each["agent"]: each["harm_difference"] for each in told["agents"]}
+    assert found == {f"full_brake ({mode})": 0.0 for mode in ("none", "episode", "step", "step-alert")}
+    check_refused(ethbrake("compare", tmp_path / "first.json", tmp_path / "total.json"), "is about another harm than")
+
+
+@pytest.mark.slow
+def test_compare__sees_that_an_agents_file_was_edited(tmp_path: Path) -> None:
+    """Each evaluation is a process of its own, as a person's two commands are."""
+    file, read = tmp_path / "mine.py", {}
+    for name, deceleration in (("before", 2), ("after", 3)):
+        file.write_text(
+            f"import ethbrake_marl as eb\ndef make():\n    return eb.make_agent('constant:{deceleration}')\n"
+        )
+        answer = subprocess.run(
+            [sys.executable, "-c", PROGRAM, "evaluate", "--agents", f"{file}:make", "--episodes", "5", "--json"],
+            env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        (tmp_path / f"{name}.json").write_text(answer.stdout)
+        read[name] = read_result(tmp_path / f"{name}.json")
+    before, after = read["before"], read["after"]
+    assert after.about["versions"]["mine.py"] == f"SHA-256 {hashlib.sha256(file.read_bytes()).hexdigest()}"
+    assert set(compare_results(before, after).other_versions) == {"mine.py"}
+    assert compare_results(after, after).other_versions == {}
+
+
+def test_versions__tell_a_file_behind_the_at_by_its_hash(ethbrake: Command, tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(
+        "import numpy as np, ethbrake_marl as eb\n"
+        "def make(argument, settings):\n"
+        "    share = np.load(settings.policy)[0]\n"
+        "    return eb.policy_agent(lambda seen: np.full((len(seen), 1), share), scenario=settings.scenario)\n"
+    )
+    line = ["evaluate", "--episodes", "5", "--json", "--agents", f"{tmp_path}/mine.py:make@{tmp_path}/w.npy"]
+    rows: list[dict[str, Any]] = []
+    for share in (-1.0, -0.2):
+        np.save(tmp_path / "w.npy", [share])
+        plugins._READ.clear()
+        rows += told_json(ethbrake(*line))
+    one, other = (row["versions"]["w.npy"] for row in rows)
+    assert one.startswith("SHA-256 ") and one != other
+
+
+# ---------------------------------------------------------------- passports, pictures, data sets, shields
+
 
 PNG = b"\x89PNG\r\n\x1a\n"
 EVIL = """from pathlib import Path

@@ -1,7 +1,5 @@
 """The parts of the site's extension that need no Sphinx, loaded from docs/extension/."""
 
-from __future__ import annotations
-
 import sys
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path

@@ -1,20 +1,33 @@
-"""The scripts of docs/studies: what they measure, and that the pages show what they print."""
+"""The scripts of docs/studies, and pages that tell what the code does or what was measured: paper, cooperation, ..."""
 
-from __future__ import annotations
-
+import json
 import math
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 
+import ethbrake_marl as eb
+from ethbrake_marl.agents import optimise_pairwise
 from ethbrake_marl.agents.registry import drive, make_agent
 from ethbrake_marl.evaluation.inputs import make_lineup
+from ethbrake_marl.evaluation.measures import PAPER_NOTE, PAPER_ROWS
 from ethbrake_marl.figures import picture_bytes
+from ethbrake_marl.harm import KINDS, scored
+from ethbrake_marl.learning.training import Scheme
 from ethbrake_marl.limits.limits import best_known
-from ethbrake_marl.physics import advance
 from ethbrake_marl.scenario import Task, load_scenario
+from ethbrake_marl.studies import reproduction
+from ethbrake_marl.studies.benchmark import read_entry
+from ethbrake_marl.studies.reproduction import FULL_BRAKE, GAPS, ITEMS, NAMES, Reproduction, Result, checked_result
 from ethbrake_marl.studies.speed import Effort
 from tests.docs.site import DOCS, load
+from tests.studies.benchmark_rows import ENTRIES, MEASURED as BENCHMARK, tables
 
 sampling, price, equal_time, scaling = (
     load(f"../studies/{name}") for name in ("sampling", "price", "equal_time", "scaling")
@@ -111,5 +124,196 @@ def test_scaling__its_lines_are_the_same_every_time_and_apart_in_their_first_ste
     worlds, again = scaling.make_lines(40, vehicles), scaling.make_lines(40, vehicles)
     assert worlds.speeds_mps.shape == (40, vehicles)
     assert (worlds.gaps_m == again.gaps_m).all() and (worlds.speeds_mps == again.speeds_mps).all()
-    after, impacts = advance(worlds, -worlds.vehicles.braking_capacity_mps2, 0.1)
+    after, impacts = eb.advance(worlds, -worlds.vehicles.braking_capacity_mps2, 0.1)
     assert impacts.count.sum() == 0 and (after.gaps_m > 0.0).all()
+
+
+# ---------------------------------------------------------------- pages
+
+
+MADE_AGAIN = (DOCS / "reproduction.md").read_text("utf-8")
+COOPERATION = "".join((DOCS / f"{name}.md").read_text("utf-8") for name in ("cooperation", "v2x", "training-schemes"))
+ABLATION = (DOCS / "ablate-cooperation.md").read_text("utf-8")
+PAPER_PAGES = [(DOCS / f"{name}.md").read_text("utf-8") for name in ("paper-motion", "paper", "paper-figures")]
+PAPER_TEXT = "".join(PAPER_PAGES)
+SITE = load("results")
+MEASURED = {table.id: table for table in SITE.read_tables("paper")}
+
+# Every \label of an equation, algorithm, figure or table in the paper's source, by the heading of the pages.
+LABELS = {
+    "Equations": (
+        "dynamics", "eq:olle1", "eq:olle2", "eq:4", "eq:5", "eq:52", "eq:rel_distance", "gamma", "eq:rel_velocity",
+        "eq:harm", "eq:harm_i+1", "eq:11", "eq:12", "eq:13", "dynamics2", "eq:total_objective", "eq:Jharmn", "Jfunc",
+        "eq:ratio", "eq:ppo_clip", "eq:alpha_loss", "Eq:BaselineHarm",
+    ),
+    "Algorithm": ("alg:hybrid",),
+    "Figures": (
+        "fig:fig1", "fig:ppo_sac_high_latency", "fig:ppo_sac_low_latency", "Fig:Harm-ivds", "Fig:harm-delay",
+        "Fig:pic5sim", "Fig:pic5act", "Fig:hybrid illu",
+    ),
+    "Tables": ("table:params", "tab:ppo-sac", "Table:hybrid", "Table:Random"),
+}  # fmt: skip
+NUMBERED = {"Equations": range(1, 36), "Figures": range(1, 9), "Tables": ("I", "II", "III")}
+
+
+def rows(page: str, heading: str, level: str = "\n## ") -> list[list[str]]:
+    """The cells of every line of a table below a heading."""
+    text = page.partition(heading)[2].partition(level)[0]
+    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in text.splitlines() if line[:1] == "|"]
+
+
+@pytest.mark.parametrize("title", LABELS)
+def test_paper__treats_every_label_and_everything_that_has_a_number_once(title: str) -> None:
+    told = [row for page in PAPER_PAGES for row in rows(page, f"\n## {title}\n") if len(row) == 5]
+    second = " ".join(row[1] for row in told)
+    assert [label for label in LABELS[title] if f"`{label}`" not in second] == []
+    numbers = [number for row in told for number in row[0].split(", ") if number.isalnum()]
+    assert title not in NUMBERED or numbers == [str(number) for number in NUMBERED[title]]
+
+
+def test_paper__says_how_the_report_and_the_code_differ_from_it() -> None:
+    sentences = ("one `k_energy` for all pairs", "masses and e they do not", "predict 3.07", "above v_max when pushed")
+    assert "docs/paper.md" in PAPER_NOTE and [each for each in sentences if each not in PAPER_TEXT] == []
+
+
+def test_paper__its_5000_worlds_cannot_come_from_the_speeds_of_the_figure_of_distances() -> None:
+    printed = next(row for row in PAPER_ROWS if row.table == "hybrid test" and row.agent == "E-V2X-BM").average_harm
+    at_figure, at_random = (
+        optimise_pairwise(load_scenario(name).sample(n, 7).worlds, 1).harm.mean()
+        for name, n in (("paper-distance", 5_000), ("paper-random", 10_000))
+    )
+    assert (f"{at_figure:.2f}", f"{at_random:.2f}") == ("3.07", "9.45") and printed > 3.0 * at_figure
+    told = [row[2] for row in MEASURED["five-thousand-worlds"].rows]
+    assert told == ["67.7 %, 3.07, 12.88", "65.4 %, 9.45, 19.20"]
+
+
+@pytest.mark.parametrize("spec", ["full_brake", "e_v2x_bm", "ppo@shipped/ppo", "best_harm"])
+def test_paper__harms_at_three_delays_are_as_printed(spec: str) -> None:
+    (row,) = (cells for cells in MEASURED["three-delays"].rows if cells[0].startswith(f"`{spec}`"))
+    state = {"gap_1_m": [7], "gap_2_m": [7], "speed_1_mps": [20], "speed_2_mps": [18], "speed_3_mps": [20]}
+    for told, delay in zip(row[1:], ("low", "middle", "high"), strict=True):
+        scenario = load_scenario(f"paper-delay-{delay}")
+        worlds = scenario.worlds_from_table(state)
+        outcome = eb.evaluate(worlds, make_lineup([spec], scenario), scenario=scenario).outcome(spec)
+        harms = f"{outcome.first_impact_harm.mean():.2f}, {outcome.total_harm.mean():.2f}"
+        assert told == harms.replace("0.00", "0")
+
+
+def test_paper__full_braking_over_the_total_distance_is_as_printed() -> None:
+    scenario = load_scenario("paper-distance")
+    result = eb.evaluate(scenario.sample(5_000, 7), make_lineup(["full_brake"], scenario), scenario=scenario)
+    groups = np.digitize(result.worlds.gaps_m.sum(axis=1), (12.0, 14.0, 16.0, 18.0))
+    harm = result.outcome("full_brake").first_impact_harm
+    told = MEASURED["harm-over-total-distance"].rows[0]
+    assert told == ["`full_brake`", *(f"{harm[groups == group].mean():.2f}" for group in range(5))]
+
+
+# docs/reproduction.md is what its committed data say, and the data are what the worlds give.
+
+
+def result_of(content: dict) -> Result:
+    """A result as the folder of a reproduction keeps it: each cell with its interval."""
+    tables = [table | {"rows": [[[cell] for cell in row] for row in table["rows"]]} for table in content["tables"]]
+    return checked_result(content | {"tables": tables}, "docs", content["name"])
+
+
+RESULTS = {each["name"]: result_of(each) for each in json.loads((DOCS / "reproduction.json").read_text("utf-8"))}
+
+
+def test_reproduction__is_made_of_the_committed_data_of_every_item_and_gap() -> None:
+    assert reproduction.docs_page(list(RESULTS.values())) == MADE_AGAIN
+    assert list(RESULTS) == [item.name for item in ITEMS]
+    assert [row[0].value for row in RESULTS["gaps"].tables[0].rows] == [gap.name for gap in GAPS]
+    for name, result in RESULTS.items():
+        assert reproduction.summarise_verdicts(result.comparisons) == result.verdict, name
+    assert [label for item in ITEMS for label in item.labels if f"`{label}`" not in PAPER_TEXT] == []
+    for name in ("README", "paper"):
+        assert "(reproduction.md)" in (DOCS / f"{name}.md").read_text("utf-8"), name
+
+
+def test_reproduction__every_figure_is_there_and_no_other() -> None:
+    folder, prefix = reproduction.FIGURES, reproduction.PREFIX
+    shown = set(re.findall(rf"\]\(\.\./{folder}/({prefix}[a-z0-9-]+\.svg)\)", SITE.add_reproduction("")))
+    assert shown == {path.name for path in (DOCS / folder).glob(f"{prefix}*")}
+    assert shown == {f"{prefix}{each.stem}.svg" for result in RESULTS.values() for each in result.figures}
+
+
+def test_reproduction__trajectories_and_full_braking_are_as_committed(tmp_path: Path) -> None:
+    (item,) = Reproduction.choose(["trajectories"])
+    made, committed = item.make(Reproduction("quick", tmp_path)), RESULTS["trajectories"]
+    assert made.verdicts == committed.comparisons
+    (table,), (kept,) = made.tables, committed.tables
+    told = [[cell.in_words for cell in row] for row in table.shown()]
+    assert told == [[cell.value for cell in row] for row in kept.rows]
+    tables = {table.title: table for table in RESULTS["random-table"].tables}
+    for reading in reproduction.READINGS:
+        scenario = reading.scenario("paper-random")
+        agents = reproduction.lineup(scenario, FULL_BRAKE)
+        found = reproduction.drive_list(scenario, agents, 10_000, Reproduction("quick", tmp_path))
+        rate = reproduction.collision_rate(found.outcome(NAMES[FULL_BRAKE]).collided)
+        (row,) = (row for row in tables[reading.name].rows if row[0].value == NAMES[FULL_BRAKE])
+        assert row[1].value == reproduction.PERCENT.show(rate).in_words
+
+
+# docs/cooperation.md and the pages of its dials
+
+
+def first_cells(heading: str) -> dict[str, list[str]]:
+    """The first table of the page below a header line: first cell -> other cells."""
+    found = rows(COOPERATION, heading, "\n\n")
+    return {row[0]: row[1:] for row in found if row[0].startswith("`")}
+
+
+def test_cooperation__its_objectives_and_schemes_are_those_of_the_code() -> None:
+    schemes = {re.findall("`(.*?)`", cell)[0] for cell in first_cells("| scheme | networks |")}
+    objectives = [re.findall("`(.*?)[:`]", cell)[0] for cell in first_cells("| `objective` | for")]
+    assert (schemes, objectives) == (set(get_args(Scheme)), list(KINDS))
+
+
+def test_cooperation__its_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    blocks = re.findall("```python\n(.*?)```", COOPERATION, re.DOTALL)
+    quick = '("cooperation-ppo").replace(total_steps=1, n_envs=8)'
+    for block in blocks:
+        of_block = {} if "result = eb.train(" in block else names
+        exec(block.replace('("cooperation-ppo")', quick).replace("1000", "20"), of_block)
+        assert of_block is names or of_block["harm"].shape == (20,)
+    assert (tmp_path / "runs" / "pair" / "team.json").is_file()
+    assert len(blocks) == 4 and names["columns"]["social:45"].shape == (20, 3)
+    assert names["columns"].keys() == scored(names["result"].outcome("full_brake").ledger, "first").keys()
+
+
+@pytest.mark.slow
+def test_ablate_cooperation__its_files_and_commands_make_what_it_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for language, name in (("python", "my_objective.py"), ("yaml", "my-level.yaml")):
+        (text,) = re.findall(f"```{language}\n(.*?)```", ABLATION, re.DOTALL)
+        (tmp_path / name).write_text(text, "utf-8")
+    environment = {**os.environ, "PYTHONPATH": str(DOCS.parent), "OMP_NUM_THREADS": "1"}
+    small = "--seeds 1 --steps 512 --episodes 20 --search-episodes 3 --budget 50"
+    for command in re.findall(r"^\$ (.*)", ABLATION, re.MULTILINE):
+        words = command.replace("--seeds 3", small).split()[1:]
+        done = subprocess.run(
+            [sys.executable, "-m", "ethbrake_marl", *words], cwd=tmp_path, env=environment, check=False
+        )
+        assert done.returncode == 0, command
+    made = {path.name for path in (tmp_path / "runs" / "mine").iterdir()}
+    assert {"ablation.html", "ablation.md", "ablation.csv", "settings.json", "trainings", "optimum"} <= made
+
+
+def test_cooperation__its_messages_are_those_of_the_code() -> None:
+    ten = {"vehicles": 10, "gaps_m": 5, "speeds_mps": 20, "latency_s": 0.0, "mass_t": 5}
+    ten |= {"braking_capacity_mps2": 6, "driving_capacity_mps2": 6}
+    given = [{"v2x": {"preset": "clear", "senses": "none"}}, {"v2x": "blocked", **ten}]
+    for message, changes in zip(re.findall(r"my.yaml, line 9: (.*)", COOPERATION), given, strict=True):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            load_scenario("paper-random").replace(roles={"vehicle_2": "learner"}, **changes)
+
+
+def test_benchmark__shows_the_tables_that_the_entries_make() -> None:
+    assert tables() == BENCHMARK.read_tables("benchmark")
+    for path in ENTRIES.glob("*.json"):  # nobody beats the best known on a list, or in many worlds
+        for result in read_entry(path).driven.values():
+            assert result.realised_share.value <= 1.0 and result.below_best_known <= 0.1 * result.worlds

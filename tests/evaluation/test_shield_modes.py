@@ -1,7 +1,5 @@
 """What each mode of the shield makes of an agent: the same figures as driving it by hand, in one table."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Parts of the user's own: trained with, evaluated, told in every output; refusals: ``refusals/extending.txt``."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re
@@ -21,7 +19,7 @@ from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.harm import declared_objectives
 from ethbrake_marl.observations import observe
 from ethbrake_marl.pages.report import Report
-from ethbrake_marl.rewards import TERMS, StepOutcome, reward_params
+from ethbrake_marl.rewards import TERMS, StepOutcome
 from ethbrake_marl.scenario import new_scenario_text, scenario_json_schema
 from ethbrake_marl.scenario.v2x import CHANNELS
 from tests.contract.interfaces import BARE
@@ -187,15 +185,6 @@ def test_term__built_in_is_counted_as_soon_as_it_has_a_weight(name: str) -> None
     env.reset(seed=1)
     *_, infos = env.step({"vehicle_2": [0.0]})
     assert [told for told in infos["vehicle_2"] if told.startswith("reward_")] == [f"reward_{name}"]
-
-
-def test_term__has_its_usual_weight_where_a_reward_does_not_say() -> None:
-    eb.register_term("mine", one, weight=0.25)
-    eb.register_term("mine", one, weight=0.25)  # twice is once
-    given = ({"harm": 1.0}, {"mine": 0.0}, "harm", {"harm": 0.0, "terms": {"mine": 2}})
-    assert [reward_params(reward).terms for reward in given] == [{"mine": 0.25}, {"mine": 0.0}, {}, {"mine": 2.0}]
-    settled = eb.RewardParams(harm=1.0, terms={"mine": 3.0})
-    assert eb.RewardParams(**settled.model_dump()) == settled and settled.weight("mine") == 3.0
 
 
 @pytest.mark.parametrize(

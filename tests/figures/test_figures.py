@@ -1,9 +1,6 @@
 """Figures: the curves of a list and of a training, criticality maps, trajectories; drawn from the very numbers."""
 
-from __future__ import annotations
-
 import re
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +9,7 @@ from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
 from ethbrake_marl.evaluation import EpisodeRecord, Evaluation, curves as module, evaluate, record_episode, summarise
-from ethbrake_marl.evaluation.curves import avoidability_boundary, criticality_map, deceleration_curve, regimes_of
+from ethbrake_marl.evaluation.curves import avoidability_boundary, criticality_map, deceleration_curve
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.figures import (
     BODY_M,
@@ -36,7 +33,6 @@ from ethbrake_marl.figures import (
 )
 from ethbrake_marl.limits.limits import Limits, Proof, known_limits
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
-from tests.physics.random_worlds import line
 
 BRAKE = {"full_brake": eb.make_agent("full_brake")}
 DISTANCE = load_scenario("paper-distance")
@@ -240,30 +236,6 @@ def test_trajectories__lines_and_impacts_are_those_of_the_record(record: Episode
 # ---------------------------------------------------------------- criticality maps
 
 
-def test_map__its_cells_are_the_worlds_of_both_gaps() -> None:
-    found = criticality_map(DISTANCE, BRAKE, cells=3)
-    assert found.gap_1_m.tolist() == found.gap_2_m.tolist() == [5.0, 7.5, 10.0]
-    alone = evaluate(world(10.0, 5.0), BRAKE, scenario=DISTANCE).outcome("full_brake")
-    cells = found.harm("first")[0, 2], found.harm("total")[0, 2]  # row: gap 2, column: gap 1
-    assert cells == (alone.first_impact_harm[0], alone.total_harm[0]) and cells[0] != found.harm("first")[2, 0]
-
-
-TIME_GAPS = {"time_gaps_s": {"uniform": [0.25, 0.5]}, "line_speed_mps": 20, "speed_deviations_mps": [0, -2, 0]}
-
-
-@pytest.mark.parametrize(
-    ("scenario", "options", "gap_1", "gap_2"),
-    [
-        (load_scenario("paper-scenario-1"), {}, [5.0, 15.0], [4.0, 12.0]),  # around a fixed gap
-        (DISTANCE, {"gap_range_m": (6.0, 7.0)}, [6.0, 7.0], [6.0, 7.0]),
-        (DISTANCE.replace(**TIME_GAPS), {}, [4.5, 9.0], [5.0, 10.0]),  # at the speed of the rear vehicle
-    ],
-)
-def test_map__has_the_range_of_the_gaps(scenario: Scenario, options: Any, gap_1: Any, gap_2: Any) -> None:
-    found = criticality_map(scenario, BRAKE, cells=2, **options)
-    assert (found.gap_1_m.tolist(), found.gap_2_m.tolist()) == (gap_1, gap_2)
-
-
 def test_boundary__lies_between_avoidable_and_unavoidable_worlds() -> None:
     found = avoidability_boundary(DISTANCE, (5.0, 10.0), (5.0, 10.0))
     inside = np.isfinite(found[1]) & (found[1] > 5.001) & (found[1] < 9.999)
@@ -273,15 +245,6 @@ def test_boundary__lies_between_avoidable_and_unavoidable_worlds() -> None:
             module._worlds_at(DISTANCE, found[0][inside], found[1][inside] + shift), Task(DISTANCE, (1,))
         )
         assert isinstance(limits, Limits) and (limits.proof.avoidable == expected).all()
-
-
-def test_boundary__leaves_the_range_and_jumps_where_it_does() -> None:
-    def avoidable(gap_1: np.ndarray, gap_2: np.ndarray) -> np.ndarray:
-        return (gap_1 >= 2.0) & (gap_2 >= 6.0 - gap_1)  # none for gap 1 < 2; then from gap 2 = 6 - gap 1 on
-
-    gap_1, gap_2 = module._halve(avoidable, np.arange(7.0), (0.5, 5.0))
-    assert gap_1.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
-    assert gap_2 == pytest.approx([np.nan, 5.0, 4.0, 3.0, 2.0, 1.0, 0.5], abs=1e-9, nan_ok=True)
 
 
 def test_criticality_figure__draws_harm_and_boundary_and_names_both_sides() -> None:
@@ -301,35 +264,6 @@ def test_criticality_figure__draws_harm_and_boundary_and_names_both_sides() -> N
 
 
 # ---------------------------------------------------------------- decelerations
-
-
-# By hand; the leader brakes from its onset, the follower from its own.
-@pytest.mark.parametrize(
-    ("gap", "speeds", "latency", "decelerations", "expected"),
-    [
-        (1.0, (20.0, 20.0), (0.0, 1.0), (6.0, 6.0), "A"),  # sqrt(2 / 6) = 0.577 s, before 1 s
-        (10.0, (3.0, 10.0), (0.0, 2.0), (6.0, 6.0), "A'"),  # the leader stands at 0.5 s, 5.75 m ahead; hit at 1.075 s
-        (10.0, (3.0, 10.0), (0.0, 0.5), (6.0, 2.0), "C"),  # the same leader; stopping takes 25 m of the 5.75 m
-        (10.0, (3.0, 10.0), (0.0, 0.5), (6.0, 10.0), "none"),  # and here 5 m
-        (1.0, (20.0, 20.0), (0.0, 0.5), (6.0, 6.0), "B"),  # 0.25 m left at 0.5 s, 3 m/s closing for good
-        (1.0, (5.0, 10.0), (1.0, 0.0), (6.0, 2.0), "early"),  # 5 t - t^2 = 1 at 0.21 s, before 1 s
-    ],
-)
-def test_regimes__by_hand(gap: float, speeds: Any, latency: Any, decelerations: Any, expected: str) -> None:
-    worlds = line([[gap]], [speeds], latency_s=latency, mass_t=5.0, restitution=0.1)
-    assert regimes_of(worlds, 0, np.array([decelerations])).tolist() == [expected]
-
-
-def test_curve__of_scenario_1_changes_its_regimes_at_the_known_decelerations() -> None:
-    scenario = load_scenario("paper-scenario-1")
-    curve = deceleration_curve(scenario.sample(1, 7).worlds, Task(scenario, (1,)))
-    at = curve.deceleration_mps2
-    front, rear = curve.regimes["front pair"], curve.regimes["rear pair"]
-    assert [list(map(str, dict.fromkeys(each))) for each in (front, rear)] == [["B", "C", "none"], ["none", "B"]]
-    assert at[front == "C"].max() <= 4.71845 + 0.004 and at[front == "none"].min() >= 4.71845 - 1e-5
-    assert at[rear == "B"].min() == pytest.approx(5.01031, abs=0.004)
-    assert (curve.predicted[(front == "none") & (rear == "none")] == 0.0).all()
-    assert curve.predicted[-1] == pytest.approx(28.98, abs=1e-9)  # full braking, by hand
 
 
 def test_curve__its_values_are_the_closed_form_and_the_simulation() -> None:

@@ -1,7 +1,5 @@
 """Algorithms: one of the user's own, how weights become ours, and learning from counterfactuals, modes, options."""
 
-from __future__ import annotations
-
 import copy
 import itertools
 import json
@@ -41,9 +39,7 @@ from ethbrake_marl.learning.algorithms import (
     show_templates,
     stages_of,
     tensors_of,
-    trusted_targets,
     visit,
-    widened,
 )
 from ethbrake_marl.learning.runs import TrainingDiverged, make_environment, make_model
 from ethbrake_marl.learning.training import ModesPlan
@@ -202,18 +198,6 @@ SMALL = {
 STILL = {"learning_rate": {"start": 1e-12, "end": 1e-12}, "total_steps": 1}
 
 
-def test_targets__keep_the_slope_and_never_leave_the_trust_radius() -> None:
-    """By hand, r = 0.05 and k = 3: g = 0.15 moves by 0.15 / (3 + 3), g = 1e6 by almost 0.05, g = 0 not at all."""
-    gradient = np.array([0.0, 0.15, -0.15, 1e6, 1e6, 0.15, -1e6, -0.15, -1e6], np.float32)
-    mean = np.array([0.3, 0.0, 0.0, 0.0, 1.0, -2.0, -2.0, 2.0, -1.0], np.float32)
-    target, weight = trusted_targets(
-        Tried(np.zeros((9, 1), np.float32), mean, gradient, np.ones(9, np.float32)), 0.05, 3.0
-    )
-    np.testing.assert_allclose(target, [0.3, 0.025, -0.025, 0.05, 1.0, -1.975, -2.0, 1.975, -1.0], rtol=1e-5)
-    np.testing.assert_allclose(weight[[0, 1, 2, 4]], [3.0, 6.0, 6.0, 3.0], rtol=1e-6)
-    np.testing.assert_allclose((weight * (target - mean))[:4], gradient[:4], rtol=1e-5)  # the slope where it stands
-
-
 def test_adam__is_torchs_without_its_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     ended = []
     for kind in (torch.optim.Adam, Adam):
@@ -258,16 +242,6 @@ def test_training__starts_from_nothing_where_no_policy_ships_and_says_so(tmp_pat
     fits = Training.of(SHIPPED, SCENARIO), Training.of(SHIPPED, "paper-random-obstacle")
     assert [each.begins for each in fits] == ["ppo@shipped/ppo", "ppo@shipped/ppo-paper-random-obstacle"]
     assert (Training.of("quick", SCENARIO).begins, Training.of("ppo", SCENARIO).begins) == ("random weights", None)
-
-
-def test_widened__puts_every_feature_where_it_is_observed_now() -> None:
-    shipped = eb.load_shipped("ppo")
-    names = list(shipped.manifest.observation.features)
-    turned = Training.of(SHIPPED.replace(observation=["contact.brake_total_harm", *reversed(names)]), SCENARIO)
-    first = widened(shipped, turned)["policy.0.weight"]
-    assert (first[:, 0] == 0.0).all()
-    assert (first[:, 1:] == shipped.tensors["policy.0.weight"][:, ::-1]).all()
-    assert "value.0.weight" not in widened(shipped, turned)
 
 
 OWN = {"reward": {"harm": 1.0, "harm_count": "total", "objective": "own", "terminal": 0.5}}

@@ -1,7 +1,5 @@
 """The scripts below train/: BenchMARL's MAPPO, SuperSuit with PPO, and a clone of a dataset."""
 
-from __future__ import annotations
-
 import runpy
 import sys
 from pathlib import Path

@@ -1,6 +1,4 @@
-"""Training schemes: who learns with whom, what is left of it, and that each of them learns."""
-
-from __future__ import annotations
+"""Which recipes train which networks; schemes: who learns with whom, what is left of it, and that each learns."""
 
 import json
 import shutil
@@ -12,10 +10,11 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.learning import RunDirectory, Training, TrainingRecipe, load_recipe, train
+from ethbrake_marl.files.yaml import parse_yaml, read_yaml
+from ethbrake_marl.learning import RunDirectory, Training, TrainingRecipe, algorithm_names, load_recipe, train
 from ethbrake_marl.learning.runs import make_model
-from ethbrake_marl.policies import PolicyTeam, load_policy
-from tests.learning.tiny import TINY_PPO, Answer, files_of, harm_beside_full_braking, watch_steps
+from ethbrake_marl.policies import NetworkSpec, PolicyTeam, load_policy
+from tests.learning.tiny import TINY_PPO, Answer, files_of, harm_beside_full_braking, marked, watch_steps
 
 PAIR = eb.load_scenario("cooperation-3-pair")
 ALONE = eb.load_scenario("cooperation-2-paper")
@@ -51,13 +50,6 @@ def test_train__takes_names_and_files_and_measuring_changes_nothing(tmp_path: Pa
     train(TINY, ALONE, tmp_path / "unmeasured", steps=128, measure=None)
     last = "policy-last/weights.safetensors"
     assert files_of(tmp_path / "named")[last] == files_of(tmp_path / "unmeasured")[last]
-
-
-def test_scheme__of_a_recipe_and_who_drives_what() -> None:
-    assert Training.of(TINY, PAIR, scheme="centralised").scheme == "centralised"
-    assert Training.of(TINY, PAIR).who_drives() == "scheme shared: policy drives vehicle_2, vehicle_3"
-    told = "scheme independent: policy/vehicle_2 drives vehicle_2; policy/vehicle_3 drives vehicle_3"
-    assert Training.of(TINY, PAIR, scheme="independent").who_drives() == told
 
 
 def history(recipe: TrainingRecipe, folder: Path) -> list[dict[str, str]]:
@@ -149,3 +141,76 @@ LEARNS = load_recipe("cooperation-ppo").replace(
 def test_scheme__learns_to_beat_full_braking(scheme: Any, tmp_path: Path) -> None:
     train(LEARNS, PAIR, tmp_path / "run", scheme=scheme)
     assert harm_beside_full_braking(f"team@{tmp_path / 'run'}") < 0.9
+
+
+# ---------------------------------------------------------------- recipes
+
+
+SHIPPED = TrainingRecipe.shipped()
+PAPERS = {
+    "ppo-paper": {
+        "gamma": 0.99, "n_steps": 2048, "n_epochs": 4, "batch_size": 512, "clip_range": 0.15, "gae_lambda": 0.95,
+        "vf_coef": 0.5, "ent_coef": 0.005, "target_kl": 0.15, "max_grad_norm": 0.3,
+    },
+    "sac-paper": {
+        "batch_size": 256, "buffer_size": 10**6, "learning_starts": 10**4, "tau": 0.02, "gamma": 0.99,
+        "steps_per_update": 1, "gradient_steps": 1, "ent_coef": "auto", "target_update_interval": 1, "n_envs": 1,
+        "update_ratio": 1.0,
+    },
+}  # fmt: skip
+NETWORKS = {
+    "ppo-paper": {"value_hidden": (256, 256, 128), "output": "clip"},
+    "sac-paper": {"value_hidden": (), "output": "tanh"},
+}
+
+
+@pytest.mark.parametrize(("name", "value"), [("ppo-paper", (256, 256, 128)), ("sac-paper", (256, 256))])
+def test_recipe__of_the_paper_has_its_network_and_table(name: str, value: tuple[int, ...]) -> None:
+    recipe = load_recipe(name)
+    assert {key: getattr(recipe, key) for key in PAPERS[name]} == PAPERS[name] and recipe.network.value == value
+    shape = {"observation_size": 27, "action_size": 1, "policy_hidden": (256, 256), "activation": "relu"}
+    assert recipe.network_spec(27) == NetworkSpec(**shape, **NETWORKS[name])
+
+
+@pytest.mark.parametrize("name", sorted(SHIPPED))
+def test_recipe__that_ships_comes_back_from_its_json_and_its_template_and_passes_the_schema(name: str) -> None:
+    recipe, new = load_recipe(name), parse_yaml(load_recipe(name).new_text("mine"), "mine.yaml").content
+    assert TrainingRecipe.of(recipe.model_dump(mode="json")) == recipe
+    assert TrainingRecipe.of(new).name == "mine"
+    schema = TrainingRecipe.json_schema()
+    assert marked(schema, read_yaml(SHIPPED[name]).content) == marked(schema, new) == set()
+    if (
+        recipe.algorithm == "ppo"
+    ):  # expects nothing beyond the horizon, but for the paper's, whose values are the paper's
+        assert recipe.horizon_is_end == (name != "ppo-paper")
+
+
+@pytest.mark.parametrize("algorithm", algorithm_names())
+def test_schema__says_what_every_key_of_an_algorithm_means(algorithm: str) -> None:
+    recipe = type(load_recipe(algorithm))
+    properties = TrainingRecipe.json_schema()["$defs"][recipe.__name__]["properties"]
+    assert set(properties) == set(recipe.model_fields)
+    assert [key for key, value in properties.items() if not value.get("description")] == []
+
+
+SCENARIO = eb.load_scenario("paper-random")
+TRAINING = Training.of(TINY_PPO, SCENARIO)
+WORDS = {"title": "Another", "description": "More.", "source": "Elsewhere."}
+
+
+@pytest.mark.parametrize("change", [WORDS, {"v2x": {"preset": "paper"}, "speed_limit_mps": 40}])
+def test_training__words_and_defaults_that_are_spelt_out_change_nothing(change: dict[str, Any], tmp_path: Path) -> None:
+    scenario = SCENARIO.model_dump(mode="json", exclude_unset=True) | change
+    config = {"recipe": TINY_PPO.model_dump(mode="json"), "scenario": scenario}
+    RunDirectory(tmp_path / "run").create(config).check_same(TRAINING)
+    assert Training.of(TINY_PPO.replace(**WORDS), SCENARIO.replace(**WORDS)).identity == TRAINING.identity
+
+
+def test_run__force_replaces_a_run_and_all_that_it_held(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path / "runs" / "first").create({"seeds": {"training": 3}})
+    assert json.loads(run.config.read_text()) == {"seeds": {"training": 3}}
+    assert json.loads(run.status.read_text())["status"] == "running"
+    (run.path / "old").touch()
+    again = RunDirectory(run.path).create({}, force=True).path
+    assert sorted(path.name for path in again.iterdir()) == ["config.json", "run.json"]
+    assert [path.name for path in run.path.parent.iterdir()] == ["first"]

@@ -1,7 +1,5 @@
 """Trainings of a second, and what the tests do to them and compare of them."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Callable

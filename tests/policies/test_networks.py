@@ -1,55 +1,49 @@
-"""What a policy's networks compute: by hand, as torch does, the same bits in any batch, behind a gate, and as ONNX."""
+"""What a policy's networks compute, by hand, gated, as ONNX; its bundle, refused when damaged; those that ship."""
 
-from __future__ import annotations
-
+import hashlib
+import json
+import os
+import pickle
+import stat
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnxruntime
 import pytest
+import safetensors.numpy
 import torch
 from torch import nn
 
 import ethbrake_marl as eb
+from ethbrake_marl import policies as bundle
+from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
+from ethbrake_marl.errors import CorruptBundle
+from ethbrake_marl.evaluation import TESTS, evaluate, make_lineup, summarise
+from ethbrake_marl.evaluation.inputs import scenario_sha256
 from ethbrake_marl.observations import observe
-from ethbrake_marl.policies import Actor, NetworkSpec, Policy, dense, squash
+from ethbrake_marl.policies import (
+    Actor,
+    NetworkSpec,
+    Policy,
+    content_sha256,
+    load_named_policy,
+    load_policy,
+    shipped_name,
+    shipped_policies,
+    squash,
+)
+from ethbrake_marl.shield import HybridAgent
+from tests.docs.site import load
+
+RandomTensors = Callable[[NetworkSpec], dict[str, np.ndarray]]
 
 
 def _observations(n: int, size: int) -> np.ndarray:
     return np.random.default_rng(1).uniform(-2.0, 2.0, (n, size)).astype(np.float32)
-
-
-def test_tensors__of_the_papers_network_has_the_tables_tensors() -> None:
-    shapes = {row.name: row.shape for row in eb.load_recipe("ppo-paper").network_spec(27).tensors}
-    assert shapes == {
-        "policy.0.weight": (256, 27),
-        "policy.0.bias": (256,),
-        "policy.1.weight": (256, 256),
-        "policy.1.bias": (256,),
-        "policy.output.weight": (1, 256),
-        "policy.output.bias": (1,),
-        "policy.log_std": (1,),
-        "value.0.weight": (256, 27),
-        "value.0.bias": (256,),
-        "value.1.weight": (256, 256),
-        "value.1.bias": (256,),
-        "value.2.weight": (128, 256),
-        "value.2.bias": (128,),
-        "value.output.weight": (1, 128),
-        "value.output.bias": (1,),
-    }
-
-
-def test_dense__numbers_by_hand() -> None:
-    weight = np.array([[1, 2, 3, 4, 5], [0, 0, 0, 0, -1]], np.float32)
-    bias = np.array([10, 20], np.float32)
-    x = np.array([[1, 0], [1, 0], [1, 0], [1, 0], [1, 2]], np.float32)
-    y = np.empty((2, 2), np.float32)
-    dense(weight, bias, x, y)
-    assert y.tolist() == [[25.0, 20.0], [19.0, 18.0]]
 
 
 @pytest.mark.parametrize(
@@ -126,7 +120,6 @@ def test_squash__is_the_rounded_hyperbolic_tangent() -> None:
     assert actual[0, -2:].tolist() == [1.0, -1.0]
 
 
-RandomTensors = Callable[[NetworkSpec], dict[str, np.ndarray]]
 SCENARIO = eb.load_scenario("paper-random")
 
 
@@ -199,3 +192,498 @@ def test_onnx__of_several_networks_and_without_the_package(mixture: Policy, monk
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(eb.MissingExtra, match=r"-m pip install 'ethbrake-marl\[export\]'$"):
         mixture.to_onnx()
+
+
+# ---------------------------------------------------------------- bundles
+
+
+Spoil = Callable[[Path], None]
+
+
+class _Payload:
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (exec, ("raise RuntimeError('code of the bundle was run')",))
+
+
+def _edit(*, rehash: bool = True, **changes: Any) -> Spoil:
+    """Change manifest fields, a dotted key ``a__b`` one level down; its hash agrees, unless not ``rehash``."""
+
+    def spoil(folder: Path) -> None:
+        manifest = json.loads((folder / "manifest.json").read_bytes())
+        for key, value in changes.items():
+            outer, _, inner = key.rpartition("__")
+            (manifest[outer] if outer else manifest)[inner] = value
+        if rehash:
+            manifest["manifest_sha256"] = content_sha256(manifest)
+        (folder / "manifest.json").write_text(json.dumps(manifest))
+
+    return spoil
+
+
+def _manifest(change: Callable[[bytes], bytes]) -> Spoil:
+    return lambda folder: _replace(folder / "manifest.json", change)
+
+
+def _weights(change: Callable[[bytes], bytes]) -> Spoil:
+    """Change the weights file and make the manifest's hash agree, as an attacker would."""
+
+    def spoil(folder: Path) -> None:
+        _replace(folder / "weights.safetensors", change)
+        digest = hashlib.sha256((folder / "weights.safetensors").read_bytes()).hexdigest()
+        _edit(weights_sha256=digest)(folder)
+
+    return spoil
+
+
+def _tensors(change: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]) -> Spoil:
+    return _weights(
+        lambda data: safetensors.numpy.save(change({k: np.array(v) for k, v in safetensors.numpy.load(data).items()}))
+    )
+
+
+def _replace(path: Path, change: Callable[[bytes], bytes]) -> None:
+    path.write_bytes(change(path.read_bytes()))
+
+
+def _header(change: Callable[[dict[str, Any]], None]) -> Spoil:
+    def rewrite(data: bytes) -> bytes:
+        length = int.from_bytes(data[:8], "little")
+        header = json.loads(data[8 : 8 + length])
+        change(header)
+        text = json.dumps(header).encode()
+        return len(text).to_bytes(8, "little") + text + data[8 + length :]
+
+    return _weights(rewrite)
+
+
+def _instead(name: str, make: Callable[[Path], object]) -> Spoil:
+    """Make something else in the place of a file, which is moved out of the folder."""
+
+    def spoil(folder: Path) -> None:
+        (folder / name).rename(folder.parent / f"moved-{name}")
+        make(folder / name)
+
+    return spoil
+
+
+def _link(path: Path) -> None:
+    path.symlink_to(path.parents[1] / f"moved-{path.name}")
+
+
+def _last_digit_of(name: str) -> Spoil:
+    """Change the last digit of a hash, and nothing else that the manifest's own hash does not follow."""
+
+    def spoil(folder: Path) -> None:
+        digest = json.loads((folder / "manifest.json").read_bytes())[name]
+        changed = digest[:-1] + ("0" if digest[-1] != "0" else "1")
+        _edit(rehash=name != "manifest_sha256", **{name: changed})(folder)
+
+    return spoil
+
+
+def _endless_device(path: Path) -> None:
+    """A file that never ends: a device where that may be made, else a huge file without blocks."""
+    try:
+        os.mknod(path, 0o600 | stat.S_IFCHR, os.makedev(1, 5))
+    except PermissionError:
+        path.touch()
+        os.truncate(path, 1 << 40)
+
+
+def _first_tensor(**changes: Any) -> Spoil:
+    return _header(lambda h: h["policy.0.bias"].update(changes))
+
+
+def _raw_header(text: bytes) -> Spoil:
+    return _weights(lambda data: len(text).to_bytes(8, "little") + text + data[-400:])
+
+
+SPOILED: dict[str, tuple[Spoil, str]] = {
+    "no_manifest": (lambda f: (f / "manifest.json").unlink(), r"manifest.json: is missing"),
+    "no_weights": (lambda f: (f / "weights.safetensors").unlink(), r"weights.safetensors: is missing"),
+    "extra_file": (lambda f: (f / "policy.pkl").write_bytes(pickle.dumps(_Payload())), r"policy.pkl: does not belong"),
+    "manifest_link": (_instead("manifest.json", _link), r"manifest.json: is a symbolic link"),
+    "weights_link": (_instead("weights.safetensors", _link), r"weights.safetensors: is a symbolic link"),
+    "pipe": (_instead("manifest.json", os.mkfifo), r"manifest.json: is not a plain file"),
+    "folder_for_file": (
+        _instead("weights.safetensors", Path.mkdir),
+        r"weights.safetensors: (is not a plain file|cannot be read)",
+    ),
+    "empty_manifest": (_manifest(lambda _: b""), r"manifest.json: "),
+    "not_utf8": (_manifest(lambda data: data.replace(b"ppo", b"\xff\xfe")), r"manifest.json: 'utf-8' codec"),
+    "list_manifest": (_manifest(lambda _: b"[]"), r"manifest.json: must be a mapping"),
+    "key_twice": (
+        _manifest(lambda data: data.replace(b"{", b'{"algorithm": "ppo",', 1)),
+        r"manifest.json: key 'algorithm' stands twice",
+    ),
+    "nan": (_manifest(lambda data: data.replace(b"1024", b"NaN")), r"manifest.json: NaN is not a JSON number"),
+    "huge_number": (_manifest(lambda data: data.replace(b"1024", b"1e999")), r"manifest.json: 1e999 is too large"),
+    "huge_integer": (_manifest(lambda data: data.replace(b"1024", b"9" * 5000)), r"manifest.json: "),
+    "deep": (_manifest(lambda _: b"[" * 200_000), r"manifest.json: nested too deeply"),
+    "two_values": (_manifest(lambda data: data + data), r"manifest.json: Extra data"),
+    "large": (_manifest(lambda data: data + b" " * (1 << 20)), r"manifest.json: larger than 1 MiB"),
+    "unknown_key": (_edit(loader="os.system"), r"manifest.json: loader: unknown key"),
+    "dotted_algorithm": (_edit(algorithm="subprocess.Popen"), r"manifest.json: algorithm: must be 1 to 64 lower case"),
+    "dotted_activation": (_edit(network__activation="torch.nn.ReLU"), r"manifest.json: network.activation"),
+    "future_version": (_edit(format_version=5), r"manifest.json: format_version: must be 2, 3 or 4"),
+    "version_of_several_networks": (
+        _edit(format_version=3),
+        r"manifest.json: format_version: 3 for 1 networks and output clip; must be 2",
+    ),
+    "several_networks_in_an_old_version": (
+        _edit(network__networks=2, network__gate_hidden=[4], network__value_hidden=[]),
+        r"manifest.json: format_version: 2 for 2 networks and output clip; must be 3",
+    ),
+    "several_networks_without_a_gate": (
+        _edit(format_version=3, network__networks=2, network__value_hidden=[]),
+        r"manifest.json: network: networks = 2 with gate_hidden = \[\]; several need a gate",
+    ),
+    "gate_of_one_network": (_edit(network__gate_hidden=[4]), r"manifest.json: network: networks = 1 with gate_hidden"),
+    "critic_beside_several_networks": (
+        _edit(format_version=3, network__networks=2, network__gate_hidden=[4]),
+        r"manifest.json: network: value_hidden = \[5\]: must be empty beside several networks",
+    ),
+    "choice_among_nothing": (
+        _edit(format_version=4, network__output="choice", network__value_hidden=[]),
+        r"manifest.json: network: choices = None with output choice; output choice needs a number of them",
+    ),
+    "choices_that_nobody_takes": (_edit(network__choices=9), r"manifest.json: network: choices = 9 with output clip"),
+    "critic_beside_choices": (
+        _edit(format_version=4, network__output="choice", network__choices=9),
+        r"manifest.json: network: output choice is for one network without a critic",
+    ),
+    "choices_in_an_old_version": (
+        _edit(network__output="choice", network__choices=9, network__value_hidden=[]),
+        r"manifest.json: format_version: 2 for 1 networks and output choice; must be 4",
+    ),
+    "too_many_networks": (_edit(network__networks=17), r"manifest.json: network.networks"),
+    "networks_without_their_tensors": (
+        _edit(format_version=3, network__networks=2, network__gate_hidden=[4], network__value_hidden=[]),
+        r"weights.safetensors: tensor 'gate.0.bias' is missing",
+    ),
+    "wrong_type": (_edit(steps="many"), r"manifest.json: steps: must be a whole number"),
+    "giant_layer": (_edit(network__policy_hidden=[10**9]), r"manifest.json: network.policy_hidden.0"),
+    "many_layers": (_edit(network__value_hidden=[1] * 9), r"manifest.json: network.value_hidden"),
+    "fewer_inputs": (
+        _edit(network__observation_size=4),
+        r"manifest.json: 27 observation features for a network that takes 4",
+    ),
+    "other_features": (_edit(observation__features=[f"own.{k}" for k in range(27)]), r"manifest.json: observation: "),
+    "other_scaling": (_edit(observation__scaling_sha256="0" * 64), r"manifest.json: observation: features or their"),
+    "older_version": (_edit(format_version=1), r"manifest.json: format_version: must be 2, 3 or 4"),
+    "other_activation": (_edit(rehash=False, network__activation="tanh"), r"manifest.json: its content has SHA-256"),
+    "other_output": (_edit(rehash=False, network__output="tanh"), r"manifest.json: its content has SHA-256"),
+    "other_steps": (_edit(rehash=False, steps=999_999_999), r"manifest.json: its content has SHA-256"),
+    "other_reward": (_edit(rehash=False, reward={"jerk": 1.0}), r"manifest.json: its content has SHA-256"),
+    "no_vehicle": (_edit(learners=["car_2"]), r"manifest.json: learners: 'car_2' is no vehicle"),
+    "learner_twice": (_edit(learners=["vehicle_2"] * 2), r"manifest.json: learners: .*each vehicle learns once"),
+    "learner_beyond_the_line": (
+        _edit(learners=["vehicle_9"], scenario={"name": "x", "vehicles": 3}),
+        r"manifest.json: learners: vehicle_9: the scenario has 3 vehicles",
+    ),
+    "learner_with_a_script": (
+        _edit(scenario={"name": "x", "roles": {"vehicle_2": "coast"}}),
+        r"manifest.json: learners: vehicle_2: does not learn",
+    ),
+    "last_digit_of_the_weights_hash": (
+        _last_digit_of("weights_sha256"),
+        r"weights.safetensors: SHA-256 is [0-9a-f]{64}, the manifest says",
+    ),
+    "last_digit_of_the_own_hash": (_last_digit_of("manifest_sha256"), r"manifest.json: its content has SHA-256"),
+    "hash_not_hex": (_edit(weights_sha256="x" * 64), r"manifest.json: weights_sha256"),
+    "bit_flip": (
+        lambda f: _replace(f / "weights.safetensors", lambda d: d[:-3] + bytes([d[-3] ^ 1]) + d[-2:]),
+        r"weights.safetensors: SHA-256 is [0-9a-f]{64}, the manifest says",
+    ),
+    "endless_device": (
+        _instead("weights.safetensors", _endless_device),
+        r"weights.safetensors: (is not a plain file|larger than)",
+    ),
+    "sparse_giant": (lambda f: os.truncate(f / "weights.safetensors", 1 << 40), r"weights.safetensors: larger than"),
+    "other_case": (lambda f: (f / "manifest.json").rename(f / "Manifest.json"), r"manifest.json: is missing"),
+    "hidden_file": (lambda f: (f / ".weights.py").write_text("raise SystemExit"), r".weights.py: does not belong"),
+    "extra_folder": (lambda f: (f / "__pycache__").mkdir(), r"__pycache__: does not belong"),
+    "byte_order_mark": (_manifest(lambda data: b"\xef\xbb\xbf" + data), r"manifest.json: "),
+    "utf16": (_manifest(lambda data: data.decode().encode("utf-16")), r"manifest.json: "),
+    "null_byte": (_manifest(lambda data: data + b"\0"), r"manifest.json: Extra data"),
+    "path_to_weights": (_edit(weights="../../other/weights.safetensors"), r"manifest.json: weights: unknown key"),
+    "path_as_learner": (_edit(learners=["../../vehicle_2"]), r"manifest.json: learners: '../../vehicle_2' is no"),
+    "unknown_activation": (_edit(network__activation="gelu"), r"manifest.json: network.activation: must be"),
+    "unknown_output": (_edit(network__output="eval"), r"manifest.json: network.output: must be"),
+    "negative_layer": (_edit(network__policy_hidden=[-13, 9]), r"manifest.json: network.policy_hidden.0"),
+    "layer_not_whole": (_edit(network__policy_hidden=[13.5, 9]), r"manifest.json: network.policy_hidden.0"),
+    "true_for_a_number": (_edit(network__action_size=True), r"manifest.json: network.action_size"),
+    "deep_scenario": (
+        _manifest(lambda data: data.replace(b'"paper-random"', b"[" * 100_000 + b"]" * 100_000)),
+        r"manifest.json: (nested too deeply|.*recursion)",
+    ),
+    "tensor_path": (
+        _header(lambda h: h.update({"../../policy.0.bias": h.pop("policy.0.bias")})),
+        r"tensor 'policy.0.bias' is missing",
+    ),
+    "tensor_dunder": (
+        _header(lambda h: h.update({"__class__.__init__": h.pop("policy.0.bias")})),
+        r"tensor 'policy.0.bias' is missing",
+    ),
+    "unknown_dtype": (_first_tensor(dtype="F99"), r"tensor 'policy.0.bias' is F99"),
+    "object_dtype": (_first_tensor(dtype="O"), r"tensor 'policy.0.bias' is O"),
+    "negative_shape": (_first_tensor(shape=[-13]), r"tensor 'policy.0.bias' is F32 \[-13\]"),
+    "overflowing_shape": (_first_tensor(shape=[2**63, 2]), r"tensor 'policy.0.bias' is F32 \[9223372036854775808, 2\]"),
+    "offsets_beyond": (_first_tensor(data_offsets=[0, 2**40]), r"weights.safetensors: not a safetensors file"),
+    "offsets_backwards": (_first_tensor(data_offsets=[52, 0]), r"weights.safetensors: not a safetensors file"),
+    "offsets_negative": (_first_tensor(data_offsets=[-52, 0]), r"weights.safetensors: not a safetensors file"),
+    "deep_header": (_raw_header(b"[" * 200_000), r"weights.safetensors: nested too deeply"),
+    "key_twice_in_header": (_raw_header(b'{"a": {}, "a": {}}'), r"weights.safetensors: key 'a' stands twice"),
+    "empty_header": (_raw_header(b"{}"), r"tensor 'policy.0.bias' is missing"),
+    "minus_infinite_weight": (
+        _tensors(lambda t: {**t, "value.0.bias": t["value.0.bias"] - np.float32(np.inf)}),
+        r"tensor 'value.0.bias' holds a number",
+    ),
+    "empty_weights": (_weights(lambda _: b""), r"weights.safetensors: not a safetensors file"),
+    "pickle": (_weights(lambda _: pickle.dumps(_Payload())), r"weights.safetensors: not a safetensors file"),
+    "zip": (_weights(lambda _: b"PK\x03\x04" + b"\0" * 4000), r"weights.safetensors: not a safetensors file"),
+    "cut_short": (_weights(lambda data: data[:-5]), r"weights.safetensors: not a safetensors file"),
+    "trailing_bytes": (_weights(lambda data: data + b"more"), r"weights.safetensors: not a safetensors file"),
+    "long_header": (_weights(lambda data: b"\xff" * 8 + data[8:]), r"weights.safetensors: not a safetensors file"),
+    "list_header": (_weights(lambda _: b"\2\0\0\0\0\0\0\0[]"), r"weights.safetensors: not a safetensors file"),
+    "metadata": (_header(lambda h: h.update(__metadata__={"a": "b"})), r"tensor '__metadata__' does not belong"),
+    "overlap": (
+        _header(lambda h: h["policy.0.bias"].update(data_offsets=h["policy.0.weight"]["data_offsets"])),
+        r"weights.safetensors: not a safetensors file",
+    ),
+    "missing_tensor": (
+        _tensors(lambda t: {name: t[name] for name in t if name != "policy.1.bias"}),
+        r"tensor 'policy.1.bias' is missing",
+    ),
+    "extra_tensor": (
+        _tensors(lambda t: {**t, "policy.9.bias": np.zeros(3, "f4")}),
+        r"tensor 'policy.9.bias' does not belong here",
+    ),
+    "wrong_shape": (
+        _tensors(lambda t: {**t, "policy.0.bias": np.zeros(14, "f4")}),
+        r"tensor 'policy.0.bias' is F32 \[14\], should be F32 \[13\]",
+    ),
+    "transposed": (
+        _tensors(lambda t: {**t, "policy.1.weight": np.ascontiguousarray(t["policy.1.weight"].T)}),
+        r"tensor 'policy.1.weight' is F32 \[13, 9\], should be F32 \[9, 13\]",
+    ),
+    "wrong_dtype": (
+        _tensors(lambda t: {**t, "policy.0.bias": np.zeros(13, "f8")}),
+        r"tensor 'policy.0.bias' is F64 \[13\], should be F32 \[13\]",
+    ),
+    "nan_weight": (
+        _tensors(lambda t: {**t, "value.0.bias": np.append(t["value.0.bias"][1:], np.float32(np.nan))}),
+        r"tensor 'value.0.bias' holds a number that is not",
+    ),
+    "infinite_weight": (
+        _tensors(lambda t: {**t, "value.0.bias": t["value.0.bias"] + np.float32(np.inf)}),
+        r"tensor 'value.0.bias' holds a number that is",
+    ),
+}
+
+
+def test_bundle__round_trip_is_exact_and_always_of_the_same_bytes(policy: Policy, tmp_path: Path) -> None:
+    """Also without the critic, as policies ship; a second name of a file, as installers make one, is no sign of it."""
+    for name in ("a", "run/policy"):
+        policy.save(tmp_path / name)
+    load("../studies/ship_policy").actor_only(policy).save(tmp_path / "shipped")
+    os.link(tmp_path / "a" / "weights.safetensors", tmp_path / "elsewhere")
+    one, other, shipped = (load_policy(tmp_path / name) for name in ("a", "run", "shipped"))
+    assert one.manifest == other.manifest == policy.manifest and one.tensors.keys() == policy.tensors.keys()
+    assert all(np.array_equal(one.tensors[name], policy.tensors[name]) for name in policy.tensors)
+    seen = np.random.default_rng(0).normal(size=(50, policy.observation.size)).astype(np.float32)
+    expected = policy(seen)
+    assert all(np.array_equal(each(seen), expected) for each in (one, other, shipped)) and np.unique(expected).size > 10
+    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["manifest.json", "weights.safetensors"]
+    for file in ("manifest.json", "weights.safetensors"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "run" / "policy" / file).read_bytes()
+    network = json.loads((tmp_path / "a" / "manifest.json").read_text())["network"]
+    assert not {"networks", "gate_hidden"} & network.keys()  # of which earlier versions of the package know nothing
+    assert not any(name.startswith("value") for name in shipped.tensors)
+    assert shipped.manifest.scenario == policy.manifest.scenario
+
+
+_watching: list[str] = []  # the folder that may be read; a hook of the interpreter stays as long as that
+_events: list[str] = []
+
+
+def _note(event: str, args: tuple[Any, ...]) -> None:
+    for root in _watching:
+        inside = event == "open" and (isinstance(args[0], int) or str(args[0]).startswith(root)) and not args[2] & 3
+        if not inside and event not in ("os.scandir", "object.__getattr__", "sys._getframe"):
+            _events.append(f"{event} {args!r:.200}")
+
+
+sys.addaudithook(_note)
+
+
+@pytest.mark.parametrize("name", SPOILED)
+def test_load_policy__refuses_a_damaged_bundle_and_runs_and_opens_nothing_else(
+    name: str, policy: Policy, tmp_path: Path
+) -> None:
+    spoil, message = SPOILED[name]
+    policy.save(tmp_path / "good")
+    load_policy(tmp_path / "good")
+    policy.save(tmp_path / "policy")
+    spoil(tmp_path / "policy")
+    _events.clear()
+    _watching.append(str(tmp_path))
+    try:
+        with pytest.raises(CorruptBundle, match=message) as caught:
+            load_policy(tmp_path / "policy")
+    finally:
+        _watching.clear()
+    assert _events == []
+    told = str(caught.value)
+    assert told.startswith(str(tmp_path / "policy")) and "\n" not in told
+
+
+def test_damaged_bundles__are_as_many_as_the_page_says() -> None:
+    page = Path(__file__).resolve().parents[2] / "docs" / "policy-bundles.md"
+    assert f"{len(SPOILED)} damaged and malicious bundles" in " ".join(page.read_text("utf-8").split())
+
+
+@pytest.fixture
+def folder(policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package in which five policies ship; they were trained on paper-random."""
+    for name in ("ppo", "ppo-total", "ppo-paper-distance", "universal", "universal-obstacle"):
+        policy.save(tmp_path / name / "policy")
+        (tmp_path / name / "card.md").write_text(f"# {name}\n")
+    monkeypatch.setattr(bundle, "_FOLDER", tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("kind", "scenario", "harm_count", "name"),
+    [
+        ("ppo", "paper-random", "first", "ppo"),
+        ("ppo", "paper-random", "total", "ppo-total"),
+        ("ppo", "paper-distance", "total", "ppo-paper-distance"),  # better than none
+        ("universal", "paper-delay-low", "first", "universal"),
+        ("universal", "paper-random-obstacle", "first", "universal-obstacle"),
+        ("policy", "paper-random-obstacle", "total", "universal-obstacle"),
+        ("universal", "cooperation-4-five", "total", "universal"),
+        ("ppo", None, "total", "ppo-total"),
+        ("policy", "paper-random", "total", "ppo-total"),
+        ("policy", "paper-delay-low", "first", "universal"),
+    ],
+)
+def test_shipped_name__is_by_kind_scenario_and_count(
+    kind: str, scenario: str | None, harm_count: HarmCount, name: str, folder: Path
+) -> None:
+    assert shipped_name(kind, None if scenario is None else eb.load_scenario(scenario), harm_count) == name
+
+
+def test_lineup__takes_what_ships(folder: Path) -> None:
+    specs = ["ppo@shipped", "universal@shipped", "policy@shipped", "team@shipped", "ppo@shipped+episode"]
+    lineup = make_lineup([*specs, "ppo@shipped/ppo-paper-distance"], SCENARIO)
+    shipped = "policy@shipped/ppo"
+    told = [spec.replace("policy@shipped", shipped).replace("team@shipped", shipped) for spec in lineup]
+    assert [each.name for each in lineup.values()] == told
+    assert isinstance(lineup["ppo@shipped+episode"], HybridAgent)
+    worlds = SCENARIO.sample(5, 1).worlds
+    acts = [lineup[spec].act(worlds, 1).tolist() for spec in specs[:4]]
+    assert acts == [acts[0]] * 4  # four copies of one policy ship here
+
+
+@pytest.mark.parametrize(("name", "path"), shipped_policies().items())
+def test_shipped_policies__each_that_ships_is_small_and_has_a_card(name: str, path: Path, tmp_path: Path) -> None:
+    manifest = load_named_policy(f"shipped/{name}").manifest
+    trained = eb.load_scenario(str(manifest.scenario["name"]))
+    assert scenario_sha256(eb.Scenario.of_dump(manifest.scenario)) == scenario_sha256(trained) and manifest.steps > 0
+    assert sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) < 1_000_000
+    load_named_policy(f"shipped/{name}").save(tmp_path / "copy")  # whatever version wrote it
+    assert load_policy(tmp_path / "copy").manifest.manifest_sha256 == manifest.manifest_sha256
+    assert (path / "card.md").read_text("utf-8").startswith("# ")
+
+
+@pytest.mark.parametrize("harm_count", HARM_COUNTS)
+@pytest.mark.parametrize("test", list(TESTS))
+def test_shipped__one_for_each_of_the_three_tests_drives_alone_and_behind_its_shield(
+    test: str, harm_count: HarmCount
+) -> None:
+    scenario = eb.load_scenario(test)
+    name = shipped_name("ppo", scenario, harm_count)
+    assert load_named_policy(f"shipped/{name}").manifest.scenario["name"] == test
+    lineup = make_lineup(["ppo@shipped", "ppo@shipped+episode"], scenario, harm_count=harm_count)
+    result = evaluate(scenario.sample(20, 7), lineup, scenario=scenario, seed=7)
+    alone, shielded = (result.outcome(spec).ledger.world_harm(harm_count) for spec in lineup)
+    assert shielded.mean() <= alone.mean()
+    assert (shielded <= result.outcome("ppo@shipped+episode").predicted_harm + 1e-9).all()
+
+
+def harms(sample: Any, specs: list[str], scenario: Any, harm_count: HarmCount) -> dict[str, float]:
+    """The mean harm of each agent."""
+    lineup = make_lineup(specs, scenario, harm_count=harm_count)
+    result = evaluate(sample, lineup, scenario=scenario, aftermath=False)
+    return {spec: float(result.outcome(spec).ledger.world_harm(harm_count).mean()) for spec in lineup}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("harm_count", HARM_COUNTS)
+@pytest.mark.parametrize("test", list(TESTS))
+def test_policy_shipped__is_the_best_that_ships(test: str, harm_count: HarmCount) -> None:
+    """By the mean harm in 2,000 worlds, within a hundredth of the best of all but those of levels of cooperation."""
+    scenario = eb.load_scenario(test)
+    names = [name for name in shipped_policies() if "cooperation" not in name]
+    each = [f"{'ppo' if name.startswith('ppo') else 'policy'}@shipped/{name}" for name in names]
+    found = harms(scenario.sample(2_000, 21), ["policy@shipped", *each], scenario, harm_count)
+    assert found["policy@shipped"] <= 1.01 * min(found.values())
+
+
+@pytest.mark.parametrize(
+    ("level", "share_of_full_braking", "collisions"),
+    [
+        ("cooperation-1-front", 0.60, 0.80),
+        ("cooperation-2-paper", 0.33, 0.70),
+        ("cooperation-2-blocked", 0.52, 0.87),
+        ("cooperation-3-pair", 0.33, 0.70),
+        ("cooperation-4-all", 0.03, 0.15),
+    ],
+)
+def test_policy_shipped__drives_all_learners_of_a_level_of_cooperation(
+    level: str, share_of_full_braking: float, collisions: float
+) -> None:
+    """At least as well as docs/levels.md says, by and large: level 3 collides no more often than level 2."""
+    scenario = eb.load_scenario(level)
+    assert shipped_name("policy", scenario, "total") == f"counterfactual-{level}"
+    assert load_named_policy(f"shipped/counterfactual-{level}").manifest.learners == tuple(
+        scenario.vehicle_names[i] for i in scenario.learners
+    )
+    lineup = make_lineup(["full_brake", "policy@shipped", "team@shipped"], scenario)
+    result = evaluate(scenario.sample(300, 7), lineup, scenario=scenario, seed=7, aftermath=False)
+    braking, policy, team = (result.outcome(spec) for spec in lineup)
+    assert policy.first_impact_harm.mean() <= share_of_full_braking * braking.first_impact_harm.mean()
+    assert policy.collided.mean() <= collisions
+    assert np.array_equal(policy.first_impact_harm, team.first_impact_harm)
+
+
+@pytest.mark.parametrize("harm_count", HARM_COUNTS)
+def test_shipped__counterfactual_does_less_harm_than_ppo(harm_count: HarmCount) -> None:
+    """On worlds that are no training's: several networks and a gate, trained for this count."""
+    manifest = load_named_policy(f"shipped/{shipped_name('counterfactual', SCENARIO, harm_count)}").manifest
+    assert manifest.reward["harm_count"] == harm_count and manifest.network.networks == 2
+    specs = ["ppo@shipped", "counterfactual@shipped"]
+    ppo, counterfactual = harms(SCENARIO.sample(600, 9), specs, SCENARIO, harm_count).values()
+    assert counterfactual < 0.98 * ppo
+
+
+# Of each list of 10,000 (seed 7) the worlds in which a shipped policy, refined, was furthest below an earlier table.
+LOWERED = {
+    "paper-random": (["ppo", "sac"], [400, 1058, 1261, 2987, 4300, 4408, 5872, 5976, 8752]),
+    "paper-random-brake-only": (["ppo"], [1325, 2801, 5278, 5547, 5814, 5984, 7228, 8020, 8166]),
+}
+
+
+@pytest.mark.parametrize("harm_count", ["first", pytest.param("total", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("test", list(LOWERED))
+def test_shipped__refined_is_nowhere_below_the_shipped_table(test: str, harm_count: HarmCount) -> None:
+    scenario = eb.load_scenario(test)
+    kinds, numbers = LOWERED[test]
+    every, rows = scenario.sample(10_000, 7), np.array(numbers)
+    sample = replace(every, worlds=every.worlds.take(rows), index=every.index[rows])
+    lineup = make_lineup([f"{kind}@shipped+refined+episode" for kind in kinds], scenario, harm_count=harm_count)
+    found = summarise(evaluate(sample, lineup, scenario=scenario, seed=7))
+    assert [(row.agent, row.known_best_share, row.below_best_known) for row in found] == [
+        (name, 1.0, 0) for name in lineup
+    ]

@@ -3,8 +3,7 @@
 Environments of other libraries and other versions are made by uv below ``.venvs/`` and kept for the next time.
 """
 
-from __future__ import annotations
-
+import argparse
 import hashlib
 import os
 import shutil
@@ -29,6 +28,7 @@ class Told(NamedTuple):
 
 
 Cases = Iterator[tuple[str, Callable[[], Told]]]
+Given = argparse.Namespace
 
 
 # ---------------------------------------------------------------- environments

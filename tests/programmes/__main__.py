@@ -6,8 +6,6 @@ each. What is called gives ``Told``: whether it was good (None: it was not tried
 text. An ``AssertionError`` is not good.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import sys

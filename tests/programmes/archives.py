@@ -1,7 +1,5 @@
 """Hostile archives of arrays: tables of best known harm as numpy writes them, and as nobody should."""
 
-from __future__ import annotations
-
 import io
 import json
 import random

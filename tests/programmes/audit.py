@@ -4,16 +4,13 @@ A package fails that has no licence that is known here, or another version than 
 pip-audit for reported weaknesses, where it is installed (`pip install pip-audit`).
 """
 
-from __future__ import annotations
-
-import argparse
 import re
 from collections import Counter
 from functools import partial
 from importlib.metadata import PackageNotFoundError, metadata
 from typing import NamedTuple
 
-from tests.programmes import ROOT, Cases, Told
+from tests.programmes import ROOT, Cases, Given, Told
 
 # Family of a licence -> the words that name it. One that is none of these, the GPL without an alternative for instance,
 # is told and fails.
@@ -75,7 +72,7 @@ def packages() -> list[Package]:
     return found
 
 
-def cases(given: argparse.Namespace) -> Cases:
+def cases(given: Given) -> Cases:
     found = packages()
     for each in found:
         good = not each.fault if each.installed else None

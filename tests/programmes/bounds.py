@@ -9,9 +9,6 @@ At the lowest versions each bound of ``pyproject.toml`` must be the version that
 what was tried. What cannot be installed is skipped with a clear word.
 """
 
-from __future__ import annotations
-
-import argparse
 import json
 import subprocess
 import sys
@@ -30,6 +27,7 @@ from tests.programmes import (
     ROOT,
     TORCH,
     Cases,
+    Given,
     NotInstalled,
     Told,
     call_uv,
@@ -45,7 +43,7 @@ KINDS = (*RESOLUTIONS, *(f"{resolution}-light" for resolution in RESOLUTIONS))
 EXTRAS = ("train", "dev")
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")  # that the light kinds of --ci look for
 # Each interface, the physics with its golden worlds, and what touches most of the packages.
-TESTS = ("contract", "envs", "physics", "golden", "scenario", "agents", "evaluation", "files", "figures", "cli")
+TESTS = ("contract", "envs", "physics", "golden", "scenario", "agents", "evaluation", "files", "figures", "cli", "told")
 CALM = "ignore::DeprecationWarning"  # that something will go from another package is what other versions differ in
 
 
@@ -57,7 +55,7 @@ OPTIONS = {
 }
 
 
-def cases(given: argparse.Namespace) -> Cases:
+def cases(given: Given) -> Cases:
     assert set(given.kinds) <= set(KINDS), f"{given.kinds}: there are {', '.join(KINDS)}"
     chosen = [(kind, python) for python in given.python or [sys.executable] for kind in given.kinds or KINDS]
     if given.ci:  # time may end: the lowest come first, as nobody uses those by chance, and most use the newest

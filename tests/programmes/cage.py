@@ -4,8 +4,6 @@ Each case runs in a process of its own, whose folder is removed. An audit hook o
 else, and what stands in and beside its folder is compared with what stood there before.
 """
 
-from __future__ import annotations
-
 import collections
 import contextlib
 import dataclasses

@@ -5,9 +5,6 @@ hour of two cores, most of it for loading torch after each kill). The table must
 local processes, byte for byte, and no job may be lost or doubled.
 """
 
-from __future__ import annotations
-
-import argparse
 import os
 import random
 import secrets
@@ -23,7 +20,7 @@ from pathlib import Path
 
 import yaml
 
-from tests.programmes import Cases, Told
+from tests.programmes import Cases, Given, Told
 from tests.studies.conftest import RECIPE
 from tests.studies.counting import PROGRAM, holders, journal
 
@@ -65,7 +62,7 @@ def disturb(
     return driver.wait()
 
 
-def run(folder: Path, given: argparse.Namespace) -> Told:
+def run(folder: Path, given: Given) -> Told:
     """The sweep by local processes, then on the cluster."""
     import ray
     from ray.cluster_utils import Cluster
@@ -110,7 +107,7 @@ OPTIONS = {
 }
 
 
-def cases(given: argparse.Namespace) -> Cases:
+def cases(given: Given) -> Cases:
     # Before Ray is loaded: 127.0.0.1 is the address of both nodes, and a token is asked of everybody.
     os.environ |= {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_AUTH_MODE": "token", "RAY_USAGE_STATS_ENABLED": "0"}
     os.environ["RAY_raylet_start_wait_time_s"] = "300"  # noqa: SIM112  # Ray's own spelling; much else may run here

@@ -16,9 +16,6 @@ functions are not seen being called: whoever mentions their name stands for them
 ``--journal`` notes each verdict, and takes those noted before as they are.
 """
 
-from __future__ import annotations
-
-import argparse
 import ast
 import copy
 import hashlib
@@ -47,7 +44,7 @@ from typing import Any, NamedTuple
 import pytest
 import yaml
 
-from tests.programmes import ROOT, Cases, Told
+from tests.programmes import ROOT, Cases, Given, Told
 
 PACKAGE = ROOT / "ethbrake_marl"
 KEPT = ROOT / ".pytest_cache" / "calls"
@@ -604,7 +601,7 @@ OPTIONS = {
 }
 
 
-def cases(given: argparse.Namespace) -> Cases:
+def cases(given: Given) -> Cases:
     """Each fault, and by which test it is found; then the table of folders."""
     wanted = given.folders.split(",")
     faults, misfits = planted()

@@ -5,34 +5,37 @@ numbers that its commands tell. What is compared by `make test`, and what by not
 search or one machine's speed, is said in tests/docs/printed.py and docs/tests.md.
 """
 
-from __future__ import annotations
-
-import argparse
 import os
 import re
 import shlex
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-from tests.docs.blocks import (
+from tests.docs.printed import (
+    BLOCKS,
+    NIGHTLY,
+    PICTURES,
     ROOT,
+    TABLES,
+    How,
     Shown,
     agrees,
     commands_of,
+    how,
     missing_figures,
     pictures,
     printed_blocks,
+    results,
     tables_of_figures,
 )
-from tests.docs.printed import BLOCKS, NIGHTLY, PICTURES, TABLES, How, how, results
-from tests.programmes import Cases, Told
+from tests.programmes import Cases, Given, Told
 
 PROGRESS = re.compile(r": [\d,]+ of [\d,]+$|^compiling ")
 
@@ -69,11 +72,6 @@ def differing_block(block: Shown, place: How, folder: Path) -> list[str]:
     return found
 
 
-def differing_table(table: Shown, place: How, folder: Path) -> list[str]:
-    """The figures of a table that its commands do not tell."""
-    return missing_figures(table.text, "\n".join(map(told_by, place.by)))
-
-
 def differing_picture(picture: Shown, place: How, folder: Path) -> list[str]:
     """Whether a picture has other pixels, in words."""
     for command in place.by:
@@ -103,7 +101,11 @@ def nightly() -> Iterator[tuple[str, Shown, How]]:
             yield kind, each, place[1]
 
 
-COMPARE = {"block": differing_block, "table": differing_table, "picture": differing_picture}
+COMPARE: dict[str, Callable[[Shown, How, Path], list[str]]] = {
+    "block": differing_block,
+    "table": lambda table, place, folder: missing_figures(table.text, "\n".join(map(told_by, place.by))),
+    "picture": differing_picture,
+}
 
 
 def compare(kind: str, shown: Shown, place: How) -> Told:
@@ -116,6 +118,6 @@ def compare(kind: str, shown: Shown, place: How) -> Told:
     return Told(not found, "\n        ".join(f"{each:.200}" for each in found) or "the same")
 
 
-def cases(given: argparse.Namespace) -> Cases:
+def cases(given: Given) -> Cases:
     for kind, shown, place in nightly():
         yield f"{shown.page}: {shown.begin:.70}", partial(compare, kind, shown, place)

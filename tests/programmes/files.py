@@ -5,8 +5,6 @@ the wrong YAML, each value exchanged for others, and what ``hostile.yaml`` lists
 run folders are damaged in ways of their own.
 """
 
-from __future__ import annotations
-
 import atexit
 import hashlib
 import json
@@ -27,12 +25,12 @@ import numpy as np
 import safetensors.numpy
 import yaml
 
+import ethbrake_marl as eb
 from ethbrake_marl.evaluation.inputs import NamedWorld, NamedWorlds, states_of
 from ethbrake_marl.learning.runs import train
-from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.policies import content_sha256, load_policy, shipped_policies
-from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies.sweep import SweepPlan, TuningPlan
+from tests.programmes.archives import npy, raw_npy
 from tests.programmes.cage import NASTY, OUTSIDE, PRECIOUS, Case, damaged, write
 
 # ---------------------------------------------------------------- text
@@ -337,7 +335,7 @@ class Text(NamedTuple):
 @cache
 def worlds_text() -> str:
     """A file of two named worlds that is in order; nobody does more harm than it says."""
-    scenario = load_scenario("paper-random")
+    scenario = eb.load_scenario("paper-random")
     states = states_of(scenario.sample(2, 7).worlds, scenario)
     worlds = [NamedWorld(name=f"world-{k}", score=1e6, harm=1e6, state=state) for k, state in enumerate(states)]
     return NamedWorlds.of(
@@ -360,10 +358,10 @@ def texts() -> dict[str, Text]:
     tune = ("study", "tune", "mine.yaml", "--output", "taken")
     states = ("evaluate", "--agents", "coast", "--initial-states", "mine.csv")
     again = ("search", "falsify", "--again", "mine.yaml")
-    paper = load_scenario("paper-random")
+    paper = eb.load_scenario("paper-random")
     return {
-        "scenario": Text(SCENARIO, ("scenario", "validate", "mine.yaml"), load_scenario, 25, both, own),
-        "recipe": Text(RECIPE, train, load_recipe, 28, both, UNCERTAIN),
+        "scenario": Text(SCENARIO, ("scenario", "validate", "mine.yaml"), eb.load_scenario, 25, both, own),
+        "recipe": Text(RECIPE, train, eb.load_recipe, 28, both, UNCERTAIN),
         "sweep": Text(SWEEP, sweep, SweepPlan.read),
         "tuning": Text(TUNING, tune, TuningPlan.read),
         "worlds": Text(worlds_text(), again, lambda path: NamedWorlds.read(path).worlds_of(paper, "x")),
@@ -504,24 +502,22 @@ def _weights(folder: Path, data: bytes) -> None:
     _signed(folder, weights_sha256=hashlib.sha256(data).hexdigest())
 
 
-def _tensor(rng: random.Random, header: dict[str, Any]) -> dict[str, Any]:
-    name = rng.choice([each for each in header if each != "__metadata__"])
-    entry = header[name]
-    match rng.randrange(6):
-        case 0:
-            entry["dtype"] = rng.choice(("F64", "BF16", "I8", "F8_E4M3", "OBJECT", None, 7, "x" * 5000))
-        case 1:
-            entry["shape"] = rng.choice(
-                ([], [-1], [10**30], None, "x", [1.5], [[1]], [True], [*entry["shape"][::-1], 1])
-            )
-        case 2:
-            entry["data_offsets"] = rng.choice(([0, 10**12], [-4, 4], [8, 0], None, [0], "x", [0, 0]))
-        case 3:
-            del header[name]
-        case 4:
-            header[rng.choice(("more", "../x", "", *NASTY))] = header.pop(name)
-        case _:
-            header[name] = rng.choice((None, 7, [], "x", {}))
+# What becomes of a tensor, by its name in the header.
+Entries = dict[str, Any]
+TENSORS: tuple[Callable[[random.Random, Entries, str], object], ...] = (
+    lambda r, h, name: h[name].update(dtype=r.choice(("F64", "BF16", "I8", "F8_E4M3", "OBJECT", None, 7, "x" * 5000))),
+    lambda r, h, name: h[name].update(
+        shape=r.choice(([], [-1], [10**30], None, "x", [1.5], [[1]], [True], [*h[name]["shape"][::-1], 1]))
+    ),
+    lambda r, h, name: h[name].update(data_offsets=r.choice(([0, 10**12], [-4, 4], [8, 0], None, [0], "x", [0, 0]))),
+    lambda r, h, name: h.pop(name),
+    lambda r, h, name: h.update({r.choice(("more", "../x", "", *NASTY)): h.pop(name)}),
+    lambda r, h, name: h.update({name: r.choice((None, 7, [], "x", {}))}),
+)
+
+
+def _tensor(rng: random.Random, header: Entries) -> Entries:
+    rng.choice(TENSORS)(rng, header, rng.choice([each for each in header if each != "__metadata__"]))
     return header
 
 
@@ -628,8 +624,8 @@ def stopped(algorithm: str) -> Path:
             signal.raise_signal(signal.SIGINT)
         return {"first_impact_harm": 1.0, "total_harm": 1.0}
 
-    recipe = load_recipe(algorithm).replace(**SETTINGS[algorithm])
-    train(recipe, load_scenario("paper-random"), folder, measure=lambda training: measure)
+    recipe = eb.load_recipe(algorithm).replace(**SETTINGS[algorithm])
+    train(recipe, eb.load_scenario("paper-random"), folder, measure=lambda training: measure)
     assert json.loads((folder / "run.json").read_text())["status"] == "interrupted"
     return folder
 
@@ -660,59 +656,49 @@ def _of_checkpoint(name: str, change: Spoil, rng: random.Random, run: Path) -> N
     listed_anew(newest(run))
 
 
+STRANGE = (
+    "more", "policy.x", "environment.engine.script.1.act", "environment.engine.script.1.__class__",
+    "optimizer.policy.99.step", "\x1b[2J",
+)  # fmt: skip
+# What becomes of an array; nothing where it is lost.
+ARRAYS: tuple[Callable[[random.Random, np.ndarray], np.ndarray | None], ...] = (
+    lambda r, a: None,
+    lambda r, a: a.astype(r.choice((np.float64, np.int32, np.uint8, np.float16, np.bool_))),
+    lambda r, a: a.reshape(1, *a.shape),
+    lambda r, a: a[..., :0] if a.ndim else np.zeros(3, a.dtype),
+    lambda r, a: np.resize(a, (7, 7)),
+    lambda r, a: np.frombuffer(r.randbytes(a.nbytes), a.dtype).reshape(a.shape),
+    lambda r, a: np.full_like(a, r.choice((np.nan, np.inf, -1e300)) if a.dtype.kind == "f" else r.choice((0, 255))),
+)
+
+
 def _arrays(rng: random.Random, path: Path) -> None:
     """Arrays of other names, types, shapes and values."""
     arrays = dict(safetensors.numpy.load(path.read_bytes()))
     name = rng.choice(sorted(arrays))
-    array = arrays[name]
-    match rng.randrange(8):
-        case 0:
-            del arrays[name]
-        case 1:
-            arrays[
-                rng.choice(
-                    (
-                        "more",
-                        "policy.x",
-                        "environment.engine.script.1.act",
-                        "environment.engine.script.1.__class__",
-                        "optimizer.policy.99.step",
-                        "\x1b[2J",
-                    )
-                )
-            ] = array
-        case 2:
-            arrays[name] = array.astype(rng.choice((np.float64, np.int32, np.uint8, np.float16, np.bool_)))
-        case 3:
-            arrays[name] = array.reshape(1, *array.shape)
-        case 4:
-            arrays[name] = array[..., :0] if array.ndim else np.zeros(3, array.dtype)
-        case 5:
-            arrays[name] = np.resize(array, (7, 7))
-        case 6:
-            arrays[name] = np.frombuffer(rng.randbytes(array.nbytes), array.dtype).reshape(array.shape)
-        case _:
-            wrong = rng.choice((np.nan, np.inf, -1e300)) if array.dtype.kind == "f" else rng.choice((0, 255))
-            with np.errstate(over="ignore"):
-                arrays[name] = np.full_like(array, wrong)
+    change, told = rng.choice([*((change, name) for change in ARRAYS), (lambda r, a: a, rng.choice(STRANGE))])
+    with np.errstate(over="ignore"):
+        changed = {told: change(rng, arrays[name])}
+    arrays = {each: array for each, array in (arrays | changed).items() if array is not None}
     path.write_bytes(safetensors.numpy.save(arrays))
+
+
+# What is written in the place of an array of the replay memory; nothing where the file is lost.
+REPLAYS: tuple[Callable[[np.ndarray], bytes | None], ...] = (
+    lambda array: None,
+    lambda array: npy(np.array([{"a": 1}], object)),
+    lambda array: npy(array[: len(array) // 2]),
+    lambda array: npy(array.astype(np.float64)),
+    lambda array: raw_npy("[" * 9000),
+)
 
 
 def _npy(rng: random.Random, path: Path) -> None:
     path = rng.choice(sorted(path.parent.glob("replay-*.npy")))
-    array = np.load(path)
-    match rng.randrange(5):
-        case 0:
-            path.unlink()
-        case 1:
-            np.save(path, np.array([{"a": 1}], object), allow_pickle=True)
-        case 2:
-            np.save(path, array[: len(array) // 2])
-        case 3:
-            np.save(path, array.astype(np.float64))
-        case _:
-            text = b"[" * 9000
-            path.write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text)
+    data = rng.choice(REPLAYS)(np.load(path))
+    path.unlink()
+    if data is not None:
+        path.write_bytes(data)
 
 
 def _text_of_table(rng: random.Random, path: Path) -> None:

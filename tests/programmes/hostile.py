@@ -6,9 +6,6 @@ Python with an exception of the project's family; nothing may be executed, and n
 for. The whole attack stands in a folder that is removed at the end.
 """
 
-from __future__ import annotations
-
-import argparse
 import functools
 import gc
 import io
@@ -32,7 +29,7 @@ import typer.main
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.limits.limits import BestHarmTable
 from ethbrake_marl.policies import load_policy
-from tests.programmes import Cases, Told
+from tests.programmes import Cases, Given, Told
 from tests.programmes.archives import COMMAND, good_bytes, table_cases
 from tests.programmes.cage import HERE, INSIDE, NASTY, OUTSIDE, PRECIOUS, REFUSED, Build, Case, Generator, judge, write
 from tests.programmes.files import (
@@ -265,7 +262,7 @@ def by_category(kind: str, seed: int) -> dict[str, list[Case]]:
     return grouped
 
 
-def cases(given: argparse.Namespace) -> Cases:
+def cases(given: Given) -> Cases:
     with tempfile.TemporaryDirectory(prefix="hostile-", ignore_cleanup_errors=True) as folder:
         own = Path(folder).resolve()
         tempfile.tempdir = os.fspath(own)

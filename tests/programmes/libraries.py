@@ -8,9 +8,6 @@ braking, and where the library evaluates policies by itself, its harm is compare
 ``--write`` puts the rows into docs/results/libraries.json. ``--ci`` takes the libraries that are cheap to install.
 """
 
-from __future__ import annotations
-
-import argparse
 import json
 import os
 import re
@@ -29,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tests.docs.site import load
-from tests.programmes import KEPT, ROOT, Cases, NotInstalled, Told, ready_python, watched
+from tests.programmes import KEPT, ROOT, Cases, Given, NotInstalled, Told, ready_python, watched
 
 PAGE, HOWTO = ROOT / "docs" / "other-libraries.md", ROOT / "docs" / "howto-train.md"
 MEASURED = load("results")
@@ -278,7 +275,7 @@ OPTIONS = {
 }
 
 
-def cases(given: argparse.Namespace) -> Cases:
+def cases(given: Given) -> Cases:
     taken = {library for library in LIBRARIES if LIBRARIES[library].in_ci or not given.ci}
     for k, way in enumerate(ways()):
         if way.library in taken:
@@ -287,7 +284,7 @@ def cases(given: argparse.Namespace) -> Cases:
         yield f"BenchMARL: docs/{HOWTO.name}", partial(run, "BenchMARL", "tell_howto()", given)
 
 
-def run(library: str, function: str, given: argparse.Namespace, way: Way | None = None) -> Told:
+def run(library: str, function: str, given: Given, way: Way | None = None) -> Told:
     """Run one way, or the how-to, in its library's environment."""
     name = re.sub(r"\W+", "_", library.lower())
     try:

@@ -6,9 +6,6 @@ the actions of policies. First as this machine does, then in one process for eac
 numpy, the C library, OpenBLAS or numba behave as on an older processor.
 """
 
-from __future__ import annotations
-
-import argparse
 import hashlib
 import json
 import math
@@ -29,7 +26,7 @@ from ethbrake_marl.limits.lower_bound import lower_bound
 from ethbrake_marl.policies import load_shipped, shipped_policies
 from ethbrake_marl.scenario import list_scenarios, load_scenario
 from tests.golden.test_golden import SHIELDS, decisions_hash, figures, sampled
-from tests.programmes import Cases, Told, watched
+from tests.programmes import Cases, Given, Told, watched
 
 SETTINGS: dict[str, dict[str, str]] = {
     "numpy without AVX-512": {"NPY_DISABLE_CPU_FEATURES": "X86_V4"},
@@ -55,14 +52,6 @@ def digest(*columns: Any) -> str:
     for column in columns:
         found.update(np.ascontiguousarray(column).tobytes())
     return found.hexdigest()[:16]
-
-
-def lists() -> dict[str, str]:
-    return {f"list {entry.name}": json.dumps(sampled(entry.name)) for entry in list_scenarios()}
-
-
-def physics() -> dict[str, str]:
-    return {"physics": str(figures("few")["sha256"])}
 
 
 def episodes() -> dict[str, str]:
@@ -91,10 +80,6 @@ def searches() -> dict[str, str]:
     return found
 
 
-def shields() -> dict[str, str]:
-    return {f"shield {name}": decisions_hash(make()[0], 10) for name, make in SHIELDS.items()}
-
-
 def tallies() -> dict[str, str]:
     found = {}
     for name in HARD[:2]:
@@ -117,7 +102,15 @@ def actions() -> dict[str, str]:
     return found
 
 
-KINDS: tuple[Callable[[], dict[str, str]], ...] = (lists, physics, episodes, searches, shields, tallies, actions)
+KINDS: tuple[Callable[[], dict[str, str]], ...] = (
+    lambda: {f"list {entry.name}": json.dumps(sampled(entry.name)) for entry in list_scenarios()},
+    lambda: {"physics": str(figures("few")["sha256"])},
+    episodes,
+    searches,
+    lambda: {f"shield {name}": decisions_hash(make()[0], 10) for name, make in SHIELDS.items()},
+    tallies,
+    actions,
+)
 
 
 TELL = "from tests.programmes import machines; machines.tell()"
@@ -126,7 +119,7 @@ TELL = "from tests.programmes import machines; machines.tell()"
 OPTIONS = {"--sample": {"action": "store_true", "help": "without the settings that compile everything anew"}}
 
 
-def cases(given: argparse.Namespace) -> Cases:
+def cases(given: Given) -> Cases:
     here: dict[str, str] = {}
 
     def differing(setting: dict[str, str]) -> Told:

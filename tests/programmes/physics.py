@@ -3,9 +3,6 @@
 The claims of ``tests/physics``, with the tolerances of ``tests/reference/tolerances.py``, on many more worlds.
 """
 
-from __future__ import annotations
-
-import argparse
 import json
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -47,7 +44,7 @@ from tests.physics.random_worlds import (
 from tests.physics.segments import Scan, random_segments, scan
 from tests.physics.test_build_up import by_small_steps, played, random_lines
 from tests.physics.test_oracles import accelerations, at_once, exact_accelerations, in_steps, law_error_eps
-from tests.programmes import Cases, Told
+from tests.programmes import Cases, Given, Told
 from tests.reference.tolerances import (
     BOUNCE_SERIES_EPS,
     CLUSTER_EPS,
@@ -72,14 +69,6 @@ class Figure(NamedTuple):
     of: str  # what it was measured on
 
 
-GATES: dict[str, Callable[[], Figure]] = {}
-
-
-def gate(name: str) -> Callable[[Callable[[], Figure]], Callable[[], Figure]]:
-    """Enter a function into the programme under a name."""
-    return partial(GATES.setdefault, name)
-
-
 def measured(measure: Callable[[], Figure]) -> Told:
     value, threshold, of = measure()
     return Told(value <= threshold, f"{value:.3g} <= {threshold:.3g}, {of}")
@@ -88,7 +77,7 @@ def measured(measure: Callable[[], Figure]) -> Told:
 OPTIONS = {"--small-step-worlds": {"type": int, "default": 10_000, "help": "of 'brakes that build up'"}}
 
 
-def cases(given: argparse.Namespace) -> Cases:
+def cases(given: Given) -> Cases:
     for name, measure in GATES.items():
         yield name, partial(measured, measure)
     each = max(1, given.small_step_worlds // 8)
@@ -124,24 +113,11 @@ def small_steps(N: int, obstacle: bool, worlds: int) -> Figure:
 # ---------------------------------------------------------------- worlds made backwards, impacts, motion between them
 
 
-def inexact(cases: list[Case]) -> int:
+def inexactly(cases: list[Case]) -> Figure:
     """How many worlds are not what rational arithmetic says to the last bit, at once and in steps."""
-    return sum(bool(at_once(case) or in_steps(case)) for case in cases)
-
-
-@gate("manufactured worlds, not bit for bit")
-def manufactured_worlds() -> Figure:
-    """Worlds built backwards from contact times: stored ones and fresh ones."""
-    cases = stored() + manufactured(9, 2, 1_500) + manufactured(9, 3, 400) + manufactured(9, 4, 100)
     hits = sum(len(case.outcome.hits) for case in cases)
-    return Figure(inexact(cases), 0, f"{len(cases)} worlds, {hits} impacts, at once and in steps of 1/8 s")
-
-
-@gate("resting contact worlds, not bit for bit")
-def pressed_worlds() -> Figure:
-    """Worlds that touch at the start."""
-    cases = [case for N in (2, 3, 4, 5) for case in pressed(11, N, 1_000)]
-    return Figure(inexact(cases), 0, f"{len(cases)} worlds")
+    wrong = sum(bool(at_once(case) or in_steps(case)) for case in cases)
+    return Figure(wrong, 0, f"{len(cases)} worlds, {hits} impacts, at once and in steps of 1/8 s")
 
 
 @cache
@@ -155,22 +131,12 @@ def impact_batches() -> list[tuple[Worlds, Worlds, Impacts]]:
     return batches
 
 
-@gate("momentum at impacts [eps of sum m |v|, per round]")
-def momentum() -> Figure:
-    """Momentum before and after."""
-    batches = impact_batches()
-    worst = max(float(np.max(momentum_eps(b, a) / rounds(i))) for b, a, i in batches)
-    return Figure(worst, MOMENTUM_EPS, f"{sum(int(i.count.sum()) for *_, i in batches):,} impacts, N = 2 to 50")
+def of_impacts(error: Callable[[Worlds, Worlds, Impacts], Floats], threshold: float) -> Figure:
+    """The largest error at their impacts."""
+    worst = max(float(np.max(error(*batch))) for batch in impact_batches())
+    return Figure(worst, threshold, f"{sum(int(i.count.sum()) for *_, i in impact_batches()):,} impacts, N = 2 to 50")
 
 
-@gate("energy rise at impacts [eps of the energy, per round]")
-def energy() -> Figure:
-    """Kinetic energy over ground."""
-    worst = max(float(np.max(energy_rise_eps(b, a) / rounds(i))) for b, a, i in impact_batches())
-    return Figure(worst, ENERGY_EPS, "the same impacts")
-
-
-@gate("restitution of pairs [eps of the larger speed]")
 def restitution() -> Figure:
     """Separation speed against e times closing speed."""
     worst, pairs = 0.0, 0
@@ -181,7 +147,6 @@ def restitution() -> Figure:
     return Figure(worst, RESTITUTION_EPS, f"{pairs:,} impacts of two vehicles")
 
 
-@gate("gap against its closed form, and below 0 [m]")
 def gaps() -> Figure:
     """Stored gaps against those that follow from the speeds."""
     runs = [Watched(41 + N, 3_000 // N, N, drive=drive) for N in (2, 3, 5, 10) for drive in (False, True)]
@@ -194,21 +159,13 @@ def braking_runs() -> list[Watched]:
     return [Watched(51 + N, 3_000 // N, N, drive=False) for N in (2, 3, 5, 10)]
 
 
-@gate("speeds below 0 that no bounce-back explains")
-def negative_speeds() -> Figure:
-    """Braking lines in short steps."""
+def of_braking(count: Callable[[Watched], int]) -> Figure:
+    """How often something happens to them."""
     seen = sum(int((state.speeds_mps < 0).sum()) for run in braking_runs() for state in run.states)
-    return Figure(sum(run.unexplained_negative_speeds() for run in braking_runs()), 0, f"{seen:,} negative speeds seen")
+    of = f"{len(braking_runs()) * 300:,} steps of 3,000 vehicles, {seen:,} negative speeds seen"
+    return Figure(sum(map(count, braking_runs())), 0, of)
 
 
-@gate("steps in which energy rose though nobody drives")
-def energy_in_motion() -> Figure:
-    """Braking lines in short steps."""
-    rises = sum(run.energy_rises() for run in braking_runs())
-    return Figure(rises, 0, f"{len(braking_runs()) * 300:,} steps of {3_000:,} vehicles")
-
-
-@gate("harm shares that do not add up to the last bit")
 def shares() -> Figure:
     """Random harm and masses."""
     draws, n = Draws(61), 2_000_000
@@ -218,7 +175,6 @@ def shares() -> Figure:
     return Figure(int(np.sum(rest != both.min(axis=1))), 0, f"{n:,} impacts")
 
 
-@gate("worlds whose ledger is not the sum of its rows")
 def ledgers() -> Figure:
     """First-impact and total harm, to the last bit, over three segments."""
     wrong, impacts_seen = 0, 0
@@ -247,24 +203,14 @@ def scans() -> list[Scan]:
     return found
 
 
-@gate("contacts missed")
-def missed() -> Figure:
-    """Against the smallest value of each gap's closed form; the doubtful ones against exact arithmetic."""
+def of_scans(kind: str) -> Figure:
+    """Contacts against the smallest value of each gap's closed form; the doubtful ones against exact arithmetic.
+
+    What is wrong: time and closing speed of the first contact, or final gaps and speeds where there is none.
+    """
     pairs, contacts, in_doubt = (sum(getattr(s, name) for s in scans()) for name in ("pairs", "contacts", "in_doubt"))
     of = f"{pairs:,} random segments of pairs, {contacts:,} with contact, {in_doubt:,} decided by exact arithmetic"
-    return Figure(sum(s.missed.size for s in scans()), 0, of)
-
-
-@gate("contacts invented")
-def phantom() -> Figure:
-    """The same scan."""
-    return Figure(sum(s.phantom.size for s in scans()), 0, "the same segments")
-
-
-@gate("contacts or gaps misplaced")
-def wrong() -> Figure:
-    """The same scan: time and closing speed of the first contact, final gaps and speeds where there is none."""
-    return Figure(sum(s.wrong.size for s in scans()), 0, "the same segments")
+    return Figure(sum(getattr(s, kind).size for s in scans()), 0, of)
 
 
 CASCADE = 100  # impacts of a world; between an obstacle and a line they come ever faster, and rounding multiplies
@@ -290,7 +236,11 @@ def run_difference(end: Worlds, found: Floats, k: int, line: Worlds, command: li
 def differences(obstacle: bool) -> tuple[Floats, int, int]:
     """``run_difference`` of every world, and how many impacts there were, and how many with the obstacle."""
     worst, impacts_seen, with_it = [], 0, 0
-    for N, n in {2: 1_500, 3: 1_000, 5: 300, 10: 40}.items() if obstacle else WHOLE_RUNS.items():
+    for N, n in (
+        {2: 1_500, 3: 1_000, 5: 300, 10: 40}.items()
+        if obstacle
+        else {2: 3_000, 3: 2_000, 5: 600, 10: 100, 50: 6}.items()
+    ):
         batch = place_ahead(driving_lines(183, n, N), 184) if obstacle else driving_lines(81, n, N)
         end, impacts = advance(batch.worlds, batch.command, HORIZON_S, record=True)
         rows = impacts.rows
@@ -302,25 +252,15 @@ def differences(obstacle: bool) -> tuple[Floats, int, int]:
     return np.array(worst), impacts_seen, with_it
 
 
-WHOLE_RUNS = {2: 3_000, 3: 2_000, 5: 600, 10: 100, 50: 6}
+def of_runs(obstacle: bool) -> Figure:
+    """Every impact's time and closing speed, in order, final gaps and speeds, after up to hundreds of events."""
+    found, impacts_seen, with_it = differences(obstacle)
+    of = f"{np.isfinite(found).sum():,} worlds, {impacts_seen:,} impacts of pairs, {with_it:,} with an obstacle"
+    return Figure(float(np.nanmax(found)), EXACT_RUN, of)
 
 
-@gate("difference from exact runs [m, m/s, s]")
-def exact_runs() -> Figure:
-    """Every impact's time and closing speed, final gaps and speeds, after up to hundreds of events."""
-    found, impacts_seen, _ = differences(obstacle=False)
-    of = f"{found.size:,} worlds of 2 to 50 vehicles, {impacts_seen:,} impacts"
-    return Figure(float(found[np.isfinite(found)].max()), EXACT_RUN, of)
-
-
-@gate("runs with other impacts than exact ones")
-def exact_counts() -> Figure:
-    """The order and the number of impacts of every pair."""
-    return Figure(int((~np.isfinite(differences(obstacle=False)[0])).sum()), 0, "the same worlds")
-
-
-def law_error(key: int, counts: dict[int, int], obstacle: bool) -> tuple[float, int]:
-    """Largest error of the cluster law in so many touching lines of each number of vehicles, and how many there are."""
+def law(key: int, counts: dict[int, int], obstacle: bool) -> Figure:
+    """Speeds after simultaneous impacts against the exact law, in so many touching lines of each number of vehicles."""
     worst = 0.0
     for (N, n), ratio in product(counts.items(), (1.0, 1e3)):
         before, command = touching_lines(key, n, N, heaviest_ratio=ratio)
@@ -328,17 +268,9 @@ def law_error(key: int, counts: dict[int, int], obstacle: bool) -> tuple[float, 
         after, impacts = advance(before, command, 0.0)
         rounds = np.maximum(np.maximum(impacts.count.max(axis=1), impacts.obstacle_count), 1)
         worst = max(worst, *(law_error_eps(before, after, k, int(rounds[k])) for k in range(n)))
-    return worst, 2 * sum(counts.values())
+    return Figure(worst, CLUSTER_EPS, f"{2 * sum(counts.values()):,} clusters of 2 to 50 vehicles")
 
 
-@gate("cluster law [eps of the largest speed, per round]")
-def exact_clusters() -> Figure:
-    """Speeds after simultaneous impacts against the exact law."""
-    worst, worlds = law_error(82, {2: 3_000, 3: 3_000, 5: 1_500, 10: 400, 20: 150, 50: 30}, obstacle=False)
-    return Figure(worst, CLUSTER_EPS, f"{worlds:,} clusters of 2 to 50 vehicles")
-
-
-@gate("resting contact against exact force ranges [m/s2]")
 def resting() -> Figure:
     """Accelerations of touching lines at rest, moving, and at a speed limit."""
     draws, found = Draws(83), []
@@ -352,29 +284,12 @@ def resting() -> Figure:
 # ---------------------------------------------------------------- an obstacle ahead of Vehicle 1
 
 
-@gate("obstacle: cluster law [eps of the largest speed, per round]")
-def obstacle_clusters() -> Figure:
-    """Speeds after simultaneous impacts of vehicles that touch each other and the obstacle, against the exact law."""
-    worst, worlds = law_error(182, {2: 1_500, 3: 1_500, 5: 800, 10: 200, 20: 80, 50: 15}, obstacle=True)
-    return Figure(worst, CLUSTER_EPS, f"{worlds:,} clusters of 2 to 50 vehicles")
-
-
-@gate("obstacle: difference from exact runs [m, m/s, s]")
-def obstacle_runs() -> Figure:
-    """The impacts of every pair and with the obstacle, in order, their times and closing speeds, final state."""
-    found, _, with_it = differences(obstacle=True)
-    of = f"{np.isfinite(found).sum():,} worlds of 2 to 10 vehicles, {with_it:,} impacts with the obstacle"
-    return Figure(float(np.nanmax(found)), EXACT_RUN, of)
-
-
-@gate("obstacle: worlds that differ after 100 impacts [share]")
 def cascades() -> Figure:
     """Worlds in which rounding changes the order of impacts, after so many of them and never before."""
     found, *_ = differences(obstacle=True)
     return Figure(float(np.isnan(found).mean()), OTHER_CASCADES, f"{found.size:,} worlds of 2 to 10 vehicles")
 
 
-@gate("obstacle out of reach: worlds with other bits")
 def out_of_reach() -> Figure:
     """The same lines without an obstacle, and with one that they never reach."""
     n, changed = 20_000, 0
@@ -406,7 +321,6 @@ def unfinished(counts: dict[int, int], make: Callable[[int, int], Batch], until_
     return failed
 
 
-@gate("instants that do not end: clusters a few ulps apart")
 def joined_clusters() -> Figure:
     """Touching lines at one speed but for the last digits, half of them against an obstacle."""
 
@@ -418,7 +332,6 @@ def joined_clusters() -> Figure:
     return Figure(failed, 0, f"{sum(NEARLY_JOINED.values()):,} clusters of 2 to 50 vehicles")
 
 
-@gate("instants that do not end: lines thrown against an obstacle")
 def thrown() -> Figure:
     """Whole runs of 6 s."""
     failed = unfinished(THROWN, lambda N, chunk: thrown_lines(100_000 + 1_000 * N + chunk, INSTANT_CHUNK, N), HORIZON_S)
@@ -434,14 +347,12 @@ def splits() -> list[Split]:
     return [split_errors(N, 60_000 // N, cuts, 91) for N in (2, 3, 5, 10, 20) for cuts in (2, 7, 80)]
 
 
-@gate("a segment that is split, few impacts [relative]")
 def splitting() -> Figure:
     """Gaps, speeds and harm, relative to at least 100 m, 30 m/s, 900 m2/s2; up to 30 impacts."""
     worst = max(float(s.error[s.few].max()) for s in splits() if s.few.any())
     return Figure(worst, SPLIT, f"{sum(int(s.few.sum()) for s in splits()):,} worlds in 2, 7 and 80 parts")
 
 
-@gate("a segment that is split, cascades [relative]")
 def splitting_cascades() -> Figure:
     """The same for worlds with more impacts; beside it what another last digit of the initial gaps changes in them."""
     worst = max(float(s.error[~s.few].max()) for s in splits() if not s.few.all())
@@ -453,13 +364,6 @@ def splitting_cascades() -> Figure:
     )
 
 
-@gate("a segment that is split, worlds with other impacts")
-def splitting_counts() -> Figure:
-    """Worlds in which some pair has another number of impacts."""
-    return Figure(sum(int(s.other.sum()) for s in splits()), 0, "the same worlds")
-
-
-@gate("worlds changed by the origin of time")
 def origin() -> Figure:
     """To the last bit; times on a grid of 2^-20 s."""
     batch = driving_lines(92, 50_000, 4)
@@ -480,7 +384,6 @@ def origin() -> Figure:
     return Figure(changed, 0, "50,000 worlds, three shifts (positions are not stored: space has no origin)")
 
 
-@gate("batches whose bits depend on their make-up")
 def batches() -> Figure:
     """One world alone, in any order, in one thread or two."""
     n, changed = 20_000, 0
@@ -507,7 +410,6 @@ def batches() -> Figure:
     return Figure(changed, 0, f"{n:,} worlds alone, on 2 threads (threads=2, and 64 parts by hand), in 10 orders")
 
 
-@gate("golden hash of 10,000 worlds, different")
 def golden() -> Figure:
     """``tests/golden/physics_worlds.json``."""
     found = figures()
@@ -516,7 +418,6 @@ def golden() -> Figure:
     )
 
 
-@gate("bounces: total time of a series [relative]")
 def bounces() -> Figure:
     """Against the geometric sum of flights, for e from 0.05 to 0.99."""
     worst = 0.0
@@ -532,3 +433,55 @@ def bounces() -> Figure:
             return Figure(np.nan, 0, f"e = {e}: {impacts.count[0, 0]} impacts instead of {len(closing)}")
         worst = max(worst, abs(float(impacts.rows.time_s[-1]) / flights - 1.0))
     return Figure(worst, BOUNCE_SERIES_EPS * EPS, "95 series of up to 506 impacts")
+
+
+# ---------------------------------------------------------------- the gates
+
+GATES: dict[str, Callable[[], Figure]] = {
+    "manufactured worlds, not bit for bit": lambda: inexactly(
+        stored() + manufactured(9, 2, 1_500) + manufactured(9, 3, 400) + manufactured(9, 4, 100)
+    ),
+    "resting contact worlds, not bit for bit": lambda: inexactly(
+        [case for N in (2, 3, 4, 5) for case in pressed(11, N, 1_000)]
+    ),
+    "momentum at impacts [eps of sum m |v|, per round]": lambda: of_impacts(
+        lambda b, a, i: momentum_eps(b, a) / rounds(i), MOMENTUM_EPS
+    ),
+    "energy rise at impacts [eps of the energy, per round]": lambda: of_impacts(
+        lambda b, a, i: energy_rise_eps(b, a) / rounds(i), ENERGY_EPS
+    ),
+    "restitution of pairs [eps of the larger speed]": restitution,
+    "gap against its closed form, and below 0 [m]": gaps,
+    "speeds below 0 that no bounce-back explains": lambda: of_braking(Watched.unexplained_negative_speeds),
+    "steps in which energy rose though nobody drives": lambda: of_braking(Watched.energy_rises),
+    "harm shares that do not add up to the last bit": shares,
+    "worlds whose ledger is not the sum of its rows": ledgers,
+    "contacts missed": lambda: of_scans("missed"),
+    "contacts invented": lambda: of_scans("phantom"),
+    "contacts or gaps misplaced": lambda: of_scans("wrong"),
+    "difference from exact runs [m, m/s, s]": lambda: of_runs(obstacle=False),
+    "runs with other impacts than exact ones": lambda: Figure(
+        int((~np.isfinite(differences(obstacle=False)[0])).sum()), 0, "the same worlds"
+    ),
+    "cluster law [eps of the largest speed, per round]": lambda: law(
+        82, {2: 3_000, 3: 3_000, 5: 1_500, 10: 400, 20: 150, 50: 30}, obstacle=False
+    ),
+    "resting contact against exact force ranges [m/s2]": resting,
+    "obstacle: cluster law [eps of the largest speed, per round]": lambda: law(
+        182, {2: 1_500, 3: 1_500, 5: 800, 10: 200, 20: 80, 50: 15}, obstacle=True
+    ),
+    "obstacle: difference from exact runs [m, m/s, s]": lambda: of_runs(obstacle=True),
+    "obstacle: worlds that differ after 100 impacts [share]": cascades,
+    "obstacle out of reach: worlds with other bits": out_of_reach,
+    "instants that do not end: clusters a few ulps apart": joined_clusters,
+    "instants that do not end: lines thrown against an obstacle": thrown,
+    "a segment that is split, few impacts [relative]": splitting,
+    "a segment that is split, cascades [relative]": splitting_cascades,
+    "a segment that is split, worlds with other impacts": lambda: Figure(
+        sum(int(s.other.sum()) for s in splits()), 0, "the same worlds"
+    ),
+    "worlds changed by the origin of time": origin,
+    "batches whose bits depend on their make-up": batches,
+    "golden hash of 10,000 worlds, different": golden,
+    "bounces: total time of a series [relative]": bounces,
+}

@@ -8,7 +8,6 @@ proven of the code; rounding is not part of it.
 
 from __future__ import annotations
 
-import argparse
 import inspect
 import itertools
 import math
@@ -28,7 +27,7 @@ import z3
 
 from ethbrake_marl.physics import kernel
 from ethbrake_marl.shield import step_shield
-from tests.programmes import Cases, Told
+from tests.programmes import Cases, Given, Told
 
 # ---------------------------------------------------------------- symbolic execution
 
@@ -573,7 +572,7 @@ def unproven(bug: Bug) -> Told:
     return Told(False, "MISSED: its statement is proven all the same")
 
 
-def cases(given: argparse.Namespace) -> Cases:
+def cases(given: Given) -> Cases:
     if os.environ.get("NUMBA_DISABLE_JIT") != "1":
         sys.exit("compilation must be switched off: NUMBA_DISABLE_JIT=1")
     for text, statement in STATEMENTS.items():

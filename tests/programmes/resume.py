@@ -1,8 +1,5 @@
 """Resuming: processes that train are killed (-9) at random moments, and must lose nothing."""
 
-from __future__ import annotations
-
-import argparse
 import hashlib
 import multiprocessing
 import random
@@ -12,14 +9,13 @@ from functools import partial
 from multiprocessing.context import ForkProcess
 from pathlib import Path
 
+import ethbrake_marl as eb
 from ethbrake_marl.learning.runs import newest_usable, resume, train
-from ethbrake_marl.learning.training import TrainingRecipe, load_recipe
-from ethbrake_marl.scenario import load_scenario
-from tests.programmes import Cases, Told
+from tests.programmes import Cases, Given, Told
 
 SOON_S = 300.0
 
-PPO = load_recipe("ppo").replace(
+PPO = eb.load_recipe("ppo").replace(
     total_steps=60 * 512,
     n_envs=32,
     n_steps=16,
@@ -28,7 +24,7 @@ PPO = load_recipe("ppo").replace(
     evaluation={"every_updates": 10, "worlds": 50, "seed": 1007},
     checkpoint_every_updates=4,
 )
-SAC = load_recipe("sac").replace(
+SAC = eb.load_recipe("sac").replace(
     total_steps=500 * 16,
     n_envs=16,
     batch_size=64,
@@ -39,14 +35,14 @@ SAC = load_recipe("sac").replace(
     checkpoint_every_updates=25,
     log_every_updates=20,
 )
-RECIPES: dict[str, TrainingRecipe] = {
+RECIPES: dict[str, eb.TrainingRecipe] = {
     "ppo": PPO,
     "sac": SAC,
     "independent": PPO.replace(scheme="independent", n_envs=16),
     "writing": SAC.replace(checkpoint_every_updates=5, total_steps=4000 * 16, evaluation=PPO.evaluation.model_dump()),
 }
 
-FORK = multiprocessing.get_context("fork")  # a fresh interpreter needs seconds; test_resume.py kills some of those
+FORK = multiprocessing.get_context("fork")  # a fresh interpreter needs seconds; tests/learning kills some of those
 
 
 def work(what: str, run: Path) -> None:
@@ -55,7 +51,7 @@ def work(what: str, run: Path) -> None:
         resume(run)
     else:
         level = "cooperation-3-pair" if what == "independent" else "paper-random"
-        train(RECIPES[what], load_scenario(level), run)
+        train(RECIPES[what], eb.load_scenario(level), run)
 
 
 def start(what: str, run: Path) -> ForkProcess:
@@ -147,7 +143,7 @@ OPTIONS = {
 }
 
 
-def cases(given: argparse.Namespace) -> Cases:
+def cases(given: Given) -> Cases:
     with tempfile.TemporaryDirectory() as scratch:
         for what in ("ppo", "sac", "independent"):
             (Path(scratch) / what).mkdir()

@@ -11,9 +11,6 @@ inside        worlds drawn from the inside of intervals, behind robust mode; cor
 horizon       what a bound is worth beyond its horizon; nothing is claimed
 """
 
-from __future__ import annotations
-
-import argparse
 import time
 from functools import partial
 from itertools import product
@@ -25,7 +22,7 @@ from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield.step_shield import StepShield, begin_running, plan_harm
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
-from tests.programmes import Cases, Told
+from tests.programmes import Cases, Given, Told
 from tests.shield.attacks import (
     ABOVE,
     ADVERSARIES,
@@ -69,7 +66,7 @@ OPTIONS = {
 }
 
 
-def cases(given: argparse.Namespace) -> Cases:
+def cases(given: Given) -> Cases:
     seed = given.seed
     for robust in ("corners", "interior"):
         yield f"inside: {robust} ({given.intervals})", partial(inside, robust, given)
@@ -92,7 +89,7 @@ def cases(given: argparse.Namespace) -> Cases:
         yield f"horizon: {proposer}", partial(beyond_horizon, proposer)
 
 
-def attacks(given: argparse.Namespace) -> Cases:
+def attacks(given: Given) -> Cases:
     """Every adversary of one learner, and of teams, each with its share of the worlds; no two cases share a world."""
     one, rates, teams = [], [], []
     for N, count, name in product(CELLS, ("first", "total"), ADVERSARIES):
@@ -185,7 +182,7 @@ def believed(scenario: Any, way: str, worlds: int, seed: int, robust: str) -> To
     )
 
 
-def inside(robust: str, given: argparse.Namespace) -> Told:
+def inside(robust: str, given: Given) -> Told:
     """Worlds out of boxes around worlds of ``paper-random``, behind one robust shield to which ``coast`` is proposed.
 
     What robust mode applies does not depend on which world of the box is the true one. So one shield decides for a box,

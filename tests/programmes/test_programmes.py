@@ -1,7 +1,5 @@
 """The programmes: their runner, what they say on the pages, samples of long ones, the hostile one's cage, faults."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re
@@ -14,7 +12,7 @@ import pytest
 
 from tests.programmes import ROOT, Told, __main__ as runner, audit, faults, hostile, libraries
 from tests.programmes.cage import Case, judge
-from tests.programmes.faults import PACKAGE, Callers, functions_of
+from tests.programmes.faults import PACKAGE
 
 PAGE = ROOT / "docs" / "security.md"
 
@@ -73,28 +71,6 @@ def test_table__lists_every_pinned_package_under_its_licence() -> None:
     found = audit.packages()
     assert sorted(each.name for each in found) == sorted(listed)
     assert [each.name for each in found if each.installed and each.family != listed[each.name]] == []
-
-
-@pytest.mark.parametrize(
-    ("licence", "family"),
-    [
-        ("GNU General Public License v3 (GPLv3)", ""),
-        ("AGPL-3.0", ""),
-        ("", ""),
-        ("Proprietary", ""),
-        ("MIT", "MIT"),
-        ("MIT AND GPL-3.0", ""),
-        ("GPL / BSD License", "BSD"),
-    ],
-)
-def test_licence__that_is_not_known_is_a_fault(licence: str, family: str) -> None:
-    package = audit.Package("mine", "1.0", "1.0", licence)
-    assert package.family == family and bool(package.fault) == (not family)
-
-
-def test_version__that_is_not_the_pinned_one_is_a_fault_but_not_its_local_part() -> None:
-    assert audit.Package("torch", "2.13.0", "2.13.0+cpu", "BSD").fault == ""
-    assert audit.Package("torch", "2.13.0", "2.12.0", "BSD").fault == "is pinned to 2.13.0"
 
 
 # ---------------------------------------------------------------- libraries
@@ -195,28 +171,3 @@ def test_mutants__are_code_of_as_many_lines_and_the_same_for_the_same_seed() -> 
         ast.parse(text)
         assert text != original
         assert text.count("\n") == original.count("\n")
-
-
-def test_tests_of_a_function__are_those_that_call_it_or_who_mentions_it() -> None:
-    recorded = {
-        "tests/test_a.py::test_one": (0.1, ["physics/batch.py:advance"]),
-        "tests/test_b.py::test_two": (0.2, ["physics/worlds.py:sum_rows"]),
-        "tests/physics/test_c.py::test_three": (9.0, ["physics/worlds.py:sum_rows"]),
-        "tests/test_d.py::test_shoving": (9.0, ["physics/worlds.py:sum_rows"]),
-    }
-    tests = Callers(recorded)
-    kernel = next(f for f in functions_of(PACKAGE / "physics/batch.py") if f.key.endswith(":advance_worlds"))
-    assert kernel.compiled
-    assert tests.of(kernel) == {"tests/test_a.py::test_one"}  # advance calls _advance_part, which mentions the kernel
-    file = PACKAGE / "physics/worlds.py"
-    line = file.read_text("utf-8").splitlines().index("def sum_rows(values: Floats) -> Floats:") + 1
-    summed = tests.at(file, line + 2)
-    assert summed.key == "physics/worlds.py:sum_rows"
-    three, two, shoving = (
-        "tests/physics/test_c.py::test_three",
-        "tests/test_b.py::test_two",
-        "tests/test_d.py::test_shoving",
-    )
-    assert tests.ordered(summed, (), "", 10.0, 9) == [three, two]
-    assert tests.ordered(summed, (), "", 5.0, 9) == [two]
-    assert tests.ordered(summed, (), "shoving counted twice", 10.0, 9) == [shoving, two]

@@ -5,9 +5,6 @@ installs the wheel in an empty environment, weighs it, and runs there what must 
 place, which must bring the same files (``make test-light``).
 """
 
-from __future__ import annotations
-
-import argparse
 import hashlib
 import os
 import re
@@ -19,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.programmes import ROOT, Cases, Told, find_uv
+from tests.programmes import ROOT, Cases, Given, Told, find_uv
 
 LIMIT_MB = 650
 NOT_OURS = ("pip", "setuptools", "pkg_resources", "wheel", "_distutils_hack")  # what an empty environment begins with
@@ -30,7 +27,7 @@ NEEDS_TRAIN = "-m pip install 'ethbrake-marl[train]'"
 OPTIONS = {"--output": {"type": Path, "default": ROOT / "dist", "help": "folder of what is built"}}
 
 
-def cases(given: argparse.Namespace) -> Cases:
+def cases(given: Given) -> Cases:
     yield "built twice: wheel and sdist", partial(built_twice, given.output)
     with tempfile.TemporaryDirectory(prefix="ethbrake-wheel-") as folder:
         yield from light(Path(folder))

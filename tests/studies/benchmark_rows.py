@@ -4,8 +4,6 @@ Makes the entries of these agents anew (by default: of all rows) in docs/benchma
 docs/results/benchmark.json. With --tables it drives nobody.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from typing import Any

@@ -1,7 +1,5 @@
 """Recipes of a second, and one finished folder of each study: none of them is to be changed."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

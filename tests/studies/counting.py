@@ -6,8 +6,6 @@ between, so that many of them disturb nobody.
     python -m tests.studies.counting SWEEP.yaml FOLDER [--jobs N] [--ray ADDRESS] [--steps K] [--sleep S]
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json

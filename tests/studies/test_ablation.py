@@ -1,7 +1,5 @@
 """``study ablate`` and ``generalise``: levels, trainings, joint optima, what is compared and shown, longer lines."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import signal
@@ -16,17 +14,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.evaluation.episodes import Passport
-from ethbrake_marl.figures import ablation_figures, signed_ticks
+from ethbrake_marl.figures import ablation_figures
 from ethbrake_marl.learning import runs as learning_train
 from ethbrake_marl.learning.training import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.limits.limits import best_harm, chunks_left
 from ethbrake_marl.policies import shipped_policies
-from ethbrake_marl.scenario import Sample, load_scenario, scenario_path
+from ethbrake_marl.scenario import Sample, load_scenario
 from ethbrake_marl.shield.guard import Shielded
 from ethbrake_marl.studies.ablation import (
     FIGURES,
-    LADDER,
-    STANDARD,
     Harms,
     Level,
     LevelOptimum,
@@ -38,7 +34,6 @@ from ethbrake_marl.studies.ablation import (
     common_worlds,
     compare,
     interval_words,
-    lengthen,
     levels_csv,
     markdown,
     measure,
@@ -61,31 +56,6 @@ def content(folder: Path) -> dict:
 
 def ablate(folder: Path, recipe: Path, *options: object) -> int:
     return study("ablate", "--output", folder, "--recipes", recipe, *ABLATE, *options)
-
-
-def test_read_levels__the_standard_set_is_a_ladder_and_its_worse_channels():
-    levels = read_levels([*STANDARD, "cooperation-3-congested"])
-    assert [level.name for level in levels if level.clear is None] == list(LADDER)
-    assert {level.name: level.clear for level in levels if level.clear} == {
-        "cooperation-2-blocked": "cooperation-2-paper",
-        "cooperation-3-congested": "cooperation-3-pair",
-    }
-    assert [bool(level.scenario.learners) for level in levels] == [False] + [True] * (len(levels) - 1)
-
-
-def test_read_levels__a_channel_belongs_to_the_level_that_came_before_it(tmp_path):
-    late = tmp_path / "mine.yaml"
-    text = scenario_path("cooperation-2-paper").read_text().replace("v2x: paper", "v2x: nominal")
-    late.write_text(text.replace("name: cooperation-2-paper", "name: mine"))
-    assert [level.clear for level in read_levels(["cooperation-2-paper", str(late)])] == [None, "cooperation-2-paper"]
-    assert [level.clear for level in read_levels([str(late), "cooperation-2-paper"])] == [None, "mine"]
-
-
-def test_common_worlds__gaps_and_speeds_are_the_same_at_every_level():
-    samples = common_worlds(read_levels(STANDARD), 50, 7)
-    for sample in samples:
-        np.testing.assert_array_equal(sample.worlds.gaps_m, samples[0].worlds.gaps_m)
-        np.testing.assert_array_equal(sample.worlds.speeds_mps, samples[0].worlds.speeds_mps)
 
 
 def test_ablate__writes_tables_and_figures(finished_ablation: Path) -> None:
@@ -314,20 +284,6 @@ def behind(levels) -> list[Measured]:
     return [*levels[:2], replace(levels[2], shielded=shielded), levels[3]]
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "ticks"),
-    [
-        (-0.47, 0.05, [-0.2, -0.1, 0.0]),
-        (-0.6, 0.3, [-0.3, -0.1, 0.0, 0.1, 0.3]),
-        (-30.0, 12.0, [-10.0, -1.0, -0.1, 0.0, 0.1, 1.0, 10.0]),
-        (-0.02, 0.0, [-0.01, -0.001, 0.0]),
-        (0.0, 0.0, [0.0]),
-    ],
-)
-def test_ticks__are_a_few_round_numbers(low, high, ticks):
-    assert set(ticks) <= set(signed_ticks(low, high)) and len(signed_ticks(low, high)) <= 11
-
-
 @pytest.mark.filterwarnings("error::UserWarning")
 def test_figures__texts_and_captions_have_room_and_the_colour_bar_reaches_its_end(levels, found):
     _, figure, pays = ablation_figures(found, "40 worlds")
@@ -455,19 +411,6 @@ def test_measure__all_brake_fully_whatever_their_roles():
 
 
 PAIR = load_scenario("cooperation-3-pair")
-
-
-def test_lengthened__vehicle_i_is_like_vehicle_i_minus_2_in_lists_and_objectives_too():
-    line = lengthen(PAIR, 6)
-    vehicles = line.sample(2, 7).worlds.vehicles
-    assert vehicles.mass_t[0].tolist() == [4.5, 5.5, 5.9, 5.5, 5.9, 5.5]
-    assert vehicles.latency_s[0].tolist() == [0.0, 0.5, 0.8, 0.5, 0.8, 0.5]
-    assert (line.learners, line.scripts) == ((1, 2, 3, 4, 5), {0: "full_brake"})
-    assert lengthen(PAIR, 2).sample(1, 7).worlds.N == 2
-    listed = PAIR.replace(gaps_m=[6.0, 8.0], objective=["own", "total", "social:45"])
-    line = lengthen(listed, 5)
-    assert line.sample(1, 7).worlds.gaps_m[0].tolist() == [6.0, 8.0, 6.0, 8.0]
-    assert line.objective == ("own", "total", "social:45", "total", "social:45")
 
 
 def test_drive_longer__full_braking_gains_nothing_on_itself():

@@ -1,7 +1,5 @@
 """The benchmark: scores by hand, entries and the leaderboard of a small suite, and suite v2 with its frozen bits."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -12,25 +10,10 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.limits.limits import BestHarmTable, task_problem
 from ethbrake_marl.scenario import Task
-from ethbrake_marl.studies.benchmark import (
-    load_suite,
-    mean_of_lists,
-    read_entry,
-    realised_share,
-    suite_names,
-    worst_mean,
-)
+from ethbrake_marl.studies.benchmark import load_suite, read_entry, suite_names, worst_mean
 from tests.studies.conftest import check_snapshot
-
-
-def test_realised_share__is_0_for_full_braking_and_1_for_the_best_known():
-    full, best = np.array([4.0, 10.0, 0.0, 6.0]), np.array([1.0, 4.0, 0.0, 5.0])
-    found = [realised_share(harm, full, best).value for harm in (full, best, full - 1.0, full + 1.0)]
-    assert found == pytest.approx([0.0, 1.0, 0.4, -0.4])  # 4 of the 10 that are possible
-    assert realised_share(best, full, best).interval == (1.0, 1.0)
 
 
 def test_worst_mean__is_that_of_the_worst_tenth_and_covers_the_true_one_in_95_of_100_lists():
@@ -39,12 +22,6 @@ def test_worst_mean__is_that_of_the_worst_tenth_and_covers_the_true_one_in_95_of
     truth = 1.0 + np.log(10.0)  # of the worst tenth of an exponential distribution
     intervals = [worst_mean(np.random.default_rng(k).exponential(size=400)).interval for k in range(300)]
     assert 0.89 <= np.mean([low <= truth <= high for low, high in intervals]) <= 0.99
-
-
-def test_mean_of_lists__half_widths_add_as_squares():
-    found = mean_of_lists([Estimate(0.2, (0.1, 0.3)), Estimate(0.8, (0.8, 0.8))])
-    assert found == Estimate(0.5, pytest.approx((0.45, 0.55)))
-    assert mean_of_lists([Estimate(0.2, None)]) == Estimate(0.2, None)
 
 
 def test_entry__tells_what_an_evaluation_gives(suites, entries):

@@ -1,16 +1,14 @@
 """Planted weaknesses are found, and sooner than at random."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.defaults import HARM_COUNTS, MeasureName
+from ethbrake_marl.defaults import HARM_COUNTS, HarmCount, MeasureName
 from ethbrake_marl.physics import Bools, Floats, Worlds
-from ethbrake_marl.studies.falsification import APART, Measure, Scored, far_apart, search
+from ethbrake_marl.studies.falsification import Measure, far_apart, search
 
 SCENARIO = eb.load_scenario("paper-random")
 
@@ -30,25 +28,12 @@ def test_falsify__finds_a_hole_in_a_thousandth_of_the_worlds(name: MeasureName) 
     assert scores[0] > 0.98 * at_random.worlds[0].score
 
 
-def test_falsify__keeps_nothing_where_nothing_is_wrong() -> None:
-    found = measured("difference", holed=eb.make_agent("full_brake")).falsify(300, 0)
-    assert (found.sample.worlds.n, len(found.worlds), found.first_above, found.share_above) == (0, 0, None, 0.0)
-
-
 @pytest.mark.parametrize("harm_count", HARM_COUNTS)
-def test_falsify__the_bound_of_the_shield_holds_where_it_is_tightest(harm_count: eb.HarmCount) -> None:
+def test_falsify__the_bound_of_the_shield_holds_where_it_is_tightest(harm_count: HarmCount) -> None:
     measure = Measure.of("bound", "coast+step", None, SCENARIO, harm_count)
     found = measure.falsify(256, 1)
     assert max(world.score for world in found.worlds) <= 1e-9 and found.sample.worlds.n > 3
     assert all(world.score == world.harm - (world.reference or 0.0) for world in found.worlds)
-
-
-def test_ranges__cover_what_a_scenario_draws_and_refused_worlds_do_not_count() -> None:
-    ranges, wide = SCENARIO.ranges(), eb.load_scenario("stress-wide").ranges()
-    sample, accepted = ranges.sample(np.full((1, 5), 0.5))
-    assert len(ranges.names) == 5 and accepted.all()
-    assert sample.worlds.gaps_m.tolist() == [[7.5, 7.5]] and sample.worlds.speeds_mps.tolist() == [[20.0, 20.0, 20.0]]
-    assert 0.9 < wide.sample(np.random.default_rng(0).random((2_000, len(wide.names))))[1].mean() < 0.99
 
 
 @pytest.mark.parametrize(
@@ -103,12 +88,6 @@ def test_search__spreads_evenly_while_all_points_are_alike() -> None:
     found = search(lambda points: np.zeros(len(points)), 3, 1_024, 0)
     cells = np.unique((found.points * 8).astype(int), axis=0)
     assert len(cells) == 512  # every eighth of every coordinate, twice
-
-
-def test_far_apart__leaves_out_what_does_not_count() -> None:
-    points = np.array([[0.1, 0.1], [0.1, 0.1 + 0.9 * APART], [0.9, 0.9], [0.5, 0.5]])
-    found = far_apart(Scored(points, np.array([1.0, 2.0, 0.5, -np.inf])), 9)
-    assert found.tolist() == [1, 2]
 
 
 class Holed:

@@ -1,7 +1,5 @@
 """The paper made again: verdicts that follow from numbers, its items, and the folder and pages of a reproduction."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping
@@ -42,16 +40,13 @@ from ethbrake_marl.studies.reproduction import (
     checked_result,
     compare_number,
     compare_rows,
-    decrease_verdict,
     docs_page,
     judge_statement,
     lineup,
     read_results,
     render_page,
     rows_table,
-    selection_verdict,
     stated,
-    summarise_verdicts,
     write_docs,
 )
 from tests.learning.tiny import TINY_PPO
@@ -158,23 +153,6 @@ def test_judge_statement__holds_where_every_interval_is_below_zero(parts, or_equ
     assert (verdict.outcome, because or verdict.because) == (outcome, verdict.because)
 
 
-@pytest.mark.parametrize(
-    ("outcomes", "worst"),
-    [
-        (("agrees", "agrees"), "agrees"),
-        (("agrees", "differs"), "differs"),
-        (("differs", "cannot agree", "agrees"), "cannot agree"),
-        (("agrees", "not run"), "not run"),
-        (("not run", "undecided", "agrees"), "undecided"),
-    ],
-)
-def test_summarise_verdicts__tells_the_worst_and_counts(outcomes, worst) -> None:
-    found = summarise_verdicts([Verdict(f"w{k}", outcome, f"b{k}") for k, outcome in enumerate(outcomes)])
-    first = outcomes.index(worst)
-    assert found.outcome == worst and found.because.startswith(f"of {len(outcomes)} comparisons ")
-    assert found.because.endswith(f"; w{first}: b{first}") and summarise_verdicts([]).outcome == "not run"
-
-
 AS_STATED, AT_200_MS = READINGS
 
 
@@ -187,20 +165,6 @@ def beside(reading, worlds: int) -> Beside:
     agents = lineup(scenario, FULL_BRAKE)
     evaluation = eb.evaluate(scenario.sample(worlds, 7), agents, scenario=scenario, aftermath=False)
     return Beside(reading.name, evaluation, {"Non-E": (NAMES[FULL_BRAKE],), "Hybrid PPO": (NAMES[FULL_BRAKE],)})
-
-
-def test_printed__the_hybrid_avoids_more_than_its_parts_and_decreases_follow_from_harms() -> None:
-    rows = [printed("hybrid test", agent) for agent in ("E-V2X-BM", "Standalone DRL", "Hybrid")]
-    baseline, row = printed("random test", "Non-E"), printed("random test", "Hybrid PPO")
-    verdict = selection_verdict(*rows)
-    assert "737 + 1,263 = 2,000 collisions; printed: 2,005" in verdict.because
-    outcomes = [
-        verdict.outcome,
-        selection_verdict(*rows[:2], replace(rows[2], collisions=3_000)).outcome,
-        decrease_verdict(row, baseline).outcome,
-        decrease_verdict(replace(row, harm_decrease=0.85), baseline).outcome,
-    ]
-    assert outcomes == ["cannot agree", "agrees", "agrees", "cannot agree"]
 
 
 def test_compare_rows__full_braking_agrees_at_200_ms_and_the_hybrid_is_excluded_as_stated() -> None:
@@ -407,15 +371,6 @@ def test_cost__is_told_before_and_at_most_an_hour(tmp_path: Path) -> None:
 def course(returns: list[list[float]], harm: list[list[float]]) -> Course:
     steps = np.arange(len(returns[0]), dtype=float)
     return Course(SeedCurve(steps, np.array(returns)), SeedCurve(steps, np.array(harm)))
-
-
-def test_course__measures_of_planted_curves() -> None:
-    one = course([[-10.0, -4.0, 0.0, 0.0], [-10.0, -6.0, 0.0, 0.0]], [[100.0, 50.0, 10.0, 0.0], [100.0, 5.0, 1.0, 0.0]])
-    arrays = [one.last_returns, one.decisions_to_converge, one.spread, one.unrest(2), one.unrest(3)]
-    expected = [[0.0, 0.0], [2.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.1, 0.15]]  # changes of 2 and 0, 3 and 0
-    np.testing.assert_allclose(arrays, expected, atol=1e-12)
-    assert (one.rise, one.still_rising) == (10.0, 0.0)
-    assert course([[-4.0, -3.0, -2.0, -1.0, 0.0]], [[1.0] * 5]).still_rising == pytest.approx(0.25)
 
 
 def test_returns__of_a_shaped_reward_say_nothing_between_delays_so_its_harm_is_compared() -> None:
