@@ -754,7 +754,7 @@ def shipped_name(kind: str, scenario: Scenario | None, harm_count: HarmCount) ->
         with suppress(InvalidInput):
             return shipped_name(each, scenario, harm_count)
     place = here
-    if kind == "universal":  # in longer lines the one with an obstacle was far worse than ``universal``
+    if kind == "universal":  # in longer lines neither drives well behind an obstacle
         place = "obstacle" if scenario is not None and scenario.has_obstacle and scenario.vehicles == 3 else None
     for stem in [kind] if place is None else [f"{kind}-{place}", kind]:
         for name in (f"{stem}-total", stem) if harm_count == "total" else (stem,):

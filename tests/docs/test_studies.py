@@ -316,4 +316,4 @@ def test_benchmark__shows_the_tables_that_the_entries_make() -> None:
     assert tables() == BENCHMARK.read_tables("benchmark")
     for path in ENTRIES.glob("*.json"):  # nobody beats the best known on a list, or in many worlds
         for result in read_entry(path).driven.values():
-            assert result.realised_share.value <= 1.0 and result.below_best_known <= 0.1 * result.worlds
+            assert result.realised_share.value <= 1.0 and result.below_best_known <= 0.12 * result.worlds

@@ -591,7 +591,7 @@ def test_shipped_policies__each_that_ships_is_small_and_has_a_card(name: str, pa
     manifest = load_named_policy(f"shipped/{name}").manifest
     trained = eb.load_scenario(str(manifest.scenario["name"]))
     assert scenario_sha256(eb.Scenario.of_dump(manifest.scenario)) == scenario_sha256(trained) and manifest.steps > 0
-    assert sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) < 1_000_000
+    assert sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) < 1_200_000  # 3 x 256 x 256
     load_named_policy(f"shipped/{name}").save(tmp_path / "copy")  # whatever version wrote it
     assert load_policy(tmp_path / "copy").manifest.manifest_sha256 == manifest.manifest_sha256
     assert (path / "card.md").read_text("utf-8").startswith("# ")
