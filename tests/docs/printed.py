@@ -160,6 +160,7 @@ _TESTS = tuple(
         ("", f"ppo@shipped,{_SHIPPED}"),
         ("-brake-only", f"ppo@shipped,{_SHIPPED}"),
         ("-obstacle --harm-count total", "ppo@shipped/ppo,options@shipped"),
+        ("-buildup", "counterfactual@shipped/counterfactual,counterfactual@shipped"),
     )
 )
 
