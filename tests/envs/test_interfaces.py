@@ -28,7 +28,7 @@ from tests.contract.interfaces import CRASH, FIVE, PAPER, REST, actions, initial
 near = pytest.approx
 ROOT = Path(__file__).resolve().parents[2]
 EPISODES, INFOS = ((ROOT / "docs" / f"{name}.md").read_text("utf-8") for name in ("episodes", "infos"))
-COAST, BRAKE = np.zeros(1, np.float32), np.full(1, -1.0, np.float32)
+BRAKE = np.full(1, -1.0, np.float32)
 
 
 def started(*args: Any, seed: int = 0, **settings: Any) -> eb.EthBrakeParallelEnv:
