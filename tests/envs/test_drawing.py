@@ -16,7 +16,6 @@ from ethbrake_marl.errors import InvalidInput
 from tests.contract.interfaces import CRASH, REST
 
 near = pytest.approx
-MODES = ["human", "rgb_array", "rgb_array_list", "ansi"]
 SHAPE = (HEIGHT, WIDTH, 3)
 FLASH = (255, 214, 10)
 COAST = np.zeros(1, np.float32)
@@ -201,13 +200,6 @@ def test_human__shows_each_step_in_real_time_and_says_what_it_needs(monkeypatch:
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(eb.MissingExtra, match=r"^[^\n]*pip install 'ethbrake-marl\[render\]'[^\n]*$"):
         eb.parallel_env(render_mode="human")
-
-
-def test_metadata__plays_in_real_time() -> None:
-    slow = CRASH.replace(time_step_s=0.05)
-    for environment in (eb.EthBrakeEnv(slow), eb.parallel_env(slow), eb.env(scenario=slow)):
-        assert (environment.metadata["render_modes"], environment.metadata["render_fps"]) == (MODES, 20)
-    assert eb.EthBrakeVectorEnv(2).metadata["render_modes"] == ["rgb_array", "ansi"]
 
 
 @pytest.mark.skipif(find_spec("moviepy") is None, reason="moviepy is not installed; RecordVideo needs it")

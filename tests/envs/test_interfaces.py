@@ -1,4 +1,4 @@
-"""What is special to one interface; what all promise stands in ``tests/contract``."""
+"""What is special to one interface; single calls: ``told/interfaces.txt``; what all promise: ``tests/contract``."""
 
 import json
 import os
@@ -19,26 +19,16 @@ from stable_baselines3.common.monitor import Monitor
 
 import ethbrake_marl as eb
 from ethbrake_marl import ethbrake_v0
-from ethbrake_marl.envs import (
-    EthBrakeEnv,
-    EthBrakeVecEnv,
-    action_box,
-    env,
-    feature_box,
-    make_sb3_vec_env,
-    parallel_env,
-    register_environments,
-)
+from ethbrake_marl.envs import EthBrakeEnv, EthBrakeVecEnv, env, make_sb3_vec_env, parallel_env, register_environments
 from ethbrake_marl.envs.registration import GYMNASIUM_ID, PETTINGZOO_ID
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.observations import Feature
 from ethbrake_marl.scenario import full_state, state_features
 from tests.contract.interfaces import CRASH, FIVE, PAPER, REST, actions, initial_state, line
 
 near = pytest.approx
 ROOT = Path(__file__).resolve().parents[2]
 EPISODES, INFOS = ((ROOT / "docs" / f"{name}.md").read_text("utf-8") for name in ("episodes", "infos"))
-COAST, BRAKE = np.zeros(1, np.float32), np.full(1, -1.0, np.float32)
+BRAKE = np.full(1, -1.0, np.float32)
 
 
 def started(*args: Any, seed: int = 0, **settings: Any) -> eb.EthBrakeParallelEnv:
@@ -48,32 +38,6 @@ def started(*args: Any, seed: int = 0, **settings: Any) -> eb.EthBrakeParallelEn
 
 
 # ---------------------------------------------------------------- PettingZoo: all agents at once
-
-
-def test_agents__are_all_vehicles_until_the_collective_end() -> None:
-    environment, names = started(REST), ["vehicle_1", "vehicle_2"]
-    assert (environment.possible_agents, eb.parallel_env(REST).agents) == (names, [])
-    for k in range(10):
-        assert environment.agents == names
-        results = environment.step({"vehicle_2": BRAKE})
-        assert all(set(part) == set(names) for part in results)
-        assert results[2:4] == (dict.fromkeys(names, k == 9), dict.fromkeys(names, False))
-    assert environment.agents == []
-    environment.reset()
-    environment.agents.clear()  # the list given out is not the environment's own
-    environment.reset()
-    assert environment.agents == names
-
-
-def test_reset__starts_at_the_first_moment_a_learner_may_act_and_else_at_the_alert() -> None:
-    assert started(CRASH).engine.worlds.time_s == [0.5]
-    assert started(CRASH.replace(obstacle_gap_m=30), learners=["vehicle_1"]).engine.worlds.time_s == [0.0]
-    observations, infos = eb.parallel_env(FIVE, learners=["vehicle_5", "vehicle_4"]).reset(seed=0)
-    assert {info["time_s"] for info in infos.values()} == {0.51}
-    assert list(observations) == [f"vehicle_{i}" for i in range(1, 6)]
-    nobody = started("paper-random", learners=[])  # also where early impacts are rejected
-    assert nobody.engine.worlds.time_s == [0.0]
-    assert nobody.step({})[4]["vehicle_2"]["chosen_action"] == BRAKE  # who learned and no longer does brakes fully
 
 
 def test_scripted_vehicle__applies_its_script_whatever_is_passed_and_infos_show_it() -> None:
@@ -91,25 +55,6 @@ def test_scripted_vehicle__applies_its_script_whatever_is_passed_and_infos_show_
     applied = [infos[agent]["chosen_action"].item() for agent in ("vehicle_1", "vehicle_2", "vehicle_4")]
     assert applied == near([-1.0, -3.0 / 7.0, -0.3])  # constant:3 of 7 m/s2
     assert [infos[agent]["chosen_command_mps2"] for agent in ("vehicle_2", "vehicle_4")] == near([-3, -0.3 * capacity])
-
-
-def test_infos__a_command_is_in_force_once_its_latency_has_elapsed() -> None:
-    environment = started(PAPER)  # Vehicle 3 wants to brake from t = 0; its latency is 0.8 s
-    infos = [environment.step({"vehicle_2": np.array([0.5], np.float32)})[4] for _ in range(4)]
-    names = ("time_s", "chosen_command_mps2", "command_in_force_mps2")
-    told = [[info["vehicle_3"][name] for name in names] for info in infos]
-    assert [told[0], told[1], told[3]] == [near([0.6, -6.0, 0.0]), near([0.7, -6.0, 0.0]), near([0.9, -6.0, -6.0])]
-    assert [info["vehicle_2"]["command_in_force_mps2"] for info in infos] == [3.5] * 4
-
-
-def test_infos_and_rewards__split_a_crash_by_mass() -> None:
-    environment = started(CRASH)
-    results = [environment.step({"vehicle_2": COAST}) for _ in range(6)]
-    assert all(sum(info["reward_harm"] for info in told[4].values()) == sum(told[1].values()) for told in results)
-    names = ("first_impact_harm", "total_harm", "world_first_impact_harm", "collided")
-    told = [[results[-1][4][agent][name] for name in names] for agent in environment.agents]
-    assert told == [near([27.0, 27.0, 36.0, True]), near([9.0, 9.0, 36.0, True])]
-    assert [sum(each[1][agent] for each in results) for agent in environment.agents] == near([-36.0, -36.0])
 
 
 def test_infos__hold_the_same_keys_in_every_step_and_the_page_names_them() -> None:
@@ -140,54 +85,6 @@ def test_infos__cost_is_the_harm_of_the_step_as_the_reward_counts_it(reward: str
         assert sum(costs) == near(info[total] - before) and info["reward_harm"] == -info["cost"]
 
 
-def test_rewards__the_papers_terms_are_named_before_their_weights() -> None:
-    *_, infos = results = started(PAPER, reward="paper").step({"vehicle_2": BRAKE})
-    told = infos["vehicle_2"]
-    weights = {"reward_collision": 1.0, "reward_risk": 0.1, "reward_jerk": 1e-5, "reward_terminal": 10.0}
-    assert {name for name in told if name.startswith("reward_")} == set(weights)
-    assert told["reward_jerk"] == near(-(70.0**2))  # from coasting to 7 m/s2 in 0.1 s
-    assert results[1]["vehicle_2"] == near(sum(told[name] * weight for name, weight in weights.items()))
-
-
-def test_rewards__do_not_tell_the_harm_before_the_first_decision() -> None:
-    # 1 m apart, braking against coasting: they meet at sqrt(2/6) s with w = 6 t, harm 12, before 0.6 s.
-    environment = eb.parallel_env(CRASH.replace(gaps_m=1, latency_s=[0, 0.6], horizon_s=3, early_impacts="keep"))
-    _, infos = environment.reset(seed=0)
-    assert infos["vehicle_2"]["world_first_impact_harm"] == near(12.0)
-    told = 0.0
-    while environment.agents:
-        _, rewards, _, _, infos = environment.step({"vehicle_2": BRAKE})
-        told += rewards["vehicle_2"]
-    assert -told == near(infos["vehicle_2"]["world_first_impact_harm"] - 12.0)
-
-
-def test_state__is_what_a_person_would_write_down() -> None:
-    environment = started(CRASH)
-    environment.step({"vehicle_2": np.array([-0.5])})
-    t = 0.6
-    speeds = [20.0 - 6.0 * t, 20.0 - 4.0 * 0.1]
-    gap = 3.0 - 0.5 * 6.0 * t * t + 0.5 * 4.0 * 0.1 * 0.1
-    own = [[speeds[0] / 20, -0.6, 0.6, 0.6, 0.1, 0.0, 0.0], [speeds[1] / 20, -0.4, 0.8, 0.4, 0.3, 0.0, 0.0]]
-    expected = [*own[0], *own[1], gap / 10, 0.0, t / 1.3]
-    assert environment.state() == near(np.array(expected), abs=1e-6)
-    for _ in range(6):
-        environment.step({"vehicle_2": COAST})
-    assert environment.state()[-3:] == near(np.array([0.0, 1.0, 1.2 / 1.3]), abs=1e-6)
-
-
-def test_state__is_clipped_to_its_bounds() -> None:
-    capacities = {"braking_capacity_mps2": 60, "driving_capacity_mps2": 60}
-    worlds = eb.make_worlds(500.0, [90.0] * 3, **capacities, latency_s=9, mass_t=400, restitution=1, speed_limit_mps=90)
-    state = full_state(worlds, PAPER)[0]
-    assert state in feature_box(state_features(PAPER)) and (state[0], state[21]) == (4.0, 10.0)
-
-
-def test_boxes__have_the_features_bounds() -> None:
-    box = feature_box([Feature("a", "1", 1.0, -2.0, 4.0, ""), Feature("b", "1", 5.0, 0.0, 1.0, "")])
-    assert (box.low.tolist(), box.high.tolist(), box.dtype) == ([-2.0, 0.0], [4.0, 1.0], np.float32)
-    assert (action_box().low.tolist(), action_box().high.tolist(), action_box().dtype) == ([-1.0], [1.0], np.float32)
-
-
 def test_learners_only__are_the_agents_and_nothing_else_changes() -> None:
     whole, learners = eb.parallel_env("cooperation-3-pair"), eb.parallel_env("cooperation-3-pair", agents="learners")
     assert learners.possible_agents == ["vehicle_2", "vehicle_3"]
@@ -200,18 +97,6 @@ def test_learners_only__are_the_agents_and_nothing_else_changes() -> None:
         given = {name: rng.uniform(-1, 1, 1).astype(np.float32) for name in learners.agents}
         told, every = learners.step(given), whole.step(given)
     assert not whole.agents and np.array_equal(learners.state(), whole.state())
-
-
-def test_max_cycles__truncates_unless_the_episode_is_over_before() -> None:
-    environment = eb.parallel_env(max_cycles=3)
-    for _ in range(2):
-        environment.reset(seed=0)
-        assert [environment.step({"vehicle_2": [0.0]})[3]["vehicle_2"] for _ in range(3)] == [False, False, True]
-        assert environment.agents == []
-    plain, limited = started(), started(max_cycles=10_000)
-    while plain.agents:
-        assert plain.step({"vehicle_2": [-1.0]})[2:4] == limited.step({"vehicle_2": [-1.0]})[2:4]
-    assert not limited.agents
 
 
 def test_supersuit__frame_skip_draws_from_the_seed_of_the_reset() -> None:
@@ -249,16 +134,6 @@ def test_aec__plays_the_same_episode_in_turns(make: Any) -> None:
 
 
 # ---------------------------------------------------------------- Gymnasium: one world
-
-
-def test_seed__of_an_unseeded_environment_can_be_read_and_that_of_the_users_stream_goes_on() -> None:
-    environment = eb.EthBrakeEnv()
-    start, _ = environment.reset()
-    assert np.array_equal(eb.EthBrakeEnv().reset(seed=environment.np_random_seed)[0], start)
-    environment = eb.EthBrakeEnv()
-    environment.np_random = np.random.default_rng(7)
-    info = environment.reset()[1]
-    assert (info["world_seed"], info["world"]) == (0, 1) and environment.np_random.integers(10**6) == 944_904
 
 
 @pytest.mark.parametrize(
@@ -342,22 +217,6 @@ def test_step__is_that_of_gymnasiums_own_vector_environment(mode: str, n: int) -
         endings.append([ending[0] < -0.1, *ending[1:]])
         ended = ending[1] | ending[2]
     assert (np.sum(endings, axis=0) >= 2).all()  # in every row: struck, at rest, cut off
-
-
-def test_describe_worlds__tells_given_ones_until_others_take_their_places() -> None:
-    start = {"gaps_m": [7, 8], "speeds_mps": [20, 18, 20], "mass_t": [1, 2, 3], "braking_capacity_mps2": 6}
-    start |= {"driving_capacity_mps2": 1, "latency_s": [0, 0.5, 0.8], "speed_limit_mps": 40}
-    mixed = eb.load_scenario("realistic-mixed")
-    environment = eb.EthBrakeVectorEnv(num_envs=2, scenario=mixed)
-    environment.reset(seed=3, options={"initial_state": start})
-    told = environment.describe_worlds()
-    assert [told[name].tolist() for name in ("gap_2_m", "mass_3_t", "world")] == [[8, 8], [3, 3], [-1, -1]]
-    environment.engine.renew(np.array([1]))
-    told, kinds = environment.describe_worlds(), mixed.sample(1, 3, channel="training").types
-    assert told["gap_2_m"][0] == 8.0 and told["vehicle_2_type"].tolist() == ["", kinds[0, 1]]
-    environment.engine.restore(environment.engine.snapshot())
-    environment.reset()  # after a snapshot nobody knew
-    assert environment.describe_worlds()["world"].min() >= 1
 
 
 @pytest.mark.parametrize("mode", [*list(AutoresetMode)[:2], *MODES])

@@ -1,4 +1,4 @@
-"""Who hears of whom, and when: distributions against their formulas, the news by hand, and nothing that leaks."""
+"""Who hears of whom, and when: distributions against formulas, nothing that leaks; by hand: ``told/news.txt``."""
 
 import math
 from dataclasses import replace
@@ -10,13 +10,11 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents import script_agents
 from ethbrake_marl.envs import make_engine
-from ethbrake_marl.evaluation import worlds_sha256
 from ethbrake_marl.observations import observe
 from ethbrake_marl.physics.batch import Packed
 from ethbrake_marl.physics.kernel import CLOCK
 from ethbrake_marl.physics.messages import CHANNEL, Messages, chance
-from ethbrake_marl.scenario import CHANNELS, full_state, state_features
-from ethbrake_marl.scenario.v2x import PER_LINK, PRESETS, V2X, Channel, Equipage, Equipped, burst_periods
+from ethbrake_marl.scenario.v2x import PER_LINK, PRESETS, V2X, Channel, Equipage, Equipped
 from ethbrake_marl.search import identities
 from tests.agents.test_knowledge import alter_unreceived
 
@@ -34,13 +32,6 @@ def vehicles(latency_s, n=1):
 
 def everybody(vehicles: int) -> Equipped:
     return Equipped.of([Equipage()] * vehicles)
-
-
-def test_burst_periods__at_the_bounds_by_hand():
-    # p = r = 0.5: P(k >= 1) = 1/2, P(k >= 2) = 1/4, P(k >= 3) = 1/8; all exact in binary.
-    u = np.array([0.5, 0.4999, 0.25, 0.2499, 0.125, 0.1249, 0.99])
-    assert burst_periods(u, 0.5, 0.5).tolist() == [0, 1, 1, 2, 2, 3, 0]
-    assert burst_periods(u, 0.0, 0.5).tolist() == [0] * 7 and burst_periods(np.array([0.0]), 0.5, 1.0).tolist() == [1]
 
 
 def slow_news(channel: Channel, own_s: list[float], links: np.ndarray) -> tuple[list[float], np.ndarray]:
@@ -88,62 +79,6 @@ def test_with_news__is_what_a_loop_over_the_links_gives(given):
         assert told.known_from_s[k] == pytest.approx(known, rel=1e-12)
 
 
-def test_channels__are_those_of_the_page():
-    usual = ("all", "both", 0.0)
-    rest = (0.1, 0.02, 0.1, 0.2, (0.8, 1.1), "first")
-    assert {name: tuple(channel) for name, channel in CHANNELS.items()} == {
-        "paper": ("latency", "all", "none", 0.0, 0.0, 1.0, 0.0, *rest),
-        "clear": ("messages", *usual, 0.01, 0.5, 0.0, *rest),
-        "nominal": ("messages", *usual, 0.05, 0.5, 0.0, *rest),
-        "congested": ("messages", *usual, 0.1, 0.3, 0.05, *rest),
-        "blocked": ("messages", *usual, 0.2, 0.2, 0.2, *rest),
-        "sensors-only": ("messages", "none", "both", 0.0, 0.0, 1.0, 0.0, *rest),
-    }
-
-
-@pytest.mark.parametrize(
-    ("given", "by_link", "drawn"),
-    [
-        ("paper", False, False),
-        ("nominal", True, True),
-        ("sensors-only", True, True),
-        ({"preset": "sensors-only", "sensing_s": [0.9, 0.9]}, True, False),
-        ({"hears": "front"}, True, False),
-        ({"lost": 0.5}, True, True),
-        ({"lost": 1.0}, True, False),
-        ({"preset": "nominal", "link_latency_s": 0.4}, True, True),  # the hops
-        ({"preset": "nominal", "link_latency_s": 0.4, "sensing_s": [1, 1]}, True, False),
-        ({"preset": "nominal", "link_latency_s": 0.4, "sensing_s": [1, 1], "lost": 0.5}, True, True),
-        ({"preset": "nominal", "link_latency_s": 0.4, "sensing_s": [1, 1], "lost": 1.0}, True, False),
-        ({"link_latency_s": 0.4, "senses": "none"}, True, False),
-    ],
-)
-def test_v2x__says_whether_it_differs_from_the_paper_and_whether_chance_decides(given, by_link, drawn):
-    v2x = V2X.model_validate(given)
-    assert (v2x.by_link, v2x.drawn) == (by_link, drawn)
-
-
-def test_observe__tells_own_parts_of_latencies_and_nothing_that_the_channel_has_drawn():
-    # Vehicle 2 knows Vehicle 3 from 0.4 s on; Vehicle 3's own part is 0.5 s, Vehicle 1's message reaches it at 0.9 s.
-    scenario = PAPER.replace(v2x="congested", latency_s=[0, 0.1, 0.5], early_impacts="keep")
-    worlds = scenario.sample(1, 7).worlds
-    worlds.vehicles.latency_s[0] = [0.0, 0.4, 0.9]
-    worlds.vehicles.known_from_s[0] = [[0.0, 0.8, 0.8], [0.4, 0.4, 0.4], [0.9, 0.9, 0.9]]
-    assert worlds.vehicles.own_latency_s.tolist() == [[0.0, 0.1, 0.5]]
-    spec = eb.observation_for(scenario)
-    at = [f.name for f in spec.features].index("rear_1.latency_left")
-    for time, own_left, rear_left in ((0.0, 0.1, 0.0), (0.4, 0.0, 0.1), (0.6, 0.0, 0.0), (0.95, 0.0, 0.0)):
-        seen = observe(replace(worlds, time_s=np.full(1, time)), 1, spec)[0]
-        assert (seen[5], seen[at]) == (pytest.approx(own_left), pytest.approx(rear_left))
-
-
-def test_full_state__has_the_latency_that_the_channel_has_drawn():
-    scenario = channel_of("blocked")
-    worlds = scenario.sample(50, 7).worlds
-    at = [f.name for f in state_features(scenario)].index("vehicle_3.latency_left")
-    assert (full_state(worlds, scenario)[:, at] == worlds.vehicles.latency_s[:, 2].astype(np.float32)).all()
-
-
 def test_observe__writing_the_papers_news_out_by_link_changes_no_bit():
     plain = PAPER.sample(50, 7).worlds
     told = Packed.of(plain).widened(obstacle=False, news=True).worlds()
@@ -183,12 +118,6 @@ def test_engine__takes_worlds_with_and_without_news_by_link():
     of_paper.reset(worlds=channel_of("nominal").sample(20, 7).worlds)
     of_paper.renew(np.array([0]))
     assert of_paper.packed.known_from_s[0].tolist() == plain.vehicles.known_from_s[0].tolist()
-
-
-def test_initial_state__of_a_channel_without_chance_has_its_news() -> None:
-    fixed = channel_of("nominal", link_latency_s=0.25, sensing_s=[1, 1])
-    given = {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
-    assert fixed.worlds_from_state(given).vehicles.latency_s.tolist() == [[0.0, 0.25, 0.25]]
 
 
 @pytest.mark.parametrize(("name", "latest"), [("clear", 5.22), ("nominal", 5.42)])
@@ -242,14 +171,6 @@ def ages_in(worlds):
     return Messages.of(worlds).age_s(worlds.time_s)
 
 
-def test_persistence__first_is_the_default_and_adds_nothing() -> None:
-    said, unsaid = BASE.replace(v2x={"preset": "blocked", "persistence": "first"}), BASE.replace(v2x="blocked")
-    one, other = said.sample(50, 3), unsaid.sample(50, 3)
-    assert one.worlds.messages.shape == (50, 0)
-    assert worlds_sha256(one.worlds, one.index) == worlds_sha256(other.worlds, other.index)
-    assert "persistence" not in unsaid.v2x.model_dump(mode="json")
-
-
 def test_periodic__the_first_news_and_the_motion_are_those_of_first() -> None:
     scenario = periodic("blocked")
     one, other = engine_of(scenario), engine_of(first_only(scenario))
@@ -263,39 +184,6 @@ def test_periodic__in_sight_what_is_seen_is_what_first_shows() -> None:
     scenario = periodic(sensing_s=[0.0, 0.0])
     for one, other in zip(driven(engine_of(scenario), 15), driven(engine_of(first_only(scenario)), 15), strict=True):
         np.testing.assert_array_equal(one[:, 1], other[:, 1])
-
-
-def delayed(gaps_m: list[float]) -> eb.Engine:
-    """All at 20 m/s; every message is 0.2 s on its way, and who is behind is not in sight."""
-    base = BASE.replace(gaps_m=gaps_m, speeds_mps=[20.0, 20.0, 20.0])
-    return engine_of(periodic("paper", base, link_latency_s=0.2, senses="front", sensing_s=[5.0, 5.0]), n=1)
-
-
-def test_fixed_delay_without_loss__by_hand() -> None:
-    # One message every 0.1 s from the alert on, 0.2 s on its way, decisions at 0.5, 0.6, ...: each carries the sample
-    # of the moment at which it is sent, so whatever is known is 0.2 s old. Vehicle 1 brakes with 6 from the alert on.
-    engine = delayed([8.0, 8.0])
-    for step in range(6):
-        time = 0.5 + 0.1 * step
-        told = Messages.of(engine.worlds).newest_told(1)
-        assert engine.worlds.time_s[0] == pytest.approx(time)
-        sent = time - 0.2
-        known = [told.at_s[0, 0], told.speed_mps[0, 0], told.place_m[0, 0]]
-        assert known == pytest.approx([sent, 20.0 - 6.0 * sent, 20.0 * sent - 3.0 * sent**2])
-        seen = engine.observe(1)[0]  # moved on with the command of then, it is where Vehicle 1 is
-        assert seen[8] == pytest.approx(engine.worlds.gaps_m[0, 0] / 10.0, abs=1e-6)
-        engine.step(np.full((1, 1), -0.5))
-
-
-def test_estimate__moves_on_with_the_command_of_then() -> None:
-    # Vehicle 3 begins to brake at 0.8 s; at 0.9 s Vehicle 2 knows it as it was at 0.7 s, coasting, at 1 s as at 0.8 s.
-    engine = delayed([8.0, 9.0])
-    for _ in range(4):
-        engine.step(np.zeros((1, 1)))
-    assert engine.worlds.time_s[0] == pytest.approx(0.9)
-    seen = engine.observe(1)[0]
-    assert seen[18] == pytest.approx(0.9) and seen[19] == pytest.approx(0.0) and seen[20] == 0.0
-    assert engine.worlds.gaps_m[0, 1] == pytest.approx(9.0 + 0.5 * 6.0 * 0.1**2)
 
 
 @pytest.mark.parametrize(("p", "r"), [(0.05, 0.5), (0.2, 0.2), (0.3, 0.7)])
