@@ -143,6 +143,13 @@ def test_standing_vehicle__moves_when_its_force_passes_zero() -> None:
     assert drives.speeds_mps[0].tolist() == pytest.approx([0.5 + 1.0, 0.0], rel=1e-15)
 
 
+@pytest.mark.parametrize("rear", [25.9, 25.91])  # the second comes so near that every event is looked for
+def test_speed_limit__is_met_while_the_drive_builds_up(rear: float) -> None:
+    worlds = line([0.001], [25.9, rear], release_rate_mps3=4.0, speed_limit_mps=26.0)
+    after, impacts = advance(worlds, [[2.0, 0.0]], 1.0)  # at 26 m/s after sqrt(0.05) s, before the 2 m/s2 are there
+    assert after.speeds_mps.tolist() == [[26.0, rear]] and impacts.count.sum() == 0
+
+
 def test_pushed_vehicle__is_let_go_when_its_front_one_would_be_faster() -> None:
     """Both touch at rest; the rear one pushes at once, the front one more and more; they part at equal forces."""
     worlds = line([0.0], [0.0, 0.0], release_rate_mps3=[4.0, math.inf])
