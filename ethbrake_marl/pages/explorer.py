@@ -69,6 +69,8 @@ _SLIDERS: dict[str, tuple[str, float, float, float, bool]] = {
     "obstacle_gap_m": ("Obstacle ahead of Vehicle 1 at", 1.0, 150.0, 0.5, True),
     "speed_limit_mps": ("Speed limit of driving", 1.0, 60.0, 0.5, False),
     "friction": ("Friction of the road", 0.1, 1.0, 0.01, True),
+    "brake_rate_mps3": ("Brakes build up at", 1.0, 60.0, 0.5, True),
+    "release_rate_mps3": ("Brakes are released at", 1.0, 60.0, 0.5, False),
 }
 
 
@@ -90,7 +92,7 @@ def slider_groups(scenario: Scenario, state: State) -> list[dict[str, Any]]:
         found.append({
             "field": field,
             "title": title,
-            "unit": rule.symbol.replace("2", "²"),
+            "unit": rule.symbol.translate({50: "²", 51: "³"}),
             "low": min(low, *values, *(least for least, _ in bounds)),
             "high": min(max(high, *values, *(most for _, most in bounds)), rule.high),
             "step": step,

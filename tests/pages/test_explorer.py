@@ -292,6 +292,10 @@ def test_sliders__are_named_by_vehicle_or_pair(scenario: Scenario) -> None:
     named = {group["field"]: group["names"] for group in groups}
     assert (named["gaps_m"], named["restitution"]) == (["1 to 2", "2 to 3"], [""])
     assert named["mass_t"] == ["Vehicle 1", "Vehicle 2", "Vehicle 3"]
+    slow = load_scenario("paper-random-buildup")
+    state = Conditions.of(slow.sample(1, DEFAULT.LIST_SEED).worlds)
+    rates = [(group["field"], group["unit"]) for group in slider_groups(slow, state) if group["field"].endswith("3")]
+    assert rates == [("brake_rate_mps3", "m/s³"), ("release_rate_mps3", "m/s³")]
 
 
 @pytest.mark.parametrize("number", [12, 10**9])
@@ -301,7 +305,7 @@ def test_world__is_that_of_the_list(client: Client, scenario: Scenario, number: 
     assert told == Conditions.of(world) == Conditions.of(read_state(json.loads(json.dumps(told)), scenario))
 
 
-@pytest.mark.parametrize("name", ["paper-random", "paper-random-obstacle", "realistic-motorway", "realistic-mixed"])
+@pytest.mark.parametrize("name", ["paper-random-buildup", "paper-random-obstacle", "realistic-motorway", "realistic-mixed"])
 def test_saved_state__reads_back_to_the_same_harm(name: str, folder: Path) -> None:
     scenario = load_scenario(name)
     world = scenario.sample(1, DEFAULT.LIST_SEED, first=3).worlds
