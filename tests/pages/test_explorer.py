@@ -305,7 +305,9 @@ def test_world__is_that_of_the_list(client: Client, scenario: Scenario, number: 
     assert told == Conditions.of(world) == Conditions.of(read_state(json.loads(json.dumps(told)), scenario))
 
 
-@pytest.mark.parametrize("name", ["paper-random-buildup", "paper-random-obstacle", "realistic-motorway", "realistic-mixed"])
+@pytest.mark.parametrize(
+    "name", ["paper-random-buildup", "paper-random-obstacle", "realistic-motorway", "realistic-mixed"]
+)
 def test_saved_state__reads_back_to_the_same_harm(name: str, folder: Path) -> None:
     scenario = load_scenario(name)
     world = scenario.sample(1, DEFAULT.LIST_SEED, first=3).worlds
