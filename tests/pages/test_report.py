@@ -331,3 +331,5 @@ def test_report__counts_a_cascade_whole_but_draws_its_last_impact(pair: eb.Scena
     (episode,) = episode_data(Report("t", eb.summarise(result), result).driven(COASTING).html)["worlds"][0]["episodes"]
     assert episode["impacts"][-1][4] == result.outcome("coast").impacts[0] > len(episode["impacts"]) - 1
     assert np.diff([impact[4] for impact in episode["impacts"]]).min() > 0
+    _, _, closing_mps, _, number, first, total = episode["impacts"][0]
+    assert number == 1 and first == total == closing_mps**2
