@@ -261,11 +261,20 @@ class Page:
         )
         return f"{policy}; connect-src 'self'" if self.served else policy
 
+    @staticmethod
+    def anchors(titles: Sequence[str]) -> list[str]:
+        """The name of each section of a page with these titles, for links: of letters and digits, no two alike."""
+        found: list[str] = []
+        for k, title in enumerate(titles):
+            name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:40]
+            found.append(f"{name}-{k + 1}" if name in found or not name else name)
+        return found
+
     @cached_property
     def html(self) -> str:
         """The page as text."""
         styles, script = self._code
-        names = anchors([section.title for section in self.sections])
+        names = self.anchors([section.title for section in self.sections])
         whole = Part.template(
             "page.html.j2",
             title=self.title,
@@ -282,15 +291,6 @@ class Page:
 def shown(value: object) -> str:
     """A value as the text that a page shows: no control or direction character, whoever wrote it."""
     return plain_text(str(value), keep=_STAY)
-
-
-def anchors(titles: Sequence[str]) -> list[str]:
-    """The name of each section of a page with these titles, for links: of letters and digits, no two alike."""
-    found: list[str] = []
-    for k, title in enumerate(titles):
-        name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:40]
-        found.append(f"{name}-{k + 1}" if name in found or not name else name)
-    return found
 
 
 @cache

@@ -28,17 +28,9 @@ from ethbrake_marl.evaluation import (
 )
 from ethbrake_marl.figures import Figure, ablation_figures, write_picture
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
-from ethbrake_marl.files.store import write_output
+from ethbrake_marl.files.store import read_object, write_output
 from ethbrake_marl.files.yaml import Override
-from ethbrake_marl.learning import (
-    WORDS,
-    RunDirectory,
-    Training,
-    TrainingRecipe,
-    load_recipe,
-    read_object,
-    read_settings,
-)
+from ethbrake_marl.learning import WORDS, RunDirectory, Training, TrainingRecipe, load_recipe, read_settings
 from ethbrake_marl.limits import BestHarmTable, best_harm, chunks_left, search_list, task_problem
 from ethbrake_marl.pages.page import Page, Part, Played, Section
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds

@@ -54,10 +54,10 @@ from ethbrake_marl.figures import (
     write_picture,
 )
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown, csv_text as csv_of
-from ethbrake_marl.files.store import check_target, read_plain, write_file, write_output
-from ethbrake_marl.learning import RunDirectory, TrainingRecipe, load_recipe, read_object
+from ethbrake_marl.files.store import check_target, read_object, read_plain, write_file, write_output
+from ethbrake_marl.learning import RunDirectory, TrainingRecipe, load_recipe
 from ethbrake_marl.limits import Unproven
-from ethbrake_marl.pages.page import Page, Part, Played, Section, anchors, shown
+from ethbrake_marl.pages.page import Page, Part, Played, Section, shown
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.policies import Policy, load_policy, load_shipped
 from ethbrake_marl.scenario import Scenario, load_scenario
@@ -1927,7 +1927,7 @@ def render_page(folder: Path, results: Sequence[Result]) -> str:
     Raises ``InvalidInput`` for a figure that is not there or holds more than a figure of ours does.
     """
     lead, command, made, few = _account(results)
-    _, *names = anchors(["Overview", *(result.title for result in results)])
+    _, *names = Page.anchors(["Overview", *(result.title for result in results)])
     link = Markup('<a href="#{}">{}</a>')
     rows = [
         [Shown(link.format(name, shown(each.title))), Shown(_outcome(each.verdict.outcome), each.verdict.because)]
