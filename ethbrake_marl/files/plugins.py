@@ -183,7 +183,6 @@ def _import(point: EntryPoint) -> str:
     """Import the module of an entry point; gives the SHA-256 of its file."""
     try:
         point.load()
-        file = sys.modules[point.module].__file__
-        return hashlib.sha256(Path(file or "").read_bytes()).hexdigest()
+        return hashlib.sha256(Path(sys.modules[point.module].__file__ or "").read_bytes()).hexdigest()
     except (Exception, SystemExit) as error:
         raise InvalidInput(f"plug-in {point.name!r} ({point.value}): {describe_error(error)}") from error

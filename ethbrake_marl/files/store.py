@@ -38,7 +38,7 @@ def new_file(path: Path) -> Iterator[Path]:
     try:
         yield partial
         with partial.open("rb") as file:
-            _to_disk(file.fileno())
+            os.fsync(file.fileno())
         partial.chmod(0o666 & ~_umask())
         os.replace(partial, path)
     except BaseException:
@@ -163,13 +163,9 @@ def _folder_to_disk(path: Path) -> None:
     if os.name == "posix":
         descriptor = os.open(path, os.O_RDONLY)
         try:
-            _to_disk(descriptor)
+            os.fsync(descriptor)
         finally:
             os.close(descriptor)
-
-
-def _to_disk(descriptor: int) -> None:
-    os.fsync(descriptor)
 
 
 def _umask() -> int:

@@ -191,15 +191,17 @@ class Part:
         episodes: Markup | str = "",
     ) -> Part:
         """A player for a page whose own script gives it one world after another, or of the data of that name."""
-        values: dict[str, Any] = {
-            "vehicles": vehicles,
-            "shielded": shielded,
-            "folded": folded,
-            "name": name,
-            "episodes": episodes,
-            "body": BODY_M,
-        }
-        return cls.template("player.html.j2", ("player.css",), _PLAYER_SCRIPTS, **values)
+        return cls.template(
+            "player.html.j2",
+            ("player.css",),
+            _PLAYER_SCRIPTS,
+            vehicles=vehicles,
+            shielded=shielded,
+            folded=folded,
+            name=name,
+            episodes=episodes,
+            body=BODY_M,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,7 +309,7 @@ def _environment() -> Environment:
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        finalize=lambda value: value if isinstance(value, Markup) else shown(value),
+        finalize=_text,
     )
 
 
@@ -369,8 +371,7 @@ class Played:
         obstacle = float(motion.world.obstacle_gap_m[0])
         without = 1 + 3 * motion.world.N
         jerks = bool(motion.pieces[:, without:].any())
-        told = motion.pieces if jerks else motion.pieces[:, :without]
-        pieces = np.ascontiguousarray(told, np.dtype("<f8"))
+        pieces = np.ascontiguousarray(motion.pieces if jerks else motion.pieces[:, :without], np.dtype("<f8"))
         return {
             **({"jerks": True} if jerks else {}),
             "pieces": base64.b64encode(pieces.tobytes()).decode("ascii"),
