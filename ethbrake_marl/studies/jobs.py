@@ -287,8 +287,7 @@ class JobFolder:
             is_new = self.check()
             remove_unfinished(self.path)
             if is_new and self._question is not None:
-                record = {**self._more, **self._question}
-                write_file(self._record, (json.dumps(record, indent=2) + "\n").encode())
+                write_file(self._record, (json.dumps({**self._more, **self._question}, indent=2) + "\n").encode())
             yield
 
     def run(
