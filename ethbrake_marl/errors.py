@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -11,6 +13,7 @@ from dataclasses import dataclass, field
 from difflib import get_close_matches
 from importlib.util import find_spec
 from numbers import Integral
+from types import FrameType
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
@@ -324,3 +327,36 @@ class ShownProgress:
         text += f"; {progress.note}" if progress.note else ""
         sys.stderr.write(f"\r{text}\x1b[K{chr(10) if ended else ''}" if self._terminal else f"{text}\n")
         sys.stderr.flush()
+
+
+# Ctrl-C and SIGTERM as a question that is asked between two steps, in the place of an exception inside one.
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+@contextmanager
+def stop_on_signal() -> Iterator[Callable[[], bool]]:
+    """Give a function that says whether to stop; the second signal acts as if nobody listened.
+
+    Outside the main thread, where Python delivers no signals, the function always says no.
+    """
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked.is_set
+        return
+    before = {number: signal.getsignal(number) for number in _SIGNALS}
+
+    def listen(number: int, frame: FrameType | None) -> None:
+        asked.set()
+        restore()
+
+    def restore() -> None:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+    try:
+        for number in _SIGNALS:
+            signal.signal(number, listen)
+        yield asked.is_set
+    finally:
+        restore()

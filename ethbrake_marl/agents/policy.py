@@ -22,7 +22,7 @@ from ethbrake_marl.engine import Memory, Script, checked_memory, map_memory, tak
 from ethbrake_marl.errors import AgentFailed, InvalidInput, describe_error, naming_extras
 from ethbrake_marl.observations import Observation, Observations, ObservationSpec, choose_observation, observe
 from ethbrake_marl.physics import Floats, Ints, Worlds
-from ethbrake_marl.scenario import Appended, Scenario, appending, load_scenario, observation_for, row_features
+from ethbrake_marl.scenario import Appended, Scenario, full_state, load_scenario, observation_for, row_features
 
 # Policies of other libraries, each as one function: ``(observation, state) -> (action, state)``.
 
@@ -269,11 +269,22 @@ def policy_agent(
             " it that says what they mean"
         )
     infer, begin = adapt_policy(policy, named, size, initial_state)
-    more = None if appended is None or scenario is None else appending(appended, scenario)
+    more = None if appended is None or scenario is None else _appending(appended, scenario)
     agent = PolicyAgent(infer, named, spec, begin, clip, lambda: weights_sha256(policy), more)
     if appended == "state":
         agent.knows = Source.STATE
     return agent
+
+
+def _appending(appended: Appended, scenario: Scenario) -> Callable[[Worlds, int], Observations]:
+    """What stands behind the own observation of one learner, from worlds and vehicle: [n, features]."""
+
+    def number(worlds: Worlds, vehicle: int) -> Observations:
+        if vehicle not in scenario.learners:
+            raise InvalidInput(f"appended = 'number': vehicle_{vehicle + 1} is no learner of {scenario.name!r}")
+        return np.full((worlds.n, 1), scenario.learners.index(vehicle), np.float32)
+
+    return number if appended == "number" else lambda worlds, _: full_state(worlds, scenario)
 
 
 def _observation_of(policy: Any, scenario: Scenario | None, given: Observation | None, trained: Any) -> ObservationSpec:

@@ -23,7 +23,7 @@ import numpy as np
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.engine import Engine, Guard, Memory, Script, ask_script, begin_script, is_state_free
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, PhysicsError, describe_error, unknown_name
-from ethbrake_marl.files.plugins import load_function, note_file
+from ethbrake_marl.files.plugins import load_function
 from ethbrake_marl.harm import Ledger, check_harm_count
 from ethbrake_marl.physics import Bools, Floats, Worlds
 from ethbrake_marl.scenario import Scenario, ScriptSpec, load_scenario
@@ -636,9 +636,7 @@ def make_from_file(argument: str | None, settings: AgentSettings) -> Driver:
     """
     named = parse_spec(settings.spec).file
     assert named is not None
-    function = load_function(*named)
-    if settings.policy is not None:
-        note_file(settings.policy)
+    function = load_function(*named, reads=settings.policy)
     given: tuple[Any, ...] = (argument, settings)
     with suppress(TypeError, ValueError):  # of something built in there is no signature
         if not inspect.signature(function).parameters:

@@ -110,14 +110,9 @@ def tell_compilation(folder: Path, empty: bool) -> None:
 
     A thread says it: one kernel may take a minute, and nothing else is heard of it meanwhile.
     """
-    if is_temporary(folder):
-        Out().note(
-            "compiling the physics; no folder can be written to keep it, so every command does (ethbrake doctor)"
-        )
-    elif empty:
-        Out().note("compiling the physics, once: minutes of one core, then it is kept")
-    else:
-        Out().note("compiling what was not used before, once, then it is kept")
+    kept = "the physics, once: minutes of one core" if empty else "what was not used before, once"
+    lost = "the physics; no folder can be written to keep it, so every command does (ethbrake doctor)"
+    Out().note(f"compiling {lost if is_temporary(folder) else f'{kept}, then it is kept'}")
     from numba.core import event  # loaded by whatever compiles, and by nothing that does not
 
     events: Any = event  # numba's own types end here
@@ -175,8 +170,10 @@ def whole_command() -> Any:
 
     Raises ``AlreadyExists`` for a command of somebody's that would take the place of another one.
     """
-    names = [each.name or each.callback.__name__.replace("_", "-") for each in app.registered_commands if each.callback]
-    names += [str(group.name) for group in app.registered_groups]
+    names = [
+        *(each.name or each.callback.__name__.replace("_", "-") for each in app.registered_commands if each.callback),
+        *(str(group.name) for group in app.registered_groups),
+    ]
     for k, name in enumerate(names):
         if name in names[:k]:
             raise AlreadyExists(f"command {name!r} is there already; give yours another name: app.command('my-{name}')")

@@ -217,8 +217,7 @@ def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str
 
 def _call(arguments: tuple[str, ...], folder: str) -> str:
     """The last line of what a command says on stderr where it fails."""
-    command = [sys.executable, *arguments]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    done = subprocess.run([sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False)
     return (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1] if done.returncode else ""
 
 

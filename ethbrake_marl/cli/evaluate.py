@@ -257,8 +257,7 @@ def _evaluate_in_shards(
     )
     _tell_horizon(out, _moving(summary), tally.worlds, question.scenario.horizon_s)
     if question.objectives and not out.as_json:
-        told = tally.rescore(question.objectives, question.scenario.vehicles)
-        out.show(told.sheet(question.harm_count))
+        out.show(tally.rescore(question.objectives, question.scenario.vehicles).sheet(question.harm_count))
 
 
 def _json_text(content: object) -> str:
@@ -746,8 +745,10 @@ def picture_robustness(
     caption = _caption(task.scenario, episodes, rest, left_out)
     about = evaluation.result_identity("robustness", task.scenario, sample, [world for world, _ in left_out])
     _write_picture(out, output, figures.robustness_figure(points, caption=caption), left_out, episodes)
-    columns: list[Column | str] = ["shield", "truth", "width", Column("mean harm"), Column("mean bound")]
-    columns += [Column("above bound", digits=1, scale=100.0, unit="%"), Column("mean excess", digits=3)]
-    columns += [Column("noticed", digits=1, scale=100.0, unit="%")]
+    columns: list[Column | str] = [
+        *("shield", "truth", "width", Column("mean harm"), Column("mean bound")),
+        *(Column("above bound", digits=1, scale=100.0, unit="%"), Column("mean excess", digits=3)),
+        Column("noticed", digits=1, scale=100.0, unit="%"),
+    ]
     rows = [(p.mode, p.truth, f"{p.width:g}", p.harm, p.bound, p.above, p.excess, p.distrusted) for p in points]
     out.result([about | point._asdict() for point in points], Sheet("", columns, rows))

@@ -112,8 +112,10 @@ def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tupl
         ranges = {key: scenarios.QUANTITY.declared[key].of(worlds) for key in varying}
     width = max(map(len, ranges), default=0)
     lines = [f"{'drawn':{width}} {'least':>8} {'median':>8} {'largest':>8}"] if ranges else []
-    for name, drawn in ranges.items():
-        lines.append(f"{name:{width}}" + "".join(f" {each:>8.4g}" for each in np.quantile(drawn, (0.0, 0.5, 1.0))))
+    lines += [
+        f"{name:{width}}" + "".join(f" {each:>8.4g}" for each in np.quantile(drawn, (0.0, 0.5, 1.0)))
+        for name, drawn in ranges.items()
+    ]
     others = {
         key: ["drawn" if np.ptp(each) else f"{each[0]:g}" for each in rule.of(worlds).T]
         for key, rule in scenarios.QUANTITY.of(worlds).items()

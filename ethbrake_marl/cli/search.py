@@ -131,8 +131,7 @@ def _spelled(name: str, **options: Any) -> str:
     words = ["ethbrake", *name.split()]
     for option, value in options.items():
         if value is not None and value is not False:
-            values = value if isinstance(value, tuple) else (value,)
-            for each in values:
+            for each in value if isinstance(value, tuple) else (value,):
                 words += [f"--{option.replace('_', '-')}", *([] if each is True else [str(each)])]
     return shlex.join(words)
 
@@ -216,6 +215,7 @@ def falsify_command(
         "median": float(np.median(good)),
         "worst": float(good.max()),
         "machine": asdict(this_machine()),
+        "worlds": [world.model_dump(exclude_none=True) for world in worlds],
     }
     first, shown = found.first_above, []
     left_out = f" ({budget - len(good):,} of them are none of the scenario's)" if len(good) < budget else ""
@@ -225,7 +225,6 @@ def falsify_command(
         f" tried, {f'the first after {first:,}' if first else 'none'}."
         " The search looks for bad worlds: shares of it say nothing about a list."
     )
-    told["worlds"] = [world.model_dump(exclude_none=True) for world in worlds]
     if worlds:
         kept = evaluation.NamedWorlds.of(
             measured_by.scenario,

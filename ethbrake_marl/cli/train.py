@@ -347,8 +347,7 @@ def tune_command(
     plan.folder(output).check()
     if export is not None:  # raise now what would be raised at the end
         if export.is_file():  # what this tuning wrote before is replaced: the same command goes on
-            head = plan.export_head(export).encode()
-            out.force = out.force or export.read_bytes().startswith(head)
+            out.force = out.force or export.read_bytes().startswith(plan.export_head(export).encode())
         if export.suffix != ".yaml":
             raise InvalidInput(f"export {export}: must end in .yaml, as recipes do")
         plan.best_recipe({}, export, "")
@@ -371,8 +370,7 @@ def tune_command(
     export = None if best is None or result.interrupted else export  # what goes on exports at its end
     if best is not None:
         shown = {"trial": best.number, "harm": best.harm, "values": best.values}
-        lines = [f"best: trial {best.number}, harm {best.harm:.4f}"]
-        lines += [f"  {key} = {value}" for key, value in best.values.items()]
+        lines = [f"best: trial {best.number}, harm {best.harm:.4f}", *(f"  {k} = {v}" for k, v in best.values.items())]
         if export is not None:
             source = f"trial {best.number}, harm {best.harm!r} on the list of seed {plan.file.measure.seed}"
             out.write(export, plan.best_recipe(best.values, export, f"ethbrake study tune: {source}"))

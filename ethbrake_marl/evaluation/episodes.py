@@ -54,7 +54,6 @@ from ethbrake_marl.evaluation.inputs import (
     worlds_sha256,
 )
 from ethbrake_marl.evaluation.measures import LeftOut, Tape
-from ethbrake_marl.evaluation.results import PARQUET
 from ethbrake_marl.evaluation.rollout import ShovedFront, controlled_vehicle
 from ethbrake_marl.files.sheet import parquet_file
 from ethbrake_marl.files.store import check_target, check_writable, new_folder
@@ -1128,12 +1127,12 @@ def check_dataset(
 ) -> DatasetFormat:
     """The format of a dataset that can be written to ``path``; raises as ``write_dataset`` does before its work."""
     target = Path(path)
-    is_file = target.suffix.lower() == PARQUET
+    is_file = target.suffix.lower() == ".parquet"
     chosen: Any = format if format is not None else "parquet" if is_file else "minari"
     if chosen not in get_args(DatasetFormat):
         raise unknown_name("format", chosen, get_args(DatasetFormat))
     if is_file != (chosen == "parquet"):
-        right = f"a file ending in {PARQUET}" if chosen == "parquet" else "a folder called NAME-vNUMBER"
+        right = "a file ending in .parquet" if chosen == "parquet" else "a folder called NAME-vNUMBER"
         raise InvalidInput(f"{target}: the format {chosen} is written to {right}")
     for package in _NEEDED_PACKAGES[chosen]:
         need(package)

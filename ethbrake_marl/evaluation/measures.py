@@ -28,7 +28,7 @@ from ethbrake_marl.errors import (
 )
 from ethbrake_marl.evaluation.inputs import result_identity, result_versions, scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.statistics import Moments, exact_sum, mean, rate
-from ethbrake_marl.files.sheet import DASH, Cell, Column, Estimate, Row, Sheet, Shown
+from ethbrake_marl.files.sheet import DASH, Column, Estimate, Row, Sheet, Shown
 from ethbrake_marl.harm import Declared, Ledger, scored
 from ethbrake_marl.limits import (
     BestHarmTable,
@@ -1547,7 +1547,7 @@ class SummaryTable(list[SummaryRow]):
         columns += [Column(_heading(name), COLUMN + name) for name in (self[0].metrics if self else ())]
         lines: list[Row] = []
         for row in self:
-            cells: dict[str, Cell] = {column.name: row[column.name] for column in columns}
+            cells: dict[str, Any] = {column.name: row[column.name] for column in columns}
             value, interval = Column("").show(row["mean_regret_first"])
             bound = row.known_best_share is not None and row.known_best_share < 1.0
             cells["mean_regret_first"] = Shown(f"≥ {value}" if bound else value, interval)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
@@ -12,12 +12,11 @@ import numpy as np
 from ethbrake_marl.agents import Agent, Driver, Team, drive
 from ethbrake_marl.errors import renumbered
 from ethbrake_marl.evaluation.inputs import policies_of, result_identity
-from ethbrake_marl.evaluation.rollout import OnWorlds
 from ethbrake_marl.evaluation.statistics import mean, paired_difference
 from ethbrake_marl.files.sheet import Column, Estimate, Row, Sheet
 from ethbrake_marl.physics import Floats, Ints, LeftOutRows, Worlds, measured_without_failed
 from ethbrake_marl.scenario import Sample, Task
-from ethbrake_marl.shield import SAME_HARM, VERDICTS, HybridAgent, Shielded, ShieldedDriver, put_shield, review
+from ethbrake_marl.shield import SAME_HARM, VERDICTS, HybridAgent, Shielded, ShieldedDriver, review
 
 # ``step-alert``: rollout at the alert only; ``step-cap``: no vehicle above its cap.
 Mode = Literal["none", "episode", "step", "step-alert", "step-cap"]
@@ -115,7 +114,7 @@ def compare_modes(
     task: Task,
     *,
     behind: bool = False,
-    on_progress: OnWorlds | None = None,
+    on_progress: Callable[[str, int], None] | None = None,
 ) -> ShieldModes:
     """Let every agent drive alone, in episode mode and in step mode, through every world; see ``ModeRow``.
 
@@ -158,7 +157,9 @@ class _Part(NamedTuple):
     verdicts: Ints | None = None  # how many interventions got each of VERDICTS
 
 
-def _compare(agents: Mapping[str, Driver], worlds: Worlds, task: Task, on_progress: OnWorlds | None) -> list[ModeRow]:
+def _compare(
+    agents: Mapping[str, Driver], worlds: Worlds, task: Task, on_progress: Callable[[str, int], None] | None
+) -> list[ModeRow]:
     """The rows of worlds that can all be advanced; ``PhysicsError`` names those that cannot."""
     rows = []
     for name, agent in agents.items():
@@ -188,7 +189,7 @@ def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[Mode, _Part]:
     behind: dict[Mode, dict[str, Any]] = {"step": {}, "step-alert": {"later_rollouts": False}}
     behind |= {"step-cap": {"cap": "baseline"}} if several else {}
     for mode, settings in behind.items():
-        episodes = drive(worlds, put_shield(agent, task, logging=True, **settings), task.scenario)
+        episodes = drive(worlds, ShieldedDriver.around(agent, task, logging=True, **settings), task.scenario)
         shielded = Shielded.of(episodes, task)
         verdict = review(episodes.guarded.shield, agent, worlds).verdict
         counted = np.array([int((verdict == each).sum()) for each in VERDICTS])

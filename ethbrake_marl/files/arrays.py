@@ -150,8 +150,7 @@ def _name(member: zipfile.ZipInfo) -> str:
 def _npy_header(name: str, beginning: bytes) -> tuple[ArrayHeader, int]:
     """Type and shape of a ``.npy``, and where its numbers begin."""
     length = int.from_bytes(beginning[8:10], "little")
-    text = beginning[10 : 10 + length]
-    match = _NPY.fullmatch(text)
+    match = _NPY.fullmatch(beginning[10 : 10 + length])
     if beginning[:8] != b"\x93NUMPY\x01\x00" or length > _NPY_HEADER_LIMIT_BYTES or match is None:
         raise ValueError(f"array {name!r}: is not a plain .npy of format 1.0, in the order of C")
     dtype, shape = match[1].decode(), match[2].decode()

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -58,27 +57,19 @@ def load_plugin(source: str | os.PathLike[str]) -> None:
     _LOADED.setdefault(str(path.resolve()), Plugin(path.name, named, sha256))
 
 
-def load_function(path: str, function: str) -> Any:
+def load_function(path: str, function: str, reads: str | None = None) -> Any:
     """A function of a Python file, which is run, once, and can do whatever you can do.
 
-    Raises ``InvalidInput`` as ``load_plugin``, and if there is no such function.
+    Of the file that it ``reads``, such as weights, the SHA-256 is remembered; nothing of what is no file. Raises
+    ``InvalidInput`` as ``load_plugin``, and if there is no such function.
     """
     found = getattr(_run_file(Path(path), f"file {path!r}")[1], function, None)
     if not callable(found):
         raise InvalidInput(f"file {path!r}: has no function {function!r}; name the one that makes the agent")
+    if reads is not None and Path(reads).is_file():
+        with Path(reads).open("rb") as file:
+            _READ.setdefault(Path(reads).name, set()).add(hashlib.file_digest(file, "sha256").hexdigest())
     return found
-
-
-def loaded_plugins() -> tuple[Plugin, ...]:
-    """The plug-ins of this process, in the order in which they were loaded."""
-    return tuple(_LOADED.values())
-
-
-def note_file(path: str) -> None:
-    """Remember the SHA-256 of a file that an agent of the user reads, such as weights; nothing for what is none."""
-    if Path(path).is_file():
-        with Path(path).open("rb") as file:
-            _READ.setdefault(Path(path).name, set()).add(hashlib.file_digest(file, "sha256").hexdigest())
 
 
 def files_run() -> dict[str, str]:
@@ -89,21 +80,21 @@ def files_run() -> dict[str, str]:
     found = {name: set(several) for name, several in _READ.items()}
     for path, (sha256, _) in _RUN.items():
         found.setdefault(path.name, set()).add(sha256)
-    for plugin in loaded_plugins():
+    for plugin in _LOADED.values():
         found.setdefault(plugin.name, set()).add(plugin.sha256)
     return {name: ", ".join(sorted(several)) for name, several in found.items()}
 
 
 def noted_plugins() -> list[dict[str, str]]:
-    """The plug-ins of this process, for ``config.json``."""
-    return [asdict(plugin) for plugin in loaded_plugins()]
+    """The plug-ins of this process in the order in which they were loaded, as ``config.json`` has them."""
+    return [asdict(plugin) for plugin in _LOADED.values()]
 
 
-def load_the_same(plugins: Sequence[Plugin]) -> None:
-    """Load, in a worker process, what its parent has loaded; raises ``InvalidInput`` where a file is another now."""
-    for plugin in plugins:
-        load_plugin(plugin.source)
-    check_plugins([asdict(plugin) for plugin in plugins], "the process that started this one", "start again")
+def load_the_same(noted: list[dict[str, str]]) -> None:
+    """Load, in a worker process, what its parent has noted; raises ``InvalidInput`` where a file is another now."""
+    for plugin in noted:
+        load_plugin(plugin["source"])
+    check_plugins(noted, "the process that started this one", "start again")
 
 
 def check_plugins(noted: object, where: str, advice: str) -> None:
@@ -112,7 +103,7 @@ def check_plugins(noted: object, where: str, advice: str) -> None:
     ``where`` begins the message, ``advice`` ends it.
     """
     then = _read_noted(noted, where)
-    now = {plugin.sha256: plugin for plugin in loaded_plugins()}
+    now = {plugin.sha256: plugin for plugin in _LOADED.values()}
     for plugin in then:
         if plugin.sha256 in now:
             continue
@@ -192,7 +183,6 @@ def _import(point: EntryPoint) -> str:
     """Import the module of an entry point; gives the SHA-256 of its file."""
     try:
         point.load()
-        file = sys.modules[point.module].__file__
-        return hashlib.sha256(Path(file or "").read_bytes()).hexdigest()
+        return hashlib.sha256(Path(sys.modules[point.module].__file__ or "").read_bytes()).hexdigest()
     except (Exception, SystemExit) as error:
         raise InvalidInput(f"plug-in {point.name!r} ({point.value}): {describe_error(error)}") from error

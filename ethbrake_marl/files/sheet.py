@@ -229,10 +229,12 @@ class Sheet:
         columns, label = self._columns(), self.title or f"Table: {self.headings[0]}"
         kinds = [' class="words"' if k and self.rows and column.text else "" for k, column in enumerate(columns)]
         heads = zip(kinds, self.headings, strict=True)
-        lines = [f'<div class="wide" tabindex="0" role="region" aria-label="{_html(label)}"><table>']
-        lines += [f"<caption>{_html(self.title)}</caption>"] if self.title else []
-        lines += ["<thead><tr>", *(f'<th scope="col"{kind}>{_html(each)}</th>' for kind, each in heads)]
-        lines += ["</tr></thead>", "<tbody>"]
+        lines = [
+            f'<div class="wide" tabindex="0" role="region" aria-label="{_html(label)}"><table>',
+            *([f"<caption>{_html(self.title)}</caption>"] if self.title else []),
+            *("<thead><tr>", *(f'<th scope="col"{kind}>{_html(each)}</th>' for kind, each in heads)),
+            *("</tr></thead>", "<tbody>"),
+        ]
         for row in self.shown():
             if isinstance(row, str):
                 lines.append(f'<tr class="block"><th colspan="{len(columns)}" scope="rowgroup">{_html(row)}</th></tr>')
@@ -245,9 +247,8 @@ class Sheet:
                 below = f' <span class="interval">[{_html(interval)}]</span>' if interval else ""
                 lines.append(f"<td{kind}>{_html(value)}{below}</td>")
             lines.append("</tr>")
-        lines += ["</tbody>", "</table></div>"]
-        lines += [f"<p>{_html(self.note)}</p>"] if self.note else []
-        return "\n".join(lines)
+        note = [f"<p>{_html(self.note)}</p>"] if self.note else []
+        return "\n".join([*lines, "</tbody>", "</table></div>", *note])
 
     def json(self) -> list[dict[str, Any]]:
         """One object per row, sections apart: cells by the names of their columns, estimates with their intervals."""

@@ -19,6 +19,7 @@ from filelock import FileLock, Timeout
 
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput
 
+_LARGEST_OBJECT_BYTES = 16 << 20
 _HIDDEN, _UNFINISHED = ".ethbrake-", ".partial"  # short whatever the target is called: file names have a longest length
 
 
@@ -37,7 +38,7 @@ def new_file(path: Path) -> Iterator[Path]:
     try:
         yield partial
         with partial.open("rb") as file:
-            _to_disk(file.fileno())
+            os.fsync(file.fileno())
         partial.chmod(0o666 & ~_umask())
         os.replace(partial, path)
     except BaseException:
@@ -162,13 +163,9 @@ def _folder_to_disk(path: Path) -> None:
     if os.name == "posix":
         descriptor = os.open(path, os.O_RDONLY)
         try:
-            _to_disk(descriptor)
+            os.fsync(descriptor)
         finally:
             os.close(descriptor)
-
-
-def _to_disk(descriptor: int) -> None:
-    os.fsync(descriptor)
 
 
 def _umask() -> int:
@@ -268,6 +265,20 @@ def parse_strict_json(data: bytes) -> Any:
         )
     except RecursionError:
         raise ValueError("nested too deeply") from None
+
+
+def read_object(file: Path) -> dict[str, Any]:
+    """The JSON object in a file of a run; raises ``InvalidInput`` naming the file and what is wrong with it."""
+    if not os.path.lexists(file):
+        raise InvalidInput(f"{file}: is missing; without it this training cannot go on")
+    data = read_plain(file, _LARGEST_OBJECT_BYTES)
+    try:
+        content = parse_strict_json(data)
+    except ValueError as error:
+        raise InvalidInput(f"{file}: is damaged: {error}") from None
+    if not isinstance(content, dict):
+        raise InvalidInput(f"{file}: is damaged: holds no JSON object")
+    return content
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -18,10 +18,8 @@ if TYPE_CHECKING:
         TrainingRecipe as TrainingRecipe,
         algorithm_names as algorithm_names,
         load_recipe as load_recipe,
-        read_object as read_object,
         read_settings as read_settings,
         register_algorithm as register_algorithm,
-        stop_on_signal as stop_on_signal,
     )
 else:
     __getattr__ = front_door(__name__, __file__)

@@ -40,7 +40,7 @@ from ethbrake_marl.agents import Driver, LearnedAgent, Team
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.engine import Arrays
 from ethbrake_marl.envs import EthBrakeVecEnv, make_sb3_vec_env
-from ethbrake_marl.errors import CorruptBundle, EthBrakeError, InvalidInput, OnProgress, Progress, Told
+from ethbrake_marl.errors import CorruptBundle, EthBrakeError, InvalidInput, OnProgress, Progress, Told, stop_on_signal
 from ethbrake_marl.evaluation import evaluate, mean
 from ethbrake_marl.files.arrays import ArrayHeader, ArrayRow, check_arrays, map_npy, safetensors_headers
 from ethbrake_marl.files.store import (
@@ -48,6 +48,7 @@ from ethbrake_marl.files.store import (
     new_folder,
     open_plain,
     parse_strict_json,
+    read_object,
     read_plain,
     remove_folder,
     remove_unfinished,
@@ -56,16 +57,7 @@ from ethbrake_marl.files.store import (
 from ethbrake_marl.files.yaml import FileModel, read_json_model
 from ethbrake_marl.harm import objective_harm
 from ethbrake_marl.learning.algorithms import tensors_of
-from ethbrake_marl.learning.training import (
-    Algorithm,
-    RunDirectory,
-    RunStatus,
-    Scheme,
-    Training,
-    TrainingRecipe,
-    read_object,
-    stop_on_signal,
-)
+from ethbrake_marl.learning.training import Algorithm, RunDirectory, RunStatus, Scheme, Training, TrainingRecipe
 from ethbrake_marl.policies import Policy, PolicyTeam, Sha256, Trained, installed_versions, read_trained
 from ethbrake_marl.scenario import Appended, Scenario
 

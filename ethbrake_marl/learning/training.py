@@ -14,17 +14,14 @@ import json
 import math
 import os
 import re
-import signal
-import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import import_module
 from operator import not_
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
 
 from filelock import FileLock, Timeout
@@ -36,7 +33,7 @@ from ethbrake_marl.agents import AgentSettings, Driver, LearnedAgent, Team
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput, unknown_name
 from ethbrake_marl.files.plugins import check_plugins, noted_plugins
-from ethbrake_marl.files.store import new_folder, parse_strict_json, read_plain, write_file
+from ethbrake_marl.files.store import new_folder, parse_strict_json, read_object, read_plain, write_file
 from ethbrake_marl.files.yaml import (
     NAME_PATTERN,
     Document,
@@ -62,7 +59,7 @@ from ethbrake_marl.policies import (
     load_policy,
     shipped_name,
 )
-from ethbrake_marl.rewards import RewardParams, registered_terms, setting_names
+from ethbrake_marl.rewards import RewardParams, setting_names
 from ethbrake_marl.scenario import Scenario, check_file_name, load_scenario, observation_for, shipped_folder
 
 if TYPE_CHECKING:  # torch takes seconds, and what is asked of a run needs none
@@ -350,7 +347,8 @@ class TrainingRecipe(FileModel):
                 keys[key] = {"description": MEANINGS[key], **keys[key]}
             keys["algorithm"]["const"] = name
         weight = {"type": "number", "minimum": 0, "description": "weight of a registered term"}
-        parts["RewardParams"]["properties"] |= dict.fromkeys(registered_terms(), weight)
+        properties = parts["RewardParams"]["properties"]
+        properties |= {name: weight for name in setting_names() if name not in properties}
         ways = [
             {
                 "if": {"properties": {"algorithm": {"const": name}}, "required": ["algorithm"]},
@@ -790,7 +788,6 @@ def read_settings(texts: Sequence[str] | None, recipes: Sequence[TrainingRecipe]
 
 # The folder of a run: its files, its configuration, how far it came, and who may train in it.
 
-_LIMIT_BYTES = 16 << 20  # of a JSON file
 
 RunStatus = Literal["running", "finished", "interrupted", "failed"]
 
@@ -977,20 +974,6 @@ class RunDirectory:
         return {int(row["steps"]): float(row[name]) for row in self.rows() if row.get(name)}
 
 
-def read_object(file: Path) -> dict[str, Any]:
-    """The JSON object in a file of a run; raises ``InvalidInput`` naming the file and what is wrong with it."""
-    if not os.path.lexists(file):
-        raise InvalidInput(f"{file}: is missing; without it this training cannot go on")
-    data = read_plain(file, _LIMIT_BYTES)
-    try:
-        content = parse_strict_json(data)
-    except ValueError as error:
-        raise InvalidInput(f"{file}: is damaged: {error}") from None
-    if not isinstance(content, dict):
-        raise InvalidInput(f"{file}: is damaged: holds no JSON object")
-    return content
-
-
 @dataclass(frozen=True, slots=True)
 class Training:
     """All that a training is before it begins; made by ``Training.of``."""
@@ -1118,39 +1101,6 @@ class Algorithm(ABC):
         """The logarithm of how much it explores, which must stay a usable number; None: nothing to check."""
         found: Tensor | None = getattr(model.policy, "log_std", None)
         return None if found is None else found.detach()
-
-
-# Ctrl-C and SIGTERM as a question that is asked between two steps, in the place of an exception inside one.
-
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-
-@contextmanager
-def stop_on_signal() -> Iterator[Callable[[], bool]]:
-    """Give a function that says whether to stop; the second signal acts as if nobody listened.
-
-    Outside the main thread, where Python delivers no signals, the function always says no.
-    """
-    asked = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield asked.is_set
-        return
-    before = {number: signal.getsignal(number) for number in _SIGNALS}
-
-    def listen(number: int, frame: FrameType | None) -> None:
-        asked.set()
-        restore()
-
-    def restore() -> None:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-    try:
-        for number in _SIGNALS:
-            signal.signal(number, listen)
-        yield asked.is_set
-    finally:
-        restore()
 
 
 # ``team.json`` in a run's folder: which bundle drives which vehicle. Reading a team needs no torch.

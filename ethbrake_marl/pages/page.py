@@ -191,15 +191,17 @@ class Part:
         episodes: Markup | str = "",
     ) -> Part:
         """A player for a page whose own script gives it one world after another, or of the data of that name."""
-        values: dict[str, Any] = {
-            "vehicles": vehicles,
-            "shielded": shielded,
-            "folded": folded,
-            "name": name,
-            "episodes": episodes,
-            "body": BODY_M,
-        }
-        return cls.template("player.html.j2", ("player.css",), _PLAYER_SCRIPTS, **values)
+        return cls.template(
+            "player.html.j2",
+            ("player.css",),
+            _PLAYER_SCRIPTS,
+            vehicles=vehicles,
+            shielded=shielded,
+            folded=folded,
+            name=name,
+            episodes=episodes,
+            body=BODY_M,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,11 +263,20 @@ class Page:
         )
         return f"{policy}; connect-src 'self'" if self.served else policy
 
+    @staticmethod
+    def anchors(titles: Sequence[str]) -> list[str]:
+        """The name of each section of a page with these titles, for links: of letters and digits, no two alike."""
+        found: list[str] = []
+        for k, title in enumerate(titles):
+            name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:40]
+            found.append(f"{name}-{k + 1}" if name in found or not name else name)
+        return found
+
     @cached_property
     def html(self) -> str:
         """The page as text."""
         styles, script = self._code
-        names = anchors([section.title for section in self.sections])
+        names = self.anchors([section.title for section in self.sections])
         whole = Part.template(
             "page.html.j2",
             title=self.title,
@@ -284,15 +295,6 @@ def shown(value: object) -> str:
     return plain_text(str(value), keep=_STAY)
 
 
-def anchors(titles: Sequence[str]) -> list[str]:
-    """The name of each section of a page with these titles, for links: of letters and digits, no two alike."""
-    found: list[str] = []
-    for k, title in enumerate(titles):
-        name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:40]
-        found.append(f"{name}-{k + 1}" if name in found or not name else name)
-    return found
-
-
 @cache
 def read_file(name: str) -> str:
     """A file of this folder, as text."""
@@ -307,7 +309,7 @@ def _environment() -> Environment:
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        finalize=lambda value: value if isinstance(value, Markup) else shown(value),
+        finalize=_text,
     )
 
 
@@ -369,8 +371,7 @@ class Played:
         obstacle = float(motion.world.obstacle_gap_m[0])
         without = 1 + 3 * motion.world.N
         jerks = bool(motion.pieces[:, without:].any())
-        told = motion.pieces if jerks else motion.pieces[:, :without]
-        pieces = np.ascontiguousarray(told, np.dtype("<f8"))
+        pieces = np.ascontiguousarray(motion.pieces if jerks else motion.pieces[:, :without], np.dtype("<f8"))
         return {
             **({"jerks": True} if jerks else {}),
             "pieces": base64.b64encode(pieces.tobytes()).decode("ascii"),

@@ -8,7 +8,6 @@ if TYPE_CHECKING:
     from ethbrake_marl.files.yaml import parse_yaml as parse_yaml
     from ethbrake_marl.scenario.observed import (
         Appended as Appended,
-        appending as appending,
         full_state as full_state,
         observation_for as observation_for,
         row_features as row_features,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal, get_args
 
@@ -80,14 +79,3 @@ def row_features(own: tuple[Feature, ...], appended: Appended | None, scenario: 
         return (*own, *state_features(scenario))
     last = len(scenario.learners) - 1
     return (*own, Feature("learner", "1", 1.0, 0.0, float(max(last, 1)), "the learner's place among the learners"))
-
-
-def appending(appended: Appended, scenario: Scenario) -> Callable[[Worlds, int], Observations]:
-    """What stands behind the own observation of one learner, from worlds and vehicle: [n, features]."""
-
-    def number(worlds: Worlds, vehicle: int) -> Observations:
-        if vehicle not in scenario.learners:
-            raise InvalidInput(f"appended = 'number': vehicle_{vehicle + 1} is no learner of {scenario.name!r}")
-        return np.full((worlds.n, 1), scenario.learners.index(vehicle), np.float32)
-
-    return number if appended == "number" else lambda worlds, _: full_state(worlds, scenario)

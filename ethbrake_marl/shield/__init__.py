@@ -22,7 +22,6 @@ if TYPE_CHECKING:
         Shielded as Shielded,
         ShieldedDriver as ShieldedDriver,
         ShieldOptions as ShieldOptions,
-        put_shield as put_shield,
     )
     from ethbrake_marl.shield.sb3 import ShieldedVecEnv as ShieldedVecEnv
     from ethbrake_marl.shield.step_shield import StepShield as StepShield

@@ -16,7 +16,7 @@ from ethbrake_marl.errors import InvalidInput, count_of, renumbered
 from ethbrake_marl.physics import Bools, Decisions, Floats, Ints, LeftOutRows, Worlds, measured_without_failed
 from ethbrake_marl.scenario import Task
 from ethbrake_marl.shield.enclosure import CORNERS, checked_robust
-from ethbrake_marl.shield.guard import Shielded, ShieldedDriver, put_shield
+from ethbrake_marl.shield.guard import Shielded, ShieldedDriver
 from ethbrake_marl.shield.step_shield import StepShield, proposed_action
 from ethbrake_marl.shield.uncertainty import Uncertainty
 
@@ -108,7 +108,7 @@ def operating_curves(
         for name, policy in policies.items():
             points = []
             for allowance in allowances:
-                team = put_shield(policy, task, allowance=allowance)
+                team = ShieldedDriver.around(policy, task, allowance=allowance)
                 found = Shielded.of(drive(worlds.take(at), team, task.scenario), task)
                 rate = float(found.replaced.sum() / (found.decisions.sum() * found.replaced.shape[1]))
                 points.append(OperatingPoint(float(allowance), rate, float(found.harm.mean())))

@@ -776,6 +776,15 @@ class ShieldedDriver:
         """What the policy knows, and what the shield adds."""
         return Knowledge.of(self.policy, also=self.adds)
 
+    @classmethod
+    def around(cls, driver: Driver, task: Task, **settings: Any) -> Team:
+        """A copy of the ``driver`` behind one shield, on the task's vehicles; settings as of the class."""
+        if isinstance(driver, Team) and len(task.vehicles) == 1:
+            driver = Team.of(driver, task.vehicles).drivers[task.vehicle]
+        elif isinstance(driver, Agent) and len(task.vehicles) > 1:
+            driver = Team.of(driver, task.vehicles)
+        return cls(driver, task.scenario, harm_count=task.harm_count, **settings).on(task.vehicles)
+
     def on(self, vehicles: Collection[int]) -> Team:
         """The team that drives these vehicles behind one shield, each by its own copy."""
         return Team(Team.of(self.policy, vehicles).drivers, self.name, shield=self)
@@ -818,12 +827,12 @@ class Shielded(NamedTuple):
 
     @staticmethod
     def driven(driver: Driver, worlds: Worlds, task: Task, **settings: Any) -> Shielded:
-        """A copy of the ``driver`` drives every world behind a step shield, ``CHUNK`` at a time; as ``put_shield``."""
+        """A copy of the ``driver`` drives every world behind a step shield, ``CHUNK`` at a time; as ``around``."""
         parts = []
         for first in range(0, worlds.n, CHUNK):
             rows = np.arange(first, min(first + CHUNK, worlds.n))
             with renumbered(rows):
-                episodes = drive(worlds.take(rows), put_shield(driver, task, **settings), task.scenario)
+                episodes = drive(worlds.take(rows), ShieldedDriver.around(driver, task, **settings), task.scenario)
             parts.append(Shielded.of(episodes, task))
         return Shielded.join(parts)
 
@@ -836,15 +845,6 @@ class Shielded(NamedTuple):
     def stack(parts: Sequence[Shielded]) -> Shielded:
         """Several drivers in the same worlds, on an axis in front."""
         return Shielded(*(np.stack(columns) for columns in zip(*parts, strict=True)))
-
-
-def put_shield(driver: Driver, task: Task, **settings: Any) -> Team:
-    """A copy of the ``driver`` behind one step shield, on the task's vehicles; settings as of ``ShieldedDriver``."""
-    if isinstance(driver, Team) and len(task.vehicles) == 1:
-        driver = Team.of(driver, task.vehicles).drivers[task.vehicle]
-    elif isinstance(driver, Agent) and len(task.vehicles) > 1:
-        driver = Team.of(driver, task.vehicles)
-    return ShieldedDriver(driver, task.scenario, harm_count=task.harm_count, **settings).on(task.vehicles)
 
 
 def shielded(driver: Driver, scenario: Scenario, mode: str, **options: Any) -> Driver:

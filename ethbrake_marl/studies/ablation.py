@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -28,17 +28,9 @@ from ethbrake_marl.evaluation import (
 )
 from ethbrake_marl.figures import Figure, ablation_figures, write_picture
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
-from ethbrake_marl.files.store import write_output
+from ethbrake_marl.files.store import read_object, write_output
 from ethbrake_marl.files.yaml import Override
-from ethbrake_marl.learning import (
-    WORDS,
-    RunDirectory,
-    Training,
-    TrainingRecipe,
-    load_recipe,
-    read_object,
-    read_settings,
-)
+from ethbrake_marl.learning import WORDS, RunDirectory, Training, TrainingRecipe, load_recipe, read_settings
 from ethbrake_marl.limits import BestHarmTable, best_harm, chunks_left, search_list, task_problem
 from ethbrake_marl.pages.page import Page, Part, Played, Section
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
@@ -517,8 +509,7 @@ def choose_worlds(measured: Sequence[Measured]) -> list[Played]:
     found: dict[int, Played] = {}
     for kind, rows in kinds:
         for row in map(int, rows):
-            why = f"total harm {before[row]:.2f} to {after[row]:.2f}"
-            found.setdefault(row, Played(row, kind, why))
+            found.setdefault(row, Played(row, kind, f"total harm {before[row]:.2f} to {after[row]:.2f}"))
     return list(found.values())
 
 
@@ -638,13 +629,13 @@ class LineQuestion:
     def markdown(self, found: Sequence[Json], runs: int) -> str:
         """One row per length of the line."""
         columns: dict[str, Column] = {
-            "full_brake": _harm("All brake fully"),
-            "reached": _harm("Reached"),
+            "full_brake": Column("All brake fully"),
+            "reached": Column("Reached"),
             "decrease": _share("Decrease"),
             "worse_off": _share("Somebody worse off"),
         }
         if self.search_episodes:
-            columns |= {"best_known": _harm("Best known"), "share": _share("Share of the joint optimum")}
+            columns |= {"best_known": Column("Best known"), "share": _share("Share of the joint optimum")}
         rows = [
             [
                 str(one["vehicles"]),
@@ -896,12 +887,12 @@ def _blocks(found: Json) -> list[tuple[str, list[Sheet]]]:
     both = [{**change, "change": f"{change['from']} to {change['to']}"} for change in steps + channels]
     vehicles = range(len(both[0]["first"]["vehicles"]) if both else 0)
     worlds = levels[0]["first"]["searched"]["worlds"]
-    braking = _harm("All brake fully")
+    braking = Column("All brake fully")
     about: _Columns = [("Level", "level"), (_ALGORITHM, "algorithm")]
     changed: _Columns = [("From", "from"), ("To", "to"), (_ALGORITHM, "algorithm")]
     for count in HARM_COUNTS:
         changed += [
-            (_harm(f"Change of {_HARM[count]}", "+"), f"{count} difference"),
+            (Column(f"Change of {_HARM[count]}", sign="+"), f"{count} difference"),
             (_share(f"Somebody worse off, {_HARM[count]}"), f"{count} worse_off"),
         ]
     blocks = {
@@ -910,7 +901,7 @@ def _blocks(found: Json) -> list[tuple[str, list[Sheet]]]:
                 *about,
                 (_share("Collisions"), "collision_rate"),
                 (braking, f"{count} full_brake value"),
-                (_harm(f"Reached, {_HARM[count]}"), f"{count} harm"),
+                (Column(f"Reached, {_HARM[count]}"), f"{count} harm"),
             ])
             for count in HARM_COUNTS
         ],
@@ -918,8 +909,8 @@ def _blocks(found: Json) -> list[tuple[str, list[Sheet]]]:
             _sheet([level for level in levels if level[count]["searched"]["best_known"] is not None], [
                 *about,
                 (braking, f"{count} searched full_brake value"),
-                (_harm(f"Reached, {_HARM[count]}"), f"{count} searched harm"),
-                (_harm("Joint optimum"), f"{count} searched best_known value"),
+                (Column(f"Reached, {_HARM[count]}"), f"{count} searched harm"),
+                (Column("Joint optimum"), f"{count} searched best_known value"),
                 (_share("Share of its reduction"), f"{count} searched realised_share"),
             ])
             for count in HARM_COUNTS
@@ -927,10 +918,10 @@ def _blocks(found: Json) -> list[tuple[str, list[Sheet]]]:
         "Behind the step shield that guards the count of the table": [
             _sheet([level for level in levels if level[count]["shielded"]], [
                 *about,
-                (_harm(f"Without, {_HARM[count]}"), f"{count} harm value"),
-                (_harm("With"), f"{count} shielded harm value"),
-                (_harm("Change", "+"), f"{count} shielded difference"),
-                (_harm("Bound"), f"{count} shielded bound value"),
+                (Column(f"Without, {_HARM[count]}"), f"{count} harm value"),
+                (Column("With"), f"{count} shielded harm value"),
+                (Column("Change", sign="+"), f"{count} shielded difference"),
+                (Column("Bound"), f"{count} shielded bound value"),
                 (_share("Replaced"), f"{count} shielded replaced"),
                 (_share("Stepped in"), f"{count} shielded stepped_in"),
                 (_share("Somebody worse off"), f"{count} shielded worse_off"),
@@ -945,7 +936,7 @@ def _blocks(found: Json) -> list[tuple[str, list[Sheet]]]:
             _sheet(both, [
                 (f"Change of {_HARM[count]}", "change"),
                 (_ALGORITHM, "algorithm"),
-                *((_harm(f"Vehicle {i + 1}", "+"), f"{count} vehicles {i}") for i in vehicles),
+                *((Column(f"Vehicle {i + 1}", sign="+"), f"{count} vehicles {i}") for i in vehicles),
                 *((_share(f"Vehicle {i + 1} worse off"), f"{count} worse_off_vehicles {i}") for i in vehicles),
             ])
             for count in HARM_COUNTS
@@ -979,10 +970,6 @@ def interval_words(seeds: int) -> str:
         return "95 % intervals for other worlds only: one seed says nothing about others"
     rough = f" (rough: {seeds} seeds)" if seeds < 3 else ""
     return f"95 % intervals for other seeds and other worlds{rough}"
-
-
-def _harm(heading: str, sign: Literal["z", "+"] = "z") -> Column:
-    return Column(heading, sign=sign)
 
 
 def _share(heading: str) -> Column:

@@ -38,7 +38,7 @@ from ethbrake_marl.files.store import read_plain, write_output
 from ethbrake_marl.files.yaml import FileModel, read_json_model
 from ethbrake_marl.limits import BestHarmTable, task_problem
 from ethbrake_marl.physics import Floats
-from ethbrake_marl.policies import Policy
+from ethbrake_marl.policies import Policy, Sha256
 from ethbrake_marl.scenario import Sample, Scenario, Task
 
 # Frozen suites: lists of worlds that never change, each with the least harm known in it.
@@ -50,7 +50,6 @@ SUITES = Path(__file__).resolve().parents[1] / "_suites"
 CONTENT = "suite.json"
 _LIMIT_BYTES, _TABLE_BYTES = 4 << 20, 16 << 20
 
-Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,63}$")]
 Mean = Annotated[float, Field(ge=0.0)]
 

@@ -34,8 +34,8 @@ from ethbrake_marl.evaluation import (
 )
 from ethbrake_marl.figures import harm_against_total_gap, learning_curve, trajectories, write_picture
 from ethbrake_marl.files.sheet import csv_text
-from ethbrake_marl.files.store import write_output
-from ethbrake_marl.learning import RunDirectory, TrainingRecipe, TrainResult, algorithm_names, read_object, train
+from ethbrake_marl.files.store import read_object, write_output
+from ethbrake_marl.learning import RunDirectory, TrainingRecipe, TrainResult, algorithm_names, train
 from ethbrake_marl.pages.page import Part
 from ethbrake_marl.pages.report import Report
 from ethbrake_marl.policies import Policy, installed_versions

@@ -36,18 +36,20 @@ from ethbrake_marl.errors import (
     describe_error,
     naming_extras,
     one_line,
+    stop_on_signal,
 )
 from ethbrake_marl.evaluation import Question, Tally, evaluate
-from ethbrake_marl.files.plugins import Plugin, load_the_same, loaded_plugins
+from ethbrake_marl.files.plugins import load_the_same, noted_plugins
 from ethbrake_marl.files.store import (
     check_writable,
     hold_lock,
     open_plain,
     parse_strict_json,
+    read_object,
     remove_unfinished,
     write_file,
 )
-from ethbrake_marl.learning import RunDirectory, Training, read_object, stop_on_signal
+from ethbrake_marl.learning import RunDirectory, Training
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Sample
 
@@ -97,7 +99,7 @@ class Attempt:
         return one_line("was stopped from outside" if error is None else describe_error(error))
 
 
-def answer(call: bytes, plugins: Sequence[Plugin]) -> Answer:
+def answer(call: bytes, plugins: list[dict[str, str]]) -> Answer:
     """Do a job in a worker, after loading the plug-ins of the process that asks for it.
 
     An error of this package would come again; any other one may be of the machine.
@@ -285,8 +287,7 @@ class JobFolder:
             is_new = self.check()
             remove_unfinished(self.path)
             if is_new and self._question is not None:
-                record = {**self._more, **self._question}
-                write_file(self._record, (json.dumps(record, indent=2) + "\n").encode())
+                write_file(self._record, (json.dumps({**self._more, **self._question}, indent=2) + "\n").encode())
             yield
 
     def run(
@@ -517,7 +518,7 @@ class LocalWorkers:
     """Up to ``number`` processes, which are begun when there is work for them; a lost one is replaced."""
 
     def __init__(self, number: int) -> None:
-        self._number, self._plugins = number, loaded_plugins()
+        self._number, self._plugins = number, noted_plugins()
         self._workers: list[_Worker] = []
         self._interrupted = False
         load_the_same(self._plugins)  # a file that was changed since is told here, in one line
@@ -609,7 +610,7 @@ def _one_thread() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _serve(pipe: Connection, plugins: Sequence[Plugin]) -> None:
+def _serve(pipe: Connection, plugins: list[dict[str, str]]) -> None:
     """Do jobs until nobody asks for any more. Ctrl-C is left to the parent, and the end of the parent is ours."""
     os.setpgrp()
     parent = parent_process()
@@ -646,14 +647,14 @@ class RayWorkers:
     """
 
     def __init__(self, address: str, number: int | None = None) -> None:
-        plugins = loaded_plugins()
+        plugins = noted_plugins()
         load_the_same(plugins)  # a file that was changed since is told here, in one line
-        self._plugins = tuple(  # files by paths that workers elsewhere understand
-            replace(each, source=str(Path(each.source).absolute()))
-            if each.source.endswith(".py") or os.sep in each.source
+        self._plugins = [  # files by paths that workers elsewhere understand
+            {**each, "source": str(Path(each["source"]).absolute())}
+            if each["source"].endswith(".py") or os.sep in each["source"]
             else each
             for each in plugins
-        )
+        ]
         self._ray = _connect(address, number)
         self._most = number if number is not None and address != _LOCAL else None
         self._do = self._ray.remote(num_cpus=1, max_retries=0, max_calls=0)(answer)

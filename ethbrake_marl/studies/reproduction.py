@@ -54,10 +54,10 @@ from ethbrake_marl.figures import (
     write_picture,
 )
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown, csv_text as csv_of
-from ethbrake_marl.files.store import check_target, read_plain, write_file, write_output
-from ethbrake_marl.learning import RunDirectory, TrainingRecipe, load_recipe, read_object
+from ethbrake_marl.files.store import check_target, read_object, read_plain, write_file, write_output
+from ethbrake_marl.learning import RunDirectory, TrainingRecipe, load_recipe
 from ethbrake_marl.limits import Unproven
-from ethbrake_marl.pages.page import Page, Part, Played, Section, anchors, shown
+from ethbrake_marl.pages.page import Page, Part, Played, Section, shown
 from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.policies import Policy, load_policy, load_shipped
 from ethbrake_marl.scenario import Scenario, load_scenario
@@ -350,8 +350,7 @@ class Reproduction:
                 kept = {result.name: list(result.trained) for result in read_results(self.folder)}
                 if kept.get(item.name) != trained:
                     self._make_item(item, trained)
-                    page = render_page(self.folder, read_results(self.folder))
-                    write_file(self.folder / "index.html", page.encode())
+                    write_file(self.folder / "index.html", render_page(self.folder, read_results(self.folder)).encode())
             results = read_results(self.folder)
         if self.docs is not None:
             write_docs(self.docs, self.folder, results)
@@ -648,8 +647,12 @@ class Group:
 def groups() -> dict[str, Group]:
     """Every group by its name, the quickest first, so that results are there early."""
     base = PPO_PAPER.load("ppo-paper").reward.model_dump(exclude_defaults=True)
-    changed = {"risk-0": {"risk": 0.0}, "risk-1": {"risk": 1.0}, "jerk-1e-4": {"jerk": 1e-4}}
-    changed["terminal-0"] = {"terminal": 0.0}
+    changed = {
+        "risk-0": {"risk": 0.0},
+        "risk-1": {"risk": 1.0},
+        "jerk-1e-4": {"jerk": 1e-4},
+        "terminal-0": {"terminal": 0.0},
+    }
     variants: dict[str, dict[str, Any]] = {
         "ppo-paper": {},
         **{f"ppo-paper-{name}": {"reward": {**base, **own}} for name, own in changed.items()},
@@ -1927,7 +1930,7 @@ def render_page(folder: Path, results: Sequence[Result]) -> str:
     Raises ``InvalidInput`` for a figure that is not there or holds more than a figure of ours does.
     """
     lead, command, made, few = _account(results)
-    _, *names = anchors(["Overview", *(result.title for result in results)])
+    _, *names = Page.anchors(["Overview", *(result.title for result in results)])
     link = Markup('<a href="#{}">{}</a>')
     rows = [
         [Shown(link.format(name, shown(each.title))), Shown(_outcome(each.verdict.outcome), each.verdict.because)]
@@ -1952,8 +1955,8 @@ def _section(folder: Path, result: Result) -> Section:
         "In the paper's source": Markup(", ").join(code.format(shown(label)) for label in result.labels),
         "Data": Markup(", ").join(data),
     }
-    body: list[str | Part] = [result.what, Part.facts({name: value for name, value in account.items() if value})]
-    body += result.notes
+    facts = Part.facts({name: value for name, value in account.items() if value})
+    body: list[str | Part] = [result.what, facts, *result.notes]
     for drawn in result.figures:
         file = folder / result.name / f"{drawn.stem}.svg"
         body.append(Part.drawing(read_plain(file, _LIMIT_BYTES), drawn.title, drawn.text, where=file))
@@ -1965,16 +1968,17 @@ def _section(folder: Path, result: Result) -> Section:
         columns = [
             Column(name, text=wordy) for name, wordy in zip(each.head, words or [False] * len(each.head), strict=True)
         ]
-        rows = [[row[0].in_words, *row[1:]] for row in each.rows]
-        body.append(Part.table(Sheet(each.title, columns, rows)))
+        body.append(Part.table(Sheet(each.title, columns, [[row[0].in_words, *row[1:]] for row in each.rows])))
         body += [Part.paragraph(each.note, "quiet")] if each.note else []
     compared = [[each.what, Shown(_outcome(each.outcome), each.because)] for each in result.comparisons]
     comparisons = Part.table(Sheet("Comparisons with the paper", ["What", "Verdict"], compared))
     shaped = [[each.name, each.value, each.origin] for each in result.parameters]
     parameters = Part.table(Sheet("What shapes the item", ["Parameter", "Value", "Origin"], shaped))
-    body.append(Part.opened(f"Comparisons: {len(compared)}", [comparisons]))
-    body.append(Part.opened(f"Parameters: {len(shaped)}", [parameters]))
-    return Section(result.title, body)
+    rest = (
+        Part.opened(f"Comparisons: {len(compared)}", [comparisons]),
+        Part.opened(f"Parameters: {len(shaped)}", [parameters]),
+    )
+    return Section(result.title, [*body, *rest])
 
 
 def _outcome(word: str) -> Markup:

@@ -1067,10 +1067,11 @@ class TuningStudy:
         """Propose a trial, and give its number."""
         trial, asked, samplers = self._study.ask(), self.file.sampler, self._optuna.samplers
         seed = int(np.random.SeedSequence([asked.seed, trial.number]).generate_state(1)[0])
-        if asked.name == "random":
-            self._study.sampler = samplers.RandomSampler(seed=seed)
-        else:
-            self._study.sampler = samplers.TPESampler(seed=seed, n_startup_trials=asked.random_trials)
+        self._study.sampler = (
+            samplers.RandomSampler(seed=seed)
+            if asked.name == "random"
+            else samplers.TPESampler(seed=seed, n_startup_trials=asked.random_trials)
+        )
         for key, dimension in self.file.search.items():
             trial._suggest(key, dimension.distribution())  # what suggest_float and its like call
         return trial.number

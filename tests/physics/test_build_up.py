@@ -16,7 +16,7 @@ from ethbrake_marl.agents.registry import drive
 from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.physics import Floats, Ints, Worlds, advance, make_worlds, stopping_distances
 from ethbrake_marl.scenario import QUANTITY, Scenario, Task, load_scenario
-from ethbrake_marl.shield.guard import put_shield
+from ethbrake_marl.shield.guard import ShieldedDriver
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 from tests.physics.random_worlds import Draws, line
 from tests.reference.small_steps import run
@@ -251,7 +251,7 @@ def test_robust_shield__trusts_a_longer_line_inside_its_box() -> None:
     shift = Draws(2).uniform(-0.4, 0.4, (20, 4)) * [1.0, 0.0, 0.0, 0.0]
     task = Task(five, five.learners, "first")
     uncertain = parse_uncertainty("gaps_m.pair_1=0.5")
-    shielded = put_shield(make_agent("full_brake"), task, mode="robust", uncertainty=uncertain, told=told)
+    shielded = ShieldedDriver.around(make_agent("full_brake"), task, mode="robust", uncertainty=uncertain, told=told)
     driven = drive(replace(told, gaps_m=told.gaps_m + shift), shielded, five)
     assert driven.guarded.shield.distrusted.sum() == 0
     assert driven.ledger.world_harm("first").sum() > 0.0

@@ -134,7 +134,7 @@ class Inside:
 
     def wait(self) -> list[tuple[int, Answer]]:
         number, call = self.begun.pop()
-        return [(number, answer(call, ()))]
+        return [(number, answer(call, []))]
 
     def interrupt(self) -> None: ...
 

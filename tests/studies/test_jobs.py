@@ -204,7 +204,7 @@ def test_jobs__an_error_of_who_is_told_stops_them() -> None:
     ],
 )
 def test_answer__an_error_of_this_package_lasts_and_any_other_may_not(call: Any, error: type, again: bool) -> None:
-    found = answer(pickle.dumps(call), ())
+    found = answer(pickle.dumps(call), [])
     assert (type(found.error), found.again, found.value) == (error, again, 5 if error is type(None) else None)
 
 
