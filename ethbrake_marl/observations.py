@@ -458,7 +458,7 @@ def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool, bool]:
 # The vehicle looks at the part of the line around it whose news it has, as its other features tell it. It goes on, once
 # its own latency has elapsed, with full braking, coasting or full driving. Every other vehicle of that part goes on
 # with the command that is observed of it; one of which none is in force brakes fully as soon as its latency has
-# elapsed.
+# elapsed, and so does one that brakes where brakes build up: its command is not seen in the force of the moment.
 
 FORECAST_S = 10.0  # how far the forecasts look; also the time to an impact that never comes
 _OF_PAIR, _HARMS = 4, 2  # numbers of each pair; of the line
@@ -541,7 +541,7 @@ def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, a
         if j == i or in_force == 0.0:
             table[ROW.ONSET, at + j] = max(params[k, own_part + j] - time, 0.0)
             table[ROW.COMMAND, at + j] = -params[k, braking + j] if known else 0.0
-        elif known and state[k, of.previous + j] > in_force and params[k, of.brake_rate + j] < math.inf:
+        elif known and in_force < 0.0 and params[k, of.brake_rate + j] < math.inf:  # it may build up still
             table[ROW.COMMAND, at + j] = -params[k, braking + j]
         table[ROW.FORCE, at + j] = in_force if known else 0.0
         if j < N - 1:

@@ -128,6 +128,16 @@ def test_contact__hides_whom_no_news_has_come_from_whatever_they_do():
     assert observe(changed, 1, CONTACT)[~news[:, 2]].tobytes() == observe(worlds, 1, CONTACT)[~news[:, 2]].tobytes()
 
 
+def test_contact__where_brakes_build_up_is_the_same_for_who_trains_and_who_is_asked():
+    roles = {"vehicle_1": "constant:2", "vehicle_2": "learner", "vehicle_3": "coast"}
+    scenario = SCENARIO.replace(brake_rate_mps3=12.65, release_rate_mps3=12.65, roles=roles)
+    env = eb.EthBrakeEnv(scenario, observation=CONTACT)
+    env.reset(seed=1)
+    for _ in range(3):
+        seen = env.step(np.array([-0.3], np.float32))[0]
+        assert seen.tobytes() == observe(env.engine.worlds, 1, CONTACT)[0].tobytes()
+
+
 def test_contact__of_some_commands_only_is_the_same():
     worlds = eb.advance(SCENARIO.sample(20, 3).worlds, np.zeros((20, 3)), until_s=0.8)[0]
     some = ["contact.brake_rear_fraction", "own.speed", "contact.drive_total_harm"]

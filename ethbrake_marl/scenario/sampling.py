@@ -163,12 +163,11 @@ class Quantities(NamedTuple):
     def of(self, worlds: Worlds) -> dict[str, QuantityRule]:
         """Those that these worlds have: the distance to an obstacle, and friction, only where all have such.
 
-        Rates of brakes are told of all where some build up.
+        A rate of brakes is told of all where some have one.
         """
         there = {key: np.isfinite(getattr(worlds, key)).all() for key in ("obstacle_gap_m", "friction")}
-        return self.usual | {
-            key: r for key, r in self.optional.items() if there.get(key, worlds.vehicles.build_up.any())
-        }
+        there |= {key: np.isfinite(getattr(worlds.vehicles, key)).any() for key in self.optional if key not in there}
+        return self.usual | {key: rule for key, rule in self.optional.items() if there[key]}
 
     def columns(self, worlds: Worlds) -> dict[str, Floats]:
         """Every one of the worlds, each [n], named as in a table of initial states: ``gap_1_m``, ``mass_2_t``."""

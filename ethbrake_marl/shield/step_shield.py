@@ -881,10 +881,10 @@ def _later_plan(
         for c, vehicle in enumerate(policies):
             column = action if action.ndim == 1 else action[:, c]
             commands[:, vehicle] = action_to_command(column, seen.vehicles, vehicle)
-        time, vehicles = episodes.time_s, seen.vehicles
-        at_once = np.isinf(vehicles.brake_rate_mps3) & np.isinf(vehicles.release_rate_mps3)
+        time, vehicles, force = episodes.time_s, seen.vehicles, episodes.states[:, -seen.N :]
         acts = np.where(vehicles.latency_s <= time[:, np.newaxis], commands, 0.0)
-        in_force = np.where(at_once, acts, episodes.states[:, -seen.N :])
+        at_once = np.isinf(np.where(acts < force, vehicles.brake_rate_mps3, vehicles.release_rate_mps3))
+        in_force = np.where(at_once, acts, force)
         seen = replace(worlds_at(seen, episodes.states), time_s=time, command_mps2=in_force)
         with renumbered(rows):
             proposed, memories = proposed_actions(policies, memories, seen)

@@ -245,6 +245,29 @@ def test_shield__of_a_mixture_in_which_some_worlds_build_up(slow: Scenario, tmp_
     assert (ends > 1).all()
 
 
+def test_shield__foresees_a_force_that_is_there_at_once_and_released_slowly() -> None:
+    scenario, at_onset = load_scenario("paper-random").replace(release_rate_mps3=12.65), []
+
+    class Watching:
+        name = "watching"
+
+        def act(self, worlds: Worlds, vehicle: int) -> Floats:
+            at_onset.extend(worlds.command_mps2[np.abs(worlds.time_s - 0.8) < 1e-6, 2])  # the latency of Vehicle 3
+            return np.full(worlds.n, -2.0)
+
+    shielded = put_shield(Watching(), Task(scenario, (1,)))
+    eb.evaluate(scenario.sample(1, seed=0), {"shielded": shielded}, scenario=scenario)
+    assert len(at_onset) > 1 and set(at_onset) == {-6.0}
+
+
+@pytest.mark.parametrize("key", ["brake_rate_mps3", "release_rate_mps3"])
+def test_table__of_a_scenario_with_one_of_both_rates_is_read_again(key: str) -> None:
+    one = load_scenario("paper-random").replace(**{key: 12})
+    drawn = one.sample(3, seed=1).worlds
+    read = one.worlds_from_table(QUANTITY.columns(drawn))
+    assert np.array_equal(getattr(read.vehicles, key), getattr(drawn.vehicles, key))
+
+
 def test_robust_shield__trusts_a_longer_line_inside_its_box() -> None:
     five = load_scenario("cooperation-2-five").replace(brake_rate_mps3=15, release_rate_mps3=25)
     told = five.sample(20, seed=7).worlds
