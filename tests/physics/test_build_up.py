@@ -255,7 +255,7 @@ def test_shield__foresees_a_force_that_is_there_at_once_and_released_slowly() ->
             at_onset.extend(worlds.command_mps2[np.abs(worlds.time_s - 0.8) < 1e-6, 2])  # the latency of Vehicle 3
             return np.full(worlds.n, -2.0)
 
-    shielded = put_shield(Watching(), Task(scenario, (1,)))
+    shielded = ShieldedDriver.around(Watching(), Task(scenario, (1,)))
     eb.evaluate(scenario.sample(1, seed=0), {"shielded": shielded}, scenario=scenario)
     assert len(at_onset) > 1 and set(at_onset) == {-6.0}
 
