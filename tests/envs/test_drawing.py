@@ -1,7 +1,9 @@
 """What the environments draw: pictures, words and windows of the running worlds."""
 
 import sys
+from hashlib import sha256
 from importlib import import_module
+from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -54,6 +56,25 @@ def test_frame__is_a_picture_of_the_state_alone_in_its_own_memory() -> None:
         before = again
         frame[:] = 0
         assert np.array_equal(environment.render(), again)
+
+
+@pytest.mark.skipif(version("pillow") != "13.0.0", reason="another Pillow draws letters otherwise")
+@pytest.mark.parametrize(
+    ("scenario", "learners", "pixels"),
+    [
+        ("paper-random", ["vehicle_2"], "0f54a251a97d"),
+        ("paper-random-obstacle", [], "5885d3fef581"),
+        ("cooperation-4-five", None, "e567a00b8f37"),
+    ],
+)
+def test_frames__are_the_same_pixels_as_ever(scenario: str, learners: list[str] | None, pixels: str) -> None:
+    environment = eb.parallel_env(scenario, learners=learners, render_mode="rgb_array")
+    environment.reset(seed=3)
+    told = sha256(environment.render())
+    while environment.agents:
+        environment.step({each: environment.action_space(each).low * 0.4 for each in environment.agents})
+        told.update(environment.render())
+    assert told.hexdigest()[:12] == pixels
 
 
 @pytest.mark.parametrize(("sign", "colour"), [(1.0, (42, 127, 63)), (-1.0, (193, 18, 31))])
