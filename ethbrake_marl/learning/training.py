@@ -788,7 +788,6 @@ def read_settings(texts: Sequence[str] | None, recipes: Sequence[TrainingRecipe]
 
 # The folder of a run: its files, its configuration, how far it came, and who may train in it.
 
-
 RunStatus = Literal["running", "finished", "interrupted", "failed"]
 
 
