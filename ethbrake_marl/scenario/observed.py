@@ -22,13 +22,18 @@ from ethbrake_marl.physics import Vehicles, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 
 
-def observation_for(scenario: Scenario) -> ObservationSpec:
-    """What vehicles observe in this scenario unless somebody says otherwise: what it declares.
+def observation_for(scenario: Scenario, vehicle: str | None = None) -> ObservationSpec:
+    """What a vehicle, or any learner, observes in this scenario unless somebody says otherwise: what it declares.
 
     Where it declares nothing: one neighbour on each side; where Vehicle 1 has an obstacle ahead, also the own place in
     the line and the obstacle. Raises ``InvalidInput`` naming two learners that observe different features.
     """
-    return common_observation(observations_of(scenario), scenario)
+    observations = observations_of(scenario)
+    if vehicle is None:
+        return common_observation(observations, scenario)
+    if vehicle not in scenario.vehicle_names:
+        raise unknown_name("vehicle", vehicle, scenario.vehicle_names)
+    return observations[scenario.vehicle_names.index(vehicle)]
 
 
 def observations_of(scenario: Scenario, given: Observation | None = None) -> tuple[ObservationSpec, ...]:

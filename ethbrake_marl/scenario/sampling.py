@@ -730,6 +730,7 @@ class Roles(dict[str, str]):
 ANY = "any"  # in ``types``: every type, by its weight
 
 TypeName = Annotated[str, Field(pattern=NAME_PATTERN)]
+VehicleName = Annotated[str, Field(pattern=r"^vehicle_[1-9][0-9]?$")]
 Weight = Annotated[float, Field(gt=0.0, le=1e9, allow_inf_nan=False)]
 
 
@@ -966,7 +967,7 @@ class ScenarioFields(FileModel):
     objective: ObjectiveName | Annotated[tuple[ObjectiveName, ...], Field(strict=False)] = Field(
         default="total", description="whose harm a reward counts: one for all vehicles, or one for each"
     )
-    observation: ListedFeatures | dict[str, ListedFeatures] | None = Field(
+    observation: ListedFeatures | Annotated[dict[VehicleName, ListedFeatures], Field(min_length=1)] | None = Field(
         default=None,
         exclude_if=not_,
         description="what vehicles observe, or by name what each does: groups and single features, in this order",
