@@ -18,13 +18,13 @@ from typing import Any
 
 import torch
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.numpy import save_file
 from torch import Tensor, nn
 
 import ethbrake_marl as eb
 from ethbrake_marl.files.store import new_folder
 
-# 1. What is observed, unless the scenario says it: how old news is, and for one policy in several vehicles, which it is.
+# 1. What is observed, unless the scenario says it: also how old news is, and which of the vehicles it is.
 
 OBSERVATION = ["own", "front_1", "rear_1", "front_1.age", "rear_1.age", "place"]
 HIDDEN, NOISE, RATE = 64, 0.3, 3e-3
@@ -64,14 +64,14 @@ def train(scenario: eb.Scenario, observation: list[str], args: argparse.Namespac
             running = torch.from_numpy(~engine.ended)[:, None]
             seen = torch.from_numpy(engine.observe_all()).flatten(0, 1)
             mean, memory = network(seen, memory)
-            policy = torch.distributions.Normal(mean.view(shape), NOISE)
+            policy: Any = torch.distributions.Normal(mean.view(shape), NOISE)  # torch's are untyped
             actions = policy.sample()
             step = engine.step(actions.clamp(-1, 1).numpy())
             chosen.append(policy.log_prob(actions) * running)
             gained.append(torch.from_numpy(step.reward[:, learners]))
         to_go = torch.stack(gained).flip(0).cumsum(0).flip(0)
         advantage = (to_go - to_go.mean(1, keepdim=True)) / (to_go.std() + 1e-8)
-        loss = -(torch.stack(chosen) * advantage).sum() / sum(shape)
+        loss: Any = -(torch.stack(chosen) * advantage).sum() / sum(shape)
         optimiser.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(network.parameters(), 0.5)
@@ -86,9 +86,9 @@ def train(scenario: eb.Scenario, observation: list[str], args: argparse.Namespac
 
 def make_agent(folder: str, settings: eb.AgentSettings) -> eb.Agent:
     """What drives one vehicle by the network in a folder."""
-    with safe_open(Path(folder) / "network.safetensors", "pt") as file:
+    with safe_open(Path(folder) / "network.safetensors", "numpy") as file:
         told = json.loads(file.metadata()["told"])
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # no mapping
+        tensors = {name: torch.from_numpy(file.get_tensor(name)) for name in file.keys()}  # noqa: SIM118  # no mapping
     network = Recurrent(tensors["cell.weight_ih"].shape[1], told["remembers"])
     network.load_state_dict(tensors)
 
@@ -121,7 +121,8 @@ def main() -> None:
     with new_folder(args.output) as folder:
         network = train(scenario, observation, args)
         told = {"observation": observation, "remembers": network.remembers}
-        save_file(network.state_dict(), folder / "network.safetensors", {"told": json.dumps(told)})
+        arrays = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
+        save_file(arrays, folder / "network.safetensors", {"told": json.dumps(told)})
 
 
 if __name__ == "__main__":
