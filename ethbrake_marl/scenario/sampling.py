@@ -730,7 +730,10 @@ class Roles(dict[str, str]):
 ANY = "any"  # in ``types``: every type, by its weight
 
 TypeName = Annotated[str, Field(pattern=NAME_PATTERN)]
-VehicleName = Annotated[str, Field(pattern=r"^vehicle_[1-9][0-9]?$")]
+ListedByVehicle = Annotated[
+    dict[Annotated[str, Field(pattern=r"^vehicle_[1-9][0-9]?$")], ListedFeatures],
+    Field(min_length=1, json_schema_extra={"additionalProperties": False}),
+]
 Weight = Annotated[float, Field(gt=0.0, le=1e9, allow_inf_nan=False)]
 
 
@@ -967,7 +970,7 @@ class ScenarioFields(FileModel):
     objective: ObjectiveName | Annotated[tuple[ObjectiveName, ...], Field(strict=False)] = Field(
         default="total", description="whose harm a reward counts: one for all vehicles, or one for each"
     )
-    observation: ListedFeatures | Annotated[dict[VehicleName, ListedFeatures], Field(min_length=1)] | None = Field(
+    observation: ListedFeatures | ListedByVehicle | None = Field(
         default=None,
         exclude_if=not_,
         description="what vehicles observe, or by name what each does: groups and single features, in this order",
