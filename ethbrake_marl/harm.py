@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from functools import lru_cache
 from typing import Annotated, Literal, NamedTuple
@@ -68,6 +68,11 @@ class Ledger:
             self.obstacle_count + impacts.obstacle_count,
             self.mass_t,
         )
+
+    def since(self, before: Ledger) -> Ledger:
+        """What came to the same worlds after ``before``, as the harm of one step, to the last rounding."""
+        names = [column.name for column in fields(self) if column.name != "mass_t"]
+        return replace(self, **{name: getattr(self, name) - getattr(before, name) for name in names})
 
     def take(self, rows: Ints | Bools | Sequence[int]) -> Ledger:
         """That of some of the worlds."""
