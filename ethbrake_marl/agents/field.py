@@ -1,6 +1,6 @@
 """Controllers that the field compares with: car-following laws, drivers of UN R157, emergency braking.
 
-Each is one entry of ``LAWS``: a formula of what a vehicle's own sensors see, its parameters and its source.
+Each is one entry of ``LAWS``: a formula of the vehicle ahead alone, its parameters and its source.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.agents.believed import Told
 from ethbrake_marl.agents.registry import AgentSettings, Source
 from ethbrake_marl.engine import Script
 from ethbrake_marl.errors import InvalidInput, unknown_name
@@ -33,7 +34,11 @@ class Parameters:
 
 
 class Seen(NamedTuple):
-    """What a vehicle's own sensors tell it of n worlds, each [n]; ahead of Vehicle 1 is the obstacle, or nothing."""
+    """What one vehicle was told of the vehicle ahead, by sensors or messages, in n worlds, each [n].
+
+    News that are old are moved on with the command of then. Ahead of Vehicle 1 is the obstacle, or nothing; so it is of
+    a vehicle that was told nothing.
+    """
 
     gap_m: Floats  # to what is ahead; infinite: to nothing
     speed_mps: Floats
@@ -45,13 +50,14 @@ class Seen(NamedTuple):
     @classmethod
     def of(cls, worlds: Worlds, vehicle: int, step_s: float) -> Seen:
         """In these worlds, by ``vehicle`` (0 = front)."""
-        speed, force = worlds.speeds_mps, worlds.command_mps2
-        if vehicle == 0:
-            ahead = worlds.obstacle_gap_m, np.zeros(worlds.n), np.zeros(worlds.n)
-        else:
-            ahead = worlds.gaps_m[:, vehicle - 1], speed[:, vehicle - 1], force[:, vehicle - 1]
-        gap, front, pressing = ahead
-        return cls(np.maximum(gap, _TOUCHING_M), speed[:, vehicle], front, pressing, force[:, vehicle], step_s)
+        told, own, none = Told.to(worlds, vehicle), worlds.command_mps2[:, vehicle], np.zeros(worlds.n)
+        gap, front, force = told.obstacle_m, none, none
+        if vehicle:
+            k = vehicle - 1
+            age, then, force = worlds.time_s - told.at_s[:, k], told.speed_mps[:, k], told.command_mps2[:, k]
+            front = np.where(age > 0.0, np.maximum(then + force * age, 0.0), then)
+            gap = np.where(told.known[:, k], told.place_m[:, k] + 0.5 * (then + front) * age, np.inf)
+        return cls(np.maximum(gap, _TOUCHING_M), worlds.speeds_mps[:, vehicle], front, force, own, step_s)
 
     @property
     def closing_mps(self) -> Floats:
@@ -78,7 +84,7 @@ def _idm(seen: Seen, p: Parameters) -> Floats:
     wanted = p.s0 + np.maximum(
         0.0, seen.speed_mps * p.T + seen.speed_mps * seen.closing_mps / (2 * math.sqrt(p.a * p.b))
     )
-    return p.a * (1.0 - (seen.speed_mps / p.v0) ** 4 - (wanted / seen.gap_m) ** 2)
+    return p.a * (1.0 - np.square(np.square(seen.speed_mps / p.v0)) - np.square(wanted / seen.gap_m))
 
 
 def _is_free(seen: Seen, p: Parameters) -> Bools:
@@ -100,8 +106,8 @@ def _cacc(seen: Seen, p: Parameters) -> Floats:
 
 def _safe_distance(seen: Seen, p: Parameters) -> Floats:
     speed = np.maximum(seen.speed_mps, 0.0)
-    ahead = np.maximum(seen.front_mps, 0.0) ** 2 / (2.0 * p.b_max)
-    way = speed * p.rho + 0.5 * p.a * p.rho**2 + (speed + p.rho * p.a) ** 2 / (2.0 * p.b_min)
+    ahead = np.square(np.maximum(seen.front_mps, 0.0)) / (2.0 * p.b_max)
+    way = speed * p.rho + 0.5 * p.a * p.rho * p.rho + np.square(speed + p.rho * p.a) / (2.0 * p.b_min)
     return np.maximum(way - ahead, 0.0)
 
 
@@ -127,18 +133,18 @@ def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
 def fuzzy(seen: Seen, p: Parameters) -> tuple[Floats, Floats]:
     """The proactive and the critical fuzzy criterion of the fuzzy safety model, each [n] from 0 to 1."""
     speed, front = np.maximum(seen.speed_mps, 0.0), np.maximum(seen.front_mps, 0.0)
-    ahead, reacting = front**2 / (2.0 * p.b_front), speed * p.reaction
+    ahead, reacting = np.square(front) / (2.0 * p.b_front), speed * p.reaction
     proactive = _share(
         seen.gap_m - p.margin,
-        reacting + speed**2 / (2.0 * p.b_min) - ahead + p.margin_safe,
-        reacting + speed**2 / (2.0 * p.b_max) - ahead,
+        reacting + np.square(speed) / (2.0 * p.b_min) - ahead + p.margin_safe,
+        reacting + np.square(speed) / (2.0 * p.b_max) - ahead,
     )
     own = np.maximum(seen.own_mps2, -p.b_min)
     after = speed + p.reaction * own - front
     way = (speed + 0.5 * own * p.reaction - front) * p.reaction
-    critical = _share(seen.gap_m, way + after**2 / (2.0 * p.b_min), way + after**2 / (2.0 * p.b_max))
+    critical = _share(seen.gap_m, way + np.square(after) / (2.0 * p.b_min), way + np.square(after) / (2.0 * p.b_max))
     slows = (after < 0.0) & (own < 0.0)  # it is slower than its front one once it has reacted
-    until = (speed - front) ** 2 / (2.0 * np.where(slows, -seen.own_mps2, 1.0))
+    until = np.square(speed - front) / (2.0 * np.where(slows, -seen.own_mps2, 1.0))
     critical = np.where(slows, np.where(seen.gap_m < until, 1.0, 0.0), critical)
     return proactive, np.where(speed > front, critical, 0.0)
 
@@ -155,7 +161,7 @@ def _fsm(seen: Seen, p: Parameters) -> Floats:
 
 
 def _aeb(seen: Seen, p: Parameters) -> Floats:
-    required = np.maximum(seen.closing_mps, 0.0) ** 2 / (2.0 * seen.gap_m)
+    required = np.square(np.maximum(seen.closing_mps, 0.0)) / (2.0 * seen.gap_m)
     return np.where((seen.until_contact_s < p.ttc) | (required > p.required), -np.inf, 0.0)
 
 
@@ -209,14 +215,14 @@ LAWS: dict[str, Law] = {
 
 
 class Controller:
-    """A vehicle that follows a ``Law`` on its own sensors; what it remembers is since when it has noticed, [n] s.
+    """A vehicle that follows a ``Law``; what it remembers is since when it has noticed, [n] s.
 
-    A reaction counts from the decision at which it notices; what it notices at its first one it has seen since its
-    front vehicle could act, so reaction and latency run side by side. The human stays with what it has begun; the
+    A reaction counts from the decision at which it notices; what it notices at its first one it has seen since the
+    alert, so reaction and latency run side by side. The human stays with what it has begun; the
     fuzzy model begins anew when what it noticed is over.
     """
 
-    knows = Source.SENSORS
+    knows = Source.MESSAGES
 
     def __init__(self, name: str, law: Law, parameters: Mapping[str, float], step_s: float) -> None:
         self.name, self.law, self.parameters, self._step_s = name, law, Parameters(**parameters), step_s
@@ -230,8 +236,7 @@ class Controller:
         seen, p, vehicles = Seen.of(worlds, vehicle, self._step_s), self.parameters, worlds.vehicles
         command = self.law.command(seen, p)
         if self.law.notices is not None:
-            front = vehicles.latency_s[:, vehicle - 1] if vehicle else 0.0
-            now = np.where(np.isnan(memory), np.minimum(front, worlds.time_s), worlds.time_s)
+            now = np.where(np.isnan(memory), 0.0, worlds.time_s)
             before = np.where(np.isnan(memory), np.inf, memory)
             gone = before if self.law.stays else np.inf
             memory = np.where(self.law.notices(seen, p), np.minimum(before, now), gone)

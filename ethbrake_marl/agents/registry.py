@@ -427,15 +427,15 @@ _ENTRIES: dict[str, Entry] = {
         Source.MODEL,
         "agents.e_v2x_bm:make_e_v2x_bm",
     ),
-    "idm": Entry("idm[:T=1.5:...]", "the intelligent driver model", Source.SENSORS, _FIELD),
-    "acc": Entry("acc[:T=1.1:...]", "adaptive cruise control of PATH", Source.SENSORS, _FIELD),
-    "cacc": Entry("cacc[:T=1.0:...]", "its cooperative one, at a shorter distance", Source.SENSORS, _FIELD),
-    "rss": Entry("rss[:rho=1.0:...]", "brakes within the safe distance of RSS", Source.SENSORS, _FIELD),
+    "idm": Entry("idm[:T=1.5]", "the intelligent driver model", Source.MESSAGES, _FIELD),
+    "acc": Entry("acc[:T=1.1]", "adaptive cruise control of PATH", Source.MESSAGES, _FIELD),
+    "cacc": Entry("cacc[:T=1.0]", "its cooperative one, at a shorter distance", Source.MESSAGES, _FIELD),
+    "rss": Entry("rss[:rho=1.0]", "brakes within the safe distance of RSS", Source.MESSAGES, _FIELD),
     "r157_human": Entry(
-        "r157_human[:reaction=0.75:...]", "the careful and competent driver of UN R157", Source.SENSORS, _FIELD
+        "r157_human[:reaction=0.75]", "the careful and competent driver of UN R157", Source.MESSAGES, _FIELD
     ),
-    "r157_fsm": Entry("r157_fsm[:reaction=0.75:...]", "the fuzzy safety model of UN R157", Source.SENSORS, _FIELD),
-    "aeb": Entry("aeb[:ttc=1.5:...]", "automatic emergency braking", Source.SENSORS, _FIELD),
+    "r157_fsm": Entry("r157_fsm[:reaction=0.75]", "the fuzzy safety model of UN R157", Source.MESSAGES, _FIELD),
+    "aeb": Entry("aeb[:ttc=1.5]", "automatic emergency braking", Source.MESSAGES, _FIELD),
     "planner": Entry(
         "planner[:CANDIDATES|:20ms][:believed]",
         "a search in the simulation at every decision, with this budget for each; believed: as above",

@@ -220,7 +220,7 @@ PARTS = [  # as ``part_names`` tells them: to ask for them takes the engine, and
     (
         "Observation",
         "own, front_K, rear_K, role, obstacle, front_K.age, rear_K.age, front_K.build_up_time, rear_K.build_up_time,"
-        " front_K.release_time, rear_K.release_time, own_build_up_time, own_release_time",
+        " front_K.release_time, rear_K.release_time, own_build_up_time, own_release_time, place",
     ),
     ("V2X presets", "paper, clear, nominal, congested, blocked, sensors-only"),
     ("Objectives", "total, own, social:ANGLE, maximin, mass-weighted, weighted:W1,W2,..."),

@@ -275,7 +275,7 @@ LADDER = (  # from no decision at all up to the best that is known
     "planner",
     "best_harm",
 )
-FIELD = ("idm", "acc", "cacc", "rss", "r157_human", "r157_fsm", "aeb")  # of other people, on own sensors
+FIELD = ("idm", "acc", "cacc", "rss", "r157_human", "r157_fsm", "aeb")  # of other people
 _GROUPS = {"ladder": LADDER, "field": FIELD}
 
 

@@ -27,6 +27,7 @@ from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation import evaluate, follow_episodes, record_episode, worlds_sha256
 from ethbrake_marl.evaluation.episodes import Task, film_scenes, record_episodes
+from ethbrake_marl.evaluation.inputs import FIELD
 from ethbrake_marl.physics import Floats, Worlds, advance
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver
 from tests.fixtures.asked import Acts, Asked
@@ -383,7 +384,7 @@ def test_agents__every_row_is_its_own_new_episodes_change_theirs_alone_and_agent
 
 def test_agent_names__are_those_that_ship_and_are_listed(capsys):
     scripts = ("coast", "constant", "copy_leader", "e_v2x_bm", "full_brake", "gentlest_front", "planner")
-    names = (*scripts, "best_harm", "ppo", "sac", "counterfactual", "options", "policy", "universal", "team")
+    names = (*scripts, *FIELD, "best_harm", "ppo", "sac", "counterfactual", "options", "policy", "universal", "team")
     assert agent_names() == tuple(sorted(names)) and run_command(["agent", "list"]) == 0
     table = capsys.readouterr().out
     assert [name for name in (*names, "+refined", "+episode", "+step", "+robust") if name not in table] == []
