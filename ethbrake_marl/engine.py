@@ -917,9 +917,14 @@ class Engine:
         """The worlds as they are now, in their own memory."""
         return self._unpacked(self.packed)
 
+    @property
+    def in_pieces(self) -> bool:
+        """Whether some script brakes in pieces."""
+        return self._pieces.shape[1] > 0
+
     def _unpacked(self, packed: Packed) -> Worlds:
         worlds = packed.worlds()
-        if not self._pieces.shape[1]:
+        if not self.in_pieces:
             return worlds
         pieces = np.repeat(self._pieces[np.newaxis], worlds.n, axis=0)
         return replace(worlds, vehicles=replace(worlds.vehicles, pieces=pieces))
@@ -998,7 +1003,7 @@ class Engine:
         self.__dict__.update(new.__dict__)  # in one piece: not even an interrupt comes between
 
     def _may_build_up(self, packed: Packed) -> bool:
-        return self.scenario.builds_up or packed.builds_up or self._pieces.shape[1] > 0
+        return self.scenario.builds_up or packed.builds_up or self.in_pieces
 
     def renew(self, rows: Ints) -> None:
         """Start new episodes of the training stream in these rows (autoreset). Whatever fails, nothing is changed."""

@@ -728,15 +728,15 @@ class ScriptSpec(NamedTuple):
 
 def checked_pieces(given: object) -> tuple[tuple[float, float], ...]:
     """The pieces of a ``profile``, [[s, m/s2], ...], as they are written in roles; raises ``InvalidInput``."""
-    right = f"profile: {given!r:.200}: must be 1 to {MOST_PIECES} pieces [s after the latency, m/s2 of braking]"
+    right = f"a profile is 1 to {MOST_PIECES} pieces [s after the latency, m/s2 of braking], such as [[0, 3], [1, 7]]"
     if not isinstance(given, list | tuple) or not 1 <= len(given) <= MOST_PIECES:
-        raise InvalidInput(f"{right}, for instance [[0, 3], [1, 7]]")
+        raise InvalidInput(right)
     for piece in given:
         numbers = isinstance(piece, list | tuple) and len(piece) == 2
         if not numbers or not all(type(each) in (int, float) and 0.0 <= each <= 3600.0 for each in piece):
-            raise InvalidInput(f"{right}, both in [0, 3600]; {piece!r:.60} is not")
+            raise InvalidInput(f"{right}; both in [0, 3600], which {piece!r:.60} is not")
     if given[0][0] != 0.0 or not all(one[0] < other[0] for one, other in pairwise(given)):
-        raise InvalidInput(f"{right}; their times must begin with 0 and rise")
+        raise InvalidInput(f"{right}; times begin with 0 and rise")
     return tuple((float(begins), float(braking)) for begins, braking in given)
 
 
