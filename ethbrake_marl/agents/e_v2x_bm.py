@@ -710,8 +710,10 @@ def _copy_state(of: Floats, table: Floats) -> None:
         table[ROW.SPEED, i] = of[ROW.SPEED, i]
         table[ROW.ACTIVE, i] = of[ROW.ACTIVE, i]
         table[ROW.FORCE, i] = of[ROW.FORCE, i]
-        if table.shape[0] > ROW.OF_BUILD_UP and table[ROW.PIECES, i] < math.inf:
-            table[ROW.COMMAND, i], table[ROW.NEXT_PIECE, i] = of[ROW.COMMAND, i], of[ROW.NEXT_PIECE, i]
+        if table.shape[0] > ROW.OF_BUILD_UP:
+            table[ROW.NEXT_PIECE, i] = of[ROW.NEXT_PIECE, i]
+            if table[ROW.PIECES, i] < math.inf:
+                table[ROW.COMMAND, i] = of[ROW.COMMAND, i]
     for p in range(vehicles - 1):
         table[ROW.GAP, p] = of[ROW.GAP, p]
         table[ROW.CONTACT_SPEED, p] = of[ROW.CONTACT_SPEED, p]

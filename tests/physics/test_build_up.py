@@ -211,7 +211,7 @@ def test_rates_too_high_to_matter__leave_the_motion_as_it_is() -> None:
         (4, 2, True, True, True),
         (5, 4, False, True, True),
         (6, 3, False, False, True),
-        (7, 5, True, False, True),
+        (7, 3, True, False, True),
     ],
 )
 def test_motion__is_that_of_small_steps(key: int, N: int, obstacle: bool, rates: bool, in_pieces: bool) -> None:
