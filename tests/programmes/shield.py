@@ -105,7 +105,11 @@ def attacks(given: Given) -> Cases:
         cap = (None, "baseline")[k % 2]
         case = {"harm_count": count, "hostile": hostile, "adversary": TEAM_ADVERSARIES[name], "cap": cap}
         told = f"joint: level {which[0]}, N = {which[1]}, {count}, {hostile} hostile, {name}, cap {cap}"
-        teams.append((told, TEAM_CELLS[which], load_scenario(TEAMS[which]), case))
+        scenario = load_scenario(TEAMS[which])
+        if which[0] == 3 and k % 3 == 0:  # Vehicle 1 is no learner
+            told = told.replace("joint:", "joint: in pieces,")
+            scenario = scenario.replace(roles={**scenario.roles, "vehicle_1": {"profile": [[0, 2], [0.4, 6], [1, 1]]}})
+        teams.append((told, TEAM_CELLS[which], scenario, case))
     first = 0
     for all_worlds, cells in ((given.worlds, one), (given.build_up_worlds, rates), (given.joint_worlds, teams)):
         whole = sum(share for _, share, *_ in cells)
