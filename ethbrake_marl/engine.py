@@ -920,7 +920,7 @@ class Engine:
     @property
     def in_pieces(self) -> bool:
         """Whether some script brakes in pieces."""
-        return self._pieces.shape[1] > 0
+        return bool(self._pieces.shape[1] > 0)
 
     def _unpacked(self, packed: Packed) -> Worlds:
         worlds = packed.worlds()
