@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.envs import (
         EthBrakeParallelEnv as EthBrakeParallelEnv,
         env as env,
+        make_engine as make_engine,
         parallel_env as parallel_env,
         raw_env as raw_env,
     )

@@ -32,7 +32,7 @@ from ethbrake_marl.errors import (
     renumbered,
 )
 from ethbrake_marl.harm import Ledger, objective_harm
-from ethbrake_marl.observations import Observations, ObservationSpec, Plan
+from ethbrake_marl.observations import Observation, Observations, ObservationSpec, Plan
 from ethbrake_marl.physics import (
     BOUND,
     FLAG,
@@ -59,7 +59,7 @@ from ethbrake_marl.physics import (
     step_end_s,
 )
 from ethbrake_marl.rewards import Reward, RewardParams, StepOutcome, reward_params
-from ethbrake_marl.scenario import Scenario, observation_for
+from ethbrake_marl.scenario import Scenario, common_observation, observations_of
 
 # The compiled step of the engine: actions to commands, motion, episode ends, the terms of reward that all share.
 #
@@ -825,7 +825,7 @@ class Engine:
         learners: indices of the vehicles (0 = front) that need an action in every step.
         scripts: vehicle index -> what drives it, for every vehicle that does not learn.
         reward: a name, a mapping of settings, or ``RewardParams``.
-        observation: what a vehicle observes; None: ``observation_for(scenario)``.
+        observation: what vehicles observe, or by name what each does; None: as the scenario says.
         seed: of the scenario's training stream, from which worlds come unless they are given.
         deciders: indices of the vehicles that set the grid of decisions; None: the learners. An evaluated agent drives
             its vehicle as a script, on a learner's grid.
@@ -833,7 +833,7 @@ class Engine:
         guard: makes what stands between proposed and applied actions; None: what is proposed is applied.
 
     >>> import ethbrake_marl as eb
-    >>> engine = eb.make_sb3_vec_env("paper-random", 4, seed=7).engine
+    >>> engine = eb.make_engine("paper-random", 4, seed=7)
     >>> engine.n, engine.learners, engine.worlds.time_s
     (4, (1,), array([0.5, 0.5, 0.5, 0.5]))
 
@@ -849,7 +849,8 @@ class Engine:
     _by_link: bool  # ... of news by link
     _builds_up: bool  # brakes of some world may build up, or come in pieces
     _pieces: Floats  # [N, 2 K] of all worlds, as in ``Vehicles``
-    _plan: Plan  # of what a vehicle observes
+    _plans: tuple[Plan, ...]  # of what each vehicle observes
+    _alike: bool  # all observe the same features
 
     def __init__(
         self,
@@ -859,7 +860,7 @@ class Engine:
         learners: Sequence[int],
         scripts: Mapping[int, Script],
         reward: Reward = "harm",
-        observation: ObservationSpec | None = None,
+        observation: Observation | None = None,
         seed: int = 0,
         deciders: Sequence[int] | None = None,
         worlds: Worlds | None = None,
@@ -881,8 +882,9 @@ class Engine:
             raise InvalidInput(f"engine: deciders {self.deciders} must be from 0 to {scenario.vehicles - 1}")
         self._terms = Terms(reward, scenario, self.learners)
         self.reward = self._terms.params
-        self.observation = (observation or observation_for(scenario)).at_steps_of(scenario.time_step_s)
-        self._plan = self.observation.plan
+        self.observations = observations_of(scenario, observation)  # of each vehicle
+        self._plans = tuple(each.plan for each in self.observations)
+        self._alike = len(set(self.observations)) == 1
         self._watched: dict[Watcher, Any] = {}
         self.memories: dict[int, Memory] = {}  # by vehicle, of the scripts that remember; never changed in place
         self._remembering = {i: s for i, s in self.scripts.items() if not is_state_free(s)}
@@ -896,6 +898,11 @@ class Engine:
         self._stream = Stream(scenario, self.deciders, self.scripts, seed)
         self.protect(None if guard is None else guard(self))
         self.reset(worlds=worlds)
+
+    @property
+    def observation(self) -> ObservationSpec:
+        """What all learners observe; raises ``InvalidInput`` where they observe different features."""
+        return common_observation(self.observations, self.scenario)
 
     @property
     def seed(self) -> int:
@@ -951,15 +958,23 @@ class Engine:
             raise InvalidInput(f"observe: vehicle index {vehicle}; must be in 0..{self.scenario.vehicles - 1}")
         return self.observe_all(np.array([vehicle]))[:, 0]
 
-    def observe_all(self, vehicles: Ints, rows: Ints | None = None) -> Observations:
-        """Current observations of several vehicles, [n, len(vehicles), F]; only of the worlds ``rows`` if given."""
+    def observe_all(self, vehicles: Ints | None = None, rows: Ints | None = None) -> Observations:
+        """Current observations of several vehicles, of all learners if none are given, [n, len(vehicles), F].
+
+        Only of the worlds ``rows`` if given. Raises ``InvalidInput`` where these vehicles observe different features.
+        """
+        vehicles = self._learner_index if vehicles is None else vehicles
+        if not self._alike and len({self.observations[i] for i in vehicles.tolist()}) > 1:
+            names = ", ".join(self.scenario.vehicle_names[i] for i in vehicles.tolist())
+            raise InvalidInput(f"observe_all: {names} observe different features; use observe for each")
         state, params = self._state, self._params
+        plan: Plan = self._plans[0 if self._alike else int(vehicles[0])]
         if rows is not None:
             state, params = state.take(rows, axis=0), params.take(rows, axis=0)
-        if not self._plan.extras:
-            return self._plan.observe(state, params, vehicles)
+        if not plan.extras:
+            return plan.observe(state, params, vehicles)
         steps = self._clock[:, STEP] if rows is None else self._clock[rows, STEP]
-        return self._plan.observe(state, params, vehicles, steps)
+        return plan.observe(state, params, vehicles, steps)
 
     def _kept(self, packed: Packed) -> Packed:
         """Rows as wide as they are kept: with columns of an obstacle, and of news by link, if the first had such."""

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from functools import lru_cache
 from typing import Annotated, Literal, NamedTuple
@@ -28,10 +28,7 @@ from pydantic_core import CoreSchema
 from ethbrake_marl.defaults import HARM_COUNTS as HARM_COUNTS, HarmCount as HarmCount
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, count_of, describe_error, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
-from ethbrake_marl.physics import Bools, Floats, Impacts, Ints, Worlds, compiled, logistic
-
-_INJURY_SLOPE = 0.177  # per m/s of speed change
-_INJURY_OFFSET = {"front": -4.457, "rear": -4.888}  # side of the car that is hit
+from ethbrake_marl.physics import Bools, Floats, Impacts, Ints, Worlds, compiled, exp, log, logistic
 
 
 def check_harm_count(harm_count: str) -> None:
@@ -68,6 +65,11 @@ class Ledger:
             self.obstacle_count + impacts.obstacle_count,
             self.mass_t,
         )
+
+    def since(self, before: Ledger) -> Ledger:
+        """What came to the same worlds after ``before``, as the harm of one step, to the last rounding."""
+        names = [column.name for column in fields(self) if column.name != "mass_t"]
+        return replace(self, **{name: getattr(self, name) - getattr(before, name) for name in names})
 
     def take(self, rows: Ints | Bools | Sequence[int]) -> Ledger:
         """That of some of the worlds."""
@@ -148,14 +150,54 @@ def front_share(harm: float, front_mass: float, rear_mass: float) -> float:
     return harm - front_mass / (front_mass + rear_mass) * harm
 
 
-def injury_probability(speed_change_mps: Floats, side: Literal["front", "rear"]) -> Floats:
-    """Probability of a severe injury (MAIS3+) in a rear-end collision from one occupant's change of speed.
+@compiled
+def _powers(shares: Floats, exponent: float) -> Floats:
+    """``x^exponent`` of each of ``shares`` [k] from 0 on, at most 1; the same bits on every processor."""
+    found = np.zeros(len(shares))
+    for i in range(len(shares)):
+        if shares[i] > 0.0:
+            found[i] = min(exp(exponent * log(shares[i])), 1.0)
+    return found
 
-    ``P = 1 / (1 + exp(-c0 - c1 dv))`` with c1 = 0.177 per m/s and c0 = -4.457 where the car is hit in front
-    (the striking car), -4.888 at its rear (the struck car). Source: Geisslinger et al. 2023.
+
+class InjuryCurve(NamedTuple):
+    """Probability of an injury in a rear-end collision from the change of speed dv (m/s) of the vehicle."""
+
+    injury: str  # at least this one, of the abbreviated injury scale
+    formula: str
+    source: str
+    front: Callable[[Floats], Floats]  # of the striking vehicle, which is hit in front
+    rear: Callable[[Floats], Floats]  # of the struck one
+
+
+_GEISSLINGER = "Geisslinger, Poszler and Lienkamp 2023, doi:10.1038/s42256-022-00607-z, parameters of its code"
+INJURY_CURVES = {
+    "lr4s": InjuryCurve(
+        "MAIS3+", "1 / (1 + exp(4.457 - 0.177 dv - c)), c = 0 in front, -0.431 at the rear", _GEISSLINGER,
+        lambda dv: logistic(-4.457 + 0.177 * dv), lambda dv: logistic(-4.888 + 0.177 * dv),
+    ),
+    "reference": InjuryCurve(
+        "MAIS3+", "(dv / s)^1.531, at most 1, s = 51.287 m/s in front, 66.956 m/s at the rear", _GEISSLINGER,
+        lambda dv: _powers(dv / 51.287, 1.531), lambda dv: _powers(dv / 66.956, 1.531),
+    ),
+    "gidas": InjuryCurve(
+        "MAIS2+", "1 / (1 + exp(5.820 - 0.292 dv))", "GIDAS, as the same code has it",
+        lambda dv: logistic(-5.820 + 0.292 * dv), lambda dv: logistic(-5.820 + 0.292 * dv),
+    ),
+}  # fmt: skip
+
+
+def injury_probability(speed_change_mps: Floats, side: Literal["front", "rear"], curve: str = "lr4s") -> Floats:
+    """Probability of an injury of one vehicle's occupant from its change of speed in a rear-end impact, [k].
+
+    ``side`` is the one that is hit: the front of the striking vehicle, the rear of the struck one. ``curve`` is one of
+    ``INJURY_CURVES``, whose entries tell formula and source. Logistic curves give about 1 % at 0: of a vehicle that was
+    not hit there is no probability.
     """
-    dv = np.abs(speed_change_mps)
-    return logistic(_INJURY_OFFSET[side] + _INJURY_SLOPE * dv)
+    if curve not in INJURY_CURVES:
+        raise unknown_name("injury curve", curve, INJURY_CURVES)
+    found = INJURY_CURVES[curve]
+    return (found.front if side == "front" else found.rear)(np.abs(np.asarray(speed_change_mps, np.float64)))
 
 
 # Objectives, whose harm counts: what each vehicle's objective makes of the harm of the line, from the one ledger.

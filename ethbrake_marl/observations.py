@@ -217,6 +217,11 @@ def release_time(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> 
     return v.braking_capacity_mps2[:, i] / v.release_rate_mps3[:, i]
 
 
+def place(worlds: Worlds, vehicle: int) -> Floats:
+    """Vehicles ahead in the line, [n]: which one this is, for a policy that several share."""
+    return np.full(worlds.n, float(vehicle))
+
+
 def _single(name: str, high: float, function: Callable[..., Floats], of: Of, meaning: str) -> RegisteredFeature:
     return RegisteredFeature(Feature(name, "s", 1.0, 0.0, high, meaning), function, of, 0.0, (0.0, 0.0, 0.0))
 
@@ -236,6 +241,13 @@ FEATURES: dict[str, RegisteredFeature] = {
     ),
     "own_release_time": _single(
         "own_release_time", 4.0, release_time, "own", "time in which own full brakes are released; 0: at once"
+    ),
+    "place": RegisteredFeature(
+        Feature("place", "1", 1.0, 0.0, 63.0, "how many vehicles are ahead in the line"),
+        place,
+        "own",
+        0.0,
+        (0.0, 1.0, 2.0),
     ),
 }
 

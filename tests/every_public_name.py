@@ -36,7 +36,7 @@ def register(recipe: type[eb.TrainingRecipe], algorithm: type[Any]) -> tuple[str
 
 
 def interfaces(policy: eb.Policy) -> list[Any]:
-    reward, engine = eb.RewardParams(harm=2.0), eb.make_sb3_vec_env("paper-random", 4).engine
+    reward, engine = eb.RewardParams(harm=2.0), eb.make_engine("paper-random", 4)
     observation = eb.ObservationSpec(front=2) if reward.harm else eb.choose_observation(["own", "front_1"])
     batch: eb.EthBrakeVecEnv = eb.make_sb3_vec_env("paper-random", 4, reward=reward, observation=observation)
     parallel: eb.EthBrakeParallelEnv = eb.parallel_env(scenario="paper-random")

@@ -417,7 +417,7 @@ class Entry:
 
 
 _SCRIPTS, _POLICIES = "agents.e_v2x_bm:make_script", "learning.training:make_policy_agent"
-_FROM_FILE = "agents.registry:make_from_file"
+_FROM_FILE, _FIELD = "agents.registry:make_from_file", "agents.field:make_controller"
 _ENTRIES: dict[str, Entry] = {
     "coast": Entry("coast", "nothing at all", Source.SENSORS, _SCRIPTS),
     "full_brake": Entry("full_brake", "full braking, the paper's non-ethical strategy", Source.SENSORS, _SCRIPTS),
@@ -433,6 +433,15 @@ _ENTRIES: dict[str, Entry] = {
         Source.MODEL,
         "agents.e_v2x_bm:make_e_v2x_bm",
     ),
+    "idm": Entry("idm[:T=1.5:...]", "the intelligent driver model", Source.SENSORS, _FIELD),
+    "acc": Entry("acc[:T=1.1:...]", "adaptive cruise control of PATH", Source.SENSORS, _FIELD),
+    "cacc": Entry("cacc[:T=1.0:...]", "its cooperative one, at a shorter distance", Source.SENSORS, _FIELD),
+    "rss": Entry("rss[:rho=1.0:...]", "brakes within the safe distance of RSS", Source.SENSORS, _FIELD),
+    "r157_human": Entry(
+        "r157_human[:reaction=0.75:...]", "the careful and competent driver of UN R157", Source.SENSORS, _FIELD
+    ),
+    "r157_fsm": Entry("r157_fsm[:reaction=0.75:...]", "the fuzzy safety model of UN R157", Source.SENSORS, _FIELD),
+    "aeb": Entry("aeb[:ttc=1.5:...]", "automatic emergency braking", Source.SENSORS, _FIELD),
     "planner": Entry(
         "planner[:CANDIDATES|:20ms][:believed]",
         "a search in the simulation at every decision, with this budget for each; believed: as above",
@@ -573,9 +582,9 @@ def find_entry(spec: AgentSpec | str) -> Entry:
     if written.name == "profile":
         return _PROFILE
     if written.name not in _ENTRIES:
-        if written.name == "ladder":
+        if written.name in ("ladder", "field"):
             raise InvalidInput(f"agent {written.core!r}: stands for several agents in --agents; here one is needed")
-        raise unknown_name("agent", written.name, {*_ENTRIES, "ladder"}, may_be_own=True)
+        raise unknown_name("agent", written.name, {*_ENTRIES, "ladder", "field"}, may_be_own=True)
     entry = _ENTRIES[written.name]
     if written.argument is not None and ":" not in entry.form:
         raise InvalidInput(f"agent {written.core!r}: {written.name} takes no argument")

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -108,6 +108,9 @@ def evaluate_command(
         str | None,
         typer.Option(metavar="COLUMN", help="Also tell the results by group: scenario (a mixture), vehicle_2_type."),
     ] = None,
+    measures: Annotated[
+        Literal["injury"] | None, typer.Option(help="Also tell injuries, by three curves from the literature.")
+    ] = None,
     shards: Annotated[
         int | None,
         typer.Option(
@@ -143,6 +146,10 @@ def evaluate_command(
     whole = {"--per-world": per_world, "--report": report, "--initial-states": initial_states, "--by": by}
     _check_shards(shards, jobs, ray, output, rows, whole)
     _check_outputs(out, per_world, report)
+    if measures is not None:
+        if jobs != 1 or ray is not None:
+            raise InvalidInput("--measures: processes of --jobs and --ray know none; leave these out")
+        evaluation.register_injury()
     chosen = _asked_task(scenario, vehicle, settings).scenario
     objectives = declared_objectives(objective or (), chosen.vehicles)
     if shards is not None:

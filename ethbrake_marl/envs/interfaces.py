@@ -25,7 +25,7 @@ from ethbrake_marl.engine import Engine, Step
 from ethbrake_marl.envs.drawing import Viewer
 from ethbrake_marl.errors import InvalidInput, check_one_learner, check_whole_number, unknown_name
 from ethbrake_marl.harm import front_share
-from ethbrake_marl.observations import Feature, Observation, Observations, ObservationSpec, choose_observation
+from ethbrake_marl.observations import Feature, Observation, Observations, ObservationSpec
 from ethbrake_marl.physics import Bools, Floats, Ints, Messages, Packed, Worlds, columns, compiled
 from ethbrake_marl.rewards import Reward, RewardParams
 from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, full_state, load_scenario, state_features
@@ -53,10 +53,22 @@ def make_engine(
     observation: Observation | None = None,
     seed: int = 0,
 ) -> Engine:
-    """Build ``n`` running worlds of a scenario: a shipped name, a path to a YAML file, its content, or a ``Scenario``.
+    """``n`` worlds for a training loop of one's own, with any number of learners; needs no other library.
 
-    ``learners`` (names such as ``vehicle_2``, or indices from 0) replace the scenario's own; a vehicle that learned
-    and is not listed brakes fully. Scripts come from the scenario's roles.
+    Args:
+        scenario: a shipped name, the path of a YAML file, its content as a mapping, or a ``Scenario``.
+        n: worlds that are advanced together, at least 1.
+        learners: vehicles that learn instead of the scenario's, by name (``vehicle_2``) or index from 0; any number.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        observation: what every vehicle observes, or a mapping from vehicles to what each does; None: the scenario's.
+        seed: of the stream of worlds.
+
+    >>> import ethbrake_marl as eb
+    >>> import numpy as np
+    >>> engine = eb.make_engine("cooperation-3-pair", 4, seed=7)
+    >>> engine.observe_all().shape, engine.step(np.full((4, 2), -1.0)).reward.shape  # of learners, of all vehicles
+    ((4, 2, 27), (4, 3))
+
     """
     check_whole_number("number of worlds", n, 1)
     loaded = load_scenario(scenario)
@@ -65,7 +77,6 @@ def make_engine(
             f"observation = {observation!r}: must be an ObservationSpec, for instance ObservationSpec(1, 1), its fields"
             " as a mapping, or a list of groups and features, for instance ['own', 'front_1']"
         )
-    chosen = None if observation is None else choose_observation(observation)
     if learners is not None and not isinstance(learners, Iterable):
         raise InvalidInput(f"learners = {learners!r}: must be a list of vehicles, for instance ['vehicle_2']")
     if learners is not None:
@@ -76,7 +87,7 @@ def make_engine(
         learners=loaded.learners,
         scripts=script_agents(loaded),
         reward=reward,
-        observation=chosen,
+        observation=observation,
         seed=seed,
     )
 
@@ -488,7 +499,7 @@ class EthBrakeEnv(_OneWorld, gymnasium.Env[Observations, NDArray[Any]]):
         self.learner = only_learner(self.engine)
         self._column = np.array([self.learner])
         self._name = self.engine.scenario.vehicle_names[self.learner]
-        self.observation_space = feature_box(self.engine.observation.features)
+        self.observation_space = feature_box(self.engine.observations[self.learner].features)
         self.action_space = action_box()
         self._running = False
 
@@ -587,7 +598,7 @@ class EthBrakeVectorEnv(Begun, VectorEnv[Observations, NDArray[Any], NDArray[Any
         self.metadata = {"autoreset_mode": self.autoreset_mode, **self.viewer.metadata}
         self.learner = only_learner(self.engine)
         self.num_envs = num_envs
-        self.single_observation_space = feature_box(self.engine.observation.features)
+        self.single_observation_space = feature_box(self.engine.observations[self.learner].features)
         self.single_action_space = action_box()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -693,7 +704,7 @@ class EthBrakeParallelEnv(_OneWorld, ParallelEnv[str, Observations, NDArray[Any]
         render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/watching.md).
         learners: vehicles that learn instead of the scenario's, by name (``vehicle_2``) or index from 0; any number.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
-        observation: what every vehicle observes; None: ``observation_for(scenario)``.
+        observation: what every vehicle observes, or by name what each does; None: the scenario's.
         agents: ``all`` vehicles, or ``learners`` only, for trainers that learn from every agent.
         max_cycles: truncates an episode after so many steps, if it is not over before; None: the horizon does.
 
@@ -729,8 +740,9 @@ class EthBrakeParallelEnv(_OneWorld, ParallelEnv[str, Observations, NDArray[Any]
         self._vehicles = _agent_vehicles(self.engine, agents)
         self.possible_agents = [names[i] for i in self._vehicles.tolist()]
         self.agents: list[str] = []
-        features = self.engine.observation.features
-        self.observation_spaces = {agent: feature_box(features) for agent in self.possible_agents}
+        seen = self.engine.observations
+        self._alike = len({seen[i] for i in self._vehicles.tolist()}) == 1
+        self.observation_spaces = {names[i]: feature_box(seen[i].features) for i in self._vehicles.tolist()}
         self.action_spaces = {agent: action_box() for agent in self.possible_agents}
         self.state_space = feature_box(state_features(self.engine.scenario))
         self.np_random = np.random.default_rng()  # for wrappers that draw (SuperSuit's); nothing here does
@@ -791,6 +803,9 @@ class EthBrakeParallelEnv(_OneWorld, ParallelEnv[str, Observations, NDArray[Any]
         return state
 
     def _observations(self) -> dict[str, Observations]:
+        if not self._alike:
+            each = (self.engine.observe(vehicle)[0] for vehicle in self._vehicles.tolist())
+            return dict(zip(self.possible_agents, each, strict=True))
         every = self.engine.observe_all(self._vehicles)
         return {agent: every[0, i] for i, agent in enumerate(self.possible_agents)}
 

@@ -54,6 +54,7 @@ if TYPE_CHECKING:
         Tally as Tally,
         other_tests as other_tests,
         proven_of_table as proven_of_table,
+        register_injury as register_injury,
         register_measure as register_measure,
         shipped_bounds as shipped_bounds,
         summarise as summarise,

@@ -275,7 +275,8 @@ LADDER = (  # from no decision at all up to the best that is known
     "planner",
     "best_harm",
 )
-_LADDER_SPEC = "ladder"
+FIELD = ("idm", "acc", "cacc", "rss", "r157_human", "r157_fsm", "aeb")  # of other people, on own sensors
+_GROUPS = {"ladder": LADDER, "field": FIELD}
 
 
 def load_runnable(
@@ -475,12 +476,13 @@ def make_lineup(
 ) -> dict[str, Driver]:
     """One fresh agent per spec of ``make_agent``, by its spec, to drive the scenario's learners.
 
-    ``ladder`` stands for every agent of ``LADDER``. ``harm_count`` is the harm that optimising and choosing agents
-    minimise. ``uncertainty`` is what agents with ``+robust`` certify against. ``alone``: each drives one vehicle.
-    ``bare``: they go behind a shield, and have none. Raises ``InvalidInput`` for a spec given twice, an uncertainty
-    that is missing or that nobody uses, a team or a shield that has no place, and what ``make_agent`` raises.
+    ``ladder`` stands for every agent of ``LADDER``, ``field`` of ``FIELD``. ``harm_count`` is the harm that optimising
+    and choosing agents minimise. ``uncertainty`` is what agents with ``+robust`` certify against. ``alone``: each
+    drives one vehicle. ``bare``: they go behind a shield, and have none. Raises ``InvalidInput`` for a spec given
+    twice, an uncertainty that is missing or that nobody uses, a team or a shield that has no place, and what
+    ``make_agent`` raises.
     """
-    specs = [each for spec in specs for each in (LADDER if spec == _LADDER_SPEC else [spec])]
+    specs = [each for spec in specs for each in _GROUPS.get(spec, (spec,))]
     written = [parse_spec(spec) for spec in specs]
     for k, each in enumerate(written):
         if each in written[:k]:

@@ -29,7 +29,7 @@ from ethbrake_marl.errors import (
 from ethbrake_marl.evaluation.inputs import result_identity, result_versions, scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.statistics import Moments, exact_sum, mean, rate
 from ethbrake_marl.files.sheet import DASH, Column, Estimate, Row, Sheet, Shown
-from ethbrake_marl.harm import Declared, Ledger, scored
+from ethbrake_marl.harm import INJURY_CURVES, Declared, Ledger, injury_probability, scored
 from ethbrake_marl.limits import (
     BestHarmTable,
     Limits,
@@ -1123,6 +1123,48 @@ def register_measure(name: str, function: EpisodeFunction, *, unit: str) -> None
     metric = replace(metric, form=_form(_checked(metric, _tried())))
     if REGISTERED.setdefault(name, metric) != metric:
         raise AlreadyExists(f"measure {name!r} is registered already; give another name")
+
+
+def register_injury() -> None:
+    """Make every evaluation from now on tell the injuries in 1,000 lines, by each of ``harm.INJURY_CURVES``.
+
+    ``injury_CURVE`` is the sum over the vehicles of a line, each by its largest change of speed, as the literature
+    takes it; ``injury_CURVE_vehicle`` tells it of each; ``injury_CURVE_every`` sums over every impact, as if each met
+    other people. A vehicle that was not hit has none.
+    """
+    for name, function in _INJURIES.items():
+        register_measure(name, function, unit="per 1,000 lines")
+
+
+def _injury(curve: str, rule: Literal["", "_vehicle", "_every"]) -> EpisodeFunction:
+    def told(episodes: EpisodeImpacts) -> Values:
+        rows, found = episodes.rows, np.zeros(episodes.worlds.speeds_mps.shape)
+        struck = rows.pair >= 0  # an obstacle ahead is no vehicle
+        world = np.concatenate([rows.world, rows.world[struck]])
+        vehicle = np.concatenate([rows.pair + 1, rows.pair[struck]])
+        front, rear = np.abs(rows.rear_speed_change_mps), np.abs(rows.front_speed_change_mps[struck])
+        p = np.concatenate([injury_probability(front, "front", curve), injury_probability(rear, "rear", curve)])
+        if rule == "_every":
+            np.add.at(found, (world, vehicle), p)
+        else:  # of several entries for one vehicle the last one stays, which is that of the largest change
+            order = np.argsort(np.concatenate([front, rear]), kind="stable")
+            found[world[order], vehicle[order]] = p[order]
+        return 1_000.0 * (found if rule == "_vehicle" else found.sum(axis=1))
+
+    each = {
+        "": "summed over the vehicles, each by its largest change of speed",
+        "_vehicle": "by its largest change of speed",
+        "_every": "summed over every impact, as if each met other people",
+    }
+    about = INJURY_CURVES[curve]
+    told.__doc__ = (
+        f"Injuries of {about.injury} in 1,000 lines, {each[rule]}: {about.formula}; dv in m/s ({about.source})."
+    )
+    return told
+
+
+_RULES: tuple[Literal["", "_vehicle", "_every"], ...] = ("", "_vehicle", "_every")
+_INJURIES = {f"injury_{curve}{rule}": _injury(curve, rule) for curve in INJURY_CURVES for rule in _RULES}
 
 
 def _heading(column: str) -> str:

@@ -270,7 +270,7 @@ def parse_strict_json(data: bytes) -> Any:
 def read_object(file: Path) -> dict[str, Any]:
     """The JSON object in a file of a run; raises ``InvalidInput`` naming the file and what is wrong with it."""
     if not os.path.lexists(file):
-        raise InvalidInput(f"{file}: is missing; without it this training cannot go on")
+        raise InvalidInput(f"{file}: is missing; nothing goes on without it")
     data = read_plain(file, _LARGEST_OBJECT_BYTES)
     try:
         content = parse_strict_json(data)

@@ -86,7 +86,7 @@ class Ppo(Algorithm):
             "device": "cpu",
         }
         if training.scheme == "independent":
-            return IndependentPPO(environment, list(training.drivers), recipe.turns, **settings)
+            return IndependentPPO(environment, list(training.drivers), recipe.turns, training.columns, **settings)
         if training.scheme == "centralised":
             settings["policy_kwargs"]["own"] = training.observation.size
             return PPO(CentralCriticPolicy, environment, **settings)
@@ -144,9 +144,9 @@ class _OwnPartForTheActor(MlpExtractor):
 
 
 class SeparatePolicies(BasePolicy):
-    """An actor, a critic and an optimiser for each learner; a row's last number says which of them sees the rest.
+    """An actor, a critic and an optimiser for each learner; a row's last number says which of them sees the row.
 
-    ``resting`` learners do not explore: they act by their mean.
+    Of the rest of it, it sees its own ``columns``. ``resting`` learners do not explore: they act by their mean.
     """
 
     def __init__(
@@ -156,14 +156,16 @@ class SeparatePolicies(BasePolicy):
         lr_schedule: Schedule,
         use_sde: bool = False,
         *,
-        learners: int,
+        columns: Sequence[Sequence[int]],
         **network: Any,
     ) -> None:
         super().__init__(observation_space, action_space)
         assert isinstance(observation_space, Box)
-        own = Box(observation_space.low[:-1], observation_space.high[:-1], dtype=observation_space.dtype.type)
+        low, high, kind = observation_space.low, observation_space.high, observation_space.dtype.type
+        own = [Box(low[list(each)], high[list(each)], dtype=kind) for each in columns]
+        self.columns = columns
         self.members = nn.ModuleList(
-            ActorCriticPolicy(own, action_space, lr_schedule, use_sde=use_sde, **network) for _ in range(learners)
+            ActorCriticPolicy(space, action_space, lr_schedule, use_sde=use_sde, **network) for space in own
         )
         self.resting: frozenset[int] = frozenset()
 
@@ -183,14 +185,14 @@ class SeparatePolicies(BasePolicy):
         actions, values, likelihood = torch.empty(count, 1), torch.empty(count, 1), torch.empty(count)
         for number, policy, rows in self._by_learner(observation):
             still = deterministic or number in self.resting
-            actions[rows], values[rows], likelihood[rows] = policy(observation[rows, :-1], still)
+            actions[rows], values[rows], likelihood[rows] = policy(observation[rows][:, self.columns[number]], still)
         return actions, values, likelihood
 
     def predict_values(self, observation: Any) -> Tensor:
         """Values [n, 1] of rows [n, F + 1]."""
         values = torch.empty(len(observation), 1)
-        for _, policy, rows in self._by_learner(observation):
-            values[rows] = policy.predict_values(observation[rows, :-1])
+        for number, policy, rows in self._by_learner(observation):
+            values[rows] = policy.predict_values(observation[rows][:, self.columns[number]])
         return values
 
     def _predict(self, observation: Any, deterministic: bool = False) -> Tensor:
@@ -213,9 +215,11 @@ class IndependentPPO(PPO):
 
     policy: SeparatePolicies  # type: ignore[assignment]  # of an actor-critic it has what PPO asks for
 
-    def __init__(self, env: VecEnv, names: Sequence[str], turns: int | None, **settings: Any) -> None:
+    def __init__(
+        self, env: VecEnv, names: Sequence[str], turns: int | None, columns: Sequence[Sequence[int]], **settings: Any
+    ) -> None:
         self.names, self.turns = tuple(names), turns
-        arguments = {**settings.pop("policy_kwargs"), "learners": len(names)}
+        arguments = {**settings.pop("policy_kwargs"), "columns": columns}
         super().__init__(SeparatePolicies, env, policy_kwargs=arguments, **settings)  # type: ignore[arg-type]
         self._learning: tuple[int, ...] = ()
 
@@ -265,7 +269,7 @@ class IndependentPPO(PPO):
         )
         for name in ("actions", "rewards", "episode_starts", "values", "log_probs", "returns", "advantages"):
             setattr(part, name, getattr(buffer, name)[:, number::count].copy())
-        part.observations = buffer.observations[:, number::count, :-1].copy()
+        part.observations = buffer.observations[:, number::count][:, :, self.policy.columns[number]]
         part.pos, part.full = buffer.buffer_size, True
         return part
 

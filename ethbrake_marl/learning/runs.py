@@ -579,14 +579,16 @@ def make_model(algorithm: Algorithm, training: Training, environment: EthBrakeVe
 
 def trained_policies(training: Training, algorithm: Algorithm, model: Model) -> Trained:
     """Policies of a model's present weights: one for all learners, or one for each."""
-    recipe, scenario, observation = training.recipe, training.scenario, training.observation
-    network = recipe.network_spec(observation.size)
-    if training.scheme == "centralised":
-        network = network.model_copy(update={"value_hidden": ()})  # its critic sees what no vehicle sees
+    recipe, scenario = training.recipe, training.scenario
     names, actors = tuple(training.drivers), algorithm.actors(model)
     apart = training.scheme == "independent"
-    policies = [
-        Policy.make(
+    policies = []
+    for learners, actor in zip([(name,) for name in names] if apart else [names], actors, strict=True):
+        observation = training.observations[learners[0]]
+        network = recipe.network_spec(observation.size)
+        if training.scheme == "centralised":
+            network = network.model_copy(update={"value_hidden": ()})  # its critic sees what no vehicle sees
+        policy = Policy.make(
             tensors_of(actor, network),
             algorithm=recipe.algorithm,
             network=network,
@@ -597,8 +599,7 @@ def trained_policies(training: Training, algorithm: Algorithm, model: Model) -> 
             seeds={"training": recipe.seed, "evaluation": recipe.evaluation.seed},
             steps=model.num_timesteps,
         )
-        for learners, actor in zip([(name,) for name in names] if apart else [names], actors, strict=True)
-    ]
+        policies.append(policy)
     return PolicyTeam(dict(zip(names, policies, strict=True))) if apart else policies[0]
 
 

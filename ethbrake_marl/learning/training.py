@@ -60,7 +60,14 @@ from ethbrake_marl.policies import (
     shipped_name,
 )
 from ethbrake_marl.rewards import RewardParams, setting_names
-from ethbrake_marl.scenario import Scenario, check_file_name, load_scenario, observation_for, shipped_folder
+from ethbrake_marl.scenario import (
+    Scenario,
+    check_file_name,
+    common_observation,
+    load_scenario,
+    observations_of,
+    shipped_folder,
+)
 
 if TYPE_CHECKING:  # torch takes seconds, and what is asked of a run needs none
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -788,7 +795,6 @@ def read_settings(texts: Sequence[str] | None, recipes: Sequence[TrainingRecipe]
 
 # The folder of a run: its files, its configuration, how far it came, and who may train in it.
 
-
 RunStatus = Literal["running", "finished", "interrupted", "failed"]
 
 
@@ -982,14 +988,16 @@ class Training:
     scenario: Scenario
     scheme: Scheme
     drivers: Mapping[str, str]  # learner, front to rear -> where in the run's folder its bundle will stand
-    observation: ObservationSpec  # of every learner
+    observation: ObservationSpec  # of a learner's row: where each observes its own features, those of all
+    observations: Mapping[str, ObservationSpec]  # of each learner
 
     @classmethod
     def of(cls, recipe: TrainingRecipe | str | Path, scenario: Scenario | str | Path, **changes: Any) -> Training:
         """The training of a recipe on a scenario, both given or by name or path; ``changes`` override the recipe.
 
         Learners observe what the recipe says; where it says nothing, what the scenario says. Raises ``InvalidInput``
-        where they do not fit each other: nobody learns, or the scheme is for others.
+        where they do not fit each other: nobody learns, the scheme is for others, or one policy for all is to drive
+        learners that observe different features.
         """
         recipe = recipe if isinstance(recipe, TrainingRecipe) else load_recipe(recipe)
         scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
@@ -997,10 +1005,20 @@ class Training:
         scheme = recipe.scheme_for(scenario)
         names = [scenario.vehicle_names[vehicle] for vehicle in scenario.learners]
         drivers = {name: _driver(scheme, name) for name in names}
-        observation = observation_for(scenario)
-        if recipe.observation is not None:
-            observation = choose_observation(recipe.observation, scenario.time_step_s)
-        return cls(recipe, scenario, scheme, drivers, observation)
+        every = observations_of(scenario, recipe.observation)
+        observations = {name: every[vehicle] for name, vehicle in zip(names, scenario.learners, strict=True)}
+        if scheme == "independent" and len(set(observations.values())) > 1:
+            listed = dict.fromkeys(feature.name for spec in observations.values() for feature in spec.features)
+            observation = choose_observation([*listed], scenario.time_step_s)
+        else:
+            observation = common_observation(every, scenario)
+        return cls(recipe, scenario, scheme, drivers, observation, observations)
+
+    @property
+    def columns(self) -> list[list[int]]:
+        """Which numbers of its row each learner observes, front to rear."""
+        place = {feature.name: column for column, feature in enumerate(self.observation.features)}
+        return [[place[feature.name] for feature in spec.features] for spec in self.observations.values()]
 
     @property
     def start(self) -> str | None:

@@ -8,8 +8,10 @@ if TYPE_CHECKING:
     from ethbrake_marl.files.yaml import parse_yaml as parse_yaml
     from ethbrake_marl.scenario.observed import (
         Appended as Appended,
+        common_observation as common_observation,
         full_state as full_state,
         observation_for as observation_for,
+        observations_of as observations_of,
         row_features as row_features,
         state_features as state_features,
     )

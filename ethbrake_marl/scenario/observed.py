@@ -2,26 +2,77 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal, get_args
 
 import numpy as np
 
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.observations import GROUPS, Feature, Observations, ObservationSpec, choose_observation, observe
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.observations import (
+    GROUPS,
+    Feature,
+    Observation,
+    Observations,
+    ObservationSpec,
+    choose_observation,
+    observe,
+)
 from ethbrake_marl.physics import Vehicles, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 
 
-def observation_for(scenario: Scenario) -> ObservationSpec:
-    """What vehicles observe in this scenario unless somebody says otherwise: what it declares.
+def observation_for(scenario: Scenario, vehicle: str | None = None) -> ObservationSpec:
+    """What a vehicle, or any learner, observes in this scenario unless somebody says otherwise: what it declares.
 
     Where it declares nothing: one neighbour on each side; where Vehicle 1 has an obstacle ahead, also the own place in
-    the line and the obstacle.
+    the line and the obstacle. Raises ``InvalidInput`` naming two learners that observe different features.
     """
-    if scenario.observation is not None:
-        return choose_observation(scenario.observation, scenario.time_step_s)
-    return ObservationSpec(role=scenario.has_obstacle, obstacle=scenario.has_obstacle)
+    observations = observations_of(scenario)
+    if vehicle is None:
+        return common_observation(observations, scenario)
+    if vehicle not in scenario.vehicle_names:
+        raise unknown_name("vehicle", vehicle, scenario.vehicle_names)
+    return observations[scenario.vehicle_names.index(vehicle)]
+
+
+def observations_of(scenario: Scenario, given: Observation | None = None) -> tuple[ObservationSpec, ...]:
+    """What each vehicle observes, front to rear, [N]: what is given, or else what the scenario declares.
+
+    Both say it of all vehicles, or by name of some: ``{"vehicle_2": ["own", "front_1"]}``. Raises ``UnknownName`` for a
+    vehicle that is not there, and what ``choose_observation`` raises.
+    """
+    names, step_s, said = scenario.vehicle_names, scenario.time_step_s, scenario.observation
+    usual = ObservationSpec(role=scenario.has_obstacle, obstacle=scenario.has_obstacle)
+    each = dict.fromkeys(names, usual)
+    for told in (said, given):
+        if isinstance(told, Mapping) and any(str(name).startswith("vehicle_") for name in told):
+            for name, listed in told.items():
+                if name not in each:
+                    raise unknown_name("vehicle", name, names)
+                try:
+                    each[name] = choose_observation(listed, step_s)
+                except InvalidInput as error:
+                    raise type(error)(f"{name}: {error}") from None
+        elif told is not None:
+            each = dict.fromkeys(names, choose_observation(told, step_s))
+    return tuple(each.values())
+
+
+def common_observation(observations: tuple[ObservationSpec, ...], scenario: Scenario) -> ObservationSpec:
+    """What all learners observe, of what each vehicle does; of all vehicles where nobody learns.
+
+    Raises ``InvalidInput`` naming two that observe different features.
+    """
+    first, *others = scenario.learners or range(scenario.vehicles)
+    for other in others:
+        if observations[other] != observations[first]:
+            one, two = (scenario.vehicle_names[i] for i in (first, other))
+            raise InvalidInput(
+                f"observation: {one} and {two} of {scenario.name!r} observe different features, here learners must"
+                " observe the same: give one list for all, let one learn, or use parallel_env or scheme independent"
+            )
+    return observations[first]
 
 
 # The full state of a line as one vector, for centralised critics: all vehicles, all pairs, the time.

@@ -812,6 +812,10 @@ class Roles(dict[str, str]):
 ANY = "any"  # in ``types``: every type, by its weight
 
 TypeName = Annotated[str, Field(pattern=NAME_PATTERN)]
+ListedByVehicle = Annotated[
+    dict[Annotated[str, Field(pattern=r"^vehicle_[1-9][0-9]?$")], ListedFeatures],
+    Field(min_length=1, json_schema_extra={"additionalProperties": False}),
+]
 Weight = Annotated[float, Field(gt=0.0, le=1e9, allow_inf_nan=False)]
 
 
@@ -1048,8 +1052,10 @@ class ScenarioFields(FileModel):
     objective: ObjectiveName | Annotated[tuple[ObjectiveName, ...], Field(strict=False)] = Field(
         default="total", description="whose harm a reward counts: one for all vehicles, or one for each"
     )
-    observation: ListedFeatures | None = Field(
-        default=None, exclude_if=not_, description="what vehicles observe: groups and single features, in this order"
+    observation: ListedFeatures | ListedByVehicle | None = Field(
+        default=None,
+        exclude_if=not_,
+        description="what vehicles observe, or by name what each does: groups and single features, in this order",
     )
     v2x: V2X = Field(
         default_factory=V2X, description="what each vehicle knows when: a preset, and what differs from it"
@@ -1203,11 +1209,17 @@ class ScenarioFields(FileModel):
 
     @field_validator("observation", mode="before")
     @classmethod
-    def _observation(cls, value: Any) -> Any:
-        try:
-            listed_features(value)
-        except InvalidInput as error:
-            refuse((), value, str(error).removeprefix("observation: "))
+    def _observation(cls, value: Any, info: ValidationInfo) -> Any:
+        vehicles = info.data.get("vehicles", 0)
+        names = [f"vehicle_{i + 1}" for i in range(vehicles)]
+        for name, listed in value.items() if isinstance(value, dict) and value else [(None, value)]:
+            at = () if name is None else (name,)
+            right = f"unknown vehicle; this scenario has vehicle_1 ... vehicle_{vehicles}"
+            require(name is None or not names or name in names, at, UNSHOWN, right)
+            try:
+                listed_features(listed)
+            except InvalidInput as error:
+                refuse(at, listed, str(error).removeprefix("observation: "))
         return value
 
     @property

@@ -253,7 +253,7 @@ def test_objective__is_paid_by_hand_and_stands_in_tables() -> None:
 def test_schemas__know_what_is_registered() -> None:
     schema = scenario_json_schema()
     parts, weights = schema["properties"], eb.TrainingRecipe.json_schema()["$defs"]["RewardParams"]["properties"]
-    assert {"urgency", "front_1.load", "own"} <= set(parts["observation"]["items"]["anyOf"][0]["enum"])
+    assert {"urgency", "front_1.load", "own"} <= set(parts["observation"]["anyOf"][0]["items"]["anyOf"][0]["enum"])
     assert "rural" in json.dumps([parts["v2x"], schema.get("$defs", {})])
     assert "front-first" in json.dumps(parts["objective"])
     assert weights["calm"]["minimum"] == weights["harm"]["minimum"] == 0
