@@ -12,6 +12,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
@@ -53,6 +54,7 @@ from ethbrake_marl.physics import (
     onset_s,
     place_forces,
     place_obstacle,
+    rows_for,
     stands,
     step_end_s,
 )
@@ -142,14 +144,15 @@ class Step(NamedTuple):
 @compiled
 def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to functions costs more than the work
     state: Floats, params: Floats, clock: Floats, actions: Floats, learners: Ints, settings: Floats, no_rows: Floats,
-    builds_up: bool, wanted: Floats, reward: Floats, outcome: Floats,
+    builds_up: bool, pieces: Floats, wanted: Floats, reward: Floats, outcome: Floats,
 ) -> tuple[int, int]:  # fmt: skip
     """Advance every running world by one step, in place (state, clock, wanted); fills the last two arrays.
 
     ``actions`` [n, L] become the learners' commands in ``wanted`` [n, N]; nothing is moved if one of them is not in
     [-1, 1]. A world that cannot be advanced stays where it was; its episode is cut off there, without a reward, and
-    marked in ``outcome``. Without ``builds_up`` no world's brakes do. Returns a world and what went wrong there
-    (BAD_ACTION, or the status of one that could not be advanced), or (-1, DONE).
+    marked in ``outcome``. Without ``builds_up`` no world's brakes do, nor come in ``pieces`` [N, 2 K], those of all
+    worlds. Returns a world and what went wrong there (BAD_ACTION, or the status of one that could not be advanced), or
+    (-1, DONE).
     """
     n, N = wanted.shape
     for k in range(n):
@@ -162,7 +165,7 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     P, obstacle, brake_rate, release_rate = N - 1, column.obstacle, column.brake_rate, column.release_rate
     worst, worst_status = -1, FLAG.DONE
     at = 1 if state.shape[1] > obstacle else 0  # vehicle i stands in column at + i, behind an obstacle
-    table = np.zeros((ROW.OF_BUILD_UP if builds_up else ROW.OF_SEGMENT, N + at))
+    table = np.zeros((rows_for(pieces.shape[1]) if builds_up else ROW.OF_SEGMENT, N + at))
     for k in range(n):
         if clock[k, ENDED] == 1.0:
             for f in range(OUTCOME_ROWS):
@@ -189,7 +192,7 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         if builds_up:
             place_forces(
                 table, state[k, command : command + N], params[k, brake_rate : brake_rate + N],
-                params[k, release_rate : release_rate + N],
+                params[k, release_rate : release_rate + N], pieces,
             )  # fmt: skip
         for p in range(P):
             table[ROW.GAP, at + p] = state[k, gap + p]
@@ -557,6 +560,7 @@ class Stream:
         self._scenario = scenario
         self._deciders = list(deciders)
         self._state_free = {i: script for i, script in scripts.items() if is_state_free(script)}
+        self._pieces = {i: getattr(script, "braking_pieces", ()) for i, script in scripts.items()}
         self.known = {i: script for i, script in scripts.items() if i not in self._deciders}  # to who looks ahead
         self.restart(seed)
 
@@ -603,6 +607,7 @@ class Stream:
 
     def prepare(self, alert: Worlds) -> Start:
         """Worlds at t = 0, made ready for their first decision. Raises ``InvalidInput`` if nobody may ever decide."""
+        alert = alert.play_pieces(self._pieces)
         clock = np.zeros((alert.n, CLOCK_WIDTH))
         clock[:, START] = alert.first_decision_s(self._deciders)
         step, horizon = self._scenario.time_step_s, self._scenario.horizon_s
@@ -842,7 +847,8 @@ class Engine:
     _potential: Floats  # [n, N]
     _obstacle: bool  # the rows have columns of an obstacle
     _by_link: bool  # ... of news by link
-    _builds_up: bool  # brakes of some world may build up
+    _builds_up: bool  # brakes of some world may build up, or come in pieces
+    _pieces: Floats  # [N, 2 K] of all worlds, as in ``Vehicles``
     _plans: tuple[Plan, ...]  # of what each vehicle observes
     _alike: bool  # all observe the same features
 
@@ -916,7 +922,19 @@ class Engine:
     @property
     def worlds(self) -> Worlds:
         """The worlds as they are now, in their own memory."""
-        return self.packed.worlds()
+        return self._unpacked(self.packed)
+
+    @property
+    def in_pieces(self) -> bool:
+        """Whether some script brakes in pieces."""
+        return bool(self._pieces.shape[1] > 0)
+
+    def _unpacked(self, packed: Packed) -> Worlds:
+        worlds = packed.worlds()
+        if not self.in_pieces:
+            return worlds
+        pieces = np.repeat(self._pieces[np.newaxis], worlds.n, axis=0)
+        return replace(worlds, vehicles=replace(worlds.vehicles, pieces=pieces))
 
     @property
     def ledger(self) -> Ledger:
@@ -990,13 +1008,17 @@ class Engine:
         new._stream, new.roster = stream, Roster(self.n, stream.seed, first, worlds)
         new._obstacle = self.scenario.has_obstacle or start.packed.has_obstacle
         new._by_link = self.scenario.by_link or start.packed.has_news
-        new._builds_up = self.scenario.builds_up or start.packed.builds_up
+        new._pieces = start.origin.vehicles.pieces[0].copy()
+        new._builds_up = new._may_build_up(start.packed)
         new._state, new._params = (array.copy() for array in new._kept(start.packed))
         new._clock, new._wanted = start.clock.copy(), start.wanted.copy()
         new._potential = np.zeros(start.wanted.shape)
         new._stops, new.ruling, new.memories = [], None, {}
         new._begin(np.arange(self.n), start)
         self.__dict__.update(new.__dict__)  # in one piece: not even an interrupt comes between
+
+    def _may_build_up(self, packed: Packed) -> bool:
+        return self.scenario.builds_up or packed.builds_up or self.in_pieces
 
     def renew(self, rows: Ints) -> None:
         """Start new episodes of the training stream in these rows (autoreset). Whatever fails, nothing is changed."""
@@ -1070,7 +1092,7 @@ class Engine:
         self.memories = self.memories | asked
         if was is not None:
             until_s = self._state[:, self.packed.column.time]
-            hear_rows(was, self._params, self._wanted, until_s, until_s, self.scenario.time_step_s)
+            hear_rows(was, self._params, self._wanted, until_s, until_s, self.scenario.time_step_s, self._pieces)
         if way is not None:
             status = self._add_way(way, reward, outcome, status)
         step = Step(reward, outcome, self.reward, {})
@@ -1102,7 +1124,7 @@ class Engine:
     def _step_worlds(self, columns: Floats, reward: Floats, outcome: Floats) -> int:
         _, status = step_worlds(
             self._state, self._params, self._clock, columns, self._learner_index, self._settings, _NO_ROWS,
-            self._builds_up, self._wanted, reward, outcome,
+            self._builds_up, self._pieces, self._wanted, reward, outcome,
         )  # fmt: skip
         return status
 
@@ -1129,10 +1151,10 @@ class Engine:
                 self._params[rows],
                 self._state[rows, self.packed.column.time],
             )
-            hear_rows(moving, params, self._wanted[rows], start_s, start_s, self.scenario.time_step_s)
+            hear_rows(moving, params, self._wanted[rows], start_s, start_s, self.scenario.time_step_s, self._pieces)
             self._params[rows] = params
         if self.reward.shaping > 0.0:
-            worlds = Packed(self._state[rows], self._params[rows]).worlds()
+            worlds = self._unpacked(Packed(self._state[rows], self._params[rows]))
             self._potential[rows] = self._terms.potentials(worlds, self.scenario)
 
     def _start_on_own_grid(self, columns: Floats) -> Way:
@@ -1175,7 +1197,7 @@ class Engine:
             now = self._state[:, column.time]
             moment = np.where((moment < np.inf) & (moment > now + ROUNDING * step_s), moment, now)
             ahead, reward, outcome = self._look_ahead(moment, until_s, columns)
-            worlds, wanted = ahead.worlds(), self._wanted.copy()
+            worlds, wanted = self._unpacked(ahead), self._wanted.copy()
             for (vehicle, script), here in zip(self._on_own_grid.items(), asked, strict=True):
                 if here.any():
                     before, idle = self.memories[vehicle], np.flatnonzero(~here)
@@ -1209,11 +1231,12 @@ class Engine:
         state, params = self._state.copy(), self._params.copy()
         step_worlds(
             state, params, clock, columns, self._learner_index[: columns.shape[1]], settings, _NO_ROWS,
-            self._builds_up, self._wanted, reward, outcome,
+            self._builds_up, self._pieces, self._wanted, reward, outcome,
         )  # fmt: skip
         if self.packed.has_messages:
             time_s = state[:, self.packed.column.time]
-            hear_rows(self._state.copy(), params, self._wanted, time_s, decision_s, self.scenario.time_step_s)
+            step_s = self.scenario.time_step_s
+            hear_rows(self._state.copy(), params, self._wanted, time_s, decision_s, step_s, self._pieces)
         return Packed(state, params), reward, outcome
 
     def _stop(self, rows: Bools, ahead: Packed) -> None:
@@ -1278,7 +1301,7 @@ class Engine:
         memories = {vehicle: checked_memory(_unflat(arrays, f"script.{vehicle}"), self.n) for vehicle in self.memories}
         for name in RUNNING:
             setattr(self, name, np.array(arrays[name.lstrip("_")], np.float64))
-        self._builds_up = self.scenario.builds_up or self.packed.builds_up
+        self._builds_up = self._may_build_up(self.packed)
         seed, taken = (int(number) for number in arrays["stream"])
         self._stream.restart(seed, taken)
         self.roster = Roster(self.n, seed, None)  # a snapshot does not keep the numbers of running episodes
@@ -1310,7 +1333,7 @@ class Engine:
         new.roster = Roster(new.n, self.seed, None)
         new.roster.warns = False
         new._state, new._params, new._clock, new._wanted = (array.copy() for array in moment[:4])
-        new._builds_up = self.scenario.builds_up or new.packed.builds_up
+        new._builds_up = new._may_build_up(new.packed)
         new._potential = np.zeros(moment.wanted.shape)
         return new
 

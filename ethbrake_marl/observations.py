@@ -500,12 +500,15 @@ def _observe_contacts(
     )  # vehicle i stands in column at + i, behind an obstacle
     line, table = np.zeros((ROW.OF_BUILD_UP, N + at)), np.zeros((ROW.OF_BUILD_UP, N + at))
     found, value = np.zeros((CONTACT.WIDTH, N + at)), np.zeros(_OF_COMMAND + _FAR)
+    no_pieces = np.zeros((N, 0))  # nobody is told how another one will brake
     for k in range(out.shape[0]):
         for o in range(observers.shape[0]):
             i = observers[o]
             first, last = _place_known(line, state, params, k, i, at)
             brake_rate, release_rate = of.brake_rate, of.release_rate
-            place_rates(table, params[k, brake_rate : brake_rate + N], params[k, release_rate : release_rate + N])
+            place_rates(
+                table, params[k, brake_rate : brake_rate + N], params[k, release_rate : release_rate + N], no_pieces
+            )
             for c in commands:
                 for j in range(N + at):
                     for row in (ROW.SPEED, ROW.COMMAND, ROW.MASS, ROW.LIMIT, ROW.ONSET, ROW.GAP, ROW.HIT):

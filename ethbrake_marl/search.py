@@ -34,6 +34,7 @@ from ethbrake_marl.physics import (
     harm_so_far,
     place_rates,
     restore,
+    rows_for,
     save,
     step_again,
     value_of,
@@ -443,6 +444,7 @@ class ProfileProblem(NamedTuple):
     limit: Floats  # [n, N]
     brake_rate: Floats  # [n, N] m/s3
     release_rate: Floats  # [n, N]
+    pieces: Floats  # [n, N, 2 K]
     identity: UInt64s  # [n]
 
     @property
@@ -660,7 +662,8 @@ def profile_problem(
     start = [after.speeds_mps, after.gaps_m, after.pair_hit, *harm, after.command_mps2]
     return ProfileProblem(
         chosen, np.concatenate(start, axis=1), clock, np.ascontiguousarray(bounds), command, v.latency_s, v.mass_t,
-        v.speed_limit_mps, v.brake_rate_mps3, v.release_rate_mps3, identities(worlds, command, clock, chosen),
+        v.speed_limit_mps, v.brake_rate_mps3, v.release_rate_mps3, v.pieces,
+        identities(worlds, command, clock, chosen),
     )  # fmt: skip
 
 
@@ -688,10 +691,12 @@ def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -
     forces = np.concatenate(
         [state[:, column.command : column.previous], params[:, column.brake_rate : column.own_latency]], 1
     )
-    digests = [
-        hashlib.blake2b(row.tobytes() + (forces[k].tobytes() if slow[k] else b""), digest_size=8).digest()
-        for k, row in enumerate(rows)
-    ]
+    further = [forces[k].tobytes() if slow[k] else b"" for k in range(worlds.n)]
+    for k in np.flatnonzero(worlds.vehicles.in_pieces):
+        pieces = worlds.vehicles.pieces[k]
+        there = np.isfinite(pieces)  # not how many others of the batch have
+        further[k] += there.sum(axis=1).astype("<i8").tobytes() + pieces[there].astype("<f8").tobytes()
+    digests = [hashlib.blake2b(row.tobytes() + further[k], digest_size=8).digest() for k, row in enumerate(rows)]
     return np.frombuffer(b"".join(digests), "<u8").astype(np.uint64)
 
 
@@ -757,11 +762,11 @@ Found = tuple[Profiles, dict[HarmCount, Floats]]
 def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> SearchWorld:
     """The surroundings of world k, with room to work in; ``random`` [n]: the states of all worlds' random numbers."""
     N = problem.mass.shape[1]
-    table = np.zeros((ROW.OF_BUILD_UP, N))
+    table = np.zeros((rows_for(problem.pieces.shape[2]), N))
     for i in range(N):
         table[ROW.COMMAND, i], table[ROW.LATENCY, i] = problem.command[k, i], problem.latency[k, i]
         table[ROW.MASS, i], table[ROW.LIMIT, i] = problem.mass[k, i], problem.limit[k, i]
-    place_rates(table, problem.brake_rate[k], problem.release_rate[k])
+    place_rates(table, problem.brake_rate[k], problem.release_rate[k], problem.pieces[k])
     return SearchWorld(Episode(table, problem.clock[k].copy(), problem.vehicles), problem.bounds[k], random[k : k + 1])
 
 

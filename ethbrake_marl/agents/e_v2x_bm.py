@@ -51,10 +51,12 @@ from ethbrake_marl.physics import (
     compiled,
     move_apart,
     onset_s,
+    pieces_to_come,
     place_forces,
     place_obstacle,
     record_impacts,
     resolve_impacts,
+    rows_for,
     start_events,
     to_next_event,
     to_next_impact,
@@ -601,7 +603,7 @@ _DIGIT = 1_000.0  # impacts of a pair that are told apart
 class Line(NamedTuple):
     """One world as candidates run in it, in tables of ``physics.kernel``; an obstacle ahead stands in column 0."""
 
-    start: Floats  # [ROW.OF_BUILD_UP, N or N + 1] with everybody's command but that of the controlled vehicle
+    start: Floats  # [rows_for(2 K), N or N + 1] with everybody's command but that of the controlled vehicle
     shared: Floats  # the same where that vehicle's command takes effect
     table: Floats  # room
     clock: Floats  # [3] length of a simulation, restitution, time from the start to ``shared``
@@ -615,14 +617,14 @@ class Line(NamedTuple):
 @compiled(apart=True)
 def make_line(
     gap: Floats, speed: Floats, hit: Bools, obstacle: float, obstacle_hit: bool, command: Floats, latency: Floats,
-    mass: Floats, limit: Floats, in_force: Floats, brake_rate: Floats, release_rate: Floats, time: float,
-    restitution: float, horizon: float, vehicle: int, total: bool,
+    mass: Floats, limit: Floats, in_force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats,
+    time: float, restitution: float, horizon: float, vehicle: int, total: bool,
 ) -> Line:  # fmt: skip
     """One world at its ``time``, ready for ``share_start``; an ``obstacle`` that is finitely far is in it."""
     at = 1 if obstacle < math.inf else 0
     vehicles = speed.shape[0]
-    table = np.zeros((ROW.OF_BUILD_UP, vehicles + at))
-    place_forces(table, in_force, brake_rate, release_rate)
+    table = np.zeros((rows_for(pieces.shape[1]), vehicles + at))
+    place_forces(table, in_force, brake_rate, release_rate, pieces)
     if at == 1:
         place_obstacle(table, obstacle, 1.0 if obstacle_hit else 0.0)
         table[ROW.ONSET, 0] = onset_s(0.0, time)
@@ -708,6 +710,10 @@ def _copy_state(of: Floats, table: Floats) -> None:
         table[ROW.SPEED, i] = of[ROW.SPEED, i]
         table[ROW.ACTIVE, i] = of[ROW.ACTIVE, i]
         table[ROW.FORCE, i] = of[ROW.FORCE, i]
+        if table.shape[0] > ROW.OF_BUILD_UP:
+            table[ROW.NEXT_PIECE, i] = of[ROW.NEXT_PIECE, i]
+            if table[ROW.PIECES, i] < math.inf:
+                table[ROW.COMMAND, i] = of[ROW.COMMAND, i]
     for p in range(vehicles - 1):
         table[ROW.GAP, p] = of[ROW.GAP, p]
         table[ROW.CONTACT_SPEED, p] = of[ROW.CONTACT_SPEED, p]
@@ -740,6 +746,8 @@ def will_stay_apart(table: Floats) -> bool:
       is concave until f stands, and falls from then on.) All with margins.
     """
     vehicles, hardest = table.shape[1], 0.0
+    if pieces_to_come(table):
+        return False
     for i in range(vehicles):
         if table[ROW.ACTIVE, i] == 0.0 or table[ROW.COMMAND, i] > 0.0 or table[ROW.SPEED, i] < 0.0:
             return False
@@ -1125,7 +1133,7 @@ def _minimise(
     lines = (
         worlds.gaps_m, worlds.speeds_mps, worlds.time_s, worlds.pair_hit, worlds.obstacle_gap_m, worlds.obstacle_hit,
         command, told.vehicles.braking_capacity_mps2, _onset_s(worlds, vehicle), v.latency_s, v.mass_t,
-        v.speed_limit_mps, worlds.command_mps2, v.brake_rate_mps3, v.release_rate_mps3, v.restitution,
+        v.speed_limit_mps, worlds.command_mps2, v.brake_rate_mps3, v.release_rate_mps3, v.pieces, v.restitution,
     )  # fmt: skip
     question = hashlib.sha256(repr((vehicle, harm_count, horizon_s, worlds.speeds_mps.shape)).encode())
     for column in (rows, *lines):
@@ -1156,8 +1164,8 @@ def _minimise(
 def _search_worlds(
     gaps: Floats, speeds: Floats, time: Floats, hit: Bools, obstacle: Floats, obstacle_hit: Bools, command: Floats,
     capacity: Floats, onset: Floats, latency: Floats, mass: Floats, limit: Floats, in_force: Floats, brake_rate: Floats,
-    release_rate: Floats, restitution: Floats, vehicle: int, rows: Ints, total: bool, horizon: float, found: Floats,
-    status: Ints,
+    release_rate: Floats, pieces: Floats, restitution: Floats, vehicle: int, rows: Ints, total: bool, horizon: float,
+    found: Floats, status: Ints,
 ) -> None:  # fmt: skip
     """Fill ``found`` [3, m] and ``status`` [m] for worlds ``rows`` [m]."""
     room, at, best = make_room(), np.empty(CANDIDATES), np.empty(3)
@@ -1165,7 +1173,7 @@ def _search_worlds(
         k = rows[m]
         line = make_line(
             gaps[k], speeds[k], hit[k], obstacle[k], obstacle_hit[k], command[k], latency[k], mass[k], limit[k],
-            in_force[k], brake_rate[k], release_rate[k], time[k], restitution[k], horizon, vehicle, total,
+            in_force[k], brake_rate[k], release_rate[k], pieces[k], time[k], restitution[k], horizon, vehicle, total,
         )  # fmt: skip
         find_breakpoints(at, vehicle, gaps[k], speeds[k], capacity[k], onset[k])
         status[m] = search_line(line, room, at, capacity[k, vehicle], best)
@@ -1236,6 +1244,8 @@ def make_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
 class StateFree:
     """``full_brake``, ``coast`` or ``constant:a`` (deceleration in m/s2): the same command whatever happens.
 
+    Of a ``profile`` it is the first piece's; the engine goes on to the others (``Worlds.play_pieces``).
+
     ``full_brake`` of every vehicle is the paper's non-ethical strategy. Raises ``InvalidInput`` for any other script
     and for a constant beyond the vehicle's capacity.
     """
@@ -1246,7 +1256,7 @@ class StateFree:
     def __init__(self, spec: str) -> None:
         if not ScriptSpec.parse(spec).is_state_free():
             raise InvalidInput(f"agent {spec!r}: must be full_brake, coast or constant:a")
-        self.name = spec
+        self.name, self.braking_pieces = spec, ScriptSpec.parse(spec).pieces
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
         """The constant command, [n] m/s2."""

@@ -150,6 +150,12 @@ def fixed_commands(
                 f"{who}: vehicle_{i + 1} is driven by {name!r}, whose command is not fixed at the alert{advice}"
             )
         command[:, i], _ = ask_script(script, worlds, begin_script(script, worlds, i, scripts), i)
+    told = {i: getattr(script, "braking_pieces", ()) for i, script in scripts.items() if i != vehicle}
+    if not np.array_equal(worlds.play_pieces(told).vehicles.pieces, worlds.vehicles.pieces):
+        raise InvalidInput(
+            f"{who}: a profile: the pieces in which vehicles brake in these worlds are not those of its scripts; draw"
+            " or read the worlds with the same scenario"
+        )
     return command
 
 
@@ -466,6 +472,8 @@ _ENTRIES: dict[str, Entry] = {
     "team": Entry("team@RUN", "the learners of a run, each as it was trained, or shipped", Source.MESSAGES, _POLICIES),
 }
 
+_PROFILE = Entry("profile:0=A,S=B", "in pieces; of roles alone", Source.SENSORS, "agents.e_v2x_bm:StateFree")
+
 _WRAPPERS: dict[str, Entry] = {
     "refined": Entry(
         "+refined[:profile|:50|:200us]",
@@ -535,6 +543,8 @@ def make_agent(
     if not isinstance(horizon_s, int | float | np.number) or not 0.0 < horizon_s < float("inf"):
         raise InvalidInput(f"horizon_s {horizon_s!r}: must be a positive number of seconds")
     written = parse_spec(spec)
+    if written.name == "profile":
+        raise InvalidInput(f"agent {spec!r}: a profile is a role of a scenario, fixed at the alert; it is no agent")
     settings = AgentSettings(
         written.core, written.policy, scenario, harm_count, float(horizon_s), most_candidates, uncertainty,
         time_step_s or (0.1 if scenario is None else scenario.time_step_s),
@@ -569,6 +579,8 @@ def find_entry(spec: AgentSpec | str) -> Entry:
     written = parse_spec(spec) if isinstance(spec, str) else spec
     if written.file is not None:
         return Entry(f"{written.name}[:ARGUMENT][@POLICY]", "your own", Source.UNSTATED, _FROM_FILE)
+    if written.name == "profile":
+        return _PROFILE
     if written.name not in _ENTRIES:
         if written.name in ("ladder", "field"):
             raise InvalidInput(f"agent {written.core!r}: stands for several agents in --agents; here one is needed")
@@ -699,7 +711,9 @@ def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | Non
     """Agents for the scenario's scripts, by vehicle."""
     left_out = (except_for,) if isinstance(except_for, int) else except_for or ()
     made = {
-        i: make_single_agent(spec, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s)
+        i: _PROFILE.load()(spec)
+        if ScriptSpec.parse(spec).pieces
+        else make_single_agent(spec, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s)
         for i, spec in scenario.scripts.items()
         if i not in left_out
     }
@@ -745,7 +759,8 @@ def drive(
 
     Raises ``PhysicsError`` naming all worlds that could not be advanced; the others are well without them.
     """
-    return Episodes.of(episode_engine(worlds, agent, scenario, vehicle), worlds, watched_by)
+    engine = episode_engine(worlds, agent, scenario, vehicle)
+    return Episodes.of(engine, scenario.play_pieces(worlds, engine.deciders), watched_by)
 
 
 def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_mps2: Floats) -> Worlds:

@@ -81,14 +81,14 @@ def _arrays_sha256(arrays: dict[str, np.ndarray]) -> str:
 def _arrays(value: Any) -> dict[str, np.ndarray]:
     """The arrays of a dataclass and of those inside it, by name; not those that say nothing.
 
-    These are messages that none sends, which have no columns, and rates of brakes that are there at once.
+    These are messages that none sends and pieces that nobody brakes in, and rates of brakes that are there at once.
     """
     found: dict[str, np.ndarray] = {}
     for field in fields(value):
         part = getattr(value, field.name)
         if is_dataclass(part):
             found |= _arrays(part)
-        elif part.shape[1:] != (0,) and not (field.name.endswith("_rate_mps3") and np.isinf(part).all()):
+        elif 0 not in part.shape[1:] and not (field.name.endswith("_rate_mps3") and np.isinf(part).all()):
             found[field.name] = part
     return found
 

@@ -296,7 +296,8 @@ def _roll_out(
     whole: Worlds, agent: Driver, driven: tuple[int, ...], scenario: Scenario, aftermath: bool, rows: Ints
 ) -> Outcome:
     """Outcome of a fresh team in these worlds; what an agent says about a world counts where it drives alone."""
-    worlds, team = whole.take(rows), Team.of(agent, driven)
+    team = Team.of(agent, driven)
+    worlds = scenario.play_pieces(whole.take(rows), tuple(team.drivers))
     task = Task(scenario, tuple(team.drivers))
     shoved = ShovedFront.of(worlds, task) if aftermath else None
     sampled = SampledHarm.of(worlds, task) if aftermath else None

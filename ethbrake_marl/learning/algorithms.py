@@ -418,8 +418,8 @@ def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
 
     A policy that sees the same does the same, and no latency or news is left that could change what it sees.
     """
-    if engine.packed.has_messages:
-        return np.zeros(len(rows), np.bool_)  # what is still on its way may change what it sees
+    if engine.packed.has_messages or engine.in_pieces:
+        return np.zeros(len(rows), np.bool_)  # what is still on its way may change what it sees, or what holds
     (state, params), stands = engine.packed, np.empty(len(rows), np.bool_)
     find_standing(state, before, params, rows, stands)
     return stands

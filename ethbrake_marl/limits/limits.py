@@ -690,7 +690,7 @@ def prove(worlds: Worlds, task: Task) -> Proof | Unproven:
 def unproven_because(worlds: Worlds, task: Task) -> str | None:
     """Why nothing is proven for the task in these worlds, as a clause; None when it is."""
     if worlds.vehicles.build_up.any():
-        return "brakes build up; nothing is proven then"
+        return _uneven_because(worlds)
     if not _is_team(task):
         return undecided_because(worlds, task)
     return _script_because(task, "harm is bounded")
@@ -700,7 +700,7 @@ def undecided_because(worlds: Worlds, task: Task) -> str | None:
     """Why it is not decided in these worlds whether contact can be avoided, as a clause; None when it is."""
     scenario, names = task.scenario, task.scenario.vehicle_names
     if worlds.vehicles.build_up.any():
-        return "brakes build up; nothing is proven then"
+        return _uneven_because(worlds)
     if not task.vehicles or (len(task.vehicles) > 1 and set(task.vehicles) not in _DECIDED):
         return f"driven are: {task.names}; avoidability is proven for one vehicle"
     if scenario.vehicles != _VEHICLES:
@@ -718,6 +718,11 @@ def undecided_because(worlds: Worlds, task: Task) -> str | None:
     if (latency_s[:, 0] > latency_s[:, _DRIVEN]).any():
         return f"{names[0]} may brake later than {names[_DRIVEN]}; nothing is proven then"
     return None
+
+
+def _uneven_because(worlds: Worlds) -> str:
+    why = "a vehicle brakes in pieces (profile)" if worlds.vehicles.in_pieces.any() else "brakes build up"
+    return f"{why}; nothing is proven then"
 
 
 def _is_team(task: Task) -> bool:

@@ -29,6 +29,7 @@ from ethbrake_marl.physics.kernel import (
     onset_s,
     place_forces,
     place_obstacle,
+    rows_for,
     solo_motion,
 )
 from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds
@@ -255,7 +256,8 @@ class Packed(NamedTuple):
         own = params[:, column.own_latency : column.news].copy()
         brake_rate, release_rate = rates
         known = self.known_from_s
-        return Vehicles(braking, driving, latency, mass, limit, restitution, brake_rate, release_rate, own, known)
+        none = np.zeros((*latency.shape, 0))
+        return Vehicles(braking, driving, latency, mass, limit, restitution, brake_rate, release_rate, none, own, known)
 
     @property
     def known_from_s(self) -> Floats:
@@ -284,7 +286,7 @@ def advance_worlds(
     gaps: Floats, speeds: Floats, time: Floats, hit: Bools, in_force: Floats, ahead: Floats, ahead_hit: Bools,
     first_harm: Floats, total_harm: Floats, count: Ints, ahead_first: Floats, ahead_total: Floats, ahead_count: Ints,
     command: Floats, until: Floats, braking: Floats, driving: Floats, latency: Floats, mass: Floats, limit: Floats,
-    restitution: Floats, brake_rate: Floats, release_rate: Floats, failed: Ints, at: int, rows: Floats,
+    restitution: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats, failed: Ints, at: int, rows: Floats,
 ) -> tuple[int, bool]:  # fmt: skip
     """Advance every world to its ``until``, in place (the first seven arrays), and fill its harm (the next six).
 
@@ -294,7 +296,7 @@ def advance_worlds(
     and stays where it was; the others go on.
     """
     n, vehicles = speeds.shape
-    table = np.zeros((ROW.OF_BUILD_UP, at + vehicles))
+    table = np.zeros((rows_for(pieces.shape[2]), at + vehicles))
     recorded = 0
     for k in range(n):
         duration = until[k] - time[k]
@@ -314,7 +316,7 @@ def advance_worlds(
         for p in range(vehicles - 1):
             table[ROW.GAP, at + p] = gaps[k, p]
             table[ROW.HIT, at + p] = 1.0 if hit[k, p] else 0.0
-        place_forces(table, in_force[k], brake_rate[k], release_rate[k])
+        place_forces(table, in_force[k], brake_rate[k], release_rate[k], pieces[k])
         recorded, status = advance_table(table, restitution[k], duration, time[k], k, rows, recorded)
         failed[k] = status
         if status != FLAG.DONE:
@@ -374,7 +376,8 @@ def advance(
         arrays = (
             after.gaps_m, after.speeds_mps, after.time_s, after.pair_hit, after.command_mps2, after.obstacle_gap_m,
             after.obstacle_hit, *harm, command, until, v.braking_capacity_mps2, v.driving_capacity_mps2, v.latency_s,
-            v.mass_t, v.speed_limit_mps, v.restitution, v.brake_rate_mps3, v.release_rate_mps3, failed,
+            v.mass_t, v.speed_limit_mps, v.restitution, v.brake_rate_mps3, v.release_rate_mps3, v.pieces,
+            failed,
         )  # fmt: skip
         parts = by_parts(partial(_advance_part, arrays, at, capacity), worlds.n, threads)
         for part in parts:

@@ -250,6 +250,9 @@ class _Rows(NamedTuple):
     OF_SEGMENT: int = 28
     OF_EPISODE: int = 31
     OF_BUILD_UP: int = 43  # of a segment or an episode in which brakes may build up
+    # of brakes in pieces: per vehicle, in tables longer than OF_BUILD_UP
+    NEXT_PIECE: int = 43  # when the next piece of its command begins, seconds from the start of the segment
+    PIECES: int = 44  # when each of K pieces begins, seconds after the onset (infinite: none), then their K commands
 
 
 ROW = _Rows()
@@ -509,6 +512,8 @@ def start_events(table: Floats) -> None:
     for i in range(table.shape[1]):
         table[ROW.ACTIVE, i] = 1.0 if table[ROW.ONSET, i] <= 0.0 else 0.0
         table[ROW.CONTACT_SPEED, i] = 0.0
+        if table.shape[0] > ROW.OF_BUILD_UP:
+            begin_piece(table, i, 0.0)
 
 
 @compiled(bare=True)
@@ -540,10 +545,18 @@ def to_next_event(table: Floats, now: float, duration: float, building: bool) ->
         sound = move(table, passed)
     if not sound:
         return False, now
+    begin_commands(table, now, passed)
+    return True, duration if passed >= duration - now else now + passed
+
+
+@compiled(bare=True)
+def begin_commands(table: Floats, now: float, passed: float) -> None:
+    """Let those commands and pieces act that begin within ``passed`` (s) from ``now`` on."""
     for i in range(table.shape[1]):
         if table[ROW.ONSET, i] - now <= passed:
             table[ROW.ACTIVE, i] = 1.0
-    return True, duration if passed >= duration - now else now + passed
+        if table.shape[0] > ROW.OF_BUILD_UP and table[ROW.NEXT_PIECE, i] - now <= passed:
+            begin_piece(table, i, table[ROW.NEXT_PIECE, i])
 
 
 @compiled(bare=True)
@@ -661,7 +674,7 @@ def built_up(table: Floats) -> bool:
     there = True
     for i in range(table.shape[1]):
         there = there and table[ROW.FORCE, i] == table[ROW.COMMAND, i] * table[ROW.ACTIVE, i]
-    return there
+    return there and not pieces_to_come(table)
 
 
 @compiled
@@ -905,6 +918,8 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
         soonest = min(soonest, table[ROW.FORCE_TIME, i])
         if table[ROW.ACTIVE, i] == 0.0:
             soonest = min(soonest, table[ROW.ONSET, i] - now)
+        if table.shape[0] > ROW.OF_BUILD_UP:
+            soonest = min(soonest, table[ROW.NEXT_PIECE, i] - now)
     for i in range(vehicles):
         speed, rate, jerk, limit = (
             table[ROW.SPEED, i],
@@ -994,8 +1009,16 @@ def move_apart_on_cubics(table: Floats, duration: float) -> bool:
         slowest, fastest = speed, speed
         if onset > 0.0:
             slowest, fastest = move_alone(table, i, 0.0, min(onset, duration))
-        if onset < duration:
-            low, high = move_alone(table, i, table[ROW.COMMAND, i], duration - max(onset, 0.0))
+        in_pieces, now = table.shape[0] > ROW.OF_BUILD_UP, max(onset, 0.0)
+        if in_pieces:
+            begin_piece(table, i, 0.0)
+        while in_pieces and table[ROW.NEXT_PIECE, i] <= duration:
+            begins = table[ROW.NEXT_PIECE, i]
+            low, high = move_alone(table, i, table[ROW.COMMAND, i], begins - now)
+            slowest, fastest, now = min(slowest, low), max(fastest, high), begins
+            begin_piece(table, i, now)
+        if now < duration:
+            low, high = move_alone(table, i, table[ROW.COMMAND, i], duration - now)
             slowest, fastest = min(slowest, low), max(fastest, high)
         table[ROW.FORCE_VALUE, i] = table[ROW.FORCE, i]
         table[ROW.FORCE, i] = before
@@ -1061,13 +1084,50 @@ def move_alone_by_events(table: Floats, i: int, wanted: float, duration: float) 
     return slowest, fastest
 
 
-@compiled(bare=True)
-def place_rates(table: Floats, brake_rate: Floats, release_rate: Floats) -> None:
-    """Write the rates of the vehicles (m/s3), each [N], into a table [ROW.OF_BUILD_UP, N or N + 1].
+# Brakes in pieces: from its onset on such a vehicle has the command of the piece in force, whatever else it is told.
+# Its world moves as one in which brakes build up, at rates that may be infinite.
 
-    Where all are infinite, the forces are not looked at.
+
+@compiled
+def rows_for(pieces: int) -> int:
+    """Rows of a table for vehicles with so many ``pieces``, times and commands; 0: ROW.OF_BUILD_UP."""
+    return ROW.PIECES + pieces if pieces > 0 else ROW.OF_BUILD_UP
+
+
+@compiled(bare=True)
+def begin_piece(table: Floats, i: int, now: float) -> None:
+    """Give vehicle ``i`` the command of its piece at ``now`` (s from the segment's start), and plan the next one."""
+    count = (table.shape[0] - ROW.PIECES) // 2
+    table[ROW.NEXT_PIECE, i] = math.inf
+    for piece in range(count):
+        begins = table[ROW.ONSET, i] + table[ROW.PIECES + piece, i]
+        if begins == math.inf or (piece > 0 and begins > now):
+            table[ROW.NEXT_PIECE, i] = begins
+            return
+        table[ROW.COMMAND, i] = table[ROW.PIECES + count + piece, i]
+
+
+@compiled(bare=True)
+def pieces_to_come(table: Floats) -> bool:
+    """Whether some vehicle's next piece is still to begin."""
+    if table.shape[0] > ROW.OF_BUILD_UP:
+        for i in range(table.shape[1]):
+            if table[ROW.NEXT_PIECE, i] < math.inf:
+                return True
+    return False
+
+
+@compiled(bare=True)
+def place_rates(table: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats) -> None:
+    """Write rates (m/s3), each [N], and pieces [N, 2 K] of the vehicles into a table [rows_for(2 K), N or N + 1].
+
+    Where all rates are infinite and nobody brakes in pieces, the forces are not looked at.
     """
     at, least = table.shape[1] - brake_rate.shape[0], math.inf
+    for row in range(pieces.shape[1]):
+        for i in range(table.shape[1]):
+            table[ROW.PIECES + row, i] = math.inf if i < at else pieces[i - at, row]
+            least = min(least, table[ROW.PIECES + row, i])
     for i in range(brake_rate.shape[0]):
         least = min(least, brake_rate[i], release_rate[i])
     table[ROW.BUILDS_UP, 0] = 1.0 if least < math.inf else 0.0
@@ -1078,9 +1138,11 @@ def place_rates(table: Floats, brake_rate: Floats, release_rate: Floats) -> None
 
 
 @compiled(bare=True)
-def place_forces(table: Floats, force: Floats, brake_rate: Floats, release_rate: Floats) -> None:
-    """Write forces (m/s2) and rates (m/s3) of the vehicles, each [N], into a table [ROW.OF_BUILD_UP, N or N + 1]."""
-    place_rates(table, brake_rate, release_rate)
+def place_forces(
+    table: Floats, force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats
+) -> None:  # fmt: skip
+    """``place_rates``, and the forces of the vehicles [N] (m/s2)."""
+    place_rates(table, brake_rate, release_rate, pieces)
     if table[ROW.BUILDS_UP, 0] == 1.0:
         for i in range(force.shape[0]):
             table[ROW.FORCE, table.shape[1] - force.shape[0] + i] = force[i]
@@ -1089,9 +1151,9 @@ def place_forces(table: Floats, force: Floats, brake_rate: Floats, release_rate:
 @compiled(bare=True)
 def force_at(table: Floats, i: int, command: float, latency_s: float, time_s: float) -> float:
     """The force of vehicle ``i`` at ``time_s``, the end of a segment; no command acts before its latency. [m/s2]"""
-    wanted = command if latency_s <= time_s else 0.0
     if not builds_up(table):
-        return wanted
+        return command if latency_s <= time_s else 0.0
+    wanted = table[ROW.COMMAND, i] if latency_s <= time_s else 0.0  # of its piece, where it brakes in pieces
     return force_now(table[ROW.FORCE, i], wanted, table[ROW.BRAKE_RATE, i], table[ROW.RELEASE_RATE, i])
 
 
@@ -1173,7 +1235,7 @@ class Grid(NamedTuple):
 class Episode(NamedTuple):
     """One world as its profiles run."""
 
-    table: Floats  # [ROW.OF_BUILD_UP, N] with latencies, masses, speed limits and the other vehicles' commands
+    table: Floats  # [rows_for(2 K), N] with latencies, masses, speed limits and the other vehicles' commands
     clock: Floats  # [CLOCK.WIDTH]
     controlled: Ints  # [C] vehicles
 
@@ -1392,9 +1454,7 @@ def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) ->
         passed = next_moving_event(table, now, duration, parting) if building else next_event(table, now, duration)
         if not (move_on_cubics(table, passed) if building else move(table, passed)):
             return -count
-        for i in range(vehicles):
-            if table[ROW.ONSET, i] - now <= passed:
-                table[ROW.ACTIVE, i] = 1.0
+        begin_commands(table, now, passed)
         now = duration if passed >= duration - now else now + passed
     return count
 
@@ -1419,12 +1479,12 @@ def segment_pieces(worlds: Worlds, command_mps2: Floats, until_s: Floats) -> lis
     found = []
     for k in range(worlds.n):
         start = float(worlds.time_s[k])
-        table = np.zeros((ROW.OF_BUILD_UP, N + 1))
+        table = np.zeros((rows_for(v.pieces.shape[2]), N + 1))
         place_obstacle(table, float(front_gaps[k]), 0.0)
         table[ROW.COMMAND, 1:], table[ROW.SPEED, 1:] = command_mps2[k], worlds.speeds_mps[k]
         table[ROW.MASS, 1:], table[ROW.LIMIT, 1:] = v.mass_t[k], v.speed_limit_mps[k]
         table[ROW.ONSET, 0], table[ROW.ONSET, 1:] = onset_s(0.0, start), latencies[k] - start
-        place_forces(table, worlds.command_mps2[k], v.brake_rate_mps3[k], v.release_rate_mps3[k])
+        place_forces(table, worlds.command_mps2[k], v.brake_rate_mps3[k], v.release_rate_mps3[k], v.pieces[k])
         table[ROW.GAP, 1:N] = worlds.gaps_m[k]
         capacity = _CAPACITY
         while True:
@@ -1477,8 +1537,8 @@ def forecast(
     forecast_worlds(
         worlds.gaps_m, worlds.speeds_mps, worlds.time_s, worlds.pair_hit, ahead, worlds.obstacle_hit,
         np.ascontiguousarray(command_mps2), vehicle, np.ascontiguousarray(candidates_mps2), until_s, v.latency_s,
-        v.mass_t, v.speed_limit_mps, v.restitution, worlds.command_mps2, v.brake_rate_mps3, v.release_rate_mps3, first,
-        total, failed,
+        v.mass_t, v.speed_limit_mps, v.restitution, worlds.command_mps2, v.brake_rate_mps3, v.release_rate_mps3,
+        v.pieces, first, total, failed,
     )  # fmt: skip
     if failed.any():
         raise PhysicsError({k: f"a forecast could not reach {until_s:g} s" for k in np.flatnonzero(failed).tolist()})
@@ -1489,7 +1549,8 @@ def forecast(
 def forecast_worlds(
     gaps: Floats, speeds: Floats, time: Floats, hit: Bools, ahead: Floats, ahead_hit: Bools, command: Floats,
     vehicle: int, candidates: Floats, until_s: float, latency: Floats, mass: Floats, limit: Floats, restitution: Floats,
-    in_force: Floats, brake_rate: Floats, release_rate: Floats, first: Floats, total: Floats, failed: Bools,
+    in_force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats, first: Floats, total: Floats,
+    failed: Bools,
 ) -> None:  # fmt: skip
     """Fill ``first`` and ``total`` [n, K], and ``failed`` [n] where a check failed.
 
@@ -1497,7 +1558,7 @@ def forecast_worlds(
     """
     n, vehicles = speeds.shape
     at = min(ahead.shape[0], 1)  # vehicle i stands in column at + i, behind an obstacle
-    table = np.zeros((ROW.OF_BUILD_UP, at + vehicles))
+    table = np.zeros((rows_for(pieces.shape[2]), at + vehicles))
     no_rows = np.empty((0, LISTED.WIDTH))
     for k in range(n):
         duration = until_s - time[k]
@@ -1516,7 +1577,7 @@ def forecast_worlds(
             for p in range(vehicles - 1):
                 table[ROW.GAP, at + p] = gaps[k, p]
                 table[ROW.HIT, at + p] = 1.0 if hit[k, p] else 0.0
-            place_forces(table, in_force[k], brake_rate[k], release_rate[k])
+            place_forces(table, in_force[k], brake_rate[k], release_rate[k], pieces[k])
             if advance_table(table, restitution[k], duration, 0.0, k, no_rows, 0)[1] != FLAG.DONE:
                 failed[k] = True
                 break

@@ -36,6 +36,7 @@ from ethbrake_marl.physics.kernel import (
     onset_s,
     place_forces,
     place_obstacle,
+    rows_for,
     solo_motion,
 )
 from ethbrake_marl.physics.worlds import Bools, Floats, Worlds
@@ -201,17 +202,19 @@ def chance(key: float, link: int, number: float) -> float:
 
 @compiled
 def hear_rows(
-    moving: Floats, params: Floats, wanted: Floats, until_s: Floats, decision_s: Floats, time_step_s: float
-) -> None:
+    moving: Floats, params: Floats, wanted: Floats, until_s: Floats, decision_s: Floats, time_step_s: float,
+    pieces: Floats,
+) -> None:  # fmt: skip
     """Take the messages' columns of every world from its time in ``moving`` to ``until_s`` [n], in place.
 
-    ``moving`` [n, S] are the worlds as they were, and go along; ``wanted`` [n, N] is what the vehicles want meanwhile.
+    ``moving`` [n, S] are the worlds as they were, and go along; ``wanted`` [n, N] is what the vehicles want meanwhile;
+    ``pieces`` [N, 2 K] as in ``Vehicles``.
     Samples are taken every ``time_step_s``, counted back from the next decision at ``decision_s`` [n]; who stops before
     it measures the present, and that sample is not kept. A world that cannot be advanced hears nothing.
     """
     column = columns(moving)
     N, head = column.vehicles, column.messages
-    table = np.zeros((ROW.OF_BUILD_UP, N + 1))
+    table = np.zeros((rows_for(pieces.shape[1]), N + 1))
     no_rows = np.empty((0, LISTED.WIDTH))
     for k in range(moving.shape[0]):
         if params[k, head + CHANNEL.PERIOD] == 0.0:
@@ -225,7 +228,7 @@ def hear_rows(
             stops = end > until_s[k]
             if stops:
                 end = until_s[k]
-            if not _move(moving[k], params[k], column, wanted[k], end, table, no_rows):
+            if not _move(moving[k], params[k], column, wanted[k], end, pieces, table, no_rows):
                 break
             _sample(moving[k], told, column)
             _receive(moving[k, column.time], told, N)
@@ -253,8 +256,9 @@ def _start(state: Floats, params: Floats, column: Columns, wanted: Floats) -> No
 
 @compiled
 def _move(
-    state: Floats, params: Floats, column: Columns, wanted: Floats, end: float, table: Floats, no_rows: Floats
-) -> bool:
+    state: Floats, params: Floats, column: Columns, wanted: Floats, end: float, pieces: Floats, table: Floats,
+    no_rows: Floats,
+) -> bool:  # fmt: skip
     """One world moved to ``end``, its places included; False, and nothing moved, where the kernel cannot."""
     N, time = column.vehicles, state[column.time]
     speed, command, gap, obstacle = column.speed, column.command, column.gap, column.obstacle
@@ -270,7 +274,7 @@ def _move(
         table[ROW.ONSET, i + 1] = onset_s(params[latency + i], time)
     place_forces(
         table, state[command : command + N], params[column.brake_rate : column.release_rate],
-        params[column.release_rate : column.own_latency],
+        params[column.release_rate : column.own_latency], pieces,
     )  # fmt: skip
     for p in range(N - 1):
         table[ROW.GAP, p + 1] = state[gap + p]

@@ -54,6 +54,9 @@ class Vehicles:
     # infinite: at once
     brake_rate_mps3: Floats
     release_rate_mps3: Floats
+    # [n, N, 2 K] when each piece of a vehicle's braking begins (s after its latency), then their commands (m/s2), which
+    # it has whatever else it is told; infinite: no such piece; [n, N, 0]: nobody brakes in pieces
+    pieces: Floats
     own_latency_s: Floats  # [n, N] the vehicle's own part of its latency, which is what others are told of it
     # [n, N, N] from when on vehicle i acts on news of vehicle j; infinite: never. Never before latency_s of vehicle i,
     # and of itself (i is j) exactly from then on. Without a channel both of these share the memory of ``latency_s``
@@ -79,17 +82,19 @@ class Vehicles:
         restitution: Floats,
         brake_rate_mps3: Floats | None = None,
         release_rate_mps3: Floats | None = None,
+        pieces: Floats | None = None,
     ) -> Vehicles:
         """Vehicles without a channel: latencies are all own, and all news is known from them on.
 
-        Without rates the acceleration in force is the command at once.
+        Without rates the acceleration in force is the command at once; without pieces nobody brakes in such.
         """
         known = cls.known_at_once(latency_s)
         at_once = np.full(mass_t.shape, np.inf)
         return cls(
             braking_mps2, driving_mps2, latency_s, mass_t, limit_mps, restitution,
             at_once if brake_rate_mps3 is None else brake_rate_mps3,
-            at_once if release_rate_mps3 is None else release_rate_mps3, latency_s, known,
+            at_once if release_rate_mps3 is None else release_rate_mps3,
+            np.zeros((*mass_t.shape, 0)) if pieces is None else pieces, latency_s, known,
         )  # fmt: skip
 
     @staticmethod
@@ -106,9 +111,23 @@ class Vehicles:
 
     @property
     def build_up(self) -> Bools:
-        """Worlds in which some vehicle's brakes build up: not every rate is infinite, [n]."""
+        """Worlds in which some vehicle's brakes build up, its rates not infinite, or brake in pieces, [n]."""
         rates = np.minimum(self.brake_rate_mps3, self.release_rate_mps3)
-        return np.asarray(np.isfinite(rates).any(axis=1))
+        return np.asarray(np.isfinite(rates).any(axis=1) | self.in_pieces)
+
+    @property
+    def in_pieces(self) -> Bools:
+        """Worlds in which some vehicle brakes in pieces, [n]."""
+        return np.asarray(np.isfinite(self.pieces).any(axis=(1, 2)))
+
+    def piece_commands(self, command_mps2: Floats, time_s: Floats) -> Floats:
+        """The commands [n, N] m/s2 at the times ``time_s`` [n]: whoever brakes in pieces has that of its piece."""
+        command, count = command_mps2, self.pieces.shape[2] // 2
+        for piece in range(count):
+            begins = self.latency_s + self.pieces[:, :, piece]
+            begun = (begins <= time_s[:, np.newaxis]) if piece else np.isfinite(begins)
+            command = np.where(begun, self.pieces[:, :, count + piece], command)
+        return command
 
     def hide_from(self, vehicle: int) -> Bools:
         """Worlds in which a channel hides something of the line from ``vehicle`` at its first decision, [n].
@@ -199,7 +218,7 @@ class Worlds:
     @staticmethod
     def concatenate(parts: Sequence[Worlds]) -> Worlds:
         """Join worlds with the same number of vehicles into one batch."""
-        parts = _on_roads_alike(parts)
+        parts = _alike(parts)
         return parts[0]._each(lambda *columns: np.concatenate(columns), *parts[1:])
 
     def assign(self, rows: Ints, fresh: Worlds) -> Worlds:
@@ -210,7 +229,7 @@ class Worlds:
             copy[rows] = part
             return copy
 
-        whole, part = _on_roads_alike((self, fresh))
+        whole, part = _alike((self, fresh))
         return whole._each(assigned, part)
 
     def read_only(self) -> Worlds:
@@ -238,9 +257,28 @@ class Worlds:
             value = self.road[:, begin : begin + self.N]
         return value
 
+    def play_pieces(self, pieces: Mapping[int, Sequence[tuple[float, float]]]) -> Worlds:
+        """These worlds, in which the vehicles (index from 0) brake in these pieces, and nobody else does.
+
+        A piece is its time (s after the latency has elapsed; the first is 0) and its braking (m/s2).
+        """
+        several = {i: np.array(each, np.float64) for i, each in pieces.items() if len(each) > 1}
+        if not several and not self.vehicles.pieces.shape[2]:
+            return self
+        most = max(map(len, several.values()), default=0)
+        found = np.full((self.n, self.N, 2, most), np.inf)
+        for i, each in several.items():
+            found[:, i, 0, : len(each)], found[:, i, 1, : len(each)] = each[:, 0], 0.0 - each[:, 1]
+        return replace(self, vehicles=replace(self.vehicles, pieces=found.reshape(self.n, self.N, 2 * most)))
+
     def refuse_build_up(self, who: str) -> None:
-        """Raise ``InvalidInput`` where brakes of some world build up, which ``who`` has no exact answer for."""
+        """Raise ``InvalidInput`` where brakes of a world build up, or come in pieces: ``who`` has no exact answer."""
         slow = self.vehicles.build_up
+        if self.vehicles.in_pieces.any():
+            raise InvalidInput(
+                f"{who}: a vehicle of world {int(np.argmax(self.vehicles.in_pieces))} brakes in pieces (profile), and"
+                " nothing exact is known for these; give a constant command"
+            )
         if slow.any():
             raise InvalidInput(
                 f"{who}: brakes of world {int(np.argmax(slow))} build up (brake_rate_mps3, release_rate_mps3), and"
@@ -281,6 +319,7 @@ class Worlds:
             vehicles.restitution,
             ahead(math.inf, vehicles.brake_rate_mps3),
             ahead(math.inf, vehicles.release_rate_mps3),
+            np.concatenate([np.full((self.n, 1, vehicles.pieces.shape[2]), np.inf), vehicles.pieces], axis=1),
         )
         return Worlds(
             written_out,
@@ -310,11 +349,24 @@ class Worlds:
         return replace(self, obstacle_gap_m=np.where(self.obstacle_ahead, self.obstacle_gap_m, farthest + 1.0))
 
 
-def _on_roads_alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
-    """The same worlds; where something is known of the road of some, it is of infinite friction for the others."""
+def _alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
+    """The same worlds, all with as many pieces; a road known of some is of infinite friction for the others."""
+    most = max(part.vehicles.pieces.shape[2] for part in parts)
+    if any(part.vehicles.pieces.shape[2] < most for part in parts):
+        parts = [
+            replace(part, vehicles=replace(part.vehicles, pieces=_padded(part.vehicles.pieces, most))) for part in parts
+        ]
     if len({part.road.shape[1] for part in parts}) == 1:
         return parts
     return [part if part.road.shape[1] else part.on_road(part.friction) for part in parts]
+
+
+def _padded(pieces: Floats, most: int) -> Floats:
+    """Pieces [n, N, 2 K] as [n, N, most]."""
+    n, N, width = pieces.shape
+    halves = pieces.reshape(n, N, 2, width // 2)
+    more = [(0, 0), (0, 0), (0, 0), (0, (most - width) // 2)]
+    return np.pad(halves, more, constant_values=np.inf).reshape(n, N, most)
 
 
 _OF_WORLDS = tuple(f.name for f in fields(Worlds))[1:]

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field as data_field, replace
 from difflib import get_close_matches
 from functools import lru_cache
+from itertools import pairwise
 from operator import not_
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, NoReturn, Self
@@ -19,13 +20,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import (
     AfterValidator,
+    BeforeValidator,
     Discriminator,
     Field,
     GetJsonSchemaHandler,
+    PlainSerializer,
     PrivateAttr,
     Tag,
     ValidationError,
     ValidationInfo,
+    WithJsonSchema,
     field_validator,
     model_validator,
 )
@@ -617,6 +621,8 @@ class Sample:
 
 LEARNER = "learner"
 STATE_FREE = ("full_brake", "coast", "constant")  # names of the scripts whose command never depends on the state
+_PROFILE = "profile"  # the same, in pieces
+MOST_PIECES = 64
 
 _SPEC = re.compile(r"(?P<name>[a-z][a-z0-9_@.-]*)(:(?P<argument>\S+))?")
 
@@ -667,11 +673,29 @@ class ScriptSpec(NamedTuple):
             )
         return deceleration
 
+    @property
+    def pieces(self) -> tuple[tuple[float, float], ...]:
+        """The pieces of a ``profile``: s after the latency, m/s2 of braking; none of any other script.
+
+        Raises ``InvalidInput`` unless times begin with 0 and rise, and no braking is negative.
+        """
+        if self.name != _PROFILE:
+            return ()
+        given = [part.split("=") for part in (self.argument or "").split(",")]
+        return checked_pieces([[parse_numeral(number) for number in piece] for piece in given])
+
+    @property
+    def hardest_mps2(self) -> float | None:
+        """The largest deceleration (m/s2) that ``constant:a`` or a ``profile`` asks for; None for any other script."""
+        return max(braking for _, braking in self.pieces) if self.name == _PROFILE else self.deceleration_mps2
+
     def is_state_free(self) -> bool:
         """Whether the script's command never depends on the state: ``full_brake``, ``coast`` or ``constant:a``.
 
         Raises ``InvalidInput`` when such a script has an argument it does not take, or lacks the one it needs.
         """
+        if self.name == _PROFILE:
+            return len(self.pieces) > 0
         if self.name in ("full_brake", "coast"):
             if self.argument is not None:
                 raise InvalidInput(f"agent {str(self)!r}: {self.name} takes no argument")
@@ -683,13 +707,14 @@ class ScriptSpec(NamedTuple):
     ) -> Floats | None:
         """Signed command (m/s2) of a state-free script, in the shape of the capacity; None for any other script.
 
-        ``full_brake`` -> -capacity, ``coast`` -> 0, ``constant:a`` -> -a. Raises ``InvalidInput`` when a is above the
-        braking capacity of any vehicle, or -a above its driving capacity where that is given.
+        ``full_brake`` -> -capacity, ``coast`` -> 0, ``constant:a`` -> -a, a ``profile`` that of its first piece.
+        Raises ``InvalidInput`` when a, or a piece, is above the braking capacity of any vehicle, or -a above its
+        driving capacity where that is given.
         """
         capacity = np.asarray(braking_capacity_mps2, dtype=np.float64)
         if not self.is_state_free():
             return None
-        deceleration = self.deceleration_mps2
+        deceleration = self.hardest_mps2
         if deceleration is None:
             return -capacity if self.name == "full_brake" else np.zeros(capacity.shape)
         if not np.all(deceleration <= capacity):
@@ -698,7 +723,64 @@ class ScriptSpec(NamedTuple):
             raise InvalidInput(
                 f"agent {str(self)!r}: above the driving capacity {np.min(driving_capacity_mps2):g} m/s2"
             )
-        return np.full(capacity.shape, 0.0 - deceleration)
+        return np.full(capacity.shape, 0.0 - (self.pieces[0][1] if self.pieces else deceleration))
+
+
+def checked_pieces(given: object) -> tuple[tuple[float, float], ...]:
+    """The pieces of a ``profile``, [[s, m/s2], ...], as they are written in roles; raises ``InvalidInput``."""
+    right = f"a profile is 1 to {MOST_PIECES} pieces [s after the latency, m/s2 of braking], such as [[0, 3], [1, 7]]"
+    if not isinstance(given, list | tuple) or not 1 <= len(given) <= MOST_PIECES:
+        raise InvalidInput(right)
+    for piece in given:
+        numbers = isinstance(piece, list | tuple) and len(piece) == 2
+        if not numbers or not all(type(each) in (int, float) and 0.0 <= each <= 3600.0 for each in piece):
+            raise InvalidInput(f"{right}; both in [0, 3600], which {piece!r:.60} is not")
+    if given[0][0] != 0.0 or not all(one[0] < other[0] for one, other in pairwise(given)):
+        raise InvalidInput(f"{right}; times begin with 0 and rise")
+    return tuple((float(begins), float(braking)) for begins, braking in given)
+
+
+def _role_text(role: object) -> object:
+    """A role as a script is named: ``{profile: [[0, 3], [1, 7]]}`` is ``profile:0=3,1=7``."""
+    if not isinstance(role, dict):
+        return role
+    try:
+        if set(role) != {_PROFILE}:
+            raise InvalidInput("must be learner, a script, or {profile: [[0, 3], [1, 7]]} and nothing beside it")
+        pieces = checked_pieces(role[_PROFILE])
+    except InvalidInput as error:
+        refuse((), role, str(error))
+    numbers = (tuple(repr(number).removesuffix(".0") for number in piece) for piece in pieces)
+    return f"{_PROFILE}:" + ",".join(f"{begins}={braking}" for begins, braking in numbers)
+
+
+def _role_content(role: str) -> str | dict[str, list[list[float]]]:
+    """A role as a file says it."""
+    pieces = ScriptSpec.parse(role).pieces
+    return {_PROFILE: [list(piece) for piece in pieces]} if pieces else role
+
+
+_ROLE_SCHEMA = {
+    "anyOf": [
+        {"type": "string"},
+        {
+            "type": "object",
+            "required": [_PROFILE],
+            "additionalProperties": False,
+            "properties": {
+                _PROFILE: {
+                    "type": "array",
+                    "minItems": 1,
+                    "maxItems": MOST_PIECES,
+                    "items": {"type": "array", "minItems": 2, "maxItems": 2, "items": {"type": "number", "minimum": 0}},
+                }
+            },
+        },
+    ]
+}
+Role = Annotated[
+    str, BeforeValidator(_role_text), PlainSerializer(_role_content, return_type=Any), WithJsonSchema(_ROLE_SCHEMA)
+]
 
 
 class Roles(dict[str, str]):
@@ -951,7 +1033,7 @@ class ScenarioFields(FileModel):
     )
     speed_limit_mps: PerVehicle = Field(default=40.0, description=_MEANING["speed_limit_mps"])
     restitution: Quantity = Field(default=0.1, description=_MEANING["restitution"])
-    roles: dict[str, str] = Field(
+    roles: dict[str, Role] = Field(
         default_factory=lambda data: Roles.complete(None, data.get("vehicles", 3)),
         description="learner or a script for each vehicle; vehicles left out of a given mapping brake fully",
     )
@@ -1161,6 +1243,10 @@ class ScenarioFields(FileModel):
         roles = [self.roles[name] for name in self.vehicle_names]
         return {i: role for i, role in enumerate(roles) if role != LEARNER}
 
+    def play_pieces(self, worlds: Worlds, driven: Sequence[int] = ()) -> Worlds:
+        """These worlds, in which its scripts brake in the pieces of their ``profile``, but for ``driven`` vehicles."""
+        return worlds.play_pieces({i: ScriptSpec.parse(s).pieces for i, s in self.scripts.items() if i not in driven})
+
     @property
     def has_obstacle(self) -> bool:
         """Whether an obstacle stands ahead of Vehicle 1, however its distance is declared."""
@@ -1343,6 +1429,7 @@ class ScenarioFields(FileModel):
             key = numbers(OF_WORLD, LATER_LOSSES)[:, 0] if periodic else np.zeros(len(u))
             equipped = self.equipped(None if typed is None else typed[0])
             worlds = self.v2x.with_channel(worlds, u, key, self.time_step_s, equipped)
+        worlds = self.play_pieces(worlds)
         return Sample(worlds, index, 0, None if typed is None or line is None else np.array(line.names)[typed[0]])
 
     @property
@@ -1587,7 +1674,7 @@ def early_impact(scenario: ScenarioFields, worlds: Worlds) -> Bools:
             raise InvalidInput(f"scenario {scenario.name!r}: early_impacts reject: {script!r} depends on the state")
         command[:, i] = scripted
     first_action_s = worlds.first_decision_s(scenario.learners)
-    _, impacts = advance(worlds, command, until_s=first_action_s)
+    _, impacts = advance(scenario.play_pieces(worlds), command, until_s=first_action_s)
     return np.asarray(impacts.count.sum(axis=1) + impacts.obstacle_count > 0)
 
 
@@ -1717,7 +1804,7 @@ def _worlds(given: Mapping[Entry, Floats], scenario: ScenarioFields, naming: _Na
     line = scenario.types_of_line
     drawn = line is not None and any(kind.v2x is not None for kind in line.kinds)
     return scenario.v2x.with_fixed_news(
-        worlds, scenario.time_step_s, naming.where, None if drawn else scenario.equipped()
+        scenario.play_pieces(worlds), scenario.time_step_s, naming.where, None if drawn else scenario.equipped()
     )
 
 

@@ -151,7 +151,7 @@ def _check_derived(scenario: ScenarioFields) -> None:
 def _check_scripts(scenario: ScenarioFields) -> None:
     """A constant command is within the vehicle's capacity; where impacts are early, no script depends on the state."""
     for i, script in scenario.scripts.items():
-        deceleration = ScriptSpec.parse(script).deceleration_mps2 or 0.0
+        deceleration = ScriptSpec.parse(script).hardest_mps2 or 0.0
         field = "braking_capacity_mps2" if deceleration > 0.0 else "driving_capacity_mps2"
         capacity = scenario.bounds(field)[i][0]
         right = f"is above this vehicle's {field}, {capacity:g} m/s2"

@@ -1479,6 +1479,8 @@ def boxes_of(
     v, N, vehicle, members = possible.vehicles, possible.N, int(problem.vehicles[0]), possible.n // n
     if possible.obstacle_ahead.any():
         raise _refusal("an obstacle ahead")
+    if v.in_pieces.any():
+        raise _refusal("a vehicle that brakes in pieces (profile)")
     if v.build_up.any():
         raise _refusal("brakes that build up")
     command, constant = problem.command.reshape(n, members, N), np.full((n, N), np.nan)

@@ -77,6 +77,7 @@ from ethbrake_marl.physics import (
     harm_so_far,
     place_rates,
     restore,
+    rows_for,
     save,
     step_again,
 )
@@ -111,6 +112,7 @@ class Members(NamedTuple):
     clock: Floats  # [M, CLOCK_WIDTH]
     bounds: Floats  # [M, K, 2] m/s2
     lines: Floats  # [M, rows, N] of its vehicles; one array for all, because each is counted at every call
+    pieces: Floats  # [M, N, 2 P] of the vehicles that brake in pieces
     vehicles: Ints  # [K] that are shielded, front to rear
     critical: Ints  # [1] the member that broke a limit last: it is tried first; no result depends on it
 
@@ -131,14 +133,15 @@ def all_members(running: Running) -> Members:
             )
             if running.caps.shape[1] > 0:
                 lines[m, OF_CAP, i] = running.caps[m, i]
-    table, critical = np.zeros((ROW.OF_BUILD_UP, N)), np.zeros(1, np.int64)
-    return Members(table, problem.clock, problem.bounds, lines, problem.vehicles, critical)
+    table, critical = np.zeros((rows_for(problem.pieces.shape[2]), N)), np.zeros(1, np.int64)
+    return Members(table, problem.clock, problem.bounds, lines, problem.pieces, problem.vehicles, critical)
 
 
 @compiled
 def members_from(every: Members, a: int, b: int) -> Members:
     """Those in the rows a to b - 1."""
-    return Members(every.table, every.clock[a:b], every.bounds[a:b], every.lines[a:b], every.vehicles, every.critical)
+    clock, bounds, lines, pieces = every.clock[a:b], every.bounds[a:b], every.lines[a:b], every.pieces[a:b]
+    return Members(every.table, clock, bounds, lines, pieces, every.vehicles, every.critical)
 
 
 @compiled
@@ -148,7 +151,7 @@ def enter(world: Members, m: int, state: Floats) -> None:
     for i in range(table.shape[1]):
         table[ROW.COMMAND, i], table[ROW.LATENCY, i] = lines[m, OF_COMMAND, i], lines[m, OF_LATENCY, i]
         table[ROW.MASS, i], table[ROW.LIMIT, i] = lines[m, OF_MASS, i], lines[m, OF_LIMIT, i]
-    place_rates(table, lines[m, OF_BRAKE_RATE], lines[m, OF_RELEASE_RATE])
+    place_rates(table, lines[m, OF_BRAKE_RATE], lines[m, OF_RELEASE_RATE], world.pieces[m])
     restore(table, state)
 
 
@@ -882,6 +885,7 @@ def _later_plan(
             column = action if action.ndim == 1 else action[:, c]
             commands[:, vehicle] = action_to_command(column, seen.vehicles, vehicle)
         time, vehicles, force = episodes.time_s, seen.vehicles, episodes.states[:, -seen.N :]
+        commands = vehicles.piece_commands(commands, time)
         acts = np.where(vehicles.latency_s <= time[:, np.newaxis], commands, 0.0)
         at_once = np.isinf(np.where(acts < force, vehicles.brake_rate_mps3, vehicles.release_rate_mps3))
         in_force = np.where(at_once, acts, force)

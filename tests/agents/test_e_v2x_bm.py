@@ -184,6 +184,8 @@ def kinds(vehicles: int) -> Iterator[tuple[str, Worlds, dict[str, object]]]:
     yield "obstacle", replace(worlds, obstacle_gap_m=obstacle), {"harm_count": "total"}
     slow = replace(worlds.vehicles, brake_rate_mps3=rng.uniform(3, 40, braking.shape))
     yield "build-up", replace(worlds, vehicles=slow, obstacle_gap_m=obstacle), {"others_mps2": others}
+    profiles = {0: [(0.0, 1.0), (0.6, 4.0), (1.4, 0.5)], worlds.N - 1: [(0.0, 3.0), (0.2, 0.0)]}
+    yield "pieces", replace(worlds, obstacle_gap_m=obstacle).play_pieces(profiles), {"others_mps2": others}
 
 
 def line_of(worlds: Worlds, k: int, vehicle: int, command: Floats, *, total: bool = False) -> Line:
@@ -191,7 +193,7 @@ def line_of(worlds: Worlds, k: int, vehicle: int, command: Floats, *, total: boo
     made = make_line(
         worlds.gaps_m[k], worlds.speeds_mps[k], worlds.pair_hit[k], worlds.obstacle_gap_m[k], worlds.obstacle_hit[k],
         command[k], v.latency_s[k], v.mass_t[k], v.speed_limit_mps[k], worlds.command_mps2[k], v.brake_rate_mps3[k],
-        v.release_rate_mps3[k], worlds.time_s[k], v.restitution[k], 7.0, vehicle, total,
+        v.release_rate_mps3[k], v.pieces[k], worlds.time_s[k], v.restitution[k], 7.0, vehicle, total,
     )  # fmt: skip
     assert share_start(made) == FLAG.DONE
     return made
@@ -205,7 +207,7 @@ def harms(made: Line, decelerations: Floats, bound: float = math.inf) -> Samples
 
 
 @pytest.mark.parametrize("vehicles", [2, 3, 5, 10, 18])  # NumPy adds up a row of 8 or more pairs in another order
-@pytest.mark.parametrize("kind", ["alert", "others", "later", "obstacle", "build-up"])
+@pytest.mark.parametrize("kind", ["alert", "others", "later", "obstacle", "build-up", "pieces"])
 def test_simulate__does_the_harm_of_advance(kind, vehicles):
     ((_, worlds, options),) = (each for each in kinds(vehicles) if each[0] == kind)
     command = options.get("others_mps2", -worlds.vehicles.braking_capacity_mps2).copy()
@@ -470,7 +472,7 @@ def recorded_cases() -> Iterator[tuple[str, CoupledOptimum]]:
             yield f"{name} {harm_count}", optimise_coupled(worlds, 1, harm_count=harm_count)
     for vehicles in (2, 4, 7):
         for kind, worlds, options in kinds(vehicles):
-            for vehicle in sorted({0, vehicles // 2, vehicles - 1}) if kind != "build-up" else ():
+            for vehicle in sorted({0, vehicles // 2, vehicles - 1}) if kind not in ("build-up", "pieces") else ():
                 yield f"{vehicles} {kind} {vehicle}", optimise_coupled(worlds, vehicle, **options)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -64,8 +65,24 @@ def played(worlds: Worlds, commands: list[Floats]) -> tuple[Worlds, Floats, Ints
     return worlds, np.concatenate([ahead, harm], axis=1) if worlds.obstacle_ahead.any() else harm, count
 
 
-def by_small_steps(given: dict[str, Floats], commands: list[Floats], step_s: float) -> tuple[Floats, ...]:
-    """Gaps, speeds, forces and total harm of each pair after the same commands."""
+Pieces = dict[int, list[tuple[float, float]]]  # by vehicle: s after its latency, m/s2 of braking
+
+
+def random_pieces(key: int, given: dict[str, Floats]) -> Pieces:
+    """Pieces of the front vehicle, and of others; where it has no latency its second one begins at a switch."""
+    draws, pieces = Draws(1_000 + key), {}
+    for i, most in enumerate(given["braking_capacity_mps2"].min(axis=0)):
+        steps = np.round(draws.uniform(0.05, 1.2, (4,)), 3)
+        times = np.cumsum([0.0, 0.75 if i == 0 else steps[0], *steps[1:]])[: draws.choice([2, 3, 5], (1,))[0]]
+        if i != 1:
+            pieces[i] = list(zip(times.tolist(), (most * draws.uniform(0.0, 1.0, times.shape)).tolist(), strict=True))
+    return pieces
+
+
+def by_small_steps(
+    given: dict[str, Floats], commands: list[Floats], step_s: float, pieces: Pieces
+) -> tuple[Floats, ...]:
+    """Gaps, speeds, forces and total harm of each pair after the same commands, and pieces."""
     ahead = "obstacle_gap_m" in given
     found: list[tuple[Floats, ...]] = []
     for k in range(len(given["speeds_mps"])):
@@ -78,8 +95,14 @@ def by_small_steps(given: dict[str, Floats], commands: list[Floats], step_s: flo
         if ahead:
             gap[0] = row["obstacle_gap_m"]
         force, first, total = np.zeros(len(speed)), -np.ones(len(gap)), np.zeros(len(gap))
-        for command, start, until in zip(commands, SWITCHES_S[:-1], SWITCHES_S[1:], strict=True):
-            wanted = np.concatenate([[0.0], command[k]]) if ahead else command[k]
+        begins = (row["latency_s"][i] + time for i, each in pieces.items() for time, _ in each)
+        for start, until in pairwise(sorted({*SWITCHES_S, *(time for time in begins if time < SWITCHES_S[-1])})):
+            command = commands[sum(start >= switch for switch in SWITCHES_S) - 1][k].copy()
+            for i, each in pieces.items():
+                command[i] = -[braking for time, braking in each if time == 0.0 or row["latency_s"][i] + time <= start][
+                    -1
+                ]
+            wanted = np.concatenate([[0.0], command]) if ahead else command
             run(
                 gap, speed, force, wanted, front("latency_s", 0.0), front("mass_t", math.inf),
                 front("speed_limit_mps", 0.0), front("brake_rate_mps3", math.inf), front("release_rate_mps3", math.inf),
@@ -179,11 +202,25 @@ def test_rates_too_high_to_matter__leave_the_motion_as_it_is() -> None:
 # ---------------------------------------------------------------- against small steps
 
 
-@pytest.mark.parametrize(("key", "N", "obstacle"), [(1, 2, False), (2, 3, True), (3, 5, False)])
-def test_motion__is_that_of_small_steps(key: int, N: int, obstacle: bool) -> None:
+@pytest.mark.parametrize(
+    ("key", "N", "obstacle", "rates", "in_pieces"),
+    [
+        (1, 2, False, True, False),
+        (2, 3, True, True, False),
+        (3, 5, False, True, False),
+        (4, 2, True, True, True),
+        (5, 4, False, True, True),
+        (6, 3, False, False, True),
+        (7, 3, True, False, True),
+    ],
+)
+def test_motion__is_that_of_small_steps(key: int, N: int, obstacle: bool, rates: bool, in_pieces: bool) -> None:
     given, commands = random_lines(key, 12, N, obstacle=obstacle)
-    worlds, harm, _ = played(make_worlds(**given), commands)
-    gaps, speeds, forces, total = by_small_steps(given, commands, 1e-4)
+    given["latency_s"] = np.round(given["latency_s"], 3) if in_pieces else given["latency_s"]
+    pieces = random_pieces(key, given) if in_pieces else {}
+    given |= {} if rates else dict.fromkeys(("brake_rate_mps3", "release_rate_mps3"), np.full((12, N), np.inf))
+    worlds, harm, _ = played(make_worlds(**given).play_pieces(pieces), commands)
+    gaps, speeds, forces, total = by_small_steps(given, commands, 1e-4, pieces)
     assert (harm.sum(axis=1) > 1.0).sum() > 4
     np.testing.assert_allclose(forces, worlds.command_mps2, atol=1e-9)
     # a step too late changes a speed by 1e-3; where one cascade of bounces falls otherwise, a world is far off

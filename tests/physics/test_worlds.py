@@ -62,6 +62,7 @@ def test_make_worlds__broadcasts_every_parameter_to_arrays_of_its_own() -> None:
         **dict.fromkeys(("gaps_m", "pair_hit"), (4, 2)),
         **dict.fromkeys(("time_s", "restitution", "obstacle_gap_m", "obstacle_hit"), (4,)),
         "known_from_s": (4, 3, 3),
+        "pieces": (4, 3, 0),
         "messages": (4, 0),
         "road": (4, 0),
     }

@@ -1,7 +1,7 @@
 """Trying to break the step shield: no realised harm may be above the bound at the alert.
 
 bound         random worlds against every adversary of ``tests/shield/attacks.py``, both counts, N = 3 and 5, e to 0.3
-build-up      the same with brakes that build up, at rates from 5 to 60 m/s3
+build-up      the same with brakes that build up, at rates from 5 to 60 m/s3; and where others brake in pieces
 joint         teams of hostile learners at cooperation levels 3 and 4, N = 3 and 5; harm must be the last bound
 interfaces    worlds through every shielded interface, alone and with a team
 interference  refused calls, exceptions and interrupts at random lines on every interface, and wrappers in between
@@ -91,17 +91,25 @@ def cases(given: Given) -> Cases:
 
 def attacks(given: Given) -> Cases:
     """Every adversary of one learner, and of teams, each with its share of the worlds; no two cases share a world."""
-    one, rates, teams = [], [], []
+    one, rates, teams, draws = [], [], [], np.random.default_rng(given.seed)
     for N, count, name in product(CELLS, ("first", "total"), ADVERSARIES):
         case, share = {"harm_count": count, "adversary": ADVERSARIES[name]}, CELLS[N] * SLOW.get(name, 1.0)
         one.append((f"bound: N = {N}, {count}, {name}", share, line(N), case))
         rates.append((f"build-up: N = {N}, {count}, {name}", share, line(N).replace(**RATES), case))
+        begins, a, b, c = np.round(draws.uniform([0.05, 0, 0, 3], [1, 6, 6, 6]), 3).tolist()
+        pieces, scenario = [[0, a], [begins, b], [1.5, c]], line(N).replace(**(RATES if draws.random() < 0.5 else {}))
+        roles = {**scenario.roles, "vehicle_1": {"profile": pieces}, f"vehicle_{N}": {"profile": pieces[::2]}}
+        rates.append((f"build-up: in pieces, N = {N}, {count}, {name}", share, scenario.replace(roles=roles), case))
     every_team = product(TEAM_CELLS, ("first", "total"), ("all", "one"), TEAM_ADVERSARIES)
     for k, (which, count, hostile, name) in enumerate(every_team):
         cap = (None, "baseline")[k % 2]
         case = {"harm_count": count, "hostile": hostile, "adversary": TEAM_ADVERSARIES[name], "cap": cap}
         told = f"joint: level {which[0]}, N = {which[1]}, {count}, {hostile} hostile, {name}, cap {cap}"
-        teams.append((told, TEAM_CELLS[which], load_scenario(TEAMS[which]), case))
+        scenario = load_scenario(TEAMS[which])
+        if which[0] == 3 and k % 3 == 0:  # Vehicle 1 is no learner
+            told = told.replace("joint:", "joint: in pieces,")
+            scenario = scenario.replace(roles={**scenario.roles, "vehicle_1": {"profile": [[0, 2], [0.4, 6], [1, 1]]}})
+        teams.append((told, TEAM_CELLS[which], scenario, case))
     first = 0
     for all_worlds, cells in ((given.worlds, one), (given.build_up_worlds, rates), (given.joint_worlds, teams)):
         whole = sum(share for _, share, *_ in cells)

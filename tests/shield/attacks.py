@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.registry import drive, make_agent
+from ethbrake_marl.agents.registry import drive, make_agent, script_agents
 from ethbrake_marl.physics import Floats, Worlds, advance
 from ethbrake_marl.physics.kernel import CLOCK
 from ethbrake_marl.shield import ShieldedDriver, StepShield
@@ -193,7 +193,7 @@ def begun(scenario: eb.Scenario, worlds: Worlds, **settings) -> StepShield:
 
 def plain_engine(scenario: eb.Scenario, worlds: Worlds) -> eb.Engine:
     """Without a shield."""
-    scripts = {i: make_agent(spec) for i, spec in scenario.scripts.items()}
+    scripts = script_agents(scenario)
     return eb.Engine(scenario, worlds.n, learners=scenario.learners, scripts=scripts, worlds=worlds)
 
 
