@@ -895,9 +895,20 @@ class Engine:
         times = scenario.time_step_s, scenario.horizon_s
         self._settings = np.array([*times, self._terms.shared_harm, total, self.reward.terminal])
         self.reward_terms = self.reward.counted  # names of those whose values each step tells
+        self.check_time_step(self.scripts)
         self._stream = Stream(scenario, self.deciders, self.scripts, seed)
         self.protect(None if guard is None else guard(self))
         self.reset(worlds=worlds)
+
+    def check_time_step(self, drivers: Mapping[int, Script]) -> None:
+        """Raise ``InvalidInput`` for one that was made for decisions at another distance in time (``time_step_s``)."""
+        for script in drivers.values():
+            step, here = getattr(script, "time_step_s", None), self.scenario.time_step_s
+            if step not in (None, here):
+                raise InvalidInput(
+                    f"agent {getattr(script, 'name', type(script).__name__)!r} was made for decisions every {step:g} s;"
+                    f" scenario {self.scenario.name!r} has one every {here:g} s: make_agent(..., scenario=...) knows"
+                )
 
     @property
     def observation(self) -> ObservationSpec:
@@ -954,8 +965,8 @@ class Engine:
 
     def observe(self, vehicle: int) -> Observations:
         """Current observation of one vehicle, [n, F]."""
-        if not 0 <= vehicle < self.scenario.vehicles:
-            raise InvalidInput(f"observe: vehicle index {vehicle}; must be in 0..{self.scenario.vehicles - 1}")
+        if not isinstance(vehicle, int | np.integer) or not 0 <= vehicle < self.scenario.vehicles:
+            raise InvalidInput(f"observe: vehicle index {vehicle!r}; must be in 0..{self.scenario.vehicles - 1}")
         return self.observe_all(np.array([vehicle]))[:, 0]
 
     def observe_all(self, vehicles: Ints | None = None, rows: Ints | None = None) -> Observations:
@@ -1024,6 +1035,8 @@ class Engine:
         """Start new episodes of the training stream in these rows (autoreset). Whatever fails, nothing is changed."""
         if len(rows) == 0:
             return
+        if not np.isin(rows, np.arange(self.n)).all() or len(set(np.asarray(rows).tolist())) < len(rows):
+            raise InvalidInput(f"renew: rows {rows}; must be different numbers from 0 to {self.n - 1}")
         if not (self._watched or self._remembering or self.guard):
             self._renew(rows)
             return

@@ -67,8 +67,13 @@ class Ledger:
         )
 
     def since(self, before: Ledger) -> Ledger:
-        """What came to the same worlds after ``before``, as the harm of one step, to the last rounding."""
+        """What came to the same worlds after ``before``, as the harm of one step, to the last rounding.
+
+        Raises ``InvalidInput`` where there were more worlds, vehicles or impacts before, as in a row that was renewed.
+        """
         names = [column.name for column in fields(self) if column.name != "mass_t"]
+        if before.count.shape != self.count.shape or (before.count > self.count).any():
+            raise InvalidInput("since: these are not the same worlds; ask before a row is renewed")
         return replace(self, **{name: getattr(self, name) - getattr(before, name) for name in names})
 
     def take(self, rows: Ints | Bools | Sequence[int]) -> Ledger:
@@ -196,6 +201,8 @@ def injury_probability(speed_change_mps: Floats, side: Literal["front", "rear"],
     """
     if curve not in INJURY_CURVES:
         raise unknown_name("injury curve", curve, INJURY_CURVES)
+    if side not in ("front", "rear"):
+        raise unknown_name("side", side, ("front", "rear"))
     found = INJURY_CURVES[curve]
     return (found.front if side == "front" else found.rear)(np.abs(np.asarray(speed_change_mps, np.float64)))
 

@@ -403,7 +403,7 @@ def optimise_pairwise(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
 
     Raises ``InvalidInput`` if ``vehicle`` is not in the line, a vehicle moves backward or brakes build up.
     """
-    worlds.refuse_build_up("E-V2X-BM's closed form")
+    worlds.refuse_build_up("the closed form of E-V2X-BM, gentlest_front and planner")
     return _closed_form(worlds, vehicle)
 
 
@@ -423,7 +423,7 @@ def pairwise_harm(worlds: Worlds, deceleration_mps2: ArrayLike) -> Floats:
     controlled vehicle's pairs. Raises ``InvalidInput`` for a deceleration that is negative or not finite, and where
     brakes build up.
     """
-    worlds.refuse_build_up("E-V2X-BM's closed form")
+    worlds.refuse_build_up("the closed form of E-V2X-BM, gentlest_front and planner")
     onset = _onset_s(worlds, 0)
     deceleration = np.array(np.broadcast_to(np.asarray(deceleration_mps2, np.float64), worlds.speeds_mps.shape))
     good = (deceleration >= 0.0) & np.isfinite(deceleration)

@@ -55,6 +55,8 @@ class Seen(NamedTuple):
         if vehicle:
             k = vehicle - 1
             age, then, force = worlds.time_s - told.at_s[:, k], told.speed_mps[:, k], told.command_mps2[:, k]
+            brakes = force < 0.0
+            age = np.minimum(age, np.where(brakes, np.maximum(then, 0.0) / np.where(brakes, -force, 1.0), np.inf))
             front = np.where(age > 0.0, np.maximum(then + force * age, 0.0), then)
             gap = np.where(told.known[:, k], told.place_m[:, k] + 0.5 * (then + front) * age, np.inf)
         return cls(np.maximum(gap, _TOUCHING_M), worlds.speeds_mps[:, vehicle], front, force, own, step_s)
@@ -225,7 +227,7 @@ class Controller:
     knows = Source.MESSAGES
 
     def __init__(self, name: str, law: Law, parameters: Mapping[str, float], step_s: float) -> None:
-        self.name, self.law, self.parameters, self._step_s = name, law, Parameters(**parameters), step_s
+        self.name, self.law, self.parameters, self.time_step_s = name, law, Parameters(**parameters), step_s
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Floats:
         """Nothing was looked at yet: NaN."""
@@ -233,7 +235,7 @@ class Controller:
 
     def act(self, worlds: Worlds, memory: Floats, vehicle: int) -> tuple[Floats, Floats]:
         """What the law calls for within the capacities, [n] m/s2."""
-        seen, p, vehicles = Seen.of(worlds, vehicle, self._step_s), self.parameters, worlds.vehicles
+        seen, p, vehicles = Seen.of(worlds, vehicle, self.time_step_s), self.parameters, worlds.vehicles
         command = self.law.command(seen, p)
         if self.law.notices is not None:
             now = np.where(np.isnan(memory), 0.0, worlds.time_s)
@@ -254,7 +256,7 @@ def make_controller(argument: str | None, settings: AgentSettings) -> Controller
     """
     name = settings.spec.partition(":")[0]
     law, where = LAWS[name], f"agent {settings.spec!r}"
-    parameters = dict(law.parameters)
+    parameters: dict[str, float] = {}
     for part in [] if argument is None else argument.split(":"):
         key, _, text = part.partition("=")
         if key not in law.parameters:
@@ -263,7 +265,10 @@ def make_controller(argument: str | None, settings: AgentSettings) -> Controller
         if value is None or not (0.0 < value < math.inf or (value == 0.0 and key in law.may_be_zero)):
             least = "0 or more" if key in law.may_be_zero else "above 0"
             raise InvalidInput(f"{where}: {key} must be a number {least}, for instance {key}={law.parameters[key]:g}")
+        if key in parameters:
+            raise InvalidInput(f"{where}: {key} is given twice")
         parameters[key] = value
+    parameters = {**law.parameters, **parameters}
     if parameters.get("b_min", 0.0) > parameters.get("b_max", math.inf):
         raise InvalidInput(f"{where}: b_min {parameters['b_min']:g} must not be above b_max {parameters['b_max']:g}")
     return Controller(settings.spec, law, parameters, settings.time_step_s)

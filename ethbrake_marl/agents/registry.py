@@ -176,6 +176,11 @@ class AgentAround:
         """What the policy knows, and what this adds."""
         return Knowledge.of(self.policy, also=self.adds)
 
+    @property
+    def time_step_s(self) -> float | None:
+        """The policy's, s; None: it goes by any."""
+        return getattr(self.policy, "time_step_s", None)
+
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         """As the policy."""
         return begin_script(self.policy, alert, vehicle, scripts)
@@ -526,7 +531,7 @@ def make_agent(
         horizon_s: until when it looks ahead, s; None: the scenario's horizon, or 8 s.
         most_candidates: for trying an agent out: no search of it takes more.
         uncertainty: what a robust shield does not know, such as ``"gaps_m=0.5"``.
-        time_step_s: between two decisions of what searches; None: the scenario's, or 0.1 s.
+        time_step_s: between two decisions of what searches or follows a law; None: the scenario's, or 0.1 s.
 
     Raises ``UnknownName`` with a suggestion for an unknown name, ``InvalidInput`` for a bad argument, harm count or
     horizon, and for a scenario that is missing.
@@ -564,8 +569,8 @@ def make_agent(
 
 
 def make_single_agent(spec: str, **settings: Any) -> Agent:
-    """``make_agent`` for who drives one vehicle; raises ``InvalidInput`` for a team too."""
-    agent = make_agent(spec, **settings)
+    """``make_agent`` for who drives one vehicle, a script's profile too; raises ``InvalidInput`` for a team too."""
+    agent = _PROFILE.load()(spec) if spec.startswith("profile:") else make_agent(spec, **settings)
     if not isinstance(agent, Agent):
         raise InvalidInput(f"agent {spec!r}: is a team, one agent is needed here: ppo@RUN/policy/vehicle_2")
     return agent
@@ -711,9 +716,7 @@ def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | Non
     """Agents for the scenario's scripts, by vehicle."""
     left_out = (except_for,) if isinstance(except_for, int) else except_for or ()
     made = {
-        i: _PROFILE.load()(spec)
-        if ScriptSpec.parse(spec).pieces
-        else make_single_agent(spec, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s)
+        i: make_single_agent(spec, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s)
         for i, spec in scenario.scripts.items()
         if i not in left_out
     }
@@ -748,6 +751,7 @@ def episode_engine(worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: i
             scenario, worlds.n, learners=tuple(drivers), scripts=scripts, worlds=worlds,
             guard=lambda engine: shield.guard(engine, drivers),
         )  # fmt: skip
+        engine.check_time_step(drivers)
     engine.roster.warns = False  # who drives looks
     return engine
 

@@ -1071,7 +1071,10 @@ class EpisodeImpacts:
 
     @property
     def largest_speed_change_mps(self) -> Floats:
-        """The largest change of speed of each vehicle in one impact (delta-v), [n, N]; 0 without one."""
+        """The largest change of speed of each vehicle in one impact (delta-v), [n, N]; 0 without one.
+
+        One that is pushed by a vehicle that touches it already has no impact of its own, and so no change from it.
+        """
         rows, change = self.rows, np.zeros(self.worlds.speeds_mps.shape)
         np.maximum.at(change, (rows.world, rows.pair + 1), np.abs(rows.rear_speed_change_mps))
         pairs = rows.pair >= 0  # an obstacle ahead is no vehicle
@@ -1130,7 +1133,7 @@ def register_injury() -> None:
 
     ``injury_CURVE`` is the sum over the vehicles of a line, each by its largest change of speed, as the literature
     takes it; ``injury_CURVE_vehicle`` tells it of each; ``injury_CURVE_every`` sums over every impact, as if each met
-    other people. A vehicle that was not hit has none.
+    other people. A vehicle that was not hit has none, nor has one pushed by a vehicle that touches it already.
     """
     for name, function in _INJURIES.items():
         register_measure(name, function, unit="per 1,000 lines")

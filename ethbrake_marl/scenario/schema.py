@@ -162,7 +162,7 @@ def _check_scripts(scenario: ScenarioFields) -> None:
         spec = ScriptSpec.parse(script)
         close = get_close_matches(spec.name, STATE_FREE, n=1)
         hint = f"; did you mean {close[0]}?" if close else ""
-        right = f"with early_impacts: reject a script must be full_brake, coast or constant:a{hint}"
+        right = f"with early_impacts: reject a script must be full_brake, coast, constant:a or a profile{hint}"
         require(spec.is_state_free(), ("roles", f"vehicle_{i + 1}"), script, right)
 
 
