@@ -42,7 +42,7 @@ from tests.physics.random_worlds import (
     touching_lines,
 )
 from tests.physics.segments import Scan, random_segments, scan
-from tests.physics.test_build_up import by_small_steps, played, random_lines
+from tests.physics.test_build_up import by_small_steps, played, random_lines, random_pieces
 from tests.physics.test_oracles import accelerations, at_once, exact_accelerations, in_steps, law_error_eps
 from tests.programmes import Cases, Given, Told
 from tests.reference.tolerances import (
@@ -80,27 +80,30 @@ OPTIONS = {"--small-step-worlds": {"type": int, "default": 10_000, "help": "of '
 def cases(given: Given) -> Cases:
     for name, measure in GATES.items():
         yield name, partial(measured, measure)
-    each = max(1, given.small_step_worlds // 8)
-    for N, obstacle in product((2, 3, 5, 8), (False, True)):
-        told = f"brakes that build up, N = {N}{', obstacle' * obstacle}"
-        yield told, partial(measured, partial(small_steps, N, obstacle, each))
+    each = max(1, given.small_step_worlds // 16)
+    for N, obstacle, in_pieces in product((2, 3, 5, 8), (False, True), (False, True)):
+        told = f"brakes that build up, N = {N}{', obstacle' * obstacle}{', in pieces' * in_pieces}"
+        yield told, partial(measured, partial(small_steps, N, obstacle, in_pieces, each))
 
 
 # ---------------------------------------------------------------- brakes that build up
 
 
-def small_steps(N: int, obstacle: bool, worlds: int) -> Figure:
+def small_steps(N: int, obstacle: bool, in_pieces: bool, worlds: int) -> Figure:
     """The largest relative error beside steps of 1e-5 s, or of 1e-6 s where those are too coarse.
 
     In longer cascades than thirty impacts a step more or less changes the order of bounces: they are not compared.
     """
-    given, commands = random_lines(100 + 2 * N + obstacle, worlds, N, obstacle=obstacle)
-    after, harm, impacts = played(make_worlds(**given), commands)
+    key = 100 + 2 * N + obstacle + 50 * in_pieces
+    given, commands = random_lines(key, worlds, N, obstacle=obstacle)
+    given["latency_s"] = np.round(given["latency_s"], 3) if in_pieces else given["latency_s"]
+    pieces = random_pieces(key, given) if in_pieces else {}
+    after, harm, impacts = played(make_worlds(**given).play_pieces(pieces), commands)
     exact = np.concatenate([after.gaps_m, after.speeds_mps, after.command_mps2, harm], axis=1)
 
     def error(rows: Ints, step_s: float) -> Floats:
         some = {key: value[rows] for key, value in given.items()}
-        found = np.concatenate(by_small_steps(some, [each[rows] for each in commands], step_s), axis=1)
+        found = np.concatenate(by_small_steps(some, [each[rows] for each in commands], step_s, pieces), axis=1)
         return np.asarray((np.abs(found - exact[rows]) / (1.0 + np.abs(exact[rows]))).max(axis=1))
 
     rows = np.flatnonzero(impacts <= 30)

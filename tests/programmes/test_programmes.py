@@ -127,6 +127,21 @@ def test_proofs__every_statement_and_every_planted_bug():
     assert done.stdout.splitlines()[-1] == "PASS: 27 of 27 good, 0 failed, 0 without a verdict", done.stdout
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "cases"),
+    [
+        ("physics --small-step-worlds 64 --only|brakes that", 16),
+        ("shield --build-up-worlds 2000 --only|build-up: in pieces, N = 3, first", 10),
+        ("shield --joint-worlds 400 --only|joint: in pieces", 24),
+    ],
+)
+def test_attacks__a_sample_of_what_only_programmes_run(words, cases):
+    options, only = words.split("|")
+    done = run(*options.split(), only)
+    assert done.stdout.splitlines()[-1] == f"PASS: {cases} of {cases} good, 0 failed, 0 without a verdict", done.stdout
+
+
 def test_proofs__refuse_compiled_functions():
     done = run("proofs", NUMBA_DISABLE_JIT="0")
     assert done.returncode == 1 and "compilation must be switched off" in done.stderr
