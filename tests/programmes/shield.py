@@ -47,6 +47,7 @@ BATCH = 50_000  # worlds driven at once by what was applied
 CELLS = {3: 3.0, 5: 1.0}  # how many of the worlds each number of vehicles gets: lines of five take five times as long
 SLOW = {"worst_case": 0.14}  # and of those, a search in every step
 RATES = {"brake_rate_mps3": {"uniform": [5, 40]}, "release_rate_mps3": {"uniform": [5, 60]}}
+UNSURE = "brake_rate_mps3=20%"  # of every vehicle; the truth is a corner
 TEAM_CELLS = {(3, 3): 5.0, (4, 3): 1.25, (3, 5): 1.0, (4, 5): 0.75}  # by what they cost
 
 
@@ -96,6 +97,11 @@ def attacks(given: Given) -> Cases:
         case, share = {"harm_count": count, "adversary": ADVERSARIES[name]}, CELLS[N] * SLOW.get(name, 1.0)
         one.append((f"bound: N = {N}, {count}, {name}", share, line(N), case))
         rates.append((f"build-up: N = {N}, {count}, {name}", share, line(N).replace(**RATES), case))
+        if name != "worst_case":  # which looks for one world
+            unsure = {**case, "uncertainty": UNSURE}
+            rates.append(
+                (f"build-up: {UNSURE}, N = {N}, {count}, {name}", 0.25 * share, line(N).replace(**RATES), unsure)
+            )
         begins, a, b, c = np.round(draws.uniform([0.05, 0, 0, 3], [1, 6, 6, 6]), 3).tolist()
         pieces, scenario = [[0, a], [begins, b], [1.5, c]], line(N).replace(**(RATES if draws.random() < 0.5 else {}))
         roles = {**scenario.roles, "vehicle_1": {"profile": pieces}, f"vehicle_{N}": {"profile": pieces[::2]}}

@@ -17,7 +17,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import drive, make_agent, script_agents
 from ethbrake_marl.physics import Floats, Worlds, advance
 from ethbrake_marl.physics.kernel import CLOCK
-from ethbrake_marl.shield import ShieldedDriver, StepShield
+from ethbrake_marl.shield import ShieldedDriver, StepShield, parse_uncertainty
 from ethbrake_marl.shield.step_shield import Decision, certify, seen_columns
 
 # ---------------------------------------------------------------- lines
@@ -150,15 +150,18 @@ class Attack(NamedTuple):
 
 def attack(
     scenario: eb.Scenario, worlds: Worlds, adversary: Adversary, *, hostile="all", harm_count="first", allowance=0.0,
-    cap=None, leak: Leak | None = None, seed=0,
+    cap=None, uncertainty: str | None = None, leak: Leak | None = None, seed=0,
 ) -> Attack:  # fmt: skip
     """Let the hostile learners propose in every step: ``all``, or ``one``, another one from world to world.
 
     Who is not hostile proposes what the plan says, or brakes fully. A ``leak`` changes the shield before each decision.
+    With an uncertainty the worlds are what the shield is told, and the truth is a corner.
     """
     rng, learners = np.random.default_rng(seed), scenario.learners
-    engine = plain_engine(scenario, worlds)
-    shield = begun(scenario, worlds, harm_count=harm_count, allowance=allowance, cap=cap)
+    intervals = None if uncertainty is None else parse_uncertainty(uncertainty)
+    truth = worlds if intervals is None else intervals.draw(worlds, rng, corners=True)
+    engine, sound = plain_engine(scenario, truth), leak is None and intervals is None
+    shield = begun(scenario, worlds, harm_count=harm_count, allowance=allowance, cap=cap, uncertainty=intervals)
     first_bound, told, decision = shield.first_bound.copy(), shield.bound, None
     rows = np.arange(worlds.n)[:, np.newaxis]
     who, obeys = rows % len(learners) == np.arange(len(learners)), rows % 4 < 2
@@ -175,9 +178,9 @@ def attack(
         accepted += (((reason == 1) | (reason == 2)) & ~engine.ended[:, np.newaxis]).sum(axis=1)
         rises, told = rises + int((decision.bound > told).sum()), decision.bound
         engine.step(decision.applied.reshape(shape(shield)))
-        assert leak is not None or shield.expects(seen_columns(engine.packed)).all()
+        assert not sound or shield.expects(seen_columns(engine.packed)).all()
         k += 1
-    assert leak is not None or not shield.distrusted.any()
+    assert not sound or not shield.distrusted.any()
     over = 0 if cap is None else int((engine.ledger.vehicle_harm(harm_count) > shield.baseline_shares).sum())
     realised = engine.ledger.world_harm(harm_count)
     return Attack(realised, first_bound, shield.bound, accepted, rises, over, decisions)
