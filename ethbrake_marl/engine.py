@@ -141,6 +141,17 @@ class Step(NamedTuple):
         return np.asarray(self.outcome[row] == 1.0, np.bool_)
 
 
+@compiled(apart=True, bare=True)
+def place_row(table: Floats, state: Floats, params: Floats, k: int, pieces: Floats) -> None:
+    """``place_forces`` of a row; a function of its own, as worlds without rates would pay for it in their loop."""
+    column, N = columns(state), pieces.shape[0]
+    command, brake_rate, release_rate = column.command, column.brake_rate, column.release_rate
+    place_forces(
+        table, state[k, command : command + N], params[k, brake_rate : brake_rate + N],
+        params[k, release_rate : release_rate + N], pieces,
+    )  # fmt: skip
+
+
 @compiled
 def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to functions costs more than the work
     state: Floats, params: Floats, clock: Floats, actions: Floats, learners: Ints, settings: Floats, no_rows: Floats,
@@ -162,7 +173,7 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     column = columns(state)
     speed, command, previous, gap, harm = column.speed, column.command, column.previous, column.gap, column.harm
     braking, driving, latency, mass, limit = column.braking, column.driving, column.latency, column.mass, column.limit
-    P, obstacle, brake_rate, release_rate = N - 1, column.obstacle, column.brake_rate, column.release_rate
+    P, obstacle = N - 1, column.obstacle
     worst, worst_status = -1, FLAG.DONE
     at = 1 if state.shape[1] > obstacle else 0  # vehicle i stands in column at + i, behind an obstacle
     table = np.zeros((rows_for(pieces.shape[1]) if builds_up else ROW.OF_SEGMENT, N + at))
@@ -189,11 +200,10 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
             table[ROW.LIMIT, at + i] = params[k, limit + i]
             table[ROW.ONSET, at + i] = onset_s(params[k, latency + i], time)
             state[k, previous + i] = state[k, command + i]
+            if not builds_up:
+                state[k, command + i] = wanted[k, i] if params[k, latency + i] <= until else 0.0
         if builds_up:
-            place_forces(
-                table, state[k, command : command + N], params[k, brake_rate : brake_rate + N],
-                params[k, release_rate : release_rate + N], pieces,
-            )  # fmt: skip
+            place_row(table, state, params, k, pieces)
         for p in range(P):
             table[ROW.GAP, at + p] = state[k, gap + p]
             table[ROW.HIT, at + p] = state[k, gap + P + p]
@@ -207,6 +217,7 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
             clock[k, ENDED] = 1.0
             clock[k, STEP] -= 1.0
             for i in range(N):
+                state[k, command + i] = state[k, previous + i]
                 reward[k, i] = 0.0
             continue
         state[k, column.time] = until
@@ -214,8 +225,8 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
         for i in range(N):
             state[k, speed + i] = table[ROW.SPEED, at + i]
             at_rest = at_rest and stands(table[ROW.SPEED, at + i], wanted[k, i])
-            state[k, command + i] = wanted[k, i] if params[k, latency + i] <= until else 0.0
-            if builds_up:
+        if builds_up:
+            for i in range(N):
                 state[k, command + i] = force_at(table, at + i, wanted[k, i], params[k, latency + i], until)
                 at_rest = at_rest and state[k, command + i] <= 0.0
         impacts, first_harm, total_harm = 0.0, 0.0, 0.0
@@ -1035,7 +1046,7 @@ class Engine:
         """Start new episodes of the training stream in these rows (autoreset). Whatever fails, nothing is changed."""
         if len(rows) == 0:
             return
-        if not np.isin(rows, np.arange(self.n)).all() or len(set(np.asarray(rows).tolist())) < len(rows):
+        if not 0 <= np.min(rows) <= np.max(rows) < self.n or np.bincount(rows).max() > 1:
             raise InvalidInput(f"renew: rows {rows}; must be different numbers from 0 to {self.n - 1}")
         if not (self._watched or self._remembering or self.guard):
             self._renew(rows)

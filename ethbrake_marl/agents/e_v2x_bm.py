@@ -647,7 +647,7 @@ def share_start(line: Line) -> int:
     """Move the line to where its controlled vehicle's command takes effect; DONE, or what went wrong."""
     table, clock = line.shared, line.clock
     copy_table(line.start, table)
-    start_events(table)
+    start_events(table, builds_up(table))
     now = 0.0
     for _ in range(BOUND.MOST_EVENTS):
         if table[ROW.ACTIVE, line.controlled] == 1.0 or now >= clock[DURATION]:

@@ -282,6 +282,15 @@ class Packed(NamedTuple):
 
 
 @compiled
+def finite_among(values: Floats) -> int:
+    """How many of n numbers are below infinity; a loop by index that counts is compiled to one of vectors."""
+    count = 0
+    for k in range(values.size):
+        count += 1 if values[k] < math.inf else 0
+    return count
+
+
+@compiled
 def advance_worlds(
     gaps: Floats, speeds: Floats, time: Floats, hit: Bools, in_force: Floats, ahead: Floats, ahead_hit: Bools,
     first_harm: Floats, total_harm: Floats, count: Ints, ahead_first: Floats, ahead_total: Floats, ahead_count: Ints,
@@ -296,7 +305,8 @@ def advance_worlds(
     and stays where it was; the others go on.
     """
     n, vehicles = speeds.shape
-    table = np.zeros((rows_for(pieces.shape[2]), at + vehicles))
+    building = pieces.shape[2] > 0 or finite_among(brake_rate.ravel()) + finite_among(release_rate.ravel()) > 0
+    table = np.zeros((rows_for(pieces.shape[2]) if building else ROW.OF_SEGMENT, at + vehicles))
     recorded = 0
     for k in range(n):
         duration = until[k] - time[k]
@@ -313,10 +323,13 @@ def advance_worlds(
             table[ROW.MASS, at + i] = mass[k, i]
             table[ROW.LIMIT, at + i] = limit[k, i]
             table[ROW.ONSET, at + i] = onset_s(latency[k, i], time[k])
+            if not building:
+                in_force[k, i] = command[k, i] if latency[k, i] <= until[k] else 0.0
         for p in range(vehicles - 1):
             table[ROW.GAP, at + p] = gaps[k, p]
             table[ROW.HIT, at + p] = 1.0 if hit[k, p] else 0.0
-        place_forces(table, in_force[k], brake_rate[k], release_rate[k], pieces[k])
+        if building:
+            place_forces(table, in_force[k], brake_rate[k], release_rate[k], pieces[k])
         recorded, status = advance_table(table, restitution[k], duration, time[k], k, rows, recorded)
         failed[k] = status
         if status != FLAG.DONE:
@@ -324,7 +337,9 @@ def advance_worlds(
         time[k] = until[k]
         for i in range(vehicles):
             speeds[k, i] = table[ROW.SPEED, at + i]
-            in_force[k, i] = force_at(table, at + i, command[k, i], latency[k, i], until[k])
+        if building:
+            for i in range(vehicles):
+                in_force[k, i] = force_at(table, at + i, command[k, i], latency[k, i], until[k])
         for p in range(vehicles - 1):
             gaps[k, p] = table[ROW.GAP, at + p]
             hit[k, p] = table[ROW.HIT, at + p] == 1.0

@@ -434,7 +434,7 @@ def _advance(
         table[ROW.COUNT, p] = 0.0
     if move_apart(table, duration, building):
         return recorded, FLAG.DONE
-    start_events(table)
+    start_events(table, building)
     now = 0.0
     for _ in range(BOUND.MOST_EVENTS):
         status, now = to_next_impact(table, restitution, now, duration, building)
@@ -507,12 +507,12 @@ def move_apart(table: Floats, duration: float, building: bool) -> bool:
 
 
 @compiled(bare=True)
-def start_events(table: Floats) -> None:
+def start_events(table: Floats, building: bool) -> None:
     """Make the table ready for ``to_next_impact`` from the start of a segment."""
     for i in range(table.shape[1]):
         table[ROW.ACTIVE, i] = 1.0 if table[ROW.ONSET, i] <= 0.0 else 0.0
         table[ROW.CONTACT_SPEED, i] = 0.0
-        if table.shape[0] > ROW.OF_BUILD_UP:
+        if building and table.shape[0] > ROW.OF_BUILD_UP:
             begin_piece(table, i, 0.0)
 
 
@@ -545,17 +545,17 @@ def to_next_event(table: Floats, now: float, duration: float, building: bool) ->
         sound = move(table, passed)
     if not sound:
         return False, now
-    begin_commands(table, now, passed)
+    begin_commands(table, now, passed, building)
     return True, duration if passed >= duration - now else now + passed
 
 
 @compiled(bare=True)
-def begin_commands(table: Floats, now: float, passed: float) -> None:
+def begin_commands(table: Floats, now: float, passed: float, building: bool) -> None:
     """Let those commands and pieces act that begin within ``passed`` (s) from ``now`` on."""
     for i in range(table.shape[1]):
         if table[ROW.ONSET, i] - now <= passed:
             table[ROW.ACTIVE, i] = 1.0
-        if table.shape[0] > ROW.OF_BUILD_UP and table[ROW.NEXT_PIECE, i] - now <= passed:
+        if building and table.shape[0] > ROW.OF_BUILD_UP and table[ROW.NEXT_PIECE, i] - now <= passed:
             begin_piece(table, i, table[ROW.NEXT_PIECE, i])
 
 
@@ -1430,15 +1430,14 @@ def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) ->
     Those that do not fit into ``rows`` [capacity, 1 + P + 3 N] are only counted; minus their number where a contact
     was missed.
     """
-    vehicles = table.shape[1]
-    start_events(table)
+    vehicles, building = table.shape[1], builds_up(table)
+    start_events(table, building)
     now, count = 0.0, 0
     for _ in range(BOUND.MOST_EVENTS):
         if resolve_impacts(table, restitution):
             continue
         if now >= duration:
             break
-        building = builds_up(table)
         parting = accelerate_moving(table) if building else math.inf
         if not building:
             accelerate(table)
@@ -1454,7 +1453,7 @@ def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) ->
         passed = next_moving_event(table, now, duration, parting) if building else next_event(table, now, duration)
         if not (move_on_cubics(table, passed) if building else move(table, passed)):
             return -count
-        begin_commands(table, now, passed)
+        begin_commands(table, now, passed, building)
         now = duration if passed >= duration - now else now + passed
     return count
 
@@ -1616,7 +1615,7 @@ def forecast_contacts(table: Floats, restitution: float, duration: float, found:
     building = builds_up(table)
     if move_apart(table, duration, building):
         return FLAG.DONE
-    start_events(table)
+    start_events(table, building)
     no_rows, now = table[:0], 0.0
     for _ in range(BOUND.MOST_EVENTS):
         status, now = to_next_impact(table, restitution, now, duration, building)
