@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 import webbrowser
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from ethbrake_marl import evaluation, learning
+from ethbrake_marl import evaluation, learning, scenario as scenarios
 from ethbrake_marl.cli.command import Out, app, whole_number
 from ethbrake_marl.defaults import DEFAULT, DatasetFormat, HarmCount
 from ethbrake_marl.errors import InvalidInput, count_of, need
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.scenario import Sample, Scenario, Task
     from ethbrake_marl.shield import Uncertainty
 
+GROUP_EPISODES = 1_000  # of each scenario of a group
 PAGES = (".html", ".htm")
 _PROPOSERS = "ppo@shipped,full_brake,constant:3"
 _HARMS = {"first_impact_harm": "First-impact harm", "total_harm": "Total harm", "harm": "Harm"}
@@ -144,6 +147,12 @@ def evaluate_command(
     from ethbrake_marl.harm import declared_objectives
 
     whole = {"--per-world": per_world, "--report": report, "--initial-states": initial_states, "--by": by}
+    if group := scenarios.group_of_scenarios(scenario):
+        other = whole | {"--objective": objective, "--measures": measures, "--shards": shards, "--output": output}
+        for option in (name for name, value in other.items() if value):
+            raise InvalidInput(f"{option}: {scenario} is a group of {len(group)} scenarios; give one of them")
+        _evaluate_group(out, group, agents, episodes, seed, partial(_asked_task, vehicle=vehicle, settings=settings))
+        return
     _check_shards(shards, jobs, ray, output, rows, whole)
     _check_outputs(out, per_world, report)
     if measures is not None:
@@ -197,6 +206,43 @@ def evaluate_command(
     _tell_horizon(out, _moving(summary), sample.worlds.n, chosen.horizon_s)
     if told and not out.as_json:
         out.show(told.sheet(harm_count))
+
+
+def _evaluate_group(
+    out: Out, group: Sequence[str], agents: str, episodes: int | None, seed: int | None, asked: Callable[[str], Task]
+) -> None:
+    """Each agent in each scenario: passed where nobody collides, else how hard the hardest pair does."""
+    told: list[dict[str, Any]] = []
+    rows: list[Any] = []
+    for name in group:
+        chosen = asked(name).scenario
+        sample, drawn_by = evaluation.choose_worlds(chosen, episodes=episodes or GROUP_EPISODES, seed=seed)
+        lineup = _make_drivers(agents.split(","), chosen)
+        evaluation.check_agents(lineup, sample.worlds, chosen)
+        found = evaluation.evaluate(sample, lineup, scenario=chosen, seed=drawn_by)
+        rows.append(name)
+        for agent, outcome in found.outcomes.items():
+            hardest = 3.6 * math.sqrt(outcome.ledger.pair_harm("first").max(initial=0.0))
+            each = {
+                "passed": not outcome.collided.any(),
+                "collision_rate": float(outcome.collided.mean()),
+                "hardest_impact_kmh": hardest,
+                "first_impact_harm": float(outcome.first_impact_harm.mean()),
+                "total_harm": float(outcome.total_harm.mean()),
+            }
+            told.append({"scenario": name, "agent": agent, "worlds": found.worlds.n, **each})
+            shown = f"{each['collision_rate']:.1%}", f"{hardest:.1f}", *(f"{each[key]:.2f}" for key in list(each)[3:])
+            rows.append((agent, "passed" if each["passed"] else "failed", *shown))
+    columns: list[Column | str] = [
+        "Agent",
+        "Result",
+        *map(Column, ("Collisions", "Hardest, km/h", "First-impact harm", "Total harm")),
+    ]
+    note = (
+        f"{found.worlds.n:,} worlds of each, seed {drawn_by}; `ethbrake scenario explain` tells their parameters."
+        " Passed: nobody collides, in no world. Harms: means per world in m²/s². Hardest: the closing speed of a pair."
+    )
+    out.result(told, Sheet("", columns, rows, note))
 
 
 def _check_shards(

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         Scenario as Scenario,
         Task as Task,
         check_file_name as check_file_name,
+        group_of_scenarios as group_of_scenarios,
         list_scenarios as list_scenarios,
         load_scenario as load_scenario,
         new_scenario_text as new_scenario_text,

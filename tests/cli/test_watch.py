@@ -73,6 +73,23 @@ def test_by__writes_every_group_down(ethbrake: Command, tmp_path: Path) -> None:
     assert sum(row["scenario"] == "paper-delay-low" for row in rows_of(out)) == 16
 
 
+def test_standards__full_braking_passes_as_published_and_is_struck_by_every_follower(ethbrake: Command) -> None:
+    words = ("evaluate", "--scenario", "standards", "--agents", "full_brake,e_v2x_bm", "--episodes", "200")
+    told = told_json(ethbrake(*words, "--json"))
+    assert len(told) == 20 and {row["worlds"] for row in told} == {200}
+    for row in told:
+        struck = row["agent"] == "full_brake" and row["scenario"].endswith("-follower")
+        assert row["passed"] == (row["collision_rate"] == row["hardest_impact_kmh"] == 0.0) == (not struck)
+        assert (row["total_harm"] > 15.0) == struck
+    # by hand: both at 60 km/h, Vehicle 2 stands after 0.2 s and v^2 / 18; that and 10 m Vehicle 3 has after its 0.75 s
+    hardest = next(row for row in told if row["scenario"] == "standards-r157-follower")["hardest_impact_kmh"]
+    speed = 16.667
+    way = 10.0 + 0.2 * speed + speed**2 / 18.0 - 0.75 * speed
+    assert hardest == pytest.approx(3.6 * (speed**2 - 2.0 * 7.59 * way) ** 0.5, rel=1e-6)
+    refused = ethbrake(*words, "--by", "scenario")
+    assert refused.status == 2 and "--by: standards is a group of 10 scenarios; give one of them" in refused.err
+
+
 def test_evaluate__a_damaged_bundle_is_refused_by_file_whatever_is_around_it(ethbrake, tmp_path) -> None:
     shutil.copytree(shipped_policies()["ppo"] / "policy", tmp_path / "policy")
     weights = tmp_path / "policy" / "weights.safetensors"
