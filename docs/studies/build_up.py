@@ -11,6 +11,7 @@ import numpy as np
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents import make_agent
+from ethbrake_marl.limits.lower_bound import lower_bound
 from ethbrake_marl.physics import advance
 
 WORLDS, SEARCHED, SEED = 1_000, 400, 7
@@ -62,5 +63,8 @@ if __name__ == "__main__":
         worlds = scenario.sample(WORLDS, SEED).worlds
         told = harms(worlds, scenario, AGENTS)
         told |= {"not told": not_told(worlds)}
+        time_step_s = BASE.time_step_s if scenario is BASE else None  # decisions are not used where brakes build up
+        bound = lower_bound(worlds, horizon_s=scenario.horizon_s, time_step_s=time_step_s).harm
+        told |= {"proven": f"{bound.mean():.2f}", "proven, of the searched": f"{bound[:SEARCHED].mean():.2f}"}
         told |= harms(worlds.take(np.arange(SEARCHED)), scenario, {"search": "best_harm"})
         print(name, told, flush=True)

@@ -684,23 +684,28 @@ def prove(worlds: Worlds, task: Task) -> Proof | Unproven:
         contact = avoidability(worlds, _DRIVEN)
         return Proof(contact.avoidable, contact.reason_name, harm)
     bound = lower_bound(worlds, task.vehicle, horizon_s=horizon_s, time_step_s=time_step_s)
+    if bound.contact is None:
+        return Proof(None, None, bound.harm)
     return Proof(bound.contact.avoidable, bound.contact.reason_name, bound.harm)
 
 
 def unproven_because(worlds: Worlds, task: Task) -> str | None:
     """Why nothing is proven for the task in these worlds, as a clause; None when it is."""
-    if worlds.vehicles.build_up.any():
+    if worlds.vehicles.in_pieces.any() or (_is_team(task) and worlds.vehicles.build_up.any()):
         return _uneven_because(worlds)
     if not _is_team(task):
-        return undecided_because(worlds, task)
+        return _uncovered_because(worlds, task)
     return _script_because(task, "harm is bounded")
 
 
 def undecided_because(worlds: Worlds, task: Task) -> str | None:
     """Why it is not decided in these worlds whether contact can be avoided, as a clause; None when it is."""
+    return _uneven_because(worlds) if worlds.vehicles.build_up.any() else _uncovered_because(worlds, task)
+
+
+def _uncovered_because(worlds: Worlds, task: Task) -> str | None:
+    """``undecided_because``, but for brakes that build up."""
     scenario, names = task.scenario, task.scenario.vehicle_names
-    if worlds.vehicles.build_up.any():
-        return _uneven_because(worlds)
     if not task.vehicles or (len(task.vehicles) > 1 and set(task.vehicles) not in _DECIDED):
         return f"driven are: {task.names}; avoidability is proven for one vehicle"
     if scenario.vehicles != _VEHICLES:

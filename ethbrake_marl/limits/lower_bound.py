@@ -11,8 +11,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.harm import check_harm_count, empty_ledger
+from ethbrake_marl.limits.ramps import FORCES, empty_legs, fill_build_up, fill_switch, force_of, meeting, travel
 from ethbrake_marl.physics import (
     BOUND,
     CLOCK,
@@ -392,6 +394,26 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
     reach before any contact.
     """
     worlds.refuse_build_up("avoidability")
+    _check_covered(worlds, vehicle, scripts)
+    v = worlds.vehicles
+    onset = np.maximum(v.latency_s - worlds.time_s[:, None], 0.0)
+    out = np.empty((worlds.n, RESULT_WIDTH))
+    decide_worlds(
+        worlds.gaps_m, worlds.speeds_mps, onset, v.braking_capacity_mps2, v.driving_capacity_mps2, v.speed_limit_mps,
+        vehicle, out,
+    )  # fmt: skip
+    reason = out[:, REASON].astype(np.int64)
+    start = worlds.time_s + onset[:, vehicle]
+    switch = np.column_stack([worlds.time_s, start + out[:, DRIVE], start + out[:, TOUCH]])
+    braking = -v.braking_capacity_mps2[:, vehicle]
+    command = np.column_stack([v.driving_capacity_mps2[:, vehicle], braking, out[:, FOLLOW]])
+    switch[reason > 0] = np.nan
+    command[reason > 0] = np.nan
+    return Avoidability(reason, out[:, MARGIN].copy(), switch, command)
+
+
+def _check_covered(worlds: Worlds, vehicle: int, scripts: Mapping[int, str] | None) -> None:
+    """Raise ``InvalidInput`` for what ``avoidability`` does not cover, but for brakes that build up."""
     # An obstacle that Vehicle 1 cannot reach by braking fully changes nothing: only a push could bring it there, and
     # that is an impact already.
     check_whole_number("avoidability: vehicle", vehicle, 0, worlds.N - 1)
@@ -420,20 +442,6 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
         _refuse(latency[:, 0] > latency[:, 1], worlds.vehicles.latency_s[:, 0], "latency_s", 0, "not above vehicle_2's")
     for i in range(worlds.N):
         _refuse(~(worlds.speeds_mps[:, i] >= 0.0), worlds.speeds_mps[:, i], "speeds_mps", i, ">= 0")
-    onset = np.maximum(v.latency_s - worlds.time_s[:, None], 0.0)
-    out = np.empty((worlds.n, RESULT_WIDTH))
-    decide_worlds(
-        worlds.gaps_m, worlds.speeds_mps, onset, v.braking_capacity_mps2, v.driving_capacity_mps2, v.speed_limit_mps,
-        vehicle, out,
-    )  # fmt: skip
-    reason = out[:, REASON].astype(np.int64)
-    start = worlds.time_s + onset[:, vehicle]
-    switch = np.column_stack([worlds.time_s, start + out[:, DRIVE], start + out[:, TOUCH]])
-    braking = -v.braking_capacity_mps2[:, vehicle]
-    command = np.column_stack([v.driving_capacity_mps2[:, vehicle], braking, out[:, FOLLOW]])
-    switch[reason > 0] = np.nan
-    command[reason > 0] = np.nan
-    return Avoidability(reason, out[:, MARGIN].copy(), switch, command)
 
 
 def _refuse(bad: Bools, values: Floats, name: str, i: int | None, right: str) -> None:
@@ -471,13 +479,23 @@ class _Line(NamedTuple):
     OBSTACLE: int = (
         15  # gap from the leader to an obstacle ahead of it (m), which it does not reach by itself; inf without
     )
-    WIDTH: int = 16
+    # only where brakes build up: accelerations in force (m/s2); rates of falling, of rising (m/s3); the horizon (s)
+    FORCE_L: int = 16
+    FALL_L: int = 17
+    FORCE_F: int = 18
+    FALL_F: int = 19
+    RISE_F: int = 20
+    FORCE_R: int = 21
+    FALL_R: int = 22
+    UNTIL: int = 23
+    WIDTH: int = 24
 
 
 LINE = _Line()
 
 
 FRONT_FIRST, REAR_FIRST = 0, 1
+RAMPED_FRONT, RAMPED_REAR = 2, 3  # the same where brakes build up
 _HALVINGS = 60
 _GUARD = 2.0**-46  # of the positions: a way that rounding shortens must not make a meeting look harder
 AHEAD_M = 1e-9  # an overlap up to this is no meeting with the other vehicle
@@ -564,7 +582,9 @@ def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
 
 @compiled(apart=True)
 def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
-    """``gentlest_front`` or ``gentlest_rear``."""
+    """``gentlest_front`` or ``gentlest_rear``, or ``gentlest_ramped``."""
+    if kind >= RAMPED_FRONT:
+        return gentlest_ramped(kind, at, time), 0.0
     return gentlest_front(at, time) if kind == FRONT_FIRST else gentlest_rear(at, time)
 
 
@@ -973,7 +993,9 @@ def after(
     kind: int, at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """``after_front`` or ``after_rear``."""
+    """``after_front`` or ``after_rear``, or ``after_ramped``."""
+    if kind >= RAMPED_FRONT:
+        return after_ramped(kind, at, early, late, closing, plan, other)
     if kind == FRONT_FIRST:
         return after_front(at, early, late, closing, end, lack, plan, other)
     return after_rear(at, early, late, closing, end, lack, plan, other)
@@ -993,6 +1015,7 @@ CELLS = 600  # room on the heap: after that many divisions a minimum stays as lo
 # further the rear vehicle has come (m)
 _HARM, _EARLY, _LATE, _SOFT, _HARD, _NEAR, _FAR, HEAP_WIDTH = range(8)
 _SPLITS = 64  # parts at most into which decisions divide the times
+_PART_S = 0.05  # of the times where brakes build up
 _TRIED = 8  # meetings tried before the search, to have something to compare with
 
 
@@ -1003,6 +1026,8 @@ def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
     It falls with the time, but for a leader that brakes harder than the controlled vehicle: it may then rise by the
     difference.
     """
+    if kind >= RAMPED_FRONT:
+        return gentlest_ramped_between(kind, at, early, late)
     least = gentlest(kind, at, late)[0]
     if kind == FRONT_FIRST and at[LINE.A_L] > at[LINE.A_F] and early * at[LINE.A_L] < at[LINE.V_L]:
         least -= (at[LINE.A_L] - at[LINE.A_F]) * (late - early)
@@ -1109,8 +1134,10 @@ def divide(
     if (late - early) * (at[LINE.U_F] + at[LINE.A_F] + at[LINE.A_L]) > hard - soft and early < middle < late:
         closing = max(soft, gentlest(kind, at, middle)[0])
         met = harm_of(kind, at, middle, middle, closing, closing, floor, plan, other)
-        least = harm_of(kind, at, middle, late, soft, hard, floor, plan, other)
-        count = put(heap, count, max(least, harm), middle, late, soft, hard)
+        later = max(soft, gentlest_between(kind, at, middle, late)) if kind >= RAMPED_FRONT else soft
+        if later < hard:
+            least = harm_of(kind, at, middle, late, later, hard, floor, plan, other)
+            count = put(heap, count, max(least, harm), middle, late, later, hard)
         soft, late = max(soft, gentlest_between(kind, at, early, middle)), middle
     else:
         middle = 0.5 * (soft + hard)
@@ -1160,7 +1187,7 @@ def least_harm(
 @compiled
 def next_split(kind: int, at: Floats, time: float, last: float) -> float:
     """The next time at which a decision falls or the leader comes to rest, at most ``last``."""
-    until = last
+    until = last if kind < RAMPED_FRONT else min(last, time + _PART_S)
     if at[LINE.TIME_STEP] > 0.0:
         until = min(until, (math.floor(time / at[LINE.TIME_STEP] + 1e-6) + 1.0) * at[LINE.TIME_STEP])
     stand = at[LINE.V_L] / at[LINE.A_L]
@@ -1191,6 +1218,7 @@ LARGE = 1e6  # m2/s2: more harm than any impact of vehicles does
 _TOUCH_HARM = 2.0 * BOUND.TOUCH_SPEED_MPS * BOUND.TOUCH_SPEED_MPS  # what two touches may hide
 _TOUCHING_M = 1e-9  # more than rounding leaves between two that touch
 _GRAZE_S = 1e-3  # more than rounding can move a graze
+_FORCES, _ROUGHLY = 12, 20  # halvings of a force and of a time that need not be exact
 _PARTS = 8  # into which the times of soft meetings are divided
 
 
@@ -1409,6 +1437,257 @@ def bound_worlds(
             out[k, COMBINED_BOUND] = combined_bound(states[k], until[k], front, rear, plan, other, heap)
 
 
+# Compiled: meetings where brakes build up, and what follows them. docs/proofs/lower-bound-cases.md has the proofs.
+#
+# ``sign`` is 1 for meetings with the leader and -1 for those with the rear vehicle, whose mirror image they are: forces
+# times ``sign`` then rise first (drive, or brake) and fall later.
+
+
+@compiled
+def fill_leader(at: Floats, plan: Floats) -> None:
+    """The front vehicle, left alone."""
+    fill_build_up(plan, 0.0, at[LINE.FORCE_L], -at[LINE.A_L], at[LINE.FALL_L])
+
+
+@compiled
+def fill_follower(at: Floats, plan: Floats) -> None:
+    """The rear vehicle, left alone."""
+    fill_build_up(plan, at[LINE.ONSET_R], at[LINE.FORCE_R], -at[LINE.A_R], at[LINE.FALL_R])
+
+
+@compiled
+def range_of(sign: float, at: Floats) -> tuple[float, float, float, float]:
+    """Largest force and how fast it is reached, least force and how fast it is reached, times ``sign``."""
+    if sign > 0.0:
+        return at[LINE.U_F], at[LINE.RISE_F], at[LINE.A_F], at[LINE.FALL_F]
+    return at[LINE.A_F], at[LINE.FALL_F], at[LINE.U_F], at[LINE.RISE_F]
+
+
+@compiled
+def fill_controlled(at: Floats, sign: float, switch: float, time: float, final: float, plan: Floats) -> None:
+    """``fill_switch`` of the controlled vehicle."""
+    high, rise, low, fall = range_of(sign, at)
+    fill_switch(plan, sign, sign * at[LINE.FORCE_F], high, rise, low, fall, switch, time, final)
+
+
+@compiled(apart=True)
+def switch_for(
+    at: Floats, sign: float, time: float, place: float, final: float, halvings: int, plan: Floats
+) -> tuple[float, float, float]:
+    """Switches just before and after which it is at ``place`` at ``time``, and the speed after the earlier one.
+
+    ``place`` is times ``sign``, and the way to it has that force at least (at most) at ``time``.
+    """
+    low, high = (-1.0 if range_of(sign, at)[1] == math.inf else 0.0), time
+    for _ in range(halvings):
+        middle = 0.5 * (low + high)
+        fill_controlled(at, sign, middle, time, final, plan)
+        if sign * travel(plan, at[LINE.V_F], at[LINE.LIMIT_F], time)[1] < place:
+            low = middle
+        else:
+            high = middle
+    fill_controlled(at, sign, low, time, final, plan)
+    return low, high, travel(plan, at[LINE.V_F], at[LINE.LIMIT_F], time)[0]
+
+
+@compiled
+def met_at(kind: int, at: Floats, time: float, plan: Floats) -> tuple[float, float, float]:
+    """Sign, speed and place (times the sign) of the vehicle that is met, left alone until ``time``."""
+    if kind == RAMPED_FRONT:
+        fill_leader(at, plan)
+        v, way = travel(plan, at[LINE.V_L], math.inf, time)
+        return 1.0, v, at[LINE.GAP_L] + way
+    fill_follower(at, plan)
+    v, way = travel(plan, at[LINE.V_R], math.inf, time)
+    return -1.0, v, at[LINE.GAP_R] - way
+
+
+@compiled(apart=True)
+def gentlest_ramped(kind: int, at: Floats, time: float) -> float:
+    """Least closing speed of a meeting at ``time``."""
+    plan = empty_legs()
+    sign, v, place = met_at(kind, at, time, plan)
+    return max(sign * (switch_for(at, sign, time, place, -math.inf, _HALVINGS, plan)[2] - v), 0.0)
+
+
+@compiled
+def slack_of(
+    kind: int, at: Floats, early: float, late: float, v: float, hard: float, plan: Floats
+) -> tuple[float, float]:
+    """How far from its place, and by which speed, a vehicle that meets in a cell may be at ``early``, at most."""
+    span = late - early
+    if kind == RAMPED_FRONT:
+        return (hard + at[LINE.A_F] * span) * span, at[LINE.A_F] * span
+    slower = v - met_at(kind, at, late, plan)[1]
+    return (hard + at[LINE.U_F] * span + slower) * span, at[LINE.U_F] * span + slower
+
+
+@compiled(apart=True)
+def gentlest_ramped_between(kind: int, at: Floats, early: float, late: float) -> float:
+    """Least closing speed of the meetings between two times."""
+    plan = empty_legs()
+    hard = gentlest_ramped(kind, at, early)
+    sign, v, place = met_at(kind, at, early, plan)
+    far, faster = slack_of(kind, at, early, late, v, hard, plan)
+    closing = sign * (switch_for(at, sign, early, place - far, -math.inf, _HALVINGS, plan)[2] - v)
+    if kind == RAMPED_FRONT:
+        fill_leader(at, plan)
+        if travel(plan, at[LINE.V_L], math.inf, late)[0] > 0.0:
+            faster = max(at[LINE.A_F] + force_of(plan, early), 0.0) * (late - early)
+    return max(min(closing - faster, hard), 0.0)
+
+
+@compiled(apart=True)
+def force_of_meeting(kind: int, at: Floats, early: float, late: float, hard: float) -> float:
+    """Largest force, times the sign, with which a meeting of a cell can be as soft as ``hard``."""
+    plan = empty_legs()
+    sign, v, place = met_at(kind, at, early, plan)
+    far, faster = slack_of(kind, at, early, late, v, hard, plan)
+    high, rise, low, _ = range_of(sign, at)
+    if rise == math.inf:
+        return high
+    least, most = -low, high
+    for k in range(_FORCES):
+        tried = most if k == 0 else 0.5 * (least + most)
+        final = tried - rise * (late - early)
+        if sign * (switch_for(at, sign, early, place - far, final, _ROUGHLY, plan)[2] - v) <= hard + faster:
+            least = tried
+        else:
+            most = tried
+    return most
+
+
+@compiled(apart=True)
+def after_ramped(
+    kind: int, at: Floats, early: float, late: float, hard: float, plan: Floats, other: Floats
+) -> float:  # fmt: skip
+    """Least squared closing speed at the other neighbour after a meeting of a cell: of the controlled one alone."""
+    sign = 1.0 if kind == RAMPED_FRONT else -1.0
+    share = at[LINE.FRONT_SHARE] if kind == RAMPED_FRONT else at[LINE.REAR_SHARE]
+    kept = 1.0 - share * (1.0 + at[LINE.RESTITUTION])
+    if kind == RAMPED_FRONT and (kept < 0.0 or at[LINE.OBSTACLE] < math.inf):
+        return 0.0  # it may be thrown back
+    kept, span = max(kept, 0.0), late - early
+    high, rise, _, _ = range_of(sign, at)
+    force = high
+    if rise < math.inf:
+        force = min(force_of_meeting(kind, at, early, late, hard) + rise * span, high)
+    fill_leader(at, plan)
+    v_l, way_l = travel(plan, at[LINE.V_L], math.inf, early)
+    fill_follower(at, other)
+    v_r, way_r = travel(other, at[LINE.V_R], math.inf, early)
+    gap = max(at[LINE.GAP_L] + at[LINE.GAP_R] + way_l - way_r, 0.0)
+    if kind == RAMPED_FRONT:
+        # until ``late`` it does not fall behind the leader
+        least = force_of(plan, early) if travel(plan, at[LINE.V_L], math.inf, late)[0] > 0.0 else 0.0
+        fill_build_up(plan, late, force, high, rise)
+        plan[FORCES, 0] = max(force, least)
+        found = meeting(
+            gap, kept * hard * span, v_l + kept * hard, plan, math.inf, v_r, other, math.inf, early, at[LINE.UNTIL]
+        )
+    else:
+        v = v_r - kept * hard
+        if v <= 0.0:
+            return 0.0
+        most = force_of(other, late)
+        since, begins = late, -force
+        fastest = (1.0 + at[LINE.RESTITUTION]) * v_r + at[LINE.U_F] * at[LINE.U_F] / rise
+        if begins > 0.0 and fastest >= at[LINE.LIMIT_F]:  # beyond its speed limit a vehicle that drives coasts
+            since, begins = late + begins / rise, 0.0
+        fill_build_up(other, since, begins, -high, rise)
+        other[FORCES, 0] = min(begins, most)
+        found = meeting(gap, kept * hard * span, v_l, plan, math.inf, v, other, math.inf, early, at[LINE.UNTIL])
+    return found[2] * found[2]
+
+
+@compiled(apart=True)
+def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
+    """Whether the other neighbour has not come before every meeting at ``time`` and later."""
+    sign, _, place = met_at(kind, at, time, plan)
+    switch = switch_for(at, sign, time, place, -math.inf, _HALVINGS, plan)[1]
+    fill_controlled(at, sign, switch, time, -math.inf, plan)
+    if kind == RAMPED_FRONT:
+        fill_follower(at, other)
+        gap = at[LINE.GAP_R] + AHEAD_M
+        return meeting(
+            gap, 0.0, at[LINE.V_F], plan, at[LINE.LIMIT_F], at[LINE.V_R], other, math.inf, 0.0, time
+        )[0] == math.inf  # fmt: skip
+    fill_leader(at, other)
+    gap = at[LINE.GAP_L] + AHEAD_M
+    return (
+        meeting(gap, 0.0, at[LINE.V_L], other, math.inf, at[LINE.V_F], plan, at[LINE.LIMIT_F], 0.0, time)[0] == math.inf
+    )
+
+
+@compiled(apart=True)
+def meet_ramped(kind: int, at: Floats, sign: float, plan: Floats, other: Floats) -> tuple[float, float, float]:
+    """``meeting`` with this neighbour of one that drives (``sign`` 1) or brakes (-1) as hard as it can."""
+    fill_controlled(at, sign, math.inf, math.inf, -math.inf, plan)
+    if kind == RAMPED_FRONT:
+        fill_leader(at, other)
+        return meeting(
+            at[LINE.GAP_L], 0.0, at[LINE.V_L], other, math.inf, at[LINE.V_F], plan, at[LINE.LIMIT_F], 0.0, math.inf
+        )
+    fill_follower(at, other)
+    return meeting(
+        at[LINE.GAP_R], 0.0, at[LINE.V_F], plan, at[LINE.LIMIT_F], at[LINE.V_R], other, math.inf, 0.0, math.inf
+    )
+
+
+@compiled(apart=True)
+def combined_ramped(
+    at: Floats, until: float, front: float, rear: float, contact_s: float, plan: Floats, other: Floats, heap: Floats
+) -> float:
+    """Least harm, whoever is met first, where both extremes show contact by ``contact_s``, or the outer two do."""
+    if min(at[LINE.GAP_L], at[LINE.GAP_R]) <= _TOUCHING_M:
+        return 0.0
+    fill_leader(at, plan)
+    fill_follower(at, other)
+    squeezed, closing, _ = meeting(
+        at[LINE.GAP_L] + at[LINE.GAP_R], 0.0, at[LINE.V_L], plan, math.inf, at[LINE.V_R], other, math.inf, 0.0, math.inf
+    )
+    last, best = min(contact_s, squeezed), LARGE
+    if not last < until:
+        return 0.0
+    for kind, sign, floor in ((RAMPED_FRONT, 1.0, rear), (RAMPED_REAR, -1.0, front)):
+        first = meet_ramped(kind, at, sign, plan, other)[0]
+        if first > last or not is_first_ramped(kind, at, first, plan, other):
+            continue
+        early, late = first, last
+        if not is_first_ramped(kind, at, last, plan, other):
+            for _ in range(_ROUGHLY):
+                middle = 0.5 * (early + late)
+                if is_first_ramped(kind, at, middle, plan, other):
+                    early = middle
+                else:
+                    late = middle
+        best = least_harm(kind, at, first, late, floor, best, front + rear, plan, other, heap)
+    if squeezed <= last:
+        most = max(min(gentlest_ramped(RAMPED_FRONT, at, squeezed), closing), 0.5 * closing)
+        best = min(best, most * most + (closing - most) * (closing - most))
+    return best - _TOUCH_HARM if best < LARGE else 0.0
+
+
+@compiled
+def bound_ramped(states: Floats, has_front: Bools, has_rear: Bools, both: Bools, out: Floats) -> None:
+    """``bound_worlds`` where brakes build up; ``both``: whether the pairs are to be bounded together too, [n]."""
+    plan, other, heap = empty_legs(), empty_legs(), np.empty((CELLS, _NEAR))
+    for k in range(states.shape[0]):
+        at, contact_s = states[k], math.inf
+        for kind, sign, there in ((RAMPED_FRONT, -1.0, has_front[k]), (RAMPED_REAR, 1.0, has_rear[k])):
+            out[k, kind - RAMPED_FRONT] = 0.0
+            if there:
+                time, closing, least = meet_ramped(kind, at, sign, plan, other)
+                found = least * least if kind == RAMPED_FRONT else closing * closing
+                contact_s = min(contact_s, time)
+                if time < at[LINE.UNTIL] and found > _TOUCH_HARM:
+                    out[k, kind - RAMPED_FRONT] = found
+        out[k, COMBINED_BOUND] = 0.0
+        if both[k]:
+            front, rear = out[k, FRONT_BOUND], out[k, REAR_BOUND]
+            out[k, COMBINED_BOUND] = combined_ramped(at, at[LINE.UNTIL], front, rear, contact_s, plan, other, heap)
+
+
 EPS = 2.0**-52  # the spacing of doubles at 1
 # Bounds are lowered by so many eps of the squared speeds that a world can hold: a segment or a round of impacts moves a
 # squared closing speed by at most 8 eps of these, and an episode has up to 500 of them.
@@ -1427,7 +1706,8 @@ class LowerBound:
     front_pair: Floats  # of the front pair alone, from then on
     rear_pair: Floats  # of the rear pair alone
     combined: Floats  # of both together; 0 where nothing is proven
-    contact: Avoidability  # the verdict on contact that the bound of both together rests on
+    # the verdict on contact that the bound of both together rests on; None where brakes of some world build up
+    contact: Avoidability | None
 
     @property
     def impact_proven(self) -> Bools:
@@ -1453,28 +1733,50 @@ def lower_bound(
     With ``time_step_s`` it is proven only for commands that change at decisions, the first one when the vehicle may
     act, one every ``time_step_s`` after it: what every agent drives. That is sharper, and takes ten times as long.
 
+    Where brakes build up it holds for any command at any time, is looser, and says nothing of contact: ``contact`` is
+    None if that is so in any of the worlds.
+
     Covers the same lines as ``avoidability``, and raises ``InvalidInput`` for others, for an unknown ``harm_count``, a
     time step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before the vehicle may act.
     """
     check_asked("lower_bound", harm_count, horizon_s, time_step_s)
-    verdict = avoidability(worlds, vehicle, scripts=scripts)
+    slow = worlds.vehicles.build_up
+    if worlds.vehicles.in_pieces.any():
+        worlds.refuse_build_up("lower_bound")
+    if slow.any() and not slow.all():
+        asked = partial(
+            lower_bound, vehicle=vehicle, harm_count=harm_count, horizon_s=horizon_s, scripts=scripts,
+            time_step_s=time_step_s,
+        )  # fmt: skip
+        order = np.argsort(np.concatenate([np.flatnonzero(slow), np.flatnonzero(~slow)]))
+        halves = asked(worlds.take(slow)), asked(worlds.take(~slow))
+        each = ((part.harm, part.early, part.front_pair, part.rear_pair, part.combined) for part in halves)
+        harm, early, front, rear, combined = (np.concatenate(columns)[order] for columns in zip(*each, strict=True))
+        return LowerBound(harm, early, front, rear, combined, None)
+    if slow.any():
+        _check_covered(worlds, vehicle, scripts)
+        verdict, reason = None, np.full(worlds.n, 2)  # it may be: the bound itself finds out
+    else:
+        verdict = avoidability(worlds, vehicle, scripts=scripts)
+        reason = verdict.reason
     at_onset, start, early, counts = _at_onset("lower_bound", worlds, np.array([vehicle]), harm_count, horizon_s)
     none = np.zeros(worlds.n, dtype=np.bool_)
     has_front = counts[:, vehicle - 1] if vehicle > 0 else none
     has_rear = counts[:, vehicle] if vehicle < worlds.N - 1 else none
     struck = at_onset.obstacle_hit & (harm_count == "first")  # whoever is pushed there is not charged for it again
-    unavoidable = has_front & has_rear & (verdict.reason >= 2) & ~struck
+    unavoidable = has_front & has_rear & (reason >= 2) & ~struck
     out = np.empty((worlds.n, BOUNDS))
-    given: tuple[Any, ...] = (
-        onset_states(at_onset, vehicle, time_step_s),
-        horizon_s - start,
-        has_front,
-        has_rear,
-        unavoidable,
-        out,
-    )
+    given: tuple[Any, ...] = (has_front, has_rear, unavoidable, out)
+    kernel: Callable[..., None] = bound_worlds
+    if slow.any():
+        # a neighbour that still drives, told otherwise before, is not yet left alone
+        left_alone = np.delete(at_onset.command_mps2, vehicle, axis=1).max(axis=1) <= 0.0
+        given = (has_front, has_rear & left_alone, unavoidable & left_alone, out)
+        given, kernel = (_ramped_states(at_onset, vehicle, horizon_s - start), *given), bound_ramped
+    else:
+        given = (onset_states(at_onset, vehicle, time_step_s), horizon_s - start, *given)
     threads = min(os.cpu_count() or 1, worlds.n // _LEAST_PART + 1)
-    by_parts(lambda part: bound_worlds(*(array[part] for array in given)), worlds.n, threads)
+    by_parts(lambda part: kernel(*(array[part] for array in given)), worlds.n, threads)
     parts = (early, *(out[:, column] for column in (FRONT_BOUND, REAR_BOUND, COMBINED_BOUND)))
     early, front, rear, combined = (np.maximum(part - rounding(worlds, vehicle), 0.0) for part in parts)
     return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined, verdict)
@@ -1487,7 +1789,6 @@ def _at_onset(
 
     And the pairs whose next impact counts, and which move forward, [n, P].
     """
-    worlds.refuse_build_up(where)
     start = np.maximum(worlds.vehicles.latency_s[:, vehicles].min(axis=1), worlds.time_s)
     if not (np.all(start <= horizon_s) and horizon_s < np.inf):
         raise InvalidInput(f"{where}: horizon_s {horizon_s!r}: must be finite and at least {start.max():g} s")
@@ -1518,7 +1819,8 @@ def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -
 
     A squared closing speed is ``D = w^2 + 2 b g``. With ``V`` the largest speed in the line, ``G`` its gaps (and
     ``way_m`` [n] beyond them), ``A`` the largest closing acceleration and ``a`` the weakest brakes, every ``w^2`` is at
-    most ``V^2`` and no gap grows beyond ``G + V^2 / 2a``, so all terms of D stay below ``S = V^2 (1 + A / a) + 2 A G``.
+    most ``V^2`` and no gap grows beyond ``G + V^2 / 2a`` (and ``V a / r`` where brakes build up at a rate r), so all
+    terms of D stay below ``S = V^2 (1 + A / a) + 2 A G``.
     A segment of motion rounds each speed twice and each gap five times, a round of impacts each speed by
     ``CLUSTER_EPS``: either moves D by at most 8 eps S. These add up and are not multiplied, for the proofs compare a
     run with itself, not with another one. ``BOUND_EPS`` grants 500 of them; the steps of an episode of 8 s are 80, and
@@ -1531,7 +1833,8 @@ def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -
     fastest = np.maximum(worlds.speeds_mps.max(axis=1), limits.max(axis=1))
     closing = v.braking_capacity_mps2.max(axis=1) + driving.max(axis=1)
     weakest = v.braking_capacity_mps2.min(axis=1)
-    scale = fastest * fastest * (1.0 + closing / weakest) + 2.0 * closing * (worlds.gaps_m.sum(axis=1) + way_m)
+    longest = worlds.gaps_m.sum(axis=1) + way_m + fastest * (v.braking_capacity_mps2 / v.brake_rate_mps3).max(axis=1)
+    scale = fastest * fastest * (1.0 + closing / weakest) + 2.0 * closing * longest
     return np.asarray(BOUND_EPS * EPS * scale, np.float64)
 
 
@@ -1568,6 +1871,22 @@ def onset_states(worlds: Worlds, i: int, time_step_s: float | Floats | None) -> 
         }
     for column, values in columns.items():
         at[:, column] = values
+    return at
+
+
+def _ramped_states(worlds: Worlds, i: int, until: Floats) -> Floats:
+    """``onset_states`` of worlds in which brakes build up; what they prove must happen within ``until`` [n] s.
+
+    A controlled vehicle that brakes or drives already is taken to have no rates.
+    """
+    v, at = worlds.vehicles, onset_states(worlds, i, None)
+    moved = worlds.command_mps2[:, i] != 0.0
+    at[:, LINE.FALL_F] = np.where(moved, np.inf, v.brake_rate_mps3[:, i])
+    at[:, LINE.RISE_F] = np.where(moved, np.inf, v.release_rate_mps3[:, i])
+    at[:, LINE.UNTIL] = until
+    for j, force, fall in ((i - 1, LINE.FORCE_L, LINE.FALL_L), (i + 1, LINE.FORCE_R, LINE.FALL_R)):
+        if 0 <= j < worlds.N:
+            at[:, force], at[:, fall] = worlds.command_mps2[:, j], v.brake_rate_mps3[:, j]
     return at
 
 
@@ -2032,6 +2351,7 @@ def team_bound(
         if index not in given and script != "full_brake":
             raise InvalidInput(f"team_bound: vehicle_{index + 1} follows {script!r}; must be 'full_brake'")
     chosen = np.array(sorted(given), np.int64)
+    worlds.refuse_build_up("team_bound")
     now, start, early, counts = _at_onset("team_bound", worlds, chosen, harm_count, horizon_s)
     onset = np.maximum(worlds.vehicles.latency_s - start[:, np.newaxis], 0.0)
     until, v = horizon_s - start, now.vehicles

@@ -48,7 +48,16 @@ from ethbrake_marl.physics import Vehicles, Worlds, advance, make_worlds
 from ethbrake_marl.physics.kernel import solo_motion
 from ethbrake_marl.scenario import Task, load_scenario
 from ethbrake_marl.search import Profiles, profile_problem
-from tests.limits.worlds import REGIONS, line, moved_profiles, opening, random_profiles, wide_worlds, worlds_of
+from tests.limits.worlds import (
+    REGIONS,
+    line,
+    moved_profiles,
+    opening,
+    random_profiles,
+    wide_worlds,
+    with_rates,
+    worlds_of,
+)
 from tests.reference.play_profile import play_profile
 
 
@@ -194,6 +203,35 @@ def test_bound__is_never_above_a_searched_profile_in_any_region(region, n, budge
     for bound, harm_count, step in ((decided, "first", 0.1), (decided, "total", 0.1), (any_time, "first", 0.025)):
         problem = profile_problem(worlds, [1], harm_count=harm_count, horizon_s=60.0, time_step_s=step)
         assert np.all(bound <= problem.search(problem.constant(problem.even_grid(9)), budget=budget)[1][harm_count])
+
+
+def bounded_and_found(region, n, budget, seed):
+    """Where brakes build up: the bound and the least harm found, [n] each, under either count."""
+    worlds = with_rates(worlds_of(region, 3 * n, 3, seed), seed)
+    worlds = worlds.take(np.flatnonzero(worlds.vehicles.latency_s[:, 0] <= worlds.vehicles.latency_s[:, 1])[:n])
+    for harm_count in ("first", "total"):
+        problem = profile_problem(worlds, [1], harm_count=harm_count, horizon_s=20.0)
+        tried = np.concatenate([problem.even_grid(9), np.zeros((worlds.n, 1, 1))], axis=1)
+        found = problem.search(problem.constant(tried), budget=budget)[1][harm_count]
+        yield lower_bound(worlds, harm_count=harm_count, horizon_s=20.0), found
+
+
+@pytest.mark.parametrize("region", list(REGIONS)[::5])
+def test_bound__is_never_above_a_searched_profile_where_brakes_build_up(region):
+    for bound, found in bounded_and_found(region, 15, 300, seed=52):
+        assert np.all(bound.harm <= found) and bound.contact is None
+
+
+def test_where_brakes_build_up__pairs_are_exact_and_worlds_at_once_keep_their_bits():
+    # v^2 / 2 after full braking that builds up, by its way: 20 m/s, 5 m/s2 at 10 m/s3 behind a leader that stands
+    worlds = line([20], [0, 20], [5, 5], driving=4)
+    slow = replace(worlds, vehicles=replace(worlds.vehicles, brake_rate_mps3=np.full((1, 2), 10.0)))
+    way = 20 * 0.5 - 10 * 0.5**3 / 6
+    assert lower_bound(slow, 1).harm[0] == pytest.approx((20 - 10 * 0.5**2 / 2) ** 2 - 2 * 5 * (20 - way))
+    plain = worlds_of("plain", 40, 3, seed=53)
+    mixed = lower_bound(Worlds.concatenate([plain, with_rates(plain, 53)]))
+    assert np.array_equal(mixed.harm[:40], lower_bound(plain).harm)
+    assert np.any(mixed.combined[40:] > mixed.front_pair[40:] + mixed.rear_pair[40:])
 
 
 # What a first meeting leaves, and what the command in force costs.

@@ -194,3 +194,12 @@ def worlds_of(region, n, N, seed, obstacle=None):
         speed_limit_mps=np.maximum(given["limit"], given["speeds"] + 1e-3),
         obstacle_gap_m=None if obstacle is None else np.maximum(stops + rng.uniform(*obstacle, n), 0.01),
     )
+
+
+def with_rates(worlds, seed):
+    """The same worlds, each brake built up and released at 3 to 100 m/s3, one in five at once."""
+    rng, shape = np.random.default_rng(seed), worlds.speeds_mps.shape
+    brake, release = (
+        np.where(rng.random(shape) < 0.2, np.inf, 10 ** rng.uniform(np.log10(3), 2, shape)) for _ in range(2)
+    )
+    return replace(worlds, vehicles=replace(worlds.vehicles, brake_rate_mps3=brake, release_rate_mps3=release))

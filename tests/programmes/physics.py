@@ -18,6 +18,8 @@ from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.harm import split
 from ethbrake_marl.physics import Floats, Impacts, Ints, Worlds, advance, make_worlds
 from tests.golden.test_golden import GOLDEN, figures
+from tests.limits.test_lower_bound import bounded_and_found
+from tests.limits.worlds import REGIONS
 from tests.physics.exact_simulator import line_of, simulate
 from tests.physics.manufacture import Case, manufactured, pressed, stored
 from tests.physics.random_worlds import (
@@ -74,7 +76,14 @@ def measured(measure: Callable[[], Figure]) -> Told:
     return Told(value <= threshold, f"{value:.3g} <= {threshold:.3g}, {of}")
 
 
-OPTIONS = {"--small-step-worlds": {"type": int, "default": 10_000, "help": "of 'brakes that build up'"}}
+OPTIONS = {
+    "--small-step-worlds": {"type": int, "default": 10_000, "help": "of 'brakes that build up'"},
+    "--bounded-worlds": {
+        "type": int,
+        "default": 3_500,
+        "help": "of each region of 'lower bound where brakes build up'",
+    },
+}
 
 
 def cases(given: Given) -> Cases:
@@ -84,9 +93,20 @@ def cases(given: Given) -> Cases:
     for N, obstacle, in_pieces in product((2, 3, 5, 8), (False, True), (False, True)):
         told = f"brakes that build up, N = {N}{', obstacle' * obstacle}{', in pieces' * in_pieces}"
         yield told, partial(measured, partial(small_steps, N, obstacle, in_pieces, each))
+    for region in REGIONS:
+        told = f"lower bound where brakes build up, {region}"
+        yield told, partial(measured, partial(never_above, region, given.bounded_worlds))
 
 
 # ---------------------------------------------------------------- brakes that build up
+
+
+def never_above(region: str, worlds: int) -> Figure:
+    """How far the lower bound is above the least harm of searched, random and constant profiles, under either count."""
+    found = [(bound.harm, least) for bound, least in bounded_and_found(region, worlds, 600, seed=7)]
+    bounds, least = (np.concatenate(each) for each in zip(*found, strict=True))
+    above = float(np.max(bounds - least, initial=0.0))
+    return Figure(above, 0.0, f"{len(least):,} searches, harm {bounds.mean():.3f} of {least.mean():.3f} proven")
 
 
 def small_steps(N: int, obstacle: bool, in_pieces: bool, worlds: int) -> Figure:
