@@ -147,14 +147,16 @@ def evaluate_command(
     from ethbrake_marl.harm import declared_objectives
 
     whole = {"--per-world": per_world, "--report": report, "--initial-states": initial_states, "--by": by}
+    _check_shards(shards, jobs, ray, output, rows, whole)
+    _check_outputs(out, per_world, report)
     if group := scenarios.group_of_scenarios(scenario):
         other = whole | {"--objective": objective, "--measures": measures, "--shards": shards, "--output": output}
         for option in (name for name, value in other.items() if value):
             raise InvalidInput(f"{option}: {scenario} is a group of {len(group)} scenarios; give one of them")
-        _evaluate_group(out, group, agents, episodes, seed, partial(_asked_task, vehicle=vehicle, settings=settings))
+        driven = partial(_asked_task, vehicle=vehicle, settings=settings)
+        made = partial(_make_drivers, agents.split(","), harm_count=harm_count, uncertainty=uncertainty)
+        _evaluate_group(out, [driven(name).scenario for name in group], made, episodes, seed)
         return
-    _check_shards(shards, jobs, ray, output, rows, whole)
-    _check_outputs(out, per_world, report)
     if measures is not None:
         if jobs != 1 or ray is not None:
             raise InvalidInput("--measures: processes of --jobs and --ray know none; leave these out")
@@ -209,18 +211,20 @@ def evaluate_command(
 
 
 def _evaluate_group(
-    out: Out, group: Sequence[str], agents: str, episodes: int | None, seed: int | None, asked: Callable[[str], Task]
-) -> None:
+    out: Out, group: Sequence[Scenario], made: Callable[[Scenario], dict[str, Any]], episodes: int | None,
+    seed: int | None,
+) -> None:  # fmt: skip
     """Each agent in each scenario: passed where nobody collides, else how hard the hardest pair does."""
     told: list[dict[str, Any]] = []
     rows: list[Any] = []
-    for name in group:
-        chosen = asked(name).scenario
-        sample, drawn_by = evaluation.choose_worlds(chosen, episodes=episodes or GROUP_EPISODES, seed=seed)
-        lineup = _make_drivers(agents.split(","), chosen)
+    for chosen in group:
+        sample, drawn_by = evaluation.choose_worlds(
+            chosen, episodes=GROUP_EPISODES if episodes is None else episodes, seed=seed
+        )
+        lineup = made(chosen)
         evaluation.check_agents(lineup, sample.worlds, chosen)
         found = evaluation.evaluate(sample, lineup, scenario=chosen, seed=drawn_by)
-        rows.append(name)
+        rows.append(chosen.name)
         for agent, outcome in found.outcomes.items():
             hardest = 3.6 * math.sqrt(outcome.ledger.pair_harm("first").max(initial=0.0))
             each = {
@@ -230,7 +234,7 @@ def _evaluate_group(
                 "first_impact_harm": float(outcome.first_impact_harm.mean()),
                 "total_harm": float(outcome.total_harm.mean()),
             }
-            told.append({"scenario": name, "agent": agent, "worlds": found.worlds.n, **each})
+            told.append({"scenario": chosen.name, "agent": agent, "worlds": found.worlds.n, **each})
             shown = f"{each['collision_rate']:.1%}", f"{hardest:.1f}", *(f"{each[key]:.2f}" for key in list(each)[3:])
             rows.append((agent, "passed" if each["passed"] else "failed", *shown))
     columns: list[Column | str] = [

@@ -641,7 +641,7 @@ def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
 
 def group_of_scenarios(name: str) -> list[str]:
     """The scenarios of a folder of those that ship, such as ``standards``; none where no folder has this name."""
-    return [stem for stem, path in _shipped_paths().items() if path.parent.name == name]
+    return sorted(stem for stem, path in _shipped_paths().items() if path.parent.name == name)
 
 
 def list_scenarios() -> list[CatalogueEntry]:
