@@ -31,7 +31,11 @@ if TYPE_CHECKING:
         raw_env as raw_env,
     )
     from ethbrake_marl.envs import EthBrakeVecEnv as EthBrakeVecEnv, make_sb3_vec_env as make_sb3_vec_env
-    from ethbrake_marl.envs import EthBrakeEnv as EthBrakeEnv, EthBrakeVectorEnv as EthBrakeVectorEnv
+    from ethbrake_marl.envs import (
+        CostEnv as CostEnv,
+        EthBrakeEnv as EthBrakeEnv,
+        EthBrakeVectorEnv as EthBrakeVectorEnv,
+    )
 
     # Scenarios, and the worlds drawn from them
     from ethbrake_marl.scenario import (
@@ -112,7 +116,7 @@ if TYPE_CHECKING:
     # Errors
     from ethbrake_marl.errors import EthBrakeError as EthBrakeError, MissingExtra as MissingExtra
 
-__version__ = "0.3.0.dev0"
+__version__ = "0.3.0"
 
 
 _HOMES = names_behind(__file__)

@@ -962,7 +962,8 @@ class Engine:
     def ledger(self) -> Ledger:
         """Harm of the running episodes so far, in its own memory."""
         packed, column = self.packed, self.packed.column
-        return Ledger(*packed.ledger(), packed.params[:, column.mass : column.limit].copy())
+        of_worlds = packed.params[:, column.mass : column.limit], packed.params[:, column.restitution]
+        return Ledger(*packed.ledger(), *(each.copy() for each in of_worlds))
 
     @property
     def ended(self) -> Bools:

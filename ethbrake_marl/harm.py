@@ -48,6 +48,7 @@ class Ledger:
     obstacle_total_harm: Floats  # [n] likewise
     obstacle_count: Ints  # [n] impacts
     mass_t: Floats  # [n, N]
+    restitution: Floats  # [n]
 
     def __repr__(self) -> str:
         return (
@@ -64,6 +65,7 @@ class Ledger:
             self.obstacle_total_harm + impacts.obstacle_total_harm,
             self.obstacle_count + impacts.obstacle_count,
             self.mass_t,
+            self.restitution,
         )
 
     def since(self, before: Ledger) -> Ledger:
@@ -71,7 +73,7 @@ class Ledger:
 
         Raises ``InvalidInput`` where there were more worlds, vehicles or impacts before, as in a row that was renewed.
         """
-        names = [column.name for column in fields(self) if column.name != "mass_t"]
+        names = [column.name for column in fields(self) if column.name not in ("mass_t", "restitution")]
         if before.count.shape != self.count.shape or (before.count > self.count).any():
             raise InvalidInput("since: these are not the same worlds; ask before a row is renewed")
         return replace(self, **{name: getattr(self, name) - getattr(before, name) for name in names})
@@ -95,6 +97,20 @@ class Ledger:
         harm = split(self.pair_harm(harm_count), self.mass_t)
         harm[:, 0] += self.obstacle_harm(harm_count)
         return harm
+
+    def speed_changes(self, harm_count: HarmCount) -> tuple[Floats, Floats]:
+        """Change of speed of each vehicle, hit in front and at the rear, each [n, N] (m/s).
+
+        That of the one impact between two vehicles which does the counted harm of their pair: exact for first impacts
+        of one pair at a time; of several impacts of a pair, counted by ``total``, more than the hardest one had.
+        """
+        with_obstacle = np.concatenate([self.obstacle_harm(harm_count)[:, np.newaxis], self.pair_harm(harm_count)], 1)
+        rebound = (1.0 + self.restitution[:, np.newaxis]) * np.sqrt(with_obstacle)
+        pair_mass = self.mass_t[:, :-1] + self.mass_t[:, 1:]
+        front, rear = rebound, np.zeros(self.mass_t.shape)
+        rear[:, :-1] = self.mass_t[:, 1:] / pair_mass * rebound[:, 1:]
+        front[:, 1:] *= self.mass_t[:, :-1] / pair_mass
+        return front, rear
 
     def world_harm(self, harm_count: HarmCount) -> Floats:
         """Harm of all vehicles of a world together, [n]: the obstacle's, then the pairs' front to rear."""
@@ -128,7 +144,8 @@ def empty_ledger(worlds: Worlds) -> Ledger:
     """The ledger at the alert: no harm yet."""
     shape = worlds.gaps_m.shape
     pairs = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64)
-    return Ledger(*pairs, *Impacts.no_obstacle(worlds.n), worlds.vehicles.mass_t)
+    of_worlds = worlds.vehicles.mass_t, worlds.vehicles.restitution
+    return Ledger(*pairs, *Impacts.no_obstacle(worlds.n), *of_worlds)
 
 
 @compiled
@@ -209,7 +226,8 @@ def injury_probability(speed_change_mps: Floats, side: Literal["front", "rear"],
 
 # Objectives, whose harm counts: what each vehicle's objective makes of the harm of the line, from the one ledger.
 #
-# Every objective is an amount of harm (m2/s2) to be made small; ``H_i`` is what vehicle i bears, ``H`` what all do:
+# Every objective but the last is an amount of harm (m2/s2) to be made small; ``H_i`` is what vehicle i bears, ``H``
+# what all do:
 #
 # ==================  ================================================================================================
 # total               ``H``: everybody's harm alike; the same number for all vehicles
@@ -219,6 +237,7 @@ def injury_probability(speed_change_mps: Floats, side: Literal["front", "rear"],
 # maximin             ``max_j H_j``: the harm of whoever bears most
 # mass-weighted       ``N sum_j m_j H_j / sum_j m_j``: harm in a heavy vehicle counts for more
 # weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``: one weight (1e-6 to 1e6) for each vehicle, as for its occupants
+# injury:curve        injuries in 1,000 lines, each vehicle's by its larger change of speed (``Ledger.speed_changes``)
 # ==================  ================================================================================================
 
 STANDARD = ("total", "own", "social:45", "maximin", "mass-weighted")  # those that need no knowledge of the scenario
@@ -234,6 +253,7 @@ class Objective(NamedTuple):
     kind: str
     angle_deg: float = 0.0
     weights: tuple[float, ...] = ()
+    curve: str = ""
 
 
 class HarmSoFar(NamedTuple):
@@ -242,6 +262,8 @@ class HarmSoFar(NamedTuple):
     borne: Floats  # [n, N] what each vehicle bears, m2/s2
     whole: Floats  # [n] what all do
     mass_t: Floats  # [n, N]
+    front_change_mps: Floats  # [n, N] change of speed of each vehicle, hit in front
+    rear_change_mps: Floats  # [n, N] likewise, hit at the rear
 
 
 ObjectiveFunction = Callable[[HarmSoFar, int], Floats]
@@ -258,9 +280,10 @@ class Kind(NamedTuple):
 
 @lru_cache(maxsize=256)
 def parse_objective(text: str) -> Objective:
-    """Read ``total``, ``own``, ``social:45``, ``maximin``, ``mass-weighted`` or ``weighted:1,4,1``.
+    """Read ``total``, ``own``, ``social:45``, ``maximin``, ``mass-weighted``, ``weighted:1,4,1`` or ``injury:lr4s``.
 
-    Raises ``InvalidInput`` for an unknown name, an angle outside [0, 90] degrees, or a weight outside [1e-6, 1e6].
+    Raises ``InvalidInput`` for an unknown name, an angle outside [0, 90] degrees, a weight outside [1e-6, 1e6], or a
+    curve that is none.
     """
     kind, colon, argument = text.partition(":")
     if kind not in KINDS:
@@ -269,6 +292,10 @@ def parse_objective(text: str) -> Objective:
         if colon:
             raise InvalidInput(f"objective {text!r}: {kind} takes no argument")
         return Objective(kind)
+    if kind == "injury":
+        if argument not in INJURY_CURVES:
+            raise unknown_name("injury curve", argument, INJURY_CURVES)
+        return Objective(kind, curve=argument)
     written = [parse_numeral(part.strip()) for part in argument.split(",")]
     numbers = tuple(number for number in written if number is not None) if None not in written else ()
     if kind == "social":
@@ -308,8 +335,9 @@ def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
 
 
 def objective_harm(ledger: Ledger, harm_count: HarmCount, objectives: Sequence[Objective]) -> Floats:
-    """What the objective of each vehicle makes of the harm so far, [n, N] (m2/s2): less is better."""
-    told = ledger.vehicle_harm(harm_count), ledger.world_harm(harm_count), ledger.mass_t
+    """What the objective of each vehicle makes of the harm so far, [n, N] (m2/s2, or injuries): less is better."""
+    harms = ledger.vehicle_harm(harm_count), ledger.world_harm(harm_count)
+    told = *harms, ledger.mass_t, *ledger.speed_changes(harm_count)
     harm = HarmSoFar(*(np.broadcast_to(each, each.shape) for each in told))  # read-only
     return np.stack([KINDS[o.kind].amount(o, harm, i) for i, o in enumerate(objectives)], axis=1)
 
@@ -422,6 +450,19 @@ def _social_weights(angle_deg: float) -> tuple[float, float]:
     return float(sums[0]), float(sums[1])
 
 
+def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
+    """Injuries in 1,000 lines, [n], summed front to rear: the same for all vehicles."""
+    del vehicle
+    front, rear = harm.front_change_mps, harm.rear_change_mps
+    injured = np.zeros(len(front))
+    for j in range(front.shape[1]):
+        by_front = injury_probability(front[:, j], "front", objective.curve)
+        by_rear = injury_probability(rear[:, j], "rear", objective.curve)
+        larger = np.where(rear[:, j] >= front[:, j], by_rear, by_front)
+        injured = injured + np.where((front[:, j] > 0.0) | (rear[:, j] > 0.0), 1_000.0 * larger, 0.0)
+    return injured
+
+
 def _weighted(borne: Floats, weights: Floats) -> Floats:
     """``N sum_j w_j H_j / sum_j w_j``, summed front to rear: the same bits in any batch."""
     n, vehicles = borne.shape
@@ -448,4 +489,5 @@ KINDS: dict[str, Kind] = {
         "one weight for each vehicle",
         lambda objective, harm, vehicle: _weighted(harm.borne, np.full(harm.borne.shape, objective.weights)),
     ),
+    "injury": Kind("injury:CURVE", "injuries in 1,000 lines, each vehicle's by its larger change of speed", _injured),
 }

@@ -42,7 +42,8 @@ def interfaces(policy: eb.Policy) -> list[Any]:
     parallel: eb.EthBrakeParallelEnv = eb.parallel_env(scenario="paper-random")
     assert_type(engine, eb.Engine)
     return [
-        *(eb.EthBrakeEnv(), eb.EthBrakeVectorEnv(num_envs=4), eb.env(), eb.raw_env(), eb.ShieldOptions(mode="step")),
+        eb.CostEnv(eb.EthBrakeEnv()),
+        *(eb.EthBrakeVectorEnv(num_envs=4), eb.env(), eb.raw_env(), eb.ShieldOptions(mode="step")),
         *(eb.HybridShield(parallel, policy, mode="step"), eb.shielded_aec(parallel, mode="step"), eb.shield(parallel)),
         *(eb.ShieldedEnv(eb.EthBrakeEnv()), eb.ShieldedVectorEnv(eb.EthBrakeVectorEnv()), eb.ShieldedVecEnv(batch)),
     ]

@@ -68,7 +68,7 @@ def test_ledger__is_the_sum_of_the_recorded_impacts_to_the_last_bit(N: int) -> N
 # ---------------------------------------------------------------- objectives
 
 PAPER = eb.load_scenario("paper-random")
-EACH = [*STANDARD, "social:30", "social:90", "weighted:1,4,2"]
+EACH = [*STANDARD, "social:30", "social:90", "weighted:1,4,2", "injury:lr4s"]
 
 
 def played(reward: Any, scenario: eb.Scenario = PAPER, n: int = 60) -> tuple[Floats, eb.Engine]:

@@ -223,7 +223,7 @@ PARTS = [  # as ``part_names`` tells them: to ask for them takes the engine, and
         " front_K.release_time, rear_K.release_time, own_build_up_time, own_release_time, place",
     ),
     ("V2X presets", "paper, clear, nominal, congested, blocked, sensors-only"),
-    ("Objectives", "total, own, social:ANGLE, maximin, mass-weighted, weighted:W1,W2,..."),
+    ("Objectives", "total, own, social:ANGLE, maximin, mass-weighted, weighted:W1,W2,..., injury:CURVE"),
     ("Algorithms", "ppo, sac, counterfactual, options"),
 ]
 

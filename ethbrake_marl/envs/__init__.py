@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     )
     from ethbrake_marl.envs.interfaces import (
         COLUMNS as COLUMNS,
+        CostEnv as CostEnv,
         EthBrakeEnv as EthBrakeEnv,
         EthBrakeParallelEnv as EthBrakeParallelEnv,
         EthBrakeVectorEnv as EthBrakeVectorEnv,

@@ -554,6 +554,37 @@ class EthBrakeEnv(_OneWorld, gymnasium.Env[Observations, NDArray[Any]]):
 _MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
 
 
+class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArray[Any]]):
+    """Cost as a value of its own: ``step`` gives observation, reward, cost, terminated, truncated, info.
+
+    That is what Safety-Gymnasium gives and OmniSafe expects. Cost is the harm that the step added to the line (m2/s2),
+    as the reward counts impacts, whatever else the reward says.
+
+    Args:
+        env: ``EthBrakeEnv``, or anything around it that hands on its infos.
+
+    Raises ``InvalidInput`` if ``env`` is another.
+
+    >>> import ethbrake_marl as eb
+    >>> env = eb.CostEnv(eb.EthBrakeEnv("paper-random"))
+    >>> observation, info = env.reset(seed=7)
+    >>> observation, reward, cost, terminated, truncated, info = env.step(env.action_space.sample())
+
+    """
+
+    def __init__(self, env: gymnasium.Env[Observations, NDArray[Any]]) -> None:
+        if not isinstance(getattr(env, "unwrapped", None), EthBrakeEnv):
+            raise InvalidInput(f"CostEnv: {env!r:.80} tells no cost; must be an EthBrakeEnv, or a wrapper of one")
+        super().__init__(env)
+
+    def step(  # type: ignore[override]  # six values, as safe-RL libraries have it
+        self, action: NDArray[Any]
+    ) -> tuple[Observations, float, float, bool, bool, dict[str, Any]]:
+        """One decision; see ``EthBrakeEnv.step``."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, float(reward), info["cost"], terminated, truncated, info
+
+
 class EthBrakeVectorEnv(Begun, VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
     """Many worlds of ``EthBrakeEnv``: ``gymnasium.make_vec("EthBrake-v0", num_envs=4096, scenario=...)``.
 

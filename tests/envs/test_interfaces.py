@@ -74,15 +74,18 @@ def test_infos__hold_the_same_keys_in_every_step_and_the_page_names_them() -> No
 
 @pytest.mark.parametrize(("reward", "total"), [("harm", "world_first_impact_harm"), ("total-harm", "world_total_harm")])
 def test_infos__cost_is_the_harm_of_the_step_as_the_reward_counts_it(reward: str, total: str) -> None:
-    environment = eb.EthBrakeEnv("paper-random", reward=reward)
+    environment = eb.CostEnv(gymnasium.wrappers.ClipAction(eb.EthBrakeEnv("paper-random", reward=reward)))
     for seed, action in ((0, 0.3), (2, -0.8)):  # collisions in front, and in front and behind
         _, info = environment.reset(seed=seed)
         before, costs, over = info[total], [info["cost"]], False
         while not over:
-            _, _, terminated, truncated, info = environment.step(np.array([action], np.float32))
+            _, _, cost, terminated, truncated, info = environment.step(np.array([action], np.float32))
             over = terminated or truncated
             costs.append(info["cost"])
+            assert cost == info["cost"]
         assert sum(costs) == near(info[total] - before) and info["reward_harm"] == -info["cost"]
+    with pytest.raises(InvalidInput, match="tells no cost"):
+        eb.CostEnv(eb.make_sb3_vec_env("paper-random", n_envs=2))  # type: ignore[arg-type]
 
 
 def test_learners_only__are_the_agents_and_nothing_else_changes() -> None:

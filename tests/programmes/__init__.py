@@ -38,14 +38,16 @@ class NotInstalled(Exception):
     """An environment cannot be made; the message says why in one line."""
 
 
-def ready_python(name: str, requires: Sequence[str], *, project: bool = True, torch: bool = True) -> Path:
+def ready_python(
+    name: str, requires: Sequence[str], overrides: Sequence[str] = (), *, project: bool = True, torch: bool = True
+) -> Path:
     """The interpreter of an environment that holds ``requires``, made if it is not there; raises ``NotInstalled``.
 
-    ``project``: this project too, as it stands.
+    ``overrides``: what these require, whatever they say. ``project``: this project too, as it stands.
     """
     folder = KEPT / name
     python, stamp = folder / "bin" / "python", folder / ".installed"
-    told = (sys.version, str(ROOT), TORCH, requires, project, torch, (ROOT / "pyproject.toml").read_text())
+    told = (sys.version, str(ROOT), TORCH, requires, overrides, project, torch, (ROOT / "pyproject.toml").read_text())
     wanted = hashlib.sha256(repr(told).encode()).hexdigest()
     if stamp.is_file() and stamp.read_text("utf-8") == wanted:
         return python
@@ -53,7 +55,7 @@ def ready_python(name: str, requires: Sequence[str], *, project: bool = True, to
     own = ["-e", str(ROOT)] if project else []
     if torch:
         install_torch(install)
-        (folder / "overrides.txt").write_text(TORCH, "utf-8")
+        (folder / "overrides.txt").write_text("\n".join([TORCH, *overrides]), "utf-8")
         own += [TORCH, "--override", str(folder / "overrides.txt")]
     call_uv([*install, *own, *requires])
     stamp.write_text(wanted, "utf-8")

@@ -59,6 +59,7 @@ class Library(NamedTuple):
     package: str = ""  # the distribution whose version is told; empty: the first that is required
     in_ci: bool = False
     finish: Callable[[dict[str, Any]], Any] = lambda names: names.get("agent")  # names of a block -> agent or policy
+    overrides: tuple[str, ...] = ()  # of what they require
 
     @property
     def told(self) -> str:
@@ -155,6 +156,13 @@ def of_agilerl(names: dict[str, Any]) -> Any:
     return lambda seen: agent.get_action(seen)[0].reshape(-1, 1)
 
 
+def of_omnisafe(names: dict[str, Any]) -> Any:
+    import torch
+
+    actor = names["model"].agent._actor_critic.actor
+    return lambda seen: actor.predict(torch.as_tensor(seen), deterministic=True).detach().numpy()
+
+
 def of_minari(names: dict[str, Any]) -> None:
     """The recovered environment plays every episode again, to the bit."""
     env = names["data"].recover_environment()
@@ -180,6 +188,9 @@ LIBRARIES = {  # by the heading of their section
     "skrl": Library(("skrl==2.1.1",), finish=of_skrl),
     "Tianshou": Library(("tianshou[eval]==2.0.1",), finish=of_tianshou),
     "AgileRL": Library(("agilerl==2.7.1",), finish=of_agilerl),
+    "OmniSafe": Library(
+        ("omnisafe==0.5.0",), finish=of_omnisafe, overrides=("safety-gymnasium; python_version < '3'", "pandas>=2.0.3")
+    ),
     "Minari": Library(("minari[create,hdf5]==0.5.4",), in_ci=True, finish=of_minari),
     "SuperSuit": Library(("supersuit==3.11.0", "stable-baselines3==2.9.2"), in_ci=True),
 }
@@ -288,7 +299,7 @@ def run(library: str, function: str, given: Given, way: Way | None = None) -> To
     """Run one way, or the how-to, in its library's environment."""
     name = re.sub(r"\W+", "_", library.lower())
     try:
-        python = ready_python(name, LIBRARIES[library].requires)
+        python = ready_python(name, LIBRARIES[library].requires, LIBRARIES[library].overrides)
     except NotInstalled as reason:
         return Told(None, f"skipped: {reason}")
     folder = KEPT / "work" / f"{name}-{re.sub(r'[^a-z0-9]+', '-', function)}"
