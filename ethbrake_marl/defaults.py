@@ -8,6 +8,8 @@ HarmCount = Literal["first", "total"]
 HARM_COUNTS: tuple[HarmCount, ...] = get_args(HarmCount)
 
 DatasetFormat = Literal["parquet", "minari"]
+DataFormat = Literal["highd", "ngsim", "openacc"]  # of recorded traffic
+DataDraw = Literal["rows", "normal", "lognormal", "quantiles"]  # how worlds are drawn from it
 
 MeasureName = Literal["harm", "regret", "difference", "bound"]  # what ``falsify`` searches for
 

@@ -11,6 +11,7 @@ SOUGHT = {
     "watching": "render video gif record animation watch episode",
     "add-a-scenario": "new own custom scenario yaml",
     "own-vehicle-data": "real measured csv import cars",
+    "recorded": "highd ngsim openacc traffic data trajectories",
     "howto-train": "train ppo sac mappo sb3 benchmarl multi-agent multi agent",
     "own-policy": "own policy onnx torch load compare",
     "learning": "recipe resume training",

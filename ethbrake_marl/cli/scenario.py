@@ -12,10 +12,10 @@ import typer
 
 from ethbrake_marl import evaluation, learning, scenario as scenarios
 from ethbrake_marl.cli.command import Out, app
-from ethbrake_marl.defaults import DEFAULT
+from ethbrake_marl.defaults import DEFAULT, DataDraw, DataFormat
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.sheet import Sheet
-from ethbrake_marl.files.store import read_plain
+from ethbrake_marl.files.store import new_file, read_plain
 from ethbrake_marl.files.yaml import flow_text
 
 TRIED_WORLDS = 200  # by `scenario validate`
@@ -235,6 +235,40 @@ def scenario_new(
 ) -> None:
     """Write a commented NAME.yaml with every key."""
     _write_new(out, "scenario", output / f"{name}.yaml", scenarios.new_scenario_text(name, based_on))
+
+
+@scenario_group.add(
+    "from-data", "scenario from-data highd/data --format highd --output my-motorway.yaml", json=True, force=True
+)
+def scenario_from_data(
+    out: Out,
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of the recordings.")],
+    format: Annotated[DataFormat, typer.Option(help="Whose recordings they are.")],
+    output: Annotated[
+        Path, typer.Option(metavar="FILE", help="The .yaml to write; its rows stand in the .csv beside.")
+    ],
+    based_on: Annotated[
+        str, typer.Option(metavar="NAME|PATH", help="What is not recorded is as here, and as many vehicles.")
+    ] = "realistic-motorway",
+    every: Annotated[float, typer.Option(help="Seconds between the moments that are looked at.")] = 1.0,
+    draw: Annotated[DataDraw, typer.Option(help="Whole rows, or each quantity by a fit to it.")] = "rows",
+) -> None:
+    """Make a scenario of recorded traffic: highD, NGSIM, OpenACC.
+
+    Vehicles that follow each other in a lane become rows: speeds, and gaps from bumper to bumper.
+    """
+    rows = output.with_suffix(".csv")
+    out.check(output, ".yaml", what="the scenario")
+    out.check(rows)
+    text, table, told = scenarios.scenario_from_data(
+        output.stem, folder, format, based_on=based_on, every_s=every, draw=draw, progress=out.progress
+    )
+    with new_file(output) as partial:
+        partial.write_text(text, "utf-8")
+        if draw == "rows":
+            out.write(rows, table, what="rows")
+    out.note(f"written: {output}; try it: ethbrake scenario validate {output}")
+    out.result({"scenario": str(output), "rows": str(rows) if draw == "rows" else None, "found": told}, *told)
 
 
 @scenario_group.add("schema", "scenario schema > scenario.schema.json")

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         row_features as row_features,
         state_features as state_features,
     )
+    from ethbrake_marl.scenario.recorded import scenario_from_data as scenario_from_data
     from ethbrake_marl.scenario.sampling import (
         QUANTITY as QUANTITY,
         Sample as Sample,

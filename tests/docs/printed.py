@@ -168,6 +168,7 @@ TABLES: dict[str, How] = {
     "| who drives Vehicle 2 | knows | collisions": _by(NIGHTLY, *_TESTS),
     "| what | first-impact harm | of the best known": TRAINED,
     "| no. | label | the paper": _by(BY_HAND),
+    "| `--draw` | full_brake": _by(SUITE, "tests/scenario/test_recorded.py"),
     "| work | has | lacks": _by(BY_HAND),
 }
 
