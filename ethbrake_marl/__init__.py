@@ -92,6 +92,15 @@ if TYPE_CHECKING:
     from ethbrake_marl.evaluation import write_dataset as write_dataset
     from ethbrake_marl.evaluation import summarise_by as summarise_by
 
+    # Somebody else's simulator
+    from ethbrake_marl.hosts import (
+        Host as Host,
+        HostCommand as HostCommand,
+        HostFailed as HostFailed,
+        HostState as HostState,
+        drive_host as drive_host,
+    )
+
     # Figures: matplotlib's, which a notebook shows
     from ethbrake_marl.evaluation import criticality_map as criticality_map, deceleration_curve as deceleration_curve
     from ethbrake_marl.figures import (

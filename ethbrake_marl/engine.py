@@ -31,7 +31,7 @@ from ethbrake_marl.errors import (
     describe_error,
     renumbered,
 )
-from ethbrake_marl.harm import Ledger, objective_harm
+from ethbrake_marl.harm import Ledger, empty_ledger, objective_harm
 from ethbrake_marl.observations import Observation, Observations, ObservationSpec, Plan
 from ethbrake_marl.physics import (
     BOUND,
@@ -41,6 +41,7 @@ from ethbrake_marl.physics import (
     Bools,
     Decisions,
     Floats,
+    Impacts,
     Ints,
     Packed,
     Worlds,
@@ -650,12 +651,17 @@ def check_alert(worlds: Worlds, n: int, vehicles: int) -> None:
 def moved(alert: Worlds, wanted: Floats, start_s: Floats) -> Packed:
     """Worlds at t = 0 moved to their first decision, harm on the way included."""
     after, impacts = advance(alert, wanted, until_s=start_s)
-    packed = Packed.of(after)
-    column, pairs = packed.column, alert.N - 1
-    for group, harm in enumerate((impacts.first_impact_harm, impacts.total_harm, impacts.count)):
-        packed.state[:, column.harm + group * pairs : column.harm + (group + 1) * pairs] = harm
+    return packed_with(after, impacts)
+
+
+def packed_with(worlds: Worlds, harm: Impacts | Ledger) -> Packed:
+    """Worlds, and the harm so far, as rows."""
+    packed = Packed.of(worlds)
+    column, pairs = packed.column, worlds.N - 1
+    for group, values in enumerate((harm.first_impact_harm, harm.total_harm, harm.count)):
+        packed.state[:, column.harm + group * pairs : column.harm + (group + 1) * pairs] = values
     if packed.has_obstacle:
-        obstacle = (impacts.obstacle_first_harm, impacts.obstacle_total_harm, impacts.obstacle_count)
+        obstacle = (harm.obstacle_first_harm, harm.obstacle_total_harm, harm.obstacle_count)
         packed.state[:, column.obstacle + 2 :] = np.column_stack(obstacle)
     return packed
 
@@ -1331,6 +1337,22 @@ class Engine:
         self._stream.restart(seed, taken)
         self.roster = Roster(self.n, seed, None)  # a snapshot does not keep the numbers of running episodes
         self.memories = memories
+
+    def place(self, worlds: Worlds, ledger: Ledger | None = None, *, ended: Bools | None = None) -> None:
+        """Put the running worlds in all rows as somebody else has moved them, with their ``ledger`` so far.
+
+        Vehicles, memories and the grid of decisions stay those of the last reset: the next step goes to the next
+        decision after the worlds' time. ``ended`` [n]: those that no step moves; None: those at the horizon. Raises
+        ``InvalidInput`` for another number of worlds or vehicles.
+        """
+        if worlds.speeds_mps.shape != self._wanted.shape:
+            n, N = self._wanted.shape
+            raise InvalidInput(f"place: {worlds.n} worlds of {worlds.N} vehicles; {n} of {N} needed")
+        state = self._kept(packed_with(worlds, empty_ledger(worlds) if ledger is None else ledger)).state
+        made = Decisions(self._clock[:, START], self.scenario.time_step_s).latest(worlds.time_s)
+        self._state, self._clock, self.ruling = state, self._clock.copy(), None
+        self._clock[:, STEP] = np.maximum(made, 0)
+        self._clock[:, ENDED] = worlds.time_s >= self.scenario.horizon_s if ended is None else ended
 
     def moment(self) -> Moment:
         """The present moment of all rows, in its own memory."""

@@ -116,6 +116,7 @@ _EXTRA_OF = {
     **dict.fromkeys(("starlette", "uvicorn"), "explore"),
     "ray": "cluster",
     "optuna": "tune",
+    "libsumo": "sumo",
 }
 
 

@@ -103,6 +103,29 @@ def show(found: eb.Evaluation, folder: Path) -> list[Any]:
     return [found.to_frame(), *figures]
 
 
+class Still:
+    """A host of one's own."""
+
+    dt = 0.1
+
+    def __init__(self, worlds: eb.Worlds) -> None:
+        self.worlds, self.time_s = worlds, 0.0
+
+    def state(self) -> eb.HostState:
+        return eb.HostState(self.time_s, self.worlds.gaps_m, self.worlds.speeds_mps)
+
+    def apply(self, command: eb.HostCommand) -> None:
+        self.time_s += float(command.acceleration_mps2.max())
+
+
+def bench(worlds: eb.Worlds) -> eb.Outcome:
+    host: eb.Host = Still(worlds)
+    try:
+        return eb.drive_host(host, Cautious(), "paper-random", worlds).outcome
+    except eb.HostFailed as failed:
+        raise SystemExit(str(failed.ledger)) from None
+
+
 def version() -> str:
     try:
         return eb.__version__

@@ -16,6 +16,7 @@ SOUGHT = {
     "own-policy": "own policy onnx torch load compare",
     "learning": "recipe resume training",
     "extending": "plugin custom agent algorithm register",
+    "hosts": "carla sumo hardware bench simulator",
     "other-libraries": "rllib torchrl tianshou cleanrl jax",
     "evaluation": "evaluate compare agents statistics confidence interval",
     "cooperation": "cooperation levels level v2x learners",

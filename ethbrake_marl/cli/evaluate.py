@@ -24,11 +24,12 @@ from ethbrake_marl.files.store import write_file
 
 if TYPE_CHECKING:
     from ethbrake_marl.agents import Driver
-    from ethbrake_marl.physics import LeftOutRows
+    from ethbrake_marl.physics import Bools, LeftOutRows
     from ethbrake_marl.scenario import Sample, Scenario, Task
     from ethbrake_marl.shield import Uncertainty
 
 GROUP_EPISODES = 1_000  # of each scenario of a group
+HOSTED = 100  # worlds in somebody else's simulator
 PAGES = (".html", ".htm")
 _PROPOSERS = "ppo@shipped,full_brake,constant:3"
 _HARMS = {"first_impact_harm": "First-impact harm", "total_harm": "Total harm", "harm": "Harm"}
@@ -114,6 +115,13 @@ def evaluate_command(
     measures: Annotated[
         Literal["injury"] | None, typer.Option(help="Also tell injuries, by three curves from the literature.")
     ] = None,
+    host: Annotated[
+        str | None,
+        typer.Option(
+            metavar="sumo[:STEP_S]",
+            help="Drive in that simulator, 100 worlds where no number is given, and tell the harm here beside it.",
+        ),
+    ] = None,
     shards: Annotated[
         int | None,
         typer.Option(
@@ -147,6 +155,7 @@ def evaluate_command(
     from ethbrake_marl.harm import declared_objectives
 
     whole = {"--per-world": per_world, "--report": report, "--initial-states": initial_states, "--by": by}
+    whole |= {"--host": host}
     _check_shards(shards, jobs, ray, output, rows, whole)
     _check_outputs(out, per_world, report)
     if group := scenarios.group_of_scenarios(scenario):
@@ -157,6 +166,9 @@ def evaluate_command(
         made = partial(_make_drivers, agents.split(","), harm_count=harm_count, uncertainty=uncertainty)
         _evaluate_group(out, [driven(name).scenario for name in group], made, episodes, seed)
         return
+    host_name, make_host = _asked_host(host, {"--report": report, "--measures": measures})
+    if host is not None and initial_states is None:
+        episodes = HOSTED if episodes is None else episodes
     if measures is not None:
         if jobs != 1 or ray is not None:
             raise InvalidInput("--measures: processes of --jobs and --ray know none; leave these out")
@@ -178,13 +190,14 @@ def evaluate_command(
         evaluation.Evaluation.check_group(sample.kinds, by)
     lineup = _make_drivers(agents.split(","), chosen, harm_count, uncertainty)
     evaluation.check_agents(lineup, sample.worlds, chosen)
-    found = evaluation.evaluate(
-        sample,
-        lineup,
-        scenario=chosen,
-        seed=drawn_by,
-        on_progress=lambda agent, done: out.progress(agent, done, sample.worlds.n),
-    )
+    evaluate, tell = evaluation.evaluate, lambda agent, done: out.progress(agent, done, sample.worlds.n)
+    beside: dict[str, Any] = {}
+    if make_host is None:
+        found = evaluate(sample, lineup, scenario=chosen, seed=drawn_by, on_progress=tell)
+    else:
+        found, distrusted = make_host(sample, lineup, chosen, drawn_by, on_progress=tell)
+        here = evaluate(sample, lineup, scenario=chosen, seed=drawn_by, aftermath=False)
+        beside, sheet = _beside_ours(host_name, found, here, distrusted, harm_count)
     summary, told = evaluation.summarise(found), found.rescore(objectives)
     if report is not None:
         _write_report(out, report, found, summary, lineup, harm_count)
@@ -196,7 +209,7 @@ def evaluate_command(
         told=told,
         groups=groups,
         per_world=per_world,
-        settings={"harm_count": harm_count, "uncertainty": uncertainty},
+        settings={"harm_count": harm_count, "uncertainty": uncertainty, **({"host": host_name} if host_name else {})},
     )
     if per_world is not None:
         out.write(_beside(per_world), _json_text(results))
@@ -204,10 +217,53 @@ def evaluate_command(
     shown: list[Any] = [*summary.tables()]
     for name, of_group in groups.items():
         shown += [f"\n{name}: {count_of(of_group[0].episodes, 'world')}\n", of_group.terminal()]
+    if beside:
+        shown, results = [*shown, "", sheet], [row | {"beside": beside[row["agent"]]} for row in results]
     out.result(results, *shown)
     _tell_horizon(out, _moving(summary), sample.worlds.n, chosen.horizon_s)
     if told and not out.as_json:
         out.show(told.sheet(harm_count))
+
+
+def _asked_host(
+    host: str | None, without: Mapping[str, object]
+) -> tuple[str, Callable[..., tuple[evaluation.Evaluation, Mapping[str, Bools | None]]] | None]:
+    """Name of the host that is asked for, and what evaluates in it; the options ``without`` know none."""
+    if host is None:
+        return "", None
+    from ethbrake_marl.hosts import evaluate_hosted, find_host
+
+    for option in (name for name, value in without.items() if value):
+        raise InvalidInput(f"{option}: tells of the physics here; leave it out, or --host")
+    name, opened = find_host(host)
+    return name, partial(evaluate_hosted, opened, name=name)
+
+
+def _beside_ours(
+    host: str, found: evaluation.Evaluation, here: evaluation.Evaluation, distrusted: Mapping[str, Bools | None],
+    harm_count: HarmCount,
+) -> tuple[dict[str, Any], Sheet]:  # fmt: skip
+    """By agent, and as a table: the harm in a host and here, and what a shield promised there."""
+    told: dict[str, Any] = {}
+    rows: list[Any] = []
+    for agent, outcome in found.outcomes.items():
+        ours, theirs = (each.world_harm(harm_count) for each in (here.outcome(agent), outcome))
+        difference, bound = evaluation.paired_difference(theirs, ours), outcome.predicted_harm
+        told[agent] = {"host": host, "harm_here": float(ours.mean()), "difference": difference.value}
+        if bound is not None and outcome.chosen_policy is not None:
+            told[agent]["above_bound"] = int((theirs > bound).sum())
+        if (shown := distrusted[agent]) is not None:
+            told[agent]["distrusted"] = int(shown.sum())
+        last = (str(told[agent].get(name, "")) for name in ("above_bound", "distrusted"))
+        rows.append((agent, f"{ours.mean():.2f}", f"{theirs.mean():.2f}", difference, *last))
+    columns: list[Column | str] = ["Agent", *map(Column, ("Here", "There", "Difference", "Above bound", "Distrusted"))]
+    note = (
+        f"There: {host}. {_HARMS['first_impact_harm' if harm_count == 'first' else 'total_harm']}, mean per world in"
+        " m²/s², and the difference world by world with its 95 % interval. Above bound: worlds with more than a shield"
+        " told at the alert. Distrusted: worlds in which the host did what the shield did not foretell; its bound"
+        " promises nothing there. Modes step and robust alone compare."
+    )
+    return told, Sheet("", columns, rows, note)
 
 
 def _evaluate_group(

@@ -67,7 +67,7 @@ if TYPE_CHECKING:
         results_to_json as results_to_json,
         write_per_world as write_per_world,
     )
-    from ethbrake_marl.evaluation.rollout import evaluate as evaluate
+    from ethbrake_marl.evaluation.rollout import evaluate as evaluate, outcome_of as outcome_of
     from ethbrake_marl.evaluation.shield_modes import ShieldModes as ShieldModes, compare_modes as compare_modes
     from ethbrake_marl.evaluation.statistics import (
         interquartile_mean as interquartile_mean,

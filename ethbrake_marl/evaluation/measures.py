@@ -235,6 +235,7 @@ class Evaluation:
     outcomes: dict[str, Outcome]  # by the agent's name
     left_out: tuple[LeftOut, ...] = ()  # worlds of the list that are in none of the arrays, the same for all agents
     kinds: Mapping[str, NDArray[np.str_]] = field(default_factory=dict)  # ``scenario``, ``vehicle_2_type``: each [n]
+    host: str = ""  # that moved the worlds; else the physics here, of which something is proven
 
     def __repr__(self) -> str:
         drivers = [f"{agent!r:.42}" for agent in list(self.outcomes)[:_SHOWN_AGENTS]]
@@ -262,6 +263,8 @@ class Evaluation:
 
         Warns (``IncompleteTable``) where a table of best known harm holds some of the worlds, and not the others.
         """
+        if self.host:
+            return Unproven(f"{self.host} moved these worlds, and what is proven is of the physics here")
         found = known_limits(self.worlds, self.task)
         if isinstance(found, Limits) and found.warning:
             warnings.warn(found.warning, IncompleteTable, stacklevel=2)
@@ -1570,7 +1573,7 @@ class SummaryTable(list[SummaryRow]):
                 knows=knows[agent],
                 policy_sha256=policies[agent],
                 parameters=conditions,
-                beside_paper=beside and is_as_shipped(scenario),
+                beside_paper=beside and not conditions.get("no_limits_because") and is_as_shipped(scenario),
                 **shared,
             )
             for agent, tally in tallies.items()

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents import Driver, Knowledge, Team, check_agent, drive, script_agents
+from ethbrake_marl.agents import Driver, Episodes, Knowledge, Team, check_agent, drive, script_agents
 from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.engine import check_alert, is_state_free
 from ethbrake_marl.errors import (
@@ -303,10 +303,23 @@ def _roll_out(
     sampled = SampledHarm.of(worlds, task) if aftermath else None
     impacts = Tape(worlds, steps=False) if aftermath and REGISTERED else None
     episodes = drive(worlds, team, scenario, watched_by=[w for w in (shoved, sampled, impacts) if w is not None])
+    outcome = outcome_of(team, episodes)
+    return replace(
+        outcome,
+        shoved_m=None if shoved is None else shoved.metres,
+        sampled_harm=None if sampled is None else sampled.finish(),
+        metrics={} if impacts is None else impacts.measured(),
+    )
+
+
+def outcome_of(team: Team, episodes: Episodes) -> Outcome:
+    """What a team achieved in its episodes, without their aftermath."""
     told: Any = next(iter(episodes.memories.values()), None) if len(team.drivers) == 1 else None
     if episodes.guarded is not None:
         told = episodes.guarded.told
-    predicted, chosen = (_read_column(team, told, what, worlds.n) for what in ("predicted_harm", "chosen_policy"))
+    predicted, chosen = (
+        _read_column(team, told, what, episodes.final.n) for what in ("predicted_harm", "chosen_policy")
+    )
     return Outcome(
         episodes.ledger,
         episodes.final,
@@ -314,10 +327,7 @@ def _roll_out(
         None if predicted is None else predicted.astype(np.float64),
         None if chosen is None else chosen.astype(np.bool_),
         Knowledge.of(team),
-        None if shoved is None else shoved.metres,
-        None if sampled is None else sampled.finish(),
-        policies_of(team.drivers),
-        {} if impacts is None else impacts.measured(),
+        policies=policies_of(team.drivers),
     )
 
 

@@ -8,6 +8,7 @@ from ethbrake_marl.physics.batch import (
     advance as advance,
     advance_sampled as advance_sampled,
     columns as columns,
+    held_speeds as held_speeds,
     leaving_out_failed as leaving_out_failed,
     measured_without_failed as measured_without_failed,
     sample_on as sample_on,

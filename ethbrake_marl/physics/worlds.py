@@ -232,6 +232,35 @@ class Worlds:
         whole, part = _alike((self, fresh))
         return whole._each(assigned, part)
 
+    def running(
+        self,
+        time_s: ArrayLike,
+        gaps_m: ArrayLike,
+        speeds_mps: ArrayLike,
+        *,
+        command_mps2: ArrayLike = 0.0,
+        pair_hit: ArrayLike = False,
+    ) -> Worlds:
+        """These lines as they run at a later time, each to its full shape: as another simulator has moved them.
+
+        Raises ``InvalidInput`` naming the field and its first bad entry.
+
+        >>> import ethbrake_marl as eb
+        >>> alert = eb.load_scenario("paper-random").sample(2, seed=7).worlds
+        >>> alert.running(0.7, [4.0, 6.0], [18.0, 17.0, 19.0], command_mps2=[-5.0, -2.0, 0.0]).time_s
+        array([0.7, 0.7])
+
+        """
+        (n, N), inf = self.speeds_mps.shape, math.inf
+        return replace(
+            self,
+            time_s=_full("time_s", time_s, (n,), 0.0, inf),
+            gaps_m=_full("gaps_m", gaps_m, (n, N - 1), 0.0, inf),
+            speeds_mps=_full("speeds_mps", speeds_mps, (n, N), -inf, inf),
+            command_mps2=_full("command_mps2", command_mps2, (n, N), -inf, inf),
+            pair_hit=_full("pair_hit", pair_hit, (n, N - 1), 0.0, 1.0) == 1.0,
+        )
+
     def read_only(self) -> Worlds:
         """The same worlds as arrays that cannot be written to; these stay as they are."""
         return self._each(_unwritable)

@@ -378,7 +378,7 @@ class StepGuard(ShieldGuard):
         return shield
 
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
-        """What is certified. In a world whose episode is over as far as the shield foretold it is full braking."""
+        """What is certified."""
         shield: StepShield = memory.shield
         goes_on, finished = ~running.ended, shield.running.finished  # type: ignore[union-attr]  # it has begun
         worlds = running.worlds if self._policies or self._told is not None else None  # made anew each time
@@ -391,7 +391,7 @@ class StepGuard(ShieldGuard):
             only=goes_on,
             proposer=self._proposer(memories, worlds) if self._later_rollouts else None,
         )
-        applied = np.where((goes_on & finished)[:, np.newaxis], -1.0, decision.applied.reshape(proposed.shape))
+        applied = decision.applied.reshape(proposed.shape)
         stepped_in: Bools = np.any(decision.intervened.reshape(proposed.shape), axis=1)
         return Ruling(proposed, applied, stepped_in, goes_on & ~finished, decision, Guarded(after, memories))
 
@@ -479,7 +479,7 @@ class BelievedGuard(ShieldGuard):
         proposed, memories = self._asked(worlds, memory.policies, proposed)
         after = copy.copy(memory.shield)
         before, proposer = after.interventions, self._proposer(memories, worlds)
-        applied = after.decide(worlds, proposed[:, 0], proposer)[:, np.newaxis]
+        applied = after.decide(worlds, proposed[:, 0], proposer, only=~running.ended)[:, np.newaxis]
         stepped_in = after.interventions > before
         return Ruling(proposed, applied, stepped_in, ~running.ended, after.decision, Guarded(after, memories))
 

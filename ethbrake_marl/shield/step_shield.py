@@ -983,9 +983,10 @@ class StepShield:
     predicted, bit by bit: where it differs (a vehicle that brakes beyond its capacity, a number that is none, a message
     that never came) ``distrusted`` [n] is set, nothing is guaranteed any more, and for the rest of the episode the
     fallback ``best constant`` drives: the better one of the plan's rest and the constants, chosen again after every
-    surprise. With an ``uncertainty`` (robust mode) all of this holds for the worst member of each world, and what is
-    seen must lie within the range of their predictions. Raises ``InvalidInput`` for an unknown count or vehicle, a
-    negative allowance, others whose commands are not fixed, or what ``robust`` interior cannot certify.
+    surprise. In a world that is asked ``only`` after its episode was to be over, full braking is applied. With an
+    ``uncertainty`` (robust mode) all of this holds for the worst member of each world, and what is seen must lie within
+    the range of their predictions. Raises ``InvalidInput`` for an unknown count or vehicle, a negative allowance,
+    others whose commands are not fixed, or what ``robust`` interior cannot certify.
     """
 
     def __init__(
@@ -1239,7 +1240,7 @@ class StepShield:
         if seen is not None:
             self._compare(seen, asked)
         before = self.running
-        asked = asked & ~before.finished
+        goes_on, asked = asked & before.finished, asked & ~before.finished
         each = np.repeat(asked, before.members)
         now = before._replace(ended=before.ended | ~each)
         given = np.array(proposed, np.float64)
@@ -1256,6 +1257,7 @@ class StepShield:
             decision = decision._replace(margin=margin).put(rows[kept], found._replace(margin=margin[rows]), kept)
         decision = certify_inside(self.boxes, now, held, budget, decision, asked & ~self.distrusted)
         decision.reason[asked & self.distrusted] = BROKEN
+        decision.applied[goes_on] = -1.0  # its episode was to be over: it holds the brakes
         self.replaced = self.replaced + (decision.intervened.T & asked).T
         self.running = decision.after._replace(ended=np.where(each, decision.after.ended, before.ended))
         self.backup = decision.backup
@@ -1299,7 +1301,8 @@ class StepShield:
         if not surprising.any():
             return
         self.distrusted = self.distrusted | surprising
-        rows = np.flatnonzero(surprising & np.isfinite(seen).all(axis=1))  # others: what was predicted goes on
+        known = np.isfinite(seen).all(axis=1) & ~running.finished  # others: what was predicted goes on, or the brakes
+        rows = np.flatnonzero(surprising & known)
         states, ended, at = running.states.copy(), running.ended.copy(), running.rows_of(rows)
         states[at, :columns] = np.repeat(seen[rows], running.members, axis=0)
         ended[at] = np.repeat(running.steps[rows], running.members) >= running.problem.last_step[at]
@@ -1468,13 +1471,16 @@ class BelievedShield:
         for name, part in begun.items():
             setattr(self, name, part if fresh else renew_memory(getattr(self, name), rows, part))
 
-    def decide(self, worlds: Worlds, proposed: Floats, proposer: Proposer | None = None) -> Floats:
+    def decide(
+        self, worlds: Worlds, proposed: Floats, proposer: Proposer | None = None, *, only: Bools | None = None
+    ) -> Floats:
         """The certified actions [n], 0 before the vehicle's latency has elapsed; the same if asked again.
 
         Args:
             worlds: as they are; of them only what the vehicle received is read.
             proposed: actions [n].
             proposer: is rolled out in the believed worlds where nothing else certifies a proposal.
+            only: worlds that decide now; None: all.
 
         Raises ``InvalidInput`` if an episode never began.
 
@@ -1487,11 +1493,10 @@ class BelievedShield:
         self._odometer = odometer = Odometer(*self._odometer).look(worlds, vehicle)
         past = worlds.vehicles.latency_s[:, vehicle] <= worlds.time_s
         due = past & (worlds.time_s != self._asked_s) & (worlds.time_s < self.scenario.horizon_s)
+        due &= True if only is None else only
         if due.any():
             believed = self._believe(worlds, odometer.way_m, None)
             self._begin_anew(worlds, believed, odometer.way_m, due)
-            assert shield.running is not None
-            due &= ~shield.running.finished
             proposer = None if proposer is None else proposer._replace(worlds=believed)
             self.decision = decision = shield.decide(proposed, only=due, proposer=proposer)
             self._wanted[due] = decision.applied[due]

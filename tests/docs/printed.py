@@ -143,6 +143,7 @@ BLOCKS: dict[str, How] = {
     "ethbrake train": _by(SUITE, "tests/test_imports.py"),
     "agent,world,impacts,first_impact_harm,total_harm": TUTORIAL,
     "-1.0 26.97": TUTORIAL,
+    "6.06 0": _by(SUITE, "tests/hosts/test_hosts.py"),
     "Policy('ppo', 27 observations": _by(SUITE, "tests/docs/test_printed.py"),
     "ethbrake train --scenario cooperation-3-pair": TRAINED,
     "ethbrake agent export runs/early": TRAINED,
@@ -169,6 +170,7 @@ TABLES: dict[str, How] = {
     "| what | first-impact harm | of the best known": TRAINED,
     "| no. | label | the paper": _by(BY_HAND),
     "| `--draw` | full_brake": _by(SUITE, "tests/scenario/test_recorded.py"),
+    "| agent in a host | here | SUMO": _by(SUITE, "tests/hosts/test_sumo.py"),
     "| work | has | lacks": _by(BY_HAND),
 }
 

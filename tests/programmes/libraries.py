@@ -35,8 +35,8 @@ OWN_EPISODES, CLOSE = 50, 1e-5  # of the library's own evaluation; m2/s2
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 BLOCK = re.compile(
     r"^(?P<title>[^\n]+) \((?P<ran>[^\n]+)\):\n\n"
-    r"(?:With these networks or settings:\n\n```python\n(?P<before>.*?)```\n\n)?"
-    r"```(?P<language>\w+)\n(?P<code>.*?)```\n(?:\nThe loop that follows:\n\n```python\n(?P<after>.*?)```\n)?",
+    r"(?:With:\n\n```python\n(?P<before>.*?)```\n\n)?"
+    r"```(?P<language>\w+)\n(?P<code>.*?)```\n(?:\nThen:\n\n```python\n(?P<after>.*?)```\n)?",
     re.MULTILINE | re.DOTALL,
 )
 
