@@ -44,7 +44,7 @@ help:
 	@echo "make test-bounds      the tests at the lowest versions that pyproject.toml allows, and at the newest"
 	@echo "make test-machines    recorded results again, as on nine older processors: the same bits"
 	@echo "make test-order       the suite ten times in random orders and in parallel: no failure"
-	@echo "make planted-bugs     plant 161 bugs, each in a copy of the code; each must turn a test red"
+	@echo "make planted-bugs     plant 164 bugs, each in a copy of the code; each must turn a test red"
 	@echo "make mutation [ARGS=] 40 small random changes of each folder: how many turn a test red (ARGS='--folders shield')"
 	@echo "make bench-peers      speed beside other simulators, each in its own environment below .venvs/"
 	@echo "make benchmark        drive suite v2 with the agents of docs/benchmark.md and make its tables (ARGS: some agents)"

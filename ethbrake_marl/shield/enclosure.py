@@ -16,7 +16,7 @@ import numpy as np
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.engine import Script
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.physics import BOUND, Floats, Ints, Worlds, compiled
+from ethbrake_marl.physics import BOUND, Bools, Floats, Ints, Worlds, compiled
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search import ProfileProblem
 
@@ -173,6 +173,19 @@ OPENING, CLOSING, WIDE, SOFTEST, HARDEST, SINCE, CREEP, SPREAD, REACH = range(9)
 TOUCH_WIDTH = 9
 
 
+class Forces(NamedTuple):
+    """Accelerations that brakes and engines call for where these build up: in ``late``, and then in piece after piece.
+
+    Impacts do not change them, so they are the same on every path.
+    """
+
+    mean: Floats  # [N, J + 1, W] over the piece
+    rise: Floats  # [N, J + 1, W] of the speed in the piece
+    gain: Floats  # [N, J + 1, W] of the way, beyond what the speed at its start gives
+    swing: Floats  # [N, J + 1, 2] by how much it may differ from the mean within the piece as it falls, and as it rises
+    build: Bools  # [N] whether the vehicle's command builds up; of the other vehicles nothing is said here
+
+
 class Cell(NamedTuple):
     """A box of worlds of one line, what is commanded in it, and the pieces of time."""
 
@@ -188,6 +201,8 @@ class Cell(NamedTuple):
     restitution: float
     times: Floats  # [J + 1] s after the first decision
     action: Floats  # [J] of the shielded vehicle
+    forces: Forces
+    moving: bool  # whether some vehicle's command builds up
 
 
 class Path(NamedTuple):
@@ -231,8 +246,11 @@ def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
         onward, reach, pull = motion.onward[i], motion.reach[i], motion.pull[i]
         onward[:], reach[:] = speed, 0.0
         add(reach, length, speed)
-        if i != cell.vehicle and high(cell.onset[i]) > cell.times[piece]:
+        if i != cell.vehicle and high(cell.onset[i]) > cell.times[piece] and not cell.forces.build[i]:
             begin_later(cell, i, piece, motion)
+        elif cell.forces.build[i]:
+            add(onward, 1.0, cell.forces.rise[i, piece + 1])
+            add(reach, 1.0, cell.forces.gain[i, piece + 1])
         else:
             add(onward, length, pull)
             add(reach, 0.5 * length * length, pull)
@@ -245,14 +263,16 @@ def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
                     most += max(touch[OPENING], touch[CLOSING], 0.0) + 5.0 * touch[CREEP]
                     for k in range(p, p + 2):
                         most += length * (abs(motion.pull[k, 0]) + radius(motion.pull[k]) + motion.vague[k])
-            fastest = high(speed) + length * high(motion.pull[i]) + most
+            fastest = high(speed) + length * (high(motion.pull[i]) + motion.vague[i]) + most
             if fastest > cell.limit[i]:
                 # the speed limit may end its drive anywhere within the piece: it gives any part of it then
-                drive = high(motion.pull[i]) + motion.vague[i]
+                drive, least = high(motion.pull[i]) + motion.vague[i], min(low(motion.pull[i]) - motion.vague[i], 0.0)
                 motion.onward[i] = between_shifted(motion.onward[i], -length * drive)
                 motion.reach[i] = between_shifted(motion.reach[i], -0.5 * length * length * drive)
-                motion.vague[i] = 0.5 * drive
-                motion.pull[i] = between(0.5 * drive, 0.5 * drive, motion.pull.shape[1])
+                motion.vague[i] = 0.5 * (drive - least)
+                motion.pull[i] = between(0.5 * (drive + least), 0.5 * (drive + least), motion.pull.shape[1])
+        if cell.moving:
+            hold(speed, i, length, motion)
         motion.onward[i, -1] += ROUNDING * (1.0 + abs(motion.onward[i, 0]))
         motion.reach[i, -1] += ROUNDING * (1.0 + abs(motion.reach[i, 0]))
         motion.speed[i], motion.way[i] = motion.onward[i], motion.reach[i]
@@ -260,7 +280,20 @@ def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
             motion.rest[i] = STANDS
             motion.speed[i], motion.way[i] = 0.0, 0.0
         elif low(motion.onward[i]) < 0.0 and low(motion.pull[i]) - motion.vague[i] < 0.0:
-            stop(speed, i, length, motion)
+            stop(cell.moving, speed, i, length, motion)
+
+
+@compiled(apart=True)
+def hold(speed: Floats, i: int, length: float, motion: Motion) -> None:
+    """A vehicle that may stand while its brakes are released in this piece: they hold it until its force is above 0.
+
+    By as much as it would have been below 0 it is then faster, and further on.
+    """
+    least, most = low(motion.pull[i]) - motion.vague[i], high(motion.pull[i]) + motion.vague[i]
+    slowest = low(speed) + least * length
+    if least < 0.0 < most and slowest < 0.0:
+        add(motion.onward[i], 1.0, between(0.0, -slowest, speed.shape[0]))
+        add(motion.reach[i], length, between(0.0, -slowest, speed.shape[0]))
 
 
 @compiled(apart=True)
@@ -277,7 +310,9 @@ def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
     pull = motion.pull[i]
     pull[:] = 0.0
     motion.rest[i], motion.vague[i] = MOVES, 0.0
-    if i == cell.vehicle:
+    if cell.forces.build[i]:
+        pull[:], motion.vague[i] = cell.forces.mean[i, piece + 1], cell.forces.swing[i, piece + 1].max()
+    elif i == cell.vehicle:
         action = cell.action[piece]
         if action < 0.0:
             add(pull, action, cell.brake[i])
@@ -317,20 +352,28 @@ def _since(cell: Cell, i: int, time: float) -> Floats:
 
 
 @compiled(apart=True)
-def stop(speed: Floats, i: int, length: float, motion: Motion) -> None:
+def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> None:
     """A braking vehicle that stops in this piece, or may: it stands from then on."""
     pull, vague, width = motion.pull[i], motion.vague[i], speed.shape[0]
     beyond = negative(motion.onward[i])
     least, most = max(low(beyond), 0.0), max(high(beyond), 0.0)
     motion.rest[i] = MAY_STOP
     motion.speed[i] = positive_part(motion.onward[i])
-    if vague > 0.0 or not high(pull) < 0.0:
+    if not high(pull) + vague < 0.0 or (vague > 0.0 and not moving):
         fastest = max(high(speed), 0.0) + max(high(pull) + vague, 0.0) * length
         motion.way[i] = between(0.0, fastest * length, width)
     elif least > 0.0:
-        add(motion.way[i], 0.5, product(square(beyond), reciprocal(negative(pull))))
+        add(motion.way[i], 0.5, product(square(beyond), reciprocal(deceleration(pull, vague))))
     else:
-        add(motion.way[i], 1.0, between(0.0, 0.5 * most * most / -high(pull), width))
+        add(motion.way[i], 1.0, between(0.0, 0.5 * most * most / -(high(pull) + vague), width))
+
+
+@compiled(apart=True)
+def deceleration(pull: Floats, vague: float) -> Floats:
+    """Mean deceleration along any part of a way, of a vehicle whose acceleration differs from ``pull`` by ``vague``."""
+    out = negative(pull)
+    out[-1] += vague
+    return out
 
 
 # Pairs of a box of worlds that stay in contact: they bounce a little, then move as one, then part.
@@ -341,6 +384,7 @@ def stop(speed: Floats, i: int, length: float, motion: Motion) -> None:
 # brakes then hold instead of pulling, and nothing but bounds on its speeds is known of it.
 
 SHARP = 0.1  # m/s: a pair that opens moves alone once its speeds are known to this
+UNEVEN = 3.0  # times its separating speed: more than a flight may close with is not bounded by flights, if forces move
 
 
 @compiled(apart=True)
@@ -418,18 +462,26 @@ def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float)
     weakest, hardest = own_pulls(motion, p)
     for rows in (motion.pull, motion.onward, motion.reach):
         rows[front] = common(cell, p, rows[front], rows[rear])
-    slowest = min(low(path.forms[front]), low(motion.onward[front]))
+    slowest = min(low(path.forms[front]), low(motion.onward[front])) - dip_of(cell, vague, length)
     bounce(cell, touch, p, least, most, length, vague)
     creep(cell, touch, p, slowest, weakest, hardest, length)
     settle(touch, cell.restitution, length)
     motion.rest[front], motion.vague[front] = MOVES, vague
+    if cell.moving:
+        hold(path.forms[front], front, length, motion)
     motion.speed[front], motion.way[front] = motion.onward[front], motion.reach[front]
     if low(motion.onward[front]) < 0.0 and weakest < 0.0:
-        stop(path.forms[front], front, length, motion)
+        stop(cell.moving, path.forms[front], front, length, motion)
     motion.way[front, -1] += stray(cell, touch, p) * length
     for rows in (motion.pull, motion.onward, motion.reach, motion.speed, motion.way):
         rows[rear] = rows[front]
     motion.rest[rear], motion.vague[rear] = motion.rest[front], vague
+
+
+@compiled(apart=True)
+def dip_of(cell: Cell, vague: float, length: float) -> float:
+    """By how much a speed may be below its values at both ends of a piece in which a force passes 0."""
+    return 0.5 * vague * length if cell.moving else 0.0
 
 
 @compiled(apart=True)
@@ -510,7 +562,8 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
     if fastest == 0.0 and wide == 0.0 and least >= 0.0:
         touch[CLOSING], touch[OPENING] = 0.0, 0.0
         return
-    if least > 0.0 and vague == 0.0 and (touch[CREEP] <= 0.0 or backwards(cell, p) <= 0.0):
+    certain = most < UNEVEN * UNEVEN * least if cell.moving else vague == 0.0
+    if least > 0.0 and certain and (touch[CREEP] <= 0.0 or backwards(cell, p) <= 0.0):
         if least < touch[SOFTEST] or most > touch[HARDEST]:
             begin_run(touch, e, min(least, touch[SOFTEST]), max(most, touch[HARDEST]), least, most)
         if touch[SOFTEST] < math.inf:
@@ -589,6 +642,8 @@ def driven(cell: Cell, i: int, speed: float, since: float) -> float:
         for j in range(cell.action.shape[0]):
             if cell.times[j + 1] > since:
                 drive = max(drive, cell.action[j] * high(cell.drive))
+                if cell.forces.build[i]:  # what it had before may still be released
+                    drive = max(drive, high(cell.forces.mean[i, j + 1]) + cell.forces.swing[i, j + 1].max())
     elif cell.constant[i] > 0.0:
         drive = cell.constant[i]
     return float(max(speed, min(cell.limit[i], speed + drive * rest)) if drive > 0.0 else speed)
@@ -717,7 +772,7 @@ def approach(
     press = motion.pull[p + 1].copy()
     if front_stands:
         if motion.rest[p] == MAY_STOP:
-            way = _stopping_way(path.forms[p], motion.pull[p], motion.vague[p], length)
+            way = _stopping_way(cell.moving, path.forms[p], motion.pull[p], motion.vague[p], length)
             add(gap, 1.0, cut(way, 0.0, math.inf))
     else:
         add(closing, -1.0, path.forms[p])
@@ -727,6 +782,8 @@ def approach(
     add(squared, 2.0, product(press, gap))
     if vague > 0.0:  # the way there and back
         opening = max(-low(closing), 0.0) + length * (vague + radius(press) + abs(press[0]))
+        if cell.moving:
+            opening = max(length * max(vague - low(press), 0.0) - low(closing), 0.0)
         squared[-1] += 2.0 * vague * (max(high(gap), 0.0) + 2.0 * length * opening)
     squared[-1] += NEVER
     there = high(squared) > BOUND.TOUCH_SPEED_MPS * BOUND.TOUCH_SPEED_MPS
@@ -743,7 +800,9 @@ def approach(
     speed = square_root(squared)
     time, whole = between(0.0, length, width), closing.copy()
     add(whole, 1.0, speed)
-    if low(whole) > SLOWEST and vague == 0.0 and slack == 0.0:
+    if cell.moving:  # twice by how much its mean differs from that of both ends
+        whole[-1] += 0.5 * vague * length
+    if low(whole) > SLOWEST and (vague == 0.0 or cell.moving) and slack == 0.0:
         time = product(gap, reciprocal(whole))
         time *= 2.0
         if low(time) > length + NEVER or high(time) < -NEVER:
@@ -753,12 +812,12 @@ def approach(
 
 
 @compiled(apart=True)
-def _stopping_way(speed: Floats, pull: Floats, vague: float, length: float) -> Floats:
+def _stopping_way(moving: bool, speed: Floats, pull: Floats, vague: float, length: float) -> Floats:
     """Way of a braking vehicle until it stands, which it does within the piece."""
-    if vague > 0.0 or not high(pull) < 0.0:
+    if not high(pull) + vague < 0.0 or (vague > 0.0 and not moving):
         fastest = max(high(speed), 0.0) + max(high(pull) + vague, 0.0) * length
         return between(0.0, fastest * length, speed.shape[0])
-    way = product(square(speed), reciprocal(negative(pull)))
+    way = product(square(speed), reciprocal(deceleration(pull, vague)))
     way *= 0.5
     return way
 
@@ -787,13 +846,16 @@ def spring_apart(
         add(after.forms[p], 1.0, front)
         add(way[p], 1.0, product(front, left))
     for i in range(p, p + 2):
-        stand_still(motion.pull[i], motion.vague[i], high(left), after.forms[i], way[i])
+        stand_still(cell, motion.pull[i], motion.vague[i], high(left), after.forms[i], way[i])
 
 
 @compiled(apart=True)
-def stand_still(pull: Floats, vague: float, left: float, speed: Floats, way: Floats) -> None:
+def stand_still(cell: Cell, pull: Floats, vague: float, left: float, speed: Floats, way: Floats) -> None:
     """Where a braking vehicle's speed would have become negative, it stood before."""
     least = low(speed)
+    if cell.moving and low(pull) - vague < 0.0 < high(pull) + vague:  # and as in ``hold``, it may drive since
+        least -= (high(pull) + vague) * left
+        speed[:] = between_shifted(speed, max(-least, 0.0))
     if least < 0.0:
         most = -least * left
         if high(pull) + vague < 0.0:
@@ -824,8 +886,9 @@ def stay(
         way[p] = common(cell, p, motion.reach[p], motion.reach[p + 1])
         add(way[p], -1.0, product(cell.share[p, 0], gap))
     weakest, hardest = own_pulls(motion, p)
-    creep(cell, touch, p, min(low(start), low(after.forms[p])), weakest, hardest, high(left))
-    stand_still(pull, vague, high(left), after.forms[p], way[p])
+    slowest = min(low(start), low(after.forms[p])) - dip_of(cell, vague, high(left))
+    creep(cell, touch, p, slowest, weakest, hardest, high(left))
+    stand_still(cell, pull, vague, high(left), after.forms[p], way[p])
     way[p, -1] += stray(cell, touch, p) * high(left)
     after.forms[p + 1], way[p + 1] = after.forms[p], way[p]
     add(way[p + 1], 1.0, gap)
@@ -885,19 +948,27 @@ def branch(
     if path.marks[p] == 0:
         add(harm, 1.0, how.squared)
     other = 1 - p
-    if P == 1 or path.marks[other] == 1:
-        return keep_worst(harm, worst, out)
-    if path.marks[P + other] != FREE:
-        return keep_with(harm, rough_harm(cell, path, p) - high(path.forms[-1]), worst, out)
+    final = P == 1 or path.marks[other] == 1
+    touches = path.marks[p] == 0 and pressing(motion, p)[1] >= 0.0 and may_only_touch(cell, path, motion, p, how)
+    touches = touches and (P == 1 or may_turn(cell, motion, p, path.marks[2 * P]))  # its first impact is then to come
+    if final:
+        worst = keep_worst(harm, worst, out)
+        if not touches:
+            return worst
+    rough = rough_harm(cell, path, -1 if touches else p) - high(path.forms[-1])
+    if P == 2 and path.marks[P + other] != FREE:
+        return keep_with(harm, rough, worst, out)
     speed = cut(square_root(how.squared), 0.0, math.inf)
     length = cell.times[path.marks[2 * P] + 1] - cell.times[path.marks[2 * P]]
-    closing = closing_after(cell, path, motion, p, speed, how.time, length)
+    closing = np.zeros_like(speed) if final else closing_after(cell, path, motion, p, speed, how.time, length)
     if high(closing) > 0.0:
+        if touches:
+            return keep_with(harm, rough, worst, out)
         both = harm.copy()
         add(both, 1.0, square(cut(closing, 0.0, math.inf)))
         worst = keep_worst(both, worst, out)
     if not strike(cell, path, stack, motion, p, how, speed, harm):
-        worst = keep_with(harm, rough_harm(cell, path, p) - high(path.forms[-1]), worst, out)
+        worst = keep_with(harm, rough, worst, out)
     return worst
 
 
@@ -956,7 +1027,10 @@ def strike(
     # drive of a front vehicle that ceases because an impact pushes it beyond its speed limit; 0: it does not
     drive = high(motion.pull[p]) + motion.vague[p]
     pushed = (1.0 + cell.restitution) * high(speed) + 2.0 * max(pressing(motion, p)[1], 0.0) * length
-    unlimited = drive if drive > 0.0 and high(motion.onward[p]) + pushed > cell.limit[p] else 0.0
+    fastest = high(motion.onward[p])
+    if cell.moving:
+        fastest = max(fastest, high(path.forms[p]) + max(drive, 0.0) * length)
+    unlimited = drive if drive > 0.0 and fastest + pushed > cell.limit[p] else 0.0
     if most < 0.0 or -returns * low(speed) + max(most, 0.0) * high(left) < 0.0:
         jump = speed * (1.0 + bounces)
         jump[-1] = abs(jump[-1]) + (bounces - returns) * BOUND.PLASTIC_SPEED_MPS
@@ -968,11 +1042,13 @@ def strike(
         touch[CLOSING] = max(hardest, 0.0) * length
         touch[OPENING] = max(most_apart, cell.restitution * touch[CLOSING]) - min(least, 0.0) * length
         touch[WIDE] = touch[OPENING] * length
-        if least > 0.0 and motion.vague[p] + motion.vague[p + 1] == 0.0:
-            ratio = math.sqrt(hardest / least)
+        ratio = math.sqrt(hardest / least) if least > 0.0 else math.inf
+        steady = motion.vague[p] + motion.vague[p + 1] == 0.0
+        regular = cell.restitution * ratio < 1.0 and (ratio < UNEVEN or not cell.moving)
+        if least > 0.0 and (steady or (cell.moving and regular)):
             touch[OPENING], touch[CLOSING] = most_apart, most_apart
             touch[WIDE] = min(0.5 * most_apart * most_apart / least, most_apart * length)
-            if cell.restitution * ratio < 1.0:
+            if regular:
                 touch[OPENING], touch[CLOSING] = most_apart * ratio, most_apart * ratio
                 touch[SOFTEST], touch[HARDEST], touch[SINCE] = least, hardest, 0.0
         touch[SPREAD], touch[REACH] = apart(touch), 0.0
@@ -988,20 +1064,25 @@ def strike(
         if after.marks[P + q] == PARTS:
             after.marks[P + q] = FREE
     stack.size[0] = size + 1
-    if after.marks[P + p] == TOUCHES and path.marks[p] == 0 and may_only_touch(cell, path, motion, p):
-        return touch_only(path, stack, p)
+    if after.marks[P + p] == TOUCHES and path.marks[p] == 0 and may_only_touch(cell, path, motion, p, how):
+        return touch_only(cell, path, stack, motion, p, length)
     return True
 
 
 @compiled(apart=True)
-def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int) -> bool:
+def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int, how: Approach) -> bool:
     """Whether a pair may have come to gap 0 at closing speed 0 just when it begins to be pressed together.
 
-    Before, it was not: so a command changed.
+    Before, it was not: so a command changed, or a force moves.
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
+    softest, hardest = pressing(motion, p)
     piece = path.marks[2 * P]
-    changed = piece == 0 or motion.vague[p] + motion.vague[p + 1] > 0.0 or (P == 2 and path.marks[1 - p] == 1)
+    harder = may_turn(cell, motion, p, piece)
+    if harder and softest <= 0.0 <= hardest and low(how.squared) <= 1e-8:
+        return True
+    vague = harder if cell.moving else motion.vague[p] + motion.vague[p + 1] > 0.0
+    changed = piece == 0 or vague or (P == 2 and path.marks[1 - p] == 1)
     for i in range(p, p + 2):
         if i != cell.vehicle:
             changed = changed or high(cell.onset[i]) == cell.times[piece]
@@ -1012,8 +1093,25 @@ def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int) -> bool:
 
 
 @compiled(apart=True)
-def touch_only(path: Path, stack: Stack, p: int) -> bool:
-    """Beside the path on top that of the worlds in which pair ``p`` met, stayed in contact, and had no impact."""
+def may_turn(cell: Cell, motion: Motion, p: int, piece: int) -> bool:
+    """Whether forces that move may press a pair together harder and harder: its front's falls, or its rear's rises."""
+    return may_move(cell, motion, p, piece, 0) or may_move(cell, motion, p + 1, piece, 1)
+
+
+@compiled(apart=True)
+def may_move(cell: Cell, motion: Motion, i: int, piece: int, which: int) -> bool:
+    """Whether an acceleration may fall (0), or rise (1), in the piece, in a cell in which some force moves."""
+    if not cell.forces.build[i] or motion.vague[i] > cell.forces.swing[i, piece + 1].max():
+        return cell.moving and motion.vague[i] > 0.0
+    return bool(cell.forces.swing[i, piece + 1, which] > 0.0)
+
+
+@compiled(apart=True)
+def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, length: float) -> bool:
+    """Beside the path on top that of the worlds in which pair ``p`` met, stayed in contact, and had no impact.
+
+    Where forces move it may open and have its first impact within the piece: that is on the path on top.
+    """
     size = stack.size[0]
     if size >= STACK:
         return False
@@ -1023,6 +1121,11 @@ def touch_only(path: Path, stack: Stack, p: int) -> bool:
     stack.forms[size, -1] = path.forms[-1]
     stack.marks[size, p] = 0
     begin_touch(stack.touch[size, p])
+    if cell.moving:
+        touch, (softest, hardest) = stack.touch[size, p], pressing(motion, p)
+        touch[OPENING], touch[CLOSING] = max(-softest, 0.0) * length, max(hardest, 0.0) * length
+        touch[WIDE] = touch[OPENING] * length
+        stack.forms[size - 1, -1, 0] += touch[CLOSING] * touch[CLOSING]
     stack.size[0] = size + 1
     return True
 
@@ -1034,7 +1137,10 @@ def thrown_back(cell: Cell, path: Path, motion: Motion, p: int, how: Approach, s
     The last one of a line, if it never drives, meets nobody then: it may as well stand.
     """
     P, share = cell.gap.shape[0], (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0
-    slowest = 0.0 if how.front_stands else max(min(low(path.forms[p]), low(motion.speed[p])), 0.0)
+    slowest = 0.0
+    if not how.front_stands:
+        dip = dip_of(cell, motion.vague[p], cell.times[path.marks[2 * P] + 1] - cell.times[path.marks[2 * P]])
+        slowest = max(min(low(path.forms[p]), low(motion.speed[p])) - dip, 0.0)
     last = p == P - 1 and driven(cell, p + 1, 0.0, cell.times[path.marks[2 * P]]) <= 0.0
     return share * high(speed) > slowest and not last
 
@@ -1178,7 +1284,7 @@ def go_on(cell: Cell, path: Path, motion: Motion) -> bool:
 # Branch and bound: an upper bound on the harm of a plan over a box, refined where it is largest.
 
 # groups of the numbers of a box, N of each but P gaps
-BRAKING, DRIVING, LATENCY, MASS, SPEED, GAP = range(6)
+BRAKING, DRIVING, LATENCY, MASS, BRAKE_RATE, RELEASE_RATE, SPEED, GAP = range(8)
 LONGEST_PIECE_S = 0.25  # before the first decision
 
 
@@ -1239,11 +1345,103 @@ def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats)
         share[p, 1, -1] = share[p, 0, -1]
     drive = form_of(low_, high_, DRIVING * N + v, free)
     times, action = pieces(known, onset, earliest, plan)
-    cell = Cell(
-        speed, gap, brake, drive, share, onset, known.constant, known.limit, v, known.restitution, times, action
-    )  # fmt: skip
     first[0] -= earliest
+    build = np.zeros(N, np.bool_)
+    for i in range(N):  # others only brake, or only drive
+        down, up = low_[BRAKE_RATE * N + i] < math.inf, low_[RELEASE_RATE * N + i] < math.inf
+        build[i] = (up and (i == v or known.constant[i] > 0.0)) or (down and not known.constant[i] >= 0.0)
+    J, moving = times.shape[0] if build.any() else 0, bool(build.any())
+    forces = Forces(np.zeros((N, J, W)), np.zeros((N, J, W)), np.zeros((N, J, W)), np.zeros((N, J, 2)), build)
+    cell = Cell(
+        speed, gap, brake, drive, share, onset, known.constant, known.limit, v, known.restitution, times, action,
+        forces, moving,
+    )  # fmt: skip
+    for i in range(N):
+        if build[i]:
+            rates = np.full((2, W), math.inf)
+            for k in range(2):
+                if low_[(BRAKE_RATE + k) * N + i] < math.inf:
+                    rates[k] = form_of(low_, high_, (BRAKE_RATE + k) * N + i, free)
+            build_up(cell, i, first, rates)
     return cell, first
+
+
+@compiled(apart=True)
+def build_up(cell: Cell, i: int, late: Floats, rates: Floats) -> None:
+    """The forces of a vehicle in ``late`` and in every piece; 0 at the alert. ``rates`` [2, W] of braking, release."""
+    forces, own, force, wanted = cell.forces, i == cell.vehicle, np.zeros_like(late), np.zeros_like(late)
+    last, there = 0.0, True  # action, and whether the force is that of it
+    for j in range(cell.times.shape[0]):
+        begin, end = cell.times[j - 1], cell.times[j]
+        duration = between(end - begin, end - begin, late.shape[0])
+        if j == 0:
+            duration, begin, end = late, 0.0, high(late)
+            early, acts = early_pull(cell, i, late)
+            action = 1.0 if acts and radius(early) + abs(early[0]) > 0.0 else 0.0
+        elif own:
+            action = cell.action[j - 1]
+        else:
+            action = 1.0 if low(cell.onset[i]) < end else 0.0
+            if action == 1.0 and high(cell.onset[i]) > begin:
+                duration = cut(difference(_since(cell, i, end), _since(cell, i, begin)), 0.0, end - begin)
+        if action != last:
+            there = False
+            wanted = np.zeros_like(late)
+            if not own and not math.isnan(cell.constant[i]):
+                wanted[0] = cell.constant[i]
+            else:
+                add(wanted, action if own else -1.0, cell.drive if own and action > 0.0 else cell.brake[i])
+        last = action
+        rise, gain = forces.rise[i, j], forces.gain[i, j]
+        if there and radius(duration) == 0.0:
+            add(rise, duration[0], wanted)
+            add(gain, 0.5 * duration[0] * duration[0], wanted)
+        else:
+            add(rise, 1.0, product(wanted, duration))
+            add(gain, 0.5, product(wanted, square(duration)))
+        if not there:
+            there = ramp(force, wanted, duration, end - begin, rates, rise, gain, forces.swing[i, j])
+            there &= low(duration) >= end - begin
+        if end > begin:
+            add(forces.mean[i, j], 1.0 / (end - begin), rise)
+
+
+@compiled(apart=True)
+def ramp(
+    force: Floats, wanted: Floats, duration: Floats, longest: float, rates: Floats, rise: Floats, gain: Floats,
+    swing: Floats,
+) -> bool:  # fmt: skip
+    """A force that moves towards another one for a while: ``force`` becomes that at its end.
+
+    With a difference d at the start and e at the end, and the time m for which it moves, it adds ``m (d + e) / 2`` to
+    the speed that ``wanted`` gives after t, and ``m t (d + e) / 2 - m^2 (d + 2 e) / 6`` to the way. ``swing`` [2]
+    becomes by how much it may differ from its mean. Returns whether it is there at the end in every world.
+    """
+    start, there = difference(force, wanted), True
+    force[:] = wanted
+    for k in range(2):
+        sign, rate = 1.0 - 2.0 * k, rates[k]
+        more = positive_part(linear(start, sign, 0.0, 0.0))
+        if math.isinf(rate[0]) or high(more) <= 0.0:
+            continue
+        moving, rest = duration.copy(), difference(more, product(rate, duration))
+        if low(rest) < 0.0:
+            rest = positive_part(rest)
+            moving = cut(product(difference(more, rest), reciprocal(rate)), 0.0, high(duration))
+        both = more.copy()
+        add(both, 1.0, rest)
+        speed = product(moving, both)
+        speed *= 0.5
+        speed = cut(speed, 0.0, high(more) * high(duration))
+        add(both, 1.0, rest)
+        way = product(speed, duration)
+        add(way, -1.0 / 6.0, product(square(moving), both))
+        add(rise, sign, speed)
+        add(gain, sign, cut(way, 0.0, 0.5 * high(more) * high(duration) * high(duration)))
+        add(force, sign, rest)
+        there &= high(rest) <= 0.0
+        swing[k] = min(0.5 * high(rate) * longest, high(more))
+    return there
 
 
 @compiled(apart=True)
@@ -1259,8 +1457,12 @@ def wait(cell: Cell, late: Floats) -> bool:
         pull, certain = early_pull(cell, i, late)
         begin = cell.speed[i].copy()
         way[i] = product(begin, late)
-        add(way[i], 0.5, product(pull, square(late)))
-        add(cell.speed[i], 1.0, product(pull, late))
+        if cell.forces.build[i]:
+            add(way[i], 1.0, cell.forces.gain[i, 0])
+            add(cell.speed[i], 1.0, cell.forces.rise[i, 0])
+        else:
+            add(way[i], 0.5, product(pull, square(late)))
+            add(cell.speed[i], 1.0, product(pull, late))
         slowest[i], fastest = min(low(begin), low(cell.speed[i])), max(high(begin), high(cell.speed[i]))
         limited = high(pull) > 0.0 and fastest >= cell.limit[i]
         if not certain or limited or slowest[i] < 0.0:
@@ -1389,7 +1591,7 @@ SCRIPTS = ("full_brake", "coast", "constant")
 class Boxes(NamedTuple):
     """The boxes of n worlds: each uncertain number from ``low`` to ``high``."""
 
-    low: Floats  # [n, Q] braking, driving, latency, mass, speed of each vehicle, then the gaps
+    low: Floats  # [n, Q] braking, driving, latency, mass, rates, speed of each vehicle, then the gaps
     high: Floats  # [n, Q]
     limit: Floats  # [n, N] m/s
     restitution: Floats  # [n]
@@ -1481,8 +1683,8 @@ def boxes_of(
         raise _refusal("an obstacle ahead")
     if v.in_pieces.any():
         raise _refusal("a vehicle that brakes in pieces (profile)")
-    if v.build_up.any():
-        raise _refusal("brakes that build up")
+    if v.build_up.any() and possible.command_mps2.any():
+        raise _refusal("brakes that began to build up before the alert")
     command, constant = problem.command.reshape(n, members, N), np.full((n, N), np.nan)
     for i, script in others.items():
         name = getattr(script, "name", type(script).__name__)
@@ -1496,9 +1698,12 @@ def boxes_of(
             )
         constant[:, i] = command[:, 0, i]
     numbers = np.concatenate(
-        [v.braking_capacity_mps2, v.driving_capacity_mps2, v.latency_s, v.mass_t, possible.speeds_mps, possible.gaps_m],
+        [
+            v.braking_capacity_mps2, v.driving_capacity_mps2, v.latency_s, v.mass_t, v.brake_rate_mps3,
+            v.release_rate_mps3, possible.speeds_mps, possible.gaps_m,
+        ],
         axis=1,
-    ).reshape(n, members, 6 * N - 1)
+    ).reshape(n, members, 8 * N - 1)  # fmt: skip
     return Boxes(
         numbers.min(axis=1), numbers.max(axis=1), v.speed_limit_mps[::members], v.restitution[::members],
         possible.time_s[::members], constant, vehicle, scenario.time_step_s, scenario.horizon_s,

@@ -48,6 +48,22 @@ CELLS = {3: 3.0, 5: 1.0}  # how many of the worlds each number of vehicles gets:
 SLOW = {"worst_case": 0.14}  # and of those, a search in every step
 RATES = {"brake_rate_mps3": {"uniform": [5, 40]}, "release_rate_mps3": {"uniform": [5, 60]}}
 UNSURE = "brake_rate_mps3=20%"  # of every vehicle; the truth is a corner
+ANY_RATE = {
+    "brake_rate_mps3": {"loguniform": [2, 200]},
+    "release_rate_mps3": {"loguniform": [2, 200]},
+    "restitution": {"uniform": [0, 1]},
+}
+RATED = {  # scenarios in which brakes build up, and what is not known in them
+    "12.65 m/s3": ("paper-random-buildup", "brake_rate_mps3=20%"),
+    "2 to 200 m/s3": (
+        load_scenario("paper-random").replace(**ANY_RATE),
+        "brake_rate_mps3=20%,gaps_m=0.2,latency_s.vehicle_2=0.1",
+    ),
+    "2 to 200 m/s3, two vehicles": (
+        line(3).replace(vehicles=2, roles={"vehicle_1": "full_brake", "vehicle_2": "learner"}, **ANY_RATE),
+        "brake_rate_mps3=20%,release_rate_mps3=20%,braking_capacity_mps2=5%,speeds_mps=0.2",
+    ),
+}
 TEAM_CELLS = {(3, 3): 5.0, (4, 3): 1.25, (3, 5): 1.0, (4, 5): 0.75}  # by what they cost
 
 
@@ -71,6 +87,8 @@ def cases(given: Given) -> Cases:
     seed = given.seed
     for robust in ("corners", "interior"):
         yield f"inside: {robust} ({given.intervals})", partial(inside, robust, given)
+    for told, (scenario, intervals) in RATED.items():
+        yield f"inside: interior, {told} ({intervals})", partial(inside, "interior", given, scenario, intervals)
     for name in PLAYS:
         yield f"interference: {name}", partial(disturbance, name, given.interfered, seed)
     for wrapper in WRAPPERS:
@@ -196,13 +214,14 @@ def believed(scenario: Any, way: str, worlds: int, seed: int, robust: str) -> To
     )
 
 
-def inside(robust: str, given: Given) -> Told:
-    """Worlds out of boxes around worlds of ``paper-random``, behind one robust shield to which ``coast`` is proposed.
+def inside(robust: str, given: Given, scenario: Any = "paper-random", intervals: str = "") -> Told:
+    """Worlds out of boxes around worlds of a scenario, behind one robust shield to which ``coast`` is proposed.
 
     What robust mode applies does not depend on which world of the box is the true one. So one shield decides for a box,
     and many worlds of it are driven by what it applied.
     """
-    scenario, uncertainty, boxes = load_scenario("paper-random"), parse_uncertainty(given.intervals), given.boxes
+    scenario, uncertainty = load_scenario(scenario), parse_uncertainty(intervals or given.intervals)
+    boxes = given.boxes
     told, rng = scenario.sample(boxes, given.seed).worlds, np.random.default_rng(given.seed)
     shield = StepShield(scenario, 1, uncertainty=uncertainty, robust=robust)
     shield.begin(told, np.arange(boxes))

@@ -25,6 +25,7 @@ from ethbrake_marl.shield.enclosure import (
     cell_of,
     go_on,
     high,
+    hold,
     may_meet_unseen,
     meet,
     move_alone,
@@ -49,6 +50,11 @@ UNUSUAL = {
     "elastic": ({"restitution": 1.0}, "speeds_mps=0.4"),
     "close": ({"gaps_m": [0.3, 0.2]}, "gaps_m=0.2,latency_s.vehicle_3=0.1"),
     "driving": ({"driving_capacity_mps2": 8, "speed_limit_mps": 22.5}, "driving_capacity_mps2=20%"),
+    "build up": ({"brake_rate_mps3": 12.65, "release_rate_mps3": 40}, "brake_rate_mps3=20%,latency_s.vehicle_2=0.1"),
+    "slow build up": (
+        {"brake_rate_mps3": [3, 2, 9], "speeds_mps": [4, 3.5, 4], "gaps_m": 1, "restitution": 1.0},
+        "brake_rate_mps3=20%,gaps_m=0.2",
+    ),
 }
 
 
@@ -154,6 +160,37 @@ def test_by_hand__a_gap_in_contact_is_as_wide_as_the_flight_of_its_piece_or_the_
     assert touch[WIDE] == wide
 
 
+def test_by_hand__brakes_build_up_from_piece_to_piece():
+    # from 0 to 7 m/s2 at 12.65 m/s3: after 0.6 s 7 * 0.6 - 7^2 / (2 * 12.65) m/s slower
+    case, plan = boxed("gaps_m=1", brake_rate_mps3=12.65), np.full(STEPS, -1.0)
+    cell, _ = cell_in(case, case.boxes.low[0], plan)
+    ends = cell.times[1:]
+    at = np.flatnonzero((ends > 1e-9) & (ends < 0.6 + 1e-9))
+    lost, gain, swing = cell.forces.rise[1, 1 + at], cell.forces.gain[1, 1 + at], cell.forces.swing[1, 1 + at, 0]
+    way = gain[:, 0].sum() + (lost[:, 0] * (0.6 - ends[at])).sum()
+    assert lost[:, 0].sum() == pytest.approx(0.5 * 7 * 7 / 12.65 - 7 * 0.6)
+    assert way == pytest.approx(-0.5 * 7 * 0.6**2 + 0.5 * 7 * 7 / 12.65 * 0.6 - 7**3 / 12.65**2 / 6)
+    assert swing == pytest.approx(0.5 * 12.65 * np.diff(cell.times)[at]) and (np.abs(lost[:, -1]) < 1e-12).all()
+
+
+def test_by_hand__brakes_released_at_standstill_hold_until_the_vehicle_drives():
+    # from -1 to 1 m/s2 in 0.1 s: it stands for 0.05 s, and drives to 0.025 m/s
+    motion = new_motion(1, 3)
+    motion.vague[0] = 1.0
+    hold(np.zeros(3), 0, 0.1, motion)
+    assert enclosure.low(motion.onward[0]) <= 0.0 < 0.025 <= enclosure.high(motion.onward[0]) <= 0.1 + 1e-12
+
+
+def test_bound__two_that_touch_from_the_alert_on_have_their_first_impact_later():
+    # gap 0, and pressed together without an impact; then vehicle_2 brakes harder, drives, and strikes
+    roles = {"vehicle_1": "full_brake", "vehicle_2": "learner"}
+    line = {"vehicles": 2, "gaps_m": 0, "speeds_mps": 20, "mass_t": 5, "latency_s": [0, 0.3], "roles": roles}
+    line |= {"braking_capacity_mps2": [6, 7], "driving_capacity_mps2": 7}
+    case = boxed("braking_capacity_mps2.vehicle_1=2%", **line)
+    plan = np.where(np.arange(STEPS) // 6 == 1, 0.9, -1.0)
+    assert 1.0 < harm_inside(*case[:3], plan, 50).max() <= bound_of(case, plan, 5)
+
+
 @pytest.mark.parametrize("name", UNUSUAL)
 def test_bound__is_at_least_the_harm_of_every_world_drawn_from_the_box(name):
     (changed, text), rng = UNUSUAL[name], np.random.default_rng(5)
@@ -182,6 +219,21 @@ STATES = {
             "roles": {"vehicle_1": "constant:-4", "vehicle_2": "learner", "vehicle_3": "coast"},
         },
         "latency_s.vehicle_1=0.1,driving_capacity_mps2.vehicle_2=10%,speeds_mps.vehicle_1=0.2",
+    ),
+    "build up": (
+        {"gaps_m": [2, 9], "speeds_mps": [12, 20, 15], "brake_rate_mps3": [9, 15, 12], "release_rate_mps3": 30},
+        "brake_rate_mps3=10%,speeds_mps.vehicle_1=0.2,latency_s.vehicle_1=0.05",
+    ),
+    "slow": (  # to standstill, and driving on from there
+        {
+            "gaps_m": [0.6, 0.9],
+            "speeds_mps": [2, 2.6, 2.4],
+            "speed_limit_mps": 2.7,
+            "restitution": 0.2,
+            "brake_rate_mps3": [9, 15, 12],
+            "release_rate_mps3": [20, 9, 30],
+        },
+        "brake_rate_mps3=10%,release_rate_mps3.vehicle_2=10%",
     ),
     "light": (
         {"gaps_m": [1, 8], "speeds_mps": [9, 15, 12], "mass_t": [5, 0.3, 4], "restitution": 0.05},
@@ -314,9 +366,13 @@ def outside(case: Case, plan, draws: int, rng) -> tuple[int, int, list[str]]:
     truth = case.uncertainty.draw(case.worlds.take(np.zeros(draws, np.int64)), rng)
     v = truth.vehicles
     numbers = np.concatenate(
-        [v.braking_capacity_mps2, v.driving_capacity_mps2, v.latency_s, v.mass_t, truth.speeds_mps, truth.gaps_m], 1
-    )
-    at = (numbers - 0.5 * (low + up))[:, free] / (0.5 * (up - low))[free]
+        [
+            v.braking_capacity_mps2, v.driving_capacity_mps2, v.latency_s, v.mass_t, v.brake_rate_mps3,
+            v.release_rate_mps3, truth.speeds_mps, truth.gaps_m,
+        ],
+        1,
+    )  # fmt: skip
+    at = (numbers[:, free] - 0.5 * (low + up)[free]) / (0.5 * (up[free] - low[free]))
     found, touching, looked = [], 0, 0
     back = np.array([backwards(cell, p) > 0.0 for p in range(truth.N - 1)])
     for piece, (now, harm) in enumerate(realised(case.scenario, truth, vehicle, plan, cell.times)):
