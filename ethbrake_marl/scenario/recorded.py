@@ -25,7 +25,7 @@ from ethbrake_marl.defaults import DataDraw, DataFormat
 from ethbrake_marl.errors import InvalidInput, count_of, plain_text
 from ethbrake_marl.files.store import open_plain
 from ethbrake_marl.files.yaml import flow_text, parse_numeral
-from ethbrake_marl.physics import Bools, Floats
+from ethbrake_marl.physics import Bools, Floats, exp, log
 from ethbrake_marl.scenario.sampling import MOST_NUMBERS, QUANTITY
 from ethbrake_marl.scenario.schema import Scenario, check_file_name, load_scenario
 
@@ -174,7 +174,8 @@ def _fit(values: Floats, draw: DataDraw) -> Any:
     if draw == "quantiles" or low == high:
         return {"choice": np.quantile(values, (np.arange(QUANTILES) + 0.5) / QUANTILES).tolist()}
     if draw == "lognormal":
-        median, sigma = math.exp(np.log(values).mean()), float(np.log(values).std())
+        logs = np.array([log(value) for value in values])
+        median, sigma = exp(logs.mean()), float(logs.std())
         return {"lognormal": {"median": median, "sigma": sigma, "low": low, "high": high}}
     return {"normal": {"mean": float(values.mean()), "sd": float(values.std()), "low": low, "high": high}}
 
