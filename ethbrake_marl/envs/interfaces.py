@@ -563,7 +563,7 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
     Args:
         env: ``EthBrakeEnv``, or anything around it that hands on its infos.
 
-    Raises ``InvalidInput`` if ``env`` is another.
+    Raises ``InvalidInput`` if ``env`` is another, or has a cost of its own already.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.CostEnv(eb.EthBrakeEnv("paper-random"))
@@ -575,6 +575,11 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
     def __init__(self, env: gymnasium.Env[Observations, NDArray[Any]]) -> None:
         if not isinstance(getattr(env, "unwrapped", None), EthBrakeEnv):
             raise InvalidInput(f"CostEnv: {env!r:.80} tells no cost; must be an EthBrakeEnv, or a wrapper of one")
+        within = env
+        while isinstance(within, gymnasium.Wrapper):
+            if isinstance(within, CostEnv):
+                raise InvalidInput(f"CostEnv: {env!r:.80} has one inside; leave one out")
+            within = within.env
         super().__init__(env)
 
     def step(  # type: ignore[override]  # six values, as safe-RL libraries have it
@@ -582,6 +587,8 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
     ) -> tuple[Observations, float, float, bool, bool, dict[str, Any]]:
         """One decision; see ``EthBrakeEnv.step``."""
         observation, reward, terminated, truncated, info = self.env.step(action)
+        if "cost" not in info:
+            raise InvalidInput(f"CostEnv: {self.env!r:.80} hands on no info['cost']; put CostEnv inside it")
         return observation, float(reward), info["cost"], terminated, truncated, info
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn, Protocol
 
@@ -337,7 +337,7 @@ class _Run:
         (n, N), read = self.alert.speeds_mps.shape, list[Floats]()
         try:
             state = HostState(*self.host.state())
-            given = [np.array(each, np.float64) for each in state[:3]]
+            given = [np.array(np.ma.filled(each, np.nan), np.float64) for each in state[:3]]
         except Exception as error:
             self._fail(f"state raised {describe_error(error)}", error)
         given[0] = given[0] if given[0].ndim else np.full(n, given[0])
@@ -350,10 +350,13 @@ class _Run:
             read.append(each)
         impacts = state.impacts
         if impacts is not None:
-            columns = [getattr(impacts, each, np.nan) for each in ("first_impact_harm", "total_harm", "count")]
-            good = [np.shape(column) == (n, N - 1) and bool((np.asarray(column) >= 0).all()) for column in columns]
-            if not (isinstance(impacts, Impacts) and all(good)):
+            if not isinstance(impacts, Impacts):
                 self._fail(f"impacts are {type(impacts).__name__}; what eb.advance gives is needed, or None")
+            for place, column in enumerate(fields(Impacts)[:6]):
+                values, shape = np.asarray(getattr(impacts, column.name)), (n, N - 1) if place < 3 else (n,)
+                whole = values.dtype.kind in ("iu" if column.name.endswith("count") else "fiu")
+                if not (whole and values.shape == shape and np.isfinite(values).all() and (values >= 0).all()):
+                    self._fail(f"impacts.{column.name} must be of shape {shape}, finite and not below 0; counts whole")
         return read[0] - self.origin_s, read[1], read[2], impacts
 
     def _first_state(self) -> tuple[Floats, Floats]:

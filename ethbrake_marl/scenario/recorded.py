@@ -127,7 +127,9 @@ def scenario_from_data(
     if not kept:
         raise InvalidInput(f"{folder}: no {vehicles} vehicles follow each other in a lane at any moment looked at")
     left_out[f"chains: a table holds {MOST_NUMBERS:,} numbers, so one in {each_of} is kept"] = seen - len(kept)
-    told = [f"{seen:,} chains of {vehicles} vehicles, every {every_s:g} s, each vehicle in one of them at most"]
+    told = [
+        f"{count_of(seen, 'chain')} of {vehicles} vehicles, every {every_s:g} s, each vehicle in one of them at most"
+    ]
     told += [f"left out: {number:,} {what}" for what, number in sorted(left_out.items()) if number]
     fastest_mps = max(max(row[vehicles - 1 :]) for row in kept)
     at_rest_s = np.max(base.bounds("latency_s")) + fastest_mps / np.min(base.bounds("braking_capacity_mps2"))

@@ -86,6 +86,8 @@ def test_infos__cost_is_the_harm_of_the_step_as_the_reward_counts_it(reward: str
         assert sum(costs) == near(info[total] - before) and info["reward_harm"] == -info["cost"]
     with pytest.raises(InvalidInput, match="tells no cost"):
         eb.CostEnv(eb.make_sb3_vec_env("paper-random", n_envs=2))  # type: ignore[arg-type]
+    with pytest.raises(InvalidInput, match="has one inside"):
+        eb.CostEnv(gymnasium.wrappers.ClipAction(environment))
 
 
 def test_learners_only__are_the_agents_and_nothing_else_changes() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.physics import advance_sampled
+from ethbrake_marl.physics import Impacts, advance_sampled
 from ethbrake_marl.shield import ShieldedDriver, StepShield
 from tests.docs.site import DOCS
 
@@ -244,6 +244,11 @@ def off(*_):
     raise OSError("the bench is off")
 
 
+def nothing(n, harm=0.0, obstacle=None):
+    harms = np.full((n, 2), harm)
+    return Impacts(harms, harms, np.zeros((n, 2), np.int64), *Impacts.no_obstacle(obstacle or n))
+
+
 def first_nan(values):
     values = values.copy()
     values[3, 1] = np.nan
@@ -268,6 +273,9 @@ def first_nan(values):
         (broken(tells=lambda t: t[:2]), "state raised TypeError: "),
         (broken(tells=lambda t: t._replace(impacts="two")), "impacts are str; what eb.advance gives is needed, or"),
         (broken(tells=lambda t: t._replace(impacts=3)), "impacts are int; "),
+        (broken(tells=lambda t: t._replace(impacts=nothing(20, obstacle=21))), "impacts.obstacle_first_harm must be"),
+        (broken(tells=lambda t: t._replace(impacts=nothing(20, math.inf))), "impacts.first_impact_harm must be"),
+        (broken(tells=lambda t: t._replace(speeds_mps=np.ma.masked_less(t.speeds_mps, 99))), "speeds_mps[0, 0] is nan"),
     ],
 )
 def test_host__that_goes_wrong_is_told_and_the_ledger_is_kept(make, message):
