@@ -237,7 +237,7 @@ def injury_probability(speed_change_mps: Floats, side: Literal["front", "rear"],
 # maximin             ``max_j H_j``: the harm of whoever bears most
 # mass-weighted       ``N sum_j m_j H_j / sum_j m_j``: harm in a heavy vehicle counts for more
 # weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``: one weight (1e-6 to 1e6) for each vehicle, as for its occupants
-# injury:curve        injuries in 1,000 lines, each vehicle's by its larger change of speed (``Ledger.speed_changes``)
+# injury:curve        injuries in 1,000 lines, each vehicle's by the pair that injures it more (``Ledger.speed_changes``)
 # ==================  ================================================================================================
 
 STANDARD = ("total", "own", "social:45", "maximin", "mass-weighted")  # those that need no knowledge of the scenario
@@ -451,15 +451,17 @@ def _social_weights(angle_deg: float) -> tuple[float, float]:
 
 
 def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
-    """Injuries in 1,000 lines, [n], summed front to rear: the same for all vehicles."""
+    """Injuries in 1,000 lines, [n], summed front to rear: the same for all vehicles.
+
+    The larger risk of a vehicle counts, not that of the larger change of speed: no impact may take away from it.
+    """
     del vehicle
     front, rear = harm.front_change_mps, harm.rear_change_mps
     injured = np.zeros(len(front))
     for j in range(front.shape[1]):
-        by_front = injury_probability(front[:, j], "front", objective.curve)
-        by_rear = injury_probability(rear[:, j], "rear", objective.curve)
-        larger = np.where(rear[:, j] >= front[:, j], by_rear, by_front)
-        injured = injured + np.where((front[:, j] > 0.0) | (rear[:, j] > 0.0), 1_000.0 * larger, 0.0)
+        by_front = np.where(front[:, j] > 0.0, injury_probability(front[:, j], "front", objective.curve), 0.0)
+        by_rear = np.where(rear[:, j] > 0.0, injury_probability(rear[:, j], "rear", objective.curve), 0.0)
+        injured = injured + 1_000.0 * np.maximum(by_front, by_rear)
     return injured
 
 
@@ -489,5 +491,5 @@ KINDS: dict[str, Kind] = {
         "one weight for each vehicle",
         lambda objective, harm, vehicle: _weighted(harm.borne, np.full(harm.borne.shape, objective.weights)),
     ),
-    "injury": Kind("injury:CURVE", "injuries in 1,000 lines, each vehicle's by its larger change of speed", _injured),
+    "injury": Kind("injury:CURVE", "injuries in 1,000 lines, each vehicle's by the impact that injures it more", _injured),
 }
