@@ -237,7 +237,7 @@ def injury_probability(speed_change_mps: Floats, side: Literal["front", "rear"],
 # maximin             ``max_j H_j``: the harm of whoever bears most
 # mass-weighted       ``N sum_j m_j H_j / sum_j m_j``: harm in a heavy vehicle counts for more
 # weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``: one weight (1e-6 to 1e6) for each vehicle, as for its occupants
-# injury:curve        injuries in 1,000 lines, each vehicle's by the pair that injures it more (``Ledger.speed_changes``)
+# injury:curve        injuries in 1,000 lines, by the pair that injures a vehicle more (``Ledger.speed_changes``)
 # ==================  ================================================================================================
 
 STANDARD = ("total", "own", "social:45", "maximin", "mass-weighted")  # those that need no knowledge of the scenario
@@ -491,5 +491,5 @@ KINDS: dict[str, Kind] = {
         "one weight for each vehicle",
         lambda objective, harm, vehicle: _weighted(harm.borne, np.full(harm.borne.shape, objective.weights)),
     ),
-    "injury": Kind("injury:CURVE", "injuries in 1,000 lines, each vehicle's by the impact that injures it more", _injured),
+    "injury": Kind("injury:CURVE", "injuries in 1,000 lines, by the impact that injures a vehicle more", _injured),
 }
