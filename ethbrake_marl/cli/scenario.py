@@ -267,6 +267,8 @@ def scenario_from_data(
         partial.write_text(text, "utf-8")
         if draw == "rows":
             out.write(rows, table, what="rows")
+        else:  # those of before would be left behind, unnamed
+            rows.unlink(missing_ok=True)
     out.note(f"written: {output}; try it: ethbrake scenario validate {output}")
     out.result({"scenario": str(output), "rows": str(rows) if draw == "rows" else None, "found": told}, *told)
 
