@@ -156,7 +156,7 @@ BLOCKS: dict[str, How] = {
 _SHIPPED = "counterfactual@shipped,counterfactual@shipped+refined:profile+episode"
 _TESTS = tuple(
     f"ethbrake evaluate --scenario paper-random{test} --agents full_brake,e_v2x_bm,{agents},best_harm --episodes 2000"
-    " --seed 7 --json"
+    " --seed 7 --measures injury --json"
     for test, agents in (
         ("", f"ppo@shipped,{_SHIPPED}"),
         ("-brake-only", f"ppo@shipped,{_SHIPPED}"),

@@ -76,22 +76,14 @@ def test_host__that_is_the_engine_equals_evaluate_to_the_bit(agent, scenario):
         )
 
 
-class SampledHost:
+class SampledHost(EngineHost):
     """The paper's fixed-step map, which has impacts of its own at the decisions of Vehicle 2."""
 
-    dt = math.inf
-
-    def __init__(self, worlds):
-        self.worlds, self.impacts = worlds, None
-
-    def state(self):
-        return eb.HostState(self.worlds.time_s, self.worlds.gaps_m, self.worlds.speeds_mps, self.impacts)
+    harm = 0.0
 
     def apply(self, command):
         self.worlds, self.impacts = advance_sampled(self.worlds, command.wanted_mps2, until_s=command.until_s)
         self.harm = self.harm + self.impacts.total_harm.sum(axis=1)  # in the order in which the paper's sum is made
-
-    harm = 0.0
 
 
 @pytest.mark.parametrize("agent", ["full_brake", "e_v2x_bm"])
