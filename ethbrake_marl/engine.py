@@ -23,7 +23,6 @@ from ethbrake_marl.actions import checked_action, command_of
 from ethbrake_marl.errors import (
     AgentFailed,
     EthBrakeError,
-    FailedWorld,
     InvalidInput,
     PhysicsError,
     UncertifiedStep,
@@ -525,6 +524,10 @@ class Start(NamedTuple):
         rows = slice(first, first + count)
         packed = Packed(self.packed.state[rows], self.packed.params[rows])
         return Start(self.origin, self.first + first, packed, self.clock[rows], self.wanted[rows])
+
+
+class FailedWorld(UserWarning):
+    """A running episode was cut off: its world could not be advanced. (The rest of the batch goes on.)"""
 
 
 class Roster:

@@ -207,20 +207,8 @@ class AgentFailed(InvalidInput):
             raise AgentFailed(name, error.row, error.reason) from error
 
 
-class FailedWorld(UserWarning):
-    """A running episode was cut off: its world could not be advanced. (The rest of the batch goes on.)"""
-
-
-class WithoutEffect(UserWarning):
-    """Something that was given changes nothing here."""
-
-
 class Unfamiliar(UserWarning):
     """A trained policy drives in worlds beyond those that it was trained in."""
-
-
-class IncompleteTable(UserWarning):
-    """A table of best known harm holds some of the worlds asked about, and not the others."""
 
 
 @contextmanager

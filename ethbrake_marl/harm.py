@@ -18,12 +18,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from functools import lru_cache
-from typing import Annotated, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
-from pydantic import GetJsonSchemaHandler
-from pydantic.json_schema import JsonSchemaValue
-from pydantic_core import CoreSchema
 
 from ethbrake_marl.defaults import HARM_COUNTS as HARM_COUNTS, HarmCount as HarmCount
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, count_of, describe_error, unknown_name
@@ -398,19 +395,6 @@ def register_objective(name: str, function: ObjectiveFunction) -> None:
     entry = Kind(name, " ".join((function.__doc__ or "").split()), amount, function)
     if KINDS.setdefault(name, entry).function is not function:
         raise AlreadyExists(f"objective {name!r} is registered already; give another name")
-
-
-class _NameSchema:
-    """The JSON schema of an objective: what is known when it is asked for."""
-
-    @classmethod
-    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        plain = [name for name, kind in KINDS.items() if ":" not in kind.form]
-        with_argument = "|".join(name for name, kind in KINDS.items() if ":" in kind.form)
-        return {"type": "string", "anyOf": [{"enum": plain}, {"pattern": f"^({with_argument}):"}]}
-
-
-ObjectiveName = Annotated[str, _NameSchema]
 
 
 def scored(ledger: Ledger, harm_count: HarmCount, declared: Sequence[Declared] | None = None) -> dict[str, Floats]:

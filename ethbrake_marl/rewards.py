@@ -29,7 +29,7 @@ import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from ethbrake_marl.defaults import HarmCount
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, WithoutEffect, describe_error, unknown_name
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, describe_error, unknown_name
 from ethbrake_marl.files.yaml import UNSHOWN, FileModel, first_mistake, require
 from ethbrake_marl.harm import Declared, Objective, check_declared, objectives_of
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, forecast, logistic
@@ -37,6 +37,10 @@ from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, forecast, logisti
 # The one table of reward terms: what each is, its unit, its usual weight, and the function that computes it.
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
+
+
+class WithoutEffect(UserWarning):
+    """Something that was given changes nothing here."""
 
 
 @dataclass(frozen=True, slots=True)

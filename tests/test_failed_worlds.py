@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.e_v2x_bm import optimise_coupled
+from ethbrake_marl.engine import FailedWorld
 from ethbrake_marl.envs.interfaces import make_engine
-from ethbrake_marl.errors import FailedWorld, PhysicsError
+from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.physics import advance, forecast, leaving_out_failed
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.search import profile_problem

@@ -10,10 +10,9 @@ from hypothesis import given, settings, strategies as st
 
 import ethbrake_marl as eb
 from ethbrake_marl.envs.interfaces import make_engine
-from ethbrake_marl.errors import WithoutEffect
 from ethbrake_marl.harm import STANDARD, Ledger, empty_ledger, objective_harm, objectives_of, split
 from ethbrake_marl.physics import Floats, Impacts, Worlds, advance, forecast, make_worlds
-from ethbrake_marl.rewards import RewardParams, StepOutcome
+from ethbrake_marl.rewards import RewardParams, StepOutcome, WithoutEffect
 from tests.contract.interfaces import CRASH, REST
 from tests.physics.random_worlds import driving_lines
 from tests.reference.tolerances import EPS
@@ -89,23 +88,6 @@ def test_rewards__add_up_to_minus_the_objective_of_the_ledger(objective: Any, ha
     assert engine.ledger.collided.sum() > 20
     expected = -objective_harm(engine.ledger, harm_count, objectives_of(objective, 3))
     assert total == pytest.approx(expected, abs=1e-9)
-
-
-def test_reward__of_the_scenario_unless_the_reward_has_its_own() -> None:
-    own = PAPER.replace(objective="own")
-    assert played("harm", own)[0].tolist() == played({"objective": "own"})[0].tolist()
-    assert played({"objective": "total"}, own)[0].tobytes() == played("harm")[0].tobytes()
-    assert played(RewardParams(objective=("total",) * 3))[0].tobytes() == played("harm")[0].tobytes()
-
-
-def test_reward__weight_and_other_terms_stay_what_they_are() -> None:
-    doubled, _ = played({"objective": "maximin", "harm": 2.0, "terminal": 3.0})
-    single, engine = played({"objective": "maximin"})
-    safe = ~engine.ledger.collided
-    assert safe.any()
-    assert doubled == pytest.approx(2.0 * single + 3.0 * safe[:, np.newaxis])
-    without, _ = played({"harm": 0.0, "terminal": 1.0})
-    assert without.tolist() == np.repeat(safe[:, np.newaxis] * 1.0, 3, axis=1).tolist()
 
 
 # ---------------------------------------------------------------- reward terms

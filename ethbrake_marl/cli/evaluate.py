@@ -154,89 +154,76 @@ def evaluate_command(
     """
     from ethbrake_marl.harm import declared_objectives
 
-    whole = {"--per-world": per_world, "--report": report, "--initial-states": initial_states, "--by": by}
-    whole |= {"--host": host}
-    _check_shards(shards, jobs, ray, output, rows, whole)
+    whole: dict[str, object] = {"--per-world": per_world, "--report": report, "--initial-states": initial_states}
+    whole |= {"--by": by, "--host": host}
+    _check_shards(shards, jobs, ray, output, rows, measures, whole)
     _check_outputs(out, per_world, report)
+    made = partial(_make_drivers, agents.split(","), harm_count=harm_count, uncertainty=uncertainty)
     if group := scenarios.group_of_scenarios(scenario):
         other = whole | {"--objective": objective, "--measures": measures, "--shards": shards, "--output": output}
-        for option in (name for name, value in other.items() if value):
-            raise InvalidInput(f"{option}: {scenario} is a group of {len(group)} scenarios; give one of them")
-        driven = partial(_asked_task, vehicle=vehicle, settings=settings)
-        made = partial(_make_drivers, agents.split(","), harm_count=harm_count, uncertainty=uncertainty)
-        _evaluate_group(out, [driven(name).scenario for name in group], made, episodes, seed)
+        _refuse(other, f"{scenario} is a group of {len(group)} scenarios; give one of them")
+        _evaluate_group(out, [_asked_task(name, vehicle, settings).scenario for name in group], made, episodes, seed)
         return
-    host_name, make_host = _asked_host(host, {"--report": report, "--measures": measures})
-    if host is not None and initial_states is None:
-        episodes = HOSTED if episodes is None else episodes
+    if host is not None:
+        _refuse({"--report": report, "--measures": measures}, "tells of the physics here; leave it out, or --host")
+        episodes = HOSTED if episodes is None and initial_states is None else episodes
     if measures is not None:
-        if jobs != 1 or ray is not None:
-            raise InvalidInput("--measures: processes of --jobs and --ray know none; leave these out")
         evaluation.register_injury()
     chosen = _asked_task(scenario, vehicle, settings).scenario
-    objectives = declared_objectives(objective or (), chosen.vehicles)
+    lineup, objectives = made(chosen), declared_objectives(objective or (), chosen.vehicles)
     if shards is not None:
         number = DEFAULT.EPISODES if episodes is None else episodes
-        list_seed = DEFAULT.LIST_SEED if seed is None else seed
-        lineup = _make_drivers(agents.split(","), chosen, harm_count, uncertainty)
-        question = evaluation.Question(
-            chosen, tuple(lineup), number, list_seed, harm_count, uncertainty, tuple(objectives)
-        )
-        evaluation.check_agents(lineup, chosen.sample(min(number, 1_000), list_seed).worlds, chosen, warn=True)
-        _evaluate_in_shards(out, question, shards, jobs, ray, output, rows)
+        seed = DEFAULT.LIST_SEED if seed is None else seed
+        asked = evaluation.Question(chosen, tuple(lineup), number, seed, harm_count, uncertainty, tuple(objectives))
+        evaluation.check_agents(lineup, chosen.sample(min(number, 1_000), seed).worlds, chosen, warn=True)
+        _evaluate_in_shards(out, asked, shards, jobs, ray, output, rows)
         return
     sample, drawn_by = evaluation.choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
     if by is not None:
         evaluation.Evaluation.check_group(sample.kinds, by)
-    lineup = _make_drivers(agents.split(","), chosen, harm_count, uncertainty)
     evaluation.check_agents(lineup, sample.worlds, chosen)
-    evaluate, tell = evaluation.evaluate, lambda agent, done: out.progress(agent, done, sample.worlds.n)
-    beside: dict[str, Any] = {}
-    if make_host is None:
-        found = evaluate(sample, lineup, scenario=chosen, seed=drawn_by, on_progress=tell)
-    else:
-        found, distrusted = make_host(sample, lineup, chosen, drawn_by, on_progress=tell)
-        here = evaluate(sample, lineup, scenario=chosen, seed=drawn_by, aftermath=False)
-        beside, sheet = _beside_ours(host_name, found, here, distrusted, harm_count)
+    found, beside, sheets = _drive(out, host, sample, lineup, chosen, drawn_by, harm_count)
     summary, told = evaluation.summarise(found), found.rescore(objectives)
-    if report is not None:
-        _write_report(out, report, found, summary, lineup, harm_count)
+    _write_report(out, report, found, summary, lineup, harm_count)
     groups = {} if by is None else evaluation.summarise_by(found, by)
+    used = {"harm_count": harm_count, "uncertainty": uncertainty} | ({"host": found.host} if found.host else {})
     if per_world is not None:
         evaluation.write_per_world(per_world, found, objectives=objectives, force=out.force)
-    results = evaluation.results_to_json(
-        summary,
-        told=told,
-        groups=groups,
-        per_world=per_world,
-        settings={"harm_count": harm_count, "uncertainty": uncertainty, **({"host": host_name} if host_name else {})},
-    )
+    results = evaluation.results_to_json(summary, told=told, groups=groups, per_world=per_world, settings=used)
     if per_world is not None:
-        out.write(_beside(per_world), _json_text(results))
-        out.note(f"every world: {per_world}; the results: {_beside(per_world)}")
+        out.write(_beside(per_world), _json_text(results), f"every world: {per_world}; the results")
     shown: list[Any] = [*summary.tables()]
     for name, of_group in groups.items():
         shown += [f"\n{name}: {count_of(of_group[0].episodes, 'world')}\n", of_group.terminal()]
-    if beside:
-        shown, results = [*shown, "", sheet], [row | {"beside": beside[row["agent"]]} for row in results]
-    out.result(results, *shown)
+    shown += [*sheets, told.sheet(harm_count)] if told else sheets
+    out.result([row | beside.get(row["agent"], {}) for row in results], *shown)
     _tell_horizon(out, _moving(summary), sample.worlds.n, chosen.horizon_s)
-    if told and not out.as_json:
-        out.show(told.sheet(harm_count))
 
 
-def _asked_host(
-    host: str | None, without: Mapping[str, object]
-) -> tuple[str, Callable[..., tuple[evaluation.Evaluation, Mapping[str, Bools | None]]] | None]:
-    """Name of the host that is asked for, and what evaluates in it; the options ``without`` know none."""
+def _refuse(options: Mapping[str, object], why: str) -> None:
+    """Refuse the first of these options that is given."""
+    for option in (name for name, value in options.items() if value):
+        raise InvalidInput(f"{option}: {why}")
+
+
+def _drive(
+    out: Out, host: str | None, sample: Sample, lineup: Mapping[str, Driver], scenario: Scenario,
+    seed: int | None, harm_count: HarmCount,
+) -> tuple[evaluation.Evaluation, dict[str, Any], list[Any]]:  # fmt: skip
+    """The agents in these worlds, and of a host by agent and as a table what it and the physics here do otherwise."""
+
+    def tell(agent: str, done: int) -> None:
+        out.progress(agent, done, sample.worlds.n)
+
     if host is None:
-        return "", None
-    from ethbrake_marl.hosts import evaluate_hosted, find_host
+        return evaluation.evaluate(sample, lineup, scenario=scenario, seed=seed, on_progress=tell), {}, []
+    from ethbrake_marl.hosts import find_host
 
-    for option in (name for name, value in without.items() if value):
-        raise InvalidInput(f"{option}: tells of the physics here; leave it out, or --host")
-    name, opened = find_host(host)
-    return name, partial(evaluate_hosted, opened, name=name)
+    hosted = find_host(host)
+    found, distrusted = hosted.evaluate(sample, lineup, scenario, seed, on_progress=tell)
+    here = evaluation.evaluate(sample, lineup, scenario=scenario, seed=seed, aftermath=False)
+    told, sheet = _beside_ours(hosted.name, found, here, distrusted, harm_count)
+    return found, told, ["", sheet]
 
 
 def _beside_ours(
@@ -249,12 +236,13 @@ def _beside_ours(
     for agent, outcome in found.outcomes.items():
         ours, theirs = (each.world_harm(harm_count) for each in (here.outcome(agent), outcome))
         difference, bound = evaluation.paired_difference(theirs, ours), outcome.predicted_harm
-        told[agent] = {"host": host, "harm_here": float(ours.mean()), "difference": difference.value}
+        about = {"host": host, "harm_here": float(ours.mean()), "difference": difference.value}
         if bound is not None and outcome.chosen_policy is not None:
-            told[agent]["above_bound"] = int((theirs > bound).sum())
+            about["above_bound"] = int((theirs > bound).sum())
         if (shown := distrusted[agent]) is not None:
-            told[agent]["distrusted"] = int(shown.sum())
-        last = (str(told[agent].get(name, "")) for name in ("above_bound", "distrusted"))
+            about["distrusted"] = int(shown.sum())
+        last = (str(about.get(name, "")) for name in ("above_bound", "distrusted"))
+        told[agent] = {"beside": about}
         rows.append((agent, f"{ours.mean():.2f}", f"{theirs.mean():.2f}", difference, *last))
     columns: list[Column | str] = ["Agent", *map(Column, ("Here", "There", "Difference", "Above bound", "Distrusted"))]
     note = (
@@ -306,17 +294,19 @@ def _evaluate_group(
 
 
 def _check_shards(
-    shards: int | None, jobs: int, ray: str | None, output: Path | None, rows: bool, whole: Mapping[str, object]
-) -> None:
+    shards: int | None, jobs: int, ray: str | None, output: Path | None, rows: bool, measures: str | None,
+    whole: Mapping[str, object],
+) -> None:  # fmt: skip
     """Refuse options that do not go together; those of ``whole`` need every world at once."""
     if shards is None:
         alone = {"--jobs": jobs != 1, "--ray": ray is not None, "--output": output is not None, "--rows": rows}
-        if given := [name for name, is_given in alone.items() if is_given]:
-            raise InvalidInput(f"{given[0]}: is for an evaluation in parts; add --shards 100")
+        _refuse(alone, "is for an evaluation in parts; add --shards 100")
         return
     if given := [name for name, value in whole.items() if value]:
         more = "; for one row per world give --output FOLDER --rows" if "--per-world" in given else ""
         raise InvalidInput(f"{given[0]}: needs every world at once, and --shards keeps none{more}")
+    if measures is not None and (jobs != 1 or ray is not None):
+        raise InvalidInput("--measures: processes of --jobs and --ray know none; leave these out")
     if rows and output is None:
         raise InvalidInput("--rows: needs a folder for them: --output FOLDER")
     if rows:
@@ -394,13 +384,15 @@ def _moving(rows: Sequence[evaluation.SummaryRow]) -> dict[str, int]:
 
 def _write_report(
     out: Out,
-    path: Path,
+    path: Path | None,
     found: evaluation.Evaluation,
     rows: Sequence[evaluation.SummaryRow],
     agents: Mapping[str, Driver],
     harm_count: HarmCount,
 ) -> None:
-    """Write the page of an evaluation that has just been made."""
+    """Write the page of an evaluation that has just been made; None: none is wanted."""
+    if path is None:
+        return
     # matplotlib takes a second to load, and most evaluations draw nothing
     from ethbrake_marl.pages.report import Report
 
@@ -618,10 +610,10 @@ def explore_command(
     It shows every agent's harm and motion at once. It listens on this machine alone, and its address holds a token that
     is new each time. Ctrl-C ends it.
     """
-    from ethbrake_marl.pages.explorer import Explored, serve_explorer
+    from ethbrake_marl.pages.explorer import serve_explorer
 
     task = _asked_task(scenario, vehicle, settings, harm_count, alone=True)
-    explored = Explored(task, _make_drivers(agents.split(","), task.scenario, harm_count, alone=True))
+    lineup = _make_drivers(agents.split(","), task.scenario, harm_count, alone=True)
 
     def ready(address: str) -> None:
         out.show(address)
@@ -629,7 +621,7 @@ def explore_command(
         if not no_browser:
             webbrowser.open(address)
 
-    serve_explorer(explored, folder.resolve(), port, ready, seed=seed, world=world)
+    serve_explorer(task, lineup, folder.resolve(), port, ready, seed=seed, world=world)
     out.note("ended")
 
 

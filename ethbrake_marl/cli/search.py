@@ -11,7 +11,7 @@ from typing import Annotated, Any, get_args
 
 import typer
 
-from ethbrake_marl import evaluation, learning, limits
+from ethbrake_marl import evaluation, learning
 from ethbrake_marl.cli.command import Out, app
 from ethbrake_marl.defaults import DEFAULT, HARM_COUNTS, HarmCount, MeasureName
 from ethbrake_marl.errors import InvalidInput, count_of
@@ -66,6 +66,7 @@ def best_harm_command(
     """
     import numpy as np
 
+    from ethbrake_marl.limits import BestHarmTable, search_list
     from ethbrake_marl.scenario import Task
 
     if shipped:
@@ -79,7 +80,7 @@ def best_harm_command(
     controlled = None if names is None else chosen.with_learners(names).learners
     if controlled is None and not chosen.learners:
         raise InvalidInput(f"scenario {chosen.name!r} has no learner; say who is controlled: --vehicles vehicle_2")
-    known = None if start is None else limits.BestHarmTable.load(start)
+    known = None if start is None else BestHarmTable.load(start)
     sample = chosen.sample(episodes, seed)
     counts: Sequence[HarmCount] = HARM_COUNTS if harm_count is None else (harm_count,)
     specs = [] if agents is None else [spec.strip() for spec in agents.split(",")]
@@ -89,7 +90,7 @@ def best_harm_command(
     parts = None if output is None else output.with_name(f".{output.name}.parts")
     if parts is not None:
         out.kept = f"{parts} keeps what was found; the same command goes on"
-    table = limits.search_list(
+    table = search_list(
         chosen, sample, chunks=parts, counts=counts, vehicles=controlled, budget=budget, seed=search_seed,
         threads=threads, known=known, on_progress=lambda done, total: out.progress("best harm", done, total),
     )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from contextlib import closing
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,7 +11,7 @@ from typing import Annotated, Any
 import typer
 from rich.text import Text
 
-from ethbrake_marl import evaluation, learning
+from ethbrake_marl import evaluation, learning, scenario as scenarios
 from ethbrake_marl.cli.command import Out, app, whole_number
 from ethbrake_marl.defaults import DEFAULT, HarmCount
 from ethbrake_marl.errors import InvalidInput, Progress, check_one_learner, check_whole_number, need
@@ -27,6 +28,34 @@ NameOption = Annotated[
     str | None, typer.Option(help="Folder of the run inside runs/.", show_default="SCENARIO-RECIPE-seedSEED")
 ]
 OutputOption = Annotated[Path | None, typer.Option(metavar="FOLDER", help="Folder of the run, instead of --name.")]
+
+
+RUNS = Path("runs")
+
+
+def run_folder(
+    scenario: scenarios.Scenario,
+    recipe: learning.TrainingRecipe,
+    *,
+    seed: int | None = None,
+    name: str | None = None,
+    output: Path | None = None,
+) -> Path:
+    """Folder of a run: ``output``, or ``runs/<name>``, by default ``runs/<scenario>-<recipe>-seed<seed>``.
+
+    The default has the scheme behind the recipe where the recipe names one. Raises ``InvalidInput`` when both are
+    given, or for a name that is not a plain folder name.
+    """
+    if output is not None:
+        if name is not None:
+            raise InvalidInput(f"name {name!r} and output {str(output)!r}: give one of the two")
+        return output
+    if name is not None and not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,127}", name):
+        raise InvalidInput(
+            f"run name {name!r:.60}: must be up to 128 letters, digits, . _ -, not beginning with . or -"
+        )
+    plan = recipe.name if recipe.scheme is None else f"{recipe.name}-{recipe.scheme}"
+    return RUNS / (name or f"{scenario.name}-{plan}-seed{recipe.seed if seed is None else seed}")
 
 
 @app.add("run", "run --steps 200000 --seed 1", kept=KEPT, json=True, force=True)
@@ -51,7 +80,7 @@ def run_command(
     Ctrl-C ends the training early, and what it has is evaluated; a second Ctrl-C stops at once.
     """
     # torch takes seconds to load, here and in the other commands that learn
-    from ethbrake_marl.studies.experiment import run_experiment, run_folder
+    from ethbrake_marl.studies.experiment import run_experiment
 
     plan = learning.load_recipe(recipe)
     given = learning.read_settings(settings, [plan])
@@ -117,8 +146,6 @@ def start_command(
     of several: `team@FOLDER`. Ctrl-C ends the training after the update in progress and keeps the policy; `ethbrake
     train resume FOLDER` goes on.
     """
-    from ethbrake_marl.studies.experiment import run_folder
-
     plan = learning.load_recipe(recipe)
     given = learning.read_settings(settings, [plan])
     chosen, plan = evaluation.load_runnable(scenario, given.scenario), given.change(plan, out.note)

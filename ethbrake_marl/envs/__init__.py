@@ -15,7 +15,6 @@ if TYPE_CHECKING:
         vehicle_colour as vehicle_colour,
     )
     from ethbrake_marl.envs.interfaces import (
-        COLUMNS as COLUMNS,
         CostEnv as CostEnv,
         EthBrakeEnv as EthBrakeEnv,
         EthBrakeParallelEnv as EthBrakeParallelEnv,
@@ -25,11 +24,9 @@ if TYPE_CHECKING:
         action_box as action_box,
         env as env,
         feature_box as feature_box,
-        in_turns as in_turns,
         make_engine as make_engine,
         parallel_env as parallel_env,
         raw_env as raw_env,
-        report as report,
     )
     from ethbrake_marl.envs.registration import register_environments as register_environments
     from ethbrake_marl.envs.sb3 import EthBrakeVecEnv as EthBrakeVecEnv, make_sb3_vec_env as make_sb3_vec_env

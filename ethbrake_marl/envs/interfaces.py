@@ -275,6 +275,34 @@ class Report(NamedTuple):
     known_from_s: Floats | None  # [n, N, N] where there is a channel
     age_s: Floats | None  # [n, N, N] where its messages are periodic
 
+    @classmethod
+    def of(cls, engine: Engine, step: Step | None = None, rows: Ints | None = None) -> Report:
+        """The engine's worlds as they are now, before any of them is renewed; only the worlds ``rows`` if given."""
+        (state, params), wanted, world = engine.packed, engine.wanted_mps2, engine.roster.numbers
+        if rows is not None:
+            state, params, wanted = (array.take(rows, axis=0) for array in (state, params, wanted))
+            world = world.take(rows)
+        values = np.empty((*wanted.shape, len(COLUMNS)))
+        _report_rows(state, params, wanted, values)
+        N = wanted.shape[1]
+        shown = Packed(state, params)
+        known = shown.known_from_s if shown.has_news else None
+        cost = np.zeros(len(world))
+        terms = dict.fromkeys(engine.reward_terms, cost)
+        if step is not None:
+            every = step.shared | step.further
+            terms = {name: every[name] for name in engine.reward_terms}
+            cost = step.counted_harm
+            if rows is not None:
+                cost, terms = cost.take(rows), {name: term.take(rows, axis=0) for name, term in terms.items()}
+        time_s, messages = state[:, shown.column.time], params[:, shown.column.messages :]
+        age = Messages(messages, N).age_s(time_s) if shown.has_messages else None
+        return cls(values, cost, terms, engine.roster.seed, world, known, age)
+
+    def columns(self) -> dict[str, Floats]:
+        """What is told of every vehicle, by name, each [n, N]."""
+        return {name: self.values[:, :, c] for c, name in enumerate(COLUMNS)}
+
     def plain_infos(self, vehicles: Ints) -> list[dict[str, Any]]:
         """Infos of these vehicles, world by world, as plain numbers; ``chosen_action`` is an array [1]."""
         worlds: list[list[list[Any]]] = self.values.take(vehicles, axis=1).tolist()
@@ -317,7 +345,7 @@ class Report(NamedTuple):
 
         The worlds marked by ``rows`` are told of. What a step brought is 0 but in the worlds marked by ``stepped``.
         """
-        columns: dict[str, NDArray[Any]] = {name: self.values[:, vehicle, c] for c, name in enumerate(COLUMNS)}
+        columns: dict[str, NDArray[Any]] = {name: told[:, vehicle] for name, told in self.columns().items()}
         columns["collided"] = columns["collided"] == 1.0
         columns["chosen_action"] = columns["chosen_action"].astype(np.float32)[:, np.newaxis]
         columns["cost"] = np.where(stepped, self.cost, 0.0)
@@ -334,30 +362,6 @@ class Report(NamedTuple):
             masked[name][rows] = column[rows]
             masked[f"_{name}"] = rows.copy()
         return masked
-
-
-def report(engine: Engine, step: Step | None = None, rows: Ints | None = None) -> Report:
-    """The engine's worlds as they are now, before any of them is renewed; only the worlds ``rows`` if given."""
-    (state, params), wanted, world = engine.packed, engine.wanted_mps2, engine.roster.numbers
-    if rows is not None:
-        state, params, wanted = (array.take(rows, axis=0) for array in (state, params, wanted))
-        world = world.take(rows)
-    values = np.empty((*wanted.shape, len(COLUMNS)))
-    _report_rows(state, params, wanted, values)
-    N = wanted.shape[1]
-    shown = Packed(state, params)
-    known = shown.known_from_s if shown.has_news else None
-    cost = np.zeros(len(world))
-    terms = dict.fromkeys(engine.reward_terms, cost)
-    if step is not None:
-        every = step.shared | step.further
-        terms = {name: every[name] for name in engine.reward_terms}
-        cost = step.counted_harm
-        if rows is not None:
-            cost, terms = cost.take(rows), {name: term.take(rows, axis=0) for name, term in terms.items()}
-    time_s, messages = state[:, shown.column.time], params[:, shown.column.messages :]
-    age = Messages(messages, N).age_s(time_s) if shown.has_messages else None
-    return Report(values, cost, terms, engine.roster.seed, world, known, age)
 
 
 @compiled
@@ -530,7 +534,7 @@ class EthBrakeEnv(_OneWorld, gymnasium.Env[Observations, NDArray[Any]]):
         super().reset(seed=self._restart(seed, options))
         self._running = True
         self.viewer.began()
-        return self._observe(), report(self.engine).plain_infos(self._column)[0]
+        return self._observe(), Report.of(self.engine).plain_infos(self._column)[0]
 
     def step(self, action: NDArray[Any]) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
         """Advance by one time step."""
@@ -540,7 +544,7 @@ class EthBrakeEnv(_OneWorld, gymnasium.Env[Observations, NDArray[Any]]):
         self._running = not step.ended[0]
         if self.render_mode is not None:
             self.viewer.play()
-        info = report(self.engine, step).plain_infos(self._column)[0]
+        info = Report.of(self.engine, step).plain_infos(self._column)[0]
         reward = float(step.reward[0, self.learner])
         return self._observe(), reward, bool(step.terminated[0]), bool(step.truncated[0]), info
 
@@ -647,7 +651,7 @@ class EthBrakeVectorEnv(Begun, VectorEnv[Observations, NDArray[Any], NDArray[Any
         """Start an episode in every world; see docs/episodes.md."""
         super().reset(seed=self._restart(seed, options))
         every = np.ones(self.num_envs, np.bool_)
-        return self.engine.observe(self.learner), report(self.engine).batch_info(self.learner, every, ~every)
+        return self.engine.observe(self.learner), Report.of(self.engine).batch_info(self.learner, every, ~every)
 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
         """Advance every world by one time step, and start new episodes as the autoreset mode says."""
@@ -662,7 +666,7 @@ class EthBrakeVectorEnv(Begun, VectorEnv[Observations, NDArray[Any], NDArray[Any
             infos = self._final_infos(step)
         engine.renew(np.flatnonzero(renewed))
         every = np.ones(self.num_envs, np.bool_)
-        infos |= report(engine, step).batch_info(self.learner, every, ~renewed)
+        infos |= Report.of(engine, step).batch_info(self.learner, every, ~renewed)
         reward = step.reward[:, self.learner].copy()
         return engine.observe(self.learner), reward, step.terminated, step.truncated, infos
 
@@ -686,7 +690,7 @@ class EthBrakeVectorEnv(Begun, VectorEnv[Observations, NDArray[Any], NDArray[Any
         final = np.full(self.num_envs, None, dtype=object)
         for row in np.flatnonzero(ended):
             final[row] = observations[row].copy()
-        info = report(self.engine, step).batch_info(self.learner, ended, ended)
+        info = Report.of(self.engine, step).batch_info(self.learner, ended, ended)
         return {"final_obs": final, "_final_obs": ended, "final_info": info, "_final_info": ended.copy()}
 
 
@@ -704,6 +708,11 @@ def _check_mode(mode: str | AutoresetMode) -> AutoresetMode:
 class InTurns(parallel_to_aec_wrapper):  # type: ignore[misc]  # PettingZoo is untyped
     """As PettingZoo's, but an unusable action is refused in its agent's own turn, which stays: nothing is lost."""
 
+    @classmethod
+    def around(cls, env: ParallelEnv[str, Observations, NDArray[Any]]) -> AECEnv[str, Observations, NDArray[Any]]:
+        """The AEC environment of a parallel one of this package, whatever wraps it; order is enforced."""
+        return OrderEnforcingWrapper(cls(env))
+
     def step(self, action: Any) -> None:
         """Take the action of ``agent_selection``; the last one's advances all by one step.
 
@@ -717,11 +726,6 @@ class InTurns(parallel_to_aec_wrapper):  # type: ignore[misc]  # PettingZoo is u
         elif engine.scenario.vehicle_names.index(agent) in engine.learners and not (action is None and engine.guard):
             checked_action(action, (1,), agent)  # left out: a shield may choose alone
         super().step(action)
-
-
-def in_turns(env: ParallelEnv[str, Observations, NDArray[Any]]) -> AECEnv[str, Observations, NDArray[Any]]:
-    """The AEC environment of a parallel one of this package, whatever wraps it; order is enforced."""
-    return OrderEnforcingWrapper(InTurns(env))
 
 
 Infos = dict[str, dict[str, Any]]
@@ -802,7 +806,7 @@ class EthBrakeParallelEnv(_OneWorld, ParallelEnv[str, Observations, NDArray[Any]
             self.np_random = np.random.default_rng(given)
         self.agents = self.possible_agents[:]
         self.viewer.began()
-        return self._observations(), self._infos(report(self.engine))
+        return self._observations(), self._infos(Report.of(self.engine))
 
     def step(
         self, actions: Mapping[str, Any]
@@ -821,7 +825,7 @@ class EthBrakeParallelEnv(_OneWorld, ParallelEnv[str, Observations, NDArray[Any]
         terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
         if self.max_cycles is not None and not terminated:
             truncated = truncated or int(self.engine.steps[0]) >= self.max_cycles
-        infos = self._infos(report(self.engine, step))
+        infos = self._infos(Report.of(self.engine, step))
         if terminated or truncated:
             self.agents = []
         if self.render_mode is not None:
@@ -877,7 +881,7 @@ def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[s
     'vehicle_1'
 
     """
-    return in_turns(parallel_env(scenario, **settings))
+    return InTurns.around(parallel_env(scenario, **settings))
 
 
 def env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:

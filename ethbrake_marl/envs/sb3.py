@@ -17,11 +17,11 @@ from ethbrake_marl.envs.interfaces import (
     INITIAL_STATE,
     AnyScenario,
     Begun,
+    Report,
     action_box,
     chosen_seed,
     feature_box,
     make_engine,
-    report,
     warn_of_unknown,
 )
 from ethbrake_marl.errors import InvalidInput
@@ -153,7 +153,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self._next_seed = None
         self._return[:], self._steps[:] = 0.0, 0
         self._started = True
-        self._begun = report(self.engine).values
+        self._begun = Report.of(self.engine).values
         return self._observe()
 
     def step_async(self, actions: NDArray[Any]) -> None:
@@ -174,13 +174,13 @@ class EthBrakeVecEnv(Begun, VecEnv):
         reward = step.reward.take(learners, axis=1).reshape(-1)
         self._return += reward
         self._steps += 1
-        infos = report(engine, step).plain_infos(learners) if self.step_infos else [{} for _ in range(self.num_envs)]
+        infos = Report.of(engine, step).plain_infos(learners) if self.step_infos else [{} for _ in range(self.num_envs)]
         over = engine.ended  # all that have ended: an interrupted step may have left some that nobody renewed
         ended = np.flatnonzero(over)
         if len(ended):
             self._close_episodes(ended, step, infos)
             engine.renew(ended)
-            self._begun[ended] = report(engine, rows=ended).values
+            self._begun[ended] = Report.of(engine, rows=ended).values
         return self._observe(), reward.astype(np.float32), self._by_row(over), infos
 
     def get_images(self) -> list[NDArray[np.uint8]]:
@@ -224,7 +224,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
     def _close_episodes(self, ended: Ints, step: Step, infos: list[dict[str, Any]]) -> None:
         """Fill in the infos of the rows whose world has ended, before the next episodes start."""
         rows, final = self._rows(ended), self._observe(ended)
-        told = report(self.engine, step, ended).plain_infos(self._learners)
+        told = Report.of(self.engine, step, ended).plain_infos(self._learners)
         truncated = self._by_row(step.truncated[ended]).tolist()
         gained, steps = self._return.take(rows).tolist(), self._steps.take(rows).tolist()
         for row, info, cut, seen, gain, count in zip(rows.tolist(), told, truncated, final, gained, steps, strict=True):
@@ -244,7 +244,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         """The infos with which the running episodes began, row by row; made when they are asked for."""
         if not self._started:
             return [{} for _ in range(self.num_envs)]
-        return report(self.engine)._replace(values=self._begun).plain_infos(self._learners)
+        return Report.of(self.engine)._replace(values=self._begun).plain_infos(self._learners)
 
     @reset_infos.setter
     def reset_infos(self, infos: list[dict[str, Any]]) -> None:

@@ -28,7 +28,7 @@ from ethbrake_marl.actions import command_to_action
 from ethbrake_marl.agents import Agent, Driver, Episodes, Team, drive, episode_engine, parse_spec, script_agents
 from ethbrake_marl.defaults import DEFAULT, HARM_COUNTS, DatasetFormat, HarmCount
 from ethbrake_marl.engine import Engine, Step
-from ethbrake_marl.envs import COLUMNS, Frame, Report, Scene, Trace, action_box, animate_films, feature_box, report
+from ethbrake_marl.envs import Frame, Report, Scene, Trace, action_box, animate_films, feature_box
 from ethbrake_marl.errors import (
     AlreadyExists,
     InvalidInput,
@@ -739,8 +739,7 @@ class Recording:
 
     def told(self, column: str) -> Floats:
         """A column of the infos of every vehicle, [T + 1, n, N]."""
-        at = COLUMNS.index(column)
-        return np.stack([each.values[:, :, at] for each in self.reports])
+        return np.stack([each.columns()[column] for each in self.reports])
 
     def terms(self) -> dict[str, Floats]:
         """Each term of the reward, before its weight, after every step: [T + 1, n, L]; row 0 is 0."""
@@ -777,7 +776,7 @@ def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Re
             front.see(*part)
         before = engine.worlds
         observations.append(engine.observe_all(np.array(engine.learners, np.int64)))
-        reports.append(report(engine, steps[-1] if steps else None))
+        reports.append(Report.of(engine, steps[-1] if steps else None))
         positions.append(line_positions(front.metres, before.gaps_m))
         speeds.append(before.speeds_mps)
         if engine.ended.all():
@@ -1020,7 +1019,7 @@ def _episodes(recording: Recording) -> Iterator[dict[str, Any]]:
 
 def _infos(recording: Recording, vehicle: int) -> dict[str, NDArray[Any]]:
     """The infos of the environment, [T + 1, n, ...]."""
-    told = {name: recording.told(name)[:, :, vehicle] for name in COLUMNS}
+    told = {name: recording.told(name)[:, :, vehicle] for name in recording.reports[0].columns()}
     cost = np.stack([each.cost for each in recording.reports])
     news = [each.known_from_s[:, vehicle] for each in recording.reports if each.known_from_s is not None]
     return {

@@ -17,15 +17,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.agents import Knowledge, Source
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
-from ethbrake_marl.errors import (
-    AlreadyExists,
-    IncompleteTable,
-    InvalidInput,
-    PhysicsError,
-    count_of,
-    describe_error,
-    unknown_name,
-)
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, PhysicsError, count_of, describe_error, unknown_name
 from ethbrake_marl.evaluation.inputs import result_identity, result_versions, scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.statistics import Moments, exact_sum, mean, rate
 from ethbrake_marl.files.sheet import DASH, Column, Estimate, Row, Sheet, Shown
@@ -69,6 +61,10 @@ _ALWAYS_TOLD = (
 )  # quantities of those files that may be the same in all worlds
 _COLUMNS = ("at_rest", "predicted_harm", "chosen_policy", "shoved_m", "sampled_harm")  # of an outcome, [n]
 _LIBRARIES = ("pandas", "polars", "columns")  # of a frame, in the order of preference
+
+
+class IncompleteTable(UserWarning):
+    """A table of best known harm holds some of the worlds asked about, and not the others."""
 
 
 @dataclass(frozen=True, slots=True)

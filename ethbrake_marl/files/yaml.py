@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any, NamedTuple, NoReturn, TypeVar, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
-from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError
+from pydantic_core import ErrorDetails, PydanticCustomError
 from pydantic_core.core_schema import NullableSchema, WithDefaultSchema
 
 from ethbrake_marl.errors import InvalidInput
@@ -574,15 +574,6 @@ class FileSchema(GenerateJsonSchema):
     def publish(schema: dict[str, Any]) -> dict[str, Any]:
         """The schema as it is printed and shipped: with the dialect that it is written in, first."""
         return {"$schema": DIALECT, **schema}
-
-
-class OneOrMore:
-    """Of a list: in a file a single entry may stand in its place (a check of the model makes it a list)."""
-
-    @classmethod
-    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        several = handler(core)
-        return {"anyOf": [several["items"], several]}
 
 
 def schema_lines(kind: str) -> str:

@@ -301,7 +301,7 @@ def _step_by_step(profiles: Profiles) -> list[float]:
 #
 # The server listens on this machine alone, but every web page that is open in a browser here can send requests to it.
 # The token in the address stops those who do not know it; ``Host`` stops a name of somebody else's that was made to
-# point here (DNS rebinding); ``Origin`` and ``Sec-Fetch-Site`` stop other pages, whatever they know. See decision 0037.
+# point here (DNS rebinding); ``Origin`` and ``Sec-Fetch-Site`` stop other pages, whatever they know.
 
 Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]
@@ -696,12 +696,20 @@ def _reply(content: object, status: int = HTTPStatus.OK) -> Response:
 
 
 def serve_explorer(
-    explored: Explored, folder: Path, port: int, ready: Callable[[str], None], *, seed: int, world: int
+    task: Task,
+    lineup: Mapping[str, Agent],
+    folder: Path,
+    port: int,
+    ready: Callable[[str], None],
+    *,
+    seed: int,
+    world: int,
 ) -> None:
     """Serve until Ctrl-C.
 
     Args:
-        explored: what is explored.
+        task: as in ``Explored``.
+        lineup: who can drive.
         folder: the only one that it writes into; it is made if it is not there.
         port: on 127.0.0.1; 0 takes a free one.
         ready: is called with the address, token included, when the server listens.
@@ -715,6 +723,7 @@ def serve_explorer(
     need("uvicorn")
     import uvicorn
 
+    explored = Explored(task, lineup)
     folder.mkdir(parents=True, exist_ok=True)
     check_writable(folder)
     token = secrets.token_urlsafe(24)

@@ -49,7 +49,7 @@ from ethbrake_marl.files.yaml import (
     require,
     suggestion,
 )
-from ethbrake_marl.harm import ObjectiveName, objectives_of
+from ethbrake_marl.harm import KINDS, objectives_of
 from ethbrake_marl.observations import ListedFeatures, listed_features
 from ethbrake_marl.physics import (
     Bools,
@@ -620,8 +620,7 @@ class Sample:
 # Roles: who learns, names of scripts (``name[:argument]``), and the commands of the scripts that need no state.
 
 LEARNER = "learner"
-STATE_FREE = ("full_brake", "coast", "constant")  # names of the scripts whose command never depends on the state
-_PROFILE = "profile"  # the same, in pieces
+_PROFILE = "profile"  # a constant command in pieces
 MOST_PIECES = 64
 
 _SPEC = re.compile(r"(?P<name>[a-z][a-z0-9_@.-]*)(:(?P<argument>\S+))?")
@@ -924,6 +923,19 @@ PerVehicle = Annotated[
 ]
 
 
+class _ObjectiveSchema:
+    """The JSON schema of an objective: what is known when it is asked for."""
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        plain = [name for name, kind in KINDS.items() if ":" not in kind.form]
+        with_argument = "|".join(name for name, kind in KINDS.items() if ":" in kind.form)
+        return {"type": "string", "anyOf": [{"enum": plain}, {"pattern": f"^({with_argument}):"}]}
+
+
+_ObjectiveName = Annotated[str, _ObjectiveSchema]
+
+
 class _MemberSchema:
     """In a file also a scenario's name, or the path of its file."""
 
@@ -1049,7 +1061,7 @@ class ScenarioFields(FileModel):
         default="keep", description="what happens to worlds with an impact before the first learner may act"
     )
 
-    objective: ObjectiveName | Annotated[tuple[ObjectiveName, ...], Field(strict=False)] = Field(
+    objective: _ObjectiveName | Annotated[tuple[_ObjectiveName, ...], Field(strict=False)] = Field(
         default="total", description="whose harm a reward counts: one for all vehicles, or one for each"
     )
     observation: ListedFeatures | ListedByVehicle | None = Field(

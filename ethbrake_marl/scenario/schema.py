@@ -36,7 +36,6 @@ from ethbrake_marl.scenario.sampling import (
     DISTRIBUTIONS,
     LEARNER,
     QUANTITY,
-    STATE_FREE,
     Member,
     ScenarioFields,
     ScriptSpec,
@@ -160,7 +159,7 @@ def _check_scripts(scenario: ScenarioFields) -> None:
     require(0 not in scenario.learners or scenario.has_obstacle, ("roles", "vehicle_1"), LEARNER, right)
     for i, script in scenario.scripts.items() if scenario.early_impacts == "reject" and scenario.learners else ():
         spec = ScriptSpec.parse(script)
-        close = get_close_matches(spec.name, STATE_FREE, n=1)
+        close = get_close_matches(spec.name, ("full_brake", "coast", "constant"), n=1)
         hint = f"; did you mean {close[0]}?" if close else ""
         right = f"with early_impacts: reject a script must be full_brake, coast, constant:a or a profile{hint}"
         require(spec.is_state_free(), ("roles", f"vehicle_{i + 1}"), script, right)

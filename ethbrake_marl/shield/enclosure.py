@@ -1601,6 +1601,71 @@ class Boxes(NamedTuple):
     time_step_s: float
     horizon_s: float
 
+    @staticmethod
+    def check_possible(robust: str, scenario: Scenario, harm_count: HarmCount, others: Mapping[int, Script]) -> None:
+        """Raise ``InvalidInput`` for a setting that interior mode cannot certify, whatever its worlds.
+
+        That is: total harm, more than three vehicles, an obstacle ahead, or others that do anything else than brake
+        fully, coast, or hold one deceleration.
+        """
+        if robust != INTERIOR:
+            return
+        for what, there in (
+            ("total harm", harm_count == "total"),
+            (f"{scenario.vehicles} vehicles", scenario.vehicles > MOST_VEHICLES),
+            ("an obstacle ahead", scenario.has_obstacle),
+        ):
+            if there:
+                raise _refusal(what)
+        for i, script in sorted(others.items()):
+            name = getattr(script, "name", type(script).__name__)
+            if name.split(":")[0] not in SCRIPTS:
+                raise InvalidInput(
+                    f"shield: robust interior: vehicle_{i + 1} is driven by {name!r}, which it cannot enclose;"
+                    " full_brake, coast and constant:A are possible; robust corners takes every script"
+                )
+
+    @classmethod
+    def of(
+        cls, possible: Worlds, problem: ProfileProblem, n: int, scenario: Scenario, others: Mapping[int, Script]
+    ) -> Boxes:
+        """The boxes of n worlds at the alert, their members being ``possible`` [n * M], as in the ``problem``.
+
+        Raises ``InvalidInput`` for worlds that interior mode cannot certify: with an obstacle ahead, or in which
+        another vehicle's command is not the same in the whole box. ``check_possible`` says what no world of a scenario
+        changes.
+        """
+        v, N, vehicle, members = possible.vehicles, possible.N, int(problem.vehicles[0]), possible.n // n
+        if possible.obstacle_ahead.any():
+            raise _refusal("an obstacle ahead")
+        if v.in_pieces.any():
+            raise _refusal("a vehicle that brakes in pieces (profile)")
+        if v.build_up.any() and possible.command_mps2.any():
+            raise _refusal("brakes that began to build up before the alert")
+        command, constant = problem.command.reshape(n, members, N), np.full((n, N), np.nan)
+        for i, script in others.items():
+            name = getattr(script, "name", type(script).__name__)
+            if i == vehicle or name.split(":")[0] == "full_brake":
+                continue
+            if not (command[:, :, i] == command[:, :1, i]).all():
+                raise InvalidInput(
+                    f"shield: robust interior: vehicle_{i + 1} is driven by {name!r}, whose command is another one in"
+                    " each world of the box; full_brake, coast and constant:A are possible, A being at most every"
+                    " capacity of the box"
+                )
+            constant[:, i] = command[:, 0, i]
+        numbers = np.concatenate(
+            [
+                v.braking_capacity_mps2, v.driving_capacity_mps2, v.latency_s, v.mass_t, v.brake_rate_mps3,
+                v.release_rate_mps3, possible.speeds_mps, possible.gaps_m,
+            ],
+            axis=1,
+        ).reshape(n, members, 8 * N - 1)  # fmt: skip
+        return cls(
+            numbers.min(axis=1), numbers.max(axis=1), v.speed_limit_mps[::members], v.restitution[::members],
+            possible.time_s[::members], constant, vehicle, scenario.time_step_s, scenario.horizon_s,
+        )  # fmt: skip
+
     def take(self, rows: Ints) -> Boxes:
         """The boxes of some worlds."""
         arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._fields[:6]}
@@ -1639,75 +1704,11 @@ class Boxes(NamedTuple):
         return bounds
 
 
-def check_possible(robust: str, scenario: Scenario, harm_count: HarmCount, others: Mapping[int, Script]) -> None:
-    """Raise ``InvalidInput`` for a setting that interior mode cannot certify, whatever its worlds.
-
-    That is: total harm, more than three vehicles, an obstacle ahead, or others that do anything else than brake fully,
-    coast, or hold one deceleration.
-    """
-    if robust != INTERIOR:
-        return
-    for what, there in (
-        ("total harm", harm_count == "total"),
-        (f"{scenario.vehicles} vehicles", scenario.vehicles > MOST_VEHICLES),
-        ("an obstacle ahead", scenario.has_obstacle),
-    ):
-        if there:
-            raise _refusal(what)
-    for i, script in sorted(others.items()):
-        name = getattr(script, "name", type(script).__name__)
-        if name.split(":")[0] not in SCRIPTS:
-            raise InvalidInput(
-                f"shield: robust interior: vehicle_{i + 1} is driven by {name!r}, which it cannot enclose; full_brake,"
-                " coast and constant:A are possible; robust corners takes every script"
-            )
-
-
 def _refusal(what: str) -> InvalidInput:
     return InvalidInput(
         f"shield: robust interior: {what}: it certifies first-impact harm of at most {MOST_VEHICLES} vehicles without"
         " an obstacle; robust corners takes every scenario"
     )
-
-
-def boxes_of(
-    possible: Worlds, problem: ProfileProblem, n: int, scenario: Scenario, others: Mapping[int, Script]
-) -> Boxes:
-    """The boxes of n worlds at the alert, their members being ``possible`` [n * M], as in the ``problem``.
-
-    Raises ``InvalidInput`` for worlds that interior mode cannot certify: with an obstacle ahead, or in which another
-    vehicle's command is not the same in the whole box. ``check_possible`` says what no world of a scenario changes.
-    """
-    v, N, vehicle, members = possible.vehicles, possible.N, int(problem.vehicles[0]), possible.n // n
-    if possible.obstacle_ahead.any():
-        raise _refusal("an obstacle ahead")
-    if v.in_pieces.any():
-        raise _refusal("a vehicle that brakes in pieces (profile)")
-    if v.build_up.any() and possible.command_mps2.any():
-        raise _refusal("brakes that began to build up before the alert")
-    command, constant = problem.command.reshape(n, members, N), np.full((n, N), np.nan)
-    for i, script in others.items():
-        name = getattr(script, "name", type(script).__name__)
-        if i == vehicle or name.split(":")[0] == "full_brake":
-            continue
-        if not (command[:, :, i] == command[:, :1, i]).all():
-            raise InvalidInput(
-                f"shield: robust interior: vehicle_{i + 1} is driven by {name!r}, whose command is another one in each"
-                " world of the box; full_brake, coast and constant:A are possible, A being at most every capacity of"
-                " the box"
-            )
-        constant[:, i] = command[:, 0, i]
-    numbers = np.concatenate(
-        [
-            v.braking_capacity_mps2, v.driving_capacity_mps2, v.latency_s, v.mass_t, v.brake_rate_mps3,
-            v.release_rate_mps3, possible.speeds_mps, possible.gaps_m,
-        ],
-        axis=1,
-    ).reshape(n, members, 8 * N - 1)  # fmt: skip
-    return Boxes(
-        numbers.min(axis=1), numbers.max(axis=1), v.speed_limit_mps[::members], v.restitution[::members],
-        possible.time_s[::members], constant, vehicle, scenario.time_step_s, scenario.horizon_s,
-    )  # fmt: skip
 
 
 def checked_robust(robust: object, where: str) -> str:

@@ -19,7 +19,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,8 +60,6 @@ from ethbrake_marl.physics import Bools, Floats, Ints, Vehicles, Worlds
 from ethbrake_marl.scenario import Scenario, Task
 from ethbrake_marl.shield.enclosure import CORNERS, INTERIOR, checked_robust
 from ethbrake_marl.shield.step_shield import (
-    CAPS,
-    REASONS,
     BelievedShield,
     Cap,
     Decision,
@@ -168,8 +166,9 @@ class ShieldOptions:
             )
         if mode != "episode" and self.bound != "coupled":
             raise InvalidInput(f"{self.where}: bound = {self.bound!r}: mode {mode} takes none; episode does")
-        if self.cap is not None and (mode != "step" or self.cap not in CAPS):
-            allowed = "mode step alone takes one" if self.cap in CAPS else f"must be {', '.join(CAPS)} or None"
+        caps = get_args(Cap)
+        if self.cap is not None and (mode != "step" or self.cap not in caps):
+            allowed = "mode step alone takes one" if self.cap in caps else f"must be {', '.join(caps)} or None"
             raise InvalidInput(f"{self.where}: cap = {self.cap!r}: {allowed}")
         if checked_robust(self.robust, self.where) == INTERIOR and mode != "robust":
             raise InvalidInput(f"{self.where}: robust = {self.robust!r}: mode {mode} takes none; robust does")
@@ -449,7 +448,7 @@ def told_of(ruling: Ruling | None) -> dict[str, Any]:
         "proposed_action": ruling.proposed,
         "chosen_action": ruling.applied,
         "intervened": decided.intervened,
-        "reason": np.array(REASONS)[decided.reason],
+        "reason": decided.reason_names,
         "margin": decided.margin,
     }
 

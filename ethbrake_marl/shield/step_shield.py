@@ -38,7 +38,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
-from typing import Any, Literal, NamedTuple, TypeVar, cast
+from typing import Any, Literal, NamedTuple, TypeVar, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,7 +83,7 @@ from ethbrake_marl.physics import (
 )
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search import ProfileProblem, profile_problem
-from ethbrake_marl.shield.enclosure import CORNERS, INTERIOR, Boxes, boxes_of, check_possible, checked_robust
+from ethbrake_marl.shield.enclosure import CORNERS, INTERIOR, Boxes, checked_robust
 from ethbrake_marl.shield.uncertainty import MOST_CORNERS, Uncertainty, check_amount, check_scenario
 
 # The compiled decisions of the step shield, for one shielded vehicle or several of one line.
@@ -604,6 +604,11 @@ class Decision(NamedTuple):
     after: Running  # as it will be at the next decision
     backup: Backup  # the plan that goes with the bound
 
+    @property
+    def reason_names(self) -> NDArray[np.str_]:
+        """The reasons in words, [n] or [n, K]."""
+        return np.array(REASONS)[self.reason]
+
     def put(self, rows: Ints, other: Decision, taken: Ints) -> Decision:
         """A copy in which some worlds, with the plans and bounds that go on, are those ``taken`` from another one."""
         columns: dict[str, Any] = {
@@ -948,8 +953,7 @@ GRID = np.linspace(0.0, -1.0, 21)  # ... of the descent of several vehicles
 ROUNDS = 2  # of that descent
 LADDER = np.linspace(0.0, -1.0, 5)  # actions of the first and of the last vehicle in the constants of several
 
-Cap = Literal["baseline"]
-CAPS = ("baseline",)  # of whose plan a vehicle's harm is the most that it may bear
+Cap = Literal["baseline"]  # whose plan a vehicle's harm is the most that it may bear
 
 
 def joint_constants(vehicles: int) -> Floats:
@@ -1017,8 +1021,8 @@ class StepShield:
         if uncertainty is not None and (len(self.vehicles) > 1 or cap is not None):
             what = "several vehicles" if cap is None else "a cap"
             raise InvalidInput(f"shield: uncertainty: {what} with it: not covered; mode robust shields one vehicle")
-        if cap not in (None, *CAPS):
-            raise unknown_name("shield cap", cap, CAPS)
+        if cap not in (None, *get_args(Cap)):
+            raise unknown_name("shield cap", cap, get_args(Cap))
         self.scenario, self.harm_count, self.allowance = scenario, harm_count, allowance
         self.uncertainty, self.cap = uncertainty, cap
         self.robust = checked_robust(robust, "shield")
@@ -1037,7 +1041,7 @@ class StepShield:
         self.baseline_shares: Floats = np.zeros((0, 0))  # [n, N] what each vehicle bears under the best constants
         scripts = script_agents(scenario, except_for=self.vehicles) if others is None else others
         self._others = {i: script for i, script in scripts.items() if i not in self.vehicles}
-        check_possible(self.robust, scenario, harm_count, self._others)
+        Boxes.check_possible(self.robust, scenario, harm_count, self._others)
         self._width = int(Decisions(np.zeros(1), scenario.time_step_s).before(scenario.horizon_s)[0]) + 1
 
     @property
@@ -1158,7 +1162,7 @@ class StepShield:
             harm = np.where(better, alone, harm)
         settles = ends_under(running, plan)[0]
         if members > 1 and self.robust == INTERIOR:
-            boxes = boxes_of(possible, problem, worlds.n, self.scenario, self._others)
+            boxes = Boxes.of(possible, problem, worlds.n, self.scenario, self._others)
             harm = boxes.at_alert(plan, harm)
             self.boxes = boxes.placed(self.boxes, rows)
         constants = joint_constants(len(vehicles)) if len(vehicles) > 1 else np.array(CONSTANTS)

@@ -16,7 +16,7 @@ from pettingzoo.utils import BaseParallelWrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from ethbrake_marl.agents import Agent, LearnedPolicy, Team
-from ethbrake_marl.envs import InTurns, in_turns
+from ethbrake_marl.envs import InTurns
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats
@@ -112,7 +112,7 @@ def shielded_aec(env: ParallelEnv[str, Observations, NDArray[Any]], *args: Any, 
 
     ``env`` is the parallel environment: in AEC all actions of a step are known only when the last agent has acted.
     """
-    return in_turns(HybridShield(env, *args, **settings))
+    return InTurns.around(HybridShield(env, *args, **settings))
 
 
 class ShieldedEnv(

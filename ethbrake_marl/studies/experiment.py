@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,7 +17,7 @@ import numpy as np
 
 from ethbrake_marl.agents import Agent, LearnedAgent
 from ethbrake_marl.defaults import DEFAULT, HarmCount
-from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, Unfamiliar, check_one_learner
+from ethbrake_marl.errors import OnProgress, Progress, Unfamiliar, check_one_learner
 from ethbrake_marl.evaluation import (
     TESTS,
     Evaluation,
@@ -46,7 +45,6 @@ from ethbrake_marl.shield import HybridAgent
 # The results of an experiment beside its policy: CSV and JSON, every world, three figures and one page.
 
 BESIDE = ("full_brake", "e_v2x_bm")  # beside the policy: in its figures, and on the other two of the three tests
-RUNS = Path("runs")
 
 
 def write_results(
@@ -138,31 +136,6 @@ class ExperimentResult:
     report: Path
     results: list[dict[str, Any]]
     beside: Mapping[str, SummaryTable] = field(default_factory=dict)  # by test: the other two of the three tests
-
-
-def run_folder(
-    scenario: Scenario,
-    recipe: TrainingRecipe,
-    *,
-    seed: int | None = None,
-    name: str | None = None,
-    output: Path | None = None,
-) -> Path:
-    """Folder of a run: ``output``, or ``runs/<name>``, by default ``runs/<scenario>-<recipe>-seed<seed>``.
-
-    The default has the scheme behind the recipe where the recipe names one. Raises ``InvalidInput`` when both are
-    given, or for a name that is not a plain folder name.
-    """
-    if output is not None:
-        if name is not None:
-            raise InvalidInput(f"name {name!r} and output {str(output)!r}: give one of the two")
-        return output
-    if name is not None and not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,127}", name):
-        raise InvalidInput(
-            f"run name {name!r:.60}: must be up to 128 letters, digits, . _ -, not beginning with . or -"
-        )
-    plan = recipe.name if recipe.scheme is None else f"{recipe.name}-{recipe.scheme}"
-    return RUNS / (name or f"{scenario.name}-{plan}-seed{recipe.seed if seed is None else seed}")
 
 
 def run_experiment(

@@ -24,6 +24,7 @@ from pydantic import (
     AfterValidator,
     Discriminator,
     Field,
+    GetJsonSchemaHandler,
     PlainValidator,
     PrivateAttr,
     Tag,
@@ -31,6 +32,8 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
 from ethbrake_marl.errors import (
     AlreadyExists,
@@ -49,7 +52,6 @@ from ethbrake_marl.files.yaml import (
     Document,
     FileModel,
     FileSchema,
-    OneOrMore,
     Wording,
     YamlPath,
     flow_text,
@@ -198,7 +200,18 @@ def _printing_to(log: Path) -> Iterator[None]:
 
 MOST_JOBS = 200_000
 _GRID: YamlPath = ("grid",)
-_Names = Annotated[tuple[str, ...], Field(strict=False, min_length=1), OneOrMore]
+
+
+class _OneOrMore:
+    """Of a list: in a file a single entry may stand in its place (a check of the model makes it a list)."""
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        several = handler(core)
+        return {"anyOf": [several["items"], several]}
+
+
+_Names = Annotated[tuple[str, ...], Field(strict=False, min_length=1), _OneOrMore]
 _Values = Annotated[tuple[Any, ...], Field(strict=False, min_length=1)]
 
 
@@ -241,7 +254,7 @@ class SeedRange(FileModel):
 
 
 _Seeds = Annotated[
-    Annotated[tuple[_Seed, ...], Field(strict=False, min_length=1), OneOrMore, Tag("#list")]
+    Annotated[tuple[_Seed, ...], Field(strict=False, min_length=1), _OneOrMore, Tag("#list")]
     | Annotated[SeedRange, Tag("#range")],
     Discriminator(lambda value: "#range" if isinstance(value, dict | SeedRange) else "#list"),
 ]

@@ -209,13 +209,6 @@ def test_evaluate__one_agent_remembers_each_learner_apart_and_predicts_for_nobod
     assert evaluate(PAIR.sample(3, 0), {"m": Remembering()}, scenario=PAIR).outcome("m").predicted_harm is None
 
 
-def test_e_v2x_bm__takes_the_other_learners_to_brake_fully():
-    worlds = PAIR.sample(30, 7).worlds
-    both = drive(worlds, Team.of(make_agent("e_v2x_bm"), (1, 2)), PAIR).memories[1]
-    alone = drive(worlds, make_agent("e_v2x_bm"), PAIR.with_learners(["vehicle_2"]), 1).memories[1]
-    assert both["deceleration_mps2"].tolist() == alone["deceleration_mps2"].tolist()
-
-
 class _Writes:
     """Writes into what it is given, when an episode begins or at each decision."""
 

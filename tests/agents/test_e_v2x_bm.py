@@ -137,23 +137,6 @@ def test_optimum__is_not_above_a_fine_grid_and_is_attained(vehicles, vehicle):
     assert np.array_equal(np.add(*harm_of_pairs(worlds, vehicle, best.deceleration_mps2)), best.harm)
 
 
-def test_optimum__takes_the_middle_of_a_flat_minimum():
-    # The front pair meets while both coast, whatever vehicle 2 does; the rear pair is spared up to 5 m/s2.
-    worlds = make_worlds(
-        [1.0, 5.0],
-        [10.0, 12.0, 12.0],
-        braking_capacity_mps2=[5, 8, 5],
-        driving_capacity_mps2=0,
-        latency_s=[1.0, 1.0, 1.0],
-        mass_t=1,
-        restitution=0,
-    )
-    best = optimise_pairwise(worlds, 1)
-    # The rear one stops in 14.4 m, so vehicle 2 may stop in 9.4 m: 7.66 m/s2.
-    assert best.spares_rear_mps2[0] == pytest.approx(72 / 9.4) and best.spares_front_mps2[0] == math.inf
-    assert best.harm[0] == 4.0 and best.deceleration_mps2[0] == pytest.approx(36 / 9.4)
-
-
 def line_worlds(n: int, vehicles: int, seed: int) -> Worlds:
     """Worlds of very different vehicles, some of them so early that nobody may brake yet."""
     rng = np.random.default_rng(seed)
@@ -355,55 +338,6 @@ def test_coupled__threads_batch_and_what_was_searched_before_change_no_bit(monke
     total, other = optimise_coupled(worlds, 1, harm_count="total"), optimise_coupled(worlds, 1, horizon_s=4.0)
     assert len(searches) == 6 and (total.harm != found[1].harm).any() and (other.harm != found[1].harm).any()
     assert [column[0] for column in optimise_coupled(worlds.take([7]), 1)] == [column[7] for column in found[1]]
-
-
-def test_coupled__stays_off_the_edge_of_a_jump():
-    # The least harm, 1.2376, ends at a* = 5.93951, where a second impact makes it 1.6387: rounding must not decide.
-    world = make_worlds(
-        [7.59, 9.53],
-        [20.07, 19.34, 20.35],
-        braking_capacity_mps2=[6, 7, 6],
-        driving_capacity_mps2=6,
-        latency_s=[0, 0.5, 0.8],
-        mass_t=[4.5, 5.5, 5.9],
-        restitution=0.1,
-    )
-    best = optimise_coupled(world, 1)
-    around = [float(realised(world, 1, best.deceleration_mps2 + d).first_impact_harm.sum()) for d in (-1e-9, 0, 1e-9)]
-    assert around == pytest.approx([1.2376] * 3, abs=1e-4)
-    assert realised(world, 1, best.deceleration_mps2 + 1e-8).first_impact_harm.sum() > 1.6
-
-
-def test_coupled__follows_the_others_commands():
-    # Nobody else brakes: vehicle 2 harms nobody by coasting like them, and is hit if it brakes.
-    worlds = make_worlds(
-        [10.0, 10.0],
-        [20.0, 20.0, 20.0],
-        braking_capacity_mps2=6,
-        driving_capacity_mps2=0,
-        latency_s=0,
-        mass_t=1,
-        restitution=0,
-    )
-    best = optimise_coupled(worlds, 1, others_mps2=np.zeros((1, 3)), horizon_s=30.0)
-    assert best.total_harm[0] == 0.0 and best.deceleration_mps2[0] == pytest.approx(0.0, abs=10 * 2 / 30**2)
-
-
-def test_coupled__finds_a_kink_to_nine_digits():
-    # Front pair alone: harm falls linearly to the grazing deceleration 2 + 4^2 / (2 * 8) = 3, from where it is zero.
-    world = make_worlds(
-        [8.0, 500.0],
-        [20.0, 24.0, 0.0],
-        braking_capacity_mps2=[2, 2.9, 6],
-        driving_capacity_mps2=0,
-        latency_s=0,
-        mass_t=1,
-        restitution=0,
-    )
-    best = optimise_coupled(world, 1, horizon_s=30.0)
-    assert best.deceleration_mps2[0] == 2.9  # beyond its brakes: as hard as it can
-    assert best.harm[0] == pytest.approx(16 - 2 * 0.9 * 8, abs=1e-12)
-    assert math.isclose(optimise_pairwise(world, 1).spares_front_mps2[0], 3.0)
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,6 @@ from ethbrake_marl.physics.messages import CHANNEL, LINK, Messages, link_at, pla
 from ethbrake_marl.scenario.v2x import PRESETS
 from ethbrake_marl.shield import ShieldedDriver, parse_uncertainty
 from ethbrake_marl.shield.step_shield import Proposer, proposed_action, seen_columns
-from tests.fixtures.asked import Acts
 from tests.fixtures.policies import make_policy
 
 
@@ -288,14 +287,6 @@ def test_knowledge__every_agent_states_it(spec, knows):
     assert Knowledge.of(agent_of(spec)) == knows
     if "+" not in spec and spec != "e_v2x_bm:pairwise" and not spec.endswith(":believed"):
         assert Knowledge.of(find_entry(parse_spec(spec))) == knows, "`ethbrake agent list` says something else"
-
-
-def test_knowledge__of_an_agent_of_the_users_own_and_of_a_team():
-    team = eb.Team({1: agent_of("ppo@shipped/ppo"), 2: agent_of("full_brake")}, "both")
-    assert Knowledge.of(team) == (SENSORS, MESSAGES) and Knowledge.of(eb.Team({}, "scripts")).text == "–"
-    silent = Acts(lambda worlds, vehicle: np.zeros(worlds.n))
-    assert Knowledge.of(silent).text == "not stated" and not Knowledge.of(silent).sees_through
-    assert Knowledge.of(silent, also=MODEL) == (MODEL, Source.UNSTATED) and Knowledge.of(Leaking()) == (MESSAGES,)
 
 
 @pytest.mark.parametrize(

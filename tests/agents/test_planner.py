@@ -6,7 +6,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl import search
 from ethbrake_marl.agents import Refined, Team, drive, make_agent, optimise_coupled, planner as refined, script_agents
-from ethbrake_marl.agents.planner import HOLDS, SIZES, Planner, RefinedProfile, changes, deviate
+from ethbrake_marl.agents.planner import Planner, RefinedProfile
 from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.search import profile_problem
@@ -127,23 +127,6 @@ def test_refined__where_nothing_is_better_drives_as_the_policy_does():
     apart = WORLDS.take(np.flatnonzero(harm(make_agent("full_brake")) == 0.0))
     agent = Asked(slowly("full_brake")).begin(apart, 1)
     assert agent.act(apart, 1).tolist() == (-apart.vehicles.braking_capacity_mps2[:, 1]).tolist()
-
-
-def test_changes__keep_their_sizes_and_hold():
-    table = changes(0, 18)
-    assert table.shape == (18, 64)
-    for k, change in enumerate(table):
-        size, hold = SIZES[k % 3], HOLDS[k // 3 % 3]
-        assert 0.5 * size < np.abs(change).max() <= size
-        assert (change[:hold] == change[0]).all() and change[hold] != change[0]
-    assert table[:4].tolist() == changes(0, 4).tolist() and table.tolist() != changes(1, 18).tolist()
-
-
-def test_deviated__stays_within_the_capacities():
-    command = np.full(WORLDS.n, -6.9)
-    low = deviate(command, np.full((WORLDS.n, 64), -0.5), WORLDS, 1)
-    high = deviate(-command, np.full((WORLDS.n, 64), 0.5), WORLDS, 1)
-    assert set(low.tolist()) == {-7.0} and set(high.tolist()) == {7.0}
 
 
 @pytest.mark.slow

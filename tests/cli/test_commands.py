@@ -336,7 +336,9 @@ def recipe(tmp_path: Path) -> Path:
     return write_recipe(tmp_path, observation=["own", "front_1", "rear_1", "time_gap_s"])
 
 
-@pytest.mark.filterwarnings("ignore::ethbrake_marl.errors.IncompleteTable")  # a list that shares worlds with a table
+@pytest.mark.filterwarnings(
+    "ignore::ethbrake_marl.evaluation.measures.IncompleteTable"
+)  # a list that shares worlds with a table
 @pytest.mark.usefixtures("undrawn")
 def test_one_file__adds_agent_term_feature_and_preset_and_is_seen_in_the_report(
     ethbrake, tmp_path, parts, scenario, recipe, again

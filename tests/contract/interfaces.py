@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ethbrake_marl as eb
-from ethbrake_marl.envs.interfaces import EthBrakeEnv, EthBrakeParallelEnv, EthBrakeVectorEnv, in_turns
+from ethbrake_marl.envs.interfaces import EthBrakeEnv, EthBrakeParallelEnv, EthBrakeVectorEnv, InTurns
 
 Array = NDArray[Any]
 Wrap = Callable[[Any], Any]
@@ -145,7 +145,7 @@ class InTurn(Parallel):
 
     def __init__(self, scenario: eb.Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
         super().__init__(scenario, n, wrap, **settings)
-        self.env = in_turns(self.env)
+        self.env = InTurns.around(self.env)
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Array:
         self.env.reset(seed=seed, options=options)

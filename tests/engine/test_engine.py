@@ -7,7 +7,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.defaults import HARM_COUNTS
-from ethbrake_marl.engine import Engine, Moment, Stream
+from ethbrake_marl.engine import Engine, Moment
 from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.learning import algorithms
@@ -73,13 +73,6 @@ def test_start__that_fails_leaves_the_running_episodes_and_the_stream_alone(star
 
 
 # ---------------------------------------------------------------- episodes
-
-
-def test_stream__gives_every_world_of_its_list_once_and_in_order_across_its_blocks() -> None:
-    stream = Stream(PAPER, [1], {0: eb.make_agent("full_brake"), 2: eb.make_agent("constant:5")}, seed=4)
-    taken = eb.Worlds.concatenate([stream.take(count).alert for count in (1000, 100, 3000, 50)])
-    expected = PAPER.sample(4150, 4, channel="training").worlds
-    assert (taken.gaps_m == expected.gaps_m).all() and (taken.speeds_mps == expected.speeds_mps).all()
 
 
 @pytest.mark.parametrize(
@@ -391,16 +384,6 @@ def test_branch__difference_is_the_gradient_of_the_harm() -> None:
     gained, moved = play_to_the_end(new, lambda seen: np.full(len(seen), np.float32(-0.5)), both, 1.0)
     assert gained.mean() == pytest.approx(-(400.0 - 6.0))
     assert (gained[0] - gained[1]) / (moved[0] - moved[1]) == pytest.approx(-12.0, rel=1e-6)
-
-
-def test_branch__row_that_cannot_be_advanced_tells_nothing() -> None:
-    engine = make_engine("paper-random", 3, seed=3)
-    moment = engine.moment()
-    moment.state[1, -1 - 5] = np.nan
-    new = engine.branch(moment)
-    new.roster.failed[1] = "a contact was missed"
-    gained, _ = play_to_the_end(new, act, no_offsets(3), 1.0)
-    assert np.isnan(gained).tolist() == [False, True, False]
 
 
 SCRIPTS = ("planner:8", "e_v2x_bm", "ppo@shipped")

@@ -110,18 +110,6 @@ def test_record__an_impact_at_the_very_alert_is_there(pair: eb.Scenario) -> None
     assert (np.diff(record.time_s) > 0.0).all() and len(record.impacts.time_s) == record.ledger.count.sum()
 
 
-def test_record__a_vehicle_pushed_above_its_speed_limit_goes_on() -> None:
-    scenario = eb.Scenario(
-        name="pushed", vehicles=2, gaps_m=5, speeds_mps=[20, 25], braking_capacity_mps2=6, driving_capacity_mps2=3,
-        mass_t=[1.5, 10], latency_s=[0, 0.5], speed_limit_mps=[20, 30], time_step_s=1.0,
-        roles={"vehicle_1": "coast", "vehicle_2": "learner"},
-    )  # fmt: skip
-    record = record_episode(scenario.sample(1, 0).worlds, make_agent("coast"), scenario=scenario)
-    assert (record.speeds_mps[-1] > 24.0).all()  # momentum: 280/11.5 = 24.35 m/s in the mean
-    # Struck at 1 s by 5 m/s, e = 0.1.
-    np.testing.assert_allclose(record.positions_m[-1, 0], 20.0 + 7.0 * (20.0 + 1.1 * 5.0 * 10.0 / 11.5), rtol=1e-12)
-
-
 # ---------------------------------------------------------------- motion
 
 

@@ -20,10 +20,9 @@ from ethbrake_marl.evaluation import Evaluation, Outcome, evaluate, record_episo
 from ethbrake_marl.evaluation.inputs import make_agents, make_lineup, policy_sha256, scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.measures import FAR_M, Tally, measures
 from ethbrake_marl.evaluation.results import Question
-from ethbrake_marl.evaluation.rollout import ShovedFront
 from ethbrake_marl.pages.report import Report
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, advance_sampled
-from ethbrake_marl.scenario import Scenario, Task, load_scenario
+from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.studies.jobs import evaluate_shards
 from tests.failing_worlds import planted_list, without
 
@@ -151,13 +150,6 @@ def test_aftermath__by_hand(scenario: Scenario, spec: str, shoved: float | None,
         assert found is None if expected is None else found == pytest.approx([expected], abs=1e-9)
     told = summarise(result)[0].to_json()
     assert (told["vehicle_1_shoved_m"] is None, told["sampled_harm"] is None) == (shoved is None, sampled is None)
-
-
-def test_aftermath__has_no_meaning_where_vehicle_1_reacts_or_another_than_vehicle_2_is_driven() -> None:
-    reacts = PUSH.replace(roles={"vehicle_1": "planner", "vehicle_2": "learner"})
-    assert ShovedFront.of(reacts.sample(1, 7).worlds, Task(reacts, (1,))) is None
-    third = PAPER.with_learners(["vehicle_3"])
-    assert evaluate(third.sample(1, 7), BRAKE, scenario=third).outcome("full_brake").sampled_harm is None
 
 
 def test_shoved__is_where_the_record_ends(evaluation: Evaluation, gap_agent: Any) -> None:
@@ -460,13 +452,6 @@ def test_a_list_of_which_every_world_fails__is_refused(failing, paper_random: Sc
 
 def test_tally__comes_back_from_json_as_it_was(tally: Tally) -> None:
     assert Tally.from_json(json.loads(json.dumps(tally.to_json()))) == tally
-
-
-@pytest.mark.long
-def test_a_hundred_thousand_worlds__are_the_same_bits_in_1_2_and_7_shards(paper_random: Scenario) -> None:
-    asked = Question(paper_random, ("full_brake", "e_v2x_bm"), 100_000, 7).ask()
-    one, two, seven = (evaluate_shards(asked, shards=k, jobs=min(k, 2)) for k in (1, 2, 7))
-    assert one == two == seven
 
 
 # ---------------------------------------------------------------- recorded before search and loop were made faster

@@ -1,6 +1,5 @@
 """Statistics: exact sums, intervals of rates, means and ratios, and what is told over seeds."""
 
-import math
 from fractions import Fraction
 
 import numpy as np
@@ -19,9 +18,7 @@ from ethbrake_marl.evaluation.statistics import (
     mean_over_seeds,
     rate,
     relative_decrease,
-    share_over_seeds,
 )
-from ethbrake_marl.files.sheet import Estimate
 
 # ---------------------------------------------------------------- exact sums
 
@@ -48,15 +45,6 @@ def test_moments__of_parts_in_any_order_are_those_of_the_whole() -> None:
     assert whole.standard_error == pytest.approx(values.std(ddof=1) / 100.0, rel=1e-12)
     equal = Moments.of(np.full(7, 0.1))
     assert (equal.mean, equal.standard_error) == (0.1, 0.0)
-
-
-def test_difference_and_ratio__are_those_of_the_pairs() -> None:
-    x, y = np.random.default_rng(4).integers(0, 50, (2, 500)).astype(float) / 8.0  # no difference of them is rounded
-    both = exact_sum(x, y)
-    assert Moments.of(x).minus(Moments.of(y), both) == Moments.of(x - y)
-    residual = x - x.mean() / y.mean() * y
-    expected = residual.std(ddof=1) / math.sqrt(500) / y.mean()
-    assert Moments.of(x).ratio_error(Moments.of(y), both) == pytest.approx(expected, rel=1e-10)
 
 
 # ---------------------------------------------------------------- rates
@@ -118,24 +106,6 @@ def test_mean_over_seeds__worlds_of_both_sides_are_drawn_together() -> None:
     half = 1.96 * difference.std(ddof=1) / 500**0.5
     expected = (difference.mean() - half, difference.mean() + half)
     assert mean_over_seeds(worlds + difference, worlds).interval == pytest.approx(expected, abs=0.02)
-
-
-def test_mean_over_seeds__of_truths_is_a_rate_and_against_a_baseline_a_difference() -> None:
-    low, high = mean_over_seeds(np.eye(4, dtype=np.bool_)[[0]].T.repeat(50, axis=1)).interval
-    assert low == 0.0 and high > 0.7  # one seed always, three never
-    found = mean_over_seeds(np.array([[True, False, False, True]]), np.array([[True] * 4]))
-    assert found.value == -0.5 and found.interval[0] < -0.5 < found.interval[1] <= 0.0
-
-
-def test_share_over_seeds__by_hand() -> None:
-    rng = np.random.default_rng(3)
-    worst, best = 10.0 + rng.normal(size=200), np.full(200, 2.0)
-    seeds = np.array([[4.0], [6.0]]) + 0.1 * rng.normal(size=(2, 200))
-    found = share_over_seeds(seeds, worst, best)
-    assert found.value == pytest.approx((worst.mean() - seeds.mean()) / (worst.mean() - 2.0), rel=1e-12)
-    assert found.interval == pytest.approx((0.5, 0.75), abs=0.02)
-    assert share_over_seeds(seeds, worst, worst) is None
-    assert share_over_seeds([[4.0]], [10.0], [0.0]) == Estimate(0.6, None)
 
 
 @pytest.mark.parametrize("resamples", [1, 2, 3])

@@ -48,15 +48,6 @@ def test_closed_form__golden_row_to_every_printed_digit(gaps, speeds, latency, e
     assert optimum[0] is not None or deceleration == 0.5 * (low + high)
 
 
-def test_closed_form__printed_harm_of_the_last_row_is_the_harm_at_its_printed_deceleration():
-    world = paper_world((7, 7), (20, 18, 20), 0.8, 1.2)
-    assert as_printed(pairwise_harm(world, [6, 6.24679, 6]).sum(), "22.2623") == "22.2623"
-    by_hand = 18**2 / (2 * (7 + 400 / 12 - 18 * 0.8))
-    found = optimise_pairwise(world, 1)
-    assert found.deceleration_mps2[0] == pytest.approx(by_hand, abs=1e-12)
-    assert found.harm[0] == pytest.approx(11.76 * by_hand - 51.2, abs=1e-12)
-
-
 def test_closed_form__one_call_gives_the_same_bits_as_five():
     worlds = [paper_world(gaps, speeds, *latency) for gaps, speeds, latency, *_ in GOLDEN]
     from_batch = optimise_pairwise(Worlds.concatenate(worlds), 1)

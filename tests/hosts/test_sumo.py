@@ -57,7 +57,7 @@ def test_sumo__tells_the_table_of_the_page(capsys, monkeypatch):
 def test_sumo__begins_where_it_is_told_and_is_one_at_a_time():
     pytest.importorskip("libsumo")
     worlds = PAPER.sample(100, 7).worlds
-    with find_host("sumo:0.1")[1](worlds) as host:
+    with find_host("sumo:0.1").open(worlds) as host:
         told = host.state()
         assert np.abs(told.gaps_m - worlds.gaps_m).max() < 1e-12 and np.array_equal(told.speeds_mps, worlds.speeds_mps)
         with pytest.raises(eb.EthBrakeError, match="a simulation is open in this process"):

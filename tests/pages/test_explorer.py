@@ -416,7 +416,7 @@ def test_ctrl_c_while_the_address_is_told_ends_it_too(explored: Explored, tmp_pa
 
     again = threading.Timer(30.0, os.kill, (os.getpid(), signal.SIGINT))
     again.start()
-    serve_explorer(explored, tmp_path, 0, interrupted, seed=DEFAULT.LIST_SEED, world=0)
+    serve_explorer(explored.task, explored.lineup, tmp_path, 0, interrupted, seed=DEFAULT.LIST_SEED, world=0)
     assert again.is_alive()
     again.cancel()
 

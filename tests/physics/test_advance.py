@@ -218,14 +218,6 @@ def test_advance__by_hand(name: str, cut: bool) -> None:
 # ---------------------------------------------------------------- where doubles end
 
 
-def test_contact__one_double_before_the_end_of_a_segment_and_one_after() -> None:
-    worlds = line([6.0], [0.0, 8.0])
-    before, after = math.nextafter(0.75, 0.0), math.nextafter(0.75, 1.0)
-    counts = [[int(part.count[0, 0]) for part in run(worlds, 0.0, *times)[1]] for times in ([before], [after])]
-    assert counts == [[0], [1]]
-    assert [int(part.count[0, 0]) for part in run(worlds, 0.0, before, 0.75, 1.0)[1]] == [0, 1, 0]
-
-
 @pytest.mark.parametrize(("onset", "end"), [(0.4, 1.45), (0.12, 1.3)])
 def test_end__that_an_event_reaches_is_the_end_itself(onset: float, end: float) -> None:
     # 1 m/s over `end` metres; the onset cuts the way in two, whose doubles add up to a little less or more than `end`

@@ -150,44 +150,11 @@ def test_force__builds_up_from_the_latency_on(settings: dict[str, Any], force: f
     assert after.speeds_mps.tolist() == [[speed, speed]] and after.gaps_m.tolist() == [[50.0]]
 
 
-def test_release__has_its_own_rate_and_passes_zero_without_a_stop() -> None:
-    worlds = line([50.0], [10.0, 10.0], brake_rate_mps3=8.0, release_rate_mps3=4.0)
-    braking, _ = advance(worlds, [[-4.0, -4.0]], 1.0)
-    driving, _ = advance(braking, [[2.0, 2.0]], 1.5)  # from -4 to 2 at 4 m/s3 takes 1.5 s
-    assert driving.command_mps2.tolist() == [[2.0, 2.0]]
-    assert driving.speeds_mps[0].tolist() == pytest.approx([7.0 - 4.0 * 1.5 + 0.5 * 4.0 * 1.5**2] * 2, rel=1e-15)
-
-
-def test_standing_vehicle__moves_when_its_force_passes_zero() -> None:
-    worlds = line([50.0], [0.0, 1.0], brake_rate_mps3=8.0, release_rate_mps3=4.0)
-    held, _ = advance(worlds, [[-4.0, -4.0]], 1.0)  # the brakes of a standing vehicle build up too
-    assert held.command_mps2.tolist() == [[-4.0, -4.0]] and held.speeds_mps.tolist() == [[0.0, 0.0]]
-    drives, _ = advance(held, [[2.0, -4.0]], 2.0)  # 1 s to release, then 0.5 s to 2 m/s2, then 0.5 s of it
-    assert drives.speeds_mps[0].tolist() == pytest.approx([0.5 + 1.0, 0.0], rel=1e-15)
-
-
 @pytest.mark.parametrize("rear", [25.9, 25.91])  # the second comes so near that every event is looked for
 def test_speed_limit__is_met_while_the_drive_builds_up(rear: float) -> None:
     worlds = line([0.001], [25.9, rear], release_rate_mps3=4.0, speed_limit_mps=26.0)
     after, impacts = advance(worlds, [[2.0, 0.0]], 1.0)  # at 26 m/s after sqrt(0.05) s, before the 2 m/s2 are there
     assert after.speeds_mps.tolist() == [[26.0, rear]] and impacts.count.sum() == 0
-
-
-def test_pushed_vehicle__is_let_go_when_its_front_one_would_be_faster() -> None:
-    """Both touch at rest; the rear one pushes at once, the front one more and more; they part at equal forces."""
-    worlds = line([0.0], [0.0, 0.0], release_rate_mps3=[4.0, math.inf])
-    after, impacts = advance(worlds, [[4.0, 2.0]], 1.0)
-    apart = 0.5 + 4.0 * 0.5**3 / 6.0  # from 0.5 s on the front one has 4 t, the rear one 2; both had the mean before
-    together = 0.5 * 2.0 * 0.5 + 0.25 * 4.0 * 0.5**2
-    assert impacts.count.sum() == 0
-    assert after.gaps_m[0, 0] == pytest.approx(4.0 * 0.5**3 / 6.0, rel=1e-9) and apart > 0.5
-    assert after.speeds_mps[0].tolist() == pytest.approx([together + 1.5, together + 1.0], rel=1e-9)
-
-
-def test_equal_vehicles__keep_their_gap_at_any_rate() -> None:
-    worlds = line([[3.0], [0.5]], [[20.0, 20.0]] * 2, brake_rate_mps3=[[12.65] * 2, [0.5] * 2])
-    after, _ = advance(worlds, -worlds.vehicles.braking_capacity_mps2, 60.0)
-    assert after.gaps_m.tolist() == worlds.gaps_m.tolist() and not after.speeds_mps.any()
 
 
 def test_rates_too_high_to_matter__leave_the_motion_as_it_is() -> None:

@@ -12,7 +12,7 @@ from hypothesis import given, settings, strategies as st
 
 from ethbrake_marl.physics import Floats, Worlds, advance
 from ethbrake_marl.physics.kernel import contact
-from tests.physics.exact_simulator import Hit, Line, line_of, regression, simulate, square_root
+from tests.physics.exact_simulator import line_of, regression, simulate, square_root
 from tests.physics.manufacture import Case, floats, manufactured, pressed, stored, worlds_of
 from tests.physics.random_worlds import HORIZON_S, driving_lines, line, place_ahead, touching_lines
 from tests.physics.segments import meetings, random_segments, scan
@@ -44,16 +44,6 @@ def test_advance__agrees_with_exact_arithmetic_event_by_event(N: int, n: int, ob
         np.testing.assert_allclose(ends, [float(x) for x in exact_ends], rtol=0, atol=CLOSE)
         hits += exact.hits
     assert len(hits) > n / 2 and (not obstacle or sum(hit.pair < 0 for hit in hits) > n / 4)
-
-
-def test_oracle__by_hand() -> None:
-    # 10 m at 10 m/s: meets after 1 s; masses 2 and 3, e = 1/2: +9 and -6; one more second opens 5 m
-    f = Fraction
-    told = Line((f(10),), (f(0), f(10)), (f(0),) * 2, (f(0),) * 2, (f(2), f(3)), (f(99),) * 2, f(1, 2))
-    outcome = simulate(told, f(2))
-    assert outcome.hits == [Hit(f(1), 0, f(10), True, f(9), f(-6))]
-    assert (outcome.gaps, outcome.speeds) == ((5,), (9, 4))
-    assert np.isclose(float(simulate(told, f(2), bits=80).speeds[0]), 9.0)
 
 
 # ---------------------------------------------------------------- worlds made backwards: every bit

@@ -15,8 +15,8 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents import drive, make_agent
 from ethbrake_marl.evaluation import worlds_sha256
 from ethbrake_marl.physics import Vehicles
-from ethbrake_marl.scenario import QUANTITY, load_scenario
-from ethbrake_marl.scenario.sampling import BLOCK, Choice, LogUniform, Normal, Uniform, support, values
+from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.scenario.sampling import Choice, LogUniform, Normal, Uniform, support, values
 from ethbrake_marl.scenario.v2x import PRESETS
 from ethbrake_marl.shield import ShieldedDriver, parse_uncertainty
 
@@ -129,17 +129,6 @@ def test_world_k__is_the_same_alone_and_in_any_list(scenario: eb.Scenario) -> No
         assert (other.kinds[name] != kinds).any() and (training.kinds[name] != kinds).any()
 
 
-def test_columns__every_entry_of_a_world_has_its_own() -> None:
-    rules = [*QUANTITY.usual.values(), QUANTITY.otherwise["line_speed_mps"]]
-    streams, places = zip(*(rule.place(index) for rule in rules for index in range(rule.count(64))), strict=True)
-    assert set(streams) == {()}
-    assert len(set(places)) == len(places) and max(places) < BLOCK * 64 and BLOCK % 4 == 0
-    for_all = {"braking_capacity_mps2": 6, "driving_capacity_mps2": 6, "mass_t": 5, "latency_s": 0.5}
-    worlds = PAPER.replace(vehicles=5, roles={"vehicle_2": "learner"}, **for_all).sample(7, 1).worlds
-    assert len(np.unique(worlds.speeds_mps)) == 35  # one entry for all: each vehicle draws its own value
-    assert worlds.gaps_m.shape == (7, 4)
-
-
 # ---------------------------------------------------------------- early impacts
 
 
@@ -169,16 +158,6 @@ N = 20_000
 def typed(**given: Any) -> eb.Scenario:
     rest = {"gaps_m": 30, "speeds_mps": 20, "driving_capacity_mps2": 3, "latency_s": 0.2}
     return eb.Scenario(**{"name": "typed", **rest, "vehicle_types": KINDS, **given})
-
-
-def test_types__of_each_place() -> None:
-    scenario = typed(types=["truck", {"car": 1, "truck": 9}, "any"])
-    counts = (scenario.sample(N, 1).types == "truck").sum(axis=0)
-    assert counts[0] == N
-    assert [stats.binomtest(counts[i], N, p).pvalue > 0.001 for i, p in ((1, 0.9), (2, 0.25))] == [True, True]
-    assert scenario.bounds("mass_t") == ((14.0, 40.0), (1.0, 40.0), (1.0, 40.0))
-    roles = {"vehicle_1": "constant:5", "vehicle_2": "learner"}  # within the capacity of every type of its place
-    assert typed(roles=roles, types=["car", "any", "any"]).scripts[0] == "constant:5"
 
 
 def test_quantities__follow_the_distribution_of_their_type() -> None:

@@ -12,10 +12,8 @@ from ethbrake_marl.agents import script_agents
 from ethbrake_marl.envs import make_engine
 from ethbrake_marl.observations import observe
 from ethbrake_marl.physics.batch import Packed
-from ethbrake_marl.physics.kernel import CLOCK
-from ethbrake_marl.physics.messages import CHANNEL, Messages, chance
+from ethbrake_marl.physics.messages import CHANNEL, Messages
 from ethbrake_marl.scenario.v2x import PER_LINK, PRESETS, V2X, Channel, Equipage, Equipped
-from ethbrake_marl.search import identities
 from tests.agents.test_knowledge import alter_unreceived
 
 PAPER = eb.load_scenario("paper-random")
@@ -131,14 +129,6 @@ def test_v2x__where_nothing_is_lost_the_longest_burst_bounds_the_news(name, late
     assert (drawn <= v2x.latest_reaction_s(np.zeros(12), everybody(12))).all() and drawn.max() > latest - 0.1
 
 
-def test_identities__do_not_depend_on_the_news():
-    worlds = PAPER.sample(5, 7).worlds
-    clock, command = np.zeros((5, CLOCK.WIDTH)), -worlds.vehicles.braking_capacity_mps2
-    late = replace(worlds.vehicles, known_from_s=worlds.vehicles.known_from_s + 1.0)
-    plain, told = (identities(w, command, clock, np.array([1])) for w in (worlds, replace(worlds, vehicles=late)))
-    assert plain.tolist() == told.tolist() and len(set(plain.tolist())) == 5
-
-
 # ---------------------------------------------------------------- messages that go on
 
 BASE = eb.load_scenario("cooperation-2-paper").replace(early_impacts="keep")
@@ -171,15 +161,6 @@ def ages_in(worlds):
     return Messages.of(worlds).age_s(worlds.time_s)
 
 
-def test_periodic__the_first_news_and_the_motion_are_those_of_first() -> None:
-    scenario = periodic("blocked")
-    one, other = engine_of(scenario), engine_of(first_only(scenario))
-    assert np.array_equal(one.packed.known_from_s, other.packed.known_from_s)
-    driven(one, 20), driven(other, 20)
-    assert np.array_equal(one.worlds.speeds_mps, other.worlds.speeds_mps)
-    assert np.array_equal(one.worlds.gaps_m, other.worlds.gaps_m)
-
-
 def test_periodic__in_sight_what_is_seen_is_what_first_shows() -> None:
     scenario = periodic(sensing_s=[0.0, 0.0])
     for one, other in zip(driven(engine_of(scenario), 15), driven(engine_of(first_only(scenario)), 15), strict=True):
@@ -197,14 +178,6 @@ def test_losses__go_on_with_the_share_and_the_bursts_of_the_channel(p: float, r:
     for m in (1, 2, 4):
         share = (lost >= m).mean()
         assert share == pytest.approx(p / (p + r) * (1 - r) ** (m - 1), abs=0.025)
-
-
-def test_chance__is_uniform_and_of_its_own_for_every_link_and_message() -> None:
-    u = np.array([[[chance(key, link, number) for number in range(40)] for link in range(9)] for key in
-                  (0.0, 1.0, 2.0**53 - 1)])  # fmt: skip
-    assert len(np.unique(u)) == u.size
-    assert (u >= 0.0).all() and (u < 1.0).all() and abs(u.mean() - 0.5) < 0.03
-    assert abs(np.corrcoef(u[0, :, :-1].ravel(), u[0, :, 1:].ravel())[0, 1]) < 0.1
 
 
 @pytest.mark.parametrize("vehicles", [2, 3, 6])
@@ -274,10 +247,3 @@ def test_interfaces__see_the_same() -> None:
         alike, _, _, _ = vec.step(np.full((3, 1), -0.5, np.float32))
     np.testing.assert_array_equal(alike, vec.engine.observe(1))
     assert np.isfinite(alike).all() and vec.reset_infos[0]["age_s"].shape == (3,)
-
-
-def test_mixture__its_scenarios_share_the_persistence() -> None:
-    members = [periodic(preset, BASE.replace(name=preset)) for preset in ("nominal", "blocked")]
-    mixed = eb.Scenario(name="mixed", mixture=[{"scenario": member} for member in members])
-    assert Messages.of(mixed.sample(30, 3).worlds).periodic.all()
-    driven(engine_of(mixed), 5)

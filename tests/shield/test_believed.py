@@ -8,8 +8,8 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import drive, make_agent
 from ethbrake_marl.physics import Floats
-from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, enclosure, shielded_aec
-from ethbrake_marl.shield.enclosure import Boxes, boxes_of
+from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
+from ethbrake_marl.shield.enclosure import Boxes
 from ethbrake_marl.shield.step_shield import BelievedShield
 from tests.shield.attacks import ABOVE, HEARD_LATE, INSIDE, LISTS, NEVER_HEARD, WAYS, all_infos, shielded
 
@@ -42,12 +42,14 @@ def test_interior__between_the_corners_no_world_is_above_the_first_bound(name: s
 
 @pytest.mark.slow
 def test_interior__a_box_that_is_the_middle_alone_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    boxes_of = Boxes.of
+
     def middle(*given: object) -> Boxes:
         boxes = boxes_of(*given)
         half = 0.5 * (boxes.low + boxes.high)
         return boxes._replace(low=half, high=half)
 
-    monkeypatch.setattr(enclosure, "boxes_of", middle)
+    monkeypatch.setattr(Boxes, "of", middle)
     monkeypatch.setattr(BelievedShield, "_corners", lambda self: [{}])
     harm, bound, _ = shielded("coast", INSIDE["never heard"], 12, 7, robust="interior")
     assert (harm > bound + 1.0).any()
@@ -113,15 +115,6 @@ def test_believed__the_script_of_the_driven_vehicle_itself_does_not_count(spec: 
         for scenario in (BASE, scripted)
     ]
     np.testing.assert_array_equal(*harms)
-
-
-def test_believed__latencies_that_are_over_are_not_waited_for_again() -> None:
-    late = eb.Scenario(
-        name="late", vehicles=2, gaps_m=15, speeds_mps=[0, 10], braking_capacity_mps2=5, driving_capacity_mps2=5,
-        mass_t=1, latency_s=[0, 0.6], roles={"vehicle_1": "full_brake", "vehicle_2": "learner"},
-    )  # fmt: skip
-    for found in driven(make_agent("full_brake+episode:believed", scenario=late), late, 1):
-        assert found == pytest.approx([10.0**2 - 2 * 5 * 9])  # 9 m are left when it begins to brake
 
 
 def test_believed__bounds_nothing_where_its_vehicle_had_an_impact_before_the_first_decision() -> None:

@@ -21,11 +21,9 @@ from ethbrake_marl.shield.enclosure import (
     Path,
     backwards,
     bounce,
-    boxes_of,
     cell_of,
     go_on,
     high,
-    hold,
     may_meet_unseen,
     meet,
     move_alone,
@@ -74,7 +72,7 @@ def boxed(text, scenario=EARLY, *, seed=3, first=0, **changes):
     possible, others = uncertainty.members(worlds), script_agents(scenario, except_for=1)
     command = fixed_commands(others, possible, "test", vehicle=1)
     problem = profile_problem(possible, [1], horizon_s=scenario.horizon_s, others_mps2=command)
-    return Case(scenario, worlds, uncertainty, boxes_of(possible, problem, 1, scenario, others))
+    return Case(scenario, worlds, uncertainty, enclosure.Boxes.of(possible, problem, 1, scenario, others))
 
 
 def cell_in(case, low, plan, vehicle=1):
@@ -142,15 +140,6 @@ def test_by_hand__two_vehicles_the_bound_up_to_the_horizon_is_that_of_the_least_
     assert harm - 1e-9 <= bound_of(boxed(text, STANDING, horizon_s=horizon), np.full(STEPS, -1.0), cells) <= harm + more
 
 
-def test_by_hand__a_drive_that_a_speed_limit_may_end_gives_any_part_of_its_way():
-    # 20 m/s are its limit: 2 m in 0.1 s, and not the 2.035 m of a drive with 7 m/s2
-    case = boxed("gaps_m=1", speeds_mps=20, speed_limit_mps=20, latency_s=0)
-    cell, _ = cell_in(case, case.boxes.low[0], np.ones(STEPS))
-    path = Path(np.concatenate([cell.speed, cell.gap, 0 * cell.gap[:1]]), np.zeros((2, TOUCH_WIDTH)), np.zeros(5, int))
-    move_alone(cell, path, 0, motion := new_motion(3, cell.drive.shape[0]))
-    assert [enclosure.low(motion.reach[1]), enclosure.high(motion.reach[1])] == pytest.approx([2.0, 2.035], abs=1e-9)
-
-
 @pytest.mark.parametrize(("length", "wide"), [(0.1, 0.1), (1.0, 0.125)])
 def test_by_hand__a_gap_in_contact_is_as_wide_as_the_flight_of_its_piece_or_the_highest_one(length, wide):
     # It opens with 1 m/s at most, and 4 m/s2 press it together: 1 / (2 * 4) m.
@@ -171,24 +160,6 @@ def test_by_hand__brakes_build_up_from_piece_to_piece():
     assert lost[:, 0].sum() == pytest.approx(0.5 * 7 * 7 / 12.65 - 7 * 0.6)
     assert way == pytest.approx(-0.5 * 7 * 0.6**2 + 0.5 * 7 * 7 / 12.65 * 0.6 - 7**3 / 12.65**2 / 6)
     assert swing == pytest.approx(0.5 * 12.65 * np.diff(cell.times)[at]) and (np.abs(lost[:, -1]) < 1e-12).all()
-
-
-def test_by_hand__brakes_released_at_standstill_hold_until_the_vehicle_drives():
-    # from -1 to 1 m/s2 in 0.1 s: it stands for 0.05 s, and drives to 0.025 m/s
-    motion = new_motion(1, 3)
-    motion.vague[0] = 1.0
-    hold(np.zeros(3), 0, 0.1, motion)
-    assert enclosure.low(motion.onward[0]) <= 0.0 < 0.025 <= enclosure.high(motion.onward[0]) <= 0.1 + 1e-12
-
-
-def test_bound__two_that_touch_from_the_alert_on_have_their_first_impact_later():
-    # gap 0, and pressed together without an impact; then vehicle_2 brakes harder, drives, and strikes
-    roles = {"vehicle_1": "full_brake", "vehicle_2": "learner"}
-    line = {"vehicles": 2, "gaps_m": 0, "speeds_mps": 20, "mass_t": 5, "latency_s": [0, 0.3], "roles": roles}
-    line |= {"braking_capacity_mps2": [6, 7], "driving_capacity_mps2": 7}
-    case = boxed("braking_capacity_mps2.vehicle_1=2%", **line)
-    plan = np.where(np.arange(STEPS) // 6 == 1, 0.9, -1.0)
-    assert 1.0 < harm_inside(*case[:3], plan, 50).max() <= bound_of(case, plan, 5)
 
 
 @pytest.mark.parametrize("name", UNUSUAL)
@@ -258,14 +229,6 @@ def test_by_hand__an_impact_before_the_first_decision_is_not_waited_for(low, met
     case = boxed("latency_s.vehicle_2=0.25", gaps_m=[1, 30], speeds_mps=[10, 19.5, 10], latency_s=[0.9, 0.3, 0.9])
     box = np.where(case.boxes.high[0] > case.boxes.low[0], low, case.boxes.low[0])
     assert wait(*cell_in(case, box, np.full(STEPS, -1.0))) != met
-
-
-def test_bound__is_never_above_what_speeds_allow():
-    # a light one, thrown back by a heavy one: no path is followed, and the bound is still a number
-    changed, text = UNUSUAL["very unequal masses"]
-    case, plan = boxed(text, **changed), np.full(STEPS, -0.9)
-    bound, fastest, e = bound_of(case, plan, 1), case.worlds.speeds_mps.max(), 0.3
-    assert harm_inside(*case[:3], plan, 50).max() <= bound <= fastest**2 * (1.0 + (1.0 + e) ** 2) + 1e-9
 
 
 def test_engine__with_an_uncertain_own_latency_no_world_of_the_box_is_distrusted_or_above_the_bound():

@@ -1,7 +1,5 @@
 """The step shield, of one vehicle and of several: decisions by hand, and in the engine, where bounds hold."""
 
-import copy
-
 import numpy as np
 import pytest
 
@@ -25,7 +23,6 @@ from ethbrake_marl.shield.step_shield import (
     certify,
     certify_rollouts,
     ends_under,
-    joint_constants,
     plan_harm,
 )
 from tests.fixtures.asked import Acts
@@ -120,24 +117,6 @@ def test_by_hand__a_pair_counts_once_for_the_first_impact_and_each_time_for_the_
         assert backup.harm[0] == harm[count]
     assert harm["first"] == pytest.approx(98.0, abs=1e-9)  # 10^2 - 2 * 1 * 1
     assert harm["total"] > harm["first"] + 0.5
-
-
-def test_plan__a_proposal_equal_to_it_costs_nothing_and_changes_nothing():
-    running, backup = start(two(15.0)[1], braking(-0.7))
-    decision = certify(running, np.array([-0.7]), backup, backup.harm)
-    assert reason(decision) == "same as plan" and not decision.intervened[0]
-    assert decision.bound.tolist() == backup.harm.tolist() and decision.margin.tolist() == [0.0]
-
-
-def test_constant__gives_a_certificate_where_the_plan_gives_none():
-    _, worlds = two(12.0)  # 14.4 m to stop
-    plan = braking(-0.96 - 1e-9)  # 15 m to stop: nothing to spare
-    running, backup = start(worlds, plan)
-    assert backup.harm[0] == 0.0
-    decision = certify(running, np.array([-0.9]), backup, backup.harm)
-    assert reason(decision) == "constant" and decision.backup.plan[0, 1:].tolist() == [-1.0] * (STEPS - 1)
-    without = certify(running, np.array([-0.9]), backup._replace(constants=np.zeros(0)), backup.harm)
-    assert without.intervened[0] and without.applied[0] == plan[0, 0]
 
 
 @pytest.mark.parametrize(("value", "instead"), [(np.nan, -0.8), (-7.0, -1.0), (-np.inf, -1.0)])
@@ -241,36 +220,6 @@ def test_surprise__is_flagged_and_falls_back_for_the_rest_of_that_episode_alone(
         seen = shield.running.states[:, :seen_columns].copy()
     shield.begin(SMALL.take([3]), np.array([1]))
     assert not shield.distrusted.any()
-
-
-def test_surprise__after_the_last_step_of_a_world_that_surprises_replaces_nothing():
-    shield = begun(TWO.replace(horizon_s=0.5), SMALL)  # decisions at 0.35 and 0.45 s
-    while not shield.running.finished.all():
-        shield.decide(np.ones(4))
-    replaced, seen = shield.interventions.tolist(), shield.running.states + 0.1
-    decision = shield.decide(np.ones(4), seen=seen, only=np.ones(4, bool))
-    assert shield.distrusted.all() and [REASONS[each] for each in decision.reason] == ["ended"] * 4
-    assert shield.interventions.tolist() == replaced and shield.running.steps.tolist() == [2] * 4
-
-
-def test_step_shield__a_copy_goes_on_apart_its_log_included():
-    shield = StepShield(PAPER, 1, logging=True)
-    shield.begin(PAPER.sample(2, 0).worlds, np.arange(2))
-    other = copy.copy(shield)
-    other.decide(np.ones(2))
-    shield.decide(np.full(2, 0.5))
-    assert (shield.running.steps.tolist(), other.running.steps.tolist()) == ([1, 1], [1, 1])
-    assert [entry.proposed for entry in shield.log + other.log] == [0.5, 0.5, 1.0, 1.0]
-
-
-def test_horizon__settles_says_what_the_plan_comes_to_in_the_engine():
-    worlds = PAPER.sample(60, 5).worlds
-    scenario = PAPER.replace(horizon_s=4.2)
-    shield = StepShield(scenario, 1)
-    shield.begin(worlds, np.arange(60))
-    episodes = drive(worlds, ShieldedDriver(eb.make_agent("e_v2x_bm"), scenario), scenario, 1)
-    rests = (episodes.final.speeds_mps == 0.0).all(axis=1)
-    assert rests.tolist() == shield.settles.tolist() and 0 < rests.sum() < 60
 
 
 @Acts
@@ -455,18 +404,6 @@ def told(decision):
     return [REASONS[each] for each in decision.reason[0]]
 
 
-def test_by_hand__of_two_proposals_the_harmless_one_is_accepted_the_other_replaced():
-    # Braking fully they stop after 2.5 m and 10 m; Vehicle 3 then stands 2.5 m behind Vehicle 2.
-    running, backup = start_pair(three(gaps_m=[2.6, 10]), braking(-1.0, 2))
-    assert backup.harm.tolist() == [0.0]
-    # Vehicle 2 has 0.1 m to spare, Vehicle 3 2.5 m: 0.1 s of coasting costs 0.5 m and 1 m.
-    decision = certify(running, np.zeros((1, 2)), backup, backup.harm)
-    assert decision.applied.tolist() == [[-1.0, 0.0]] and decision.intervened.tolist() == [[True, False]]
-    assert told(decision) == ["no certificate", "plan remains"] and decision.bound.tolist() == [0.0]
-    assert decision.margin[0, 0] < 0.0 == decision.margin[0, 1]
-    assert decision.backup.plan[0, :2].tolist() == [[-1.0, 0.0], [-1.0, -1.0]]
-
-
 def test_by_hand__proposals_that_are_harmless_alone_and_collide_together_go_to_the_front_one():
     # Vehicle 2 may brake sooner than planned, or Vehicle 3 later, but not both: 12 m/s need 14.4 m to stop.
     plan = braking(-1.0, 2)
@@ -479,23 +416,6 @@ def test_by_hand__proposals_that_are_harmless_alone_and_collide_together_go_to_t
     assert plan_harm(certify(running, several, backup, np.full(1, 1e9)).after, plan)[0] > 0.0
     decision = certify(running, several, backup, backup.harm)
     assert told(decision) == ["plan remains", "no certificate"] and decision.applied[0].tolist() == [-1.0, -1.0]
-
-
-def test_by_hand__what_one_of_two_makes_better_is_in_the_bound_at_once():
-    plan = braking(-1.0, 2)
-    plan[0, 0, 1] = -0.5  # Vehicle 3 runs into Vehicle 2, and brakes too little at first
-    running, backup = start_pair(three(gaps_m=[2.6, 10], speeds_mps=[0, 5, 11]), plan)
-    decision = certify(running, np.array([[1.0, -1.0]]), backup, backup.harm)
-    assert decision.intervened.tolist() == [[True, False]]  # Vehicle 2 has 0.1 m to spare
-    assert decision.bound.tolist() == plan_harm(decision.after, decision.backup.plan).tolist()
-    assert decision.bound[0] < backup.harm[0] - 1.0
-
-
-def test_by_hand__who_says_no_number_keeps_the_plan_and_the_other_is_clipped():
-    running, backup = start_pair(three(), braking(-0.9, 2))
-    decision = certify(running, np.array([[np.nan, -7.0]]), backup, backup.harm)
-    assert told(decision) == ["not a number", "plan remains"]
-    assert decision.applied.tolist() == [[-0.9, -1.0]] and decision.intervened.tolist() == [[True, False]]
 
 
 def test_caps__reject_what_only_moves_harm_to_another_vehicle_also_in_a_later_rollout():
@@ -527,15 +447,6 @@ def test_one_vehicle_in_a_list__is_the_single_shield_bit_for_bit():
             assert getattr(one, name).tolist() == getattr(other, name).reshape(20).tolist()
 
 
-def test_bound_at_the_alert__is_at_most_full_braking_and_any_single_constant():
-    worlds = PAIR.sample(40, 8).worlds
-    joint = begun(PAIR, worlds)
-    braked = plan_harm(joint.running, np.full((40, STEPS, 2), -1.0))
-    assert (joint.first_bound <= braked).all() and joint.first_bound.mean() < 0.8 * braked.mean()
-    for vehicle in (1, 2):
-        assert (joint.first_bound <= begun(PAIR.with_learners([vehicle]), worlds).first_bound + 1e-6).all()
-
-
 def test_team__whose_rollout_keeps_the_bound_is_left_alone():
     worlds = PAIR.sample(30, 2).worlds
     without = begun(PAIR, worlds)
@@ -546,23 +457,6 @@ def test_team__whose_rollout_keeps_the_bound_is_left_alone():
         command = [team[i].act(worlds, i) / worlds.vehicles.braking_capacity_mps2[:, i] for i in (1, 2)]
         assert not shield.decide(np.stack(command, axis=1)).intervened[drives].any() and drives.any()
         assert (shield.first_bound <= without.first_bound).all()
-
-
-def test_constants__hold_all_alike_and_ladders_each_once():
-    constants = joint_constants(3)
-    assert len({tuple(row) for row in constants.tolist()}) == len(constants) == 31
-    assert constants.min() == -1.0 and constants.max() == 0.0
-
-
-def test_surprise__of_one_world_hands_the_whole_team_to_the_fallback():
-    scenario = eb.load_scenario(TEAMS[4, 3])
-    shield = begun(scenario, scenario.sample(3, 1).worlds)
-    seen = shield.running.states.copy()
-    seen[1, 1] -= 0.5  # a vehicle is slower than it can be
-    decision = shield.decide(np.ones((3, 3)), seen=seen)
-    assert shield.distrusted.tolist() == [False, True, False]
-    assert [REASONS[each] for each in decision.reason[1]] == ["assumption broken"] * 3
-    assert decision.intervened[1].all() and (decision.applied[1] <= 0.0).all()
 
 
 # Behind the interfaces.

@@ -26,7 +26,6 @@ from ethbrake_marl.studies.ablation import (
     Harms,
     Level,
     LevelOptimum,
-    LineQuestion,
     Measured,
     Plan,
     ablation_page,
@@ -343,15 +342,6 @@ def test_best_known__more_learners_are_never_worse_world_by_world(answers):
         assert with_obstacle[harm_count].mean() < best.harm.mean() - 0.1
 
 
-def test_best_known__an_obstacle_that_is_reached_counts():
-    """All brake fully: without an obstacle it is harmless; one 20 m ahead stands where Vehicle 1 runs into it."""
-    pair = load_scenario("cooperation-3-pair").replace(gaps_m=60)
-    near = pair.replace(name="near", roles=dict.fromkeys(pair.vehicle_names, "learner"), obstacle_gap_m=20)
-    answers = [answer(Level(pair), 1), answer(Level(near), 1)]
-    assert best_known(answers[0], answers)["total"].max() == 0.0
-    assert best_known(answers[1], answers)["total"].min() > 0.0
-
-
 def test_best_known__other_latencies_scripts_learners_or_times_count_for_nothing(answers):
     """Vehicle 3 of ``early`` may act 0.05 s before Vehicle 2: its decisions fall between those of Vehicle 2 alone."""
     pair, early = answers["cooperation-3-pair"], load_scenario("cooperation-3-pair").replace(latency_s=[0, 0.5, 0.45])
@@ -411,12 +401,3 @@ def test_measure__all_brake_fully_whatever_their_roles():
 
 
 PAIR = load_scenario("cooperation-3-pair")
-
-
-def test_drive_longer__full_braking_gains_nothing_on_itself():
-    question, braking = LineQuestion(PAIR, (3, 4), 20, 7, "total", 3, 50), eb.make_agent("full_brake")
-    found = question.drive([braking])
-    told = [(one["vehicles"], one["decrease"], one["worse_off"], one["share"]) for one in found]
-    assert told == [(3, 0.0, 0.0, 0.0), (4, 0.0, 0.0, 0.0)]
-    three = eb.evaluate(PAIR.sample(20, 7), {"b": braking}, scenario=PAIR).outcome("b").total_harm
-    assert found[0]["reached"] == pytest.approx(three.mean(), rel=1e-12)

@@ -3,7 +3,6 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from ethbrake_marl.cli.app import run_command
@@ -12,16 +11,8 @@ from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.limits.limits import BestHarmTable, task_problem
 from ethbrake_marl.scenario import Task
-from ethbrake_marl.studies.benchmark import load_suite, read_entry, suite_names, worst_mean
+from ethbrake_marl.studies.benchmark import load_suite, read_entry, suite_names
 from tests.studies.conftest import check_snapshot
-
-
-def test_worst_mean__is_that_of_the_worst_tenth_and_covers_the_true_one_in_95_of_100_lists():
-    regret = np.arange(100.0)
-    assert worst_mean(np.random.default_rng(0).permutation(regret)).value == pytest.approx(regret[90:].mean())
-    truth = 1.0 + np.log(10.0)  # of the worst tenth of an exponential distribution
-    intervals = [worst_mean(np.random.default_rng(k).exponential(size=400)).interval for k in range(300)]
-    assert 0.89 <= np.mean([low <= truth <= high for low, high in intervals]) <= 0.99
 
 
 def test_entry__tells_what_an_evaluation_gives(suites, entries):

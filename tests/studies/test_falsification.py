@@ -65,14 +65,6 @@ def test_search__climbs_a_peak_that_random_points_stay_away_from() -> None:
     assert adaptive > 0.6 * at_random
 
 
-def test_search__stays_in_the_cube_and_repeats_by_seed() -> None:
-    one, same, other = (search(_peak, 2, 700, seed) for seed in (1, 1, 2))
-    assert len(one.points) == len(one.scores) == 700
-    assert ((one.points >= 0.0) & (one.points < 1.0)).all()
-    assert np.array_equal(one.points, same.points)
-    assert not np.array_equal(one.points, other.points)
-
-
 def test_search__finds_several_peaks() -> None:
     centres = np.array([[0.2, 0.2, 0.8], [0.8, 0.3, 0.1], [0.5, 0.9, 0.5]])
 
@@ -82,12 +74,6 @@ def test_search__finds_several_peaks() -> None:
     found = search(peaks, 3, 3_000, 0)
     best = found.points[far_apart(found, 3)]
     assert (np.linalg.norm(best[:, np.newaxis] - centres, axis=2).min(axis=0) < 0.1).all()
-
-
-def test_search__spreads_evenly_while_all_points_are_alike() -> None:
-    found = search(lambda points: np.zeros(len(points)), 3, 1_024, 0)
-    cells = np.unique((found.points * 8).astype(int), axis=0)
-    assert len(cells) == 512  # every eighth of every coordinate, twice
 
 
 class Holed:

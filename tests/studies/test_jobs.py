@@ -248,27 +248,6 @@ def test_shards__killed_go_on_with_what_is_left_and_damaged_ones_are_driven_agai
 
 
 @pytest.mark.slow
-def test_shards__in_processes_give_the_same_tally_and_one_whose_process_was_killed_is_driven_again(
-    asked, tally, tmp_path: Path
-) -> None:
-    folder, told = tmp_path / "kept", []
-
-    class Killing(LocalWorkers):
-        def wait(self):
-            for worker in self._workers if not told else ():
-                worker.process.kill()
-                worker.process.join()
-            told.append(super().wait())
-            return told[-1]
-
-    with closing(Killing(2)) as workers:
-        assert evaluate_shards(asked, shards=4, workers=workers, folder=folder) == tally
-    lost = [answer for answers in told for _, answer in answers if answer.value is None]
-    assert 1 <= len(lost) <= 2 and all("was killed by signal 9" in str(answer.error) for answer in lost)
-    assert kept_by(folder) == 4
-
-
-@pytest.mark.slow
 def test_shards__their_processes_are_ended_where_one_fails_or_on_ctrl_c(asked, tmp_path: Path) -> None:
     changed = replace(asked, identity={**asked.identity, "seed": 12})
     with pytest.raises(InvalidInput, match="seed changed since the evaluation began"):

@@ -373,15 +373,6 @@ def course(returns: list[list[float]], harm: list[list[float]]) -> Course:
     return Course(SeedCurve(steps, np.array(returns)), SeedCurve(steps, np.array(harm)))
 
 
-def test_returns__of_a_shaped_reward_say_nothing_between_delays_so_its_harm_is_compared() -> None:
-    worse = course([[-9.0] * 20, [-8.99] * 20], [[90.0] * 20, [80.0] * 20])
-    better = course([[-10.0] * 20, [-9.99] * 20], [[10.0] * 20, [8.0] * 20])  # of lower returns
-    for recipe, outcome, told in (("ppo", "agrees", "minus its harm"), ("ppo-paper", "differs", "ppo-paper")):
-        assert bool(eb.load_recipe(recipe).reward.shaping) == (recipe == "ppo")
-        verdict = reproduction._higher_when_low({"high": {recipe: worse}, "low": {recipe: better}})
-        assert (verdict.outcome, told in verdict.because) == (outcome, True)
-
-
 @pytest.mark.slow
 def test_trajectories__are_watched_side_by_side_and_their_passports_play_them_again(tmp_path: Path) -> None:
     Reproduction("quick", tmp_path / "out", 10).make(Reproduction.choose(["trajectories"]))

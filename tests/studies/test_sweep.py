@@ -18,7 +18,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import read_yaml
-from ethbrake_marl.learning.training import Training, TrainingRecipe, load_recipe
+from ethbrake_marl.learning.training import TrainingRecipe, load_recipe
 from ethbrake_marl.studies.sweep import SweepFile, SweepPlan, TuningFile, TuningPlan
 from tests.cli.conftest import rows_of as read
 from tests.learning.tiny import marked
@@ -62,16 +62,6 @@ def test_grid__is_every_combination_seed_by_seed(write_sweep):
     assert (asked.settings, asked.scenario) == (("total_steps=100", "mass_t=6"), "cooperation-2-paper")
     assert [*plan.rows[1].settings] == ["total_steps", "mass_t"]
     assert {row.first.recipe.total_steps for row in plan.rows} == {100}
-
-
-def test_rows__have_the_hash_that_their_trainings_have(write_sweep):
-    listed = [{"scenario": "paper-distance", "recipe": "sac", "seed": 9, "set": {"network.policy": [8, 8]}}]
-    plan = SweepPlan.read(write_sweep(grid={**GRID, "seed": [0, 2**32 - 1]}, jobs=listed))
-    for row in plan.rows:
-        training = plan.training(row)
-        assert training.identity == row.identity and training.recipe.seed == row.asked.seed
-        assert Training.of(training.recipe, training.scenario).identity == row.identity
-    assert plan.training(plan.rows[2]).recipe.network.policy == (8, 8)
 
 
 def test_example__of_the_page_is_in_order():
@@ -268,9 +258,6 @@ def test_schema__marks_what_the_reader_refuses_and_that_alone(
 
 
 # ---------------------------------------------------------------- tuning
-
-
-DOCS = ROOT / "docs"
 
 
 def test_every_trial__is_measured_as_often_whatever_an_update_holds(write_tuning):
