@@ -277,10 +277,13 @@ class Progress:
     note: str = ""  # to be told once
     updates: int = 0  # of a training
     wall_s: float = 0.0  # of a training
+    objective: str = field(default="", repr=False)  # what ``metrics["objective"]`` is, in words
 
     @property
     def harm(self) -> str:
         """The harm that a training is for, in words: that of ``metrics`` which stands first; empty without one."""
+        if self.objective and "objective" in self.metrics:
+            return f"{self.objective} {self.metrics['objective']:.2f}"
         words = {"first_impact_harm": "first-impact harm", "total_harm": "total harm"}
         told = [f"{words[key]} {value:.2f}" for key, value in self.metrics.items() if key in words]
         return ", ".join(told[:1])

@@ -1159,12 +1159,17 @@ class SeedCurve:
 
 
 def seed_curves(
-    panels: Mapping[str, Mapping[str, SeedCurve]], *, logarithmic: Collection[str] = (), caption: str = ""
+    panels: Mapping[str, Mapping[str, SeedCurve]],
+    *,
+    logarithmic: Collection[str] = (),
+    caption: str = "",
+    x_label: str = "Training steps",
+    known: Mapping[str, float] | None = None,
 ) -> Figure:
     """One panel per label, one line per recipe: the mean over seeds, bands one standard deviation to either side.
 
     Panels in ``logarithmic`` have a logarithmic axis if their means allow it: harm falls to a tenth, and the last
-    tenth is what matters. Raises ``InvalidInput`` without panels or lines.
+    tenth is what matters. A dashed line is the best that is ``known``. Raises ``InvalidInput`` without panels or lines.
     """
     if not panels or not all(panels.values()):
         raise InvalidInput("seed_curves: nothing to draw; at least one training with one evaluation is needed")
@@ -1181,7 +1186,9 @@ def seed_curves(
             axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
             axes.yaxis.set_minor_formatter(NullFormatter())
-        name_axes(axes, label, "Training steps")
+        if known is not None:
+            axes.axhline(known[label], label="best known", color=GREY, linestyle="--", linewidth=1.0)
+        name_axes(axes, label, x_label)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     return finish(figure, caption, every[0])
 

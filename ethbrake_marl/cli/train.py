@@ -6,7 +6,7 @@ import os
 import re
 from contextlib import closing
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.text import Text
@@ -207,6 +207,9 @@ def curves_command(
     settings: list[str] | None = None,
     steps: int | None = None,
     jobs: int = 1,
+    against: Annotated[
+        Literal["steps", "cpu"], typer.Option(help="Draw over training steps, or over processor seconds of learning.")
+    ] = "steps",
 ) -> None:
     """Train several seeds of recipes, and draw the curves.
 
@@ -221,7 +224,7 @@ def curves_command(
     changed = [(given.change(recipe, out.note), seeds) for recipe, seeds in plan]
     names = [chosen.vehicle_names[i] for i in chosen.learners]
     check_one_learner(chosen.name, names, "learning curves need exactly one")
-    curves = LearningCurves(chosen, changed, output)
+    curves = LearningCurves(chosen, changed, output, against)
     if not curves.train(steps=steps, jobs=jobs, tell=out.show_progress, settings=given.texts):
         out.interrupted(f"interrupted; the same command goes on with what is in {output}")
     out.result(curves.write())

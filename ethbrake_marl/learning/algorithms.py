@@ -48,7 +48,7 @@ from ethbrake_marl.learning.training import (
     Training,
 )
 from ethbrake_marl.observations import Observations
-from ethbrake_marl.physics import Bools, Floats, Ints, Packed, Worlds, columns, compiled
+from ethbrake_marl.physics import Bools, Floats, Ints, Packed, Worlds, columns, compiled, exp, log
 from ethbrake_marl.policies import Activation, Float32s, NetworkSpec, Policy, load_named_policy
 from ethbrake_marl.search import profile_problem
 
@@ -641,6 +641,8 @@ class CounterfactualModel(BaseAlgorithm):
         self.set_random_seed(self.seed)
         kind: Any = AveragedActor if self.recipe.modes is None else ModesPolicy
         self.policy = kind(self.observation_space, self.action_space, self.lr_schedule, self.recipe)
+        if self.recipe.gradient_limit == "auto":  # a checkpoint keeps it with the policy's weights
+            self.policy.register_buffer("measured", torch.zeros(REMEMBERED, 2, dtype=torch.float64))
 
     def learn(
         self,
@@ -690,15 +692,25 @@ class CounterfactualModel(BaseAlgorithm):
         observed = seen.reshape(-1, seen.shape[2])
         rows, importance = choose_rows(observed, moving, recipe.counterfactuals, recipe.focus, actor.expect)
         least, most = recipe.offset.smallest, recipe.offset.largest
+        memory: Tensor | None = getattr(self.policy, "measured", None)  # where the limit is auto
+        if memory is not None:
+            least = smallest_offset(memory.numpy(), least, most)
         sizes: Floats = least * (most / least) ** torch.rand(len(rows), dtype=torch.float64).numpy()
         holds = np.array(recipe.holds, np.int64)[torch.randint(len(recipe.holds), (len(rows),)).numpy()]
         worlds: Ints = np.tile(rows // learners, 2)
         engine = self.engine.branch(moments.take(worlds))
         offsets = Offsets(np.tile(rows % learners, 2), np.concatenate([sizes, -sizes]), np.tile(holds, 2))
         gained, moved = (np.split(each, 2) for each in play_to_the_end(engine, actor.act, offsets, recipe.gamma))
-        limit = recipe.gradient_limit
         measured = (gained[0] - gained[1]) / (moved[0] - moved[1])
         good = np.isfinite(measured)
+        limit = recipe.gradient_limit
+        if memory is not None:
+            new = torch.from_numpy(np.stack([np.abs(measured[good]), sizes[good]], axis=1))
+            memory.copy_(torch.cat([memory, new])[-len(memory) :])
+            limit = limit_that_cuts(memory[:, 0].numpy(), CUT)
+            self.logger.record("train/gradient_limit", limit)
+            self.logger.record("train/smallest_offset", least)
+        assert limit != "auto"
         gradient = np.clip(measured, -limit, limit)
         whole = float(np.abs(measured[good]).sum())
         self.logger.record("train/gradient_cut", 1.0 - float(np.abs(gradient[good]).sum()) / whole if whole else 0.0)
@@ -727,6 +739,37 @@ class CounterfactualModel(BaseAlgorithm):
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
         self.logger.record("train/gradient", float(np.abs(tried.gradient).mean()) if len(wanted) else 0.0)
         self.logger.record("train/counterfactuals", len(wanted))
+
+
+# ``gradient_limit: auto``: limit and smallest offset follow the gradients that were measured last.
+
+REMEMBERED = 65_536  # measured gradients
+CUT = 0.1  # share of the sum of their sizes that the limit cuts
+SPREAD = 2.0  # at the smallest offset the spread of gradients is at most so many times that at the largest
+NARROWEST = 4.0  # but offsets are drawn from a range at least so wide
+
+
+def limit_that_cuts(sizes: Floats, share: float) -> float:
+    """The limit at which cutting takes this share of the sum of these sizes [n]."""
+    rising = np.sort(sizes)
+    kept = np.cumsum(rising) + np.arange(len(rising) - 1, -1, -1) * rising  # of the sum, by each of them as the limit
+    return float(np.interp((1.0 - share) * kept[-1], kept, rising))
+
+
+def smallest_offset(measured: Floats, least: float, most: float) -> float:
+    """The smallest offset to draw: ``least``, or more where the spread of gradients falls steeply with the offset.
+
+    A jump of the harm makes the spread fall as the root of the offset, a smooth harm leaves it as it is. The slope is
+    that between the smaller and the larger half of the offsets of ``measured`` [n, 2], sizes and offsets (0: none yet).
+    """
+    known = measured[measured[:, 1] > 0.0]
+    halves = np.array_split(known[np.argsort(known[:, 1], kind="stable")], 2)
+    if not all(half[:, 0].any() for half in halves):
+        return least
+    near, far = (log(float(np.mean(half[:, 0] * half[:, 0]))) / 2.0 for half in halves)
+    apart = log(float(np.median(halves[1][:, 1]) / np.median(halves[0][:, 1])))
+    lower = exp(-log(SPREAD) * apart / (near - far)) if near > far else 0.0
+    return max(least, most * min(lower, 1.0 / NARROWEST))
 
 
 def moving_rows(moments: Moment) -> Bools:

@@ -344,6 +344,7 @@ class Session(BaseCallback):
         self.updates = 0
         self.course = Course(self.recipe.reward.harm_count)
         self.notes: list[str] = []  # to be told when the training begins
+        self._objective = objective_in_words(training)
         self._ended: dict[str, list[float]] = {column: [] for column in EPISODE_COLUMNS}
         self._resumed = False  # what is due at this rest was done before the checkpoint was written
 
@@ -449,6 +450,10 @@ class Session(BaseCallback):
                 self.model.dump_logs()
             elif updates or self.course.evaluations:
                 self.logger.dump(step=self.model.num_timesteps)
+            alarm = cut_gradients(self._table.latest("train/gradient_cut", WINDOW))
+            if alarm is not None and not any(told.startswith(CUTS) for told in self.course.alarms):
+                self.course.alarms.append(alarm)
+                self.tell(f"alarm: {alarm}")
             self.tell()
         if not last and updates and updates % recipe.checkpoint_every_updates == 0:
             self._rest()
@@ -465,7 +470,9 @@ class Session(BaseCallback):
 
     def _measure(self) -> None:
         assert self.course.policy is not None and self._evaluate is not None
+        begun = time.process_time()
         metrics = {name: float(value) for name, value in self._evaluate(self.course.policy).items()}
+        self.course.cpu_started += time.process_time() - begun
         alarm = self.course.add_evaluation(self.course.policy, metrics, self._recent_return())
         for name, value in metrics.items():
             self.logger.record(f"eval/{name}", value)
@@ -493,7 +500,7 @@ class Session(BaseCallback):
         rollout = self.model.n_envs * self.recipe.rounds
         planned = -(-self.recipe.total_steps // rollout) * rollout  # whole rollouts
         self._wishes.on_progress(
-            Progress("training", course.steps, planned, metrics, note, course.updates, course.wall_s)
+            Progress("training", course.steps, planned, metrics, note, course.updates, course.wall_s, self._objective)
         )
 
     def _save(self) -> None:
@@ -525,6 +532,7 @@ class Session(BaseCallback):
             "start": self.training.begins,
             "reason": reason,
             "wall_s": round(course.wall_s, 3),
+            "cpu_s": {str(steps): round(spent, 3) for steps, spent in course.cpu_s.items()},
             "steps": course.steps,
             "updates": course.updates,
             "policy_steps": None if course.kept is None else course.kept.steps,
@@ -642,6 +650,8 @@ class Course:
     lost: str | None = None  # the alarm of the last evaluation, if by that one the training is lost
     wall_before_s: float = 0.0  # of the parts of this training that other processes did
     started: float = field(default_factory=time.monotonic)
+    cpu_s: dict[int, float] = field(default_factory=dict)  # steps of an evaluation -> processor seconds of learning
+    cpu_started: float = field(default_factory=time.process_time)
 
     @property
     def wall_s(self) -> float:
@@ -657,6 +667,7 @@ class Course:
         """Take in an evaluation of ``policy``; gives the alarm, if this one raises it."""
         extra = {} if episode_return is None else {RETURN: episode_return}
         self.evaluations.append({"steps": self.steps, "updates": self.updates, **metrics, **extra})
+        self.cpu_s[self.steps] = time.process_time() - self.cpu_started
         name = RunDirectory.chosen_by(self.evaluations, self.harm_count)
         if name in metrics and metrics[name] < self.best_harm:
             self.best, self.best_harm = policy, metrics[name]
@@ -673,6 +684,8 @@ class Course:
             "alarms": self.alarms,
             "best_harm": None if math.isinf(self.best_harm) else self.best_harm,
             "wall_s": self.wall_s,
+            "cpu_s": [[steps, spent] for steps, spent in self.cpu_s.items()],
+            "cpu_spent_s": time.process_time() - self.cpu_started,
         }
 
     def restore(self, content: Mapping[str, Any]) -> None:
@@ -681,6 +694,36 @@ class Course:
         self.alarms = list(content["alarms"])
         self.best_harm = math.inf if content["best_harm"] is None else float(content["best_harm"])
         self.wall_before_s = float(content["wall_s"])
+        self.cpu_s = {int(steps): float(spent) for steps, spent in content.get("cpu_s", [])}
+        self.cpu_started = time.process_time() - float(content.get("cpu_spent_s", 0.0))
+
+
+WINDOW = 25  # updates over which the share that ``gradient_limit`` cuts is a mean
+CUT_LIMIT = 0.2
+CUTS = "gradient_limit cuts"  # an alarm of this once in a training
+
+
+def cut_gradients(shares: Sequence[float]) -> str | None:
+    """The alarm if ``gradient_limit`` cut much of what was measured in each of so many updates, in the mean."""
+    share = sum(shares) / WINDOW
+    if len(shares) < WINDOW or share <= CUT_LIMIT:
+        return None
+    return (
+        f"{CUTS} {share:.0%} of the sum of all gradients: the harm jumps here, and what is left of them may lead"
+        " elsewhere; try recipe options, or gradient_limit: auto"
+    )
+
+
+def objective_in_words(training: Training) -> str:
+    """What the mean over the learners of their objectives' harm is, where one is another than total; else empty."""
+    scenario, learners = training.scenario, training.scenario.learners
+    reward, objectives = training.recipe.reward.settled(scenario.objective, scenario.vehicles)
+    declared = reward.objective
+    if declared is None:
+        return ""
+    names = [declared] if isinstance(declared, str) else dict.fromkeys(declared[i] for i in learners)
+    what = "injuries in 1,000 lines" if {objectives[i].kind for i in learners} == {"injury"} else "harm"
+    return f"{'first-impact' if reward.harm_count == 'first' else 'total'} {what} ({', '.join(names)})"
 
 
 def misleading_return(evaluations: Sequence[Mapping[str, float]], harm: str) -> str | None:
@@ -780,6 +823,10 @@ class ProgressTable(KVWriter):
         self._columns = ["steps", *sorted({name for row in self._rows for name in row} - {"steps"})]
         heading = _lines([dict(zip(self._columns, self._columns, strict=True))], self._columns)
         write_file(self._path, (heading + _lines(self._rows, self._columns)).encode())
+
+    def latest(self, name: str, rows: int) -> list[float]:
+        """A column in the last rows, where there is a value."""
+        return [float(row[name]) for row in self._rows[-rows:] if name in row]
 
     def content(self) -> bytes:
         """The file as it is; empty before the first row."""
@@ -945,6 +992,8 @@ class _Course(FileModel):
     alarms: list[str]
     best_harm: Number | None
     wall_s: Annotated[float, Field(strict=False, ge=0.0, allow_inf_nan=False)]
+    cpu_s: list[Annotated[list[Number], Field(min_length=2, max_length=2)]] = Field(default=[])
+    cpu_spent_s: Number = 0.0  # earlier checkpoints say nothing of it
 
 
 def _every_column(ended: dict[str, list[Number]]) -> dict[str, list[Number]]:

@@ -515,7 +515,7 @@ class CounterfactualRecipe(TrainingRecipe):
     counterfactuals: Annotated[int, Field(ge=1)]
     offset: OffsetRange
     holds: Annotated[tuple[Steps, ...], Field(strict=False, min_length=1, max_length=16)]
-    gradient_limit: Positive
+    gradient_limit: Positive | Literal["auto"]
     trust_radius: Rate
     anchor: Positive
     n_epochs: Annotated[int, Field(ge=1, le=1000)]
@@ -526,6 +526,13 @@ class CounterfactualRecipe(TrainingRecipe):
     )
     network: ActorShape
     modes: Annotated[ModesPlan | None, Field(exclude_if=not_)] = None  # several networks and a gate
+
+    @field_validator("gradient_limit", mode="wrap")
+    @classmethod
+    def _automatic_or_fixed(cls, value: Any, check: Callable[[Any], Any]) -> Any:
+        with suppress(ValueError):
+            return check(value)
+        raise ValueError("must be auto or a finite number above 0")
 
     @model_validator(mode="after")
     def _keys_fit(self) -> CounterfactualRecipe:
@@ -703,7 +710,7 @@ MEANINGS = {
     "counterfactuals": "how many of the decisions of a round are tried in two ways",
     "offset": "how far an action is moved to see what comes of it; the logarithm of what is drawn is uniform",
     "holds": "for how many steps an action is tried, one of these",
-    "gradient_limit": "a larger gradient, at a jump, counts as this one; return per unit of action",
+    "gradient_limit": "a larger gradient, at a jump, counts as this one; return per unit of action; auto: follows what is measured",
     "trust_radius": "farthest that one update asks an action to move",
     "anchor": "how much an action that makes no difference holds to where it is",
     "averaging": "share of itself that the average of the weights, which drives, keeps in each gradient step",
@@ -974,6 +981,13 @@ class RunDirectory:
     def rows(self) -> list[dict[str, str]]:
         """Its table, one row per update."""
         return list(csv.DictReader(self.progress.read_text("utf-8").splitlines()))
+
+    def cpu_s(self) -> dict[int, float]:
+        """Processor seconds of learning until each evaluation, by step; raises ``InvalidInput`` where none are kept."""
+        kept = read_object(self.status).get("cpu_s") or {}
+        if not kept:
+            raise InvalidInput(f"{self.path}: tells no processor time; train again with this version")
+        return {int(steps): float(spent) for steps, spent in kept.items()}
 
     def column(self, name: str) -> dict[int, float]:
         """A column of its table: step -> value, where there is one."""

@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
 
 from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import InvalidInput, OnProgress, count_of
@@ -26,6 +29,12 @@ _LABELS = {
     "return": "Mean return of training episodes",
 }
 
+Against = Literal["steps", "cpu"]  # training steps, or processor seconds of learning
+AXES: dict[Against, tuple[str, str, type]] = {  # column, axis, kind of number
+    "steps": ("steps", "Training steps", int),
+    "cpu": ("cpu_s", "Processor time of learning (s)", float),
+}
+
 
 class LearningCurves(NamedTuple):
     """Trainings of several recipes on one scenario: ``folder/RECIPE-seedK`` for the seeds 0, 1, ... of each."""
@@ -33,6 +42,7 @@ class LearningCurves(NamedTuple):
     scenario: Scenario
     plan: Sequence[tuple[TrainingRecipe, int]]  # recipes, each with its number of seeds
     folder: Path
+    against: Against = "steps"  # what stands below the curves
 
     @staticmethod
     def parse(text: str) -> list[tuple[TrainingRecipe, int]]:
@@ -77,7 +87,7 @@ class LearningCurves(NamedTuple):
         policy that each training kept, and of the last one; hashes of the recipe's fixed list, and of the policy that
         each of its seeds kept. Raises ``InvalidInput`` when they have no evaluation in common.
         """
-        scenario, curves, lists = self.scenario, self._curves(), set()
+        scenario, curves, lists = self.scenario, self.curves(), set()
         summary: dict[str, Any] = {
             **result_identity("learning-curves", scenario, None),
             "scenario": scenario.name,
@@ -102,10 +112,12 @@ class LearningCurves(NamedTuple):
         fixed_lists = "; ".join(f"{count_of(worlds, 'world')} of seed {seed}" for worlds, seed in sorted(lists))
         caption = f"{scenario.name}: mean over seeds, bands: one standard deviation. Fixed list: {fixed_lists}."
         panels = {_LABELS[metric]: lines for metric, lines in curves.items()}
-        figure = seed_curves(panels, logarithmic=[_LABELS[m] for m in curves if m != _RETURNED], caption=caption)
+        column, axis, number = AXES[self.against]
+        harms = [_LABELS[metric] for metric in curves if metric != _RETURNED]
+        figure = seed_curves(panels, logarithmic=harms, caption=caption, x_label=axis)
         write_picture(self.folder / "learning_curves.png", figure, force=True)
         rows = [
-            {"figure": metric, "recipe": recipe, "seed": seed, "steps": int(step), "value": float(value)}
+            {"figure": metric, "recipe": recipe, "seed": seed, column: number(step), "value": float(value)}
             for metric, lines in curves.items()
             for recipe, curve in lines.items()
             for seed, values in enumerate(curve.values)
@@ -119,15 +131,21 @@ class LearningCurves(NamedTuple):
     def _run(self, recipe: TrainingRecipe, seed: int) -> Path:
         return self.folder / f"{recipe.name}-seed{seed}"
 
-    def _curves(self) -> dict[str, dict[str, SeedCurve]]:
-        """What the trainings reached, by metric and recipe; without what no episode told."""
+    def curves(self) -> dict[str, dict[str, SeedCurve]]:
+        """What the trainings reached, by metric and recipe; without what no episode told.
+
+        Against processor time a step stands at the mean over the seeds, between evaluations in proportion.
+        """
         counts = {recipe.reward.harm_count for recipe, _ in self.plan}
         metrics = [RunDirectory.HARM[count] for count in HARM_COUNTS if count in counts]
         curves: dict[str, dict[str, SeedCurve]] = {metric: {} for metric in (*metrics, _RETURNED)}
         for recipe, seeds in self.plan:
             runs = [RunDirectory(self._run(recipe, seed)) for seed in range(seeds)]
+            spent = [run.cpu_s() for run in runs] if self.against == "cpu" else []
             for metric in curves:
                 values = [run.column(RunDirectory.RETURN if metric == _RETURNED else f"eval/{metric}") for run in runs]
                 if metric != _RETURNED or all(values):  # no episode may have ended in a very short training
-                    curves[metric][recipe.name] = SeedCurve.of(values)
+                    curve = SeedCurve.of(values)
+                    each = [np.interp(curve.steps, [*seconds], [*seconds.values()]) for seconds in spent]
+                    curves[metric][recipe.name] = replace(curve, steps=np.mean(each, axis=0)) if each else curve
         return {metric: lines for metric, lines in curves.items() if lines}

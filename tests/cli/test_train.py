@@ -268,6 +268,9 @@ def test_curves__one_command_trains_draws_and_goes_on(ethbrake, tiny_recipe, tin
     assert told["worlds_sha256"] == worlds_sha256(fixed.worlds, fixed.index)
     policies = [eb.load_policy(folder / f"tiny-seed{seed}").manifest.manifest_sha256 for seed in (0, 1)]
     assert told["policy_sha256"] == policies
+    assert ethbrake(*arguments, "--against", "cpu").status == 0
+    spent = [float(row["cpu_s"]) for row in rows_of(folder / "learning_curves.csv")[:3]]
+    assert 0.0 <= spent[0] < spent[1] < spent[2]
 
 
 def test_curves__another_training_or_an_edited_scenario_is_told_before_any_is_begun(

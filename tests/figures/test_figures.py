@@ -208,8 +208,8 @@ def test_seed_curves__draw_means_and_bands_of_one_standard_deviation() -> None:
     band = left.collections[0].get_paths()[0].vertices[:, 1]
     assert (band.min(), band.max()) == pytest.approx((2.0 - 2.0**0.5, 6.0 + 8.0**0.5))
     single = SeedCurve(np.array([0.0, 1.0]), np.array([[5.0, 0.0]]))  # zero has no logarithm
-    figure = seed_curves({"harm": {"sac": single}}, logarithmic=["harm"])
-    assert (figure.axes[0].get_yscale(), legend(figure)) == ("linear", ["sac, 1 seed"])
+    figure = seed_curves({"harm": {"sac": single}}, logarithmic=["harm"], known={"harm": 0.5})
+    assert (figure.axes[0].get_yscale(), legend(figure)) == ("linear", ["sac, 1 seed", "best known"])
 
 
 # ---------------------------------------------------------------- of an episode

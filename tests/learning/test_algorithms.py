@@ -33,10 +33,12 @@ from ethbrake_marl.learning.algorithms import (
     draw_rows,
     drive_from,
     explore,
+    limit_that_cuts,
     own_worlds,
     ppo_arguments,
     sac_arguments,
     show_templates,
+    smallest_offset,
     stages_of,
     tensors_of,
     visit,
@@ -474,6 +476,18 @@ def test_gradients__are_cut_at_their_limit_and_the_share_is_told() -> None:
     assert np.abs(whole).max() > 0.1 and none == 0.0
     np.testing.assert_array_equal(cut, np.clip(whole, -0.01, 0.01))
     assert share == pytest.approx(1.0 - np.abs(cut).sum() / np.abs(whole).sum(), rel=1e-5)
+
+
+def test_automatic_limit__cuts_its_share_and_offsets_grow_where_harm_jumps() -> None:
+    random = np.random.default_rng(0)
+    sizes, offsets = np.abs(random.standard_cauchy(9_000)), 0.003 * (100.0 / 3.0) ** random.random(9_000)
+    kept = np.minimum(sizes, limit_that_cuts(sizes, 0.1))
+    assert kept.sum() == pytest.approx(0.9 * sizes.sum()) and limit_that_cuts(np.zeros(3), 0.1) == 0.0
+    jumps = np.where(random.random(9_000) < offsets, 5.0 / (2.0 * offsets), 0.0)  # met in proportion to the offset
+    smooth = random.standard_normal(9_000)
+    found = [smallest_offset(np.stack([each, offsets], axis=1), 0.003, 0.1) for each in (jumps, np.abs(smooth))]
+    assert 0.015 < found[0] <= 0.025 and found[1] == 0.003
+    assert smallest_offset(np.zeros((4, 2)), 0.01, 0.3) == 0.01
 
 
 def test_options__costs_are_those_of_episodes_driven_so() -> None:

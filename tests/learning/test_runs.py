@@ -265,7 +265,9 @@ def test_train__keeps_and_tells_what_the_learners_objectives_make_of_the_harm(tm
     objectives = ["total", "own", "weighted:0.001,0.001,1"]
     scenario = SCENARIO.with_learners(["vehicle_2", "vehicle_3"]).replace(objective=objectives)
     recipe = TINY.replace(total_steps=6 * 128, evaluation={"every_updates": 1, "worlds": 10, "seed": 7})
-    result = runs.train(recipe, scenario, tmp_path / "run", on_progress=None)
+    said: list[str] = []
+    result = runs.train(recipe, scenario, tmp_path / "run", on_progress=lambda shown: said.append(shown.harm))
+    assert said[0] == f"first-impact harm (own, {objectives[2]}) {result.evaluations[0]['objective']:.2f}"
     rows = [row for row in RunDirectory(tmp_path / "run").rows() if row["eval/objective"]]
     best = min(result.evaluations, key=lambda each: each["objective"])
     kept = load_policy(tmp_path / "run" / "policy")
@@ -275,6 +277,22 @@ def test_train__keeps_and_tells_what_the_learners_objectives_make_of_the_harm(tm
     told = [best["objective_vehicle_2"], best["objective_vehicle_3"]]
     assert told == pytest.approx(harm[1:]) and best["objective"] == sum(told) / 2
     assert "objective" not in runs.train(TINY, SCENARIO, tmp_path / "plain", steps=1).evaluations[0]
+    injuries = Training.of(TINY, SCENARIO.replace(objective="injury:lr4s"))
+    assert runs.objective_in_words(injuries) == "first-impact injuries in 1,000 lines (injury:lr4s)"
+
+
+def test_train__an_alarm_once_where_the_limit_cuts_most_of_the_gradients(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runs, "WINDOW", 3)
+    said: list[str] = []
+    cut = TINY_COUNTERFACTUAL.replace(gradient_limit=0.01)
+    result = runs.train(cut, SCENARIO, tmp_path / "cut", on_progress=lambda shown: said.append(shown.note))
+    shares = RunDirectory(tmp_path / "cut").column("train/gradient_cut")
+    (alarm,) = result.alarms
+    assert alarm.startswith(f"gradient_limit cuts {np.mean([*shares.values()][:3]):.0%} of the sum")
+    assert said.count(f"alarm: {alarm}") == 1 and "recipe options" in alarm
+    assert runs.train(cut.replace(gradient_limit=1e9), SCENARIO, tmp_path / "all", on_progress=None).alarms == ()
 
 
 GOAL = 1.10  # harm of the policy, in the least harm known
@@ -492,7 +510,7 @@ TRAININGS = {
     "independent": (TEAM.replace(scheme="independent"), PAIR),
     "turns": (TEAM.replace(scheme="independent", turns=2), PAIR),
     "centralised": (TEAM.replace(scheme="centralised"), PAIR),
-    "counterfactual": (TINY_COUNTERFACTUAL, PAPER),
+    "counterfactual": (TINY_COUNTERFACTUAL.replace(gradient_limit="auto"), PAPER),
     "modes": (TINY_MODES, PAPER),
     "options": (TINY_OPTIONS, PAPER),
     "scout": (TINY_MODES.replace(focus=0.75, modes=MODES | {"tie_break": 0.0}), PAPER),

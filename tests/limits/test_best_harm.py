@@ -32,6 +32,7 @@ from ethbrake_marl.limits.limits import (
 from ethbrake_marl.limits.lower_bound import KEPT, extreme_profiles, lower_bound, onset_states, team_bound
 from ethbrake_marl.pages.report import avoidable_section, worst_section
 from ethbrake_marl.physics import Floats, Worlds, advance
+from ethbrake_marl.policies import load_shipped, shipped_policies
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from ethbrake_marl.search import Profiles, profile_problem
 from tests.failing_worlds import planted_list, without
@@ -216,6 +217,17 @@ def test_shipped_tables__hold_the_shipped_lists_and_their_profiles_do_the_stored
                 assert np.array_equal(problem.follow(profiles)[harm_count == "total"][found], known[found])
                 assert (known <= optimise_coupled(worlds, 1, harm_count=harm_count).harm + 1e-7).all()
     assert max(path.stat().st_size for path in TABLES.glob("*.npz")) < 700_000
+
+
+def test_shipped_tables__no_policy_that_ships_does_less_harm() -> None:
+    names = [name for name in shipped_policies() if len(load_shipped(name).manifest.learners) == 1]
+    for table in shipped_tables():
+        scenario = load_scenario(table.header["scenario"])
+        worlds = scenario.sample(20, seed=7).worlds
+        for name in names:
+            driven = drive(worlds, make_agent(f"policy@shipped/{name}", scenario=scenario), scenario, 1).ledger
+            for count, known in best_known(worlds, Task(scenario, scenario.learners)).items():
+                assert (driven.world_harm(count) > known - 1e-6).all(), (scenario.name, name, count)
 
 
 def test_best_known__is_nan_where_no_table_holds_the_world() -> None:

@@ -1,0 +1,70 @@
+"""Algorithms at equal processor time on the three tests: a figure of docs/options.md, a table of docs/results.
+
+    .venv/bin/python docs/studies/equal_processor.py SECONDS FOLDER docs/figures/learning-curves-equal.png
+
+FOLDER keeps the trainings: the same command goes on. SECONDS of one core are spent on each; what measuring takes is
+not counted.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from ethbrake_marl.defaults import HarmCount
+from ethbrake_marl.figures import seed_curves, write_picture
+from ethbrake_marl.learning import RunDirectory, TrainingRecipe, load_recipe
+from ethbrake_marl.limits.limits import best_harm
+from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.studies.learning_curves import AXES, LearningCurves
+
+TESTS: dict[str, HarmCount] = {
+    "paper-random": "first",
+    "paper-random-brake-only": "first",
+    "paper-random-obstacle": "total",
+}
+STEPS = {  # in half a minute, by a short training of each
+    "quick": 4_400_000,
+    "ppo-long": 800_000,
+    "sac-long": 225_000,
+    "options": 180_000,
+}
+POINTS, WORLDS, SEED, BUDGET = 12, 2000, 1007, 2000
+
+
+def plan(count: HarmCount, seconds: int) -> list[tuple[TrainingRecipe, int]]:
+    """The recipes with their steps, for a count."""
+    found = []
+    for name in STEPS:
+        recipe, steps = load_recipe(name), STEPS[name] * seconds // 30
+        updates = steps // (recipe.n_envs * recipe.rounds)
+        reward = recipe.reward.model_dump() | {"harm_count": count}
+        measured = {"every_updates": max(updates // POINTS, 1), "worlds": WORLDS, "seed": SEED}
+        found.append((recipe.replace(total_steps=steps, reward=reward, evaluation=measured), 1))
+    return found
+
+
+if __name__ == "__main__":
+    seconds, folder, picture = int(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3])
+    panels, known = {}, {}
+    for test, count in TESTS.items():
+        curves = LearningCurves(load_scenario(test), plan(count, seconds), folder / test, "cpu")
+        if not curves.train():
+            raise SystemExit(1)
+        curves.write()
+        label = f"{test}: {'first-impact' if count == 'first' else 'total'} harm (m²/s²)"
+        panels[label] = curves.curves()[RunDirectory.HARM[count]]
+        worlds = load_scenario(test).sample(WORLDS, SEED).worlds
+        least = best_harm(load_scenario(test), worlds, counts=[count], budget=BUDGET, threads=1).best[count].harm
+        known[label] = float(np.mean(least))
+        for name, curve in panels[label].items():
+            harm = curve.values[0]
+            told = [f"{each:.3f}" for each in (harm[-1], harm.min(), harm.min() / known[label])]
+            print(f"| `{test}` | {count} | `{name}` | {curve.steps[-1]:.0f} s | {' | '.join(told)} |")
+        print(f"best known: {known[label]:.3f}", flush=True)
+    caption = f"One seed each; harm on the fixed list of the trainings, {WORLDS:,} worlds of seed {SEED}."
+    axis = AXES["cpu"][1]
+    figure = seed_curves(panels, logarithmic=[*panels], caption=caption, x_label=axis, known=known)
+    write_picture(picture, figure, force=True)
