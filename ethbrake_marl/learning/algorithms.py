@@ -856,6 +856,8 @@ def choose_rows(
 
 # Options: several actions are tried at a decision, and the actor learns to choose the one that costs least.
 
+FOR_GOOD = 2**31  # steps: more than any episode has
+
 
 class Options(Algorithm):
     """Policy iteration by what actions cost in closed loop; one actor for all learners."""
@@ -964,7 +966,7 @@ class OptionsModel(CounterfactualModel):
     def _try_actions(self, seen: Float32s, moments: Moment) -> tuple[Float32s, Ints, Floats]:
         """At some decisions: what is seen [B, F], numbers of the actions tried [B, C], and what each costs [B, C].
 
-        The first one is the one that the actor takes.
+        The first one is the one that the actor takes. ``caution`` is part of the costs.
         """
         recipe, actor, learners = self.recipe, self.policy, len(self.engine.learners)
         observed, last = seen.reshape(-1, seen.shape[2]), recipe.network.choices - 1
@@ -982,7 +984,11 @@ class OptionsModel(CounterfactualModel):
         holds = np.array(recipe.holds, np.int64)[torch.randint(len(recipe.holds), (len(rows),)).numpy()]
         each, back = np.unique(np.arange(len(rows))[:, None] * (last + 1) + tried, return_inverse=True)
         row, number = each // (last + 1), each % (last + 1)
-        learner, steps, actions = rows[row] % learners, holds[row], actor.actions[number].astype(np.float64)
+        steps = holds[row]
+        if recipe.caution:  # one more branch of each decision brakes fully from there to the end
+            row, number = np.append(row, np.arange(len(rows))), np.append(number, np.zeros(len(rows), np.int64))
+            steps = np.append(steps, np.full(len(rows), FOR_GOOD))
+        learner, actions = rows[row] % learners, actor.actions[number].astype(np.float64)
 
         def decide(now: Observations, some: Ints, done: int) -> Floats:
             wanted = actor.act(now.reshape(-1, now.shape[2])).astype(np.float64).reshape(now.shape[:2])
@@ -992,7 +998,11 @@ class OptionsModel(CounterfactualModel):
 
         engine = self.engine.branch(moments.take(rows[row] // learners))
         gained = play_on(engine, decide, recipe.gamma, at_least=max(recipe.holds))
-        costs = -gained[np.arange(len(row)), learner][back].reshape(tried.shape)
+        found = -gained[np.arange(len(row)), learner]
+        costs = found[back].reshape(tried.shape)
+        if recipe.caution:
+            done = 1.0 - self._current_progress_remaining
+            costs += recipe.caution * done * np.maximum(costs - found[len(each) :, np.newaxis], 0.0)
         good = np.isfinite(costs).all(axis=1)
         return observed[rows[good]], tried[good], costs[good]
 

@@ -572,6 +572,7 @@ class OptionsRecipe(TrainingRecipe):
     drawn: Annotated[int, Field(ge=0, le=16)]
     holds: Annotated[tuple[Steps, ...], Field(strict=False, min_length=1, max_length=16)]
     largest_cost: Positive
+    caution: Annotated[float, Field(ge=0.0, allow_inf_nan=False, exclude_if=not_)] = 0.0
     guide: NonNegative
     memory: Annotated[int, Field(ge=1, le=500_000)]
     gradient_steps: Annotated[int, Field(ge=1, le=100_000)]
@@ -720,6 +721,7 @@ MEANINGS = {
     "near": "ranges of distances to the action taken, each tried below and above it; the logarithm drawn is uniform",
     "fixed": "actions tried at each of these decisions, from -1 (full braking) to 1; the nearest of the choices is",
     "drawn": "how many more actions are tried there, any of the choices",
+    "caution": "how many times the excess over full braking from there on counts besides, at the end; it grows from 0",
     "largest_cost": "an action that costs more than this beyond the best one counts as this much more",
     "guide": "weight of the convex part of the loss, without which learning can stand still at the beginning",
     "memory": "how many decisions are learned from: the last ones at which the tried actions differ in cost",

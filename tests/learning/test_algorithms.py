@@ -507,6 +507,12 @@ def test_options__costs_are_those_of_episodes_driven_so() -> None:
             if engine.ended.all():
                 break
         np.testing.assert_allclose(costs[order, way], engine.ledger.world_harm("total"), rtol=1e-12, atol=1e-12)
+    model.recipe = model.recipe.replace(caution=2.0)  # what goes beyond full braking, here the policy
+    model._update_current_progress_remaining(1, 2)  # half of it by now
+    torch.manual_seed(5)
+    cautious, beyond = model._try_actions(model._last_obs[np.newaxis], start)[2], np.maximum(costs - costs[:, :1], 0.0)
+    assert beyond.max() > 0.1
+    np.testing.assert_allclose(cautious, costs + beyond, rtol=1e-12, atol=1e-12)
 
 
 def test_options__loss_by_hand_and_what_is_remembered_last() -> None:
