@@ -34,11 +34,12 @@ def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> No
     train_mappo(plan, line, output)
 
 
-def train_mappo(recipe: PpoRecipe, scenario: eb.Scenario, directory: Path) -> Policy:
+def train_mappo(recipe: PpoRecipe, scenario: eb.Scenario, directory: Path, algorithm: str = "mappo") -> Policy:
     """Train BenchMARL's MAPPO with the numbers of `recipe`, and leave the shared actor in the new `directory`.
 
-    `load_team` and `ppo@DIRECTORY` take it. The learning rate stays at its start, as BenchMARL has no schedule;
-    there are no checkpoints and nothing is measured on the way.
+    `algorithm` may also be "ippo", whose critic sees what the actor does. `load_team` and `ppo@DIRECTORY` take it. The
+    learning rate stays at its start, as BenchMARL has no schedule; there are no checkpoints and nothing is measured on
+    the way.
     """
     from ethbrake_marl.learning.runs import own_random_state
 
@@ -49,7 +50,7 @@ def train_mappo(recipe: PpoRecipe, scenario: eb.Scenario, directory: Path) -> Po
     content = {"recipe": recipe.model_dump(mode="json"), "scenario": scenario.model_dump(mode="json")}
     run = RunDirectory(directory).create({**content, "library": "benchmarl"}, team=team)
     with own_random_state(), tempfile.TemporaryDirectory() as scratch:
-        experiment = make_experiment(recipe, scenario, scratch)
+        experiment = make_experiment(recipe, scenario, scratch, algorithm)
         experiment.run()
         policy = policy_of(experiment, recipe, scenario)
     policy.save(run.policy)
@@ -57,10 +58,10 @@ def train_mappo(recipe: PpoRecipe, scenario: eb.Scenario, directory: Path) -> Po
     return policy
 
 
-def make_experiment(recipe: PpoRecipe, scenario: eb.Scenario, scratch: str) -> Any:
+def make_experiment(recipe: PpoRecipe, scenario: eb.Scenario, scratch: str, algorithm: str = "mappo") -> Any:
     """An experiment with the numbers of `recipe`; what BenchMARL writes of its own goes to the folder `scratch`."""
     import torch
-    from benchmarl.algorithms import MappoConfig
+    from benchmarl.algorithms import algorithm_config_registry
     from benchmarl.experiment import Experiment, ExperimentConfig
     from benchmarl.models.mlp import MlpConfig
 
@@ -77,9 +78,9 @@ def make_experiment(recipe: PpoRecipe, scenario: eb.Scenario, scratch: str) -> A
     config.on_policy_minibatch_size = max(recipe.batch_size // learners, 1)
     config.save_folder = scratch
     config.evaluation, config.loggers, config.create_json = False, [], False
-    algorithm = MappoConfig.get_from_yaml()
-    algorithm.lmbda, algorithm.clip_epsilon = recipe.gae_lambda, recipe.clip_range
-    algorithm.entropy_coef, algorithm.critic_coef = recipe.ent_coef, recipe.vf_coef
+    learns = algorithm_config_registry[algorithm].get_from_yaml()
+    learns.lmbda, learns.clip_epsilon = recipe.gae_lambda, recipe.clip_range
+    learns.entropy_coef, learns.critic_coef = recipe.ent_coef, recipe.vf_coef
     models = [MlpConfig.get_from_yaml(), MlpConfig.get_from_yaml()]
     activation = torch.nn.ReLU if recipe.network.activation == "relu" else torch.nn.Tanh
     for model, cells in zip(models, (recipe.network.policy, recipe.network.value), strict=True):
@@ -87,7 +88,7 @@ def make_experiment(recipe: PpoRecipe, scenario: eb.Scenario, scratch: str) -> A
     task = LineTask(
         scenario.name, {"scenario": scenario, "reward": recipe.reward, "horizon_is_end": recipe.horizon_is_end}
     )
-    return Experiment(task, algorithm, models[0], recipe.seed, config, critic_model_config=models[1])
+    return Experiment(task, learns, models[0], recipe.seed, config, critic_model_config=models[1])
 
 
 def policy_of(experiment: Any, recipe: PpoRecipe, scenario: eb.Scenario) -> Policy:

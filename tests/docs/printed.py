@@ -194,6 +194,7 @@ PICTURES: dict[str, How] = {
     "shield-modes.png": _by(TRAINING),
     "regimes.png": _by(NIGHTLY, "python docs/studies/regimes.py regimes.png"),
     "cooperation-ablation": _by(TRAINING),
+    "cooperative-learners.png": _by(TRAINING),
     "learning-curves": _by(TRAINING),
     "explorer.png": _by(BY_HAND),
     "speed-scaling.png": _by(SPEED),

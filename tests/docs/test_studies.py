@@ -29,8 +29,8 @@ from ethbrake_marl.studies.speed import Effort
 from tests.docs.site import DOCS, load
 from tests.studies.benchmark_rows import ENTRIES, MEASURED as BENCHMARK, tables
 
-sampling, price, equal_time, scaling = (
-    load(f"../studies/{name}") for name in ("sampling", "price", "equal_time", "scaling")
+sampling, price, equal_time, scaling, cooperative = (
+    load(f"../studies/{name}") for name in ("sampling", "price", "equal_time", "scaling", "cooperative")
 )
 
 
@@ -117,6 +117,17 @@ def test_equal_time__tells_the_harm_of_an_evaluation_in_the_columns_of_the_page(
     assert list(equal_time.HEAD) in [table.columns for table in BASELINES]
     worlds = PAPER.sample(equal_time.WORLDS, equal_time.SEED).worlds  # which no table holds
     assert not np.isfinite(best_known(worlds, Task(PAPER, PAPER.learners))["first"]).any()
+
+
+def test_cooperative__tells_how_likely_a_training_is_to_do_less_harm_than_ppos() -> None:
+    less, more = np.array([[1.0, 2.0], [2.0, 3.0]]), np.array([[2.0, 4.0], [5.0, 6.0]])
+    harms = {f"{name}-1": (20.0, more if name == "ppo" else less) for name in cooperative.METHODS}
+    level, braking = "cooperation-3-pair", np.array([9.0, 10.0])
+    rows = cooperative.lines(level, harms | {f"ppo-{cooperative.LONGER}": (240.0, less[:1])}, braking)
+    assert [row[-1] for row in rows] == ["–", "0.88", "0.88", "0.50", "0.88", "0.88", "–"]
+    assert [rows[3][5], rows[3][7], rows[6][5:]] == ["3.50", "5.00", ["1.00", "–", "2.00", "–", "–"]]
+    assert cooperative.HEAD in [table.columns for table in load("results").read_tables("cooperation")]
+    assert picture_bytes(cooperative.draw({level: (harms, braking)}), "learners.png").startswith(PNG)
 
 
 @pytest.mark.parametrize("vehicles", [2, 50])

@@ -21,6 +21,7 @@ from stable_baselines3.sac.policies import SACPolicy
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.harm import scored
 from ethbrake_marl.learning import Training, TrainingRecipe, load_recipe, resume, train
 from ethbrake_marl.learning.algorithms import (
     Adam,
@@ -320,18 +321,18 @@ def test_training__numbers_that_are_not_finite_stop_it(tmp_path: Path, monkeypat
     assert all(np.isfinite(tensor).all() for tensor in kept.tensors.values())
 
 
-def new_model(recipe: TrainingRecipe) -> Any:
+def new_model(recipe: TrainingRecipe, scenario: eb.Scenario = SCENARIO) -> Any:
     """What is trained, before its first update."""
-    training = Training.of(recipe, SCENARIO)
+    training = Training.of(recipe, scenario)
     model: Any = make_model(training.recipe.make_algorithm(), training, make_environment(training))
     model._setup_learn(1)
     model.set_logger(Logger(None, []))
     return model
 
 
-def choosing(**changes: Any) -> Any:
+def choosing(scenario: eb.Scenario = SCENARIO, **changes: Any) -> Any:
     """A new model that chooses among actions."""
-    return new_model(TINY_OPTIONS.replace(**changes))
+    return new_model(TINY_OPTIONS.replace(**changes), scenario)
 
 
 def constant(value: float) -> Callable[[np.ndarray], np.ndarray]:
@@ -490,23 +491,32 @@ def test_automatic_limit__cuts_its_share_and_offsets_grow_where_harm_jumps() -> 
     assert smallest_offset(np.zeros((4, 2)), 0.01, 0.3) == 0.01
 
 
-def test_options__costs_are_those_of_episodes_driven_so() -> None:
-    """Full braking but for what is tried: each action for its steps, then the policy, to the end."""
-    model = choosing(tried=8, near=[], fixed=[1.0], drawn=1, holds=[3], network={"policy": [8], "choices": 5})
+@pytest.mark.parametrize(("objective", "learners"), [("total", ["vehicle_2"]), ("own", ["vehicle_2", "vehicle_3"])])
+def test_options__costs_are_those_of_the_moved_learner_in_episodes_driven_so(
+    objective: str, learners: list[str]
+) -> None:
+    """Full braking of all but for what is tried: each action for its steps, then the policy, to the end."""
+    line, rows = SCENARIO.with_learners(learners).replace(objective=objective), np.arange(8 * len(learners))
+    model = choosing(
+        line, tried=len(rows), near=[], fixed=[1.0], drawn=1, holds=[3], network={"policy": [8], "choices": 5}
+    )
     start = model.engine.moment()
     torch.manual_seed(5)
     seen, tried, costs = model._try_actions(model._last_obs[np.newaxis], start)
-    order = np.argsort(seen[:, 0])
-    assert len(tried) == 8 and (tried[:, 0] == 0).all() and (tried[:, 1] == 4).all() and len(set(tried[:, 2])) > 1
-    rows = np.argsort(model._last_obs[:, 0])
+    order, rows = np.argsort(seen[:, 0]), np.argsort(model._last_obs[:, 0])
+    assert len(tried) == len(rows) and (tried[:, :2] == [0, 4]).all() and len(set(tried[:, 2])) > 1
+    world, moved = np.divmod(rows, len(learners))
     for way in range(3):
-        engine = model.engine.branch(start.take(rows))
+        engine = model.engine.branch(start.take(world))
         for step in range(200):
-            action = -1.0 + 0.5 * tried[order, way] if step < 3 else np.full(8, -1.0)
-            engine.step(action[:, np.newaxis].astype(np.float64))
+            action = np.full((len(rows), len(learners)), -1.0)
+            if step < 3:
+                action[np.arange(len(rows)), moved] += 0.5 * tried[order, way]
+            engine.step(action)
             if engine.ended.all():
                 break
-        np.testing.assert_allclose(costs[order, way], engine.ledger.world_harm("total"), rtol=1e-12, atol=1e-12)
+        harm = scored(engine.ledger, "total")[objective][np.arange(len(rows)), moved + 1]
+        np.testing.assert_allclose(costs[order, way], harm, rtol=1e-12, atol=1e-12)
     model.recipe = model.recipe.replace(caution=2.0)  # what goes beyond full braking, here the policy
     model._update_current_progress_remaining(1, 2)  # half of it by now
     torch.manual_seed(5)

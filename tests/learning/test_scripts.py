@@ -92,12 +92,16 @@ def test_line_env__keeps_torchrls_contract_and_shows_the_native_worlds() -> None
     assert ended > 0
 
 
-def test_mappo__leaves_a_policy_that_acts_as_benchmarls_own_does(mappo: ModuleType, tmp_path: Path) -> None:
+@pytest.mark.parametrize("algorithm", ["mappo", "ippo"])
+def test_mappo__leaves_a_policy_that_acts_as_benchmarls_own_does(
+    algorithm: str, mappo: ModuleType, tmp_path: Path
+) -> None:
     from tensordict import TensorDict
     from torchrl.envs.utils import ExplorationType, set_exploration_type
 
     recipe = RECIPE.replace(total_steps=2 * 16 * 16 * 2, scheme="centralised")
-    experiment = mappo.make_experiment(recipe, PAIR, str(tmp_path))
+    experiment = mappo.make_experiment(recipe, PAIR, str(tmp_path), algorithm)
+    assert type(experiment.algorithm).__name__.lower() == algorithm
     experiment.run()
     policy = mappo.policy_of(experiment, recipe, PAIR)
     assert policy.manifest.steps == 2 * 16 * 16 * 2
