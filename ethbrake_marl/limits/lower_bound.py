@@ -1194,7 +1194,7 @@ def least_beyond(
     if not _SHORTEST_S < time < at[LINE.UNTIL] - early:
         return least
     v = (at[LINE.WALL] - leader(at, early)[1]) / time - 0.5 * at[LINE.A_L] * time
-    return max(least, v * v) if v > 0.0 else least
+    return float(max(least, v * v)) if v > 0.0 else least
 
 
 @compiled(apart=True)
@@ -1322,7 +1322,7 @@ def behind_leader(
             faster, span = (v_r - v_f + weak * since) * (left - since), late - early if since <= 0.0 else 0.0
             faster += further - (front + 1.0 + rear) * room - span * weak * (left + span)
             closing = max(closing, faster / (left - since + span))
-    return closing * closing
+    return float(closing * closing)
 
 
 @compiled(apart=True)
