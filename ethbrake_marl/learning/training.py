@@ -711,7 +711,7 @@ MEANINGS = {
     "counterfactuals": "how many of the decisions of a round are tried in two ways",
     "offset": "how far an action is moved to see what comes of it; the logarithm of what is drawn is uniform",
     "holds": "for how many steps an action is tried, one of these",
-    "gradient_limit": "a larger gradient, at a jump, counts as this one; return per unit of action; auto: follows what is measured",
+    "gradient_limit": "a larger gradient, at a jump, counts as this one; return per action; auto: as measured",
     "trust_radius": "farthest that one update asks an action to move",
     "anchor": "how much an action that makes no difference holds to where it is",
     "averaging": "share of itself that the average of the weights, which drives, keeps in each gradient step",
