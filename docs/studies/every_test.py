@@ -31,7 +31,7 @@ WORLDS, SEED, BUDGET = 600, 20_261_124, 10_000
 WORSE = 1.0  # m2/s2: so much more harm than full braking in the same world
 ID, NONE = "every-test", "–"
 NOTE = (
-    f"{WORLDS} worlds of each scenario, seed {SEED:,}. Best known: the least, in each world, of a search with"
+    f"{WORLDS} worlds of each scenario, seed {SEED}. Best known: the least, in each world, of a search with"
     f" {BUDGET:,} candidates and of all policies here. In a cell: times the best known harm; share of what could be"
     f" saved against full braking that is saved; share of worlds with over {WORSE:g} m²/s² more harm than full braking."
     f" Bold: trained there. {NONE}: it cannot drive there, or there is next to no harm to save."
