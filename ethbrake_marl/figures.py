@@ -769,7 +769,7 @@ def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
     found: list[tuple[int, str, Floats]] = []
     for rule in QUANTITY.of(worlds).values():
         values, own = rule.of(worlds), {"vehicle": focus, "pair": max(focus - 1, 0), "world": 0}[rule.per]
-        varying = np.flatnonzero(np.ptp(values, axis=0))
+        varying = np.flatnonzero(np.ptp(values, axis=0) > 0.0)  # not where only some have an obstacle
         nearest = varying[np.argsort(np.abs(varying - own), kind="stable")].tolist()
         for i in sorted(nearest):
             owner = "" if rule.per == "world" else f"{rule.per.capitalize()} {i + 1}, "

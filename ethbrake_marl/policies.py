@@ -71,7 +71,8 @@ class NetworkSpec(FileModel):
     remembers nothing. There is neither noise nor critic then.
 
     With output ``choice`` the actor gives each of ``choices`` actions, evenly from -1 to 1, a score, and the action of
-    the highest one is taken, the lowest of equal ones. Again there is neither noise nor critic.
+    the highest one is taken, the lowest of equal ones. Again there is neither noise nor critic. Where it chooses
+    ``among`` whole policies, too, their scores come before those of the actions, and all see the same observation.
     """
 
     observation_size: Annotated[int, Field(ge=1, le=4096)]
@@ -83,6 +84,7 @@ class NetworkSpec(FileModel):
     choices: Annotated[int | None, Field(ge=2, le=4096, exclude_if=lambda choices: choices is None)] = None
     networks: Annotated[int, Field(ge=1, le=16, exclude_if=lambda networks: networks == 1)] = 1
     gate_hidden: Annotated[PerhapsHidden, Field(exclude_if=not_)] = ()
+    among: Annotated[tuple[NetworkSpec, ...], Field(max_length=16, exclude_if=not_)] = ()
 
     @model_validator(mode="after")
     def _a_gate_between_several(self) -> NetworkSpec:
@@ -98,6 +100,11 @@ class NetworkSpec(FileModel):
             )
         if self.choices is not None and (self.value_hidden or self.networks > 1 or self.action_size > 1):
             raise ValueError("output choice is for one network without a critic, and one action")
+        for m, member in enumerate(self.among):
+            if self.choices is None or member.among:
+                raise ValueError("among: is for output choice, and its policies choose among no others")
+            if (member.observation_size, member.action_size) != (self.observation_size, self.action_size):
+                raise ValueError(f"among[{m}]: observes or acts in another size; must be the same in all")
         return self
 
     @property
@@ -112,10 +119,10 @@ class NetworkSpec(FileModel):
         return found
 
     @property
-    def format_version(self) -> Literal[2, 3, 4]:
+    def format_version(self) -> Literal[2, 3, 4, 5]:
         """Of a bundle with this network."""
         if self.choices is not None:
-            return 4
+            return 5 if self.among else 4
         return 2 if self.networks == 1 else 3
 
     @property
@@ -147,7 +154,12 @@ class NetworkSpec(FileModel):
             ]
             return (*chain(*actors), *gate)
         if self.choices is not None:
-            return tuple(network("policy", "average", hidden, f"average.{2 * len(hidden)}", self.choices))
+            scores = len(self.among) + self.choices
+            chooser = network("policy", "average", hidden, f"average.{2 * len(hidden)}", scores)
+            for m, each in enumerate(self.among, 1):
+                named = ((f"among_{m}.{row.name}", row.shape) for row in each.tensors)
+                chooser += [TensorRow(name, shape, name.replace(".", "_")) for name, shape in named]
+            return tuple(chooser)
         if self.output == "clip":
             rows = network("policy", "mlp_extractor.policy_net", hidden, "action_net", actions)
             rows.append(TensorRow("policy.log_std", (actions,), "log_std"))
@@ -217,12 +229,12 @@ class ObservationSchema(_Strict):
 class Manifest(_Strict):
     """Everything about a policy but its tensors; ``action`` is a fraction of the own capacity, -1 = full braking.
 
-    Format 3 is for policies of several networks, 4 for one that scores its choices; any other network is written as
-    ever, for earlier versions too.
+    Format 3 is for policies of several networks, 4 for one that scores its choices, 5 for one that chooses among
+    policies; any other network is written as ever, for earlier versions too.
     """
 
     format: Literal["ethbrake-policy"] = "ethbrake-policy"
-    format_version: Literal[2, 3, 4] = 2
+    format_version: Literal[2, 3, 4, 5] = 2
     algorithm: Annotated[str, Field(pattern=NAME_PATTERN)]
     network: NetworkSpec
     observation: ObservationSchema
@@ -313,12 +325,13 @@ class Actor:
     Of several networks only the one that the gate chooses is computed in a row.
     """
 
-    def __init__(self, spec: NetworkSpec, tensors: Mapping[str, Float32s]) -> None:
+    def __init__(self, spec: NetworkSpec, tensors: Mapping[str, Float32s], prefix: str = "") -> None:
         """Take the layers out of ``tensors``, which must fit ``spec`` (see ``NetworkSpec.tensors``)."""
         self.spec = spec
-        self._networks = [_layers_of(name, len(spec.policy_hidden), tensors) for name in spec.actors]
-        self._gate = _layers_of("gate", len(spec.gate_hidden), tensors) if spec.networks > 1 else []
+        self._networks = [_layers_of(prefix + name, len(spec.policy_hidden), tensors) for name in spec.actors]
+        self._gate = _layers_of(f"{prefix}gate", len(spec.gate_hidden), tensors) if spec.networks > 1 else []
         self._actions = spec.actions
+        self._among = [type(self)(each, tensors, f"among_{m}.") for m, each in enumerate(spec.among, 1)]
 
     def __call__(self, observation: Float32s) -> Float32s:
         """Return the action of each row; raises ``InvalidInput`` on a wrong shape, dtype or a non-finite entry."""
@@ -334,12 +347,21 @@ class Actor:
         chosen: NDArray[np.int64] = self._forward(self._gate, x).argmax(axis=0)
         return chosen
 
+    def take(self, number: NDArray[np.int64], x: Float32s) -> Float32s:
+        """The actions with these numbers [rows], policies first, where [F, rows] is seen, [1, rows]."""
+        found = self._actions[np.newaxis, np.maximum(number - len(self._among), 0)]
+        for m, member in enumerate(self._among):
+            rows = np.flatnonzero(number == m)
+            if len(rows):
+                found[:, rows] = member._block(np.ascontiguousarray(x[:, rows]))
+        return found
+
     def _block(self, x: Float32s) -> Float32s:
         """[F, rows] -> [A, rows]."""
         if len(self._networks) == 1:
             y = self._forward(self._networks[0], x)
             if self.spec.choices is not None:
-                return self._actions[np.newaxis, y.argmax(axis=0)]
+                return self.take(y.argmax(axis=0), x)
         else:
             chosen = self.choose(x)
             y = np.empty((self.spec.action_size, x.shape[1]), dtype=np.float32)
@@ -525,7 +547,10 @@ class Policy:
             nodes.append(helper.make_node(operator, inputs, [name], **attributes))
             return name
 
-        def network(name: str, hidden: int) -> str:
+        zero = constant("zero", np.zeros(1, np.float32))
+        bounds = [constant(name, np.array(at, np.float32)) for name, at in (("lowest", -1.0), ("highest", 1.0))]
+
+        def network(name: str, hidden: int, activation: Activation) -> str:
             """One network of the policy, from the observation on."""
             x = "observation"
             for layer in [*(f"{name}.{k}" for k in range(hidden)), f"{name}.output"]:
@@ -534,22 +559,28 @@ class Policy:
                 )
                 x = node("Gemm", [x, weight, bias], transB=1)
                 if not layer.endswith("output"):
-                    x = node("Relu" if spec.activation == "relu" else "Tanh", [x])
+                    x = node("Relu" if activation == "relu" else "Tanh", [x])
             return x
 
-        outputs = [network(name, len(spec.policy_hidden)) for name in spec.actors]
-        x = outputs[0]
-        if len(outputs) > 1:  # the one that the gate chooses
-            chosen = node("ArgMax", [network("gate", len(spec.gate_hidden))], axis=1, keepdims=1)
-            x = node("GatherElements", [node("Concat", outputs, axis=1), chosen], axis=1)
-        if spec.output == "tanh":
-            action = node("Tanh", [x], output="action")
-        elif spec.choices is not None:
+        def actor(spec: NetworkSpec, prefix: str) -> str:
+            """The actions [n, 1] of a policy, or of one among which it chooses."""
+            outputs = [network(prefix + name, len(spec.policy_hidden), spec.activation) for name in spec.actors]
+            x = outputs[0]
+            if len(outputs) > 1:  # the one that the gate chooses
+                gate = network(f"{prefix}gate", len(spec.gate_hidden), spec.activation)
+                chosen = node("ArgMax", [gate], axis=1, keepdims=1)
+                x = node("GatherElements", [node("Concat", outputs, axis=1), chosen], axis=1)
+            if spec.output == "tanh":
+                return node("Tanh", [x])
+            if spec.choices is None:
+                return node("Clip", [x, *bounds])
+            members = [actor(each, f"{prefix}among_{m}.") for m, each in enumerate(spec.among, 1)]
+            nothing = node("Mul", [node("ReduceMax", [x], axes=[1], keepdims=1), zero])  # [n, 1]
+            actions = node("Add", [nothing, constant(f"{prefix}choices", spec.actions[np.newaxis])])
             chosen = node("ArgMax", [x], axis=1, keepdims=1)
-            action = node("Gather", [constant("choices", spec.actions), chosen], output="action")
-        else:
-            bounds = [constant(name, np.array(at, np.float32)) for name, at in (("lowest", -1.0), ("highest", 1.0))]
-            action = node("Clip", [x, *bounds], output="action")
+            return node("GatherElements", [node("Concat", [*members, actions], axis=1), chosen], axis=1)
+
+        action = node("Identity", [actor(spec, "")], output="action")
         capacities = []  # in m/s2, [n, 1]
         features = [f.name for f in self.observation.features]
         for name in ("own.braking_capacity", "own.driving_capacity"):
@@ -557,7 +588,6 @@ class Policy:
             index = constant(f"{name}.column", np.array([column], np.int64))
             unit = constant(f"{name}.scale", np.array([self.observation.features[column].scale], np.float32))
             capacities.append(node("Mul", [node("Gather", ["observation", index], axis=1), unit]))
-        zero = constant("zero", np.zeros(1, np.float32))
         below = node("Mul", [node("Min", [action, zero]), capacities[0]])
         above = node("Mul", [node("Max", [action, zero]), capacities[1]])
         node("Add", [below, above], output="acceleration_mps2")
@@ -744,19 +774,15 @@ def shipped_policies() -> dict[str, Path]:
 def shipped_name(kind: str, scenario: Scenario | None, harm_count: HarmCount) -> str:
     """Name of the policy of this kind for ``scenario``, of those trained for ``harm_count`` if there is one.
 
-    ``universal`` is for all scenarios, ``universal-obstacle`` for those of three vehicles with an obstacle ahead;
-    ``ppo`` and ``sac`` are for the one that they were trained on, ``ppo-SCENARIO`` and ``sac-SCENARIO`` for that one;
-    ``-total`` behind says that a policy was trained for total harm. ``policy`` is the best of all kinds. Raises
+    ``universal`` is for all scenarios, ``ppo`` and ``sac`` for the one that they were trained on, ``ppo-SCENARIO`` and
+    ``sac-SCENARIO`` for that one; ``-total`` behind says that a policy was trained for total harm. ``policy`` is the best of all kinds. Raises
     ``InvalidInput`` listing what ships.
     """
     names, here = shipped_policies(), None if scenario is None else scenario.name
     for each in _BEST_FIRST if kind == "policy" else ():
         with suppress(InvalidInput):
             return shipped_name(each, scenario, harm_count)
-    place = here
-    if kind == "universal":  # in longer lines neither drives well behind an obstacle
-        place = "obstacle" if scenario is not None and scenario.has_obstacle and scenario.vehicles == 3 else None
-    for stem in [kind] if place is None else [f"{kind}-{place}", kind]:
+    for stem in [kind] if here is None or kind == "universal" else [f"{kind}-{here}", kind]:
         for name in (f"{stem}-total", stem) if harm_count == "total" else (stem,):
             if name in names and (
                 stem != kind

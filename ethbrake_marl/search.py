@@ -607,6 +607,7 @@ def profile_problem(
     time_step_s: float = TIME_STEP_S,
     others_mps2: Floats | None = None,
     deciders: Sequence[int] | None = None,
+    written_out: bool = False,
 ) -> ProfileProblem:
     """The problem of choosing the whole profiles of ``vehicles`` (indices from 0) so as to do the least harm.
 
@@ -627,7 +628,7 @@ def profile_problem(
         raise InvalidInput(f"others_mps2: shape {command.shape}; {worlds.speeds_mps.shape} is needed")
     command[:, chosen] = 0.0
     obstacle = worlds.obstacle_ahead
-    if obstacle.any():
+    if obstacle.any() or written_out:
         found = profile_problem(
             worlds.with_post_ahead(np.full(worlds.n, horizon_s)).with_obstacle(),
             [i + 1 for i in chosen.tolist()],

@@ -113,17 +113,17 @@ def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tupl
     width = max(map(len, ranges), default=0)
     lines = [f"{'drawn':{width}} {'least':>8} {'median':>8} {'largest':>8}"] if ranges else []
     lines += [
-        f"{name:{width}}" + "".join(f" {each:>8.4g}" for each in np.quantile(drawn, (0.0, 0.5, 1.0)))
+        f"{name:{width}}" + "".join(f" {each:>8.4g}" for each in np.nanquantile(drawn, (0.0, 0.5, 1.0)))
         for name, drawn in ranges.items()
     ]
     others = {
         key: ["drawn" if np.ptp(each) else f"{each[0]:g}" for each in rule.of(worlds).T]
         for key, rule in scenarios.QUANTITY.of(worlds).items()
-        if key not in ranges and not np.ptp(rule.of(worlds), axis=0).all()
+        if key not in varying and not np.ptp(rule.of(worlds), axis=0).all()
     }
     told = (f"{key} {each[0] if len(set(each)) == 1 else ', '.join(each)}" for key, each in others.items())
     columns = {
-        name: dict(zip(("least", "median", "largest"), np.quantile(drawn, (0.0, 0.5, 1.0)).tolist(), strict=True))
+        name: dict(zip(("least", "median", "largest"), np.nanquantile(drawn, (0.0, 0.5, 1.0)).tolist(), strict=True))
         for name, drawn in scenarios.QUANTITY.columns(worlds).items()
     }
     return lines, f"fixed: {'; '.join(told)}" if others else "", columns
@@ -157,8 +157,8 @@ def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
     yield f"{scenario.name}: {scenario.title or 'no title'}. {scenario.description}".rstrip()
     learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners) or "nobody"
     yield (
-        f"{scenario.vehicles} vehicles in line, vehicle_1 in front, {'an' if scenario.has_obstacle else 'no'} obstacle"
-        f" ahead. Learning: {learners}."
+        f"{scenario.vehicles} vehicles in line, vehicle_1 in front, {_obstacle_in_words(scenario)}. Learning:"
+        f" {learners}."
     )
     for script in dict.fromkeys(scenario.scripts.values()):
         who = ", ".join(name for name, role in scenario.roles.items() if role == script)
@@ -189,6 +189,11 @@ def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
     objectives = dict.fromkeys([scenario.objective] if isinstance(scenario.objective, str) else scenario.objective)
     aims = ", ".join(f"{each} ({KINDS[each.partition(':')[0]].about})" for each in objectives)
     yield f"Objective: {aims}; a shield always bounds the harm of the whole line."
+
+
+def _obstacle_in_words(scenario: scenarios.Scenario) -> str:
+    there = [each.has_obstacle for each in scenario.members or (scenario,)]
+    return f"{'an' if any(there) else 'no'} obstacle ahead{'' if len(set(there)) == 1 else ' in some worlds'}"
 
 
 def _declared_in_words(scenario: scenarios.Scenario, key: str) -> str:
@@ -308,7 +313,10 @@ def scenario_sample(
     usual = TABLE_WORLDS if pictured is None else PICTURE_WORLDS
     sample = chosen.sample(usual if episodes is None else episodes, seed)
     states = evaluation.states_of(sample.worlds, chosen)
-    lines = [",".join(states[0]), *(",".join(map(repr, state.values())) for state in states)]
+    lines = [
+        ",".join(states[0]),
+        *(",".join("" if each is None else repr(each) for each in state.values()) for state in states),
+    ]
     if pictured is not None:
         from ethbrake_marl.figures import worlds_figure, write_picture
 

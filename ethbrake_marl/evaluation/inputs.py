@@ -225,8 +225,11 @@ class NamedWorlds(FileModel):
         return scenario.worlds_from_table({name: [world.state[name] for world in self.worlds] for name in columns})
 
 
-def states_of(worlds: Worlds, scenario: Scenario) -> list[dict[str, float]]:
-    """The initial state of each world: the columns that the scenario does not fix, and gaps and speeds."""
+def states_of(worlds: Worlds, scenario: Scenario) -> list[dict[str, float | None]]:
+    """The initial state of each world: the columns that the scenario does not fix, and gaps and speeds.
+
+    The distance to an obstacle is None where only other worlds have one.
+    """
     fixed = {
         rule.column_of(i)
         for key, rule in QUANTITY.usual.items()
@@ -238,7 +241,10 @@ def states_of(worlds: Worlds, scenario: Scenario) -> list[dict[str, float]]:
         for name, values in QUANTITY.columns(worlds).items()
         if name not in fixed or (name.startswith(("gap_", "speed_")) and not name.startswith("speed_limit"))
     }
-    return [{name: float(values[k]) for name, values in columns.items()} for k in range(worlds.n)]
+    return [
+        {name: None if np.isnan(values[k]) else float(values[k]) for name, values in columns.items()}
+        for k in range(worlds.n)
+    ]
 
 
 _LONGEST_OWNERS = 30  # characters
@@ -252,6 +258,7 @@ def drawn_alike(worlds: Worlds, scenario: Scenario) -> dict[str, dict[str, Float
     found: dict[str, dict[str, Floats]] = {}
     for key, rule in QUANTITY.of(worlds).items():
         values, groups = rule.of(worlds), dict[object, list[int]]()
+        values = values[~np.isnan(values).any(axis=1)]
         for i in np.flatnonzero(np.ptp(values, axis=0)).tolist():
             groups.setdefault(None if rule.per == "world" else scenario.bounds(key, dry=True)[i], []).append(i)
         for number, alike in enumerate(groups.values()):
@@ -457,9 +464,12 @@ def _beyond(before: Worlds, worlds: Worlds) -> list[str]:
             found.append(key)
             continue
         values, seen = rule.of(worlds), rule.of(before)
-        low, high = seen.min(axis=0), seen.max(axis=0)
+        low, high = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)
         margin = 0.01 * (high - low) + 1e-9 * np.abs(high)
         share = ((values < low - margin) | (values > high + margin)).any(axis=1).mean()
+        none = np.isnan(values).any(axis=1).mean()
+        if none > _MOST_BEYOND and not np.isnan(seen).any():
+            found.append(f"no {key} in {100.0 * none:.0f} % of the worlds")
         if share > _MOST_BEYOND:
             found.append(f"{key} in {100.0 * share:.0f} % of the worlds")
     return found + [f"no {key}" for key in known if key not in here]

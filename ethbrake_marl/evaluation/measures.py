@@ -107,9 +107,10 @@ class Outcome:
     @classmethod
     def join(cls, parts: Sequence[Outcome]) -> Outcome:
         """One from those of consecutive worlds."""
-        first = parts[0]
-        given = [name for name in _COLUMNS if getattr(first, name) is not None]
-        columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in given}
+        first, columns = parts[0], dict[str, Any]()
+        for name in _COLUMNS:  # what one part cannot tell is not told of the whole
+            told = [getattr(part, name) for part in parts]
+            columns[name] = None if any(each is None for each in told) else np.concatenate(told)
         ledger = Ledger(*(np.concatenate([getattr(part.ledger, f.name) for part in parts]) for f in fields(Ledger)))
         final = Worlds.concatenate([part.final for part in parts])
         metrics = {name: np.concatenate([part.metrics[name] for part in parts]) for name in first.metrics}
@@ -163,11 +164,11 @@ class Outcome:
     def columns(self) -> dict[str, Values | None]:
         """What happened in each world, by the names of ``--per-world``; None where the agent says nothing."""
         final, obstacle = self.final, {}
-        if np.isfinite(final.obstacle_gap_m).all():  # of the harm above, what Vehicle 1's impacts with the obstacle did
+        if (ahead := final.obstacle_ahead).any():  # of the harm above, what Vehicle 1's impacts with the obstacle did
             obstacle = {
-                "obstacle_first_impact_harm": self.ledger.obstacle_harm("first"),
-                "obstacle_total_harm": self.ledger.obstacle_harm("total"),
-                "final_obstacle_gap_m": final.obstacle_gap_m,
+                "obstacle_first_impact_harm": np.where(ahead, self.ledger.obstacle_harm("first"), np.nan),
+                "obstacle_total_harm": np.where(ahead, self.ledger.obstacle_harm("total"), np.nan),
+                "final_obstacle_gap_m": np.where(ahead, final.obstacle_gap_m, np.nan),
             }
         return {
             "collided": self.collided + 0,
@@ -186,6 +187,11 @@ class Outcome:
             "chosen_policy": None if self.chosen_policy is None else self.chosen_policy + 0,
             **{COLUMN + name: column + 0 for name, column in self.metrics.items()},  # truths as 0 and 1
         }
+
+
+def none_for_nan(column: Values) -> list[Any]:
+    """The values of a column, None where there is no number."""
+    return [None if value != value else value for value in column.tolist()]
 
 
 class LeftOut(NamedTuple):
@@ -358,7 +364,7 @@ class Evaluation:
         for key, rule in QUANTITY.of(self.worlds).items():
             values = rule.of(self.worlds)
             if not limits or key in _ALWAYS_TOLD or np.ptp(values, axis=0).any():
-                initial |= {rule.column_of(i): values[:, i].tolist() for i in range(values.shape[1])}
+                initial |= {rule.column_of(i): none_for_nan(values[:, i]) for i in range(values.shape[1])}
         found: Columns = {}
         for agent, outcome in self.outcomes.items():
             told = outcome.columns()
@@ -368,7 +374,7 @@ class Evaluation:
             columns: Columns = {
                 "agent": [agent] * n,
                 **initial,
-                **{name: [None] * n if column is None else column.tolist() for name, column in told.items()},
+                **{name: [None] * n if column is None else none_for_nan(column) for name, column in told.items()},
                 "knows": [outcome.knows.text] * n,
                 "hidden": self.hidden.astype(int).tolist(),
             }
@@ -547,7 +553,8 @@ class Conditions(dict[str, Any]):
     def of_ranges(cls, ranges: Mapping[str, Iterable[Any]]) -> Conditions:
         """Those whose entries have these values, or these least and largest ones."""
         found = {
-            key: [(float(np.min(each)), float(np.max(each))) for each in entries] for key, entries in ranges.items()
+            key: [(float(np.nanmin(each)), float(np.nanmax(each))) for each in entries]
+            for key, entries in ranges.items()
         }
         told = {key: [low if low == high else [low, high] for low, high in ends] for key, ends in found.items()}
         return cls({key: ends[0] if QUANTITY.declared[key].per == "world" else ends for key, ends in told.items()})

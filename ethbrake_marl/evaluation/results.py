@@ -590,7 +590,7 @@ def _answer_block(
         write(evaluation)
     worlds, index = evaluation.worlds, evaluation.index
     ranges = {
-        name: tuple((float(c.min()), float(c.max())) for c in rule.of(worlds).T)
+        name: tuple((float(np.nanmin(c)), float(np.nanmax(c))) for c in rule.of(worlds).T)
         for name, rule in QUANTITY.of(worlds).items()
     }
     leaves = [np.flatnonzero(index // LEAF == number) for number in np.unique(index // LEAF)]

@@ -111,7 +111,8 @@ class SampledHarm:
         None with an obstacle or brakes that build up, which the map does not know, or if others decide than Vehicle 2,
         whose decisions are its samples.
         """
-        if task.vehicles != (VEHICLE_2,) or worlds.obstacle_ahead.any() or worlds.vehicles.build_up.any():
+        obstacle = task.scenario.has_obstacle or worlds.obstacle_ahead.any()
+        if task.vehicles != (VEHICLE_2,) or obstacle or worlds.vehicles.build_up.any():
             return None
         if not all(map(is_state_free, script_agents(task.scenario, except_for=VEHICLE_2).values())):
             return None

@@ -49,7 +49,7 @@ from ethbrake_marl.learning.training import (
 )
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats, Ints, Packed, Worlds, columns, compiled, exp, log
-from ethbrake_marl.policies import Activation, Float32s, NetworkSpec, Policy, load_named_policy
+from ethbrake_marl.policies import Activation, Actor, Float32s, Layers, NetworkSpec, Policy, load_named_policy
 from ethbrake_marl.search import profile_problem
 
 ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh}
@@ -490,18 +490,28 @@ def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]
                 f"recipe {recipe.name!r}: network: {name} is {getattr(wanted, name)}, but {getattr(found, name)} in the"
                 " policy to start from; they must be the same"
             )
+    return padded(policy, training, "start")
+
+
+def padded(policy: Policy, training: Training, key: str) -> dict[str, NDArray[np.float32]]:
+    """All tensors of ``policy`` but a critic's, for what the training observes; features new to it count for nothing.
+
+    Raises ``InvalidInput``, naming the recipe's ``key``, where the training does not observe all that the policy does.
+    """
     names = [feature.name for feature in training.observation.features]
     known = policy.manifest.observation.features
     missing = [name for name in known if name not in names]
     if missing:
         raise InvalidInput(
-            f"recipe {recipe.name!r}: observation: lacks {', '.join(missing[:5])}, which the policy to start from"
+            f"recipe {training.recipe.name!r}: observation: lacks {', '.join(missing[:5])}, which the policy of {key}"
             " observes; list what it observes, and more"
         )
-    tensors = {name: tensor.copy() for name, tensor in policy.tensors.items() if name.startswith("policy.")}
-    first = np.zeros((wanted.policy_hidden[0], len(names)), np.float32)
-    first[:, [names.index(name) for name in known]] = tensors["policy.0.weight"]
-    return {**tensors, "policy.0.weight": first}
+    found = {name: tensor.copy() for name, tensor in policy.tensors.items() if not name.startswith("value.")}
+    for name in [name for name in found if name.endswith(".0.weight")]:
+        first = np.zeros((len(found[name]), len(names)), np.float32)
+        first[:, [names.index(feature) for feature in known]] = found[name]
+        found[name] = first
+    return found
 
 
 class Adam(torch.optim.Adam):
@@ -672,10 +682,11 @@ class CounterfactualModel(BaseAlgorithm):
 
     def _visit(self, told: BaseCallback, act: Act) -> tuple[Float32s, Moment]:
         """Drive on for ``n_steps``; what was seen [n_steps, rows, F], and the worlds' moments, step by step."""
-        seen, moments = [], []
+        seen, moments, numbers = [], [], []
         for _ in range(self.recipe.n_steps):
             observations: Any = self._last_obs
             seen.append(observations)
+            numbers.append(self.engine.roster.numbers.copy())
             moments.append(self.engine.moment())
             new_obs, rewards, dones, infos = self.rows.step(act(observations)[:, np.newaxis])
             self.num_timesteps += self.n_envs
@@ -683,6 +694,7 @@ class CounterfactualModel(BaseAlgorithm):
             self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]
             told.update_locals(locals())
             told.on_step()
+        self._numbers = np.concatenate(numbers)  # of those worlds in the training
         return np.stack(seen), Moment.join(moments)
 
     def _try_out(self, seen: Float32s, moments: Moment, actor: _Deterministic) -> Tried:
@@ -772,6 +784,11 @@ def smallest_offset(measured: Floats, least: float, most: float) -> float:
     return max(least, most * min(lower, 1.0 / NARROWEST))
 
 
+def other_count(count: HarmCount) -> HarmCount:
+    """Of both, the one that it is not."""
+    return "total" if count == "first" else "first"
+
+
 def moving_rows(moments: Moment) -> Bools:
     """In which rows some vehicle moves; where everything stands there is nothing to learn."""
     column = Packed(moments.state, moments.params).column
@@ -857,6 +874,8 @@ def choose_rows(
 # Options: several actions are tried at a decision, and the actor learns to choose the one that costs least.
 
 FOR_GOOD = 2**31  # steps: more than any episode has
+USUAL_KEPT = 0.98  # share of itself that the running mean of costs keeps in each update
+LEAST_USUAL = 0.1  # m2/s2: a scenario with next to no harm counts no more than one with so much
 
 
 class Options(Algorithm):
@@ -867,7 +886,22 @@ class Options(Algorithm):
         recipe = training.recipe
         assert isinstance(recipe, OptionsRecipe)
         environment.engine.branch(environment.engine.moment())  # refuses what cannot be branched before it begins
-        return OptionsModel(environment, recipe)  # type: ignore[arg-type]  # it has what all models ask for
+        among = [padded(policy, training, "among") for policy in recipe.policies()]
+        return OptionsModel(environment, recipe, among)
+
+
+class _TorchActor(Actor):
+    """The actor of a bundle, three times as fast, to other last bits."""
+
+    @torch.no_grad()
+    def _forward(self, layers: Layers, x: Float32s) -> Float32s:
+        activation = torch.relu if self.spec.activation == "relu" else torch.tanh
+        y: Tensor = torch.from_numpy(x)
+        for number, (weight, bias) in enumerate(layers, start=1):
+            y = torch.addmm(torch.from_numpy(bias)[:, None], torch.from_numpy(weight), y)
+            y = y if number == len(layers) else activation(y)
+        found: Float32s = y.numpy()
+        return found
 
 
 class ChoosingActor(_Deterministic):
@@ -879,17 +913,33 @@ class ChoosingActor(_Deterministic):
     tried: Tensor  # [M, C] numbers of actions, the one that was taken first
     more: Tensor  # [M, C]
     known: Tensor  # [1] decisions so far; the newest take the places of the oldest
+    usual: Tensor  # [members] what the best action tried costs on average in each scenario of a mixture; 0: not known
 
-    def __init__(self, observation_space: Space[Any], action_space: Any, rate: Schedule, recipe: OptionsRecipe) -> None:
+    def __init__(
+        self,
+        observation_space: Space[Any],
+        action_space: Any,
+        rate: Schedule,
+        recipe: OptionsRecipe,
+        among: Sequence[Mapping[str, Float32s]],
+        members: int,
+    ) -> None:
         super().__init__(observation_space, action_space)
         inputs, shape, room = flatdim(observation_space), recipe.network, (recipe.memory, 1 + recipe.others)
-        layers = create_mlp(inputs, shape.choices, list(shape.policy), ACTIVATIONS[shape.activation])
-        nn.init.zeros_(layers[-1].weight)  # type: ignore[arg-type]  # until it learns, it brakes fully
-        nn.init.zeros_(layers[-1].bias)  # type: ignore[arg-type]
+        self.first, scores = len(among), len(among) + shape.choices  # the number of the first action behind policies
+        layers = create_mlp(inputs, scores, list(shape.policy), ACTIVATIONS[shape.activation])
+        nn.init.zeros_(layers[-1].weight)  # type: ignore[arg-type]  # until it learns, it takes the first: a policy's
+        nn.init.zeros_(layers[-1].bias)  # type: ignore[arg-type]  # action, or full braking
         self.average = nn.Sequential(*layers)
         self.learning = copy.deepcopy(self.average)
         self.optimizer = adam(rate(1.0), self.learning)
-        self.actions = shape.spec(inputs).actions
+        spec = recipe.network_spec(inputs)
+        tensors = {f"among_{m}.{name}": each[name] for m, each in enumerate(among, 1) for name in each}
+        for name, tensor in tensors.items():
+            self.register_buffer(name.replace(".", "_"), torch.from_numpy(tensor))
+        chooser = {row.name: np.zeros(row.shape, np.float32) for row in spec.tensors if row.name not in tensors}
+        self.take = _TorchActor(spec, {**chooser, **tensors}).take
+        self.register_buffer("usual", torch.zeros(members, dtype=torch.float64))
         self.register_buffer("seen", torch.zeros(recipe.memory, inputs))
         self.register_buffer("tried", torch.zeros(room, dtype=torch.int64))
         self.register_buffer("more", torch.zeros(room))
@@ -902,11 +952,12 @@ class ChoosingActor(_Deterministic):
         return chosen
 
     def act(self, observation: Float32s) -> Float32s:
-        return self.actions[self.choose(observation)]
+        found: Float32s = self.take(self.choose(observation), observation.T)[0]
+        return found
 
     def forward(self, observation: Tensor) -> Tensor:
         """Actions [rows, 1] of the average."""
-        return torch.from_numpy(self.actions)[self.average(observation).argmax(dim=1)][:, None]
+        return torch.from_numpy(self.act(observation.numpy()))[:, None]
 
     def remember(self, seen: Float32s, tried: Ints, more: Floats) -> None:
         """Keep decisions."""
@@ -915,18 +966,29 @@ class ChoosingActor(_Deterministic):
         self.more[places] = torch.from_numpy(more.astype(np.float32))
         self.known += len(seen)
 
-    def loss(self, count: int, guide: float) -> Tensor:
+    def draw(self, batches: int, count: int, focus: float) -> Iterator[tuple[Tensor, Tensor]]:
+        """Some of the kept decisions for each step, and what each of them counts; ``focus`` as for ``draw_rows``."""
+        known = min(int(self.known), len(self.seen))
+        if focus == 0.0:
+            for _ in range(batches):
+                yield torch.randint(known, (count,)), torch.ones(count)
+            return
+        rows, importance = draw_rows(self.more[:known].max(dim=1).values.numpy(), batches * count, focus)
+        for start in range(0, len(rows), count):
+            part = slice(start, start + count)
+            yield torch.from_numpy(rows[part]), torch.from_numpy(importance[part])
+
+    def loss(self, some: Tensor, importance: Tensor, guide: float) -> Tensor:
         """Of some of the kept decisions: the expected cost of choosing with the chances of a softmax of the scores.
 
         Where the chances are nearly 0 or 1 this has no slope. So ``guide`` times a convex loss is added: each action
         that is not the best should have a lower score, the more so the more it costs.
         """
-        some = torch.randint(min(int(self.known), len(self.seen)), (count,))
         more = self.more[some]
         scores = self.learning(self.seen[some]).gather(1, self.tried[some])
         best = scores.gather(1, more.argmin(dim=1, keepdim=True))
         expected = (scores.softmax(dim=1) * more).sum(dim=1)
-        found: Tensor = (expected + guide * (more * softplus(scores - best)).sum(dim=1)).mean()
+        found: Tensor = (importance * (expected + guide * (more * softplus(scores - best)).sum(dim=1))).mean()
         return found
 
 
@@ -936,10 +998,19 @@ class OptionsModel(CounterfactualModel):
     policy: ChoosingActor  # type: ignore[assignment]
     recipe: OptionsRecipe  # type: ignore[assignment]
 
+    def __init__(
+        self, environment: EthBrakeVecEnv, recipe: OptionsRecipe, among: Sequence[Mapping[str, Float32s]]
+    ) -> None:
+        self._among = among
+        super().__init__(environment, recipe)  # type: ignore[arg-type]  # it has what all models ask for
+
     def _setup_model(self) -> None:
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
-        self.policy = ChoosingActor(self.observation_space, self.action_space, self.lr_schedule, self.recipe)
+        members = len(self.engine.scenario.members) or 1
+        self.policy = ChoosingActor(
+            self.observation_space, self.action_space, self.lr_schedule, self.recipe, self._among, members
+        )
 
     def _update(self, told: BaseCallback, total: int) -> None:
         recipe, actor = self.recipe, self.policy
@@ -955,8 +1026,9 @@ class OptionsModel(CounterfactualModel):
         self.logger.record("train/regret", float(more[:, 0].mean()) if len(more) else 0.0)
         self.logger.record("train/telling", len(telling))
         losses = []
-        for _ in range(recipe.gradient_steps if int(actor.known) else 0):
-            loss = actor.loss(recipe.batch_size, recipe.guide)
+        steps = recipe.gradient_steps if int(actor.known) else 0
+        for some, importance in actor.draw(steps, recipe.batch_size, recipe.focus):
+            loss = actor.loss(some, importance, recipe.guide)
             descend(actor.optimizer, loss)
             follow(actor.average.parameters(), actor.learning, recipe.averaging)
             losses.append(loss.item())
@@ -969,42 +1041,67 @@ class OptionsModel(CounterfactualModel):
         The first one is the one that the actor takes. ``caution`` is part of the costs.
         """
         recipe, actor, learners = self.recipe, self.policy, len(self.engine.learners)
-        observed, last = seen.reshape(-1, seen.shape[2]), recipe.network.choices - 1
+        observed, first, last = seen.reshape(-1, seen.shape[2]), actor.first, recipe.network.choices - 1
         moving = np.flatnonzero(moving_rows(moments).repeat(learners))
         rows = moving[torch.randperm(len(moving))[: recipe.tried].numpy()]
         taken = actor.choose(observed[rows])
+        at = np.rint((actor.take(taken, observed[rows].T)[0] + 1.0) * last / 2.0).astype(np.int64)
         numbers = [taken]
         for near in recipe.near:
             ratio = (near.largest / near.smallest) ** torch.rand(len(rows), dtype=torch.float64).numpy()
             far = np.maximum(np.rint(near.smallest * ratio * last / 2.0).astype(np.int64), 1)
-            numbers += [taken - far, taken + far]
-        numbers += [np.full(len(rows), round((action + 1.0) * last / 2.0)) for action in recipe.fixed]
-        numbers += [torch.randint(last + 1, (len(rows),)).numpy() for _ in range(recipe.drawn)]
-        tried = np.clip(np.stack(numbers, axis=1), 0, last)
+            numbers += [first + np.clip(at - far, 0, last), first + np.clip(at + far, 0, last)]
+        numbers += [np.full(len(rows), first + round((action + 1.0) * last / 2.0)) for action in recipe.fixed]
+        if first:
+            numbers += [*torch.rand(len(rows), first).argsort(dim=1)[:, : recipe.drawn].T.numpy()]
+        else:
+            numbers += [torch.randint(last + 1, (len(rows),)).numpy() for _ in range(recipe.drawn)]
+        tried, every = np.stack(numbers, axis=1), first + last + 1
         holds = np.array(recipe.holds, np.int64)[torch.randint(len(recipe.holds), (len(rows),)).numpy()]
-        each, back = np.unique(np.arange(len(rows))[:, None] * (last + 1) + tried, return_inverse=True)
-        row, number = each // (last + 1), each % (last + 1)
+        each, back = np.unique(np.arange(len(rows))[:, None] * every + tried, return_inverse=True)
+        row, number = each // every, each % every
         steps = holds[row]
         if recipe.caution:  # one more branch of each decision brakes fully from there to the end
-            row, number = np.append(row, np.arange(len(rows))), np.append(number, np.zeros(len(rows), np.int64))
+            row, number = np.append(row, np.arange(len(rows))), np.append(number, np.full(len(rows), first))
             steps = np.append(steps, np.full(len(rows), FOR_GOOD))
-        learner, actions = rows[row] % learners, actor.actions[number].astype(np.float64)
+        learner = rows[row] % learners
 
         def decide(now: Observations, some: Ints, done: int) -> Floats:
-            wanted = actor.act(now.reshape(-1, now.shape[2])).astype(np.float64).reshape(now.shape[:2])
-            held = np.flatnonzero(done < steps[some])
-            wanted[held, learner[some[held]]] = actions[some[held]]
-            return wanted
+            flat, held = now.reshape(-1, now.shape[2]), np.flatnonzero(done < steps[some])
+            chosen = np.full(len(flat), -1)
+            chosen[held * learners + learner[some[held]]] = number[some[held]]
+            free = np.flatnonzero(chosen < 0)
+            chosen[free] = actor.choose(flat[free])
+            wanted: Floats = actor.take(chosen, flat.T)[0].astype(np.float64)
+            return wanted.reshape(now.shape[:2])
 
         engine = self.engine.branch(moments.take(rows[row] // learners))
         gained = play_on(engine, decide, recipe.gamma, at_least=max(recipe.holds))
         found = -gained[np.arange(len(row)), learner]
+        if recipe.tie_break:
+            found += recipe.tie_break * engine.ledger.world_harm(other_count(engine.reward.harm_count))
         costs = found[back].reshape(tried.shape)
         if recipe.caution:
             done = 1.0 - self._current_progress_remaining
             costs += recipe.caution * done * np.maximum(costs - found[len(each) :, np.newaxis], 0.0)
         good = np.isfinite(costs).all(axis=1)
+        if recipe.relative:
+            costs /= self._usual(rows // learners, np.where(good, costs.min(axis=1), 0.0))[:, np.newaxis]
         return observed[rows[good]], tried[good], costs[good]
+
+    def _usual(self, rows: Ints, least: Floats) -> Floats:
+        """What decisions [B] of these rows usually cost in their scenarios [B], to which these costs are added."""
+        numbers = self._numbers[rows]
+        first = int(numbers.min())
+        drawn = self.engine.scenario.members_of(
+            int(numbers.max()) - first + 1, self.engine.seed, first=first, channel="training"
+        )
+        member, usual = drawn[numbers - first], self.policy.usual.numpy()
+        for m in np.unique(member):
+            mean = float(least[member == m].mean())
+            usual[m] = USUAL_KEPT * usual[m] + (1.0 - USUAL_KEPT) * mean if usual[m] else mean
+        found: Floats = np.maximum(usual[member], LEAST_USUAL)
+        return found
 
 
 # Several networks: which updates of a training do what.
@@ -1305,7 +1402,7 @@ class ModesModel(CounterfactualModel):
         count, scout = self.plan.gate_states, self.policy.gate.scout
         expect = None if scout is None else scout.expect
         rows, importance = choose_rows(observed, np.flatnonzero(differ), count, self.recipe.focus, expect)
-        other: HarmCount = "total" if engine.reward.harm_count == "first" else "first"
+        other = other_count(engine.reward.harm_count)
         then = moments.take(rows)
         costs = np.empty((len(rows), len(members)))
         for number, act in enumerate(members):

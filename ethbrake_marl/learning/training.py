@@ -500,6 +500,10 @@ Steps = Annotated[int, Field(ge=1, le=1000)]
 _NO_SHAPING = "must be 0: what is tried is played to the end, where shaping tells nothing more"
 
 
+Focus = Annotated[float, Field(ge=0.0, le=0.99, exclude_if=not_)]
+PolicyName = Annotated[str, Field(pattern=r"^[a-z]+@.+$", max_length=4096)]
+
+
 class CounterfactualRecipe(TrainingRecipe):
     """Try ``counterfactuals`` of the ``n_envs x n_steps`` decisions of a round otherwise, then learn from all of them.
 
@@ -521,9 +525,7 @@ class CounterfactualRecipe(TrainingRecipe):
     n_epochs: Annotated[int, Field(ge=1, le=1000)]
     batch_size: Annotated[int, Field(ge=2)]
     averaging: Averaging
-    focus: Annotated[float, Field(ge=0.0, le=0.99, exclude_if=not_)] = (
-        0.0  # share of what is tried that a scout chooses
-    )
+    focus: Focus = 0.0  # share of what is tried that a scout chooses
     network: ActorShape
     modes: Annotated[ModesPlan | None, Field(exclude_if=not_)] = None  # several networks and a gate
 
@@ -558,13 +560,15 @@ class CounterfactualRecipe(TrainingRecipe):
 class OptionsRecipe(TrainingRecipe):
     """Try ``tried`` of the ``n_envs x n_steps`` decisions of a round with several actions each; learn to choose.
 
-    The actions of the policy are ``network.choices``, evenly from -1 to 1. Tried are the one that it takes, one below
-    and one above it in each of the distances ``near``, the actions ``fixed``, and ``drawn`` ones.
+    The actions of the policy are ``network.choices``, evenly from -1 to 1, and those of the policies ``among`` which it
+    chooses too. Tried are the one that it takes, one below and one above it in each of the distances ``near``, the
+    actions ``fixed``, and ``drawn`` ones: of the policies, or of the actions where there are none.
     """
 
     most_decisions = 2**22
 
     algorithm: Literal["options"]
+    among: Annotated[tuple[PolicyName, ...], Field(strict=False, max_length=16, exclude_if=not_)] = ()
     n_steps: Annotated[int, Field(ge=1)]
     tried: Annotated[int, Field(ge=1)]
     near: Annotated[tuple[OffsetRange, ...], Field(strict=False, max_length=8)]
@@ -573,6 +577,9 @@ class OptionsRecipe(TrainingRecipe):
     holds: Annotated[tuple[Steps, ...], Field(strict=False, min_length=1, max_length=16)]
     largest_cost: Positive
     caution: Annotated[float, Field(ge=0.0, allow_inf_nan=False, exclude_if=not_)] = 0.0
+    tie_break: Annotated[float, Field(ge=0.0, allow_inf_nan=False, exclude_if=not_)] = 0.0
+    relative: Annotated[bool, Field(exclude_if=not_)] = False
+    focus: Focus = 0.0  # share of what is learned from that is drawn by what there is to lose
     guide: NonNegative
     memory: Annotated[int, Field(ge=1, le=500_000)]
     gradient_steps: Annotated[int, Field(ge=1, le=100_000)]
@@ -589,6 +596,8 @@ class OptionsRecipe(TrainingRecipe):
             refuse(("tried",), self.tried, f"must be at most n_envs x n_steps = {visited}")
         if not self.memory >= self.tried:
             refuse(("memory",), self.memory, f"must be at least tried = {self.tried}")
+        if self.among and not self.drawn <= len(self.among):
+            refuse(("drawn",), self.drawn, f"must be at most the number of policies among = {len(self.among)}")
         if not self.others:
             refuse(("near",), list(self.near), "must hold a range where there are neither fixed nor drawn actions")
         return self
@@ -597,6 +606,16 @@ class OptionsRecipe(TrainingRecipe):
     def others(self) -> int:
         """How many actions are tried beside the one that the policy takes."""
         return 2 * len(self.near) + len(self.fixed) + self.drawn
+
+    def network_spec(self, observation_size: int) -> NetworkSpec:
+        """The actor, with the policies among which it chooses."""
+        several = {"observation_size": observation_size, "value_hidden": ()}
+        among = tuple(each.manifest.network.model_copy(update=several) for each in self.policies())
+        return self.network.spec(observation_size, among=among)
+
+    def policies(self) -> list[Policy]:
+        """Those among which it chooses; raises ``InvalidInput`` naming one that cannot be read."""
+        return [load_named_policy(path, kind) for kind, _, path in (each.partition("@") for each in self.among)]
 
 
 # The names of the learning algorithms, each with the class of its recipes and the algorithm itself.
@@ -720,7 +739,10 @@ MEANINGS = {
     "tried": "how many of the decisions of a round are tried with other actions",
     "near": "ranges of distances to the action taken, each tried below and above it; the logarithm drawn is uniform",
     "fixed": "actions tried at each of these decisions, from -1 (full braking) to 1; the nearest of the choices is",
-    "drawn": "how many more actions are tried there, any of the choices",
+    "drawn": "how many more are tried there: of the policies among, or where there are none of the choices",
+    "among": "policies of which one can act at each decision, for instance policy@runs/first; left out: none",
+    "tie_break": "weight of the other count's harm in the costs",
+    "relative": "true: in a mixture, costs count beside the usual ones of the same scenario",
     "caution": "how many times the excess over full braking from there on counts besides, at the end; it grows from 0",
     "largest_cost": "an action that costs more than this beyond the best one counts as this much more",
     "guide": "weight of the convex part of the loss, without which learning can stand still at the beginning",

@@ -149,6 +149,8 @@ class QuantityRule:
             values = worlds.dry(self.name)
         if self.stream == BRAKES:  # as high as a rate can be declared: at once
             values = np.minimum(values, self.high)
+        if self.stream == OBSTACLE:  # no number where there is none
+            values = np.where(np.isfinite(values), values, np.nan)
         return values.reshape(worlds.n, -1)
 
 
@@ -165,11 +167,12 @@ class Quantities(NamedTuple):
     declared: dict[str, QuantityRule]  # every key that declares one
 
     def of(self, worlds: Worlds) -> dict[str, QuantityRule]:
-        """Those that these worlds have: the distance to an obstacle, and friction, only where all have such.
+        """Those that these worlds have: friction only where all have such.
 
-        A rate of brakes is told of all where some have one.
+        The distance to an obstacle, and a rate of brakes, are told of all where some have one: the former is NaN
+        where there is no obstacle.
         """
-        there = {key: np.isfinite(getattr(worlds, key)).all() for key in ("obstacle_gap_m", "friction")}
+        there = {"obstacle_gap_m": worlds.obstacle_ahead.any(), "friction": np.isfinite(worlds.friction).all()}
         there |= {key: np.isfinite(getattr(worlds.vehicles, key)).any() for key in self.optional if key not in there}
         return self.usual | {key: rule for key, rule in self.optional.items() if there[key]}
 
@@ -1383,9 +1386,7 @@ class ScenarioFields(FileModel):
             raise InvalidInput(f"sample: channel {channel!r}: must be one of {', '.join(CHANNELS)}")
         if self.mixture is None:
             return _draw_numbers(self, np.arange(first, first + n, dtype=np.int64), int(seed), channel)
-        cumulative = np.cumsum([member.weight for member in self.mixture])
-        u = uniform_numbers(int(seed), channel, 0, first, n, OF_WORLD, of=MIXTURE)[:, 0]
-        chosen = np.searchsorted(cumulative / cumulative[-1], u, side="right")
+        chosen = self.members_of(n, int(seed), first=first, channel=channel)
         typed = any(member.vehicle_types is not None for member in self.members)
         parts = []
         for k, member in enumerate(self.members):
@@ -1395,6 +1396,12 @@ class ScenarioFields(FileModel):
                 no_type = np.full((len(index), self.vehicles), "") if typed and drawn.types is None else drawn.types
                 parts.append(replace(drawn, types=no_type, scenarios=np.full(len(index), member.name)))
         return Sample.join(parts, sum(part.rejected for part in parts))
+
+    def members_of(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Ints:
+        """From which of its ``members`` such worlds of a mixture are drawn, [n]; 0 without a mixture."""
+        cumulative = np.cumsum([member.weight for member in self.mixture or ()] or [1.0])
+        u = uniform_numbers(seed, channel, 0, first, n, OF_WORLD, of=MIXTURE)[:, 0]
+        return np.searchsorted(cumulative / cumulative[-1], u, side="right")
 
     def equipped(self, types: Ints | None = None) -> Equipped:
         """Who has what of V2X in worlds with these types [n, N]; without them, what everybody surely has, [1, N]."""

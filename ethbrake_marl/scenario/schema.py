@@ -259,12 +259,6 @@ def _check_members(document: Document, members: Sequence[ScenarioFields]) -> Non
                 f"{where}: v2x.persistence must be the same in all, and so must the delay of periodic messages:"
                 f" {first.name} and {member.name} differ; give v2x beside mixture, and it holds for all"
             )
-        if member.has_obstacle != first.has_obstacle:
-            one, other = ("one" if each.has_obstacle else "none" for each in (first, member))
-            raise InvalidInput(
-                f"{where}: an obstacle ahead must be there in all or in none: {first.name} has {one}, {member.name} has"
-                f" {other}"
-            )
 
 
 def _told(scenario: ScenarioFields, key: str) -> str:

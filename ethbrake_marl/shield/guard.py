@@ -410,7 +410,7 @@ class StepGuard(ShieldGuard):
             raise UncertifiedStep(
                 f"shield: world {k} is at step {after.steps[k]} of its episode, certified was step {running.steps[k]}"
             )
-        seen = seen_columns(after.packed)
+        seen = shield.as_seen(seen_columns(after.packed))
         surprising = wanted & ~shield.expects(seen)
         if not surprising.any():
             return memory

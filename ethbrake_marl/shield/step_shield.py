@@ -716,9 +716,7 @@ def seen_columns(packed: Packed) -> Floats:
     """
     state, column = packed.state, packed.column
     speeds, first, pairs, at = state[:, column.speed : column.command], column.gap, column.vehicles - 1, column.obstacle
-    if packed.has_obstacle and (ahead := np.isfinite(state[:, at])).any():
-        if not ahead.all():
-            raise InvalidInput("shield: only some of the worlds have an obstacle ahead (obstacle_gap_m), not all")
+    if packed.has_obstacle:
         groups = [state[:, first + g * pairs : first + (g + 1) * pairs] for g in range(len(GROUPS))]
         whole = [part for g, group in enumerate(groups) for part in (state[:, at + g : at + g + 1], group)]
         return np.concatenate([np.zeros((len(state), 1)), speeds, *whole], axis=1)
@@ -727,7 +725,7 @@ def seen_columns(packed: Packed) -> Floats:
 
 def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
     """These worlds in the states [n, S] of a problem with them: speeds, gaps, hit flags, and those of the obstacle."""
-    added = int(worlds.obstacle_ahead.any())  # columns in front of each group
+    added = (states.shape[1] + 4) // 6 - worlds.N  # 1: columns of an obstacle, or of a post, in front of each group
     N = worlds.N + added
     gaps, hit = states[:, N : 2 * N - 1], states[:, 2 * N - 1 : 3 * N - 2] == 1.0
     return replace(
@@ -735,7 +733,7 @@ def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
         speeds_mps=states[:, added:N].copy(),
         gaps_m=gaps[:, added:].copy(),
         pair_hit=hit[:, added:].copy(),
-        obstacle_gap_m=gaps[:, 0].copy() if added else worlds.obstacle_gap_m,
+        obstacle_gap_m=np.where(worlds.obstacle_ahead, gaps[:, 0], np.inf) if added else worlds.obstacle_gap_m,
         obstacle_hit=hit[:, 0].copy() if added else worlds.obstacle_hit,
     )
 
@@ -1138,7 +1136,7 @@ class StepShield:
         with renumbered(np.repeat(np.arange(worlds.n), members)):
             problem = profile_problem(
                 possible, vehicles, harm_count=self.harm_count, horizon_s=horizon_s,
-                time_step_s=self.scenario.time_step_s, others_mps2=others,
+                time_step_s=self.scenario.time_step_s, others_mps2=others, written_out=self.scenario.has_obstacle,
             )  # fmt: skip
         running = begin_running(problem, members)
         plan = self._best_constants(worlds, running)
@@ -1273,6 +1271,16 @@ class StepShield:
             self._logged = len(self._entries)
         return decision
 
+    def as_seen(self, seen: Floats) -> Floats:
+        """What is seen, with a post ahead where it was predicted: nothing stands there."""
+        assert self.running is not None
+        N = self.running.problem.mass.shape[1]
+        if self.scenario.vehicles == N:
+            return seen
+        seen = seen.copy()
+        seen[:, N] = np.where(np.isposinf(seen[:, N]), self.running.states[:: self.running.members, N], seen[:, N])
+        return seen
+
     def expects(self, seen: Floats) -> Bools:
         """Where what is seen now [n, columns] does not contradict what was predicted, [n].
 
@@ -1283,6 +1291,7 @@ class StepShield:
         """
         running, boxes = self.running, self.boxes
         assert running is not None
+        seen = self.as_seen(seen)
         columns, N = seen.shape[1], running.problem.mass.shape[1]
         if running.members == 1:
             return np.asarray((seen == running.states[:, :columns]).all(axis=1), np.bool_)
@@ -1300,8 +1309,8 @@ class StepShield:
     def _compare(self, seen: Floats, asked: Bools) -> None:
         """Find the worlds that did not do what was predicted, and choose anew there from what is seen."""
         assert self.running is not None
-        running, columns = self.running, seen.shape[1]
-        surprising = asked & ~self.expects(seen)
+        running, seen = self.running, self.as_seen(seen)
+        columns, surprising = seen.shape[1], asked & ~self.expects(seen)
         if not surprising.any():
             return
         self.distrusted = self.distrusted | surprising

@@ -105,7 +105,7 @@ class Measure:
                     score=float(found.score[k]),
                     harm=float(found.harm[k]),
                     reference=None if found.reference is None else float(found.reference[k]),
-                    state=state,
+                    state={name: each for name, each in state.items() if each is not None},
                 )
                 for k, state in enumerate(states_of(sample.worlds, self.scenario))
             ]

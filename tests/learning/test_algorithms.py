@@ -536,5 +536,43 @@ def test_options__loss_by_hand_and_what_is_remembered_last() -> None:
     with torch.no_grad():
         actor.learning[-1].bias.copy_(torch.log(torch.tensor([1.0, 2.0, 3.0])))
     expected, convex = (2.0 * 2.0 + 4.0 * 3.0) / 6.0, 2.0 * math.log(1.0 + 2.0) + 4.0 * math.log(1.0 + 3.0)
-    assert actor.loss(4, 0.0).item() == pytest.approx(expected)
-    assert actor.loss(4, 0.1).item() == pytest.approx(expected + 0.1 * convex)
+    (kept,) = actor.draw(1, 4, 0.0)
+    assert actor.loss(*kept, 0.0).item() == pytest.approx(expected)
+    assert actor.loss(*kept, 0.1).item() == pytest.approx(expected + 0.1 * convex)
+    actor.more[0] = 0.0  # nothing to lose: hardly drawn any more, but what is drawn counts as before on average
+    batches = [*actor.draw(50, 40, 0.8)]
+    rows, importance = (torch.cat(each) for each in zip(*batches, strict=True))
+    assert [len(some) for some, _ in batches] == [40] * 50 and float((rows == 1).float().mean()) > 0.85
+    assert [float(importance[rows == row].sum()) / 1000 for row in (0, 1)] == pytest.approx([1.0, 1.0], abs=0.2)
+
+
+def test_options__among_policies_drive_as_alone_and_costs_are_beside_those_usual_in_each_scenario() -> None:
+    line = eb.load_scenario(
+        {"name": "two", "mixture": [{"scenario": "paper-random"}, {"scenario": "paper-delay-high"}]}
+    )
+    among, shape = ["policy@shipped/ppo", "policy@shipped/sac"], {"policy": [8], "choices": 2}
+    model = choosing(line, among=among, tried=8, near=[], fixed=[-1.0], drawn=2, holds=[1000], network=shape)
+    start = model.engine.moment()
+    model._numbers = model.engine.roster.numbers.copy()
+    torch.manual_seed(5)
+    seen, tried, costs = model._try_actions(model._last_obs[np.newaxis], start)
+    order, rows = np.argsort(seen[:, 0]), np.argsort(model._last_obs[:, 0])
+    assert (tried[:, 0] == 0).all() and (tried[:, 1] == 2).all() and (np.sort(tried[:, 2:]) == [0, 1]).all()
+    alone = [eb.load_shipped("ppo"), eb.load_shipped("sac"), lambda now: np.full((len(now), 1), -1.0)]
+    for number, act in enumerate(alone):
+        engine = model.engine.branch(start.take(rows))
+        for _ in range(200):
+            engine.step(act(engine.observe_all()[:, 0]).astype(np.float64))
+            if engine.ended.all():
+                break
+        found = costs[order][tried[order] == number].reshape(len(rows), -1)
+        np.testing.assert_allclose(found.T, np.tile(engine.ledger.world_harm("total"), (found.shape[1], 1)), rtol=1e-3)
+    model.recipe = model.recipe.replace(relative=True, tie_break=0.5)
+    torch.manual_seed(5)
+    both = model._try_actions(model._last_obs[np.newaxis], start)[2]
+    usual = model.policy.usual.numpy()
+    assert (usual > 0.0).all() and usual[0] < usual[1]
+    member = line.members_of(8, model.engine.seed, channel="training")
+    least = both[order].min(axis=1)
+    for m in range(2):  # the first time what is usual is the mean of these
+        assert least[member[rows] == m].mean() == pytest.approx(1.0)

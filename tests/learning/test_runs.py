@@ -499,6 +499,8 @@ MIXTURE = eb.load_scenario(
 REMEMBERING = PAPER.replace(
     early_impacts="keep", roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "e_v2x_bm:pairwise"}
 )
+AMONG = {"among": ["policy@shipped/ppo", "policy@shipped/counterfactual"], "drawn": 2, "near": [], "focus": 0.5,
+         "relative": True, "tie_break": 0.5, "observation": ["own", "front_1", "rear_1", "contact"]}  # fmt: skip
 PPO = TINY_PPO.replace(total_steps=8 * 128)
 TEAM = TINY_PPO.replace(total_steps=6 * 256)
 TRAININGS = {
@@ -513,6 +515,7 @@ TRAININGS = {
     "counterfactual": (TINY_COUNTERFACTUAL.replace(gradient_limit="auto"), PAPER),
     "modes": (TINY_MODES, PAPER),
     "options": (TINY_OPTIONS, PAPER),
+    "among": (TINY_OPTIONS.replace(**AMONG), MIXTURE),
     "scout": (TINY_MODES.replace(focus=0.75, modes=MODES | {"tie_break": 0.0}), PAPER),
 }
 Whole = Callable[[str], tuple[Path, TrainResult]]

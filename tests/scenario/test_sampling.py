@@ -226,6 +226,38 @@ def test_results__tell_scenario_and_types_agree_with_the_members_and_can_be_grou
     assert np.sum(told, axis=0).tolist() == [200, eb.summarise(found)[0].collisions]
 
 
+def test_mixture__an_obstacle_in_some_worlds_changes_nothing_in_the_others() -> None:
+    """Nor does what is searched in a world, or certified, depend on the worlds beside it; the rest is left open."""
+    mixture = mixed("paper-random", "paper-random-obstacle")
+    sample = mixture.sample(12, 7)
+    names = ("e_v2x_bm", "best_harm:20", "full_brake+refined:profile", "coast+episode", "coast+step")
+
+    def driven(scenario: eb.Scenario, worlds: Any, **options: Any) -> Any:
+        agents = {name: eb.make_agent(name, scenario=scenario, harm_count="total") for name in names}
+        return eb.evaluate(worlds, agents, scenario=scenario, seed=7, **options)
+
+    together, apart = driven(mixture, sample), driven(mixture, sample, chunk=1)
+    for member in map(eb.load_scenario, ("paper-random", "paper-random-obstacle")):
+        rows = np.flatnonzero(sample.scenarios == member.name)
+        own = driven(member, member.sample(12, 7).take(rows))
+        for name in names:
+            harm = own.outcome(name).total_harm.tobytes()
+            assert [found.outcome(name).total_harm[rows].tobytes() for found in (together, apart)] == [harm, harm]
+        told = {row for row, gap in enumerate(together.per_world()["obstacle_gap_m"][: sample.worlds.n]) if gap is None}
+        assert bool(told & set(rows)) != member.has_obstacle
+    assert "obstacle at = " in " ".join(str(eb.summarise(together)).split())
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_step_shield__in_a_batch_whose_rows_come_to_an_obstacle_and_lose_it(seed: int) -> None:
+    env = eb.shield(
+        eb.make_sb3_vec_env(mixed("paper-random", "paper-random-obstacle"), n_envs=2, seed=seed), mode="step"
+    )
+    env.reset()
+    for _ in range(120):
+        env.step(np.full((2, 1), 0.5, np.float32))
+
+
 def test_shields_and_searches__take_a_mixture() -> None:
     agents = {name: eb.make_agent(name, scenario=DELAYS) for name in ("full_brake+step", "constant:3+episode")}
     plain = eb.evaluate(DELAYS.sample(20, 7), {"b": eb.make_agent("full_brake")}, scenario=DELAYS).outcome("b")
