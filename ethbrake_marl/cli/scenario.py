@@ -119,7 +119,7 @@ def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tupl
     others = {
         key: ["drawn" if np.ptp(each) else f"{each[0]:g}" for each in rule.of(worlds).T]
         for key, rule in scenarios.QUANTITY.of(worlds).items()
-        if key not in varying and not np.ptp(rule.of(worlds), axis=0).all()
+        if key not in ranges and not np.ptp(rule.of(worlds), axis=0).all()
     }
     told = (f"{key} {each[0] if len(set(each)) == 1 else ', '.join(each)}" for key, each in others.items())
     columns = {

@@ -472,7 +472,8 @@ def _beyond(before: Worlds, worlds: Worlds) -> list[str]:
             found.append(f"no {key} in {100.0 * none:.0f} % of the worlds")
         if share > _MOST_BEYOND:
             found.append(f"{key} in {100.0 * share:.0f} % of the worlds")
-    return found + [f"no {key}" for key in known if key not in here]
+    gone = {key: rule.of(before) < rule.high for key, rule in known.items() if key not in here}
+    return found + [f"no {key}" for key, there in gone.items() if there.any(axis=1).all()]  # all had it before
 
 
 def make_lineup(

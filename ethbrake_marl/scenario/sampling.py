@@ -1096,8 +1096,10 @@ class ScenarioFields(FileModel):
                 return {key: given(value) for key, value in part.items() if value is not None}
             return [given(each) for each in part] if isinstance(part, list | tuple) else part
 
+        usual["v2x"] = None, given(V2X().model_dump(mode="json"))  # beside a mixture it would hold for all members
+
         def declared(scenario: Mapping[str, Any]) -> dict[str, Any]:
-            told = {key: given(value) for key, value in scenario.items() if value not in usual.get(key, ())}
+            told = {key: given(value) for key, value in scenario.items() if given(value) not in usual.get(key, ())}
             if "mixture" in told:
                 told["mixture"] = [{**each, "scenario": declared(each["scenario"])} for each in told["mixture"]]
             return told
@@ -1349,7 +1351,8 @@ class ScenarioFields(FileModel):
         Capacities are what the road allows; ``dry``: what they are on a dry one.
         """
         found = [world_quantities(member, _supports_of(member)) for member in self.members or (self,)]
-        lows, highs = zip(*((each if dry else on_road(each))[field] for each in found), strict=True)
+        at_once = np.full((2, self.vehicles), QUANTITY.declared[field].high)  # of members that declare no rate
+        lows, highs = zip(*((each if dry else on_road(each)).get(field, at_once) for each in found), strict=True)
         return tuple(zip(np.min(lows, axis=0).tolist(), np.max(highs, axis=0).tolist(), strict=True))
 
     @property

@@ -323,7 +323,7 @@ def test_every_results_file__says_its_kind_worlds_scenario_and_versions(
 @pytest.mark.parametrize(
     ("agent", "scenario", "beyond"),
     [
-        ("universal@shipped/universal+step", load_scenario("paper-random-obstacle"), "obstacle_gap_m"),
+        ("counterfactual@shipped/universal-wide+step", load_scenario("paper-random-obstacle"), "obstacle_gap_m"),
         ("options@shipped/options-paper-random-obstacle-total", PAPER, "no obstacle_gap_m"),
         ("ppo@shipped/ppo", PAPER.replace(time_step_s=0.05), "time_step_s"),
         ("ppo@shipped/ppo", PAPER.replace(roles={**ROLES, "vehicle_3": "coast"}), "vehicle_3 by coast"),

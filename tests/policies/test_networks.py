@@ -360,7 +360,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "unknown_key": (_edit(loader="os.system"), r"manifest.json: loader: unknown key"),
     "dotted_algorithm": (_edit(algorithm="subprocess.Popen"), r"manifest.json: algorithm: must be 1 to 64 lower case"),
     "dotted_activation": (_edit(network__activation="torch.nn.ReLU"), r"manifest.json: network.activation"),
-    "future_version": (_edit(format_version=5), r"manifest.json: format_version: must be 2, 3 or 4"),
+    "future_version": (_edit(format_version=6), r"manifest.json: format_version: must be 2, 3, 4 or 5"),
     "version_of_several_networks": (
         _edit(format_version=3),
         r"manifest.json: format_version: 3 for 1 networks and output clip; must be 2",
@@ -405,7 +405,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     ),
     "other_features": (_edit(observation__features=[f"own.{k}" for k in range(27)]), r"manifest.json: observation: "),
     "other_scaling": (_edit(observation__scaling_sha256="0" * 64), r"manifest.json: observation: features or their"),
-    "older_version": (_edit(format_version=1), r"manifest.json: format_version: must be 2, 3 or 4"),
+    "older_version": (_edit(format_version=1), r"manifest.json: format_version: must be 2, 3, 4 or 5"),
     "other_activation": (_edit(rehash=False, network__activation="tanh"), r"manifest.json: its content has SHA-256"),
     "other_output": (_edit(rehash=False, network__output="tanh"), r"manifest.json: its content has SHA-256"),
     "other_steps": (_edit(rehash=False, steps=999_999_999), r"manifest.json: its content has SHA-256"),
