@@ -775,8 +775,8 @@ def shipped_name(kind: str, scenario: Scenario | None, harm_count: HarmCount) ->
     """Name of the policy of this kind for ``scenario``, of those trained for ``harm_count`` if there is one.
 
     ``universal`` is for all scenarios, ``ppo`` and ``sac`` for the one that they were trained on, ``ppo-SCENARIO`` and
-    ``sac-SCENARIO`` for that one; ``-total`` behind says that a policy was trained for total harm. ``policy`` is the best of all kinds. Raises
-    ``InvalidInput`` listing what ships.
+    ``sac-SCENARIO`` for that one; ``-total`` behind says that a policy was trained for total harm. ``policy`` is the
+    best of all kinds. Raises ``InvalidInput`` listing what ships.
     """
     names, here = shipped_policies(), None if scenario is None else scenario.name
     for each in _BEST_FIRST if kind == "policy" else ():
