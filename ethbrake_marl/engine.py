@@ -1315,6 +1315,7 @@ class Engine:
         """
         arrays: Arrays = {name.lstrip("_"): getattr(self, name).copy() for name in RUNNING}
         arrays["stream"] = np.array([self.seed, self._stream.position], np.uint64)
+        arrays["numbers"] = self.roster.numbers.copy()
         return arrays | {f"script.{name}": array for name, array in _flat(self.memories).items()}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -1327,18 +1328,20 @@ class Engine:
             raise InvalidInput(
                 "engine snapshot: a shield stands in this engine; restore first, then put the shield around"
             )
-        for name in RUNNING:
-            have, wanted = arrays.get(name.lstrip("_")), getattr(self, name)
-            if have is None or have.shape != wanted.shape:
+        wanted = {name.lstrip("_"): getattr(self, name).shape for name in RUNNING} | {"numbers": (self.n,)}
+        for name, needed in wanted.items():
+            have = arrays.get(name)
+            if have is None or have.shape != needed:
                 shape = "nothing" if have is None else have.shape
-                raise InvalidInput(f"engine snapshot: {name.lstrip('_')} is {shape}; {wanted.shape} is needed")
+                raise InvalidInput(f"engine snapshot: {name} is {shape}; {needed} is needed")
         memories = {vehicle: checked_memory(_unflat(arrays, f"script.{vehicle}"), self.n) for vehicle in self.memories}
         for name in RUNNING:
             setattr(self, name, np.array(arrays[name.lstrip("_")], np.float64))
         self._builds_up = self._may_build_up(self.packed)
         seed, taken = (int(number) for number in arrays["stream"])
         self._stream.restart(seed, taken)
-        self.roster = Roster(self.n, seed, None)  # a snapshot does not keep the numbers of running episodes
+        self.roster = Roster(self.n, seed, None)
+        self.roster.numbers = np.array(arrays["numbers"], np.int64)
         self.memories = memories
 
     def place(self, worlds: Worlds, ledger: Ledger | None = None, *, ended: Bools | None = None) -> None:

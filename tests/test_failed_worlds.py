@@ -92,11 +92,11 @@ def test_engine__cuts_the_episode_off_names_the_world_and_steps_the_others():
         running.step(np.zeros((3, 1)))
 
 
-def test_engine__after_a_snapshot_names_the_row():
+def test_engine__after_a_snapshot_names_the_world():
     running, other = engine(), engine(seed=9)
     other.restore(running.snapshot())
     break_row(other, 2)
-    with pytest.warns(FailedWorld, match=r"^the world of row 2: a contact was missed"):
+    with pytest.warns(FailedWorld, match=r"^world 2 of seed 5: a contact was missed"):
         other.step(np.zeros((3, 1)))
 
 

@@ -473,7 +473,7 @@ _ENTRIES: dict[str, Entry] = {
         Source.MESSAGES,
         _POLICIES,
     ),
-    "universal": Entry("universal@shipped", "the shipped policy for all parameters", Source.MESSAGES, _POLICIES),
+    "universal": Entry("universal@shipped", "the shipped policy for every scenario", Source.MESSAGES, _POLICIES),
     "team": Entry("team@RUN", "the learners of a run, each as it was trained, or shipped", Source.MESSAGES, _POLICIES),
 }
 

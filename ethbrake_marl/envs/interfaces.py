@@ -189,8 +189,8 @@ def describe_worlds(engine: Engine) -> Columns:
     Quantities of the world at the alert, named as in a table of initial states (``gap_1_m``, ``mass_2_t``); where there
     is such, ``scenario`` of a mixture and ``vehicle_2_type``; and ``world_seed`` and ``world`` as in the infos. Where
     worlds were given and others have taken the places of some since, types are of these only. Raises ``InvalidInput``
-    for worlds of which nobody knows: after a snapshot was restored, or where a world could not be advanced to its first
-    decision and another one stands in its place.
+    for worlds of which nobody knows: given ones after a snapshot was restored, or one that could not be advanced to its
+    first decision, where another one stands in its place.
     """
     numbers, given = engine.roster.numbers, engine.roster.given
     named = {"world_seed": np.full(engine.n, engine.roster.seed), "world": numbers.copy()}
@@ -198,7 +198,7 @@ def describe_worlds(engine: Engine) -> Columns:
     if own.any():
         if given is None:
             raise InvalidInput(
-                "describe_worlds: these episodes go on from a snapshot, which does not keep what they were drawn as;"
+                "describe_worlds: these episodes go on from a snapshot, which does not keep worlds that were given;"
                 " ask again once they have ended, or after a reset"
             )
         found = QUANTITY.columns(given)

@@ -886,7 +886,7 @@ class Options(Algorithm):
         recipe = training.recipe
         assert isinstance(recipe, OptionsRecipe)
         environment.engine.branch(environment.engine.moment())  # refuses what cannot be branched before it begins
-        among = [padded(policy, training, "among") for policy in recipe.policies()]
+        among = [padded(policy, training, "among") for policy in recipe.policies]
         return OptionsModel(environment, recipe, among)
 
 
@@ -969,7 +969,7 @@ class ChoosingActor(_Deterministic):
     def draw(self, batches: int, count: int, focus: float) -> Iterator[tuple[Tensor, Tensor]]:
         """Some of the kept decisions for each step, and what each of them counts; ``focus`` as for ``draw_rows``."""
         known = min(int(self.known), len(self.seen))
-        if focus == 0.0:
+        if focus == 0.0 or batches == 0:
             for _ in range(batches):
                 yield torch.randint(known, (count,)), torch.ones(count)
             return
@@ -1076,18 +1076,21 @@ class OptionsModel(CounterfactualModel):
             return wanted.reshape(now.shape[:2])
 
         engine = self.engine.branch(moments.take(rows[row] // learners))
+        other = other_count(engine.reward.harm_count)
+        before = engine.ledger.world_harm(other)
         gained = play_on(engine, decide, recipe.gamma, at_least=max(recipe.holds))
         found = -gained[np.arange(len(row)), learner]
         if recipe.tie_break:
-            found += recipe.tie_break * engine.ledger.world_harm(other_count(engine.reward.harm_count))
+            found += recipe.tie_break * (engine.ledger.world_harm(other) - before)
         costs = found[back].reshape(tried.shape)
         if recipe.caution:
             done = 1.0 - self._current_progress_remaining
             costs += recipe.caution * done * np.maximum(costs - found[len(each) :, np.newaxis], 0.0)
         good = np.isfinite(costs).all(axis=1)
-        if recipe.relative:
-            costs /= self._usual(rows // learners, np.where(good, costs.min(axis=1), 0.0))[:, np.newaxis]
-        return observed[rows[good]], tried[good], costs[good]
+        rows, tried, costs = rows[good], tried[good], costs[good]
+        if recipe.relative and len(rows):
+            costs /= self._usual(rows // learners, costs.min(axis=1))[:, np.newaxis]
+        return observed[rows], tried, costs
 
     def _usual(self, rows: Ints, least: Floats) -> Floats:
         """What decisions [B] of these rows usually cost in their scenarios [B], to which these costs are added."""

@@ -19,6 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cached_property
 from importlib import import_module
 from operator import not_
 from pathlib import Path
@@ -610,12 +611,23 @@ class OptionsRecipe(TrainingRecipe):
     def network_spec(self, observation_size: int) -> NetworkSpec:
         """The actor, with the policies among which it chooses."""
         several = {"observation_size": observation_size, "value_hidden": ()}
-        among = tuple(each.manifest.network.model_copy(update=several) for each in self.policies())
+        among = tuple(each.manifest.network.model_copy(update=several) for each in self.policies)
         return self.network.spec(observation_size, among=among)
 
-    def policies(self) -> list[Policy]:
-        """Those among which it chooses; raises ``InvalidInput`` naming one that cannot be read."""
-        return [load_named_policy(path, kind) for kind, _, path in (each.partition("@") for each in self.among)]
+    @cached_property
+    def policies(self) -> tuple[Policy, ...]:
+        """Those among which it chooses, read once; raises ``InvalidInput`` naming one that cannot be taken."""
+        found = []
+        for name in self.among:
+            kind, _, path = name.partition("@")
+            policy = load_named_policy(path)
+            where, by = f"recipe {self.name!r}: among: {name}", policy.manifest.algorithm
+            if policy.manifest.network.among:
+                raise InvalidInput(f"{where} chooses among policies itself; list those")
+            if path == SHIPPED or kind not in ("policy", by):
+                raise InvalidInput(f"{where}: give policy@shipped/NAME, or {by}@ and its path")
+            found.append(policy)
+        return tuple(found)
 
 
 # The names of the learning algorithms, each with the class of its recipes and the algorithm itself.
@@ -734,14 +746,14 @@ MEANINGS = {
     "trust_radius": "farthest that one update asks an action to move",
     "anchor": "how much an action that makes no difference holds to where it is",
     "averaging": "share of itself that the average of the weights, which drives, keeps in each gradient step",
-    "focus": "share of what is tried that a scout chooses; left out: 0, all decisions alike",
+    "focus": "share drawn where a choice matters most: of what is tried, by a scout; in options of what is learned",
     "modes": "several networks and a gate between them; left out: one network",
     "tried": "how many of the decisions of a round are tried with other actions",
     "near": "ranges of distances to the action taken, each tried below and above it; the logarithm drawn is uniform",
     "fixed": "actions tried at each of these decisions, from -1 (full braking) to 1; the nearest of the choices is",
     "drawn": "how many more are tried there: of the policies among, or where there are none of the choices",
     "among": "policies of which one can act at each decision, for instance policy@runs/first; left out: none",
-    "tie_break": "weight of the other count's harm in the costs",
+    "tie_break": "weight of the whole line's harm in the other count, beside the reward",
     "relative": "true: in a mixture, costs count beside the usual ones of the same scenario",
     "caution": "how many times the excess over full braking from there on counts besides, at the end; it grows from 0",
     "largest_cost": "an action that costs more than this beyond the best one counts as this much more",

@@ -601,6 +601,7 @@ FAST = [("ppo", 37), ("sac", 52), ("mixture", 70), ("remembering", 100), ("turns
         *((name, ("step", step)) for name, step in FAST),
         ("counterfactual", ("update", 5)),
         ("modes", ("update", 5)),
+        ("among", ("update", 5)),
         *(
             pytest.param(name, (unit, number), marks=pytest.mark.slow)
             for name, unit, numbers in (
