@@ -710,7 +710,7 @@ def cut_gradients(shares: Sequence[float]) -> str | None:
         return None
     return (
         f"{CUTS} {share:.0%} of the sum of all gradients: the harm jumps here, and what is left of them may lead"
-        " elsewhere; try recipe options, or gradient_limit: auto"
+        " elsewhere; try recipe options, or gradient_limit: auto where it is a number"
     )
 
 
