@@ -327,5 +327,5 @@ def test_benchmark__shows_the_tables_that_the_entries_make() -> None:
     assert tables() == BENCHMARK.read_tables("benchmark")
     for path in ENTRIES.glob("*.json"):  # nobody clearly beats the best known on a list; of paper-distance it is loose
         for name, result in read_entry(path).driven.items():
-            most = 0.21 if name == "paper-distance" else 0.12
+            most = 0.25 if name == "paper-distance" else 0.12
             assert result.realised_share.interval[0] <= 1.0 and result.below_best_known <= most * result.worlds
