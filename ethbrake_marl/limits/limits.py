@@ -198,7 +198,8 @@ class BestHarmTable:
         table, identity = self, task_problem(worlds, task).identity
         known = np.max([table.harm(identity, harm_count) for harm_count in table.best], axis=0)
         hard = np.flatnonzero(known > 0.0)
-        lowered = dict.fromkeys(table.best, 0)
+        before = table.header.get(LOWERED, {})
+        lowered = {harm_count: before.get(name, {}).get(harm_count, 0) for harm_count in table.best}
         if hard.size:
             worlds, identity = worlds.take(hard), identity[hard]
             problem = task_problem(worlds, task)
@@ -216,7 +217,6 @@ class BestHarmTable:
                         identity[rows], harm_count, first if harm_count == "first" else total, profiles
                     )
                     lowered[harm_count] += int(better.sum())
-        before = table.header.get(LOWERED, {})
         return replace(table, header={**table.header, LOWERED: {**before, name: lowered}})
 
 

@@ -350,6 +350,8 @@ def test_best_harm_command__takes_what_agents_do_better(tmp_path: Path) -> None:
         assert after.header["lowered_by"]["planner:60"][count] >= changed.sum()
         assert count == "first" or changed.sum() >= 1
         assert problem.follow(after.best[count].profiles)[k].tolist() == harm.tolist()
+    again = after.folded(SCENARIO, SCENARIO.sample(15, 7).worlds, "planner:60", {"first": make_agent("full_brake")})
+    assert again.header["lowered_by"] == after.header["lowered_by"]  # what it lowered before stays counted
 
 
 # ---------------------------------------------------------------- the limits of an evaluation: proven and best known
