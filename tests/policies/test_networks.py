@@ -668,7 +668,7 @@ def test_policy_shipped__is_the_best_that_ships(test: str, harm_count: HarmCount
     ("level", "share_of_full_braking", "collisions"),
     [
         ("cooperation-1-front", 0.60, 0.80),
-        ("cooperation-2-paper", 0.33, 0.70),
+        ("cooperation-2-paper", 0.29, 0.70),
         ("cooperation-2-blocked", 0.52, 0.87),
         ("cooperation-3-pair", 0.33, 0.70),
         ("cooperation-4-all", 0.03, 0.15),
@@ -679,8 +679,9 @@ def test_policy_shipped__drives_all_learners_of_a_level_of_cooperation(
 ) -> None:
     """At least as well as docs/levels.md says, by and large: level 3 collides no more often than level 2."""
     scenario = eb.load_scenario(level)
-    assert shipped_name("policy", scenario, "total") == f"counterfactual-{level}"
-    assert load_named_policy(f"shipped/counterfactual-{level}").manifest.learners == tuple(
+    name = shipped_name("policy", scenario, "total")
+    assert name == ("universal" if level == "cooperation-2-paper" else f"counterfactual-{level}")
+    assert load_named_policy(f"shipped/{name}").manifest.learners == tuple(
         scenario.vehicle_names[i] for i in scenario.learners
     )
     lineup = make_lineup(["full_brake", "policy@shipped", "team@shipped"], scenario)
