@@ -36,7 +36,7 @@ NOTE = (
     f" {BUDGET:,} candidates and of all policies here. In a cell: times the best known harm; share of what could be"
     f" saved against full braking that is saved; share of worlds with over {WORSE:g} m²/s² more harm than full braking."
     f" Bold: trained there. {NONE}: it cannot drive there, or there is next to no harm to save. Where parameters are"
-    " wide a few worlds rule the mean: in `stress-wide` one holds 60 % of the total harm beyond the best known."
+    " wide, a few worlds rule the mean."
 )
 
 
