@@ -24,8 +24,9 @@ from ethbrake_marl.physics.kernel import (
     FLAG,
     LISTED,
     ROW,
+    acts_within,
     advance_table,
-    force_at,
+    force_at_end,
     onset_s,
     place_forces,
     place_obstacle,
@@ -324,7 +325,7 @@ def advance_worlds(
             table[ROW.LIMIT, at + i] = limit[k, i]
             table[ROW.ONSET, at + i] = onset_s(latency[k, i], time[k])
             if not building:
-                in_force[k, i] = command[k, i] if latency[k, i] <= until[k] else 0.0
+                in_force[k, i] = command[k, i] if acts_within(table[ROW.ONSET, at + i], duration) else 0.0
         for p in range(vehicles - 1):
             table[ROW.GAP, at + p] = gaps[k, p]
             table[ROW.HIT, at + p] = 1.0 if hit[k, p] else 0.0
@@ -339,7 +340,7 @@ def advance_worlds(
             speeds[k, i] = table[ROW.SPEED, at + i]
         if building:
             for i in range(vehicles):
-                in_force[k, i] = force_at(table, at + i, command[k, i], latency[k, i], until[k])
+                in_force[k, i] = force_at_end(table, at + i, duration)
         for p in range(vehicles - 1):
             gaps[k, p] = table[ROW.GAP, at + p]
             hit[k, p] = table[ROW.HIT, at + p] == 1.0

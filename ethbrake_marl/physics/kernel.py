@@ -419,6 +419,9 @@ def advance_on_cubics(
     table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int
 ) -> tuple[int, int]:
     """``advance_table`` where brakes build up."""
+    for i in range(table.shape[1]):
+        if not acts_within(table[ROW.ONSET, i], duration):
+            table[ROW.ONSET, i] = max(table[ROW.ONSET, i], duration)
     return _advance(table, restitution, duration, start_s, world, rows, recorded, True)
 
 
@@ -658,6 +661,8 @@ def move_speeds(table: Floats, duration: float) -> None:
 # force reaches the command or passes 0; and joined vehicles part, or a body that is held is so no more. A world in
 # which all rates are infinite never comes here.
 
+_ONSET_ROUNDING_S = 1e-9  # a decision and an onset this close are one moment
+_SAME_MPS2 = 5e-13  # touching vehicles whose accelerations differ by less are one body: less than parting needs
 _PARTS_LATE_S = 1e-9  # joined vehicles part this much late, so that rounding cannot undo it: it costs 1e-26 m
 _PARTS_LATE_MPS2 = 1e-12  # and by no smaller a difference of accelerations
 
@@ -795,7 +800,8 @@ def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) ->
 def pool_moving(table: Floats, first: int, last: int) -> float:
     """Accelerations and jerks of touching vehicles ``first..last`` of equal speed; the time until one of them parts.
 
-    The regression of ``pool``, but vehicles of equal acceleration are joined, and part by their jerks.
+    The regression of ``pool``, but vehicles of equal acceleration are joined, and part by their jerks. Accelerations
+    that differ by rounding alone are equal.
     """
     count = 0
     for i in range(first, last + 1):
@@ -808,7 +814,7 @@ def pool_moving(table: Floats, first: int, last: int) -> float:
         table[ROW.BLOCK_FIRST, count] = i
         top = count + first
         settle_block(table, count, top)
-        while count > 0 and table[ROW.ACCELERATION, top] >= table[ROW.ACCELERATION, top - 1]:
+        while count > 0 and table[ROW.ACCELERATION, top] >= table[ROW.ACCELERATION, top - 1] - _SAME_MPS2:
             count -= 1
             top -= 1
             for row in (ROW.BLOCK_MASS, ROW.BLOCK_LOW, ROW.BLOCK_HIGH, ROW.BLOCK_LOW_JERK, ROW.BLOCK_HIGH_JERK):
@@ -1148,12 +1154,22 @@ def place_forces(
             table[ROW.FORCE, table.shape[1] - force.shape[0] + i] = force[i]
 
 
+@compiled
+def acts_within(onset: float, duration: float) -> bool:
+    """Whether a command that begins to act ``onset`` s after the start of a segment acts in it.
+
+    A segment holds its beginning, but not its end: a command whose latency elapses there never acts, because the next
+    decision replaces it. The end counts as reached a rounding error early.
+    """
+    return onset <= 0.0 or onset < duration - _ONSET_ROUNDING_S
+
+
 @compiled(bare=True)
-def force_at(table: Floats, i: int, command: float, latency_s: float, time_s: float) -> float:
-    """The force of vehicle ``i`` at ``time_s``, the end of a segment; no command acts before its latency. [m/s2]"""
+def force_at_end(table: Floats, i: int, duration: float) -> float:
+    """The acceleration that the brakes or the engine of vehicle ``i`` call for at the end of a segment. [m/s2]"""
+    wanted = table[ROW.COMMAND, i] if acts_within(table[ROW.ONSET, i], duration) else 0.0
     if not builds_up(table):
-        return command if latency_s <= time_s else 0.0
-    wanted = table[ROW.COMMAND, i] if latency_s <= time_s else 0.0  # of its piece, where it brakes in pieces
+        return wanted
     return force_now(table[ROW.FORCE, i], wanted, table[ROW.BRAKE_RATE, i], table[ROW.RELEASE_RATE, i])
 
 
@@ -1182,7 +1198,7 @@ def place_obstacle(table: Floats, gap: float, hit: float) -> None:
 # The step of an episode, compiled: onset of the commands, motion, harm, rest, and the times of the decisions.
 #
 # Search and shield advance an episode by ``step_episode``. The engine, whose loop keeps its worlds in rows, is made of
-# the same rules (``step_end_s``, ``onset_s``, ``force_at``, ``stands``) around the same ``advance_table``, so
+# the same rules (``step_end_s``, ``onset_s``, ``force_at_end``, ``stands``) around the same ``advance_table``, so
 # all three agree to the bit (decision 0025). Search and shield copy one world at a time into the table of
 # ``physics.kernel``, which is longer here by the rows below.
 #

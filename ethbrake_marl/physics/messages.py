@@ -31,7 +31,7 @@ from ethbrake_marl.physics.kernel import (
     LISTED,
     ROW,
     advance_table,
-    force_at,
+    force_at_end,
     force_now,
     onset_s,
     place_forces,
@@ -286,7 +286,7 @@ def _move(
     state[column.time] = end
     for i in range(N):
         state[speed + i] = table[ROW.SPEED, i + 1]
-        state[command + i] = force_at(table, i + 1, wanted[i], params[latency + i], end)
+        state[command + i] = force_at_end(table, i + 1, end - time)
     for p in range(N - 1):
         state[gap + p] = table[ROW.GAP, p + 1]
         state[gap + N - 1 + p] = table[ROW.HIT, p + 1]
