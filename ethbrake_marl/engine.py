@@ -44,12 +44,12 @@ from ethbrake_marl.physics import (
     Ints,
     Packed,
     Worlds,
-    acts_within,
     advance,
     advance_table,
     columns,
+    command_acts,
     compiled,
-    force_at_end,
+    force_at,
     hear_rows,
     leaving_out_failed,
     onset_s,
@@ -202,7 +202,7 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
             table[ROW.ONSET, at + i] = onset_s(params[k, latency + i], time)
             state[k, previous + i] = state[k, command + i]
             if not builds_up:
-                state[k, command + i] = wanted[k, i] if acts_within(table[ROW.ONSET, at + i], until - time) else 0.0
+                state[k, command + i] = wanted[k, i] if command_acts(params[k, latency + i], until) else 0.0
         if builds_up:
             place_row(table, state, params, k, pieces)
         for p in range(P):
@@ -228,7 +228,7 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
             at_rest = at_rest and stands(table[ROW.SPEED, at + i], wanted[k, i])
         if builds_up:
             for i in range(N):
-                state[k, command + i] = force_at_end(table, at + i, until - time)
+                state[k, command + i] = force_at(table, at + i, wanted[k, i], params[k, latency + i], until)
                 at_rest = at_rest and state[k, command + i] <= 0.0
         impacts, first_harm, total_harm = 0.0, 0.0, 0.0
         if at == 1 and state[k, obstacle] < math.inf:

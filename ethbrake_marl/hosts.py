@@ -50,7 +50,18 @@ from ethbrake_marl.errors import (
 from ethbrake_marl.evaluation import Evaluation, Outcome, outcome_of
 from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.harm import Ledger, empty_ledger
-from ethbrake_marl.physics import BOUND, Bools, Decisions, Floats, Impacts, Ints, Vehicles, Worlds, held_speeds
+from ethbrake_marl.physics import (
+    BOUND,
+    Bools,
+    Decisions,
+    Floats,
+    Impacts,
+    Ints,
+    Vehicles,
+    Worlds,
+    has_acted,
+    held_speeds,
+)
 from ethbrake_marl.scenario import Sample, Scenario, load_scenario
 
 STANDS_MPS = 1e-3  # a vehicle that a host with steps of its own moves more slowly stands
@@ -274,7 +285,7 @@ class _Run:
     def _seen(self) -> Worlds:
         """The worlds as agents see them."""
         latency, speeds = self.alert.vehicles.latency_s, self.speeds_mps
-        in_force = np.where(latency <= self.time_s[:, np.newaxis], self.wanted_mps2, 0.0)
+        in_force = np.where(has_acted(latency, self.time_s[:, np.newaxis]), self.wanted_mps2, 0.0)
         if not self.exact:
             speeds = np.where(np.abs(speeds) < STANDS_MPS, 0.0, speeds)
         gaps = np.maximum(self.gaps_m, 0.0)

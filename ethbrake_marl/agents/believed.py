@@ -19,7 +19,7 @@ import numpy as np
 from ethbrake_marl.agents.registry import Agent, AgentAround, Knowledge, Source, fixed_commands, script_agents
 from ethbrake_marl.engine import Memory, Script, ask_script, begin_script, renew_memory
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics import Bools, Floats, Messages, Vehicles, Worlds, move_on
+from ethbrake_marl.physics import Bools, Floats, Messages, Vehicles, Worlds, has_acted, move_on
 from ethbrake_marl.scenario import Scenario
 
 TOUCHING_M = 1e-9  # a gap below this is a contact: places are told with rounding
@@ -215,7 +215,7 @@ class Ranges:
             pair_hit=hit,
             speeds_mps=speed,
             gaps_m=np.where(gaps < TOUCHING_M, 0.0, gaps),
-            command_mps2=np.where((latency <= worlds.time_s[:, np.newaxis]), command, 0.0),
+            command_mps2=np.where(has_acted(latency, worlds.time_s[:, np.newaxis]), command, 0.0),
             obstacle_gap_m=np.maximum(obstacle - place[:, 0], 0.0),
         )
 

@@ -24,16 +24,16 @@ from ethbrake_marl.physics.kernel import (
     FLAG,
     LISTED,
     ROW,
-    acts_within,
     advance_table,
-    force_at_end,
+    command_acts,
+    force_at,
     onset_s,
     place_forces,
     place_obstacle,
     rows_for,
     solo_motion,
 )
-from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds
+from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds, has_acted
 
 # Worlds that cannot be advanced: left out, named, and never at the expense of the others.
 
@@ -325,7 +325,7 @@ def advance_worlds(
             table[ROW.LIMIT, at + i] = limit[k, i]
             table[ROW.ONSET, at + i] = onset_s(latency[k, i], time[k])
             if not building:
-                in_force[k, i] = command[k, i] if acts_within(table[ROW.ONSET, at + i], duration) else 0.0
+                in_force[k, i] = command[k, i] if command_acts(latency[k, i], until[k]) else 0.0
         for p in range(vehicles - 1):
             table[ROW.GAP, at + p] = gaps[k, p]
             table[ROW.HIT, at + p] = 1.0 if hit[k, p] else 0.0
@@ -340,7 +340,7 @@ def advance_worlds(
             speeds[k, i] = table[ROW.SPEED, at + i]
         if building:
             for i in range(vehicles):
-                in_force[k, i] = force_at_end(table, at + i, duration)
+                in_force[k, i] = force_at(table, at + i, command[k, i], latency[k, i], until[k])
         for p in range(vehicles - 1):
             gaps[k, p] = table[ROW.GAP, at + p]
             hit[k, p] = table[ROW.HIT, at + p] == 1.0
@@ -637,8 +637,7 @@ def advance_sampled(
     _refuse_unsampled(worlds, until, step_s)
     after = worlds.copy()
     impacts = sample_on(after, command, until, step_s)
-    acting = worlds.vehicles.latency_s <= after.time_s[:, np.newaxis] + _ON_SAMPLE * step_s
-    after.command_mps2[...] = np.where(acting, command, 0.0)
+    after.command_mps2[...] = np.where(has_acted(worlds.vehicles.latency_s, after.time_s[:, np.newaxis]), command, 0.0)
     return after, impacts
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.physics.compiling import compiled
-from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds, has_acted
 
 # Closed-form times of the events that end a segment of constant acceleration.
 #
@@ -33,6 +33,8 @@ class _Bounds(NamedTuple):
 
 
 BOUND = _Bounds()
+
+command_acts = compiled(has_acted)
 
 
 @compiled
@@ -420,7 +422,7 @@ def advance_on_cubics(
 ) -> tuple[int, int]:
     """``advance_table`` where brakes build up."""
     for i in range(table.shape[1]):
-        if not acts_within(table[ROW.ONSET, i], duration):
+        if not command_acts(table[ROW.ONSET, i], duration):
             table[ROW.ONSET, i] = max(table[ROW.ONSET, i], duration)
     return _advance(table, restitution, duration, start_s, world, rows, recorded, True)
 
@@ -661,7 +663,6 @@ def move_speeds(table: Floats, duration: float) -> None:
 # force reaches the command or passes 0; and joined vehicles part, or a body that is held is so no more. A world in
 # which all rates are infinite never comes here.
 
-_ONSET_ROUNDING_S = 1e-9  # a decision and an onset this close are one moment
 _SAME_MPS2 = 5e-13  # touching vehicles whose accelerations differ by less are one body: less than parting needs
 _PARTS_LATE_S = 1e-9  # joined vehicles part this much late, so that rounding cannot undo it: it costs 1e-26 m
 _PARTS_LATE_MPS2 = 1e-12  # and by no smaller a difference of accelerations
@@ -1154,22 +1155,13 @@ def place_forces(
             table[ROW.FORCE, table.shape[1] - force.shape[0] + i] = force[i]
 
 
-@compiled
-def acts_within(onset: float, duration: float) -> bool:
-    """Whether a command that begins to act ``onset`` s after the start of a segment acts in it.
-
-    A segment holds its beginning, but not its end: a command whose latency elapses there never acts, because the next
-    decision replaces it. The end counts as reached a rounding error early.
-    """
-    return onset <= 0.0 or onset < duration - _ONSET_ROUNDING_S
-
-
 @compiled(bare=True)
-def force_at_end(table: Floats, i: int, duration: float) -> float:
-    """The acceleration that the brakes or the engine of vehicle ``i`` call for at the end of a segment. [m/s2]"""
-    wanted = table[ROW.COMMAND, i] if acts_within(table[ROW.ONSET, i], duration) else 0.0
+def force_at(table: Floats, i: int, command: float, latency_s: float, time_s: float) -> float:
+    """The force of vehicle ``i`` at ``time_s``, the end of a segment; no command acts before its latency. [m/s2]"""
+    acts = command_acts(latency_s, time_s)
     if not builds_up(table):
-        return wanted
+        return command if acts else 0.0
+    wanted = table[ROW.COMMAND, i] if acts else 0.0  # of its piece, where it brakes in pieces
     return force_now(table[ROW.FORCE, i], wanted, table[ROW.BRAKE_RATE, i], table[ROW.RELEASE_RATE, i])
 
 
@@ -1198,7 +1190,7 @@ def place_obstacle(table: Floats, gap: float, hit: float) -> None:
 # The step of an episode, compiled: onset of the commands, motion, harm, rest, and the times of the decisions.
 #
 # Search and shield advance an episode by ``step_episode``. The engine, whose loop keeps its worlds in rows, is made of
-# the same rules (``step_end_s``, ``onset_s``, ``force_at_end``, ``stands``) around the same ``advance_table``, so
+# the same rules (``step_end_s``, ``onset_s``, ``force_at``, ``stands``) around the same ``advance_table``, so
 # all three agree to the bit (decision 0025). Search and shield copy one world at a time into the table of
 # ``physics.kernel``, which is longer here by the rows below.
 #

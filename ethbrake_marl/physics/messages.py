@@ -31,7 +31,8 @@ from ethbrake_marl.physics.kernel import (
     LISTED,
     ROW,
     advance_table,
-    force_at_end,
+    command_acts,
+    force_at,
     force_now,
     onset_s,
     place_forces,
@@ -246,7 +247,7 @@ def _start(state: Floats, params: Floats, column: Columns, wanted: Floats) -> No
     for p in range(N - 1):
         told[place + p + 1] = told[place + p] - state[gap + p]
     for i in range(N):
-        acts = params[column.latency + i] <= state[column.time]
+        acts = command_acts(params[column.latency + i], state[column.time])
         state[force + i] = force_now(
             state[force + i], wanted[i] if acts else 0.0, params[column.brake_rate + i], params[column.release_rate + i]
         )
@@ -286,7 +287,7 @@ def _move(
     state[column.time] = end
     for i in range(N):
         state[speed + i] = table[ROW.SPEED, i + 1]
-        state[command + i] = force_at_end(table, i + 1, end - time)
+        state[command + i] = force_at(table, i + 1, wanted[i], params[latency + i], end)
     for p in range(N - 1):
         state[gap + p] = table[ROW.GAP, p + 1]
         state[gap + N - 1 + p] = table[ROW.HIT, p + 1]

@@ -31,6 +31,7 @@ Ints = NDArray[np.int64]
 UInt64s = NDArray[np.uint64]
 
 GRAVITY_MPS2 = 9.81
+ONSET_ROUNDING_S = 1e-9  # a latency that elapses this close before the end of an interval elapses at its end
 _ON_ROADS = ("braking_capacity_mps2", "driving_capacity_mps2")  # what friction limits
 
 
@@ -38,6 +39,15 @@ def as_road_allows(quantities: Mapping[str, Floats], friction: Floats) -> dict[s
     """The quantities, of which no capacity is above ``friction * GRAVITY_MPS2``."""
     most = friction * GRAVITY_MPS2
     return {key: np.minimum(value, most) if key in _ON_ROADS else value for key, value in quantities.items()}
+
+
+def has_acted(latency_s: Any, time_s: Any) -> Any:
+    """Whether a command acts in the interval from 0 to ``time_s``; numbers (in kernels) or arrays, s.
+
+    A latency that elapses at the beginning of the interval counts, one that elapses at its end does not: there the next
+    decision replaces the command before it has acted.
+    """
+    return (latency_s <= 0.0) | (latency_s < time_s - ONSET_ROUNDING_S)
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +188,7 @@ class Worlds:
     speeds_mps: Floats  # [n, N] forward positive; negative only after a bounce-back
     time_s: Floats  # [n] since Vehicle 1 began to brake
     pair_hit: Bools  # [n, P] this pair has had an impact
-    command_mps2: Floats  # [n, N] signed acceleration in force at this time; 0 before the latency has elapsed
+    command_mps2: Floats  # [n, N] signed acceleration in force up to this time; 0 up to the latency
     obstacle_gap_m: Floats  # [n] from Vehicle 1's front to an unmovable obstacle ahead, >= 0; infinite: there is none
     obstacle_hit: Bools  # [n] Vehicle 1 has had an impact with it
     messages: Floats  # [n, M] what periodic messages have told whom (``physics.messages``); [n, 0] without them

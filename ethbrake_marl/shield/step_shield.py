@@ -75,6 +75,7 @@ from ethbrake_marl.physics import (
     compiled,
     grid_of,
     harm_so_far,
+    has_acted,
     place_rates,
     restore,
     rows_for,
@@ -889,7 +890,7 @@ def _later_plan(
             commands[:, vehicle] = action_to_command(column, seen.vehicles, vehicle)
         time, vehicles, force = episodes.time_s, seen.vehicles, episodes.states[:, -seen.N :]
         commands = vehicles.piece_commands(commands, time)
-        acts = np.where(vehicles.latency_s <= time[:, np.newaxis], commands, 0.0)
+        acts = np.where(has_acted(vehicles.latency_s, time[:, np.newaxis]), commands, 0.0)
         at_once = np.isinf(np.where(acts < force, vehicles.brake_rate_mps3, vehicles.release_rate_mps3))
         in_force = np.where(at_once, acts, force)
         seen = replace(worlds_at(seen, episodes.states), time_s=time, command_mps2=in_force)

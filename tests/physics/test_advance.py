@@ -52,13 +52,17 @@ CASES: dict[str, tuple[Worlds, Any, float, Events, dict[str, Any]]] = {
         line([50.0], [8.0, 8.0], latency_s=[0.0, 0.75]), [-2.0, -4.0], 1.75, [],
         {"speeds_mps": [4.5, 4.0], "gaps_m": [50.0 + 8.0 * 1.75 - 1.75**2 - 12.0]},
     ),
-    "a latency that ends with the segment is in force after it": (
+    "a command whose latency elapses at the end of the segment never acts": (
         line([8.0], [4.0, 4.0], latency_s=[0.5, 0.75]), [-4.0, -4.0], 0.5, [],
-        {"speeds_mps": [4.0, 4.0], "command_mps2": [-4.0, 0.0]},
+        {"speeds_mps": [4.0, 4.0], "command_mps2": [0.0, 0.0]},
+    ),
+    "an onset a rounding error before the end of the segment is at its end": (
+        line([8.0], [4.0, 4.0], latency_s=[0.5 - 2.0**-52, 0.75], release_rate_mps3=8.0), [-4.0, -4.0], 0.5, [],
+        {"speeds_mps": [4.0, 4.0], "command_mps2": [0.0, 0.0]},
     ),
     "an onset at the moment of contact comes too late": (
         line([6.0], [0.0, 8.0], latency_s=[0.0, 0.75]), [0.0, -16.0], 0.75, [(0.75, 0, 8.0)],
-        {"speeds_mps": [4.0, 4.0], "command_mps2": [0.0, -16.0]},
+        {"speeds_mps": [4.0, 4.0], "command_mps2": [0.0, 0.0]},
     ),
     "an onset releases the front vehicle": (  # joined at 4 m/s; from 0.5 s on the front drives away at 2
         line([0.0], [4.0, 4.0], latency_s=[0.5, 0.0]), [2.0, 0.0], 1.5, [],

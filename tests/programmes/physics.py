@@ -45,6 +45,7 @@ from tests.physics.random_worlds import (
 )
 from tests.physics.segments import Scan, random_segments, scan
 from tests.physics.test_build_up import by_small_steps, played, random_lines, random_pieces
+from tests.physics.test_one_physics import KINDS, disagreeing, first_harm_error, random_lines as random_lines_of_all
 from tests.physics.test_oracles import accelerations, at_once, exact_accelerations, in_steps, law_error_eps
 from tests.programmes import Cases, Given, Told
 from tests.reference.tolerances import (
@@ -78,6 +79,7 @@ def measured(measure: Callable[[], Figure]) -> Told:
 
 OPTIONS = {
     "--small-step-worlds": {"type": int, "default": 10_000, "help": "of 'brakes that build up'"},
+    "--one-physics-worlds": {"type": int, "default": 10_000, "help": "of 'one physics'"},
     "--bounded-worlds": {
         "type": int,
         "default": 3_500,
@@ -93,6 +95,10 @@ def cases(given: Given) -> Cases:
     for N, obstacle, in_pieces in product((2, 3, 5, 8), (False, True), (False, True)):
         told = f"brakes that build up, N = {N}{', obstacle' * obstacle}{', in pieces' * in_pieces}"
         yield told, partial(measured, partial(small_steps, N, obstacle, in_pieces, each))
+    for kind in KINDS:
+        N, learners, obstacle, in_pieces = kind
+        told = f"one physics, N = {N}, {len(learners)} decide{', obstacle' * obstacle}{', in pieces' * in_pieces}"
+        yield told, partial(measured, partial(one_physics, kind, max(1, given.one_physics_worlds // len(KINDS))))
     for region in REGIONS:
         told = f"lower bound where brakes build up, {region}"
         yield told, partial(measured, partial(never_above, region, given.bounded_worlds))
@@ -124,7 +130,7 @@ def small_steps(N: int, obstacle: bool, in_pieces: bool, worlds: int) -> Figure:
 
     def error(rows: Ints, step_s: float) -> Floats:
         some = {key: value[rows] for key, value in given.items()}
-        found = np.concatenate(by_small_steps(some, [each[rows] for each in commands], step_s, pieces), axis=1)
+        found = np.concatenate(by_small_steps(some, [each[rows] for each in commands], step_s, pieces)[:4], axis=1)
         return np.asarray((np.abs(found - exact[rows]) / (1.0 + np.abs(exact[rows]))).max(axis=1))
 
     rows = np.flatnonzero(impacts <= 30)
@@ -134,6 +140,20 @@ def small_steps(N: int, obstacle: bool, in_pieces: bool, worlds: int) -> Figure:
         found[far] = error(rows[far], step_s)
     finer = ", ".join(f"{count} by 1e-{6 + k} s" for k, count in enumerate(coarse)) or "none by finer steps"
     return Figure(float(found.max()), 2e-3, f"{len(rows):,} of {worlds:,} worlds, {finer}")
+
+
+def one_physics(kind: tuple[int, tuple[int, ...], bool, bool], worlds: int) -> Figure:
+    """The largest error of first-impact harm beside small steps; infinite where engine, search and shield differ."""
+    N, learners, obstacle, in_pieces = kind
+    lines = random_lines_of_all(7, worlds, N, learners, obstacle=obstacle, in_pieces=in_pieces)
+    different = len(disagreeing(lines))
+    step_s, rows = 1e-4, np.arange(worlds)
+    found = first_harm_error(lines, rows, step_s)
+    while (far := found > 1e-3).any() and step_s > 2e-7:
+        step_s /= 10.0
+        found[far] = first_harm_error(lines, rows[far], step_s)
+    told = f"{worlds:,} worlds, {different} with other bits, the last {int(far.sum())} by steps of {step_s:g} s"
+    return Figure(np.inf if different else float(found.max()), 1e-3, told)
 
 
 # ---------------------------------------------------------------- worlds made backwards, impacts, motion between them
