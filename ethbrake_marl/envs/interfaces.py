@@ -240,7 +240,7 @@ def _drawn_again(engine: Engine, numbers: Ints) -> Sample:
 
 # Infos of every interface, computed once for all vehicles of all worlds: the same keys after a reset and a step.
 #
-# ``time_s``, ``command_in_force_mps2`` (in force now; 0 until the latency has elapsed), ``chosen_command_mps2`` and
+# ``time_s``, ``command_in_force_mps2`` (in force up to now; 0 up to the latency), ``chosen_command_mps2`` and
 # ``chosen_action`` (what the vehicle asked for, whoever chose it; 0 before a learner's first step), the vehicle's share
 # of the harm so far under both counts, the same for the whole world, and whether anything has collided. Of the last
 # step: ``cost`` (the harm it added to the line, as the reward counts impacts; for safe-RL libraries) and

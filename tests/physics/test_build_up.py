@@ -305,6 +305,16 @@ def test_shield__foresees_a_force_that_is_there_at_once_and_released_slowly() ->
 
 
 @pytest.mark.parametrize("key", ["brake_rate_mps3", "release_rate_mps3"])
+def test_shield__of_several_learners_with_one_finite_rate_certifies_every_step(key: str) -> None:
+    env = eb.shield(eb.parallel_env(scenario=load_scenario("cooperation-3-pair").replace(**{key: 12.65})))
+    draws = Draws(0)
+    for seed in range(15):
+        env.reset(seed=seed)  # at 0.5 s; the latency of Vehicle 3 elapses at 0.8 s, a decision
+        while env.agents:
+            env.step({f"vehicle_{i}": draws.uniform(-1.0, 1.0, (1,)).astype(np.float32) for i in (2, 3)})
+
+
+@pytest.mark.parametrize("key", ["brake_rate_mps3", "release_rate_mps3"])
 def test_table__of_a_scenario_with_one_of_both_rates_is_read_again(key: str) -> None:
     one = load_scenario("paper-random").replace(**{key: 12})
     drawn = one.sample(3, seed=1).worlds
