@@ -42,7 +42,7 @@ if TYPE_CHECKING:
         find_entry as find_entry,
         fixed_commands as fixed_commands,
         make_agent as make_agent,
-        make_single_agent as make_single_agent,
+        make_role as make_role,
         parse_spec as parse_spec,
         record_commands as record_commands,
         register_agent as register_agent,

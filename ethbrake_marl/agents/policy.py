@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from gymnasium.wrappers import NormalizeObservation, RescaleObservation
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import LARGEST, action_to_command
 from ethbrake_marl.agents.registry import Source
+from ethbrake_marl.agents.wrappers import normalisation, training_environment
 from ethbrake_marl.engine import Memory, Script, checked_memory, map_memory, take_memory
 from ethbrake_marl.errors import AgentFailed, InvalidInput, describe_error, naming_extras
 from ethbrake_marl.observations import Observation, Observations, ObservationSpec, choose_observation, observe
@@ -70,7 +70,7 @@ def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | Non
     """
 
     def predict(seen: Observations, **memory: Any) -> tuple[Any, State]:
-        statistics = _statistics(model)
+        statistics = normalisation(model)
         given = seen if statistics is None else statistics.normalize_obs(seen)
         found = model.predict(given, deterministic=True, **memory)
         return found if isinstance(found, tuple) else (found, None)
@@ -102,31 +102,6 @@ def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | Non
         return np.ones(n, np.bool_), map_memory(lambda array: np.zeros((n, *array.shape[1:]), array.dtype), shaped)
 
     return infer, begin
-
-
-def training_environment(model: Any, name: str) -> Any:
-    """The environment of this package in which a Stable-Baselines3 model is trained, inside whatever wraps it.
-
-    None where that is not known. Raises ``InvalidInput`` where Gymnasium's own wrappers change what it observes.
-    """
-    env = getattr(model, "get_env", lambda: None)()
-    if env is None:
-        return None
-    for wrapper in (NormalizeObservation, RescaleObservation):
-        if any(env.env_is_wrapped(wrapper)):
-            raise InvalidInput(
-                f"agent {name!r}: the model is trained under {wrapper.__name__}, which this agent knows nothing of;"
-                " write a function around it that does the same, or train under Stable-Baselines3's VecNormalize"
-            )
-    try:
-        return env.get_attr("unwrapped")[0] if env.get_attr("engine") else None
-    except AttributeError:  # another library's
-        return None
-
-
-def _statistics(model: Any) -> Any:
-    """Stable-Baselines3's ``VecNormalize`` that the model is trained under, as it counts now; None without one."""
-    return getattr(model, "get_vec_normalize_env", lambda: None)()
 
 
 def _ask_onnx(session: Any) -> Infer:
@@ -182,7 +157,7 @@ def weights_sha256(policy: Any) -> str | None:
     module: Any = policy if _is_torch_module(policy) else getattr(policy, "policy", None)
     if not _is_torch_module(module):
         return None
-    arrays, statistics = dict(module.state_dict()), _statistics(policy)
+    arrays, statistics = dict(module.state_dict()), normalisation(policy)
     if statistics is not None and statistics.norm_obs:
         counted = statistics.obs_rms
         arrays |= {"mean": counted.mean, "var": counted.var, "clip": statistics.clip_obs, "eps": statistics.epsilon}
@@ -210,6 +185,7 @@ def policy_agent(
     initial_state: Callable[[int], State] | None = None,
     clip: bool = False,
     appended: Appended | None = None,
+    ignore_wrappers: bool = False,
 ) -> PolicyAgent:
     """An agent that drives by a policy of any library: observations [n, F] float32 -> actions [n, 1] in [-1, 1].
 
@@ -230,8 +206,11 @@ def policy_agent(
         appended: ``number`` or ``state`` of ``make_sb3_vec_env``, where the policy was trained on such rows; needs the
             scenario with its learners. None: as in the environment that the model has. Who sees the ``state`` knows
             the true state of the line.
+        ignore_wrappers: drive a model as it is, although wrappers of its training may have changed what it saw or did,
+            its actions have other bounds, or the statistics of its ``VecNormalize`` are missing.
 
-    Raises ``InvalidInput`` for what is no such policy, or one for another number of features.
+    Raises ``InvalidInput`` for what is no such policy, one for another number of features, and a model that was trained
+    under wrappers that may change what it sees or does.
 
     >>> import ethbrake_marl as eb
     >>> agent = eb.policy_agent(lambda observation: -observation[:, :1].clip(0, 1), name="mine")
@@ -243,7 +222,7 @@ def policy_agent(
     scenario = load_scenario(scenario) if isinstance(scenario, str) else scenario
     of_file = isinstance(policy, str | os.PathLike)
     named = name or (Path(policy).stem if of_file else str(getattr(policy, "__name__", type(policy).__name__)))
-    trained = training_environment(policy, named)
+    trained = training_environment(policy, named, ignore_wrappers=ignore_wrappers)
     spec = _observation_of(policy, scenario, observation, trained)
     if appended is None and (appended := getattr(trained, "appended", None)) is not None:
         scenario = trained.engine.scenario if scenario is None else scenario
@@ -256,14 +235,15 @@ def policy_agent(
             f"agent {named!r}: the policy takes observations of shape {shape}, here are {size} features;"
             " give what it was trained on: scenario, observation, or appended (number or state, of make_sb3_vec_env)"
         )
-    if trained is not None and [f.name for f in spec.features] != [f.name for f in trained.engine.observation.features]:
+    seen = spec if trained is None or ignore_wrappers else trained.engine.observation
+    if [f.name for f in spec.features] != [f.name for f in seen.features]:
         raise InvalidInput(
-            f"agent {named!r}: the model is trained on other features than {spec}: {trained.engine.observation}; leave"
+            f"agent {named!r}: the model is trained on other features than {spec}: {seen}; leave"
             " observation out, and give the scenario it was trained in, or none"
         )
     actions = getattr(policy, "action_space", None)
-    ends = getattr(actions, "low", -1.0), getattr(actions, "high", 1.0)
-    if not (clip or (np.all(ends[0] == -1.0) and np.all(ends[1] == 1.0))):
+    low, high = (np.asarray(getattr(actions, end, np.nan)) for end in ("low", "high"))
+    if not (actions is None or ignore_wrappers or (low.tolist() == [-1.0] and high.tolist() == [1.0])):
         raise InvalidInput(
             f"agent {named!r}: the policy gives actions in {actions}, here they mean [-1, 1]; write a function around"
             " it that says what they mean"

@@ -379,13 +379,13 @@ class AgentSettings:
     uncertainty: object = None  # what a robust shield does not know, as ``shield.uncertainty`` reads it
     time_step_s: float = 0.1  # between two decisions
     believes: bool = False  # ``:believed`` stood behind the argument: it decides on what was received
+    role: int | None = None  # index of the vehicle whose role it is; None: a driver, whichever vehicles it drives
 
     def needed_scenario(self) -> Scenario:
         """The scenario, for an agent that cannot do without. Raises ``InvalidInput`` if there is none."""
         if self.scenario is None:
             raise InvalidInput(
-                f"agent {self.spec!r}: needs a scenario: make_agent({self.spec!r},"
-                " scenario='paper-random'); as a vehicle's script it cannot be used"
+                f"agent {self.spec!r}: needs a scenario: make_agent({self.spec!r}, scenario='paper-random')"
             )
         return self.scenario
 
@@ -554,6 +554,10 @@ def make_agent(
         written.core, written.policy, scenario, harm_count, float(horizon_s), most_candidates, uncertainty,
         time_step_s or (0.1 if scenario is None else scenario.time_step_s),
     )  # fmt: skip
+    return _make_driver(written, settings)
+
+
+def _make_driver(written: AgentSpec, settings: AgentSettings) -> Driver:
     driver = _make(find_entry(written), written.argument, settings)
     for each in written.around:
         settings = replace(settings, spec=f"{settings.spec}+{each}")
@@ -568,12 +572,28 @@ def make_agent(
     return driver
 
 
-def make_single_agent(spec: str, **settings: Any) -> Agent:
-    """``make_agent`` for who drives one vehicle, a script's profile too; raises ``InvalidInput`` for a team too."""
-    agent = _PROFILE.load()(spec) if spec.startswith("profile:") else make_agent(spec, **settings)
-    if not isinstance(agent, Agent):
-        raise InvalidInput(f"agent {spec!r}: is a team, one agent is needed here: ppo@RUN/policy/vehicle_2")
-    return agent
+def make_role(scenario: Scenario, vehicle: int, *, most_candidates: int | None = None) -> Agent:
+    """The agent that ``vehicle`` follows as its role: the one that would drive it, made for first-impact harm.
+
+    ``most_candidates`` is as in ``make_agent``. Raises what that raises, and ``InvalidInput`` for what goes around an
+    agent, and for a team without this vehicle.
+    """
+    spec = scenario.scripts[vehicle]
+    if spec.startswith("profile:"):
+        profile: Agent = _PROFILE.load()(spec)
+        return profile
+    written = parse_spec(spec)
+    settings = AgentSettings(
+        written.core, written.policy, scenario, horizon_s=scenario.horizon_s, most_candidates=most_candidates,
+        time_step_s=scenario.time_step_s, role=vehicle,
+    )  # fmt: skip
+    team = None if written.around else Team.of(_make_driver(written, settings), (vehicle,))
+    if team is None or team.shield is not None:
+        raise InvalidInput(
+            f"agent {spec!r}: a refinement or a shield goes around a driver, never around a role; let"
+            f" {scenario.vehicle_names[vehicle]} follow {written.core}, or drive it"
+        )
+    return team.drivers[vehicle]
 
 
 def find_entry(spec: AgentSpec | str) -> Entry:
@@ -715,12 +735,7 @@ class Watch(Protocol):
 def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | None = None) -> dict[int, Agent]:
     """Agents for the scenario's scripts, by vehicle."""
     left_out = (except_for,) if isinstance(except_for, int) else except_for or ()
-    made = {
-        i: make_single_agent(spec, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s)
-        for i, spec in scenario.scripts.items()
-        if i not in left_out
-    }
-    return made
+    return {i: make_role(scenario, i) for i in scenario.scripts if i not in left_out}
 
 
 def episode_engine(worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None) -> Engine:

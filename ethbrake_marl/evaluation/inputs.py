@@ -28,7 +28,7 @@ from ethbrake_marl.agents import (
     episode_engine,
     find_entry,
     make_agent,
-    make_single_agent,
+    make_role,
     parse_spec,
     script_agents,
 )
@@ -308,7 +308,7 @@ def load_runnable(
     worlds = scenario.replace(early_impacts="keep").sample(1, DEFAULT.LIST_SEED).worlds
     for i, script in scenario.scripts.items():
         try:
-            agent = make_single_agent(script, horizon_s=scenario.horizon_s, most_candidates=TRIED_CANDIDATES)
+            agent = make_role(scenario, i, most_candidates=TRIED_CANDIDATES)
             ask_script(agent, worlds, begin_script(agent, worlds, i, {}), i)
         except InvalidInput as error:
             role = scenario.vehicle_names[i]
@@ -343,7 +343,8 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
         if "CANDIDATES" in find_entry(script).form
     }
     tried = scenario.replace(roles={**scenario.roles, **searches})
-    scripts = {**script_agents(tried), **dict.fromkeys(scenario.learners, make_single_agent("full_brake"))}
+    braking = {scenario.vehicle_names[i]: "full_brake" for i in scenario.learners}
+    scripts = script_agents(tried.replace(roles={**tried.roles, **braking}))
     early, moving = np.zeros((2, worlds.n), np.bool_)
     beyond: dict[str, dict[int, str]] = {}
 

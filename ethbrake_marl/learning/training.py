@@ -15,7 +15,7 @@ import math
 import os
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -969,10 +969,12 @@ class RunDirectory:
         """Whether its learners have a policy each, so that no policy alone drives all of them."""
         return os.path.lexists(self.team) and len(set(_read_team(self.team).drivers.values())) > 1
 
-    def load_team(self, scenario: str | Path | Scenario, name: str = "team") -> Team:
-        """The learners of ``scenario`` driven as they were trained together in this run.
+    def load_team(
+        self, scenario: str | Path | Scenario, name: str = "team", vehicles: Collection[int] | None = None
+    ) -> Team:
+        """The ``vehicles`` (None: the learners of ``scenario``) driven as they were trained together in this run.
 
-        A learner that the scenario gives a script is left out. Raises ``InvalidInput`` where there is no team, for one
+        A learner of the run that is none of them is left out. Raises ``InvalidInput`` where there is no team, for one
         of another line length, or for a learner that it does not drive; ``CorruptBundle`` (file, what is wrong) for a
         damaged one.
         """
@@ -994,7 +996,7 @@ class RunDirectory:
                     else "only a shared policy can drive others"
                 )
             )
-        wanted = {scenario.vehicle_names[i]: i for i in scenario.learners}
+        wanted = {scenario.vehicle_names[i]: i for i in (scenario.learners if vehicles is None else vehicles)}
         missing = [each for each in wanted if each not in team.drivers]
         if missing or not wanted:
             who = ", ".join(missing) or "nobody"
@@ -1237,7 +1239,8 @@ def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
     if name == "universal" and path.partition("/universal")[0] != SHIPPED:
         raise InvalidInput(f"agent {spec!r}: must be universal@{SHIPPED}; for another policy: ppo@PATH or sac@PATH")
     if not ships and (name == "team" or (name != "universal" and RunDirectory(Path(path)).is_team)):
-        agent = RunDirectory(Path(path)).load_team(settings.needed_scenario(), spec)
+        vehicles = None if settings.role is None else (settings.role,)
+        agent = RunDirectory(Path(path)).load_team(settings.needed_scenario(), spec, vehicles)
         first: Any = agent.drivers[min(agent.drivers)]
         policy: Policy = first.policy
     else:
