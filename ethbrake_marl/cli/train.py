@@ -104,8 +104,8 @@ def run_command(
     count = "total" if plan.reward.harm_count == "total" else "first-impact"
     told = (
         f"Trained by recipe {plan.name}, seed {plan.seed if seed is None else seed}: {trained.steps:,} decisions in"
-        f" {trained.wall_s:.0f} s ({trained.status}). {trained.policy.manifest.algorithm} is the policy, hybrid the"
-        f" policy behind its shield. All minimise {count} harm.\n"
+        f" {trained.wall_s:.0f} s ({trained.status}). hybrid is the trained policy behind its shield. All minimise"
+        f" {count} harm.\n"
     )
     out.result(result.results, Text(told), result.rows.brief(result.beside), *result.rows.tables()[1:])
     out.note(f"report, with every measure and the paper's rows: {result.report}")
