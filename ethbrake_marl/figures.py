@@ -357,12 +357,15 @@ def harm_by_agent(
         harms = {row.agent: getattr(row, name).value for row in others}
         places = [k for k, row in enumerate(rows) if row.agent in harms]
         style = series_style(number + 4) | {"linestyle": "none", "markersize": 6.0}
-        axes.plot([harms[rows[k].agent] for k in places], places, label=title.lower(), **style)
+        axes.plot([harms[rows[k].agent] for k in places], places, label=label_text(title.lower(), 22), **style)
     name_axes(axes, x=_TITLES[harm_count])
     axes.set_xlim(left=0.0)
     _name_rows(axes, [row.agent for row in rows], most=22)
     axes.tick_params(labelsize=8)
-    figure.legend(loc="outside upper right", ncols=3, frameon=False, fontsize=8, handletextpad=0.4, columnspacing=1.0)
+    named = axes.get_legend_handles_labels()
+    figure.legend(
+        *named, loc="outside upper right", ncols=3, frameon=False, fontsize=8, handletextpad=0.4, columnspacing=1
+    )
     return figure
 
 

@@ -305,7 +305,7 @@ class Report:
         numbers = f"{impacts}: {_words(value)} m²/s² per emergency instead of {_words(before[harm])}{known}"
         fails = self._fails(harm)
         joined = ", but " if fails and change == "less" else ", and "
-        return f"{name} does {told} ({numbers}){joined}{fails or 'more in none of these worlds'}."
+        return f"{name} does {told} ({numbers}){joined}{fails or 'in none of these worlds more'}."
 
     def _fails(self, harm: str) -> str:
         """Where the agent does no less harm than full braking; empty: nowhere."""
@@ -321,8 +321,9 @@ class Report:
         after, before = (
             self.evaluation.outcome(agent).world_harm(self.harm_count) for agent in (self.about, _BASELINE)
         )
-        share = float((after > before + _ROUNDING).mean())
-        return f"more in {100.0 * share:.1f} % of these worlds" if share else ""
+        more = after - before
+        share = float((more > _ROUNDING).mean())
+        return f"more in {100.0 * share:.1f} % of these worlds, by {more.max():.2f} at most" if share else ""
 
     def _opening(self, rows: SummaryTable) -> list[Part]:
         """What must not be overlooked, one figure and one table."""
