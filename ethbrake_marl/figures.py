@@ -67,6 +67,7 @@ from ethbrake_marl.shield import OperatingPoint, RobustnessPoint
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 DASHES: tuple[str | tuple[int, tuple[int, ...]], ...] = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1)), "-", "--")
 GREY = "#555555"
+ALARM = "#b00020"
 DPI = 150
 
 _CAPTION = "caption"  # the name of a caption's group in an SVG
@@ -219,6 +220,7 @@ _PALETTE = {  # colours of figures by what a page calls them: it has others for 
     "#ffffff": "var(--paper)",
     "#555555": "var(--quiet)",
     "#262626": "var(--ink)",
+    "#b00020": "var(--alarm)",
     "#dddddd": "var(--grid)",
     "black": "var(--ink)",
     "white": "var(--paper)",
@@ -980,8 +982,20 @@ Json = dict[str, Any]
 
 
 def ablation_figures(found: Json, caption: str) -> list[Figure]:
-    """What an ablation found: harm level by level, what each step changes, and who pays."""
-    return [_harm_curve(found, caption), _change_figure(found, caption), _who_pays(found, caption)]
+    """What an ablation found: harm level by level, what each step changes, and who pays.
+
+    Above each, in red: which levels are not trained enough.
+    """
+    figures = [_harm_curve(found, caption), _change_figure(found, caption), _who_pays(found, caption)]
+    for figure in figures if found["undertrained"] else ():
+        text = "\n".join(textwrap.fill(line, int(figure.get_figwidth() * 13.0)) for line in found["undertrained"])
+        for legend in figure.legends:  # a title of the figure would stand on it
+            legend.set_title(text, prop={"size": 9})
+            legend.set_alignment("left")
+            legend.get_title().set_color(ALARM)
+        if not figure.legends:
+            figure.suptitle(text, x=0.01, ha="left", fontsize=9, color=ALARM)
+    return figures
 
 
 def _harm_curve(found: Json, caption: str) -> Figure:

@@ -400,9 +400,9 @@ def tune_command(
     export = None if best is None or result.interrupted else export  # what goes on exports at its end
     if best is not None:
         shown = {"trial": best.number, "harm": best.harm, "values": best.values}
-        lines = [f"best: trial {best.number}, harm {best.harm:.4f}", *(f"  {k} = {v}" for k, v in best.values.items())]
+        lines = [f"best: trial {best.number}, {best.harm:.4f}", *(f"  {k} = {v}" for k, v in best.values.items())]
         if export is not None:
-            source = f"trial {best.number}, harm {best.harm!r} on the list of seed {plan.file.measure.seed}"
+            source = f"trial {best.number}, {best.harm!r} on the list of seed {plan.file.measure.seed}"
             out.write(export, plan.best_recipe(best.values, export, f"ethbrake study tune: {source}"))
             told += f"; recipe: {export}"
     found = {
@@ -493,7 +493,8 @@ def ablate_command(
     if written is None:
         out.interrupted(f"interrupted; {KEPT_IN_FOLDER}")
     found, (page, text, *figures) = written
-    out.result(found, text.read_text("utf-8"), end="")
+    alarms = [Text(line, "bold red") for line in found["undertrained"]]
+    out.result(found, text.read_text("utf-8"), *alarms, end="")
     drawn = f"; figures: {', '.join(map(str, figures))}" if figures else ""
     out.note(f"page: {page}; tables: {text}{drawn}")
 

@@ -46,7 +46,7 @@ class Part:
 
     @classmethod
     def paragraph(cls, text: str, kind: str = "") -> Part:
-        """Text as a paragraph: ``quiet`` (conditions), ``note`` (what must not be overlooked), or a plain one."""
+        """Text as a paragraph: ``quiet`` (conditions), ``note`` (what must not be overlooked), ``alarm``, or plain."""
         return cls(Markup('<p class="{}">{}</p>\n').format(kind, shown(text)))
 
     @classmethod
