@@ -23,7 +23,7 @@ from matplotlib.axes import Axes
 from matplotlib.backend_bases import RendererBase
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure as Figure  # the type that every figure has, for other modules
-from matplotlib.font_manager import findfont, get_font
+from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
@@ -990,7 +990,7 @@ def ablation_figures(found: Json, caption: str) -> list[Figure]:
     for figure in figures if found["undertrained"] else ():
         text = "\n".join(textwrap.fill(line, int(figure.get_figwidth() * 13.0)) for line in found["undertrained"])
         for legend in figure.legends:  # a title of the figure would stand on it
-            legend.set_title(text, prop={"size": 9})
+            legend.set_title(text, prop=FontProperties(size=9))
             legend.set_alignment("left")
             legend.get_title().set_color(ALARM)
         if not figure.legends:

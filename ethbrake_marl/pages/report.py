@@ -299,31 +299,28 @@ class Report:
         if before is None or row is before:
             return f"{name} does {_words(value)} m²/s² of harm per emergency ({impacts}{known})."
         change, decrease = _change(row, harm), row[f"harm_decrease_{self.harm_count}"]
-        told = "about as much harm as full braking"
-        if change != "as much" and decrease is not None:
-            told = f"{abs(100.0 * decrease.value):.0f} % {change} harm than full braking"
+        much = "" if decrease is None else f"{abs(100.0 * decrease.value):.0f} % "  # None: full braking does none
+        told = "about as much harm as" if change == "as much" else f"{much}{change} harm than"
         numbers = f"{impacts}: {_words(value)} m²/s² per emergency instead of {_words(before[harm])}{known}"
         fails = self._fails(harm)
         joined = ", but " if fails and change == "less" else ", and "
-        return f"{name} does {told} ({numbers}){joined}{fails or 'in none of these worlds more'}."
+        return f"{name} does {told} full braking ({numbers}){joined}{fails or 'in none of these worlds more'}."
 
     def _fails(self, harm: str) -> str:
         """Where the agent does no less harm than full braking; empty: nowhere."""
         found = []
-        for title, _, rows in self.tests:
-            there = {row.agent: row for row in rows}
-            if self.about in there and _BASELINE in there and _change(there[self.about], harm) != "less":
-                much = _change(there[self.about], harm)
-                value, before = (_words(there[agent][harm]) for agent in (self.about, _BASELINE))
-                found.append(f"{much} in the {title.lower()} ({value} instead of {before})")
+        for title, _, others in self.tests:
+            rows = {row.agent: row for row in others}
+            if self.about in rows and _BASELINE in rows and (change := _change(rows[self.about], harm)) != "less":
+                numbers = f"{_words(rows[self.about][harm])} instead of {_words(rows[_BASELINE][harm])}"
+                found.append(f"{change} in the {title.lower()} ({numbers})")
         if found:
             return " and ".join(found)
-        after, before = (
-            self.evaluation.outcome(agent).world_harm(self.harm_count) for agent in (self.about, _BASELINE)
-        )
-        more = after - before
-        share = float((more > _ROUNDING).mean())
-        return f"more in {100.0 * share:.1f} % of these worlds, by {more.max():.2f} at most" if share else ""
+        outcomes = (self.evaluation.outcome(agent) for agent in (self.about, _BASELINE))
+        after, before = (outcome.world_harm(self.harm_count) for outcome in outcomes)
+        share = float((after > before + _ROUNDING).mean())
+        most = float((after - before).max())
+        return f"more in {100.0 * share:.1f} % of these worlds, by {most:.2f} at most" if share else ""
 
     def _opening(self, rows: SummaryTable) -> list[Part]:
         """What must not be overlooked, one figure and one table."""

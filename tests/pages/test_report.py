@@ -232,9 +232,12 @@ def test_report__flatters_nobody(paper_random: eb.Scenario, pair: eb.Scenario) -
     assert unsure.startswith("constant:6.5 does about as much harm as full braking (first impacts: ")
     alone = summed_up(paper_random, "full_brake").first_sentence
     assert alone.startswith("Full braking does ") and "instead of" not in alone and alone.endswith(").")
-    harmless = summed_up(pair.replace(gaps_m={"uniform": [60.0, 70.0]}), "full_brake", "constant:5").first_sentence
+    far = pair.replace(gaps_m={"uniform": [60.0, 70.0]})
+    harmless = summed_up(far, "full_brake", "constant:5").first_sentence
     assert harmless.startswith("constant:5 does about as much harm as full braking (first impacts: 0.00 ")
     assert harmless.endswith("), and in none of these worlds more.")
+    harmful = summed_up(far, "full_brake", "coast").first_sentence  # no share of nothing
+    assert harmful.startswith("coast does more harm than full braking (first impacts: ")
 
 
 def test_report__says_below_its_first_sentence_what_must_not_be_overlooked(pair: eb.Scenario) -> None:
