@@ -23,7 +23,7 @@ from matplotlib.axes import Axes
 from matplotlib.backend_bases import RendererBase
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure as Figure  # the type that every figure has, for other modules
-from matplotlib.font_manager import findfont, get_font
+from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch
 from matplotlib.patheffects import Normal, Stroke
@@ -67,6 +67,7 @@ from ethbrake_marl.shield import OperatingPoint, RobustnessPoint
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 DASHES: tuple[str | tuple[int, tuple[int, ...]], ...] = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1)), "-", "--")
 GREY = "#555555"
+ALARM = "#b00020"
 DPI = 150
 
 _CAPTION = "caption"  # the name of a caption's group in an SVG
@@ -219,6 +220,7 @@ _PALETTE = {  # colours of figures by what a page calls them: it has others for 
     "#ffffff": "var(--paper)",
     "#555555": "var(--quiet)",
     "#262626": "var(--ink)",
+    "#b00020": "var(--alarm)",
     "#dddddd": "var(--grid)",
     "black": "var(--ink)",
     "white": "var(--paper)",
@@ -235,6 +237,7 @@ _ATTRIBUTES = {
 _MOST_DEEP = 50
 _LINE_PT = 1.2 * _CAPTION_PT  # of a caption, from one line to the next
 _NARROW_PT = 540.0  # figures up to this width have one panel
+SLIM_IN = 3.8  # a figure of this width can be read on a phone without scrolling
 
 
 def inline_svg(figure: Figure | bytes, label: str, *, recolour: bool = True) -> tuple[str, str]:
@@ -274,6 +277,8 @@ def inline_svg(figure: Figure | bytes, label: str, *, recolour: bool = True) -> 
         root.attrib.pop(name, None)
     if _size_pt(root)[0] > _NARROW_PT:
         root.attrib["class"] = "broad"
+    elif _size_pt(root)[0] <= 72.0 * SLIM_IN + 0.1:
+        root.attrib["class"] = "slim"
     root.attrib |= {"role": "img", "aria-label": plain_text(label, keep="\u00a0")}
     root.attrib |= {
         "stroke-linejoin": "round",
@@ -332,35 +337,43 @@ _PARTS = (
 )
 
 
-def harm_by_agent(rows: Sequence[SummaryRow]) -> Figure:
-    """Mean harm of each agent under both counts with 95 % intervals; a line: the best known.
+def harm_by_agent(
+    rows: Sequence[SummaryRow],
+    harm_count: HarmCount = "first",
+    elsewhere: Mapping[str, Sequence[SummaryRow]] | None = None,
+) -> Figure:
+    """Mean harm of each agent with its 95 % interval; a line: the best known; marks: the same agent elsewhere.
 
-    Raises ``InvalidInput`` without rows.
+    As narrow as a phone. ``elsewhere``: rows of other tests, by title. Raises ``InvalidInput`` without rows.
     """
     if not rows:
         raise InvalidInput("harm_by_agent: no rows; evaluate at least one agent")
-    figure, panels = new_panels((10.0, 1.2 + 0.36 * len(rows)), columns=2, sharey=True)
-    for axes, count, name in zip(panels, HARM_COUNTS, ("first_impact_harm", "total_harm"), strict=True):
-        for k, row in enumerate(rows):
-            value, ends = getattr(row, name).value, getattr(row, name).ends
-            axes.barh(k, value, height=0.62, color=COLOURS[2])
-            axes.hlines(k, *ends, color=COLOURS[0], linewidth=1.6)
-            axes.annotate(
-                f"{value:.2f}", (ends[1], k), xytext=(5, 0), textcoords="offset points", va="center", fontsize=9
-            )
-        if (best := rows[0][f"best_known_{name}"]) is not None:
-            axes.axvline(best.value, color=COLOURS[3], linewidth=1.6, linestyle="--", label="best known")
-        name_axes(axes, x=_TITLES[count])
-        axes.margins(x=0.14)
-        axes.set_xlim(left=0.0)
-    _name_rows(panels[0], [row.agent for row in rows])
-    caption = f"Mean per world; black lines: 95 % intervals. {rows[0].parameters.line}."
-    return finish(figure, caption, panels[0], columns=1, loc="outside upper right")
+    figure, (axes,) = new_panels((SLIM_IN, 0.9 + 0.24 * len(rows)))
+    name = {"first": "first_impact_harm", "total": "total_harm"}[harm_count]
+    for k, row in enumerate(rows):
+        axes.barh(k, getattr(row, name).value, height=0.62, color=COLOURS[2])
+        axes.hlines(k, *getattr(row, name).ends, color=COLOURS[0], linewidth=1.6)
+    if (best := rows[0][f"best_known_{name}"]) is not None:
+        axes.axvline(best.value, color=COLOURS[3], linewidth=1.6, linestyle="--", label="best known")
+    for number, (title, others) in enumerate((elsewhere or {}).items()):
+        harms = {row.agent: getattr(row, name).value for row in others}
+        places = [k for k, row in enumerate(rows) if row.agent in harms]
+        style = series_style(number + 4) | {"linestyle": "none", "markersize": 6.0}
+        axes.plot([harms[rows[k].agent] for k in places], places, label=label_text(title.lower(), 22), **style)
+    name_axes(axes, x=_TITLES[harm_count])
+    axes.set_xlim(left=0.0)
+    _name_rows(axes, [row.agent for row in rows], most=22)
+    axes.tick_params(labelsize=8)
+    named = axes.get_legend_handles_labels()
+    figure.legend(
+        *named, loc="outside upper right", ncols=3, frameon=False, fontsize=8, handletextpad=0.4, columnspacing=1
+    )
+    return figure
 
 
-def _name_rows(axes: Axes, agents: Sequence[str]) -> None:
-    """One row per agent, the first on top."""
-    axes.set_yticks(range(len(agents)), [label_text(agent) for agent in agents])
+def _name_rows(axes: Axes, agents: Sequence[str], most: int = 40) -> None:
+    """One row per agent, the first on top; no name longer than ``most`` signs."""
+    axes.set_yticks(range(len(agents)), [label_text(agent, most) for agent in agents])
     axes.invert_yaxis()
 
 
@@ -969,8 +982,20 @@ Json = dict[str, Any]
 
 
 def ablation_figures(found: Json, caption: str) -> list[Figure]:
-    """What an ablation found: harm level by level, what each step changes, and who pays."""
-    return [_harm_curve(found, caption), _change_figure(found, caption), _who_pays(found, caption)]
+    """What an ablation found: harm level by level, what each step changes, and who pays.
+
+    Above each, in red: which levels are not trained enough.
+    """
+    figures = [_harm_curve(found, caption), _change_figure(found, caption), _who_pays(found, caption)]
+    for figure in figures if found["undertrained"] else ():
+        text = "\n".join(textwrap.fill(line, int(figure.get_figwidth() * 13.0)) for line in found["undertrained"])
+        for legend in figure.legends:  # a title of the figure would stand on it
+            legend.set_title(text, prop=FontProperties(size=9))
+            legend.set_alignment("left")
+            legend.get_title().set_color(ALARM)
+        if not figure.legends:
+            figure.suptitle(text, x=0.01, ha="left", fontsize=9, color=ALARM)
+    return figures
 
 
 def _harm_curve(found: Json, caption: str) -> Figure:

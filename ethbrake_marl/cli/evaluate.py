@@ -408,6 +408,7 @@ def _write_report(
         f"{scenario.name}: {names}" if len(names) <= 60 else f"{scenario.name}: {len(rows)} agents compared",
         rows,
         found,
+        harm_count=harm_count,
         summary=scenario.title or "Agents on the same worlds.",
         settings={
             "Command": "ethbrake " + " ".join(sys.argv[1:]),
@@ -420,7 +421,7 @@ def _write_report(
         },
         versions=rows[0].versions,
     )
-    report.driven(agents, harm_count=harm_count, on_agent=tell).write(path, force=out.force)
+    report.driven(agents, on_agent=tell).write(path, force=out.force)
     out.note(f"report: {path}")
 
 

@@ -104,8 +104,8 @@ def run_command(
     count = "total" if plan.reward.harm_count == "total" else "first-impact"
     told = (
         f"Trained by recipe {plan.name}, seed {plan.seed if seed is None else seed}: {trained.steps:,} decisions in"
-        f" {trained.wall_s:.0f} s ({trained.status}). {trained.policy.manifest.algorithm} is the policy, hybrid the"
-        f" policy behind its shield. All minimise {count} harm.\n"
+        f" {trained.wall_s:.0f} s ({trained.status}). hybrid is the trained policy behind its shield. All minimise"
+        f" {count} harm.\n"
     )
     out.result(result.results, Text(told), result.rows.brief(result.beside), *result.rows.tables()[1:])
     out.note(f"report, with every measure and the paper's rows: {result.report}")
@@ -400,9 +400,9 @@ def tune_command(
     export = None if best is None or result.interrupted else export  # what goes on exports at its end
     if best is not None:
         shown = {"trial": best.number, "harm": best.harm, "values": best.values}
-        lines = [f"best: trial {best.number}, harm {best.harm:.4f}", *(f"  {k} = {v}" for k, v in best.values.items())]
+        lines = [f"best: trial {best.number}, {best.harm:.4f}", *(f"  {k} = {v}" for k, v in best.values.items())]
         if export is not None:
-            source = f"trial {best.number}, harm {best.harm!r} on the list of seed {plan.file.measure.seed}"
+            source = f"trial {best.number}, {best.harm!r} on the list of seed {plan.file.measure.seed}"
             out.write(export, plan.best_recipe(best.values, export, f"ethbrake study tune: {source}"))
             told += f"; recipe: {export}"
     found = {
@@ -493,7 +493,8 @@ def ablate_command(
     if written is None:
         out.interrupted(f"interrupted; {KEPT_IN_FOLDER}")
     found, (page, text, *figures) = written
-    out.result(found, text.read_text("utf-8"), end="")
+    alarms = [Text(line, "bold red") for line in found["undertrained"]]
+    out.result(found, text.read_text("utf-8"), *alarms, end="")
     drawn = f"; figures: {', '.join(map(str, figures))}" if figures else ""
     out.note(f"page: {page}; tables: {text}{drawn}")
 

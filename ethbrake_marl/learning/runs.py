@@ -715,15 +715,21 @@ def cut_gradients(shares: Sequence[float]) -> str | None:
 
 
 def objective_in_words(training: Training) -> str:
-    """What the mean over the learners of their objectives' harm is, where one is another than total; else empty."""
+    """What the mean over the learners of their objectives is, where one is another than total; else empty.
+
+    Only what some vehicles bear is called harm: a weighted sum of it is an objective.
+    """
     scenario, learners = training.scenario, training.scenario.learners
     reward, objectives = training.recipe.reward.settled(scenario.objective, scenario.vehicles)
     declared = reward.objective
     if declared is None:
         return ""
     names = [declared] if isinstance(declared, str) else dict.fromkeys(declared[i] for i in learners)
-    what = "injuries in 1,000 lines" if {objectives[i].kind for i in learners} == {"injury"} else "harm"
-    return f"{'first-impact' if reward.harm_count == 'first' else 'total'} {what} ({', '.join(names)})"
+    kinds, first = {objectives[i].kind for i in learners}, reward.harm_count == "first"
+    if not kinds <= {"total", "own", "maximin"} and kinds != {"injury"}:
+        return f"objective by {'first' if first else 'all'} impacts ({', '.join(names)})"
+    what = "injuries in 1,000 lines" if kinds == {"injury"} else "harm"
+    return f"{'first-impact' if first else 'total'} {what} ({', '.join(names)})"
 
 
 def misleading_return(evaluations: Sequence[Mapping[str, float]], harm: str) -> str | None:

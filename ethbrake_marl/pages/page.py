@@ -46,7 +46,7 @@ class Part:
 
     @classmethod
     def paragraph(cls, text: str, kind: str = "") -> Part:
-        """Text as a paragraph: ``quiet`` (conditions), ``note`` (what must not be overlooked), or a plain one."""
+        """Text as a paragraph: ``quiet`` (conditions), ``note`` (what must not be overlooked), ``alarm``, or plain."""
         return cls(Markup('<p class="{}">{}</p>\n').format(kind, shown(text)))
 
     @classmethod
@@ -61,13 +61,31 @@ class Part:
         return cls(Markup("<dl>\n{}\n</dl>\n").format(Markup("\n").join(lines)))
 
     @classmethod
+    def remarks(cls, texts: Sequence[str]) -> Part:
+        """A list of what must not be overlooked, one line each; nothing without any."""
+        lines = [Markup("<li>{}</li>").format(shown(text)) for text in texts]
+        return cls(Markup('<ul class="remarks">\n{}\n</ul>\n').format(Markup("\n").join(lines)) if lines else Markup())
+
+    @classmethod
+    def box(cls, title: str, meanings: Mapping[str, str]) -> Part:
+        """Words and what they mean, in a box."""
+        return cls(Markup('<aside class="box"><strong>{}</strong>{}</aside>\n').format(title, cls.facts(meanings).html))
+
+    @classmethod
+    def beside(cls, parts: Sequence[Part]) -> Part:
+        """Parts of equal width side by side; on a narrow screen, one below the other."""
+        return cls._around('<div class="beside">{}</div>\n', parts)
+
+    @classmethod
     def opened(cls, title: str, parts: Sequence[Part]) -> Part:
         """Parts that show when their title is chosen."""
+        return cls._around("<details><summary>{}</summary>\n{}</details>\n", parts, shown(title))
+
+    @classmethod
+    def _around(cls, markup: str, parts: Sequence[Part], *texts: str) -> Part:
         inside = Markup("").join(part.html for part in parts)
         styles, scripts = (tuple(n for part in parts for n in getattr(part, what)) for what in ("styles", "scripts"))
-        return cls(
-            Markup("<details><summary>{}</summary>\n{}</details>\n").format(shown(title), inside), styles, scripts
-        )
+        return cls(Markup(markup).format(*texts, inside), styles, scripts)
 
     @classmethod
     def data(cls, name: str, content: object, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = ()) -> Part:
@@ -225,6 +243,7 @@ class Page:
         title: of the page.
         sections: in this order, each with an entry in the table of contents.
         lead: what the page is about, in a sentence or two below its title.
+        opening: parts between these and the table of contents.
         served: it comes from a server of ours, which its script may ask; else it asks nobody.
 
     >>> from ethbrake_marl.pages.page import Page, Part, Section
@@ -238,10 +257,11 @@ class Page:
     sections: Sequence[Section]
     lead: str = ""
     served: bool = False
+    opening: Sequence[Part] = ()
 
     @cached_property
     def _parts(self) -> list[Part]:
-        return [part for section in self.sections for part in section.parts]
+        return [*self.opening, *(part for section in self.sections for part in section.parts)]
 
     @cached_property
     def _code(self) -> tuple[str, str]:
@@ -281,6 +301,7 @@ class Page:
             "page.html.j2",
             title=self.title,
             lead=self.lead,
+            opening=self.opening,
             sections=list(zip(names, self.sections, strict=True)),
             policy=self.policy,
             served=self.served,

@@ -1,12 +1,14 @@
-"""The report of an evaluation as one page: results, episodes to watch, what was avoidable, shield, figures."""
+"""The report of an evaluation as one page.
+
+It begins with one sentence, one figure and one table; episodes to watch, what was avoidable and every number follow.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from markupsafe import Markup
@@ -40,6 +42,14 @@ WORST = 10
 _EACH = 5  # of the other kinds
 _RANDOM_SEED = 0
 _BASELINE = "full_brake"
+_ROUNDING = 1e-6  # m2/s2
+_NAMES: dict[HarmCount, str] = {"first": "first_impact_harm", "total": "total_harm"}
+TRAINED_POLICY = "trained policy"  # the name of the policy that a run trains
+WORDS = {
+    "Contact": "Two vehicles, or Vehicle 1 and an obstacle, touch: the gap between them is 0.",
+    "Impact": "A contact with a closing speed above 0. The square of that speed is its harm.",
+    "Collision": "A world with at least one impact.",
+}
 
 
 def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS) -> dict[int, Played]:
@@ -172,7 +182,8 @@ def shield_section(rows: ShieldModes, conditions: str) -> Section:
     return Section("Shield", body)
 
 
-_SHORT = {"collision_rate", "first_impact_harm", "total_harm", "harm_decrease_first"}  # what the page begins with
+_SHORT = {"collision_rate", "first_impact_harm", "total_harm"}  # beside the agent, in the table that all begins with
+_CAPTION = "Means with 95 % intervals, m²/s²"
 _OTHERS = {"Knows", "sampled_harm", "vehicle_1_shoved_m", "vehicle_1_shoved_far_rate", "predicted_harm"}
 
 
@@ -188,7 +199,9 @@ class Report:
     focus: str = ""  # the agent whose worst worlds are shown
     figures: Sequence[Part] = ()
     tests: Sequence[tuple[str, str, Sequence[SummaryRow]]] = ()  # the same agents elsewhere: title, what differs, rows
-    summary: str = ""  # a sentence or two below the title
+    harm_count: HarmCount = "first"  # that agents minimised
+    remarks: Sequence[str] = ()  # what must not be overlooked, below the first sentence
+    summary: str = ""  # what was compared, in a sentence or two
     settings: Mapping[str, object] = field(default_factory=dict)  # command, seeds, training set-up
     versions: Mapping[str, str] = field(default_factory=dict)
 
@@ -197,24 +210,19 @@ class Report:
         agents: Mapping[str, Driver],
         *,
         spellings: Mapping[str, str] | None = None,
-        harm_count: HarmCount = "first",
         on_agent: Callable[[str], None] | None = None,
     ) -> Report:
         """The same with episodes, which every agent drives once more, and with what any shields among them are worth.
 
-        Without a ``focus`` that becomes the last agent that drives by a trained policy, or the last. Shields are
-        measured in the first worlds, alone and in every mode.
+        Shields are measured in the first worlds, alone and in every mode.
 
         Args:
             agents: that were evaluated, by name; they are left as they are.
             spellings: how an agent is written on a command line, where that is not its name.
-            harm_count: that agents minimised.
             on_agent: is told each agent that is done.
 
         """
-        evaluation = self.evaluation
-        learned = [row.agent for row in self.rows if row.policy_sha256]
-        focus = self.focus or [*[row.agent for row in self.rows][-1:], *learned][-1]
+        evaluation, focus, harm_count = self.evaluation, self.about, self.harm_count
         chosen = choose_shown(evaluation, focus)
         worlds, played = evaluation.worlds.take(np.array(list(chosen), np.int64)), list(chosen.values())
         scenario = evaluation.scenario
@@ -233,6 +241,12 @@ class Report:
         return replace(self, played=played, shield=shield, focus=focus)
 
     @property
+    def about(self) -> str:
+        """The agent that the page is about: its focus, or the last that drives by a trained policy, or the last."""
+        learned = [row.agent for row in self.rows if row.policy_sha256]
+        return self.focus or (learned or [row.agent for row in self.rows] or [""])[-1]
+
+    @property
     def html(self) -> str:
         """The page; it loads nothing from anywhere."""
         sections: list[Section | None] = [self._results(), self._episodes()]
@@ -243,7 +257,8 @@ class Report:
         sheet, nowhere = all_rows.sheet(), set(_empty(all_rows))
         for title, about, told_rows in self.tests:
             rows = SummaryTable(told_rows)
-            told = [*_measured(rows), Part.paragraph(rows.identity_line(), "quiet")]
+            notes = [Part.paragraph(text, "note") for text in _remarks(rows)]
+            told = [_short_table(rows), *notes, *_measured(rows), Part.paragraph(rows.identity_line(), "quiet")]
             sections.append(Section(title, [about, *told]))
             nowhere.intersection_update(_empty(rows))
         unseen = tuple(name for name in sheet.headings[2:] if name in nowhere)
@@ -261,42 +276,69 @@ class Report:
             Section("Versions", versions),
         ]
         shown = [section for section in sections if section is not None and section.body]
-        return Page(self.title, shown, lead=f"{self._found()}{self.summary}").html
+        return Page(self.title, shown, self.first_sentence, opening=self._opening(all_rows)).html
 
     def write(self, path: str | Path, *, force: bool = False) -> None:
         """Write the page; raises ``AlreadyExists`` unless ``force``, ``InvalidInput`` without a folder."""
         write_output(path, self.html.encode("utf-8"), force=force)
 
-    def _found(self) -> str:
-        """What full braking and the agent in focus cost, and what nobody could avoid, each with its 95 % interval."""
-        rows = {row.agent: row for row in self.rows}
-        before, after = rows.get(_BASELINE), rows.get(self.focus)
-        if before is None or after is None or after is before:
+    @property
+    def first_sentence(self) -> str:
+        """How much harm the agent does against full braking, beside the best known, and where it fails.
+
+        It fails in the other tests where it does no less harm than full braking; if in none, in single worlds.
+        """
+        rows, harm = {row.agent: row for row in self.rows}, _NAMES[self.harm_count]
+        if self.about not in rows:
             return ""
-        percent = partial(Estimate.in_words, digits=0, scale=100.0, unit="\N{NO-BREAK SPACE}%")
-        costs = [
-            f"{name} does {row.first_impact_harm.in_words()} m²/s² of harm per emergency by first impacts,"
-            f" {row.total_harm.in_words()} by all impacts, and collides in {percent(row.collision_rate)}"
-            for name, row in (("Full braking", before), (self.focus, after))
-        ]
-        first, total, certain = (
-            after[name] for name in ("harm_decrease_first", "harm_decrease_total", "impact_proven_rate")
-        )
-        saved = "" if first is None else f", {percent(first)} less harm by first impacts"
-        saved += "" if first is None or total is None else f" and {percent(total)} less by all"
-        proven = (
-            "" if certain is None else f" In {percent(certain)} no command could have avoided a collision (proven)."
-        )
-        return f"{costs[0]}. {costs[1]}{saved}.{proven} "
+        row, before = rows[self.about], rows.get(_BASELINE)
+        name = {_BASELINE: "Full braking", TRAINED_POLICY: f"The {TRAINED_POLICY}"}.get(self.about, self.about)
+        value, best = row[harm], row[f"best_known_{harm}"]
+        known = "" if best is None else f"; best known {_words(best)}"
+        impacts = "first impacts" if self.harm_count == "first" else "all impacts"
+        if before is None or row is before:
+            return f"{name} does {_words(value)} m²/s² of harm per emergency ({impacts}{known})."
+        change, decrease = _change(row, harm), row[f"harm_decrease_{self.harm_count}"]
+        much = "" if decrease is None else f"{abs(100.0 * decrease.value):.0f} % "  # None: full braking does none
+        told = "about as much harm as" if change == "as much" else f"{much}{change} harm than"
+        numbers = f"{impacts}: {_words(value)} m²/s² per emergency instead of {_words(before[harm])}{known}"
+        fails = self._fails(harm)
+        joined = ", but " if fails and change == "less" else ", and "
+        return f"{name} does {told} full braking ({numbers}){joined}{fails or 'in none of these worlds more'}."
+
+    def _fails(self, harm: str) -> str:
+        """Where the agent does no less harm than full braking; empty: nowhere."""
+        found = []
+        for title, _, others in self.tests:
+            rows = {row.agent: row for row in others}
+            if self.about in rows and _BASELINE in rows and (change := _change(rows[self.about], harm)) != "less":
+                numbers = f"{_words(rows[self.about][harm])} instead of {_words(rows[_BASELINE][harm])}"
+                found.append(f"{change} in the {title.lower()} ({numbers})")
+        if found:
+            return " and ".join(found)
+        outcomes = (self.evaluation.outcome(agent) for agent in (self.about, _BASELINE))
+        after, before = (outcome.world_harm(self.harm_count) for outcome in outcomes)
+        share = float((after > before + _ROUNDING).mean())
+        most = float((after - before).max())
+        return f"more in {100.0 * share:.1f} % of these worlds, by {most:.2f} at most" if share else ""
+
+    def _opening(self, rows: SummaryTable) -> list[Part]:
+        """What must not be overlooked, one figure and one table."""
+        if not rows:
+            return []
+        which = "First-impact" if self.harm_count == "first" else "Total"
+        elsewhere = {title: told for title, _, told in self.tests}
+        marks = "; marks: the other tests" if elsewhere else ""
+        figure = harm_by_agent(rows, self.harm_count, elsewhere)
+        about = f"Mean and 95 % interval{marks}."
+        drawing = Part.drawing(figure, f"{which} harm of each agent", about)
+        return [Part.remarks([*self.remarks, *_remarks(rows)]), Part.beside([drawing, _short_table(rows)])]
 
     def _results(self) -> Section:
         rows, limits = SummaryTable(self.rows), self.evaluation.limits
         because = f" Nothing is proven of these worlds: {limits.because}." if isinstance(limits, Unproven) else ""
-        body = _measured(rows, because)
-        if rows:
-            about = "Mean per world of the squared closing speed of impacts: each pair's first one, and every one."
-            body.append(Part.drawing(harm_by_agent(rows), "Harm of each agent", about))
-        return Section("Results", body)
+        told: list[str | Part] = [self.summary] if self.summary else []
+        return Section("Results", [*told, Part.box("Three words", WORDS), *_measured(rows, because)])
 
     def _episodes(self) -> Section:
         """The episodes to watch; which agents drove otherwise when they drove once more, and where episodes end."""
@@ -329,8 +371,32 @@ class Report:
         return Section("Episodes", body)
 
 
+def _words(estimate: Estimate | None) -> str:
+    """A mean without its interval."""
+    return Column("").show(estimate).value
+
+
+def _change(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
+    """How the harm compares with that of full braking in the same worlds; "as much" if the interval holds 0."""
+    difference = row[f"{harm}_difference"]
+    low, high = (0.0, 0.0) if difference is None else difference.ends
+    return "less" if high < 0.0 else "more" if low > 0.0 else "as much"
+
+
+def _short_table(rows: SummaryTable) -> Part:
+    """Each agent, how often it collides, and both harms."""
+    return _table(SummaryTable(replace(row, beside_paper=False) for row in rows).sheet(), _CAPTION, _SHORT)
+
+
+def _remarks(rows: SummaryTable) -> list[str]:
+    """What must not be overlooked about these rows."""
+    return [
+        text for kind, text in SummaryTable(replace(row, beside_paper=False) for row in rows).notes() if kind == "note"
+    ]
+
+
 def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
-    """The short table of these rows, what stands below it, and folded every measure with the paper's rows.
+    """The conditions of these rows, and folded every measure with the paper's rows.
 
     ``because``: why columns may be empty.
     """
@@ -343,13 +409,12 @@ def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
     left_out = f"Columns without a value in any row are left out: {'; '.join(empty)}.{because}"
     told = [*([("quiet", left_out)] if empty else []), *(note for note in rows.notes() if note not in notes)]
     folded += [Part.paragraph(text, kind) for kind, text in told]
-    notes = [*(("quiet", f"{row.parameters.line}. Harm in m²/s².") for row in rows[:1]), *notes]
-    title = "Every measure" + (", and the paper's rows" if len(whole.rows) > len(rows) else "")
-    return [
-        _table(ours.sheet(), "Means with 95 % intervals", _SHORT),
-        *(Part.paragraph(text, kind) for kind, text in notes),
-        Part.opened(title, folded),
+    quiet = [
+        *(f"{row.parameters.line}. Harm in m²/s²." for row in rows[:1]),
+        *(t for kind, t in notes if kind == "quiet"),
     ]
+    title = "Every measure" + (", and the paper's rows" if len(whole.rows) > len(rows) else "")
+    return [*(Part.paragraph(text, "quiet") for text in quiet), Part.opened(title, folded)]
 
 
 def _empty(rows: SummaryTable) -> list[str]:

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from ethbrake_marl.figures import Figure, ablation_figures, write_picture
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
 from ethbrake_marl.files.store import read_object, write_output
 from ethbrake_marl.files.yaml import Override
+from ethbrake_marl.harm import Ledger, objective_harm
 from ethbrake_marl.learning import WORDS, RunDirectory, Training, TrainingRecipe, load_recipe, read_settings
 from ethbrake_marl.limits import BestHarmTable, best_harm, chunks_left, search_list, task_problem
 from ethbrake_marl.pages.page import Page, Part, Played, Section
@@ -411,6 +412,34 @@ class Harms:
     vehicle: dict[HarmCount, Floats]  # [seeds, worlds, N] harm of each
     collided: Bools  # [seeds, worlds]
     policies: tuple[Mapping[str, str], ...] = ()  # of each seed: vehicle -> SHA-256 of its policy's manifest
+    ledgers: tuple[Ledger, ...] = ()  # of each seed
+
+
+class Goal(NamedTuple):
+    """What the trainings of a level make small: mean over seeds, worlds and learners; of full braking, too."""
+
+    name: str
+    reached: float
+    full_brake: float
+
+    @classmethod
+    def of(cls, training: Training, reached: Harms, full_brake: Harms) -> Goal:
+        """The goal that the training's reward counts: the harm of the line, or the objective of each learner."""
+        reward, scenario = training.recipe.reward, training.scenario
+        objectives = reward.settled(scenario.objective, scenario.vehicles)[1]
+
+        def mean(harms: Harms) -> float:
+            if not objectives:
+                return float(harms.world[reward.harm_count].mean())
+            each = [objective_harm(ledger, reward.harm_count, objectives) for ledger in harms.ledgers]
+            return float(np.stack(each)[:, :, list(scenario.learners)].mean())
+
+        return cls("objective" if objectives else _HARM[reward.harm_count], mean(reached), mean(full_brake))
+
+    @property
+    def missed(self) -> bool:
+        """Whether full braking of everybody does better than what was trained."""
+        return self.reached > self.full_brake + TOLERANCE
 
 
 @dataclass(frozen=True, slots=True)
@@ -424,6 +453,7 @@ class Measured:
     best: dict[HarmCount, Floats] | None  # [1, search_episodes] joint optimum, best known; None: nobody to control
     identity: Mapping[str, Any] = field(default_factory=dict)  # of worlds and scenario, and what computed it
     shielded: dict[HarmCount, Shielded] | None = None  # [seeds, worlds] behind the shield that guards that count
+    goal: Goal | None = None  # None: nobody learns
 
 
 def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[Measured]:
@@ -434,7 +464,9 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
     """
     say = tell or (lambda progress: None)
     teams: dict[tuple[str, str], list[Team]] = {}
+    trainings: dict[tuple[str, str], Training] = {}
     for level, algorithm, training in plan.trainings():
+        trainings[level.name, algorithm] = training.training
         team = RunDirectory(training.folder).load_team(level.scenario, training.folder.name)
         teams.setdefault((level.name, algorithm), []).append(team)
     samples = common_worlds(plan.levels, plan.episodes, plan.list_seed)
@@ -467,7 +499,8 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
                     name = f"driving {team.name} behind the shield, {harm_count}"
                     say(Progress(name, sample.worlds.n, sample.worlds.n))
                 behind[harm_count] = Shielded.stack(parts)
-            found.append(Measured(level, algorithm, reached, braking, best, about, behind or None))
+            goal = Goal.of(trainings[level.name, algorithm], reached, braking)
+            found.append(Measured(level, algorithm, reached, braking, best, about, behind or None, goal))
     return found
 
 
@@ -484,6 +517,7 @@ def _drive(scenario: Scenario, sample: Sample, drivers: Sequence[Driver], tell: 
         {harm_count: np.stack([each.vehicle_harm(harm_count) for each in ledgers]) for harm_count in HARM_COUNTS},
         np.stack([outcome.collided for outcome in outcomes]),
         tuple(dict(outcome.policies) for outcome in outcomes),
+        tuple(ledgers),
     )
 
 
@@ -699,6 +733,8 @@ TOLERANCE = 1e-6  # m2/s2; a vehicle whose harm rose by more is worse off
 def compare(measured: Sequence[Measured], searched: int) -> Json:
     """Plain data for JSON: ``levels``, ``steps`` of the ladder, ``channels``; see docs/ablate-cooperation.md.
 
+    ``undertrained`` has a sentence for each level in which everybody braking fully does better than what was trained.
+
     The joint optimum is known in the first ``searched`` worlds; what stands beside it is of these worlds too. Each
     algorithm has a ladder of its own; levels in which nobody learns are in all of them.
     """
@@ -715,7 +751,15 @@ def compare(measured: Sequence[Measured], searched: int) -> Json:
         "levels": [_level(one, searched) for one in measured],
         "steps": steps,
         "channels": channels,
+        "undertrained": [_undertrained(one, one.goal) for one in measured if one.goal is not None and one.goal.missed],
     }
+
+
+def _undertrained(one: Measured, goal: Goal) -> str:
+    return (
+        f"{one.level.name} ({one.algorithm}) is not trained enough to say anything: its {goal.name} is"
+        f" {goal.reached:.2f}, and {goal.full_brake:.2f} if everybody brakes fully."
+    )
 
 
 def _level(one: Measured, searched: int) -> Json:
@@ -735,6 +779,7 @@ def _level(one: Measured, searched: int) -> Json:
         "seeds": len(one.reached.collided),
         "worlds": one.reached.collided.shape[1],
         "collision_rate": mean_over_seeds(one.reached.collided).to_json(),
+        "goal": None if one.goal is None else {**one.goal._asdict(), "missed": one.goal.missed},
     }
     for harm_count in HARM_COUNTS:
         reached, braking = one.reached.world[harm_count], one.full_brake.world[harm_count]
@@ -852,7 +897,8 @@ _HARM = {"first": "first-impact harm", "total": "total harm"}
 
 def markdown(found: Json, conditions: str) -> str:
     """All tables, with their conditions below."""
-    blocks = [text for title, sheets in _blocks(found) for text in (f"## {title}", *(s.markdown() for s in sheets))]
+    blocks = [f"**{line}**" for line in found["undertrained"]]
+    blocks += [text for title, sheets in _blocks(found) for text in (f"## {title}", *(s.markdown() for s in sheets))]
     return "\n\n".join([*blocks, conditions]) + "\n"
 
 
@@ -874,7 +920,8 @@ def ablation_page(found: Json, conditions: str, figures: Mapping[str, Figure], e
     settings = {name: value for name, value in found["settings"].items() if name != "recipes"}
     sections.append(Section("Settings", [Part.facts(settings)]))
     lead = "Who learns, who knows, whose harm counts: step by step."
-    return Page("What cooperation is worth", sections, lead).html
+    alarms = [Part.paragraph(line, "alarm") for line in found["undertrained"]]
+    return Page("What cooperation is worth", sections, lead, opening=alarms).html
 
 
 def _blocks(found: Json) -> list[tuple[str, list[Sheet]]]:

@@ -34,9 +34,9 @@ from ethbrake_marl.evaluation import (
 from ethbrake_marl.figures import harm_against_total_gap, learning_curve, trajectories, write_picture
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import read_object, write_output
-from ethbrake_marl.learning import RunDirectory, TrainingRecipe, TrainResult, algorithm_names, train
+from ethbrake_marl.learning import RunDirectory, TrainingRecipe, TrainResult, train
 from ethbrake_marl.pages.page import Part
-from ethbrake_marl.pages.report import Report
+from ethbrake_marl.pages.report import TRAINED_POLICY, Report
 from ethbrake_marl.policies import Policy, installed_versions
 from ethbrake_marl.rewards import RewardParams
 from ethbrake_marl.scenario import Scenario
@@ -86,7 +86,7 @@ def write_figures(
     world, row = int(evaluation.index[shown]), evaluation.worlds.take([shown])
     records = {
         name: record_episode(row, agents[name], scenario=evaluation.scenario, vehicle=evaluation.vehicle)
-        for name in (*BESIDE, learned_name(evaluation))
+        for name in (*BESIDE, TRAINED_POLICY)
     }
     drawn = {
         "learning_curve.png": (
@@ -111,18 +111,13 @@ def write_figures(
     return [Part.drawing(figure, title, description) for title, description, figure in drawn.values()]
 
 
-def learned_name(evaluation: Evaluation) -> str:
-    """What the trained policy is called among the agents."""
-    return next(name for name in algorithm_names() if name in evaluation.outcomes)
-
-
 def telling_world(evaluation: Evaluation, harm_count: HarmCount = "first") -> int:
     """Row of the world to draw: median saving of the policy among the worlds where full braking harms, else row 0."""
     before = evaluation.outcome(BESIDE[0]).world_harm(harm_count)
     rows = np.flatnonzero(before > 0.0)
     if not len(rows):
         return 0
-    saved = before[rows] - evaluation.outcome(learned_name(evaluation)).world_harm(harm_count)[rows]
+    saved = before[rows] - evaluation.outcome(TRAINED_POLICY).world_harm(harm_count)[rows]
     order = np.argsort(saved, kind="stable")
     return int(rows[order[(len(order) - 1) // 2]])
 
@@ -231,12 +226,9 @@ def run_experiment(
 def _agents(
     policy: Policy, scenario: Scenario, harm_count: HarmCount, baselines: Sequence[str] = (*BESIDE, "e_v2x_bm:pairwise")
 ) -> dict[str, Agent]:
-    """The baselines, the policy alone (``ppo`` or ``sac``), and the policy behind its shield (``hybrid``)."""
-    name = policy.manifest.algorithm
-    learned: dict[str, Agent] = {
-        name: LearnedAgent(policy, name),
-        "hybrid": HybridAgent(LearnedAgent(policy, name), scenario, harm_count=harm_count),
-    }
+    """The baselines, the trained policy alone, and the same behind its shield (``hybrid``)."""
+    alone = LearnedAgent(policy, TRAINED_POLICY)
+    learned: dict[str, Agent] = {TRAINED_POLICY: alone, "hybrid": HybridAgent(alone, scenario, harm_count=harm_count)}
     return {**make_agents(baselines, scenario, harm_count=harm_count), **learned}
 
 
@@ -275,29 +267,32 @@ def _show(
         "Settings": ", ".join(config.get("settings", ())),
         "Plug-ins": ", ".join(f"{each['name']} (SHA-256 {each['sha256']})" for each in config["plugins"]),
     }
-    manifest = trained.policy.manifest
-    which = f"Policy by {manifest.algorithm}, after {manifest.steps:,} steps (least harm on its own list)"
-    summary = f"{which}, alone and behind its shield, against the baselines."
-    if evaluation.scenario.name in TESTS and beside:
-        summary += f" {TESTS[evaluation.scenario.name]} The other two tests stand below."
-    if trained.status == "interrupted":
-        summary += " The training was interrupted; this is the policy it had by then."
+    manifest, name = trained.policy.manifest, evaluation.scenario.name
+    which = (
+        f"The {TRAINED_POLICY} is by {manifest.algorithm}, after {manifest.steps:,} steps (least harm on its own list)"
+    )
+    summary = f"{which}; hybrid is the same behind its shield."
+    if beside:
+        summary += f" {TESTS[name]} The other two tests stand below."
+    stopped = f"The training was interrupted: this is the policy after {manifest.steps:,} steps."
     begin("the page and its episodes")
-    name, learned = evaluation.scenario.name, learned_name(evaluation)
-    spellings = {learned: f"{learned}@{run.path}", "hybrid": f"{learned}@{run.path}+episode"}
+    spelling = f"{manifest.algorithm}@{run.path}"
+    spellings = {TRAINED_POLICY: spelling, "hybrid": f"{spelling}+episode"}
     report = Report(
-        f"ethbrake run: {name}{' (the main test of three)' if beside and name == next(iter(TESTS)) else ''}",
+        f"ethbrake run: {name}",
         rows,
         evaluation,
-        focus=learned,
+        focus=TRAINED_POLICY,
         figures=figures,
-        tests=[(name, TESTS[name], other) for name, other in beside.items()],
+        tests=[(TESTS[name].partition(":")[0], TESTS[name], other) for name, other in beside.items()],
+        harm_count=harm_count,
+        remarks=[stopped] if trained.status == "interrupted" else [],
         summary=summary,
         settings={name: value for name, value in told.items() if value},
         versions=installed_versions(),
     )
     path = run.path / "report.html"
-    report.driven(agents, spellings=spellings, harm_count=harm_count).write(path, force=True)
+    report.driven(agents, spellings=spellings).write(path, force=True)
     return path
 
 

@@ -933,7 +933,7 @@ class TuningPlan:
                 study.end(number, "pruned" if end["pruned"] else "finished", end["results"], harm)
                 best = study.best()
                 is_best = best is not None and best.number == number
-                say(f"trial {number}: least harm so far, {harm:.3f}" if is_best else "")
+                say(f"trial {number}: least so far, {harm:.3f}" if is_best else "")
 
             whole = kept.run(jobs(), workers, note, retries=retries)
             found = study.trials()

@@ -13,7 +13,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.evaluation.inputs import make_agents, make_lineup
 from ethbrake_marl.pages.explorer import Explored, HandDriven, outcome, read_profile
-from ethbrake_marl.pages.report import Report
+from ethbrake_marl.pages.report import TRAINED_POLICY, Report
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from ethbrake_marl.studies.reproduction import Reproduction
 from tests.browser.conftest import AGENTS, PAPER, wait_until
@@ -72,6 +72,46 @@ def test_page__never_scrolls_sideways_and_is_no_giant(open_page: Open, name: str
         assert outside == [], width
     assert name != "reproduction_file" or page.evaluate("document.querySelectorAll('svg').length") == 3
     assert path.stat().st_size <= MOST_BYTES
+
+
+@pytest.fixture(scope="module")
+def run_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A report of as many agents, tests and remarks as one of ``ethbrake run``."""
+    specs = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "ppo@shipped", "ppo@shipped+episode")
+    names = (*specs[:3], TRAINED_POLICY, "hybrid")
+    found = {}
+    for name in ("paper-random", "paper-random-obstacle"):
+        scenario = load_scenario(name)
+        agents = dict(zip(names, make_lineup(specs, scenario).values(), strict=True))
+        found[name] = eb.evaluate(scenario.sample(60, 7), agents, scenario=scenario, seed=7)
+    main, other = found.values()
+    report = Report(
+        "ethbrake run: paper-random", eb.summarise(main), main, focus=TRAINED_POLICY,
+        tests=[("Brake-only test", "x", eb.summarise(main)), ("Obstacle test", "y", eb.summarise(other))],
+        remarks=["The training was interrupted: this is the policy after 100,000 steps."],
+    )  # fmt: skip
+    path = tmp_path_factory.mktemp("run") / "report.html"
+    report.write(path)
+    return path
+
+
+@pytest.mark.parametrize(("width", "height"), [(1440, 900), (390, 844)])
+def test_report__sentence_figure_and_table_of_four_columns_stand_above_the_fold(
+    open_page: Open, run_file: Path, width: int, height: int
+) -> None:
+    page = open_page(run_file.as_uri(), width=width)
+    page.set_viewport_size({"width": width, "height": height})
+    bottoms = {
+        name: page.evaluate(f"document.querySelector('{name}').getBoundingClientRect().bottom")
+        for name in (".lead", ".beside svg", ".beside table")
+    }
+    assert all(0 < bottom <= height for bottom in bottoms.values()), bottoms
+    assert page.locator(".beside thead th").count() == 4 and page.locator(".beside tbody tr").count() == 5
+    for name in (".beside .wide", ".beside .drawing"):  # nothing is hidden at the side
+        assert page.evaluate(f"(e => e.scrollWidth <= e.clientWidth)(document.querySelector('{name}'))")
+    assert page.locator(".remarks li").count() == 2
+    least_px = page.evaluate("(e => e.clientWidth / e.viewBox.baseVal.width)(document.querySelector('.beside svg'))")
+    assert least_px * 8.0 >= 9.0  # labels are of 8 pt or more
 
 
 def test_figures__say_that_they_scroll_and_can_be_read(report_page: Any) -> None:

@@ -267,7 +267,7 @@ def test_train__keeps_and_tells_what_the_learners_objectives_make_of_the_harm(tm
     recipe = TINY.replace(total_steps=6 * 128, evaluation={"every_updates": 1, "worlds": 10, "seed": 7})
     said: list[str] = []
     result = runs.train(recipe, scenario, tmp_path / "run", on_progress=lambda shown: said.append(shown.harm))
-    assert said[0] == f"first-impact harm (own, {objectives[2]}) {result.evaluations[0]['objective']:.2f}"
+    assert said[0] == f"objective by first impacts (own, {objectives[2]}) {result.evaluations[0]['objective']:.2f}"
     rows = [row for row in RunDirectory(tmp_path / "run").rows() if row["eval/objective"]]
     best = min(result.evaluations, key=lambda each: each["objective"])
     kept = load_policy(tmp_path / "run" / "policy")
@@ -277,8 +277,25 @@ def test_train__keeps_and_tells_what_the_learners_objectives_make_of_the_harm(tm
     told = [best["objective_vehicle_2"], best["objective_vehicle_3"]]
     assert told == pytest.approx(harm[1:]) and best["objective"] == sum(told) / 2
     assert "objective" not in runs.train(TINY, SCENARIO, tmp_path / "plain", steps=1).evaluations[0]
-    injuries = Training.of(TINY, SCENARIO.replace(objective="injury:lr4s"))
-    assert runs.objective_in_words(injuries) == "first-impact injuries in 1,000 lines (injury:lr4s)"
+
+
+@pytest.mark.parametrize(
+    ("objective", "words"),
+    [
+        ("total", ""),
+        ("own", "first-impact harm (own)"),
+        ("maximin", "first-impact harm (maximin)"),
+        ("injury:lr4s", "first-impact injuries in 1,000 lines (injury:lr4s)"),
+        ("mass-weighted", "objective by first impacts (mass-weighted)"),
+        ("weighted:1,4,1", "objective by first impacts (weighted:1,4,1)"),
+        ("social:45", "objective by first impacts (social:45)"),
+    ],
+)
+def test_progress__calls_harm_only_what_somebody_bears(objective: str, words: str) -> None:
+    assert runs.objective_in_words(Training.of(TINY, SCENARIO.replace(objective=objective))) == words
+    total = TINY.replace(reward=TINY.reward.model_copy(update={"harm_count": "total"}))
+    said = runs.objective_in_words(Training.of(total, SCENARIO.replace(objective=objective)))
+    assert said == words.replace("by first", "by all").replace("first-impact", "total")
 
 
 def test_train__an_alarm_once_where_the_limit_cuts_most_of_the_gradients(

@@ -10,7 +10,9 @@ import pytest
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
+from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import AlreadyExists, plain_text
+from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.figures import COLOURS, add_caption, inline_svg, new_figure
 from ethbrake_marl.files.sheet import Column, Sheet, Shown
 from ethbrake_marl.pages import page as pages
@@ -157,8 +159,7 @@ def test_report__is_well_formed_and_says_everything(html: str, report: Report) -
     told = [
         "paper-random: 200 worlds, seed 7; d = ", "Training seed 5 Command ethbrake run", "numpy 2.4.6",
         "Hybrid PPO 59.74 % 5.6202", "62.3 %", report.rows[0].worlds_sha256, "from the alert to rest.",
-        "Full braking does ", " less harm by first impacts and ", " less by all. In ",
-        "no command could have avoided a collision (proven). One million",
+        "constant:4.5 does ", "One million steps.", "of these worlds no command of Vehicle 2 avoids contact",
     ]  # fmt: skip
     for row in report.rows:
         for estimate in (row.first_impact_harm, row.total_harm):
@@ -177,6 +178,85 @@ def test_report__embeds_fifty_worlds_whose_counts_are_the_ledgers(html: str, rep
             outcome = report.evaluation.outcome(agent)
             told = episode["impacts"][-1][4:] if episode["impacts"] else [0, 0.0, 0.0]
             assert told == [outcome.impacts[k], outcome.first_impact_harm[k], outcome.total_harm[k]]
+
+
+def summed_up(scenario: eb.Scenario, *specs: str) -> Report:
+    """A report of agents in 60 worlds, about the last one."""
+    result = eb.evaluate(scenario.sample(60, 7), make_lineup(specs, scenario), scenario=scenario, seed=7)
+    return Report("t", eb.summarise(result), result, focus=specs[-1])
+
+
+@pytest.mark.parametrize("harm_count", ["first", "total"])
+def test_report__begins_with_what_the_agent_does_against_full_braking_and_where_it_fails(
+    paper_random: eb.Scenario, harm_count: HarmCount
+) -> None:
+    """By the first impacts it is worse in no world, by all of them in some."""
+    mine = replace(summed_up(paper_random, "full_brake", "ppo@shipped"), harm_count=harm_count)
+    after, before = (mine.evaluation.outcome(name).world_harm(harm_count) for name in ("ppo@shipped", "full_brake"))
+    best, worse = mine.evaluation.regrets.best(harm_count).mean(), after > before + 1e-6
+    words = "first impacts" if harm_count == "first" else "all impacts"
+    more = f"but more in {100 * worse.mean():.1f} % of these worlds, by {(after - before).max():.2f} at most"
+    assert worse.any() == (harm_count == "total")
+    assert mine.first_sentence == (
+        f"ppo@shipped does {100 * (1 - after.mean() / before.mean()):.0f} % less harm than full braking ({words}:"
+        f" {after.mean():.2f} m²/s² per emergency instead of {before.mean():.2f}; best known {best:.2f}),"
+        f" {more if worse.any() else 'and in none of these worlds more'}."
+    )
+
+
+def test_report__names_the_tests_in_which_the_agent_does_no_less_harm_than_full_braking(
+    paper_random: eb.Scenario,
+) -> None:
+    mine = summed_up(paper_random, "full_brake", "coast", "e_v2x_bm")
+    braking, coasting, _ = mine.rows
+    tests = [
+        ("Same test", "It brakes fully.", [braking, replace(braking, agent="e_v2x_bm")]),
+        ("Obstacle test", "It does not brake at all.", [braking, replace(coasting, agent="e_v2x_bm")]),
+        ("Easy test", "As here.", mine.rows),
+        ("Other test", "It is not there.", [braking]),
+    ]
+    harm, much = (f"{row.first_impact_harm.value:.2f}" for row in (braking, coasting))
+    told = replace(mine, tests=tests)
+    assert told.first_sentence.endswith(
+        f"), but as much in the same test ({harm} instead of {harm}) and more in the obstacle test ({much} instead of"
+        f" {harm})."
+    )
+    text = Page(told.html).text
+    assert text.index(told.first_sentence) < text.index("First-impact harm of each agent")
+
+
+def test_report__flatters_nobody(paper_random: eb.Scenario, pair: eb.Scenario) -> None:
+    worse = summed_up(paper_random, "full_brake", "coast").first_sentence
+    assert " % more harm than full braking (" in worse and "), and more in " in worse
+    unsure = summed_up(paper_random, "full_brake", "constant:6.5").first_sentence  # 19.01 for 20.34
+    assert unsure.startswith("constant:6.5 does about as much harm as full braking (first impacts: ")
+    alone = summed_up(paper_random, "full_brake").first_sentence
+    assert alone.startswith("Full braking does ") and "instead of" not in alone and alone.endswith(").")
+    far = pair.replace(gaps_m={"uniform": [60.0, 70.0]})
+    harmless = summed_up(far, "full_brake", "constant:5").first_sentence
+    assert harmless.startswith("constant:5 does about as much harm as full braking (first impacts: 0.00 ")
+    assert harmless.endswith("), and in none of these worlds more.")
+    harmful = summed_up(far, "full_brake", "coast").first_sentence  # no share of nothing
+    assert harmful.startswith("coast does more harm than full braking (first impacts: ")
+
+
+def test_report__says_below_its_first_sentence_what_must_not_be_overlooked(pair: eb.Scenario) -> None:
+    short = summed_up(pair.replace(horizon_s=1.0), "full_brake", "coast")
+    mine = replace(short, remarks=["The training was interrupted."])
+    html = mine.html
+    (text,) = re.findall(r'<ul class="remarks">(.*?)</ul>', html, re.DOTALL)
+    assert re.findall(r"<li>(.*?)</li>", text) == [
+        "The training was interrupted.",
+        "At the horizon (1 s) something still moved; harm after it is not counted. Worlds, of 60: full_brake"
+        " 60, coast 60.",
+    ]
+    assert html.index('class="lead"') < html.index('class="remarks"') < html.index('class="beside"')
+    assert 'class="remarks"' not in summed_up(pair, "full_brake").html
+
+
+def test_report__says_once_what_contact_impact_and_collision_are(html: str) -> None:
+    (box,) = re.findall(r'<aside class="box">(.*?)</aside>', html, re.DOTALL)
+    assert re.findall(r"<dt>(.*?)</dt>", box) == ["Contact", "Impact", "Collision"]
 
 
 def episode_data(html: str) -> dict:
@@ -296,6 +376,9 @@ ALLOWED = set(
         "pattern",
         "line",
         "image",
+        "ul",
+        "li",
+        "aside",
     ]
 )
 

@@ -13,16 +13,18 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.evaluation.episodes import Passport
-from ethbrake_marl.figures import ablation_figures
+from ethbrake_marl.figures import ALARM, ablation_figures
 from ethbrake_marl.learning import runs as learning_train
-from ethbrake_marl.learning.training import Scheme, TrainingRecipe, load_recipe
+from ethbrake_marl.learning.training import Scheme, Training, TrainingRecipe, load_recipe
 from ethbrake_marl.limits.limits import best_harm, chunks_left
 from ethbrake_marl.policies import shipped_policies
 from ethbrake_marl.scenario import Sample, load_scenario
 from ethbrake_marl.shield.guard import Shielded
 from ethbrake_marl.studies.ablation import (
     FIGURES,
+    Goal,
     Harms,
     Level,
     LevelOptimum,
@@ -42,6 +44,7 @@ from ethbrake_marl.studies.ablation import (
     with_scheme,
 )
 from ethbrake_marl.studies.jobs import TrainingJob
+from tests.learning.tiny import TINY_PPO
 from tests.pages.hostile import Page
 from tests.policies.test_networks import another
 from tests.studies.conftest import ABLATE, LEVELS, check_snapshot, study
@@ -264,6 +267,62 @@ def test_compare__the_share_follows_from_what_stands_beside_the_joint_optimum(le
     assert row["realised_share"]["value"] == pytest.approx((15.0 - 8.25) / (15.0 - 6.0))
     assert row["each_seed"] == [7.5, 9.0] and row["worlds"] == SEARCHED
     assert level["full_brake"]["value"] == pytest.approx(20.0 * mild.mean())
+
+
+def test_undertrained__full_braking_does_better_is_said_in_table_page_and_figures(levels) -> None:
+    told = "cooperation-3-pair (ppo) is not trained enough to say anything: its total harm is 38.20, and 24.20 if"
+    told += " everybody brakes fully."
+    worse, better = Goal("total harm", 38.2, 24.2), Goal("total harm", 24.2, 24.2)
+    found = compare([levels[0], replace(levels[1], goal=better), replace(levels[2], goal=worse)], SEARCHED)
+    assert found["undertrained"] == [told]
+    assert [level["goal"] and level["goal"]["missed"] for level in found["levels"]] == [None, False, True]
+    assert markdown(found, "Conditions.").startswith(f"**{told}**\n\n## Levels")
+    page = ablation_page({**found, "settings": {}}, "Conditions.", {})
+    assert page.index(f'<p class="alarm">{told}</p>') < page.index("<nav")
+    for figure in ablation_figures(found, "Conditions."):
+        FigureCanvasAgg(figure).draw()
+        texts = [legend.get_title() for legend in figure.legends] or [figure._suptitle]
+        assert [" ".join(text.get_text().split()) for text in texts] == [told] and texts[0].get_color() == ALARM
+        assert texts[0].get_window_extent().y0 >= max(axes.get_tightbbox().y1 for axes in figure.axes) - 1.0
+    silent = compare(levels, SEARCHED)
+    assert silent["undertrained"] == [] and "not trained enough" not in markdown(silent, "Conditions.")
+
+
+@pytest.mark.parametrize(
+    ("level", "harm_count", "name"),
+    [("cooperation-2-paper", "first", "first-impact harm"), ("cooperation-1-front", "total", "objective")],
+)
+def test_goal__is_what_the_reward_counts(level: str, harm_count: HarmCount, name: str) -> None:
+    """In ``cooperation-1-front`` Vehicle 2 looks after itself."""
+    scenario = load_scenario(level)
+    ledgers = [
+        eb.evaluate(scenario.sample(30, 7), {agent: eb.make_agent(agent)}, scenario=scenario).outcome(agent).ledger
+        for agent in ("coast", "full_brake")
+    ]
+    reached, braking = (
+        Harms({harm_count: each.world_harm(harm_count)[np.newaxis]}, {}, each.collided[np.newaxis], (), (each,))
+        for each in ledgers
+    )
+    recipe = TINY_PPO.replace(reward={"harm": 1.0, "harm_count": harm_count})
+    goal = Goal.of(Training.of(recipe, scenario), reached, braking)
+    means = [
+        each.vehicle_harm(harm_count)[:, 1].mean() if name == "objective" else each.world_harm(harm_count).mean()
+        for each in ledgers
+    ]
+    assert goal.name == name and [goal.reached, goal.full_brake] == pytest.approx(means)
+    assert goal.missed and not goal._replace(reached=goal.full_brake).missed
+
+
+def test_ablate__goals_are_those_of_the_recipe(finished_ablation: Path) -> None:
+    found = content(finished_ablation)
+    goals = [level.pop("goal") for level in found["levels"]]
+    assert goals[0] is None
+    for goal, level in zip(goals[1:], found["levels"][1:], strict=True):
+        assert goal["name"] == "total harm"
+        assert goal["reached"] == pytest.approx(level["total"]["harm"]["value"])
+        assert goal["full_brake"] == pytest.approx(level["total"]["full_brake"]["value"])
+        said = any(line.startswith(f"{level['level']} (") for line in found["undertrained"])
+        assert said == goal["missed"] == (goal["reached"] > goal["full_brake"] + 1e-6)
 
 
 @pytest.fixture(scope="module")

@@ -345,7 +345,7 @@ def test_export__is_a_recipe_that_trains_the_best_trial_again_to_the_bit(finishe
     assert again.policy.manifest.manifest_sha256 == best["policy_sha256"]
     assert min(each["first_impact_harm"] for each in again.evaluations) == float(best["first_impact_harm"])
     text = file.read_text()
-    assert f"trial {best['trial']}, harm {float(best['first_impact_harm'])!r}" in text and "name: best\n" in text
+    assert f"trial {best['trial']}, {float(best['first_impact_harm'])!r}" in text and "name: best\n" in text
     assert "ethbrake train --scenario paper-random --recipe best.yaml" in text
 
 
