@@ -62,9 +62,9 @@ def test_frame__is_a_picture_of_the_state_alone_in_its_own_memory() -> None:
 @pytest.mark.parametrize(
     ("scenario", "learners", "pixels"),
     [
-        ("paper-random", ["vehicle_2"], "0f54a251a97d"),
-        ("paper-random-obstacle", [], "5885d3fef581"),
-        ("cooperation-4-five", None, "e567a00b8f37"),
+        ("paper-random", ["vehicle_2"], "f11b70d3a510"),
+        ("paper-random-obstacle", [], "320fe8dd969a"),
+        ("cooperation-4-five", None, "9d8b561a1ad1"),
     ],
 )
 def test_frames__are_the_same_pixels_as_ever(scenario: str, learners: list[str] | None, pixels: str) -> None:
