@@ -88,5 +88,6 @@ from ethbrake_marl.physics.worlds import (
     Worlds as Worlds,
     as_road_allows as as_road_allows,
     make_worlds as make_worlds,
+    real_numbers as real_numbers,
     sum_rows as sum_rows,
 )
