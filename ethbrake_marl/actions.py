@@ -5,11 +5,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.physics import Floats, Vehicles, compiled
+from ethbrake_marl.physics import Floats, Vehicles, compiled, real_numbers
 
 LARGEST = float(np.nextafter(np.float32(1.0), np.float32(2.0)))  # one float32 step beyond 1 is rounding, and means 1
 
@@ -20,12 +22,7 @@ def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str) -> Flo
     Axes of length 1 may be missing or added: a single action may come as a number, as [1] or as [1, 1]. One float32
     step beyond -1 or 1, which a network's last rounding can give, is -1 or 1.
     """
-    try:
-        if np.asarray(action).dtype.kind not in "fiubO":  # neither complex, nor text, nor a date
-            raise TypeError
-        given = np.asarray(action, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        raise InvalidInput(f"action of {names}: {action!r} is not a number; one in [-1, 1] is needed") from None
+    given = _numbers(action, names)
     if given.shape != shape and _longer_axes(given.shape) != _longer_axes(shape):
         raise InvalidInput(f"action of {names}: shape {given.shape}; {shape} is needed")
     good = (given >= -LARGEST) & (given <= LARGEST)
@@ -34,6 +31,18 @@ def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str) -> Flo
             f"action of {names}: {float(given[~good].flat[0])!r}; must be in [-1, 1], from full braking to full driving"
         )
     return given.reshape(shape).clip(-1.0, 1.0)
+
+
+def own_actions(actions: ArrayLike, names: str) -> NDArray[Any]:
+    """A copy of the actions, unchecked where they are an array already; ``InvalidInput`` for what is no number."""
+    return actions.copy() if isinstance(actions, np.ndarray) else _numbers(actions, names).copy()
+
+
+def _numbers(action: ArrayLike, names: str) -> Floats:
+    try:
+        return real_numbers(action)
+    except ValueError as error:
+        raise InvalidInput(f"action of {names}: {action!r} {error}; a number in [-1, 1] is needed") from None
 
 
 def _longer_axes(shape: tuple[int, ...]) -> tuple[int, ...]:

@@ -1067,6 +1067,11 @@ class Engine:
         new._renew(rows)
         self.__dict__.update(new.__dict__)
 
+    def cut(self, step: Step, most_steps: int) -> None:
+        """Truncate the episodes that have taken ``most_steps`` with the last ``step``, here and in what that tells."""
+        cut = (self.steps >= most_steps) & (step.ended | ~self.ended)
+        step.outcome[TRUNCATED, cut] = self._clock[cut, ENDED] = 1.0
+
     def _apart(self) -> Engine:
         """An engine that goes on from here without changing this one."""
         new = copy.copy(self)
@@ -1141,11 +1146,15 @@ class Engine:
     def _columns(self, actions: Actions) -> Floats:
         """The learners' actions as [n, L]; their range is checked where they are used."""
         shape = (self.n, len(self.learners))
-        if isinstance(actions, np.ndarray) or not isinstance(actions, Mapping):
-            given = np.asarray(actions)
-            if given.shape != shape or given.dtype.kind not in "fiu":
-                return checked_action(actions, shape, "the learners")
-            return np.ascontiguousarray(given, np.float64)
+        if type(actions) is np.ndarray and actions.shape == shape and actions.dtype.kind in "fiu":
+            return np.ascontiguousarray(actions, np.float64)
+        if not isinstance(actions, Mapping):
+            return checked_action(actions, shape, "the learners")
+        for vehicle in actions:
+            if vehicle not in self.learners:
+                raise InvalidInput(
+                    f"step: an action for vehicle index {vehicle!r}; the learners have the indices {self.learners}"
+                )
         columns = np.empty(shape)
         for c, vehicle in enumerate(self.learners):
             if vehicle not in actions and self.guard is not None:

@@ -49,7 +49,7 @@ _FOR_A_RUN = (
 _FIRST_STEP = """
 import ethbrake_marl as eb
 for given in ({}, {"reward": {"harm": 0.05, "shaping": 0.05}}):  # shaped, as PPO is trained
-    env = eb.parallel_env(**given)
+    env = eb.parallel_env(agents="learners", **given)
     env.reset(seed=0)
     env.step({agent: env.action_space(agent).sample() for agent in env.agents})
 """

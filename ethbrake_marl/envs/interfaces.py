@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -19,14 +20,14 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec_wrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
-from ethbrake_marl.actions import action_of, checked_action
+from ethbrake_marl.actions import action_of, checked_action, own_actions
 from ethbrake_marl.agents import script_agents
 from ethbrake_marl.engine import Engine, Step
 from ethbrake_marl.envs.drawing import Viewer
 from ethbrake_marl.errors import InvalidInput, check_one_learner, check_whole_number, unknown_name
 from ethbrake_marl.harm import front_share
 from ethbrake_marl.observations import Feature, Observation, Observations, ObservationSpec
-from ethbrake_marl.physics import Bools, Floats, Ints, Messages, Packed, Worlds, columns, compiled
+from ethbrake_marl.physics import Bools, Decisions, Floats, Ints, Messages, Packed, Worlds, columns, compiled
 from ethbrake_marl.rewards import Reward, RewardParams
 from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, full_state, load_scenario, state_features
 
@@ -113,24 +114,27 @@ def learner_actions(engine: Engine, actions: Mapping[str, Any]) -> Floats | dict
         name = names[vehicle]
         if actions.get(name) is None:
             if engine.guard is not None:
-                given = {
-                    i: np.atleast_1d(actions[names[i]]) for i in engine.learners if actions.get(names[i]) is not None
-                }
+                given = {i: actions[names[i]] for i in engine.learners if actions.get(names[i]) is not None}
                 return {i: checked_action(each, (1,), names[i]) for i, each in given.items()}
             raise InvalidInput(f"step: no action for the learner {name}")
-        action = np.asarray(actions[name])
-        if action.shape != (1,) or action.dtype.kind not in "fiu":
-            action = checked_action(actions[name], (1,), name)
+        action = actions[name]
+        if type(action) is not np.ndarray or action.shape != (1,) or action.dtype.kind not in "fiu":
+            action = checked_action(action, (1,), name)
         columns[0, c] = action.item()
     return columns
 
 
 INITIAL_STATE = "initial_state"
 LISTED_WORLD = "listed_world"
+RESET_MASK = "reset_mask"
 
 
 class UnknownResetOption(UserWarning):
     """A key of ``reset``'s options is not known to this environment; it is ignored."""
+
+
+class IgnoredAction(UserWarning):
+    """An action was passed for a vehicle that follows a script; it is ignored."""
 
 
 def chosen_seed(seed: int | None) -> int:
@@ -401,31 +405,77 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
 
 
 class Begun:
-    """What the interfaces share: an engine in which episodes have begun, or not yet."""
+    """What the interfaces share: an engine in which episodes have begun, or not yet, and the seed of its worlds.
+
+    ``np_random`` and ``np_random_seed`` mean what they mean in ``gymnasium.Env``.
+    """
 
     engine: Engine
+    _known_options: Sequence[str] = (INITIAL_STATE, LISTED_WORLD)
     _started = False
+    _goes_on = False  # a reset without a seed goes on in the running stream
+    _np_random: np.random.Generator | None = None
+    _np_random_seed: int | None = None  # -1: nobody knows, since the user set the generator
 
-    def _restart(self, seed: int | None, options: Mapping[str, Any] | None) -> int | None:
+    @property
+    def np_random(self) -> np.random.Generator:
+        """A generator for wrappers to draw from; the worlds come from ``np_random_seed`` alone.
+
+        Once you set another generator, each ``reset`` without a seed draws the seed of its worlds from it, until a
+        ``reset`` with one.
+        """
+        if self._np_random is None:
+            self._set_seed(chosen_seed(None))
+            assert self._np_random is not None
+        return self._np_random
+
+    @np_random.setter
+    def np_random(self, generator: np.random.Generator) -> None:
+        if not isinstance(generator, np.random.Generator):
+            raise InvalidInput(f"np_random = {generator!r}: must be a numpy.random.Generator")
+        self._np_random, self._np_random_seed, self._goes_on = generator, -1, False
+
+    @property
+    def np_random_seed(self) -> int:
+        """Seed of the stream of worlds, from fresh entropy where nobody named one; -1 once ``np_random`` was set."""
+        if self._np_random_seed is None:
+            self._set_seed(chosen_seed(None))
+            assert self._np_random_seed is not None
+        return self._np_random_seed
+
+    def _set_seed(self, seed: int) -> None:
+        self._np_random, self._np_random_seed = np.random.default_rng(seed), seed
+
+    def _restart(self, seed: int | None, options: Mapping[str, Any] | None) -> None:
         """Start new episodes in all worlds: the stream of ``seed`` from its start, or where the stream stands.
 
-        The first ones without a seed come from fresh entropy. ``options["initial_state"]`` (see
-        ``Scenario.worlds_from_state``) is the start of every world instead; ``options["listed_world"] = {"seed": 7,
-        "number": 3}`` starts in that world of the list on which agents are evaluated, a batch in that one and those
-        after it. With autoreset, later episodes come from the stream. Other options warn with ``UnknownResetOption``
-        and are ignored. Returns the seed that was used. Raises ``InvalidInput``, with nothing changed, for a seed that
-        is not a whole number >= 0, a bad initial state or listed world, or both of them.
+        ``options["initial_state"]`` (see ``Scenario.worlds_from_state``) is the start of every world instead;
+        ``options["listed_world"] = {"seed": 7, "number": 3}`` starts in that world of the list on which agents are
+        evaluated, a batch in that one and those after it. With autoreset, later episodes come from the stream. Other
+        options warn with ``UnknownResetOption`` and are ignored. Raises ``InvalidInput``, with nothing changed, for a
+        seed that is not a whole number >= 0, a bad initial state or listed world, or both of them.
         """
-        goes_on = self._started or getattr(self, "_np_random_seed", None) is not None  # Gymnasium's own stream was used
-        used = None if seed is None and goes_on else chosen_seed(seed)
+        named = None if seed is None else chosen_seed(seed)
         if not (options is None or isinstance(options, Mapping)):
             raise InvalidInput(
                 f"reset: options = {options!r}: must be None or a mapping, for instance {{'{INITIAL_STATE}': ...}}"
             )
-        warn_of_unknown(options or (), (INITIAL_STATE, LISTED_WORLD))
-        self.engine.reset(seed=used, worlds=_wanted_worlds(self.engine, options or {}))
-        self._started = True
-        return used
+        warn_of_unknown(options or (), self._known_options)
+        self._begin(named, _wanted_worlds(self.engine, options or {}))
+
+    def _begin(self, seed: int | None, worlds: Worlds | None) -> None:
+        """Start these worlds, or those of the stream: of ``seed``, of the user's generator, or where it stands."""
+        drawn, used = seed is None and self._np_random_seed == -1, seed
+        if drawn:
+            used = int(copy.deepcopy(self.np_random).integers(2**63))  # a copy: the reset may still be refused
+        elif seed is None and not self._goes_on:
+            used = self.np_random_seed
+        self.engine.reset(seed=used, worlds=worlds)
+        if drawn:
+            self.np_random.integers(2**63)
+        elif seed is not None:
+            self._set_seed(seed)
+        self._started = self._goes_on = True
 
     def _check_started(self, what: str) -> None:
         if not self._started:
@@ -459,7 +509,50 @@ class _OneWorld(Begun):
 # Gymnasium's interface: one learner, one world.
 
 
-class EthBrakeEnv(_OneWorld, gymnasium.Env[Observations, NDArray[Any]]):
+class _Specified:
+    """What Gymnasium makes by an id: ``spec`` says how, in settings that JSON keeps."""
+
+    engine: Engine
+    max_episode_steps: int | None = None
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How it was made; None where no id was used. No episode has more than its ``max_episode_steps``."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        if spec is not None:
+            kwargs = {name: _plain(value) for name, value in spec.kwargs.items()}
+            if kwargs.get("learners") is not None:  # any iterable, perhaps used up
+                kwargs["learners"] = [self.engine.scenario.vehicle_names[i] for i in self.engine.learners]
+            scenario = self.engine.scenario
+            from_alert = int(Decisions(np.zeros(1), scenario.time_step_s).before(scenario.horizon_s)[0])
+            spec = replace(spec, kwargs=kwargs, max_episode_steps=self.max_episode_steps or from_alert)
+        self._spec = spec
+
+
+def _plain(setting: Any) -> Any:
+    """A setting of an environment as JSON keeps it."""
+    if isinstance(setting, Scenario):
+        return setting.declared()
+    if isinstance(setting, RewardParams):
+        return setting.model_dump(mode="json")
+    if isinstance(setting, ObservationSpec):
+        return asdict(setting)
+    if isinstance(setting, Path):
+        return str(setting)
+    if isinstance(setting, AutoresetMode):
+        return setting.value
+    if isinstance(setting, np.generic | np.ndarray):
+        return setting.tolist()
+    if isinstance(setting, Mapping):
+        return {name: _plain(value) for name, value in setting.items()}
+    return [_plain(value) for value in setting] if isinstance(setting, list | tuple) else setting
+
+
+class EthBrakeEnv(_OneWorld, _Specified, gymnasium.Env[Observations, NDArray[Any]]):
     """One learner brakes in a line of vehicles that follow their scripts: ``gymnasium.make("EthBrake-v0")``.
 
     Observation: float32 [F], the features of ``ObservationSpec``. Action: [1] in [-1, 1]; -1 full braking capacity, 0
@@ -486,7 +579,6 @@ class EthBrakeEnv(_OneWorld, gymnasium.Env[Observations, NDArray[Any]]):
 
     """
 
-    _spec: EnvSpec | None = None
     metadata: dict[str, Any] = dict(Viewer.METADATA)  # noqa: RUF012  # as Gymnasium declares it
 
     def __init__(
@@ -507,31 +599,11 @@ class EthBrakeEnv(_OneWorld, gymnasium.Env[Observations, NDArray[Any]]):
         self.action_space = action_box()
         self._running = False
 
-    @property
-    def spec(self) -> EnvSpec | None:
-        """How it was made, in plain settings; None where no id was used."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, spec: EnvSpec | None) -> None:
-        """Objects among the settings are kept as plain mappings, so that JSON keeps them."""
-        if spec is not None:
-            kwargs = dict(spec.kwargs)
-            for name, value in kwargs.items():
-                if isinstance(value, Scenario):
-                    kwargs[name] = value.declared()
-                elif isinstance(value, RewardParams):
-                    kwargs[name] = value.model_dump(mode="json")
-                elif isinstance(value, ObservationSpec):
-                    kwargs[name] = asdict(value)
-            spec = replace(spec, kwargs=kwargs)
-        self._spec = spec
-
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode; see docs/episodes.md."""
-        super().reset(seed=self._restart(seed, options))
+        self._restart(seed, options)
         self._running = True
         self.viewer.began()
         return self._observe(), Report.of(self.engine).plain_infos(self._column)[0]
@@ -554,8 +626,6 @@ class EthBrakeEnv(_OneWorld, gymnasium.Env[Observations, NDArray[Any]]):
 
 
 # Gymnasium's vector interface: one learner, many worlds, advanced together.
-
-_MODES = (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP)
 
 
 class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArray[Any]]):
@@ -596,7 +666,7 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
         return observation, float(reward), info["cost"], terminated, truncated, info
 
 
-class EthBrakeVectorEnv(Begun, VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
+class EthBrakeVectorEnv(Begun, _Specified, VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
     """Many worlds of ``EthBrakeEnv``: ``gymnasium.make_vec("EthBrake-v0", num_envs=4096, scenario=...)``.
 
     All worlds take their episodes from one stream: row k of ``reset(seed=s)`` is world k of s, and each new episode is
@@ -612,7 +682,8 @@ class EthBrakeVectorEnv(Begun, VectorEnv[Observations, NDArray[Any], NDArray[Any
         autoreset_mode: Gymnasium's. ``NextStep``, its default and ours, returns the last observation and spends the
             next step, whose action is ignored and whose reward is 0, on the reset. ``SameStep`` returns the first
             observation of the new episode, with the last one of the old in ``infos["final_obs"]`` and its infos in
-            ``infos["final_info"]``.
+            ``infos["final_info"]``. ``Disabled`` never resets: the next step wants ended rows reset by hand.
+        max_episode_steps: truncates an episode after so many steps; None: the horizon does.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -624,6 +695,8 @@ class EthBrakeVectorEnv(Begun, VectorEnv[Observations, NDArray[Any], NDArray[Any
 
     """
 
+    _known_options = (INITIAL_STATE, LISTED_WORLD, RESET_MASK)
+
     def __init__(
         self,
         num_envs: int = 1,
@@ -633,7 +706,11 @@ class EthBrakeVectorEnv(Begun, VectorEnv[Observations, NDArray[Any], NDArray[Any
         reward: Reward = "harm",
         observation: Observation | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        max_episode_steps: int | None = None,
     ) -> None:
+        if max_episode_steps is not None:
+            check_whole_number("max_episode_steps", max_episode_steps, 1)
+        self.max_episode_steps = max_episode_steps
         self.autoreset_mode = _check_mode(autoreset_mode)
         self.engine = make_engine(scenario, num_envs, learners=learners, reward=reward, observation=observation)
         self.render_mode, self.viewer = render_mode, Viewer(self.engine, render_mode, batch=True)
@@ -648,17 +725,28 @@ class EthBrakeVectorEnv(Begun, VectorEnv[Observations, NDArray[Any], NDArray[Any
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode in every world; see docs/episodes.md."""
-        super().reset(seed=self._restart(seed, options))
-        every = np.ones(self.num_envs, np.bool_)
-        return self.engine.observe(self.learner), Report.of(self.engine).batch_info(self.learner, every, ~every)
+        """Start an episode in every world, or where ``options["reset_mask"]`` says; see docs/episodes.md."""
+        rows = self._rows_to_reset(options)
+        if rows.all():
+            self._restart(seed, options)
+        else:
+            self._renew(rows, seed, options or {})
+        told = Report.of(self.engine).batch_info(self.learner, rows, np.zeros(self.num_envs, np.bool_))
+        return self.engine.observe(self.learner), told
 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
         """Advance every world by one time step, and start new episodes as the autoreset mode says."""
         if not self._started:
             raise InvalidInput("step: no episode is running; call reset first")
         engine, before = self.engine, self.engine.ended
+        if self.autoreset_mode is AutoresetMode.DISABLED and before.any():
+            over = ", ".join(str(row) for row in np.flatnonzero(before))
+            raise InvalidInput(
+                f"step: episodes are over in rows {over}; reset(options={{'reset_mask': ...}}) them first"
+            )
         step = engine.step(self._fill_ignored(actions, before))
+        if self.max_episode_steps is not None:
+            engine.cut(step, self.max_episode_steps)
         # all that have ended: an interrupted step may have left some that nobody renewed
         renewed = engine.ended if self.autoreset_mode is AutoresetMode.SAME_STEP else before
         infos: dict[str, Any] = {}
@@ -676,12 +764,35 @@ class EthBrakeVectorEnv(Begun, VectorEnv[Observations, NDArray[Any], NDArray[Any
 
     def _fill_ignored(self, actions: NDArray[Any], before: Bools) -> NDArray[Any]:
         """The actions with those that the autoreset mode ignores replaced: their worlds had ended ``before``."""
-        ignoring = self.autoreset_mode is AutoresetMode.NEXT_STEP and before.any()
-        if not ignoring or np.shape(actions)[:1] != (self.num_envs,):
+        if self.autoreset_mode is not AutoresetMode.NEXT_STEP or not before.any():
             return actions
-        heeded = np.array(actions)
-        heeded[before] = 0.0
+        heeded = own_actions(actions, "the learners")
+        if heeded.shape[:1] == (self.num_envs,):
+            heeded[before] = 0.0
         return heeded
+
+    def _rows_to_reset(self, options: Any) -> Bools:
+        """The rows [n] that ``options["reset_mask"]`` marks; all without one. ``InvalidInput`` for what is no mask."""
+        if not isinstance(options, Mapping) or RESET_MASK not in options:
+            return np.ones(self.num_envs, np.bool_)
+        mask = options[RESET_MASK]
+        if not (
+            isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.shape == (self.num_envs,) and mask.any()
+        ):
+            raise InvalidInput(
+                f"reset: {RESET_MASK} = {mask!r}: must be an array of {self.num_envs} truth values, one of them True"
+            )
+        return mask.copy()
+
+    def _renew(self, rows: Bools, seed: int | None, options: Mapping[str, Any]) -> None:
+        """Start the next episodes of the stream in these rows, as an automatic reset does; the others go on."""
+        warn_of_unknown(options, self._known_options)
+        starts = [name for name in (INITIAL_STATE, LISTED_WORLD) if name in options]
+        starts += ["seed"] * (seed is not None)
+        if starts or not self._goes_on:
+            what = " and ".join(starts) or ("np_random" if self._started else "the first reset")
+            raise InvalidInput(f"reset: {what} with a {RESET_MASK} that leaves rows out: must start all rows")
+        self.engine.renew(np.flatnonzero(rows))
 
     def _final_infos(self, step: Step) -> dict[str, Any]:
         """The last observation and infos of the episodes that ended with this step."""
@@ -695,23 +806,52 @@ class EthBrakeVectorEnv(Begun, VectorEnv[Observations, NDArray[Any], NDArray[Any
 
 
 def _check_mode(mode: str | AutoresetMode) -> AutoresetMode:
-    for known in _MODES:
+    for known in AutoresetMode:
         if mode in (known, known.value):
             return known
-    raise InvalidInput(f"autoreset_mode = {mode!r}: must be {' or '.join(repr(m.value) for m in _MODES)}")
+    raise InvalidInput(f"autoreset_mode = {mode!r}: must be {' or '.join(repr(m.value) for m in AutoresetMode)}")
 
 
 # PettingZoo's interface: the vehicles of one world are agents, to the end; and around it the one
 # in which they act in turn (AEC).
 
 
-class InTurns(parallel_to_aec_wrapper):  # type: ignore[misc]  # PettingZoo is untyped
+class SeededInside:
+    """A wrapper of PettingZoo's or SB3's whose ``np_random`` is that of the environment inside, also when it is set."""
+
+    unwrapped: Any
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """See ``EthBrakeParallelEnv.np_random``."""
+        generator: np.random.Generator = self.unwrapped.np_random
+        return generator
+
+    @np_random.setter
+    def np_random(self, generator: np.random.Generator) -> None:
+        self.unwrapped.np_random = generator
+
+    @property
+    def np_random_seed(self) -> int:
+        """See ``EthBrakeParallelEnv.np_random_seed``."""
+        seed: int = self.unwrapped.np_random_seed
+        return seed
+
+
+class Ordered(SeededInside, OrderEnforcingWrapper):  # type: ignore[misc]  # PettingZoo is untyped
+    """PettingZoo's, seeded inside."""
+
+    def __str__(self) -> str:
+        return str(self.env)
+
+
+class InTurns(SeededInside, parallel_to_aec_wrapper):  # type: ignore[misc]  # PettingZoo is untyped
     """As PettingZoo's, but an unusable action is refused in its agent's own turn, which stays: nothing is lost."""
 
     @classmethod
     def around(cls, env: ParallelEnv[str, Observations, NDArray[Any]]) -> AECEnv[str, Observations, NDArray[Any]]:
         """The AEC environment of a parallel one of this package, whatever wraps it; order is enforced."""
-        return OrderEnforcingWrapper(cls(env))
+        return Ordered(cls(env))
 
     def step(self, action: Any) -> None:
         """Take the action of ``agent_selection``; the last one's advances all by one step.
@@ -782,12 +922,13 @@ class EthBrakeParallelEnv(_OneWorld, ParallelEnv[str, Observations, NDArray[Any]
         self._vehicles = _agent_vehicles(self.engine, agents)
         self.possible_agents = [names[i] for i in self._vehicles.tolist()]
         self.agents: list[str] = []
+        learners = [names[i] for i in self.engine.learners]
+        self._scripted = [agent for agent in self.possible_agents if agent not in learners]  # to be warned of, once
         seen = self.engine.observations
         self._alike = len({seen[i] for i in self._vehicles.tolist()}) == 1
         self.observation_spaces = {names[i]: feature_box(seen[i].features) for i in self._vehicles.tolist()}
         self.action_spaces = {agent: action_box() for agent in self.possible_agents}
         self.state_space = feature_box(state_features(self.engine.scenario))
-        self.np_random = np.random.default_rng()  # for wrappers that draw (SuperSuit's); nothing here does
 
     def observation_space(self, agent: str) -> Any:
         """Float32 box [F], the same object on each call."""
@@ -801,9 +942,7 @@ class EthBrakeParallelEnv(_OneWorld, ParallelEnv[str, Observations, NDArray[Any]
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observations], Infos]:
         """Start an episode; see docs/episodes.md."""
-        given = self._restart(seed, options)
-        if given is not None:
-            self.np_random = np.random.default_rng(given)
+        self._restart(seed, options)
         self.agents = self.possible_agents[:]
         self.viewer.began()
         return self._observations(), self._infos(Report.of(self.engine))
@@ -819,6 +958,8 @@ class EthBrakeParallelEnv(_OneWorld, ParallelEnv[str, Observations, NDArray[Any]
         for agent in actions:
             if agent not in self.action_spaces:
                 raise unknown_name("agent", agent, self.possible_agents)
+        if self._scripted:
+            self._warn_of_ignored(actions)
         step = self.engine.step(learner_actions(self.engine, actions))
         agents = self.possible_agents
         (rewards,) = step.reward.take(self._vehicles, axis=1).tolist()
@@ -843,6 +984,19 @@ class EthBrakeParallelEnv(_OneWorld, ParallelEnv[str, Observations, NDArray[Any]
         self._check_started("state")
         state: Observations = full_state(self.engine.worlds, self.engine.scenario)[0].copy()
         return state
+
+    def _warn_of_ignored(self, actions: Mapping[str, Any]) -> None:
+        """Warn once of actions that are ignored, since their vehicles follow scripts."""
+        ignored = [agent for agent in self._scripted if actions.get(agent) is not None]
+        if not ignored:
+            return
+        self._scripted = []
+        learners = [self.engine.scenario.vehicle_names[i] for i in self.engine.learners]
+        right = "nobody learns: name learners, for instance learners=['vehicle_2']"
+        if learners:
+            right = f"with agents='learners' the environment has the learners alone: {', '.join(learners)}"
+        text = f"step: actions of {', '.join(ignored)} are ignored, as scripts drive them; {right}"
+        warnings.warn(text, IgnoredAction, stacklevel=3)
 
     def _observations(self) -> dict[str, Observations]:
         if not self._alike:

@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium.utils.env_checker import data_equivalence
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
+from ethbrake_marl.actions import own_actions
 from ethbrake_marl.engine import Arrays, Engine, Step
 from ethbrake_marl.envs.drawing import Viewer
 from ethbrake_marl.envs.interfaces import (
@@ -36,7 +36,7 @@ Rewards = NDArray[np.float32]
 def make_sb3_vec_env(
     scenario: AnyScenario,
     n_envs: int,
-    seed: int | None = 0,
+    seed: int | None = None,
     learners: Sequence[str | int] | None = None,
     reward: Reward = "harm",
     observation: Observation | None = None,
@@ -125,7 +125,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         if render_mode not in (None, "rgb_array"):
             raise InvalidInput(f"render_mode = {render_mode!r}: must be 'rgb_array', or None")
         self.render_mode, self.viewer = render_mode, Viewer(engine, render_mode, batch=True)
-        self._next_seed: int | None = seed
+        self._set_seed(seed)
         self._learners = np.array(engine.learners, np.int64)
         self._actions: NDArray[Any] | None = None
         rows = engine.n * len(engine.learners)
@@ -137,8 +137,9 @@ class EthBrakeVecEnv(Begun, VecEnv):
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Start the stream of ``seed`` at the next reset (None: fresh entropy); one stream serves all rows."""
-        self._next_seed = chosen_seed(seed)
-        return [self._next_seed] * self.num_envs
+        self._set_seed(chosen_seed(seed))
+        self._goes_on = False
+        return [self.np_random_seed] * self.num_envs
 
     def reset(self) -> Observations:
         """Start an episode in every world, with the seed and options set before (``seed``, ``set_options``).
@@ -149,16 +150,14 @@ class EthBrakeVecEnv(Begun, VecEnv):
             worlds = self._read_options()
         finally:
             self._reset_options()
-        self.engine.reset(seed=self._next_seed, worlds=worlds)
-        self._next_seed = None
+        self._begin(None, worlds)
         self._return[:], self._steps[:] = 0.0, 0
-        self._started = True
         self._begun = Report.of(self.engine).values
         return self._observe()
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Keep actions [rows, 1] for ``step_wait``."""
-        self._actions = np.array(actions)
+        self._actions = own_actions(actions, "the learners")
 
     def step_wait(self) -> tuple[Observations, Rewards, Bools, list[dict[str, Any]]]:
         """Advance every world by one time step; worlds that end start their next episode at once."""
@@ -201,7 +200,8 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self.engine.restore({n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)})
         self._return, self._steps = arrays["return"].copy(), arrays["steps"].copy()
         self._begun = arrays["begun"].copy()
-        self._next_seed, self._started = None, True
+        self._set_seed(self.engine.seed)
+        self._started = self._goes_on = True
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """The batch's attribute, once per row asked for."""
@@ -270,23 +270,26 @@ class EthBrakeVecEnv(Begun, VecEnv):
 
     def _read_options(self) -> Worlds | None:
         """The worlds that the options of the rows ask for; None for the stream's."""
+
+        def bytes_of(start: Worlds) -> list[bytes]:
+            return [part.tobytes() for part in Packed.of(start)]
+
         options = [row or {} for row in self._options]
         if len(options) != self.num_envs:
             raise InvalidInput(f"set_options: {len(options)} entries; one for each of {self.num_envs} rows is needed")
         warn_of_unknown((name for row in options for name in row), (INITIAL_STATE,))
         if not any(INITIAL_STATE in row for row in options):
             return None
-        width = len(self.engine.learners)
+        width, starts = len(self.engine.learners), list[Worlds]()
         for k, row in enumerate(options):
-            first = options[k - k % width]
-            if INITIAL_STATE not in row or not data_equivalence(row, first, exact=True):
+            start = self.engine.scenario.worlds_from_state(row[INITIAL_STATE]) if INITIAL_STATE in row else None
+            if start is None or (k % width and bytes_of(start) != bytes_of(starts[-1])):
                 raise InvalidInput(
                     f"set_options: row {k} has {row!r}; if one row has an {INITIAL_STATE}, every row needs one, and the"
                     " learners of a world the same options"
                 )
-        return Worlds.concatenate(
-            [self.engine.scenario.worlds_from_state(row[INITIAL_STATE]) for row in options[::width]]
-        )
+            starts += [] if k % width else [start]
+        return Worlds.concatenate(starts)
 
     def _refuse_some_rows(self, what: str, indices: VecEnvIndices) -> None:
         if list(self._get_indices(indices)) != list(range(self.num_envs)):

@@ -90,5 +90,6 @@ from ethbrake_marl.physics.worlds import (
     as_road_allows as as_road_allows,
     has_acted as has_acted,
     make_worlds as make_worlds,
+    real_numbers as real_numbers,
     sum_rows as sum_rows,
 )

@@ -268,7 +268,7 @@ class Worlds:
             gaps_m=_full("gaps_m", gaps_m, (n, N - 1), 0.0, inf),
             speeds_mps=_full("speeds_mps", speeds_mps, (n, N), -inf, inf),
             command_mps2=_full("command_mps2", command_mps2, (n, N), -inf, inf),
-            pair_hit=_full("pair_hit", pair_hit, (n, N - 1), 0.0, 1.0) == 1.0,
+            pair_hit=_full("pair_hit", np.asarray(pair_hit, np.float64), (n, N - 1), 0.0, 1.0) == 1.0,
         )
 
     def read_only(self) -> Worlds:
@@ -446,6 +446,44 @@ def sum_rows(values: Floats) -> Floats:
     return total
 
 
+def real_numbers(value: ArrayLike) -> Floats:
+    """``value`` as float64, the same array where it is one already.
+
+    Raises ``ValueError``, with the reason as its text, for what is no number, or which numpy would make one of: truth
+    values, masked entries, texts, tensors that need gradients or lie on another device.
+    """
+    if type(value) is np.ndarray and value.dtype.kind in "fiu":
+        return np.asarray(value, np.float64)
+    if isinstance(value, list | tuple):
+        parts = [real_numbers(part) for part in value]
+        if len({part.shape for part in parts}) > 1:
+            raise ValueError("has rows of different lengths")
+        return np.array(parts, np.float64)
+    if np.ma.is_masked(value):
+        raise ValueError("is masked")
+    if getattr(value, "requires_grad", False):
+        raise ValueError("needs gradients; pass its .detach()")
+    try:
+        array = np.asarray(value)
+        if array.dtype.hasobject and array.ndim > 0:
+            return real_numbers(list(array))
+        entry = array.item() if array.dtype.hasobject else None
+        if array.dtype.kind == "b" or isinstance(entry, bool | np.bool_):
+            raise ValueError("is a truth value")
+        if array.dtype.kind in "fiu" or hasattr(entry, "__float__"):
+            return array.astype(np.float64)
+    except (TypeError, RuntimeError, OverflowError):
+        pass
+    raise ValueError("is not a number")
+
+
+def _checked_numbers(name: str, value: ArrayLike) -> Floats:
+    try:
+        return real_numbers(value)
+    except ValueError as error:
+        raise InvalidInput(f"{name} = {value!r}: {error}; must be a number or an array of numbers") from None
+
+
 def make_worlds(
     gaps_m: ArrayLike,
     speeds_mps: ArrayLike,
@@ -480,10 +518,10 @@ def make_worlds(
     Raises ``InvalidInput`` naming the field, the first bad entry and its range.
 
     """
-    speeds = np.atleast_2d(np.asarray(speeds_mps, dtype=np.float64))
+    speeds = np.atleast_2d(_checked_numbers("speeds_mps", speeds_mps))
     if speeds.ndim != 2 or speeds.shape[1] < 2:
         raise InvalidInput(f"speeds_mps: shape {speeds.shape}; a line needs at least 2 vehicles, as [n, N]")
-    gaps = np.asarray(gaps_m, dtype=np.float64)
+    gaps = _checked_numbers("gaps_m", gaps_m)
     n = speeds.shape[0] if gaps.ndim < 2 else max(speeds.shape[0], gaps.shape[0])
     N = speeds.shape[1]
     restitution_ = _full("restitution", restitution, (n,), 0.0, 1.0)
@@ -530,7 +568,7 @@ def _full(
     finite: bool = True,
 ) -> Floats:
     """Broadcast ``value`` to ``shape`` in its own memory and check that it is in range, and ``finite``."""
-    given = np.asarray(value, dtype=np.float64)
+    given = _checked_numbers(name, value)
     try:
         full = np.array(np.broadcast_to(given, shape), dtype=np.float64, order="C")
     except ValueError:

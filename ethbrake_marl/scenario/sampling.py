@@ -63,6 +63,7 @@ from ethbrake_marl.physics import (
     make_worlds,
     normal_probability,
     normal_quantile_each,
+    real_numbers,
     stopping_distances,
 )
 from ethbrake_marl.scenario.v2x import V2X, Equipage, Equipped
@@ -1882,12 +1883,9 @@ def _known_columns(header: list[str], scenario: ScenarioFields, where: str) -> l
 
 def _numbers(what: str, value: ArrayLike) -> Floats:
     try:
-        array = np.asarray(value)
-    except ValueError:
-        raise InvalidInput(f"{what}: must be a number or a list of numbers") from None
-    if array.dtype.kind not in "iuf":
-        raise InvalidInput(f"{what} = {value!r}: must be a number or a list of numbers")
-    return array.astype(np.float64)
+        return real_numbers(value)
+    except ValueError as error:
+        raise InvalidInput(f"{what} = {value!r}: {error}; must be a number or a list of numbers") from None
 
 
 def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:

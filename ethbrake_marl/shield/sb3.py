@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from ethbrake_marl.envs import EthBrakeVecEnv
+from ethbrake_marl.envs import EthBrakeVecEnv, SeededInside
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools
 from ethbrake_marl.shield.guard import Attached, Proposing
 
 
-class ShieldedVecEnv(VecEnvWrapper):
+class ShieldedVecEnv(SeededInside, VecEnvWrapper):
     """``make_sb3_vec_env`` behind a shield, by default in mode ``step``, in which the rows of a world decide together.
 
     The ``options`` are those of ``ShieldOptions``; the penalty is not taken off the return in

@@ -16,7 +16,7 @@ from pettingzoo.utils import BaseParallelWrapper
 from pettingzoo.utils.wrappers import OrderEnforcingWrapper
 
 from ethbrake_marl.agents import Agent, LearnedPolicy, Team
-from ethbrake_marl.envs import InTurns
+from ethbrake_marl.envs import InTurns, Ordered, SeededInside
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats
@@ -37,7 +37,7 @@ class _Closing:
         super().close(**settings)  # type: ignore[misc]  # of the wrapper's own library
 
 
-class HybridShield(_Closing, BaseParallelWrapper[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
+class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
     """Shield the learners of a parallel environment, who are driven by the caller's actions or by a policy.
 
     Mode ``step``, the default, certifies every action, or replaces it, of several learners together; ``robust`` does so
@@ -241,7 +241,7 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
         return shielded(env, load_scenario(settings.pop("scenario")), **settings)
     if isinstance(env, AECEnv):
         inside: Any = env
-        while type(inside) in (InTurns, OrderEnforcingWrapper):  # those of eb.env; another one may change actions
+        while type(inside) in (InTurns, Ordered, OrderEnforcingWrapper):  # as in eb.env; others may change actions
             inside = inside.env
         if not isinstance(inside, ParallelEnv):
             raise InvalidInput(

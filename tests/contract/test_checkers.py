@@ -23,6 +23,7 @@ pytestmark = pytest.mark.filterwarnings(
     "error",
     # PettingZoo's checkers pass {"options": 1} on purpose; asking for a warning here is our own rule.
     "ignore:reset. unknown option options, ignored:ethbrake_marl.envs.interfaces.UnknownResetOption",
+    "ignore::ethbrake_marl.envs.interfaces.IgnoredAction",  # they act for all agents
     "ignore:.*is different from the unwrapped version",  # a shield is: that is its use
 )
 ANY_START = PAPER.replace(early_impacts="keep")

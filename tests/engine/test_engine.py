@@ -208,7 +208,7 @@ def test_infos__tell_the_same_shares_as_the_ledger() -> None:
     env = eb.parallel_env(NEAR)
     env.reset(seed=11)
     while env.agents:
-        infos = env.step({name: np.array([-0.1], np.float32) for name in env.agents})[4]
+        infos = env.step({f"vehicle_{i + 1}": np.array([-0.1], np.float32) for i in env.engine.learners})[4]
     ledger = env.engine.ledger
     assert ledger.obstacle_count[0] > 0
     for count, key in (("first", "first_impact_harm"), ("total", "total_harm")):

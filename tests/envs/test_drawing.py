@@ -72,7 +72,7 @@ def test_frames__are_the_same_pixels_as_ever(scenario: str, learners: list[str] 
     environment.reset(seed=3)
     told = sha256(environment.render())
     while environment.agents:
-        environment.step({each: environment.action_space(each).low * 0.4 for each in environment.agents})
+        environment.step({f"vehicle_{i + 1}": [-0.4] for i in environment.engine.learners})
         told.update(environment.render())
     assert told.hexdigest()[:12] == pixels
 

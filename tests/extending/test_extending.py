@@ -146,7 +146,7 @@ def test_interfaces__observe_and_pay_the_same_and_infos_tell_the_terms() -> None
     seen, _ = env.reset(seed=1)
     vector.reset(seed=1)
     assert seen["vehicle_2"].tobytes() == told[0][1]  # also where the scenario declares it
-    _, rewards, _, _, infos = env.step(dict.fromkeys(env.agents, np.array([-0.5], np.float32)))
+    _, rewards, _, _, infos = env.step({"vehicle_2": np.array([-0.5], np.float32)})
     for agent, info in infos.items():
         assert {name for name in info if name.startswith("reward_")} == {"reward_calm", "reward_hurry"}
         assert info["reward_calm"] == min(info["command_in_force_mps2"], 0.0) and info["reward_hurry"] < 0.0
@@ -176,7 +176,7 @@ def test_term__per_learner_leaves_the_others_out() -> None:
     eb.register_term("mine", changed(lambda step: np.broadcast_to(step.learners, (len(step.time_s), 2))))
     env = eb.parallel_env(scenario=PAPER, reward={"harm": 0.0, "mine": 1.0}, learners=["vehicle_2", "vehicle_3"])
     env.reset(seed=1)
-    assert list(env.step({agent: [0.0] for agent in env.agents})[1].values()) == [0.0, 1.0, 2.0]
+    assert list(env.step({"vehicle_2": [0.0], "vehicle_3": [0.0]})[1].values()) == [0.0, 1.0, 2.0]
 
 
 @pytest.mark.parametrize("name", TERMS)

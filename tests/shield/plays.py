@@ -186,7 +186,7 @@ class Aec(Play):
     """PettingZoo AEC."""
 
     def make(self) -> None:
-        env = inner = shielded_aec(self.between(eb.parallel_env(self.scenario)), mode="step")
+        env = inner = shielded_aec(self.between(eb.parallel_env(self.scenario, agents="learners")), mode="step")
         while not isinstance(inner, HybridShield):
             inner = inner.env
         self.put(env, inner, seed=self.begin())

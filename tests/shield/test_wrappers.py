@@ -160,8 +160,8 @@ def test_shield__chooses_the_wrapper_of_the_interface(make, kind):
     env = eb.shield(make(), eb.make_agent("full_brake"), shares=True)
     env.reset(**{} if kind is eb.ShieldedVecEnv else {"seed": 7})
     if isinstance(env, AECEnv):
-        for _ in range(3):
-            env.step(np.ones(1, np.float32))
+        for agent in env.possible_agents:
+            env.step(np.ones(1, np.float32) if agent == "vehicle_2" else None)
         infos = env.infos
     else:
         assert isinstance(env, kind) and env.attached.options.mode == "step"
