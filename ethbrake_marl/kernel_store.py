@@ -16,7 +16,7 @@ _tellers: list[Callable[[Path, bool], None]] = []
 
 @cache
 def cache_folder() -> Path:
-    """Folder of the compiled kernels: the user's cache, or without one that can be written a folder for this process."""
+    """Folder of the compiled kernels: the user's cache; if that cannot be written, one for this process."""
     try:
         home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         folder = Path(home) / "ethbrake_marl"
