@@ -206,6 +206,7 @@ class _Run:
         _check_known(worlds, scenario, tuple(team.drivers))
         self.ledger, self.time_s, self.ticks = empty_ledger(worlds), np.zeros(worlds.n), 0
         self.origin_s: Floats = np.zeros(worlds.n)
+        self.told_s: Floats = np.zeros(worlds.n)
         self.alert = self.final = worlds
         self.gaps_m, self.speeds_mps, self.wanted_mps2 = worlds.gaps_m, worlds.speeds_mps, worlds.command_mps2
         self.gaps_m, self.speeds_mps = self._first_state()
@@ -379,7 +380,6 @@ class _Run:
     def _first_state(self) -> tuple[Floats, Floats]:
         """Gaps and speeds at the alert, and when that is by the host's clock."""
         self.origin_s, gaps, speeds, _ = self._read()
-        self.told_s = np.zeros(len(gaps))
         for name, told, given in (("gaps_m", gaps, self.alert.gaps_m), ("speeds_mps", speeds, self.alert.speeds_mps)):
             if not (close := np.abs(told - given) <= STARTS_WITHIN).all():
                 at = tuple(np.argwhere(~close)[0].tolist())

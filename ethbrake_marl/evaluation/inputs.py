@@ -489,10 +489,10 @@ def make_lineup(
     """One fresh agent per spec of ``make_agent``, by its spec, to drive the scenario's learners.
 
     A text has commas between specs. ``ladder`` stands for every agent of ``LADDER``, ``field`` of ``FIELD``.
-    ``harm_count`` is the harm that optimising and choosing agents minimise. ``uncertainty`` is what agents with ``+robust`` certify against. ``alone``: each
-    drives one vehicle. ``bare``: they go behind a shield, and have none. Raises ``InvalidInput`` for a spec given
-    twice, an uncertainty that is missing or that nobody uses, a team or a shield that has no place, and what
-    ``make_agent`` raises.
+    ``harm_count`` is the harm that optimising and choosing agents minimise. ``uncertainty`` is what agents with
+    ``+robust`` certify against. ``alone``: each drives one vehicle. ``bare``: they go behind a shield, and have none.
+    Raises ``InvalidInput`` for a spec given twice, an uncertainty that is missing or that nobody uses, a team or a
+    shield that has no place, and what ``make_agent`` raises.
     """
     listed = split_specs(specs) if isinstance(specs, str) else specs
     specs = [each for spec in listed for each in _GROUPS.get(spec, (spec,))]
