@@ -66,7 +66,9 @@ from ethbrake_marl.scenario import Sample, Scenario, load_scenario
 
 STANDS_MPS = 1e-3  # a vehicle that a host with steps of its own moves more slowly stands
 STARTS_WITHIN = 0.01  # m, m/s: how far the first state may be from the worlds that the host was set up with
-IGNORED = 0.5  # share of a change of speed by an impact that a host must at least have made
+READ_WITHIN = 0.2  # m, m/s: how far a change between two states may be misread
+# how a host's vehicles may follow commands: late by so much, and off by so much and by this share of the command
+LAG_S, OFF_MPS2, OFF_SHARE = 0.5, 0.5, 0.2
 SNAP = 1e-6  # of a step: moments so close are one
 
 
@@ -215,6 +217,7 @@ class _Run:
         _check_known(worlds, scenario, tuple(team.drivers))
         self.ledger, self.time_s, self.ticks = empty_ledger(worlds), np.zeros(worlds.n), 0
         self.origin_s: Floats = np.zeros(worlds.n)
+        self.told_s: Floats = np.zeros(worlds.n)
         self.alert = self.final = worlds
         self.gaps_m, self.speeds_mps, self.wanted_mps2 = worlds.gaps_m, worlds.speeds_mps, worlds.command_mps2
         self.gaps_m, self.speeds_mps = self._first_state()
@@ -232,6 +235,7 @@ class _Run:
         self.memories = engine.memories | {i: begin_script(known[i], self.alert, i, known) for i in others}
         self.wanted_mps2 = engine.wanted_mps2.copy()
         self.wanted_mps2[:, asked] = 0.0
+        self.motion = _Motion(self.alert, self.dt)
         self.ended: Bools = np.zeros(worlds.n, np.bool_)
         self.at_rest: Bools = np.zeros(worlds.n, np.bool_)
 
@@ -326,10 +330,11 @@ class _Run:
             self._fail(f"apply raised {describe_error(error)}", error)
         time_s, gaps, speeds, impacts = self._read()
         self._check_clock(time_s, until)
-        if impacts is None and not self.exact:
-            self._check_obeyed(begin, acceleration, speeds)
         before_m, step_s = self.gaps_m, until - self.time_s
-        self.told_s, self.told_mps, self.time_s, self.gaps_m = time_s, speeds, until, gaps
+        step = _Step(self.wanted_mps2, begin, until, time_s - self.told_s, gaps, speeds, impacts)
+        if refusal := self.motion.refusal(step):
+            self._fail(refusal[1], world=refusal[0])
+        self.told_s, self.time_s, self.gaps_m = time_s, until, gaps
         self.speeds_mps = speeds.copy()
         self.ledger = self.ledger.add(self._meet(before_m, begin, step_s) if impacts is None else impacts)
 
@@ -386,7 +391,6 @@ class _Run:
     def _first_state(self) -> tuple[Floats, Floats]:
         """Gaps and speeds at the alert, and when that is by the host's clock."""
         self.origin_s, gaps, speeds, _ = self._read()
-        self.told_s, self.told_mps = np.zeros(len(gaps)), speeds
         for name, told, given in (("gaps_m", gaps, self.alert.gaps_m), ("speeds_mps", speeds, self.alert.speeds_mps)):
             if not (close := np.abs(told - given) <= STARTS_WITHIN).all():
                 at = tuple(np.argwhere(~close)[0].tolist())
@@ -407,21 +411,136 @@ class _Run:
                 f" right to {within:g} s; each call of apply must make one step of dt"
             )
 
-    def _check_obeyed(self, begin: Floats, acceleration: Floats, speeds: Floats) -> None:
-        """Refuse a host that goes on as if nothing had happened where vehicles have met."""
-        change, expected = np.abs(begin - self.told_mps), begin + acceleration * self.dt
-        off = np.minimum(np.abs(speeds - expected), np.abs(speeds - np.maximum(expected, 0.0)))  # some cannot go back
-        most = IGNORED * change + self.alert.vehicles.braking_capacity_mps2 * self.dt
-        if (wrong := (change > 0.0) & (off > most)).any():
-            k, i = np.argwhere(wrong)[0].tolist()
-            self._fail(
-                f"vehicle_{i + 1} of world {k} begins the step at {begin[k, i]:g} m/s after an impact, and ends it at"
-                f" {speeds[k, i]:g} m/s; begin with command.speeds_mps, or tell impacts of your own in the state"
-            )
-
-    def _fail(self, what: str, error: Exception | None = None) -> NoReturn:
-        at = float(self.time_s.max(initial=0.0))
+    def _fail(self, what: str, error: Exception | None = None, world: int | None = None) -> NoReturn:
+        at = float(self.time_s.max(initial=0.0) if world is None else self.time_s[world])
         raise HostFailed(f"host {type(self.host).__name__} at {at:.2f} s: {what}", self.ledger, self._seen()) from error
+
+
+class _Step(NamedTuple):
+    """One step of a host: what it was to do, and what it says of its end."""
+
+    wanted_mps2: Floats  # [n, N]
+    begin_mps: Floats  # [n, N] the speeds it was to begin with
+    until_s: Floats  # [n] when it was to end
+    clock_s: Floats  # [n] how long it was by the host's clock
+    gaps_m: Floats  # [n, N - 1]
+    speeds_mps: Floats  # [n, N]
+    impacts: Impacts | None
+
+
+class _Motion:
+    """How the vehicles of a host can have moved since the alert. Three rules refuse what is impossible:
+
+    1. *Speed in a step.* It changes by no more than the commands so far allow.
+    2. *Gaps since the alert.* They follow from the speeds at the beginning and at the end of each step.
+    3. *Speed since the alert.* The commands lead to it, late by ``LAG_S`` at most, with accelerations that are off by
+       ``OFF_MPS2`` and ``OFF_SHARE`` of the command at most.
+
+    Bodies that pass through one another never push. In a host that reports impacts, vehicles that touch push one
+    another: rule 1 takes the commands of their whole line, and its energy where there was an impact; rules 2 and 3
+    begin again at what the host says.
+    """
+
+    def __init__(self, alert: Worlds, dt: float) -> None:
+        self.vehicles, self.jitter_s = alert.vehicles, 0.0 if math.isinf(dt) else dt
+        self.time_s, self.gaps_m, self.speeds_mps = alert.time_s, alert.gaps_m, alert.speeds_mps
+        self.least_mps2 = self.most_mps2 = np.zeros(alert.speeds_mps.shape)  # of the commands so far
+        self.least_m = self.most_m = alert.gaps_m  # where the speeds lead
+        self.led_mps = alert.speeds_mps  # where the commands lead
+        self.off_mps = np.full(alert.speeds_mps.shape, READ_WITHIN)  # how far from there, apart from the lag
+
+    def refusal(self, step: _Step) -> tuple[int, str] | None:
+        """The world and what is impossible in it; None: every world can be as the host says."""
+        acting_s = np.maximum(step.until_s[:, np.newaxis] - np.maximum(self._now, self.vehicles.latency_s), 0.0)
+        command = np.where(acting_s > 0.0, step.wanted_mps2, 0.0)
+        met = self._met(step)
+        low, high = self._reachable(step, met)
+        wrong = (
+            _refused(
+                step.speeds_mps, low, high,
+                lambda k, i, right: f"vehicle_{i + 1} of world {k} goes from {step.begin_mps[k, i]:g} to"
+                f" {step.speeds_mps[k, i]:g} m/s within {step.until_s[k] - self.time_s[k]:g} s; {right} m/s is possible"
+                f" under {command[k, i]:g} m/s2: begin a step with command.speeds_mps and let bodies pass through one"
+                " another, or report every impact in the state",
+            )
+            or self._wrong_gap(step, met, low, high)
+            or self._wrong_speed(step, met, command * acting_s)
+        )  # fmt: skip
+        self.time_s, self.gaps_m, self.speeds_mps = step.until_s, step.gaps_m, step.speeds_mps
+        return wrong
+
+    @property
+    def _now(self) -> Floats:
+        return self.time_s[:, np.newaxis]
+
+    def _met(self, step: _Step) -> Bools:
+        """Which vehicles may have pushed one another, [n, N]."""
+        met = np.zeros(step.speeds_mps.shape, np.bool_)
+        if step.impacts is not None:
+            touch = (step.impacts.count > 0) | (np.minimum(step.gaps_m, self.gaps_m) <= READ_WITHIN)
+            met[:, :-1] |= touch
+            met[:, 1:] |= touch
+        return met
+
+    def _reachable(self, step: _Step, met: Bools) -> tuple[Floats, Floats]:
+        """The least and the greatest speed at the end of the step, [n, N] m/s."""
+        # a host that keeps latencies by itself does not round them up
+        begun = step.until_s[:, np.newaxis] + self.jitter_s > self.vehicles.latency_s
+        command = np.where(begun, step.wanted_mps2, 0.0)
+        self.least_mps2, self.most_mps2 = np.minimum(self.least_mps2, command), np.maximum(self.most_mps2, command)
+        least = np.where(met, self.least_mps2.min(axis=1, keepdims=True), self.least_mps2)
+        most = np.where(met, self.most_mps2.max(axis=1, keepdims=True), self.most_mps2)
+        begin, seconds = step.begin_mps, np.maximum(step.until_s - self.time_s, step.clock_s)[:, np.newaxis]
+        low = begin + least * seconds - READ_WITHIN
+        high = np.maximum(begin, 0.0) + most * seconds + READ_WITHIN  # brakes bring one that rolls back to rest
+        if step.impacts is None:
+            return low, high
+        mass, fastest = self.vehicles.mass_t, np.maximum(np.abs(low), np.abs(high))
+        by_energy = np.sqrt((mass * fastest * fastest).sum(axis=1, keepdims=True) / mass)
+        struck = met & (step.impacts.count > 0).any(axis=1, keepdims=True)
+        return np.where(struck, -by_energy, low), np.where(struck, by_energy, high)
+
+    def _wrong_gap(self, step: _Step, met: Bools, low: Floats, high: Floats) -> tuple[int, str] | None:
+        seconds = (step.until_s - self.time_s)[:, np.newaxis]
+        low = np.where(met, low, np.minimum(step.begin_mps, step.speeds_mps))
+        high = np.where(met, high, np.maximum(step.begin_mps, step.speeds_mps))
+        closing = np.abs(np.diff(step.speeds_mps, axis=1))
+        jitter = self.jitter_s / 2.0 * np.abs(np.diff(step.speeds_mps - self.speeds_mps, axis=1))
+        least = self.least_m + seconds * (low[:, :-1] - high[:, 1:]) - jitter
+        most = self.most_m + seconds * (high[:, :-1] - low[:, 1:]) + jitter
+        off, pushed = READ_WITHIN + self.jitter_s * closing, met[:, :-1] | met[:, 1:]
+        self.least_m, self.most_m = np.where(pushed, step.gaps_m, least), np.where(pushed, step.gaps_m, most)
+        return _refused(
+            step.gaps_m, least - off, most + off,
+            lambda k, p, right: f"the gap between vehicle_{p + 1} and vehicle_{p + 2} of world {k} is"
+            f" {step.gaps_m[k, p]:g} m at {step.until_s[k]:g} s; their speeds lead to {right} m",
+        )  # fmt: skip
+
+    def _wrong_speed(self, step: _Step, met: Bools, change: Floats) -> tuple[int, str] | None:
+        """By a command that alone makes ``change`` [n, N] m/s of a vehicle's speed."""
+        began = self.led_mps + step.begin_mps - self.speeds_mps
+        led = held_speeds(began, change, self.vehicles.speed_limit_mps, 1.0)
+        seconds = (step.until_s - self.time_s)[:, np.newaxis]
+        self.off_mps = self.off_mps + OFF_MPS2 * seconds + OFF_SHARE * np.abs(led - began)
+        self.led_mps = np.where(met, step.speeds_mps, led)
+        off = self.off_mps + LAG_S * (self.most_mps2 - self.least_mps2)
+        led = np.where(step.speeds_mps >= 0.0, np.maximum(led, 0.0), led)  # some hosts know no speed below 0
+        return _refused(
+            step.speeds_mps, np.where(met, -np.inf, led - off), np.where(met, np.inf, led + off),
+            lambda k, i, right: f"vehicle_{i + 1} of world {k} drives at {step.speeds_mps[k, i]:g} m/s at"
+            f" {step.until_s[k]:g} s; its commands lead to {right} m/s: follow command.acceleration_mps2",
+        )  # fmt: skip
+
+
+def _refused(
+    values: Floats, low: Floats, high: Floats, describe: Callable[[int, int, str], str]
+) -> tuple[int, str] | None:
+    """The world of the first value outside its range, and what is wrong there."""
+    good = (low <= values) & (values <= high)
+    if good.all():
+        return None
+    k, i = np.argwhere(~good)[0].tolist()
+    return k, describe(k, i, f"{low[k, i]:g} to {high[k, i]:g}")
 
 
 def _checked_dt(host: Host, scenario: Scenario) -> float:
@@ -518,7 +637,7 @@ class SumoHost:
     def apply(self, command: HostCommand) -> None:
         """One step of SUMO."""
         vehicle, begin = self._sumo.vehicle, np.maximum(command.speeds_mps, 0.0)
-        end = np.maximum(begin + command.acceleration_mps2 * self.dt, 0.0)
+        end = np.maximum(command.speeds_mps + command.acceleration_mps2 * self.dt, 0.0)
         for k, line in enumerate(self._names):
             for i, name in enumerate(line):
                 if begin[k, i] != self._speeds[k, i]:

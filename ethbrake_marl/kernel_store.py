@@ -16,14 +16,14 @@ _tellers: list[Callable[[Path, bool], None]] = []
 
 @cache
 def cache_folder() -> Path:
-    """Folder of the compiled kernels: the user's cache, or where that cannot be written one for this process alone."""
-    home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(home) / "ethbrake_marl"
+    """Folder of the compiled kernels: the user's cache; if that cannot be written, one for this process."""
     try:
+        home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(home) / "ethbrake_marl"
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             return folder
-    except OSError:
+    except (OSError, RuntimeError):  # RuntimeError: without HOME, for a user id that has no name
         temporary = Path(tempfile.mkdtemp(prefix=_TEMPORARY))
         atexit.register(shutil.rmtree, temporary, ignore_errors=True)
         return temporary

@@ -58,6 +58,18 @@ def test_cache_folder__is_in_the_named_place(monkeypatch, tmp_path, numba, xdg, 
     assert cache_folder() == tmp_path / place / "ethbrake_marl" and cache_folder().is_dir()
 
 
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="users have no number here")
+def test_cache_folder__without_a_home_is_a_temporary_one(monkeypatch, tmp_path):
+    """In a container: no HOME, and a user id that stands in no list of users."""
+    for variable in ("HOME", "USERPROFILE", "NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr(os, "getuid", lambda: 987_654_321)
+    monkeypatch.setattr(kernel_store.tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(RuntimeError, match="home"):
+        Path.home()
+    assert cache_folder().parent == tmp_path and cache_folder().is_dir()
+
+
 def test_cache_folder__that_cannot_be_written_is_a_temporary_one_that_goes_at_the_end_of_the_process(
     monkeypatch, tmp_path
 ):

@@ -47,6 +47,8 @@ if TYPE_CHECKING:
         record_commands as record_commands,
         register_agent as register_agent,
         script_agents as script_agents,
+        split_names as split_names,
+        split_specs as split_specs,
         write_down as write_down,
     )
 else:

@@ -260,6 +260,8 @@ Driver = Team | Agent | Shielding  # an agent alone drives every learner
 # ``+refined``, ``+refined:profile`` or, at every decision, ``+refined:50`` or ``+refined:200us`` comes first, then one
 # shield: ``+episode``, ``+episode:pairwise``, ``+step`` or ``+robust``, each also with ``:believed`` behind it. A name
 # may be a function of a Python file, ``my_file.py:make_agent``.
+#
+# Each of ``, + @ :`` may stand in a path, too. A path that exists wins: what stands in it separates nothing.
 
 REFINED = ("refined", "refined:profile")
 SHIELDS = ("episode", "episode:pairwise", "step", "robust", "robust:interior")
@@ -269,7 +271,7 @@ BELIEVED = (  # on what was received
 AROUND = (*REFINED, *SHIELDS, *BELIEVED)  # in the order in which they are put around an agent
 
 _WITH_BUDGET = re.compile(r"refined:(0|[1-9][0-9]*)(us)?")
-_IN_FILE = re.compile(r"(?P<name>[^:]+\.py:[A-Za-z_]\w*)(:(?P<argument>[^\s@]+))?(@(?P<policy>.+))?")
+_IN_FILE = re.compile(r":(?P<function>[A-Za-z_]\w*)(:(?P<argument>[^\s@]+))?(@(?P<policy>.+))?")
 _BEGINS_WITH_FILE = re.compile(r"[^:@]+\.py(:.*)?")
 
 
@@ -304,20 +306,21 @@ class AgentSpec:
 
 
 def parse_spec(spec: str) -> AgentSpec:
-    """The parts of a spec. A path may hold any character; one that ends like ``+step`` is written with a ``/`` behind.
+    """The parts of a spec. A path may hold any character.
 
-    Raises ``InvalidInput`` for what is not written so, and for two shields or another order; ``UnknownName`` for
-    something else behind a ``+``.
+    ``ppo@c+step`` is the folder ``c+step`` where that exists, and else the folder ``c`` behind the shield;
+    ``ppo@c/+step`` is always the latter. Raises ``InvalidInput`` for what is not written so, and for two shields or
+    another order; ``UnknownName`` for something else behind a ``+``.
     """
     core, around = _split_around(spec)
-    if _BEGINS_WITH_FILE.fullmatch(core):
-        match = _IN_FILE.fullmatch(core)
+    if file := _python_file(core):
+        match = _IN_FILE.fullmatch(core, len(file))
         if match is None:
             raise InvalidInput(
                 f"agent {spec!r}: one from a file is FILE.py:FUNCTION, FILE.py:FUNCTION:ARGUMENT or"
                 " FILE.py:FUNCTION@POLICY, for instance my_file.py:make_agent"
             )
-        return AgentSpec(match["name"], match["argument"], match["policy"], around)
+        return AgentSpec(f"{file}:{match['function']}", match["argument"], match["policy"], around)
     head, at, path = core.partition("@")
     name, argument = ScriptSpec.parse(head if at else core)
     if at and not path:
@@ -325,15 +328,59 @@ def parse_spec(spec: str) -> AgentSpec:
     return AgentSpec(name, argument, path if at else None, around)
 
 
-def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
-    core, around = spec if isinstance(spec, str) else "", list[str]()
-    if not core:
-        ScriptSpec.parse(spec)  # says what is right
+def split_names(text: str, is_one: Callable[[str], bool] = os.path.lexists) -> list[str]:
+    """The names in a list with commas between them: as many parts as possible are one name where ``is_one`` says so."""
+    parts, names = text.split(","), list[str]()
+    while parts:
+        joined = (k for k in range(len(parts), 1, -1) if is_one(",".join(parts[:k])))
+        count = next(joined, 1)
+        names.append(",".join(parts[:count]))
+        parts = parts[count:]
+    return names
+
+
+def split_specs(text: str) -> list[str]:
+    """The specs in a list with commas between them, which may stand in paths that exist."""
+    return split_names(text, _is_one_spec)
+
+
+def _is_one_spec(text: str) -> bool:
+    core, _ = _strip_around(text)
+    head, _, path = core[len(_existing_file(core)) :].partition("@")
+    return "," not in head and ("," not in path or os.path.lexists(path))
+
+
+def _existing_file(core: str) -> str:
+    """The longest Python file that exists and with which a spec begins; empty without one."""
+    ends = (match.start() for match in re.finditer(r"(?<=\.py):", core))
+    return max((core[:end] for end in ends if os.path.isfile(core[:end])), key=len, default="")
+
+
+def _python_file(core: str) -> str:
+    """The Python file with which a spec begins, whether it exists or not; empty without one."""
+    return _existing_file(core) or (core.partition(":")[0] if _BEGINS_WITH_FILE.fullmatch(core) else "")
+
+
+def _policy_path(core: str) -> str:
+    return core[len(_python_file(core)) :].partition("@")[2]
+
+
+def _strip_around(spec: str) -> tuple[str, list[str]]:
+    """What stands before all that is around it, and that; the path of an existing policy is left whole."""
+    core, around = spec, list[str]()
     while True:
         before, plus, last = core.rpartition("+")
-        if not plus or not (last in AROUND or _WITH_BUDGET.fullmatch(last)):
-            break
+        is_around = plus and (last in AROUND or _WITH_BUDGET.fullmatch(last))
+        if not is_around or os.path.lexists(_policy_path(core)):
+            return core, around
         core, around = before, [last, *around]
+
+
+def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
+    core, around = _strip_around(spec if isinstance(spec, str) else "")
+    if not core:
+        ScriptSpec.parse(spec)  # says what is right
+    before, plus, last = core.rpartition("+")
     if plus and _is_meant_around(before, core, last):
         raise unknown_name("shield or refinement", last, AROUND)
     shields = [each for each in around if each in (*SHIELDS, *BELIEVED)]
@@ -347,14 +394,14 @@ def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
 
 def _is_meant_around(before: str, core: str, last: str) -> bool:
     """Whether a word behind a ``+`` that is none of ``AROUND`` is no part of an argument or path either."""
-    if ".py" in last or _IN_FILE.fullmatch(core):
+    file = _python_file(core)
+    if ".py" in last or (file and _IN_FILE.fullmatch(core, len(file))):
         return False  # the + is part of a file's path, or of its argument
     if ":" not in before and "@" not in before:
         return True
     if "/" in last or "\\" in last:
         return False  # the last part of a path
-    path = core.partition("@")[2]
-    return bool(get_close_matches(last, AROUND)) and not (path and os.path.lexists(path))
+    return not os.path.lexists(_policy_path(core)) and bool(get_close_matches(last, AROUND))
 
 
 HORIZON_S = 8.0  # until when an agent looks ahead that knows no scenario

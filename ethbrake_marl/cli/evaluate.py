@@ -60,7 +60,7 @@ def _intervals(uncertainty: str | None) -> Uncertainty | None:
 
 
 def _make_drivers(
-    specs: Sequence[str],
+    agents: str | Sequence[str],
     scenario: Scenario,
     harm_count: HarmCount = "first",
     uncertainty: str | None = None,
@@ -68,7 +68,7 @@ def _make_drivers(
 ) -> dict[str, Any]:
     """Who is named on the command line, as ``make_lineup`` makes them; tells which policies ``@shipped`` stands for."""
     intervals = _intervals(uncertainty)
-    lineup = evaluation.make_lineup(specs, scenario, harm_count=harm_count, uncertainty=intervals, **how)
+    lineup = evaluation.make_lineup(agents, scenario, harm_count=harm_count, uncertainty=intervals, **how)
     for spec, driver in lineup.items():
         if "@shipped" in spec and (meant := getattr(driver, "name", spec)) != spec:
             Out().note(f"{spec} is {meant}")
@@ -158,7 +158,7 @@ def evaluate_command(
     whole |= {"--by": by, "--host": host}
     _check_shards(shards, jobs, ray, output, rows, measures, whole)
     _check_outputs(out, per_world, report)
-    made = partial(_make_drivers, agents.split(","), harm_count=harm_count, uncertainty=uncertainty)
+    made = partial(_make_drivers, agents, harm_count=harm_count, uncertainty=uncertainty)
     if group := scenarios.group_of_scenarios(scenario):
         other = whole | {"--objective": objective, "--measures": measures, "--shards": shards, "--output": output}
         _refuse(other, f"{scenario} is a group of {len(group)} scenarios; give one of them")
@@ -477,7 +477,7 @@ def shield_command(
 
 def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> evaluation.ShieldModes:
     """The rows of these agents, with progress on stderr."""
-    lineup = _make_drivers(agents.split(","), task.scenario, task.harm_count, bare=True)
+    lineup = _make_drivers(agents, task.scenario, task.harm_count, bare=True)
     n = sample.worlds.n
     return evaluation.compare_modes(
         lineup, sample.worlds, task, on_progress=lambda name, done: out.progress(name, done, n)
@@ -519,7 +519,7 @@ def record_command(
     out.check(output)
     evaluation.check_film(output.suffix.lower())
     chosen = _asked_task(scenario, vehicle, None).scenario
-    lineup = _make_drivers(agents.split(","), chosen, uncertainty=uncertainty)
+    lineup = _make_drivers(agents, chosen, uncertainty=uncertainty)
     worlds = chosen.sample(1, seed, first=world).worlds
     titled = {f"{name}: world {world} of {chosen.name}": agent for name, agent in lineup.items()}
     out.write(output, evaluation.film(worlds, titled, output.suffix.lower(), scenario=chosen), what="film")
@@ -614,7 +614,7 @@ def explore_command(
     from ethbrake_marl.pages.explorer import serve_explorer
 
     task = _asked_task(scenario, vehicle, settings, harm_count, alone=True)
-    lineup = _make_drivers(agents.split(","), task.scenario, harm_count, alone=True)
+    lineup = _make_drivers(agents, task.scenario, harm_count, alone=True)
 
     def ready(address: str) -> None:
         out.show(address)
@@ -649,7 +649,7 @@ def dataset_command(
     """
     chosen = _asked_task(scenario, vehicle, settings, harm_count).scenario
     evaluation.check_dataset(output, chosen, format, force=out.force)
-    lineup = _make_drivers(agents.split(","), chosen, harm_count, uncertainty)
+    lineup = _make_drivers(agents, chosen, harm_count, uncertainty)
     evaluation.check_agents(lineup, chosen.sample(1, seed).worlds, chosen)
     summary = evaluation.write_dataset(
         output,
@@ -776,7 +776,7 @@ def picture_shield(
     figures = _figures(out, output)
     task = _asked_task(scenario, vehicle, settings, harm_count)
     worlds = task.scenario.sample(episodes, DEFAULT.LIST_SEED).worlds
-    lineup = _make_drivers(agents.split(","), task.scenario, harm_count, bare=True)
+    lineup = _make_drivers(agents, task.scenario, harm_count, bare=True)
     curves = operating_curves(worlds, lineup, task, on_progress=lambda name: out.progress(name, episodes, episodes))
     left_out = next(iter(curves.values()))[0].left_out
     rest = f"; step shield, {harm_count} harm. Beside the points: what certificates may reach above the bound (m²/s²)."

@@ -66,6 +66,7 @@ def best_harm_command(
     """
     import numpy as np
 
+    from ethbrake_marl.agents import split_specs
     from ethbrake_marl.limits import BestHarmTable, search_list
     from ethbrake_marl.scenario import Task
 
@@ -83,7 +84,7 @@ def best_harm_command(
     known = None if start is None else BestHarmTable.load(start)
     sample = chosen.sample(episodes, seed)
     counts: Sequence[HarmCount] = HARM_COUNTS if harm_count is None else (harm_count,)
-    specs = [] if agents is None else [spec.strip() for spec in agents.split(",")]
+    specs = [] if agents is None else [spec.strip() for spec in split_specs(agents)]
     if specs and (len(chosen.learners) != 1 or controlled not in (None, chosen.learners)):
         raise InvalidInput("--agents: drive the scenario's only learner; leave out --vehicles")
     lineups = {each: evaluation.make_agents(specs, chosen, harm_count=each) for each in counts}

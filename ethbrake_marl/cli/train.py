@@ -522,6 +522,7 @@ def generalise_command(
 
     They drive every follower, and Vehicle 1 where it learns in the scenario.
     """
+    from ethbrake_marl.agents import split_names
     from ethbrake_marl.studies.ablation import LineQuestion
 
     lengths = tuple(int(each) if each.strip().isdecimal() else 0 for each in vehicles.split(","))
@@ -530,7 +531,7 @@ def generalise_command(
     check_whole_number("search-episodes", search_episodes, 0, episodes)
     line = evaluation.load_runnable(scenario, learning.read_settings(settings).scenario)
     question = LineQuestion(line, lengths, episodes, seed, harm_count, search_episodes, budget)
-    agents = question.load_runs([each.strip() for each in runs.split(",")])
+    agents = question.load_runs([each.strip() for each in split_names(runs)])
     found = question.drive(agents, out.show_progress)
     out.result(found, question.markdown(found, len(agents)), end="")
 

@@ -31,6 +31,7 @@ from ethbrake_marl.agents import (
     make_role,
     parse_spec,
     script_agents,
+    split_specs,
 )
 from ethbrake_marl.defaults import DEFAULT, HarmCount
 from ethbrake_marl.engine import Engine, ask_script, begin_script
@@ -478,7 +479,7 @@ def _beyond(before: Worlds, worlds: Worlds) -> list[str]:
 
 
 def make_lineup(
-    specs: Sequence[str],
+    specs: str | Sequence[str],
     scenario: Scenario,
     *,
     harm_count: HarmCount = "first",
@@ -488,13 +489,14 @@ def make_lineup(
 ) -> dict[str, Driver]:
     """One fresh agent per spec of ``make_agent``, by its spec, to drive the scenario's learners.
 
-    ``ladder`` stands for every agent of ``LADDER``, ``field`` of ``FIELD``. ``harm_count`` is the harm that optimising
-    and choosing agents minimise. ``uncertainty`` is what agents with ``+robust`` certify against. ``alone``: each
-    drives one vehicle. ``bare``: they go behind a shield, and have none. Raises ``InvalidInput`` for a spec given
-    twice, an uncertainty that is missing or that nobody uses, a team or a shield that has no place, and what
-    ``make_agent`` raises.
+    A text has commas between specs. ``ladder`` stands for every agent of ``LADDER``, ``field`` of ``FIELD``.
+    ``harm_count`` is the harm that optimising and choosing agents minimise. ``uncertainty`` is what agents with
+    ``+robust`` certify against. ``alone``: each drives one vehicle. ``bare``: they go behind a shield, and have none.
+    Raises ``InvalidInput`` for a spec given twice, an uncertainty that is missing or that nobody uses, a team or a
+    shield that has no place, and what ``make_agent`` raises.
     """
-    specs = [each for spec in specs for each in _GROUPS.get(spec, (spec,))]
+    listed = split_specs(specs) if isinstance(specs, str) else specs
+    specs = [each for spec in listed for each in _GROUPS.get(spec, (spec,))]
     written = [parse_spec(spec) for spec in specs]
     for k, each in enumerate(written):
         if each in written[:k]:

@@ -182,8 +182,6 @@ def evaluate(
 
     """
     scenario = load_scenario(scenario)
-    if isinstance(agents, str):
-        agents = agents.split(",")
     if isinstance(agents, Sequence):
         agents = make_lineup(agents, scenario)
     if worlds is None:

@@ -653,7 +653,7 @@ class ScriptSpec(NamedTuple):
                 f"agent {spec!r}: must be name or name:argument, the name in lower case letters, digits and _ @ . -,"
                 " for instance full_brake or constant:3.5"
             )
-        if match["name"].endswith(".py"):
+        if match["name"].endswith(".py") or ".py:" in spec:
             raise InvalidInput(
                 f"agent {spec!r}: is a function of a Python file, and those are loaded only where a person names them"
                 " (--agents, --plugin); no scenario does. A plug-in can register it under a name"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents import Agent, Driver, LearnedAgent, Team, make_agent
+from ethbrake_marl.agents import Agent, Driver, LearnedAgent, Team, make_agent, split_names
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, check_whole_number, count_of
 from ethbrake_marl.evaluation import (
@@ -284,8 +285,8 @@ def plan_ablation(
     Raises ``InvalidInput`` for recipes of one name, numbers below 1, an unknown shield, nothing to train, and whatever
     cannot be trained or compared.
     """
-    names = [*(LADDER if quick else STANDARD)] if levels is None else levels.split(",")
-    loaded = [load_recipe(each.strip()) for each in recipes.split(",")]
+    names = [*(LADDER if quick else STANDARD)] if levels is None else split_names(levels, os.path.isfile)
+    loaded = [load_recipe(each.strip()) for each in split_names(recipes, os.path.isfile)]
     changed = read_settings(settings, loaded)
     plan = Plan(
         levels=tuple(read_levels([each.strip() for each in names], changed.scenario)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.agents import split_names
 from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import InvalidInput, OnProgress, count_of
 from ethbrake_marl.evaluation import interquartile_mean, result_identity, worlds_sha256
@@ -48,7 +50,7 @@ class LearningCurves(NamedTuple):
     def parse(text: str) -> list[tuple[TrainingRecipe, int]]:
         """Read ``ppo:5,sac:3``: recipes (names, or paths) with their numbers of seeds; raises ``InvalidInput``."""
         found = []
-        for part in text.split(","):
+        for part in split_names(text, lambda part: os.path.isfile(part.rpartition(":")[0])):
             match = re.fullmatch(r"(.+):([1-9][0-9]{0,3})", part)
             if match is None:
                 raise InvalidInput(f"recipes {text!r}: {part!r} must be RECIPE:SEEDS, for instance ppo:5,sac:3")

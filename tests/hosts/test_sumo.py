@@ -64,3 +64,12 @@ def test_sumo__begins_where_it_is_told_and_is_one_at_a_time():
             SumoHost(worlds)
     with pytest.raises(eb.EthBrakeError, match=r"dt = 0.0005: must be whole milliseconds"):
         SumoHost(worlds, 0.0005)
+
+
+@pytest.mark.parametrize("dt", [0.01, 0.05, 0.1])
+def test_sumo__is_driven_to_the_end_and_no_vehicle_drives_on_by_its_brakes_after_it_bounced_back(dt):
+    pytest.importorskip("libsumo")
+    scenario = eb.load_scenario("stress-wide")
+    worlds = scenario.sample(60, 3).worlds
+    with find_host(f"sumo:{dt}").open(worlds) as host:
+        assert eb.drive_host(host, eb.make_agent("full_brake"), scenario, worlds).outcome.ledger.collided.any()

@@ -1,0 +1,118 @@
+"""Names with paths in them: a path that exists wins over every sign that would separate something there."""
+
+import shutil
+
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.agents import parse_spec, split_names, split_specs
+from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.learning import TrainingRecipe
+from ethbrake_marl.policies import shipped_policies
+from ethbrake_marl.studies.ablation import plan_ablation
+from ethbrake_marl.studies.learning_curves import LearningCurves
+
+NAMES = (
+    "lr=0.001,seed=1",
+    "c+step",
+    "c+step,d",
+    "x+refined:50",
+    "a:b",
+    "a@b",
+    "a,full_brake",
+    "a,ppo@b",
+    "my.py:make",
+    "a,b+step,c=1@2:3",
+    " a, b ",
+)
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def put(name):
+    shutil.copytree(shipped_policies()["ppo"], name)
+
+
+@pytest.mark.parametrize("folder", ["", "runs/", "./", "runs/2+3,4/"])
+@pytest.mark.parametrize("name", NAMES)
+def test_policy__in_a_folder_of_any_name_is_that_folder_wherever_agents_are_named(name, folder):
+    path = folder + name
+    put(path)
+    for around in ("", "+step", "+refined:5+step"):
+        spec = parse_spec(f"ppo@{path}{around}")
+        assert (spec.name, spec.policy, "".join(f"+{each}" for each in spec.around)) == ("ppo", path, around)
+        assert split_specs(f"full_brake,ppo@{path}{around},coast") == ["full_brake", f"ppo@{path}{around}", "coast"]
+    assert split_specs(f"ppo@{path}+step,ppo@{path}") == [f"ppo@{path}+step", f"ppo@{path}"]
+    assert split_names(f"{path},{path}") == [path, path]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_policy__in_a_folder_of_any_name_drives_in_python_and_in_commands(name, capsys):
+    put(name)
+    scenario = eb.load_scenario("paper-random")
+    found = eb.evaluate(agents=f"full_brake,ppo@{name}", scenario=scenario, episodes=5)
+    assert list(found.outcomes) == ["full_brake", f"ppo@{name}"]
+    ours = eb.evaluate(agents="ppo@shipped", scenario=scenario, episodes=5).outcome("ppo@shipped")
+    assert (found.outcome(f"ppo@{name}").total_harm == ours.total_harm).all()
+    assert run_command(["evaluate", "--agents", f"full_brake,ppo@{name}", "--episodes", "5", "--json"]) == 0
+    assert "ppo@" in capsys.readouterr().out
+
+
+def test_folder__that_is_not_there_separates_as_before():
+    assert parse_spec("ppo@c+step").around == ("step",) and parse_spec("ppo@c+step").policy == "c"
+    assert split_specs("ppo@lr=0.001,seed=1") == ["ppo@lr=0.001", "seed=1"]
+    put("c+step")
+    put("c")
+    assert parse_spec("ppo@c+step").policy == "c+step" and parse_spec("ppo@c/+step").around == ("step",)
+    assert parse_spec("ppo@c").policy == "c" and parse_spec("ppo@c+step+step").around == ("step",)
+
+
+def test_folder__that_is_called_like_a_list_of_agents_is_none_of_them():
+    put("full_brake,coast")
+    assert split_specs("full_brake,coast") == ["full_brake", "coast"]
+    put("a")
+    put("b")
+    assert split_specs("ppo@a,ppo@b,coast") == ["ppo@a", "ppo@b", "coast"]
+
+
+@pytest.mark.parametrize("name", ["my,agents.py", "a:b.py", "a@b.py", "a+step.py", "lr=1,x/y+z.py", "a.py:make.py"])
+def test_python_file__of_any_name_makes_agents(name, tmp_path):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text(
+        "import ethbrake_marl as eb\ndef make(argument, settings):\n    return eb.make_agent(argument or 'coast')\n",
+        "utf-8",
+    )
+    put("w,1")
+    for behind, argument, policy in (("", None, None), (":full_brake", "full_brake", None), ("@w,1", None, "w,1")):
+        spec = f"{name}:make{behind}"
+        parts = parse_spec(spec)
+        assert (parts.file, parts.argument, parts.policy) == ((name, "make"), argument, policy)
+        assert parse_spec(f"{spec}+step").around == ("step",)
+        assert split_specs(f"coast,{spec}+step,{spec}") == ["coast", f"{spec}+step", spec]
+    assert eb.make_agent(f"{name}:make:full_brake").name == "full_brake"
+
+
+@pytest.mark.parametrize("name", ["constant:b.py", "policy@b.py"])
+def test_scenario__cannot_name_a_python_file_however_it_is_called(name, tmp_path):
+    (tmp_path / name).write_text("raise SystemExit('was run')", "utf-8")
+    with pytest.raises(eb.EthBrakeError, match=r"is a function of a Python file, and those are loaded only"):
+        eb.load_scenario("paper-random").replace(
+            roles={"vehicle_1": f"{name}:make", "vehicle_2": "learner", "vehicle_3": "full_brake"}
+        )
+
+
+def test_recipes_and_levels__may_lie_in_folders_of_any_name(tmp_path):
+    folder = tmp_path / "lr=1,b:2"
+    folder.mkdir()
+    shutil.copy(TrainingRecipe.shipped()["quick"], folder)
+    for level in ("cooperation-1-front", "cooperation-2-paper"):
+        shutil.copy(next(each.path for each in eb.list_scenarios() if each.name == level), folder)
+    curves = LearningCurves.parse("lr=1,b:2/quick.yaml:3,ppo:2")
+    assert [(recipe.name, seeds) for recipe, seeds in curves] == [("quick", 3), ("ppo", 2)]
+    levels = "lr=1,b:2/cooperation-1-front.yaml,lr=1,b:2/cooperation-2-paper.yaml"
+    plan = plan_ablation(levels, "lr=1,b:2/quick.yaml,ppo", None, None, list_seed=7, folder=tmp_path / "out")
+    assert [level.name for level in plan.levels] == ["cooperation-1-front", "cooperation-2-paper"]
+    assert [recipe.name for recipe in plan.recipes] == ["quick", "ppo"]
