@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         ShieldedDriver as ShieldedDriver,
         ShieldMode as ShieldMode,
         ShieldOptions as ShieldOptions,
+        guard_of as guard_of,
     )
     from ethbrake_marl.shield.sb3 import ShieldedVecEnv as ShieldedVecEnv
     from ethbrake_marl.shield.step_shield import ShieldReason as ShieldReason, StepShield as StepShield

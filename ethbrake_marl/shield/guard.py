@@ -309,16 +309,17 @@ class ShieldGuard(ABC):
         """
 
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
-        """What infos say of each vehicle, [n, N]: of the last step, or, in rows that have made none since, of the alert.
+        """What infos say of each vehicle, [n, N]: of the last step, or of the alert in rows that made none since.
 
         Where a row has begun anew since the last step, that step was of the episode before.
         """
+        memory: Any = running.guarded
         ruling, begun = running.ruling, running.steps == 0
         if ruling is None or begun.all():
-            return self._of_vehicles(self.tell(running.guarded, None), running)
+            return self._of_vehicles(self.tell(memory, None), running)
         told = self._of_vehicles(self.tell(ruling.memory, ruling), running)
         if begun.any():
-            alert = self._of_vehicles(self.tell(running.guarded, None), running)
+            alert = self._of_vehicles(self.tell(memory, None), running)
             told = {name: np.where(begun[:, np.newaxis], alert[name], each) for name, each in told.items()}
         return told
 

@@ -306,7 +306,7 @@ class ShieldReason(IntEnum):
 
 
 # those that kernels give
-_, SAME_AS_PLAN, PLAN_REMAINS, CONSTANT, NO_CERTIFICATE, NOT_A_NUMBER, ENDED, *_ = map(int, ShieldReason)
+SAME_AS_PLAN, PLAN_REMAINS, CONSTANT, NO_CERTIFICATE, NOT_A_NUMBER, ENDED = map(int, list(ShieldReason)[1:7])
 APPLIED, REASON, BOUND, MARGIN = range(4)  # columns of what is told of each vehicle
 NEARLY = 1e-9  # a constant whose harm (m2/s2) in one segment is above the limit by less is certified step by step
 
@@ -981,8 +981,6 @@ def joint_constants(vehicles: int) -> Floats:
 def held(action: Floats, width: int) -> Floats:
     """The plans [n, width, K] that hold these actions [n, K]."""
     return np.repeat(action[:, np.newaxis], width, axis=1)
-
-
 
 
 class StepShield:

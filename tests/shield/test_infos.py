@@ -255,7 +255,8 @@ def test_codes__are_those_of_the_documented_table_and_of_the_texts_in_the_engine
 @pytest.mark.parametrize("penalty", [0.0, 5.0])
 def test_cost_env__inside_the_shield_says_what_it_does_around_it(penalty: float) -> None:
     options = {"intervention_penalty": penalty}
-    inside, around = eb.shield(eb.CostEnv(eb.EthBrakeEnv()), **options), eb.CostEnv(eb.shield(eb.EthBrakeEnv(), **options))
+    inside = eb.shield(eb.CostEnv(eb.EthBrakeEnv()), **options)
+    around = eb.CostEnv(eb.shield(eb.EthBrakeEnv(), **options))
     rng, costs = np.random.default_rng(0), 0.0
     for seed in range(5):
         inside.reset(seed=seed)
