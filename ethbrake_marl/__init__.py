@@ -67,7 +67,9 @@ if TYPE_CHECKING:
         HybridShield as HybridShield,
         ShieldedEnv as ShieldedEnv,
         ShieldedVectorEnv as ShieldedVectorEnv,
+        ShieldMode as ShieldMode,
         ShieldOptions as ShieldOptions,
+        ShieldReason as ShieldReason,
         shielded_aec as shielded_aec,
     )
     from ethbrake_marl.shield import ShieldedVecEnv as ShieldedVecEnv

@@ -808,6 +808,9 @@ class Guard(Protocol):
     def check(self, ruling: Ruling, after: Engine) -> Any:
         """The memory now that the step led to ``after``. Raises ``UncertifiedStep``: then it was not made."""
 
+    def report(self, running: Engine) -> dict[str, NDArray[Any]]:
+        """What infos say of each vehicle, by name, each [n, N]: of its last step, or of the alert before the first."""
+
 
 class Moment(NamedTuple):
     """Running worlds between two steps, row by row."""

@@ -46,6 +46,7 @@ def interfaces(policy: eb.Policy) -> list[Any]:
         *(eb.EthBrakeVectorEnv(num_envs=4), eb.env(), eb.raw_env(), eb.ShieldOptions(mode="step")),
         *(eb.HybridShield(parallel, policy, mode="step"), eb.shielded_aec(parallel, mode="step"), eb.shield(parallel)),
         *(eb.ShieldedEnv(eb.EthBrakeEnv()), eb.ShieldedVectorEnv(eb.EthBrakeVectorEnv()), eb.ShieldedVecEnv(batch)),
+        *(eb.ShieldReason(3).text, eb.ShieldMode.STEP.name),
     ]
 
 

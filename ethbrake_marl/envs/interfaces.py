@@ -252,7 +252,7 @@ def _drawn_again(engine: Engine, numbers: Ints) -> Sample:
 # name the world, so that it can be played again (-1: it was given). Where the scenario has a ``v2x`` channel also
 # ``known_from_s`` [N]: from when on this vehicle acts on news of each one (infinite: never; of itself: its latency);
 # and where its messages are periodic ``age_s`` [N]: how old the newest sample is that it was told of each (infinite:
-# none).
+# none). Behind a shield also what that reports, as ``shield_NAME``.
 
 COLUMNS = (
     "time_s",
@@ -268,6 +268,20 @@ COLUMNS = (
 _FLOAT32 = np.dtype(np.float32)
 
 
+def shield_columns(engine: Engine, rows: Ints | None = None) -> Columns:
+    """What the shield in an engine reports, ``shield_NAME`` -> [n, N]; only of the worlds ``rows`` if given."""
+    if engine.guard is None or engine.guarded is None:
+        return {}
+    every = slice(None) if rows is None else rows
+    return {f"shield_{name}": column[every] for name, column in engine.guard.report(engine).items()}
+
+
+def plain_rows(columns: Columns, vehicles: Ints, count: int) -> list[dict[str, Any]]:
+    """Columns [n, N] as plain values by name, for each of these vehicles, world by world: ``count`` in all."""
+    values = [column.take(vehicles, axis=1).reshape(-1).tolist() for column in columns.values()]
+    return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)] or [{} for _ in range(count)]
+
+
 class Report(NamedTuple):
     """What there is to tell about n worlds of N vehicles."""
 
@@ -278,6 +292,7 @@ class Report(NamedTuple):
     world: Ints  # [n] numbers in the stream of that seed
     known_from_s: Floats | None  # [n, N, N] where there is a channel
     age_s: Floats | None  # [n, N, N] where its messages are periodic
+    shield: Columns  # each [n, N]; none without a shield
 
     @classmethod
     def of(cls, engine: Engine, step: Step | None = None, rows: Ints | None = None) -> Report:
@@ -301,7 +316,7 @@ class Report(NamedTuple):
                 cost, terms = cost.take(rows), {name: term.take(rows, axis=0) for name, term in terms.items()}
         time_s, messages = state[:, shown.column.time], params[:, shown.column.messages :]
         age = Messages(messages, N).age_s(time_s) if shown.has_messages else None
-        return cls(values, cost, terms, engine.roster.seed, world, known, age)
+        return cls(values, cost, terms, engine.roster.seed, world, known, age, shield_columns(engine, rows))
 
     def columns(self) -> dict[str, Floats]:
         """What is told of every vehicle, by name, each [n, N]."""
@@ -342,6 +357,8 @@ class Report(NamedTuple):
                 of_these = news.take(vehicles, axis=1)
                 for info, row in zip(infos, of_these.reshape(-1, of_these.shape[2]), strict=True):
                     info[name] = row.copy()
+        for info, of_shield in zip(infos, plain_rows(self.shield, vehicles, len(infos)), strict=True):
+            info |= of_shield
         return infos
 
     def batch_info(self, vehicle: int, rows: Bools, stepped: Bools) -> dict[str, Any]:
@@ -360,6 +377,7 @@ class Report(NamedTuple):
             columns["known_from_s"] = self.known_from_s[:, vehicle]
         if self.age_s is not None:
             columns["age_s"] = self.age_s[:, vehicle]
+        columns |= {name: column[:, vehicle] for name, column in self.shield.items()}
         masked: dict[str, Any] = {}
         for name, column in columns.items():
             masked[name] = np.zeros_like(column, order="C")

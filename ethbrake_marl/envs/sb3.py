@@ -11,17 +11,20 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from ethbrake_marl.actions import own_actions
-from ethbrake_marl.engine import Arrays, Engine, Step
+from ethbrake_marl.engine import Arrays, Engine, Step, renew_memory
 from ethbrake_marl.envs.drawing import Viewer
 from ethbrake_marl.envs.interfaces import (
     INITIAL_STATE,
     AnyScenario,
     Begun,
+    Columns,
     Report,
     action_box,
     chosen_seed,
     feature_box,
     make_engine,
+    plain_rows,
+    shield_columns,
     warn_of_unknown,
 )
 from ethbrake_marl.errors import InvalidInput
@@ -132,6 +135,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self._return = np.zeros(rows)
         self._steps = np.zeros(rows, np.int64)
         self._begun = np.zeros(0)  # values of the report at each episode's beginning
+        self._begun_shield: Columns = {}  # ... and what a shield reported then
         super().__init__(rows, feature_box(features), action_box())
         self.metadata = {**self.viewer.metadata, "render_modes": ["rgb_array"]}
 
@@ -152,7 +156,8 @@ class EthBrakeVecEnv(Begun, VecEnv):
             self._reset_options()
         self._begin(None, worlds)
         self._return[:], self._steps[:] = 0.0, 0
-        self._begun = Report.of(self.engine).values
+        report = Report.of(self.engine)
+        self._begun, self._begun_shield = report.values, report.shield
         return self._observe()
 
     def step_async(self, actions: NDArray[Any]) -> None:
@@ -173,13 +178,19 @@ class EthBrakeVecEnv(Begun, VecEnv):
         reward = step.reward.take(learners, axis=1).reshape(-1)
         self._return += reward
         self._steps += 1
-        infos = Report.of(engine, step).plain_infos(learners) if self.step_infos else [{} for _ in range(self.num_envs)]
+        infos = (
+            Report.of(engine, step).plain_infos(learners)
+            if self.step_infos
+            else plain_rows(shield_columns(engine), learners, self.num_envs)
+        )
         over = engine.ended  # all that have ended: an interrupted step may have left some that nobody renewed
         ended = np.flatnonzero(over)
         if len(ended):
             self._close_episodes(ended, step, infos)
             engine.renew(ended)
-            self._begun[ended] = Report.of(engine, rows=ended).values
+            told = Report.of(engine, rows=ended)
+            self._begun[ended] = told.values
+            self._begun_shield = renew_memory(self._begun_shield, ended, told.shield) if told.shield else {}
         return self._observe(), reward.astype(np.float32), self._by_row(over), infos
 
     def get_images(self) -> list[NDArray[np.uint8]]:
@@ -199,7 +210,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         prefix = "engine."
         self.engine.restore({n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)})
         self._return, self._steps = arrays["return"].copy(), arrays["steps"].copy()
-        self._begun = arrays["begun"].copy()
+        self._begun, self._begun_shield = arrays["begun"].copy(), {}
         self._set_seed(self.engine.seed)
         self._started = self._goes_on = True
 
@@ -244,7 +255,8 @@ class EthBrakeVecEnv(Begun, VecEnv):
         """The infos with which the running episodes began, row by row; made when they are asked for."""
         if not self._started:
             return [{} for _ in range(self.num_envs)]
-        return Report.of(self.engine)._replace(values=self._begun).plain_infos(self._learners)
+        begun = Report.of(self.engine)._replace(values=self._begun, shield=self._begun_shield)
+        return begun.plain_infos(self._learners)
 
     @reset_infos.setter
     def reset_infos(self, infos: list[dict[str, Any]]) -> None:

@@ -20,6 +20,7 @@ from torchrl.envs import EnvBase
 from ethbrake_marl.envs import feature_box, make_engine
 from ethbrake_marl.rewards import Reward
 from ethbrake_marl.scenario import Scenario, full_state, load_scenario, observation_for, state_features
+from ethbrake_marl.shield import ShieldOptions, guard_of
 
 GROUP = "learners"
 
@@ -27,12 +28,23 @@ GROUP = "learners"
 class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is missing
     """``n`` worlds of ``scenario``: observation [n, L, F], action and reward [n, L, 1], state [n, S], done [n, 1].
 
-    ``horizon_is_end``: an episode that the horizon cuts off counts as terminated, as in a recipe.
+    ``horizon_is_end``: an episode that the horizon cuts off counts as terminated, as in a recipe. ``shield``: the mode
+    of a shield around the learners, ``step`` for several; None: none.
     """
 
-    def __init__(self, scenario: Scenario, n: int, seed: int, reward: Reward, horizon_is_end: bool = False) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        n: int,
+        seed: int,
+        reward: Reward,
+        horizon_is_end: bool = False,
+        shield: str | None = None,
+    ) -> None:
         super().__init__(device="cpu", batch_size=torch.Size([n]))
         self.engine = make_engine(scenario, n, reward=reward, observation=observation_for(scenario), seed=seed)
+        if shield is not None:
+            self.engine.protect(guard_of(self.engine, None, ShieldOptions(shield)))
         self.horizon_is_end = horizon_is_end
         self._learners = np.array(self.engine.learners, np.int64)
         rows = (n, len(self._learners))
@@ -87,7 +99,7 @@ class LineTask(TaskClass):  # type: ignore[misc]
     """A scenario as a task.
 
     ``config``: ``scenario`` (a shipped name, a YAML file, its content, or a ``Scenario``), ``reward``,
-    ``horizon_is_end``.
+    ``horizon_is_end``, and, if wanted, the mode of a ``shield``.
     """
 
     def __init__(self, name: str, config: dict[str, Any]) -> None:
@@ -96,7 +108,8 @@ class LineTask(TaskClass):  # type: ignore[misc]
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:
         """How to make the worlds."""
         config = self.config
-        return lambda: LineEnv(config["scenario"], num_envs, seed or 0, config["reward"], config["horizon_is_end"])
+        settings = config["reward"], config["horizon_is_end"], config.get("shield")
+        return lambda: LineEnv(config["scenario"], num_envs, seed or 0, *settings)
 
     def supports_continuous_actions(self) -> bool:
         """Yes."""

@@ -21,10 +21,12 @@ if TYPE_CHECKING:
         MovingAtHorizon as MovingAtHorizon,
         Shielded as Shielded,
         ShieldedDriver as ShieldedDriver,
+        ShieldMode as ShieldMode,
         ShieldOptions as ShieldOptions,
+        guard_of as guard_of,
     )
     from ethbrake_marl.shield.sb3 import ShieldedVecEnv as ShieldedVecEnv
-    from ethbrake_marl.shield.step_shield import StepShield as StepShield
+    from ethbrake_marl.shield.step_shield import ShieldReason as ShieldReason, StepShield as StepShield
     from ethbrake_marl.shield.uncertainty import Uncertainty as Uncertainty, parse_uncertainty as parse_uncertainty
     from ethbrake_marl.shield.wrappers import (
         HybridShield as HybridShield,

@@ -19,6 +19,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from enum import IntEnum
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -62,8 +63,8 @@ from ethbrake_marl.shield.enclosure import CORNERS, INTERIOR, checked_robust
 from ethbrake_marl.shield.step_shield import (
     BelievedShield,
     Cap,
-    Decision,
     Proposer,
+    ShieldReason,
     StepShield,
     difference,
     proposed_actions,
@@ -73,7 +74,22 @@ from ethbrake_marl.shield.uncertainty import Uncertainty, check_amount, check_sc
 
 # The options of a shield around an interface, and their checks, the same for every interface.
 
-MODES = ("episode", "step", "robust")
+
+class ShieldMode(IntEnum):
+    """The mode of a shield: the code ``shield_mode`` of the infos.
+
+    >>> import ethbrake_marl as eb
+    >>> eb.ShieldMode(1).name
+    'STEP'
+
+    """
+
+    EPISODE = 0
+    STEP = 1
+    ROBUST = 2
+
+
+MODES = tuple(each.name.lower() for each in ShieldMode)
 
 
 def checked_uncertainty(given: object) -> Uncertainty | None:
@@ -286,8 +302,51 @@ class ShieldGuard(ABC):
         """What is applied instead of the actions [n, L]."""
 
     @abstractmethod
-    def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, NDArray[Any]]:
-        """What is told of a step, each [n, L]; without a ruling the same keys before the first decision."""
+    def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
+        """What infos say after a ruling, or, without one, before the first decision: the same keys.
+
+        Of a world: a number or [n]. Of vehicles: [n, L] of the learners, or [n, N].
+        """
+
+    def report(self, running: Engine) -> dict[str, NDArray[Any]]:
+        """What infos say of each vehicle, [n, N]: of the last step, or of the alert in rows that made none since.
+
+        Where a row has begun anew since the last step, that step was of the episode before.
+        """
+        memory: Any = running.guarded
+        ruling, begun = running.ruling, running.steps == 0
+        if ruling is None or begun.all():
+            return self._of_vehicles(self.tell(memory, None), running)
+        told = self._of_vehicles(self.tell(ruling.memory, ruling), running)
+        if begun.any():
+            alert = self._of_vehicles(self.tell(memory, None), running)
+            told = {name: np.where(begun[:, np.newaxis], alert[name], each) for name, each in told.items()}
+        return told
+
+    def _of_vehicles(self, told: Mapping[str, Any], running: Engine) -> dict[str, NDArray[Any]]:
+        """The same of every vehicle, [n, N]; for one that is not shielded nothing was decided."""
+        shape, found = running.wanted_mps2.shape, dict[str, NDArray[Any]]()
+        for name, given in told.items():
+            each = np.asarray(given)
+            if each.ndim == 2 and each.shape != shape:
+                found[name] = np.full(shape, ShieldReason.NO_DECISION if name == "reason" else 0, each.dtype)
+                found[name][:, list(self.vehicles)] = each
+            else:
+                found[name] = np.broadcast_to(each[:, np.newaxis] if each.ndim == 1 else each, shape)
+        return found
+
+    def _of_step(self, ruling: Ruling | None) -> dict[str, Any]:
+        """The mode, what was proposed and what was applied; 0 where there was no step."""
+        told: dict[str, Any] = {"mode": ShieldMode[str(self.options.mode).upper()]}
+        if ruling is None:
+            return told | {"proposed_action": 0.0, "applied_action": 0.0, "intervened": False}
+        intervened = self.intervened(ruling)
+        return told | {"proposed_action": ruling.proposed, "applied_action": ruling.applied, "intervened": intervened}
+
+    def intervened(self, ruling: Ruling) -> Bools:
+        """Where something else was applied than what was proposed, [n, L]."""
+        decided: Bools = ruling.decision.intervened
+        return decided.reshape(ruling.applied.shape)
 
     def begin(self, memory: Guarded | None, alert: Worlds, rows: Ints) -> Guarded:
         """The shield and the policies once episodes start in these rows."""
@@ -320,10 +379,11 @@ class ShieldGuard(ABC):
         return Proposer(self._policies, memories, worlds) if self._policies and worlds is not None else None
 
 
-def by_row(columns: Any, n: int, learners: int) -> NDArray[Any]:
-    """What is told, [], [n] of a world, or [n, L], with the axis of learners: [n, L]."""
-    each = np.asarray(columns)
-    return np.broadcast_to(each[:, np.newaxis] if each.ndim == 1 else each, (n, learners))
+def why(ruling: Ruling | None) -> dict[str, Any]:
+    """Reason and margin of a certified decision, [n, L]."""
+    if ruling is None:
+        return {"reason": ShieldReason.NO_DECISION, "margin": 0.0}
+    return {name: getattr(ruling.decision, name).reshape(ruling.applied.shape) for name in ("reason", "margin")}
 
 
 class StepGuard(ShieldGuard):
@@ -423,34 +483,17 @@ class StepGuard(ShieldGuard):
         shield.distrusted = shield.distrusted | surprising
         return memory._replace(shield=shield)
 
-    def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, NDArray[Any]]:
-        """The keys of ``infos[agent]["shield"]``."""
+    def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
+        """Of a certified step."""
         shield: StepShield = memory.shield
         assert shield.running is not None
-        told: dict[str, Any] = {"mode": self.options.mode, **told_of(ruling), "bound_harm": shield.bound}
-        told |= {"trusted": ~shield.distrusted, "settles": shield.settles}
+        told = self._of_step(ruling) | why(ruling)
+        told |= {"bound_harm": shield.bound, "trusted": ~shield.distrusted, "settles": shield.settles}
         if self.options.mode == "robust":
             told["members"] = shield.running.members
         if self.options.shares or self.options.cap is not None:
-            told |= {
-                name: shares[:, list(self.vehicles)]
-                for name, shares in (("own_harm", shield.shares()), ("baseline_own_harm", shield.baseline_shares))
-            }
-        return {name: by_row(columns, shield.running.n, len(self.vehicles)) for name, columns in told.items()}
-
-
-def told_of(ruling: Ruling | None) -> dict[str, Any]:
-    """What is told of a certified decision; nothing was proposed or chosen without one."""
-    if ruling is None:
-        return {"proposed_action": 0.0, "chosen_action": 0.0, "intervened": False, "reason": "", "margin": 0.0}
-    decided: Decision = ruling.decision
-    return {
-        "proposed_action": ruling.proposed,
-        "chosen_action": ruling.applied,
-        "intervened": decided.intervened,
-        "reason": decided.reason_names,
-        "margin": decided.margin,
-    }
+            told |= {"own_harm": shield.shares(), "baseline_own_harm": shield.baseline_shares}
+        return told
 
 
 class BelievedGuard(ShieldGuard):
@@ -482,18 +525,18 @@ class BelievedGuard(ShieldGuard):
         stepped_in = after.interventions > before
         return Ruling(proposed, applied, stepped_in, ~running.ended, after.decision, Guarded(after, memories))
 
-    def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, NDArray[Any]]:
-        """The keys of ``infos[agent]["shield"]``; ``trusted``: the mode promises something of the world as it is."""
+    def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
+        """Of a step that is certified in the believed worlds; ``trusted``: something is promised of the real one."""
         believed: BelievedShield = memory.shield
-        robust, n, shield = believed.robust is not None, len(believed.predicted_harm), believed.shield
-        told: dict[str, Any] = {"mode": self.options.mode, **told_of(ruling)}
+        robust, shield = believed.robust is not None, believed.shield
+        told = self._of_step(ruling) | why(ruling)
         told |= {"bound_harm": np.inf, "settles": False, "believed": True, "trusted": robust}
         if ruling is not None:
             told["bound_harm"] = np.where(np.isfinite(believed.predicted_harm), shield.bound, np.inf)
             told["settles"] = shield.settles
         if robust:
             told["members"] = believed.members
-        return {name: by_row(columns, n, 1) for name, columns in told.items()}
+        return told
 
 
 # The paper's hybrid (Algorithm 1): at the alert, choose between policy and baseline for the whole episode.
@@ -593,18 +636,14 @@ class EpisodeGuard(ShieldGuard):
         memory = memory._replace(shield=hybrid)
         return Ruling(proposed, applied, ~hybrid["chosen_policy"], ~running.ended, None, memory)
 
-    def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, NDArray[Any]]:
-        """The keys of ``infos[agent]["shield"]``; ``proposed_action`` is NaN where nothing was proposed."""
-        nothing = np.zeros((1, 1))
-        proposed, applied = (nothing, nothing) if ruling is None else (ruling.proposed, ruling.applied)
-        told = {
-            "mode": "episode",
-            "proposed_action": proposed,
-            "chosen_action": applied,
-            "intervened": abs(applied - proposed) > ROUNDING,
-            **{name: memory.shield[name] for name in ("chosen_policy", "policy_harm", "bound_harm")},
-        }
-        return {name: by_row(columns, len(memory.shield["bound_harm"]), 1) for name, columns in told.items()}
+    def intervened(self, ruling: Ruling) -> Bools:
+        """Where something else was applied than what was proposed, [n, L]."""
+        return np.asarray(abs(ruling.applied - ruling.proposed) > ROUNDING, np.bool_)
+
+    def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
+        """Who drives, and what was compared; ``proposed_action`` is NaN where nothing was proposed."""
+        compared = {name: memory.shield[name] for name in ("chosen_policy", "policy_harm", "bound_harm")}
+        return self._of_step(ruling) | compared
 
 
 def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -> ShieldGuard:
@@ -695,16 +734,13 @@ class Attached:
             self._left = self.memory
             self.engine.protect(None)
 
-    def tell(self) -> dict[str, NDArray[Any]]:
-        """What is told of the last step, or, before the first one, of the alert; each [n, L]."""
+    def penalty(self) -> Floats:
+        """What the interventions of the last step take off the rewards, [n, L]."""
         self.check_open()
         ruling = self.engine.ruling
-        return self.guard.tell(self.memory if ruling is None else ruling.memory, ruling)
-
-    def infos(self) -> list[dict[str, Any]]:
-        """``tell`` as plain values, for each learner of each world."""
-        told = {name: columns.reshape(-1).tolist() for name, columns in self.tell().items()}
-        return [dict(zip(told, row, strict=True)) for row in zip(*told.values(), strict=True)]
+        if ruling is None:
+            return np.zeros((self.engine.n, len(self.engine.learners)))
+        return self.options.intervention_penalty * (self.guard.intervened(ruling) & ruling.asked[:, np.newaxis])
 
 
 # Drivers behind a shield, in evaluations: what they did, and what the shield did to them, world by world.

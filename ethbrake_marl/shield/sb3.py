@@ -20,14 +20,15 @@ class ShieldedVecEnv(SeededInside, VecEnvWrapper):
 
     The ``options`` are those of ``ShieldOptions``; the penalty is not taken off the return in
     ``infos[row]["episode"]``. Without a ``policy`` the bound is the coupled optimum's harm. Each row's infos hold
-    ``shield`` in every step. Raises ``InvalidInput`` for another environment, or several learners in another mode.
+    ``shield_bound_harm`` and its like in every step, and ``reset_infos`` those of the alert. Raises ``InvalidInput``
+    for another environment, or several learners in another mode.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
     >>> env = eb.ShieldedVecEnv(eb.make_sb3_vec_env("paper-random", 4, seed=7))
     >>> observations = env.reset()
     >>> observations, rewards, dones, infos = env.step(np.full((4, 1), 1.0))
-    >>> [info["shield"]["intervened"] for info in infos]
+    >>> [info["shield_intervened"] for info in infos]
     [True, True, True, True]
 
     """
@@ -51,12 +52,18 @@ class ShieldedVecEnv(SeededInside, VecEnvWrapper):
         """Advance every world by one step with the actions certified or replaced."""
         self.attached.check_open()
         observation, reward, done, infos = self.venv.step_wait()
-        told = self.attached.infos()
-        for info, row in zip(infos, told, strict=True):
-            info["shield"] = row
-        intervened = np.array([row["intervened"] for row in told], np.float32)
-        paid = reward - np.float32(self.attached.options.intervention_penalty) * intervened
+        paid = reward - self.attached.penalty().reshape(-1).astype(np.float32)
         return observation, paid, done, infos  # type: ignore[return-value]
+
+    @property
+    def reset_infos(self) -> list[dict[str, Any]]:
+        """The infos with which the running episodes began, row by row; wrappers inside keep none of their own."""
+        infos: list[dict[str, Any]] = self.unwrapped.reset_infos
+        return infos
+
+    @reset_infos.setter
+    def reset_infos(self, infos: list[dict[str, Any]]) -> None:
+        """Nothing: SB3's constructor assigns empty ones."""
 
     def __getstate__(self) -> dict[str, Any]:
         """State for a copy, without the table of the class that SB3 keeps in every wrapper and nobody can pickle."""

@@ -37,6 +37,7 @@ import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from enum import IntEnum
 from itertools import product
 from typing import Any, Literal, NamedTuple, TypeVar, cast, get_args
 
@@ -280,8 +281,33 @@ def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int,
     return harm_so_far(table, clock[CLOCK.HARM_IS_TOTAL])
 
 
-# reasons of a decision, in the order of REASONS
-SAME_AS_PLAN, PLAN_REMAINS, CONSTANT, NO_CERTIFICATE, NOT_A_NUMBER, ENDED = range(6)
+class ShieldReason(IntEnum):
+    """Why a shield accepted or replaced an action: the code ``shield_reason`` of the infos. ``text``: in words.
+
+    >>> import ethbrake_marl as eb
+    >>> eb.ShieldReason(3).name, eb.ShieldReason.NO_CERTIFICATE.text
+    ('NO_CERTIFICATE', 'no certificate')
+
+    """
+
+    NO_DECISION = -1  # before the first step of an episode, and always for a vehicle that follows a script
+    SAME_AS_PLAN = 0  # the proposal is the plan's action
+    PLAN_REMAINS = 1  # the rest of the plan still keeps the budget after the proposal
+    CONSTANT = 2  # a constant action after the proposal keeps it
+    NO_CERTIFICATE = 3  # neither does: the plan's action was applied
+    NOT_A_NUMBER = 4  # nothing usable was proposed: the plan's action was applied
+    ENDED = 5  # the episode is over
+    ASSUMPTION_BROKEN = 6  # the world did not do what was predicted: the fallback was applied
+    POLICY_ROLLOUT = 7  # nothing else kept the budget, but the policy itself does, rolled out after the proposal
+
+    @property
+    def text(self) -> str:
+        """The reason in words."""
+        return self.name.lower().replace("_", " ")
+
+
+# those that kernels give
+SAME_AS_PLAN, PLAN_REMAINS, CONSTANT, NO_CERTIFICATE, NOT_A_NUMBER, ENDED = map(int, list(ShieldReason)[1:7])
 APPLIED, REASON, BOUND, MARGIN = range(4)  # columns of what is told of each vehicle
 NEARLY = 1e-9  # a constant whose harm (m2/s2) in one segment is above the limit by less is certified step by step
 
@@ -514,16 +540,6 @@ def descend_constants(running: Running, grid: Floats, rounds: int, action: Float
             action[k, c] = best
 
 
-REASONS = (
-    "same as plan",  # the proposal is the plan's action
-    "plan remains",  # the rest of the plan still keeps the budget after the proposal
-    "constant",  # a constant action after the proposal keeps it
-    "no certificate",  # neither does: the plan's action was applied
-    "not a number",  # nothing usable was proposed: the plan's action was applied
-    "ended",  # the episode is over
-    "assumption broken",  # the world did not do what was predicted: the fallback was applied
-    "policy rollout",  # nothing else kept the budget, but the policy itself does, rolled out after the proposal
-)
 CONSTANTS = tuple(-k / 10 for k in range(11))  # actions that are tried as constants: coasting to full braking
 
 
@@ -599,7 +615,7 @@ class Decision(NamedTuple):
 
     applied: Floats  # [n] or [n, K] actions in [-1, 1]
     intervened: Bools  # [n] or [n, K] what is applied is not what was proposed (clipped)
-    reason: NDArray[np.int64]  # [n] or [n, K] places in REASONS
+    reason: NDArray[np.int64]  # [n] or [n, K] values of ShieldReason
     bound: Floats  # [n] harm of the episode is at most this from now on (m2/s2)
     margin: Floats  # [n] or [n, K] budget minus the least harm found after the proposal; negative: why it was rejected
     after: Running  # as it will be at the next decision
@@ -608,7 +624,8 @@ class Decision(NamedTuple):
     @property
     def reason_names(self) -> NDArray[np.str_]:
         """The reasons in words, [n] or [n, K]."""
-        return np.array(REASONS)[self.reason]
+        texts = [ShieldReason(code).text for code in self.reason.ravel().tolist()]
+        return np.array(texts).reshape(self.reason.shape)
 
     def put(self, rows: Ints, other: Decision, taken: Ints) -> Decision:
         """A copy in which some worlds, with the plans and bounds that go on, are those ``taken`` from another one."""
@@ -778,7 +795,7 @@ class Intervention(NamedTuple):
     time_s: float
     proposed: float  # action, as it was given
     applied: float  # action
-    reason: int  # place in REASONS
+    reason: int  # value of ShieldReason
     bound: float  # m2/s2, from now on
     margin: float  # m2/s2; negative: what the proposal would have cost beyond the budget at least
     state: Floats  # [S] at the decision
@@ -807,7 +824,6 @@ def interventions(
 # What a rollout does is written down as a plan and certified like any other (``plan_harm``): a policy that would drive
 # differently the second time costs interventions, never the bound.
 
-ROLLOUT = ENDED + 2  # a reason that the kernel does not know
 Number = TypeVar("Number", bound=np.generic)
 
 
@@ -856,7 +872,7 @@ def certify_rollouts(
             kept &= within.reshape(part.n, -1).all(axis=1)
         decision = certify(part, first, Backup(plan, harm, no_constants(plan)), np.maximum(least, harm))
     each = kept.reshape(-1, *[1] * (first.ndim - 1))
-    told = np.where(silent, NOT_A_NUMBER, ROLLOUT)
+    told = np.where(silent, NOT_A_NUMBER, ShieldReason.POLICY_ROLLOUT)
     margin = np.broadcast_to((least - harm).reshape(each.shape), first.shape)
     return decision._replace(intervened=silent | ~each, margin=margin, reason=np.where(each, told, NO_CERTIFICATE))
 
@@ -966,9 +982,6 @@ def joint_constants(vehicles: int) -> Floats:
 def held(action: Floats, width: int) -> Floats:
     """The plans [n, width, K] that hold these actions [n, K]."""
     return np.repeat(action[:, np.newaxis], width, axis=1)
-
-
-BROKEN = ENDED + 1  # a reason that the kernel does not know
 
 
 class StepShield:
@@ -1259,7 +1272,7 @@ class StepShield:
             kept = np.flatnonzero((found.reason != NO_CERTIFICATE).reshape(len(rows), -1).all(axis=1))
             decision = decision._replace(margin=margin).put(rows[kept], found._replace(margin=margin[rows]), kept)
         decision = certify_inside(self.boxes, now, held, budget, decision, asked & ~self.distrusted)
-        decision.reason[asked & self.distrusted] = BROKEN
+        decision.reason[asked & self.distrusted] = ShieldReason.ASSUMPTION_BROKEN
         decision.applied[goes_on] = -1.0  # its episode was to be over: it holds the brakes
         self.replaced = self.replaced + (decision.intervened.T & asked).T
         self.running = decision.after._replace(ended=np.where(each, decision.after.ended, before.ended))

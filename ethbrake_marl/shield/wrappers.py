@@ -1,4 +1,4 @@
-"""The shield as a wrapper of each interface: it puts a guard into the engine, and hands on what that tells."""
+"""The shield as a wrapper of each interface: it puts a guard into the engine, whose report then stands in the infos."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
-import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv, VectorWrapper
 from numpy.typing import NDArray
@@ -43,7 +42,7 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
     Mode ``step``, the default, certifies every action, or replaces it, of several learners together; ``robust`` does so
     in every member of an uncertainty. Mode ``episode`` is the paper's Algorithm 1: policy or E-V2X-BM drives a whole
     episode, whatever is proposed. Bounds hold where the other vehicles follow their scripts.
-    ``infos[agent]["shield"]`` says what was done. See docs/shield.md.
+    ``shield_reason`` and its like in ``infos[agent]`` say what was done. See docs/shield.md.
 
     Args:
         env: ``eb.parallel_env(...)`` with one learner (mode ``step``: or more), or what wraps it.
@@ -56,7 +55,7 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
     >>> env = eb.HybridShield(eb.parallel_env(scenario="paper-random"))
     >>> observations, infos = env.reset(seed=7)
     >>> infos = env.step({"vehicle_2": [1.0]})[4]
-    >>> infos["vehicle_2"]["shield"]["intervened"]
+    >>> infos["vehicle_2"]["shield_intervened"]
     True
 
     """
@@ -89,21 +88,17 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observations], dict[str, dict[str, Any]]]:
-        """Start an episode; the bound stands in ``infos[agent]["shield"]`` already."""
+        """Start an episode; the bound stands in ``infos[agent]["shield_bound_harm"]`` already."""
         self.attached.check_open()
-        observations, infos = super().reset(seed=seed, options=options)
-        for agent, told in zip(self.shielded, self.attached.infos(), strict=True):
-            infos[agent]["shield"] = told
-        return observations, infos
+        begun: tuple[dict[str, Observations], dict[str, dict[str, Any]]] = super().reset(seed=seed, options=options)
+        return begun
 
     def step(self, actions: Mapping[str, Any]) -> Told:
         """Advance by one step with the shielded agents' actions certified or replaced; they may also be left out."""
         self.attached.check_open()
         found: Told = super().step(actions)
-        for agent, told in zip(self.shielded, self.attached.infos(), strict=True):
-            found[4][agent]["shield"] = told
-            if told["intervened"]:
-                found[1][agent] -= self.attached.options.intervention_penalty
+        for agent, penalty in zip(self.shielded, self.attached.penalty()[0].tolist(), strict=True):
+            found[1][agent] -= penalty
         return found
 
 
@@ -120,16 +115,16 @@ class ShieldedEnv(
 ):
     """``EthBrake-v0`` behind a shield, by default in mode ``step``: each action is certified, or replaced.
 
-    The ``options`` are those of ``ShieldOptions``. ``info["shield"]`` says what was done. ``policy`` (in mode ``step``
-    and ``robust`` it may be None) is rolled out at each alert: where it harms no more than the coupled optimum, its
-    harm is the bound.
+    The ``options`` are those of ``ShieldOptions``. ``shield_reason`` and its like in the info say what was done.
+    ``policy`` (in mode ``step`` and ``robust`` it may be None) is rolled out at each alert: where it harms no more than
+    the coupled optimum, its harm is the bound.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.ShieldedEnv(eb.EthBrakeEnv("paper-random"))
     >>> observation, info = env.reset(seed=7)
     >>> info = env.step([1.0])[4]
-    >>> info["shield"]["intervened"], info["shield"]["reason"]
-    (True, 'no certificate')
+    >>> info["shield_intervened"], eb.ShieldReason(info["shield_reason"]).name
+    (True, 'NO_CERTIFICATE')
 
     """
 
@@ -146,19 +141,15 @@ class ShieldedEnv(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode; the bound stands in ``info["shield"]`` already."""
+        """Start an episode; the bound stands in ``info["shield_bound_harm"]`` already."""
         self.attached.check_open()
-        observation, info = self.env.reset(seed=seed, options=options)
-        info["shield"] = self.attached.infos()[0]
-        return observation, info
+        return self.env.reset(seed=seed, options=options)
 
-    def step(self, action: NDArray[Any]) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
-        """Advance by one time step with the action certified or replaced."""
+    def step(self, action: NDArray[Any]) -> Any:
+        """Advance by one time step with the action certified or replaced; around ``CostEnv`` with a cost, as there."""
         self.attached.check_open()
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        told = info["shield"] = self.attached.infos()[0]
-        paid = float(reward) - self.attached.options.intervention_penalty * float(told["intervened"])
-        return observation, paid, terminated, truncated, info
+        observation, reward, *others = self.env.step(action)
+        return observation, float(reward) - self.attached.penalty().item(), *others
 
 
 class ShieldedVectorEnv(_Closing, VectorWrapper):
@@ -166,16 +157,16 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
 
     The ``options`` are those of ``ShieldOptions``.
 
-    ``infos["shield"]`` tells the step that was made, also of rows whose episode ended with it: one array per key,
-    marked by ``infos["_shield"]`` (rows that the autoreset mode spends on a reset are not). Raises ``InvalidInput`` for
-    another environment.
+    ``infos["shield_bound_harm"]`` and its like belong to the same moment as the other infos: in a row that has begun
+    anew they tell of the alert, and ``infos["final_info"]`` of the last step. Raises ``InvalidInput`` for another
+    environment.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
     >>> env = eb.ShieldedVectorEnv(eb.EthBrakeVectorEnv(num_envs=4, scenario="paper-random"))
     >>> observations, infos = env.reset(seed=7)
     >>> infos = env.step(np.full((4, 1), 1.0))[4]
-    >>> infos["shield"]["intervened"]
+    >>> infos["shield_intervened"]
     array([ True,  True,  True,  True])
 
     """
@@ -190,24 +181,15 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode in every row; the bounds stand in ``infos["shield"]`` already."""
+        """Start an episode in every row; the bounds stand in ``infos["shield_bound_harm"]`` already."""
         self.attached.check_open()
-        observations, infos = self.env.reset(seed=seed, options=options)
-        if not isinstance(infos, dict):
-            raise InvalidInput("ShieldedVectorEnv: a wrapper inside makes a list of infos; put it around the shield")
-        return observations, infos | self._told(np.ones(self.num_envs, np.bool_))
+        return self.env.reset(seed=seed, options=options)
 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
         """Advance every world by one time step with the actions [rows, 1] certified or replaced."""
         self.attached.check_open()
-        running = ~self.attached.engine.ended
         observation, reward, terminated, truncated, infos = self.env.step(actions)
-        told = self._told(running)
-        penalty = self.attached.options.intervention_penalty * (told["shield"]["intervened"] & running)
-        return observation, reward - penalty, terminated, truncated, infos | told
-
-    def _told(self, rows: Bools) -> dict[str, Any]:
-        return {"shield": {name: column[:, 0].copy() for name, column in self.attached.tell().items()}, "_shield": rows}
+        return observation, reward - self.attached.penalty()[:, 0], terminated, truncated, infos
 
 
 def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, **options: Any) -> Any:
@@ -228,7 +210,7 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
     >>> import ethbrake_marl as eb
     >>> env = eb.shield(eb.parallel_env(scenario="paper-random"))
     >>> observations, infos = env.reset(seed=7)
-    >>> env.step({"vehicle_2": [1.0]})[4]["vehicle_2"]["shield"]["intervened"]
+    >>> env.step({"vehicle_2": [1.0]})[4]["vehicle_2"]["shield_intervened"]
     True
 
     """

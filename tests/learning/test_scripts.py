@@ -92,6 +92,29 @@ def test_line_env__keeps_torchrls_contract_and_shows_the_native_worlds() -> None
     assert ended > 0
 
 
+@pytest.mark.usefixtures("mappo")
+def test_line_env__behind_a_shield_keeps_the_bound_of_every_alert() -> None:
+    from torchrl.envs.utils import check_env_specs
+
+    from ethbrake_marl.learning.benchmarl import LineEnv, LineTask
+
+    check_env_specs(LineEnv(PAIR, 4, 0, RECIPE.reward, shield="step"))
+    config = {"scenario": PAIR, "reward": "harm", "horizon_is_end": True}
+    harm = {}
+    for shield in (None, "step"):
+        env = LineTask("pair", {**config, "shield": shield}).get_env_fun(64, True, 5, "cpu")()
+        seen = env.reset()
+        bound = env.engine.guarded.shield.first_bound.copy() if shield else np.inf
+        returned = torch.zeros(64)
+        for _ in range(90):
+            seen["learners", "action"] = torch.ones((64, 2, 1))
+            seen = env.step(seen)["next"]
+            returned += seen["learners", "reward"][:, 0, 0]
+        harm[shield] = -returned.numpy()
+        assert env.engine.ended.all() and (harm[shield] <= bound + 1e-3).all()
+    assert harm["step"].mean() < 0.5 * harm[None].mean()
+
+
 @pytest.mark.parametrize("algorithm", ["mappo", "ippo"])
 def test_mappo__leaves_a_policy_that_acts_as_benchmarls_own_does(
     algorithm: str, mappo: ModuleType, tmp_path: Path

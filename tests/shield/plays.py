@@ -311,6 +311,11 @@ PLAYS: dict[str, Callable[[int], Play]] = {
 }  # fmt: skip
 
 
+def reported(info: dict[str, Any]) -> dict[str, Any]:
+    """What an info says of the shield, by name without ``shield_``; of a vector environment each a column."""
+    return {name.removeprefix("shield_"): told for name, told in info.items() if name.startswith("shield_")}
+
+
 # ---------------------------------------------------------------- played, disturbed, wrapped
 
 

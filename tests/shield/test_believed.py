@@ -12,6 +12,7 @@ from ethbrake_marl.shield import HybridShield, ShieldedEnv, ShieldedVectorEnv, s
 from ethbrake_marl.shield.enclosure import Boxes
 from ethbrake_marl.shield.step_shield import BelievedShield
 from tests.shield.attacks import ABOVE, HEARD_LATE, INSIDE, LISTS, NEVER_HEARD, WAYS, all_infos, shielded
+from tests.shield.plays import reported
 
 BASE = eb.load_scenario("cooperation-2-paper").replace(early_impacts="keep")
 PERIODIC = BASE.replace(v2x={"preset": "blocked", "persistence": "periodic"})
@@ -130,7 +131,7 @@ def test_believed__bounds_nothing_where_its_vehicle_had_an_impact_before_the_fir
 def told_in(env: Any, world: int = 3, action: float = 0.0) -> list[dict[str, Any]]:
     """All that a parallel shield told of an episode in which one action is proposed, in that world of list 7."""
     infos = all_infos(env, {"vehicle_2": [action]}, options={"listed_world": {"seed": 7, "number": world}})
-    return [each["vehicle_2"]["shield"] for each in infos]
+    return [reported(each["vehicle_2"]) for each in infos]
 
 
 @pytest.mark.parametrize("mode", ["step", "robust"])
@@ -146,7 +147,8 @@ def test_parallel__does_what_the_agent_of_evaluations_does(scenario: eb.Scenario
         assert sum(each["intervened"] for each in told) == shield.interventions[0]
         assert told[1]["bound_harm"] <= shield.predicted_harm[0]
         assert all(
-            (each["mode"], each["trusted"], "members" in each) == (mode, *2 * [mode == "robust"]) for each in told
+            (each["mode"], each["trusted"], "members" in each) == (eb.ShieldMode[mode.upper()], *2 * [mode == "robust"])
+            for each in told
         )
 
 
@@ -162,13 +164,13 @@ def test_every_interface__decides_alike_and_says_that_the_bound_is_of_the_belief
     for wanted in told:
         *_, info = single.step(np.array([0.5], np.float32))
         *_, infos = vector.step(np.array([[0.5]], np.float32))
-        assert info["shield"] == {key: column[0] for key, column in infos["shield"].items()} == wanted
+        assert reported(info) == {key: column[0] for key, column in reported(infos).items()} == wanted
     decided = []
     for agent in aec.agent_iter():
         ended = aec.terminations[agent] or aec.truncations[agent]
-        decided += [aec.infos[agent]["shield"]["chosen_action"]] if agent == "vehicle_2" else []
+        decided += [aec.infos[agent]["shield_applied_action"]] if agent == "vehicle_2" else []
         aec.step(np.array([0.5], np.float32) if agent == "vehicle_2" and not ended else None)
-    assert decided[1:] == [each["chosen_action"] for each in told]
+    assert decided[1:] == [each["applied_action"] for each in told]
 
 
 @pytest.mark.parametrize(
@@ -187,7 +189,7 @@ def test_batch__rows_that_begin_again_are_those_of_a_fresh_episode(make: Any) ->
     for _ in range(120):
         fresh, idle = engine.steps == 0, engine.ended.copy()
         env.step(rng.uniform(-1.0, 1.0, (2, 1)).astype(np.float32))
-        told = env.attached.tell()["bound_harm"][:, 0]
+        told = env.attached.guard.tell(engine.ruling.memory, engine.ruling)["bound_harm"]
         bounds = np.where(fresh, told, bounds)
         assert (told <= bounds + ABOVE)[~idle].all()
         begun += int(fresh.sum())

@@ -25,6 +25,7 @@ from ethbrake_marl.shield import (
 )
 from tests.fixtures.asked import Acts, Asked
 from tests.shield.attacks import above_later
+from tests.shield.plays import reported
 
 PAPER = eb.load_scenario("paper-random")
 WORLDS = PAPER.sample(300, 3).worlds
@@ -110,11 +111,11 @@ def test_last_step__is_compared_too_whatever_starts_the_next_episode(interface, 
 def test_ledger__harm_that_nobody_predicted_is_seen_before_the_next_decision(group):
     env = shielded()
     *_, info = env.step(DRIVE)
-    assert info["shield"]["trusted"]
+    assert info["shield_trusted"]
     engine = env.attached.engine
     engine._state[0, engine.packed.column.harm + 2 * group] += 1e-12
     *_, info = env.step(DRIVE)
-    assert not info["shield"]["trusted"] and info["shield"]["reason"] == "assumption broken"
+    assert not info["shield_trusted"] and info["shield_reason"] == eb.ShieldReason.ASSUMPTION_BROKEN
 
 
 def test_autoreset__of_gymnasium_inside_is_left_alone():
@@ -125,7 +126,7 @@ def test_autoreset__of_gymnasium_inside_is_left_alone():
         while not over:
             *_, terminated, truncated, info = env.step(DRIVE)
             over = terminated or truncated
-        assert info["shield"]["trusted"]
+        assert info["shield_trusted"]
         env.step(DRIVE)  # begins the next episode
         assert env.attached.shield.running.steps.tolist() == [0]
 
@@ -138,8 +139,8 @@ def test_clone__between_proposal_and_step_goes_on_apart(clone):
     env.step_async(np.ones((4, 1), np.float32))
     other = clone(env)
     assert other.attached.engine is other.venv.engine and other.attached.engine is not env.attached.engine
-    told, again = ([row["shield"] for row in each.step_wait()[3]] for each in (env, other))
-    assert told == again
+    told, again = ([reported(row) for row in each.step_wait()[3]] for each in (env, other))
+    assert told == again and "bound_harm" in told[0]
     assert env.attached.shield.running.steps.tolist() == other.attached.shield.running.steps.tolist()
 
 
@@ -148,7 +149,7 @@ def test_reset__in_between_brings_the_proposal_to_another_episode_and_its_bound_
     env.reset()
     env.step_async(np.ones((2, 1), np.float32))
     env.venv.reset()
-    assert all(row["shield"]["trusted"] for row in env.step_wait()[3])
+    assert all(row["shield_trusted"] for row in env.step_wait()[3])
     assert env.attached.shield.running.steps.tolist() == env.attached.engine.steps.tolist() == [1, 1]
 
 
@@ -160,7 +161,7 @@ def test_threads__no_episode_gets_above_its_bound():
     def work():
         for _ in range(60):
             with contextlib.suppress(UncertifiedStep):
-                trusted.append(env.step(np.ones((4, 1)))[4]["shield"]["trusted"].all())
+                trusted.append(env.step(np.ones((4, 1)))[4]["shield_trusted"].all())
 
     with ThreadPoolExecutor(3) as pool:
         for done in [pool.submit(work) for _ in range(3)]:
@@ -196,7 +197,7 @@ def test_horizon__what_still_moves_then_is_told_and_warned_of_once():
         env.reset(seed=0)
         env.reset(seed=1)
     assert len(told) == 1
-    assert [each.step(DRIVE)[-1]["shield"]["settles"] for each in (env, shielded())] == [False, True]
+    assert [each.step(DRIVE)[-1]["shield_settles"] for each in (env, shielded())] == [False, True]
 
 
 def test_horizon__beyond_it_the_bound_says_nothing():
@@ -242,9 +243,9 @@ def test_episode__applies_the_certified_strategy_whatever_is_proposed():
         shielded.reset(seed=seed)
         while shielded.agents:
             _, _, _, _, infos = shielded.step({"vehicle_2": np.array([1.0])})
-            told = infos["vehicle_2"]["shield"]
-            assert told["proposed_action"] == 1.0 and told["chosen_action"] <= 0.0
-            assert infos["vehicle_2"]["chosen_action"] == pytest.approx(told["chosen_action"], abs=1e-12)
+            told = reported(infos["vehicle_2"])
+            assert told["proposed_action"] == 1.0 and told["applied_action"] <= 0.0
+            assert infos["vehicle_2"]["chosen_action"] == pytest.approx(told["applied_action"], abs=1e-12)
         realised = shielded.unwrapped.engine.ledger.world_harm("first")[0]
         assert realised == pytest.approx(min(told["policy_harm"], told["bound_harm"]), abs=1e-9)
 

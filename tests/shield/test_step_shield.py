@@ -16,9 +16,9 @@ from ethbrake_marl.shield import (
     parse_uncertainty,
 )
 from ethbrake_marl.shield.step_shield import (
-    REASONS,
     Backup,
     Proposer,
+    ShieldReason,
     begin_running,
     certify,
     certify_rollouts,
@@ -27,6 +27,7 @@ from ethbrake_marl.shield.step_shield import (
 )
 from tests.fixtures.asked import Acts
 from tests.shield.attacks import ADVERSARIES, LEAKS, TEAM_ADVERSARIES, TEAMS, all_infos, attack, begun, line, search
+from tests.shield.plays import reported
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::RuntimeWarning",  # uncompiled, a division by 0 warns
@@ -75,7 +76,7 @@ def braking(action=-1.0, *vehicles):
 
 
 def reason(decision):
-    return REASONS[decision.reason[0]]
+    return ShieldReason(decision.reason[0]).text
 
 
 @pytest.mark.parametrize(
@@ -215,7 +216,7 @@ def test_surprise__is_flagged_and_falls_back_for_the_rest_of_that_episode_alone(
     for _ in range(3):
         decision = shield.decide(np.ones(4), seen=seen)
         assert shield.distrusted.tolist() == [False, True, False, False]
-        assert REASONS[decision.reason[1]] == "assumption broken" and decision.intervened[1]
+        assert ShieldReason(decision.reason[1]).text == "assumption broken" and decision.intervened[1]
         assert decision.applied[1] <= 0.0 and np.isfinite([decision.applied, shield.bound]).all()
         seen = shield.running.states[:, :seen_columns].copy()
     shield.begin(SMALL.take([3]), np.array([1]))
@@ -338,10 +339,10 @@ def driven(policy, **settings):
 @pytest.mark.parametrize("policy", [eb.LearnedAgent(Weights()), Remembering()], ids=["divisible", "remembering"])
 def test_rollout__once_accepted_is_what_the_policy_then_does_and_the_bound_is_exact(policy):
     guarded, harm, reasons, _ = driven(policy)
-    accepted = reasons == REASONS.index("policy rollout")
+    accepted = reasons == ShieldReason.POLICY_ROLLOUT
     assert accepted.sum() > 3
     later = np.cumsum(accepted, axis=0) - accepted > 0  # after the first accepted rollout of that world
-    assert np.isin(reasons[later], [-1, REASONS.index("same as plan"), REASONS.index("ended")]).all()
+    assert np.isin(reasons[later], [-1, ShieldReason.SAME_AS_PLAN, ShieldReason.ENDED]).all()
     assert harm.tolist() == guarded.shield.bound.tolist()
     assert (harm <= guarded.shield.predicted_harm).all() and not guarded.shield.distrusted.any()
 
@@ -350,7 +351,7 @@ def test_rollout__once_accepted_is_what_the_policy_then_does_and_the_bound_is_ex
 def test_rollout__leaves_the_past_in_the_plan_what_was_applied(distrusted):
     told = parse_uncertainty("braking_capacity_mps2=20%").draw(ROLLED, np.random.default_rng(0)) if distrusted else None
     guarded, _, reasons, applied = driven(eb.LearnedAgent(Weights()), logging=True, told=told)
-    shield, running = guarded.shield, ~np.isin(reasons, [-1, REASONS.index("ended")])
+    shield, running = guarded.shield, ~np.isin(reasons, [-1, ShieldReason.ENDED])
     assert (shield.distrusted == distrusted).all()
     assert (shield.backup.plan.T[: len(applied)] == applied)[running].all() and running[0].all()
     for entry in shield.log:
@@ -359,19 +360,19 @@ def test_rollout__leaves_the_past_in_the_plan_what_was_applied(distrusted):
 
 def test_rollout__leaves_the_policys_memory_alone():
     guarded, _, reasons, _ = driven(Remembering())
-    assert (reasons == REASONS.index("no certificate")).any()
+    assert (reasons == ShieldReason.NO_CERTIFICATE).any()
     assert set(guarded.policies[1]["asked"]) == {float(len(reasons))}
 
 
 def test_rollout__a_policy_that_does_otherwise_when_it_is_tried_out_gets_no_further_than_the_bound():
     guarded, harm, reasons, _ = driven(two_faced)
-    assert (reasons == REASONS.index("policy rollout")).any()
+    assert (reasons == ShieldReason.POLICY_ROLLOUT).any()
     assert harm.tolist() == guarded.shield.bound.tolist() and (harm <= guarded.shield.predicted_harm).all()
 
 
 def test_later_rollouts__may_be_switched_off():
     _, _, reasons, _ = driven(eb.LearnedAgent(Weights()), later_rollouts=False)
-    assert not (reasons == REASONS.index("policy rollout")).any()
+    assert not (reasons == ShieldReason.POLICY_ROLLOUT).any()
 
 
 def test_rollout__also_of_a_refined_policy_that_cannot_be_divided():
@@ -401,7 +402,7 @@ def start_pair(worlds, plan):
 
 
 def told(decision):
-    return [REASONS[each] for each in decision.reason[0]]
+    return [ShieldReason(each).text for each in decision.reason[0]]
 
 
 def test_by_hand__proposals_that_are_harmless_alone_and_collide_together_go_to_the_front_one():
@@ -472,7 +473,7 @@ def test_parallel__a_team_proposes_where_nobody_does_and_one_may_be_left_out():
         env = eb.HybridShield(eb.parallel_env("cooperation-3-pair"), policy, mode="step")
         env.reset(seed=1)
         *_, infos = env.step(given)
-        assert [infos[agent]["shield"]["proposed_action"] for agent in env.shielded] == proposed
+        assert [infos[agent]["shield_proposed_action"] for agent in env.shielded] == proposed
 
 
 @pytest.mark.parametrize("settings", [{"shares": True}, {"cap": "baseline"}, {"shares": True, "harm_count": "total"}])
@@ -485,9 +486,9 @@ def test_shares__at_the_end_are_what_the_ledger_says(scenario, settings):
         ledger, count = env.unwrapped.engine.ledger, settings.get("harm_count", "first")
         borne = ledger.vehicle_harm(count)[0]
         for agent in env.shielded:
-            first, *_, last = told = [each[agent]["shield"] for each in infos]
+            first, *_, last = told = [reported(each[agent]) for each in infos]
             bounds = [each["bound_harm"] for each in told]  # common to all, and never rising
-            assert bounds == [each[env.shielded[0]]["shield"]["bound_harm"] for each in infos]
+            assert bounds == [each[env.shielded[0]]["shield_bound_harm"] for each in infos]
             assert bounds == sorted(bounds, reverse=True) and bounds[-1] == ledger.world_harm(count)[0]
             assert all(each["proposed_action"] == 0.6 and each["trusted"] for each in told[1:])
             assert set(first) == set(last) and last["own_harm"] == borne[int(agent[-1]) - 1]

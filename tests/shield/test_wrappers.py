@@ -8,7 +8,8 @@ from pettingzoo.utils import BaseParallelWrapper
 from stable_baselines3.common.vec_env import VecMonitor
 
 import ethbrake_marl as eb
-from tests.shield.plays import INSIDE, PLAYS, WRAPPERS, disturbed, wrapped
+from tests.shield.plays import INSIDE, PLAYS, WRAPPERS, disturbed, reported, wrapped
+from tests.shield.test_infos import of_row
 from tests.shield.test_step_shield import speechless
 
 PAPER = eb.load_scenario("paper-random")
@@ -31,7 +32,7 @@ MODES = {
     "robust": {"mode": "robust", "uncertainty": "gaps_m=0.2", "harm_count": "total"},
 }
 KEYS = {
-    "mode", "proposed_action", "chosen_action", "intervened", "reason", "bound_harm", "margin", "trusted", "settles",
+    "mode", "proposed_action", "applied_action", "intervened", "reason", "bound_harm", "margin", "trusted", "settles",
 }  # fmt: skip
 
 
@@ -40,15 +41,15 @@ def reset(env, interface):
     if interface is eb.ShieldedVecEnv:
         env.seed(3)
         env.reset()
-        return env.attached.infos()
+        return rows_told(interface, env.reset_infos)
     return rows_told(interface, env.reset(seed=3)[1])
 
 
 def rows_told(interface, infos):
     """What the infos of an interface tell of each world."""
     if interface is eb.ShieldedVectorEnv:
-        return [{key: column[k] for key, column in infos["shield"].items()} for k in range(2)]
-    return [info["shield"] for info in (infos if interface is eb.ShieldedVecEnv else [infos.get("vehicle_2", infos)])]
+        return [{key: column[k] for key, column in reported(infos).items()} for k in range(2)]
+    return [reported(info) for info in (infos if interface is eb.ShieldedVecEnv else [infos.get("vehicle_2", infos)])]
 
 
 @pytest.mark.parametrize("interface", [*MAKERS, eb.shield])
@@ -69,11 +70,11 @@ def test_interfaces__have_every_mode_and_the_penalty_and_tell_the_bound_after_a_
         for _ in range(3):
             _, reward, *_, infos = env.step(DRIVE[interface])
             told = rows_told(interface, infos)
-            assert told == env.attached.infos() and (mode != "step" or set(told[0]) == KEYS)
+            assert mode != "step" or set(told[0]) == KEYS
             rewards.append(reward["vehicle_2"] if interface is eb.HybridShield else reward)
             intervened.append([bool(each["intervened"]) for each in told])
             for start, step in zip(starts, told, strict=True):
-                assert start.keys() == step.keys() and step["mode"] == mode.partition(":")[0]
+                assert start.keys() == step.keys() and step["mode"] == eb.ShieldMode[mode.partition(":")[0].upper()]
         assert all(each["bound_harm"] > 0.0 == each["proposed_action"] and not each["intervened"] for each in starts)
         paid.append(np.array(rewards).reshape(3, -1))
     assert np.any(intervened) and paid[0] - paid[1] == pytest.approx(7.0 * np.array(intervened), abs=1e-5)
@@ -84,10 +85,10 @@ def test_policy__proposes_where_nobody_does_and_is_replaced_where_it_says_no_num
     for policy in (eb.make_agent("constant:5"), speechless):
         env = eb.HybridShield(eb.parallel_env(), policy, mode="step")
         env.reset(seed=1)
-        told += [env.step({})[-1]["vehicle_2"]["shield"] for _ in range(8)]
+        told += [reported(env.step({})[-1]["vehicle_2"]) for _ in range(8)]
     assert told[0]["proposed_action"] == pytest.approx(-5.0 / 7.0)
     silent = [each for each in told if np.isnan(each["proposed_action"])]
-    assert silent and all(each["intervened"] and each["reason"] == "not a number" for each in silent)
+    assert silent and all(each["intervened"] and each["reason"] == eb.ShieldReason.NOT_A_NUMBER for each in silent)
 
 
 BATCHES = {
@@ -113,15 +114,13 @@ def test_batch__tells_of_every_row_the_episode_that_ended(name, mode):
         before = shield["bound_harm"].copy() if mode == "episode" else shield.first_bound.copy()
         found = env.step(rng.uniform(-1.0, 1.0, (8, 1)).astype(np.float32))
         over, infos = (found[2], found[3]) if name == "sb3" else (found[2] | found[3], found[4])
-        assert name == "sb3" or infos["_shield"].tolist() == running.tolist()
         for k in np.flatnonzero(over):
-            told = {key: column[k] for key, column in infos["shield"].items()} if name != "sb3" else infos[k]["shield"]
-            final = infos[k] if name == "sb3" else infos.get("final_info", infos)
-            harm = np.atleast_1d(final["first_impact_harm"])[0 if name == "sb3" else k]
+            final = infos[k] if name == "sb3" else of_row(infos.get("final_info", infos), k)
+            told, harm = reported(final), final["first_impact_harm"]
             assert told["own_harm"] == harm if mode == "step" else told["bound_harm"] == before[k]
             assert mode == "episode" or (told["trusted"] and told["bound_harm"] <= before[k])
         ended += int(over.sum())
-        intervened += int((env.attached.tell()["intervened"][:, 0] & running).sum())
+        intervened += int((env.attached.guard.intervened(env.attached.engine.ruling)[:, 0] & running).sum())
     assert ended > 8
     if mode == "step":  # over resets too, and episodes are told apart
         log = env.attached.shield.log
@@ -167,7 +166,7 @@ def test_shield__chooses_the_wrapper_of_the_interface(make, kind):
         assert isinstance(env, kind) and env.attached.options.mode == "step"
         action = np.ones((2, 1) if kind in (eb.ShieldedVectorEnv, eb.ShieldedVecEnv) else 1, np.float32)
         infos = env.step({"vehicle_2": action} if kind is eb.HybridShield else action)[-1]
-    told = (infos[0] if kind is eb.ShieldedVecEnv else infos.get("vehicle_2", infos))["shield"]
+    told = reported(infos[0] if kind is eb.ShieldedVecEnv else infos.get("vehicle_2", infos))
     assert "own_harm" in told and np.all(told["proposed_action"] == 1.0)
 
 
