@@ -30,7 +30,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is miss
     ``horizon_is_end``: an episode that the horizon cuts off counts as terminated, as in a recipe.
     """
 
-    def __init__(self, scenario: Scenario, n: int, seed: int, reward: Reward, horizon_is_end: bool = False) -> None:
+    def __init__(self, scenario: Scenario, n: int, seed: int, reward: Reward, horizon_is_end: bool = True) -> None:
         super().__init__(device="cpu", batch_size=torch.Size([n]))
         self.engine = make_engine(scenario, n, reward=reward, observation=observation_for(scenario), seed=seed)
         self.horizon_is_end = horizon_is_end
