@@ -29,7 +29,7 @@ from ethbrake_marl.errors import InvalidInput, check_whole_number, renumbered
 from ethbrake_marl.harm import check_harm_count
 from ethbrake_marl.physics import CLOCK, Bools, Decisions, Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search import MOST_PHASES, TIME_STEP_S, ProfileProblem, Profiles, profile_problem
+from ethbrake_marl.search import TIME_STEP_S, ProfileProblem, Profiles, profile_problem
 
 MOST_CANDIDATES = 1_000_000  # per world and decision
 
@@ -201,9 +201,10 @@ class BestHarm:
 
     ``recall`` gives the kept profiles. A world without one is searched at the alert with ``budget`` candidates, and
     then around the better of what was found and the episode of ``universal`` with as many: where the ``scenario`` is
-    known, the harm is never above that policy's. Decisions fall every ``time_step_s`` from the vehicle's latency on. ``predicted_harm`` [n] is what the engine will
-    count (m2/s2), to the same bits, if the engine's time step is that. Raises ``InvalidInput`` for a budget below 1 or
-    an unknown count and, when an episode begins, for another vehicle's script whose command is not fixed at the alert.
+    known, the harm is never above that policy's. Decisions fall every ``time_step_s`` from the vehicle's latency on.
+    ``predicted_harm`` [n] is what the engine will count (m2/s2), to the same bits, if the engine's time step is that.
+    Raises ``InvalidInput`` for a budget below 1 or an unknown count and, when an episode begins, for another vehicle's
+    script whose command is not fixed at the alert.
     """
 
     name = "best_harm"

@@ -1820,8 +1820,8 @@ class SummaryTable(list[SummaryRow]):
         row = next(row for row in self if not row.collisions)
         most = 100 * row.collision_rate.ends[1]
         return (
-            f"No impact in {count_of(row.episodes, 'world')}: {unhurt}. With 95 % confidence at most {most:.2g} % of all"
-            " such worlds have one; how much harm these would do is not known."
+            f"No impact in {count_of(row.episodes, 'world')}: {unhurt}. With 95 % confidence at most {most:.2g} % of"
+            " all such worlds have one; how much harm these would do is not known."
         )
 
     def identity_line(self) -> str:

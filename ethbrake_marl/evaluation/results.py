@@ -323,14 +323,13 @@ class Comparison:
     @property
     def exploits_line(self) -> str:
         """Who exploits in which result what harm does not count, as a sentence; empty where nobody does."""
-        sides = ("in the first", "in the second")
-        return Exploits.sentence(
-            {
-                f"{each.agent} {side}": found
-                for each in self.differences
-                for side, found in zip(sides, each.exploits, strict=True)
-            }
-        )
+        found = {}
+        for each in self.differences:
+            first, second = each.exploits
+            same = {each.agent: first}
+            apart = {f"{each.agent} in the first": first, f"{each.agent} in the second": second}
+            found |= same if first == second else apart
+        return Exploits.sentence(found)
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON."""

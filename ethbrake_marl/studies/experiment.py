@@ -24,11 +24,11 @@ from ethbrake_marl.evaluation import (
     SummaryRow,
     SummaryTable,
     evaluate,
+    is_papers_test,
     make_agents,
     other_tests,
     record_episode,
     results_to_json,
-    is_papers_test,
     summarise,
     write_per_world,
 )

@@ -90,6 +90,17 @@ def test_standards__full_braking_passes_as_published_and_is_struck_by_every_foll
     assert refused.status == 2 and "--by: standards is a group of 10 scenarios; give one of them" in refused.err
 
 
+def test_evaluate__prints_the_papers_rows_where_they_are_asked_for_and_fit(ethbrake: Command) -> None:
+    words = ("evaluate", "--agents", "full_brake", "--episodes", "5")
+    assert "paper, random test" not in ethbrake(*words).out and "paper, random test" in ethbrake(*words, "--paper").out
+    for other in (("--scenario", "stress-wide"), ("--set", "mass_t=5"), ("--vehicle", "vehicle_3")):
+        check_refused(
+            ethbrake(*words, *other, "--paper"), "paper: the paper's rows are about Vehicle 2", "leave paper out"
+        )
+    check_refused(ethbrake(*words, "--shards", "1", "--paper"), "--paper: --shards prints no rows of the paper")
+    check_refused(ethbrake(*words, "--scenario", "standards", "--paper"), "--paper: standards is a group")
+
+
 def test_evaluate__a_damaged_bundle_is_refused_by_file_whatever_is_around_it(ethbrake, tmp_path) -> None:
     shutil.copytree(shipped_policies()["ppo"] / "policy", tmp_path / "policy")
     weights = tmp_path / "policy" / "weights.safetensors"

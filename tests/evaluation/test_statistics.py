@@ -103,7 +103,7 @@ def test_mean__of_rare_harm_does_not_reach_below_zero(parts: int) -> None:
 
 
 def test_mean__of_nothing_but_zeros_has_no_interval() -> None:
-    """Where 0.045 % of the worlds collide, 2,000 worlds without a collision are usual, and say nothing of their harm."""
+    """Where 0.045 % of the worlds collide, 2,000 without a collision are usual, and say nothing of the harm."""
     nothing = Moments.of(np.zeros(2_000))
     assert nothing.estimate == mean(np.zeros(2_000)) == Estimate(0.0, None)
     assert nothing.minus(nothing, 0).estimate == Estimate(0.0, (0.0, 0.0))  # twice the same: that is certain
