@@ -323,7 +323,7 @@ class Comparison:
     @property
     def exploits_line(self) -> str:
         """Who exploits in which result what harm does not count, as a sentence; empty where nobody does."""
-        found = {}
+        found: dict[str, Exploits] = {}
         for each in self.differences:
             first, second = each.exploits
             same = {each.agent: first}
