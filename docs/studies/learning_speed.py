@@ -77,7 +77,7 @@ def learn_by_its_own_loop(scenario: Scenario, seed: int, steps: int) -> Course:
         return summarise(evaluate(worlds, agents, scenario=scenario, aftermath=False))[0].first_impact_harm.value
 
     watch = Stopwatch()
-    environment = make_sb3_vec_env(scenario, N_ENVS, seed, reward="harm")
+    environment = make_sb3_vec_env(scenario, N_ENVS, seed, reward="harm", horizon_is_end=False)
     model = PPO("MlpPolicy", environment, n_steps=N_STEPS, seed=seed, device="cpu")
     for _ in range(PARTS):
         model.learn(steps // PARTS, reset_num_timesteps=False)

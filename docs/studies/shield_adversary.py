@@ -34,7 +34,9 @@ def train(N: int, steps: int) -> str:
             return observation, -reward, done, infos
 
     torch.set_num_threads(1)
-    env = PaidForHarm(ShieldedVecEnv(make_sb3_vec_env(line(N), WORLDS, seed=N, reward={"harm": 0.02})))
+    env = PaidForHarm(
+        ShieldedVecEnv(make_sb3_vec_env(line(N), WORLDS, seed=N, reward={"harm": 0.02}, horizon_is_end=False))
+    )
     model = PPO(
         "MlpPolicy", env, n_steps=64, batch_size=1024, n_epochs=4, learning_rate=1e-3, gamma=1.0, gae_lambda=0.95,
         policy_kwargs={"net_arch": list(HIDDEN)}, seed=N, device="cpu",

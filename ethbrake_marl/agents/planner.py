@@ -20,6 +20,7 @@ from ethbrake_marl.agents.registry import (
     check_agent,
     drive,
     fixed_commands,
+    make_agent,
     record_commands,
 )
 from ethbrake_marl.defaults import HarmCount
@@ -28,7 +29,7 @@ from ethbrake_marl.errors import InvalidInput, check_whole_number, renumbered
 from ethbrake_marl.harm import check_harm_count
 from ethbrake_marl.physics import CLOCK, Bools, Decisions, Floats, Ints, Worlds
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search import MOST_PHASES, TIME_STEP_S, ProfileProblem, Profiles, profile_problem
+from ethbrake_marl.search import TIME_STEP_S, ProfileProblem, Profiles, profile_problem
 
 MOST_CANDIDATES = 1_000_000  # per world and decision
 
@@ -189,6 +190,7 @@ def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
 # An agent that drives the best profile known: one kept beforehand where there is one, else searched at the alert.
 
 PROFILE_BUDGET = 20_000  # candidates in a world of which nothing is known
+START = "universal@shipped"  # whose episode a search also starts from
 
 Recall = Callable[[ProfileProblem, HarmCount], tuple[Profiles, Bools]]
 """Kept profiles [n] of a problem, and where there is one [n]; the others are ignored."""
@@ -197,10 +199,12 @@ Recall = Callable[[ProfileProblem, HarmCount], tuple[Profiles, Bools]]
 class BestHarm:
     """Drives the profile of least harm known, while the others follow their scripts (without one: brake fully).
 
-    ``recall`` gives the kept profiles; a world without one is searched at the alert with ``budget`` candidates.
-    Decisions fall every ``time_step_s`` from the vehicle's latency on. ``predicted_harm`` [n] is what the engine will
-    count (m2/s2), to the same bits, if the engine's time step is that. Raises ``InvalidInput`` for a budget below 1 or
-    an unknown count and, when an episode begins, for another vehicle's script whose command is not fixed at the alert.
+    ``recall`` gives the kept profiles. A world without one is searched at the alert with ``budget`` candidates, and
+    then around the better of what was found and the episode of ``universal`` with as many: where the ``scenario`` is
+    known, the harm is never above that policy's. Decisions fall every ``time_step_s`` from the vehicle's latency on.
+    ``predicted_harm`` [n] is what the engine will count (m2/s2), to the same bits, if the engine's time step is that.
+    Raises ``InvalidInput`` for a budget below 1 or an unknown count and, when an episode begins, for another vehicle's
+    script whose command is not fixed at the alert.
     """
 
     name = "best_harm"
@@ -210,6 +214,7 @@ class BestHarm:
         self,
         recall: Recall,
         *,
+        scenario: Scenario | None = None,
         harm_count: HarmCount = "first",
         horizon_s: float = 8.0,
         budget: int = PROFILE_BUDGET,
@@ -218,7 +223,7 @@ class BestHarm:
         if not budget >= 1:
             raise InvalidInput(f"best_harm: budget = {budget}; at least 1 candidate is needed")
         check_harm_count(harm_count)
-        self._recall, self._budget = recall, budget
+        self._recall, self._budget, self._scenario = recall, budget, scenario
         self._outlook = _Outlook(harm_count, horizon_s, time_step_s)
 
     @classmethod
@@ -231,7 +236,8 @@ class BestHarm:
                 f" {PROFILE_BUDGET}, at most {MOST_CANDIDATES:,}"
             )
         return cls(
-            recall, harm_count=settings.harm_count, horizon_s=settings.horizon_s, time_step_s=settings.time_step_s,
+            recall, scenario=settings.scenario, harm_count=settings.harm_count, horizon_s=settings.horizon_s,
+            time_step_s=settings.time_step_s,
             budget=budget[0] if settings.most_candidates is None else min(budget[0], settings.most_candidates),
         )  # fmt: skip
 
@@ -240,34 +246,46 @@ class BestHarm:
         others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
         problem, outlook = self._outlook.problem(alert, vehicle, others), self._outlook
         profiles, known = self._recall(problem, outlook.harm_count)
+        first, total = problem.follow(profiles)
+        harm, commands = (first if outlook.harm_count == "first" else total), self._stepwise(profiles)
         unknown = np.flatnonzero(~known)
         if unknown.size:
-            found = self._search(alert.take(unknown), vehicle, others[unknown], unknown)
-            profiles, found = Profiles.padded([profiles, found], MOST_PHASES)
-            profiles.ends[unknown] = found.ends
-            profiles.commands_mps2[unknown] = found.commands_mps2
-        first, total = problem.follow(profiles)
-        steps = [profiles.at(np.full(alert.n, step))[:, 0] for step in range(outlook.decisions)]
+            with renumbered(unknown):
+                commands[unknown], harm[unknown] = self._search(alert.take(unknown), vehicle, others[unknown])
         return {
-            "predicted_harm": first if outlook.harm_count == "first" else total,
+            "predicted_harm": harm,
             "searched": ~known,
             "start_s": problem.clock[:, CLOCK.START].copy(),
-            "commands_mps2": np.stack(steps, axis=1),
+            "commands_mps2": commands,
         }
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
         """The command of the phase in force, [n] m/s2."""
         return self._outlook.command(worlds, memory), memory
 
-    def _search(self, worlds: Worlds, vehicle: int, others: Floats, rows: Ints) -> Profiles:
-        """The best profiles that are found in these worlds, which are the ``rows`` of a batch."""
+    def _search(self, worlds: Worlds, vehicle: int, others: Floats) -> tuple[Floats, Floats]:
+        """The best commands that are found in these worlds, [n, decisions] m/s2, and their harm [n] m2/s2."""
         problem, outlook = self._outlook.problem(worlds, vehicle, others), self._outlook
-        with renumbered(rows):
-            coupled = optimise_coupled(
-                worlds, vehicle, harm_count=outlook.harm_count, horizon_s=outlook.horizon_s, others_mps2=others
-            )
-            given = problem.constant(-coupled.deceleration_mps2[:, np.newaxis, np.newaxis])
-            return problem.search(given, budget=self._budget)[0]
+        coupled = optimise_coupled(
+            worlds, vehicle, harm_count=outlook.harm_count, horizon_s=outlook.horizon_s, others_mps2=others
+        )
+        given = problem.constant(-coupled.deceleration_mps2[:, np.newaxis, np.newaxis])
+        found, harms = problem.search(given, budget=self._budget)
+        best = self._stepwise(found)
+        if self._scenario is None:
+            return best, harms[outlook.harm_count]
+        policy, steps = make_agent(START, scenario=self._scenario), int(problem.last_step.max())
+        driven = record_commands(policy, worlds, self._scenario, vehicle, steps)
+        of_policy = problem.refine(driven, budget=1)[1]
+        better = (of_policy < harms[outlook.harm_count])[:, np.newaxis]
+        best[:, :steps], harm = problem.refine(np.where(better, driven, best[:, :steps]), budget=self._budget)
+        return best, harm
+
+    def _stepwise(self, profiles: Profiles) -> Floats:
+        """The commands of profiles decision by decision, [n, decisions] m/s2."""
+        n = len(profiles.ends)
+        steps = [profiles.at(np.full(n, step))[:, 0] for step in range(self._outlook.decisions)]
+        return np.stack(steps, axis=1)
 
 
 # The compiled refinement of a policy: a search around its own episode at the alert, which then drives.

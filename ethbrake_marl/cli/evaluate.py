@@ -145,6 +145,9 @@ def evaluate_command(
     rows: Annotated[
         bool, typer.Option("--rows", help="With --output: also one row per world and agent, as Parquet files in it.")
     ] = False,
+    paper: Annotated[
+        bool, typer.Option("--paper", help="Also print the rows of the paper's tables; on paper-random alone.")
+    ] = False,
 ) -> None:
     """Compare agents on the same fixed list of worlds.
 
@@ -160,18 +163,29 @@ def evaluate_command(
     _check_outputs(out, per_world, report)
     made = partial(_make_drivers, agents, harm_count=harm_count, uncertainty=uncertainty)
     if group := scenarios.group_of_scenarios(scenario):
-        other = whole | {"--objective": objective, "--measures": measures, "--shards": shards, "--output": output}
+        other = whole | {
+            "--paper": paper,
+            "--objective": objective,
+            "--measures": measures,
+            "--shards": shards,
+            "--output": output,
+        }
         _refuse(other, f"{scenario} is a group of {len(group)} scenarios; give one of them")
         _evaluate_group(out, [_asked_task(name, vehicle, settings).scenario for name in group], made, episodes, seed)
         return
     if host is not None:
-        _refuse({"--report": report, "--measures": measures}, "tells of the physics here; leave it out, or --host")
+        _refuse(
+            {"--report": report, "--measures": measures, "--paper": paper},
+            "tells of the physics here; leave it out, or --host",
+        )
         episodes = HOSTED if episodes is None and initial_states is None else episodes
     if measures is not None:
         evaluation.register_injury()
-    chosen = _asked_task(scenario, vehicle, settings).scenario
+    task = _asked_task(scenario, vehicle, settings)
+    chosen = task.scenario
     lineup, objectives = made(chosen), declared_objectives(objective or (), chosen.vehicles)
     if shards is not None:
+        _refuse({"--paper": paper}, "--shards prints no rows of the paper; leave one of the two out")
         number = DEFAULT.EPISODES if episodes is None else episodes
         seed = DEFAULT.LIST_SEED if seed is None else seed
         asked = evaluation.Question(chosen, tuple(lineup), number, seed, harm_count, uncertainty, tuple(objectives))
@@ -181,9 +195,11 @@ def evaluate_command(
     sample, drawn_by = evaluation.choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
     if by is not None:
         evaluation.Evaluation.check_group(sample.kinds, by)
+    if paper:
+        evaluation.check_papers_test(task, drawn_by)
     evaluation.check_agents(lineup, sample.worlds, chosen)
     found, beside, sheets = _drive(out, host, sample, lineup, chosen, drawn_by, harm_count)
-    summary, told = evaluation.summarise(found), found.rescore(objectives)
+    summary, told = evaluation.summarise(found, paper=paper), found.rescore(objectives)
     _write_report(out, report, found, summary, lineup, harm_count)
     groups = {} if by is None else evaluation.summarise_by(found, by)
     used = {"harm_count": harm_count, "uncertainty": uncertainty} | ({"host": found.host} if found.host else {})
@@ -437,11 +453,13 @@ def compare_command(out: Out, first: Annotated[Path, _FILE], second: Annotated[P
     """
     found = evaluation.compare_results(evaluation.read_result(first), evaluation.read_result(second))
     names = [_HARMS[name] for name in found.differences[0].harms]
-    rows = [[each.agent, _POLICIES[each.policy], *each.harms.values()] for each in found.differences]
+    rows = [[each.marked, _POLICIES[each.policy], *each.harms.values()] for each in found.differences]
     out.result(found.to_json(), Sheet("", ["Agent", Column("Policy", text=True), *map(Column, names)], rows))
     out.note("second minus first, mean per world in m²/s²; in brackets: 95 % intervals,")
     why = found.unpaired_because
     out.note("paired by world" if why is None else f"NOT paired, wider than they would be paired by world: {why}")
+    if found.exploits_line:
+        out.note(found.exploits_line)
     for which, agents in zip(("first", "second"), found.left_over, strict=True):
         if agents:
             out.note(f"in the {which} only: {', '.join(agents)}")

@@ -43,7 +43,7 @@ def make_sb3_vec_env(
     learners: Sequence[str | int] | None = None,
     reward: Reward = "harm",
     observation: Observation | None = None,
-    horizon_is_end: bool = False,
+    horizon_is_end: bool = True,
     appended: Appended | None = None,
     step_infos: bool = False,
     render_mode: str | None = None,
@@ -59,7 +59,7 @@ def make_sb3_vec_env(
         observation: what the learners observe; None: ``observation_for(scenario)``.
         horizon_is_end: infos report no truncation, so that an algorithm does not add the value it expects beyond the
             horizon. Harm is counted to the horizon: nothing lies beyond it, and what is imagined there can grow without
-            limit.
+            limit (docs/exploits.md). False: ``TimeLimit.truncated`` says which episodes the horizon cut off.
         appended: numbers of a row behind the vehicle's own observation. ``number``: the learner's place among the
             learners (0 = the foremost); ``state``: the full state of the line (``observations.state``), for a central
             critic.
@@ -113,7 +113,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         engine: Engine,
         seed: int,
         *,
-        horizon_is_end: bool = False,
+        horizon_is_end: bool = True,
         appended: Appended | None = None,
         step_infos: bool = False,
         render_mode: str | None = None,

@@ -520,6 +520,21 @@ PAPER_NOTE = (
 _SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the variant of which the note speaks
 
 
+def is_papers_test(task: Task, seed: int | None) -> bool:
+    """Whether the paper's rows are about this: Vehicle 2 in a list of its random test, as shipped."""
+    scenario = task.scenario
+    return scenario.name in _SHOWN_WITH and seed is not None and task.vehicles == (1,) and is_as_shipped(scenario)
+
+
+def check_papers_test(task: Task, seed: int | None) -> None:
+    """Raise ``InvalidInput`` where the paper's rows are about something else."""
+    if not is_papers_test(task, seed):
+        raise InvalidInput(
+            f"paper: the paper's rows are about Vehicle 2 in a list of {' or '.join(_SHOWN_WITH)} as shipped, and these"
+            f" are {'worlds' if seed is None else 'a list'} of {task.scenario.name!r}; leave paper out"
+        )
+
+
 # The conditions behind a result: what stands beside every table, figure and report.
 
 _SYMBOLS = {
@@ -703,6 +718,7 @@ class Between:
 
 BASELINE = "full_brake"
 FAR_M = 5.0  # Vehicle 1 counts as shoved far beyond this
+MOVING = 0.05  # share of worlds: more of them not at rest at the horizon, and harm after it may have been left out
 
 
 @dataclass(frozen=True, slots=True)
@@ -914,7 +930,7 @@ class AgentTally:
         """Plain data; whole numbers of any size are hexadecimal texts."""
         return {
             "counts": {name: list(pair) for name, pair in self.counts.items()},
-            "moments": {name: [m.count, hex(m.total), hex(m.squares)] for name, m in self.moments.items()},
+            "moments": {name: [m.count, hex(m.total), hex(m.squares), m.negative] for name, m in self.moments.items()},
             "products": {name: hex(value) for name, value in self.products.items()},
         }
 
@@ -926,8 +942,8 @@ class AgentTally:
             if _whole(so) > _whole(of):
                 raise ValueError(f"{so} of {of} worlds")
         moments = {
-            name: Moments(_whole(count), int(total, 16), int(squares, 16))
-            for name, (count, total, squares) in told["moments"].items()
+            name: Moments(_whole(count), int(total, 16), int(squares, 16), _whole(negative))
+            for name, (count, total, squares, negative) in told["moments"].items()
         }
         if not all(each.possible for each in moments.values()):
             raise ValueError("moments that no values have")
@@ -1384,8 +1400,52 @@ class Rescores(list[Rescored]):
         return Sheet(title, ["Agent", "Objective", *columns], lines)
 
 
+@dataclass(frozen=True, slots=True)
+class Exploits:
+    """What an agent does that harm does not count: it shoves Vehicle 1, or still moves at the horizon.
+
+    >>> from ethbrake_marl.evaluation.measures import Exploits
+    >>> found = Exploits(shoved_m=8.1, moving=0.504)
+    >>> found.names, found.text
+    (('shoves', 'moving'), 'shoves Vehicle 1 by 8.1 m on average, still moves at the horizon in 50.4 % of the worlds')
+    >>> Exploits(shoved_m=None, moving=0.0).names  # shoving is not measured
+    ()
+
+    """
+
+    shoved_m: float | None  # how far Vehicle 1 ends beyond where it would by itself, mean; None: not measured
+    moving: float  # share of the worlds in which the line is not at rest at the horizon
+
+    @classmethod
+    def of_json(cls, row: Mapping[str, Any]) -> Exploits:
+        """Those of a row of a results file."""
+        return cls(row.get("vehicle_1_shoved_m"), row["horizon_ends"] / row["episodes"])
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Which of the two are beyond what is usual: ``shoves`` (more than 5 m), ``moving`` (more than 5 %)."""
+        shoves = self.shoved_m is not None and self.shoved_m > FAR_M
+        return ("shoves",) * shoves + ("moving",) * (self.moving > MOVING)
+
+    @property
+    def text(self) -> str:
+        """The same in words; empty without any."""
+        words = {
+            "shoves": f"shoves Vehicle 1 by {self.shoved_m or 0.0:.1f} m on average",
+            "moving": f"still moves at the horizon in {100 * self.moving:.1f} % of the worlds",
+        }
+        return ", ".join(words[name] for name in self.names)
+
+    @staticmethod
+    def sentence(agents: Mapping[str, Exploits]) -> str:
+        """What stands below a table of these agents; empty where none of them does such a thing."""
+        each = "; ".join(f"{agent} {found.text}" for agent, found in agents.items() if found.names)
+        return f"{MARK} Harm does not count this: {each} (docs/exploits.md)." if each else ""
+
+
 # The table of an evaluation: a row per agent, for a terminal and for a document, and the sentences below it.
 
+MARK = "‡"  # behind the name of an agent that exploits what harm does not count
 SEES_THROUGH = "† "  # before what an agent knows that no channel brought
 _HEAD = {
     "Agent": "What drives the controlled vehicle; all other vehicles follow the scenario. full_brake is the paper's"
@@ -1436,7 +1496,7 @@ class SummaryRow:
     between: Between | None = None  # the worlds in which contact is proven and no impact
     warning: str = ""  # a table of best known harm holds some of the worlds, and not the others
     left_out: tuple[LeftOut, ...] = ()  # worlds of the list that no row counts: they could not be advanced
-    beside_paper: bool = False  # these are results of the test that the paper's rows are about
+    beside_paper: bool = False  # the paper's rows stand below
     knows: Knowledge = UNSTATED  # what the agent says it knows of the line
     hidden_share: float = 0.0  # worlds in which the channel hides something from a driven vehicle, whoever drives
     worlds_sha256: str = ""  # of the list; results on the same worlds have the same
@@ -1473,6 +1533,17 @@ class SummaryRow:
         """Whether the channel hides something here that this agent reads all the same."""
         return self.hidden_share > 0.0 and self.knows.sees_through
 
+    @property
+    def exploits(self) -> Exploits:
+        """What it does that harm does not count."""
+        shoved = self.estimates["vehicle_1_shoved_m"]
+        return Exploits(None if shoved is None else shoved.value, self.horizon_ends / self.episodes)
+
+    @property
+    def marked(self) -> str:
+        """Its agent, marked where it exploits what harm does not count."""
+        return f"{self.agent} {MARK}" if self.exploits.names else self.agent
+
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON; what does not exist is null, intervals are ``[low, high]``."""
         of_limits = {measure.name for measure in measures() if measure.limits}
@@ -1487,6 +1558,7 @@ class SummaryRow:
             "episodes": self.episodes,
             "collisions": self.collisions,
             "horizon_ends": self.horizon_ends,
+            "exploits": list(self.exploits.names),
             **Estimate.side_by_side({name: each for name, each in told.items() if name not in of_limits}),
             **({"policy_share": self.policy_share} if self.policy_share is not None else {}),
             **Estimate.side_by_side({name: each for name, each in told.items() if name in of_limits}),
@@ -1546,6 +1618,7 @@ class SummaryTable(list[SummaryRow]):
         *,
         exact: bool = False,
         baseline: str = BASELINE,
+        paper: bool = False,
         **shared: Any,
     ) -> SummaryTable:
         """One row per agent, from what was counted in the worlds of a list.
@@ -1558,11 +1631,15 @@ class SummaryTable(list[SummaryRow]):
             policies: by agent: vehicle's name -> SHA-256 of its policy.
             exact: tell rates with their exact intervals.
             baseline: what is compared with.
+            paper: show the paper's rows below.
             shared: what all rows say alike.
 
+        Raises ``InvalidInput`` for ``paper`` where its rows are about something else.
+
         """
-        worlds, scenario = conditions["count"], task.scenario
-        beside = scenario.name in _SHOWN_WITH and conditions["seed"] is not None and task.vehicles == (1,)
+        worlds = conditions["count"]
+        if paper:
+            check_papers_test(task, conditions["seed"])
         return cls(
             SummaryRow(
                 agent=agent,
@@ -1576,7 +1653,7 @@ class SummaryTable(list[SummaryRow]):
                 knows=knows[agent],
                 policy_sha256=policies[agent],
                 parameters=conditions,
-                beside_paper=beside and not conditions.get("no_limits_because") and is_as_shipped(scenario),
+                beside_paper=paper,
                 **shared,
             )
             for agent, tally in tallies.items()
@@ -1592,7 +1669,7 @@ class SummaryTable(list[SummaryRow]):
         """The table: agent, what it knows, and every measure that has a heading, those of registered ones last.
 
         A regret is marked as a lower bound where the best of some world is not known beforehand. Below it stand the
-        paper's rows, where they are about the same test.
+        paper's rows, if they were asked for.
         """
         columns = [each.column() for each in measures() if each.heading]
         columns += [Column(_heading(name), COLUMN + name) for name in (self[0].metrics if self else ())]
@@ -1602,7 +1679,7 @@ class SummaryTable(list[SummaryRow]):
             value, interval = Column("").show(row["mean_regret_first"])
             bound = row.known_best_share is not None and row.known_best_share < 1.0
             cells["mean_regret_first"] = Shown(f"≥ {value}" if bound else value, interval)
-            lines.append((row.agent, SEES_THROUGH * row.sees_through + row.knows.text, *cells.values()))
+            lines.append((row.marked, SEES_THROUGH * row.sees_through + row.knows.text, *cells.values()))
         for paper in PAPER_ROWS if self and self[0].beside_paper else ():
             printed = {
                 "collision_rate": f"{100 * paper.collision_rate:.4g} %",
@@ -1672,7 +1749,8 @@ class SummaryTable(list[SummaryRow]):
         """What must be told beside the table: ``quiet`` or ``note`` (it must not be overlooked), and the sentences.
 
         Which worlds no row counts, that a table of best known harm lacks some of these worlds, where the horizon cut a
-        motion off, the limits, who knows what, and the conditions of the paper's rows.
+        motion off, who exploits what harm does not count, who met no impact at all, the limits, who knows what, and the
+        conditions of the paper's rows.
         """
         if not self:
             return []
@@ -1688,6 +1766,8 @@ class SummaryTable(list[SummaryRow]):
             ("note", left_out if row.left_out else ""),
             ("note", f"WARNING: {row.warning}." if row.warning else ""),
             ("note", cut_off if moving else ""),
+            ("note", Exploits.sentence({each.agent: each.exploits for each in self})),
+            ("note", self._nothing_seen_line()),
             ("quiet", self.limit_line()),
             ("note", self._knowledge_line()),
             *([*paper, ("note", PAPER_NOTE)] if row.beside_paper else []),
@@ -1732,6 +1812,18 @@ class SummaryTable(list[SummaryRow]):
         ]
         return text + (f" Less harm than the best known before: {', '.join(below)}." if below else "")
 
+    def _nothing_seen_line(self) -> str:
+        """What may be said of agents that met no impact in any world, as a sentence; empty without one."""
+        unhurt = ", ".join(row.agent for row in self if not row.collisions)
+        if not unhurt:
+            return ""
+        row = next(row for row in self if not row.collisions)
+        most = 100 * row.collision_rate.ends[1]
+        return (
+            f"No impact in {count_of(row.episodes, 'world')}: {unhurt}. With 95 % confidence at most {most:.2g} % of"
+            " all such worlds have one; how much harm these would do is not known."
+        )
+
     def identity_line(self) -> str:
         """By which hashes this result is recognised, as a sentence; empty without rows."""
         if not self:
@@ -1759,8 +1851,15 @@ class SummaryTable(list[SummaryRow]):
         return text + (f" Not stated what it knows: {silent}." if silent else "")
 
 
-def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTable:
-    """One row per agent, in the order of the evaluation; compared with ``baseline`` where that was evaluated."""
+def summarise(evaluation: Evaluation, *, baseline: str = BASELINE, paper: bool = False) -> SummaryTable:
+    """One row per agent, in the order of the evaluation.
+
+    Args:
+        evaluation: of the agents.
+        baseline: agent to compare with, where it was evaluated.
+        paper: print the rows of the paper's tables below; ``InvalidInput`` where they are about another test.
+
+    """
     limits, regrets = evaluation.limits, evaluation.regrets
     return SummaryTable.of_tallies(
         evaluation.tally(baseline=baseline),
@@ -1769,6 +1868,7 @@ def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTab
         {name: outcome.knows for name, outcome in evaluation.outcomes.items()},
         {name: outcome.policies for name, outcome in evaluation.outcomes.items()},
         baseline=baseline,
+        paper=paper,
         between=None if regrets is None else regrets.between,
         warning=limits.warning if isinstance(limits, Limits) else "",
         left_out=evaluation.left_out,

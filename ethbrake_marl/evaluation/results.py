@@ -38,9 +38,11 @@ from ethbrake_marl.evaluation.inputs import (
     worlds_sha256,
 )
 from ethbrake_marl.evaluation.measures import (
+    MARK,
     REGISTERED,
     Conditions,
     Evaluation,
+    Exploits,
     Rescored,
     SummaryRow,
     SummaryTable,
@@ -134,7 +136,14 @@ SAME = {  # all but the hashes: where they are told
     "scenario_sha256": _HASHES["scenario_sha256"],
     "harm_count": "another harm",
 }
-_NEEDED = {"agent": str, "episodes": int, **dict.fromkeys(_HASHES, str), "policy_sha256": dict, "versions": dict}
+_NEEDED = {
+    "agent": str,
+    "episodes": int,
+    "horizon_ends": int,
+    **dict.fromkeys(_HASHES, str),
+    "policy_sha256": dict,
+    "versions": dict,
+}
 
 
 def results_to_json(
@@ -217,6 +226,11 @@ def read_result(path: Path) -> Result:
         who = f"{path}: {row['agent']}"
         if not 1 <= row["episodes"] <= _MOST_EPISODES or isinstance(row["episodes"], bool):
             raise InvalidInput(f"{who}: episodes = {row['episodes']!s:.40}: must be 1 to {_MOST_EPISODES:,}")
+        if not 0 <= row["horizon_ends"] <= row["episodes"]:
+            raise InvalidInput(f"{who}: horizon_ends = {row['horizon_ends']!s:.40}: must be 0 to {row['episodes']:,}")
+        shoved = row.get("vehicle_1_shoved_m")
+        if shoved is not None and not (type(shoved) in (int, float) and abs(shoved) <= _MOST_HARM):
+            raise InvalidInput(f"{who}: vehicle_1_shoved_m = {shoved!r:.40}: must be metres, or null")
         for harm in _COMPARED[row["kind"]]:
             if not _is_mean(row.get(harm), row.get(f"{harm}_interval"), row["episodes"]):
                 raise InvalidInput(f"{who}: {harm} is no mean with an interval [low, high] around it")
@@ -280,11 +294,18 @@ class Difference:
     agent: str
     policy: Literal["same", "other", "none"]  # whether both drove by the same one
     harms: Mapping[str, Estimate]  # by the name of the harm
+    exploits: tuple[Exploits, Exploits]  # in the first result and in the second: what harm does not count
+
+    @property
+    def marked(self) -> str:
+        """Its agent, marked where it exploits what harm does not count, in either result."""
+        return f"{self.agent} {MARK}" if any(each.names for each in self.exploits) else self.agent
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON."""
         harms = {f"{name}_difference": estimate for name, estimate in self.harms.items()}
-        return {"agent": self.agent, "policy": self.policy, **Estimate.side_by_side(harms)}
+        exploits = [list(each.names) for each in self.exploits]
+        return {"agent": self.agent, "policy": self.policy, **Estimate.side_by_side(harms), "exploits": exploits}
 
 
 @dataclass(frozen=True, slots=True)
@@ -298,6 +319,17 @@ class Comparison:
         str, tuple[str | None, str | None]
     ]  # of the agents of the first and of the second, likewise
     other_versions: Mapping[str, tuple[str | None, str | None]]  # of the first and of the second, where they differ
+
+    @property
+    def exploits_line(self) -> str:
+        """Who exploits in which result what harm does not count, as a sentence; empty where nobody does."""
+        found: dict[str, Exploits] = {}
+        for each in self.differences:
+            first, second = each.exploits
+            same = {each.agent: first}
+            apart = {f"{each.agent} in the first": first, f"{each.agent} in the second": second}
+            found |= same if first == second else apart
+        return Exploits.sentence(found)
 
     def to_json(self) -> dict[str, Any]:
         """Plain data for JSON."""
@@ -345,7 +377,8 @@ def compare_results(first: Result, second: Result) -> Comparison:
             harms = {name: paired_difference(after[:, k], before[:, k]) for k, name in enumerate(HARMS)}
         policies = one["policy_sha256"], other["policy_sha256"]
         same: Literal["same", "other"] = "same" if policies[0] == policies[1] else "other"
-        differences.append(Difference(agent, same if any(policies) else "none", harms))
+        exploits = Exploits.of_json(one), Exploits.of_json(other)
+        differences.append(Difference(agent, same if any(policies) else "none", harms, exploits))
     changed = []
     for key in ("agent_settings", "versions"):
         one, other = (each if isinstance(each := of.about.get(key), dict) else {} for of in (first, second))
@@ -482,7 +515,7 @@ class Question:
         ]
         because = next((each.because for each in found if isinstance(each, Unproven)), None)
         identity = {
-            "format": 2,
+            "format": 3,
             "scenario": scenario.name,
             "scenario_sha256": scenario_sha256(scenario),
             "seed": self.seed,

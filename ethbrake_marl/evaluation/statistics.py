@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -122,24 +122,26 @@ class Moments:
     count: int = 0
     total: int = 0  # multiple of 2^-1074
     squares: int = 0  # multiple of 2^-2148
+    negative: int = field(default=0, compare=False)  # number of values that are, or may be, below 0
 
     @classmethod
     def of(cls, values: Floats) -> Moments:
         """Those of ``values`` [n]; raises as ``exact_sum``."""
-        return cls(len(values), exact_sum(values), exact_sum(values, values))
+        return cls(len(values), exact_sum(values), exact_sum(values, values), int(np.count_nonzero(values < 0.0)))
 
     def __add__(self, other: Moments) -> Moments:
-        return Moments(self.count + other.count, self.total + other.total, self.squares + other.squares)
+        negative = self.negative + other.negative
+        return Moments(self.count + other.count, self.total + other.total, self.squares + other.squares, negative)
 
     def minus(self, other: Moments, products: int) -> Moments:
         """The moments of the differences pair by pair; ``products``: the exact sum of the products."""
-        return Moments(self.count, self.total - other.total, self.squares - 2 * products + other.squares)
+        return Moments(self.count, self.total - other.total, self.squares - 2 * products + other.squares, self.count)
 
     @property
     def possible(self) -> bool:
         """Whether some values can have them, none of them beyond 2^1000."""
         n, far = self.count, abs(self.total) > self.count << (VALUE_BITS + 1000)
-        return not far and n * self.squares >= self.total**2 and not n == 0 < self.squares
+        return not far and n * self.squares >= self.total**2 and not n == 0 < self.squares and self.negative <= n
 
     @property
     def mean(self) -> float:
@@ -155,7 +157,8 @@ class Moments:
     @property
     def estimate(self) -> Estimate:
         """The mean of at least one value, with the interval ``mean -+ t s / sqrt(n)``; see ``mean``."""
-        return self._around(self.mean, self.standard_error if self.count > 1 else 0.0)
+        found = self._around(self.mean, self.standard_error if self.count > 1 else 0.0)
+        return found if self.negative else _of_amounts(found, nothing=not self.squares)
 
     def ratio_error(self, others: Moments, products: int) -> float:
         """Standard error of the ratio ``r`` of two paired means, by the delta method.
@@ -180,6 +183,17 @@ class Moments:
             return Estimate(value, None)
         half = float(stdtrit(self.count - 1, _UPPER)) * error
         return Estimate(value, (value - half, value + half))
+
+
+def _of_amounts(found: Estimate, *, nothing: bool) -> Estimate:
+    """The estimate where no value is below 0: its interval is not either, and there is none where all values are 0.
+
+    Then nothing was seen of what may happen in other worlds: a bound of its share is that of ``rate``, a bound of the
+    mean there is not.
+    """
+    if nothing or found.interval is None:
+        return Estimate(found.value, None)
+    return Estimate(found.value, (max(found.interval[0], 0.0), found.interval[1]))
 
 
 def root(above: int, below: int) -> float:
@@ -222,7 +236,8 @@ def mean(values: Floats) -> Estimate:
     """Mean of ``values`` [n] with the interval ``mean -+ t s / sqrt(n)``; t with n - 1 degrees of freedom.
 
     At thousands of worlds the mean is normal whatever the harm's own distribution, and the interval equals the
-    bootstrap's. Raises ``InvalidInput`` when ``values`` is empty or not finite.
+    bootstrap's. Where no value is below 0 the interval ends at 0; where all are 0 there is none. Raises
+    ``InvalidInput`` when ``values`` is empty or not finite.
     """
     return Moments.of(_check(values)).estimate
 
@@ -331,16 +346,19 @@ def mean_over_seeds(values: ArrayLike, baseline: ArrayLike | None = None, *, see
 
     Numbers of seeds may differ. The bootstrap interval draws the seeds of either side and the worlds, which both sides
     share, anew: an interval of differences that leaves out 0 holds for other seeds *and* other worlds. None with a
-    single world. That is no interval of truths that hold nearly always or never: draws of such worlds are all alike. So
-    that of truths without a baseline reaches at least as far as Wilson's of their share over the worlds. Raises
-    ``InvalidInput`` for arrays that cannot be paired or are not finite.
+    single world, and where all values are 0 and have no baseline. That is no interval of truths that hold nearly
+    always or never: draws of such worlds are all alike. So that of truths without a baseline reaches at least as far
+    as Wilson's of their share over the worlds. Raises ``InvalidInput`` for arrays that cannot be paired or are not
+    finite.
     """
     given = np.atleast_2d(np.asarray(values))
     sides = _pair_sides("mean_over_seeds", given, np.zeros((1, given.shape[-1])) if baseline is None else baseline)
     value = float((sides[0].mean(axis=0) - sides[1].mean(axis=0)).mean())
     found = _resampled(value, sides, lambda means: means[:, 0] - means[:, 1], seed)
-    if given.dtype != np.bool_ or baseline is not None:
+    if baseline is not None or (given < 0).any():
         return found
+    if given.dtype != np.bool_:
+        return _of_amounts(found, nothing=not given.any())
     share = min(value, 1.0)  # a mean of ones may be rounded up
     low, high = wilson(share, given.shape[1])
     ends = found.interval or (low, high)

@@ -38,7 +38,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is miss
         n: int,
         seed: int,
         reward: Reward,
-        horizon_is_end: bool = False,
+        horizon_is_end: bool = True,
         shield: str | None = None,
     ) -> None:
         super().__init__(device="cpu", batch_size=torch.Size([n]))

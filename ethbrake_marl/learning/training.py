@@ -206,7 +206,7 @@ class TrainingRecipe(FileModel):
     gamma: Fraction  # discount of one time step
     reward: RewardParams  # what is learned for
     observation: Annotated[ListedFeatures | None, Field(exclude_if=not_)] = None  # of learners; None: the scenario's
-    horizon_is_end: bool = False  # nothing is expected beyond the horizon
+    horizon_is_end: bool = True  # nothing is expected beyond the horizon
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0  # of worlds, networks and exploration
     evaluation: EvaluationPlan  # the fixed list, and how often
     checkpoint_every_updates: Annotated[int, Field(ge=1)]  # updates

@@ -24,6 +24,7 @@ from ethbrake_marl.evaluation import (
     SummaryRow,
     SummaryTable,
     evaluate,
+    is_papers_test,
     make_agents,
     other_tests,
     record_episode,
@@ -200,7 +201,7 @@ def run_experiment(
             tell(Progress(f"report{stage and ': '}{stage}", next(done), 3 + len(others)))
 
         begin("what nobody can avoid")
-        rows = summarise(evaluation)
+        rows = summarise(evaluation, paper=is_papers_test(evaluation.task, list_seed))
         beside: dict[str, SummaryTable] = {}
         for other in others:  # the policy was trained on ``scenario`` alone
             part = other.sample(min(episodes, 2_000), list_seed)

@@ -90,6 +90,17 @@ def test_standards__full_braking_passes_as_published_and_is_struck_by_every_foll
     assert refused.status == 2 and "--by: standards is a group of 10 scenarios; give one of them" in refused.err
 
 
+def test_evaluate__prints_the_papers_rows_where_they_are_asked_for_and_fit(ethbrake: Command) -> None:
+    words = ("evaluate", "--agents", "full_brake", "--episodes", "5")
+    assert "paper, random test" not in ethbrake(*words).out and "paper, random test" in ethbrake(*words, "--paper").out
+    for other in (("--scenario", "stress-wide"), ("--set", "mass_t=5"), ("--vehicle", "vehicle_3")):
+        check_refused(
+            ethbrake(*words, *other, "--paper"), "paper: the paper's rows are about Vehicle 2", "leave paper out"
+        )
+    check_refused(ethbrake(*words, "--shards", "1", "--paper"), "--paper: --shards prints no rows of the paper")
+    check_refused(ethbrake(*words, "--scenario", "standards", "--paper"), "--paper: standards is a group")
+
+
 def test_evaluate__a_damaged_bundle_is_refused_by_file_whatever_is_around_it(ethbrake, tmp_path) -> None:
     shutil.copytree(shipped_policies()["ppo"] / "policy", tmp_path / "policy")
     weights = tmp_path / "policy" / "weights.safetensors"
@@ -184,6 +195,37 @@ def test_compare__difference_is_paired_by_world_where_every_world_is_there(resul
     assert both[0] == pytest.approx(both[1])
     assert [found.to_json()["intervals"] for found in (paired, apart)] == ["paired", "unpaired"]
     assert "alone.json has none" in str(apart.unpaired_because)
+
+
+def test_compare__marks_who_exploits_what_harm_does_not_count(ethbrake: Command, results: Path) -> None:
+    rows = json.loads((results / "a.csv.json").read_text())
+    for name, shoved, moving in (("before", 4.0, 0), ("after", 6.0, rows[0]["episodes"])):
+        told = [row | {"vehicle_1_shoved_m": shoved, "horizon_ends": moving} for row in rows[:1]] + rows[1:]
+        (results / f"{name}.json").write_text(json.dumps(told))
+    agent = rows[0]["agent"]
+    found = compare_results(read_result(results / "before.json"), read_result(results / "after.json"))
+    assert found.to_json()["agents"][0]["exploits"] == [[], ["shoves", "moving"]]
+    answer = ethbrake("compare", results / "before.json", results / "after.json")
+    assert f"{agent} ‡" in answer.out
+    sentence = f"{agent} in the second shoves Vehicle 1 by 6.0 m on average, still moves at the horizon in 100.0 %"
+    assert sentence in " ".join(answer.err.split()) and f"{agent} in the first" not in answer.err
+    same = ethbrake("compare", results / "before.json", results / "before.json")
+    assert f"{agent} ‡" not in same.out and f"{agent} in the" not in same.err
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"horizon_ends": -1}, "horizon_ends = -1: must be 0 to "),
+        ({"horizon_ends": "3"}, "horizon_ends is missing or no int"),
+        ({"vehicle_1_shoved_m": "far"}, "vehicle_1_shoved_m = 'far': must be metres, or null"),
+    ],
+)
+def test_compare__refuses_what_no_evaluation_wrote(results: Path, wrong: dict[str, Any], says: str) -> None:
+    rows = [row | wrong for row in json.loads((results / "a.csv.json").read_text())]
+    (results / "wrong.json").write_text(json.dumps(rows))
+    with pytest.raises(InvalidInput, match=says):
+        read_result(results / "wrong.json")
 
 
 def test_compare__unpaired_interval_is_welchs() -> None:

@@ -199,7 +199,7 @@ class Vector(Batch):
 
 class Sb3(Batch):
     def __init__(self, scenario: eb.Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
-        self.env, self.n = wrap(eb.make_sb3_vec_env(scenario, n, seed=None, **settings)), n
+        self.env, self.n = wrap(eb.make_sb3_vec_env(scenario, n, seed=None, horizon_is_end=False, **settings)), n
         self.space = self.env.observation_space
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Array:

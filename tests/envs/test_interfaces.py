@@ -441,14 +441,16 @@ def test_step_async__keeps_its_own_copy_of_the_actions() -> None:
     assert np.array_equal(env.step_wait()[0], untouched.step(np.full((2, 1), -0.5, np.float32))[0])
 
 
-@pytest.mark.parametrize("horizon_is_end", [False, True])
-def test_horizon_is_end__hides_the_truncation_and_nothing_else(horizon_is_end: bool) -> None:
-    env = begun(PAPER, 3, seed=4, horizon_is_end=horizon_is_end)
+@pytest.mark.parametrize(
+    ("settings", "hides"), [({}, True), ({"horizon_is_end": True}, True), ({"horizon_is_end": False}, False)]
+)
+def test_horizon_is_end__hides_the_truncation_and_nothing_else(settings: dict[str, bool], hides: bool) -> None:
+    env = begun(PAPER, 3, seed=4, **settings)
     cut = []
     for _ in range(75):  # 0.5 s to 8 s
         _, _, done, infos = env.step(np.ones((3, 1), np.float32))  # drives on, so that the horizon cuts the episode off
         cut += [info["TimeLimit.truncated"] for info in infos if info]
-    assert done.all() and cut == [not horizon_is_end] * 3
+    assert done.all() and cut == [not hides] * 3
     assert all(info["terminal_observation"].shape == (27,) for info in infos)
 
 

@@ -17,10 +17,19 @@ from rich.console import Console
 
 import ethbrake_marl as eb
 from ethbrake_marl.defaults import HARM_COUNTS
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import Evaluation, Outcome, SummaryTable, evaluate, measures, summarise, write_per_world
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.evaluation.measures import KNOWN_OF_WORLDS, PAPER_ROWS, IncompleteTable, shipped_bounds
+from ethbrake_marl.evaluation.measures import (
+    KNOWN_OF_WORLDS,
+    PAPER_ROWS,
+    Exploits,
+    IncompleteTable,
+    is_papers_test,
+    shipped_bounds,
+)
 from ethbrake_marl.evaluation.results import read_harms
+from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.harm import STANDARD, Ledger
 from ethbrake_marl.limits import limits as limits_module
 from ethbrake_marl.limits.limits import BestHarmTable, Unproven, known_limits, shipped_tables, unproven_because
@@ -44,6 +53,7 @@ ESTIMATES = {
 }  # fmt: skip
 ALWAYS = {
     "kind", "agent", "knows", "sees_through_channel", "hidden_share", "episodes", "collisions", "horizon_ends",
+    "exploits",
     "impact_unproven", "left_out", "worlds_sha256", "scenario_sha256", "policy_sha256", "versions",
     "known_best_share", "best_known_warning", "below_best_known", "parameters",
     *ESTIMATES, *(f"{name}_interval" for name in ESTIMATES),
@@ -122,7 +132,7 @@ def test_parameters__say_under_which_conditions(evaluation: Evaluation) -> None:
 
 def test_table__has_every_figure_and_the_papers_rows_in_80_columns_and_in_markdown(evaluation: Evaluation) -> None:
     """What it looks like in 120 columns stands in tests/cli/printed."""
-    rows = summarise(evaluation)
+    rows = summarise(evaluation, paper=True)
     narrow, markdown = printed(rows), rows.markdown()
     for row in rows:
         low, high = row.total_harm.interval
@@ -134,6 +144,8 @@ def test_table__has_every_figure_and_the_papers_rows_in_80_columns_and_in_markdo
             assert f"{100 * row[name].value:.1f} %" in markdown
     lines = [line for line in markdown.splitlines() if line.startswith("|")]
     assert {line.count("|") for line in lines} == {14} and len(lines) == 2 + 3 + len(PAPER_ROWS)
+    ours = summarise(evaluation)
+    assert "paper's" not in f"{ours}{ours.markdown()}" and len(ours.sheet().rows) == 3
 
 
 def test_table__of_another_line_has_no_limit_and_none_of_the_papers_rows_and_names_are_text(pair: Scenario) -> None:
@@ -141,7 +153,7 @@ def test_table__of_another_line_has_no_limit_and_none_of_the_papers_rows_and_nam
     rows = summarise(evaluate(pair.sample(2, 0), agents, scenario=pair))
     text = printed(rows, 160)
     assert text.count("Decrease") == 2 and "≥" not in text and "ppo@[red]x|b" in text
-    assert "x\\|b |" in rows.markdown()  # a bar makes no column
+    assert "x\\|b ‡ |" in rows.markdown()  # a bar makes no column
     assert "paper" not in text.lower() and "paper" not in rows.markdown().lower()
     assert "Agent" in SummaryTable().markdown() and "Agent" in printed(SummaryTable())
 
@@ -163,14 +175,74 @@ def test_html__escapes_hostile_names_and_shows_every_agent_with_its_figures() ->
     assert repr(evaluation).isprintable()
 
 
+# ---------------------------------------------------------------- exploits
+
+
+def pushing(shoved_m: float, moving: int, worlds: int = 20) -> Evaluation:
+    """Full braking, and the same one as if it shoved Vehicle 1 so far, and were not at rest in so many worlds."""
+    scenario = load_scenario("paper-random")
+    found = evaluate(scenario.sample(worlds, 7), BRAKE, scenario=scenario, seed=7)
+    braking = found.outcome("full_brake")
+    shoved = np.linspace(0.0, 2.0 * shoved_m, worlds)
+    mine = replace(braking, shoved_m=shoved, at_rest=np.arange(worlds) >= moving)
+    return replace(found, outcomes={"full_brake": braking, "mine": mine})
+
+
+@pytest.mark.parametrize(
+    ("shoved_m", "moving", "names"),
+    [
+        (4.9, 1, ()), (5.1, 1, ("shoves",)), (4.9, 2, ("moving",)), (25.0, 12, ("shoves", "moving")),
+    ],
+)  # fmt: skip
+def test_exploits__mark_the_row_and_are_one_sentence_below(shoved_m: float, moving: int, names: tuple[str]) -> None:
+    found = pushing(shoved_m, moving)
+    rows = summarise(found)
+    assert [row.exploits.names for row in rows] == [(), names]
+    assert [row.to_json()["exploits"] for row in rows] == [[], list(names)]
+    assert Exploits.of_json(rows[1].to_json()) == rows[1].exploits
+    page = Report("t", rows, found).html
+    for text in (str(rows), rows.markdown(), rows._repr_html_() if names else "", page):
+        assert ("mine ‡" in text) == bool(names and text) and "full_brake ‡" not in text
+    sentences = [text for kind, text in rows.notes() if text.startswith("‡") and kind == "note"]
+    assert len(sentences) == bool(names)
+    for sentence in sentences:
+        assert (f"mine shoves Vehicle 1 by {shoved_m:.1f} m on average" in sentence) == ("shoves" in names)
+        assert (f"still moves at the horizon in {5 * moving:.1f} % of the worlds" in sentence) == ("moving" in names)
+        assert sentence in " ".join(str(rows).split()) and sentence in rows.markdown()
+
+
+def test_exploits__where_shoving_is_not_measured_nobody_is_marked_for_it(pair: Scenario) -> None:
+    rows = summarise(evaluate(pair.sample(3, 0), {"coast": eb.make_agent("coast")}, scenario=pair, aftermath=False))
+    assert rows[0]["vehicle_1_shoved_m"] is None and "shoves" not in rows[0].exploits.names
+
+
+# ---------------------------------------------------------------- harm that was not seen
+
+
+def test_summarise__where_nobody_collided_a_bound_of_the_share_is_said_and_none_of_the_harm() -> None:
+    scenario = load_scenario("paper-random").replace(gaps_m=300.0)
+    rows = summarise(evaluate(scenario.sample(500, 7), {**BRAKE, "coast": eb.make_agent("coast")}, scenario=scenario))
+    assert [row.collisions > 0 for row in rows] == [False, False]
+    for row in rows:
+        assert row.first_impact_harm == row.total_harm == Estimate(0.0, None)
+        assert row.collision_rate.interval[1] >= 1.0 - 0.025 ** (1.0 / 500)  # Clopper-Pearson's
+    assert rows.markdown().count("| 0.00 | 0.00 |") == 2
+    sentence = "No impact in 500 worlds: full_brake, coast. With 95 % confidence at most 0.76 % of all such worlds"
+    assert sentence in rows.markdown() and sentence in " ".join(str(rows).split())
+    first = summarise(evaluate(load_scenario("paper-random").sample(500, 7), BRAKE, scenario="paper-random"))
+    assert "No impact" not in first.markdown()
+
+
 # ---------------------------------------------------------------- the paper's rows
 
 
 def beside_paper(scenario: Scenario, *, vehicle: int = 1, seed: int | None = 7) -> bool:
     driven = scenario.with_learners([vehicle])
-    (row,) = summarise(evaluate(driven.sample(2, 7), BRAKE, scenario=driven, seed=seed, aftermath=False))
-    assert ("paper, " in SummaryTable([row]).markdown()) is row.beside_paper
-    return row.beside_paper
+    found = evaluate(driven.sample(2, 7), BRAKE, scenario=driven, seed=seed, aftermath=False)
+    fits = is_papers_test(found.task, seed)
+    with nullcontext() if fits else pytest.raises(InvalidInput, match="leave paper out"):
+        assert "paper, " in summarise(found, paper=True).markdown()
+    return fits
 
 
 @SILENT

@@ -497,6 +497,7 @@ def digest_of(tally: Tally) -> str:
     for agent in told["agents"].values():
         assert all(of == tally.worlds for _, of in agent["counts"].values())
         agent["counts"] = {name: count for name, (count, _) in agent["counts"].items()}
+        agent["moments"] = {name: each[:3] for name, each in agent["moments"].items()}  # the sums alone
         agent |= {part: {NAMES.get(name, name): each for name, each in agent[part].items()} for part in agent}
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
 

@@ -19,6 +19,7 @@ from ethbrake_marl.evaluation.statistics import (
     rate,
     relative_decrease,
 )
+from ethbrake_marl.files.sheet import Estimate
 
 # ---------------------------------------------------------------- exact sums
 
@@ -90,7 +91,31 @@ def test_estimate__at_the_size_of_our_lists_has_the_bootstrap_interval(found, da
     assert (low, high) == pytest.approx(tuple(boot.confidence_interval), abs=0.06 * (high - low))
 
 
+@pytest.mark.parametrize("parts", [1, 4])
+def test_mean__of_rare_harm_does_not_reach_below_zero(parts: int) -> None:
+    rare = np.zeros(400)
+    rare[7] = 30.0
+    moments = sum(map(Moments.of, np.array_split(rare, parts)), Moments())
+    for found in (moments.estimate, mean(rare)):
+        assert found.interval[0] == 0.0 < found.value < found.interval[1]
+    assert mean(rare - 1.0).interval[0] < -1.0  # these may be negative
+    assert moments.minus(Moments.of(np.zeros(400)), 0).estimate.interval[0] < 0.0  # and so may a difference
+
+
+def test_mean__of_nothing_but_zeros_has_no_interval() -> None:
+    """Where 0.045 % of the worlds collide, 2,000 without a collision are usual, and say nothing of the harm."""
+    nothing = Moments.of(np.zeros(2_000))
+    assert nothing.estimate == mean(np.zeros(2_000)) == Estimate(0.0, None)
+    assert nothing.minus(nothing, 0).estimate == Estimate(0.0, (0.0, 0.0))  # twice the same: that is certain
+    assert mean(np.full(9, 2.5)).interval == (2.5, 2.5)
+
+
 # ---------------------------------------------------------------- over seeds
+
+
+def test_mean_over_seeds__of_nothing_but_zeros_has_no_interval() -> None:
+    assert mean_over_seeds(np.zeros((3, 500))) == Estimate(0.0, None)
+    assert mean_over_seeds(np.zeros((3, 500)), np.zeros((3, 500))).interval == (0.0, 0.0)
 
 
 def test_interquartile_mean__covers_the_truth_as_often_as_it_says() -> None:

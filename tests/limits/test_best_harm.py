@@ -149,6 +149,20 @@ DIFFERS = {
 }  # fmt: skip
 
 
+@pytest.mark.parametrize("harm_count", HARM_COUNTS)
+@pytest.mark.parametrize(
+    "name", ["paper-distance", "paper-random-obstacle", "paper-random-buildup", "realistic-truck", "cooperation-3-five"]
+)
+def test_best_harm_agent__is_in_no_world_above_universal(name: str, harm_count: HarmCount) -> None:
+    scenario = load_scenario(name)
+    scenario = scenario.with_learners([1])
+    lineup = make_lineup(["universal@shipped", "best_harm:50"], scenario, harm_count=harm_count)
+    found = evaluate(scenario.sample(30, 5007), lineup, scenario=scenario, aftermath=False)
+    policy, best = (found.outcome(spec).world_harm(harm_count) for spec in lineup)
+    assert (best <= policy).all() and best.mean() < policy.mean()
+    assert (best == found.outcome("best_harm:50").predicted_harm).all()
+
+
 @pytest.mark.parametrize("change", DIFFERS)
 def test_table__does_not_know_a_world_that_differs_in_anything(table: BestHarmTable, change: str) -> None:
     worlds, scenario, vehicle = DIFFERS[change]

@@ -132,7 +132,7 @@ def report(evaluation: eb.Evaluation) -> Report:
     part = replace(evaluation, outcomes={name: evaluation.outcome(name) for name in agents})
     return Report(
         title="PPO on paper-random",
-        rows=eb.summarise(part),
+        rows=eb.summarise(part, paper=True),
         evaluation=part,
         figures=[Part.drawing(new_figure(4.0, 3.0), "Learning curve", "Harm over steps.")],
         tests=[("paper-other", "Another test.", eb.summarise(evaluation))],

@@ -32,6 +32,22 @@ def test_robust__at_the_corners_no_world_is_above_the_first_bound(name: str, way
     assert (harm <= bound + ABOVE).all() and replaced > 4
 
 
+def test_robust__between_the_corners_some_worlds_are_above_though_trusted_and_none_inside_the_box() -> None:
+    """The counterexample of docs/shield-believed.md: whoever proposes to coast, in the first world of seed 5006."""
+    harm, bound = {}, {}
+    for robust in ("members", "interior"):
+        settings = {"robust": "interior"} if robust == "interior" else {}
+        env = eb.HybridShield(eb.parallel_env("cooperation-1-front"), mode="robust", believed=True, **settings)
+        env.reset(seed=5006)
+        infos, bounds = {}, []
+        while env.agents:
+            infos = env.step({"vehicle_2": [0.0]})[4]["vehicle_2"]
+            bounds.append(infos["shield"]["bound_harm"])
+            assert infos["shield"]["trusted"]
+        harm[robust], bound[robust] = infos["world_first_impact_harm"], bounds[0]
+    assert harm["members"] > bound["members"] + 8.0 and harm["interior"] <= bound["interior"] + ABOVE
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "n"), [("never heard", 2), ("heard late", 12), ("sensors-only", 6)])
 def test_interior__between_the_corners_no_world_is_above_the_first_bound(name: str, n: int) -> None:

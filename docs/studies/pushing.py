@@ -1,0 +1,74 @@
+"""What the training blocks of docs/howto-train.md and README reach over five seeds: the table `training-blocks`.
+
+    python docs/studies/pushing.py one pair readme one-bootstrap pair-bootstrap readme-bootstrap one-speed pair-speed
+
+Each argument is a block. ``-bootstrap`` trains it with ``horizon_is_end=False``, ``-speed`` with the reward term of
+docs/exploits.md that makes a vehicle stop. A training takes a minute or two of one core.
+"""
+
+from __future__ import annotations
+
+import sys
+from statistics import median
+
+import torch
+from stable_baselines3 import PPO
+
+import ethbrake_marl as eb
+from ethbrake_marl.physics import Floats
+from ethbrake_marl.rewards import StepOutcome
+
+SHAPED = {"harm": 0.05, "shaping": 0.05, "shaping_discount": 0.99}
+BLOCKS = {  # scenario, worlds at once, reward
+    "one": ("paper-random", 64, SHAPED),
+    "pair": ("cooperation-3-pair", 32, SHAPED),
+    "readme": ("paper-random", 64, {"harm": 1.0}),
+}
+SEEDS, STEPS, WORLDS = range(5), 200_000, 500
+MEASURES = {  # heading -> measure, times what, and digits
+    "first-impact harm": ("first_impact_harm", 1.0, 2),
+    "total harm": ("total_harm", 1.0, 2),
+    "sampled harm": ("sampled_harm", 1.0, 1),
+    "Vehicle 1 shoved (m)": ("vehicle_1_shoved_m", 1.0, 1),
+    "moving at 8 s (%)": ("moving", 100.0, 1),
+}
+
+
+def speed(step: StepOutcome) -> Floats:
+    """Minus the own speed."""
+    return -step.speeds_mps
+
+
+def train(block: str, seed: int) -> PPO:
+    """The model of a block, trained as the page does with another seed."""
+    name, _, variant = block.partition("-")
+    scenario, worlds, reward = BLOCKS[name]
+    reward = {**reward, "speed": 5e-4} if variant == "speed" else reward
+    settings = {"horizon_is_end": False} if variant == "bootstrap" else {}
+    venv = eb.make_sb3_vec_env(scenario, n_envs=worlds, reward=reward, **settings)
+    return PPO("MlpPolicy", venv, n_steps=64, batch_size=512, learning_rate=1e-3, seed=seed).learn(STEPS)
+
+
+def measure(block: str, model: PPO) -> dict[str, float]:
+    """The measures of the policy on worlds that no training has seen."""
+    agents = {block: eb.policy_agent(model, clip=True)}
+    (row,) = eb.summarise(eb.evaluate(agents=agents, scenario=BLOCKS[block.partition("-")[0]][0], episodes=WORLDS))
+    told = {name: estimate.value for name, estimate in row.estimates.items() if estimate is not None}
+    return told | {"moving": row.exploits.moving}
+
+
+def line(block: str, seeds: list[dict[str, float]]) -> str:
+    """The row of a block: median and range of each measure over its seeds."""
+    cells = [f"`{block}`"]
+    for name, scale, digits in MEASURES.values():
+        values = sorted(scale * each[name] for each in seeds if name in each)
+        told = [f"{value:.{digits}f}" for value in (median(values), values[0], values[-1])] if values else []
+        cells.append(f"{told[0]} ({told[1]} to {told[2]})" if told else "–")
+    return f"| {' | '.join(cells)} |"
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    eb.register_term("speed", speed, unit="m/s")
+    rows = [line(block, [measure(block, train(block, seed)) for seed in SEEDS]) for block in sys.argv[1:]]
+    print("\n".join([f"| {' | '.join(['block', *MEASURES])} |", "| --- |" + " ---: |" * len(MEASURES), *rows]))
