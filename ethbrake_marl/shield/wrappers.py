@@ -91,6 +91,7 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
         """Start an episode; the bound stands in ``infos[agent]["shield_bound_harm"]`` already."""
         self.attached.check_open()
         begun: tuple[dict[str, Observations], dict[str, dict[str, Any]]] = super().reset(seed=seed, options=options)
+        self.attached.check_open()
         return begun
 
     def step(self, actions: Mapping[str, Any]) -> Told:
@@ -143,7 +144,9 @@ class ShieldedEnv(
     ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode; the bound stands in ``info["shield_bound_harm"]`` already."""
         self.attached.check_open()
-        return self.env.reset(seed=seed, options=options)
+        begun = self.env.reset(seed=seed, options=options)
+        self.attached.check_open()  # a wrapper inside may have put another environment there
+        return begun
 
     def step(self, action: NDArray[Any]) -> Any:
         """Advance by one time step with the action certified or replaced; around ``CostEnv`` with a cost, as there."""
@@ -183,7 +186,9 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
     ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode in every row; the bounds stand in ``infos["shield_bound_harm"]`` already."""
         self.attached.check_open()
-        return self.env.reset(seed=seed, options=options)
+        begun = self.env.reset(seed=seed, options=options)
+        self.attached.check_open()  # a wrapper inside may have put another environment there
+        return begun
 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
         """Advance every world by one time step with the actions [rows, 1] certified or replaced."""
