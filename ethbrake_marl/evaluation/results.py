@@ -139,10 +139,10 @@ SAME = {  # all but the hashes: where they are told
 _NEEDED = {
     "agent": str,
     "episodes": int,
-    "horizon_ends": int,
     **dict.fromkeys(_HASHES, str),
     "policy_sha256": dict,
     "versions": dict,
+    "horizon_ends": int,
 }
 
 
