@@ -27,13 +27,14 @@ from ethbrake_marl.physics.kernel import (
     advance_table,
     command_acts,
     force_at,
+    has_acted,
     onset_s,
     place_forces,
     place_obstacle,
     rows_for,
     solo_motion,
 )
-from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds, has_acted
+from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds
 
 # Worlds that cannot be advanced: left out, named, and never at the expense of the others.
 

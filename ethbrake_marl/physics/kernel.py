@@ -8,13 +8,13 @@ table of one world whose first rows ``impact`` names.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.physics.compiling import compiled
-from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds, has_acted
+from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Worlds
 
 # Closed-form times of the events that end a segment of constant acceleration.
 #
@@ -33,6 +33,18 @@ class _Bounds(NamedTuple):
 
 
 BOUND = _Bounds()
+
+ONSET_ROUNDING_S = 1e-9  # a latency that elapses this close before the end of an interval elapses at its end
+
+
+def has_acted(latency_s: Any, time_s: Any) -> Any:
+    """Whether a command acts in the interval from 0 to ``time_s``; numbers (in kernels) or arrays, s.
+
+    A latency that elapses at the beginning of the interval counts, one that elapses at its end does not: there the next
+    decision replaces the command before it has acted.
+    """
+    return (latency_s <= 0.0) | (latency_s < time_s - ONSET_ROUNDING_S)
+
 
 command_acts = compiled(has_acted)
 

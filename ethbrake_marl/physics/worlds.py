@@ -31,7 +31,6 @@ Ints = NDArray[np.int64]
 UInt64s = NDArray[np.uint64]
 
 GRAVITY_MPS2 = 9.81
-ONSET_ROUNDING_S = 1e-9  # a latency that elapses this close before the end of an interval elapses at its end
 _ON_ROADS = ("braking_capacity_mps2", "driving_capacity_mps2")  # what friction limits
 
 
@@ -39,15 +38,6 @@ def as_road_allows(quantities: Mapping[str, Floats], friction: Floats) -> dict[s
     """The quantities, of which no capacity is above ``friction * GRAVITY_MPS2``."""
     most = friction * GRAVITY_MPS2
     return {key: np.minimum(value, most) if key in _ON_ROADS else value for key, value in quantities.items()}
-
-
-def has_acted(latency_s: Any, time_s: Any) -> Any:
-    """Whether a command acts in the interval from 0 to ``time_s``; numbers (in kernels) or arrays, s.
-
-    A latency that elapses at the beginning of the interval counts, one that elapses at its end does not: there the next
-    decision replaces the command before it has acted.
-    """
-    return (latency_s <= 0.0) | (latency_s < time_s - ONSET_ROUNDING_S)
 
 
 @dataclass(frozen=True, slots=True)

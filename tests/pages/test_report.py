@@ -240,7 +240,9 @@ def test_report__flatters_nobody(paper_random: eb.Scenario, pair: eb.Scenario) -
     assert harmful.startswith("coast does more harm than full braking (first impacts: ")
 
 
-def test_report__says_below_its_first_sentence_what_must_not_be_overlooked(pair: eb.Scenario) -> None:
+def test_report__says_below_its_first_sentence_what_must_not_be_overlooked(
+    paper_random: eb.Scenario, pair: eb.Scenario
+) -> None:
     short = summed_up(pair.replace(horizon_s=1.0), "full_brake", "coast")
     mine = replace(short, remarks=["The training was interrupted."])
     html = mine.html
@@ -249,9 +251,11 @@ def test_report__says_below_its_first_sentence_what_must_not_be_overlooked(pair:
         "The training was interrupted.",
         "At the horizon (1 s) something still moved; harm after it is not counted. Worlds, of 60: full_brake"
         " 60, coast 60.",
+        "‡ Harm does not count this: full_brake still moves at the horizon in 100.0 % of the worlds; coast still moves"
+        " at the horizon in 100.0 % of the worlds (docs/exploits.md).",
     ]
     assert html.index('class="lead"') < html.index('class="remarks"') < html.index('class="beside"')
-    assert 'class="remarks"' not in summed_up(pair, "full_brake").html
+    assert 'class="remarks"' not in summed_up(paper_random, "full_brake").html
 
 
 def test_report__says_once_what_contact_impact_and_collision_are(html: str) -> None:

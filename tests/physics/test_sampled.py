@@ -64,7 +64,7 @@ CASES: dict[str, tuple[Worlds, Any, list[float], list[float], dict[str, Any]]] =
     ),
     "before the grid Vehicle 1 stops exactly and an overlap is unseen": (  # 1 m in 0.5 s
         line([2.0], [4.0, 8.0], latency_s=[0.0, 0.75], braking_capacity_mps2=8.0), -8.0, [0.5, 0.75], [0.0],
-        {"time_s": 0.75, "speeds_mps": [0.0, 8.0], "gaps_m": [-3.0], "command_mps2": [-8.0, -8.0]},
+        {"time_s": 0.75, "speeds_mps": [0.0, 8.0], "gaps_m": [-3.0], "command_mps2": [-8.0, 0.0]},
     ),
     "after the grid begins, whole steps": (  # both at 4 m/s, and braking
         line([2.0], [4.0, 8.0], latency_s=[0.0, 0.75], braking_capacity_mps2=8.0), -8.0, [0.5, 0.75, 0.8], [64.0],
@@ -128,7 +128,7 @@ def test_first_sample__is_a_time_that_rounding_parts_from_it(until: float) -> No
     again, _ = advance_sampled(after, -8.0, until_s=0.75, step_s=0.5)
     for each in (after, again):
         assert (each.time_s.tolist(), each.speeds_mps.tolist()) == ([0.75], [[0.0, 8.0]])
-        assert each.command_mps2.tolist() == [[-8.0, -8.0]] and each.gaps_m.tolist() == after.gaps_m.tolist()
+        assert each.command_mps2.tolist() == [[-8.0, 0.0]] and each.gaps_m.tolist() == after.gaps_m.tolist()
 
 
 # The line, its command, the step, the end, and columns of the state then.
@@ -149,7 +149,7 @@ REACH: list[tuple[Worlds, float, float, float, dict[str, Any]]] = [
             (1e-6, 1.0, True), (math.nextafter(1e-6, 1.0), 1.0, False), (0.5e-6, 0.5, True), (0.8e-6, 0.5, False)
         )
         for until, state in (
-            (0.0, {"command_mps2": [-2.0 * acts, -2.0]}),
+            (0.0, {"command_mps2": [0.0, -2.0]}),
             (step, {"speeds_mps": [8.0 - 2.0 * step * acts, 8.0 - 2.0 * step]}),
         )
     ),

@@ -42,8 +42,8 @@ def test_robust__between_the_corners_some_worlds_are_above_though_trusted_and_no
         infos, bounds = {}, []
         while env.agents:
             infos = env.step({"vehicle_2": [0.0]})[4]["vehicle_2"]
-            bounds.append(infos["shield"]["bound_harm"])
-            assert infos["shield"]["trusted"]
+            bounds.append(infos["shield_bound_harm"])
+            assert infos["shield_trusted"]
         harm[robust], bound[robust] = infos["world_first_impact_harm"], bounds[0]
     assert harm["members"] > bound["members"] + 8.0 and harm["interior"] <= bound["interior"] + ABOVE
 

@@ -50,7 +50,7 @@ def aec(**options: Any) -> Iterator[Episode]:
         for agent in env.agent_iter():
             *_, terminated, truncated, told = env.last()
             info = told if agent == "vehicle_2" else info
-            env.step(None if terminated or truncated else drawn(rng, 1))
+            env.step(drawn(rng, 1) if agent == "vehicle_2" and not (terminated or truncated) else None)
         yield Episode(first, info)
         env.reset()
 
