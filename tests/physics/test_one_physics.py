@@ -125,7 +125,12 @@ def by_engine(lines: Lines) -> Floats:
 
 
 def by_advance(lines: Lines) -> Floats:
-    """The same after ``advance`` from decision to decision, up to where everything stands and would stay so."""
+    """The same after ``advance`` from decision to decision."""
+    return columns(*advanced(lines))
+
+
+def advanced(lines: Lines) -> tuple[Worlds, Ledger]:
+    """The lines after ``advance`` from decision to decision, up to where everything stands and would stay so."""
     worlds, ended = lines.worlds, np.zeros(len(lines.actions), np.bool_)
     ledger = empty_ledger(worlds)
     for step, until in enumerate(lines.times_s):
@@ -136,7 +141,7 @@ def by_advance(lines: Lines) -> Floats:
             wanted = worlds.vehicles.piece_commands(command, worlds.time_s)
             stays = (worlds.speeds_mps == 0.0) & (np.maximum(wanted, worlds.command_mps2) <= 0.0)
             ended |= stays.all(axis=1)
-    return columns(worlds, ledger)
+    return worlds, ledger
 
 
 def columns(worlds: Worlds, ledger: Ledger) -> Floats:
