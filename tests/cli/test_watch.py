@@ -239,7 +239,8 @@ def test_compare__unpaired_interval_is_welchs() -> None:
 def test_compare__a_run_its_report_and_shields_are_results_too(ethbrake, finished_run: Path, tmp_path: Path) -> None:
     results = finished_run / "results.json"
     told = told_json(ethbrake("compare", results, results, "--json"))
-    assert told["intervals"] == "paired" and {each["agent"]: each["policy"] for each in told["agents"]}["trained policy"] == "same"
+    policies = {each["agent"]: each["policy"] for each in told["agents"]}
+    assert told["intervals"] == "paired" and policies["trained policy"] == "same"
     assert all(each["total_harm_difference_interval"] == [0.0, 0.0] for each in told["agents"])
     tests = ethbrake("compare", results, finished_run / "other_tests.json")
     check_refused(tests, "each test needs a file of its own")
