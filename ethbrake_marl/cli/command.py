@@ -209,7 +209,6 @@ MOVED = {  # commands of earlier versions
     "generalise": "study generalise",
     "leaderboard": "benchmark table",
     "record": "watch record",
-    "replay": "watch replay",
     "explore": "watch explore",
     "picture": "watch picture",
     "dataset": "watch dataset",

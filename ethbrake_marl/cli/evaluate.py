@@ -490,11 +490,11 @@ def _tell_left_out(out: Out, left_out: LeftOutRows, whole: int) -> None:
         out.note(evaluation.LeftOut.line(told, whole))
 
 
-# The commands ``watch ...``: films, episodes played again, the explorer, pictures, and what was seen as a dataset.
+# The commands ``watch ...``: films, the explorer, pictures, and what was seen as a dataset.
 
 watch_group = app.group(
     "watch",
-    "See and keep episodes: films, replays, pictures, data.",
+    "See and keep episodes: films, pictures, data.",
     "watch record --agents full_brake,e_v2x_bm --world 3 --output both.gif",
     "watch explore --agents full_brake,ppo@shipped",
 )
@@ -522,73 +522,6 @@ def record_command(
     worlds = chosen.sample(1, seed, first=world).worlds
     titled = {f"{name}: world {world} of {chosen.name}": agent for name, agent in lineup.items()}
     out.write(output, evaluation.film(worlds, titled, output.suffix.lower(), scenario=chosen), what="film")
-
-
-@watch_group.add("replay", "watch replay PASSPORT --output again.html", json=True, force=True)
-def replay_command(
-    out: Out,
-    passport: Annotated[str, typer.Argument(metavar="PASSPORT", help="As it stands under an episode of a report.")],
-    scenario: Annotated[
-        str | None, typer.Option(metavar="NAME|PATH", help="Its scenario.", show_default="the shipped one of that name")
-    ] = None,
-    agent: Annotated[
-        str | None, typer.Option(help="Who drives, where the passport cannot say it.", show_default="the passport's")
-    ] = None,
-    initial_states: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="The worlds, where they came from a file.")
-    ] = None,
-    uncertainty: str | None = None,
-    settings: list[str] | None = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.html|FILE.gif|FILE.mp4|FILE.svg", help="Also write it as a page or a film."),
-    ] = None,
-) -> None:
-    """Play an episode again, bit for bit, or say what differs.
-
-    Exit status 1 where the world or the episode is another one than the passport's.
-    """
-    named = evaluation.Passport.parse(passport)
-    out.check(output)
-    if output is not None and output.suffix.lower() not in PAGES:
-        evaluation.check_film(output.suffix.lower())
-    found = named.replay(
-        scenario=scenario,
-        settings=learning.read_settings(settings).scenario,
-        agent=agent,
-        initial_states=initial_states,
-        uncertainty=_intervals(uncertainty),
-    )
-    first, total = found.motion.harm
-    impacts = int(found.motion.ledger.impacts[0])
-    lines = [
-        f"{found.title}: {count_of(impacts, 'impact')}, harm {first:.2f} first-impact, {total:.2f} total (m²/s²).",
-        "The same episode, bit for bit." if found.same else "Not the same episode.",
-        *(f"Differs: {each}." for each in found.differences),
-    ]
-    if output is not None and output.suffix.lower() not in PAGES:
-        drivers = {found.title: found.agent}
-        out.write(output, evaluation.film(found.worlds, drivers, output.suffix.lower(), scenario=found.scenario))
-    elif output is not None:
-        from ethbrake_marl.pages.page import Page, Part, Played, Section
-
-        name, again = found.passport.agent, str(found.passport)
-        one = Played(found.passport.number, "Replayed", "", {name: found.motion}, {name: again})
-        section = Section("Episode", [Part.player([one], found.scenario.learners)])
-        out.write(output, Page(found.title, [section], " ".join(lines)).html)
-    told = {
-        "same": found.same,
-        "differences": list(found.differences),
-        "passport": str(found.passport),
-        "impacts": impacts,
-        "first_impact_harm": first,
-        "total_harm": total,
-    }
-    out.result(told, *lines)
-    if output is not None:
-        out.note(f"written: {output}")
-    if not found.same:
-        raise typer.Exit(1)
 
 
 @watch_group.add("explore", "watch explore --agents full_brake,ppo@shipped", needs=("starlette", "uvicorn"))

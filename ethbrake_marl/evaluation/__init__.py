@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from ethbrake_marl.evaluation.episodes import (
         EpisodeMotion as EpisodeMotion,
         EpisodeRecord as EpisodeRecord,
-        Passport as Passport,
         check_dataset as check_dataset,
         check_film as check_film,
         film as film,

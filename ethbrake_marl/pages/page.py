@@ -22,10 +22,9 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from ethbrake_marl.agents import Driver
-from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.envs import BODY_M
 from ethbrake_marl.errors import InvalidInput, plain_text
-from ethbrake_marl.evaluation import Conditions, EpisodeMotion, Passport, follow_episodes
+from ethbrake_marl.evaluation import Conditions, EpisodeMotion, follow_episodes
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario
@@ -145,7 +144,7 @@ class Part:
             driven: indices (0 = front) of the vehicles that the agents drive; by agent where they drive others.
             focus: the agent that is shown from the beginning, between the first and the last.
             shown_first: numbers of the agents that are shown from the beginning, where those are others.
-            folded: traces and passports show when their title is chosen.
+            folded: traces show when their title is chosen.
 
         """
         agents, one = list(worlds[0].motions), next(iter(worlds[0].motions.values())).world
@@ -156,10 +155,7 @@ class Part:
         for world in worlds:
             alert = next(iter(world.motions.values())).world
             title = shown(world.title or f"World {world.number}")
-            episodes = [
-                Played.episode(motion, by_agent[agent]) | {"passport": shown(world.passports[agent])}
-                for agent, motion in world.motions.items()
-            ]
+            episodes = [Played.episode(motion, by_agent[agent]) for agent, motion in world.motions.items()]
             told.append({
                 "conditions": f"{title}: {Conditions.of(alert).quantities}.",
                 "episodes": episodes,
@@ -332,22 +328,11 @@ class Played:
     kind: str  # why it was chosen, as a heading
     why: str  # what is special about it, in a few words
     motions: dict[str, EpisodeMotion] = field(default_factory=dict)  # by agent
-    passports: dict[str, str] = field(default_factory=dict)  # by agent
     title: str = ""  # what the world is called; empty: World and its number
 
     @staticmethod
-    def drive(
-        played: Sequence[Played],
-        worlds: Worlds,
-        name: str,
-        agent: Driver,
-        scenario: Scenario,
-        spelling: str,
-        *,
-        seed: int | None,
-        harm_count: HarmCount = "first",
-    ) -> None:
-        """Let one agent drive the worlds of ``played`` and keep each motion and passport there, by the agent's name.
+    def drive(played: Sequence[Played], worlds: Worlds, name: str, agent: Driver, scenario: Scenario) -> None:
+        """Let one agent drive the worlds of ``played`` and keep each motion there, by the agent's name.
 
         Args:
             played: one for each world.
@@ -355,15 +340,10 @@ class Played:
             name: of the agent on the page.
             agent: is left as it is.
             scenario: of the worlds, with the vehicles that are driven as its learners.
-            spelling: how the agent is written on a command line.
-            seed: of the list of worlds; None: they came from a file.
-            harm_count: that the agent minimised.
 
         """
         for one, motion in zip(played, follow_episodes(worlds, agent, scenario), strict=True):
-            passport = Passport.of(motion, scenario, spelling, seed=seed, number=one.number, harm_count=harm_count)
             one.motions[name] = motion
-            one.passports[name] = str(passport)
 
     @staticmethod
     def episode(motion: EpisodeMotion, driven: Sequence[int]) -> dict[str, Any]:

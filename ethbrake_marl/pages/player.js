@@ -162,21 +162,9 @@ class Player {
         traces: new Traces(columns[k], episode, this.data, ranges, this.until, (time) => this.seek(time)),
       };
     });
-    this.find("passports")?.replaceChildren(...episodes.map((episode) => this.passport(episode)));
     const scrub = this.find("scrub");
     scrub.max = this.until;
     this.show();
-  }
-
-  passport(episode) {
-    const code = make("code", { tabindex: 0 }, episode.passport);
-    const copy = make("button", { type: "button", class: "small", "aria-label": `Copy the passport of ${episode.agent}` }, "Copy");
-    copy.addEventListener("click", async () => {
-      getSelection().selectAllChildren(code);
-      const done = await navigator.clipboard?.writeText(episode.passport).then(() => true, () => false);
-      copy.textContent = done || document.execCommand("copy") ? "Copied" : "Selected";
-    });
-    return make("div", { class: "passport" }, make("strong", {}, episode.agent), code, copy);
   }
 
   show() {

@@ -196,7 +196,6 @@ class Report:
         self,
         agents: Mapping[str, Driver],
         *,
-        spellings: Mapping[str, str] | None = None,
         harm_count: HarmCount = "first",
         on_agent: Callable[[str], None] | None = None,
     ) -> Report:
@@ -207,7 +206,6 @@ class Report:
 
         Args:
             agents: that were evaluated, by name; they are left as they are.
-            spellings: how an agent is written on a command line, where that is not its name.
             harm_count: that agents minimised.
             on_agent: is told each agent that is done.
 
@@ -221,8 +219,7 @@ class Report:
         if evaluation.vehicles != scenario.learners:
             scenario = scenario.with_learners(evaluation.vehicles)
         for name, agent in agents.items():
-            spelling = (spellings or {}).get(name, name)
-            Played.drive(played, worlds, name, agent, scenario, spelling, seed=evaluation.seed, harm_count=harm_count)
+            Played.drive(played, worlds, name, agent, scenario)
             if on_agent is not None:
                 on_agent(name)
         some = evaluation.worlds.take(np.arange(min(evaluation.worlds.n, SHIELD_WORLDS)))

@@ -520,15 +520,15 @@ def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
     driven: dict[str, tuple[int, ...]] = {}
     for level in plan.levels:
         worlds = level.scenario.sample(plan.episodes, plan.list_seed).worlds.take(rows)
-        drivers = {level.name: (Team({}, level.name), "full_brake")}  # who drives nobody changes nothing
+        drivers = {level.name: Team({}, level.name)}  # who drives nobody changes nothing
         if level.scenario.learners:
             drivers = {}
             for recipe in plan.recipes:
                 folder = plan.training(level, recipe, 0).folder
                 name = level.name if len(plan.recipes) == 1 else f"{level.name}, {_algorithm(recipe)}"
-                drivers[name] = RunDirectory(folder).load_team(level.scenario, name), f"{recipe.algorithm}@{folder}"
-        for name, (team, spelling) in drivers.items():
-            Played.drive(played, worlds, name, team, level.scenario, spelling, seed=plan.list_seed)
+                drivers[name] = RunDirectory(folder).load_team(level.scenario, name)
+        for name, team in drivers.items():
+            Played.drive(played, worlds, name, team, level.scenario)
             driven[name] = level.scenario.learners
     told = (
         f"{count_of(len(played), 'world')}, the same line at every level; of several seeds the first drives."

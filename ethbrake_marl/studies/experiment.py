@@ -284,7 +284,6 @@ def _show(
         summary += " The training was interrupted; this is the policy it had by then."
     begin("the page and its episodes")
     name, learned = evaluation.scenario.name, learned_name(evaluation)
-    spellings = {learned: f"{learned}@{run.path}", "hybrid": f"{learned}@{run.path}+episode"}
     report = Report(
         f"ethbrake run: {name}{' (the main test of three)' if beside and name == next(iter(TESTS)) else ''}",
         rows,
@@ -297,7 +296,7 @@ def _show(
         versions=installed_versions(),
     )
     path = run.path / "report.html"
-    report.driven(agents, spellings=spellings, harm_count=harm_count).write(path, force=True)
+    report.driven(agents, harm_count=harm_count).write(path, force=True)
     return path
 
 

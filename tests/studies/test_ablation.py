@@ -13,7 +13,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.evaluation.episodes import Passport
 from ethbrake_marl.figures import ablation_figures
 from ethbrake_marl.learning import runs as learning_train
 from ethbrake_marl.learning.training import Scheme, TrainingRecipe, load_recipe
@@ -96,17 +95,12 @@ def test_ablate__the_shield_goes_around_what_was_trained(finished_ablation, tmp_
     assert "Behind the step shield" in (copied / "ablation.html").read_text("utf-8")
 
 
-@pytest.mark.parametrize("column", [0, 1])
-def test_page__plays_the_same_worlds_at_every_level(finished_ablation: Path, column: int) -> None:
+def test_page__plays_the_same_worlds_at_every_level(finished_ablation: Path) -> None:
     html = (finished_ablation / "ablation.html").read_text("utf-8")
     told = html.split('<script type="application/json" id="episode_data">')[1].partition("</script>")[0]
     content = json.loads(told)
     assert content["agents"] == LEVELS.split(",") and len(html) <= 5 << 20 and 3 <= len(content["worlds"]) <= 7
     assert [episode["driven"] for episode in content["worlds"][0]["episodes"]] == [[], [1, 2], [1, 2]]
-    passport = Passport.parse(content["worlds"][2]["episodes"][column]["passport"])
-    (folder,) = (finished_ablation / "trainings").glob("cooperation-3-pair-*-seed0")
-    again = passport.replay(agent=f"ppo@{folder}" if column else None)
-    assert again.same and again.passport.policy_sha == passport.policy_sha
 
 
 @pytest.mark.slow
