@@ -209,7 +209,6 @@ MOVED = {  # commands of earlier versions
     "generalise": "study generalise",
     "leaderboard": "benchmark table",
     "record": "watch record",
-    "explore": "watch explore",
     "picture": "watch picture",
     "dataset": "watch dataset",
     "bench": "doctor speed",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import sys
-import webbrowser
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from functools import partial
@@ -490,13 +489,12 @@ def _tell_left_out(out: Out, left_out: LeftOutRows, whole: int) -> None:
         out.note(evaluation.LeftOut.line(told, whole))
 
 
-# The commands ``watch ...``: films, the explorer, pictures, and what was seen as a dataset.
+# The commands ``watch ...``: films, pictures, and what was seen as a dataset.
 
 watch_group = app.group(
     "watch",
     "See and keep episodes: films, pictures, data.",
     "watch record --agents full_brake,e_v2x_bm --world 3 --output both.gif",
-    "watch explore --agents full_brake,ppo@shipped",
 )
 
 
@@ -522,40 +520,6 @@ def record_command(
     worlds = chosen.sample(1, seed, first=world).worlds
     titled = {f"{name}: world {world} of {chosen.name}": agent for name, agent in lineup.items()}
     out.write(output, evaluation.film(worlds, titled, output.suffix.lower(), scenario=chosen), what="film")
-
-
-@watch_group.add("explore", "watch explore --agents full_brake,ppo@shipped", needs=("starlette", "uvicorn"))
-def explore_command(
-    out: Out,
-    scenario: str = "paper-random",
-    agents: str = "full_brake,copy_leader,e_v2x_bm,ppo@shipped,ppo@shipped+step",
-    vehicle: str | None = None,
-    settings: list[str] | None = None,
-    world: int = 0,
-    seed: int = DEFAULT.LIST_SEED,
-    harm_count: HarmCount = "first",
-    folder: Annotated[Path, typer.Option(metavar="DIR", help="Where states are saved, and nowhere else.")] = Path(),
-    port: Annotated[int, typer.Option(help="On 127.0.0.1; 0 takes a free one.", min=0, max=65535)] = 0,
-    no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address, open nothing.")] = False,
-) -> None:
-    """Open a local page with sliders for one emergency.
-
-    It shows every agent's harm and motion at once. It listens on this machine alone, and its address holds a token that
-    is new each time. Ctrl-C ends it.
-    """
-    from ethbrake_marl.pages.explorer import serve_explorer
-
-    task = _asked_task(scenario, vehicle, settings, harm_count, alone=True)
-    lineup = _make_drivers(agents.split(","), task.scenario, harm_count, alone=True)
-
-    def ready(address: str) -> None:
-        out.show(address)
-        out.note(f"explore {task.scenario.name} there; files go to {folder.resolve()}; Ctrl-C ends it")
-        if not no_browser:
-            webbrowser.open(address)
-
-    serve_explorer(task, lineup, folder.resolve(), port, ready, seed=seed, world=world)
-    out.note("ended")
 
 
 @watch_group.add("dataset", "watch dataset --agents best_harm --episodes 1000 --output best.parquet", force=True)

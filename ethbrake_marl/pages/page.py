@@ -172,30 +172,15 @@ class Part:
             "worlds": told,
         }
         shielded = any(episode["stepped"] for world in told for episode in world["episodes"])
-        return cls.live_player(
-            one.N, shielded=shielded, folded=folded, name=_DATA, episodes=cls.data(_DATA, content).html
-        )
-
-    @classmethod
-    def live_player(
-        cls,
-        vehicles: int,
-        *,
-        shielded: bool,
-        folded: bool = False,
-        name: str | None = None,
-        episodes: Markup | str = "",
-    ) -> Part:
-        """A player for a page whose own script gives it one world after another, or of the data of that name."""
         return cls.template(
             "player.html.j2",
             ("player.css",),
             _PLAYER_SCRIPTS,
-            vehicles=vehicles,
+            vehicles=one.N,
             shielded=shielded,
             folded=folded,
-            name=name,
-            episodes=episodes,
+            name=_DATA,
+            episodes=cls.data(_DATA, content).html,
             body=BODY_M,
         )
 
@@ -221,7 +206,6 @@ class Page:
         title: of the page.
         sections: in this order, each with an entry in the table of contents.
         lead: what the page is about, in a sentence or two below its title.
-        served: it comes from a server of ours, which its script may ask; else it asks nobody.
 
     >>> from ethbrake_marl.pages.page import Page, Part, Section
     >>> section = Section("Results", ["Text with <b> stays text.", Part.paragraph("small print")])
@@ -233,7 +217,6 @@ class Page:
     title: str
     sections: Sequence[Section]
     lead: str = ""
-    served: bool = False
 
     @cached_property
     def _parts(self) -> list[Part]:
@@ -253,11 +236,10 @@ class Page:
             f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" if text else "'none'"
             for text in self._code
         )
-        policy = (
+        return (
             f"default-src 'none'; style-src {styles}; script-src {script}; img-src data:;"
             " base-uri 'none'; form-action 'none'"
         )
-        return f"{policy}; connect-src 'self'" if self.served else policy
 
     @staticmethod
     def anchors(titles: Sequence[str]) -> list[str]:
@@ -279,7 +261,6 @@ class Page:
             lead=self.lead,
             sections=list(zip(names, self.sections, strict=True)),
             policy=self.policy,
-            served=self.served,
             style=Markup(styles),
             script=Markup(script),
         )

@@ -196,7 +196,6 @@ PICTURES: dict[str, How] = {
     "cooperation-ablation": _by(TRAINING),
     "cooperative-learners.png": _by(TRAINING),
     "learning-curves": _by(TRAINING),
-    "explorer.png": _by(BY_HAND),
     "speed-scaling.png": _by(SPEED),
 }
 
