@@ -1,4 +1,4 @@
-"""The commands that train, and compare trainings: ``run``, ``train``, ``study``, ``reproduce`` and ``benchmark``."""
+"""The commands that train, and compare trainings: ``run``, ``train``, ``study`` and ``reproduce``."""
 
 from __future__ import annotations
 
@@ -255,7 +255,7 @@ def _end(out: Out, result: learning.TrainResult) -> None:
     out.note(f"{result.status} after {result.steps:,} training steps: {result.directory}")
 
 
-# The commands of many trainings or evaluations: ``study``, ``reproduce`` and ``benchmark``.
+# The commands of many trainings or evaluations: ``study`` and ``reproduce``.
 
 KEPT_IN_FOLDER = "the same command goes on with what is in the folder"
 PAPER_EPISODES, MOST_WORKERS = 10_000, 4096
@@ -586,63 +586,3 @@ def reproduce_command(
     out.note(f"page: {output / 'index.html'}")
     if not finished:
         out.interrupted(f"interrupted: items are made of the trainings that were finished; {KEPT_IN_FOLDER}")
-
-
-benchmark_group = app.group(
-    "benchmark",
-    "Score an agent on a frozen suite, or show entries as a table.",
-    "benchmark v2 --agent ppo@shipped --output mine.json",
-    "benchmark table mine.json theirs.json --output table.md",
-)
-
-
-@benchmark_group.add("drive", "benchmark v2 --agent ppo@shipped --output mine.json", json=True, force=True)
-def drive_command(
-    out: Out,
-    suite: Annotated[str, typer.Argument(metavar="SUITE", help="A suite that ships, such as v2.")],
-    agent: Annotated[str, typer.Option(metavar="SPEC", help="Who drives; any agent of `ethbrake evaluate`.")],
-    output: Annotated[
-        Path | None, typer.Option(metavar="ENTRY.json", help="Also write the entry to this file.")
-    ] = None,
-) -> None:
-    """Let an agent drive a frozen suite of lists, and score it.
-
-    The score of a list is the realised share of what is possible, 0 for full braking and 1 for the best known. A list
-    that the agent cannot drive has none, and then there is no overall score.
-    """
-    from ethbrake_marl.studies.benchmark import load_suite
-
-    out.check(output, ".json", what="an entry")
-    chosen = load_suite(suite)
-    entry = chosen.make_entry(agent, on_progress=out.show_progress)
-    if output is not None:
-        entry.write(output, force=out.force)
-        out.note(f"entry: {output}")
-    mean = entry.mean_of_driven.in_words(digits=1, scale=100.0, unit=" %")
-    if entry.overall is not None:
-        told = f"{agent}: overall {mean} of what is possible, mean over {len(chosen.lists)} lists of suite {suite}"
-    else:
-        told = (
-            f"{agent}: no overall score, as it drives {entry.lists_driven} of {len(chosen.lists)} lists of suite"
-            f" {suite}; {mean} of what is possible there"
-        )
-    out.result(entry.model_dump(mode="json"), entry.sheet(), told)
-
-
-@benchmark_group.add("table", "benchmark table mine.json theirs.json --output table.md", json=True, force=True)
-def table_command(
-    out: Out,
-    entries: Annotated[list[Path], typer.Argument(metavar="ENTRY.json...", help="Entries of one suite.")],
-    output: Annotated[Path | None, typer.Option(metavar="FILE.md", help="Also write the table, as Markdown.")] = None,
-) -> None:
-    """Show entries of `ethbrake benchmark` as one table.
-
-    It is sorted by their score. Refused by name: entries of another suite, and changed ones.
-    """
-    from ethbrake_marl.studies.benchmark import read_leaderboard
-
-    out.check(output, ".md", what="the table")
-    found = read_leaderboard(entries)
-    if output is not None:
-        out.write(output, f"{found.table().markdown()}\n", what="table")
-    out.result(found.to_json(), found.sheet(), *found.notes)

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
         NamedWorlds as NamedWorlds,
         check_agents as check_agents,
         choose_worlds as choose_worlds,
-        content_sha256 as content_sha256,
         drawn_alike as drawn_alike,
         driving_policy as driving_policy,
         load_runnable as load_runnable,

@@ -61,13 +61,6 @@ def worlds_sha256(worlds: Worlds, index: Ints) -> str:
     return _arrays_sha256({"index": index, **_arrays(worlds)})
 
 
-def content_sha256(*parts: Any) -> str:
-    """SHA-256 of every array of some dataclasses, one after the other."""
-    return _arrays_sha256(
-        {f"{k} {name}": array for k, part in enumerate(parts) for name, array in _arrays(part).items()}
-    )
-
-
 def _arrays_sha256(arrays: dict[str, np.ndarray]) -> str:
     digest = hashlib.sha256()
     for name, array in arrays.items():

@@ -752,7 +752,7 @@ def _level(one: Measured, searched: int) -> Json:
                 "harm": mean_over_seeds(reached[:, :searched]).to_json(),
                 "each_seed": reached[:, :searched].mean(axis=1).tolist(),
                 "best_known": None if best is None else mean_over_seeds(best).to_json(),
-                "realised_share": None if share is None else share.to_json(),
+                "share_of_possible_reduction": None if share is None else share.to_json(),
             },
             "shielded": None if one.shielded is None else _behind(one, one.shielded[harm_count], harm_count, searched),
         }
@@ -911,7 +911,7 @@ def _blocks(found: Json) -> list[tuple[str, list[Sheet]]]:
                 (braking, f"{count} searched full_brake value"),
                 (Column(f"Reached, {_HARM[count]}"), f"{count} searched harm"),
                 (Column("Joint optimum"), f"{count} searched best_known value"),
-                (_share("Share of its reduction"), f"{count} searched realised_share"),
+                (_share("Share of its reduction"), f"{count} searched share_of_possible_reduction"),
             ])
             for count in HARM_COUNTS
         ],

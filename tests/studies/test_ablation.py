@@ -255,7 +255,7 @@ def test_compare__the_share_follows_from_what_stands_beside_the_joint_optimum(le
     level = compare([replace(one, reached=reached, full_brake=braking)], SEARCHED)["levels"][0]["first"]
     row = level["searched"]
     assert (row["full_brake"]["value"], row["harm"]["value"], row["best_known"]["value"]) == (15.0, 8.25, 6.0)
-    assert row["realised_share"]["value"] == pytest.approx((15.0 - 8.25) / (15.0 - 6.0))
+    assert row["share_of_possible_reduction"]["value"] == pytest.approx((15.0 - 8.25) / (15.0 - 6.0))
     assert row["each_seed"] == [7.5, 9.0] and row["worlds"] == SEARCHED
     assert level["full_brake"]["value"] == pytest.approx(20.0 * mild.mean())
 
