@@ -206,7 +206,6 @@ MOVED = {  # commands of earlier versions
     "sweep": "study sweep",
     "tune": "study tune",
     "ablate": "study ablate",
-    "generalise": "study generalise",
     "record": "watch record",
     "picture": "watch picture",
     "dataset": "watch dataset",

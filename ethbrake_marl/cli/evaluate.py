@@ -513,6 +513,7 @@ watch_group = app.group(
     "watch",
     "See and keep episodes: films, pictures, data.",
     "watch record --agents full_brake,e_v2x_bm --world 3 --output both.gif",
+    "watch picture deceleration --world 5 --output curve.png",
 )
 
 
@@ -589,38 +590,11 @@ def dataset_command(
 
 picture_group = watch_group.group(
     "picture",
-    "Draw a scenario, one world, or the shield's work.",
-    "watch picture criticality --output map.png",
-    "watch picture shield-modes --episodes 500 --output modes.png",
+    "Draw one world, or the shield's work.",
+    "watch picture deceleration --world 5 --output curve.png",
+    "watch picture shield --episodes 500 --output shield.png",
 )
 PictureOption = Annotated[Path, typer.Option(metavar="FILE", help="The picture to write: .png, .svg or .pdf.")]
-
-
-@picture_group.add(
-    "criticality", "watch picture criticality --scenario paper-distance --agent e_v2x_bm --output map.png", force=True,
-)  # fmt: skip
-def picture_criticality(
-    out: Out,
-    output: PictureOption,
-    scenario: str = "paper-distance",
-    agent: Annotated[str, typer.Option(help="Who drives; any agent of `ethbrake evaluate`.")] = "e_v2x_bm",
-    harm_count: HarmCount = "first",
-    cells: Annotated[int, typer.Option(help="Worlds along each gap.")] = 81,
-    gaps: Annotated[
-        tuple[float, float] | None,
-        typer.Option(metavar="LOW HIGH", help="Range of both gaps (m).", show_default="the scenario's"),
-    ] = None,
-    settings: list[str] | None = None,
-) -> None:
-    """Harm of an agent over both gaps.
-
-    With the boundary of what is avoidable. Everything else must be a fixed number in the scenario.
-    """
-    figures = _figures(out, output)
-    chosen = _asked_task(scenario, None, settings, alone=True).scenario
-    lineup = _make_drivers([agent], chosen, harm_count, alone=True)
-    found = evaluation.criticality_map(chosen, lineup, cells=cells, gap_range_m=gaps, on_progress=out.progress)
-    _write_picture(out, output, figures.criticality_figure(found))
 
 
 def _figures(out: Out, output: Path) -> ModuleType:
@@ -696,79 +670,3 @@ def picture_shield(
     rest = f"; step shield, {harm_count} harm. Beside the points: what certificates may reach above the bound (m²/s²)."
     figure = figures.operating_figure(list(curves.items()), caption=_caption(task.scenario, episodes, rest, left_out))
     _write_picture(out, output, figure, left_out, episodes)
-
-
-@picture_group.add("shield-modes", "watch picture shield-modes --episodes 500 --output modes.png", force=True)
-def picture_shield_modes(
-    out: Out,
-    output: PictureOption,
-    agents: str = _PROPOSERS,
-    scenario: str = "paper-random",
-    episodes: int = 2_000,
-    harm_count: HarmCount = "first",
-    vehicle: str | None = None,
-    settings: list[str] | None = None,
-) -> None:
-    """Harm without a shield and in each of its modes.
-
-    As `ethbrake shield` measures it.
-    """
-    figures = _figures(out, output)
-    task = _asked_task(scenario, vehicle, settings, harm_count)
-    rows = _measure_modes(out, agents, task.scenario.sample(episodes, DEFAULT.LIST_SEED), task)
-    rest = f", {harm_count} harm; mean and 95 % interval of the difference, paired by world."
-    figure = figures.shield_modes_figure(rows, caption=_caption(task.scenario, episodes, rest, rows[0].left_out))
-    _write_picture(out, output, figure, rows[0].left_out, episodes)
-
-
-@picture_group.add(
-    "robustness", "watch picture robustness --agent ppo@shipped --episodes 100 --output robust.png",
-    json=True, force=True,
-)  # fmt: skip
-def picture_robustness(
-    out: Out,
-    output: PictureOption,
-    agent: Annotated[
-        str, typer.Option(help="Who proposes; an agent of `ethbrake evaluate` without a shield.")
-    ] = "full_brake",
-    uncertainty: Annotated[
-        str, typer.Option(metavar="QUANTITY=WIDTH,...", help="The intervals; drawn at 0 to 2 times their width.")
-    ] = "braking_capacity_mps2=10%,gaps_m=0.5",
-    robust: Annotated[
-        str, typer.Option(help="What the robust shield certifies of the intervals: their corners, or their interior.")
-    ] = "corners",
-    scenario: str = "paper-random",
-    episodes: int = 200,
-    harm_count: HarmCount = "first",
-    vehicle: str | None = None,
-    settings: list[str] | None = None,
-) -> None:
-    """What it costs not to know a world.
-
-    The robust shield's price, and both shields where the truth differs. Prints the figures, too.
-    """
-    from ethbrake_marl.shield import parse_uncertainty, robustness
-
-    figures = _figures(out, output)
-    intervals = parse_uncertainty(uncertainty)
-    task = _asked_task(scenario, vehicle, settings, harm_count, alone=True)
-    sample = task.scenario.sample(episodes, DEFAULT.LIST_SEED)
-    (policy,) = _make_drivers([agent], task.scenario, harm_count, bare=True).values()
-    points = robustness(
-        sample.worlds, policy, task, intervals, robust=robust,
-        on_progress=lambda what, done: out.progress(what, done, episodes),
-    )  # fmt: skip
-    left_out = points[0].left_out
-    rest = f"; {agent} proposes; {harm_count} harm. Intervals of width 1: {intervals}." + (
-        f" Robust mode certifies their {robust}." if robust != "corners" else ""
-    )
-    caption = _caption(task.scenario, episodes, rest, left_out)
-    about = evaluation.result_identity("robustness", task.scenario, sample, [world for world, _ in left_out])
-    _write_picture(out, output, figures.robustness_figure(points, caption=caption), left_out, episodes)
-    columns: list[Column | str] = [
-        *("shield", "truth", "width", Column("mean harm"), Column("mean bound")),
-        *(Column("above bound", digits=1, scale=100.0, unit="%"), Column("mean excess", digits=3)),
-        Column("noticed", digits=1, scale=100.0, unit="%"),
-    ]
-    rows = [(p.mode, p.truth, f"{p.width:g}", p.harm, p.bound, p.above, p.excess, p.distrusted) for p in points]
-    out.result([about | point._asdict() for point in points], Sheet("", columns, rows))

@@ -13,8 +13,8 @@ from rich.text import Text
 
 from ethbrake_marl import evaluation, learning, scenario as scenarios
 from ethbrake_marl.cli.command import Out, app, whole_number
-from ethbrake_marl.defaults import DEFAULT, HarmCount
-from ethbrake_marl.errors import InvalidInput, Progress, check_one_learner, check_whole_number, need
+from ethbrake_marl.defaults import DEFAULT
+from ethbrake_marl.errors import InvalidInput, Progress, check_one_learner, need
 from ethbrake_marl.files.sheet import Column, Sheet
 
 KEPT = (
@@ -496,42 +496,6 @@ def ablate_command(
     out.result(found, text.read_text("utf-8"), end="")
     drawn = f"; figures: {', '.join(map(str, figures))}" if figures else ""
     out.note(f"page: {page}; tables: {text}{drawn}")
-
-
-@study_group.add("generalise", "study generalise --runs runs/cooperation-4-all-cooperation-seed0 --vehicles 3,5,10",
-    json=True,
-)  # fmt: skip
-def generalise_command(
-    out: Out,
-    runs: Annotated[str, typer.Option(metavar="RUN,RUN,...", help="Runs or bundles, seeds of one training.")],
-    scenario: str = "cooperation-4-all",
-    vehicles: Annotated[
-        str, typer.Option(metavar="N,N,...", help="Lengths of the lines; vehicle i > 3 is like vehicle i - 2.")
-    ] = "3,4,5,6,7,8,9,10",
-    episodes: Annotated[int, typer.Option(help="Worlds of each length.", callback=whole_number(1))] = 1000,
-    seed: int = DEFAULT.LIST_SEED,
-    harm_count: HarmCount = "total",
-    search_episodes: Annotated[int, typer.Option(help="Worlds of the joint optimum; 0: none.")] = 0,
-    budget: Annotated[
-        int, typer.Option(help="Candidates per world of that search.", callback=whole_number(1))
-    ] = 20_000,
-    settings: list[str] | None = None,
-) -> None:
-    """Let trained policies drive longer lines with the same weights.
-
-    They drive every follower, and Vehicle 1 where it learns in the scenario.
-    """
-    from ethbrake_marl.studies.ablation import LineQuestion
-
-    lengths = tuple(int(each) if each.strip().isdecimal() else 0 for each in vehicles.split(","))
-    if not all(2 <= each <= 64 for each in lengths):
-        raise InvalidInput(f"vehicles {vehicles!r}: must be lengths from 2 to 64, for instance 3,4,5")
-    check_whole_number("search-episodes", search_episodes, 0, episodes)
-    line = evaluation.load_runnable(scenario, learning.read_settings(settings).scenario)
-    question = LineQuestion(line, lengths, episodes, seed, harm_count, search_episodes, budget)
-    agents = question.load_runs([each.strip() for each in runs.split(",")])
-    found = question.drive(agents, out.show_progress)
-    out.result(found, question.markdown(found, len(agents)), end="")
 
 
 @app.add("reproduce", "reproduce random-table harm-distance --quick --output runs/paper",

@@ -6,9 +6,7 @@ from ethbrake_marl.doors import front_door
 
 if TYPE_CHECKING:
     from ethbrake_marl.evaluation.curves import (
-        CriticalityMap as CriticalityMap,
         DecelerationCurve as DecelerationCurve,
-        criticality_map as criticality_map,
         deceleration_curve as deceleration_curve,
     )
     from ethbrake_marl.evaluation.episodes import (
@@ -27,7 +25,6 @@ if TYPE_CHECKING:
         check_agents as check_agents,
         choose_worlds as choose_worlds,
         drawn_alike as drawn_alike,
-        driving_policy as driving_policy,
         load_runnable as load_runnable,
         make_agents as make_agents,
         make_lineup as make_lineup,

@@ -48,9 +48,7 @@ from ethbrake_marl.shield import ShieldedDriver, Uncertainty
 # Two results can be compared where worlds and scenario have the same hashes. Versions are told, and no reason to
 # refuse.
 
-Kind = Literal[
-    "evaluate", "evaluate-shards", "shield", "best-harm", "ablate", "generalise", "learning-curves", "robustness"
-]
+Kind = Literal["evaluate", "evaluate-shards", "shield", "best-harm", "ablate", "learning-curves"]
 _PACKAGES = ("ethbrake-marl", "numba", "numpy")
 _WORDS = {"name", "title", "description", "source"}  # what a scenario is called changes nothing
 _BLOCK = 50_000  # worlds hashed at once: news of a world may be a view that takes no memory

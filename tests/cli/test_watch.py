@@ -88,6 +88,17 @@ def test_standards__full_braking_passes_as_published_and_is_struck_by_every_foll
     assert refused.status == 2 and "--by: standards is a group of 10 scenarios; give one of them" in refused.err
 
 
+def test_benchmark__shares_are_those_of_each_scenario_alone(ethbrake: Command) -> None:
+    words = ("--agents", "full_brake,coast", "--episodes", "10", "--harm-count", "total", "--json")
+    told = told_json(ethbrake("evaluate", "--scenario", "benchmark", *words))
+    assert len({row["scenario"] for row in told}) == 10 and len(told) == 20
+    shares = {(row["scenario"], row["agent"]): row["share_of_possible_reduction"] for row in told}
+    for name in ("paper-random", "cooperation-2-five"):
+        for row in told_json(ethbrake("evaluate", "--scenario", name, *words)):
+            alone = row["share_of_possible_reduction_total"]
+            assert shares[name, row["agent"]]["value"] == alone and (alone == 0.0) == (row["agent"] == "full_brake")
+
+
 def test_evaluate__a_damaged_bundle_is_refused_by_file_whatever_is_around_it(ethbrake, tmp_path) -> None:
     shutil.copytree(shipped_policies()["ppo"] / "policy", tmp_path / "policy")
     weights = tmp_path / "policy" / "weights.safetensors"
@@ -298,25 +309,12 @@ def test_falsify__as_many_worlds_as_it_keeps_read_back(ethbrake: Command) -> Non
 
 
 @pytest.mark.parametrize(
-    "words",
-    [
-        ("criticality", "--scenario", "paper-distance", "--agent", "constant:5", "--cells", "3", "--gaps", "8", "9"),
-        pytest.param(("shield-modes", "--agents", "full_brake", "--episodes", "6"), marks=pytest.mark.slow),
-        ("shield-modes", "--scenario", "cooperation-3-pair", "--agents", "full_brake", "--episodes", "6"),
-        ("shield", "--scenario", "cooperation-3-pair", "--agents", "full_brake", "--episodes", "6"),
-    ],
+    "words", [("shield", "--scenario", "cooperation-3-pair", "--agents", "full_brake", "--episodes", "6")]
 )
 def test_picture__is_drawn_and_said_where(ethbrake: Command, words: tuple[str, ...]) -> None:
     answer = ethbrake("watch", "picture", *words, "--output", "x.png")
     assert (answer.status, answer.out) == (0, "") and "picture: x.png" in answer.err
     assert Path("x.png").read_bytes().startswith(PNG)
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_picture__of_robustness_tells_its_figures(ethbrake: Command) -> None:
-    words = ("--uncertainty", "gaps_m.pair_1=1", "--episodes", "2", "--output", "x.png", "--json")
-    told = told_json(ethbrake("watch", "picture", "robustness", *words))
-    assert len(told) == 5 * 3 * 2 and {row["mode"] for row in told} == {"step", "robust"}
 
 
 @pytest.mark.parametrize(
@@ -338,13 +336,7 @@ def test_picture__is_written_as_its_name_ends_and_the_same_bytes_again(ethbrake,
 
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
-    "words",
-    [
-        ("criticality", "--cells", "2"),
-        ("deceleration",),
-        pytest.param(("shield", "--episodes", "3"), marks=pytest.mark.slow),
-        pytest.param(("robustness", "--episodes", "2", "--uncertainty", "gaps_m=1"), marks=pytest.mark.slow),
-    ],
+    "words", [("deceleration",), pytest.param(("shield", "--episodes", "3"), marks=pytest.mark.slow)]
 )
 def test_picture__overwrites_only_by_force(ethbrake: Command, words: tuple[str, ...]) -> None:
     out = Path("map.png")
@@ -403,9 +395,7 @@ def test_file__of_an_extra_that_is_missing_says_the_line_that_installs_it(
     "words",
     [
         ("shield", "--agents", "full_brake"),
-        ("watch", "picture", "shield-modes", "--agents", "coast", "--output", "x.png"),
         ("watch", "picture", "shield", "--agents", "coast,full_brake", "--output", "x.png"),
-        pytest.param(("watch", "picture", "robustness", "--output", "x.png"), marks=pytest.mark.slow),
     ],
     ids=lambda words: " ".join(words[:3]),
 )

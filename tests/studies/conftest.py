@@ -36,8 +36,6 @@ ABLATE += ["--steps", "128", "--scheme", "shared"]
 TRIALS = 5
 
 
-
-
 Write = Callable[..., Path]
 
 

@@ -1,9 +1,8 @@
-"""``study ablate`` and ``generalise``: levels, trainings, joint optima, what is compared and shown, longer lines."""
+"""``study ablate``: levels, trainings, joint optima, what is compared and shown."""
 
 import json
 import shutil
 import signal
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from ethbrake_marl.figures import ablation_figures
 from ethbrake_marl.learning import runs as learning_train
 from ethbrake_marl.learning.training import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.limits.limits import best_harm, chunks_left
-from ethbrake_marl.policies import shipped_policies
 from ethbrake_marl.scenario import Sample, load_scenario
 from ethbrake_marl.shield.guard import Shielded
 from ethbrake_marl.studies.ablation import (
@@ -42,7 +40,6 @@ from ethbrake_marl.studies.ablation import (
 )
 from ethbrake_marl.studies.jobs import TrainingJob
 from tests.pages.hostile import Page
-from tests.policies.test_networks import another
 from tests.studies.conftest import ABLATE, LEVELS, check_snapshot, study
 from tests.studies.counting import PROGRAM, end_when
 
@@ -187,27 +184,6 @@ def test_tables_figures_and_page__show_what_was_found(levels, behind, found) -> 
     assert page.open == [] and not {"script", "b", "img"} & {tag for tag, _ in page.tags}
     assert "cooperation-2-paper 100.0 % [91.2, 100.0] 20.00 11.00 [10.00, 12.00]" in page.text
     assert "`" not in page.text and html.count("<figure>") == 3 and "</script><b>" in page.text
-
-
-def generalise(*runs: Path, more: Sequence[str] = ()) -> int:
-    words = ["--runs", ",".join(map(str, runs)), "--scenario", PAIR.name, "--vehicles", "3,6", "--episodes", "10"]
-    return run_command(["study", "generalise", *words, *more])
-
-
-def test_generalise__prints_a_table_or_json(tmp_path: Path, capsys) -> None:
-    run = shipped_policies()["counterfactual-cooperation-3-pair"]
-    assert generalise(run, more=["--search-episodes", "2", "--budget", "20", "--json"]) == 0
-    rows = json.loads(capsys.readouterr().out)
-    assert [row["vehicles"] for row in rows] == [3, 6] and {row["kind"] for row in rows} == {"generalise"}
-    assert len({row["worlds_sha256"] for row in rows}) == 2 == len({row["scenario_sha256"] for row in rows})
-    assert rows[0]["policy_sha256"] == [eb.load_policy(run).manifest.manifest_sha256]
-    assert rows[1]["best_known"] <= rows[1]["full_brake"] * 10 and rows[1]["share_interval"] is not None
-    assert generalise(run) == 0
-    out = capsys.readouterr().out
-    assert "| 6 |" in out and "one seed says nothing about others" in out
-    policy = eb.load_policy(run)
-    another(policy, {name: each + np.float32(0.01) for name, each in policy.tensors.items()}).save(tmp_path / "seed")
-    assert generalise(run, tmp_path / "seed") == 0 and "2 policies" in capsys.readouterr().out
 
 
 WORLDS, SEARCHED = 40, 10
