@@ -64,7 +64,8 @@ def training_environment(model: Any, name: str, *, ignore_wrappers: bool = False
     if statistics is None and not ignore_wrappers and _was_normalised(model):
         raise InvalidInput(
             f"agent {name!r}: the model was trained under VecNormalize, whose statistics are missing; load them,"
-            " model.set_env(VecNormalize.load(PATH, venv)), or drive without them by ignore_wrappers=True"
+            " model.set_env(VecNormalize.load(PATH, venv)), or drive without them by ignore_wrappers=True,"
+            " as is right if it normalised rewards alone"
         )
     env, bases = getattr(model, "get_env", lambda: None)(), list[Any]()
     for layer in [] if env is None else _layers(env):

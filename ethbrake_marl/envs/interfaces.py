@@ -794,13 +794,12 @@ class EthBrakeVectorEnv(Begun, _Specified, VectorEnv[Observations, NDArray[Any],
         if not isinstance(options, Mapping) or RESET_MASK not in options:
             return np.ones(self.num_envs, np.bool_)
         mask = options[RESET_MASK]
-        if not (
-            isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.shape == (self.num_envs,) and mask.any()
-        ):
+        is_mask = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.shape == (self.num_envs,)
+        if not is_mask or np.ma.is_masked(mask) or not mask.any():
             raise InvalidInput(
                 f"reset: {RESET_MASK} = {mask!r}: must be an array of {self.num_envs} truth values, one of them True"
             )
-        return mask.copy()
+        return np.array(mask)
 
     def _renew(self, rows: Bools, seed: int | None, options: Mapping[str, Any]) -> None:
         """Start the next episodes of the stream in these rows, as an automatic reset does; the others go on."""

@@ -34,7 +34,7 @@ from ethbrake_marl.physics.kernel import (
     rows_for,
     solo_motion,
 )
-from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds
+from ethbrake_marl.physics.worlds import Bools, Floats, Ints, Vehicles, Worlds, checked_numbers
 
 # Worlds that cannot be advanced: left out, named, and never at the expense of the others.
 
@@ -380,10 +380,11 @@ def advance(
 
     """
     command = _shaped("command_mps2", command_mps2, worlds.speeds_mps.shape)
-    if (duration_s is None) == (until_s is None):
+    if until_s is None and duration_s is not None:
+        until_s = worlds.time_s + _shaped("duration_s", duration_s, (worlds.n,))
+    elif until_s is None or duration_s is not None:
         raise InvalidInput("advance: give either duration_s or until_s")
-    end = until_s if duration_s is None else worlds.time_s + _shaped("duration_s", duration_s, (worlds.n,))
-    until = _shaped("until_s", end, (worlds.n,))
+    until = _shaped("until_s", until_s, (worlds.n,))
     v, shape = worlds.vehicles, worlds.gaps_m.shape
     at, capacity = int(worlds.obstacle_ahead.any()), 4 * worlds.n + 64 if record else 0
     while True:
@@ -428,8 +429,8 @@ def _advance_part(arrays: tuple[NDArray[Any], ...], at: int, capacity: int, part
     return _Part(part.start, rows, *kernel(*mine, at, rows))
 
 
-def _shaped(name: str, value: ArrayLike | None, shape: tuple[int, ...]) -> Floats:
-    given = np.asarray(value, np.float64)
+def _shaped(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
+    given = checked_numbers(name, value)
     if given.shape == shape:
         return np.ascontiguousarray(given)
     try:

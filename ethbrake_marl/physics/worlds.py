@@ -467,7 +467,8 @@ def real_numbers(value: ArrayLike) -> Floats:
     raise ValueError("is not a number")
 
 
-def _checked_numbers(name: str, value: ArrayLike) -> Floats:
+def checked_numbers(name: str, value: ArrayLike) -> Floats:
+    """``real_numbers``; raises ``InvalidInput``, which names the value, where that raises."""
     try:
         return real_numbers(value)
     except ValueError as error:
@@ -508,10 +509,10 @@ def make_worlds(
     Raises ``InvalidInput`` naming the field, the first bad entry and its range.
 
     """
-    speeds = np.atleast_2d(_checked_numbers("speeds_mps", speeds_mps))
+    speeds = np.atleast_2d(checked_numbers("speeds_mps", speeds_mps))
     if speeds.ndim != 2 or speeds.shape[1] < 2:
         raise InvalidInput(f"speeds_mps: shape {speeds.shape}; a line needs at least 2 vehicles, as [n, N]")
-    gaps = _checked_numbers("gaps_m", gaps_m)
+    gaps = checked_numbers("gaps_m", gaps_m)
     n = speeds.shape[0] if gaps.ndim < 2 else max(speeds.shape[0], gaps.shape[0])
     N = speeds.shape[1]
     restitution_ = _full("restitution", restitution, (n,), 0.0, 1.0)
@@ -558,7 +559,7 @@ def _full(
     finite: bool = True,
 ) -> Floats:
     """Broadcast ``value`` to ``shape`` in its own memory and check that it is in range, and ``finite``."""
-    given = _checked_numbers(name, value)
+    given = checked_numbers(name, value)
     try:
         full = np.array(np.broadcast_to(given, shape), dtype=np.float64, order="C")
     except ValueError:

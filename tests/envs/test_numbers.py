@@ -141,3 +141,21 @@ def test_row__beside_one_that_is_reset_must_be_a_number() -> None:
         with pytest.raises(InvalidInput, match=r"action of the learners: (?s:.*)is masked|needs gradients"):
             env.step(bad)
     assert env.step(np.array([[0.5], [np.nan]]))[4]["chosen_action"][:, 0].tolist() == [0.5, 0.0]
+
+
+@pytest.mark.parametrize(
+    "wrong", [np.ma.array([0.0, -1.0, -1.0], mask=[0, 1, 0]), [False] * 3, torch.zeros(3, requires_grad=True)]
+)
+def test_advance__refuses_commands_and_times_that_are_no_numbers(wrong: Any) -> None:
+    worlds = eb.load_scenario("paper-random").sample(1, 0).worlds
+    with pytest.raises(InvalidInput, match=r"^command_mps2 = (?s:.*)(is masked|is a truth value|needs gradients)"):
+        eb.advance(worlds, wrong, 0.1)
+    for time in ({"duration_s": True}, {"until_s": True}):
+        with pytest.raises(InvalidInput, match=r"^(duration|until)_s = True: is a truth value"):
+            eb.advance(worlds, 0.0, **time)
+
+
+def test_reset_mask__may_not_be_masked_itself() -> None:
+    env = started(eb.EthBrakeVectorEnv(2))
+    with pytest.raises(InvalidInput, match="reset_mask"):
+        env.reset(options={"reset_mask": np.ma.array([True, True], mask=[False, True])})
