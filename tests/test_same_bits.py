@@ -38,7 +38,6 @@ REMAINS = {
         "scipy.special",
     ): "quantiles for the ends of an interval; the last bit of the t quantile"
     " differs for 1 in 1,000 counts where the processor has no FMA. Means and errors are exact sums",
-    ("figures.py", "**"): SQUARES,
     ("learning/algorithms.py", "**"): TRAINED,
     ("learning/algorithms.py", "np.exp"): TRAINED,
     ("learning/training.py", "math.cos"): TRAINED,
