@@ -104,7 +104,7 @@ def test_report__sentence_figure_and_table_of_four_columns_stand_above_the_fold(
     assert page.locator(".beside thead th").count() == 4 and page.locator(".beside tbody tr").count() == 5
     for name in (".beside .wide", ".beside .drawing"):  # nothing is hidden at the side
         assert page.evaluate(f"(e => e.scrollWidth <= e.clientWidth)(document.querySelector('{name}'))")
-    assert page.locator(".remarks li").count() == 2
+    assert page.locator(".remarks li").count() == 3
     least_px = page.evaluate("(e => e.clientWidth / e.viewBox.baseVal.width)(document.querySelector('.beside svg'))")
     assert least_px * 8.0 >= 9.0  # labels are of 8 pt or more
 
