@@ -148,7 +148,7 @@ def evaluate_command(
     """Compare agents on the same fixed list of worlds.
 
     `ethbrake agent list` says who can drive; ladder stands for all of them from coast to best_harm. Behind any agent:
-    +refined, then one shield, +episode, +step or +robust; for instance full_brake+step or ppo@PATH+refined+episode.
+    +search, then one shield, +episode, +step or +robust; for instance full_brake+step or ppo@PATH+search+episode.
     PATH is a run or a policy bundle, or shipped.
     """
     from ethbrake_marl.harm import declared_objectives

@@ -265,9 +265,7 @@ TRIED_CANDIDATES = 16  # of a script that searches, when a scenario is only chec
 
 LADDER = (  # from no decision at all up to the best that is known
     "coast",
-    "copy_leader",
     "full_brake",
-    "gentlest_front",
     "e_v2x_bm:pairwise",
     "e_v2x_bm",
     "planner",

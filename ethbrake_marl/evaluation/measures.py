@@ -1395,7 +1395,7 @@ _HEAD = {
     "Knows": "What the agent has to know of the line. own sensors: its own vehicle and what its sensors see. messages:"
     " also the messages that have reached it. true state: the others' states, capacities and latencies as they are,"
     " received or not. true model: also masses, restitution and scripts, enough to simulate the line ahead. Of a policy"
-    " behind a shield, or a refined one, both parts are told. † marks agents that see through a channel that hides"
+    " behind a shield or +search both parts are told. † marks agents that see through a channel that hides"
     " something here.",
 }
 _ALWAYS_SHOWN = ("collision_rate", "first_impact_harm", "total_harm", "sampled_harm", "vehicle_1_shoved_m")

@@ -104,7 +104,7 @@ def test_evaluate__a_damaged_bundle_is_refused_by_file_whatever_is_around_it(eth
     weights = tmp_path / "policy" / "weights.safetensors"
     data = weights.read_bytes()
     weights.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
-    for around in ("", "+episode", "+step", "+refined"):
+    for around in ("", "+episode", "+step", "+search"):
         spec = f"ppo@{tmp_path / 'policy'}{around}"
         check_refused(ethbrake("evaluate", "--episodes", "5", "--agents", spec), str(weights), "SHA-256")
 
@@ -129,7 +129,7 @@ def test_lineup__a_team_goes_behind_the_step_shield_and_no_other(monkeypatch) ->
 def test_check_agents__a_constant_above_the_capacity_of_any_world_is_refused_and_nobody_is_changed() -> None:
     scenario = SCENARIO.replace(braking_capacity_mps2={"uniform": [5, 7]})
     worlds = scenario.sample(500, 7).worlds
-    lineup = make_lineup(["e_v2x_bm", "constant:5", "gentlest_front"], scenario)
+    lineup = make_lineup(["e_v2x_bm", "constant:5", "coast"], scenario)
     before = dict(vars(lineup["e_v2x_bm"]))
     check_agents(lineup, worlds, scenario)
     assert vars(lineup["e_v2x_bm"]) == before

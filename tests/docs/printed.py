@@ -153,7 +153,7 @@ BLOCKS: dict[str, How] = {
     "paper-random full_brake        backward": EXACT,
 }
 
-_SHIPPED = "counterfactual@shipped,counterfactual@shipped+refined:profile+episode"
+_SHIPPED = "counterfactual@shipped,counterfactual@shipped+search+episode"
 _TESTS = tuple(
     f"ethbrake evaluate --scenario paper-random{test} --agents full_brake,e_v2x_bm,{agents},best_harm --episodes 2000"
     " --seed 7 --measures injury --json"

@@ -246,7 +246,7 @@ def test_record__an_agent_whose_commands_are_actions_is_as_in_an_evaluation(spec
     np.testing.assert_array_equal(*(np.stack([each.world_harm(c) for c in ("first", "total")]) for each in ledgers))
 
 
-@pytest.mark.parametrize("spec", ["best_harm", "e_v2x_bm", "full_brake+step", "ppo@shipped+refined+episode"])
+@pytest.mark.parametrize("spec", ["best_harm", "e_v2x_bm", "full_brake+step", "ppo@shipped+search+episode"])
 def test_record__of_any_agent_the_harm_is_that_of_its_float32_actions(spec: str) -> None:
     found = record(spec)
     assert found.actions.dtype == np.float32 and np.abs(found.actions).max() <= 1.0

@@ -269,7 +269,7 @@ def test_worlds_sha256__tells_every_bit_and_not_how_it_lies_in_memory(monkeypatc
     ("spec", "policy"),
     [
         ("ppo@shipped", "ppo"),
-        ("ppo@shipped+refined+episode", "ppo"),
+        ("ppo@shipped+search+episode", "ppo"),
         ("ppo@shipped+step", "ppo"),
         ("full_brake+step", None),
     ],
