@@ -257,8 +257,8 @@ Driver = Team | Agent | Shielding  # an agent alone drives every learner
 
 # The grammar of agents: ``name[:argument][@policy]``, and behind it what is put around that agent.
 #
-# ``+search`` comes first, then one shield: ``+episode``, ``+episode:pairwise``, ``+step`` or ``+robust``, each also with
-# ``:believed`` behind it. A name may be a function of a Python file, ``my_file.py:make_agent``.
+# ``+search`` comes first, then one shield: ``+episode``, ``+episode:pairwise``, ``+step`` or ``+robust``, each also
+# with ``:believed`` behind it. A name may be a function of a Python file, ``my_file.py:make_agent``.
 
 SEARCH = "search"
 SHIELDS = ("episode", "episode:pairwise", "step", "robust", "robust:interior")
