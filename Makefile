@@ -21,7 +21,7 @@ INSTALL := sh .ci/install $(VENV)
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs mutation bench-peers test-libraries test-bounds test-machines proofs test-cluster docs dist kernels benchmark audit figures
+.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs mutation bench-peers test-libraries test-bounds test-machines proofs test-cluster docs dist kernels audit figures
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
@@ -47,7 +47,6 @@ help:
 	@echo "make planted-bugs     plant 164 bugs, each in a copy of the code; each must turn a test red"
 	@echo "make mutation [ARGS=] 40 small random changes of each folder: how many turn a test red (ARGS='--folders shield')"
 	@echo "make bench-peers      speed beside other simulators, each in its own environment below .venvs/"
-	@echo "make benchmark        drive suite v2 with the agents of docs/benchmark.md and make its tables (ARGS: some agents)"
 	@echo "make venv             the environment alone: $(VENV)"
 	@echo "make clean            remove $(VENV), .venvs, caches and builds (runs/ stays)"
 	@echo "TORCH_INDEX=URL       take torch from this index; else uv picks the build for this machine"
@@ -209,9 +208,6 @@ mutation: $(STAMP)
 bench-peers: $(STAMP)
 	@echo "== speed beside other simulators"
 	@PYTHONPATH="$(CURDIR)" $(BIN)/python docs/studies/peers.py $(ARGS)
-
-benchmark: $(STAMP)
-	@$(BIN)/python -m tests.studies.benchmark_rows $(ARGS)
 
 clean:
 	rm -rf $(VENV) .venvs .pytest_cache .ruff_cache .mypy_cache .hypothesis build dist docs/_build

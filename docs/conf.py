@@ -29,6 +29,7 @@ nb_execution_timeout = -1  # however busy the machine is
 nb_execution_raise_on_error = True
 nb_execution_in_temp = True
 nb_merge_streams = True
+nb_ipywidgets_js: dict[str, dict[str, str]] = {}  # the site loads nothing; sliders move in Jupyter alone
 
 autodoc_typehints = "none"  # they stand in the signature's line
 autodoc_member_order = "bysource"

@@ -104,9 +104,8 @@ if TYPE_CHECKING:
     )
 
     # Figures: matplotlib's, which a notebook shows
-    from ethbrake_marl.evaluation import criticality_map as criticality_map, deceleration_curve as deceleration_curve
+    from ethbrake_marl.evaluation import deceleration_curve as deceleration_curve
     from ethbrake_marl.figures import (
-        criticality_figure as criticality_figure,
         deceleration_figure as deceleration_figure,
         trajectories as trajectories,
         harm_against_total_gap as harm_against_total_gap,

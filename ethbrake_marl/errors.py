@@ -113,7 +113,6 @@ _EXTRA_OF = {
     **dict.fromkeys(("onnx", "onnxruntime"), "export"),
     **dict.fromkeys(("pyarrow", "minari", "h5py"), "data"),
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
-    **dict.fromkeys(("starlette", "uvicorn"), "explore"),
     "ray": "cluster",
     "optuna": "tune",
     "libsumo": "sumo",

@@ -26,7 +26,6 @@ from matplotlib.figure import Figure as Figure  # the type that every figure has
 from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch
-from matplotlib.patheffects import Normal, Stroke
 from matplotlib.ticker import (
     EngFormatter,
     FuncFormatter,
@@ -47,11 +46,9 @@ from ethbrake_marl.envs import (
 from ethbrake_marl.errors import InvalidInput, count_of, plain_text
 from ethbrake_marl.evaluation import (
     Conditions,
-    CriticalityMap,
     DecelerationCurve,
     EpisodeRecord,
     Evaluation,
-    ShieldModes,
     SummaryRow,
     drawn_alike,
     mean,
@@ -61,7 +58,7 @@ from ethbrake_marl.files.store import write_output
 from ethbrake_marl.limits import Unproven
 from ethbrake_marl.physics import Floats, Worlds
 from ethbrake_marl.scenario import QUANTITY, Sample, Scenario
-from ethbrake_marl.shield import OperatingPoint, RobustnessPoint
+from ethbrake_marl.shield import OperatingPoint
 
 # Markers and dashes repeat the distinction of the colours.
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
@@ -600,50 +597,6 @@ def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | No
     return finish(figure, caption, panels[0])
 
 
-# Criticality map: the harm of one agent over both gaps, and the line between avoidable and unavoidable worlds.
-
-LABELLED_SHARE = 0.02  # share of the cells that a region needs to have its name written in it
-
-_HARMS: dict[HarmCount, str] = {"first": "First-impact harm", "total": "Total harm"}
-
-
-def criticality_figure(found: CriticalityMap) -> Figure:
-    """Both harms as colour over both gaps, on one scale; the boundary of avoidability as a line."""
-    figure = new_figure(10.0, 4.9)
-    panels = figure.subplots(1, 2, sharex=True, sharey=True)
-    largest = max(float(found.harm(harm_count).max()) for harm_count in HARM_COUNTS)
-    (agent,) = found.evaluation.outcomes
-    for axes, (harm_count, label) in zip(panels, _HARMS.items(), strict=True):
-        harm = found.harm(harm_count)
-        mesh = axes.pcolormesh(  # white where there is no harm
-            found.gap_1_m, found.gap_2_m, np.where(harm > 0.0, harm, np.nan), cmap="viridis_r", vmin=0.0,
-            vmax=max(largest, 1e-9), shading="nearest", rasterized=True,
-        )  # fmt: skip
-        if found.avoidable is not None and found.boundary_gap_1_m is not None and found.boundary_gap_2_m is not None:
-            axes.plot(
-                found.boundary_gap_1_m, found.boundary_gap_2_m, color=COLOURS[1], linewidth=2.0,
-                path_effects=[Stroke(linewidth=4.0, foreground="white"), Normal()],
-            )  # fmt: skip
-            for name, region in (("avoidable", found.avoidable), ("unavoidable", ~found.avoidable)):
-                if not region.mean() > LABELLED_SHARE:
-                    continue
-                cells = np.argwhere(region)
-                row, column = cells[np.argmin(((cells - cells.mean(axis=0)) ** 2).sum(axis=1))]
-                axes.text(
-                    found.gap_1_m[column], found.gap_2_m[row], name, fontsize=10, ha="center", va="center",
-                    bbox={"boxstyle": "round,pad=0.25", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
-                )  # fmt: skip
-        axes.tick_params(labelsize=9, color=GREY)
-        name_axes(axes, f"{label} of {label_text(agent)}", "Gap 1, Vehicle 1 to Vehicle 2 (m)")
-    name_axes(panels[0], y="Gap 2, Vehicle 2 to Vehicle 3 (m)")
-    bar = figure.colorbar(mesh, ax=panels, label="Harm (m²/s²)", pad=0.015)
-    bar.ax.tick_params(labelsize=9)
-    line = "Line: above it some command of Vehicle 2 avoids all contact, below it none does (proven)."
-    if found.boundary_gap_1_m is None:
-        line = "Nothing is proven about avoidability for this line-up."
-    return finish(figure, f"{line} White: no harm. {found.evaluation.conditions.line}.")
-
-
 # Harm against the constant deceleration of one vehicle in one world: predicted, realised, and the best known.
 
 _PREDICTED = COLOURS[2]
@@ -886,89 +839,6 @@ def operating_figure(curves: Sequence[tuple[str, Sequence[OperatingPoint]]], *, 
     axes.xaxis.set_major_formatter(PercentFormatter(1.0))
     name_axes(axes, x="Decisions in which the shield intervenes", y="Mean harm (m²/s²)")
     axes.legend(fontsize=9, frameon=False)
-    return finish(figure, caption)
-
-
-_PRICE = (("step", "harm", 0, "harm"), ("robust", "harm", 3, "harm"), ("robust", "bound", 2, "bound at the alert"))
-_MISMATCH = (
-    ("step", "corner", 0, "step, a corner"),
-    ("step", "inside", 1, "step, inside"),
-    ("robust", "corner", 2, "robust, a corner"),
-    ("robust", "inside", 3, "robust, inside"),
-)
-# of each panel: title, unit, and its lines: mode, truth, what is drawn, number of the style, label
-_ROBUSTNESS: tuple[tuple[str, str, list[tuple[str, str, str, int, str]]], ...] = (
-    (
-        "The world is as told",
-        "Mean over worlds (m²/s²)",
-        [(mode, "as told", what, number, f"{mode}: {words}") for mode, what, number, words in _PRICE],
-    ),
-    (
-        "The truth differs: above the bound",
-        "Worlds above the bound at the alert",
-        [(mode, truth, "above", number, label) for mode, truth, number, label in _MISMATCH],
-    ),
-    (
-        "The truth differs: excess",
-        "Mean excess (m²/s²)",
-        [(mode, truth, "excess", number, label) for mode, truth, number, label in _MISMATCH],
-    ),
-)
-
-
-def robustness_figure(points: Sequence[RobustnessPoint], *, caption: str = "") -> Figure:
-    """Left the price where the world is as told; then, where it is not, how often and how far the bound is broken.
-
-    Raises ``InvalidInput`` without a point.
-    """
-    if not points:
-        raise InvalidInput("robustness_figure: at least one point is needed")
-    figure, panels = new_panels((11.0, 4.0), columns=3)
-    for axes, (title, unit, lines) in zip(panels, _ROBUSTNESS, strict=True):
-        for mode, truth, what, number, label in lines:
-            chosen = [point for point in points if (point.mode, point.truth) == (mode, truth)]
-            values = [float(getattr(point, what)) for point in chosen]
-            axes.plot([point.width for point in chosen], values, label=label, **series_style(number))
-        axes.set_title(title, fontsize=9.5, loc="left")
-        name_axes(axes, x="Width of the intervals (1: as given)", y=unit)
-        axes.set_ylim(bottom=0.0)
-        axes.legend(fontsize=8, frameon=False)
-    panels[1].yaxis.set_major_formatter(PercentFormatter(1.0))
-    return finish(figure, caption)
-
-
-_OFFSETS = {"none": -0.2, "step": 0.0, "step-alert": 0.2, "step-cap": 0.35}
-_LABELS = {
-    "none": "no shield",
-    "step": "step mode",
-    "step-alert": "step mode, rollout at the alert only",
-    "step-cap": "step mode with caps",
-}
-
-
-def shield_modes_figure(rows: ShieldModes, *, caption: str = "") -> Figure:
-    """Per agent the paired difference to episode mode with its 95 % interval, one mark per mode; left is less harm.
-
-    Of teams, for which there is no episode mode, the difference to no shield. Raises ``InvalidInput`` without a row.
-    """
-    if not rows:
-        raise InvalidInput("shield_modes_figure: at least one agent is needed")
-    agents = list(dict.fromkeys(row.agent for row in rows))
-    figure, (axes,) = new_panels((7.2, 1.4 + 0.55 * len(agents)))
-    for number, mode in enumerate(_OFFSETS):
-        for row in (row for row in rows if row.mode == mode):
-            against, place = row.against_none if rows.of_teams else row.against_episode, agents.index(row.agent)
-            if against is not None:
-                style = {**series_style(number), "linestyle": "none", "label": _LABELS[mode] if place == 0 else None}
-                _with_intervals(axes, [place + _OFFSETS[mode]], [against], upright=False, capsize=2.5, **style)
-    axes.axvline(0.0, color=GREY, linewidth=1.0)
-    axes.set_xscale("symlog", linthresh=1.0)
-    axes.xaxis.set_major_formatter(FuncFormatter(_plain))
-    axes.set_yticks(range(len(agents)), agents, fontsize=9)
-    axes.invert_yaxis()
-    other = "without a shield" if rows.of_teams else "of episode mode"
-    name_axes(axes, x=f"Harm minus that {other} (m²/s² per world; linear within ±1)")
-    axes.legend(fontsize=8.5, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3)
     return finish(figure, caption)
 
 

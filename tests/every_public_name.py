@@ -96,11 +96,10 @@ def show(found: eb.Evaluation, folder: Path) -> list[Any]:
     record = eb.record_episode(found.worlds.take([0]), Cautious(), scenario=found.scenario)
     eb.write_picture(folder / "episode.svg", eb.trajectories({"world 0": record}))
     eb.compare_results(eb.read_result(folder / "a.json"), eb.read_result(folder / "b.json"))
-    cells = eb.criticality_map(eb.load_scenario("paper-distance"), {"cautious": Cautious()}, cells=3)
     curve = eb.deceleration_curve(found.worlds.take([0]), found.task)
     assert_type(eb.summarise(found), eb.SummaryTable)
     assert_type(eb.summarise_by(found, "scenario"), dict[str, eb.SummaryTable])
-    figures = [eb.criticality_figure(cells), eb.deceleration_figure(curve), eb.harm_against_total_gap(found)]
+    figures = [eb.deceleration_figure(curve), eb.harm_against_total_gap(found)]
     return [found.to_frame(), *figures]
 
 

@@ -76,7 +76,7 @@ def drive(test: str) -> list[Played]:
     played = [Played(number, test, "", title=f"{test}, world {number}") for number in WORLDS]
     for agent, spelling in AGENTS.items():
         driver = make_agent(spelling or own, scenario=scenario, harm_count=count)
-        Played.drive(played, worlds, agent, driver, scenario, spelling or own, seed=SEED, harm_count=count)
+        Played.drive(played, worlds, agent, driver, scenario)
     harms = [[one.motions[agent].harm[count == "total"] for agent in ("Full braking", OWN)] for one in played]
     return [
         replace(one, why=f"harm {full:.1f} by full braking, {trained:.1f} trained for this test")

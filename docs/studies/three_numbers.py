@@ -12,8 +12,6 @@ from ethbrake_marl.physics import advance
 worlds = load_scenario("paper-random").sample(10_000, seed=7).worlds
 for spec, count in [
     ("full_brake", "first"),
-    ("copy_leader", "first"),
-    ("gentlest_front", "first"),
     ("e_v2x_bm:pairwise", "first"),
     ("e_v2x_bm", "first"),
     ("e_v2x_bm", "total"),

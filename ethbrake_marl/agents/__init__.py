@@ -17,7 +17,7 @@ if TYPE_CHECKING:
         optimise_pairwise as optimise_pairwise,
         pairwise_harm as pairwise_harm,
     )
-    from ethbrake_marl.agents.planner import BestHarm as BestHarm, Refined as Refined
+    from ethbrake_marl.agents.planner import BestHarm as BestHarm, Searched as Searched
     from ethbrake_marl.agents.policy import (
         LearnedAgent as LearnedAgent,
         LearnedPolicy as LearnedPolicy,

@@ -403,7 +403,7 @@ def optimise_pairwise(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
 
     Raises ``InvalidInput`` if ``vehicle`` is not in the line, a vehicle moves backward or brakes build up.
     """
-    worlds.refuse_build_up("the closed form of E-V2X-BM, gentlest_front and planner")
+    worlds.refuse_build_up("the closed form of E-V2X-BM and planner")
     return _closed_form(worlds, vehicle)
 
 
@@ -423,7 +423,7 @@ def pairwise_harm(worlds: Worlds, deceleration_mps2: ArrayLike) -> Floats:
     controlled vehicle's pairs. Raises ``InvalidInput`` for a deceleration that is negative or not finite, and where
     brakes build up.
     """
-    worlds.refuse_build_up("the closed form of E-V2X-BM, gentlest_front and planner")
+    worlds.refuse_build_up("the closed form of E-V2X-BM and planner")
     onset = _onset_s(worlds, 0)
     deceleration = np.array(np.broadcast_to(np.asarray(deceleration_mps2, np.float64), worlds.speeds_mps.shape))
     good = (deceleration >= 0.0) & np.isfinite(deceleration)
@@ -1268,51 +1268,6 @@ class StateFree:
         return command
 
 
-class CopyLeader:
-    """Brake exactly as hard as the vehicle in front can, as far as the own brakes allow.
-
-    ``a = min(a_front, a_own)``. Needs one number from the front vehicle. Raises ``InvalidInput`` for the first vehicle.
-    """
-
-    name = "copy_leader"
-    state_free = True
-    knows = Source.STATE
-
-    def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """``-min(a_front, a_own)``, [n] m/s2."""
-        _check_has_front(self.name, vehicle)
-        capacity = worlds.vehicles.braking_capacity_mps2
-        return -np.minimum(capacity[:, vehicle - 1], capacity[:, vehicle])
-
-
-class GentlestFront:
-    """The smallest constant deceleration that spares the vehicle in front; full braking if none does.
-
-    From the pairwise closed form; it needs nothing from the vehicle behind, and collides in the very worlds in which
-    E-V2X-BM does: what it lacks is the choice between two harms. Raises ``InvalidInput`` for the first vehicle.
-    """
-
-    name = "gentlest_front"
-    state_free = True  # once the episode has begun
-    knows = Source.STATE
-
-    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Floats:
-        """The command of these episodes."""
-        _check_has_front(self.name, vehicle)
-        least = optimise_pairwise(alert, vehicle).spares_front_mps2
-        return -np.minimum(least, alert.vehicles.braking_capacity_mps2[:, vehicle])
-
-    def act(self, worlds: Worlds, memory: Floats, vehicle: int) -> tuple[Floats, Floats]:
-        """That command, [n] m/s2."""
-        return memory, memory
-
-
 def make_script(argument: str | None, settings: AgentSettings) -> Agent:
     """The script of that name."""
-    others: dict[str, type[CopyLeader | GentlestFront]] = {"copy_leader": CopyLeader, "gentlest_front": GentlestFront}
-    return others[settings.spec]() if settings.spec in others else StateFree(settings.spec)
-
-
-def _check_has_front(name: str, vehicle: int) -> None:
-    if vehicle < 1:
-        raise InvalidInput(f"agent {name!r}: vehicle_{vehicle + 1} has no vehicle in front of it")
+    return StateFree(settings.spec)

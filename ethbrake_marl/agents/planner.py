@@ -1,11 +1,9 @@
-"""Agents that search whole profiles in the engine's physics: a planner, the best profile known, refined policies."""
+"""Agents that search whole profiles in the engine's physics: planner, best profile known, search around a policy."""
 
 from __future__ import annotations
 
 import re
-import time
-from collections.abc import Callable, Iterator, Mapping
-from itertools import count
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -18,13 +16,12 @@ from ethbrake_marl.agents.registry import (
     AgentSettings,
     Source,
     check_agent,
-    drive,
     fixed_commands,
     make_agent,
     record_commands,
 )
 from ethbrake_marl.defaults import HarmCount
-from ethbrake_marl.engine import Memory, Script, ask_script, begin_script, renew_memory, take_memory
+from ethbrake_marl.engine import Memory, Script, renew_memory, take_memory
 from ethbrake_marl.errors import InvalidInput, check_whole_number, renumbered
 from ethbrake_marl.harm import check_harm_count
 from ethbrake_marl.physics import CLOCK, Bools, Decisions, Floats, Ints, Worlds
@@ -65,27 +62,13 @@ class _Outlook(NamedTuple):
         return now
 
 
-def _budget(argument: str, unit: str = "", longest: float = 0.0, each: int = 0) -> tuple[int, float] | None:
-    """Candidates per decision (0 of time), or those of ``each`` round and a number of units of time; else None."""
-    match = re.fullmatch(rf"([0-9]+(?:\.[0-9]+)?)({unit})?", argument)
-    number = float(match[1]) if match else 0.0
-    if match and match[2]:
-        return (each, number) if 0.0 < number <= longest else None
-    return (int(number), 0.0) if 1.0 <= number <= MOST_CANDIDATES and "." not in argument else None
-
-
-def _rounds(seconds: float) -> Iterator[int]:
-    """The seeds of rounds that follow each other, one at least, as long as there is time."""
-    stop = time.perf_counter() + seconds
-    for seed in count():
-        yield seed
-        if time.perf_counter() >= stop:
-            return
+def _budget(argument: str) -> int | None:
+    """The number of candidates that an argument is; None: it is none."""
+    number = int(argument) if re.fullmatch("[0-9]{1,7}", argument) else 0
+    return number if 1 <= number <= MOST_CANDIDATES else None
 
 
 CANDIDATES = 256  # per world and decision
-ROUND = 256  # candidates between two looks at the clock
-MOST_MILLISECONDS = 60_000.0  # per world and decision
 
 
 class Planner:
@@ -97,8 +80,7 @@ class Planner:
     an episode begins, for another vehicle's script whose command is not fixed at the alert.
 
     Args:
-        argument: candidates per world and decision (deterministic), or a time like ``20ms`` for each (as many rounds as
-            fit, at least one; depends on the machine).
+        argument: candidates per world and decision.
         harm_count: which harm it minimises, ``first`` or ``total``.
         horizon_s: until when it looks ahead, s.
         most_candidates: of a search, whatever the argument says.
@@ -125,17 +107,14 @@ class Planner:
         time_step_s: float = TIME_STEP_S,
     ) -> None:
         check_harm_count(harm_count)
-        budget = (CANDIDATES, 0.0) if argument is None else _budget(argument, "ms", MOST_MILLISECONDS, ROUND)
+        budget = CANDIDATES if argument is None else _budget(argument)
         if budget is None:
             raise InvalidInput(
                 f"agent 'planner:{argument}': the argument must be a number of candidates per decision, for instance"
-                f" {CANDIDATES} (at most {MOST_CANDIDATES:,}), or a time per decision, for instance 20ms (at most"
-                f" {MOST_MILLISECONDS:,.0f}ms)"
+                f" {CANDIDATES}, at most {MOST_CANDIDATES:,}"
             )
         self.name = "planner" if argument is None else f"planner:{argument}"
-        self._candidates, self._seconds = budget[0], 1e-3 * budget[1]
-        if most_candidates is not None:
-            self._candidates, self._seconds = min(self._candidates, most_candidates), 0.0
+        self._candidates = budget if most_candidates is None else min(budget, most_candidates)
         self._outlook = _Outlook(harm_count, horizon_s, time_step_s)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
@@ -168,18 +147,17 @@ class Planner:
     def _search(self, problem: ProfileProblem, plan: Profiles) -> tuple[Profiles, Floats]:
         """The best plans found from these and from constants, with their harm under the own count."""
         constants = problem.constant(problem.even_grid(15))
-        for seed in _rounds(self._seconds * problem.n):
-            n, K = plan.ends.shape  # each world's plan, then its constants: [n * Q]
-            ends = np.concatenate([plan.ends[:, np.newaxis], constants.ends.reshape(n, -1, K)], axis=1)
-            commands = constants.commands_mps2.reshape(n, -1, K, 1)
-            commands = np.concatenate([plan.commands_mps2[:, np.newaxis], commands], axis=1)
-            given = Profiles(ends.reshape(-1, K), commands.reshape(-1, K, 1))
-            plan, harm = problem.search(given, budget=self._candidates, seed=seed)
+        n, K = plan.ends.shape  # each world's plan, then its constants: [n * Q]
+        ends = np.concatenate([plan.ends[:, np.newaxis], constants.ends.reshape(n, -1, K)], axis=1)
+        commands = constants.commands_mps2.reshape(n, -1, K, 1)
+        commands = np.concatenate([plan.commands_mps2[:, np.newaxis], commands], axis=1)
+        given = Profiles(ends.reshape(-1, K), commands.reshape(-1, K, 1))
+        plan, harm = problem.search(given, budget=self._candidates, seed=0)
         return plan, harm[self._outlook.harm_count]
 
 
 def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
-    """``planner``, ``planner:CANDIDATES`` or ``planner:20ms``; with ``:believed`` behind, in the believed world."""
+    """``planner`` or ``planner:CANDIDATES``; with ``:believed`` behind, in the believed world."""
     planner = Planner(
         argument, harm_count=settings.harm_count, horizon_s=settings.horizon_s,
         most_candidates=settings.most_candidates, time_step_s=settings.time_step_s,
@@ -229,7 +207,7 @@ class BestHarm:
     @classmethod
     def make(cls, argument: str | None, settings: AgentSettings, recall: Recall) -> BestHarm:
         """``best_harm`` or ``best_harm:CANDIDATES``; raises ``InvalidInput`` for an argument that is no such number."""
-        budget = (PROFILE_BUDGET, 0.0) if argument is None else _budget(argument)
+        budget = PROFILE_BUDGET if argument is None else _budget(argument)
         if budget is None:
             raise InvalidInput(
                 f"agent 'best_harm:{argument}': the argument must be a number of candidates, for instance"
@@ -238,7 +216,7 @@ class BestHarm:
         return cls(
             recall, scenario=settings.scenario, harm_count=settings.harm_count, horizon_s=settings.horizon_s,
             time_step_s=settings.time_step_s,
-            budget=budget[0] if settings.most_candidates is None else min(budget[0], settings.most_candidates),
+            budget=budget if settings.most_candidates is None else min(budget, settings.most_candidates),
         )  # fmt: skip
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
@@ -288,10 +266,10 @@ class BestHarm:
         return np.stack(steps, axis=1)
 
 
-# The compiled refinement of a policy: a search around its own episode at the alert, which then drives.
+# A search around the own episode of a policy at the alert: what it finds then drives.
 
 
-class RefinedProfile(AgentAround):
+class Searched(AgentAround):
     """Drives the commands that a search around the policy's episode found at the alert, step by step.
 
     It knows the model of the line and the other vehicles' scripts, and does not react to what happens otherwise.
@@ -308,8 +286,8 @@ class RefinedProfile(AgentAround):
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
-    >>> refined = eb.make_agent("constant:5+refined:profile", scenario=scenario)
-    >>> outcome = eb.evaluate(scenario.sample(2, seed=7), {"refined": refined}, scenario=scenario).outcome("refined")
+    >>> searched = eb.make_agent("constant:5+search", scenario=scenario)
+    >>> outcome = eb.evaluate(scenario.sample(2, seed=7), {"searched": searched}, scenario=scenario).outcome("searched")
     >>> bool((outcome.first_impact_harm == outcome.predicted_harm).all())
     True
 
@@ -317,16 +295,14 @@ class RefinedProfile(AgentAround):
 
     adds = Source.MODEL
 
-    adds = Source.MODEL
-
     def __init__(
         self, policy: Agent, scenario: Scenario, *, candidates: int = 500, harm_count: HarmCount = "first"
     ) -> None:
-        check_agent(policy, "refined")
-        check_whole_number("refined: candidates", candidates, 1, MOST_CANDIDATES)
+        check_agent(policy, "search")
+        check_whole_number("search: candidates", candidates, 1, MOST_CANDIDATES)
         check_harm_count(harm_count)
-        super().__init__(policy, f"{policy.name}+refined:profile")
-        self.scenario, self._candidates, self._seconds = scenario, candidates, 0.0
+        super().__init__(policy, f"{policy.name}+search")
+        self.scenario, self._candidates = scenario, candidates
         self._outlook = _Outlook(harm_count, scenario.horizon_s, scenario.time_step_s)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
@@ -334,13 +310,10 @@ class RefinedProfile(AgentAround):
         others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
         problem = self._outlook.problem(alert, vehicle, others)
         own = record_commands(self.policy, alert, self.scenario, vehicle, int(problem.last_step.max()))
-        commands, harm = self._search(problem, own)
-        start_s = problem.clock[:, CLOCK.START].copy()  # of the first decision
+        commands, harm = problem.refine(own, budget=self._candidates)
         return {
             "commands_mps2": np.pad(commands, ((0, 0), (0, self._outlook.decisions - own.shape[1])), mode="edge"),
-            "start_s": start_s,
-            "planned_s": start_s,
-            "others_mps2": others,
+            "start_s": problem.clock[:, CLOCK.START].copy(),  # of the first decision
             "predicted_harm": harm,
         }
 
@@ -348,201 +321,7 @@ class RefinedProfile(AgentAround):
         """The command of the step, [n] m/s2."""
         return self._outlook.command(worlds, memory), memory
 
-    def _search(self, problem: ProfileProblem, commands_mps2: Floats) -> tuple[Floats, Floats]:
-        """The best that is found around these commands in the budget, with its harm under the own count."""
-        for seed in _rounds(self._seconds * problem.n):
-            commands_mps2, harm = problem.refine(commands_mps2, budget=self._candidates, seed=seed)
-        return commands_mps2, harm
 
-
-# The compiled refinement once more at every decision, from the worlds as they are then.
-
-MOST_MICROSECONDS = 60_000_000
-
-
-class RefinedAgain(RefinedProfile):
-    """Drives the first command of a plan that begins as the policy's own episode and is searched around ever again.
-
-    Each decision begins with what is left of the last plan, from the worlds as they have become: where another vehicle
-    does not follow its script, the next plan knows. If all do, ``predicted_harm`` [n] (m2/s2) is what the plan at the
-    alert leads to, and the later ones lead to no more. Raises ``InvalidInput`` as ``RefinedProfile``.
-
-    Args:
-        policy: any agent.
-        scenario: in which it searches.
-        argument: candidates per world and decision (deterministic), or a time like ``200us`` for each (as many rounds
-            as fit, at least one; depends on the machine).
-        harm_count: which harm is least, ``first`` or ``total``.
-
-    >>> import ethbrake_marl as eb
-    >>> scenario = eb.load_scenario("paper-random")
-    >>> refined = eb.make_agent("constant:5+refined:20", scenario=scenario)
-    >>> outcome = eb.evaluate(scenario.sample(2, seed=7), {"refined": refined}, scenario=scenario).outcome("refined")
-    >>> bool((outcome.first_impact_harm <= outcome.predicted_harm).all())
-    True
-
-    """
-
-    def __init__(self, policy: Agent, scenario: Scenario, argument: str, *, harm_count: HarmCount = "first") -> None:
-        budget = _budget(argument, "us", MOST_MICROSECONDS, 50)  # candidates between two looks at the clock
-        if budget is None:
-            raise InvalidInput(
-                f"+refined:{argument}: must be profile (one search at the alert), a number of candidates per decision,"
-                f" for instance 50 (at most {MOST_CANDIDATES:,}), or a time per decision, for instance 200us (at most"
-                f" {MOST_MICROSECONDS:,}us)"
-            )
-        super().__init__(policy, scenario, candidates=budget[0], harm_count=harm_count)
-        self._seconds = 1e-6 * budget[1]
-        self.name = f"{policy.name}+refined:{argument}"
-
-    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """The first command of the new plans, [n] m/s2."""
-        rows = self._outlook.due(worlds, memory["planned_s"])
-        if rows.size:
-            plan = self._plan_again(worlds.take(rows), vehicle, take_memory(memory, rows))
-            memory = renew_memory(memory, rows, {"commands_mps2": plan, "planned_s": worlds.time_s[rows]})
-        return super().act(worlds, memory, vehicle)
-
-    def _plan_again(self, worlds: Worlds, vehicle: int, held: Memory) -> Floats:
-        """The plans [m, steps] with what is left of them searched around, from the worlds as they are now."""
-        plan: Floats = held["commands_mps2"]
-        problem = self._outlook.problem(worlds, vehicle, held["others_mps2"])
-        step = Decisions(held["start_s"], self._outlook.time_step_s).latest(worlds.time_s)
-        later = step[:, np.newaxis] + np.arange(int(problem.last_step.max()))
-        rows, last = np.arange(worlds.n)[:, np.newaxis], self._outlook.decisions - 1
-        found, _ = self._search(problem, plan[rows, np.minimum(later, last)])
-        inside = later <= last
-        plan[np.broadcast_to(rows, later.shape)[inside], later[inside]] = found[inside]
-        return plan
-
-
-TRIES = 32  # deviations tried in each round
-ROUNDS = 6  # each starts from the best of the rounds before
-SEGMENT_S = 0.4  # a deviation changes at multiples of this time
-HOLDS = (2, 3, 6)  # segments for which it stays the same, in turn
-SIZES = (0.05, 0.15, 0.4)  # largest change in one round, as shares of the braking capacity, in turn
-_SEGMENTS = 64  # of different deviation; the last one goes on
-_BLOCK = 4096  # worlds rolled out together: bounds memory, changes no result
-
-
-class Refined(AgentAround):
-    """Drives by ``policy`` plus the deviation that did the least harm when many were rolled out at the alert.
-
-    A deviation is a sequence of accelerations added to what the policy does, which goes on reacting to what it
-    observes. Each round adds fixed changes, the same in every world, to the best deviation so far; the first is none.
-    ``predicted_harm`` [n] (m2/s2) is the least harm found, never above the policy's own, and is realised if the other
-    vehicles follow their scripts. Equal harms: the earlier one. A world's choice does not depend on its batch. Raises
-    ``InvalidInput`` for what is not an agent, or numbers outside 1 to 10,000.
-
-    Args:
-        policy: any agent.
-        scenario: in which it tries them.
-        tries: deviations of each round.
-        rounds: each starts from the best of those before.
-        harm_count: which harm is least, ``first`` or ``total``.
-
-    >>> import ethbrake_marl as eb
-    >>> scenario = eb.load_scenario("paper-random")
-    >>> refined = eb.make_agent("constant:5+refined", scenario=scenario)
-    >>> outcome = eb.evaluate(scenario.sample(2, seed=7), {"refined": refined}, scenario=scenario).outcome("refined")
-    >>> bool((outcome.first_impact_harm == outcome.predicted_harm).all())
-    True
-
-    """
-
-    adds = Source.MODEL  # in which it tries them
-
-    def __init__(
-        self,
-        policy: Agent,
-        scenario: Scenario,
-        *,
-        tries: int = TRIES,
-        rounds: int = ROUNDS,
-        harm_count: HarmCount = "first",
-    ) -> None:
-        check_agent(policy, "refined")
-        for name, number in (("tries", tries), ("rounds", rounds)):
-            check_whole_number(f"refined: {name}", number, 1, 10_000)
-        check_harm_count(harm_count)
-        super().__init__(policy, f"{policy.name}+refined")
-        self.scenario = scenario
-        self.tries = tries
-        self.rounds = rounds
-        self.harm_count: HarmCount = harm_count
-
-    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Search in these worlds."""
-        best = np.zeros((alert.n, _SEGMENTS))
-        least = self._harm(alert, vehicle, best)
-        for number in range(self.rounds):
-            change = changes(number, self.tries)
-            open_rows = np.flatnonzero(least > 0.0)
-            step = max(1, _BLOCK // self.tries)
-            for some in (open_rows[i : i + step] for i in range(0, len(open_rows), step)):
-                tried = best[some, np.newaxis] + change  # [worlds, tries, segments]
-                each = np.repeat(some, len(change))
-                with renumbered(each):
-                    harm = self._harm(alert.take(each), vehicle, tried.reshape(-1, _SEGMENTS))
-                harm = harm.reshape(len(some), len(change))
-                chosen = harm.argmin(axis=1)
-                better = harm[np.arange(len(some)), chosen] < least[some]
-                best[some[better]] = tried[better, chosen[better]]
-                least[some[better]] = harm[better, chosen[better]]
-        policy = begin_script(self.policy, alert, vehicle, scripts)
-        return {"policy": policy, "deviation": best, "predicted_harm": least}
-
-    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Wanted signed acceleration, [n] m/s2."""
-        command, policy = ask_script(self.policy, worlds, memory["policy"], vehicle)
-        return deviate(command, memory["deviation"], worlds, vehicle), {**memory, "policy": policy}
-
-    def _harm(self, worlds: Worlds, vehicle: int, deviation: Floats) -> Floats:
-        """Harm under one deviation per world, [n]."""
-        return drive(worlds, _Deviating(self.policy, deviation, self.name), self.scenario, vehicle).ledger.world_harm(
-            self.harm_count
-        )
-
-
-def refine(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """``+refined``, ``+refined:profile``, ``+refined:50`` or ``+refined:200us`` around an agent."""
-    if argument not in (None, "profile"):
-        return RefinedAgain(policy, settings.needed_scenario(), argument, harm_count=settings.harm_count)
-    if argument is not None:
-        return RefinedProfile(policy, settings.needed_scenario(), harm_count=settings.harm_count)
-    return Refined(policy, settings.needed_scenario(), harm_count=settings.harm_count)
-
-
-class _Deviating(AgentAround):
-    """A policy plus one given deviation per world."""
-
-    def __init__(self, policy: Agent, deviation: Floats, name: str) -> None:
-        super().__init__(policy, name)
-        self.deviation = deviation  # [n, segments]
-
-    def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        command, memory = ask_script(self.policy, worlds, memory, vehicle)
-        return deviate(command, self.deviation, worlds, vehicle), memory
-
-
-def changes(number: int, tries: int) -> Floats:
-    """What round ``number`` adds to a deviation, as shares of the braking capacity: [tries, segments].
-
-    Change k is constant over ``HOLDS`` segments and uniform in plus or minus one of ``SIZES``, in turn; the numbers are
-    Philox's integers with the round as their key, the same for ever.
-    """
-    integers = np.asarray(np.random.Philox(key=number).random_raw(tries * _SEGMENTS))
-    share = (integers >> np.uint64(11)).astype(np.float64).reshape(tries, _SEGMENTS) * 2.0**-52 - 1.0
-    kind = np.arange(tries)
-    hold = np.array(HOLDS)[(kind // len(SIZES)) % len(HOLDS), np.newaxis]
-    held = np.take_along_axis(share, np.arange(_SEGMENTS) // hold, axis=1)
-    return np.array(SIZES)[kind % len(SIZES), np.newaxis] * held
-
-
-def deviate(command_mps2: Floats, deviation: Floats, worlds: Worlds, vehicle: int) -> Floats:
-    """Commands [n] plus the deviations [n, segments] in force now, within the vehicle's capacities."""
-    segment = np.minimum((worlds.time_s / SEGMENT_S).astype(np.int64), _SEGMENTS - 1)
-    braking = worlds.vehicles.braking_capacity_mps2[:, vehicle]
-    driving = worlds.vehicles.driving_capacity_mps2[:, vehicle]
-    wanted: Floats = command_mps2 + deviation[np.arange(worlds.n), segment] * braking
-    return np.clip(wanted, -braking, driving)
+def search_around(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
+    """``+search`` around an agent, which takes no argument."""
+    return Searched(policy, settings.needed_scenario(), harm_count=settings.harm_count)

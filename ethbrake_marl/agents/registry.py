@@ -123,7 +123,7 @@ def check_agent(agent: object, where: str, *, alone: bool = True) -> None:
         )
 
 
-ADVICE = "; looking ahead needs full_brake, coast, constant:a, copy_leader or gentlest_front"
+ADVICE = "; looking ahead needs full_brake, coast or constant:a"
 
 
 def fixed_commands(
@@ -217,7 +217,7 @@ class Team:
     Raises ``InvalidInput`` for what is not an agent, or an index that is no whole number from 0.
 
     >>> import ethbrake_marl as eb
-    >>> team = eb.Team({1: eb.make_agent("full_brake"), 2: eb.make_agent("copy_leader")}, "mixed")
+    >>> team = eb.Team({1: eb.make_agent("full_brake"), 2: eb.make_agent("coast")}, "mixed")
     >>> sorted(team.drivers)
     [1, 2]
 
@@ -257,20 +257,18 @@ Driver = Team | Agent | Shielding  # an agent alone drives every learner
 
 # The grammar of agents: ``name[:argument][@policy]``, and behind it what is put around that agent.
 #
-# ``+refined``, ``+refined:profile`` or, at every decision, ``+refined:50`` or ``+refined:200us`` comes first, then one
-# shield: ``+episode``, ``+episode:pairwise``, ``+step`` or ``+robust``, each also with ``:believed`` behind it. A name
-# may be a function of a Python file, ``my_file.py:make_agent``.
+# ``+search`` comes first, then one shield: ``+episode``, ``+episode:pairwise``, ``+step`` or ``+robust``, each also
+# with ``:believed`` behind it. A name may be a function of a Python file, ``my_file.py:make_agent``.
 #
 # Each of ``, + @ :`` may stand in a path, too. A path that exists wins: what stands in it separates nothing.
 
-REFINED = ("refined", "refined:profile")
+SEARCH = "search"
 SHIELDS = ("episode", "episode:pairwise", "step", "robust", "robust:interior")
 BELIEVED = (  # on what was received
     "episode:believed", "episode:pairwise:believed", "step:believed", "robust:believed", "robust:interior:believed",
 )  # fmt: skip
-AROUND = (*REFINED, *SHIELDS, *BELIEVED)  # in the order in which they are put around an agent
+AROUND = (SEARCH, *SHIELDS, *BELIEVED)  # in the order in which they are put around an agent
 
-_WITH_BUDGET = re.compile(r"refined:(0|[1-9][0-9]*)(us)?")
 _IN_FILE = re.compile(r":(?P<function>[A-Za-z_]\w*)(:(?P<argument>[^\s@]+))?(@(?P<policy>.+))?")
 _BEGINS_WITH_FILE = re.compile(r"[^:@]+\.py(:.*)?")
 
@@ -370,8 +368,7 @@ def _strip_around(spec: str) -> tuple[str, list[str]]:
     core, around = spec, list[str]()
     while True:
         before, plus, last = core.rpartition("+")
-        is_around = plus and (last in AROUND or _WITH_BUDGET.fullmatch(last))
-        if not is_around or os.path.lexists(_policy_path(core)):
+        if not (plus and last in AROUND) or os.path.lexists(_policy_path(core)):
             return core, around
         core, around = before, [last, *around]
 
@@ -382,12 +379,12 @@ def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
         ScriptSpec.parse(spec)  # says what is right
     before, plus, last = core.rpartition("+")
     if plus and _is_meant_around(before, core, last):
-        raise unknown_name("shield or refinement", last, AROUND)
+        raise unknown_name("shield or search", last, AROUND)
     shields = [each for each in around if each in (*SHIELDS, *BELIEVED)]
     if len(shields) > 1 or any(each not in shields for each in around[1:]):
         raise InvalidInput(
-            f"agent {spec!r}: +{REFINED[0]} comes first and once, then one shield of +{', +'.join(SHIELDS)}; for"
-            " instance ppo@shipped+refined+step"
+            f"agent {spec!r}: +{SEARCH} comes first and once, then one shield of +{', +'.join(SHIELDS)}; for"
+            " instance ppo@shipped+search+step"
         )
     return core, tuple(around)
 
@@ -474,10 +471,6 @@ _ENTRIES: dict[str, Entry] = {
     "coast": Entry("coast", "nothing at all", Source.SENSORS, _SCRIPTS),
     "full_brake": Entry("full_brake", "full braking, the paper's non-ethical strategy", Source.SENSORS, _SCRIPTS),
     "constant": Entry("constant:A", "this deceleration in m/s2; negative drives", Source.SENSORS, _SCRIPTS),
-    "copy_leader": Entry("copy_leader", "brakes as hard as the vehicle in front can", Source.STATE, _SCRIPTS),
-    "gentlest_front": Entry(
-        "gentlest_front", "the smallest constant deceleration that spares the vehicle in front", Source.STATE, _SCRIPTS
-    ),
     "e_v2x_bm": Entry(
         "e_v2x_bm[:pairwise][:believed]",
         "the best constant deceleration in this simulation; pairwise: the paper's closed form, from the true state;"
@@ -495,8 +488,8 @@ _ENTRIES: dict[str, Entry] = {
     "r157_fsm": Entry("r157_fsm[:reaction=0.75]", "the fuzzy safety model of UN R157", Source.MESSAGES, _FIELD),
     "aeb": Entry("aeb[:ttc=1.5]", "automatic emergency braking", Source.MESSAGES, _FIELD),
     "planner": Entry(
-        "planner[:CANDIDATES|:20ms][:believed]",
-        "a search in the simulation at every decision, with this budget for each; believed: as above",
+        "planner[:CANDIDATES][:believed]",
+        "a search in the simulation at every decision, with so many candidates each; believed: as above",
         Source.MODEL,
         "agents.planner:make_planner",
     ),
@@ -527,12 +520,11 @@ _ENTRIES: dict[str, Entry] = {
 _PROFILE = Entry("profile:0=A,S=B", "in pieces; of roles alone", Source.SENSORS, "agents.e_v2x_bm:StateFree")
 
 _WRAPPERS: dict[str, Entry] = {
-    "refined": Entry(
-        "+refined[:profile|:50|:200us]",
-        "plus the best deviation that a search at the alert finds; profile: compiled, it drives what that finds;"
-        " with a budget: again at every decision",
+    "search": Entry(
+        "+search",
+        "drives the best commands that a search around its own episode finds at the alert",
         Source.MODEL,
-        "agents.planner:refine",
+        "agents.planner:search_around",
     ),
     "episode": Entry(
         "+episode[:pairwise][:believed]",
@@ -569,8 +561,8 @@ def make_agent(
     """A fresh agent for one vehicle in one batch, or the team of a run.
 
     Args:
-        spec: ``name[:argument][@policy]`` and what is put around it, for instance ``constant:3.5``, ``planner:20ms``,
-            ``ppo@shipped+refined+step``; ``ethbrake agent list`` has all. ``my_file.py:make_agent`` runs that file,
+        spec: ``name[:argument][@policy]`` and what is put around it, for instance ``constant:3.5``, ``planner:64``,
+            ``ppo@shipped+search+step``; ``ethbrake agent list`` has all. ``my_file.py:make_agent`` runs that file,
             which can do whatever you can: its function gets what a factory of ``register_agent`` gets, or nothing.
         scenario: also its name or the path of its file; needed by teams, by what is put around an agent, and to find
             the shipped policy of this scenario.
@@ -637,7 +629,7 @@ def make_role(scenario: Scenario, vehicle: int, *, most_candidates: int | None =
     team = None if written.around else Team.of(_make_driver(written, settings), (vehicle,))
     if team is None or team.shield is not None:
         raise InvalidInput(
-            f"agent {spec!r}: a refinement or a shield goes around a driver, never around a role; let"
+            f"agent {spec!r}: a search or a shield goes around a driver, never around a role; let"
             f" {scenario.vehicle_names[vehicle]} follow {written.core}, or drive it"
         )
     return team.drivers[vehicle]
@@ -800,7 +792,7 @@ def episode_engine(worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: i
         raise InvalidInput(
             f"agent {team.name!r} drives {', '.join(scenario.vehicle_names[i] for i in drivers) or 'nobody'}, but"
             f" {', '.join(undriven)} of scenario {scenario.name!r} must be driven too. An agent that rolls itself out"
-            " (+refined, +episode, +robust) can drive one learner, the others need scripts: --vehicle NAME"
+            " (+search, +episode, +robust) can drive one learner, the others need scripts: --vehicle NAME"
         )
     scripts = script_agents(scenario, except_for=drivers)
     shield = team.shield

@@ -193,9 +193,9 @@ OPTIONS: dict[str, Any] = {  # of parameters that bring no option of their own, 
 
 ORDER = (
     *("run", "train", "evaluate", "compare", "shield", "reproduce", "agent", "scenario", "recipe", "search", "study"),
-    *("benchmark", "watch", "doctor"),
+    *("watch", "doctor"),
 )
-DEFAULTS = {"train": "start", "benchmark": "drive", "doctor": "check"}  # of a group where no command is named
+DEFAULTS = {"train": "start", "doctor": "check"}  # of a group where no command is named
 MOVED = {  # commands of earlier versions
     "resume": "train resume",
     "learning-curves": "train curves",
@@ -206,11 +206,7 @@ MOVED = {  # commands of earlier versions
     "sweep": "study sweep",
     "tune": "study tune",
     "ablate": "study ablate",
-    "generalise": "study generalise",
-    "leaderboard": "benchmark table",
     "record": "watch record",
-    "replay": "watch replay",
-    "explore": "watch explore",
     "picture": "watch picture",
     "dataset": "watch dataset",
     "bench": "doctor speed",

@@ -403,7 +403,7 @@ agent_group = app.group(
 def agent_list(out: Out) -> None:
     """List all agents: how each is written, what it does, what it knows.
 
-    What begins with + goes behind any agent, for instance full_brake+step: +refined first, then one shield.
+    What begins with + goes behind any agent, for instance full_brake+step: +search first, then one shield.
     """
     from ethbrake_marl.agents import Knowledge, agent_entries
 

@@ -1,4 +1,4 @@
-"""The commands that train, and compare trainings: ``run``, ``train``, ``study``, ``reproduce`` and ``benchmark``."""
+"""The commands that train, and compare trainings: ``run``, ``train``, ``study`` and ``reproduce``."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from rich.text import Text
 
 from ethbrake_marl import evaluation, learning, scenario as scenarios
 from ethbrake_marl.cli.command import Out, app, whole_number
-from ethbrake_marl.defaults import DEFAULT, HarmCount
-from ethbrake_marl.errors import InvalidInput, Progress, check_one_learner, check_whole_number, need
+from ethbrake_marl.defaults import DEFAULT
+from ethbrake_marl.errors import InvalidInput, Progress, check_one_learner, need
 from ethbrake_marl.files.sheet import Column, Sheet
 
 KEPT = (
@@ -255,7 +255,7 @@ def _end(out: Out, result: learning.TrainResult) -> None:
     out.note(f"{result.status} after {result.steps:,} training steps: {result.directory}")
 
 
-# The commands of many trainings or evaluations: ``study``, ``reproduce`` and ``benchmark``.
+# The commands of many trainings or evaluations: ``study`` and ``reproduce``.
 
 KEPT_IN_FOLDER = "the same command goes on with what is in the folder"
 PAPER_EPISODES, MOST_WORKERS = 10_000, 4096
@@ -499,43 +499,6 @@ def ablate_command(
     out.note(f"page: {page}; tables: {text}{drawn}")
 
 
-@study_group.add("generalise", "study generalise --runs runs/cooperation-4-all-cooperation-seed0 --vehicles 3,5,10",
-    json=True,
-)  # fmt: skip
-def generalise_command(
-    out: Out,
-    runs: Annotated[str, typer.Option(metavar="RUN,RUN,...", help="Runs or bundles, seeds of one training.")],
-    scenario: str = "cooperation-4-all",
-    vehicles: Annotated[
-        str, typer.Option(metavar="N,N,...", help="Lengths of the lines; vehicle i > 3 is like vehicle i - 2.")
-    ] = "3,4,5,6,7,8,9,10",
-    episodes: Annotated[int, typer.Option(help="Worlds of each length.", callback=whole_number(1))] = 1000,
-    seed: int = DEFAULT.LIST_SEED,
-    harm_count: HarmCount = "total",
-    search_episodes: Annotated[int, typer.Option(help="Worlds of the joint optimum; 0: none.")] = 0,
-    budget: Annotated[
-        int, typer.Option(help="Candidates per world of that search.", callback=whole_number(1))
-    ] = 20_000,
-    settings: list[str] | None = None,
-) -> None:
-    """Let trained policies drive longer lines with the same weights.
-
-    They drive every follower, and Vehicle 1 where it learns in the scenario.
-    """
-    from ethbrake_marl.agents import split_names
-    from ethbrake_marl.studies.ablation import LineQuestion
-
-    lengths = tuple(int(each) if each.strip().isdecimal() else 0 for each in vehicles.split(","))
-    if not all(2 <= each <= 64 for each in lengths):
-        raise InvalidInput(f"vehicles {vehicles!r}: must be lengths from 2 to 64, for instance 3,4,5")
-    check_whole_number("search-episodes", search_episodes, 0, episodes)
-    line = evaluation.load_runnable(scenario, learning.read_settings(settings).scenario)
-    question = LineQuestion(line, lengths, episodes, seed, harm_count, search_episodes, budget)
-    agents = question.load_runs([each.strip() for each in split_names(runs)])
-    found = question.drive(agents, out.show_progress)
-    out.result(found, question.markdown(found, len(agents)), end="")
-
-
 @app.add("reproduce", "reproduce random-table harm-distance --quick --output runs/paper",
     kept=KEPT_IN_FOLDER, json=True, force=True,
 )  # fmt: skip
@@ -588,63 +551,3 @@ def reproduce_command(
     out.note(f"page: {output / 'index.html'}")
     if not finished:
         out.interrupted(f"interrupted: items are made of the trainings that were finished; {KEPT_IN_FOLDER}")
-
-
-benchmark_group = app.group(
-    "benchmark",
-    "Score an agent on a frozen suite, or show entries as a table.",
-    "benchmark v2 --agent ppo@shipped --output mine.json",
-    "benchmark table mine.json theirs.json --output table.md",
-)
-
-
-@benchmark_group.add("drive", "benchmark v2 --agent ppo@shipped --output mine.json", json=True, force=True)
-def drive_command(
-    out: Out,
-    suite: Annotated[str, typer.Argument(metavar="SUITE", help="A suite that ships, such as v2.")],
-    agent: Annotated[str, typer.Option(metavar="SPEC", help="Who drives; any agent of `ethbrake evaluate`.")],
-    output: Annotated[
-        Path | None, typer.Option(metavar="ENTRY.json", help="Also write the entry to this file.")
-    ] = None,
-) -> None:
-    """Let an agent drive a frozen suite of lists, and score it.
-
-    The score of a list is the realised share of what is possible, 0 for full braking and 1 for the best known. A list
-    that the agent cannot drive has none, and then there is no overall score.
-    """
-    from ethbrake_marl.studies.benchmark import load_suite
-
-    out.check(output, ".json", what="an entry")
-    chosen = load_suite(suite)
-    entry = chosen.make_entry(agent, on_progress=out.show_progress)
-    if output is not None:
-        entry.write(output, force=out.force)
-        out.note(f"entry: {output}")
-    mean = entry.mean_of_driven.in_words(digits=1, scale=100.0, unit=" %")
-    if entry.overall is not None:
-        told = f"{agent}: overall {mean} of what is possible, mean over {len(chosen.lists)} lists of suite {suite}"
-    else:
-        told = (
-            f"{agent}: no overall score, as it drives {entry.lists_driven} of {len(chosen.lists)} lists of suite"
-            f" {suite}; {mean} of what is possible there"
-        )
-    out.result(entry.model_dump(mode="json"), entry.sheet(), told)
-
-
-@benchmark_group.add("table", "benchmark table mine.json theirs.json --output table.md", json=True, force=True)
-def table_command(
-    out: Out,
-    entries: Annotated[list[Path], typer.Argument(metavar="ENTRY.json...", help="Entries of one suite.")],
-    output: Annotated[Path | None, typer.Option(metavar="FILE.md", help="Also write the table, as Markdown.")] = None,
-) -> None:
-    """Show entries of `ethbrake benchmark` as one table.
-
-    It is sorted by their score. Refused by name: entries of another suite, and changed ones.
-    """
-    from ethbrake_marl.studies.benchmark import read_leaderboard
-
-    out.check(output, ".md", what="the table")
-    found = read_leaderboard(entries)
-    if output is not None:
-        out.write(output, f"{found.table().markdown()}\n", what="table")
-    out.result(found.to_json(), found.sheet(), *found.notes)

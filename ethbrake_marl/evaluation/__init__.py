@@ -6,15 +6,12 @@ from ethbrake_marl.doors import front_door
 
 if TYPE_CHECKING:
     from ethbrake_marl.evaluation.curves import (
-        CriticalityMap as CriticalityMap,
         DecelerationCurve as DecelerationCurve,
-        criticality_map as criticality_map,
         deceleration_curve as deceleration_curve,
     )
     from ethbrake_marl.evaluation.episodes import (
         EpisodeMotion as EpisodeMotion,
         EpisodeRecord as EpisodeRecord,
-        Passport as Passport,
         check_dataset as check_dataset,
         check_film as check_film,
         film as film,
@@ -27,9 +24,7 @@ if TYPE_CHECKING:
         NamedWorlds as NamedWorlds,
         check_agents as check_agents,
         choose_worlds as choose_worlds,
-        content_sha256 as content_sha256,
         drawn_alike as drawn_alike,
-        driving_policy as driving_policy,
         load_runnable as load_runnable,
         make_agents as make_agents,
         make_lineup as make_lineup,

@@ -1,9 +1,8 @@
-"""Whole episodes, exact at every moment: motions, films, passports by which one is played again, and datasets."""
+"""Whole episodes, exact at every moment: motions, films and datasets."""
 
 from __future__ import annotations
 
 import copy
-import hashlib
 import io
 import json
 import math
@@ -11,13 +10,12 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
-from functools import cache, cached_property
+from functools import cached_property
 from importlib.metadata import version
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, get_args
-from urllib.parse import quote, unquote
 
 import gymnasium
 import numpy as np
@@ -25,45 +23,33 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from ethbrake_marl.actions import command_to_action
-from ethbrake_marl.agents import Agent, Driver, Episodes, Team, drive, episode_engine, parse_spec, script_agents
-from ethbrake_marl.defaults import DEFAULT, HARM_COUNTS, DatasetFormat, HarmCount
+from ethbrake_marl.agents import Agent, Driver, Episodes, Team, drive, episode_engine, script_agents
+from ethbrake_marl.defaults import DEFAULT, HARM_COUNTS, DatasetFormat
 from ethbrake_marl.engine import Engine, Step
 from ethbrake_marl.envs import Frame, Report, Scene, Trace, action_box, animate_films, feature_box
 from ethbrake_marl.errors import (
     AlreadyExists,
     InvalidInput,
     PhysicsError,
-    UnknownName,
     check_one_learner,
     check_whole_number,
     count_of,
     naming_extras,
     need,
-    plain_text,
     renumbered,
     unknown_name,
 )
-from ethbrake_marl.evaluation.inputs import (
-    choose_worlds,
-    content_sha256,
-    load_runnable,
-    make_lineup,
-    policies_of,
-    result_versions,
-    scenario_sha256,
-    worlds_sha256,
-)
+from ethbrake_marl.evaluation.inputs import policies_of, result_versions, scenario_sha256
 from ethbrake_marl.evaluation.measures import LeftOut, Tape
 from ethbrake_marl.evaluation.rollout import ShovedFront, controlled_vehicle
 from ethbrake_marl.files.sheet import parquet_file
 from ethbrake_marl.files.store import check_target, check_writable, new_folder
-from ethbrake_marl.files.yaml import Override
 from ethbrake_marl.harm import Ledger
 from ethbrake_marl.observations import Observation, ObservationSpec, choose_observation
 from ethbrake_marl.physics import Bools, Floats, ImpactRows, Ints, Worlds, advance, leaving_out_failed, segment_pieces
 from ethbrake_marl.rewards import Reward, RewardParams, reward_params
 from ethbrake_marl.scenario import Sample, Scenario, observation_for
-from ethbrake_marl.shield import HybridAgent, Uncertainty
+from ethbrake_marl.shield import HybridAgent
 
 _SAME = 1e-9  # m, m/s: a piece that goes on like the one before it is part of it
 _SHORT_S = 1e-4  # pieces of a cascade of tiny bounces may be shorter; they are not told apart
@@ -82,7 +68,6 @@ class EpisodeMotion:
     ledger: Ledger  # n = 1
     final: Worlds  # n = 1, as the episode left it
     at_rest: bool  # the line came to rest; else the horizon cut the episode off
-    policies: Mapping[str, str]  # SHA-256 of the policy that drove a vehicle, by vehicle, where one did
 
     @property
     def harm(self) -> tuple[float, float]:
@@ -118,7 +103,6 @@ class _Follower(Tape):
         self._first_s = worlds.first_decision_s(list(team.drivers))
         self._stepped_in: list[list[float]] = [[] for _ in range(worlds.n)]
         self._engine, self._ruling = engine, engine.ruling
-        self._policies = policies_of(team.drivers)
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
         """Keep one step."""
@@ -153,7 +137,6 @@ class _Follower(Tape):
                     ledger,
                     final,
                     bool(episodes.at_rest[k]),
-                    self._policies,
                 )
             )
         return found
@@ -419,270 +402,6 @@ _WRITERS: dict[str, Callable[[Films, int], bytes]] = {
     ".mp4": _write_mp4,
     ".svg": lambda films, fps: animate_films(films, fps=fps).encode(),
 }
-
-
-# Passports: one short string that names an episode, so that it can be played again and compared to the bit.
-#
-# ``EB1:SCENARIO:HASH:SEED.WORLD:COUNT:VERSIONS:WORLD-HASH:EPISODE-HASH:POLICY-HASH:AGENT:CHECK``, of letters, digits
-# and ``:.,-_@+/=%``, which no shell touches. Hashes are the beginnings of those in results files; the last part tells a
-# typo from a difference.
-
-MOST_CHARACTERS = 160
-LEFT_OUT = "..."  # in the place of what would make a passport too long
-_MARK, _KIND = "EB", "1"
-_NAME = 30  # characters of a scenario's name
-_NONE = "-"
-_SCENARIO, _WORLD, _EPISODE, _POLICY, _CHECK = 10, 6, 10, 8, 6  # hexadecimal digits of each hash
-_VERSIONS = ("ethbrake-marl", "Python", "numba", "numpy")
-_SHAPE = re.compile(
-    r"EB1:(?P<scenario>[\w.-]+):(?P<scenario_sha>[0-9a-f]{10}):(?P<seed>\d{1,20}|-)\.(?P<number>\d{1,18})"
-    r":(?P<count>[ft])(?P<vehicles>[\d.]+|-):(?P<versions>[\w.,+-]+):(?P<world_sha>[0-9a-f]{6})"
-    r":(?P<episode_sha>[0-9a-f]{10}):(?P<policy_sha>[0-9a-f]{8}|-):(?P<agent>[\w%:.,@+/=-]+)"
-)
-
-
-@dataclass(frozen=True, slots=True)
-class Passport:
-    """What names an episode."""
-
-    scenario: str  # its name
-    scenario_sha: str
-    seed: int | None  # of the list; None: the world came from a file
-    number: int  # of the world in its list
-    harm_count: HarmCount  # that agents minimised
-    vehicles: tuple[int, ...]  # driven, from 0
-    versions: tuple[str, ...]  # of the package, Python, numba and numpy
-    world_sha: str
-    episode_sha: str  # of the ledger and of what the episode left
-    policy_sha: str | None
-    agent: str  # as it is written; LEFT_OUT stands for what did not fit
-
-    def __str__(self) -> str:
-        name = self.scenario if len(self.scenario) <= _NAME else self.scenario[:_NAME] + LEFT_OUT
-        kind, at, _ = self.agent.partition("@")
-        try:
-            around = "".join(f"+{each}" for each in parse_spec(self.agent).around)
-        except InvalidInput:  # the name of an agent that was made in Python
-            around = ""
-        # where there is little room: as it is, without its path, not at all
-        for agent in (self.agent, *([f"{kind}@{LEFT_OUT}{around}"] if at else []), LEFT_OUT):
-            text = replace(self, agent=agent)._written(name)
-            if len(text) <= MOST_CHARACTERS:
-                return text
-        return replace(self, agent=LEFT_OUT)._written(name[:20] + LEFT_OUT)
-
-    def _written(self, scenario: str) -> str:
-        parts = (
-            _MARK + _KIND,
-            scenario,
-            self.scenario_sha,
-            f"{_NONE if self.seed is None else self.seed}.{self.number}",
-            self.harm_count[0] + (".".join(str(i + 1) for i in self.vehicles) or _NONE),
-            ",".join(self.versions),
-            self.world_sha,
-            self.episode_sha,
-            self.policy_sha or _NONE,
-            quote(self.agent, safe="@+:,./=-_", errors="replace").replace("~", "%7E"),
-        )
-        text = ":".join(parts)
-        return f"{text}:{_check(text)}"
-
-    @classmethod
-    def of(
-        cls,
-        motion: EpisodeMotion,
-        scenario: Scenario,
-        agent: str,
-        *,
-        seed: int | None,
-        number: int,
-        harm_count: HarmCount = "first",
-    ) -> Passport:
-        """The passport of an episode that was driven.
-
-        Args:
-            motion: the episode.
-            scenario: as it was driven, with its learners.
-            agent: as it is written.
-            seed: of the list of worlds; None: they came from a file.
-            number: of the world in its list.
-            harm_count: that agents minimise.
-
-        """
-        shas = list(motion.policies.values())
-        joined = shas[0] if len(shas) == 1 else hashlib.sha256("".join(shas).encode()).hexdigest()
-        return cls(
-            scenario=scenario.name,
-            scenario_sha=scenario_sha256(scenario)[:_SCENARIO],
-            seed=seed,
-            number=number,
-            harm_count=harm_count,
-            vehicles=scenario.learners,
-            versions=_versions(),
-            world_sha=worlds_sha256(motion.world, np.array([number], np.int64))[:_WORLD],
-            episode_sha=content_sha256(motion.ledger, motion.final, motion.impacts)[:_EPISODE],
-            policy_sha=joined[:_POLICY] if shas else None,
-            agent=agent,
-        )
-
-    @classmethod
-    def parse(cls, text: str) -> Passport:
-        """The passport that a text is; raises ``InvalidInput`` that tells a typo from another kind of text."""
-        given = text.strip()
-        shown = plain_text(given[:40])
-        if not given.startswith(_MARK) or ":" not in given:
-            raise InvalidInput(
-                f"{shown!r}: is no passport; one begins with {_MARK}{_KIND}: and stands under each episode of a report"
-            )
-        if not given.startswith(f"{_MARK}{_KIND}:"):
-            raise InvalidInput(
-                f"{shown!r}: a passport of another kind; this version reads those that begin with {_MARK}{_KIND}:"
-            )
-        body, _, check = given.rpartition(":")
-        found = _SHAPE.fullmatch(body)
-        if check != _check(body) or found is None or len(given) > 2 * MOST_CHARACTERS:
-            raise InvalidInput(
-                f"{shown!r}...: a typo, or a part is missing: the check at the end does not fit; copy it whole"
-            )
-        part = found.groupdict()
-        versions, driven = tuple(part["versions"].split(",")), part["vehicles"]
-        if len(versions) != len(_VERSIONS):
-            raise InvalidInput(f"{shown!r}...: names {count_of(len(versions), 'version')}; {len(_VERSIONS)} are needed")
-        if driven != _NONE and not re.fullmatch(r"[1-9]\d?(\.[1-9]\d?)*", driven):
-            raise InvalidInput(f"{shown!r}...: vehicles {driven!r}: must be numbers from 1, with dots between them")
-        return cls(
-            scenario=part["scenario"],
-            scenario_sha=part["scenario_sha"],
-            seed=None if part["seed"] == _NONE else int(part["seed"]),
-            number=int(part["number"]),
-            harm_count="first" if part["count"] == "f" else "total",
-            vehicles=() if driven == _NONE else tuple(int(each) - 1 for each in driven.split(".")),
-            versions=versions,
-            world_sha=part["world_sha"],
-            episode_sha=part["episode_sha"],
-            policy_sha=None if part["policy_sha"] == _NONE else part["policy_sha"],
-            agent=unquote(part["agent"], errors="strict"),
-        )
-
-    def differences(self, other: Passport) -> list[str]:
-        """What another passport of the same world and agent says differently, in words; nothing if it is the same."""
-        found = []
-        if self.scenario_sha != other.scenario_sha:
-            found.append(
-                f"the scenario: its values have the hash {other.scenario_sha}, in the passport {self.scenario_sha}; it"
-                " was edited since, or other settings (--set) were given"
-            )
-        told = [
-            *zip(_VERSIONS, self.versions, other.versions, strict=True),
-            ("the world at the alert", self.world_sha, other.world_sha),
-            ("the policy", self.policy_sha or "none", other.policy_sha or "none"),
-            ("the episode", self.episode_sha, other.episode_sha),
-        ]
-        return [*found, *(f"{name}: {now} here, {then} in the passport" for name, then, now in told if then != now)]
-
-    def replay(
-        self,
-        *,
-        scenario: str | None = None,
-        settings: Sequence[Override] = (),
-        agent: str | None = None,
-        initial_states: Path | None = None,
-        uncertainty: Uncertainty | None = None,
-    ) -> Replay:
-        """Play the episode again, and compare it to the bit. The arguments are what a passport does not hold.
-
-        Args:
-            scenario: a name or path; None: the shipped one of the passport's name.
-            settings: of the scenario.
-            agent: as it is written; None: as in the passport, from it alone: no passport names code to run.
-            initial_states: the file that the world came from.
-            uncertainty: that ``+robust`` was certified against.
-
-        Raises ``InvalidInput`` that says what is missing: the scenario's file, the agent or its policy, the worlds.
-
-        """
-        played = self._scenario(scenario, settings)
-        if agent is None and LEFT_OUT in self.agent:
-            raise InvalidInput(
-                f"passport: the agent, {self.agent}, did not fit into it; give it whole: --agent AGENT, for instance"
-                " ppo@runs/my-run"
-            )
-        if agent is None and parse_spec(self.agent).file is not None:
-            raise InvalidInput(
-                f"passport: the agent, {self.agent!r}, is code in a file, which is run only where you name it: --agent"
-                f" {self.agent}"
-            )
-        spelling, world = self.agent if agent is None else agent, self._world(played, initial_states)
-        try:
-            lineup = make_lineup([spelling], played, harm_count=self.harm_count, uncertainty=uncertainty)
-        except InvalidInput as error:
-            hint = "" if agent else "; a policy or agent that lies elsewhere here is given by --agent"
-            raise InvalidInput(f"passport: agent {spelling!r}: {error}{hint}") from None
-        (driver,) = lineup.values()
-        (motion,) = follow_episodes(world, driver, played)
-        now = Passport.of(motion, played, spelling, seed=self.seed, number=self.number, harm_count=self.harm_count)
-        same = (self.world_sha, self.episode_sha) == (now.world_sha, now.episode_sha)
-        return Replay(now, played, world, driver, motion, tuple(self.differences(now)), same)
-
-    def _scenario(self, given: str | None, settings: Sequence[Override]) -> Scenario:
-        try:
-            scenario = load_runnable(given or self.scenario, settings)
-        except UnknownName:
-            if given is not None:
-                raise
-            raise InvalidInput(
-                f"passport: scenario {self.scenario!r} does not ship; give its file: --scenario FILE.yaml"
-            ) from None
-        if scenario.learners == self.vehicles:
-            return scenario
-        if not all(0 <= i < scenario.vehicles for i in self.vehicles):
-            most = max(self.vehicles) + 1
-            raise InvalidInput(
-                f"passport: drives Vehicle {most}, but {scenario.name!r} has {count_of(scenario.vehicles, 'vehicle')}"
-            )
-        return scenario.with_learners(self.vehicles)
-
-    def _world(self, scenario: Scenario, initial_states: Path | None) -> Worlds:
-        if self.seed is not None:
-            if initial_states is not None:
-                raise InvalidInput("passport: its world is of a list that is drawn; leave --initial-states out")
-            return scenario.sample(1, self.seed, first=self.number).worlds
-        if initial_states is None:
-            raise InvalidInput("passport: its world came from a file; give it: --initial-states FILE.csv")
-        worlds = choose_worlds(scenario, initial_states=initial_states)[0].worlds
-        if not self.number < worlds.n:
-            raise InvalidInput(
-                f"{initial_states}: has {count_of(worlds.n, 'world')}; the passport is of number {self.number}, from 0"
-            )
-        return worlds.take(np.array([self.number]))
-
-
-@cache
-def _versions() -> tuple[str, ...]:
-    found = result_versions()
-    return tuple(found[name.lower()] for name in _VERSIONS)
-
-
-def _check(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()[:_CHECK]
-
-
-@dataclass(frozen=True, slots=True)
-class Replay:
-    """An episode that was played again."""
-
-    passport: Passport  # as the episode went now
-    scenario: Scenario
-    worlds: Worlds  # n = 1, at the alert
-    agent: Driver
-    motion: EpisodeMotion
-    differences: tuple[str, ...]  # in words; none: everything is the same
-    same: bool  # the world and the episode are, to the bit
-
-    @property
-    def title(self) -> str:
-        """What it is, for a page or a film."""
-        return f"{self.passport.agent}: world {self.passport.number} of {self.scenario.name}"
 
 
 # Episodes as a learner of any interface meets them, with the actions that an agent chose.

@@ -49,9 +49,7 @@ from ethbrake_marl.shield import ShieldedDriver, Uncertainty
 # Two results can be compared where worlds and scenario have the same hashes. Versions are told, and no reason to
 # refuse.
 
-Kind = Literal[
-    "evaluate", "evaluate-shards", "shield", "best-harm", "ablate", "generalise", "learning-curves", "robustness"
-]
+Kind = Literal["evaluate", "evaluate-shards", "shield", "best-harm", "ablate", "learning-curves"]
 _PACKAGES = ("ethbrake-marl", "numba", "numpy")
 _WORDS = {"name", "title", "description", "source"}  # what a scenario is called changes nothing
 _BLOCK = 50_000  # worlds hashed at once: news of a world may be a view that takes no memory
@@ -60,13 +58,6 @@ _BLOCK = 50_000  # worlds hashed at once: news of a world may be a view that tak
 def worlds_sha256(worlds: Worlds, index: Ints) -> str:
     """SHA-256 of a list of worlds: of every array (little-endian, by name) and the worlds' numbers in the list."""
     return _arrays_sha256({"index": index, **_arrays(worlds)})
-
-
-def content_sha256(*parts: Any) -> str:
-    """SHA-256 of every array of some dataclasses, one after the other."""
-    return _arrays_sha256(
-        {f"{k} {name}": array for k, part in enumerate(parts) for name, array in _arrays(part).items()}
-    )
 
 
 def _arrays_sha256(arrays: dict[str, np.ndarray]) -> str:
@@ -275,9 +266,7 @@ TRIED_CANDIDATES = 16  # of a script that searches, when a scenario is only chec
 
 LADDER = (  # from no decision at all up to the best that is known
     "coast",
-    "copy_leader",
     "full_brake",
-    "gentlest_front",
     "e_v2x_bm:pairwise",
     "e_v2x_bm",
     "planner",

@@ -857,17 +857,18 @@ _OF_THE_LIMITS = (
         about="The same of total harm.",
     ),
     Measure(
-        "realised_share", "mean_regret_first", against="decrease", limits=True,
-        about="The same as realised_share_first.",
+        "share_of_possible_reduction", "mean_regret_first", against="decrease", limits=True,
+        about="The same as share_of_possible_reduction_first.",
     ),
     Measure(
-        "realised_share_first", "mean_regret_first", "Realised share, first-impact", "Realised\nfirst",
+        "share_of_possible_reduction_first", "mean_regret_first", "Share of the possible reduction, first-impact",
+        "Share of\npossible",
         "(Full braking − agent) / (full braking − best known), first-impact harm: how much of the reduction of harm"
         " that is known to be possible the agent brings.",
         percent=True, against="decrease", limits=True,
     ),
     Measure(
-        "realised_share_total", "mean_regret_total", against="decrease", limits=True,
+        "share_of_possible_reduction_total", "mean_regret_total", against="decrease", limits=True,
         about="The same of total harm.",
     ),
 )  # fmt: skip
@@ -1454,17 +1455,17 @@ _HEAD = {
     "Knows": "What the agent has to know of the line. own sensors: its own vehicle and what its sensors see. messages:"
     " also the messages that have reached it. true state: the others' states, capacities and latencies as they are,"
     " received or not. true model: also masses, restitution and scripts, enough to simulate the line ahead. Of a policy"
-    " behind a shield, or a refined one, both parts are told. † marks agents that see through a channel that hides"
+    " behind a shield or +search both parts are told. † marks agents that see through a channel that hides"
     " something here.",
 }
 _ALWAYS_SHOWN = ("collision_rate", "first_impact_harm", "total_harm", "sampled_harm", "vehicle_1_shoved_m")
 _NARROW = (  # in a narrow terminal too, where there is no regret to show, and where there is
     ("harm_decrease_first", "harm_decrease_total"),
-    ("mean_regret_first", "realised_share_first"),
+    ("mean_regret_first", "share_of_possible_reduction_first"),
 )
 _IN_NOTEBOOKS = (
     *("Agent", "Knows", "collision_rate", "first_impact_harm", "total_harm"),
-    *("mean_regret_first", "harm_decrease_first", "realised_share_first"),
+    *("mean_regret_first", "harm_decrease_first", "share_of_possible_reduction_first"),
 )
 _BELOW = ("collision_rate", "first_impact_harm", "total_harm")  # a terminal shows their intervals; JSON has all
 
@@ -1805,7 +1806,7 @@ class SummaryTable(list[SummaryRow]):
         if known is not None and known < 1.0:
             text += (
                 f" Found beforehand in {100 * known:.1f} % of the worlds; in the others it is the best of"
-                " the agents above, so that regrets are lower bounds and no realised share is stated."
+                " the agents above, so that regrets are lower bounds and no share of the possible reduction is stated."
             )
         below = [
             f"{each.agent} in {count_of(each.below_best_known, 'world')}" for each in self if each.below_best_known

@@ -11,16 +11,13 @@ if TYPE_CHECKING:
         Unproven as Unproven,
         best_harm as best_harm,
         chunks_left as chunks_left,
-        driven_profiles as driven_profiles,
         known_limits as known_limits,
         prove as prove,
         scripted_commands as scripted_commands,
         search_list as search_list,
         shipped_tables as shipped_tables,
         task_problem as task_problem,
-        undecided_because as undecided_because,
         unproven_because as unproven_because,
     )
-    from ethbrake_marl.limits.lower_bound import avoidability as avoidability
 else:
     __getattr__ = front_door(__name__, __file__)

@@ -654,7 +654,8 @@ class Limits:
         return (
             f"the table of best known harm holds {listed.sum():,} of these {len(known):,} worlds, and not"
             f" the other {missing:,} ({100.0 * missing / len(known):.1f} %), whose best is not proven either. There the"
-            " best agent of this evaluation stands in: regrets are lower bounds, and no realised share is stated. A"
+            " best agent of this evaluation stands in: regrets are lower bounds, and no share of the possible"
+            " reduction is stated. A"
             " table is made for one list; a longer list, or one of another version, has other worlds (ethbrake"
             " search best-harm)"
         )

@@ -22,10 +22,9 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from ethbrake_marl.agents import Driver
-from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.envs import BODY_M
 from ethbrake_marl.errors import InvalidInput, plain_text
-from ethbrake_marl.evaluation import Conditions, EpisodeMotion, Passport, follow_episodes
+from ethbrake_marl.evaluation import Conditions, EpisodeMotion, follow_episodes
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.physics import Worlds
 from ethbrake_marl.scenario import Scenario
@@ -163,7 +162,7 @@ class Part:
             driven: indices (0 = front) of the vehicles that the agents drive; by agent where they drive others.
             focus: the agent that is shown from the beginning, between the first and the last.
             shown_first: numbers of the agents that are shown from the beginning, where those are others.
-            folded: traces and passports show when their title is chosen.
+            folded: traces show when their title is chosen.
 
         """
         agents, one = list(worlds[0].motions), next(iter(worlds[0].motions.values())).world
@@ -174,10 +173,7 @@ class Part:
         for world in worlds:
             alert = next(iter(world.motions.values())).world
             title = shown(world.title or f"World {world.number}")
-            episodes = [
-                Played.episode(motion, by_agent[agent]) | {"passport": shown(world.passports[agent])}
-                for agent, motion in world.motions.items()
-            ]
+            episodes = [Played.episode(motion, by_agent[agent]) for agent, motion in world.motions.items()]
             told.append({
                 "conditions": f"{title}: {Conditions.of(alert).quantities}.",
                 "episodes": episodes,
@@ -194,30 +190,15 @@ class Part:
             "worlds": told,
         }
         shielded = any(episode["stepped"] for world in told for episode in world["episodes"])
-        return cls.live_player(
-            one.N, shielded=shielded, folded=folded, name=_DATA, episodes=cls.data(_DATA, content).html
-        )
-
-    @classmethod
-    def live_player(
-        cls,
-        vehicles: int,
-        *,
-        shielded: bool,
-        folded: bool = False,
-        name: str | None = None,
-        episodes: Markup | str = "",
-    ) -> Part:
-        """A player for a page whose own script gives it one world after another, or of the data of that name."""
         return cls.template(
             "player.html.j2",
             ("player.css",),
             _PLAYER_SCRIPTS,
-            vehicles=vehicles,
+            vehicles=one.N,
             shielded=shielded,
             folded=folded,
-            name=name,
-            episodes=episodes,
+            name=_DATA,
+            episodes=cls.data(_DATA, content).html,
             body=BODY_M,
         )
 
@@ -244,7 +225,6 @@ class Page:
         sections: in this order, each with an entry in the table of contents.
         lead: what the page is about, in a sentence or two below its title.
         opening: parts between these and the table of contents.
-        served: it comes from a server of ours, which its script may ask; else it asks nobody.
 
     >>> from ethbrake_marl.pages.page import Page, Part, Section
     >>> section = Section("Results", ["Text with <b> stays text.", Part.paragraph("small print")])
@@ -256,7 +236,6 @@ class Page:
     title: str
     sections: Sequence[Section]
     lead: str = ""
-    served: bool = False
     opening: Sequence[Part] = ()
 
     @cached_property
@@ -277,11 +256,10 @@ class Page:
             f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" if text else "'none'"
             for text in self._code
         )
-        policy = (
+        return (
             f"default-src 'none'; style-src {styles}; script-src {script}; img-src data:;"
             " base-uri 'none'; form-action 'none'"
         )
-        return f"{policy}; connect-src 'self'" if self.served else policy
 
     @staticmethod
     def anchors(titles: Sequence[str]) -> list[str]:
@@ -304,7 +282,6 @@ class Page:
             opening=self.opening,
             sections=list(zip(names, self.sections, strict=True)),
             policy=self.policy,
-            served=self.served,
             style=Markup(styles),
             script=Markup(script),
         )
@@ -353,22 +330,11 @@ class Played:
     kind: str  # why it was chosen, as a heading
     why: str  # what is special about it, in a few words
     motions: dict[str, EpisodeMotion] = field(default_factory=dict)  # by agent
-    passports: dict[str, str] = field(default_factory=dict)  # by agent
     title: str = ""  # what the world is called; empty: World and its number
 
     @staticmethod
-    def drive(
-        played: Sequence[Played],
-        worlds: Worlds,
-        name: str,
-        agent: Driver,
-        scenario: Scenario,
-        spelling: str,
-        *,
-        seed: int | None,
-        harm_count: HarmCount = "first",
-    ) -> None:
-        """Let one agent drive the worlds of ``played`` and keep each motion and passport there, by the agent's name.
+    def drive(played: Sequence[Played], worlds: Worlds, name: str, agent: Driver, scenario: Scenario) -> None:
+        """Let one agent drive the worlds of ``played`` and keep each motion there, by the agent's name.
 
         Args:
             played: one for each world.
@@ -376,15 +342,10 @@ class Played:
             name: of the agent on the page.
             agent: is left as it is.
             scenario: of the worlds, with the vehicles that are driven as its learners.
-            spelling: how the agent is written on a command line.
-            seed: of the list of worlds; None: they came from a file.
-            harm_count: that the agent minimised.
 
         """
         for one, motion in zip(played, follow_episodes(worlds, agent, scenario), strict=True):
-            passport = Passport.of(motion, scenario, spelling, seed=seed, number=one.number, harm_count=harm_count)
             one.motions[name] = motion
-            one.passports[name] = str(passport)
 
     @staticmethod
     def episode(motion: EpisodeMotion, driven: Sequence[int]) -> dict[str, Any]:

@@ -42,7 +42,7 @@ class Player {
   }
 
   listen() {
-    const on = (name, kind, act) => this.find(name)?.addEventListener(kind, act); // a live player has no list of worlds
+    const on = (name, kind, act) => this.find(name)?.addEventListener(kind, act); // not every player is folded
     on("world", "change", (event) => this.choose(Number(event.target.value)));
     on("before", "click", () => this.choose(this.world - 1));
     on("after", "click", () => this.choose(this.world + 1));
@@ -111,7 +111,7 @@ class Player {
 
   // At least one agent and at most three; one more takes the place of the first.
   toggle(k) {
-    if (!this.shown.includes(k)) this.shown = [...this.shown, k].slice(-(this.data.most ?? MOST_AGENTS));
+    if (!this.shown.includes(k)) this.shown = [...this.shown, k].slice(-MOST_AGENTS);
     else if (this.shown.length > 1) this.shown = this.shown.filter((each) => each !== k);
     this.shown.sort((a, b) => a - b);
     for (const box of this.find("agents").querySelectorAll("input")) box.checked = this.shown.includes(Number(box.value));
@@ -162,21 +162,9 @@ class Player {
         traces: new Traces(columns[k], episode, this.data, ranges, this.until, (time) => this.seek(time)),
       };
     });
-    this.find("passports")?.replaceChildren(...episodes.map((episode) => this.passport(episode)));
     const scrub = this.find("scrub");
     scrub.max = this.until;
     this.show();
-  }
-
-  passport(episode) {
-    const code = make("code", { tabindex: 0 }, episode.passport);
-    const copy = make("button", { type: "button", class: "small", "aria-label": `Copy the passport of ${episode.agent}` }, "Copy");
-    copy.addEventListener("click", async () => {
-      getSelection().selectAllChildren(code);
-      const done = await navigator.clipboard?.writeText(episode.passport).then(() => true, () => false);
-      copy.textContent = done || document.execCommand("copy") ? "Copied" : "Selected";
-    });
-    return make("div", { class: "passport" }, make("strong", {}, episode.agent), code, copy);
   }
 
   show() {

@@ -205,20 +205,13 @@ class Report:
     settings: Mapping[str, object] = field(default_factory=dict)  # command, seeds, training set-up
     versions: Mapping[str, str] = field(default_factory=dict)
 
-    def driven(
-        self,
-        agents: Mapping[str, Driver],
-        *,
-        spellings: Mapping[str, str] | None = None,
-        on_agent: Callable[[str], None] | None = None,
-    ) -> Report:
+    def driven(self, agents: Mapping[str, Driver], *, on_agent: Callable[[str], None] | None = None) -> Report:
         """The same with episodes, which every agent drives once more, and with what any shields among them are worth.
 
         Shields are measured in the first worlds, alone and in every mode.
 
         Args:
             agents: that were evaluated, by name; they are left as they are.
-            spellings: how an agent is written on a command line, where that is not its name.
             on_agent: is told each agent that is done.
 
         """
@@ -229,8 +222,7 @@ class Report:
         if evaluation.vehicles != scenario.learners:
             scenario = scenario.with_learners(evaluation.vehicles)
         for name, agent in agents.items():
-            spelling = (spellings or {}).get(name, name)
-            Played.drive(played, worlds, name, agent, scenario, spelling, seed=evaluation.seed, harm_count=harm_count)
+            Played.drive(played, worlds, name, agent, scenario)
             if on_agent is not None:
                 on_agent(name)
         some = evaluation.worlds.take(np.arange(min(evaluation.worlds.n, SHIELD_WORLDS)))

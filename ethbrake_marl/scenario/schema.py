@@ -632,8 +632,16 @@ def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
     raise unknown_name("scenario", text, paths)
 
 
+BENCHMARK = (  # each ships with a table of best known harm, so that shares of the possible reduction are known
+    *("paper-random", "paper-random-brake-only", "paper-random-obstacle", "paper-delay-high", "paper-distance"),
+    *("realistic-motorway", "realistic-mixed", "stress-wide", "cooperation-2-blocked", "cooperation-2-five"),
+)
+
+
 def group_of_scenarios(name: str) -> list[str]:
-    """The scenarios of a folder of those that ship, such as ``standards``; none where no folder has this name."""
+    """``benchmark``, or the scenarios of a folder of those that ship, such as ``standards``; else none."""
+    if name == "benchmark":
+        return list(BENCHMARK)
     return sorted(stem for stem, path in _shipped_paths().items() if path.parent.name == name)
 
 

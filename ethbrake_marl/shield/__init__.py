@@ -11,10 +11,8 @@ if TYPE_CHECKING:
         SAME_HARM as SAME_HARM,
         VERDICTS as VERDICTS,
         OperatingPoint as OperatingPoint,
-        RobustnessPoint as RobustnessPoint,
         operating_curves as operating_curves,
         review as review,
-        robustness as robustness,
     )
     from ethbrake_marl.shield.guard import (
         HybridAgent as HybridAgent,

@@ -1,8 +1,7 @@
-"""Was an intervention needed? Every one is simulated again without it, and the price of the bound is measured."""
+"""Was an intervention needed? Every one is simulated again without it."""
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -15,10 +14,8 @@ from ethbrake_marl.engine import Memory, Script
 from ethbrake_marl.errors import InvalidInput, count_of, renumbered
 from ethbrake_marl.physics import Bools, Decisions, Floats, Ints, LeftOutRows, Worlds, measured_without_failed
 from ethbrake_marl.scenario import Task
-from ethbrake_marl.shield.enclosure import CORNERS, checked_robust
 from ethbrake_marl.shield.guard import Shielded, ShieldedDriver
 from ethbrake_marl.shield.step_shield import StepShield, proposed_action
-from ethbrake_marl.shield.uncertainty import Uncertainty
 
 SAME_HARM = 1e-9  # harms (m2/s2) closer than this are one harm
 ALLOWANCES = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0, 1e6)  # m2/s2, of an operating curve
@@ -140,85 +137,3 @@ class _Released(AgentAround):
         held = self._actions[np.arange(len(step)), np.clip(step, 0, self._actions.shape[1] - 1)]
         action = np.where(step < self._release, held, own)
         return action_to_command(action, worlds.vehicles, vehicle), {**memory, "policy": policy}
-
-
-# The cost of not knowing: robust mode's price, and harm where the truth is not what the shield believes.
-
-WIDTHS = (0.0, 0.25, 0.5, 1.0, 2.0)  # of a curve, in units of the intervals that are given
-TRUTHS = ("as told", "inside", "corner")  # the world that was told; one evenly out of its box; one of the box's corners
-MODES = ("step", "robust")
-
-Progress = Callable[[str, int], None]  # what is driven, worlds done so far
-
-
-class RobustnessPoint(NamedTuple):
-    """How one shield did at one width of the intervals, in one kind of truth; means are over all worlds."""
-
-    mode: str  # one of MODES; step mode believes what it is told
-    truth: str  # one of TRUTHS
-    width: float  # in units of the intervals that were given
-    harm: float  # mean realised (m2/s2)
-    bound: float  # mean stated at the alert (m2/s2)
-    above: float  # share of worlds that realise more than the bound stated at the alert
-    excess: float  # mean of how much more, 0 where it is not (m2/s2)
-    distrusted: float  # share of worlds in which the shield noticed
-    left_out: LeftOutRows = ()  # worlds that could not be advanced: in no point, whichever shield and truth met them
-
-
-def robustness(
-    worlds: Worlds,
-    policy: Agent,
-    task: Task,
-    uncertainty: Uncertainty,
-    *,
-    widths: Sequence[float] = WIDTHS,
-    seed: int = 0,
-    robust: str = CORNERS,
-    on_progress: Progress | None = None,
-) -> list[RobustnessPoint]:
-    """Both shields around ``policy`` in every kind of truth at each width; ``worlds`` is what the shields are told.
-
-    The engine runs the truth, and the policy sees it; the shields begin with what they are told and see what happens.
-    The numbers that place a truth in its box are those of ``seed``, the same for all widths. ``robust`` says what the
-    robust shield certifies of a box, as in ``ShieldOptions``. A world that cannot be advanced in one of the cases is
-    left out of all, and named in ``left_out``. Raises ``InvalidInput`` for no width or a negative one, ``UnknownName``
-    for another ``robust``, ``PhysicsError`` where no world is left, and what ``ShieldedDriver`` raises.
-    """
-    checked_robust(robust, "robustness")
-    if not widths or not all(0.0 <= width < np.inf for width in widths):
-        raise InvalidInput(f"robustness: widths {tuple(widths)}: at least one is needed, each at least 0")
-    try:
-        uncertainty.scaled(max(widths)).draw(worlds, np.random.default_rng(seed))
-    except InvalidInput as error:
-        raise InvalidInput(f"{error}; widths of up to {max(widths):g} times those given are measured") from None
-
-    def measured(at: Ints) -> list[RobustnessPoint]:
-        points, known, told = [], dict[tuple[float, str, str], RobustnessPoint](), worlds.take(at)
-        for width, truth, mode in itertools.product(map(float, widths), TRUTHS, MODES):
-            alike = width == 0.0 or (mode, truth) == ("step", "as told")  # what is told is all that matters
-            key = (0.0, "as told", "step") if alike else (width, truth, mode)
-            if key not in known:
-                intervals = uncertainty.scaled(width)
-                shielded = ShieldedDriver(
-                    policy, task.scenario, harm_count=task.harm_count, told=told,
-                    uncertainty=intervals if mode == "robust" else None,
-                    robust=robust if mode == "robust" else CORNERS,
-                )  # fmt: skip
-                driven = worlds
-                if key[1] != "as told":  # drawn for all worlds: a truth does not depend on which of them are left out
-                    driven = intervals.draw(worlds, np.random.default_rng(seed), corners=truth == "corner")
-                episodes = drive(driven.take(at), shielded, task.scenario, task.vehicle)
-                harm, shield = episodes.ledger.world_harm(task.harm_count), episodes.guarded.shield
-                bound = shield.predicted_harm
-                above = np.maximum(harm - bound, 0.0)
-                known[key] = RobustnessPoint(
-                    mode, truth, width, float(harm.mean()), float(bound.mean()), float((above > 0.0).mean()),
-                    float(above.mean()), float(shield.distrusted.mean()),
-                )  # fmt: skip
-            points.append(known[key]._replace(mode=mode, truth=truth, width=width))
-            if on_progress is not None:
-                on_progress(f"{mode}, {truth}, width {width:g}", worlds.n)
-        return points
-
-    found, _, left_out = measured_without_failed(measured, worlds.n)
-    return [point._replace(left_out=left_out) for point in found]

@@ -37,7 +37,6 @@ from ethbrake_marl.agents import (
     Knowledge,
     LearnedAgent,
     LearnedPolicy,
-    Refined,
     Source,
     Team,
     check_agent,
@@ -575,10 +574,7 @@ class HybridAgent(AgentAround):
         """Choose in these worlds."""
         policy = begin_script(self.policy, alert, vehicle, scripts)
         backup = begin_script(self.backup, alert, vehicle, scripts)
-        if isinstance(self.policy, Refined):  # was rolled out just now
-            policy_harm = policy["predicted_harm"]
-        else:
-            policy_harm = self._harm(alert, self.policy, vehicle)
+        policy_harm = self._harm(alert, self.policy, vehicle)
         bound = backup["predicted_harm"]
         if self.bound == "coupled":
             bound = self._harm(alert, FixedCommand(-backup["deceleration_mps2"]), vehicle)

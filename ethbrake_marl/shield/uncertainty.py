@@ -118,10 +118,6 @@ class Uncertainty:
         """Whether one uncertain number moves several quantities: then gaps and speeds have no extremes in corners."""
         return any(each.quantity == "friction" and each.half_width > 0.0 for each in self.intervals)
 
-    def scaled(self, factor: float) -> Uncertainty:
-        """The same intervals, ``factor`` times as wide."""
-        return Uncertainty(tuple(replace(each, half_width=each.half_width * factor) for each in self.intervals))
-
     def members(self, worlds: Worlds) -> Worlds:
         """The members [n * M] of worlds at the alert: for each world itself, then its corners, the next world's after.
 

@@ -1,4 +1,4 @@
-"""Ablations: levels of cooperation, trained and compared on the same worlds; and trained policies on longer lines."""
+"""Ablations: levels of cooperation, trained and compared on the same worlds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents import Agent, Driver, LearnedAgent, Team, make_agent, split_names
+from ethbrake_marl.agents import Driver, Team, make_agent, split_names
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, check_whole_number, count_of
 from ethbrake_marl.evaluation import (
@@ -23,21 +23,19 @@ from ethbrake_marl.evaluation import (
     interquartile_mean,
     load_runnable,
     mean_over_seeds,
-    policy_sha256,
     result_identity,
     share_over_seeds,
 )
 from ethbrake_marl.figures import Figure, ablation_figures, write_picture
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
-from ethbrake_marl.files.store import read_object, write_output
+from ethbrake_marl.files.store import write_output
 from ethbrake_marl.files.yaml import Override
 from ethbrake_marl.harm import Ledger, objective_harm
 from ethbrake_marl.learning import WORDS, RunDirectory, Training, TrainingRecipe, load_recipe, read_settings
 from ethbrake_marl.limits import BestHarmTable, best_harm, chunks_left, search_list, task_problem
 from ethbrake_marl.pages.page import Page, Part, Played, Section
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
-from ethbrake_marl.policies import Policy, load_policy
-from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, Task
+from ethbrake_marl.scenario import Sample, Scenario, Task
 from ethbrake_marl.shield import Shielded
 from ethbrake_marl.studies.jobs import JobFolder, Timed, TrainingJob
 
@@ -555,15 +553,15 @@ def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
     driven: dict[str, tuple[int, ...]] = {}
     for level in plan.levels:
         worlds = level.scenario.sample(plan.episodes, plan.list_seed).worlds.take(rows)
-        drivers = {level.name: (Team({}, level.name), "full_brake")}  # who drives nobody changes nothing
+        drivers = {level.name: Team({}, level.name)}  # who drives nobody changes nothing
         if level.scenario.learners:
             drivers = {}
             for recipe in plan.recipes:
                 folder = plan.training(level, recipe, 0).folder
                 name = level.name if len(plan.recipes) == 1 else f"{level.name}, {_algorithm(recipe)}"
-                drivers[name] = RunDirectory(folder).load_team(level.scenario, name), f"{recipe.algorithm}@{folder}"
-        for name, (team, spelling) in drivers.items():
-            Played.drive(played, worlds, name, team, level.scenario, spelling, seed=plan.list_seed)
+                drivers[name] = RunDirectory(folder).load_team(level.scenario, name)
+        for name, team in drivers.items():
+            Played.drive(played, worlds, name, team, level.scenario)
             driven[name] = level.scenario.learners
     told = (
         f"{count_of(len(played), 'world')}, the same line at every level; of several seeds the first drives."
@@ -571,157 +569,6 @@ def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
         " level's own."
     )
     return Section("Episodes", [told, Part.player(played, driven)])
-
-
-# The same weights on longer lines: policies of one line length drive every learner of lines of other lengths.
-
-
-@dataclass(frozen=True, slots=True)
-class LineQuestion:
-    """On which lines the policies are measured."""
-
-    scenario: Scenario  # of any length; see ``lengthen``
-    vehicles: tuple[int, ...]  # lengths of the lines
-    episodes: int
-    list_seed: int
-    harm_count: HarmCount
-    search_episodes: int  # worlds in which the joint optimum is searched; 0: none
-    budget: int
-
-    def load_runs(self, paths: Sequence[str]) -> list[Agent]:
-        """One agent for each run or bundle, the seeds of one training, to drive these lines.
-
-        Raises ``InvalidInput`` for no path, a run whose learners have a policy each, one policy twice, policies of
-        different trainings, or policies that never drove Vehicle 1 where it learns.
-        """
-        if not paths or not all(paths):
-            raise InvalidInput(f"runs {','.join(paths)!r}: must be runs or bundles, for instance runs/my-run")
-        for path in paths:
-            if RunDirectory(Path(path)).is_team:
-                raise InvalidInput(
-                    f"{path}: its learners have a policy each; only one that all share drives other lines"
-                )
-        policies = [load_policy(Path(path)) for path in paths]
-        trained = [_training(path, policy) for path, policy in zip(paths, policies, strict=True)]
-        for k, policy in enumerate(policies):
-            manifest = policy.manifest
-            if 0 in self.scenario.learners and "vehicle_1" not in manifest.learners:
-                raise InvalidInput(
-                    f"scenario {self.scenario.name!r}: vehicle_1 learns there, and {paths[k]} was trained for"
-                    f" {', '.join(manifest.learners)}; give one whose Vehicle 1 follows a script, for instance"
-                    f" --scenario {manifest.scenario['name']}"
-                )
-            same = [paths[j] for j in range(k) if policies[j].manifest.weights_sha256 == manifest.weights_sha256]
-            if same:
-                raise InvalidInput(f"runs {same[0]} and {paths[k]}: are one policy; give each once")
-            other = [name for name, value in trained[k].items() if trained[0].get(name, value) != value]
-            if other:
-                raise InvalidInput(
-                    f"runs {paths[0]} and {paths[k]}: differ in {', '.join(other)}; give seeds of one training"
-                )
-        return [LearnedAgent(policy, path) for path, policy in zip(paths, policies, strict=True)]
-
-    def drive(self, agents: Sequence[Agent], tell: OnProgress | None = None) -> list[Json]:
-        """Let every agent drive all learners of lines of each length, on the same worlds as full braking.
-
-        Plain data for JSON, one for each length: means over the worlds, and over several agents (m2/s2). All lines are
-        made before the first is driven. Raises ``InvalidInput`` for a length that is given twice or that the scenario
-        cannot have.
-        """
-        if len(set(self.vehicles)) < len(self.vehicles):
-            raise InvalidInput(f"vehicles {', '.join(map(str, self.vehicles))}: each length once")
-        lines = [lengthen(self.scenario, vehicles) for vehicles in self.vehicles]
-        lists = [line.sample(self.episodes, self.list_seed) for line in lines]
-        return [self._drive_line(*each, agents, tell) for each in zip(lines, lists, strict=True)]
-
-    def _drive_line(self, scenario: Scenario, sample: Sample, agents: Sequence[Agent], tell: OnProgress | None) -> Json:
-        count, say = self.harm_count, tell or (lambda progress: None)
-        braking = _drive(scenario, sample, [make_agent("full_brake")], say)
-        reached = _drive(scenario, sample, agents, say)
-        worst, own = braking.world[count], reached.world[count]
-        best_known, share = None, None
-        if self.search_episodes:
-            part = sample.worlds.take(np.arange(self.search_episodes))
-            searched = best_harm(scenario, part, counts=[count], budget=self.budget).best[count].harm
-            say(Progress(f"joint optimum of {scenario.name}", part.n, part.n))
-            best: Floats = np.minimum(searched, own[:, : part.n].min(axis=0))[np.newaxis]
-            best_known, share = mean_over_seeds(best), share_over_seeds(own[:, : part.n], worst[:, : part.n], best)
-        told = {
-            "full_brake": mean_over_seeds(worst),
-            "reached": mean_over_seeds(own),
-            "decrease": share_over_seeds(own, worst, np.zeros_like(worst)),
-            "best_known": best_known,  # in the worlds that were searched
-            "share": share,  # of the joint optimum's reduction, there
-            "worse_off": mean_over_seeds((reached.vehicle[count] > braking.vehicle[count] + TOLERANCE).any(axis=2)),
-        }
-        return {
-            **result_identity("generalise", scenario, sample),
-            "vehicles": scenario.vehicles,
-            **Estimate.side_by_side(told),
-            "policy_sha256": [policy_sha256(agent) for agent in agents],
-        }
-
-    def markdown(self, found: Sequence[Json], runs: int) -> str:
-        """One row per length of the line."""
-        columns: dict[str, Column] = {
-            "full_brake": Column("All brake fully"),
-            "reached": Column("Reached"),
-            "decrease": _share("Decrease"),
-            "worse_off": _share("Somebody worse off"),
-        }
-        if self.search_episodes:
-            columns |= {"best_known": Column("Best known"), "share": _share("Share of the joint optimum")}
-        rows = [
-            [
-                str(one["vehicles"]),
-                *(None if one[key] is None else Estimate(one[key], one[f"{key}_interval"]) for key in columns),
-            ]
-            for one in found
-        ]
-        conditions = (
-            f"{_HARM[self.harm_count].capitalize()} (m²/s², means per world) of the line of {self.scenario.name}"
-            f" made longer: {runs} {'policies' if runs > 1 else 'policy'}, {count_of(self.episodes, 'world')} of seed"
-            f" {self.list_seed} for each length; {interval_words(runs)}."
-        )
-        if self.search_episodes:
-            conditions += (
-                f" Best known and share: the first {count_of(self.search_episodes, 'world')},"
-                f" {self.budget:,} candidates each."
-            )
-        return f"{Sheet('', ['Vehicles', *columns.values()], rows).markdown()}\n\n{conditions}\n"
-
-
-def lengthen(scenario: Scenario, vehicles: int) -> Scenario:
-    """The scenario with a line of ``vehicles``: shorter ones lose the rear, vehicle i > N is like vehicle i - 2.
-
-    All followers learn; Vehicle 1 keeps its role.
-    """
-    given = scenario.model_dump(mode="json", exclude_unset=True)
-    changes: dict[str, Any] = {"vehicles": vehicles, "name": f"{scenario.name}-n{vehicles}"}
-    for key in (*QUANTITY.declared, "objective", "types"):
-        values = given.get(key)
-        if isinstance(values, list):
-            wanted = vehicles - (scenario.vehicles - len(values))
-            while len(values) < wanted:
-                values = [*values, values[-2] if len(values) > 1 else values[-1]]
-            changes[key] = values[:wanted]
-    first = scenario.roles.get("vehicle_1", "full_brake")
-    roles = {"vehicle_1": first} | {f"vehicle_{i + 1}": "learner" for i in range(1, vehicles)}
-    return scenario.replace(**changes, roles=roles)
-
-
-def _training(path: str, policy: Policy) -> dict[str, Any]:
-    """What seeds of one training have in common; the recipe too where ``path`` is a run."""
-    manifest = policy.manifest.model_dump(mode="json")
-    found = {name: manifest[name] for name in ("algorithm", "network", "observation", "learners", "reward", "scenario")}
-    config = RunDirectory(Path(path)).config
-    if config.is_file():
-        try:
-            recipe = read_object(config).get("recipe") or {}
-        except InvalidInput as error:
-            raise InvalidInput(f"{error}; give the policy instead: {Path(path) / 'policy'}") from None
-        found["recipe"] = {name: value for name, value in recipe.items() if name not in (*WORDS, "seed")}
-    return found
 
 
 # The comparison of levels: harm of each, what each step is worth, who pays, the distance to the joint optimum.
@@ -798,7 +645,7 @@ def _level(one: Measured, searched: int) -> Json:
                 "harm": mean_over_seeds(reached[:, :searched]).to_json(),
                 "each_seed": reached[:, :searched].mean(axis=1).tolist(),
                 "best_known": None if best is None else mean_over_seeds(best).to_json(),
-                "realised_share": None if share is None else share.to_json(),
+                "share_of_possible_reduction": None if share is None else share.to_json(),
             },
             "shielded": None if one.shielded is None else _behind(one, one.shielded[harm_count], harm_count, searched),
         }
@@ -959,7 +806,7 @@ def _blocks(found: Json) -> list[tuple[str, list[Sheet]]]:
                 (braking, f"{count} searched full_brake value"),
                 (Column(f"Reached, {_HARM[count]}"), f"{count} searched harm"),
                 (Column("Joint optimum"), f"{count} searched best_known value"),
-                (_share("Share of its reduction"), f"{count} searched realised_share"),
+                (_share("Share of its reduction"), f"{count} searched share_of_possible_reduction"),
             ])
             for count in HARM_COUNTS
         ],

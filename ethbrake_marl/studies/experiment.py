@@ -277,8 +277,6 @@ def _show(
         summary += f" {TESTS[name]} The other two tests stand below."
     stopped = f"The training was interrupted: this is the policy after {manifest.steps:,} steps."
     begin("the page and its episodes")
-    spelling = f"{manifest.algorithm}@{run.path}"
-    spellings = {TRAINED_POLICY: spelling, "hybrid": f"{spelling}+episode"}
     report = Report(
         f"ethbrake run: {name}",
         rows,
@@ -293,7 +291,7 @@ def _show(
         versions=installed_versions(),
     )
     path = run.path / "report.html"
-    report.driven(agents, spellings=spellings).write(path, force=True)
+    report.driven(agents).write(path, force=True)
     return path
 
 

@@ -1698,10 +1698,10 @@ def _play() -> Part:
         scenario = reading.scenario(f"paper-scenario-{number}")
         world = scenario.sample(1, LIST_SEED).worlds
         latencies = ",".join(f"{each:g}" for each in scenario.model_dump()["latency_s"])
-        again = "" if reading.acts_s is None else f"replay with --set latency_s=[{latencies}]"
+        again = "" if reading.acts_s is None else f"--set latency_s=[{latencies}]"
         one = Played(0, reading.name, again, title=f"Scenario {number}, {reading.name}")
         for spec, agent in make_agents(_AGENTS, scenario).items():
-            Played.drive([one], world, NAMES[spec], agent, scenario, spec, seed=LIST_SEED)
+            Played.drive([one], world, NAMES[spec], agent, scenario)
         found.append(one)
     return Part.player(found, scenario.learners, shown_first=[_AGENTS.index(PPO), _AGENTS.index(SAC)])
 

@@ -8,7 +8,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents import (
     LearnedAgent,
-    Refined,
+    Searched,
     Team,
     agent_entries,
     agent_names,
@@ -28,7 +28,7 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation import evaluate, follow_episodes, record_episode, worlds_sha256
 from ethbrake_marl.evaluation.episodes import Task, film_scenes, record_episodes
 from ethbrake_marl.evaluation.inputs import FIELD
-from ethbrake_marl.physics import Floats, Worlds, advance
+from ethbrake_marl.physics import Floats, Worlds
 from ethbrake_marl.shield import HybridAgent, ShieldedDriver
 from tests.fixtures.asked import Acts, Asked
 
@@ -41,7 +41,7 @@ def with_role(role, vehicle="vehicle_3"):
 
 
 @pytest.mark.parametrize("spec", ["e_v2x_bm", "e_v2x_bm+episode"])
-@pytest.mark.parametrize("role", ["constant:3", "coast", "copy_leader", "gentlest_front", "e_v2x_bm"])
+@pytest.mark.parametrize("role", ["constant:3", "coast", "e_v2x_bm"])
 def test_e_v2x_bm__predicts_and_beats_constants_whatever_script_the_others_follow(spec, role):
     scenario = with_role(role)
     worlds = scenario.sample(60, 7).worlds
@@ -276,7 +276,7 @@ def asked(spec: str, worlds: Worlds, vehicle: int = 1, **settings) -> Floats:
     [
         ("full_brake", AgentSpec("full_brake", None, None, ())),
         ("constant:-5+step", AgentSpec("constant", "-5", None, ("step",))),
-        ("ppo@shipped+refined+step", AgentSpec("ppo", None, "shipped", ("refined", "step"))),
+        ("ppo@shipped+search+step", AgentSpec("ppo", None, "shipped", ("search", "step"))),
         ("ppo@runs/a+b:c@d+episode:pairwise", AgentSpec("ppo", None, "runs/a+b:c@d", ("episode:pairwise",))),
         ("ppo@runs/my+step/", AgentSpec("ppo", None, "runs/my+step/", ())),
         ("mine:x@path+robust", AgentSpec("mine", "x", "path", ("robust",))),
@@ -293,13 +293,11 @@ def test_spec__is_taken_apart_and_written_again(spec, parts):
         ("full_brake+step", ShieldedDriver),
         ("constant:-5+step", ShieldedDriver),
         ("planner:8+episode", HybridAgent),
-        ("best_harm:20+refined", Refined),
-        ("e_v2x_bm+refined+episode", HybridAgent),
-        ("gentlest_front+robust", ShieldedDriver),
-        ("ppo@shipped+refined+step", ShieldedDriver),
-        ("full_brake+refined:10+episode", HybridAgent),
-        ("full_brake+refined:10+step", ShieldedDriver),
-        ("full_brake+refined:profile+step", ShieldedDriver),
+        ("best_harm:20+search", Searched),
+        ("e_v2x_bm+search+episode", HybridAgent),
+        ("coast+robust", ShieldedDriver),
+        ("ppo@shipped+search+step", ShieldedDriver),
+        ("full_brake+search+step", ShieldedDriver),
     ],
 )
 def test_shields__go_around_any_agent_and_hold(spec, kind):
@@ -311,33 +309,11 @@ def test_shields__go_around_any_agent_and_hold(spec, kind):
 
 @pytest.mark.parametrize(
     ("spec", "capacity", "expected"),
-    [
-        ("full_brake", 7, -7.0),
-        ("coast", 7, 0.0),
-        ("constant:3.5", 7, -3.5),
-        ("constant:-2", 7, 2.0),
-        ("copy_leader", 7, -6.0),
-        ("copy_leader", 4, -4.0),  # no harder than its own brakes
-    ],
+    [("full_brake", 7, -7.0), ("coast", 7, 0.0), ("constant:3.5", 7, -3.5), ("constant:-2", 7, 2.0)],
 )
 def test_scripts__ask_for_their_acceleration(spec, capacity, expected):
     worlds = SCENARIO.replace(braking_capacity_mps2=[6, capacity, 6]).sample(3, 7).worlds
     assert asked(spec, worlds).tolist() == [expected] * 3
-
-
-def test_gentlest_front__spares_the_front_vehicle_and_nothing_gentler_does():
-    worlds = SCENARIO.sample(300, 31).worlds
-    command = -worlds.vehicles.braking_capacity_mps2
-    command[:, 1] = asked("gentlest_front", worlds)
-    reachable = command[:, 1] > -7.0
-    assert 100 < reachable.sum() < 300
-    alone = worlds.take(reachable)
-    alone.gaps_m[:, 1] = 1000.0  # nobody behind
-    _, impacts = advance(alone, command[reachable], until_s=20.0)
-    assert impacts.count.sum() == 0
-    command[:, 1] += 1e-4
-    _, impacts = advance(alone, command[reachable], until_s=20.0)
-    assert np.all(impacts.count[:, 0] >= 1)
 
 
 def test_e_v2x_bm__drives_by_its_optimum_of_the_count_and_horizon_it_was_given():
@@ -356,8 +332,8 @@ def test_e_v2x_bm__drives_by_its_optimum_of_the_count_and_horizon_it_was_given()
 @pytest.mark.parametrize(
     "spec",
     [
-        *("full_brake", "coast", "constant:3.5", "copy_leader", "gentlest_front", "e_v2x_bm", "e_v2x_bm:pairwise"),
-        *("planner:20", "best_harm:20", "constant:5+refined", "constant:5+refined:profile", "full_brake+refined:10"),
+        *("full_brake", "coast", "constant:3.5", "e_v2x_bm", "e_v2x_bm:pairwise"),
+        *("planner:20", "best_harm:20", "constant:5+search"),
         *("full_brake+episode", "ppo@shipped+episode"),
     ],
 )
@@ -376,11 +352,11 @@ def test_agents__every_row_is_its_own_new_episodes_change_theirs_alone_and_agent
 
 
 def test_agent_names__are_those_that_ship_and_are_listed(capsys):
-    scripts = ("coast", "constant", "copy_leader", "e_v2x_bm", "full_brake", "gentlest_front", "planner")
+    scripts = ("coast", "constant", "e_v2x_bm", "full_brake", "planner")
     names = (*scripts, *FIELD, "best_harm", "ppo", "sac", "counterfactual", "options", "policy", "universal", "team")
     assert agent_names() == tuple(sorted(names)) and run_command(["agent", "list"]) == 0
     table = capsys.readouterr().out
-    assert [name for name in (*names, "+refined", "+episode", "+step", "+robust") if name not in table] == []
+    assert [name for name in (*names, "+search", "+episode", "+step", "+robust") if name not in table] == []
     assert all(callable(entry.load()) and entry.about and entry.knows for entry in agent_entries())
 
 

@@ -1,4 +1,4 @@
-"""Policies of bundles and of other libraries drive as agents: alone, refined and behind every shield."""
+"""Policies of bundles and of other libraries drive as agents: alone, searched around and behind every shield."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from tests.fixtures.asked import Asked
 
 SCENARIO = eb.load_scenario("paper-random")
 WORLDS = SCENARIO.sample(12, 7).worlds
-AROUND = ("+refined", "+episode", "+episode:pairwise", "+step", "+refined+step")
+AROUND = ("+search", "+episode", "+episode:pairwise", "+step", "+search+step")
 
 
 def harms(agent, worlds=WORLDS):

@@ -20,11 +20,9 @@ SPECS = {
     "cacc": ["cacc:T=0.8"],
     "coast": ["coast"],
     "constant": ["constant:3"],
-    "copy_leader": ["copy_leader"],
     "counterfactual": ["counterfactual@shipped"],
     "e_v2x_bm": ["e_v2x_bm", "e_v2x_bm:pairwise", "e_v2x_bm:believed", "e_v2x_bm:pairwise:believed"],
     "full_brake": ["full_brake"],
-    "gentlest_front": ["gentlest_front"],
     "idm": ["idm:T=1.0"],
     "options": ["options@shipped"],
     "planner": ["planner:8", "planner:8:believed"],
@@ -112,18 +110,18 @@ def test_role__does_what_a_driver_does_in_an_evaluation(name):
     assert harm[0].total_harm == pytest.approx(harm[1].total_harm, abs=1e-9)
 
 
-@pytest.mark.parametrize("around", ["+refined", "+refined:profile", "+episode", "+step", "+step:believed"])
+@pytest.mark.parametrize("around", ["+search", "+episode", "+step", "+step:believed"])
 def test_role__has_nothing_around_it(around):
     """Two that roll themselves out would ask each other for ever, and a shield stands around who is driven."""
     with pytest.raises(InvalidInput) as caught:
         script_agents(scripted("paper-random", f"planner:8{around}"))
     assert str(caught.value) == (
-        f"agent 'planner:8{around}': a refinement or a shield goes around a driver, never around a role; let vehicle_2"
+        f"agent 'planner:8{around}': a search or a shield goes around a driver, never around a role; let vehicle_2"
         " follow planner:8, or drive it"
     )
 
 
 def test_role__is_no_team_behind_a_shield():
     eb.register_agent("behind", lambda argument, settings: eb.make_agent("coast+step", scenario="paper-random").on([1]))
-    with pytest.raises(InvalidInput, match="agent 'behind': a refinement or a shield goes around a driver"):
+    with pytest.raises(InvalidInput, match="agent 'behind': a search or a shield goes around a driver"):
         script_agents(scripted("paper-random", "behind"))

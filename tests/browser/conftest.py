@@ -16,7 +16,6 @@ from ethbrake_marl.pages.report import Report
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 AGENTS = ("full_brake", "e_v2x_bm", "constant:3+step", "ppo@shipped")
-REFUSED = "the server responded with a status of 400"  # which some tests ask the explorer for
 PAPER = eb.load_scenario("paper-random")
 
 
@@ -43,7 +42,7 @@ def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
         context = browser.new_context(viewport={"width": width, "height": 900}, **settings)
         contexts.append(context)
         page = context.new_page()
-        page.on("console", lambda each: None if REFUSED in each.text else told.append(f"console: {each.text}"))
+        page.on("console", lambda each: told.append(f"console: {each.text}"))
         page.on("pageerror", lambda error: told.append(f"error: {error}"))
         page.on("dialog", lambda dialog: told.append(f"dialog: {dialog.message}"))
         page.on("request", lambda each: None if each.url.startswith(address) else told.append(each.url))
@@ -57,7 +56,7 @@ def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
 
 
 def wait_until(page: Any, condition: str) -> None:
-    """Wait up to two minutes: the explorer's first answer may have to compile the physics.
+    """Wait up to two minutes.
 
     The pages' own policy forbids what Playwright would run there to wait.
     """

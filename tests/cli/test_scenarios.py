@@ -68,7 +68,7 @@ def test_validate__drives_scripts_and_tells_what_refuses_them(ethbrake: Command,
     assert calm["not_state_free"] == {"vehicle_3": "own_calm"} and not calm["commands_out_of_range"]
     assert {"e_v2x_bm", "best_harm", "+step", "search best-harm"} < calm["refused_by"].keys()
     assert "command is not fixed at the alert" in calm["refused_by"]["+step"]
-    assert told_json(tried("copy_leader", "--json"))["refused_by"].keys() == {
+    assert told_json(tried("e_v2x_bm:pairwise", "--json"))["refused_by"].keys() == {
         "+robust:interior",
         "early_impacts: reject",
     }
@@ -83,7 +83,7 @@ def test_validate__drives_scripts_and_tells_what_refuses_them(ethbrake: Command,
 def test_validate_and_explain__stay_short_where_each_vehicle_draws_alone(ethbrake: Command, tmp_path: Path) -> None:
     each = [{"uniform": [4, 5 + 0.1 * i]} for i in range(40)]
     drawn = dict.fromkeys(("braking_capacity_mps2", "driving_capacity_mps2", "mass_t"), each)
-    roles = {"vehicle_1": "coast", "vehicle_2": "learner", "vehicle_3": "copy_leader"}
+    roles = {"vehicle_1": "coast", "vehicle_2": "learner", "vehicle_3": "coast"}
     usual = {"vehicles": 40, "latency_s": 0.4, "early_impacts": "keep", "roles": roles}
     declared = {**load_scenario("paper-random").declared(), "name": "long", **usual, **drawn}
     (tmp_path / "long.yaml").write_text(json.dumps(declared))
@@ -182,10 +182,10 @@ def test_tutorial__its_changed_scenario_is_valid_and_evaluates_to_the_printed_ta
     assert ethbrake("scenario", "new", "rainy").status == 0
     change_lines("rainy.yaml", TUTORIAL)
     assert ethbrake("scenario", "validate", "rainy.yaml").out.strip() in TUTORIAL
-    command = "evaluate --scenario rainy.yaml --agents full_brake,gentlest_front,e_v2x_bm --episodes 2000"
+    command = "evaluate --scenario rainy.yaml --agents full_brake,e_v2x_bm --episodes 2000"
     printed = TUTORIAL.partition(f"$ ethbrake {command}\n")[2].partition("\n...")[0].splitlines()
     told = ethbrake(*command.split()).out.splitlines()
-    assert len(printed) == 9 and [line.rstrip() for line in told[:9]] == printed
+    assert len(printed) == 7 and [line.rstrip() for line in told[:7]] == printed
 
 
 def test_how_to_add__its_commands_lead_from_a_copy_to_the_figures_that_it_tells(

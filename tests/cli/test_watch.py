@@ -19,18 +19,16 @@ from ethbrake_marl.agents import registry
 from ethbrake_marl.agents.registry import Entry, Team, make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.episodes import Passport, follow_episodes
 from ethbrake_marl.evaluation.inputs import NamedWorlds, check_agents, make_lineup
 from ethbrake_marl.evaluation.results import compare_results, read_result
 from ethbrake_marl.evaluation.statistics import mean, paired_difference, unpaired_difference
 from ethbrake_marl.files import plugins
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.policies import shipped_policies
-from ethbrake_marl.scenario import Scenario, load_scenario, new_scenario_text
+from ethbrake_marl.scenario import Scenario, load_scenario
 from tests.cli.conftest import Command, check_refused, rows_of, told_json
 from tests.failing_worlds import plant
 from tests.fixtures.pictures import EMPTY
-from tests.pages.hostile import HOSTILE, UNSEEN
 from tests.studies.counting import journal
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -101,12 +99,23 @@ def test_evaluate__prints_the_papers_rows_where_they_are_asked_for_and_fit(ethbr
     check_refused(ethbrake(*words, "--scenario", "standards", "--paper"), "--paper: standards is a group")
 
 
+def test_benchmark__shares_are_those_of_each_scenario_alone(ethbrake: Command) -> None:
+    words = ("--agents", "full_brake,coast", "--episodes", "10", "--harm-count", "total", "--json")
+    told = told_json(ethbrake("evaluate", "--scenario", "benchmark", *words))
+    assert len({row["scenario"] for row in told}) == 10 and len(told) == 20
+    shares = {(row["scenario"], row["agent"]): row["share_of_possible_reduction"] for row in told}
+    for name in ("paper-random", "cooperation-2-five"):
+        for row in told_json(ethbrake("evaluate", "--scenario", name, *words)):
+            alone = row["share_of_possible_reduction_total"]
+            assert shares[name, row["agent"]]["value"] == alone and (alone == 0.0) == (row["agent"] == "full_brake")
+
+
 def test_evaluate__a_damaged_bundle_is_refused_by_file_whatever_is_around_it(ethbrake, tmp_path) -> None:
     shutil.copytree(shipped_policies()["ppo"] / "policy", tmp_path / "policy")
     weights = tmp_path / "policy" / "weights.safetensors"
     data = weights.read_bytes()
     weights.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
-    for around in ("", "+episode", "+step", "+refined"):
+    for around in ("", "+episode", "+step", "+search"):
         spec = f"ppo@{tmp_path / 'policy'}{around}"
         check_refused(ethbrake("evaluate", "--episodes", "5", "--agents", spec), str(weights), "SHA-256")
 
@@ -131,7 +140,7 @@ def test_lineup__a_team_goes_behind_the_step_shield_and_no_other(monkeypatch) ->
 def test_check_agents__a_constant_above_the_capacity_of_any_world_is_refused_and_nobody_is_changed() -> None:
     scenario = SCENARIO.replace(braking_capacity_mps2={"uniform": [5, 7]})
     worlds = scenario.sample(500, 7).worlds
-    lineup = make_lineup(["e_v2x_bm", "constant:5", "gentlest_front"], scenario)
+    lineup = make_lineup(["e_v2x_bm", "constant:5", "coast"], scenario)
     before = dict(vars(lineup["e_v2x_bm"]))
     check_agents(lineup, worlds, scenario)
     assert vars(lineup["e_v2x_bm"]) == before
@@ -292,7 +301,7 @@ def test_versions__tell_a_file_behind_the_at_by_its_hash(ethbrake: Command, tmp_
     assert one.startswith("SHA-256 ") and one != other
 
 
-# ---------------------------------------------------------------- passports, pictures, data sets, shields
+# ---------------------------------------------------------------- pictures, data sets, shields
 
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -309,57 +318,8 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-# Passports
-
-
-def passport_of(spec: str, scenario_name: str | Path = "paper-random", *, seed: int | None = 7, world: int = 3) -> str:
-    scenario = load_scenario(scenario_name)
-    worlds = scenario.sample(1, 7, first=world).worlds
-    (motion,) = follow_episodes(worlds, make_agent(spec, scenario=scenario), scenario)
-    return str(Passport.of(motion, scenario, spec, seed=seed, number=world))
-
-
-def test_replay__is_the_same_episode_bit_for_bit(ethbrake: Command) -> None:
-    for spec in ("full_brake", "constant:4.5"):
-        told = ethbrake("watch", "replay", passport_of(spec)).out
-        assert "The same episode, bit for bit." in told and "Differs" not in told
-
-
-def test_replay__writes_a_page_and_a_film(ethbrake: Command) -> None:
-    text, page, film = passport_of("full_brake"), Path("again.html"), Path("again.gif")
-    assert ethbrake("watch", "replay", text, "--output", page).status == 0
-    assert text in page.read_text() and "bit for bit" in page.read_text()
-    assert ethbrake("watch", "replay", text, "--output", film).status == 0
-    assert film.read_bytes().startswith(b"GIF89a")
-    check_refused(ethbrake("watch", "replay", text, "--output", page), "--force")
-    check_refused(ethbrake("watch", "replay", text, "--output", "again.txt"), "films are written as")
-
-
-def test_replay__says_that_the_scenario_was_edited_and_what_is_missing(ethbrake: Command) -> None:
-    path = Path("elsewhere/mine.yaml").absolute()  # a file beside the caller would be found
-    path.parent.mkdir()
-    path.write_text(new_scenario_text("mine"))
-    text = passport_of("full_brake", path)
-    for words, told in (
-        ([text], "--scenario FILE.yaml"),
-        ([passport_of("full_brake", seed=None)], "--initial-states FILE.csv"),
-        ([passport_of("full_brake"), "--initial-states", __file__], "leave --initial-states out"),
-    ):
-        check_refused(ethbrake("watch", "replay", *words), told)
-    assert ethbrake("watch", "replay", text, "--scenario", path).status == 0
-    path.write_text(path.read_text().replace("restitution: 0.1", "restitution: 0.2"))
-    answer = ethbrake("watch", "replay", text, "--scenario", path, "--json")
-    told = json.loads(answer.out)
-    assert (answer.status, told["same"]) == (1, False)
-    assert any(each.startswith("the scenario") for each in told["differences"])
-    assert ethbrake("watch", "replay", text, "--scenario", path, "--set", "restitution=0.1").status == 0
-
-
-def test_replay_and_again__run_no_code_that_only_a_file_names(ethbrake: Command) -> None:
+def test_again__runs_no_code_that_only_a_file_names(ethbrake: Command) -> None:
     Path("mine.py").write_text(EVIL)
-    text = passport_of("mine.py:make")
-    Path("ran").unlink()
-    check_refused(ethbrake("watch", "replay", text), "--agent mine.py:make")
     found = ("search", "falsify", "--agent", "coast", "--against", "full_brake", "--budget", "64")
     assert ethbrake(*found, "--output", "worst.yaml").status == 0
     whole = Path("worst.yaml").read_text()
@@ -367,38 +327,14 @@ def test_replay_and_again__run_no_code_that_only_a_file_names(ethbrake: Command)
         Path("worst.yaml").write_text(whole.replace(line, f'{line.partition(" ")[0]} "mine.py:make"\n'))
         check_refused(ethbrake("search", "falsify", "--again", "worst.yaml"), "is code")
     assert not Path("ran").exists()
-    assert ethbrake("watch", "replay", text, "--agent", "mine.py:make").status == 0
-
-
-EXAMPLE = Passport(
-    "paper-random", "0" * 10, 7, 3, "first", (1,), ("0.1.0", "3.11.7", "0.68.1", "2.4.6"), "0" * 6, "0" * 10, None,
-    "coast",
-)  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    "text", [pytest.param(text, marks=pytest.mark.slow if k % 6 else ()) for k, text in enumerate(HOSTILE)]
-)
-def test_replay__of_anything_else_is_refused_in_one_line(ethbrake: Command, text: str) -> None:
-    passport = str(EXAMPLE)
-    given = (text, "EB1:" + text, passport.replace("paper-random", text), f"{passport[:-6]}{text}")
-    for each in (*given, str(replace(EXAMPLE, agent=text))):
-        answer = ethbrake("watch", "replay", "--", each)
-        check_refused(answer)
-        assert not set(answer.err[:-1]) & UNSEEN
-    assert list(Path().iterdir()) == []
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_report__its_passports_can_be_replayed(ethbrake: Command) -> None:
+def test_report__says_which_harm_the_shield_bounds(ethbrake: Command) -> None:
     answer = ethbrake("evaluate", "--agents", "full_brake,constant:3+step", "--episodes", "12", "--report", "r.html")
     assert answer.status == 0, answer.err
     text = Path("r.html").read_text()
-    passports = [each.partition('"')[0] for each in text.split('"passport":"')[1:]]
-    assert len(passports) == len(set(passports)) == 24 and "minus episode mode" in text
-    assert "First-impact harm, which the shield bounds" in text
-    for passport in (passports[0], passports[-1]):
-        assert "bit for bit" in ethbrake("watch", "replay", passport).out
+    assert "minus episode mode" in text and "First-impact harm, which the shield bounds" in text
 
 
 # Worlds in which an agent is worst
@@ -416,25 +352,12 @@ def test_falsify__as_many_worlds_as_it_keeps_read_back(ethbrake: Command) -> Non
 
 
 @pytest.mark.parametrize(
-    "words",
-    [
-        ("criticality", "--scenario", "paper-distance", "--agent", "constant:5", "--cells", "3", "--gaps", "8", "9"),
-        pytest.param(("shield-modes", "--agents", "full_brake", "--episodes", "6"), marks=pytest.mark.slow),
-        ("shield-modes", "--scenario", "cooperation-3-pair", "--agents", "full_brake", "--episodes", "6"),
-        ("shield", "--scenario", "cooperation-3-pair", "--agents", "full_brake", "--episodes", "6"),
-    ],
+    "words", [("shield", "--scenario", "cooperation-3-pair", "--agents", "full_brake", "--episodes", "6")]
 )
 def test_picture__is_drawn_and_said_where(ethbrake: Command, words: tuple[str, ...]) -> None:
     answer = ethbrake("watch", "picture", *words, "--output", "x.png")
     assert (answer.status, answer.out) == (0, "") and "picture: x.png" in answer.err
     assert Path("x.png").read_bytes().startswith(PNG)
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_picture__of_robustness_tells_its_figures(ethbrake: Command) -> None:
-    words = ("--uncertainty", "gaps_m.pair_1=1", "--episodes", "2", "--output", "x.png", "--json")
-    told = told_json(ethbrake("watch", "picture", "robustness", *words))
-    assert len(told) == 5 * 3 * 2 and {row["mode"] for row in told} == {"step", "robust"}
 
 
 @pytest.mark.parametrize(
@@ -456,13 +379,7 @@ def test_picture__is_written_as_its_name_ends_and_the_same_bytes_again(ethbrake,
 
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
-    "words",
-    [
-        ("criticality", "--cells", "2"),
-        ("deceleration",),
-        pytest.param(("shield", "--episodes", "3"), marks=pytest.mark.slow),
-        pytest.param(("robustness", "--episodes", "2", "--uncertainty", "gaps_m=1"), marks=pytest.mark.slow),
-    ],
+    "words", [("deceleration",), pytest.param(("shield", "--episodes", "3"), marks=pytest.mark.slow)]
 )
 def test_picture__overwrites_only_by_force(ethbrake: Command, words: tuple[str, ...]) -> None:
     out = Path("map.png")
@@ -521,9 +438,7 @@ def test_file__of_an_extra_that_is_missing_says_the_line_that_installs_it(
     "words",
     [
         ("shield", "--agents", "full_brake"),
-        ("watch", "picture", "shield-modes", "--agents", "coast", "--output", "x.png"),
         ("watch", "picture", "shield", "--agents", "coast,full_brake", "--output", "x.png"),
-        pytest.param(("watch", "picture", "robustness", "--output", "x.png"), marks=pytest.mark.slow),
     ],
     ids=lambda words: " ".join(words[:3]),
 )

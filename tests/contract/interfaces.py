@@ -30,7 +30,7 @@ FIVE = eb.Scenario(
         "vehicle_2": "constant:3",
         "vehicle_3": "e_v2x_bm:pairwise",
         "vehicle_4": "learner",
-        "vehicle_5": "copy_leader",
+        "vehicle_5": "full_brake",
     },
 )
 # Vehicle 1 brakes with 6 m/s2 from 20 m/s; Vehicle 2 may act after 0.5 s. Coasting, it closes 3 m in 1 s and hits with

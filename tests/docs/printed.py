@@ -153,7 +153,7 @@ BLOCKS: dict[str, How] = {
     "paper-random full_brake        backward": EXACT,
 }
 
-_SHIPPED = "counterfactual@shipped,counterfactual@shipped+refined:profile+episode"
+_SHIPPED = "counterfactual@shipped,counterfactual@shipped+search+episode"
 _TESTS = tuple(
     f"ethbrake evaluate --scenario paper-random{test} --agents full_brake,e_v2x_bm,{agents},best_harm --episodes 2000"
     " --seed 7 --measures injury --json"
@@ -179,24 +179,15 @@ PICTURES: dict[str, How] = {
         NIGHTLY, "ethbrake watch record --agents full_brake,counterfactual@shipped --output emergency.svg"
     ),
     "model-": _by(SUITE, "tests/docs/test_studies.py"),
-    "criticality.png": _by(
-        NIGHTLY,
-        "ethbrake watch picture criticality --scenario paper-distance --agent e_v2x_bm --output criticality.png",
-    ),
     "deceleration.png": _by(
         NIGHTLY, "ethbrake watch picture deceleration --scenario paper-random --world 5 --output deceleration.png"
     ),
     "sampled-convergence.png": _by(NIGHTLY, "python docs/studies/sampling.py sampled-convergence.png"),
-    "shield-robustness.png": _by(
-        SEARCH, "ethbrake watch picture robustness --agent ppo@shipped --episodes 300 --output shield-robustness.png"
-    ),
     "price-of-not-knowing.png": _by(NIGHTLY, "python docs/studies/price.py price-of-not-knowing.png"),
-    "shield-modes.png": _by(TRAINING),
     "regimes.png": _by(NIGHTLY, "python docs/studies/regimes.py regimes.png"),
     "cooperation-ablation": _by(TRAINING),
     "cooperative-learners.png": _by(TRAINING),
     "learning-curves": _by(TRAINING),
-    "explorer.png": _by(BY_HAND),
     "speed-scaling.png": _by(SPEED),
 }
 

@@ -23,11 +23,9 @@ from ethbrake_marl.learning.training import Scheme
 from ethbrake_marl.limits.limits import best_known
 from ethbrake_marl.scenario import Task, load_scenario
 from ethbrake_marl.studies import reproduction
-from ethbrake_marl.studies.benchmark import read_entry
 from ethbrake_marl.studies.reproduction import FULL_BRAKE, GAPS, ITEMS, NAMES, Reproduction, Result, checked_result
 from ethbrake_marl.studies.speed import Effort
 from tests.docs.site import DOCS, load
-from tests.studies.benchmark_rows import ENTRIES, MEASURED as BENCHMARK, tables
 
 sampling, price, equal_time, scaling, cooperative = (
     load(f"../studies/{name}") for name in ("sampling", "price", "equal_time", "scaling", "cooperative")
@@ -321,11 +319,3 @@ def test_cooperation__its_messages_are_those_of_the_code() -> None:
     for message, changes in zip(re.findall(r"my.yaml, line 9: (.*)", COOPERATION), given, strict=True):
         with pytest.raises(ValueError, match=re.escape(message)):
             load_scenario("paper-random").replace(roles={"vehicle_2": "learner"}, **changes)
-
-
-def test_benchmark__shows_the_tables_that_the_entries_make() -> None:
-    assert tables() == BENCHMARK.read_tables("benchmark")
-    for path in ENTRIES.glob("*.json"):  # nobody clearly beats the best known on a list; of paper-distance it is loose
-        for name, result in read_entry(path).driven.items():
-            most = 0.25 if name == "paper-distance" else 0.12
-            assert result.realised_share.interval[0] <= 1.0 and result.below_best_known <= most * result.worlds

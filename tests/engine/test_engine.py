@@ -267,7 +267,6 @@ def with_script(script: str) -> eb.Scenario:
             ),
             "harm",
         ),
-        (with_script("gentlest_front"), "harm"),
         (with_script("e_v2x_bm:pairwise"), "harm"),
         (with_script("planner:20"), "harm"),
     ],

@@ -48,8 +48,8 @@ ESTIMATES = {
     "vehicle_1_shoved_far_rate", "first_impact_harm_difference", "total_harm_difference", "harm_decrease_first",
     "harm_decrease_total", "unavoidable_rate", "impact_proven_rate", "proven_harm", "best_known_minus_proven_first",
     "best_known_minus_proven_total", "avoidable_collision_rate", "best_known_first_impact_harm",
-    "best_known_total_harm", "mean_regret", "mean_regret_first", "mean_regret_total", "realised_share",
-    "realised_share_first", "realised_share_total",
+    "best_known_total_harm", "mean_regret", "mean_regret_first", "mean_regret_total", "share_of_possible_reduction",
+    "share_of_possible_reduction_first", "share_of_possible_reduction_total",
 }  # fmt: skip
 ALWAYS = {
     "kind", "agent", "knows", "sees_through_channel", "hidden_share", "episodes", "collisions", "horizon_ends",
@@ -445,8 +445,9 @@ AGENT = ([1.0, 4.0, 3.0, 6.0], [1.0, 4.0, 5.0, 7.0])
 NULLS = {
     "unavoidable_rate", "impact_proven_rate", "avoidable_collision_rate", "best_known_first_impact_harm",
     "best_known_total_harm", "proven_harm", "best_known_minus_proven_first", "best_known_minus_proven_total",
-    "mean_regret", "mean_regret_first", "mean_regret_total", "realised_share", "realised_share_first",
-    "realised_share_total", "known_best_share", "below_best_known",
+    "mean_regret", "mean_regret_first", "mean_regret_total",
+    "share_of_possible_reduction", "share_of_possible_reduction_first",
+    "share_of_possible_reduction_total", "known_best_share", "below_best_known",
 }  # fmt: skip
 
 
@@ -520,8 +521,8 @@ def test_best_known__rounding_below_the_table_is_not_below_it(four: Evaluation) 
 def test_distance__by_hand(four: Evaluation) -> None:
     (_, found) = summarise(first_worlds(four, 3, full_brake=FULL, a=AGENT))
     expected = {
-        "realised_share_first": (30.0 - 8.0) / (30.0 - 5.0),
-        "realised_share_total": (36.0 - 10.0) / (36.0 - 8.0),
+        "share_of_possible_reduction_first": (30.0 - 8.0) / (30.0 - 5.0),
+        "share_of_possible_reduction_total": (36.0 - 10.0) / (36.0 - 8.0),
         "mean_regret_first": 1.0,
         "mean_regret_total": 2.0 / 3.0,
         "unavoidable_rate": 2.0 / 3.0,
@@ -534,7 +535,7 @@ def test_distance__by_hand(four: Evaluation) -> None:
     assert {name: found[name].value for name in expected} == pytest.approx(expected, rel=1e-12)
     assert (found.known_best_share, found.below_best_known) == (1.0, 1)
     (alone,) = summarise(first_worlds(four, 3, a=AGENT))  # without full braking nothing is realised
-    assert alone["realised_share_first"] is alone["realised_share_total"] is None
+    assert alone["share_of_possible_reduction_first"] is alone["share_of_possible_reduction_total"] is None
     assert alone["mean_regret_first"].value == 1.0
 
 
@@ -543,7 +544,7 @@ def test_distance__a_best_that_is_not_known_everywhere_realises_nothing(four: Ev
         full, agent = (row.to_json() for row in summarise(four))
     assert "(25.0 %)" in agent["best_known_warning"] and agent["best_known_warning"] == full["best_known_warning"]
     assert agent["known_best_share"] == full["known_best_share"] == 0.75
-    assert agent["realised_share"] is agent["realised_share_total"] is None
+    assert agent["share_of_possible_reduction"] is agent["share_of_possible_reduction_total"] is None
     assert (agent["mean_regret"], agent["mean_regret_first"], agent["mean_regret_total"]) == (0.75, 0.75, 0.5)
     assert full["mean_regret"] == (10.0 + 8.0 + 7.0 + 4.0) / 4.0
     assert (full["below_best_known"], agent["below_best_known"]) == (0, 1)

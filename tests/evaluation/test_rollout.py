@@ -269,7 +269,7 @@ def test_worlds_sha256__tells_every_bit_and_not_how_it_lies_in_memory(monkeypatc
     ("spec", "policy"),
     [
         ("ppo@shipped", "ppo"),
-        ("ppo@shipped+refined+episode", "ppo"),
+        ("ppo@shipped+search+episode", "ppo"),
         ("ppo@shipped+step", "ppo"),
         ("full_brake+step", None),
     ],
@@ -302,11 +302,6 @@ ABOUT = {"worlds_sha256": worlds_sha256(SAMPLE.worlds, SAMPLE.index), "scenario_
         ("evaluate", "evaluate --agents full_brake"),
         ("shield", "shield --agents full_brake"),
         ("best-harm", "search best-harm --budget 20"),
-        pytest.param(
-            "robustness",
-            "watch picture robustness --uncertainty mass_t.vehicle_3=1% --output x.png",
-            marks=pytest.mark.slow,
-        ),
     ],
 )
 def test_every_results_file__says_its_kind_worlds_scenario_and_versions(

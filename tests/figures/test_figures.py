@@ -1,4 +1,4 @@
-"""Figures: the curves of a list and of a training, criticality maps, trajectories; drawn from the very numbers."""
+"""Figures: the curves of a list and of a training, trajectories; drawn from the very numbers."""
 
 import re
 
@@ -9,14 +9,13 @@ from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
 from ethbrake_marl.evaluation import EpisodeRecord, Evaluation, curves as module, evaluate, record_episode, summarise
-from ethbrake_marl.evaluation.curves import avoidability_boundary, criticality_map, deceleration_curve
+from ethbrake_marl.evaluation.curves import deceleration_curve
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.figures import (
     BODY_M,
     COLOURS,
     SeedCurve,
     ShownFigure,
-    criticality_figure,
     deceleration_figure,
     harm_against_total_gap,
     harm_by_agent,
@@ -31,7 +30,7 @@ from ethbrake_marl.figures import (
     trajectories,
     worlds_figure,
 )
-from ethbrake_marl.limits.limits import Limits, Proof, known_limits
+from ethbrake_marl.limits.limits import Limits, Proof
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 
 BRAKE = {"full_brake": eb.make_agent("full_brake")}
@@ -231,36 +230,6 @@ def test_trajectories__lines_and_impacts_are_those_of_the_record(record: Episode
     assert "Vehicle 2 (m/s²)" in command.get_ylabel() and "paper-random: d = (" in caption(figure)
     two = trajectories({"one": record, "two": record}, caption="mine")
     assert len(two.axes) == 6 and two.axes[0].get_ylim() == two.axes[1].get_ylim() and caption(two) == "mine"
-
-
-# ---------------------------------------------------------------- criticality maps
-
-
-def test_boundary__lies_between_avoidable_and_unavoidable_worlds() -> None:
-    found = avoidability_boundary(DISTANCE, (5.0, 10.0), (5.0, 10.0))
-    inside = np.isfinite(found[1]) & (found[1] > 5.001) & (found[1] < 9.999)
-    assert inside.sum() > 100
-    for shift, expected in ((1e-6, True), (-1e-6, False)):
-        limits = known_limits(
-            module._worlds_at(DISTANCE, found[0][inside], found[1][inside] + shift), Task(DISTANCE, (1,))
-        )
-        assert isinstance(limits, Limits) and (limits.proof.avoidable == expected).all()
-
-
-def test_criticality_figure__draws_harm_and_boundary_and_names_both_sides() -> None:
-    found = criticality_map(DISTANCE, BRAKE, cells=9)
-    figure = criticality_figure(found)
-    for axes, count in zip(figure.axes, ("first", "total"), strict=False):
-        drawn = np.ma.filled(axes.collections[0].get_array(), 0.0).reshape(9, 9)
-        np.testing.assert_array_equal(np.nan_to_num(drawn), found.harm(count))
-        assert {text.get_text() for text in axes.texts} == {"avoidable", "unavoidable"}
-        np.testing.assert_array_equal(axes.lines[0].get_xydata()[:, 1], found.boundary_gap_2_m)
-        assert "full_brake" in figure.axes[0].get_title(loc="left") and "proven" in figure.get_supxlabel()
-    roles = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "coast"}
-    unproven = criticality_map(DISTANCE.replace(roles=roles), BRAKE, cells=2)
-    assert unproven.avoidable is unproven.boundary_gap_1_m is unproven.boundary_gap_2_m is None
-    figure = criticality_figure(unproven)
-    assert not figure.axes[0].lines and "Nothing is proven" in figure.get_supxlabel()
 
 
 # ---------------------------------------------------------------- decelerations

@@ -59,7 +59,7 @@ def test_write__replaces_a_plain_file_by_force_and_takes_the_longest_name(tmp_pa
         ("evaluate --agents coast --report", "html"),
         ("search best-harm --output", "npz"),
         ("search falsify --agent coast --output", "yaml"),
-        ("watch picture criticality --output", "png"),
+        ("watch picture deceleration --output", "png"),
         ("watch record --agents coast --output", "svg"),
         ("watch dataset --format parquet --agents coast --output", "parquet"),
     ],

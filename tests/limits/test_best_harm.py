@@ -13,6 +13,7 @@ import pytest
 
 from ethbrake_marl.agents import BestHarm, drive, make_agent, optimise_coupled
 from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.cli.evaluate import GROUP_EPISODES
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
 from ethbrake_marl.evaluation import TESTS, evaluate, make_lineup, measures, rollout, summarise, write_per_world
@@ -33,7 +34,7 @@ from ethbrake_marl.limits.lower_bound import KEPT, extreme_profiles, lower_bound
 from ethbrake_marl.pages.report import avoidable_section, worst_section
 from ethbrake_marl.physics import Floats, Worlds, advance
 from ethbrake_marl.policies import load_shipped, shipped_policies
-from ethbrake_marl.scenario import Scenario, Task, load_scenario
+from ethbrake_marl.scenario import Scenario, Task, group_of_scenarios, load_scenario
 from ethbrake_marl.search import Profiles, profile_problem
 from tests.failing_worlds import planted_list, without
 from tests.limits.worlds import line
@@ -231,6 +232,13 @@ def test_shipped_tables__hold_the_shipped_lists_and_their_profiles_do_the_stored
                 assert np.array_equal(problem.follow(profiles)[harm_count == "total"][found], known[found])
                 assert (known <= optimise_coupled(worlds, 1, harm_count=harm_count).harm + 1e-7).all()
     assert max(path.stat().st_size for path in TABLES.glob("*.npz")) < 700_000
+
+
+def test_shipped_tables__hold_the_first_worlds_of_every_scenario_of_the_benchmark() -> None:
+    for name in group_of_scenarios("benchmark"):
+        scenario = load_scenario(name)
+        known = best_known(scenario.sample(GROUP_EPISODES, seed=7).worlds, Task(scenario, scenario.learners))
+        assert all(np.isfinite(harm).all() for harm in known.values()), name
 
 
 def test_shipped_tables__no_policy_that_ships_does_less_harm() -> None:
@@ -436,7 +444,8 @@ def test_prove__bounds_the_harm_of_other_teams_without_a_verdict_on_contact(name
     found = known_limits(sample.worlds, Task(scenario, vehicles))
     assert found.proof.avoidable is None and found.proof.contact is None
     assert np.array_equal(found.proof.harm, team_bound(sample.worlds, vehicles, horizon_s=8.0, time_step_s=0.1).harm)
-    assert not found.known.any() and (found.proof.harm > 0).any() == (name != "cooperation-4-all")
+    assert found.known.any() == found.known.all() == (name == "cooperation-2-five")  # for which a table ships
+    assert (found.proof.harm > 0).any() == (name != "cooperation-4-all")
 
 
 def test_evaluation__of_a_team_tells_the_proven_harm_where_contact_is_not_decided(tmp_path: Path) -> None:

@@ -181,15 +181,15 @@ def test_among__acts_as_the_policy_or_the_action_of_the_highest_score(
             NetworkSpec(**{**dict(spec), **wrong})
 
 
-@pytest.mark.parametrize("around", ["+episode", "+step", "+refined", "+refined:profile"])
-def test_mixture__drives_shielded_and_refined(around: str, mixture: Policy, tmp_path: Path) -> None:
+@pytest.mark.parametrize("around", ["+episode", "+step", "+search"])
+def test_mixture__drives_shielded_and_searched(around: str, mixture: Policy, tmp_path: Path) -> None:
     mixture.save(tmp_path / "mixture")
     assert eb.load_policy(tmp_path / "mixture").manifest == mixture.manifest
     spec = f"counterfactual@{tmp_path / 'mixture'}"
     agents = {name: eb.make_agent(name, scenario=SCENARIO) for name in (spec, spec + around)}
     found = eb.evaluate(SCENARIO.sample(4, seed=7).worlds, agents, scenario=SCENARIO)
     alone, harm = (found.outcome(name).first_impact_harm for name in agents)
-    assert np.isfinite(harm).all() and ((harm <= alone).all() or "refined" not in around)
+    assert np.isfinite(harm).all() and ((harm <= alone).all() or "search" not in around)
 
 
 def onnx_of(policy: Policy) -> onnxruntime.InferenceSession:
@@ -702,7 +702,7 @@ def test_shipped__counterfactual_does_less_harm_than_ppo(harm_count: HarmCount) 
     assert counterfactual < 0.98 * ppo
 
 
-# Of each list of 10,000 (seed 7) the worlds in which a shipped policy, refined, was furthest below an earlier table.
+# Of each list of 10,000 (seed 7) the worlds where a search around a shipped policy was furthest below an earlier table.
 LOWERED = {
     "paper-random": (["ppo", "sac"], [400, 1058, 1261, 2987, 4300, 4408, 5872, 5976, 8752]),
     "paper-random-brake-only": (["ppo"], [1325, 2801, 5278, 5547, 5814, 5984, 7228, 8020, 8166]),
@@ -711,12 +711,12 @@ LOWERED = {
 
 @pytest.mark.parametrize("harm_count", ["first", pytest.param("total", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("test", list(LOWERED))
-def test_shipped__refined_is_nowhere_below_the_shipped_table(test: str, harm_count: HarmCount) -> None:
+def test_shipped__searched_around_is_nowhere_below_the_shipped_table(test: str, harm_count: HarmCount) -> None:
     scenario = eb.load_scenario(test)
     kinds, numbers = LOWERED[test]
     every, rows = scenario.sample(10_000, 7), np.array(numbers)
     sample = replace(every, worlds=every.worlds.take(rows), index=every.index[rows])
-    lineup = make_lineup([f"{kind}@shipped+refined+episode" for kind in kinds], scenario, harm_count=harm_count)
+    lineup = make_lineup([f"{kind}@shipped+search+episode" for kind in kinds], scenario, harm_count=harm_count)
     found = summarise(evaluate(sample, lineup, scenario=scenario, seed=7))
     assert [(row.agent, row.known_best_share, row.below_best_known) for row in found] == [
         (name, 1.0, 0) for name in lineup

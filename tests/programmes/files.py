@@ -119,7 +119,7 @@ SPECS = (
     "best_harm:" + "9" * 5000, "constant:.inf", "constant:1e400", "constant:nan", "constant:" + "9" * 3000,
     "constant:-7", "e_v2x_bm:eval", "coast:1", "__import__('os').system('touch pwned')", "ppo@/dev/zero", "ppo@shipped",
     "hybrid@shipped", "team@.", "learner:1", "Learner", "replay", "a" * 5000, "constant:3;touch pwned",
-    "$(touch pwned)", "../../etc/passwd", "ladder", "gentlest_front:x", "",
+    "$(touch pwned)", "../../etc/passwd", "ladder", "coast:x", "",
 )  # fmt: skip
 ESCAPES = (
     "\\e[2J", "\\x1b]0;x\\x07", "\\u202e", "\\u2028", "\\0", "\\r\\nOK", "\\x9b", "\\ud800", "\\uFEFF", "\\a\\b\\v\\f",

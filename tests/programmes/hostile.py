@@ -185,8 +185,7 @@ LINES = (
     "evaluate --episodes 3 --set @", "evaluate --episodes 3 --set mass_t=@", "evaluate --episodes 3 --vehicle @",
     "evaluate --no@", "train --name @", "train --recipe @", "evaluate --episodes 3 --objective @",
     "shield --episodes 3 --agents @", "agent export @ --onnx x.onnx", "train curves --output o --scenario @",
-    "study ablate --levels @ --output o", "study generalise --runs @ --vehicles 3",
-    "study generalise --runs x --vehicles @",
+    "study ablate --levels @ --output o",
 )  # fmt: skip
 # Places below the case's own folder where nothing can be written, not even by the superuser.
 TARGETS = ("file", "file/x", "full", "link", "dangling", "loop", "pipe", "pipe/x", f"{HERE}/loop/x", "x" * 300, "\0b")
@@ -195,7 +194,7 @@ WRITERS: dict[str, tuple[str, ...]] = {
     "table": ("search", "best-harm", *FEW, "--budget", "1", "--output"),
     "run": ("train", "--steps", "1", "--output"),
     "new scenario": ("scenario", "new", "mine", "--output"),
-    "picture": ("watch", "picture", "criticality", "--output"),
+    "picture": ("watch", "picture", "deceleration", "--output"),
 }
 MAY_CHANGE = ("file", "file.json", "full/mine.yaml")
 
@@ -304,9 +303,9 @@ WARM = (
           (" ".join(COMMAND[:-2]), "t.npz", " --json"),
           ("evaluate --agents ppo@shipped --initial-states", "CSV.csv", ""),
       )),
-    "train resume ppo", "train resume sac", "nonsense", "study generalise --runs x --vehicles 3", "shield --agents x",
+    "train resume ppo", "train resume sac", "nonsense", "shield --agents x",
     "study ablate --levels x --output x", "train curves --scenario x --output x", "agent export x --onnx x",
-    "watch picture criticality --output file", "evaluate --agents coast,full_brake --episodes 3 --per-world out.csv",
+    "watch picture deceleration --output file", "evaluate --agents coast,full_brake --episodes 3 --per-world out.csv",
 )  # fmt: skip
 
 

@@ -1,6 +1,6 @@
 """The same bits on other processors: every recorded result, computed again as nine older ones would.
 
-Computes one hash for each thing that is recorded somewhere: worlds of every shipped scenario and of the benchmark,
+Computes one hash for each thing that is recorded somewhere: worlds of every shipped scenario,
 physics, episodes with rewards and observations, E-V2X-BM, searches, bounds, shield decisions, tallies, intervals and
 the actions of policies. First as this machine does, then in one process for each of the settings below, which make
 numpy, the C library, OpenBLAS or numba behave as on an older processor.

@@ -73,7 +73,6 @@ COMMANDS = (
     Call(("ethbrake", "evaluate", "--agents", "full_brake,ppo@shipped+step", "--episodes", "20", "--json")),
     Call(("ethbrake", "shield", "--agents", "ppo@shipped", "--episodes", "20")),
     Call(("ethbrake", "watch", "picture", "deceleration", "--output", "deceleration.png")),
-    Call(("ethbrake", "watch", "picture", "shield-modes", "--episodes", "20", "--output", "modes.png")),
     Call(("ethbrake", "scenario", "validate", "paper-random")),
     Call(("ethbrake", "doctor")),
     Call(("ethbrake", "train", "--steps", "1000"), 2, NEEDS_TRAIN),

@@ -230,7 +230,7 @@ def test_mixture__an_obstacle_in_some_worlds_changes_nothing_in_the_others() -> 
     """Nor does what is searched in a world, or certified, depend on the worlds beside it; the rest is left open."""
     mixture = mixed("paper-random", "paper-random-obstacle")
     sample = mixture.sample(12, 7)
-    names = ("e_v2x_bm", "best_harm:20", "full_brake+refined:profile", "coast+episode", "coast+step")
+    names = ("e_v2x_bm", "best_harm:20", "full_brake+search", "coast+episode", "coast+step")
 
     def driven(scenario: eb.Scenario, worlds: Any, **options: Any) -> Any:
         agents = {name: eb.make_agent(name, scenario=scenario, harm_count="total") for name in names}

@@ -123,7 +123,7 @@ def test_believed__shields_other_lines(scenario: eb.Scenario, robust: str | None
         "e_v2x_bm:believed",
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("script", ["copy_leader", "e_v2x_bm"])
+@pytest.mark.parametrize("script", ["coast", "e_v2x_bm"])
 def test_believed__the_script_of_the_driven_vehicle_itself_does_not_count(spec: str, script: str) -> None:
     scripted = BASE.replace(roles={"vehicle_1": "full_brake", "vehicle_2": script, "vehicle_3": "full_brake"})
     worlds = scripted.sample(3, 1).worlds

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import Refined, drive
+from ethbrake_marl.agents import Searched, drive
 from ethbrake_marl.scenario import Task
 from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield import (
@@ -375,8 +375,8 @@ def test_later_rollouts__may_be_switched_off():
     assert not (reasons == ShieldReason.POLICY_ROLLOUT).any()
 
 
-def test_rollout__also_of_a_refined_policy_that_cannot_be_divided():
-    driver = ShieldedDriver(Refined(Remembering(), PAPER, tries=2), PAPER)
+def test_rollout__also_of_a_searched_policy_that_cannot_be_divided():
+    driver = ShieldedDriver(Searched(Remembering(), PAPER, candidates=20), PAPER)
     episodes = drive(WORLDS.take(np.arange(20)), driver, PAPER, 1)
     assert episodes.ledger.world_harm("first").tolist() == episodes.guarded.shield.bound.tolist()
 

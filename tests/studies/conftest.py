@@ -9,12 +9,8 @@ import pytest
 import yaml
 
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.limits.limits import search_list
-from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies import jobs
-from ethbrake_marl.studies.benchmark import load_suite
 from ethbrake_marl.studies.reproduction import Reproduction
-from tests.docs.site import load
 from tests.fixtures.pictures import draw_nothing
 from tests.learning.tiny import TINY_PPO
 from tests.studies.counting import Inside
@@ -38,9 +34,6 @@ ABLATE += ["--steps", "128", "--scheme", "shared"]
 
 
 TRIALS = 5
-
-
-SUITE = {"paper-random": ("first", 901), "paper-random-obstacle": ("total", 902), "cooperation-3-pair": ("total", 903)}
 
 
 Write = Callable[..., Path]
@@ -140,28 +133,6 @@ def write_tuning(tmp_path: Path, small_tuning: dict[str, Any]) -> Write:
 def settings(tmp_path: Path) -> Reproduction:
     """A quick reproduction of few worlds."""
     return Reproduction("quick", tmp_path / "out", 24, machine="a machine")
-
-
-@pytest.fixture(scope="session")
-def suites(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the suite ``tiny`` of three small lists."""
-    freezing, lists = load("../studies/freeze_suite"), []
-    for name, (harm_count, seed) in SUITE.items():
-        scenario = load_scenario(name)
-        table = search_list(scenario, scenario.sample(12, seed), counts=(harm_count,), budget=300, threads=1)
-        lists.append(freezing.NewList(name, "small", scenario, seed, 12, harm_count, table))
-    folder = tmp_path_factory.mktemp("suites")
-    freezing.freeze_suite("tiny", lists, folder)
-    return folder
-
-
-@pytest.fixture(scope="session")
-def entries(suites: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with an entry of full_brake, coast (all lists) and full_brake+episode (two lists)."""
-    made, folder = load_suite("tiny", suites), tmp_path_factory.mktemp("entries")
-    for spec in ("full_brake", "coast", "full_brake+episode"):
-        made.make_entry(spec).write(folder / f"{spec}.json")
-    return folder
 
 
 def check_snapshot(name: str, text: str) -> None:

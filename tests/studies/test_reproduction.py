@@ -11,12 +11,10 @@ import pytest
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
-from ethbrake_marl.evaluation.episodes import Passport
 from ethbrake_marl.evaluation.measures import PAPER_ROWS, PaperRow
 from ethbrake_marl.evaluation.statistics import rate
 from ethbrake_marl.figures import SeedCurve, estimates_figure
 from ethbrake_marl.files.sheet import Estimate, Sheet
-from ethbrake_marl.files.yaml import Override
 from ethbrake_marl.studies import reproduction
 from ethbrake_marl.studies.reproduction import (
     FULL_BRAKE,
@@ -374,16 +372,14 @@ def course(returns: list[list[float]], harm: list[list[float]]) -> Course:
 
 
 @pytest.mark.slow
-def test_trajectories__are_watched_side_by_side_and_their_passports_play_them_again(tmp_path: Path) -> None:
+def test_trajectories__are_watched_side_by_side(tmp_path: Path) -> None:
     Reproduction("quick", tmp_path / "out", 10).make(Reproduction.choose(["trajectories"]))
     page = (tmp_path / "out" / "index.html").read_text("utf-8")
     shown, text = Page(page), page.split('type="application/json"')[1].partition(">")[2]
     content = json.loads(text.partition("</script>")[0])
-    assert shown.open == [] and "Passports" in shown.text
+    assert shown.open == []
     assert [content["agents"][k] for k in content["shown"]] == ["PPO", "SAC"]
     titles = [world["title"] for world in content["worlds"]]
     assert titles[0] == "Scenario 1, as stated" and len(set(titles)) == 4
-    for one in (content["worlds"][0], content["worlds"][3]):
-        settings = tuple(Override.parse([one["why"].partition("--set ")[2]])) if one["why"] else ()
-        again = Passport.parse(one["episodes"][0]["passport"]).replay(settings=settings)
-        assert again.same and again.differences == ()
+    whys = [world["why"] for world in content["worlds"]]
+    assert whys[0] == "" and whys[3].startswith("--set latency_s=[")
