@@ -114,8 +114,7 @@ _EXTRA_OF = {
     **dict.fromkeys(("pyarrow", "minari", "h5py"), "data"),
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
     **dict.fromkeys(("starlette", "uvicorn"), "explore"),
-    "ray": "cluster",
-    "optuna": "tune",
+    **dict.fromkeys(("ray", "optuna"), "cluster"),
     "libsumo": "sumo",
 }
 
