@@ -7,7 +7,7 @@ ended by then, and not on how often the command was stopped in between.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +16,7 @@ import optuna
 from optuna.samplers import BaseSampler, RandomSampler, TPESampler
 from ray.tune.search.optuna import OptunaSearch
 
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.store import read_object, write_file
+from ethbrake_marl.files.store import write_file
 from ethbrake_marl.studies.figures import HARM
 
 if TYPE_CHECKING:
@@ -35,17 +34,23 @@ class Proposals(OptunaSearch):
 
     Args:
         file: of the proposals; made with the first one.
+        known: what stands in it.
         search: the space.
         sampling: who proposes.
-        first: the first proposal, where the file has none.
-
-    Raises ``InvalidInput`` for a damaged file.
+        first: the first proposal, where none is known.
 
     """
 
-    def __init__(self, file: Path, search: Mapping[str, Dimension], sampling: Sampling, first: Proposal | None) -> None:
+    def __init__(
+        self,
+        file: Path,
+        known: Sequence[Proposal],
+        search: Mapping[str, Dimension],
+        sampling: Sampling,
+        first: Proposal | None,
+    ) -> None:
         optuna.logging.set_verbosity(optuna.logging.ERROR)
-        self._file, self.known, self._asked = file, read_proposals(file, search), 0
+        self._file, self.known, self._asked = file, [*known], 0
         points = self.known or ([] if first is None else [first])
         super().__init__(
             {key: dimension.distribution() for key, dimension in search.items()},
@@ -63,22 +68,6 @@ class Proposals(OptunaSearch):
             write_file(self._file, (json.dumps({"trials": self.known}, indent=1) + "\n").encode())
         self._asked += 1
         return {"trial": number, "values": values}
-
-
-def read_proposals(file: Path, search: Mapping[str, Dimension]) -> list[Proposal]:
-    """What the file has; raises ``InvalidInput`` unless every value is in the space."""
-    if not file.exists():
-        return []
-    known = read_object(file).get("trials")
-    try:
-        for values in known:
-            if values.keys() != search.keys() or any(
-                search[key].own(search[key].value(v)) is None for key, v in values.items()
-            ):
-                raise ValueError
-    except (TypeError, ValueError, AttributeError, LookupError):
-        raise InvalidInput(f"{file}: is damaged: a trial has other keys or values than the space") from None
-    return known
 
 
 class _SeededByTrial(BaseSampler):

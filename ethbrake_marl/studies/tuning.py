@@ -18,7 +18,7 @@ from pydantic import AfterValidator, Discriminator, Field, PlainValidator, Tag, 
 from ethbrake_marl.errors import InvalidInput, OnProgress, count_of, naming_extras
 from ethbrake_marl.files.plugins import noted_plugins
 from ethbrake_marl.files.sheet import csv_text
-from ethbrake_marl.files.store import remove_unfinished, write_file
+from ethbrake_marl.files.store import read_object, remove_unfinished, write_file
 from ethbrake_marl.files.yaml import FileModel, FileSchema, flow_text
 from ethbrake_marl.learning import Training, TrainingRecipe, load_recipe, read_settings
 from ethbrake_marl.policies import installed_versions
@@ -243,7 +243,7 @@ _NOT_SEARCHED = {  # key -> why; what is inside it, too
     "reward.harm_count": "it says which harm is least; give it in set",
 }
 _TRIED = 200  # points of the space that are checked before anything starts
-TABLE, TRIALS = "trials.csv", "trials"  # inside the folder
+TABLE, TRIALS, PROPOSALS = "trials.csv", "trials", "proposals.json"  # inside the folder
 
 
 @dataclass(frozen=True)
@@ -385,8 +385,9 @@ class TuningPlan:
         with self.folder(path).work():
             (path / TRIALS).mkdir(exist_ok=True)
             remove_unfinished(path / TRIALS)
+            known = read_proposals(path / PROPOSALS, self.file)
             with connected(ray, jobs):
-                proposed, ends = self._search(path, trials, jobs, retries, tell)
+                proposed, ends = self._search(path, known, trials, jobs, retries, tell)
             records = [
                 Trial.of(number, self.file.values(values), end)
                 for number, (values, end) in enumerate(zip(proposed, ends, strict=False))
@@ -408,7 +409,7 @@ class TuningPlan:
         return TuningResult(path / TABLE, max(trials, len(proposed)), tuple(records))
 
     def _search(
-        self, path: Path, trials: int, jobs: int, retries: int, tell: OnProgress | None
+        self, path: Path, known: list[Values], trials: int, jobs: int, retries: int, tell: OnProgress | None
     ) -> tuple[list[Values], list[dict[str, Any]]]:
         """What was proposed, and how each trial of these ended."""
         from ethbrake_marl.studies.proposals import Proposals
@@ -416,18 +417,18 @@ class TuningPlan:
 
         own = self.own_values()
         first = None if own is None else {key: self.file.search[key].stored(value) for key, value in own.items()}
-        search = Proposals(path / "proposals.json", self.file.search, self.file.sampler, first)
-        known = len(search.known)
-        told, prune = Told("tuning", 0, max(trials, known), tell), self.file.prune
+        search = Proposals(path / PROPOSALS, known, self.file.search, self.file.sampler, first)
+        total, prune = max(trials, len(known)), self.file.prune
+        told = Told("tuning", 0, total, tell)
         if known:
-            told.say(f"{count_of(known, 'trial')} begun already, each goes on from where it stopped")
+            told.say(f"{count_of(len(known), 'trial')} begun already, each goes on from where it stopped")
         elif own is None:
             told.say("the recipe's own values are not in the space, so no trial has them")
         ends = run_trials(
             do_trial,
             {"plan": self, "path": path.absolute()},
             path,
-            tune.TuneConfig(search_alg=search, num_samples=max(trials, known), scheduler=prune and prune.rule()),
+            tune.TuneConfig(search_alg=search, num_samples=total, scheduler=prune and prune.rule()),
             {},
             jobs=jobs,
             retries=retries,
@@ -510,6 +511,21 @@ class TuningResult:
         """The finished trial of least harm, of equals the first; None where none has finished."""
         finished = [each for each in self.trials if each.harm is not None]
         return min(finished, key=lambda each: (each.harm, each.number), default=None)
+
+
+def read_proposals(file: Path, tuning: TuningFile) -> list[Values]:
+    """What was proposed, as Optuna has it; raises ``InvalidInput`` unless every value is in the space."""
+    if not file.exists():
+        return []
+    known: Any = read_object(file).get("trials")
+    try:
+        for proposal in known:
+            values = tuning.values(proposal)
+            if values.keys() != tuning.search.keys() or None in (tuning.search[k].own(v) for k, v in values.items()):
+                raise ValueError
+    except (TypeError, ValueError, AttributeError, LookupError):
+        raise InvalidInput(f"{file}: is damaged: a trial has other keys or values than the space") from None
+    return [*known]
 
 
 def do_trial(config: dict[str, Any], plan: TuningPlan, path: Path) -> None:
