@@ -19,6 +19,7 @@ _WORKERS = {  # environment of the processes: one thread each, in the folder of 
 }
 _DRIVER = {
     "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_raylet_start_wait_time_s": "300",  # much else may run here; Ray gives up after 30 s
     "RAY_AIR_NEW_OUTPUT": "0",
     "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
     "TUNE_PRINT_ALL_TRIAL_ERRORS": "0",

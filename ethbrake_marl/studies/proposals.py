@@ -1,19 +1,18 @@
 """What Optuna proposes for a tuning, through Ray Tune, and kept in a file: what stands there is proposed again first.
 
-A sampler is made anew for each trial, of the file's seed and the trial's number: what is proposed depends on what had
+A sampler is made anew for each trial, of a seed and the trial's number: what is proposed depends on what had
 ended by then, and not on how often the command was stopped in between.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import optuna
-from optuna.samplers import BaseSampler, RandomSampler, TPESampler
+from optuna.samplers import BaseSampler
 from ray.tune.search.optuna import OptunaSearch
 
 from ethbrake_marl.files.store import write_file
@@ -24,19 +23,17 @@ if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
     from optuna.trial import FrozenTrial
 
-    from ethbrake_marl.studies.tuning import Dimension, Sampling
-
 Proposal = Mapping[str, Any]  # key -> value as Optuna has it
 
 
-class Proposals(OptunaSearch):
+class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
     """Optuna's search of a space; a trial's configuration is its ``trial``, a number, and its ``values``.
 
     Args:
         file: of the proposals; made with the first one.
         known: what stands in it.
-        search: the space.
-        sampling: who proposes.
+        space: the distribution of each key.
+        sampler: makes the sampler for the trial of a number.
         first: the first proposal, where none is known.
 
     """
@@ -45,19 +42,19 @@ class Proposals(OptunaSearch):
         self,
         file: Path,
         known: Sequence[Proposal],
-        search: Mapping[str, Dimension],
-        sampling: Sampling,
+        space: Mapping[str, BaseDistribution],
+        sampler: Callable[[int], BaseSampler],
         first: Proposal | None,
     ) -> None:
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         self._file, self.known, self._asked = file, [*known], 0
         points = self.known or ([] if first is None else [first])
         super().__init__(
-            {key: dimension.distribution() for key, dimension in search.items()},
+            dict(space),
             metric=HARM,
             mode="min",
             points_to_evaluate=[dict(each) for each in points],
-            sampler=_SeededByTrial(sampling),
+            sampler=_SamplerOfTrial(sampler),
         )
 
     def suggest(self, trial_id: str) -> dict[str, Any] | None:
@@ -70,20 +67,14 @@ class Proposals(OptunaSearch):
         return {"trial": number, "values": values}
 
 
-class _SeededByTrial(BaseSampler):
-    """A sampler for each trial, seeded by its number."""
+class _SamplerOfTrial(BaseSampler):
+    """A sampler of its own for each trial."""
 
-    def __init__(self, sampling: Sampling) -> None:
-        self._sampling = sampling
+    def __init__(self, of: Callable[[int], BaseSampler]) -> None:
+        self._of = of
 
     def before_trial(self, study: Study, trial: FrozenTrial) -> None:
-        asked = self._sampling
-        seed = int(np.random.SeedSequence([asked.seed, trial.number]).generate_state(1)[0])
-        self._sampler: BaseSampler = (
-            RandomSampler(seed=seed)
-            if asked.name == "random"
-            else TPESampler(seed=seed, n_startup_trials=asked.random_trials)
-        )
+        self._sampler = self._of(trial.number)
 
     def infer_relative_search_space(self, study: Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
         return {}

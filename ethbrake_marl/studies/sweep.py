@@ -333,7 +333,9 @@ class SweepPlan:
     ) -> dict[str, str]:
         """Train the jobs of these numbers; why some failed, by name."""
         with connected(ray, jobs):
-            from ethbrake_marl.studies.trials import Told, run_trials, tune
+            from ray import tune
+
+            from ethbrake_marl.studies.trials import Told, run_trials
 
             ends = run_trials(
                 do_job,

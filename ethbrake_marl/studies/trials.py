@@ -86,7 +86,7 @@ def _reason(error: BaseException) -> str:
     return describe_error(getattr(error, "cause", None) or error)
 
 
-class Told(tune.Callback):
+class Told(tune.Callback):  # type: ignore[misc]  # Ray ships no types
     """Tells how many trials have ended, and why some failed."""
 
     def __init__(self, name: str, done: int, total: int, tell: OnProgress | None) -> None:

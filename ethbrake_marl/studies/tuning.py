@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 from pydantic import AfterValidator, Discriminator, Field, PlainValidator, Tag, WithJsonSchema, model_validator
 
 from ethbrake_marl.errors import InvalidInput, OnProgress, count_of, naming_extras
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from optuna.distributions import BaseDistribution
+    from optuna.samplers import BaseSampler
     from ray.tune.schedulers import TrialScheduler
 
 _Count = Annotated[int, Field(ge=0, le=1_000_000)]
@@ -201,6 +203,15 @@ class Sampling(FileModel):
     seed: Seed = Field(default=0, description="of what is proposed")
     random_trials: _Count = Field(default=10, description="trials by chance before TPE begins")
 
+    def of_trial(self, number: int) -> BaseSampler:
+        """The same for Optuna, for one trial."""
+        from optuna.samplers import RandomSampler, TPESampler
+
+        seed = int(np.random.SeedSequence([self.seed, number]).generate_state(1)[0])
+        if self.name == "random":
+            return RandomSampler(seed=seed)
+        return TPESampler(seed=seed, n_startup_trials=self.random_trials)
+
 
 class TuningFile(StudyFile):
     """The whole file."""
@@ -222,13 +233,17 @@ class TuningFile(StudyFile):
         """What Optuna proposes, as YAML has it."""
         return {key: self.search[key].value(value) for key, value in proposal.items()}
 
+    def space(self) -> dict[str, BaseDistribution]:
+        """The space for Optuna."""
+        return {key: dimension.distribution() for key, dimension in self.search.items()}
+
     def points(self, number: int) -> Iterator[dict[str, Any]]:
         """Points of the space by chance, the same ones each time."""
         with naming_extras():
             import optuna
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
-        space = {key: dimension.distribution() for key, dimension in self.search.items()}
+        space = self.space()
         return (self.values(study.ask(space).params) for _ in range(number))
 
 
@@ -412,12 +427,14 @@ class TuningPlan:
         self, path: Path, known: list[Values], trials: int, jobs: int, retries: int, tell: OnProgress | None
     ) -> tuple[list[Values], list[dict[str, Any]]]:
         """What was proposed, and how each trial of these ended."""
+        from ray import tune
+
         from ethbrake_marl.studies.proposals import Proposals
-        from ethbrake_marl.studies.trials import Told, run_trials, tune
+        from ethbrake_marl.studies.trials import Told, run_trials
 
         own = self.own_values()
         first = None if own is None else {key: self.file.search[key].stored(value) for key, value in own.items()}
-        search = Proposals(path / PROPOSALS, known, self.file.search, self.file.sampler, first)
+        search = Proposals(path / PROPOSALS, known, self.file.space(), self.file.sampler.of_trial, first)
         total, prune = max(trials, len(known)), self.file.prune
         told = Told("tuning", 0, total, tell)
         if known:
