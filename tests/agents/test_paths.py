@@ -16,7 +16,7 @@ NAMES = (
     "lr=0.001,seed=1",
     "c+step",
     "c+step,d",
-    "x+refined:50",
+    "x+search",
     "a:b",
     "a@b",
     "a,full_brake",
@@ -41,7 +41,7 @@ def put(name):
 def test_policy__in_a_folder_of_any_name_is_that_folder_wherever_agents_are_named(name, folder):
     path = folder + name
     put(path)
-    for around in ("", "+step", "+refined:5+step"):
+    for around in ("", "+step", "+search+step"):
         spec = parse_spec(f"ppo@{path}{around}")
         assert (spec.name, spec.policy, "".join(f"+{each}" for each in spec.around)) == ("ppo", path, around)
         assert split_specs(f"full_brake,ppo@{path}{around},coast") == ["full_brake", f"ppo@{path}{around}", "coast"]

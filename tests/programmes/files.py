@@ -29,7 +29,8 @@ import ethbrake_marl as eb
 from ethbrake_marl.evaluation.inputs import NamedWorld, NamedWorlds, states_of
 from ethbrake_marl.learning.runs import train
 from ethbrake_marl.policies import content_sha256, load_policy, shipped_policies
-from ethbrake_marl.studies.sweep import SweepPlan, TuningPlan
+from ethbrake_marl.studies.sweep import SweepPlan
+from ethbrake_marl.studies.tuning import TuningPlan
 from tests.programmes.archives import npy, raw_npy
 from tests.programmes.cage import NASTY, OUTSIDE, PRECIOUS, Case, damaged, write
 
