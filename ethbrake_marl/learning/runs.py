@@ -78,7 +78,6 @@ class _Wishes(NamedTuple):
     """What is asked of a training beside its result."""
 
     measure: Measure | None
-    stop_when_lost: bool
     stop_at: StopAt | None
     on_progress: OnProgress | None
 
@@ -107,7 +106,6 @@ class TrainResult:
     updates: int  # rounds of collecting and learning
     wall_s: float  # s, of all stretches together
     evaluations: tuple[Mapping[str, float], ...]  # what was measured on the way, in order
-    alarms: tuple[str, ...]  # training lost, or harm up with the return
 
     @property
     def policies(self) -> dict[str, Policy]:
@@ -177,7 +175,6 @@ def train(
     force: bool = False,
     settings: Sequence[str] = (),
     measure: Measure | None = measure_on_list,
-    stop_when_lost: bool = False,
     stop_at: StopAt | None = None,
     on_progress: Told = "show",
 ) -> TrainResult:
@@ -200,7 +197,6 @@ def train(
         settings: by which recipe and scenario differ from their files, ``KEY=VALUE`` each: noted in ``config.json``.
         measure: makes of the training what measures its policies before the first update, then as the recipe says, and
             at the end: by default on the recipe's fixed list. None: nothing is measured.
-        stop_when_lost: stop, ``interrupted``, at an evaluation that finds the training lost (docs/run-folder.md).
         stop_at: is given every evaluation, as it stands in ``TrainResult.evaluations``, and gives a reason to stop
             there, ``interrupted``, or None.
         on_progress: is told how far the training is; by default stderr shows it, None: nobody is told.
@@ -213,14 +209,13 @@ def train(
     training = Training.of(recipe, scenario, **{name: value for name, value in changes.items() if value is not None})
     run = RunDirectory(Path(directory))
     begin = partial(run.create, training.config(settings), team=training.team(), force=force)
-    return _run(run, begin, training, _Wishes(measure, stop_when_lost, stop_at, Progress.listener(on_progress)))
+    return _run(run, begin, training, _Wishes(measure, stop_at, Progress.listener(on_progress)))
 
 
 def resume(
     directory: str | Path,
     *,
     measure: Measure | None = measure_on_list,
-    stop_when_lost: bool = False,
     stop_at: StopAt | None = None,
     on_progress: Told = "show",
     other_versions: bool = False,
@@ -233,7 +228,6 @@ def resume(
     Args:
         directory: the run's folder.
         measure: as it was given to ``train``.
-        stop_when_lost: stop again at the next evaluation that finds the training lost.
         stop_at: as it was given to ``train``; it hears of new evaluations only.
         on_progress: is told how far the training is; by default stderr shows it, None: nobody is told.
         other_versions: go on from a checkpoint that other versions, or other plug-ins, wrote, although its numbers may
@@ -259,7 +253,7 @@ def resume(
         )
 
     begin = partial(run.write_json, run.team, training.team())  # a damaged one would stay
-    wishes = _Wishes(measure, stop_when_lost, stop_at, Progress.listener(on_progress))
+    wishes = _Wishes(measure, stop_at, Progress.listener(on_progress))
     return _run(run, begin, training, wishes, partial(_newest, run, training.identity, other_versions))
 
 
@@ -292,7 +286,7 @@ def _run(
     assert course.policy is not None and course.kept is not None  # set before the first rollout
     return TrainResult(
         run.path, training, course.kept, course.policy, status, course.steps, course.updates, course.wall_s,
-        tuple(course.evaluations), tuple(course.alarms),
+        tuple(course.evaluations),
     )  # fmt: skip
 
 
@@ -326,8 +320,7 @@ class Session(BaseCallback):
 
     It keeps the run's folder complete. What is due stands in ``_after_update``, before the first rollout and after each
     update. ``stop`` is asked before every rollout; ``StopRequested`` is raised when it says yes, with everything saved.
-    With ``stop_when_lost`` also where the evaluation just before has found the training lost, with ``stop_at`` where
-    that gave a reason.
+    The same where ``stop_at`` gave a reason at the evaluation just before.
     """
 
     model: Model
@@ -397,12 +390,10 @@ class Session(BaseCallback):
         if not self._resumed:
             self._after_update()
         self._resumed = False
-        lost = self.course.lost if self._wishes.stop_when_lost else None
-        reason = lost or self._reason
-        if self._stop() or reason is not None:
+        if self._stop() or self._reason is not None:
             self._rest()
             self._save()
-            raise StopRequested(reason)
+            raise StopRequested(self._reason)
 
     def _on_step(self) -> bool:
         infos = self.locals["infos"]
@@ -450,10 +441,6 @@ class Session(BaseCallback):
                 self.model.dump_logs()
             elif updates or self.course.evaluations:
                 self.logger.dump(step=self.model.num_timesteps)
-            alarm = cut_gradients(self._table.latest("train/gradient_cut", WINDOW))
-            if alarm is not None and not any(told.startswith(CUTS) for told in self.course.alarms):
-                self.course.alarms.append(alarm)
-                self.tell(f"alarm: {alarm}")
             self.tell()
         if not last and updates and updates % recipe.checkpoint_every_updates == 0:
             self._rest()
@@ -473,12 +460,9 @@ class Session(BaseCallback):
         begun = time.process_time()
         metrics = {name: float(value) for name, value in self._evaluate(self.course.policy).items()}
         self.course.cpu_started += time.process_time() - begun
-        alarm = self.course.add_evaluation(self.course.policy, metrics, self._recent_return())
+        self.course.add_evaluation(self.course.policy, metrics, self._recent_return())
         for name, value in metrics.items():
             self.logger.record(f"eval/{name}", value)
-        self.logger.record("eval/alarm", int(alarm is not None))
-        if alarm is not None:
-            self.tell(f"alarm: {alarm}")
         if self._wishes.stop_at is not None:
             self._reason = self._wishes.stop_at(self.course.evaluations[-1])
 
@@ -536,7 +520,6 @@ class Session(BaseCallback):
             "steps": course.steps,
             "updates": course.updates,
             "policy_steps": None if course.kept is None else course.kept.steps,
-            "alarms": course.alarms,
             "policy": run.policy.name if run.policy.is_dir() else None,
             "checkpoints": sorted(path.name for path in left_over),
         }
@@ -611,7 +594,7 @@ def trained_policies(training: Training, algorithm: Algorithm, model: Model) -> 
     return PolicyTeam(dict(zip(names, policies, strict=True))) if apart else policies[0]
 
 
-# The progress of a training: its policies, its evaluations, and alarms when it is lost or its return misleads.
+# The progress of a training: its policies and its evaluations.
 
 # Column of the log -> info of an episode's end; means over the episodes since the last row, exploration included.
 EPISODE_COLUMNS = {
@@ -621,14 +604,6 @@ EPISODE_COLUMNS = {
 }
 RETURN = "episode_return"
 AT_HORIZON = "horizon_rate"  # share of the fixed list's episodes in which something still moves at the horizon
-
-ALARM_AFTER = 3  # evaluations that are compared with as many before them
-RISEN = 0.05  # by this share of its size the harm must have grown to count as risen
-
-LOST_AFTER = 2  # evaluations in a row; one may be an accident
-TIMES_LEAST = 1.5  # so much harm, in the least harm so far
-GIVEN_BACK = 0.1  # and so much of what the training had gained since its first evaluation
-CUT_OFF = 0.5  # or any harm that has risen, with so many more of the episodes cut off by the horizon
 
 
 @dataclass
@@ -646,8 +621,6 @@ class Course:
     steps: int = 0
     updates: int = 0
     evaluations: list[dict[str, float]] = field(default_factory=list)  # steps, updates and what ``evaluate`` gave
-    alarms: list[str] = field(default_factory=list)
-    lost: str | None = None  # the alarm of the last evaluation, if by that one the training is lost
     wall_before_s: float = 0.0  # of the parts of this training that other processes did
     started: float = field(default_factory=time.monotonic)
     cpu_s: dict[int, float] = field(default_factory=dict)  # steps of an evaluation -> processor seconds of learning
@@ -663,25 +636,19 @@ class Course:
         """The policy to use: the best, or the last where nothing was measured."""
         return self.best or self.policy
 
-    def add_evaluation(self, policy: Trained, metrics: Mapping[str, float], episode_return: float | None) -> str | None:
-        """Take in an evaluation of ``policy``; gives the alarm, if this one raises it."""
+    def add_evaluation(self, policy: Trained, metrics: Mapping[str, float], episode_return: float | None) -> None:
+        """Take in an evaluation of ``policy``."""
         extra = {} if episode_return is None else {RETURN: episode_return}
         self.evaluations.append({"steps": self.steps, "updates": self.updates, **metrics, **extra})
         self.cpu_s[self.steps] = time.process_time() - self.cpu_started
         name = RunDirectory.chosen_by(self.evaluations, self.harm_count)
         if name in metrics and metrics[name] < self.best_harm:
             self.best, self.best_harm = policy, metrics[name]
-        self.lost = lost_training(self.evaluations, name)
-        alarm = self.lost or misleading_return(self.evaluations, name)
-        if alarm is not None:
-            self.alarms.append(alarm)
-        return alarm
 
     def to_json(self) -> dict[str, Any]:
         """Everything but the policies."""
         return {
             "evaluations": self.evaluations,
-            "alarms": self.alarms,
             "best_harm": None if math.isinf(self.best_harm) else self.best_harm,
             "wall_s": self.wall_s,
             "cpu_s": [[steps, spent] for steps, spent in self.cpu_s.items()],
@@ -691,27 +658,10 @@ class Course:
     def restore(self, content: Mapping[str, Any]) -> None:
         """Take back what ``to_json`` gave."""
         self.evaluations = [dict(entry) for entry in content["evaluations"]]
-        self.alarms = list(content["alarms"])
         self.best_harm = math.inf if content["best_harm"] is None else float(content["best_harm"])
         self.wall_before_s = float(content["wall_s"])
         self.cpu_s = {int(steps): float(spent) for steps, spent in content.get("cpu_s", [])}
         self.cpu_started = time.process_time() - float(content.get("cpu_spent_s", 0.0))
-
-
-WINDOW = 25  # updates over which the share that ``gradient_limit`` cuts is a mean
-CUT_LIMIT = 0.2
-CUTS = "gradient_limit cuts"  # an alarm of this once in a training
-
-
-def cut_gradients(shares: Sequence[float]) -> str | None:
-    """The alarm if ``gradient_limit`` cut much of what was measured in each of so many updates, in the mean."""
-    share = sum(shares) / WINDOW
-    if len(shares) < WINDOW or share <= CUT_LIMIT:
-        return None
-    return (
-        f"{CUTS} {share:.0%} of the sum of all gradients: the harm jumps here, and what is left of them may lead"
-        " elsewhere; try recipe options, or gradient_limit: auto where it is a number"
-    )
 
 
 def objective_in_words(training: Training) -> str:
@@ -730,63 +680,6 @@ def objective_in_words(training: Training) -> str:
         return f"objective by {'first' if first else 'all'} impacts ({', '.join(names)})"
     what = "injuries in 1,000 lines" if kinds == {"injury"} else "harm"
     return f"{'first-impact' if first else 'total'} {what} ({', '.join(names)})"
-
-
-def misleading_return(evaluations: Sequence[Mapping[str, float]], harm: str) -> str | None:
-    """The alarm if each of the last three evaluations has more return, and more harm, than each of the three before.
-
-    The return is the mean of the training's recent episodes, exploration included. The mean harm must have risen by a
-    twentieth. A policy that learns to please the reward instead of sparing people looks like this. At an optimum harm
-    stays, while the return rises as exploration shrinks: no alarm.
-    """
-    last = [entry for entry in evaluations if RETURN in entry and harm in entry][-2 * ALARM_AFTER :]
-    if len(last) < 2 * ALARM_AFTER:
-        return None
-    before, now = last[:ALARM_AFTER], last[ALARM_AFTER:]
-    if not all(min(e[name] for e in now) > max(e[name] for e in before) for name in (RETURN, harm)):
-        return None
-    (gained, harmed), (gains, harms) = (
-        [sum(entry[name] for entry in part) / len(part) for name in (RETURN, harm)] for part in (before, now)
-    )
-    if not harms > harmed + RISEN * abs(harmed):
-        return None
-    return (
-        f"step {int(last[-1]['steps']):,}: since step {int(before[-1]['steps']):,} the return rose from {gained:.4g} to"
-        f" {gains:.4g}, and {harm} from {harmed:.4g} to {harms:.4g} (means of {ALARM_AFTER} evaluations); does the"
-        " reward say what you mean?"
-    )
-
-
-def lost_training(evaluations: Sequence[Mapping[str, float]], harm: str) -> str | None:
-    """The alarm if the last two evaluations have lost what the training had learned.
-
-    Each has half as much harm again as the least so far, and that is a tenth of what had been gained since the first
-    evaluation; or its harm has risen by a twentieth, and half of all episodes that ended by themselves at the least
-    harm are cut off by the horizon now.
-    """
-    measured = [entry for entry in evaluations if harm in entry]
-    if len(measured) <= LOST_AFTER:
-        return None
-    least = min(measured, key=lambda entry: entry[harm])
-    limit = max(TIMES_LEAST * least[harm], least[harm] + GIVEN_BACK * (measured[0][harm] - least[harm]))
-
-    last = measured[-1]
-    by_horizon = AT_HORIZON in last and AT_HORIZON in least  # where it is measured
-    for entry in measured[-LOST_AFTER:]:
-        risen = entry[harm] > least[harm] + RISEN * abs(least[harm])
-        cut_off = by_horizon and entry[AT_HORIZON] - least[AT_HORIZON] > CUT_OFF
-        if not (entry[harm] > limit or (risen and cut_off)):
-            return None
-    at_horizon = (
-        f"; the horizon cuts off {100.0 * last[AT_HORIZON]:.1f} % of the episodes"
-        f" (then {100.0 * least[AT_HORIZON]:.1f} %)"
-        if by_horizon
-        else ""
-    )
-    return (
-        f"step {int(last['steps']):,}: training is lost: {harm} is {last[harm]:.4g}, and was {least[harm]:.4g} at step"
-        f" {int(least['steps']):,}{at_horizon}; the policy of then is kept"
-    )
 
 
 _LOSSES = ("loss", "policy_loss", "value_loss", "policy_gradient_loss", "actor_loss", "critic_loss", "ent_coef_loss")
@@ -995,7 +888,6 @@ def _check_place(evaluation: dict[str, Number]) -> dict[str, Number]:
 
 class _Course(FileModel):
     evaluations: list[Annotated[dict[str, Number], AfterValidator(_check_place)]]
-    alarms: list[str]
     best_harm: Number | None
     wall_s: Annotated[float, Field(strict=False, ge=0.0, allow_inf_nan=False)]
     cpu_s: list[Annotated[list[Number], Field(min_length=2, max_length=2)]] = Field(default=[])
