@@ -2,9 +2,7 @@
 
 import hashlib
 import json
-import os
 import random
-import re
 import shutil
 import signal
 import subprocess
@@ -19,17 +17,24 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-import safetensors.numpy
 import torch
-from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
 import ethbrake_marl as eb
-from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput, Progress
+from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, Progress
 from ethbrake_marl.evaluation import evaluate, measures as outcomes, summarise
 from ethbrake_marl.files.store import new_folder, write_file
 from ethbrake_marl.harm import objective_harm, objectives_of
 from ethbrake_marl.learning import RunDirectory, Training, TrainingRecipe, TrainResult, load_recipe, resume, runs
-from ethbrake_marl.learning.runs import Course, EventFile, TrainingDiverged, cut_back, event_sizes
+from ethbrake_marl.learning.runs import (
+    ARRAYS,
+    NUMBERS,
+    Course,
+    TrainingDiverged,
+    TrainingState,
+    open_logs,
+    read_checkpoint,
+    write_checkpoint,
+)
 from ethbrake_marl.policies import Policy, Trained, load_policy, read_trained
 from tests.learning.tiny import (
     MODES,
@@ -44,7 +49,7 @@ from tests.learning.tiny import (
     scalars,
     watch_steps,
 )
-from tests.programmes.files import CHANGES, listed_anew, newest
+from tests.programmes.files import CHANGES, newest
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of those who read event files
 SCENARIO = eb.load_scenario("paper-random")
@@ -334,49 +339,32 @@ def test_new_folder__is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*")) == ["a", "a/good", "a/good/x", "a/taken"]
 
 
-def write_one(folder: Path, step: int) -> None:
-    """A file with one row, as one stretch of a training leaves it."""
-    file = EventFile(folder)
-    file.write({"loss": step / 2}, {"loss": ()}, step)
-    file.close()
+def test_open_logs__goes_on_after_the_rows_of_a_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Event files are named by the second in which they begin."""
+    clock = iter(range(10**9, 2 * 10**9))
+    monkeypatch.setattr(time, "time", lambda: float(next(clock)))
+    run = RunDirectory(tmp_path)
 
+    def write(state: TrainingState | None, **losses: float) -> None:
+        """One stretch of a training, a row for each loss."""
+        formats = open_logs(run, state)
+        for name, loss in losses.items():
+            step = int(name[1:])
+            for each in formats:
+                each.write({"steps": step, "loss": loss}, {"steps": ("tensorboard",), "loss": ()}, step)
+        for each in formats:
+            each.close()
 
-def test_order__is_that_of_their_beginning_even_where_the_clock_stands_still_or_goes_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clock = iter([1e9] * 20 + [9e8] * 20)
-    monkeypatch.setattr(time, "time", lambda: next(clock))
-    for step in range(1, 13):  # 9 to 12: a name of more digits must not come before
-        monkeypatch.setattr(os, "getpid", lambda pid=1000 - step: pid)
-        write_one(tmp_path, step)
-    monkeypatch.undo()
-    assert scalars(tmp_path)["loss"] == [(step, step / 2) for step in range(1, 13)]
-    assert [path.name for path in sorted(tmp_path.iterdir())][::11] == [
-        "events.out.tfevents.0000000001",
-        "events.out.tfevents.0000000012",
-    ]
-
-
-def test_order__goes_on_after_files_that_are_named_by_the_clock(tmp_path: Path) -> None:
-    EventFileWriter(str(tmp_path)).close()
-    write_one(tmp_path, 1)
-    first, second = sorted(tmp_path.iterdir())
-    assert int(second.name.rpartition(".")[2]) == int(first.name.split(".")[3]) + 1
-    assert scalars(tmp_path)["loss"] == [(1, 0.5)]
-
-
-def test_file__holds_every_number_at_once_and_can_be_cut_between_two_rows(tmp_path: Path) -> None:
-    file, sizes = EventFile(tmp_path), []
-    told = {"loss": (), "count": (), "csv only": ("tensorboard",)}
-    for step in (1, 2):
-        file.write({"loss": np.float32(step), "count": step, "csv only": 1}, told, step)
-        sizes.append(event_sizes(tmp_path))  # before it is closed
-    assert scalars(tmp_path)["loss"] == [(1, 1.0), (2, 2.0)]
-    file.close()
-    write_one(tmp_path, 3)
-    cut_back(tmp_path, sizes[0])
-    assert scalars(tmp_path)["loss"] == scalars(tmp_path)["count"] == [(1, 1.0)]
-    assert "csv only" not in scalars(tmp_path) and len(list(tmp_path.iterdir())) == 1
+    write(None, s1=0.9)
+    progress = run.progress.read_text()
+    write(TrainingState({"steps": 1, "progress": progress}, {}), s2=0.8, s3=np.float32(0.7))
+    progress = "".join(run.progress.read_text().splitlines(keepends=True)[:3])
+    write(TrainingState({"steps": 2, "progress": progress}, {}), s3=0.6, s4=0.5)
+    expected = [(1, 0.9), (2, 0.8), (3, 0.6), (4, 0.5)]
+    assert [(int(row["steps"]), float(row["loss"])) for row in run.rows()] == expected
+    assert scalars(run.tensorboard) == {"loss": [(step, pytest.approx(loss)) for step, loss in expected]}
+    write(None, s1=0.4)
+    assert len(run.rows()) == 1 and scalars(run.tensorboard)["loss"] == [(1, pytest.approx(0.4))]
 
 
 # ---------------------------------------------------------------- going on
@@ -573,15 +561,25 @@ def test_resume__after_kill_9_the_weights_are_the_same(name: str, whole: Whole, 
     assert_same(run, whole(name)[0])
 
 
+def half(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def other_digit(path: Path) -> None:
+    text = path.read_text()
+    at = text.index('"steps": ') + 9
+    path.write_text(text[:at] + str((int(text[at]) + 1) % 10) + text[at + 1 :])
+
+
+def other_byte(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[-5] ^= 1
+    path.write_bytes(data)
+
+
 @pytest.mark.parametrize(
     ("file", "damage"),
-    [
-        ("checkpoint.json", lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])),
-        ("checkpoint.json", Path.unlink),
-        ("state.json", lambda path: path.write_bytes(path.read_bytes()[:200] + b"\x07" + path.read_bytes()[201:])),
-        ("arrays.safetensors", lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])),
-        pytest.param("policy/weights.safetensors", Path.unlink, marks=pytest.mark.slow),
-    ],
+    [(NUMBERS, half), (NUMBERS, other_digit), (ARRAYS, half), (ARRAYS, other_byte), (ARRAYS, Path.unlink)],
 )
 def test_resume__a_damaged_checkpoint_is_found_and_the_one_before_is_used(
     file: str, damage: Callable[[Path], object], whole: Whole, run: Path
@@ -595,8 +593,8 @@ def test_resume__a_damaged_checkpoint_is_found_and_the_one_before_is_used(
 
 
 def test_resume__without_any_checkpoint_it_starts_again(whole: Whole, run: Path) -> None:
-    for file in run.glob("checkpoints/step_*/state.json"):
-        file.unlink()
+    for file in run.glob(f"checkpoints/step_*/{NUMBERS}"):
+        half(file)
     (run / ".ethbrake-left.partial").mkdir()
     resume(run, measure=measure)
     assert_same(run, whole("ppo")[0])
@@ -651,61 +649,23 @@ def test_resume__one_process_at_a_time(run: Path, monkeypatch: pytest.MonkeyPatc
     assert asked == [5]
 
 
-@pytest.mark.parametrize(
-    ("file", "change", "reason"),
-    [
-        ("checkpoint.json", {"format_version": 2}, "format_version = 2: must be 1"),
-        ("state.json", {"training": None}, "training: is missing"),  # of a time when no checkpoint said so
-        ("state.json", {"counters": {}}, "counters.num_timesteps: is missing"),
-        (
-            "state.json",
-            {"random": {"numpy": [0, 0, 0.0], "python": [3, None], "actions": {}}},
-            "random.actions.bit_generator",
-        ),
-        ("state.json", {"log": {"a": ["x", 1, []]}}, "log.a.0"),
-        ("state.json", {"events": {"x": "1"}}, "events.x"),
-        ("state.json", {"between": []}, "between: must be a mapping"),
-        ("state.json", {"more": 1}, "more: unknown key"),
-    ],
-)
-def test_resume__a_checkpoint_as_another_version_wrote_it_is_refused_and_stays(
-    run: Path, file: str, change: dict[str, Any], reason: str
-) -> None:
-    """Its listing agrees with what is there, so it is not damaged."""
-    path = newest(run) / file
-    content = {**json.loads(path.read_text()), **change}
-    path.write_text(json.dumps({key: value for key, value in content.items() if value is not None}))
-    if file == "state.json":
-        listed_anew(newest(run))
-    before = {file: file.read_bytes() for file in run.glob("checkpoints/**/*.*")}
-    told = rf"{file}: .*{re.escape(reason)}.*is as version .* wrote it, .*: go on with that version, or"
-    with pytest.raises(InvalidInput, match=told):
-        resume(run, measure=measure)
-    assert {file: file.read_bytes() for file in run.glob("checkpoints/**/*.*")} == before
-
-
-@pytest.mark.parametrize(
-    ("name", "array", "reason"),
-    [
-        ("policy.log_std", np.zeros(2, np.float32), r"'policy.log_std' is <f4 \[2\], should be <f4 \[1\]"),
-        ("policy.log_std", np.full(1, np.nan, np.float32), r"'policy.log_std' holds a number that is not finite"),
-        ("environment.begun", np.nan, r"'environment.begun' holds a number that is not finite"),
-        ("environment.engine.script.1.act", np.zeros(3), r"'environment.engine.script.1.act' does not belong here"),
-        ("random.python", np.full(625, 2**40, np.uint64), r"'random.python' is no state"),
-        ("environment.engine.stream", np.array([0, 2**60], np.uint64), r"'environment.engine.stream' is"),
-    ],
-)
-def test_resume__arrays_must_be_those_of_this_training(run: Path, name: str, array: Any, reason: str) -> None:
-    path = newest(run) / "arrays.safetensors"
-    arrays = safetensors.numpy.load(path.read_bytes())
-    arrays[name] = np.full_like(arrays[name], array) if isinstance(array, float) else array
-    path.write_bytes(safetensors.numpy.save(arrays))
-    listed_anew(newest(run))
+@pytest.mark.parametrize("change", ["lost", "forged"])
+def test_resume__a_checkpoint_that_does_not_fit_is_refused_and_stays(run: Path, change: str) -> None:
+    place = newest(run)
+    if change == "lost":  # as of another version
+        (place / NUMBERS).unlink()
+        told = rf"{place}: has no numbers.json, so another version of this package wrote it"
+    else:  # whole, and not of this model
+        state = read_checkpoint(place)
+        shutil.rmtree(place)
+        arrays = state.arrays | {"policy.log_std": np.zeros(2, np.float32)}
+        write_checkpoint(place, TrainingState(state.numbers, arrays))
+        told = rf"the checkpoint of step {state.steps} is not of this training: .*log_std.*; delete it to go on from"
     before = {file: file.read_bytes() for file in run.rglob("*") if file.is_file() and file.name != "run.lock"}
-    with pytest.raises(CorruptBundle, match=rf"is not of this training: array {reason}"):
-        resume(run)
-    del before[run / "team.json"]
-    assert all(file.read_bytes() == data for file, data in before.items())
+    with pytest.raises(EthBrakeError, match=told) as error:
+        resume(run, measure=measure)
+    del before[run / "team.json"]  # is written anew
+    assert "\n" not in str(error.value) and all(file.read_bytes() == data for file, data in before.items())
 
 
 @pytest.mark.parametrize("category", [name for name in CHANGES if name.endswith(": link outside")])
