@@ -13,8 +13,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import safetensors.numpy
@@ -601,7 +602,8 @@ def make_policies(
 def open_logs(run: RunDirectory, state: TrainingState | None) -> list[KVWriter]:
     """``progress.csv`` and TensorBoard's events, which go on after the rows of ``state``; None: from the beginning."""
     run.progress.unlink(missing_ok=True)  # it may be a link
-    table, events = CSVOutputFormat(str(run.progress)), TensorBoardOutputFormat(str(run.tensorboard))
+    table = CSVOutputFormat(str(run.progress))
+    events: Any = TensorBoardOutputFormat(str(run.tensorboard))  # whose writer torch declares as None
     if state is not None:
         table.file.write(state.numbers["progress"])
         table.file.flush()
@@ -765,7 +767,7 @@ def read_checkpoint(folder: Path) -> TrainingState:
     return TrainingState(numbers, safetensors.numpy.load_file(folder / ARRAYS))
 
 
-def _digest(arrays: BinaryIO, numbers: Mapping[str, Any]) -> str:
+def _digest(arrays: BufferedReader, numbers: Mapping[str, Any]) -> str:
     """SHA-256 of both files of a checkpoint, in hexadecimal digits."""
     digest = hashlib.file_digest(arrays, "sha256")
     digest.update(json.dumps(numbers, sort_keys=True).encode())

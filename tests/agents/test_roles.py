@@ -21,7 +21,7 @@ SPECS = {
     "coast": ["coast"],
     "constant": ["constant:3"],
     "copy_leader": ["copy_leader"],
-    "counterfactual": ["counterfactual@shipped"],
+    "counterfactual": ["counterfactual@shipped/counterfactual-cooperation-1-front"],
     "e_v2x_bm": ["e_v2x_bm", "e_v2x_bm:pairwise", "e_v2x_bm:believed", "e_v2x_bm:pairwise:believed"],
     "full_brake": ["full_brake"],
     "gentlest_front": ["gentlest_front"],

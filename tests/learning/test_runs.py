@@ -377,7 +377,7 @@ MIXTURE = eb.load_scenario(
 REMEMBERING = PAPER.replace(
     early_impacts="keep", roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "e_v2x_bm:pairwise"}
 )
-AMONG = {"among": ["policy@shipped/ppo", "policy@shipped/counterfactual"], "drawn": 2, "near": [], "focus": 0.5,
+AMONG = {"among": ["policy@shipped/ppo", "policy@shipped/sac"], "drawn": 2, "near": [], "focus": 0.5,
          "relative": True, "tie_break": 0.5, "observation": ["own", "front_1", "rear_1", "contact"]}  # fmt: skip
 PPO = TINY_PPO.replace(total_steps=8 * 128)
 TEAM = TINY_PPO.replace(total_steps=6 * 256)
