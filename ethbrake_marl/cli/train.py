@@ -20,9 +20,6 @@ KEPT = (
     "if the training had begun, the run's folder keeps the last good policy, and ethbrake train resume FOLDER goes on"
 )
 SeedOption = Annotated[int | None, typer.Option(help="Seed of the training alone.", show_default="the recipe's")]
-StopWhenLostOption = Annotated[
-    bool, typer.Option("--stop-when-lost", help="Stop, resumable, when harm comes back and stays.")
-]
 NameOption = Annotated[
     str | None, typer.Option(help="Folder of the run inside runs/.", show_default="SCENARIO-RECIPE-seedSEED")
 ]
@@ -70,7 +67,6 @@ def run_command(
     vehicle: str | None = None,
     name: NameOption = None,
     output: OutputOption = None,
-    stop_when_lost: StopWhenLostOption = False,
 ) -> None:
     """Train a policy, shield it, compare with the baselines, report.
 
@@ -94,7 +90,6 @@ def run_command(
         seed=seed,
         episodes=episodes,
         list_seed=list_seed,
-        stop_when_lost=stop_when_lost,
         force=out.force,
         settings=given.texts,
         on_progress=out.show_progress,
@@ -137,7 +132,6 @@ def start_command(
     seed: SeedOption = None,
     name: NameOption = None,
     output: OutputOption = None,
-    stop_when_lost: StopWhenLostOption = False,
 ) -> None:
     """Train a policy, or those of several learners.
 
@@ -164,7 +158,6 @@ def start_command(
         steps=steps,
         seed=seed,
         force=out.force,
-        stop_when_lost=stop_when_lost,
         on_progress=tell,
         settings=given.texts,
     )
@@ -181,15 +174,12 @@ def resume_command(
             "--other-versions", help="Go on although other versions or plug-ins trained it; numbers may differ."
         ),
     ] = False,
-    stop_when_lost: StopWhenLostOption = False,
 ) -> None:
     """Go on with a training that was stopped or killed.
 
     The policy is the one that the training would have come to without the stop, bit for bit.
     """
-    ended = learning.resume(
-        folder, stop_when_lost=stop_when_lost, on_progress=out.show_progress, other_versions=other_versions
-    )
+    ended = learning.resume(folder, on_progress=out.show_progress, other_versions=other_versions)
     _tell(out, ended)
 
 
@@ -241,7 +231,6 @@ def _tell(out: Out, result: learning.TrainResult) -> None:
         "drivers": dict(result.training.drivers),
         "evaluation": result.evaluations[-1] if result.evaluations else None,
         "policy_steps": next(iter(result.policies.values())).manifest.steps,
-        "alarms": list(result.alarms),
     })  # fmt: skip
     _end(out, result)
 
