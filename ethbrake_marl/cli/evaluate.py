@@ -289,7 +289,7 @@ def _evaluate_group(
         for row in evaluation.summarise(found):
             outcome, share = found.outcome(row.agent), row[f"share_of_possible_reduction_{task.harm_count}"]
             hardest = 3.6 * math.sqrt(outcome.ledger.pair_harm("first").max(initial=0.0))
-            each = {
+            each: dict[str, Any] = {
                 "passed": not outcome.collided.any(),
                 "collision_rate": float(outcome.collided.mean()),
                 "hardest_impact_kmh": hardest,
