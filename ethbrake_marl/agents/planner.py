@@ -178,8 +178,8 @@ class BestHarm:
     """Drives the profile of least harm known, while the others follow their scripts (without one: brake fully).
 
     ``recall`` gives the kept profiles. A world without one is searched at the alert with ``budget`` candidates. Where
-    the vehicle is the only learner of a known ``scenario``, a second search with as many candidates starts from the
-    better of that result and the episode of ``universal``: the harm is never above that policy's. Decisions fall every
+    no other vehicle of a known ``scenario`` learns, a second search with as many candidates starts from the better of
+    that result and the episode of ``universal``: the harm is never above that policy's. Decisions fall every
     ``time_step_s`` from the vehicle's latency on. ``predicted_harm`` [n] is what the engine will count (m2/s2), to the
     same bits, if the engine's time step is that. Raises ``InvalidInput`` for a budget below 1 or an unknown count and,
     when an episode begins, for another vehicle's script whose command is not fixed at the alert.
@@ -250,7 +250,7 @@ class BestHarm:
         given = problem.constant(-coupled.deceleration_mps2[:, np.newaxis, np.newaxis])
         found, harms = problem.search(given, budget=self._budget)
         best = self._stepwise(found)
-        if self._scenario is None or self._scenario.learners != (vehicle,):
+        if self._scenario is None or set(self._scenario.learners) - {vehicle}:
             return best, harms[outlook.harm_count]
         policy, steps = make_agent(START, scenario=self._scenario), int(problem.last_step.max())
         driven = record_commands(policy, worlds, self._scenario, vehicle, steps)
