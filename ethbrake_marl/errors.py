@@ -113,8 +113,7 @@ _EXTRA_OF = {
     **dict.fromkeys(("onnx", "onnxruntime"), "export"),
     **dict.fromkeys(("pyarrow", "minari", "h5py"), "data"),
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
-    "ray": "cluster",
-    "optuna": "tune",
+    **dict.fromkeys(("ray", "optuna"), "cluster"),
     "libsumo": "sumo",
 }
 

@@ -509,6 +509,18 @@ class Policy:
         except ValueError as error:
             raise InvalidInput(f"policy: {error}") from None
 
+    @property
+    def among(self) -> tuple[Policy, ...]:
+        """The policies among which it chooses; most choose among none."""
+        follows = {"network", "observation", "format_version", "weights_sha256", "manifest_sha256"}
+        fields = self.manifest.model_dump(exclude=follows)
+        found = []
+        for k, network in enumerate(self.manifest.network.among, start=1):
+            start = f"among_{k}."
+            tensors = {name.removeprefix(start): each for name, each in self.tensors.items() if name.startswith(start)}
+            found.append(Policy.make(tensors, network=network, observation=self.manifest.observation, **fields))
+        return tuple(found)
+
     @staticmethod
     def stands_in(folder: Path) -> bool:
         """Whether the files of a bundle stand in ``folder``; they are not read."""
@@ -761,7 +773,6 @@ def read_trained(folder: Path) -> Trained:
 # it is and where it is bad.
 
 SHIPPED = "shipped"
-_BEST_FIRST = ("counterfactual", "options", "ppo", "sac", "universal")  # of ``policy``, where several are
 
 _FOLDER = Path(__file__).resolve().parent / "_policies"
 
@@ -776,12 +787,13 @@ def shipped_name(kind: str, scenario: Scenario | None, harm_count: HarmCount) ->
 
     ``universal`` is for all scenarios, ``ppo`` and ``sac`` for the one that they were trained on, ``ppo-SCENARIO`` and
     ``sac-SCENARIO`` for that one; ``-total`` behind says that a policy was trained for total harm. ``policy`` is the
-    best of all kinds. Raises ``InvalidInput`` listing what ships.
+    one whose name ends in the scenario's, where ``universal`` does more harm, and ``universal`` elsewhere. Raises
+    ``InvalidInput`` listing what ships.
     """
     names, here = shipped_policies(), None if scenario is None else scenario.name
-    for each in _BEST_FIRST if kind == "policy" else ():
-        with suppress(InvalidInput):
-            return shipped_name(each, scenario, harm_count)
+    if kind == "policy":
+        ends = (f"{here}-total", here) if harm_count == "total" else (here,)
+        return next((name for end in ends for name in names if name.partition("-")[2] == end), "universal")
     for stem in [kind] if here is None or kind == "universal" else [f"{kind}-{here}", kind]:
         for name in (f"{stem}-total", stem) if harm_count == "total" else (stem,):
             if name in names and (

@@ -20,9 +20,7 @@ AGENTS = {
     "full_brake": "full_brake",
     "e_v2x_bm": "e_v2x_bm",
     "universal": "universal@shipped",
-    "main": "counterfactual@shipped/counterfactual",
-    "at 30": "counterfactual@shipped/counterfactual-paper-random-buildup-30",
-    "at 12.65": "counterfactual@shipped/counterfactual-paper-random-buildup",
+    "main": "ppo@shipped/ppo",
 }
 AT_ONCE = 1e6
 CASES = {

@@ -27,8 +27,8 @@ TESTS: dict[str, HarmCount] = {
 }
 STEPS = {  # in half a minute, by a short training of each
     "quick": 4_400_000,
-    "ppo-long": 1_080_000,
-    "sac-long": 225_000,
+    "ppo": 1_080_000,
+    "sac": 225_000,
     "options": 270_000,
 }
 POINTS, WORLDS, SEED, BUDGET = 12, 2000, 1007, 2000

@@ -31,7 +31,7 @@ from ethbrake_marl.kernel_store import cache_folder, is_temporary
 if TYPE_CHECKING:
     from packaging.requirements import Requirement
 
-EXTRAS = ("train", "marl", "export", "data", "render", "cluster", "tune", "notebook")
+EXTRAS = ("train", "marl", "export", "data", "render", "cluster", "notebook")
 _TINY = ("--set=n_envs=16", "--set=n_steps=8", "--set=counterfactuals=16", "--set=evaluation.worlds=10")
 _LINEUP = "ladder,ppo@shipped,ppo@shipped+search+episode,full_brake+step,full_brake+robust"
 # Small calls of what people call first: what they use is what is compiled. One world alone lies otherwise in memory.

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
-from contextlib import closing
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,9 +20,6 @@ KEPT = (
     "if the training had begun, the run's folder keeps the last good policy, and ethbrake train resume FOLDER goes on"
 )
 SeedOption = Annotated[int | None, typer.Option(help="Seed of the training alone.", show_default="the recipe's")]
-StopWhenLostOption = Annotated[
-    bool, typer.Option("--stop-when-lost", help="Stop, resumable, when harm comes back and stays.")
-]
 NameOption = Annotated[
     str | None, typer.Option(help="Folder of the run inside runs/.", show_default="SCENARIO-RECIPE-seedSEED")
 ]
@@ -71,7 +67,6 @@ def run_command(
     vehicle: str | None = None,
     name: NameOption = None,
     output: OutputOption = None,
-    stop_when_lost: StopWhenLostOption = False,
 ) -> None:
     """Train a policy, shield it, compare with the baselines, report.
 
@@ -95,7 +90,6 @@ def run_command(
         seed=seed,
         episodes=episodes,
         list_seed=list_seed,
-        stop_when_lost=stop_when_lost,
         force=out.force,
         settings=given.texts,
         on_progress=out.show_progress,
@@ -138,7 +132,6 @@ def start_command(
     seed: SeedOption = None,
     name: NameOption = None,
     output: OutputOption = None,
-    stop_when_lost: StopWhenLostOption = False,
 ) -> None:
     """Train a policy, or those of several learners.
 
@@ -165,7 +158,6 @@ def start_command(
         steps=steps,
         seed=seed,
         force=out.force,
-        stop_when_lost=stop_when_lost,
         on_progress=tell,
         settings=given.texts,
     )
@@ -182,15 +174,12 @@ def resume_command(
             "--other-versions", help="Go on although other versions or plug-ins trained it; numbers may differ."
         ),
     ] = False,
-    stop_when_lost: StopWhenLostOption = False,
 ) -> None:
     """Go on with a training that was stopped or killed.
 
     The policy is the one that the training would have come to without the stop, bit for bit.
     """
-    ended = learning.resume(
-        folder, stop_when_lost=stop_when_lost, on_progress=out.show_progress, other_versions=other_versions
-    )
+    ended = learning.resume(folder, on_progress=out.show_progress, other_versions=other_versions)
     _tell(out, ended)
 
 
@@ -242,7 +231,6 @@ def _tell(out: Out, result: learning.TrainResult) -> None:
         "drivers": dict(result.training.drivers),
         "evaluation": result.evaluations[-1] if result.evaluations else None,
         "policy_steps": next(iter(result.policies.values())).manifest.steps,
-        "alarms": list(result.alarms),
     })  # fmt: skip
     _end(out, result)
 
@@ -267,6 +255,9 @@ RetriesOption = Annotated[
 DryRunOption = Annotated[
     bool, typer.Option("--dry-run", help="Print what would be done and what it takes; do nothing.")
 ]
+ClusterOption = Annotated[
+    str, typer.Option(metavar="local|ADDRESS", help="A Ray of this machine alone, or a cluster that runs.")
+]
 CostOption = Annotated[bool, typer.Option("--cost", help="Say what is left to do and what it takes; stop.")]
 
 study_group = app.group(
@@ -277,21 +268,21 @@ study_group = app.group(
 )
 
 
-def _schema_option(plan: str) -> Any:
+def _schema_option(module: str, plan: str) -> Any:
     """The option ``--schema`` of a command that reads files of one kind: print their JSON Schema and exit."""
 
     def show_schema(asked: bool) -> None:
         if asked:
-            from ethbrake_marl.studies import sweep
-
-            Out().print_json(getattr(sweep, plan).json_schema())
+            Out().print_json(getattr(import_module(module), plan).json_schema())
             raise typer.Exit
 
     told = "Print the JSON Schema of the file, and exit."
     return Annotated[bool, typer.Option("--schema", is_eager=True, callback=show_schema, help=told)]
 
 
-@study_group.add("sweep", "study sweep sweep.yaml --output runs/sweep", kept=KEPT_IN_FOLDER, json=True)
+@study_group.add("sweep", "study sweep sweep.yaml --output runs/sweep",
+    kept=KEPT_IN_FOLDER, json=True,
+)  # fmt: skip
 def sweep_command(
     out: Out,
     file: Annotated[Path, typer.Argument(metavar="SWEEP.yaml", help="A grid or a list of jobs.")],
@@ -300,42 +291,37 @@ def sweep_command(
         int | None,
         typer.Option(
             help="Jobs at once, a process with one thread each.",
-            show_default="the usable cores",
+            show_default="one for each core",
             callback=whole_number(1, MOST_WORKERS),
         ),
     ] = None,
-    ray: str | None = None,
+    ray: ClusterOption = "local",
     retries: RetriesOption = 2,
     dry_run: DryRunOption = False,
-    schema: _schema_option("SweepPlan") = False,  # type: ignore[valid-type]  # made here, read by Typer
+    schema: _schema_option("ethbrake_marl.studies.sweep", "SweepPlan") = False,  # type: ignore[valid-type]  # made here
 ) -> None:
     """Train every job of a file, and write one table.
 
-    It tells what they reached. The same command goes on after an interruption: finished jobs are kept, begun ones go
-    on. Exit status 1 where jobs failed: failures.csv holds the last lines of each.
+    It shows what they reached. The same command goes on after an interruption: finished jobs are kept, begun ones go
+    on. Exit status 1 where jobs failed: failures.csv says why.
     """
-    from ethbrake_marl.studies.jobs import open_workers
     from ethbrake_marl.studies.sweep import SweepPlan
 
-    if ray is not None:
-        need("ray")
     plan = SweepPlan.read(file)
     plan.folder(output).check()
     if dry_run:
-        left, words = plan.cost(output, len(os.sched_getaffinity(0)) if jobs is None else jobs)
-        lines = ([f"{job['state']:8}", job["job"], *map("=".join, job["set"].items())] for job in left["jobs"])
-        out.result(left, *map("  ".join, lines))
-        if not out.as_json:
-            out.note(words)
+        states = plan.states(output)
+        lines = ([f"{job['state']:8}", job["job"], *map("=".join, job["set"].items())] for job in states)
+        out.result(states, *map("  ".join, lines))
         return
-    with closing(open_workers(ray, jobs)) as workers:
-        result = plan.run(output, workers, retries=retries, tell=out.show_progress)
-    counts = result.counts
+    need("ray")
+    result = plan.run(output, jobs=jobs, ray=ray, retries=retries, tell=out.show_progress)
+    counts = {"jobs": result.jobs, "finished": result.finished, "failed": result.failed}
     out.result({**counts, "interrupted": result.interrupted, "table": str(result.table)})
-    told = f"{counts['finished']:,} of {counts['jobs']:,} jobs finished; table: {result.table}"
-    if counts["failed"]:
-        told += f"; {counts['failed']:,} failed: {output / 'failures.csv'}"
-    _end_study(out, told, interrupted=result.interrupted, failed=counts["failed"] > 0)
+    told = f"{result.finished:,} of {result.jobs:,} jobs finished; table: {result.table}"
+    if result.failed:
+        told += f"; {result.failed:,} failed: {output / 'failures.csv'}"
+    _end_study(out, told, interrupted=result.interrupted, failed=result.failed > 0)
 
 
 @study_group.add("tune", "study tune tuning.yaml --output runs/tuning --trials 30 --export best.yaml",
@@ -346,7 +332,7 @@ def tune_command(
     file: Annotated[Path, typer.Argument(metavar="TUNING.yaml", help="A training and the ranges of its settings.")],
     output: FolderOption,
     trials: Annotated[
-        int, typer.Option(help="Trials that the folder shall have altogether.", callback=whole_number(1, 100_000))
+        int, typer.Option(help="Trials that the folder shall have altogether.", callback=whole_number(1, 10_000))
     ] = 30,
     jobs: Annotated[
         int,
@@ -355,24 +341,21 @@ def tune_command(
             callback=whole_number(1, MOST_WORKERS),
         ),
     ] = 1,
-    ray: str | None = None,
+    ray: ClusterOption = "local",
     retries: RetriesOption = 2,
     export: Annotated[
         Path | None, typer.Option(metavar="NAME.yaml", help="Write the best trial as a recipe of this name.")
     ] = None,
     dry_run: DryRunOption = False,
-    schema: _schema_option("TuningPlan") = False,  # type: ignore[valid-type]  # made here, read by Typer
+    schema: _schema_option("ethbrake_marl.studies.tuning", "TuningPlan") = False,  # type: ignore[valid-type]  # made here
 ) -> None:
     """Search the settings of a recipe for the least harm.
 
     Harm on a list of worlds of its own. The same command goes on after an interruption: trials that ended are kept,
     those that were begun go on. Exit status 1 where no trial came to its end.
     """
-    from ethbrake_marl.studies.jobs import open_workers
-    from ethbrake_marl.studies.sweep import TuningPlan
+    from ethbrake_marl.studies.tuning import TuningPlan
 
-    if ray is not None:
-        need("ray")
     plan = TuningPlan.read(file)
     plan.folder(output).check()
     if export is not None:  # raise now what would be raised at the end
@@ -383,18 +366,16 @@ def tune_command(
         plan.best_recipe({}, export, "")
         out.check(export)
     if dry_run:
-        (per_trial, words), own = plan.cost(trials, jobs), plan.own_values()
+        own = plan.own_values()
         space = {key: dimension.model_dump(mode="json") for key, dimension in plan.file.search.items()}
         now = {key: "not in the space" if own is None else f"the recipe has {own[key]}" for key in space}
         out.result(
-            {"search": space, "own_values": own, "core_s_per_trial": per_trial, "trials": trials},
+            {"search": space, "own_values": own, "trials": trials},
             *(f"{key}  {dimension}  ({now[key]})" for key, dimension in plan.file.search.items()),
         )
-        if not out.as_json:
-            out.note(words)
         return
-    with closing(open_workers(ray, jobs)) as workers:
-        result = plan.run(output, workers, trials, retries=retries, tell=out.show_progress)
+    need("ray")
+    result = plan.run(output, trials, jobs=jobs, ray=ray, retries=retries, tell=out.show_progress)
     counted = ", ".join(f"{number:,} {state}" for state, number in sorted(result.counts.items()))
     told, best, shown, lines = f"trials: {counted or 'none'}; table: {result.table}", result.best, None, []
     export = None if best is None or result.interrupted else export  # what goes on exports at its end

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import io
 import math
-import os
 import re
 import struct
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,17 +158,6 @@ def _npy_header(name: str, beginning: bytes) -> tuple[ArrayHeader, int]:
     if _SHAPE.fullmatch(shape) is None:
         raise ValueError(f"array {name!r}: has the shape ({shape:.60}), which is none")
     return ArrayHeader(dtype, tuple(int(each) for each in shape.split(",") if each.strip())), 10 + length
-
-
-def map_npy(stream: BinaryIO, name: str) -> NDArray[Any]:
-    """The array of an open ``.npy`` file, read-only and not in memory until it is used; raises ``ValueError``."""
-    header, start = _npy_header(name, stream.read(10 + _NPY_HEADER_LIMIT_BYTES))
-    size = os.fstat(stream.fileno()).st_size
-    if math.prod(header.shape) * np.dtype(header.dtype).itemsize != size - start:
-        raise ValueError(f"array {name!r} is {header.dtype} {list(header.shape)}, in a file of {size:,} bytes")
-    if not math.prod(header.shape):
-        return np.empty(header.shape, header.dtype)
-    return np.memmap(stream, header.dtype, "r", start, header.shape)
 
 
 def _check_directory(data: bytes) -> None:

@@ -597,8 +597,6 @@ class OptionsRecipe(TrainingRecipe):
             refuse(("tried",), self.tried, f"must be at most n_envs x n_steps = {visited}")
         if not self.memory >= self.tried:
             refuse(("memory",), self.memory, f"must be at least tried = {self.tried}")
-        if self.among and not self.drawn <= len(self.among):
-            refuse(("drawn",), self.drawn, f"must be at most the number of policies among = {len(self.among)}")
         if not self.others:
             refuse(("near",), list(self.near), "must hold a range where there are neither fixed nor drawn actions")
         return self
@@ -616,17 +614,20 @@ class OptionsRecipe(TrainingRecipe):
 
     @cached_property
     def policies(self) -> tuple[Policy, ...]:
-        """Those among which it chooses, read once; raises ``InvalidInput`` naming one that cannot be taken."""
-        found = []
+        """Those among which it chooses, read once; raises ``InvalidInput`` naming one that cannot be taken.
+
+        One that itself chooses among policies stands for those.
+        """
+        found: list[Policy] = []
         for name in self.among:
             kind, _, path = name.partition("@")
             policy = load_named_policy(path)
             where, by = f"recipe {self.name!r}: among: {name}", policy.manifest.algorithm
-            if policy.manifest.network.among:
-                raise InvalidInput(f"{where} chooses among policies itself; list those")
             if path == SHIPPED or kind not in ("policy", by):
                 raise InvalidInput(f"{where}: give policy@shipped/NAME, or {by}@ and its path")
-            found.append(policy)
+            found += policy.among or [policy]
+        if found and not self.drawn <= len(found):
+            raise InvalidInput(f"recipe {self.name!r}: drawn = {self.drawn}: must be at most the {len(found)} of among")
         return tuple(found)
 
 
@@ -752,7 +753,7 @@ MEANINGS = {
     "near": "ranges of distances to the action taken, each tried below and above it; the logarithm drawn is uniform",
     "fixed": "actions tried at each of these decisions, from -1 (full braking) to 1; the nearest of the choices is",
     "drawn": "how many more are tried there: of the policies among, or where there are none of the choices",
-    "among": "policies of which one can act at each decision, for instance policy@runs/first; left out: none",
+    "among": "policies of which one can act at each decision; one that chooses among others stands for them",
     "tie_break": "weight of the whole line's harm in the other count, beside the reward",
     "relative": "true: in a mixture, costs count beside the usual ones of the same scenario",
     "caution": "how many times the excess over full braking from there on counts besides, at the end; it grows from 0",

@@ -143,7 +143,6 @@ def run_experiment(
     seed: int | None = None,
     episodes: int = DEFAULT.EPISODES,
     list_seed: int = DEFAULT.LIST_SEED,
-    stop_when_lost: bool = False,
     force: bool = False,
     settings: Sequence[str] = (),
     on_progress: OnProgress | None = None,
@@ -153,8 +152,7 @@ def run_experiment(
     Hybrid and baselines minimise the harm that the policy is trained for (``reward.harm_count`` of the recipe).
     On one of the three tests the policy also drives the other two, which it was not trained for.
 
-    ``seed`` is the training's; the list is ``episodes`` worlds of ``list_seed``; ``settings`` are noted;
-    ``stop_when_lost`` is as in ``train``.
+    ``seed`` is the training's; the list is ``episodes`` worlds of ``list_seed``; ``settings`` are noted.
     Ctrl-C during the training ends it
     after the update in progress, and the policy so far is evaluated; a second one, or one during the evaluation,
     raises ``KeyboardInterrupt``, and the folder keeps the policy. ``run.json`` always says which. Raises what
@@ -166,15 +164,7 @@ def run_experiment(
     check_one_learner(scenario.name, names, "say which vehicle the agents drive")
     sample = scenario.sample(episodes, list_seed)
     trained = train(
-        recipe,
-        scenario,
-        directory,
-        steps=steps,
-        seed=seed,
-        force=force,
-        stop_when_lost=stop_when_lost,
-        settings=settings,
-        on_progress=on_progress,
+        recipe, scenario, directory, steps=steps, seed=seed, force=force, settings=settings, on_progress=on_progress
     )
     run = RunDirectory(trained.directory)
     with _status(run, trained.status):

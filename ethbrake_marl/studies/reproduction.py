@@ -536,7 +536,7 @@ def _plain(value: object) -> str:
 # Strategies on the paper's worlds, at the latencies that it states and with Vehicle 2 acting at 0.2 s.
 
 FULL_BRAKE, PAIRWISE, COUPLED = "full_brake", "e_v2x_bm:pairwise", "e_v2x_bm"
-SAC, PPO, UNIVERSAL = "sac@shipped/sac", "ppo@shipped/ppo", "ppo@shipped/universal-ppo"
+SAC, PPO, UNIVERSAL = "sac@shipped/sac", "ppo@shipped/ppo", "universal@shipped"
 PREDICTED, PROVEN = "E-V2X-BM, predicted", "least harm, proven"
 NAMES = {  # of the strategies in tables and figures
     FULL_BRAKE: "Non-ethical (full braking)",
@@ -677,9 +677,7 @@ def groups() -> dict[str, Group]:
 
 # The policies that ``ethbrake reproduce`` lets drive beside the shipped ones, as agents.
 
-_STAND_IN = (
-    "universal-ppo"  # the shipped policy that stands in for one that has not converged, where nothing is trained
-)
+_STAND_IN = "ppo-paper-random-obstacle"  # for one that has not converged, where nothing is trained
 
 
 def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:

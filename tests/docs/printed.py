@@ -153,15 +153,14 @@ BLOCKS: dict[str, How] = {
     "paper-random full_brake        backward": EXACT,
 }
 
-_SHIPPED = "counterfactual@shipped,counterfactual@shipped+search+episode"
 _TESTS = tuple(
     f"ethbrake evaluate --scenario paper-random{test} --agents full_brake,e_v2x_bm,{agents},best_harm --episodes 2000"
     " --seed 7 --measures injury --json"
     for test, agents in (
-        ("", f"ppo@shipped,{_SHIPPED}"),
-        ("-brake-only", f"ppo@shipped,{_SHIPPED}"),
+        ("", "ppo@shipped/ppo,universal@shipped"),
+        ("-brake-only", "ppo@shipped/ppo,universal@shipped"),
         ("-obstacle --harm-count total", "ppo@shipped/ppo,options@shipped"),
-        ("-buildup", "counterfactual@shipped/counterfactual,counterfactual@shipped"),
+        ("-buildup", "ppo@shipped/ppo,universal@shipped"),
     )
 )
 
@@ -175,9 +174,7 @@ TABLES: dict[str, How] = {
 }
 
 PICTURES: dict[str, How] = {
-    "emergency.svg": _by(
-        NIGHTLY, "ethbrake watch record --agents full_brake,counterfactual@shipped --output emergency.svg"
-    ),
+    "emergency.svg": _by(NIGHTLY, "ethbrake watch record --agents full_brake,universal@shipped --output emergency.svg"),
     "model-": _by(SUITE, "tests/docs/test_studies.py"),
     "deceleration.png": _by(
         NIGHTLY, "ethbrake watch picture deceleration --scenario paper-random --world 5 --output deceleration.png"

@@ -318,7 +318,7 @@ def test_every_results_file__says_its_kind_worlds_scenario_and_versions(
 @pytest.mark.parametrize(
     ("agent", "scenario", "beyond"),
     [
-        ("counterfactual@shipped/universal-wide+step", load_scenario("paper-random-obstacle"), "obstacle_gap_m"),
+        ("ppo@shipped/ppo+step", load_scenario("paper-random-obstacle"), "obstacle_gap_m"),
         ("options@shipped/options-paper-random-obstacle-total", PAPER, "no obstacle_gap_m"),
         ("ppo@shipped/ppo", PAPER.replace(time_step_s=0.05), "time_step_s"),
         ("ppo@shipped/ppo", PAPER.replace(roles={**ROLES, "vehicle_3": "coast"}), "vehicle_3 by coast"),
@@ -337,7 +337,7 @@ def test_policy__that_drives_beyond_what_it_was_trained_for_is_told_so_once(agen
 
 def test_policy__that_drives_where_it_was_trained_is_not_warned_of() -> None:
     with warnings.catch_warnings(action="error"):
-        evaluate(None, "universal@shipped,ppo@shipped,ppo@shipped/ppo-total", scenario=PAPER, episodes=200)
+        evaluate(None, "universal@shipped,ppo@shipped", scenario=PAPER, episodes=200)
         for name in ("stress-wide", "paper-random-obstacle"):
             evaluate(None, "universal@shipped", scenario=name, episodes=200)
         evaluate(None, "team@shipped", scenario="cooperation-3-pair", episodes=100)

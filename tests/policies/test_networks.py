@@ -596,8 +596,9 @@ def folder(policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> P
         ("universal", "paper-delay-low", "first", "universal"),
         ("policy", "paper-random-obstacle", "total", "universal"),
         ("ppo", None, "total", "ppo-total"),
-        ("policy", "paper-random", "total", "ppo-total"),
-        ("policy", "paper-delay-low", "first", "universal"),
+        ("policy", "paper-random", "total", "universal"),
+        ("policy", "paper-distance", "total", "ppo-paper-distance"),
+        ("policy", None, "first", "universal"),
     ],
 )
 def test_shipped_name__is_by_kind_scenario_and_count(
@@ -609,7 +610,7 @@ def test_shipped_name__is_by_kind_scenario_and_count(
 def test_lineup__takes_what_ships(folder: Path) -> None:
     specs = ["ppo@shipped", "universal@shipped", "policy@shipped", "team@shipped", "ppo@shipped+episode"]
     lineup = make_lineup([*specs, "ppo@shipped/ppo-paper-distance"], SCENARIO)
-    shipped = "policy@shipped/ppo"
+    shipped = "policy@shipped/universal"
     told = [spec.replace("policy@shipped", shipped).replace("team@shipped", shipped) for spec in lineup]
     assert [each.name for each in lineup.values()] == told
     assert isinstance(lineup["ppo@shipped+episode"], HybridAgent)
@@ -623,25 +624,36 @@ def test_shipped_policies__each_that_ships_is_small_and_has_a_card(name: str, pa
     manifest = load_named_policy(f"shipped/{name}").manifest
     trained = eb.load_scenario(str(manifest.scenario["name"]))
     assert scenario_sha256(eb.Scenario.of_dump(manifest.scenario)) == scenario_sha256(trained) and manifest.steps > 0
-    assert sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) < 4_000_000  # eleven policies in one
     load_named_policy(f"shipped/{name}").save(tmp_path / "copy")  # whatever version wrote it
     assert load_policy(tmp_path / "copy").manifest.manifest_sha256 == manifest.manifest_sha256
-    assert (path / "card.md").read_text("utf-8").startswith("# ")
+    card = (path / "card.md").read_text("utf-8")
+    assert card.startswith(f"# {name}\n") and (name == "universal" or "\nNot `universal`: " in card)
+
+
+def test_shipped_policies__are_small_together() -> None:
+    assert (
+        sum((path / "policy" / "weights.safetensors").stat().st_size for path in shipped_policies().values())
+        < 5_000_000
+    )
+
+
+def test_among__are_the_policies_inside_universal(policy: Policy) -> None:
+    universal = eb.load_shipped("universal")
+    seen = np.random.default_rng(0).uniform(0.0, 1.0, (50, universal.observation.size)).astype(np.float32)
+    acts = [*(each(seen) for each in universal.among), np.full((50, 1), -1.0), np.full((50, 1), 1.0)]
+    assert policy.among == () and len(universal.among) == 11
+    assert np.abs(np.stack(acts) - universal(seen)).min(axis=0).max() == 0.0
 
 
 @pytest.mark.parametrize("harm_count", HARM_COUNTS)
 @pytest.mark.parametrize("test", list(TESTS))
-def test_shipped__one_for_each_of_the_three_tests_drives_alone_and_behind_its_shield(
-    test: str, harm_count: HarmCount
-) -> None:
+def test_shipped__drives_each_of_the_three_tests_alone_and_behind_its_shield(test: str, harm_count: HarmCount) -> None:
     scenario = eb.load_scenario(test)
-    name = shipped_name("ppo", scenario, harm_count)
-    assert load_named_policy(f"shipped/{name}").manifest.scenario["name"] == test
-    lineup = make_lineup(["ppo@shipped", "ppo@shipped+episode"], scenario, harm_count=harm_count)
+    lineup = make_lineup(["policy@shipped", "policy@shipped+episode"], scenario, harm_count=harm_count)
     result = evaluate(scenario.sample(20, 7), lineup, scenario=scenario, seed=7)
     alone, shielded = (result.outcome(spec).ledger.world_harm(harm_count) for spec in lineup)
     assert shielded.mean() <= alone.mean()
-    assert (shielded <= result.outcome("ppo@shipped+episode").predicted_harm + 1e-9).all()
+    assert (shielded <= result.outcome("policy@shipped+episode").predicted_harm + 1e-9).all()
 
 
 def harms(sample: Any, specs: list[str], scenario: Any, harm_count: HarmCount) -> dict[str, float]:
@@ -679,7 +691,7 @@ def test_policy_shipped__drives_all_learners_of_a_level_of_cooperation(
     """At least as well as docs/levels.md says, by and large: level 3 collides no more often than level 2."""
     scenario = eb.load_scenario(level)
     name = shipped_name("policy", scenario, "total")
-    assert name == ("universal" if level == "cooperation-2-paper" else f"counterfactual-{level}")
+    assert name == ("universal" if level.startswith("cooperation-2") else f"counterfactual-{level}")
     assert load_named_policy(f"shipped/{name}").manifest.learners == tuple(
         scenario.vehicle_names[i] for i in scenario.learners
     )
@@ -692,10 +704,7 @@ def test_policy_shipped__drives_all_learners_of_a_level_of_cooperation(
 
 
 @pytest.mark.parametrize("harm_count", HARM_COUNTS)
-def test_shipped__counterfactual_does_less_harm_than_ppo(harm_count: HarmCount) -> None:
-    """On worlds that are no training's: several networks and a gate, trained for this count."""
-    manifest = load_named_policy(f"shipped/{shipped_name('counterfactual', SCENARIO, harm_count)}").manifest
-    assert manifest.reward["harm_count"] == harm_count and manifest.network.networks == 2
-    specs = ["ppo@shipped", "counterfactual@shipped"]
-    ppo, counterfactual = harms(SCENARIO.sample(600, 9), specs, SCENARIO, harm_count).values()
-    assert counterfactual < 0.98 * ppo
+def test_shipped__universal_does_less_harm_than_ppo(harm_count: HarmCount) -> None:
+    """On worlds that are no training's."""
+    ppo, universal = harms(SCENARIO.sample(600, 9), ["ppo@shipped", "universal@shipped"], SCENARIO, harm_count).values()
+    assert universal < 0.98 * ppo

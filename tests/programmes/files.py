@@ -21,16 +21,14 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-import safetensors.numpy
 import yaml
 
 import ethbrake_marl as eb
 from ethbrake_marl.evaluation.inputs import NamedWorld, NamedWorlds, states_of
-from ethbrake_marl.learning.runs import train
+from ethbrake_marl.learning.runs import NUMBERS, train
 from ethbrake_marl.policies import content_sha256, load_policy, shipped_policies
-from ethbrake_marl.studies.sweep import SweepPlan, TuningPlan
-from tests.programmes.archives import npy, raw_npy
+from ethbrake_marl.studies.sweep import SweepPlan
+from ethbrake_marl.studies.tuning import TuningPlan
 from tests.programmes.cage import NASTY, OUTSIDE, PRECIOUS, Case, damaged, write
 
 # ---------------------------------------------------------------- text
@@ -635,72 +633,6 @@ def newest(run: Path) -> Path:
     return max(run.glob("checkpoints/step_*"))
 
 
-def listed_anew(checkpoint: Path) -> None:
-    """Let the listing agree with what is there."""
-    path = checkpoint / "checkpoint.json"
-    listing = json.loads(path.read_text())
-    files = [file for file in checkpoint.rglob("*") if file.is_file() and file != path]
-    listing["files"] = {
-        file.relative_to(checkpoint).as_posix(): {
-            "bytes": file.stat().st_size,
-            "sha256": hashlib.sha256(file.read_bytes()).hexdigest(),
-        }
-        for file in files
-    }
-    path.write_text(json.dumps(listing))
-
-
-def _of_checkpoint(name: str, change: Spoil, rng: random.Random, run: Path) -> None:
-    """Change a file of the newest checkpoint, and list it anew."""
-    change(rng, newest(run) / name)
-    listed_anew(newest(run))
-
-
-STRANGE = (
-    "more", "policy.x", "environment.engine.script.1.act", "environment.engine.script.1.__class__",
-    "optimizer.policy.99.step", "\x1b[2J",
-)  # fmt: skip
-# What becomes of an array; nothing where it is lost.
-ARRAYS: tuple[Callable[[random.Random, np.ndarray], np.ndarray | None], ...] = (
-    lambda r, a: None,
-    lambda r, a: a.astype(r.choice((np.float64, np.int32, np.uint8, np.float16, np.bool_))),
-    lambda r, a: a.reshape(1, *a.shape),
-    lambda r, a: a[..., :0] if a.ndim else np.zeros(3, a.dtype),
-    lambda r, a: np.resize(a, (7, 7)),
-    lambda r, a: np.frombuffer(r.randbytes(a.nbytes), a.dtype).reshape(a.shape),
-    lambda r, a: np.full_like(a, r.choice((np.nan, np.inf, -1e300)) if a.dtype.kind == "f" else r.choice((0, 255))),
-)
-
-
-def _arrays(rng: random.Random, path: Path) -> None:
-    """Arrays of other names, types, shapes and values."""
-    arrays = dict(safetensors.numpy.load(path.read_bytes()))
-    name = rng.choice(sorted(arrays))
-    change, told = rng.choice([*((change, name) for change in ARRAYS), (lambda r, a: a, rng.choice(STRANGE))])
-    with np.errstate(over="ignore"):
-        changed = {told: change(rng, arrays[name])}
-    arrays = {each: array for each, array in (arrays | changed).items() if array is not None}
-    path.write_bytes(safetensors.numpy.save(arrays))
-
-
-# What is written in the place of an array of the replay memory; nothing where the file is lost.
-REPLAYS: tuple[Callable[[np.ndarray], bytes | None], ...] = (
-    lambda array: None,
-    lambda array: npy(np.array([{"a": 1}], object)),
-    lambda array: npy(array[: len(array) // 2]),
-    lambda array: npy(array.astype(np.float64)),
-    lambda array: raw_npy("[" * 9000),
-)
-
-
-def _npy(rng: random.Random, path: Path) -> None:
-    path = rng.choice(sorted(path.parent.glob("replay-*.npy")))
-    data = rng.choice(REPLAYS)(np.load(path))
-    path.unlink()
-    if data is not None:
-        path.write_bytes(data)
-
-
 def _text_of_table(rng: random.Random, path: Path) -> None:
     path.write_bytes(
         rng.choice(
@@ -764,7 +696,7 @@ def _more(rng: random.Random, run: Path) -> None:
         )
     )
     if rng.random() < 0.5 and not (run / name).exists():
-        write(run / name / "checkpoint.json", rng.choice(("{}", "", "[" * 9999)))
+        write(run / name / NUMBERS, rng.choice(("{}", "", "[" * 9999)))
     else:
         write(run / name, "x")
 
@@ -790,13 +722,8 @@ CHANGES: dict[str, tuple[tuple[str, ...], int, bool, Spoil]] = {
     "policy: link outside": (("ppo",), 1, False, partial(_link, "policy", "")),
     "events: link outside": (("ppo",), 1, False, partial(_link, "tensorboard/events.out.tfevents.1.x", PRECIOUS)),
     "progress.csv damaged": (("ppo",), 10, False, lambda r, f: _text_of_table(r, f / "progress.csv")),
-    "checkpoint: state.json edited": (("ppo", "sac"), 90, False, partial(_of_checkpoint, "state.json", edited)),
-    "checkpoint: state.json is no JSON": (("ppo",), 17, False, partial(_of_checkpoint, "state.json", no_json)),
-    "checkpoint: arrays changed": (("ppo", "sac"), 60, False, partial(_of_checkpoint, "arrays.safetensors", _arrays)),
-    "checkpoint: replay changed": (("sac",), 20, False, partial(_of_checkpoint, "x", _npy)),
-    "checkpoint: table changed": (("ppo",), 15, False, partial(_of_checkpoint, "progress.csv", _text_of_table)),
-    "checkpoint: listing edited": (("ppo", "sac"), 40, False, lambda r, f: edited(r, newest(f) / "checkpoint.json")),
-    "checkpoint: listing is no JSON": (("ppo",), 17, False, lambda r, f: no_json(r, newest(f) / "checkpoint.json")),
+    "checkpoint: numbers edited": (("ppo", "sac"), 40, False, lambda r, f: edited(r, newest(f) / NUMBERS)),
+    "checkpoint: numbers are no JSON": (("ppo",), 17, False, lambda r, f: no_json(r, newest(f) / NUMBERS)),
     "checkpoint: files damaged": (("ppo", "sac"), 70, False, lambda r, f: damaged_file(r, newest(f))),
     "checkpoint: of another training": (
         ("ppo",),

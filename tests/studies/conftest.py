@@ -85,6 +85,7 @@ def small_sweep(tiny: Path) -> dict[str, Any]:
 @pytest.fixture(scope="session")
 def finished_sweep(tmp_path_factory: pytest.TempPathFactory, small_sweep: dict[str, Any]) -> Path:
     """The folder of that sweep."""
+    pytest.importorskip("ray")
     file = write_yaml(tmp_path_factory.mktemp("sweep") / "sweep.yaml", small_sweep)
     assert study("sweep", file, "--output", file.parent / "out", "--jobs", "1") == 0
     return file.parent / "out"
@@ -111,6 +112,7 @@ def small_tuning(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 @pytest.fixture(scope="session")
 def finished_tuning(tmp_path_factory: pytest.TempPathFactory, small_tuning: dict[str, Any]) -> Path:
     """The folder of that tuning; its best recipe stands beside it."""
+    pytest.importorskip("ray")
     file = write_yaml(tmp_path_factory.mktemp("tuning") / "tuning.yaml", small_tuning)
     words = ("--output", file.parent / "out", "--trials", TRIALS, "--export", file.parent / "best.yaml")
     assert study("tune", file, *words) == 0

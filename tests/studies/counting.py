@@ -1,9 +1,9 @@
-"""A job that trains nothing, for measuring and disturbing the machinery around it, and the command that sweeps it.
+"""A job that trains nothing, for disturbing the machinery around it, and the command that sweeps it.
 
 It makes so many steps, each a hash of the one before, keeps a checkpoint of each as a training does, and sleeps in
 between, so that many of them disturb nobody.
 
-    python -m tests.studies.counting SWEEP.yaml FOLDER [--jobs N] [--ray ADDRESS] [--steps K] [--sleep S]
+    python -m tests.studies.counting SWEEP.yaml FOLDER [--jobs N] [--ray ADDRESS]
 """
 
 import argparse
@@ -15,60 +15,63 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock
 
+from ethbrake_marl.studies.figures import FIGURES
 from ethbrake_marl.studies.jobs import Answer, answer
+from ethbrake_marl.studies.sweep import RUNS, Row, SweepPlan
 
 ROOT = Path(__file__).resolve().parents[2]
-RESULTS = 10  # values of a row
+STEPS, SLEEP_S = 40, 0.01
 
 
-def count(folder: Path, seed: int, steps: int, sleep_s: float) -> list[str]:
-    """The row of a job."""
+def count(folder: Path, seed: int) -> None:
+    """Do a job, from where it stopped."""
     folder.mkdir(parents=True, exist_ok=True)
     with FileLock(folder / "run.lock", timeout=60.0):
         checkpoint = folder / "checkpoint.json"
         done, text = json.loads(checkpoint.read_text()) if checkpoint.exists() else (0, str(seed))
-        while done < steps:
-            time.sleep(sleep_s)
+        while done < STEPS:
+            time.sleep(SLEEP_S)
             done, text = done + 1, hashlib.sha256(text.encode()).hexdigest()
             (folder / "new.json").write_text(json.dumps([done, text]))
             os.replace(folder / "new.json", checkpoint)
-        (folder / "policy").mkdir(exist_ok=True)
-        for name in ("manifest.json", "weights.safetensors"):
-            (folder / "policy" / name).touch()
-        (folder / "run.json").write_text("{}")
-    return [str(steps), str(seed), *["0.0"] * (RESULTS - 3), text]
+        if not (folder / "run.json").exists():  # its worker may have been killed before it could say so
+            (folder / "new.json").write_text(json.dumps({"status": "finished", "text": text}))
+            os.replace(folder / "new.json", folder / "run.json")
+            with (folder / "ends").open("a") as ends:
+                ends.write("finished\n")
+
+
+class Counting(SweepPlan):
+    """A sweep of such jobs."""
+
+    def train(self, row: Row, path: Path) -> None:
+        count(path / RUNS / row.name, row.asked.seed)
+
+    def results(self, path: Path) -> dict[str, dict[str, Any]]:
+        files = {row: path / RUNS / row.name / "run.json" for row in self.rows}
+        return {
+            row.name: {FIGURES[0]: STEPS, FIGURES[-1]: json.loads(file.read_text())["text"]}
+            for row, file in files.items()
+            if file.exists()
+        }
 
 
 def main() -> int:
-    from ethbrake_marl.studies.jobs import Job, LocalWorkers, RayWorkers
-    from ethbrake_marl.studies.sweep import RUNS, Row, SweepPlan
-    from tests.studies.counting import count as job  # by a name that workers know, not of __main__
+    from tests.studies.counting import Counting as Plan  # by a name that workers know, not of __main__
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("file", type=Path)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--ray")
-    parser.add_argument("--steps", type=int, default=40)
-    parser.add_argument("--sleep", type=float, default=0.01)
+    parser.add_argument("--jobs", type=int)
+    parser.add_argument("--ray", default="local")
     options = parser.parse_args()
-
-    class Counting(SweepPlan):
-        def job(self, row: Row, folder: Path, log: Path) -> Job:
-            place = folder.absolute() / RUNS / row.name
-            return Job(row.name, job, (place, row.asked.seed, options.steps, options.sleep))
-
-    plan = Counting.read(options.file)
-    workers = LocalWorkers(options.jobs) if options.ray is None else RayWorkers(options.ray)
-    with closing(workers):
-        result = plan.run(options.folder, workers, retries=5)
-    return 130 if result.interrupted else result.counts["failed"]
+    result = Plan.read(options.file).run(options.folder, jobs=options.jobs, ray=options.ray, retries=5)
+    return 130 if result.interrupted else result.failed
 
 
 if __name__ == "__main__":
@@ -83,6 +86,11 @@ def journal(folder: Path) -> list[dict[str, Any]]:
     path = folder / "journal.jsonl"
     lines = path.read_text().splitlines(keepends=True) if path.exists() else []
     return [json.loads(line) for line in lines if line.endswith("}\n")]
+
+
+def finished(folder: Path) -> int:
+    """Runs of a sweep that came to their end."""
+    return sum('"status": "finished"' in file.read_text() for file in (folder / "runs").glob("*/run.json"))
 
 
 def holders(folder: Path) -> dict[int, str]:
