@@ -114,7 +114,7 @@ _EXTRA_OF = {
     **dict.fromkeys(("pyarrow", "minari", "h5py"), "data"),
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
     **dict.fromkeys(("starlette", "uvicorn"), "explore"),
-    "ray": "cluster",
+    **dict.fromkeys(("ray", "joblib"), "cluster"),
     "optuna": "tune",
     "libsumo": "sumo",
 }

@@ -1,7 +1,4 @@
-"""Jobs: a folder in which each is done once, and where they run: processes of one thread each, here or on Ray.
-
-Trainings and the shards of an evaluation are jobs of this kind.
-"""
+"""Jobs: a folder in which each is done once, and where they run: processes of one thread each, here or on Ray."""
 
 from __future__ import annotations
 
@@ -14,15 +11,14 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import partial, reduce
+from functools import partial
 from itertools import count
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from operator import add
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -32,13 +28,12 @@ from ethbrake_marl.errors import (
     InvalidInput,
     OnProgress,
     Progress,
-    count_of,
     describe_error,
     naming_extras,
     one_line,
     stop_on_signal,
 )
-from ethbrake_marl.evaluation import Question, Tally, evaluate
+from ethbrake_marl.evaluation import evaluate
 from ethbrake_marl.files.plugins import load_the_same, noted_plugins
 from ethbrake_marl.files.store import (
     check_writable,
@@ -738,83 +733,3 @@ def open_workers(ray: str | None, jobs: int | None) -> Workers:
     if ray is None:
         return LocalWorkers(number)
     return RayWorkers(ray, number if ray == _LOCAL else jobs)
-
-
-# Sharded evaluations: shards in processes, what is finished in a folder, and the merged tally.
-
-
-def evaluate_shards(
-    asked: Question,
-    *,
-    shards: int,
-    jobs: int = 1,
-    workers: Workers | None = None,
-    folder: Path | None = None,
-    with_rows: bool = False,
-    block: int = 4_000,
-    tell: OnProgress | None = None,
-) -> Tally:
-    """The merged tally of all worlds of a list; the same bits whatever ``shards``, ``jobs`` and ``block`` are.
-
-    Args:
-        asked: the question.
-        shards: parts of the list; finished ones are kept.
-        jobs: processes; 1: this one.
-        workers: where shards are answered, of a cluster for instance, in place of ``jobs``; not closed here.
-        folder: keeps finished shards of this many, and those that it has are not driven again.
-        with_rows: a file with one row per world and agent is kept in the folder for each shard.
-        block: worlds advanced together, a multiple of 1,000.
-        tell: is told the worlds done so far.
-
-    Raises what ``Question.answer`` and ``JobFolder.work`` raise, ``WorkerLost`` where a shard was lost again and again.
-
-    """
-    run, note = run_jobs, ""
-    bounds = {f"{first:013d}-{end:013d}": (first, end) for first, end in asked.bounds(shards)}
-    files = {} if folder is None else {name: folder.absolute() / f"worlds-{name}.parquet" for name in bounds}
-    done: dict[str, Any] = {}
-    with ExitStack() as stack:
-        if folder is not None:
-            question = {**asked.identity, "rows": with_rows, "shards": len(bounds)}
-            kept = JobFolder(folder, "shards", question, beside=())
-            stack.enter_context(kept.work())
-            found, damaged = kept.kept()
-            for name in bounds.keys() & found.keys():
-                is_there = files[name].is_file() and files[name].stat().st_size == found[name]["rows_bytes"]
-                if with_rows and not is_there:
-                    damaged += 1
-                else:
-                    done[name] = found[name]
-            for file in folder.glob("worlds-*.parquet"):
-                if file.stem.removeprefix("worlds-") not in done:
-                    file.unlink()
-            note = f"{count_of(damaged, 'finished shard')} damaged: driven again" if damaged else ""
-            run = kept.run
-        whole = reduce(add, (Tally.from_json(told["tally"]) for told in done.values()), Tally())
-        worlds = sum(told["end"] - told["first"] for told in done.values())
-
-        def say(note: str = "") -> None:
-            if tell is not None:
-                tell(Progress("worlds", worlds, asked.episodes, note=note))
-
-        def take(job: Job, found: dict[str, Any]) -> None:
-            nonlocal whole, worlds
-            whole += Tally.from_json(found["tally"])
-            worlds += found["end"] - found["first"]
-            say()
-
-        say(note)
-        left = [
-            Job(name, _answer, (asked, *ends, files[name] if with_rows and files else None, block))
-            for name, ends in bounds.items()
-            if name not in done
-        ]
-        if not run(left, workers or (jobs if len(left) > 1 else 1), each(take)):
-            raise KeyboardInterrupt
-        return whole
-
-
-def _answer(asked: Question, first: int, end: int, rows: Path | None, block: int) -> dict[str, Any]:
-    tally = asked.answer(first, end, rows, block)
-    size = None if rows is None else rows.stat().st_size
-    return {"first": first, "end": end, "rows_bytes": size, "tally": tally.to_json()}

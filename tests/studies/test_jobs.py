@@ -10,23 +10,17 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import replace
 from functools import partial
-from multiprocessing import active_children
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 from unittest.mock import ANY, Mock
 
-import numpy as np
 import pytest
 from filelock import FileLock
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput, check_whole_number
-from ethbrake_marl.evaluation.measures import Tally
-from ethbrake_marl.evaluation.results import Question
-from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.studies import jobs
 from ethbrake_marl.studies.jobs import (
     Answer,
@@ -37,10 +31,9 @@ from ethbrake_marl.studies.jobs import (
     RayWorkers,
     WorkerLost,
     answer,
-    evaluate_shards,
     run_jobs,
 )
-from tests.studies.conftest import ABLATE, TRIALS
+from tests.studies.conftest import TRIALS
 from tests.studies.counting import Inside, journal
 
 QUESTION = {"seed": 1, "levels": [1, 2], "versions": {"numpy": "2", "torch": "2"}}
@@ -208,60 +201,6 @@ def test_answer__an_error_of_this_package_lasts_and_any_other_may_not(call: Any,
     assert (type(found.error), found.again, found.value) == (error, again, 5 if error is type(None) else None)
 
 
-def kept_by(folder: Path) -> int:
-    """How many shards the folder keeps."""
-    return len([one for one in journal(folder) if one["status"] == "finished"])
-
-
-def killed(asked: Question, folder: Path, after: int, shards: int, **more) -> None:
-    """Let an evaluation be killed when so many shards are finished."""
-
-    def tell(progress) -> None:
-        if kept_by(folder) == after:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        evaluate_shards(asked, shards=shards, folder=folder, tell=tell, **more)
-
-
-def test_shards__killed_go_on_with_what_is_left_and_damaged_ones_are_driven_again(
-    asked, tally, driven, tmp_path
-) -> None:
-    folder, told = tmp_path / "kept", []
-
-    def ranges(**more) -> list[tuple[int, int]]:
-        driven.clear()
-        assert evaluate_shards(asked, shards=4, folder=folder, **more) == tally
-        return [*driven]
-
-    killed(asked, folder, 2, shards=4)
-    assert driven == [(0, 1_000), (1_000, 2_000)]
-    assert ranges() == [(2_000, 3_000), (3_000, 4_500)] and ranges() == []
-    with pytest.raises(InvalidInput, match="rows False, here True; shards 4, here 3"):
-        evaluate_shards(asked, shards=3, folder=folder, with_rows=True)
-    lines = folder / "journal.jsonl"
-    lines.write_text(lines.read_text().replace('"worlds": 1000', '"worlds": 1001', 1))
-    assert ranges(tell=told.append) == [(0, 1_000)] and "1 finished shard damaged" in told[0].note
-    evaluate_shards(asked, shards=1, folder=tmp_path / "one")
-    lines.write_text(lines.read_text() + (tmp_path / "one" / "journal.jsonl").read_text())
-    assert ranges() == []  # no world counts twice
-
-
-@pytest.mark.slow
-def test_shards__their_processes_are_ended_where_one_fails_or_on_ctrl_c(asked, tmp_path: Path) -> None:
-    changed = replace(asked, identity={**asked.identity, "seed": 12})
-    with pytest.raises(InvalidInput, match="seed changed since the evaluation began"):
-        evaluate_shards(changed, shards=4, jobs=2)
-
-    def stop(progress) -> None:
-        if progress.done:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        evaluate_shards(asked, shards=4, jobs=2, folder=tmp_path / "kept", tell=stop)
-    assert 1 <= kept_by(tmp_path / "kept") < 4 and not active_children()
-
-
 def test_processes__have_one_thread_each_and_a_lost_one_is_replaced() -> None:
     work = [(os.getenv, "OMP_NUM_THREADS"), (os._exit, 3), (os.getpid,), (signal.raise_signal, 9)]
     jobs = [Job(str(k), function, tuple(given)) for k, (function, *given) in enumerate(work)]
@@ -373,56 +312,6 @@ def test_cluster__of_two_nodes_whose_workers_are_killed_makes_the_same_table(wor
     assert subprocess.run(command, cwd=ROOT, timeout=3600, check=False).returncode == 0
 
 
-N = 4_500
-
-
-@pytest.fixture(scope="module")
-def asked(paper_random: Scenario) -> Question:
-    return Question(paper_random, ("full_brake", "coast"), N, 11).ask()
-
-
-@pytest.fixture(scope="module")
-def tally(asked: Question) -> Tally:
-    return evaluate_shards(asked, shards=1)
-
-
-@pytest.fixture
-def driven(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
-    """The ranges of worlds that are driven from now on."""
-    found: list[tuple[int, int]] = []
-    answer = Question.answer
-
-    def noted(asked, first, end, *more):
-        found.append((first, end))
-        return answer(asked, first, end, *more)
-
-    monkeypatch.setattr(Question, "answer", noted)
-    return found
-
-
-def test_rows__are_the_same_for_any_shards_and_those_of_killed_shards_go(asked, tally, tmp_path: Path) -> None:
-    parquet = pytest.importorskip("pyarrow.parquet")
-    tables = []
-    for shards in (1, 4):
-        folder = tmp_path / str(shards)
-        if shards == 4:
-            killed(asked, folder, 2, shards, with_rows=True)
-            (folder / "worlds-0000000002000-0000000004500.parquet").write_bytes(b"half")
-        assert evaluate_shards(asked, shards=shards, folder=folder, with_rows=True, block=1_000 * shards) == tally
-        files = sorted(folder.glob("worlds-*.parquet"))
-        assert len(files) == shards
-        tables.append([row for file in files for row in parquet.read_table(file).to_pylist()])
-    assert tables[0] == tables[1]
-    order = [(row["world"], row["agent"]) for row in tables[0]]
-    assert order == [(world, agent) for world in range(N) for agent in ("full_brake", "coast")]
-    harm = np.mean([row["total_harm"] for row in tables[0] if row["agent"] == "full_brake"])
-    assert harm == pytest.approx(tally.agents["full_brake"].moments["total_harm"].mean, rel=1e-12)
-    damaged = tmp_path / "1" / "worlds-0000000000000-0000000004500.parquet"
-    damaged.write_bytes(b"")
-    assert evaluate_shards(asked, shards=1, folder=tmp_path / "1", with_rows=True) == tally  # driven again
-    assert parquet.read_table(damaged).num_rows == 2 * N
-
-
 # ---------------------------------------------------------------- one contract for every folder
 
 
@@ -436,38 +325,7 @@ class Study(NamedTuple):
     record: str = ""
 
 
-@pytest.fixture(scope="module")
-def done(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folders of a sharded evaluation and of a reproduction; not to be changed."""
-    folder = tmp_path_factory.mktemp("done")
-    assert run_command(["evaluate", *SHARDS, "--output", str(folder / "shards")]) == 0
-    assert run_command([*REPRODUCE, "--output", str(folder / "reproduction")]) == 0
-    return folder
-
-
-REPRODUCE = ("reproduce", "learning-low", "--episodes", "20")
-SHARDS = ("--agents", "coast", "--episodes", "20", "--shards", "2")
-
-
 STUDIES: dict[str, Callable[[Callable[[str], Any]], Study]] = {
-    "shards": lambda get: Study(
-        ("evaluate", *SHARDS),
-        get("done") / "shards",
-        ("evaluate", *SHARDS, "--seed", "8"),
-        "holds shards with other settings (seed 7, here 8)",
-        "question.json",
-    ),
-    "reproduction": lambda get: Study(
-        REPRODUCE, get("done") / "reproduction", (*REPRODUCE, "--episodes", "50"), "(episodes 20, here 50)",
-        "reproduction.json",
-    ),
-    "ablation": lambda get: Study(
-        ("study", "ablate", "--recipes", get("tiny_total"), *ABLATE),
-        get("finished_ablation"),
-        ("study", "ablate", "--recipes", get("tiny_total"), *ABLATE, "--budget", "60", "--seeds", "3"),
-        "(seeds 2, here 3; budget 50, here 60)",
-        "settings.json",
-    ),
     "tuning": lambda get: Study(
         ("study", "tune", get("finished_tuning").parent / "tuning.yaml", "--trials", TRIALS),
         get("finished_tuning"),
@@ -516,14 +374,10 @@ def test_folder_of_something_else__is_left_alone(study: Study, told, tmp_path: P
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("years of work")
     assert "is a file; give a folder" in told(tmp_path / "mine" / "thesis.tex", *study.line)
-    if study.line[0] != "study":  # a study's own files stand beside what is there
-        assert "holds no" in told(tmp_path / "mine", *study.line)
 
 
 def test_second_process__is_refused(study: Study, told, tmp_path: Path) -> None:
     shutil.copytree(study.folder, tmp_path / "copy")
-    if study.line[0] == "evaluate":  # which looks at what is finished first
-        (tmp_path / "copy" / "journal.jsonl").unlink()
     with FileLock(tmp_path / "copy" / ".lock"):
         assert "another process works in it" in told(tmp_path / "copy", *study.line)
 
@@ -535,9 +389,6 @@ def test_damaged_record__is_named(study: Study, told, tmp_path: Path) -> None:
         assert f"{study.record}: is damaged" in told(tmp_path / "copy", *study.line)
 
 
-LAST = "trainings/cooperation-3-congested-tiny-shared-seed1"
-
-
 @pytest.mark.parametrize(
     ("study", "file", "damage", "message"),
     [
@@ -546,27 +397,13 @@ LAST = "trainings/cooperation-3-congested-tiny-shared-seed1"
         ("tuning", "study.journal", ('{"op_code":0', "\x00"), "cannot be used"),
         ("tuning", "study.journal", ('"results":"[', '"results":"{'), "trial 0 is damaged"),
         ("tuning", "study.journal", ('"results":"[', '"results":7,"x":"['), "cannot be used"),
-        ("ablation", f"{LAST}/run.json", ("{", "["), "run.json: is damaged"),
-        ("ablation", f"{LAST}/config.json", ("{", "["), "config.json: is damaged"),
-        (
-            "ablation",
-            f"{LAST}/config.json",
-            ('"total_steps": 256', '"total_steps": 512'),
-            "holds another training (here other: recipe total_steps); give another folder",
-        ),
-        ("ablation", f"{LAST}/run.json", None, "is no training"),
-        ("ablation", f"{LAST}/team.json", ('"scheme"', '"shceme"'), "team.json"),
-        ("ablation", f"{LAST}/policy/manifest.json", ("{", "{}"), "manifest.json"),
     ],
     indirect=["study"],
 )
 def test_damaged_file__is_named_in_one_line_before_anything_is_done(
     study: Study, file: str, damage: tuple[str, str] | None, message: str, told, tmp_path: Path
 ) -> None:
-    """Of an ablation a joint optimum and a training are left to be made, which come before it."""
     damaged = Path(shutil.copytree(study.folder, tmp_path / "copy")) / file
-    for other in (tmp_path / "copy" / "optimum", damaged.parents[1] / "cooperation-3-pair-tiny-shared-seed0"):
-        shutil.rmtree(other, ignore_errors=True)
     text = damaged.read_text()
     damaged.unlink()
     if damage is not None:
@@ -579,14 +416,6 @@ def test_damaged_file__is_named_in_one_line_before_anything_is_done(
 @pytest.mark.parametrize(
     ("study", "copied", "options", "patterns"),
     [
-        (
-            "ablation",
-            True,
-            ["--cost"],
-            ["to do: 0 trainings, 0 decisions: 0 s; joint", "npz: is damaged; its worlds are"],
-        ),
-        ("ablation", True, ["--seeds", "3", "--cost"], ["to do: 2 trainings, 512 decisions at"]),
-        ("ablation", False, ["--seeds", "1", "--cost"], ["to do: 2 trainings, 512 decisions at"]),
         ("sweep", True, ["--dry-run", "--json"], ['(?s)("state": "finished".*){4}', '"decisions_left": 0,']),
         (
             "sweep",
@@ -614,7 +443,5 @@ def test_cost__is_told_and_nothing_is_made(
     folder = tmp_path / "there"
     if copied:
         shutil.copytree(study.folder, folder)
-    for damaged in [*folder.glob("optimum/*/*.npz")][:1]:
-        damaged.write_bytes(b"no table")
     said = told(folder, *study.line, *options, status=0)
     assert [each for each in patterns if not re.search(each, said)] == [] and folder.exists() == copied
