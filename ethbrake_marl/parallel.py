@@ -127,12 +127,12 @@ def _connect(address: str, jobs: int | None) -> Any:
     with naming_extras():
         import ray
     quiet = {"log_to_driver": False, "configure_logging": False, "runtime_env": {"env_vars": ONE_THREAD}}
-    if address == _LOCAL:
-        cores = len(os.sched_getaffinity(0)) if jobs is None else jobs
-        ray.init(address=_LOCAL, num_cpus=cores, include_dashboard=False, **quiet)
-        return ray
+    cores = len(os.sched_getaffinity(0)) if jobs is None else jobs
+    own = {"num_cpus": cores, "include_dashboard": False} if address == _LOCAL else {}
     try:
-        ray.init(address=address, **quiet)
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        raise InvalidInput(f"ray {address!r}: no cluster can be reached there ({error})") from None
+        ray.init(address=address, **own, **quiet)
+    except Exception as error:  # where a Ray cannot start it raises just that
+        raise InvalidInput(
+            f"ray {address!r}: cannot be started, or no cluster can be reached there ({error})"
+        ) from None
     return ray

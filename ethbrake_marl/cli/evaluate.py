@@ -142,8 +142,9 @@ def evaluate_command(
 
     _check_outputs(out, output, per_world, report=report)
     if group := scenarios.group_of_scenarios(scenario):
-        other = {"--per-world": per_world, "--report": report, "--initial-states": initial_states, "--by": by}
-        other |= {"--host": host, "--objective": objective, "--measures": measures, "--jobs": jobs, "--ray": ray}
+        other: dict[str, object] = {"--per-world": per_world, "--report": report, "--initial-states": initial_states}
+        other |= {"--by": by, "--host": host, "--objective": objective, "--measures": measures}
+        other |= {"--jobs": jobs, "--ray": ray}
         _refuse(other, f"{scenario} is a group of {len(group)} scenarios; give one of them")
         made = partial(_make_drivers, agents.split(","), harm_count=harm_count, uncertainty=uncertainty)
         chosen_ones = [_asked_task(name, vehicle, settings).scenario for name in group]

@@ -66,13 +66,17 @@ def worlds_sha256(worlds: Worlds, index: Ints) -> str:
     """
     if worlds.n > HELD:
         return f"{hash_of_chunks(worlds, index):064x}"
+    return _hash_at_once(worlds, index)
+
+
+def _hash_at_once(worlds: Worlds, index: Ints) -> str:
     return _arrays_sha256({"index": index, **_arrays(worlds)})
 
 
 def hash_of_chunks(worlds: Worlds, index: Ints) -> int:
     """Sum modulo 2^256 of the SHA-256 of the worlds of each chunk: those numbered 0 to 2,499, 2,500 to 4,999, ..."""
     chunks = [np.flatnonzero(index // CHUNK == number) for number in np.unique(index // CHUNK)]
-    return sum(int(worlds_sha256(worlds.take(chunk), index[chunk]), 16) for chunk in chunks) % HASHES
+    return sum(int(_hash_at_once(worlds.take(chunk), index[chunk]), 16) for chunk in chunks) % HASHES
 
 
 def content_sha256(*parts: Any) -> str:

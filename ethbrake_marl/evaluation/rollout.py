@@ -197,8 +197,9 @@ def evaluate(
     warn_unfamiliar(agents, sample.worlds, scenario, driven)
     for first, part in chunks_of(sample, chunk or CHUNK):
         parts.append(drive_chunk(part, agents, scenario, seed, driven, first, aftermath))
-        for name in agents if on_progress is not None else ():
-            on_progress(name, first + part.worlds.n)
+        if on_progress is not None:
+            for name in agents:
+                on_progress(name, first + part.worlds.n)
     return Evaluation.join(parts)
 
 

@@ -105,7 +105,7 @@ def test_evaluate__does_not_depend_on_the_chunk_nor_on_the_worlds_behind(
     assert chunked.outcome("gap").collided.any()
     for name in agents:
         assert_same(chunked.outcome(name), evaluation.outcome(name), rows)
-    assert seen == [(name, end) for name in agents for end in [*range(chunk, n, chunk), n]]
+    assert seen == [(name, end) for end in [*range(chunk, n, chunk), n] for name in agents]
 
 
 def test_evaluate__an_episode_that_the_horizon_cuts_is_reported_so(pair: Scenario) -> None:
