@@ -113,7 +113,7 @@ _EXTRA_OF = {
     **dict.fromkeys(("onnx", "onnxruntime"), "export"),
     **dict.fromkeys(("pyarrow", "minari", "h5py"), "data"),
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
-    **dict.fromkeys(("ray", "optuna"), "cluster"),
+    **dict.fromkeys(("ray", "optuna", "joblib"), "cluster"),
     "libsumo": "sumo",
 }
 

@@ -54,9 +54,10 @@ np.lib.format.read_array(file)
 subprocess.run(line, shell=True)
 os.system(line)
 importlib.util.spec_from_file_location(a, b)
-import runpy, code, joblib
+import runpy, code
+joblib.load(path)
 """
-USUAL = "import importlib.util, os, subprocess, numpy as np, torch, torch as t, yaml, yaml as y\n"
+USUAL = "import importlib.util, joblib, os, subprocess, numpy as np, torch, torch as t, yaml, yaml as y\n"
 
 
 def test_planted__is_refused() -> None:

@@ -63,7 +63,7 @@ def sizes(folder: Path) -> dict[str, float]:
     found = {}
     driven = evaluate(scenario.sample(1000, 7), {"full_brake": make_agent("full_brake")}, scenario=scenario)
     write_per_world(folder / "worlds.csv", driven)
-    found["world of evaluate --per-world (CSV)"] = (folder / "worlds.csv").stat().st_size / 1000
+    found["world of evaluate --per-world csv"] = (folder / "worlds.csv").stat().st_size / 1000
     settings = {"total_steps": 1, "evaluation.worlds": 100}
     grid = {"scenario": SCENARIO, "recipe": "ppo", "seed": {"count": 2}}
     (folder / "sweep.yaml").write_text(yaml.safe_dump({"set": settings, "grid": grid}))

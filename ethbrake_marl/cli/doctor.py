@@ -43,7 +43,7 @@ _DOORS = (
 )
 # What `ethbrake run` uses but for three small kernels, without torch, and no more than that.
 _FOR_A_RUN = (
-    *("-m", "ethbrake_marl", "evaluate", "--episodes", "20", "--report", "page.html"),
+    *("-m", "ethbrake_marl", "evaluate", "--episodes", "20", "--output", "page", "--report"),
     *("--agents", "full_brake,e_v2x_bm,e_v2x_bm:pairwise,ppo@shipped,ppo@shipped+episode"),
 )
 _FIRST_STEP = """

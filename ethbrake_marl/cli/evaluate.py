@@ -6,7 +6,6 @@ import json
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -15,11 +14,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from ethbrake_marl import evaluation, learning, scenario as scenarios
-from ethbrake_marl.cli.command import Out, app, whole_number
+from ethbrake_marl.cli.command import Out, app
 from ethbrake_marl.defaults import DEFAULT, DatasetFormat, HarmCount
 from ethbrake_marl.errors import InvalidInput, count_of, need
 from ethbrake_marl.files.sheet import Column, Sheet
-from ethbrake_marl.files.store import write_file
+from ethbrake_marl.files.store import check_folder, write_output
 
 if TYPE_CHECKING:
     from ethbrake_marl.agents import Driver
@@ -29,6 +28,8 @@ if TYPE_CHECKING:
 
 GROUP_EPISODES = 400  # of each scenario of a group; the tables of best known harm of `benchmark` hold them
 HOSTED = 100  # worlds in somebody else's simulator
+RESULTS, WORLDS, REPORT = "results.json", "worlds", "report.html"  # in the folder of an evaluation
+_FILES = (RESULTS, f"{WORLDS}.csv", f"{WORLDS}.parquet", REPORT)
 PAGES = (".html", ".htm")
 _PROPOSERS = "ppo@shipped,full_brake,constant:3"
 _HARMS = {"first_impact_harm": "First-impact harm", "total_harm": "Total harm", "harm": "Harm"}
@@ -68,10 +69,14 @@ def _make_drivers(
     """Who is named on the command line, as ``make_lineup`` makes them; tells which policies ``@shipped`` stands for."""
     intervals = _intervals(uncertainty)
     lineup = evaluation.make_lineup(agents, scenario, harm_count=harm_count, uncertainty=intervals, **how)
+    _tell_shipped(lineup)
+    return lineup
+
+
+def _tell_shipped(lineup: Mapping[str, Driver]) -> None:
     for spec, driver in lineup.items():
         if "@shipped" in spec and (meant := getattr(driver, "name", spec)) != spec:
             Out().note(f"{spec} is {meant}")
-    return lineup
 
 
 @app.add(
@@ -92,14 +97,16 @@ def evaluate_command(
     ] = None,
     vehicle: str | None = None,
     settings: list[str] | None = None,
+    output: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Also write the results to this folder: results.json.")
+    ] = None,
     per_world: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Also write one row per world and agent (.csv, .parquet), and FILE.json."),
+        Literal["csv", "parquet"] | None,
+        typer.Option(help="Write one row per world and agent, too: worlds.csv or worlds.parquet."),
     ] = None,
     report: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.html", help="Also write a page with tables, figures and episodes to watch."),
-    ] = None,
+        bool, typer.Option("--report", help="Write a page with tables, figures and episodes, too: report.html.")
+    ] = False,
     objective: Annotated[
         list[str] | None,
         typer.Option(
@@ -121,29 +128,8 @@ def evaluate_command(
             help="Drive in that simulator, 100 worlds where no number is given, and tell the harm here beside it.",
         ),
     ] = None,
-    shards: Annotated[
-        int | None,
-        typer.Option(
-            metavar="K",
-            help="Evaluate the list in K parts, in flat memory; changes no figure.",
-            callback=whole_number(1),
-        ),
-    ] = None,
-    jobs: Annotated[
-        int,
-        typer.Option(metavar="N", help="With --shards: processes; changes no figure.", callback=whole_number(1, 256)),
-    ] = 1,
-    ray: Annotated[
-        str | None,
-        typer.Option(metavar="local|ADDRESS", help="With --shards: on Ray, on all its cores or on --jobs of them."),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="With --shards: keeps finished ones; the same command goes on."),
-    ] = None,
-    rows: Annotated[
-        bool, typer.Option("--rows", help="With --output: also one row per world and agent, as Parquet files in it.")
-    ] = False,
+    jobs: int | None = None,
+    ray: str | None = None,
     paper: Annotated[
         bool, typer.Option("--paper", help="Also print the rows of the paper's tables; on paper-random alone.")
     ] = False,
@@ -154,66 +140,75 @@ def evaluate_command(
     +search, then one shield, +episode, +step or +robust; for instance full_brake+step or ppo@PATH+search+episode.
     PATH is a run or a policy bundle, or shipped.
     """
+    from ethbrake_marl.agents import split_specs
     from ethbrake_marl.harm import declared_objectives
 
-    whole: dict[str, object] = {"--per-world": per_world, "--report": report, "--initial-states": initial_states}
-    whole |= {"--by": by, "--host": host}
-    _check_shards(shards, jobs, ray, output, rows, measures, whole)
-    _check_outputs(out, per_world, report)
-    made = partial(_make_drivers, agents, harm_count=harm_count, uncertainty=uncertainty)
+    _check_outputs(out, output, per_world, report=report)
     if group := scenarios.group_of_scenarios(scenario):
-        other = whole | {
-            "--paper": paper,
-            "--objective": objective,
-            "--measures": measures,
-            "--shards": shards,
-            "--output": output,
-        }
+        other: dict[str, object] = {"--per-world": per_world, "--report": report, "--initial-states": initial_states}
+        other |= {"--by": by, "--host": host, "--objective": objective, "--measures": measures, "--paper": paper}
+        other |= {"--jobs": jobs, "--ray": ray}
         _refuse(other, f"{scenario} is a group of {len(group)} scenarios; give one of them")
+        made = partial(_make_drivers, agents, harm_count=harm_count, uncertainty=uncertainty)
         tasks = [_asked_task(name, vehicle, settings, harm_count) for name in group]
-        _evaluate_group(out, tasks, made, episodes, seed)
+        _evaluate_group(out, output, tasks, made, episodes, seed)
         return
     if host is not None:
-        _refuse(
-            {"--report": report, "--measures": measures, "--paper": paper},
-            "tells of the physics here; leave it out, or --host",
-        )
+        other = {"--report": report, "--measures": measures, "--paper": paper}
+        _refuse(other, "tells of the physics here; leave it out, or --host")
+        _refuse({"--jobs": jobs, "--ray": ray}, "a host drives in one process; leave it out, or --host")
         episodes = HOSTED if episodes is None and initial_states is None else episodes
-    if measures is not None:
-        evaluation.register_injury()
     task = _asked_task(scenario, vehicle, settings)
     chosen = task.scenario
-    lineup, objectives = made(chosen), declared_objectives(objective or (), chosen.vehicles)
-    if shards is not None:
-        _refuse({"--paper": paper}, "--shards prints no rows of the paper; leave one of the two out")
-        number = DEFAULT.EPISODES if episodes is None else episodes
-        seed = DEFAULT.LIST_SEED if seed is None else seed
-        asked = evaluation.Question(chosen, tuple(lineup), number, seed, harm_count, uncertainty, tuple(objectives))
-        evaluation.check_agents(lineup, chosen.sample(min(number, 1_000), seed).worlds, chosen, warn=True)
-        _evaluate_in_shards(out, asked, shards, jobs, ray, output, rows)
-        return
-    sample, drawn_by = evaluation.choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
-    if by is not None:
-        evaluation.Evaluation.check_group(sample.kinds, by)
-    if paper:
-        evaluation.check_papers_test(task, drawn_by)
-    evaluation.check_agents(lineup, sample.worlds, chosen)
-    found, beside, sheets = _drive(out, host, sample, lineup, chosen, drawn_by, harm_count)
-    summary, told = evaluation.summarise(found, paper=paper), found.rescore(objectives)
-    _write_report(out, report, found, summary, lineup, harm_count)
-    groups = {} if by is None else evaluation.summarise_by(found, by)
-    used = {"harm_count": harm_count, "uncertainty": uncertainty} | ({"host": found.host} if found.host else {})
-    if per_world is not None:
-        evaluation.write_per_world(per_world, found, objectives=objectives, force=out.force)
-    results = evaluation.results_to_json(summary, told=told, groups=groups, per_world=per_world, settings=used)
-    if per_world is not None:
-        out.write(_beside(per_world), _json_text(results), f"every world: {per_world}; the results")
-    shown: list[Any] = [*summary.tables()]
-    for name, of_group in groups.items():
-        shown += [f"\n{name}: {count_of(of_group[0].episodes, 'world')}\n", of_group.terminal()]
-    shown += [*sheets, told.sheet(harm_count)] if told else sheets
-    out.result([row | beside.get(row["agent"], {}) for row in results], *shown)
-    _tell_horizon(out, _moving(summary), sample.worlds.n, chosen.horizon_s)
+    lineup = evaluation.Lineup.of(
+        split_specs(agents), chosen, harm_count=harm_count, uncertainty=uncertainty, injury=measures is not None
+    )
+    objectives = declared_objectives(objective or (), chosen.vehicles)
+    _tell_shipped(lineup.make())
+    used = {"harm_count": harm_count, "uncertainty": uncertainty}
+    all_at_once = per_world or report or by or host or initial_states or paper
+    if not all_at_once and (DEFAULT.EPISODES if episodes is None else episodes) > evaluation.HELD:
+        summary, told = _evaluate_long_list(out, lineup, episodes or 0, seed, objectives, jobs, ray)
+        results, shown = evaluation.results_to_json(summary, told=told, settings=used), [*summary.tables()]
+    else:
+        sample, drawn_by = evaluation.choose_worlds(chosen, initial_states=initial_states, episodes=episodes, seed=seed)
+        if by is not None:
+            evaluation.Evaluation.check_group(sample.kinds, by)
+        if paper:
+            evaluation.check_papers_test(task, drawn_by)
+        found, beside, sheets = _drive(out, host, sample, lineup, drawn_by, jobs, ray)
+        used |= {"host": found.host} if found.host else {}
+        summary, told = evaluation.summarise(found, paper=paper), found.rescore(objectives)
+        groups = {} if by is None else evaluation.summarise_by(found, by)
+        beside_it = _write_worlds(out, output, found, objectives, per_world)
+        results = evaluation.results_to_json(summary, told=told, groups=groups, per_world=beside_it, settings=used)
+        results = [row | beside.get(row["agent"], {}) for row in results]
+        shown = [*summary.tables(), *_group_tables(groups), *sheets]
+        if report and output is not None:
+            output.mkdir(parents=True, exist_ok=True)
+            _write_report(out, output / REPORT, found, summary, lineup.make(), harm_count)
+    _write_results(out, output, results, f"{WORLDS}.{per_world}", REPORT if report else "")
+    out.result(results, *shown, *([told.sheet(harm_count)] if told else []))
+    _tell_horizon(out, _moving(summary), summary[0].episodes, chosen.horizon_s)
+
+
+def _evaluate_long_list(
+    out: Out, lineup: evaluation.Lineup, episodes: int, seed: int | None, objectives: Sequence[str],
+    jobs: int | None, ray: str | None,
+) -> tuple[evaluation.SummaryTable, evaluation.Rescores]:  # fmt: skip
+    """The agents in a list of which no world is held in memory."""
+    scenario, seed = lineup.scenario, DEFAULT.LIST_SEED if seed is None else seed
+    evaluation.check_agents(lineup.make(), scenario.sample(1_000, seed).worlds, scenario, warn=True)
+    tell = _tell_worlds(out, episodes)
+    tally = evaluation.tally_list(lineup, episodes, seed, objectives=objectives, jobs=jobs, ray=ray, on_done=tell)
+    return evaluation.summarise_tally(lineup, tally, seed), tally.rescore(objectives, scenario.vehicles)
+
+
+def _tell_worlds(out: Out, worlds: int) -> Callable[[int], None]:
+    def tell(done: int) -> None:
+        out.progress("worlds", done, worlds)
+
+    return tell
 
 
 def _refuse(options: Mapping[str, object], why: str) -> None:
@@ -223,22 +218,24 @@ def _refuse(options: Mapping[str, object], why: str) -> None:
 
 
 def _drive(
-    out: Out, host: str | None, sample: Sample, lineup: Mapping[str, Driver], scenario: Scenario,
-    seed: int | None, harm_count: HarmCount,
+    out: Out, host: str | None, sample: Sample, lineup: evaluation.Lineup, seed: int | None, jobs: int | None,
+    ray: str | None,
 ) -> tuple[evaluation.Evaluation, dict[str, Any], list[Any]]:  # fmt: skip
     """The agents in these worlds, and of a host by agent and as a table what it and the physics here do otherwise."""
+    agents, scenario = lineup.make(), lineup.scenario
+    evaluation.check_agents(agents, sample.worlds, scenario, warn=host is None)
+    if host is None:
+        tell_worlds = _tell_worlds(out, sample.worlds.n)
+        return evaluation.evaluate_held(lineup, sample, seed, jobs=jobs, ray=ray, on_done=tell_worlds), {}, []
+    from ethbrake_marl.hosts import find_host
 
     def tell(agent: str, done: int) -> None:
         out.progress(agent, done, sample.worlds.n)
 
-    if host is None:
-        return evaluation.evaluate(sample, lineup, scenario=scenario, seed=seed, on_progress=tell), {}, []
-    from ethbrake_marl.hosts import find_host
-
     hosted = find_host(host)
-    found, distrusted = hosted.evaluate(sample, lineup, scenario, seed, on_progress=tell)
-    here = evaluation.evaluate(sample, lineup, scenario=scenario, seed=seed, aftermath=False)
-    told, sheet = _beside_ours(hosted.name, found, here, distrusted, harm_count)
+    found, distrusted = hosted.evaluate(sample, agents, scenario, seed, on_progress=tell)
+    here = evaluation.evaluate(sample, agents, scenario=scenario, seed=seed, aftermath=False)
+    told, sheet = _beside_ours(hosted.name, found, here, distrusted, lineup.harm_count)
     return found, told, ["", sheet]
 
 
@@ -270,9 +267,16 @@ def _beside_ours(
     return told, Sheet("", columns, rows, note)
 
 
+def _group_tables(groups: Mapping[str, evaluation.SummaryTable]) -> list[Any]:
+    tables: list[Any] = []
+    for name, of_group in groups.items():
+        tables += [f"\n{name}: {count_of(of_group[0].episodes, 'world')}\n", of_group.terminal()]
+    return tables
+
+
 def _evaluate_group(
-    out: Out, group: Sequence[Task], made: Callable[[Scenario], dict[str, Any]], episodes: int | None,
-    seed: int | None,
+    out: Out, output: Path | None, group: Sequence[Task], made: Callable[[Scenario], dict[str, Any]],
+    episodes: int | None, seed: int | None,
 ) -> None:  # fmt: skip
     """Each agent in each scenario: whether anybody collides, how hard the hardest pair does, and what is left to do."""
     told: list[dict[str, Any]] = []
@@ -323,77 +327,42 @@ def _evaluate_group(
         f" Share of the possible reduction of {counted} harm: 0 % for full braking,"
         " 100 % for the best known harm; none where that is not known of every world."
     )
+    _write_results(out, output, told)
     out.result(told, Sheet("", columns, rows, note))
 
 
-def _check_shards(
-    shards: int | None, jobs: int, ray: str | None, output: Path | None, rows: bool, measures: str | None,
-    whole: Mapping[str, object],
-) -> None:  # fmt: skip
-    """Refuse options that do not go together; those of ``whole`` need every world at once."""
-    if shards is None:
-        alone = {"--jobs": jobs != 1, "--ray": ray is not None, "--output": output is not None, "--rows": rows}
-        _refuse(alone, "is for an evaluation in parts; add --shards 100")
+def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, report: bool) -> None:
+    """Refuse, before any work, a folder that cannot be written to, or that holds other results."""
+    if output is None:
+        _refuse({"--per-world": per_world, "--report": report}, "needs a folder for it: --output FOLDER")
         return
-    if given := [name for name, value in whole.items() if value]:
-        more = "; for one row per world give --output FOLDER --rows" if "--per-world" in given else ""
-        raise InvalidInput(f"{given[0]}: needs every world at once, and --shards keeps none{more}")
-    if measures is not None and (jobs != 1 or ray is not None):
-        raise InvalidInput("--measures: processes of --jobs and --ray know none; leave these out")
-    if rows and output is None:
-        raise InvalidInput("--rows: needs a folder for them: --output FOLDER")
-    if rows:
+    if per_world == "parquet":
         need("pyarrow")
+    check_folder(output, _FILES, force=out.force)
 
 
-def _check_outputs(out: Out, per_world: Path | None, report: Path | None) -> None:
-    """Refuse outputs that cannot be written, or that would replace one another, before any work."""
-    out.check(report, *PAGES, what="a report")
-    if per_world is None:
+def _write_worlds(
+    out: Out, output: Path | None, found: evaluation.Evaluation, objectives: Sequence[str], per_world: str | None
+) -> Path | None:
+    """The file with one row per world and agent, where it is asked for."""
+    if output is None or per_world is None:
+        return None
+    file = output / f"{WORLDS}.{per_world}"
+    output.mkdir(parents=True, exist_ok=True)
+    evaluation.write_per_world(file, found, objectives=objectives, force=out.force)
+    out.note(f"every world: {file}")
+    return file
+
+
+def _write_results(out: Out, output: Path | None, results: object, *beside: str) -> None:
+    """``results.json``, with the files ``beside`` it; those of earlier results go."""
+    if output is None:
         return
-    out.check(per_world, ".csv", ".parquet", what="a file of every world")
-    if per_world.suffix.lower() == ".parquet":
-        need("pyarrow")
-    for file in (per_world, _beside(per_world)):
-        out.check(file)
-        if report is not None and file.resolve() == report.resolve():
-            raise InvalidInput(f"{file}: is the report, too (--report, --per-world); give another name")
-
-
-def _beside(per_world: Path) -> Path:
-    """The results file that stands beside a file with one row per world."""
-    return per_world.with_name(f"{per_world.name}.json")
-
-
-def _evaluate_in_shards(
-    out: Out, question: evaluation.Question, shards: int, jobs: int, ray: str | None, output: Path | None, rows: bool
-) -> None:
-    """Drive the list shard by shard, and print the table that is printed without shards."""
-    from ethbrake_marl.studies.jobs import evaluate_shards, open_workers
-
-    asked = question.ask()
-    if output is not None:
-        out.kept = "finished shards are kept: the same command goes on"
-    with ExitStack() as stack:
-        # on a Ray all cores where --jobs says nothing
-        workers = None if ray is None else stack.enter_context(closing(open_workers(ray, None if jobs == 1 else jobs)))
-        tally = evaluate_shards(
-            asked, shards=shards, jobs=jobs, workers=workers, folder=output, with_rows=rows, tell=out.show_progress
-        )
-    summary = asked.summarise(tally)
-    results = asked.to_json(tally, summary)
-    if output is not None:
-        write_file(output / "results.json", _json_text(results).encode())
-        out.note(f"finished shards: {output}; the results: {output / 'results.json'}")
-    out.result(
-        results,
-        *summary.tables(),
-        "Intervals: rates exact (Clopper-Pearson), means by Student's t; all from exact sums, the same bits in any"
-        " number of shards.",
-    )
-    _tell_horizon(out, _moving(summary), tally.worlds, question.scenario.horizon_s)
-    if question.objectives and not out.as_json:
-        out.show(tally.rescore(question.objectives, question.scenario.vehicles).sheet(question.harm_count))
+    output.mkdir(parents=True, exist_ok=True)
+    for name in {*_FILES} - {RESULTS, *beside}:
+        (output / name).unlink(missing_ok=True)
+    write_output(output / RESULTS, _json_text(results).encode(), force=out.force)
+    out.note(f"results: {output / RESULTS}")
 
 
 def _json_text(content: object) -> str:
@@ -417,15 +386,13 @@ def _moving(rows: Sequence[evaluation.SummaryRow]) -> dict[str, int]:
 
 def _write_report(
     out: Out,
-    path: Path | None,
+    path: Path,
     found: evaluation.Evaluation,
     rows: Sequence[evaluation.SummaryRow],
     agents: Mapping[str, Driver],
     harm_count: HarmCount,
 ) -> None:
-    """Write the page of an evaluation that has just been made; None: none is wanted."""
-    if path is None:
-        return
+    """Write the page of an evaluation that has just been made."""
     # matplotlib takes a second to load, and most evaluations draw nothing
     from ethbrake_marl.pages.report import Report
 
@@ -461,7 +428,7 @@ def _write_report(
 _FILE = typer.Argument(metavar="RESULTS.json", help="Results of evaluate, shield (--json) or run.")
 
 
-@app.add("compare", "compare before.csv.json after.csv.json", json=True)
+@app.add("compare", "compare before/results.json after/results.json", json=True)
 def compare_command(out: Out, first: Annotated[Path, _FILE], second: Annotated[Path, _FILE]) -> None:
     """Tell the difference of harm between two results.
 

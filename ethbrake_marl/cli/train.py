@@ -466,7 +466,7 @@ def ablate_command(
         folder=output,
     )  # fmt: skip
     if not cost:
-        plan.job_folder().check()
+        plan.study_folder().check()
     out.note(plan.cost())
     if cost:
         return

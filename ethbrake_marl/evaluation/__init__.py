@@ -5,6 +5,12 @@ from typing import TYPE_CHECKING
 from ethbrake_marl.doors import front_door
 
 if TYPE_CHECKING:
+    from ethbrake_marl.evaluation.chunks import (
+        Lineup as Lineup,
+        evaluate_held as evaluate_held,
+        summarise_tally as summarise_tally,
+        tally_list as tally_list,
+    )
     from ethbrake_marl.evaluation.curves import (
         DecelerationCurve as DecelerationCurve,
         deceleration_curve as deceleration_curve,
@@ -20,6 +26,7 @@ if TYPE_CHECKING:
         write_dataset as write_dataset,
     )
     from ethbrake_marl.evaluation.inputs import (
+        HELD as HELD,
         NamedWorld as NamedWorld,
         NamedWorlds as NamedWorlds,
         check_agents as check_agents,
@@ -45,6 +52,7 @@ if TYPE_CHECKING:
         LeftOut as LeftOut,
         Outcome as Outcome,
         PaperRow as PaperRow,
+        Rescores as Rescores,
         SummaryRow as SummaryRow,
         SummaryTable as SummaryTable,
         Tally as Tally,
@@ -59,7 +67,6 @@ if TYPE_CHECKING:
         summarise_by as summarise_by,
     )
     from ethbrake_marl.evaluation.results import (
-        Question as Question,
         compare_results as compare_results,
         read_result as read_result,
         results_to_json as results_to_json,

@@ -49,15 +49,35 @@ from ethbrake_marl.shield import ShieldedDriver, Uncertainty
 # Two results can be compared where worlds and scenario have the same hashes. Versions are told, and no reason to
 # refuse.
 
-Kind = Literal["evaluate", "evaluate-shards", "shield", "best-harm", "ablate", "learning-curves"]
+Kind = Literal["evaluate", "shield", "best-harm", "ablate", "learning-curves"]
 _PACKAGES = ("ethbrake-marl", "numba", "numpy")
 _WORDS = {"name", "title", "description", "source"}  # what a scenario is called changes nothing
 _BLOCK = 50_000  # worlds hashed at once: news of a world may be a view that takes no memory
 
 
+CHUNK = 2_500  # worlds advanced together: bounds memory, changes no result
+HELD = 100_000  # worlds of a list that is held in memory as a whole, unless each of its worlds is asked for
+HASHES = 1 << 256  # sums of hashes are kept modulo this
+
+
 def worlds_sha256(worlds: Worlds, index: Ints) -> str:
-    """SHA-256 of a list of worlds: of every array (little-endian, by name) and the worlds' numbers in the list."""
+    """SHA-256 of a list of worlds: of every array (little-endian, by name) and the worlds' numbers in the list.
+
+    Of more than ``HELD`` worlds it is ``hash_of_chunks``, which needs no more than one chunk of them at once.
+    """
+    if worlds.n > HELD:
+        return f"{hash_of_chunks(worlds, index):064x}"
+    return _hash_at_once(worlds, index)
+
+
+def _hash_at_once(worlds: Worlds, index: Ints) -> str:
     return _arrays_sha256({"index": index, **_arrays(worlds)})
+
+
+def hash_of_chunks(worlds: Worlds, index: Ints) -> int:
+    """Sum modulo 2^256 of the SHA-256 of the worlds of each chunk: those numbered 0 to 2,499, 2,500 to 4,999, ..."""
+    chunks = [np.flatnonzero(index // CHUNK == number) for number in np.unique(index // CHUNK)]
+    return sum(int(_hash_at_once(worlds.take(chunk), index[chunk]), 16) for chunk in chunks) % HASHES
 
 
 def _arrays_sha256(arrays: dict[str, np.ndarray]) -> str:

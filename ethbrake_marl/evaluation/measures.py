@@ -7,6 +7,7 @@ import sys
 import warnings
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
+from fractions import Fraction
 from functools import cached_property, partial
 from importlib import import_module
 from importlib.util import find_spec
@@ -18,7 +19,14 @@ from numpy.typing import NDArray
 from ethbrake_marl.agents import Knowledge, Source
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, PhysicsError, count_of, describe_error, unknown_name
-from ethbrake_marl.evaluation.inputs import result_identity, result_versions, scenario_sha256, worlds_sha256
+from ethbrake_marl.evaluation.inputs import (
+    HASHES,
+    hash_of_chunks,
+    result_identity,
+    result_versions,
+    scenario_sha256,
+    worlds_sha256,
+)
 from ethbrake_marl.evaluation.statistics import Moments, exact_sum, mean, rate
 from ethbrake_marl.files.sheet import DASH, Column, Estimate, Row, Sheet, Shown
 from ethbrake_marl.harm import INJURY_CURVES, Declared, Ledger, injury_probability, scored
@@ -272,6 +280,24 @@ class Evaluation:
             warnings.warn(found.warning, IncompleteTable, stacklevel=2)
         return found
 
+    @classmethod
+    def join(cls, parts: Sequence[Evaluation]) -> Evaluation:
+        """One from those of consecutive worlds of a list; raises ``PhysicsError`` if every world was left out."""
+        left_out = tuple(left for part in parts for left in part.left_out)
+        some = [part for part in parts if part.worlds.n]
+        if not some:
+            raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in left_out})
+        if len(parts) == 1:
+            return parts[0]
+        return replace(
+            some[0],
+            worlds=Worlds.concatenate([part.worlds for part in some]),
+            index=np.concatenate([part.index for part in some]),
+            outcomes={name: Outcome.join([part.outcomes[name] for part in some]) for name in some[0].outcomes},
+            left_out=left_out,
+            kinds={name: np.concatenate([part.kinds[name] for part in some]) for name in some[0].kinds},
+        )
+
     def take(self, rows: Ints | Bools) -> Evaluation:
         """That of some of the worlds; nobody is left out of them."""
         outcomes = {name: outcome.take(rows) for name, outcome in self.outcomes.items()}
@@ -351,24 +377,23 @@ class Evaluation:
         because = self.limits.because if isinstance(self.limits, Unproven) else None
         return Conditions.of_test(self.task, self.seed, self.worlds.n, because, Conditions.of(self.worlds))
 
-    def per_world(self, objectives: Sequence[Declared] = (), *, limits: bool = True) -> Columns:
+    def per_world(self, objectives: Sequence[Declared] = ()) -> Columns:
         """One row per agent and world; docs/per-world.md lists the columns. None where there is no value.
 
-        Without ``limits`` those of the best known harm are left out, every quantity is told, and no world that was left
-        out: the rows of a shard, which have the same columns as those of any other. Initial quantities are named as in
-        a table of initial states: ``gap_1_m``, ``speed_1_mps``, ``latency_2_s``, ``restitution``.
+        Initial quantities are named as in a table of initial states: ``gap_1_m``, ``speed_1_mps``, ``latency_2_s``,
+        ``restitution``.
         """
-        n, regrets = self.worlds.n, self.regrets if limits else None
+        n, regrets = self.worlds.n, self.regrets
         initial: Columns = {"world": self.index.tolist()}
         initial |= {name: column.tolist() for name, column in self.kinds.items()}
         for key, rule in QUANTITY.of(self.worlds).items():
             values = rule.of(self.worlds)
-            if not limits or key in _ALWAYS_TOLD or np.ptp(values, axis=0).any():
+            if key in _ALWAYS_TOLD or np.ptp(values, axis=0).any():
                 initial |= {rule.column_of(i): none_for_nan(values[:, i]) for i in range(values.shape[1])}
         found: Columns = {}
         for agent, outcome in self.outcomes.items():
             told = outcome.columns()
-            for name, of in KNOWN_OF_WORLDS.items() if limits else ():
+            for name, of in KNOWN_OF_WORLDS.items():
                 told[name] = None if regrets is None else of(regrets, outcome)
             told |= {name: column for name, column in outcome.borne(objectives).items() if name not in told}
             columns: Columns = {
@@ -378,7 +403,7 @@ class Evaluation:
                 "knows": [outcome.knows.text] * n,
                 "hidden": self.hidden.astype(int).tolist(),
             }
-            for left in self.left_out if limits else ():
+            for left in self.left_out:
                 told_of = {"agent": agent, "world": left.world, "ended": f"left out: {left.agent}: {left.reason}"}
                 columns = {name: [*values, told_of.get(name)] for name, values in columns.items()}
             found = {name: [*found.get(name, ()), *values] for name, values in columns.items()}
@@ -901,7 +926,7 @@ class AgentTally:
 
     counts: Mapping[str, tuple[int, int]] = field(default_factory=dict)  # worlds in which it is so, of how many
     moments: Mapping[str, Moments] = field(default_factory=dict)
-    products: Mapping[str, int] = field(default_factory=dict)  # with the baseline's
+    products: Mapping[str, Fraction] = field(default_factory=dict)  # with the baseline's
 
     def __add__(self, other: AgentTally) -> AgentTally:
         counts = dict(self.counts)
@@ -910,7 +935,7 @@ class AgentTally:
             counts[name] = before[0] + so, before[1] + of
         moments, products = dict(self.moments), dict(self.products)
         moments |= {name: moments.get(name, Moments()) + each for name, each in other.moments.items()}
-        products |= {name: products.get(name, 0) + each for name, each in other.products.items()}
+        products |= {name: products.get(name, Fraction()) + each for name, each in other.products.items()}
         return AgentTally(counts, moments, products)
 
     def count(self, name: str) -> int:
@@ -927,55 +952,13 @@ class AgentTally:
         moments = self.moments.get(name)
         return moments if moments is not None and moments.count == worlds else None
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain data; whole numbers of any size are hexadecimal texts."""
-        return {
-            "counts": {name: list(pair) for name, pair in self.counts.items()},
-            "moments": {name: [m.count, hex(m.total), hex(m.squares), m.negative] for name, m in self.moments.items()},
-            "products": {name: hex(value) for name, value in self.products.items()},
-        }
 
-    @classmethod
-    def from_json(cls, told: Mapping[str, Any]) -> AgentTally:
-        """What ``to_json`` gave; raises ``ValueError`` and the like for anything else."""
-        counts = {name: (so, of) for name, (so, of) in told["counts"].items()}
-        for so, of in counts.values():
-            if _whole(so) > _whole(of):
-                raise ValueError(f"{so} of {of} worlds")
-        moments = {
-            name: Moments(_whole(count), int(total, 16), int(squares, 16), _whole(negative))
-            for name, (count, total, squares, negative) in told["moments"].items()
-        }
-        if not all(each.possible for each in moments.values()):
-            raise ValueError("moments that no values have")
-        return cls(counts, moments, {name: int(value, 16) for name, value in told["products"].items()})
-
-    def knowing(self, worlds: int) -> AgentTally:
-        """The tally without what needs the best known harm, unless that is known in every one of so many worlds."""
-        if self.count(KNOWN) == worlds:
-            return self
-        names = {measure.name for measure in (*measures(), *COUNTED) if measure.limits}
-        counts = {name: pair for name, pair in self.counts.items() if name not in names}
-        return AgentTally(counts, {n: each for n, each in self.moments.items() if n not in names}, self.products)
-
-
-def _whole(value: Any) -> int:
-    """A whole number from 0 on, of a file; raises ``ValueError`` for anything else."""
-    if type(value) is not int or not 0 <= value < 1 << 64:
-        raise ValueError(f"{value!r} is no whole number from 0 on")
-    return value
-
-
-HASHES = 1 << 256  # sums of hashes are kept modulo this
 Range = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """The statistics of some worlds of a list, added in any order.
-
-    ``worlds_hash`` is the sum, modulo 2^256, of the SHA-256 of the leaves: 1,000 neighbouring worlds of the list each.
-    """
+    """The statistics of some worlds of a list, added in any order; ``worlds_hash`` as in ``worlds_sha256``."""
 
     worlds: int = 0  # that count, driven by all agents
     hidden: int = 0  # in which the channel hides something from a driven vehicle
@@ -983,6 +966,20 @@ class Tally:
     ranges: Mapping[str, tuple[Range, ...]] = field(default_factory=dict)  # least and largest of every quantity
     left_out: tuple[LeftOut, ...] = ()
     agents: Mapping[str, AgentTally] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, part: Evaluation, objectives: Sequence[str] | None = None, *, limits: bool = False) -> Tally:
+        """Those of a part of a list; ``objectives`` and ``limits`` as in ``Evaluation.tally``."""
+        worlds = part.worlds
+        if not worlds.n:
+            return cls(left_out=part.left_out)
+        ranges = {
+            name: tuple((float(np.nanmin(c)), float(np.nanmax(c))) for c in rule.of(worlds).T)
+            for name, rule in QUANTITY.of(worlds).items()
+        }
+        agents = part.tally(limits=limits, objectives=objectives)
+        hashed = hash_of_chunks(worlds, part.index)
+        return cls(worlds.n, int(part.hidden.sum()), hashed, ranges, part.left_out, agents)
 
     def __add__(self, other: Tally) -> Tally:
         ranges, agents = dict(self.ranges), dict(self.agents)
@@ -997,41 +994,6 @@ class Tally:
             tuple(sorted((*self.left_out, *other.left_out))),
             agents | {name: agents.get(name, AgentTally()) + each for name, each in other.agents.items()},
         )
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain data, as in the file of a finished shard."""
-        return {
-            "worlds": self.worlds,
-            "hidden": self.hidden,
-            "worlds_hash": hex(self.worlds_hash),
-            "ranges": {name: [list(each) for each in entries] for name, entries in self.ranges.items()},
-            "left_out": [list(left) for left in self.left_out],
-            "agents": {name: agent.to_json() for name, agent in self.agents.items()},
-        }
-
-    @classmethod
-    def from_json(cls, told: Any) -> Tally:
-        """What ``to_json`` gave; raises ``InvalidInput`` for anything else."""
-        try:
-            left_out = tuple(LeftOut(*left) for left in told["left_out"])
-            tally = cls(
-                _whole(told["worlds"]),
-                _whole(told["hidden"]),
-                int(told["worlds_hash"], 16) % HASHES,
-                {name: tuple((float(a), float(b)) for a, b in entries) for name, entries in told["ranges"].items()},
-                left_out,
-                {name: AgentTally.from_json(agent) for name, agent in told["agents"].items()},
-            )
-            for left in left_out:
-                _whole(left.world), _whole(left.seed)
-                if not (isinstance(left.agent, str) and isinstance(left.reason, str)):
-                    raise ValueError(f"{left.agent!r}, {left.reason!r}: must be texts")
-            for agent in tally.agents.values() if tally.worlds else ():
-                if any(agent.moments[name].count != tally.worlds for name in ("first_impact_harm", "total_harm")):
-                    raise ValueError("an agent that did not drive every world")
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise InvalidInput(f"is no tally of a shard: {error!r}") from None
-        return tally
 
     def rescore(self, objectives: Sequence[str], vehicles: int) -> Rescores:
         """Every agent under these objectives and both counts, as ``Evaluation.rescore``."""
@@ -1048,7 +1010,7 @@ class Tally:
 
 
 def _estimate_all(
-    tallies: Mapping[str, AgentTally], agent: str, worlds: int, *, exact: bool, baseline: str
+    tallies: Mapping[str, AgentTally], agent: str, worlds: int, *, baseline: str
 ) -> dict[str, Estimate | None]:
     """What one agent did in so many worlds, by measure; None for what not all of them have."""
     own = tallies[agent]
@@ -1059,7 +1021,7 @@ def _estimate_all(
     def estimate(measure: Measure) -> Estimate | None:
         name = measure.name if callable(measure.of) else measure.of
         if own.share(name, worlds) is not None:
-            return rate(own.count(name), worlds, exact=exact)
+            return rate(own.count(name), worlds)
         found = own.found(name, worlds)
         if found is None or not measure.against:
             return None if found is None else found.estimate
@@ -1123,7 +1085,7 @@ REGISTERED: dict[str, _Registered] = {}
 
 
 def register_measure(name: str, function: EpisodeFunction, *, unit: str) -> None:
-    """Make every evaluation from now on tell ``name`` with its interval: in tables, files, shards and pages.
+    """Make every evaluation from now on tell ``name`` with its interval: in tables, files and pages.
 
     Args:
         name: 1 to 64 of ``a-z``, digits and ``_``, beginning with a letter, not ending in ``_`` and a number,
@@ -1617,7 +1579,6 @@ class SummaryTable(list[SummaryRow]):
         knows: Mapping[str, Knowledge],
         policies: Mapping[str, Mapping[str, str]],
         *,
-        exact: bool = False,
         baseline: str = BASELINE,
         paper: bool = False,
         **shared: Any,
@@ -1630,7 +1591,6 @@ class SummaryTable(list[SummaryRow]):
             task: who is driven where.
             knows: by agent.
             policies: by agent: vehicle's name -> SHA-256 of its policy.
-            exact: tell rates with their exact intervals.
             baseline: what is compared with.
             paper: show the paper's rows below.
             shared: what all rows say alike.
@@ -1645,7 +1605,7 @@ class SummaryTable(list[SummaryRow]):
             SummaryRow(
                 agent=agent,
                 episodes=worlds,
-                estimates=_estimate_all(tallies, agent, worlds, exact=exact, baseline=baseline),
+                estimates=_estimate_all(tallies, agent, worlds, baseline=baseline),
                 collisions=tally.count("collision_rate"),
                 horizon_ends=tally.count(HORIZON),
                 policy_share=tally.share(CHOSEN, worlds),

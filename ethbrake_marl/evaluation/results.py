@@ -1,62 +1,26 @@
-"""Results as files: what ``evaluate``, ``shield`` and ``run`` write, how they are read again; and shards."""
+"""Results as files: what ``evaluate``, ``shield`` and ``run`` write, and how they are read again."""
 
 from __future__ import annotations
 
 import csv
 import hashlib
 import io
-import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field, replace
-from functools import reduce
-from itertools import pairwise
-from operator import add
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ethbrake_marl.agents import Driver, Knowledge, Team
-from ethbrake_marl.defaults import HarmCount
-from ethbrake_marl.errors import (
-    EthBrakeError,
-    InvalidInput,
-    PhysicsError,
-    check_whole_number,
-    count_of,
-    naming_extras,
-    unknown_name,
-)
-from ethbrake_marl.evaluation.inputs import (
-    Kind,
-    make_lineup,
-    policies_of,
-    result_versions,
-    scenario_sha256,
-    worlds_sha256,
-)
-from ethbrake_marl.evaluation.measures import (
-    MARK,
-    REGISTERED,
-    Conditions,
-    Evaluation,
-    Exploits,
-    Rescored,
-    SummaryRow,
-    SummaryTable,
-    Tally,
-)
-from ethbrake_marl.evaluation.rollout import evaluate_list
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, count_of, naming_extras, unknown_name
+from ethbrake_marl.evaluation.inputs import Kind
+from ethbrake_marl.evaluation.measures import MARK, Evaluation, Exploits, Rescored, SummaryRow
 from ethbrake_marl.evaluation.statistics import paired_difference, unpaired_difference
 from ethbrake_marl.files.sheet import Estimate, parquet_file
 from ethbrake_marl.files.store import check_target, parse_strict_json, read_plain, write_output
 from ethbrake_marl.harm import Declared
-from ethbrake_marl.limits import Unproven, known_limits
 from ethbrake_marl.physics import Floats
-from ethbrake_marl.scenario import QUANTITY, Scenario, Task
-from ethbrake_marl.shield import parse_uncertainty
 
 # One row per agent and world: its columns, and its file, written whole and never over another by accident.
 
@@ -123,7 +87,6 @@ USUAL: Mapping[str, str | None] = {"harm_count": "first", "uncertainty": None}  
 _COMPARED: dict[Kind, tuple[str, ...]] = {  # harms of each
     "evaluate": HARMS,
     "shield": ("harm",),
-    "evaluate-shards": HARMS,
 }
 _LIMIT_BYTES, _MOST_BYTES = 64 << 20, 4 << 30  # of a results file, and of one with every world
 _MOST_EPISODES = 10**12
@@ -410,226 +373,3 @@ def _worlds_of_both(first: Result, second: Result, common: Sequence[str]) -> tup
                         f"{result.path}: {agent}: {name} = {told:g}, but the mean of its worlds is {mean:g}"
                     )
     return found, None  # type: ignore[return-value]  # two of them each
-
-
-# One row per world and agent of a shard, as a Parquet file: world by world, whatever the shards and blocks are.
-
-_WHOLE = {"world", "collided", "impacts", "chosen_policy", "hidden"}
-
-
-@contextmanager
-def rows_file(path: Path, objectives: Sequence[str]) -> Iterator[Callable[[Evaluation], None]]:
-    """Give what adds the rows of evaluations to the file, which appears at ``path`` when the block ends well.
-
-    Worlds that were left out have no row. Raises ``MissingExtra`` without pyarrow.
-    """
-    with naming_extras():
-        import pyarrow
-
-    def array(name: str, values: Sequence[Any]) -> Any:
-        whole = pyarrow.int64() if name in _WHOLE else pyarrow.float64()
-        return pyarrow.array(values, pyarrow.string() if isinstance(values[0], str) else whole)
-
-    with parquet_file(path, compression="zstd") as write:
-
-        def add(evaluation: Evaluation) -> None:
-            found = evaluation.per_world(objectives, limits=False)
-            n, agents = evaluation.worlds.n, len(evaluation.outcomes)
-            order = np.arange(n * agents).reshape(agents, n).T.ravel().tolist()  # world by world
-            write({name: array(name, [values[k] for k in order]) for name, values in found.items()})
-
-        yield add
-
-
-LEAF = 1_000  # worlds that are hashed together; shards and blocks begin at a multiple of it
-BLOCK = 4 * LEAF  # worlds advanced together: bounds memory, changes no result
-MOST_EPISODES = 10**12
-_TRIED = 100  # worlds at each end of a list that say whether best known harms may be had for all of it
-
-
-@dataclass(frozen=True, slots=True)
-class Question:
-    """What is asked of the worlds 0 to ``episodes - 1`` of a list; it travels to other processes.
-
-    Args:
-        scenario: of the worlds, with the learners that are driven.
-        agents: by name, as they are written.
-        episodes: worlds of the list.
-        seed: of the list.
-        harm_count: harm that agents minimise.
-        uncertainty: what agents behind ``+robust`` do not know, as on the command line.
-        objectives: under which results are told, too.
-
-    """
-
-    scenario: Scenario
-    agents: tuple[str, ...]
-    episodes: int
-    seed: int
-    harm_count: HarmCount = "first"
-    uncertainty: str | None = None
-    objectives: tuple[str, ...] = ()
-    # what ``ask`` looks up
-    identity: Mapping[str, Any] = field(default_factory=dict)  # plain data: all that the answer depends on
-    knows: Mapping[str, Knowledge] = field(default_factory=dict)  # by agent
-    policies: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # by agent: vehicle -> its policy's SHA-256
-    limits: bool = False  # the best known harm of its worlds is looked up
-    because: str | None = None  # why nothing is proven for its worlds; None where something is
-
-    def __post_init__(self) -> None:
-        check_whole_number("episodes", self.episodes, 1, MOST_EPISODES)
-        check_whole_number("seed", self.seed, 0)
-
-    @property
-    def task(self) -> Task:
-        """Who is driven."""
-        return Task(self.scenario, self.scenario.learners, self.harm_count)
-
-    def lineup(self) -> Mapping[str, Driver]:
-        """The agents, made anew; raises what ``make_lineup`` raises."""
-        intervals = None if self.uncertainty is None else parse_uncertainty(self.uncertainty)
-        return make_lineup(self.agents, self.scenario, harm_count=self.harm_count, uncertainty=intervals)
-
-    def bounds(self, shards: int) -> list[tuple[int, int]]:
-        """First world and end of every shard: as equal as whole leaves allow, and no more than leaves."""
-        check_whole_number("shards", shards, 1)
-        leaves = -(-self.episodes // LEAF)
-        shards = min(shards, leaves)
-        ends = [min(leaves * k // shards * LEAF, self.episodes) for k in range(shards + 1)]
-        return list(pairwise(ends))
-
-    def ask(self) -> Question:
-        """The same with what it is about, looked up once and told to every process.
-
-        That are hashes of scenario, policies and user files, versions, and what is proven. Raises what ``lineup``
-        raises.
-        """
-        lineup, scenario = self.lineup(), self.scenario
-        teams = {name: Team.of(agent, scenario.learners) for name, agent in lineup.items()}
-        knows = {name: Knowledge.of(team) for name, team in teams.items()}
-        policies = {name: policies_of(team.drivers) for name, team in teams.items()}
-        ends = sorted({0, max(self.episodes - _TRIED, 0)})
-        found = [
-            known_limits(scenario.sample(min(_TRIED, self.episodes), self.seed, first=k).worlds, self.task)
-            for k in ends
-        ]
-        because = next((each.because for each in found if isinstance(each, Unproven)), None)
-        identity = {
-            "format": 3,
-            "scenario": scenario.name,
-            "scenario_sha256": scenario_sha256(scenario),
-            "seed": self.seed,
-            "episodes": self.episodes,
-            "agents": list(lineup),
-            "policy_sha256": policies,
-            "knows": {name: each.text for name, each in knows.items()},
-            "harm_count": self.harm_count,
-            "uncertainty": self.uncertainty,
-            "objectives": list(self.objectives),
-            "metrics": sorted(REGISTERED),
-            "versions": result_versions(),
-        }
-        limits = all(not isinstance(each, Unproven) and bool(each.known.all()) for each in found)
-        told = {"identity": identity, "knows": knows, "policies": policies, "limits": limits, "because": because}
-        return replace(self, **told)  # type: ignore[arg-type]
-
-    @property
-    def sha256(self) -> str:
-        """Of the identity: answers belong together where it is the same."""
-        return hashlib.sha256(json.dumps(self.identity, sort_keys=True).encode()).hexdigest()
-
-    def answer(self, first: int, end: int, rows: Path | None = None, block: int = BLOCK) -> Tally:
-        """The statistics of worlds ``first`` to ``end - 1``; depends on nothing else, and ``block`` changes no bit.
-
-        Args:
-            first: a multiple of ``LEAF``.
-            end: another one, or the end of the list.
-            rows: also write one row per world and agent to this Parquet file.
-            block: worlds advanced together, a multiple of ``LEAF``.
-
-        Raises ``InvalidInput`` for a policy that is not the one that was asked about, and what driving raises.
-
-        """
-        if first % LEAF or block % LEAF or not (end % LEAF == 0 or end == self.episodes) or not first < end:
-            raise InvalidInput(
-                f"shard from {first} to {end} in blocks of {block}: must be whole leaves of {LEAF:,} worlds"
-            )
-        lineup, starts = self._lineup(), range(first, end, block)
-        with nullcontext(None) if rows is None else rows_file(rows, self.objectives) as write:
-            return reduce(add, (_answer_block(self, lineup, k, min(k + block, end), write) for k in starts), Tally())
-
-    def _lineup(self) -> Mapping[str, Driver]:
-        """The agents in this process, once."""
-        if self.sha256 not in _LINEUPS:
-            if not self.identity:
-                raise InvalidInput("question: it was not asked yet; answer what ask() gives")
-            here = self.ask()
-            if here.sha256 != self.sha256:
-                changed = sorted(key for key in self.identity if here.identity.get(key) != self.identity[key])
-                raise InvalidInput(f"shards: {', '.join(changed)} changed since the evaluation began; begin it again")
-            _LINEUPS[self.sha256] = self.lineup()
-        return _LINEUPS[self.sha256]
-
-    def summarise(self, tally: Tally) -> SummaryTable:
-        """One row per agent, as ``summarise``; rates with exact intervals. ``PhysicsError`` if no world is left."""
-        if not tally.worlds:
-            raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in tally.left_out})
-        task, told = self.task, Conditions.of_ranges(tally.ranges)
-        return SummaryTable.of_tallies(
-            {name: tally.agents[name].knowing(tally.worlds) for name in self.identity["agents"]},
-            Conditions.of_test(task, self.seed, tally.worlds, self.because, told),
-            task,
-            self.knows,
-            self.policies,
-            exact=True,
-            left_out=tally.left_out,
-            hidden_share=tally.hidden / tally.worlds,
-            worlds_sha256=f"{tally.worlds_hash:064x}",
-            scenario_sha256=self.identity["scenario_sha256"],
-            versions=self.identity["versions"],
-        )
-
-    def to_json(self, tally: Tally, rows: Sequence[SummaryRow]) -> list[dict[str, Any]]:
-        """What a results file holds: one object per agent, each vehicle's harm and the kind of intervals in it."""
-        vehicles = self.scenario.vehicles
-        settings = {"harm_count": self.harm_count, "uncertainty": self.uncertainty}
-        found = results_to_json(rows, told=tally.rescore(self.objectives, vehicles), settings=settings)
-        names = [f"{name}_{i + 1}" for name in HARMS for i in range(vehicles)]
-        told = {"kind": "evaluate-shards", "intervals": INTERVALS}
-        return [
-            {
-                **row,
-                **told,
-                "vehicle_harm": Estimate.side_by_side(
-                    {name: tally.agents[row["agent"]].moments[name].estimate for name in names}
-                ),
-            }
-            for row in found
-        ]
-
-
-_LINEUPS: dict[str, Mapping[str, Driver]] = {}  # of this process; an evaluation drives copies
-
-
-def _answer_block(
-    question: Question, lineup: Mapping[str, Driver], first: int, end: int, write: Callable[[Evaluation], None] | None
-) -> Tally:
-    """The statistics of worlds that are advanced together."""
-    sample = question.scenario.sample(end - first, question.seed, first=first)
-    evaluation, left_out = evaluate_list(sample, lineup, question.scenario, question.seed)
-    if evaluation is None:
-        return Tally(left_out=left_out)
-    if write is not None:
-        write(evaluation)
-    worlds, index = evaluation.worlds, evaluation.index
-    ranges = {
-        name: tuple((float(np.nanmin(c)), float(np.nanmax(c))) for c in rule.of(worlds).T)
-        for name, rule in QUANTITY.of(worlds).items()
-    }
-    leaves = [np.flatnonzero(index // LEAF == number) for number in np.unique(index // LEAF)]
-    hashes = sum(int(worlds_sha256(worlds.take(leaf), index[leaf]), 16) for leaf in leaves)
-    agents = evaluation.tally(limits=question.limits, objectives=question.objectives)
-    return Tally(worlds.n, int(evaluation.hidden.sum()), hashes, ranges, left_out, agents)
-
-
-INTERVALS = {"rates": "Clopper-Pearson", "means": "Student's t, of exact sums"}

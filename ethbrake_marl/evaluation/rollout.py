@@ -5,7 +5,7 @@ Counting "the first episodes that finish" instead would over-count short ones, a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,12 +20,12 @@ from ethbrake_marl.engine import check_alert, is_state_free
 from ethbrake_marl.errors import (
     AgentFailed,
     InvalidInput,
-    PhysicsError,
     check_one_learner,
     check_whole_number,
+    renumbered,
     unknown_name,
 )
-from ethbrake_marl.evaluation.inputs import make_lineup, policies_of, warn_unfamiliar
+from ethbrake_marl.evaluation.inputs import CHUNK, make_lineup, policies_of, warn_unfamiliar
 from ethbrake_marl.evaluation.measures import REGISTERED, Evaluation, LeftOut, Outcome, Tape
 from ethbrake_marl.physics import (
     Decisions,
@@ -139,9 +139,6 @@ class SampledHarm:
         return self._harm
 
 
-CHUNK = 10_000  # worlds advanced together: bounds memory, changes no result
-_TOLD_CHUNK = 2_500  # the same where somebody waits for a sign of life
-
 OnWorlds = Callable[[str, int], None]  # agent, worlds done so far
 
 
@@ -171,8 +168,8 @@ def evaluate(
         vehicle: the one that is driven, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
         episodes: worlds of the list, 10,000 where neither they nor their number is given.
         seed: of the list, 7 where none is given; noted, not used, where worlds are given.
-        chunk: worlds advanced together; None: 10,000, or 2,500 with ``on_progress``.
-        on_progress: is called with an agent's name and its worlds done so far.
+        chunk: worlds advanced together; None: 2,500.
+        on_progress: is called with an agent's name and its worlds done so far, chunk by chunk.
         aftermath: look how far Vehicle 1 is shoved, what the paper's sum over samples is, and what registered harm
             metrics are; costs time.
 
@@ -194,54 +191,55 @@ def evaluate(
     if not sample.worlds.n:
         raise InvalidInput("evaluate: worlds: there are none; at least one is needed")
     check_alert(sample.worlds, sample.worlds.n, scenario.vehicles)
-    warn_unfamiliar(agents, sample.worlds, scenario, driven_vehicles(scenario, vehicle, agents))
-    whole, left_out = evaluate_list(sample, agents, scenario, seed, vehicle, chunk, on_progress, aftermath)
-    if whole is None:
-        raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in left_out})
-    return whole
+    driven, parts = driven_vehicles(scenario, vehicle, agents), []
+    warn_unfamiliar(agents, sample.worlds, scenario, driven)
+    for first, part in chunks_of(sample, chunk or CHUNK):
+        parts.append(drive_chunk(part, agents, scenario, seed, driven, first, aftermath))
+        if on_progress is not None:
+            for name in agents:
+                on_progress(name, first + part.worlds.n)
+    return Evaluation.join(parts)
 
 
-def evaluate_list(
+def chunks_of(sample: Sample, size: int = CHUNK) -> Iterator[tuple[int, Sample]]:
+    """The worlds in parts of this size, each with the row of its first."""
+    for first in range(0, sample.worlds.n, size):
+        yield first, sample.take(np.arange(first, min(first + size, sample.worlds.n)))
+
+
+def drive_chunk(
     sample: Sample,
     agents: Mapping[str, Driver],
     scenario: Scenario,
     seed: int | None,
-    vehicle: int | str | None = None,
-    chunk: int | None = None,
-    on_progress: OnWorlds | None = None,
+    driven: tuple[int, ...],
+    first: int = 0,
     aftermath: bool = True,
-) -> tuple[Evaluation | None, tuple[LeftOut, ...]]:
-    """``evaluate`` worlds at the alert, and which of them were left out; None where that is all of them."""
-    n, driven = sample.worlds.n, driven_vehicles(scenario, vehicle, agents)
-    chunk = chunk or (CHUNK if on_progress is None else _TOLD_CHUNK)
-    others = [script.name for script in script_agents(scenario, except_for=driven).values()]
-    parts: dict[str, list[tuple[Outcome, Ints]]] = {name: [] for name in agents}
+) -> Evaluation:
+    """Let each agent drive all of these worlds at the alert together; ``first``: row of the first one, for messages.
+
+    The evaluation has no worlds where each was left out.
+    """
+    n, others = sample.worlds.n, [script.name for script in script_agents(scenario, except_for=driven).values()]
+    found: dict[str, tuple[Outcome | None, Ints]] = {}
     lost: dict[int, LeftOut] = {}
     for name, agent in agents.items():
         roll_out = partial(_roll_out, sample.worlds, agent, driven, scenario, aftermath)
-        for first in range(0, n, chunk):
-            end = min(first + chunk, n)
-            with AgentFailed.naming(name, others):
-                outcome, rows, failed = leaving_out_failed(roll_out, np.arange(first, end))
-            lost = {row: LeftOut(int(sample.index[row]), seed, name, why) for row, why in failed.items()} | lost
-            if outcome is not None:
-                parts[name].append((outcome, rows))
-            if on_progress is not None:
-                on_progress(name, end)
+        with AgentFailed.naming(name, others), renumbered(range(first, first + n)):
+            outcome, rows, failed = leaving_out_failed(roll_out, np.arange(n))
+        found[name] = outcome, rows
+        lost = {row: LeftOut(int(sample.index[row]), seed, name, why) for row, why in failed.items()} | lost
     left_out = tuple(lost[row] for row in sorted(lost))
-    if len(lost) == n:
-        return None, left_out
-    outcomes = {name: Outcome.join([outcome for outcome, _ in found]) for name, found in parts.items()}
-    whole = Evaluation(scenario, driven, sample.worlds, sample.index, seed, outcomes, kinds=sample.kinds)
+    outcomes = {name: outcome for name, (outcome, _) in found.items() if outcome is not None}
     if lost:
         good = np.setdiff1d(np.arange(n), list(lost))
-        for name, found in parts.items():
-            outcomes[name] = outcomes[name].take(np.isin(np.concatenate([rows for _, rows in found]), good))
-        kinds = {name: column[good] for name, column in sample.kinds.items()}
-        whole = replace(
-            whole, worlds=sample.worlds.take(good), index=sample.index[good], kinds=kinds, left_out=left_out
+        sample, outcomes = (
+            sample.take(good),
+            {name: outcome.take(np.isin(found[name][1], good)) for name, outcome in outcomes.items()},
         )
-    return whole, left_out
+    return Evaluation(
+        scenario, driven, sample.worlds, sample.index, seed, outcomes, left_out=left_out, kinds=sample.kinds
+    )
 
 
 def _check_request(worlds: object, agents: object, chunk: object) -> None:

@@ -1,9 +1,9 @@
 """Estimates with 95 % intervals, from one number per world.
 
 The worlds of a list are independent draws, and every agent is measured on the same ones: rates get Wilson's score
-interval (of a sharded list the exact one), means the t interval of the mean, and comparisons with a baseline are paired
-by world, so that the spread between easy and hard worlds cancels. Means and their errors come from exact sums
-of whole numbers: the order of the worlds changes no bit of them.
+interval, means the t interval of the mean, and comparisons with a baseline are paired
+by world, so that the spread between easy and hard worlds cancels. Means and their errors come from exact sums: the
+order of the worlds changes no bit of them.
 """
 
 from __future__ import annotations
@@ -11,97 +11,39 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 
 import numpy as np
-from numpy.typing import ArrayLike
-from scipy.special import betaincinv, ndtri, stdtrit
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtri, stdtrit
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.physics import Floats, Ints, compiled
-
-# Exact sums of float64: whole numbers, so that no order of the worlds, and no division into parts, changes a bit.
-#
-# A float64 is a whole multiple of 2^-1074, a product of two of them one of 2^-2148. A sum of such multiples is kept as
-# a whole number: compiled as limbs of 32 bits (Kulisch's long accumulator), between calls as a Python integer. Means
-# and standard errors are then quotients and roots of whole numbers, each rounded once.
-
-VALUE_BITS = 1074  # a value is a multiple of 2^-1074
-PRODUCT_BITS = 2 * VALUE_BITS
-_LIMBS = 138  # of 32 bits: products reach from 2^-2148 to 2^2048; the rest is for carries and the sign
-_MOST = 1 << 28  # products of one call: each adds less than 2^35 to a limb of 63 bits
-_LOW, _FRACTION, _HALF = 0xFFFFFFFF, (1 << 52) - 1, (1 << 26) - 1
+from ethbrake_marl.physics import Floats, Ints
 
 
-@compiled
-def add_whole(limbs: Ints, number: int, place: int, sign: int) -> None:
-    """Add ``sign * number * 2^place`` to the limbs; 0 <= number < 2^62."""
-    limb, bit = place >> 5, place & 31
-    low, high = (number & _LOW) << bit, (number >> 32) << bit
-    limbs[limb] += sign * (low & _LOW)
-    limbs[limb + 1] += sign * ((low >> 32) + (high & _LOW))
-    limbs[limb + 2] += sign * (high >> 32)
+def exact_sum(values: Floats, others: Floats | None = None) -> Fraction:
+    """Sum of ``values`` [n], or of their products with ``others`` [n], without any rounding.
 
-
-@compiled
-def mantissa_and_place(bits: int) -> tuple[int, int]:
-    """``m`` and ``p`` of a float64, given as its bits: ``|value| = m 2^(p - 1074)``, m < 2^53."""
-    exponent, fraction = (bits >> 52) & 0x7FF, bits & _FRACTION
-    if exponent == 0:
-        return fraction, 0
-    return fraction | (1 << 52), exponent - 1
-
-
-@compiled
-def carry(limbs: Ints) -> None:
-    """Bring every limb but the last to 0 .. 2^32 - 1; the last one keeps the sign."""
-    for j in range(limbs.shape[0] - 1):
-        over = limbs[j] >> 32
-        limbs[j] -= over << 32
-        limbs[j + 1] += over
-
-
-@compiled
-def sum_values(bits: Ints, limbs: Ints) -> None:
-    """Add all values, given as their bits [n], in units of 2^-1074."""
-    for k in range(bits.shape[0]):
-        m, place = mantissa_and_place(bits[k])
-        add_whole(limbs, m, place, -1 if bits[k] < 0 else 1)
-    carry(limbs)
-
-
-@compiled
-def sum_products(one: Ints, other: Ints, limbs: Ints) -> None:
-    """Add all products of two values, given as their bits [n], in units of 2^-2148: halves of 27 and 26 bits."""
-    for k in range(one.shape[0]):
-        m, place = mantissa_and_place(one[k])
-        m2, place2 = mantissa_and_place(other[k])
-        high, low, high2, low2 = m >> 26, m & _HALF, m2 >> 26, m2 & _HALF
-        sign, at = (-1 if (one[k] < 0) != (other[k] < 0) else 1), place + place2
-        add_whole(limbs, high * high2, at + 52, sign)
-        add_whole(limbs, high * low2 + low * high2, at + 26, sign)
-        add_whole(limbs, low * low2, at, sign)
-    carry(limbs)
-
-
-def exact_sum(values: Floats, others: Floats | None = None) -> int:
-    """Sum of ``values`` [n] as a multiple of 2^-1074, or of their products with ``others`` [n], of 2^-2148.
-
-    Raises ``InvalidInput`` for what is not finite.
+    A float64 is a whole number of 53 bits times a power of two. The whole numbers of each power are added as Python's
+    own, which have no largest one. So no order of the worlds, and no division into parts, changes a bit. ``math.fsum``
+    rounds the sum of each part, and a sum of parts once more. Raises ``InvalidInput`` for what is not finite.
     """
-    sides = []
-    for side in (values, *([] if others is None else [others])):
-        data = np.ascontiguousarray(side, np.float64)
-        if data.ndim != 1 or len(data) > _MOST or not np.isfinite(data).all():
-            raise InvalidInput(f"exact sum: shape {data.shape}; finite numbers, as [n], at most {_MOST:,}, are needed")
-        sides.append(data.view(np.int64))
-    limbs = np.zeros(_LIMBS, np.int64)
-    if others is None:
-        sum_values(sides[0], limbs)
-    else:
-        sum_products(sides[0], sides[1], limbs)
-    low = int.from_bytes(limbs[:-1].astype("<u4").tobytes(), "little")
-    return low + (int(limbs[-1]) << (32 * (len(limbs) - 1)))
+    wholes, powers = _in_wholes(values)
+    if others is not None:
+        factors, more = _in_wholes(others)
+        wholes, powers = wholes * factors, powers + more
+    sums = {power: int(wholes[powers == power].sum()) for power in np.unique(powers).tolist()}
+    return sum((number * Fraction(2) ** power for power, number in sums.items()), Fraction())
+
+
+def _in_wholes(values: Floats) -> tuple[NDArray[np.object_], Ints]:
+    """Whole numbers and powers, [n] each: ``values = whole * 2 ** power``."""
+    data = np.asarray(values, np.float64)
+    if data.ndim != 1 or not np.isfinite(data).all():
+        raise InvalidInput(f"exact sum: shape {data.shape}; finite numbers, as [n], are needed")
+    fractions, powers = np.frexp(data)
+    return np.ldexp(fractions, 53).astype(np.int64).astype(np.object_), powers.astype(np.int64) - 53
 
 
 CONFIDENCE = 0.95
@@ -120,8 +62,8 @@ class Moments:
     """
 
     count: int = 0
-    total: int = 0  # multiple of 2^-1074
-    squares: int = 0  # multiple of 2^-2148
+    total: Fraction = Fraction()
+    squares: Fraction = Fraction()
     negative: int = field(default=0, compare=False)  # number of values that are, or may be, below 0
 
     @classmethod
@@ -133,26 +75,20 @@ class Moments:
         negative = self.negative + other.negative
         return Moments(self.count + other.count, self.total + other.total, self.squares + other.squares, negative)
 
-    def minus(self, other: Moments, products: int) -> Moments:
+    def minus(self, other: Moments, products: Fraction) -> Moments:
         """The moments of the differences pair by pair; ``products``: the exact sum of the products."""
         return Moments(self.count, self.total - other.total, self.squares - 2 * products + other.squares, self.count)
 
     @property
-    def possible(self) -> bool:
-        """Whether some values can have them, none of them beyond 2^1000."""
-        n, far = self.count, abs(self.total) > self.count << (VALUE_BITS + 1000)
-        return not far and n * self.squares >= self.total**2 and not n == 0 < self.squares and self.negative <= n
-
-    @property
     def mean(self) -> float:
         """The mean, rounded once; raises ``ZeroDivisionError`` without a value."""
-        return self.total / (self.count << VALUE_BITS)
+        return float(self.total / self.count)
 
     @property
     def standard_error(self) -> float:
         """``s / sqrt(n)`` with n - 1 degrees of freedom; raises ``ZeroDivisionError`` for fewer than two values."""
         n = self.count
-        return root(n * self.squares - self.total**2, (n * n * (n - 1)) << PRODUCT_BITS)
+        return root((n * self.squares - self.total**2) / (n * n * (n - 1)))
 
     @property
     def estimate(self) -> Estimate:
@@ -160,7 +96,7 @@ class Moments:
         found = self._around(self.mean, self.standard_error if self.count > 1 else 0.0)
         return found if self.negative else _of_amounts(found, nothing=not self.squares)
 
-    def ratio_error(self, others: Moments, products: int) -> float:
+    def ratio_error(self, others: Moments, products: Fraction) -> float:
         """Standard error of the ratio ``r`` of two paired means, by the delta method.
 
         The residuals ``values - r others`` have mean 0: ``s(residuals) / (sqrt(n) |mean(others)|)``. With sums S and
@@ -168,14 +104,14 @@ class Moments:
         """
         n, x, y = self.count, self.total, others.total
         residuals = self.squares * y * y - 2 * x * y * products + x * x * others.squares
-        return root(n * residuals, (n - 1) * y**4)
+        return root(n * residuals / ((n - 1) * y**4))
 
-    def decrease(self, baseline: Moments, products: int) -> Estimate | None:
+    def decrease(self, baseline: Moments, products: Fraction) -> Estimate | None:
         """``relative_decrease`` from exact moments and the exact sum of the products."""
         if baseline.total == 0:
             return None
         error = self.ratio_error(baseline, products) if self.count > 1 else 0.0
-        return self._around(1.0 - self.total / baseline.total, error)
+        return self._around(1.0 - float(self.total / baseline.total), error)
 
     def _around(self, value: float, error: float) -> Estimate:
         """``value`` with the half-width ``t error`` of n - 1 degrees of freedom."""
@@ -196,29 +132,21 @@ def _of_amounts(found: Estimate, *, nothing: bool) -> Estimate:
     return Estimate(found.value, (max(found.interval[0], 0.0), found.interval[1]))
 
 
-def root(above: int, below: int) -> float:
-    """``sqrt(above / below)`` of whole numbers of any size, ``above >= 0``; no step of it overflows."""
-    shift = (above.bit_length() - below.bit_length()) // 2
-    quotient = (above << max(-2 * shift, 0)) / (below << max(2 * shift, 0))
-    return math.ldexp(math.sqrt(quotient), shift)
+def root(number: Fraction) -> float:
+    """Square root of a fraction of any size, at least 0; no step of it overflows."""
+    shift = (number.numerator.bit_length() - number.denominator.bit_length()) // 2
+    return math.ldexp(math.sqrt(number / Fraction(4) ** shift), shift)
 
 
-def rate(successes: int, count: int, *, exact: bool = False) -> Estimate:
+def rate(successes: int, count: int) -> Estimate:
     """Share ``p = successes / count`` with Wilson's score interval, which stays inside [0, 1].
 
     With z the normal quantile: centre ``(p + z^2/2n) / (1 + z^2/n)``, half-width
-    ``z / (1 + z^2/n) sqrt(p (1 - p) / n + z^2/4n^2)``. ``exact``: with the Clopper-Pearson interval, which covers at
-    least 95 %. Its ends are the shares at which so many successes or more, or so few or fewer, have probability 2.5 %:
-    quantiles of the beta distribution. Raises ``InvalidInput`` unless 0 <= successes <= count >= 1.
+    ``z / (1 + z^2/n) sqrt(p (1 - p) / n + z^2/4n^2)``. Raises ``InvalidInput`` unless 0 <= successes <= count >= 1.
     """
     if not (count >= 1 and 0 <= successes <= count):
         raise InvalidInput(f"rate: {successes} of {count}: must be 0 <= successes <= count, and count at least 1")
-    k, n, tail = successes, count, 0.5 - 0.5 * CONFIDENCE
-    if not exact:
-        return Estimate(k / n, wilson(k / n, n))
-    low = 0.0 if k == 0 else float(betaincinv(k, n - k + 1, tail))
-    high = 1.0 if k == n else float(betaincinv(k + 1, n - k, 1.0 - tail))
-    return Estimate(k / n, (low, high))
+    return Estimate(successes / count, wilson(successes / count, count))
 
 
 def wilson(p: float, count: int) -> tuple[float, float]:
@@ -287,7 +215,7 @@ def _check(values: ArrayLike, who: str = "statistics", each: str = "world") -> F
     return data
 
 
-def _check_pair(values: Floats, baseline: Floats) -> tuple[Moments, Moments, int]:
+def _check_pair(values: Floats, baseline: Floats) -> tuple[Moments, Moments, Fraction]:
     """The moments of both, and the exact sum of their products."""
     data, reference = _check(values), _check(baseline)
     if data.shape != reference.shape:

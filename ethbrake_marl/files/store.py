@@ -9,7 +9,7 @@ import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
@@ -79,6 +79,26 @@ def check_target(path: str | Path, *, force: bool = False) -> Path:
         reason = getattr(error, "strerror", None) or error
         raise InvalidInput(f"{target!s:.200}: cannot be written ({reason})") from None
     return target
+
+
+def check_folder(path: Path, files: Collection[str] = (), *, force: bool = False) -> None:
+    """Refuse a folder for results that is none or cannot be written to, or that holds one of these ``files``.
+
+    Raises ``InvalidInput``, and ``AlreadyExists`` unless ``force``. Makes nothing.
+    """
+    try:
+        places = (path, *path.absolute().parents)
+        there = next(each for each in places if os.access(each, os.F_OK) or each.is_symlink())
+        if there.is_dir():
+            check_writable(there)
+    except (OSError, ValueError) as error:
+        raise InvalidInput(
+            f"{path!s:.200}: cannot be written to ({getattr(error, 'strerror', None) or error})"
+        ) from None
+    if not there.is_dir():
+        raise InvalidInput(f"{path}: {there} is no folder; give a folder of its own (--output)")
+    for name in files if there == path else ():
+        check_target(path / name, force=force)
 
 
 def write_output(path: str | Path, data: bytes, *, force: bool = False) -> None:

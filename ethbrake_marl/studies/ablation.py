@@ -37,7 +37,8 @@ from ethbrake_marl.pages.page import Page, Part, Played, Section
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario import Sample, Scenario, Task
 from ethbrake_marl.shield import Shielded
-from ethbrake_marl.studies.jobs import JobFolder, Timed, TrainingJob
+from ethbrake_marl.studies.folder import StudyFolder
+from ethbrake_marl.studies.trainings import Timed, TrainingJob, train_all
 
 # Levels of cooperation that belong together: the same lines; what differs is who learns, knows and cares.
 
@@ -194,10 +195,10 @@ class Plan:
             "shield": self.shield,
         }
 
-    def job_folder(self) -> JobFolder:
+    def study_folder(self) -> StudyFolder:
         """The folder, which no ablation with other settings may have: its results would be lost."""
         advice = f"give another folder (--output), or, to use its trainings, a copy of it without {SETTINGS}"
-        return JobFolder(self.folder, "an ablation", self.settings(), record=SETTINGS, advice=advice)
+        return StudyFolder(self.folder, "an ablation", self.settings(), record=SETTINGS, advice=advice)
 
     def optimum_folder(self, level: Level) -> Path:
         """Where the parts of its search stand."""
@@ -207,11 +208,10 @@ class Plan:
         """Bring every training to its end, ``jobs`` at a time, measure, and write all files, replacing earlier ones.
 
         What ``ablation.json`` holds; page, Markdown and figures. None when Ctrl-C stopped the trainings. Raises what
-        ``JobFolder.work``, ``JobFolder.train`` and ``measure`` raise.
+        ``StudyFolder.work``, ``train_all`` and ``measure`` raise.
         """
-        kept = self.job_folder()
-        with kept.work():
-            if not kept.train([training for _, _, training in self.trainings()], jobs, tell):
+        with self.study_folder().work():
+            if not train_all([training for _, _, training in self.trainings()], jobs, tell):
                 return None
             return write_ablation(self, measure(self, jobs, tell), machine)
 
@@ -305,7 +305,7 @@ def plan_ablation(
         )
     if not any(level.scenario.learners for level in plan.levels):
         raise InvalidInput("levels: nobody learns in any of them; give at least one with a learner")
-    JobFolder(plan.folder, "an ablation").check()
+    StudyFolder(plan.folder, "an ablation").check()
     common_worlds(plan.levels, 5, plan.list_seed)
     list(plan.trainings())  # one that cannot be is refused
     return plan

@@ -9,7 +9,7 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.files.store import remove_folder
 from ethbrake_marl.learning import RunDirectory, StopAt
 from ethbrake_marl.policies import Policy, read_trained
-from ethbrake_marl.studies.jobs import TrainingJob
+from ethbrake_marl.studies.trainings import TrainingJob
 
 _MEASURED = ("first_impact_harm", "total_harm", "collision_rate")
 FIGURES = (

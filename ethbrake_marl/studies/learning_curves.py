@@ -22,7 +22,8 @@ from ethbrake_marl.files.store import write_output
 from ethbrake_marl.learning import RunDirectory, Training, TrainingRecipe, load_recipe
 from ethbrake_marl.policies import load_policy
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.studies.jobs import JobFolder, TrainingJob
+from ethbrake_marl.studies.folder import StudyFolder
+from ethbrake_marl.studies.trainings import TrainingJob, train_all
 
 _RETURNED = "return"  # what it is called here
 _LABELS = {
@@ -78,9 +79,8 @@ class LearningCurves(NamedTuple):
             for recipe, seeds in self.plan
             for seed in range(seeds)
         ]
-        kept = JobFolder(self.folder, "learning curves")
-        with kept.work():
-            return kept.train(trainings, jobs, tell)
+        with StudyFolder(self.folder, "learning curves").work():
+            return train_all(trainings, jobs, tell)
 
     def write(self) -> dict[str, Any]:
         """Draw the finished trainings, write figure, table and summary, and give the summary.

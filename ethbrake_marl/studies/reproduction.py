@@ -62,7 +62,7 @@ from ethbrake_marl.physics import Bools, Floats
 from ethbrake_marl.policies import Policy, load_policy, load_shipped
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.shield import HybridAgent
-from ethbrake_marl.studies.jobs import JobFolder
+from ethbrake_marl.studies.folder import StudyFolder
 
 # Verdicts on the paper's numbers and statements, computed from ours; nobody writes one by hand.
 #
@@ -316,7 +316,7 @@ class Reproduction:
         training_s = self.seconds_left(wanted)
         return f"{told}; trainings before them about {training_s / 60.0:.0f} min of one core" if wanted else told
 
-    def open_folder(self, *, force: bool = False) -> JobFolder:
+    def open_folder(self, *, force: bool = False) -> StudyFolder:
         """The folder, in which the same settings go on; with ``force`` its results go and its trainings stay.
 
         Raises ``InvalidInput`` for a link.
@@ -329,7 +329,7 @@ class Reproduction:
                 (path / item.name / _RESULT).unlink(missing_ok=True)
             write_file(path / _SETTINGS, _text({**_FORMAT, **question}))
         advice = "give another folder (--output), or replace it with force (--force)"
-        return JobFolder(
+        return StudyFolder(
             path, "reproduction", question, record=_SETTINGS, more=_FORMAT, advice=advice, beside=("trainings",)
         )
 
@@ -338,7 +338,7 @@ class Reproduction:
 
         Items that need no training come first. One whose result is there, with the same trainings behind it, is kept.
         After each item the page is written anew. Ctrl-C during a training ends all trainings, and the items are made
-        of those that are finished; a second one stops at once. Raises what ``open_folder`` and ``JobFolder.work``
+        of those that are finished; a second one stops at once. Raises what ``open_folder`` and ``StudyFolder.work``
         raise.
         """
         full, finished = self.mode == "full", True

@@ -22,10 +22,12 @@ from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import remove_unfinished, write_file
 from ethbrake_marl.files.yaml import FileModel, FileSchema, YamlPath, flow_text
 from ethbrake_marl.learning import Training
-from ethbrake_marl.studies.cluster import LOCAL, connected
+from ethbrake_marl.parallel import LOCAL
+from ethbrake_marl.studies.cluster import connected
 from ethbrake_marl.studies.figures import FIGURES, REASON, final_figures, finish, is_done
-from ethbrake_marl.studies.jobs import JobFolder, TrainingJob
+from ethbrake_marl.studies.folder import StudyFolder
 from ethbrake_marl.studies.study_file import Seed, StudyFile, load_parts, refused_part, texts_of
+from ethbrake_marl.studies.trainings import TrainingJob
 
 MOST_JOBS = 10_000
 _GRID: YamlPath = ("grid",)
@@ -248,9 +250,9 @@ class SweepPlan:
         return cls(rows)
 
     @staticmethod
-    def folder(path: Path) -> JobFolder:
+    def folder(path: Path) -> StudyFolder:
         """The folder of a sweep; its jobs know by themselves what they are."""
-        return JobFolder(path, "a sweep")
+        return StudyFolder(path, "a sweep")
 
     @staticmethod
     def job(row: Row, path: Path) -> TrainingJob:

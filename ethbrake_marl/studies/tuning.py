@@ -22,9 +22,10 @@ from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import read_object, remove_unfinished, write_file
 from ethbrake_marl.files.yaml import FileModel, FileSchema, flow_text
 from ethbrake_marl.learning import Training, TrainingRecipe, load_recipe, read_settings
+from ethbrake_marl.parallel import LOCAL
 from ethbrake_marl.policies import installed_versions
 from ethbrake_marl.scenario import Scenario, check_file_name
-from ethbrake_marl.studies.cluster import LOCAL, connected
+from ethbrake_marl.studies.cluster import connected
 from ethbrake_marl.studies.figures import (
     FIGURES,
     HARM,
@@ -35,8 +36,9 @@ from ethbrake_marl.studies.figures import (
     final_figures,
     finish,
 )
-from ethbrake_marl.studies.jobs import JobFolder, TrainingJob
+from ethbrake_marl.studies.folder import StudyFolder
 from ethbrake_marl.studies.study_file import Seed, StudyFile, load_parts, refused_part, texts_of
+from ethbrake_marl.studies.trainings import TrainingJob
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -362,9 +364,9 @@ class TuningPlan:
         except InvalidInput as error:
             raise InvalidInput(f"search, at {', '.join(texts_of(values))}: {error}") from None
 
-    def folder(self, path: Path) -> JobFolder:
+    def folder(self, path: Path) -> StudyFolder:
         """The folder, which no other tuning may have."""
-        return JobFolder(path, "a tuning", self.question, record="tuning.json")
+        return StudyFolder(path, "a tuning", self.question, record="tuning.json")
 
     def job(self, values: Values, path: Path) -> TrainingJob:
         """The training of a trial in the folder of a tuning; equal trials are one training."""

@@ -28,7 +28,7 @@ from ethbrake_marl.files import plugins
 from ethbrake_marl.learning.training import Training, load_recipe
 from ethbrake_marl.physics.compiling import compiled
 from ethbrake_marl.scenario import load_scenario, new_scenario_text
-from ethbrake_marl.studies.jobs import JobFolder, TrainingJob
+from ethbrake_marl.studies.trainings import TrainingJob, train_all
 from tests.cli.conftest import TINY_RECIPE, Command, check_refused, told_json
 from tests.fixtures.registered import restore, tables
 
@@ -431,10 +431,9 @@ def test_worker_processes__load_the_plugins_of_their_parent(tmp_path, parts, mon
     monkeypatch.setenv("PYTHONPATH", os.getcwd())
     plugins.load_plugin(parts)
     recipe = load_recipe(str(write_recipe(tmp_path)))
-    scenario, kept = load_scenario("paper-random"), JobFolder(tmp_path / "trainings", "trainings")
+    scenario = load_scenario("paper-random")
     wanted = [TrainingJob(Training.of(recipe, scenario, seed=seed), tmp_path / f"seed{seed}") for seed in (0, 1)]
-    with kept.work():
-        assert kept.train(wanted, 2)
+    assert train_all(wanted, 2)
     for training in wanted:
         config = json.loads((training.folder / "config.json").read_text())
         assert [each["name"] for each in config["plugins"]] == ["my_parts.py"]

@@ -152,11 +152,20 @@ def test_set__is_noted_in_a_training(ethbrake: Command, tiny_recipe: Path, tmp_p
 
 
 def test_tutorial__own_worlds_give_the_printed_harms(ethbrake: Command, tmp_path: Path) -> None:
-    worlds, out = tmp_path / "worlds.csv", tmp_path / "out.csv"
+    worlds, out = tmp_path / "mine.csv", tmp_path / "new" / "worlds.csv"
     worlds.write_text(
         "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps\n10,8,20,18,20\n5,9,22,18,20\n7,7,20,18,20\n"
     )
-    words = ("--initial-states", worlds, "--agents", "full_brake,e_v2x_bm", "--per-world", out)
+    words = (
+        "--initial-states",
+        worlds,
+        "--agents",
+        "full_brake,e_v2x_bm",
+        "--output",
+        out.parent,
+        "--per-world",
+        "csv",
+    )
     assert worlds.read_text() in TUTORIAL and ethbrake("evaluate", *words).status == 0
     printed = re.search(r"\n(agent,world,[^`]+)```", TUTORIAL)
     for old, new in zip(csv.DictReader(printed[1].splitlines()), rows_of(out), strict=True):

@@ -178,7 +178,7 @@ def test_run__with_sac_all_minimise_the_harm_it_is_for(ethbrake, tiny_sac, tmp_p
     rows = told_json(ethbrake("run", "--recipe", tiny_sac, *total, "--json"))
     assert [row["agent"] for row in rows][-2:] == ["trained policy", "hybrid"]
     agents = f"full_brake,e_v2x_bm,sac@{folder}+episode"
-    asked = ("--episodes", "20", "--harm-count", "total", "--per-world", tmp_path / "w.csv", "--json")
+    asked = ("--episodes", "20", "--harm-count", "total", "--output", tmp_path / "w", "--per-world", "csv", "--json")
     for row, then in zip(
         told_json(ethbrake("evaluate", "--agents", agents, *asked)), (rows[0], rows[1], rows[4]), strict=True
     ):
@@ -189,8 +189,8 @@ def test_run__with_sac_all_minimise_the_harm_it_is_for(ethbrake, tiny_sac, tmp_p
 
 
 def test_evaluate__interrupted_writes_nothing(ethbrake: Command, tmp_path: Path, monkeypatch) -> None:
-    ctrl_c_when(monkeypatch, lambda shown: shown["name"] == "coast")
-    answer = ethbrake("evaluate", "--episodes", "5", "--agents", "coast", "--per-world", tmp_path / "out.csv")
+    ctrl_c_when(monkeypatch, lambda shown: shown["name"] == "worlds")
+    answer = ethbrake("evaluate", "--episodes", "5", "--agents", "coast", "--output", tmp_path / "new")
     assert (answer.status, answer.out) == (130, "")
     assert answer.err.splitlines()[-1] == "interrupted; nothing was written" and list(tmp_path.iterdir()) == []
 

@@ -29,7 +29,6 @@ from ethbrake_marl.scenario import Scenario, load_scenario
 from tests.cli.conftest import Command, check_refused, rows_of, told_json
 from tests.failing_worlds import plant
 from tests.fixtures.pictures import EMPTY
-from tests.studies.counting import journal
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENARIO = load_scenario("paper-random")
@@ -46,11 +45,21 @@ def test_evaluate__the_harm_count_is_what_agents_lower(ethbrake: Command) -> Non
 def test_evaluate__a_world_computed_by_hand(ethbrake: Command, tmp_path: Path) -> None:
     # Vehicle 2 at 10 m/s coasts 5 m in its 0.5 s and brakes the last 3 m with 7 m/s2 towards a standing Vehicle 1:
     # closing speed squared 10^2 - 2 * 7 * 3 = 58. Vehicle 3 stands 5 km behind. In the second world nobody moves.
-    worlds, out = tmp_path / "worlds.csv", tmp_path / "out.csv"
+    worlds, out = tmp_path / "mine.csv", tmp_path / "new" / "worlds.csv"
     worlds.write_text(
         "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps,restitution\n8,5000,0,10,0,0\n8,5000,0,0,0,0\n"
     )
-    words = ("--initial-states", worlds, "--agents", "full_brake", "--per-world", out, "--json")
+    words = (
+        "--initial-states",
+        worlds,
+        "--agents",
+        "full_brake",
+        "--output",
+        out.parent,
+        "--per-world",
+        "csv",
+        "--json",
+    )
     (row,) = told_json(ethbrake("evaluate", *words))
     told = row["episodes"], row["collision_rate"], row["first_impact_harm"]
     assert told == (2, 0.5, pytest.approx(29.0, rel=1e-12))
@@ -60,15 +69,15 @@ def test_evaluate__a_world_computed_by_hand(ethbrake: Command, tmp_path: Path) -
 
 
 def test_by__writes_every_group_down(ethbrake: Command, tmp_path: Path) -> None:
-    out = tmp_path / "w.csv"
+    out = tmp_path / "new"
     command = ("evaluate", "--scenario", "mixture-delays", "--agents", "full_brake,coast", "--episodes", "30")
-    assert ethbrake(*command, "--by", "scenario", "--per-world", out).status == 0
-    found = [row["groups"] for row in json.loads((tmp_path / "w.csv.json").read_text())]
+    assert ethbrake(*command, "--by", "scenario", "--output", out, "--per-world", "csv").status == 0
+    found = [row["groups"] for row in json.loads((out / "results.json").read_text())]
     sizes = {"paper-delay-high": 11, "paper-delay-low": 8, "paper-delay-middle": 11}
     assert [{name: (each["episodes"], each["agent"]) for name, each in groups.items()} for groups in found] == [
         {name: (size, agent) for name, size in sizes.items()} for agent in ("full_brake", "coast")
     ]
-    assert sum(row["scenario"] == "paper-delay-low" for row in rows_of(out)) == 16
+    assert sum(row["scenario"] == "paper-delay-low" for row in rows_of(out / "worlds.csv")) == 16
 
 
 def test_standards__full_braking_passes_as_published_and_is_struck_by_every_follower(ethbrake: Command) -> None:
@@ -121,7 +130,7 @@ def test_evaluate__a_damaged_bundle_is_refused_by_file_whatever_is_around_it(eth
 
 
 def test_evaluate__one_agent_that_cannot_drive_is_refused_before_another_works(ethbrake, monkeypatch) -> None:
-    monkeypatch.setattr("ethbrake_marl.evaluation.evaluate", lambda *args, **kwargs: pytest.fail("worked"))
+    monkeypatch.setattr("ethbrake_marl.evaluation.evaluate_held", lambda *args, **kwargs: pytest.fail("worked"))
     refused = ethbrake("evaluate", "--agents", "e_v2x_bm,constant:99", "--episodes", "5")
     check_refused(refused, "agent 'constant:99': above the braking capacity 7 m/s2")
 
@@ -150,25 +159,45 @@ def test_check_agents__a_constant_above_the_capacity_of_any_world_is_refused_and
         check_agents(make_lineup([f"constant:{between}"], scenario), worlds, scenario)
 
 
-# Evaluations in parts
-
-
-def test_shards__print_the_same_in_any_parts_and_the_figures_of_one_piece(ethbrake: Command) -> None:
-    three, one = (ethbrake(*LIST, "--shards", number, "--json") for number in "31")
-    assert three.out == one.out
-    for sharded, row in zip(told_json(one), told_json(ethbrake(*LIST, "--json")), strict=True):
-        assert (sharded["kind"], sharded["intervals"]["rates"]) == ("evaluate-shards", "Clopper-Pearson")
-        for name in ("first_impact_harm", "total_harm_interval", "collision_rate", "sampled_harm", "parameters"):
-            assert sharded[name] == row[name], name
-        assert sharded["vehicle_harm"]["total_harm_1"] > 0.0
+# Evaluations in several processes, and their folder
 
 
 @pytest.mark.long
-def test_shards__on_ray_answer_the_same(ethbrake: Command, tmp_path: Path) -> None:
+def test_evaluate__on_ray_and_in_processes_prints_the_same(ethbrake: Command, tmp_path: Path) -> None:
     pytest.importorskip("ray")
-    found = ethbrake(*LIST, "--shards", "3", "--ray", "local", "--output", tmp_path / "kept", "--json")
-    assert found.status == 0 and found.out == ethbrake(*LIST, "--shards", "3", "--json").out
-    assert [line["status"] for line in journal(tmp_path / "kept")] == ["finished"] * 3
+    line = ("evaluate", "--agents", "full_brake,e_v2x_bm:pairwise", "--episodes", "6000", "--json")
+    here = ethbrake(*line)
+    for more in (("--jobs", "2"), ("--ray", "local", "--jobs", "2")):
+        found = ethbrake(*line, *more, "--output", tmp_path / more[0])
+        assert found.status == 0 and found.out == here.out == (tmp_path / more[0] / "results.json").read_text()
+
+
+def test_evaluate__by_force_leaves_no_file_of_earlier_results(ethbrake: Command, tmp_path: Path) -> None:
+    folder, line = tmp_path / "new", ("evaluate", "--agents", "coast", "--episodes", "3", "--output")
+    assert ethbrake(*line, folder, "--per-world", "csv", "--report").status == 0
+    (folder / "mine.txt").write_text("mine")
+    assert sorted(each.name for each in folder.iterdir()) == ["mine.txt", "report.html", "results.json", "worlds.csv"]
+    check_refused(ethbrake(*line, folder), "results.json: is there already")
+    assert ethbrake(*line, folder, "--force", "--per-world", "parquet").status == 0
+    assert sorted(each.name for each in folder.iterdir()) == ["mine.txt", "results.json", "worlds.parquet"]
+
+
+def test_evaluate__a_list_that_is_not_held_tells_what_needs_no_proof(ethbrake: Command, monkeypatch) -> None:
+    line = ("evaluate", "--agents", "full_brake,coast", "--episodes", "600", "--objective", "own", "--json")
+    held = told_json(ethbrake(*line))
+    monkeypatch.setattr("ethbrake_marl.evaluation.inputs.HELD", 500)
+    flat = told_json(ethbrake(*line))
+    for one, other in zip(flat, held, strict=True):
+        assert one["parameters"]["no_limits_because"]
+        for name in (
+            "first_impact_harm",
+            "total_harm_interval",
+            "collision_rate_interval",
+            "objectives",
+            "worlds_sha256",
+        ):
+            assert one[name] == other[name], name
+        assert one["mean_regret"] is None is not other["mean_regret"]
 
 
 # Two results
@@ -179,23 +208,26 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Results on the same worlds; d is b as another policy of the name coast left it; not to be changed."""
     folder = tmp_path_factory.mktemp("results")
     for name, agents in (("a", "full_brake,coast"), ("b", "full_brake,e_v2x_bm")):
-        options = ("--agents", agents, "--episodes", "40", "--per-world", str(folder / f"{name}.csv"))
+        options = ("--agents", agents, "--episodes", "40", "--output", str(folder / name), "--per-world", "csv")
         assert run_command(["evaluate", *options]) == 0
-    content = json.loads((folder / "b.csv.json").read_text().replace('"agent": "e_v2x_bm"', '"agent": "coast"'))
-    data = (folder / "b.csv").read_text().replace("\ne_v2x_bm,", "\ncoast,")
-    (folder / "d.csv").write_text(data)
-    beside = {"file": "d.csv", "sha256": hashlib.sha256(data.encode()).hexdigest()}
-    (folder / "d.csv.json").write_text(json.dumps([row | {"per_world": beside} for row in content]))
+    content = json.loads((folder / "b/results.json").read_text().replace('"agent": "e_v2x_bm"', '"agent": "coast"'))
+    data = (folder / "b/worlds.csv").read_text().replace("\ne_v2x_bm,", "\ncoast,")
+    (folder / "d").mkdir()
+    (folder / "d/worlds.csv").write_text(data)
+    beside = {"file": "worlds.csv", "sha256": hashlib.sha256(data.encode()).hexdigest()}
+    (folder / "d/results.json").write_text(json.dumps([row | {"per_world": beside} for row in content]))
     alone = [{key: value for key, value in row.items() if key != "per_world"} for row in content]
     (folder / "alone.json").write_text(json.dumps(alone))
     return folder
 
 
 def test_compare__difference_is_paired_by_world_where_every_world_is_there(results: Path) -> None:
-    first = read_result(results / "a.csv.json")
-    paired, apart = (compare_results(first, read_result(results / name)) for name in ("d.csv.json", "alone.json"))
+    first = read_result(results / "a/results.json")
+    paired, apart = (compare_results(first, read_result(results / name)) for name in ("d/results.json", "alone.json"))
     columns = [
-        np.array([float(row["total_harm"]) for row in rows_of(results / f"{name}.csv") if row["agent"] == "coast"])
+        np.array(
+            [float(row["total_harm"]) for row in rows_of(results / name / "worlds.csv") if row["agent"] == "coast"]
+        )
         for name in "da"
     ]
     assert paired.differences[1].harms["total_harm"] == paired_difference(*columns)
@@ -331,9 +363,11 @@ def test_again__runs_no_code_that_only_a_file_names(ethbrake: Command) -> None:
 
 @pytest.mark.usefixtures("undrawn")
 def test_report__says_which_harm_the_shield_bounds(ethbrake: Command) -> None:
-    answer = ethbrake("evaluate", "--agents", "full_brake,constant:3+step", "--episodes", "12", "--report", "r.html")
+    answer = ethbrake(
+        "evaluate", "--agents", "full_brake,constant:3+step", "--episodes", "12", "--report", "--output", "r"
+    )
     assert answer.status == 0, answer.err
-    text = Path("r.html").read_text()
+    text = Path("r/report.html").read_text()
     assert "minus episode mode" in text and "First-impact harm, which the shield bounds" in text
 
 
@@ -416,7 +450,7 @@ def test_dataset__is_written_and_told(ethbrake: Command, packages: list[str], wo
     [
         ("pyarrow", "data", "watch dataset --episodes 2 --output a.parquet"),
         ("minari", "data", "watch dataset --episodes 2 --output brakes-v0"),
-        ("pyarrow", "data", "evaluate --agents coast --episodes 2 --per-world worlds.parquet"),
+        ("pyarrow", "data", "evaluate --agents coast --episodes 2 --output new --per-world parquet"),
         ("imageio_ffmpeg", "render", "watch record --agents coast --output film.mp4"),
         ("onnx", "export", "agent export shipped/ppo --onnx policy.onnx"),
     ],

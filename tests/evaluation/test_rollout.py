@@ -1,4 +1,4 @@
-"""Rollouts and whole lists, by hand and in shards: the same bits for any number of shards and workers."""
+"""Rollouts and whole lists, by hand and chunk by chunk: the same bits for any chunks and processes."""
 
 import csv
 import hashlib
@@ -9,21 +9,32 @@ from dataclasses import fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock, call
 
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.errors import PhysicsError, Unfamiliar
-from ethbrake_marl.evaluation import Evaluation, Outcome, evaluate, record_episode, summarise, write_per_world
+from ethbrake_marl.errors import InvalidInput, PhysicsError, Unfamiliar
+from ethbrake_marl.evaluation import (
+    Evaluation,
+    Outcome,
+    chunks,
+    evaluate,
+    inputs,
+    record_episode,
+    summarise,
+    write_per_world,
+)  # fmt: skip
+from ethbrake_marl.evaluation.chunks import Lineup, evaluate_held, summarise_tally, tally_list
 from ethbrake_marl.evaluation.inputs import make_agents, make_lineup, policy_sha256, scenario_sha256, worlds_sha256
-from ethbrake_marl.evaluation.measures import FAR_M, Tally, measures
-from ethbrake_marl.evaluation.results import Question
+from ethbrake_marl.evaluation.measures import FAR_M, REGISTERED, Tally, measures
+from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk
+from ethbrake_marl.limits import Limits
 from ethbrake_marl.pages.report import Report
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, advance_sampled
 from ethbrake_marl.scenario import Scenario, load_scenario
-from ethbrake_marl.studies.jobs import evaluate_shards
 from tests.failing_worlds import planted_list, without
 
 BRAKE = {"full_brake": eb.make_agent("full_brake")}
@@ -94,7 +105,7 @@ def test_evaluate__does_not_depend_on_the_chunk_nor_on_the_worlds_behind(
     assert chunked.outcome("gap").collided.any()
     for name in agents:
         assert_same(chunked.outcome(name), evaluation.outcome(name), rows)
-    assert seen == [(name, end) for name in agents for end in [*range(chunk, n, chunk), n]]
+    assert seen == [(name, end) for end in [*range(chunk, n, chunk), n] for name in agents]
 
 
 def test_evaluate__an_episode_that_the_horizon_cuts_is_reported_so(pair: Scenario) -> None:
@@ -343,7 +354,7 @@ def test_policy__that_drives_where_it_was_trained_is_not_warned_of() -> None:
         evaluate(None, "team@shipped", scenario="cooperation-3-pair", episodes=100)
 
 
-# ---------------------------------------------------------------- a list in shards
+# ---------------------------------------------------------------- a list chunk by chunk
 
 
 AGENTS = ("full_brake", "e_v2x_bm:pairwise")
@@ -373,48 +384,55 @@ def make(argument, settings):
 
 
 @pytest.fixture(scope="module")
-def asked(paper_random: Scenario):
-    return Question(paper_random, AGENTS, LISTED, 11, objectives=("own",)).ask()
+def lineup(paper_random: Scenario) -> Lineup:
+    return Lineup.of(AGENTS, paper_random)
 
 
 @pytest.fixture(scope="module")
-def tally(asked) -> Tally:
-    return evaluate_shards(asked, shards=1)
+def tally(lineup: Lineup) -> Tally:
+    return tally_list(lineup, LISTED, 11, objectives=("own",))
 
 
-@pytest.mark.parametrize(("shards", "block"), [(2, 2_000), (4, 1_000), (3, 5_000)])
-def test_tally__is_the_same_bits_in_any_shards_and_blocks(asked, tally: Tally, shards: int, block: int) -> None:
-    found = evaluate_shards(asked, shards=shards, block=block)
-    assert found == tally
-    one, other = (json.dumps(asked.to_json(each, asked.summarise(each))) for each in (found, tally))
-    assert one == other
+@pytest.mark.parametrize("size", [5_000, 1_000, 777])
+def test_tally__is_the_same_bits_for_any_chunks(lineup: Lineup, tally: Tally, size: int, monkeypatch) -> None:
+    monkeypatch.setattr(chunks, "CHUNK", size)
+    found = tally_list(lineup, LISTED, 11, objectives=("own",))
+    assert replace(found, worlds_hash=0) == replace(tally, worlds_hash=0)
 
 
 @pytest.mark.slow
-def test_tally__is_the_same_bits_from_two_processes(paper_random: Scenario) -> None:
-    asked = Question(paper_random, ("full_brake", "e_v2x_bm"), 3_000, 5).ask()
-    assert evaluate_shards(asked, shards=3, jobs=2) == evaluate_shards(asked, shards=1)
+def test_figures__are_the_same_bits_from_two_processes(paper_random: Scenario) -> None:
+    lineup, told = Lineup.of(("full_brake", "e_v2x_bm"), paper_random), Mock()
+    assert tally_list(lineup, 6_000, 5, jobs=2, on_done=told) == tally_list(lineup, 6_000, 5)
+    assert told.call_args_list == [call(2_500), call(5_000), call(6_000)]
+    sample = paper_random.sample(6_000, 5)
+    one, two = (summarise(evaluate_held(lineup, sample, 5, jobs=jobs)) for jobs in (1, 2))
+    assert one == two
 
 
-@pytest.mark.parametrize(("n", "seed", "known"), [(LISTED, 11, False), (1_100, 7, True)])  # whether a table holds them
-def test_rows__are_those_of_evaluate_on_the_same_worlds(paper_random: Scenario, n: int, seed: int, known: bool) -> None:
-    asked = Question(paper_random, AGENTS, n, seed, objectives=("own",)).ask()
-    tally, lineup = evaluate_shards(asked, shards=2), make_lineup(AGENTS, paper_random)
-    evaluation = evaluate(paper_random.sample(n, seed), lineup, scenario=paper_random, seed=seed, chunk=777)
-    for one, other in zip(asked.summarise(tally), summarise(evaluation), strict=True):
-        assert one.collision_rate.interval == pytest.approx(other.collision_rate.interval, abs=1.32 / n)
+@pytest.mark.slow
+def test_worker__of_other_measures_is_refused(paper_random: Scenario, monkeypatch) -> None:
+    monkeypatch.setitem(REGISTERED, "here_alone", REGISTERED.get("here_alone"))
+    lineup = Lineup.of(("full_brake",), paper_random)
+    with pytest.raises(InvalidInput, match="a worker has other policies, measures or versions than the process"):
+        tally_list(lineup, 6_000, 5, jobs=2)
+
+
+def test_figures__of_a_list_that_is_not_held_are_those_of_evaluate(lineup, paper_random, monkeypatch) -> None:
+    """Those that need no proof; ``HELD`` is lowered for the hash of the list."""
+    tally = tally_list(lineup, LISTED, 11, objectives=("own",))
+    monkeypatch.setattr(inputs, "HELD", LISTED - 1)
+    evaluation = evaluate(paper_random.sample(LISTED, 11), lineup.make(), scenario=paper_random, seed=11, chunk=777)
+    for one, other in zip(summarise_tally(lineup, tally, 11), summarise(evaluation), strict=True):
         for measure in measures(()):
-            told, expected = one[measure.name], other[measure.name]
-            if measure.limits and not known:
-                assert told is None, measure.name
-            elif measure.name.endswith("_rate"):
-                assert told.value == expected.value, measure.name
-            else:
-                assert told == expected, measure.name  # to the last bit: both are exact sums
-        names = ("collisions", "horizon_ends", "knows", "hidden_share", "episodes", "policy_share", "beside_paper",
-                 "scenario_sha256", "parameters")  # fmt: skip
-        assert [getattr(one, name) for name in names] == [getattr(other, name) for name in names]
-        assert not known or one.below_best_known == other.below_best_known
+            assert one[measure.name] == (None if measure.limits else other[measure.name]), measure.name
+        told, expected = ({**each.to_json(), "parameters": None} for each in (one, other))
+        proven = {name for name in told if told[name] is None}
+        assert [expected[name] for name in told if name not in proven] == [
+            told[name] for name in told if name not in proven
+        ]
+        assert {**one.parameters, "no_limits_because": None} == other.parameters
+        assert one.parameters["no_limits_because"] == "a list of more than 100,000 worlds is driven without proofs"
     assert tally.rescore(["own"], 3) == evaluation.rescore(["own"])
 
 
@@ -426,27 +444,28 @@ def failing(tmp_path: Path) -> Callable[[float], str]:
     return lambda below: f"{file}:make:{below}"
 
 
-def test_worlds_that_fail__are_left_out_for_all_agents(failing, paper_random: Scenario) -> None:
-    asked = Question(paper_random, ("full_brake", failing(5.01)), 1_100, 7).ask()
-    one, two = (evaluate_shards(asked, shards=k) for k in (1, 2))
-    sample = paper_random.sample(1_100, 7)
+def test_worlds_that_fail__are_left_out_for_all_agents(failing, paper_random: Scenario, monkeypatch) -> None:
+    lineup, sample = Lineup.of(("full_brake", failing(5.01)), paper_random), paper_random.sample(1_100, 7)
+    whole = tally_list(lineup, 1_100, 7)
+    monkeypatch.setattr(chunks, "CHUNK", 100)
+    assert replace(tally_list(lineup, 1_100, 7), worlds_hash=whole.worlds_hash) == whole
     bad = sample.worlds.gaps_m[:, 0] < 5.01
-    assert one == two and one.worlds == 1_100 - bad.sum() < 1_100
-    told = [(left.world, left.seed, left.reason) for left in one.left_out]
+    assert whole.worlds == 1_100 - bad.sum() < 1_100
+    told = [(left.world, left.seed, left.reason) for left in whole.left_out]
     assert told == [(k, 7, "planted") for k in np.flatnonzero(bad).tolist()]
-    row, lineup = asked.summarise(one)[0], make_lineup(["full_brake"], paper_random)
-    whole = summarise(evaluate(sample.worlds.take(np.flatnonzero(~bad)), lineup, scenario=paper_random))
-    assert row.first_impact_harm == whole[0].first_impact_harm and len(row.left_out) == bad.sum()
+    row, braking = summarise_tally(lineup, whole, 7)[0], make_lineup(["full_brake"], paper_random)
+    without = evaluate(sample.worlds.take(np.flatnonzero(~bad)), braking, scenario=paper_random)
+    assert row.first_impact_harm == summarise(without)[0].first_impact_harm and len(row.left_out) == bad.sum()
+    held = evaluate(sample, lineup.make(), scenario=paper_random, seed=7, chunk=10)  # of some chunks nothing is left
+    assert held.left_out == whole.left_out and np.array_equal(held.index, np.flatnonzero(~bad))
 
 
 def test_a_list_of_which_every_world_fails__is_refused(failing, paper_random: Scenario) -> None:
-    asked = Question(paper_random, (failing(1e9),), 1_500, 7).ask()
+    lineup = Lineup.of((failing(1e9),), paper_random)
     with pytest.raises(PhysicsError, match="planted"):
-        asked.summarise(evaluate_shards(asked, shards=2))
-
-
-def test_tally__comes_back_from_json_as_it_was(tally: Tally) -> None:
-    assert Tally.from_json(json.loads(json.dumps(tally.to_json()))) == tally
+        summarise_tally(lineup, tally_list(lineup, 1_500, 7), 7)
+    with pytest.raises(PhysicsError, match="planted"):
+        evaluate_held(lineup, paper_random.sample(150, 7), 7)
 
 
 # ---------------------------------------------------------------- recorded before search and loop were made faster
@@ -488,12 +507,22 @@ NAMES = {
 
 
 def digest_of(tally: Tally) -> str:
-    told = tally.to_json()
-    for agent in told["agents"].values():
-        assert all(of == tally.worlds for _, of in agent["counts"].values())
-        agent["counts"] = {name: count for name, (count, _) in agent["counts"].items()}
-        agent["moments"] = {name: each[:3] for name, each in agent["moments"].items()}  # the sums alone
-        agent |= {part: {NAMES.get(name, name): each for name, each in agent[part].items()} for part in agent}
+    """Sums are written as they were kept then: multiples of 2^-1074, products of 2^-2148."""
+    agents = {}
+    for name, agent in tally.agents.items():
+        assert all(of == tally.worlds for _, of in agent.counts.values())
+        counts = {NAMES.get(of, of): so for of, (so, _) in agent.counts.items()}
+        moments = {
+            NAMES.get(of, of): [each.count, hex(int(each.total * 2**1074)), hex(int(each.squares * 2**2148))]
+            for of, each in agent.moments.items()
+        }
+        products = {NAMES.get(of, of): hex(int(value * 2**2148)) for of, value in agent.products.items()}
+        agents[name] = {"counts": counts, "moments": moments, "products": products}
+    told = {
+        "worlds": tally.worlds, "hidden": tally.hidden, "worlds_hash": hex(tally.worlds_hash), "agents": agents,
+        "ranges": {name: [list(each) for each in entries] for name, entries in tally.ranges.items()},
+        "left_out": [list(left) for left in tally.left_out],
+    }  # fmt: skip
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -505,6 +534,9 @@ def digest_of(tally: Tally) -> str:
     ],
 )
 def test_tally__is_the_one_that_was_recorded(worlds: int, scenario: str, harm_count: str, digest: str) -> None:
-    asked = Question(load_scenario(scenario), RECORDED_AGENTS, worlds, 11, harm_count).ask()
-    parts = [asked.answer(first, min(first + 1_000, worlds)) for first in range(0, worlds, 1_000)]
+    lineup, parts = Lineup.of(RECORDED_AGENTS, load_scenario(scenario), harm_count=harm_count), []
+    for first, part in chunks_of(lineup.scenario.sample(worlds, 11), 1_000):
+        driven = drive_chunk(part, lineup.make(), lineup.scenario, 11, lineup.scenario.learners, first)
+        limits = isinstance(driven.limits, Limits) and bool(driven.limits.known.all())
+        parts.append(Tally.of(driven, (), limits=limits))
     assert digest_of(sum(parts[1:], parts[0])) == digest

@@ -55,8 +55,6 @@ def test_write__replaces_a_plain_file_by_force_and_takes_the_longest_name(tmp_pa
 @pytest.mark.parametrize(
     ("words", "ending"),
     [
-        ("evaluate --agents coast --per-world", "csv"),
-        ("evaluate --agents coast --report", "html"),
         ("search best-harm --output", "npz"),
         ("search falsify --agent coast --output", "yaml"),
         ("watch picture deceleration --output", "png"),

@@ -28,8 +28,8 @@ def test_sumo__that_is_not_installed_is_told_in_one_line(monkeypatch, capsys):
     [
         (["--host", "carla"], "unknown host 'carla'; known: sumo"),
         (["--host", "sumo:x"], "host 'sumo:x': 'x' is no step in s; for instance sumo:0.01"),
-        (["--host", "sumo", "--shards", "3"], "--host: needs every world at once, and --shards keeps none"),
-        (["--host", "sumo", "--report", "a.html"], "--report: tells of the physics here; leave it out, or --host"),
+        (["--host", "sumo", "--jobs", "3"], "--jobs: a host drives in one process; leave it out, or --host"),
+        (["--host", "sumo", "--report", "--output", "a"], "--report: tells of the physics here; leave it out, or"),
         (["--host", "sumo", "--measures", "injury"], "--measures: tells of the physics here; leave it out, or --host"),
         (["--host", "sumo", "--scenario", "standards"], "--host: standards is a group of"),
     ],

@@ -16,7 +16,7 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.cli.evaluate import GROUP_EPISODES
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError
-from ethbrake_marl.evaluation import TESTS, evaluate, make_lineup, measures, rollout, summarise, write_per_world
+from ethbrake_marl.evaluation import TESTS, chunks, evaluate, make_lineup, measures, summarise, write_per_world
 from ethbrake_marl.figures import harm_in_parts
 from ethbrake_marl.limits import Unproven, known_limits, limits, lower_bound as bounding, prove
 from ethbrake_marl.limits.limits import (
@@ -387,14 +387,14 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> dict[str, Mock]:
     found: dict[str, Mock] = {}
     for place, name in (
         (limits, "avoidability"), (bounding, "avoidability"), (limits, "lower_bound"), (limits, "best_known"),
-        (measures, "known_limits"), (rollout, "evaluate_list"),
+        (measures, "known_limits"), (chunks, "drive_chunk"),
     ):  # fmt: skip
         monkeypatch.setattr(place, name, found.setdefault(name, Mock(wraps=getattr(place, name))))
     return found
 
 
 def test_evaluate__finds_the_limits_once_for_table_csv_and_json(calls: dict[str, Mock], tmp_path: Path) -> None:
-    lines = ["--episodes", "20", "--per-world", str(tmp_path / "worlds.csv"), "--json"]
+    lines = ["--episodes", "20", "--per-world", "csv", "--output", str(tmp_path / "new"), "--json"]
     assert run_command(["evaluate", "--agents", "full_brake,coast", *lines]) == 0
     assert {name: part.call_count for name, part in calls.items()} == dict.fromkeys(calls, 1)
 

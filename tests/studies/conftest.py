@@ -9,11 +9,9 @@ import pytest
 import yaml
 
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.studies import jobs
 from ethbrake_marl.studies.reproduction import Reproduction
 from tests.fixtures.pictures import draw_nothing
 from tests.learning.tiny import TINY_PPO
-from tests.studies.counting import Inside
 
 RECIPE = {
     **TINY_PPO.model_dump(mode="json"),
@@ -40,10 +38,8 @@ Write = Callable[..., Path]
 
 
 def study(*words: object) -> int:
-    """Run ``ethbrake study ...`` in this process, each job in it too; its exit status."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jobs, "LocalWorkers", Inside)
-        return run_command(["study", *map(str, words)])
+    """Run ``ethbrake study ...`` in this process; its exit status."""
+    return run_command(["study", *map(str, words)])
 
 
 def write_yaml(path: Path, content: Any) -> Path:

@@ -21,7 +21,6 @@ from typing import Any
 from filelock import FileLock
 
 from ethbrake_marl.studies.figures import FIGURES
-from ethbrake_marl.studies.jobs import Answer, answer
 from ethbrake_marl.studies.sweep import RUNS, Row, SweepPlan
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -81,13 +80,6 @@ if __name__ == "__main__":
 PROGRAM = [sys.executable, "-c", "from ethbrake_marl.cli.app import main; main()"]
 
 
-def journal(folder: Path) -> list[dict[str, Any]]:
-    """The lines of a sweep's journal that are whole."""
-    path = folder / "journal.jsonl"
-    lines = path.read_text().splitlines(keepends=True) if path.exists() else []
-    return [json.loads(line) for line in lines if line.endswith("}\n")]
-
-
 def finished(folder: Path) -> int:
     """Runs of a sweep that came to their end."""
     return sum('"status": "finished"' in file.read_text() for file in (folder / "runs").glob("*/run.json"))
@@ -126,24 +118,3 @@ def end_when(command: list[Any], ready: Callable[[int], bool], by: signal.Signal
         finally:
             driver.kill()
     return driver.returncode, told
-
-
-class Inside:
-    """Takes the place of ``LocalWorkers``: a job at a time, done in this process when it is waited for."""
-
-    def __init__(self, number: int) -> None:
-        self.begun: list[tuple[int, bytes]] = []
-
-    def room(self) -> int:
-        return 1 - len(self.begun)
-
-    def begin(self, number: int, call: bytes) -> None:
-        self.begun.append((number, call))
-
-    def wait(self) -> list[tuple[int, Answer]]:
-        number, call = self.begun.pop()
-        return [(number, answer(call, []))]
-
-    def interrupt(self) -> None: ...
-
-    def close(self) -> None: ...

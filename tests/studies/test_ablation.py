@@ -40,7 +40,7 @@ from ethbrake_marl.studies.ablation import (
     search_all,
     with_scheme,
 )
-from ethbrake_marl.studies.jobs import TrainingJob
+from ethbrake_marl.studies.trainings import TrainingJob
 from tests.learning.tiny import TINY_PPO
 from tests.pages.hostile import Page
 from tests.studies.conftest import ABLATE, LEVELS, check_snapshot, study

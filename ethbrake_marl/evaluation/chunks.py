@@ -1,0 +1,168 @@
+"""Lists of worlds, evaluated chunk by chunk: here, in several processes, or on a Ray.
+
+Chunks have a fixed size, and sums over worlds are exact. So no figure depends on how many processes there are, nor on
+whether the worlds are held in memory.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ethbrake_marl.agents import Driver, Knowledge, Team
+from ethbrake_marl.defaults import HarmCount
+from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
+from ethbrake_marl.evaluation.inputs import CHUNK, HELD, make_lineup, policies_of, result_versions, scenario_sha256
+from ethbrake_marl.evaluation.measures import REGISTERED, Conditions, Evaluation, SummaryTable, Tally, register_injury
+from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk
+from ethbrake_marl.parallel import Call, run_each
+from ethbrake_marl.scenario import Sample, Scenario, Task
+from ethbrake_marl.shield import parse_uncertainty
+
+MOST_EPISODES = 10**12
+OnDone = Callable[[int], None]  # worlds done so far
+_MADE: dict[str, Mapping[str, Driver]] = {}  # the last lineup of this process; an evaluation drives copies
+
+
+@dataclass(frozen=True, slots=True)
+class Lineup:
+    """Who drives, by specs: plain data, of which every process makes the same agents.
+
+    Args:
+        agents: specs, as on the command line.
+        scenario: whose learners they drive.
+        harm_count: harm that agents minimise.
+        uncertainty: what agents behind ``+robust`` do not know, as on the command line.
+        injury: evaluations report injuries too (``register_injury``).
+        same: what must be the same in every process; see ``Lineup.of``.
+
+    """
+
+    agents: tuple[str, ...]
+    scenario: Scenario
+    harm_count: HarmCount = "first"
+    uncertainty: str | None = None
+    injury: bool = False
+    same: str = ""
+
+    @classmethod
+    def of(cls, agents: Sequence[str], scenario: Scenario, **how: Any) -> Lineup:
+        """A lineup that other processes make only from the same policies, measures and versions.
+
+        Raises what ``make_lineup`` raises.
+        """
+        lineup = cls(tuple(agents), scenario, **how)
+        made = lineup._make_anew()
+        same = lineup._same(made)
+        _MADE.clear()
+        _MADE[same] = made
+        return cls(tuple(agents), scenario, **how, same=same)
+
+    def make(self) -> Mapping[str, Driver]:
+        """The agents in this process; raises ``InvalidInput`` where they are others than in the process that asks."""
+        if self.same not in _MADE:
+            made = self._make_anew()
+            if self._same(made) != self.same:
+                raise InvalidInput(
+                    "evaluate: a worker has other policies, measures or versions than the process that asks it;"
+                    " install the same everywhere, and change no file while an evaluation runs"
+                )
+            _MADE.clear()
+            _MADE[self.same] = made
+        return _MADE[self.same]
+
+    def _make_anew(self) -> Mapping[str, Driver]:
+        if self.injury:
+            register_injury()
+        intervals = None if self.uncertainty is None else parse_uncertainty(self.uncertainty)
+        return make_lineup(self.agents, self.scenario, harm_count=self.harm_count, uncertainty=intervals)
+
+    def _same(self, made: Mapping[str, Driver]) -> str:
+        policies = {name: policies_of(Team.of(agent, self.scenario.learners).drivers) for name, agent in made.items()}
+        asked = self.harm_count, self.uncertainty, scenario_sha256(self.scenario)
+        text = json.dumps([asked, policies, sorted(REGISTERED), result_versions()], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def evaluate_held(
+    lineup: Lineup,
+    sample: Sample,
+    seed: int | None,
+    *,
+    jobs: int | None = None,
+    ray: str | None = None,
+    on_done: OnDone | None = None,
+) -> Evaluation:
+    """``evaluate`` all worlds of a sample; ``jobs`` and ``ray`` as in ``run_each``."""
+    calls: Iterator[Call] = ((_drive, lineup, part, seed, first) for first, part in chunks_of(sample))
+    parts: list[Evaluation] = []
+    for part in run_each(calls, jobs, ray):
+        parts.append(part)
+        _tell(on_done, len(parts), sample.worlds.n)
+    return Evaluation.join(parts)
+
+
+def _drive(lineup: Lineup, part: Sample, seed: int | None, first: int) -> Evaluation:
+    return drive_chunk(part, lineup.make(), lineup.scenario, seed, lineup.scenario.learners, first)
+
+
+def tally_list(
+    lineup: Lineup,
+    episodes: int,
+    seed: int,
+    *,
+    objectives: Sequence[str] = (),
+    jobs: int | None = None,
+    ray: str | None = None,
+    on_done: OnDone | None = None,
+) -> Tally:
+    """The statistics of the worlds 0 to ``episodes - 1`` of a list of any length; no world is kept.
+
+    Nothing of what is known whoever drives is in them: proofs take longer than driving. ``jobs`` and ``ray`` as in
+    ``run_each``.
+    """
+    check_whole_number("episodes", episodes, 1, MOST_EPISODES)
+    check_whole_number("seed", seed, 0)
+    chunks = range(0, episodes, CHUNK)
+    calls: Iterator[Call] = (
+        (_count, lineup, first, min(first + CHUNK, episodes), seed, tuple(objectives) or None) for first in chunks
+    )
+    whole = Tally()
+    for done, part in enumerate(run_each(calls, jobs, ray), 1):
+        whole += part
+        _tell(on_done, done, episodes)
+    return whole
+
+
+def _count(lineup: Lineup, first: int, end: int, seed: int, objectives: Sequence[str] | None) -> Tally:
+    return Tally.of(_drive(lineup, lineup.scenario.sample(end - first, seed, first=first), seed, first), objectives)
+
+
+def _tell(on_done: OnDone | None, chunks: int, worlds: int) -> None:
+    if on_done is not None:
+        on_done(min(chunks * CHUNK, worlds))
+
+
+def summarise_tally(lineup: Lineup, tally: Tally, seed: int) -> SummaryTable:
+    """One row per agent, as ``summarise``. Raises ``PhysicsError`` if no world is left."""
+    if not tally.worlds:
+        raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in tally.left_out})
+    scenario = lineup.scenario
+    task = Task(scenario, scenario.learners, lineup.harm_count)
+    teams = {name: Team.of(agent, scenario.learners) for name, agent in lineup.make().items()}
+    because = f"a list of more than {HELD:,} worlds is driven without proofs"
+    return SummaryTable.of_tallies(
+        {name: tally.agents[name] for name in teams},
+        Conditions.of_test(task, seed, tally.worlds, because, Conditions.of_ranges(tally.ranges)),
+        task,
+        {name: Knowledge.of(team) for name, team in teams.items()},
+        {name: policies_of(team.drivers) for name, team in teams.items()},
+        left_out=tally.left_out,
+        hidden_share=tally.hidden / tally.worlds,
+        worlds_sha256=f"{tally.worlds_hash:064x}",
+        scenario_sha256=scenario_sha256(scenario),
+        versions=result_versions(),
+    )

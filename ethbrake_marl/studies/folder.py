@@ -1,0 +1,104 @@
+"""The folder of a study: it answers one question, and one process at a time works in it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.files.store import check_folder, hold_lock, read_object, remove_unfinished, write_file
+
+_LOCK = ".lock"
+
+
+class StudyFolder:
+    """Where a study leaves its results, so that the same command goes on after a kill.
+
+    Args:
+        path: made when work begins.
+        kind: what it holds, for messages.
+        question: what every result in it depends on, as plain data; None: each result knows its own.
+        record: name of the file with the question, and with what ``more`` adds to it when it is written.
+        advice: what to do about a folder that answers another question.
+        beside: names of what may be in a folder without a record; None: anything.
+
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        kind: str,
+        question: Mapping[str, Any] | None = None,
+        *,
+        record: str = "question.json",
+        more: Mapping[str, Any] | None = None,
+        advice: str = "give another folder (--output)",
+        beside: Collection[str] | None = None,
+    ) -> None:
+        self.path, self._kind, self._advice, self._beside = path, kind, advice, beside
+        self._question: dict[str, Any] | None = None if question is None else json.loads(json.dumps(question))
+        self._record, self._more = path / record, dict(more or {})
+
+    def check(self) -> bool:
+        """Whether the record of the question is still to be written; makes nothing.
+
+        Raises ``InvalidInput`` for what is no folder, cannot be written to, or answers another question, with what
+        differs; ``AlreadyExists`` for a folder of something else.
+        """
+        check_folder(self.path)
+        if self._question is None:
+            if self._record.is_file():
+                raise AlreadyExists(
+                    f"{self.path}: is no folder of {self._kind}: {self._record.name} of another command is there;"
+                    f" {self._advice}"
+                )
+            return False
+        if not self._record.is_file():
+            held = {each.name for each in self.path.iterdir()} if self.path.is_dir() else set()
+            if self._beside is not None and held - {*self._beside, _LOCK}:
+                raise AlreadyExists(f"{self.path}: is there already, and holds no {self._kind}; give another folder")
+            return True
+        try:
+            kept = read_object(self._record)
+        except InvalidInput as error:
+            raise InvalidInput(f"{error}; {self._advice}") from None
+        other = _differences({key: kept[key] for key in kept if key not in self._more}, self._question)
+        if other:
+            raise InvalidInput(
+                f"{self.path}: holds {self._kind} with other settings ({'; '.join(other)}); {self._advice}"
+            )
+        return False
+
+    @contextmanager
+    def work(self) -> Iterator[None]:
+        """Keep others out of the folder while the block runs; what killed writers left goes.
+
+        Raises what ``check`` raises, and ``InvalidInput`` where another process works in it.
+        """
+        self.check()
+        self.path.mkdir(parents=True, exist_ok=True)
+        with hold_lock(self.path / _LOCK, "another process works in it; wait for it, or end it"):
+            is_new = self.check()
+            remove_unfinished(self.path)
+            if is_new:
+                write_file(
+                    self._record, (json.dumps({**self._more, **(self._question or {})}, indent=2) + "\n").encode()
+                )
+            yield
+
+
+def _differences(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> list[str]:
+    """What differs between two questions, in words; of lists and of what stands in one alone the name."""
+    found: list[str] = []
+    for name in dict.fromkeys([*now, *before]):
+        old, new = before.get(name), now.get(name)
+        told = f"{inside}{name.replace('_', '-')}"
+        if isinstance(old, dict) and isinstance(new, dict):
+            found += _differences(old, new, f"{told} ")
+        elif old != new:
+            plain = not isinstance(old, list | dict) and not isinstance(new, list | dict)
+            found.append(f"{told} {old!s:.40}, here {new!s:.40}" if plain else told)
+    return found
