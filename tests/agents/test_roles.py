@@ -20,7 +20,7 @@ SPECS = {
     "cacc": ["cacc:T=0.8"],
     "coast": ["coast"],
     "constant": ["constant:3"],
-    "counterfactual": ["counterfactual@shipped/counterfactual-cooperation-1-front"],
+    "counterfactual": ["counterfactual@shipped"],
     "e_v2x_bm": ["e_v2x_bm", "e_v2x_bm:pairwise", "e_v2x_bm:believed", "e_v2x_bm:pairwise:believed"],
     "full_brake": ["full_brake"],
     "idm": ["idm:T=1.0"],

@@ -104,7 +104,6 @@ def test_evaluate__prints_the_papers_rows_where_they_are_asked_for_and_fit(ethbr
         check_refused(
             ethbrake(*words, *other, "--paper"), "paper: the paper's rows are about Vehicle 2", "leave paper out"
         )
-    check_refused(ethbrake(*words, "--shards", "1", "--paper"), "--paper: --shards prints no rows of the paper")
     check_refused(ethbrake(*words, "--scenario", "standards", "--paper"), "--paper: standards is a group")
 
 
@@ -239,7 +238,7 @@ def test_compare__difference_is_paired_by_world_where_every_world_is_there(resul
 
 
 def test_compare__marks_who_exploits_what_harm_does_not_count(ethbrake: Command, results: Path) -> None:
-    rows = json.loads((results / "a.csv.json").read_text())
+    rows = json.loads((results / "a/results.json").read_text())
     for name, shoved, moving in (("before", 4.0, 0), ("after", 6.0, rows[0]["episodes"])):
         told = [row | {"vehicle_1_shoved_m": shoved, "horizon_ends": moving} for row in rows[:1]] + rows[1:]
         (results / f"{name}.json").write_text(json.dumps(told))
@@ -263,7 +262,7 @@ def test_compare__marks_who_exploits_what_harm_does_not_count(ethbrake: Command,
     ],
 )
 def test_compare__refuses_what_no_evaluation_wrote(results: Path, wrong: dict[str, Any], says: str) -> None:
-    rows = [row | wrong for row in json.loads((results / "a.csv.json").read_text())]
+    rows = [row | wrong for row in json.loads((results / "a/results.json").read_text())]
     (results / "wrong.json").write_text(json.dumps(rows))
     with pytest.raises(InvalidInput, match=says):
         read_result(results / "wrong.json")
