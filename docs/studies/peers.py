@@ -46,7 +46,7 @@ def rates(work: Work, repetitions: int = REPETITIONS, seconds: float = SECONDS) 
 
 
 def ours(name: str, n: int) -> Work:
-    """A loop of ``ethbrake doctor speed``."""
+    """A loop of ``python docs/studies/speed.py``."""
     from ethbrake_marl.studies import speed
 
     work: Work = getattr(speed, name)(n)

@@ -5,18 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
 from ethbrake_marl.agents import Driver
-from ethbrake_marl.defaults import DEFAULT, HarmCount, MeasureName
-from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
+from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number, unknown_name
 from ethbrake_marl.evaluation import NamedWorld, evaluate, make_lineup, states_of
+from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Floats, Ints
 from ethbrake_marl.scenario import Sample, Scenario
 
 # Measures of an agent's weakness, world by world.
+
+MeasureName = Literal["harm", "regret", "difference", "bound"]
+HINDSIGHT = "best_harm"  # the reference of regret, unless another is given
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,15 +115,15 @@ class Measure:
         return Falsified(sample, kept, tried.scores, int(above[0]) + 1 if len(above) else None)
 
     @classmethod
-    def of(
-        cls, name: MeasureName, agent: str, against: str | None, scenario: Scenario, harm_count: HarmCount
-    ) -> Measure:
-        """The measure of that name; raises ``InvalidInput`` for a reference that is missing or that nobody asks."""
+    def of(cls, name: str, agent: str, against: str | None, scenario: Scenario, harm_count: HarmCount) -> Measure:
+        """The measure of that name; raises ``InvalidInput`` for a reference that is missing or not asked for."""
+        if name not in get_args(MeasureName):
+            raise unknown_name("measure", name, get_args(MeasureName))
         if name in ("harm", "bound") and against is not None:
             raise InvalidInput(f"--against {against}: --measure {name} compares with nobody; use regret or difference")
         if name == "difference" and against is None:
             raise InvalidInput("--measure difference: compares two agents; say which is the other one, --against AGENT")
-        specs = [agent] if name in ("harm", "bound") else [agent, against or DEFAULT.HINDSIGHT]
+        specs = [agent] if name in ("harm", "bound") else [agent, against or HINDSIGHT]
         lineup = make_lineup(specs, scenario, harm_count=harm_count)
         if len(lineup) != len(specs):
             raise InvalidInput(f"agent {' or '.join(specs)}: stands for several agents; one is needed here")
