@@ -115,7 +115,8 @@ figures: $(STAMP)
 	@$(PROGRAMME) figures $(ARGS)
 
 programme: $(STAMP)
-	@$(PROGRAMME) $(NAME) $(ARGS)
+	@$(if $(filter cluster,$(NAME)),$(INSTALL) -e ".[cluster]",:)
+	@$(if $(filter proofs,$(NAME)),NUMBA_DISABLE_JIT=1) $(PROGRAMME) $(NAME) $(ARGS)
 
 clean:
 	rm -rf $(VENV) .venvs .pytest_cache .ruff_cache .mypy_cache .hypothesis build dist docs/_build

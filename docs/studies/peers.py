@@ -1,4 +1,4 @@
-"""Beside other simulators: speeds, all measured now, by one loop, on this machine: ``make bench-peers``.
+"""Beside other simulators: speeds, all measured now, by one loop, on this machine: ``python docs/studies/peers.py``.
 
 Each peer has an environment of its own below ``.venvs/``: some have licences or dependencies that this project does not
 want. One that cannot be installed or measured is told with the reason. Work is counted per second of processor time of

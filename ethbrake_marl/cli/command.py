@@ -1,4 +1,4 @@
-"""What commands share: their options, and their output."""
+"""Options that commands share, and the output of a command."""
 
 from __future__ import annotations
 

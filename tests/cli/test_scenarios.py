@@ -126,7 +126,8 @@ def test_sample__draws_the_worlds_that_evaluate_draws(ethbrake: Command, tmp_pat
     table.write_text(ethbrake("scenario", "sample", "paper-random", *drawn).out)
     (one,) = told_json(ethbrake("evaluate", "--agents", "full_brake", "--json", *drawn))
     paper = eb.load_scenario("paper-random")
-    (other,) = eb.summarise(eb.evaluate(paper.read_worlds(table), "full_brake", scenario=paper)).to_json()
+    (row,) = eb.summarise(eb.evaluate(paper.read_worlds(table), "full_brake", scenario=paper))
+    other = row.to_json()
     assert all(one[name] == other[name] for name in ("first_impact_harm", "worlds_sha256"))
 
 

@@ -148,7 +148,7 @@ BLOCKS: dict[str, How] = {
     "ethbrake train --scenario cooperation-3-pair": TRAINED,
     "ethbrake agent export runs/early": TRAINED,
     "Agent,                           First-impact": _by(TRAINING, "make run"),
-    "resume, ppo: 20/20": _by(TRAINING, "make test-resume"),
+    "resume, ppo: 20/20": _by(TRAINING, "make programme NAME=resume"),
     "gap_1_m,gap_2_m,speed_1_mps": _by(BY_HAND),
     "paper-random full_brake        backward": EXACT,
 }

@@ -201,7 +201,9 @@ def test_programs__of_a_page_run_and_print_what_stands_below_them(
 
 @pytest.mark.slow
 def test_howto_train__runs_and_beats_full_braking(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)  # MAPPO of BenchMARL, where it is missing here, is run by ``make test-libraries``
+    monkeypatch.chdir(
+        tmp_path
+    )  # MAPPO of BenchMARL, where it is missing here, is run by ``make programme NAME=libraries``
     assert {"one", "pair"} <= harm_of_howto().keys()
 
 
