@@ -16,27 +16,20 @@ import pytest
 from rich.console import Console
 
 import ethbrake_marl as eb
-from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation import Evaluation, Outcome, SummaryTable, evaluate, measures, summarise, write_per_world
+from ethbrake_marl.evaluation import Evaluation, Outcome, SummaryTable, evaluate, summarise, write_per_world
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.evaluation.measures import (
-    KNOWN_OF_WORLDS,
-    PAPER_ROWS,
-    Exploits,
-    IncompleteTable,
-    is_papers_test,
-    shipped_bounds,
-)
+from ethbrake_marl.evaluation.measures import KNOWN_OF_WORLDS, PAPER_ROWS, Exploits, IncompleteTable, is_papers_test
 from ethbrake_marl.evaluation.results import read_harms
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.harm import STANDARD, Ledger
+from ethbrake_marl.harm import HARM_COUNTS, STANDARD, Ledger
 from ethbrake_marl.limits import limits as limits_module
 from ethbrake_marl.limits.limits import BestHarmTable, Unproven, known_limits, shipped_tables, unproven_because
 from ethbrake_marl.pages.report import Report
 from ethbrake_marl.physics.batch import Impacts
 from ethbrake_marl.scenario import Scenario, Task, list_scenarios, load_scenario
 from ethbrake_marl.studies.experiment import results_csv
+from tests.docs.site import load
 
 SILENT = pytest.mark.filterwarnings("ignore::ethbrake_marl.evaluation.measures.IncompleteTable")
 BRAKE = {"full_brake": eb.make_agent("full_brake")}
@@ -638,13 +631,16 @@ def test_limits__of_the_first_500_worlds_of_the_papers_random_test(name: str, un
 # ---------------------------------------------------------------- proven and best known harm beside each other
 
 
+STUDY = load("../studies/best_harm")
+
+
 def shipped(name: str, **header: Any) -> BestHarmTable:
     (table,) = (table for table in shipped_tables() if table.header["scenario"] == name)
     return replace(table, header={**table.header, **header})
 
 
 def test_shipped__stress_wide_has_a_loose_proof_and_says_so() -> None:
-    (found,), sheet = shipped_bounds([shipped("stress-wide")])
+    (found,), sheet = STUDY.shipped_bounds([shipped("stress-wide")])
     proven, inside = found["proven"], found["proven"]["between"]
     assert (found["worlds"], found["list_seed"]) == (5000, 7)
     assert (found["gap_first"], found["gap_total"]) == pytest.approx((0.057, 0.122), abs=5e-4)
@@ -652,20 +648,20 @@ def test_shipped__stress_wide_has_a_loose_proof_and_says_so() -> None:
     assert inside["mean_first"] > 0.9 and inside["harmless_rate"] < 0.55  # nobody leans there
     (_, _, line) = sheet.markdown().splitlines()
     assert "| 5.7 % |" in line and "| 12.2 % |" in line
-    (leaning,), _ = shipped_bounds([shipped("paper-delay-low", episodes=1000)])
+    (leaning,), _ = STUDY.shipped_bounds([shipped("paper-delay-low", episodes=1000)])
     assert leaning["proven"]["between"]["mean_first"] < 0.03  # in the paper's lists leaning explains what is between
 
 
 def test_shipped__every_table_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     names = [table.header["scenario"] for table in shipped_tables()]
     few = [replace(table, header={**table.header, "episodes": 20}) for table in shipped_tables()]
-    monkeypatch.setattr(measures, "shipped_tables", lambda: few)
-    found, sheet = shipped_bounds()
+    monkeypatch.setattr(STUDY, "shipped_tables", lambda: few)
+    found, sheet = STUDY.shipped_bounds()
     assert [one["scenario"] for one in found] == names and len(sheet.markdown().splitlines()) == 2 + len(found)
 
 
 def test_shipped__where_nothing_is_proven_the_reason_stands_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(measures, "unproven_because", lambda *_: "an obstacle stands ahead of vehicle_1")
-    (found,), sheet = shipped_bounds([shipped("paper-delay-low", episodes=5)])
+    monkeypatch.setattr(STUDY, "unproven_because", lambda *_: "an obstacle stands ahead of vehicle_1")
+    (found,), sheet = STUDY.shipped_bounds([shipped("paper-delay-low", episodes=5)])
     assert found["proven"] is None and found["gap_first"] is None
     assert "an obstacle stands ahead" in sheet.markdown().splitlines()[2]

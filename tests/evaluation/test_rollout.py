@@ -308,12 +308,7 @@ ABOUT = {"worlds_sha256": worlds_sha256(SAMPLE.worlds, SAMPLE.index), "scenario_
 
 
 @pytest.mark.parametrize(
-    ("kind", "command"),
-    [
-        ("evaluate", "evaluate --agents full_brake"),
-        ("shield", "shield --agents full_brake"),
-        ("best-harm", "search best-harm --budget 20"),
-    ],
+    ("kind", "command"), [("evaluate", "evaluate --agents full_brake"), ("shield", "shield --agents full_brake")]
 )
 def test_every_results_file__says_its_kind_worlds_scenario_and_versions(
     kind: str, command: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
