@@ -220,7 +220,7 @@ PARTS = [  # as ``part_names`` tells them: to ask for them takes the engine, and
     ),
     ("V2X presets", "paper, clear, nominal, congested, blocked, sensors-only"),
     ("Objectives", "total, own, social:ANGLE, maximin, mass-weighted, weighted:W1,W2,..., injury:CURVE"),
-    ("Algorithms", "ppo, sac, counterfactual, options"),
+    ("Algorithms", "counterfactual, options, ppo, sac"),
     ("Measures", "injury"),
 ]
 
