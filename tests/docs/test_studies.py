@@ -20,7 +20,7 @@ from ethbrake_marl.agents.registry import drive, make_agent
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.evaluation.measures import PAPER_NOTE, PAPER_ROWS
 from ethbrake_marl.figures import picture_bytes
-from ethbrake_marl.harm import KINDS, scored
+from ethbrake_marl.harm import OBJECTIVES, scored
 from ethbrake_marl.learning.training import Scheme
 from ethbrake_marl.limits.limits import best_known
 from ethbrake_marl.scenario import Task, load_scenario
@@ -278,7 +278,7 @@ def first_cells(heading: str) -> dict[str, list[str]]:
 def test_cooperation__its_objectives_and_schemes_are_those_of_the_code() -> None:
     schemes = {re.findall("`(.*?)`", cell)[0] for cell in first_cells("| scheme | networks |")}
     objectives = [re.findall("`(.*?)[:`]", cell)[0] for cell in first_cells("| `objective` | for")]
-    assert (schemes, objectives) == (set(get_args(Scheme)), list(KINDS))
+    assert (schemes, objectives) == (set(get_args(Scheme)), list(OBJECTIVES))
 
 
 def test_cooperation__its_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
