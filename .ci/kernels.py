@@ -1,4 +1,4 @@
-"""A wheel of ready-made kernels, ``ethbrake-marl-kernels``, for this version of Python, in dist/ (``python .ci/kernels.py``).
+"""A wheel of ready-made kernels, ``ethbrake-marl-kernels``, for this version of Python, in dist/.
 
 It holds the machine code of what Python calls, for two levels of x86-64. A kernel's name holds the hash of all that
 makes it: of another version of this package, of numba or of Python it is never loaded.

@@ -49,9 +49,9 @@ def read_task(scenario: str, settings: Sequence[str] | None) -> Task:
     return Task(chosen, chosen.learners, given.harm_count)
 
 
-def make_drivers(agents: str | Sequence[str], task: Task, **how: bool) -> dict[str, Any]:
+def make_drivers(agents: str | Sequence[str], task: Task, *, bare: bool = False) -> dict[str, Any]:
     """Who is named on the command line, as ``make_lineup`` makes them; tells which policies ``@shipped`` stands for."""
-    lineup = evaluation.make_lineup(agents, task.scenario, harm_count=task.harm_count, **how)
+    lineup = evaluation.make_lineup(agents, task.scenario, harm_count=task.harm_count, bare=bare)
     _tell_shipped(lineup)
     return lineup
 

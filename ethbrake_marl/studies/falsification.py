@@ -19,6 +19,7 @@ from ethbrake_marl.scenario import Sample, Scenario
 # Measures of an agent's weakness, world by world.
 
 MeasureName = Literal["harm", "regret", "difference", "bound"]
+MEASURES: tuple[MeasureName, ...] = get_args(MeasureName)
 HINDSIGHT = "best_harm"  # the reference of regret, unless another is given
 
 
@@ -117,8 +118,9 @@ class Measure:
     @classmethod
     def of(cls, name: str, agent: str, against: str | None, scenario: Scenario, harm_count: HarmCount) -> Measure:
         """The measure of that name; raises ``InvalidInput`` for a reference that is missing or not asked for."""
-        if name not in get_args(MeasureName):
-            raise unknown_name("measure", name, get_args(MeasureName))
+        chosen = next((each for each in MEASURES if each == name), None)
+        if chosen is None:
+            raise unknown_name("measure", name, MEASURES)
         if name in ("harm", "bound") and against is not None:
             raise InvalidInput(f"--against {against}: --measure {name} compares with nobody; use regret or difference")
         if name == "difference" and against is None:
@@ -127,7 +129,7 @@ class Measure:
         lineup = make_lineup(specs, scenario, harm_count=harm_count)
         if len(lineup) != len(specs):
             raise InvalidInput(f"agent {' or '.join(specs)}: stands for several agents; one is needed here")
-        return cls(name, lineup, scenario, harm_count)
+        return cls(chosen, lineup, scenario, harm_count)
 
 
 # An adaptive search of the unit cube for the points of highest score, of which several far apart are wanted.

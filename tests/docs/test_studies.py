@@ -11,7 +11,6 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from ethbrake_marl.studies.speed import Effort
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents import optimise_pairwise
@@ -41,7 +40,7 @@ BASELINES = load("results").read_tables("baselines")
 BASE = load_scenario("cooperation-2-paper")
 
 
-SHORT = Effort(1, 1e-6)
+SHORT = load("../studies/speed").Effort(1, 1e-6)
 
 
 PNG = b"\x89PNG"
@@ -301,7 +300,7 @@ def test_ablate_cooperation__its_files_and_commands_make_what_it_says(
         (text,) = re.findall(f"```{language}\n(.*?)```", ABLATION, re.DOTALL)
         (tmp_path / name).write_text(text, "utf-8")
     environment = {**os.environ, "PYTHONPATH": str(DOCS.parent), "OMP_NUM_THREADS": "1"}
-    small = "--seeds 1 --steps 512 --episodes 20 --search-episodes 3 --budget 50"
+    small = "--seeds 1 --steps 512 --episodes 20 --search-episodes 3"
     for command in re.findall(r"^\$ (.*)", ABLATION, re.MULTILINE):
         words = command.replace("--seeds 3", small).split()[1:]
         done = subprocess.run(
