@@ -12,7 +12,6 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from ethbrake_marl.studies.speed import Effort
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents import optimise_pairwise
@@ -43,7 +42,7 @@ BASELINES = load("results").read_tables("baselines")
 BASE = load_scenario("cooperation-2-paper")
 
 
-SHORT = Effort(1, 1e-6)
+SHORT = load("../studies/speed").Effort(1, 1e-6)
 
 
 PNG = b"\x89PNG"
@@ -306,7 +305,7 @@ def test_ablate_cooperation__its_files_and_commands_make_what_it_says(
     write_metadata(tmp_path, tomllib.loads(package)["project"])  # as pip does
     path = os.pathsep.join([os.environ["PYTHONPATH"], str(tmp_path)])
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path}
-    small = "--seeds 1 --steps 512 --episodes 20 --search-episodes 3 --budget 50"
+    small = "--seeds 1 --steps 512 --episodes 20 --search-episodes 3"
     for command in re.findall(r"^\$ (.*)", ABLATION, re.MULTILINE):
         words = command.replace("--seeds 3", small).split()[1:]
         done = subprocess.run(
