@@ -202,7 +202,7 @@ mutation: $(STAMP)
 
 bench-peers: $(STAMP)
 	@echo "== speed beside other simulators"
-	@PYTHONPATH="$(CURDIR)" $(BIN)/python docs/studies/peers.py $(ARGS)
+	@$(PROGRAMME) peers $(ARGS)
 
 clean:
 	rm -rf $(VENV) .venvs .pytest_cache .ruff_cache .mypy_cache .hypothesis build dist docs/_build
