@@ -1,8 +1,4 @@
-<<<<<<< HEAD:docs/studies/peers.py
-"""Beside other simulators: speeds, all measured now, by one loop, on this machine: ``python docs/studies/peers.py``.
-=======
 """Beside other simulators: speeds, all measured now, by one loop, on this machine.
->>>>>>> h2-docs:tests/programmes/peers.py
 
 Each peer has an environment of its own below ``.venvs/``: some have licences or dependencies that this project does not
 want. One that cannot be installed or measured is told with the reason. Work is counted per second of processor time of
@@ -22,6 +18,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
+from tests.docs.site import load
 from tests.programmes import Cases, Given, NotInstalled, Told, ready_python, watched
 
 Work = Callable[[], int]  # does some work and says how many worlds it advanced by a step
@@ -50,9 +47,7 @@ def rates(work: Work, repetitions: int = REPETITIONS, seconds: float = SECONDS) 
 
 def ours(name: str, n: int) -> Work:
     """A loop of ``python docs/studies/speed.py``."""
-    from ethbrake_marl.studies import speed
-
-    work: Work = getattr(speed, name)(n)
+    work: Work = getattr(load("../studies/speed"), name)(n)
     return work
 
 
