@@ -196,7 +196,7 @@ def test_naming_extras__leaves_other_missing_modules_alone() -> None:
 
 
 def test_extras__are_those_of_the_table_and_all_is_their_sum() -> None:
-    assert {"dev", "docs", "all", "kernels", "notebook", *_EXTRA_OF.values()} == set(EXTRAS)
+    assert {"dev", "docs", "all", "notebook", *_EXTRA_OF.values()} == set(EXTRAS)
     distribution = {
         "stable_baselines3": "stable-baselines3",
         "pygame": "pygame-ce",

@@ -113,6 +113,6 @@ def test_recipes_and_levels__may_lie_in_folders_of_any_name(tmp_path):
     curves = LearningCurves.parse("lr=1,b:2/quick.yaml:3,ppo:2")
     assert [(recipe.name, seeds) for recipe, seeds in curves] == [("quick", 3), ("ppo", 2)]
     levels = "lr=1,b:2/cooperation-1-front.yaml,lr=1,b:2/cooperation-2-paper.yaml"
-    plan = plan_ablation(levels, "lr=1,b:2/quick.yaml,ppo", None, None, list_seed=7, folder=tmp_path / "out")
+    plan = plan_ablation(levels, "lr=1,b:2/quick.yaml,ppo", None, list_seed=7, folder=tmp_path / "out")
     assert [level.name for level in plan.levels] == ["cooperation-1-front", "cooperation-2-paper"]
     assert [recipe.name for recipe in plan.recipes] == ["quick", "ppo"]

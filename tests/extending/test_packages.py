@@ -191,7 +191,7 @@ def test_entry_point__that_fails_is_named_and_breaks_nothing_else(
             use()
     for words in (["hills"], ["evaluate", "--set", "measures=hills"]):
         assert run_command(words) == 2 and told in capsys.readouterr().err
-    for words in (["--help"], ["evaluate", "--help"], ["scenario", "schema"], ["recipe", "schema"], ["agent", "list"]):
+    for words in (["--help"], ["evaluate", "--help"], ["scenario", "schema"], ["train", "--schema"], ["agent", "list"]):
         assert run_command(words) == 0
     assert capsys.readouterr().err.count("left out: ") == 2
 
