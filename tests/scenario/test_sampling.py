@@ -1,6 +1,6 @@
 """Worlds that are drawn, derived or given, by every key.
 
-By hand: ``told/worlds.txt``, ``told/roads.txt``; refusals: ``refusals/worlds.txt``, ``keys.txt``; worlds: ``golden``.
+By hand: ``told/worlds.txt``, ``told/roads.txt``; refusals: ``test_refusals``, ``test_refused_worlds``; worlds: ``golden``.
 """
 
 from dataclasses import fields

@@ -1,6 +1,6 @@
 """What a scenario says, the shipped ones, and what editors and pages are told.
 
-Single calls: ``told/declared.txt``; refusals: ``refusals/scenario.txt``. The names of the shipped
+Single calls: ``told/declared.txt``; refusals: ``test_refusals``. The names of the shipped
 ones stand in ``cli/printed/scenarios.txt``, their worlds in ``golden``.
 """
 
