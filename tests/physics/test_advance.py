@@ -238,7 +238,7 @@ def test_block__takes_the_limit_of_any_of_its_members_to_the_last_bit(limit: flo
     assert after.speeds_mps.tolist() == [[limit, limit]] and after.gaps_m.tolist() == [[0.0]]
 
 
-@pytest.mark.parametrize("gap", [-1.5e-9, -2e-9])  # beyond: `refusals/physics.txt`
+@pytest.mark.parametrize("gap", [-1.5e-9, -2e-9])  # beyond: `test_refusals.py`
 def test_overlap__at_an_event_is_rounding_up_to_1e_9_m(gap: float) -> None:
     # vehicle 1 leaves vehicle 2 with 1e-9 m/s; vehicle 3 meets them after 1 s, when 1e-9 m of the overlap are gone
     worlds = dataclasses.replace(line([0.0, 8.0], [1e-9, 0.0, 8.0]), gaps_m=np.array([[gap, 8.0]]))

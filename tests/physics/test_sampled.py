@@ -133,7 +133,7 @@ def test_first_sample__is_a_time_that_rounding_parts_from_it(until: float) -> No
 
 # The line, its command, the step, the end, and columns of the state then.
 REACH: list[tuple[Worlds, float, float, float, dict[str, Any]]] = [
-    # a sample reaches to both sides (beyond: `refusals/physics.txt`), the first one to before it
+    # a sample reaches to both sides (beyond: `test_refusals.py`), the first one to before it
     *(
         (replace(line([9.0], [4.0, 4.0]), time_s=np.array([time])), 0.0, 1.0, 2.0, {"time_s": 2.0})
         for time in (1e-6, 1.0 + 0.5e-6, 1.0 - 0.5e-6)
