@@ -65,39 +65,63 @@ def modes(**changes: Any) -> Any:
 
 RECIPES: dict[str, Callable[[], object]] = {
     "mine.yaml, line 4: n_env: unknown key; did you mean n_envs?": lambda: recipe("n_envs: 16", "n_env: 16"),
-    "mine.yaml, line 15: network.policies: unknown key; did you mean policy?": lambda: recipe("policy: [8]", "policies: [8]"),
+    "mine.yaml, line 15: network.policies: unknown key; did you mean policy?": lambda: recipe(
+        "policy: [8]", "policies: [8]"
+    ),
     "mine.yaml, line 16: reward.speed: unknown key": lambda: recipe("harm: 1", "speed: 1"),
-    "mine.yaml: gamma: missing; it is needed; every key is in the shipped recipe ppo": lambda: recipe("gamma: 0.99\n", ""),
+    "mine.yaml: gamma: missing; it is needed; every key is in the shipped recipe ppo": lambda: recipe(
+        "gamma: 0.99\n", ""
+    ),
     "mine.yaml, line 9: gamma = .nan: must be a finite number": lambda: recipe("gamma: 0.99", "gamma: .nan"),
     "mine.yaml, line 9: gamma = 1.5: must be less than or equal to 1": lambda: recipe("gamma: 0.99", "gamma: 1.5"),
     "must be one of ppo, sac, counterfactual, options": lambda: recipe("algorithm: ppo", "algorithm: trpo"),
     "must be a whole number, written without a decimal point": lambda: recipe("total_steps: 4096", "total_steps: 1e6"),
-    "mine.yaml, line 8: learning_rate.start = -0.001: must be greater than 0": lambda: recipe("start: 1e-3", "start: -1e-3"),
-    "mine.yaml, line 6: batch_size = 100: must divide n_envs x n_steps = 512": lambda: recipe("batch_size: 128", "batch_size: 100"),
+    "mine.yaml, line 8: learning_rate.start = -0.001: must be greater than 0": lambda: recipe(
+        "start: 1e-3", "start: -1e-3"
+    ),
+    "mine.yaml, line 6: batch_size = 100: must divide n_envs x n_steps = 512": lambda: recipe(
+        "batch_size: 128", "batch_size: 100"
+    ),
     "n_envs x n_steps = 3200000000 decisions per update": lambda: recipe("n_envs: 16", "n_envs: 100000000"),
     "mine.yaml, line 15: network.policy = []: must not be empty": lambda: recipe("policy: [8]", "policy: []"),
-    "mine.yaml, line 16: reward = {harm: 0}: every weight is 0; nothing could be learned": lambda: recipe("harm: 1", "harm: 0"),
-    "mine.yaml, line 17: evaluation.every_updates = 0: must be greater than or equal to 1": lambda: recipe("every_updates: 2", "every_updates: 0"),
+    "mine.yaml, line 16: reward = {harm: 0}: every weight is 0; nothing could be learned": lambda: recipe(
+        "harm: 1", "harm: 0"
+    ),
+    "mine.yaml, line 17: evaluation.every_updates = 0: must be greater than or equal to 1": lambda: recipe(
+        "every_updates: 2", "every_updates: 0"
+    ),
     "must be 1 to 64 lower case letters, digits, - and _, beginning": lambda: recipe("name: mine", "name: ../mine"),
     "mine.yaml, line 8: learning_rate = 0.0003: must be a mapping": lambda: recipe("{start: 1e-3, end: 1e-4}", "3e-4"),
     "mine.yaml, line 2, column 10: not valid YAML: expected ',' or ']'": lambda: recipe("name: mine", "name: [mine"),
     "mine.yaml: must be a mapping of keys to values": lambda: recipe(GOOD, "- ppo\n"),
     "recipe 'ppo': seed = -1: must be greater than or equal to 0": lambda: load_recipe("ppo").replace(seed=-1),
-    "recipe 'sac': ent_coef = automatic: must be auto or a number of at least 0": lambda: load_recipe("sac").replace(ent_coef="automatic"),
+    "recipe 'sac': ent_coef = automatic: must be auto or a number of at least 0": lambda: load_recipe("sac").replace(
+        ent_coef="automatic"
+    ),
     "recipe 'sac': buffer_size = 63: must be at least n_envs = 128": lambda: load_recipe("sac").replace(buffer_size=63),
     "recipe 'sac': n_steps: unknown key; did you mean total_steps?": lambda: load_recipe("sac").replace(n_steps=3),
     "recipe 'options': averaging = 1: must be less than 1": lambda: load_recipe("options").replace(averaging=1.0),
-    "recipe 'options': near = [{smallest: 0.1, largest: 1}, {smallest: 0.1, largest: 1}...": lambda: load_recipe("options").replace(near=[{"smallest": 0.1, "largest": 1.0}] * 9),
-    "recipe 'counterfactual': reward.shaping = 0.1: must be 0: what is tried is played to the end": lambda: TINY_COUNTERFACTUAL.replace(reward={"harm": 1.0, "shaping": 0.1}),
-    "recipe 'counterfactual': offset.largest = 0.1: must be at least smallest = 0.3": lambda: TINY_COUNTERFACTUAL.replace(offset={"smallest": 0.3, "largest": 0.1}),
-    "recipe 'counterfactual': gradient_limit = often: must be auto or a finite number above 0": lambda: TINY_COUNTERFACTUAL.replace(gradient_limit="often"),
+    "recipe 'options': near = [{smallest: 0.1, largest: 1}, {smallest: 0.1, largest: 1}...": lambda: load_recipe(
+        "options"
+    ).replace(near=[{"smallest": 0.1, "largest": 1.0}] * 9),
+    "recipe 'counterfactual': reward.shaping = 0.1: must be 0: what is tried is played to the end": lambda: (
+        TINY_COUNTERFACTUAL.replace(reward={"harm": 1.0, "shaping": 0.1})
+    ),
+    "recipe 'counterfactual': offset.largest = 0.1: must be at least smallest = 0.3": lambda: (
+        TINY_COUNTERFACTUAL.replace(offset={"smallest": 0.3, "largest": 0.1})
+    ),
+    "recipe 'counterfactual': gradient_limit = often: must be auto or a finite number above 0": lambda: (
+        TINY_COUNTERFACTUAL.replace(gradient_limit="often")
+    ),
     "must be ppo@, counterfactual@ or universal@ and a": lambda: TINY_COUNTERFACTUAL.replace(start="sac@shipped"),
     "n_envs x n_steps = 16777216 decisions per update; at most": lambda: TINY_COUNTERFACTUAL.replace(n_envs=2**22),
     "must be single, shared, independent or centralised": lambda: TINY_COUNTERFACTUAL.replace(scheme="centralized"),
     "recipe 'options': memory = 15: must be at least tried = 16": lambda: TINY_OPTIONS.replace(memory=15),
     "must hold a range where there are neither fixed no": lambda: TINY_OPTIONS.replace(near=[], fixed=[], drawn=0),
     "recipe 'counterfactual': modes.networks = 1: must be greater than or equal to 2": lambda: modes(networks=1),
-    "recipe 'counterfactual': modes.shares = {alone: 0.5, further: 0.5, gate: 0.5, together: 0}: alone": lambda: modes(shares={"alone": 0.5, "further": 0.5, "gate": 0.5, "together": 0.0}),
+    "recipe 'counterfactual': modes.shares = {alone: 0.5, further: 0.5, gate: 0.5, together: 0}: alone": lambda: modes(
+        shares={"alone": 0.5, "further": 0.5, "gate": 0.5, "together": 0.0}
+    ),
     "recipe 'counterfactual': modes.gat: unknown key; did you mean gate?": lambda: modes(gat=[8]),
 }
 
@@ -112,11 +136,19 @@ def test_recipe__is_refused(message: str) -> None:
 SETTINGS: dict[str, Callable[[], object]] = {
     "--set 'gamma': must be KEY=VALUE or KEY.KEY=VALUE": lambda: read_settings(["gamma"], [PPO]),
     "--set 'a..b=1': must be KEY=VALUE or KEY.KEY=VALUE": lambda: read_settings(["a..b=1"], [PPO]),
-    "--set gamma, line 1, column 2: not valid YAML: expected the node content, but found '<stream end>'": lambda: read_settings(["gamma=["], [PPO]),
+    "--set gamma, line 1, column 2: not valid YAML: expected the node content, but found '<stream end>'": lambda: (
+        read_settings(["gamma=["], [PPO])
+    ),
     "--set gamma: is given twice": lambda: read_settings(["gamma=0.9", "gamma=0.8"], [PPO]),
-    "recipe 'ppo': reward.terminl: unknown key; did you mean terminal?": lambda: read_settings(["reward.terminl=1"], [PPO]).change(PPO),
-    "--set gamma.x: there is nothing inside 0.995; set the whole value": lambda: read_settings(["gamma.x=1"], [PPO]).change(PPO),
-    "scenario 'paper-random': restitution = 3: must be finite and in [0, 1]": lambda: load_runnable("paper-random", read_settings(["restitution=3"]).scenario),
+    "recipe 'ppo': reward.terminl: unknown key; did you mean terminal?": lambda: read_settings(
+        ["reward.terminl=1"], [PPO]
+    ).change(PPO),
+    "--set gamma.x: there is nothing inside 0.995; set the whole value": lambda: read_settings(
+        ["gamma.x=1"], [PPO]
+    ).change(PPO),
+    "scenario 'paper-random': restitution = 3: must be finite and in [0, 1]": lambda: load_runnable(
+        "paper-random", read_settings(["restitution=3"]).scenario
+    ),
 }
 
 
@@ -127,24 +159,54 @@ def test_setting__is_refused(message: str) -> None:
 
 
 TRAININGS: dict[str, Callable[[], object]] = {
-    "runs/mine: is not a folder; give a policy bundle (manifest.json, weights.safetensors) or a run": lambda: train(load_recipe("counterfactual").replace(start="ppo@runs/mine"), "cooperation-2-five", "run", steps=1),
-    "recipe 'options': drawn = 2: must be at most the 1 of among": lambda: train(load_recipe("options").replace(among=["policy@shipped/ppo"]), "paper-random", "new"),
-    "recipe 'options': among: sac@shipped/ppo: give policy@shipped/NAME, or ppo@ and its path": lambda: train(load_recipe("options").replace(among=["sac@shipped/ppo"], drawn=1), "paper-random", "new"),
+    "runs/mine: is not a folder; give a policy bundle (manifest.json, weights.safetensors) or a run": lambda: train(
+        load_recipe("counterfactual").replace(start="ppo@runs/mine"), "cooperation-2-five", "run", steps=1
+    ),
+    "recipe 'options': drawn = 2: must be at most the 1 of among": lambda: train(
+        load_recipe("options").replace(among=["policy@shipped/ppo"]), "paper-random", "new"
+    ),
+    "recipe 'options': among: sac@shipped/ppo: give policy@shipped/NAME, or ppo@ and its path": lambda: train(
+        load_recipe("options").replace(among=["sac@shipped/ppo"], drawn=1), "paper-random", "new"
+    ),
     "algorithm 'ppo': is registered already; give another name": lambda: register_algorithm("ppo", PpoRecipe, Ppo),
-    "algorithm 'My algorithm': must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _": lambda: register_algorithm("My algorithm", PpoRecipe, Ppo),
-    "algorithm 'new': recipe = <class 'dict'>: must be a class with network_spec": lambda: register_algorithm("new", dict, Ppo),
-    "algorithm 'new': algorithm = <built-in function len>: must be a class with build": lambda: register_algorithm("new", PpoRecipe, len),
-    "recipe 'ppo': total_steps = 0: must be greater than or equal to 1": lambda: train("ppo", "paper-random", Path("run"), steps=0),
-    "scenario 'cooperation-3-pair': no vehicle learns; give at least one the role learner": lambda: train(TINY_PPO, PAIR.with_learners([]), Path("run")),
-    "scheme single: scenario 'cooperation-3-pair' has 2 learners; use shared, independent or centralised": lambda: train(TINY_PPO, PAIR, Path("run"), scheme="single"),
-    "scheme independent: scenario 'paper-random' has one learner; use single": lambda: train(TINY_PPO, PAPER, Path("run"), scheme="independent"),
-    "scheme independent: recipe 'sac' is for SAC; it needs one for PPO": lambda: train("sac", PAIR, Path("run"), scheme="independent"),
-    "scheme centralised: recipe 'sac' is for SAC; it needs one for PPO": lambda: train("sac", PAIR, Path("run"), scheme="centralised"),
-    "recipe 'ppo': turns = 3: is for scheme: independent only; leave it out": lambda: train(TINY_PPO, PAIR, Path("run"), scheme="shared", turns=3),
-    "recipe 'ppo': turns = 5: 2 learners need 10 updates, total_steps = 2048 are 8": lambda: train(TINY_PPO, PAIR, Path("run"), scheme="independent", steps=2048, turns=5),
+    "algorithm 'My algorithm': must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _": lambda: (
+        register_algorithm("My algorithm", PpoRecipe, Ppo)
+    ),
+    "algorithm 'new': recipe = <class 'dict'>: must be a class with network_spec": lambda: register_algorithm(
+        "new", dict, Ppo
+    ),
+    "algorithm 'new': algorithm = <built-in function len>: must be a class with build": lambda: register_algorithm(
+        "new", PpoRecipe, len
+    ),
+    "recipe 'ppo': total_steps = 0: must be greater than or equal to 1": lambda: train(
+        "ppo", "paper-random", Path("run"), steps=0
+    ),
+    "scenario 'cooperation-3-pair': no vehicle learns; give at least one the role learner": lambda: train(
+        TINY_PPO, PAIR.with_learners([]), Path("run")
+    ),
+    "scheme single: scenario 'cooperation-3-pair' has 2 learners; use shared, independent or centralised": lambda: (
+        train(TINY_PPO, PAIR, Path("run"), scheme="single")
+    ),
+    "scheme independent: scenario 'paper-random' has one learner; use single": lambda: train(
+        TINY_PPO, PAPER, Path("run"), scheme="independent"
+    ),
+    "scheme independent: recipe 'sac' is for SAC; it needs one for PPO": lambda: train(
+        "sac", PAIR, Path("run"), scheme="independent"
+    ),
+    "scheme centralised: recipe 'sac' is for SAC; it needs one for PPO": lambda: train(
+        "sac", PAIR, Path("run"), scheme="centralised"
+    ),
+    "recipe 'ppo': turns = 3: is for scheme: independent only; leave it out": lambda: train(
+        TINY_PPO, PAIR, Path("run"), scheme="shared", turns=3
+    ),
+    "recipe 'ppo': turns = 5: 2 learners need 10 updates, total_steps = 2048 are 8": lambda: train(
+        TINY_PPO, PAIR, Path("run"), scheme="independent", steps=2048, turns=5
+    ),
     "recipe 'counterfactual': modes: are for one learner, not for 2": lambda: train(TINY_MODES, PAIR, Path("run")),
     ".: holds no training; give the folder of a run": lambda: resume(Path()),
-    ".: holds no team (team.json); give the folder of a run, or a bundle as ppo@.": lambda: RunDirectory(Path()).load_team(PAIR),
+    ".: holds no team (team.json); give the folder of a run, or a bundle as ppo@.": lambda: RunDirectory(
+        Path()
+    ).load_team(PAIR),
 }
 
 
@@ -157,12 +219,16 @@ def test_training__is_refused(message: str) -> None:
 
 NAMES: dict[str, Callable[[], object]] = {
     "unknown recipe 'ppo-papre'; did you mean 'ppo-paper'?": lambda: load_recipe("ppo-papre"),
-    "unknown shipped policy 'nobody'": lambda: train(load_recipe("options").replace(among=["policy@shipped/nobody"], drawn=1), "paper-random", "new"),
+    "unknown shipped policy 'nobody'": lambda: train(
+        load_recipe("options").replace(among=["policy@shipped/nobody"], drawn=1), "paper-random", "new"
+    ),
     "unknown recipe 'pppo'; did you mean 'ppo'?": lambda: train("pppo", PAPER, Path("run")),
     "unknown scenario 'paper-randm'; did you mean 'paper-random'?": lambda: train("ppo", "paper-randm", Path("run")),
     "unknown setting 'gama'; did you mean 'gamma'?": lambda: read_settings(["gama=0.9"], [PPO]),
     "unknown setting 'mass_t'": lambda: read_settings(["recipe.mass_t=1"], [PPO]),
-    "unknown setting 'mass'; did you mean 'mass_t'?": lambda: load_runnable("paper-random", read_settings(["mass=3"]).scenario),
+    "unknown setting 'mass'; did you mean 'mass_t'?": lambda: load_runnable(
+        "paper-random", read_settings(["mass=3"]).scenario
+    ),
 }
 
 
@@ -178,7 +244,9 @@ def test_observation_and_network__hold_those_of_the_policy_to_start_from() -> No
     with refused("observation: lacks rear_1.known, rear_1.gap, rear_1.closing_speed, rear_1.acceleration"):
         widened(eb.load_shipped("ppo"), Training.of(turned, PAPER))
     smaller = load_recipe("counterfactual").replace(network={"policy": [64, 64]})
-    with refused("network: policy_hidden is (64, 64), but (128, 128) in the policy to start from; they must be the same"):
+    with refused(
+        "network: policy_hidden is (64, 64), but (128, 128) in the policy to start from; they must be the same"
+    ):
         widened(eb.load_shipped("ppo"), Training.of(smaller, PAPER))
 
 
@@ -227,7 +295,9 @@ def run(empty_folder: Path) -> RunDirectory:
 
 
 def test_folder__that_is_there_is_not_replaced_unasked(run: RunDirectory) -> None:
-    with refused("run: is there already; give another name (--name), go on with it (ethbrake train resume)", AlreadyExists):
+    with refused(
+        "run: is there already; give another name (--name), go on with it (ethbrake train resume)", AlreadyExists
+    ):
         RunDirectory(run.path).create({})
     Path("thesis").mkdir()
     Path("thesis/chapter-1").touch()
@@ -242,12 +312,17 @@ def test_folder__that_is_there_is_not_replaced_unasked(run: RunDirectory) -> Non
     [
         (lambda: Training.of(TINY_PPO.replace(seed=1), PAPER), "recipe seed"),
         (lambda: Training.of(TINY_PPO.replace(reward={"harm": 2.0}), PAPER), "recipe reward"),
-        (lambda: Training.of(TINY_PPO, PAPER.replace(v2x="clear", early_impacts="keep")), "scenario early_impacts, scenario v2x"),
+        (
+            lambda: Training.of(TINY_PPO, PAPER.replace(v2x="clear", early_impacts="keep")),
+            "scenario early_impacts, scenario v2x",
+        ),
         (lambda: Training.of(TINY_PPO, PAPER.replace(name="mine")), "scenario name"),
     ],
     ids=["seed", "reward", "channel", "name"],
 )
-def test_folder__of_another_training_is_refused(training: Callable[[], Training], other: str, run: RunDirectory) -> None:
+def test_folder__of_another_training_is_refused(
+    training: Callable[[], Training], other: str, run: RunDirectory
+) -> None:
     with refused(f"run: holds another training (here other: {other}); give another folder (--output)"):
         run.check_same(training())
 
@@ -255,10 +330,16 @@ def test_folder__of_another_training_is_refused(training: Callable[[], Training]
 @pytest.mark.parametrize(
     ("status", "message"),
     [
-        ('{"format": "ethbrake', "run/run.json: is damaged: Unterminated string starting at: line 1 column 12 (char 11)"),
+        (
+            '{"format": "ethbrake',
+            "run/run.json: is damaged: Unterminated string starting at: line 1 column 12 (char 11)",
+        ),
         ("[]", "run/run.json: is damaged: holds no JSON object"),
         ("{}", "run/run.json: format = None: must be ethbrake-run"),
-        ('{"format": "ethbrake-run", "status": "done"}', "run/run.json: status = 'done': must be running or finished or"),
+        (
+            '{"format": "ethbrake-run", "status": "done"}',
+            "run/run.json: status = 'done': must be running or finished or",
+        ),
         (None, "run/run.json: is missing; nothing goes on without it"),
     ],
     ids=["cut off", "a list", "empty", "other status", "missing"],
@@ -288,11 +369,15 @@ def test_configuration_of_a_run__is_refused(changes: dict[str, Any], message: st
 
 def test_training_that_has_finished__says_how_to_measure_it(run: RunDirectory) -> None:
     run.write_status("finished")
-    with refused("finished; measure what it has learned with: ethbrake evaluate --scenario paper-random --agents ppo@run+epis"):
+    with refused(
+        "finished; measure what it has learned with: ethbrake evaluate --scenario paper-random --agents ppo@run+epis"
+    ):
         resume(run.path)
     team = RunDirectory(Path("team")).create(Training.of(TINY_PPO, PAIR, scheme="independent").config())
     team.write_status("finished")
-    with refused("measure what it has learned with: ethbrake evaluate --scenario cooperation-3-pair --agents team@team"):
+    with refused(
+        "measure what it has learned with: ethbrake evaluate --scenario cooperation-3-pair --agents team@team"
+    ):
         resume(team.path)
 
 
@@ -350,8 +435,14 @@ def test_team__drives_a_line_of_its_length_and_vehicles_of_its_own(team: RunDire
         ("{", "team/team.json: is not JSON (Expecting property name enclosed in double quotes"),
         ("[]", "team/team.json: must be a mapping of keys to values"),
         ("{}", "team/team.json: scheme: missing"),
-        ({"drivers": {**DRIVERS, "vehicle_3": "../policy"}}, "drivers.vehicle_3 = \"../policy\": must be policy/vehicle_3"),
-        ({"drivers": {**DRIVERS, "vehicle_3": "policy/vehicle_2"}}, "must be policy/vehicle_3 under scheme independent"),
+        (
+            {"drivers": {**DRIVERS, "vehicle_3": "../policy"}},
+            'drivers.vehicle_3 = "../policy": must be policy/vehicle_3',
+        ),
+        (
+            {"drivers": {**DRIVERS, "vehicle_3": "policy/vehicle_2"}},
+            "must be policy/vehicle_3 under scheme independent",
+        ),
         ({"scheme": "shared"}, "drivers.vehicle_2 = policy/vehicle_2: must be policy under scheme shared"),
         ({"vehicles": 2}, "drivers = vehicle_3: must be one of vehicle_1 to vehicle_2"),
         ({"scheme": "together"}, "scheme = together: must be single, shared, independent or centralised"),
