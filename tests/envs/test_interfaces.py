@@ -1,4 +1,4 @@
-"""What is special to one interface; single calls: ``told/interfaces.txt``; what all promise: ``tests/contract``."""
+"""What is special to one interface; what all promise: ``tests/contract``."""
 
 import json
 import os

@@ -1,7 +1,7 @@
 """What a scenario says, the shipped ones, and what editors and pages are told.
 
-Refusals: ``test_refusals``. The names of the shipped
-ones stand in ``cli/printed/scenarios.txt``, their worlds in ``golden``.
+Refusals: ``test_refusals``. The names of the shipped ones stand in ``cli/printed/scenarios.txt``, their worlds in
+``golden``.
 """
 
 import copy

@@ -1,4 +1,4 @@
-"""Who hears of whom, and when: distributions against formulas, nothing that leaks; by hand: ``told/news.txt``."""
+"""Who hears of whom, and when: distributions against formulas, nothing that leaks."""
 
 import math
 from dataclasses import replace
