@@ -21,7 +21,7 @@ INSTALL := sh .ci/install $(VENV)
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs mutation bench-peers test-libraries test-bounds test-machines proofs test-cluster docs dist kernels audit figures
+.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs mutation bench-peers test-libraries test-bounds test-machines proofs test-cluster docs dist audit figures
 
 help:
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
@@ -31,7 +31,6 @@ help:
 	@echo "make docs             the documentation site, its notebooks run: docs/_build/html; a warning is an error"
 	@echo "make figures          the printed blocks, tables and pictures of README and docs made again and compared (minutes)"
 	@echo "make dist             wheel and sdist in dist/, built twice with the same SHA-256"
-	@echo "make kernels          a wheel of ready-made kernels for this Python in dist/ (Linux, x86-64)"
 	@echo "make test-physics     the long programme on the physics: one line per gate"
 	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
 	@echo "make test-shield      try to break the step shield: speed, interference, search, interfaces, bound (three quarters of an hour of one core)"
@@ -137,10 +136,6 @@ figures: $(STAMP)
 dist: $(STAMP)
 	@echo "== wheel and sdist, twice"
 	@$(PROGRAMME) wheel --only built $(ARGS)
-
-kernels: $(STAMP)
-	@echo "== ready-made kernels, for two levels of x86-64"
-	@$(BIN)/python .ci/kernels.py $(ARGS)
 
 test-physics: $(STAMP)
 	@echo "== long programme on the physics"

@@ -112,16 +112,16 @@ if TYPE_CHECKING:
         write_picture as write_picture,
     )
 
-    # Registration of your own parts
+    # Your own parts
     from ethbrake_marl.agents import register_agent as register_agent
     from ethbrake_marl.evaluation import register_measure as register_measure
-    from ethbrake_marl.files.plugins import load_plugin as load_plugin
     from ethbrake_marl.learning import register_algorithm as register_algorithm
     from ethbrake_marl.harm import register_objective as register_objective
     from ethbrake_marl.observations import register_feature as register_feature
     from ethbrake_marl.rewards import register_term as register_term
     from ethbrake_marl.scenario import register_scenarios as register_scenarios
     from ethbrake_marl.scenario import register_preset as register_preset
+    from ethbrake_marl.registry import Part as Part
 
     # Errors
     from ethbrake_marl.errors import EthBrakeError as EthBrakeError, MissingExtra as MissingExtra

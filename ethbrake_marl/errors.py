@@ -225,11 +225,11 @@ class UncertifiedStep(EthBrakeError):
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
     """Build the error for an unknown ``name``, with a suggestion when one is close.
 
-    ``may_be_own``: users register some of their own, so that a plug-in may have been forgotten.
+    ``may_be_own``: users have some of their own, so that a package may not be installed.
     """
     names = sorted(known)
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
-    own = "; one of your own needs eb.register_... first, or --plugin FILE.py (docs/extending.md)" if may_be_own else ""
+    own = "; one of your own must be registered or installed first (docs/extending.md)" if may_be_own else ""
     hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}{own}"
     return UnknownName(f"unknown {kind} {name!r}; {hint}")
 

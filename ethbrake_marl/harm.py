@@ -23,9 +23,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from ethbrake_marl.defaults import HARM_COUNTS as HARM_COUNTS, HarmCount as HarmCount
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, count_of, describe_error, unknown_name
+from ethbrake_marl.errors import InvalidInput, count_of, describe_error, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.physics import Bools, Floats, Impacts, Ints, Worlds, compiled, exp, log, logistic
+from ethbrake_marl.registry import Registry
 
 
 def check_harm_count(harm_count: str) -> None:
@@ -283,9 +284,7 @@ def parse_objective(text: str) -> Objective:
     curve that is none.
     """
     kind, colon, argument = text.partition(":")
-    if kind not in KINDS:
-        raise unknown_name("objective", kind, KINDS, may_be_own=True)
-    if ":" not in KINDS[kind].form:
+    if ":" not in OBJECTIVES[kind].form:
         if colon:
             raise InvalidInput(f"objective {text!r}: {kind} takes no argument")
         return Objective(kind)
@@ -336,12 +335,12 @@ def objective_harm(ledger: Ledger, harm_count: HarmCount, objectives: Sequence[O
     harms = ledger.vehicle_harm(harm_count), ledger.world_harm(harm_count)
     told = *harms, ledger.mass_t, *ledger.speed_changes(harm_count)
     harm = HarmSoFar(*(np.broadcast_to(each, each.shape) for each in told))  # read-only
-    return np.stack([KINDS[o.kind].amount(o, harm, i) for i, o in enumerate(objectives)], axis=1)
+    return np.stack([OBJECTIVES[o.kind].amount(o, harm, i) for i, o in enumerate(objectives)], axis=1)
 
 
 def standard_objectives() -> tuple[str, ...]:
-    """The built-in objectives that need no knowledge of the scenario, then the registered ones."""
-    return (*STANDARD, *(name for name, kind in KINDS.items() if kind.function is not None))
+    """The built-in objectives that need no knowledge of the scenario, then those of others that were loaded."""
+    return (*STANDARD, *(name for name, kind in OBJECTIVES.loaded.items() if kind.function is not None))
 
 
 def declared_objectives(texts: Sequence[str], vehicles: int) -> list[str]:
@@ -359,6 +358,9 @@ def declared_objectives(texts: Sequence[str], vehicles: int) -> list[str]:
 
 def register_objective(name: str, function: ObjectiveFunction) -> None:
     """Make ``objective: name`` known to every scenario and reward, and to ``--objective``.
+
+    An installed package does the same with an entry point of the group ``ethbrake_marl.objectives`` that names the
+    function.
 
     Args:
         name: 1 to 64 of ``a-z``, digits, ``-`` and ``_``.
@@ -393,8 +395,7 @@ def register_objective(name: str, function: ObjectiveFunction) -> None:
         return given.astype(np.float64)
 
     entry = Kind(name, " ".join((function.__doc__ or "").split()), amount, function)
-    if KINDS.setdefault(name, entry).function is not function:
-        raise AlreadyExists(f"objective {name!r} is registered already; give another name")
+    OBJECTIVES.add(name, entry, lambda kind: kind.function is function)
 
 
 def scored(ledger: Ledger, harm_count: HarmCount, declared: Sequence[Declared] | None = None) -> dict[str, Floats]:
@@ -460,7 +461,7 @@ def _weighted(borne: Floats, weights: Floats) -> Floats:
     return mean
 
 
-KINDS: dict[str, Kind] = {
+_BUILT_IN: dict[str, Kind] = {
     "total": Kind("total", "everybody's harm alike", lambda _, harm, vehicle: harm.whole),
     "own": Kind("own", "what the vehicle itself bears", lambda _, harm, vehicle: harm.borne[:, vehicle]),
     "social": Kind("social:ANGLE", "social value orientation: own harm at 0, the others' at 90 degrees", _social),
@@ -477,3 +478,4 @@ KINDS: dict[str, Kind] = {
     ),
     "injury": Kind("injury:CURVE", "injuries in 1,000 lines, by the impact that injures a vehicle more", _injured),
 }
+OBJECTIVES: Registry[Kind] = Registry("objective", "objectives", register_objective, _BUILT_IN)

@@ -51,6 +51,7 @@ from ethbrake_marl.physics import (
     place_rates,
     stopping_distance,
 )
+from ethbrake_marl.registry import Registry
 
 # The named features, built in or registered.
 
@@ -226,7 +227,7 @@ def _single(name: str, high: float, function: Callable[..., Floats], of: Of, mea
     return RegisteredFeature(Feature(name, "s", 1.0, 0.0, high, meaning), function, of, 0.0, (0.0, 0.0, 0.0))
 
 
-FEATURES: dict[str, RegisteredFeature] = {
+_BUILT_IN: dict[str, RegisteredFeature] = {
     "age": _single(
         "age", 8.0, age, "neighbour", "time since the sample that was last told of it; 0 where the present is known"
     ),
@@ -308,8 +309,9 @@ def choices(sides: Iterable[str] = ("front_1", "rear_1")) -> list[str]:
     """What an ``observation:`` may list: groups, then single features, of these neighbours."""
     groups = ["own", *sides, "role", "obstacle", "contact", "contact_far"]
     single = [f"{group}.{feature.name}" for group in groups for feature in _group(group)]
-    own = [name for name, entry in FEATURES.items() if entry.of == "own"]
-    each = [f"{side}.{name}" for side in sides for name, entry in FEATURES.items() if entry.of == "neighbour"]
+    entries = FEATURES.usable()
+    own = [name for name, entry in entries.items() if entry.of == "own"]
+    each = [f"{side}.{name}" for side in sides for name, entry in entries.items() if entry.of == "neighbour"]
     return [*groups, *single, *own, *each]
 
 
@@ -826,6 +828,9 @@ def register_feature(
 ) -> None:
     """Make ``name`` a feature that an ``observation:`` may list; its docstring says what it means.
 
+    An installed package does the same with an entry point of the group ``ethbrake_marl.features``: a ``Part`` of the
+    function and what stands behind it here.
+
     Args:
         name: lower case letters, digits and ``_``, listed as it is; one of a neighbour as ``front_1.name``.
         function: from worlds and the vehicle (0 = front) to its value [n], in ``unit``; of a neighbour: from worlds,
@@ -857,8 +862,9 @@ def register_feature(
     entry = replace(entry, tried=_tried(entry))
     sides = (f"{side}_{k}" for side in ("front", "rear") for k in range(MOST_NEIGHBOURS + 1))
     taken = {*GROUPS._fields[:-1], *sides, *(feature.name for group in GROUPS for feature in group)}
-    if name in taken or FEATURES.setdefault(name, entry) != entry:
+    if name in taken:
         raise AlreadyExists(f"feature {name!r} is registered already; give another name")
+    FEATURES.add(name, entry, lambda other: other == entry)
 
 
 def _check_numbers(name: str, **numbers: float) -> None:
@@ -892,3 +898,6 @@ def _tried(entry: RegisteredFeature) -> tuple[float, ...]:
             f" {error}"
         ) from error
     return tuple(float(value) for each in values for value in each)
+
+
+FEATURES: Registry[RegisteredFeature] = Registry("feature", "features", register_feature, _BUILT_IN)

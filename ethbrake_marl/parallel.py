@@ -12,11 +12,9 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from functools import cache
 from itertools import islice
-from pathlib import Path
 from typing import Any
 
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
-from ethbrake_marl.files.plugins import load_the_same, noted_plugins
 
 LOCAL = "local"
 _WORKERS = {  # environment of a Ray's processes: one thread each, in the folder of the command
@@ -60,11 +58,7 @@ def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = N
     with naming_extras():
         from joblib import Parallel, delayed, parallel_config
         from joblib.externals.loky.process_executor import BrokenProcessPool
-    plugins = noted_plugins()
-    load_the_same(plugins)  # a file that was changed since is reported here, in one line
-    if ray is not None:
-        plugins = [{**each, "source": _absolute(each["source"])} for each in plugins]
-    work = (delayed(_answer)(pickle.dumps(call), plugins) for call in calls)
+    work = (delayed(_answer)(pickle.dumps(call)) for call in calls)
     with _backend(ray, jobs) as (backend, at_once):
         with parallel_config(**backend):
             parallel = Parallel(at_once, batch_size=1, return_as="generator" if ray is None else "list")
@@ -83,11 +77,10 @@ def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = N
                 results.close()
 
 
-def _answer(call: bytes, plugins: list[dict[str, str]]) -> Any:
-    """Make a call in a worker, after loading the plug-ins of the process that asks; what it prints is no result."""
+def _answer(call: bytes) -> Any:
+    """Make a call in a worker; what it prints is no result."""
     _end_with_parent()
     with redirect_stdout(sys.stderr):
-        load_the_same(plugins)
         function, *given = pickle.loads(call)
         return function(*given)
 
@@ -102,11 +95,6 @@ def _end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, args=(os.getppid(),), daemon=True).start()
-
-
-def _absolute(source: str) -> str:
-    """A plug-in as workers elsewhere understand it: a file by its absolute path."""
-    return str(Path(source).absolute()) if source.endswith(".py") or os.sep in source else source
 
 
 @contextmanager

@@ -34,6 +34,7 @@ from ethbrake_marl.files.store import new_folder, read_plain, write_file
 from ethbrake_marl.files.yaml import NAME_PATTERN, FileModel, first_mistake, read_json_model
 from ethbrake_marl.observations import FEATURES, ObservationSpec, Of, choose_observation, registered_in
 from ethbrake_marl.physics import PER_LN2, compiled, exp_rest
+from ethbrake_marl.registry import versions_used
 from ethbrake_marl.scenario import Scenario
 
 # The manifest of a policy: network, observation, training, versions and hashes.
@@ -42,8 +43,11 @@ _PACKAGES = ("ethbrake-marl", "gymnasium", "numba", "numpy", "safetensors", "sta
 
 
 def installed_versions() -> dict[str, str]:
-    """Name -> version of this package, Python and every package that a training's numbers depend on."""
-    return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}
+    """Name -> version of this package, Python and every package that a training's numbers depend on.
+
+    Those that gave a part to this process are among them.
+    """
+    return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES} | versions_used()
 
 
 Activation = Literal["relu", "tanh"]
@@ -688,7 +692,8 @@ def _check_observed(path: Path, manifest: Manifest) -> None:
         of = f"{path}: the policy observes {was.name!r:.80}"
         if was.name not in FEATURES:
             raise InvalidInput(
-                f"{of}, which is not registered; import the file that registers it (eb.register_feature) first"
+                f"{of}, which is not registered; install the package that gives it, or register it first"
+                " (eb.register_feature)"
             )
         entry = FEATURES[was.name]
         now = {name: getattr(entry.feature, name) for name in ("unit", "scale", "low", "high")}

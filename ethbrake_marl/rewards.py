@@ -33,6 +33,7 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput, describe_error, un
 from ethbrake_marl.files.yaml import UNSHOWN, FileModel, first_mistake, require
 from ethbrake_marl.harm import Declared, Objective, check_declared, objectives_of
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, forecast, logistic
+from ethbrake_marl.registry import Registry
 
 # The one table of reward terms: what each is, its unit, its usual weight, and the function that computes it.
 
@@ -87,40 +88,39 @@ class Term:
     name: str
     meaning: str
     unit: str
-    weight: float  # where a reward does not say
     function: Callable[..., Floats] | None  # of the reward's settings and the step; None: the engine adds it itself
     registered: bool = False  # by somebody else; its function takes the step alone
 
 
-def register_term(name: str, function: TermFunction, *, weight: float = 0.0, unit: str = "1") -> None:
-    """Make ``name`` a term of every reward: a weight in a recipe, in ``RewardParams(terms=...)``, a column of infos.
+def register_term(name: str, function: TermFunction, *, unit: str = "1") -> None:
+    """Make ``name`` a term of rewards: a weight in a recipe, in ``RewardParams(terms=...)``, a column of infos.
+
+    An installed package does the same with an entry point of the group ``ethbrake_marl.rewards``: its function, or a
+    ``Part`` of it.
 
     Args:
         name: lower case letters, digits and ``_``; the key of its weight beside ``harm`` and ``jerk``.
         function: from a ``StepOutcome`` to the term before its weight, of worlds [n] (shared by all vehicles), of the
             learners [n, L], or of all vehicles [n, N]; its docstring says what it means.
-        weight: of a reward made from now on that does not name it (those by name, ``harm`` or ``paper``, stay as
-            they are); at least 0.
         unit: of the term.
 
     Registering the same again changes nothing. Raises ``AlreadyExists`` for another term of that name, and
-    ``InvalidInput`` for a name that is none, a function without a docstring, or a weight below 0.
+    ``InvalidInput`` for a name that is none, or a function without a docstring.
 
     """
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
         raise InvalidInput(f"reward term {name!r:.80}: must be 1 to 64 of a-z, 0-9 and _, beginning with a letter")
     if not callable(function) or not (function.__doc__ or "").strip():
         raise InvalidInput(f"reward term {name!r}: needs a function with a docstring that says what it means")
-    if isinstance(weight, bool) or not isinstance(weight, int | float) or not 0.0 <= weight < float("inf"):
-        raise InvalidInput(f"reward term {name!r}: weight = {weight!r}: must be a number, at least 0")
-    term = Term(name, " ".join((function.__doc__ or "").split()), str(unit), float(weight), function, registered=True)
-    if name in RewardParams.model_fields or TERMS.setdefault(name, term) != term:
+    if name in RewardParams.model_fields:
         raise AlreadyExists(f"reward term {name!r} is registered already; give another name")
+    term = Term(name, " ".join((function.__doc__ or "").split()), str(unit), function, registered=True)
+    TERMS.add(name, term, lambda other: other == term)
 
 
-def registered_terms() -> dict[str, Term]:
-    """Those that are not built in, in the order in which they were registered."""
-    return {name: term for name, term in TERMS.items() if term.registered}
+def own_terms() -> list[str]:
+    """Names of those that are not built in; nothing is loaded."""
+    return [name for name in TERMS if name not in RewardParams.model_fields]
 
 
 def checked_term(term: Term, step: StepOutcome, counts: Bools, steps: Ints) -> Floats:
@@ -210,7 +210,7 @@ class RewardParams(FileModel):
         """Weights of registered terms that stand beside the others go where they belong."""
         if not isinstance(value, dict):
             return value
-        beside = {name: weight for name, weight in value.items() if name in registered_terms()}
+        beside = {name: weight for name, weight in value.items() if name in own_terms()}
         if not beside:
             return value
         inside = value.get("terms", {})
@@ -221,13 +221,11 @@ class RewardParams(FileModel):
     @field_validator("terms")
     @classmethod
     def _settled(cls, value: dict[str, float]) -> dict[str, float]:
-        """Those that are registered, each said to be its usual one left out where that is 0."""
-        known = registered_terms()
+        """Those that count, which are loaded."""
         for name in value:
-            if name not in known:
-                raise unknown_name("reward term", name, known, may_be_own=True)
-        every = {name: value.get(name, term.weight) for name, term in known.items()}
-        return {name: weight for name, weight in every.items() if weight > 0.0 or known[name].weight > 0.0}
+            if name not in own_terms():
+                raise unknown_name("reward term", name, own_terms(), may_be_own=True)
+        return {name: value[name] for name in sorted(value) if value[name] > 0.0 and TERMS[name]}
 
     @field_validator("objective", mode="before")
     @classmethod
@@ -257,8 +255,8 @@ class RewardParams(FileModel):
 
     @property
     def weights(self) -> dict[str, float]:
-        """The weight of every term."""
-        return {name: self.weight(name) for name in TERMS}
+        """The weight of every built-in term, and of its own."""
+        return {name: self.weight(name) for name in (*(term.name for term in _BUILT_IN), *self.terms)}
 
     @property
     def counted(self) -> tuple[str, ...]:
@@ -360,17 +358,15 @@ def _risk(params: RewardParams, step: StepOutcome) -> Floats:
     return risk
 
 
-TERMS: dict[str, Term] = {
-    term.name: term
-    for term in (
-        Term("harm", "minus the harm of the step, as `harm_count` and `objective` count it", "m2/s2", 1.0, None),
-        Term("collision", "minus `k_energy` times the harm of every impact of the step", "m2/s2", 0.0, _collision),
-        Term("risk", "minus how near and how soon a collision of each own pair is, 0 to 2 a pair", "1", 0.0, _risk),
-        Term("jerk", "minus the squared rate of change of the own command", "m2/s6", 0.0, _jerk),
-        Term("terminal", "1 when an episode ends without any collision", "1", 0.0, None),
-        Term("shaping", "difference of potentials: minus the least harm ahead, for learners", "m2/s2", 0.0, None),
-    )
-}
+_BUILT_IN = (
+    Term("harm", "minus the harm of the step, as `harm_count` and `objective` count it", "m2/s2", None),
+    Term("collision", "minus `k_energy` times the harm of every impact of the step", "m2/s2", _collision),
+    Term("risk", "minus how near and how soon a collision of each own pair is, 0 to 2 a pair", "1", _risk),
+    Term("jerk", "minus the squared rate of change of the own command", "m2/s6", _jerk),
+    Term("terminal", "1 when an episode ends without any collision", "1", None),
+    Term("shaping", "difference of potentials: minus the least harm ahead, for learners", "m2/s2", None),
+)
+TERMS: Registry[Term] = Registry("reward term", "rewards", register_term, {term.name: term for term in _BUILT_IN})
 
 
 REWARDS = {
@@ -413,4 +409,4 @@ def reward_params(reward: Reward) -> RewardParams:
 
 def setting_names() -> list[str]:
     """The keys that a reward may have: its own, then the registered terms."""
-    return [*RewardParams.model_fields, *registered_terms()]
+    return [*RewardParams.model_fields, *own_terms()]

@@ -7,7 +7,6 @@ import os
 import signal
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 import typer.main
@@ -20,19 +19,13 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM
     "MPLBACKEND": "Agg", "SDL_VIDEODRIVER": "dummy", "SDL_AUDIODRIVER": "dummy", "PYGAME_HIDE_SUPPORT_PROMPT": "1",
 }  # fmt: skip
 
-pytest_plugins = [f"tests.fixtures.{name}" for name in ("evaluation", "pictures", "policies", "registered")]
+# `installed` comes first: what it finds is what the others, and all processes that they start, find.
+pytest_plugins = [
+    f"tests.fixtures.{name}" for name in ("installed", "evaluation", "pictures", "policies", "registered")
+]
 
 # Typer builds all commands for each command line, 100 ms; the suite has a thousand in one process.
-_build_command = functools.cache(typer.main.get_command_from_info)
-
-
-def _copied_command(*given: Any, **how: Any) -> Any:
-    command = copy.copy(_build_command(*given, **how))
-    command.params = [*command.params]  # which get one more, `--plugin`, for each command line
-    return command
-
-
-typer.main.get_command_from_info = _copied_command
+typer.main.get_command_from_info = functools.cache(typer.main.get_command_from_info)
 
 # The suite reads the shipped files several thousand times, 10 ms each: what is parsed is the same for the same text.
 _parse_anew = yaml._parse

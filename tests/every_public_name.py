@@ -24,15 +24,15 @@ def make_cautious(argument: str | None, settings: eb.AgentSettings) -> eb.Agent:
 def register(recipe: type[eb.TrainingRecipe], algorithm: type[Any]) -> tuple[str, ...]:
     eb.register_agent("cautious", make_cautious)
     eb.register_algorithm("own", recipe, algorithm)
-    eb.register_term("smooth", lambda step: -np.abs(step.command_mps2), weight=0.1, unit="m/s2")
+    eb.register_term("smooth", lambda step: -np.abs(step.command_mps2), unit="m/s2")
     eb.register_feature("load", lambda worlds, i: worlds.vehicles.mass_t[:, i], unit="t", scale=10.0, low=0.0, high=6.0)
     eb.register_preset("deaf", {"preset": "nominal", "lost": 0.5})
     eb.register_objective("front", lambda harm, vehicle: harm.borne[:, 0])
     eb.register_measure("delta_v", lambda episodes: episodes.largest_speed_change_mps, unit="m/s")
     driver: eb.Agent = eb.policy_agent(lambda seen: -abs(seen[:, :1]), name="mine", clip=True)
-    eb.load_plugin("my_parts.py")
     eb.register_scenarios("my_scenarios")
-    return (driver.name, *eb.agent_names())
+    part: eb.Part = eb.Part(make_cautious, about="careful")
+    return (driver.name, *part.settings, *eb.agent_names())
 
 
 def interfaces(policy: eb.Policy) -> list[Any]:

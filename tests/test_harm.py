@@ -437,17 +437,12 @@ def test_rewards__are_those_of_the_page() -> None:
 
 @pytest.mark.parametrize(
     ("reward", "terms"),
-    [
-        ({"harm": 1.0}, {"mine": 0.25}),
-        ({"mine": 0.0}, {"mine": 0.0}),
-        ("harm", {}),
-        ({"harm": 0.0, "terms": {"mine": 2}}, {"mine": 2.0}),
-    ],
+    [({"harm": 1.0}, {}), ({"mine": 0.0}, {}), ("harm", {}), ({"harm": 0.0, "terms": {"mine": 2}}, {"mine": 2.0})],
     ids=str,
 )
-def test_term_of_ones_own__has_its_usual_weight_where_a_reward_does_not_say(reward, terms) -> None:
+def test_term_of_ones_own__counts_where_a_reward_says_so(reward, terms) -> None:
     for _ in range(2):  # registered twice it is one
-        eb.register_term("mine", one, weight=0.25)
+        eb.register_term("mine", one)
     assert reward_params(reward).terms == terms
     settled = RewardParams(harm=1.0, terms={"mine": 3.0})
     assert RewardParams(**settled.model_dump()) == settled

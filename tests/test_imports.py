@@ -1,7 +1,6 @@
 """The package imports one way, without a circle, stays light, and its core needs no extra."""
 
 import ast
-import os
 import re
 import subprocess
 import sys
@@ -92,7 +91,6 @@ def ended(program: str, *, cwd: Path = ROOT, warnings: str = "error") -> tuple[i
     """Exit status, stdout and stderr of a Python program that begins as the script `ethbrake` does."""
     result = subprocess.run(
         [sys.executable, "-W", warnings, "-c", f"import sys; sys.argv[0] = '/somewhere/bin/ethbrake'\n{program}"],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
         cwd=cwd,
         capture_output=True,
         text=True,

@@ -3,7 +3,6 @@
 import importlib
 import json
 import os
-import platform
 import shutil
 import subprocess
 import sys
@@ -23,7 +22,6 @@ from ethbrake_marl import kernel_store
 from ethbrake_marl.kernel_store import cache_folder
 from ethbrake_marl.physics import compiling as compiled
 from ethbrake_marl.physics.compiling import digest_of_sources, keep_kernel, kernel_sources, load_kernel
-from tests.docs.site import load
 
 needs_compiler = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="compilation is switched off")
 PACKAGE = Path(ethbrake_marl.__file__).parent
@@ -373,23 +371,3 @@ def test_kernels__are_compiled_once_for_all_numbers_or_as_numba_does_where_it_is
 
     assert outer(3) == (12 if known else 6)
     assert (len(twice._linked), len(twice.overloads)) == (linked, overloads)
-
-
-@pytest.mark.skipif((sys.platform, platform.machine()) != ("linux", "x86_64"), reason="none are built for this machine")
-def test_ready_made_kernels__are_taken_where_the_own_store_has_none_unless_they_are_damaged(monkeypatch, tmp_path, run):
-    with monkeypatch.context() as chosen:
-        chosen.setenv("NUMBA_CPU_NAME", "x86-64-v2")
-        chosen.setenv("NUMBA_CPU_FEATURES", "")
-        assert run(way="cold") == COMPILED
-    wheel = load("../../.ci/kernels").pack(
-        {file.name: file.read_bytes() for file in cache_folder().glob("*.entry")}, tmp_path
-    )
-    site = tmp_path / "site"
-    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", str(site)]
-    subprocess.run([*pip, str(wheel)], check=True, timeout=120)
-    shutil.copytree(PACKAGE, site / "ethbrake_marl", ignore=shutil.ignore_patterns("__pycache__"))
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "another"))
-    assert run(site / "ethbrake_marl") == SAME
-    (kernel,) = (site / "ethbrake_marl_kernels").glob("*.entry")
-    kernel.write_bytes(kernel.read_bytes()[:-1])
-    assert run(site / "ethbrake_marl") == COMPILED

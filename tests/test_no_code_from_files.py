@@ -18,7 +18,7 @@ UNRULED = re.compile(
     r"(?<![.\w])(?<!def )(?:compile|__import__)\(|\.extractall\b|\.(?:to|read)_pickle\b|unsafe_load"
     r"|allow_pickle=(?!False)|\.load\([^)]*\b(?:device|map_location|weights_only|custom_objects)="
 )
-PLACES = {"ethbrake_marl/files/plugins.py"}  # a plug-in that the user names is code
+PLACES = {"ethbrake_marl/files/python_file.py"}  # a file that the user names is code
 
 
 def refused(*arguments: str, text: str = "") -> dict[str, set[int]]:

@@ -12,7 +12,7 @@ from ethbrake_marl.agents.registry import Source, agent_entries
 from ethbrake_marl.cli.app import whole_command
 from ethbrake_marl.cli.command import MOVED
 from ethbrake_marl.evaluation.measures import measures
-from ethbrake_marl.harm import KINDS
+from ethbrake_marl.harm import OBJECTIVES
 from ethbrake_marl.learning import TrainingRecipe
 from ethbrake_marl.learning.training import MEANINGS
 from ethbrake_marl.observations import Feature, ObservationSpec, choose_observation
@@ -22,7 +22,7 @@ from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario, scen
 from ethbrake_marl.scenario.sampling import QUANTITY
 from ethbrake_marl.scenario.v2x import CHANNELS, V2X
 
-ON_EVERY_COMMAND = ("--plugin", "--help")
+ON_EVERY_COMMAND = ("--help",)
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -236,7 +236,7 @@ def rewards() -> str:
     return sections(
         Terms=table(("term", "unit", "meaning"), [(f"`{t.name}`", t.unit, t.meaning) for t in TERMS.values()]),
         Named_rewards=table(("setting", "meaning", *(f"`{name}`" for name in settings)), rows),
-        Objectives=table(("objective", "counts"), [(f"`{kind.form}`", kind.about) for kind in KINDS.values()]),
+        Objectives=table(("objective", "counts"), [(f"`{kind.form}`", kind.about) for kind in OBJECTIVES.values()]),
     )
 
 

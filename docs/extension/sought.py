@@ -15,7 +15,7 @@ SOUGHT = {
     "howto-train": "train ppo sac mappo sb3 benchmarl multi-agent multi agent",
     "own-policy": "own policy onnx torch load compare",
     "learning": "recipe resume training",
-    "extending": "plugin custom agent algorithm register",
+    "extending": "plugin package entry point custom agent algorithm register",
     "hosts": "carla sumo hardware bench simulator",
     "other-libraries": "rllib torchrl tianshou cleanrl jax",
     "evaluation": "evaluate compare agents statistics confidence interval",

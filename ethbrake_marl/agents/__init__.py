@@ -25,7 +25,6 @@ if TYPE_CHECKING:
         policy_agent as policy_agent,
     )
     from ethbrake_marl.agents.registry import (
-        SHIELDS as SHIELDS,
         Agent as Agent,
         AgentAround as AgentAround,
         AgentSettings as AgentSettings,
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
         Team as Team,
         agent_entries as agent_entries,
         agent_names as agent_names,
+        agents_refused as agents_refused,
         check_agent as check_agent,
         drive as drive,
         episode_engine as episode_engine,
@@ -46,7 +46,9 @@ if TYPE_CHECKING:
         parse_spec as parse_spec,
         record_commands as record_commands,
         register_agent as register_agent,
+        register_shield as register_shield,
         script_agents as script_agents,
+        shield_forms as shield_forms,
         split_names as split_names,
         split_specs as split_specs,
         write_down as write_down,

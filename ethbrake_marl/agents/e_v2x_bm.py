@@ -61,6 +61,7 @@ from ethbrake_marl.physics import (
     to_next_event,
     to_next_impact,
 )
+from ethbrake_marl.registry import Part
 from ethbrake_marl.scenario import ScriptSpec
 
 TOUCH_SQUARED = (
@@ -1271,3 +1272,23 @@ class StateFree:
 def make_script(argument: str | None, settings: AgentSettings) -> Agent:
     """The script of that name."""
     return StateFree(settings.spec)
+
+
+# What this package's entry points name (pyproject.toml).
+
+
+COAST = Part(make_script, form="coast", about="nothing at all", knows=Source.SENSORS)
+FULL_BRAKE = Part(
+    make_script, form="full_brake", about="full braking, the paper's non-ethical strategy", knows=Source.SENSORS
+)
+CONSTANT = Part(
+    make_script, form="constant:A", about="this deceleration in m/s2; negative drives", knows=Source.SENSORS
+)
+PROFILE = Part(make_script, form="profile:0=A,S=B", about="in pieces; of roles alone", knows=Source.SENSORS)
+E_V2X_BM = Part(
+    make_e_v2x_bm,
+    form="e_v2x_bm[:pairwise][:believed]",
+    about="the best constant deceleration in this simulation; pairwise: the paper's closed form, from the true state;"
+    " believed: on what was received, and the scenario's ranges for the rest",
+    knows=Source.MODEL,
+)

@@ -18,6 +18,7 @@ from ethbrake_marl.engine import Script
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.physics import Bools, Floats, Worlds
+from ethbrake_marl.registry import Part
 
 _TOUCHING_M = 1e-6  # a gap below this counts as this: laws divide by it
 _SAME_S = 1e-9  # what rounding may take from a time that has elapsed
@@ -272,3 +273,24 @@ def make_controller(argument: str | None, settings: AgentSettings) -> Controller
     if parameters.get("b_min", 0.0) > parameters.get("b_max", math.inf):
         raise InvalidInput(f"{where}: b_min {parameters['b_min']:g} must not be above b_max {parameters['b_max']:g}")
     return Controller(settings.spec, law, parameters, settings.time_step_s)
+
+
+# What this package's entry points name (pyproject.toml).
+
+
+IDM = Part(make_controller, form="idm[:T=1.5]", about="the intelligent driver model", knows=Source.MESSAGES)
+ACC = Part(make_controller, form="acc[:T=1.1]", about="adaptive cruise control of PATH", knows=Source.MESSAGES)
+CACC = Part(
+    make_controller, form="cacc[:T=1.0]", about="its cooperative one, at a shorter distance", knows=Source.MESSAGES
+)
+RSS = Part(make_controller, form="rss[:rho=1.0]", about="brakes within the safe distance of RSS", knows=Source.MESSAGES)
+R157_HUMAN = Part(
+    make_controller,
+    form="r157_human[:reaction=0.75]",
+    about="the careful and competent driver of UN R157",
+    knows=Source.MESSAGES,
+)
+R157_FSM = Part(
+    make_controller, form="r157_fsm[:reaction=0.75]", about="the fuzzy safety model of UN R157", knows=Source.MESSAGES
+)
+AEB = Part(make_controller, form="aeb[:ttc=1.5]", about="automatic emergency braking", knows=Source.MESSAGES)

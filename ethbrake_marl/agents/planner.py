@@ -25,6 +25,7 @@ from ethbrake_marl.engine import Memory, Script, renew_memory, take_memory
 from ethbrake_marl.errors import InvalidInput, check_whole_number, renumbered
 from ethbrake_marl.harm import check_harm_count
 from ethbrake_marl.physics import CLOCK, Bools, Decisions, Floats, Ints, Worlds
+from ethbrake_marl.registry import Part
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search import TIME_STEP_S, ProfileProblem, Profiles, profile_problem
 
@@ -325,3 +326,21 @@ class Searched(AgentAround):
 def search_around(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
     """``+search`` around an agent, which takes no argument."""
     return Searched(policy, settings.needed_scenario(), harm_count=settings.harm_count)
+
+
+# What this package's entry points name (pyproject.toml).
+
+
+PLANNER = Part(
+    make_planner,
+    form="planner[:CANDIDATES][:believed]",
+    about="a search in the simulation at every decision, with so many candidates each; believed: as above",
+    knows=Source.MODEL,
+)
+SEARCH = Part(
+    search_around,
+    form="+search",
+    about="drives the best commands that a search around its own episode finds at the alert",
+    knows=Source.MODEL,
+    inner=True,
+)

@@ -1,7 +1,7 @@
 """Agents: what one is and what it knows, the list of them by name, and the loop that lets them drive episodes.
 
-An entry of the list of names tells the function that makes the agent, and is loaded when it is first used: so policies,
-searches and shields, which stand above this folder, are in the same list without being imported here.
+Names are those of entry points (``ethbrake_marl.registry``), which are loaded when they are first used: so policies,
+searches and shields, which stand above this folder, have names without being imported here.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from enum import StrEnum
-from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
@@ -22,10 +21,11 @@ import numpy as np
 
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.engine import Engine, Guard, Memory, Script, ask_script, begin_script, is_state_free
-from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, PhysicsError, describe_error, unknown_name
-from ethbrake_marl.files.plugins import load_function
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, PhysicsError, describe_error, unknown_name
+from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.harm import Ledger, check_harm_count
 from ethbrake_marl.physics import Bools, Floats, Worlds
+from ethbrake_marl.registry import Registry
 from ethbrake_marl.scenario import Scenario, ScriptSpec, load_scenario
 
 # The vocabulary in which every agent states what it knows of the line while it drives.
@@ -262,13 +262,6 @@ Driver = Team | Agent | Shielding  # an agent alone drives every learner
 #
 # Each of ``, + @ :`` may stand in a path, too. A path that exists wins: what stands in it separates nothing.
 
-SEARCH = "search"
-SHIELDS = ("episode", "episode:pairwise", "step", "robust", "robust:interior")
-BELIEVED = (  # on what was received
-    "episode:believed", "episode:pairwise:believed", "step:believed", "robust:believed", "robust:interior:believed",
-)  # fmt: skip
-AROUND = (SEARCH, *SHIELDS, *BELIEVED)  # in the order in which they are put around an agent
-
 _IN_FILE = re.compile(r":(?P<function>[A-Za-z_]\w*)(:(?P<argument>[^\s@]+))?(@(?P<policy>.+))?")
 _BEGINS_WITH_FILE = re.compile(r"[^:@]+\.py(:.*)?")
 
@@ -280,7 +273,7 @@ class AgentSpec:
     name: str  # or FILE.py:FUNCTION
     argument: str | None  # after the colon
     policy: str | None  # after the @: a path, or "shipped"
-    around: tuple[str, ...]  # of AROUND, innermost first
+    around: tuple[str, ...]  # names with their arguments, innermost first
 
     @property
     def core(self) -> str:
@@ -297,7 +290,7 @@ class AgentSpec:
     @property
     def shield(self) -> str | None:
         """The shield around it, if there is one."""
-        return self.around[-1] if self.around and self.around[-1] in (*SHIELDS, *BELIEVED) else None
+        return self.around[-1] if self.around and not _around(self.around[-1]).inner else None
 
     def __str__(self) -> str:
         return "".join([self.core, *(f"+{each}" for each in self.around)])
@@ -368,7 +361,7 @@ def _strip_around(spec: str) -> tuple[str, list[str]]:
     core, around = spec, list[str]()
     while True:
         before, plus, last = core.rpartition("+")
-        if not (plus and last in AROUND) or os.path.lexists(_policy_path(core)):
+        if not (plus and last.partition(":")[0] in _SHIELDS) or os.path.lexists(_policy_path(core)):
             return core, around
         core, around = before, [last, *around]
 
@@ -379,18 +372,22 @@ def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
         ScriptSpec.parse(spec)  # says what is right
     before, plus, last = core.rpartition("+")
     if plus and _is_meant_around(before, core, last):
-        raise unknown_name("shield or search", last, AROUND)
-    shields = [each for each in around if each in (*SHIELDS, *BELIEVED)]
+        raise unknown_name("shield or search", last, around_forms())
+    for each in around:
+        if not _around(each).takes(each.partition(":")[2]):
+            raise unknown_name("shield or search", each, around_forms())
+    shields = [each for each in around if not _around(each).inner]
     if len(shields) > 1 or any(each not in shields for each in around[1:]):
+        searches = [each for each in around_forms() if _around(each).inner]
         raise InvalidInput(
-            f"agent {spec!r}: +{SEARCH} comes first and once, then one shield of +{', +'.join(SHIELDS)}; for"
-            " instance ppo@shipped+search+step"
+            f"agent {spec!r}: +{', +'.join(searches)} comes first and once, then one shield of"
+            f" +{', +'.join(shield_forms())}; for instance ppo@shipped+search+step"
         )
     return core, tuple(around)
 
 
 def _is_meant_around(before: str, core: str, last: str) -> bool:
-    """Whether a word behind a ``+`` that is none of ``AROUND`` is no part of an argument or path either."""
+    """Whether a word behind a ``+`` that is no name of ``_SHIELDS`` is no part of an argument or path either."""
     file = _python_file(core)
     if ".py" in last or (file and _IN_FILE.fullmatch(core, len(file))):
         return False  # the + is part of a file's path, or of its argument
@@ -398,7 +395,7 @@ def _is_meant_around(before: str, core: str, last: str) -> bool:
         return True
     if "/" in last or "\\" in last:
         return False  # the last part of a path
-    return not os.path.lexists(_policy_path(core)) and bool(get_close_matches(last, AROUND))
+    return not os.path.lexists(_policy_path(core)) and bool(get_close_matches(last.partition(":")[0], _SHIELDS))
 
 
 HORIZON_S = 8.0  # until when an agent looks ahead that knows no scenario
@@ -448,104 +445,36 @@ class Entry:
     form: str  # how it is written; without ":" it takes no argument, without "@" no policy
     about: str  # one line
     knows: Source | Sequence[Source]  # while it drives; of what goes around an agent: what is added
-    make: str | Factory | Wrapper  # "module:function" is loaded at first use
+    make: Factory | Wrapper
+    inner: bool = False  # of what goes around an agent: directly, inside a shield
+    teams: bool = False  # likewise: around a team, too
 
-    def load(self) -> Any:
-        """Its function."""
-        if not isinstance(self.make, str):
-            return self.make
-        module, _, function = self.make.partition(":")
-        return getattr(import_module(f"ethbrake_marl.{module}"), function)
+    @property
+    def is_ours(self) -> bool:
+        """Whether this package makes it; of others' errors are told as such."""
+        return str(getattr(self.make, "__module__", "")).startswith("ethbrake_marl.") and self.make != make_from_file
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """How what goes around an agent may be written behind the ``+``, where that is a list of words."""
+        name, *options = re.findall(r"[^\[\]+]+", self.form)
+        found = [name]
+        for option in options:
+            found += [f"{each}{option}" for each in found]
+        return tuple(found)
+
+    def takes(self, argument: str) -> bool:
+        """Whether what goes around an agent takes this argument; empty for none."""
+        name = self.words[0]
+        return "[:ARGUMENT]" in self.form or (f"{name}:{argument}" if argument else name) in self.words
 
     def call(self, argument: str | None, settings: AgentSettings, *inside: Driver) -> Driver:
         """What its function makes, of a wrapper around what is ``inside``."""
         if "[:believed]" in self.form and argument is not None and f":{argument}".endswith(":believed"):
             argument, settings = argument[: -len(":believed")] or None, replace(settings, believes=True)
-        made: Driver = self.load()(*inside, argument, settings)
+        make: Any = self.make
+        made: Driver = make(*inside, argument, settings)
         return made
-
-
-_SCRIPTS, _POLICIES = "agents.e_v2x_bm:make_script", "learning.training:make_policy_agent"
-_FROM_FILE, _FIELD = "agents.registry:make_from_file", "agents.field:make_controller"
-_ENTRIES: dict[str, Entry] = {
-    "coast": Entry("coast", "nothing at all", Source.SENSORS, _SCRIPTS),
-    "full_brake": Entry("full_brake", "full braking, the paper's non-ethical strategy", Source.SENSORS, _SCRIPTS),
-    "constant": Entry("constant:A", "this deceleration in m/s2; negative drives", Source.SENSORS, _SCRIPTS),
-    "e_v2x_bm": Entry(
-        "e_v2x_bm[:pairwise][:believed]",
-        "the best constant deceleration in this simulation; pairwise: the paper's closed form, from the true state;"
-        " believed: on what was received, and the scenario's ranges for the rest",
-        Source.MODEL,
-        "agents.e_v2x_bm:make_e_v2x_bm",
-    ),
-    "idm": Entry("idm[:T=1.5]", "the intelligent driver model", Source.MESSAGES, _FIELD),
-    "acc": Entry("acc[:T=1.1]", "adaptive cruise control of PATH", Source.MESSAGES, _FIELD),
-    "cacc": Entry("cacc[:T=1.0]", "its cooperative one, at a shorter distance", Source.MESSAGES, _FIELD),
-    "rss": Entry("rss[:rho=1.0]", "brakes within the safe distance of RSS", Source.MESSAGES, _FIELD),
-    "r157_human": Entry(
-        "r157_human[:reaction=0.75]", "the careful and competent driver of UN R157", Source.MESSAGES, _FIELD
-    ),
-    "r157_fsm": Entry("r157_fsm[:reaction=0.75]", "the fuzzy safety model of UN R157", Source.MESSAGES, _FIELD),
-    "aeb": Entry("aeb[:ttc=1.5]", "automatic emergency braking", Source.MESSAGES, _FIELD),
-    "planner": Entry(
-        "planner[:CANDIDATES][:believed]",
-        "a search in the simulation at every decision, with so many candidates each; believed: as above",
-        Source.MODEL,
-        "agents.planner:make_planner",
-    ),
-    "best_harm": Entry(
-        "best_harm[:CANDIDATES]",
-        "the best profile known; a search at the alert where none is known",
-        Source.MODEL,
-        "limits.limits:make_best_harm",
-    ),
-    "ppo": Entry("ppo@PATH", "a policy trained by PPO: a run, a bundle, or shipped", Source.MESSAGES, _POLICIES),
-    "sac": Entry("sac@PATH", "a policy trained by SAC: a run, a bundle, or shipped", Source.MESSAGES, _POLICIES),
-    "counterfactual": Entry(
-        "counterfactual@PATH", "a policy trained by counterfactuals: a run or a bundle", Source.MESSAGES, _POLICIES
-    ),
-    "options": Entry(
-        "options@PATH", "a policy trained by options: a run, a bundle, or shipped", Source.MESSAGES, _POLICIES
-    ),
-    "policy": Entry(
-        "policy@PATH",
-        "a policy, whatever trained it: a run, a bundle, or shipped, the best for scenario and harm",
-        Source.MESSAGES,
-        _POLICIES,
-    ),
-    "universal": Entry("universal@shipped", "the shipped policy for every scenario", Source.MESSAGES, _POLICIES),
-    "team": Entry("team@RUN", "the learners of a run, each as it was trained, or shipped", Source.MESSAGES, _POLICIES),
-}
-
-_PROFILE = Entry("profile:0=A,S=B", "in pieces; of roles alone", Source.SENSORS, "agents.e_v2x_bm:StateFree")
-
-_WRAPPERS: dict[str, Entry] = {
-    "search": Entry(
-        "+search",
-        "drives the best commands that a search around its own episode finds at the alert",
-        Source.MODEL,
-        "agents.planner:search_around",
-    ),
-    "episode": Entry(
-        "+episode[:pairwise][:believed]",
-        "behind Algorithm 1: it or E-V2X-BM drives the episode, whichever harms less; believed: as far as is received",
-        Source.MODEL,
-        "shield.guard:shield_episodes",
-    ),
-    "step": Entry(
-        "+step[:believed]",
-        "every action certified, or replaced; of a team together; believed: certified in the world that is believed",
-        Source.MODEL,
-        "shield.guard:shield_steps",
-    ),
-    "robust": Entry(
-        "+robust[:interior][:believed]",
-        "the same where not everything is known: in the corners of an uncertainty, interior: in all of it;"
-        " believed: against all that was not received",
-        Source.MODEL,
-        "shield.guard:shield_steps_robustly",
-    ),
-}
 
 
 def make_agent(
@@ -587,7 +516,7 @@ def make_agent(
     if not isinstance(horizon_s, int | float | np.number) or not 0.0 < horizon_s < float("inf"):
         raise InvalidInput(f"horizon_s {horizon_s!r}: must be a positive number of seconds")
     written = parse_spec(spec)
-    if written.name == "profile":
+    if written.name == _PROFILE:
         raise InvalidInput(f"agent {spec!r}: a profile is a role of a scenario, fixed at the alert; it is no agent")
     settings = AgentSettings(
         written.core, written.policy, scenario, harm_count, float(horizon_s), most_candidates, uncertainty,
@@ -599,15 +528,14 @@ def make_agent(
 def _make_driver(written: AgentSpec, settings: AgentSettings) -> Driver:
     driver = _make(find_entry(written), written.argument, settings)
     for each in written.around:
-        settings = replace(settings, spec=f"{settings.spec}+{each}")
-        if isinstance(driver, Team) and each != "step":
+        settings, entry = replace(settings, spec=f"{settings.spec}+{each}"), _around(each)
+        if isinstance(driver, Team) and not entry.teams:
             raise InvalidInput(
                 f"agent {settings.spec!r}: is a team, and +{each} is for one driven vehicle, the others following"
                 " scripts; +step goes around a team; else name that vehicle (--vehicle vehicle_2) and one policy of the"
                 " team (ppo@RUN/policy/vehicle_2)"
             )
-        name, _, argument = each.partition(":")
-        driver = _WRAPPERS[name].call(argument or None, settings, driver)
+        driver = _make(entry, each.partition(":")[2] or None, settings, driver)
     return driver
 
 
@@ -618,10 +546,8 @@ def make_role(scenario: Scenario, vehicle: int, *, most_candidates: int | None =
     agent, and for a team without this vehicle.
     """
     spec = scenario.scripts[vehicle]
-    if spec.startswith("profile:"):
-        profile: Agent = _PROFILE.load()(spec)
-        return profile
-    written = parse_spec(spec)
+    name, _, argument = spec.partition(":")
+    written = AgentSpec(_PROFILE, argument, None, ()) if name == _PROFILE else parse_spec(spec)
     settings = AgentSettings(
         written.core, written.policy, scenario, horizon_s=scenario.horizon_s, most_candidates=most_candidates,
         time_step_s=scenario.time_step_s, role=vehicle,
@@ -642,30 +568,50 @@ def find_entry(spec: AgentSpec | str) -> Entry:
     """
     written = parse_spec(spec) if isinstance(spec, str) else spec
     if written.file is not None:
-        return Entry(f"{written.name}[:ARGUMENT][@POLICY]", "your own", Source.UNSTATED, _FROM_FILE)
-    if written.name == "profile":
-        return _PROFILE
-    if written.name not in _ENTRIES:
+        return Entry(f"{written.name}[:ARGUMENT][@POLICY]", "your own", Source.UNSTATED, make_from_file)
+    if written.name not in _AGENTS:
         if written.name in ("ladder", "field"):
             raise InvalidInput(f"agent {written.core!r}: stands for several agents in --agents; here one is needed")
-        raise unknown_name("agent", written.name, {*_ENTRIES, "ladder", "field"}, may_be_own=True)
-    entry = _ENTRIES[written.name]
+        raise _AGENTS.unknown(written.name, {*agent_names(), "ladder", "field"})
+    entry = _AGENTS[written.name]
     if written.argument is not None and ":" not in entry.form:
         raise InvalidInput(f"agent {written.core!r}: {written.name} takes no argument")
     if written.policy is not None and "@" not in entry.form:
-        own = "" if isinstance(entry.make, str) else "; register_agent(..., takes_policy=True) says that it does"
+        own = "" if entry.is_ours else "; register_agent(..., takes_policy=True) says that it does"
         raise InvalidInput(f"agent {written.core!r}: {written.name} takes no policy{own}")
     return entry
 
 
+def _around(each: str) -> Entry:
+    """The entry of what is written behind a ``+``."""
+    return _SHIELDS[each.partition(":")[0]]
+
+
 def agent_names() -> tuple[str, ...]:
     """Names that ``make_agent`` knows, in alphabetical order."""
-    return tuple(sorted(_ENTRIES))
+    return tuple(sorted({*_AGENTS} - {_PROFILE}))
 
 
 def agent_entries() -> tuple[Entry, ...]:
-    """All agents, and then all that can be put around one, in the order in which they were registered."""
-    return (*_ENTRIES.values(), *_WRAPPERS.values())
+    """All agents, and then all that can be put around one: those that can be loaded, which is done."""
+    agents = (entry for name, entry in _AGENTS.usable().items() if name != _PROFILE)
+    return (*agents, *_SHIELDS.usable().values())
+
+
+def agents_refused() -> list[str]:
+    """Why some of the installed agents and shields cannot be loaded."""
+    found = [each.why_not(name) for each in (_AGENTS, _SHIELDS) for name in each]
+    return [reason for reason in found if reason is not None]
+
+
+def around_forms() -> tuple[str, ...]:
+    """All that may stand behind a ``+``."""
+    return tuple(word for entry in _SHIELDS.usable().values() for word in entry.words)
+
+
+def shield_forms() -> tuple[str, ...]:
+    """The shields among that, without those that decide on what was received."""
+    return tuple(each for each in around_forms() if not (_around(each).inner or each.endswith(":believed")))
 
 
 def register_agent(
@@ -674,9 +620,13 @@ def register_agent(
     *,
     about: str = "an agent of your own",
     knows: Source | Sequence[Source] = Source.UNSTATED,
+    form: str | None = None,
     takes_policy: bool = False,
 ) -> None:
     """Make ``name`` and ``name:argument`` known to ``make_agent``, and so to every command.
+
+    An installed package does the same with an entry point of the group ``ethbrake_marl.agents``: its factory, or a
+    ``Part`` of it.
 
     Args:
         name: plain, without argument.
@@ -684,6 +634,8 @@ def register_agent(
             changes nothing.
         about: one line for ``ethbrake agent list``.
         knows: of the line while it drives, for ``ethbrake agent list`` too.
+        form: how it is written, for ``ethbrake agent list`` too; without ``:`` in it, it takes no argument, without
+            ``@`` no policy. None: ``name[:ARGUMENT]``.
         takes_policy: whether ``name@policy`` is known, too; the factory finds it in ``AgentSettings.policy``.
 
     Raises ``AlreadyExists`` for a name that another factory has, ``InvalidInput`` for one that is not plain.
@@ -691,22 +643,60 @@ def register_agent(
     """
     if parse_spec(name) != AgentSpec(name, None, None, ()):
         raise InvalidInput(f"agent name {name!r}: must be a plain name without argument")
-    entry = Entry(f"{name}[:ARGUMENT]{'[@POLICY]' * takes_policy}", about, knows, factory)
-    if _ENTRIES.setdefault(name, entry).make is not factory:
-        raise AlreadyExists(f"agent {name!r} is registered already")
+    form = f"{name}[:ARGUMENT]{'[@POLICY]' * takes_policy}" if form is None else form
+    _AGENTS.add(name, Entry(form, about, knows, factory), lambda entry: entry.make is factory)
 
 
-def _make(entry: Entry, argument: str | None, settings: AgentSettings) -> Driver:
+def register_shield(
+    name: str,
+    wrapper: Wrapper,
+    *,
+    about: str = "a shield of your own",
+    knows: Source | Sequence[Source] = (),
+    form: str | None = None,
+    inner: bool = False,
+    teams: bool = False,
+) -> None:
+    """Make ``+name`` known behind every agent.
+
+    An installed package does the same with an entry point of the group ``ethbrake_marl.shields``: its wrapper, or a
+    ``Part`` of it.
+
+    Args:
+        name: plain, without argument.
+        wrapper: makes the agent around an agent, from that, what stands after the colon (or None) and
+            ``AgentSettings``. The same one again changes nothing.
+        about: one line for ``ethbrake agent list``.
+        knows: what it adds to what the agent knows.
+        form: how it is written, ``+name[:WORD]`` with every word that it takes; None: with any argument.
+        inner: it is no shield, and goes around the agent before one.
+        teams: it also goes around a team.
+
+    Raises ``AlreadyExists`` for a name that another one has, ``InvalidInput`` for one that is not plain.
+
+    """
+    if not isinstance(name, str) or not _PLAIN.fullmatch(name):
+        raise InvalidInput(f"shield name {name!r}: must be a plain name without argument")
+    entry = Entry(f"+{name}[:ARGUMENT]" if form is None else form, about, knows, wrapper, inner, teams)
+    _SHIELDS.add(name, entry, lambda entry: entry.make is wrapper)
+
+
+_PLAIN = re.compile(r"[a-z][a-z0-9_.-]*")
+_PROFILE = "profile"  # a role of scenarios alone
+_AGENTS: Registry[Entry] = Registry("agent", "agents", register_agent)
+_SHIELDS: Registry[Entry] = Registry("shield or search", "shields", register_shield)
+
+
+def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: Driver) -> Driver:
     """The driver of an entry; of one that is not ours, what it raises becomes ``InvalidInput``, and it is looked at."""
     try:
-        driver = entry.call(argument, settings)
+        driver = entry.call(argument, settings, *inside)
     except Exception as error:
-        ours = isinstance(entry.make, str) and entry.make != _FROM_FILE
-        if ours or isinstance(error, EthBrakeError):
+        if entry.is_ours or isinstance(error, EthBrakeError):
             raise
         raise InvalidInput(f"agent {settings.spec!r}: {describe_error(error)}") from error
     if not isinstance(driver, Team):
-        check_agent(driver, f"agent {settings.spec!r}")
+        check_agent(driver, f"agent {settings.spec!r}", alone=not inside)
     return driver
 
 
@@ -721,7 +711,9 @@ def make_from_file(argument: str | None, settings: AgentSettings) -> Driver:
     """
     named = parse_spec(settings.spec).file
     assert named is not None
-    function = load_function(*named, reads=settings.policy)
+    function = load_from_file(*named, reads=settings.policy)
+    if not callable(function):
+        raise InvalidInput(f"file {named[0]!r}: {named[1]!r} is no function; name the one that makes the agent")
     given: tuple[Any, ...] = (argument, settings)
     with suppress(TypeError, ValueError):  # of something built in there is no signature
         if not inspect.signature(function).parameters:

@@ -9,22 +9,21 @@ import re
 import sys
 import time
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import redirect_stdout
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from threading import Thread
-from typing import Annotated, Any
+from typing import Any
 
 import typer
+from typer.core import TyperCommand
 from typer.exceptions import TyperException
 from typer.main import get_command
 
 from ethbrake_marl.cli import doctor, evaluate, scenario, search, train
 from ethbrake_marl.cli.command import EVERY_S, Out, app
-from ethbrake_marl.envs import register_environments
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, naming_extras
-from ethbrake_marl.files.plugins import load_plugin
 from ethbrake_marl.kernel_store import is_temporary, on_first_compilation
+from ethbrake_marl.registry import Registry, giver, points
 
 __all__ = ["app", "doctor", "evaluate", "main", "run_command", "scenario", "search", "train"]
 
@@ -145,53 +144,53 @@ def abandon_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _load_all(sources: list[str] | None) -> None:
-    with redirect_stdout(sys.stderr):
-        for source in sources or ():
-            register_environments()
-            load_plugin(source)
+def add_command(name: str, command: typer.Typer | Callable[..., Any]) -> None:
+    """Make ``ethbrake NAME`` known: a function, as ``app.command`` takes it, or a Typer with commands of its own.
 
-
-PluginOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--plugin",
-        metavar="FILE.py|NAME",
-        help="Load this file, or installed plug-in, first: it is code, and can do what you can. Repeatable.",
-        is_eager=True,  # before the values of other options are looked at
-        expose_value=False,
-        callback=_load_all,
-    ),
-]
-
-
-def whole_command() -> Any:
-    """All commands, users' own among them, with ``--plugin`` on each and on every group.
-
-    Raises ``AlreadyExists`` for a command of somebody's that would take the place of another one.
+    An installed package does it with an entry point of the group ``ethbrake_marl.commands``.
     """
-    names = [
+    if isinstance(command, typer.Typer):
+        given = command
+    else:
+        given = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+        given.command()(command)
+    COMMANDS.add(name, get_command(given), lambda other: True)
+
+
+def _names() -> list[str]:
+    """Of the commands that were added to the app."""
+    return [
         *(each.name or each.callback.__name__.replace("_", "-") for each in app.registered_commands if each.callback),
         *(str(group.name) for group in app.registered_groups),
     ]
+
+
+_OURS = tuple(_names())
+COMMANDS: Registry[Any] = Registry("command", "commands", add_command, dict.fromkeys(_OURS))
+
+
+class Installed(TyperCommand):
+    """A command of an installed package, which is loaded when it is called."""
+
+    def __init__(self, name: str) -> None:
+        of = " and ".join(giver(point) for point in points(COMMANDS.group)[name])
+        super().__init__(name, help=f"Of the installed package {of}.", rich_markup_mode=None)
+
+    def make_context(self, *given: Any, **settings: Any) -> Any:
+        """The context of the command itself."""
+        return COMMANDS[str(self.name)].make_context(*given, **settings)
+
+
+def whole_command() -> Any:
+    """All commands, those of installed packages and of a user's program among them.
+
+    Raises ``AlreadyExists`` for a command of a program that would take the place of another one.
+    """
+    installed = points(COMMANDS.group)
+    names = [*_names(), *(name for name in installed if name not in _OURS)]
     for k, name in enumerate(names):
         if name in names[:k]:
             raise AlreadyExists(f"command {name!r} is there already; give yours another name: app.command('my-{name}')")
-    only_option = typer.Typer(add_completion=False)
-
-    @only_option.command()
-    def takes_plugins(plugin: PluginOption = None) -> None:
-        """Nothing but the option, as Typer makes it."""
-
-    (option,) = get_command(only_option).params
-    whole = get_command(app)
-    for each in _all(whole):
-        each.params.append(option)
+    whole: Any = get_command(app)
+    whole.commands |= {name: Installed(name) for name in installed}
     return whole
-
-
-def _all(command: Any) -> Iterator[Any]:
-    """A command, and every one inside it."""
-    yield command
-    for each in getattr(command, "commands", {}).values():
-        yield from _all(each)

@@ -1,4 +1,4 @@
-"""The frame of every command: groups, shared options, help, plug-ins, where a wrong name leads, and its output."""
+"""The frame of every command: groups, shared options, help, where a wrong name leads, and its output."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ class _PlainConsole(Console):
             yield piece if piece.control else Segment(plain_text(piece.text, keep=_KEPT), piece.style)
 
 
-# The frame of every command: groups, options that commands share, help, plug-ins, and where a wrong name leads.
+# The frame of every command: groups, options that commands share, help, and where a wrong name leads.
 
 Run = TypeVar("Run", bound=Callable[..., None])
 
@@ -221,6 +221,7 @@ PARTS = [  # as ``part_names`` tells them: to ask for them takes the engine, and
     ("V2X presets", "paper, clear, nominal, congested, blocked, sensors-only"),
     ("Objectives", "total, own, social:ANGLE, maximin, mass-weighted, weighted:W1,W2,..., injury:CURVE"),
     ("Algorithms", "ppo, sac, counterfactual, options"),
+    ("Measures", "injury"),
 ]
 
 
@@ -243,21 +244,22 @@ class CommandWithParts(TyperCommand):
 
 def part_names() -> list[tuple[str, str]]:
     """Kinds of parts, each with its names; what is registered is among them."""
-    from ethbrake_marl.evaluation import REGISTERED
-    from ethbrake_marl.harm import KINDS
+    from ethbrake_marl.evaluation import MEASURES
+    from ethbrake_marl.harm import OBJECTIVES
     from ethbrake_marl.learning import algorithm_names
     from ethbrake_marl.observations import FEATURES
     from ethbrake_marl.rewards import TERMS
     from ethbrake_marl.scenario import CHANNELS
 
-    own = [name if entry.of == "own" else f"front_K.{name}, rear_K.{name}" for name, entry in FEATURES.items()]
+    features = FEATURES.usable().items()
+    own = [name if entry.of == "own" else f"front_K.{name}, rear_K.{name}" for name, entry in features]
     return [
         ("Reward terms", ", ".join(TERMS)),
         ("Observation", ", ".join(["own", "front_K", "rear_K", "role", "obstacle", *own])),
         ("V2X presets", ", ".join(CHANNELS)),
-        ("Objectives", ", ".join(kind.form for kind in KINDS.values())),
+        ("Objectives", ", ".join(kind.form for kind in OBJECTIVES.usable().values())),
         ("Algorithms", ", ".join(algorithm_names())),
-        *([("Measures", ", ".join(REGISTERED))] if REGISTERED else []),
+        ("Measures", ", ".join(MEASURES)),
     ]
 
 
@@ -276,15 +278,12 @@ class Group(TyperGroup):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Put the default's name where no command is named; who asks for completion or help may want any."""
-        k = 0
-        while k < len(args) and args[k].partition("=")[0] == "--plugin":
-            k += 1 if "=" in args[k] else 2
-        default, word = self.default, args[k] if k < len(args) else ""
+        default, word = self.default, args[0] if args else ""
         named = word in (*self.commands, "-h", "--help") or (not word and ctx.resilient_parsing)
         if default is not None and not named:
             takes_words = any(isinstance(each, TyperArgument) for each in default.params)
             if not word or word.startswith("-") or takes_words:
-                args = [*args[:k], default.name, *args[k:]]
+                args = [default.name, *args]
         return super().parse_args(ctx, args)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:

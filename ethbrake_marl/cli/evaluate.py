@@ -119,7 +119,11 @@ def evaluate_command(
         typer.Option(metavar="COLUMN", help="Also tell the results by group: scenario (a mixture), vehicle_2_type."),
     ] = None,
     measures: Annotated[
-        Literal["injury"] | None, typer.Option(help="Also tell injuries, by three curves from the literature.")
+        str | None,
+        typer.Option(
+            metavar="A,B,...",
+            help="Also tell these: injury (by three curves), those of installed packages, my_file.py:measure.",
+        ),
     ] = None,
     host: Annotated[
         str | None,
@@ -140,7 +144,7 @@ def evaluate_command(
     +search, then one shield, +episode, +step or +robust; for instance full_brake+step or ppo@PATH+search+episode.
     PATH is a run or a policy bundle, or shipped.
     """
-    from ethbrake_marl.agents import split_specs
+    from ethbrake_marl.agents import split_names, split_specs
     from ethbrake_marl.harm import declared_objectives
 
     _check_outputs(out, output, per_world, report=report)
@@ -160,8 +164,9 @@ def evaluate_command(
         episodes = HOSTED if episodes is None and initial_states is None else episodes
     task = _asked_task(scenario, vehicle, settings)
     chosen = task.scenario
+    told_too = tuple(split_names(measures)) if measures else ()
     lineup = evaluation.Lineup.of(
-        split_specs(agents), chosen, harm_count=harm_count, uncertainty=uncertainty, injury=measures is not None
+        split_specs(agents), chosen, harm_count=harm_count, uncertainty=uncertainty, measures=told_too
     )
     objectives = declared_objectives(objective or (), chosen.vehicles)
     _tell_shipped(lineup.make())

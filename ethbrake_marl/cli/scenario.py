@@ -40,7 +40,7 @@ scenario_group = app.group(
 def scenario_list(out: Out) -> None:
     """List the scenarios that have a name.
 
-    Name and title, and the folder of those that a plug-in registers.
+    Name and title, and the folder of those that a program registers.
     """
     entries = scenarios.list_scenarios()
     width = max(len(entry.name) for entry in entries)
@@ -152,7 +152,7 @@ def scenario_explain(out: Out, scenario: NameArgument) -> None:
 def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
     """What is declared, piece by piece; empty where there is nothing to say."""
     from ethbrake_marl.agents import find_entry
-    from ethbrake_marl.harm import KINDS
+    from ethbrake_marl.harm import OBJECTIVES
 
     yield f"{scenario.name}: {scenario.title or 'no title'}. {scenario.description}".rstrip()
     learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners) or "nobody"
@@ -187,7 +187,7 @@ def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
         + (f" A world with an impact before a learner may act {early}." if "early_impacts" in common else "")
     )
     objectives = dict.fromkeys([scenario.objective] if isinstance(scenario.objective, str) else scenario.objective)
-    aims = ", ".join(f"{each} ({KINDS[each.partition(':')[0]].about})" for each in objectives)
+    aims = ", ".join(f"{each} ({OBJECTIVES[each.partition(':')[0]].about})" for each in objectives)
     yield f"Objective: {aims}; a shield always bounds the harm of the whole line."
 
 
@@ -405,13 +405,15 @@ def agent_list(out: Out) -> None:
 
     What begins with + goes behind any agent, for instance full_brake+step: +search first, then one shield.
     """
-    from ethbrake_marl.agents import Knowledge, agent_entries
+    from ethbrake_marl.agents import Knowledge, agent_entries, agents_refused
 
     told, rows = [], []
     for entry in agent_entries():
         knows, added = Knowledge.of(entry), "also " if entry.form.startswith("+") else ""
         told.append({"agent": entry.form, "about": entry.about, "knows": list(knows), "omniscient": knows.sees_through})
         rows.append((entry.form, entry.about, f"{added}{knows.text}{' †' if knows.sees_through else ''}"))
+    for reason in agents_refused():
+        out.note(f"left out: {reason}")
     out.result(
         told,
         Sheet("", ("Agent", "Drives by", "Knows"), rows, gap=2),

@@ -169,10 +169,7 @@ def resume_command(
     out: Out,
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the run.")],
     other_versions: Annotated[
-        bool,
-        typer.Option(
-            "--other-versions", help="Go on although other versions or plug-ins trained it; numbers may differ."
-        ),
+        bool, typer.Option("--other-versions", help="Go on although other versions trained it; numbers may differ.")
     ] = False,
 ) -> None:
     """Go on with a training that was stopped or killed.

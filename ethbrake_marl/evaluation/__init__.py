@@ -43,6 +43,7 @@ if TYPE_CHECKING:
         worlds_sha256 as worlds_sha256,
     )
     from ethbrake_marl.evaluation.measures import (
+        MEASURES as MEASURES,
         PAPER_ROWS as PAPER_ROWS,
         REGISTERED as REGISTERED,
         TESTS as TESTS,
@@ -58,9 +59,9 @@ if TYPE_CHECKING:
         Tally as Tally,
         check_papers_test as check_papers_test,
         is_papers_test as is_papers_test,
+        load_measures as load_measures,
         other_tests as other_tests,
         proven_of_table as proven_of_table,
-        register_injury as register_injury,
         register_measure as register_measure,
         shipped_bounds as shipped_bounds,
         summarise as summarise,

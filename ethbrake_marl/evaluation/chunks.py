@@ -16,7 +16,7 @@ from ethbrake_marl.agents import Driver, Knowledge, Team
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.evaluation.inputs import CHUNK, HELD, make_lineup, policies_of, result_versions, scenario_sha256
-from ethbrake_marl.evaluation.measures import REGISTERED, Conditions, Evaluation, SummaryTable, Tally, register_injury
+from ethbrake_marl.evaluation.measures import REGISTERED, Conditions, Evaluation, SummaryTable, Tally, load_measures
 from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk
 from ethbrake_marl.parallel import Call, run_each
 from ethbrake_marl.scenario import Sample, Scenario, Task
@@ -36,7 +36,7 @@ class Lineup:
         scenario: whose learners they drive.
         harm_count: harm that agents minimise.
         uncertainty: what agents behind ``+robust`` do not know, as on the command line.
-        injury: evaluations report injuries too (``register_injury``).
+        measures: that evaluations tell, too, as ``load_measures`` takes them.
         same: what must be the same in every process; see ``Lineup.of``.
 
     """
@@ -45,7 +45,7 @@ class Lineup:
     scenario: Scenario
     harm_count: HarmCount = "first"
     uncertainty: str | None = None
-    injury: bool = False
+    measures: tuple[str, ...] = ()
     same: str = ""
 
     @classmethod
@@ -75,8 +75,7 @@ class Lineup:
         return _MADE[self.same]
 
     def _make_anew(self) -> Mapping[str, Driver]:
-        if self.injury:
-            register_injury()
+        load_measures(self.measures)
         intervals = None if self.uncertainty is None else parse_uncertainty(self.uncertainty)
         return make_lineup(self.agents, self.scenario, harm_count=self.harm_count, uncertainty=intervals)
 

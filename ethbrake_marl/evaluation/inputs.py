@@ -17,7 +17,6 @@ import numpy as np
 from pydantic import Field
 
 from ethbrake_marl.agents import (
-    SHIELDS,
     Agent,
     AgentAround,
     Driver,
@@ -31,16 +30,18 @@ from ethbrake_marl.agents import (
     make_role,
     parse_spec,
     script_agents,
+    shield_forms,
     split_specs,
 )
 from ethbrake_marl.defaults import DEFAULT, HarmCount
 from ethbrake_marl.engine import Engine, ask_script, begin_script
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar, check_one_learner
-from ethbrake_marl.files.plugins import files_run
+from ethbrake_marl.files.python_file import files_run
 from ethbrake_marl.files.yaml import FileModel, Override, Wording, flow_text, read_model, read_yaml
 from ethbrake_marl.limits import task_problem
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.policies import Policy
+from ethbrake_marl.registry import versions_used
 from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, ScriptSpec, Task, load_scenario, scenario_path
 from ethbrake_marl.shield import ShieldedDriver, Uncertainty
 
@@ -138,9 +139,9 @@ def policies_of(drivers: Mapping[int, object]) -> dict[str, str]:
 def result_versions() -> dict[str, str]:
     """Name -> version of Python and of every package that a result's numbers depend on.
 
-    Of the user's own files that this process ran (plug-ins, agents) the SHA-256 is told in its place.
+    Packages that gave a part to this process are among them; of the user's own files that it ran the SHA-256 is told.
     """
-    versions = {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}
+    versions = {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES} | versions_used()
     return versions | {name: f"SHA-256 {sha256}" for name, sha256 in files_run().items()}
 
 
@@ -400,7 +401,7 @@ def _refusals(scenario: Scenario, worlds: Worlds) -> dict[str, str]:
         check_agents({spec: agent}, worlds, scenario)
 
     asked: dict[str, Callable[[], object]] = {spec: partial(drive_by, spec) for spec in LADDER}
-    asked |= {f"+{shield}": partial(drive_by, f"full_brake+{shield}") for shield in SHIELDS}
+    asked |= {f"+{shield}": partial(drive_by, f"full_brake+{shield}") for shield in shield_forms()}
     asked["search best-harm"] = lambda: task_problem(worlds, Task(scenario, scenario.learners))
     asked["early_impacts: reject"] = lambda: scenario.replace(early_impacts="reject")
     refused = {}

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.agents import Knowledge, Source
 from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, PhysicsError, count_of, describe_error, unknown_name
+from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, describe_error, unknown_name
 from ethbrake_marl.evaluation.inputs import (
     HASHES,
     hash_of_chunks,
@@ -28,6 +28,7 @@ from ethbrake_marl.evaluation.inputs import (
     worlds_sha256,
 )
 from ethbrake_marl.evaluation.statistics import Moments, exact_sum, mean, rate
+from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.files.sheet import DASH, Column, Estimate, Row, Sheet, Shown
 from ethbrake_marl.harm import INJURY_CURVES, Declared, Ledger, injury_probability, scored
 from ethbrake_marl.limits import (
@@ -51,6 +52,7 @@ from ethbrake_marl.physics import (
     leaving_out_failed,
     make_worlds,
 )
+from ethbrake_marl.registry import Part, Registry
 from ethbrake_marl.scenario import QUANTITY, Scenario, Task, load_scenario
 
 _SHOWN_AGENTS = 5  # by name, in ``repr``
@@ -1072,7 +1074,7 @@ EpisodeFunction = Callable[[EpisodeImpacts], Values]
 
 @dataclass(frozen=True, slots=True)
 class _Registered:
-    """A measure of a user's own file."""
+    """A measure beside the usual ones."""
 
     name: str
     unit: str
@@ -1081,11 +1083,11 @@ class _Registered:
     form: str = ""  # what it gives: a truth or a number, per world or per vehicle
 
 
-REGISTERED: dict[str, _Registered] = {}
-
-
-def register_measure(name: str, function: EpisodeFunction, *, unit: str) -> None:
+def register_measure(name: str, function: EpisodeFunction, *, unit: str = "1") -> None:
     """Make every evaluation from now on tell ``name`` with its interval: in tables, files and pages.
+
+    An installed package does the same, for evaluations that name it, with an entry point of the group
+    ``ethbrake_marl.measures``: its function, a ``Part`` of it, or a mapping of names to such.
 
     Args:
         name: 1 to 64 of ``a-z``, digits and ``_``, beginning with a letter, not ending in ``_`` and a number,
@@ -1109,19 +1111,27 @@ def register_measure(name: str, function: EpisodeFunction, *, unit: str) -> None
         raise InvalidInput(f"measure {name!r}: needs a function with a docstring that says what it is")
     metric = _Registered(name, str(unit), " ".join((function.__doc__ or "").split()), function)
     metric = replace(metric, form=_form(_checked(metric, _tried())))
-    if REGISTERED.setdefault(name, metric) != metric:
-        raise AlreadyExists(f"measure {name!r} is registered already; give another name")
+    MEASURES.add(name, metric, lambda other: other == metric)
 
 
-def register_injury() -> None:
-    """Make every evaluation from now on tell the injuries in 1,000 lines, by each of ``harm.INJURY_CURVES``.
+MEASURES: Registry[_Registered] = Registry("measure", "measures", register_measure)
+REGISTERED = MEASURES.loaded  # those that every evaluation tells
 
-    ``injury_CURVE`` is the sum over the vehicles of a line, each by its largest change of speed, as the literature
-    takes it; ``injury_CURVE_vehicle`` tells it of each; ``injury_CURVE_every`` sums over every impact, as if each met
-    other people. A vehicle that was not hit has none, nor has one pushed by a vehicle that touches it already.
+
+def load_measures(names: Iterable[str]) -> None:
+    """Make every evaluation from now on tell these measures: those of installed packages, ``injury`` among them.
+
+    ``my_file.py:measure`` runs that file, which can do whatever you can: it names a function or a ``Part``. Raises
+    ``UnknownName`` with a suggestion, ``InvalidInput`` for what cannot be loaded.
     """
-    for name, function in _INJURIES.items():
-        register_measure(name, function, unit="per 1,000 lines")
+    for name in names:
+        file, colon, own = name.rpartition(":")
+        if colon:
+            part = load_from_file(file, own)
+            given, settings = (part.given, part.settings) if isinstance(part, Part) else ((part,), {})
+            register_measure(own, *given, **settings)
+        else:
+            MEASURES.load(name)
 
 
 def _injury(curve: str, rule: Literal["", "_vehicle", "_every"]) -> EpisodeFunction:
@@ -1152,7 +1162,16 @@ def _injury(curve: str, rule: Literal["", "_vehicle", "_every"]) -> EpisodeFunct
 
 
 _RULES: tuple[Literal["", "_vehicle", "_every"], ...] = ("", "_vehicle", "_every")
-_INJURIES = {f"injury_{curve}{rule}": _injury(curve, rule) for curve in INJURY_CURVES for rule in _RULES}
+# The injuries in 1,000 lines, by each of ``harm.INJURY_CURVES``, under one name of the entry points (pyproject.toml).
+#
+# ``injury_CURVE`` is the sum over the vehicles of a line, each by its largest change of speed, as the literature takes
+# it; ``injury_CURVE_vehicle`` tells it of each; ``injury_CURVE_every`` sums over every impact, as if each met other
+# people. A vehicle that was not hit has none, nor has one pushed by a vehicle that touches it already.
+INJURY = {
+    f"injury_{curve}{rule}": Part(_injury(curve, rule), unit="per 1,000 lines")
+    for curve in INJURY_CURVES
+    for rule in _RULES
+}
 
 
 def _heading(column: str) -> str:

@@ -50,6 +50,7 @@ from ethbrake_marl.harm import objective_harm
 from ethbrake_marl.learning.algorithms import tensors_of
 from ethbrake_marl.learning.training import Algorithm, RunDirectory, RunStatus, Scheme, Training, TrainingRecipe
 from ethbrake_marl.policies import Float32s, NetworkSpec, Policy, PolicyTeam, Trained, installed_versions
+from ethbrake_marl.registry import versions_used
 from ethbrake_marl.scenario import Appended, Scenario
 
 Model = BaseAlgorithm  # of Stable-Baselines3
@@ -221,17 +222,14 @@ def resume(
         measure: as it was given to ``train``.
         stop_at: as it was given to ``train``; it hears of new evaluations only.
         on_progress: is told how far the training is; by default stderr shows it, None: nobody is told.
-        other_versions: go on from a checkpoint that other versions, or other plug-ins, wrote, although its numbers may
-            differ.
+        other_versions: go on from a checkpoint that other versions wrote, although its numbers may differ.
 
     Raises ``InvalidInput`` for a folder without a training, one that has finished, one in which another process trains,
-    one whose ``config.json`` was edited since the checkpoint, a checkpoint of other versions, and other plug-ins.
+    one whose ``config.json`` was edited since the checkpoint, and a checkpoint of other versions.
 
     """
     run = RunDirectory(Path(directory))
     config = run.read_config()
-    if not other_versions:
-        run.check_plugins(config, "or go on all the same with --other-versions")
     training = run.training(config)
     status = read_object(run.status)
     resumable = any(run.checkpoints.glob("step_*"))
@@ -296,7 +294,8 @@ def _newest(run: RunDirectory, training: str, other_versions: bool) -> tuple[Tra
             " train again in another folder"
         )
     now, then = installed_versions(), state.numbers["versions"]
-    other = sorted(name for name in now.keys() | then.keys() if now.get(name) != then.get(name))
+    asked = then.keys() | (now.keys() - versions_used().keys())  # other parts may have been loaded here since
+    other = sorted(name for name in asked if now.get(name) != then.get(name))
     if other and not other_versions:
         name = other[0]
         raise InvalidInput(

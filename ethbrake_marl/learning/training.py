@@ -20,9 +20,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
-from importlib import import_module
 from operator import not_
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
 
 from filelock import FileLock, Timeout
@@ -30,10 +30,9 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pydantic.json_schema import models_json_schema
 from pydantic_core import ErrorDetails
 
-from ethbrake_marl.agents import AgentSettings, Driver, LearnedAgent, Team
+from ethbrake_marl.agents import AgentSettings, Driver, LearnedAgent, Source, Team
 from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput, unknown_name
-from ethbrake_marl.files.plugins import check_plugins, noted_plugins
 from ethbrake_marl.files.store import new_folder, parse_strict_json, read_object, read_plain, write_file
 from ethbrake_marl.files.yaml import (
     NAME_PATTERN,
@@ -60,6 +59,7 @@ from ethbrake_marl.policies import (
     load_policy,
     shipped_name,
 )
+from ethbrake_marl.registry import Part, Registry
 from ethbrake_marl.rewards import RewardParams, setting_names
 from ethbrake_marl.scenario import (
     Scenario,
@@ -273,11 +273,8 @@ class TrainingRecipe(FileModel):
 
     def make_algorithm(self) -> Any:
         """Its algorithm, new."""
-        algorithm = _ALGORITHMS[self.algorithm][1]
-        if isinstance(algorithm, str):
-            module, _, attribute = algorithm.partition(":")
-            algorithm = getattr(import_module(module), attribute)
-        return algorithm()
+        algorithm = ALGORITHMS[self.algorithm][1]
+        return (resolve_name(algorithm) if isinstance(algorithm, str) else algorithm)()
 
     @staticmethod
     def shipped() -> dict[str, Path]:
@@ -344,7 +341,7 @@ class TrainingRecipe(FileModel):
 
         Which keys there are depends on ``algorithm``. Registered algorithms and reward terms are known, too.
         """
-        classes = {name: recipe for name, (recipe, _) in _ALGORITHMS.items()}
+        classes = {name: recipe for name, (recipe, _) in ALGORITHMS.usable().items()}
         places, whole = models_json_schema(
             [(each, "validation") for each in classes.values()], schema_generator=FileSchema
         )
@@ -632,42 +629,47 @@ class OptionsRecipe(TrainingRecipe):
 
 
 # The names of the learning algorithms, each with the class of its recipes and the algorithm itself.
-#
-# An algorithm of the package is a string ``module:attribute``, imported when it is first used: torch takes seconds.
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
-_ALGORITHMS: dict[str, tuple[type[TrainingRecipe], str | type[Any]]] = {
-    "ppo": (PpoRecipe, "ethbrake_marl.learning.algorithms:Ppo"),
-    "sac": (SacRecipe, "ethbrake_marl.learning.algorithms:Sac"),
-    "counterfactual": (CounterfactualRecipe, "ethbrake_marl.learning.algorithms:Counterfactual"),
-    "options": (OptionsRecipe, "ethbrake_marl.learning.algorithms:Options"),
-}
 
 
-def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[Any]) -> None:
+def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[Any] | str) -> None:
     """Make ``algorithm: name`` a recipe that can be read, trained, stopped and resumed.
+
+    An installed package does the same with an entry point of the group ``ethbrake_marl.algorithms``: a ``Part`` of
+    both.
 
     Args:
         name: 1 to 64 of ``a-z``, digits, ``-`` and ``_``.
         recipe: the class of its recipes, made from ``learning.training.TrainingRecipe``; it checks the YAML file.
-        algorithm: the class of the algorithm, made from ``learning.training.Algorithm``.
+        algorithm: the class of the algorithm, made from ``learning.training.Algorithm``; or ``"module:class"``, so
+            that recipes are read without importing it, since torch takes seconds.
 
     Raises ``InvalidInput`` for a name that is taken or is no such name, or a class that lacks what is needed.
 
     """
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
         raise InvalidInput(f"algorithm {name!r:.80}: must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _")
-    if name in _ALGORITHMS:
-        raise InvalidInput(f"algorithm {name!r}: is registered already; give another name")
-    for what, given, needed in (("recipe", recipe, "network_spec"), ("algorithm", algorithm, "build")):
-        if not (isinstance(given, type) and hasattr(given, needed)):
-            raise InvalidInput(f"algorithm {name!r}: {what} = {given!r:.80}: must be a class with {needed}")
-    _ALGORITHMS[name] = recipe, algorithm
+    if not (isinstance(recipe, type) and hasattr(recipe, "network_spec")):
+        raise InvalidInput(f"algorithm {name!r}: recipe = {recipe!r:.80}: must be a class with network_spec")
+    is_place = isinstance(algorithm, str) and ":" in algorithm
+    if not (is_place or (isinstance(algorithm, type) and hasattr(algorithm, "build"))):
+        raise InvalidInput(f"algorithm {name!r}: algorithm = {algorithm!r:.80}: must be a class with build")
+    ALGORITHMS.add(name, (recipe, algorithm), lambda entry: entry == (recipe, algorithm))
+
+
+ALGORITHMS: Registry[tuple[type[TrainingRecipe], type[Any] | str]] = Registry(
+    "algorithm", "algorithms", register_algorithm
+)
+_PLACE = "ethbrake_marl.learning.algorithms:"
+PPO, SAC = Part(PpoRecipe, f"{_PLACE}Ppo"), Part(SacRecipe, f"{_PLACE}Sac")
+COUNTERFACTUAL = Part(CounterfactualRecipe, f"{_PLACE}Counterfactual")
+OPTIONS = Part(OptionsRecipe, f"{_PLACE}Options")
 
 
 def algorithm_names() -> tuple[str, ...]:
-    """Every registered name, the package's own first."""
-    return tuple(_ALGORITHMS)
+    """Every name, the package's own first."""
+    return tuple(ALGORITHMS)
 
 
 def load_recipe(name_or_path: str | Path) -> TrainingRecipe:
@@ -681,11 +683,11 @@ def load_recipe(name_or_path: str | Path) -> TrainingRecipe:
 def _checked(source: Path | Document) -> TrainingRecipe:
     document = source if isinstance(source, Document) else read_yaml(source)
     name = document.content.get("algorithm", "ppo") if isinstance(document.content, dict) else "ppo"
-    if not isinstance(name, str) or name not in _ALGORITHMS:
-        where, right = document.where(("algorithm",)), f"one of {', '.join(_ALGORITHMS)}"
+    if not isinstance(name, str) or name not in ALGORITHMS:
+        where, right = document.where(("algorithm",)), f"one of {', '.join(ALGORITHMS)}"
         raise InvalidInput(f"{where}: algorithm = {flow_text(name, 60)}: must be {right}")
     shipped = f"; every key is in the shipped recipe {name}" if name in TrainingRecipe.shipped() else ""
-    model = _ALGORITHMS[name][0]
+    model = ALGORITHMS[name][0]
     wording = _RecipeWording(model, f"it is needed{shipped}")
     return read_model(document, model, wording, "of keys to values, for instance algorithm: ppo")
 
@@ -917,10 +919,6 @@ class RunDirectory:
                 raise InvalidInput(f"{self.status}: {key} = {status.get(key)!r:.60}: must be {' or '.join(right)}")
         return config
 
-    def check_plugins(self, config: Mapping[str, Any], advice: str) -> None:
-        """Raise ``InvalidInput``, ending in ``advice``, unless the plug-ins of this process are those of this run."""
-        check_plugins(config.get("plugins", []), str(self.config), advice)
-
     def training(self, config: Mapping[str, Any]) -> Training:
         """The training of its configuration.
 
@@ -940,13 +938,8 @@ class RunDirectory:
         return Training.of(recipe, scenario)
 
     def check_same(self, training: Training) -> None:
-        """Raise ``InvalidInput`` unless it holds this training, naming the keys in which they differ.
-
-        Its plug-ins must be those of this process.
-        """
-        config = read_object(self.config)
-        self.check_plugins(config, "or give another folder (--output)")
-        found = self.training(config)
+        """Raise ``InvalidInput`` unless it holds this training, naming the keys in which they differ."""
+        found = self.training(read_object(self.config))
         if found.identity == training.identity:
             return
         kept, wanted = found.content(), training.content()
@@ -1118,7 +1111,6 @@ class Training:
             "scenario": self.scenario.model_dump(mode="json", exclude_unset=True),  # as in its file: defaults may clash
             "seeds": {"training": recipe.seed, "evaluation": recipe.evaluation.seed},
             "versions": installed_versions(),
-            "plugins": noted_plugins(),
             **({"update_ratio": recipe.update_ratio} if isinstance(recipe, SacRecipe) else {}),
             **({"settings": list(settings)} if settings else {}),
         }
@@ -1256,3 +1248,43 @@ def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
             f"agent '{name}@{path}': that policy was trained by {trained_by.upper()}: {trained_by}@{path}"
         )
     return agent
+
+
+# What this package's entry points name (pyproject.toml).
+
+PPO_AGENT, SAC_AGENT = (
+    Part(
+        make_policy_agent,
+        form=f"{name}@PATH",
+        about=f"a policy trained by {name.upper()}: a run, a bundle, or shipped",
+        knows=Source.MESSAGES,
+    )
+    for name in ("ppo", "sac")
+)
+COUNTERFACTUAL_AGENT = Part(
+    make_policy_agent,
+    form="counterfactual@PATH",
+    about="a policy trained by counterfactuals: a run or a bundle",
+    knows=Source.MESSAGES,
+)
+OPTIONS_AGENT = Part(
+    make_policy_agent,
+    form="options@PATH",
+    about="a policy trained by options: a run, a bundle, or shipped",
+    knows=Source.MESSAGES,
+)
+POLICY = Part(
+    make_policy_agent,
+    form="policy@PATH",
+    about="a policy, whatever trained it: a run, a bundle, or shipped, the best for scenario and harm",
+    knows=Source.MESSAGES,
+)
+UNIVERSAL = Part(
+    make_policy_agent, form="universal@shipped", about="the shipped policy for every scenario", knows=Source.MESSAGES
+)
+TEAM = Part(
+    make_policy_agent,
+    form="team@RUN",
+    about="the learners of a run, each as it was trained, or shipped",
+    knows=Source.MESSAGES,
+)

@@ -30,6 +30,7 @@ from ethbrake_marl.agents import (
     AgentSettings,
     BestHarm,
     Driver,
+    Source,
     fixed_commands,
     optimise_coupled,
     record_commands,
@@ -52,6 +53,7 @@ from ethbrake_marl.physics import (
     leaving_out_failed,
     stopping_distances,
 )
+from ethbrake_marl.registry import Part
 from ethbrake_marl.scenario import Sample, Scenario, Task
 from ethbrake_marl.search import MOST_PHASES, Found, ProfileProblem, Profiles, profile_problem
 
@@ -598,6 +600,14 @@ def shipped_profiles(problem: ProfileProblem, harm_count: HarmCount) -> tuple[Pr
 def make_best_harm(argument: str | None, settings: AgentSettings) -> Agent:
     """``best_harm[:candidates]``: the shipped profile, or a search with so many candidates where there is none."""
     return BestHarm.make(argument, settings, shipped_profiles)
+
+
+BEST_HARM = Part(  # what the entry point names (pyproject.toml)
+    make_best_harm,
+    form="best_harm[:CANDIDATES]",
+    about="the best profile known; a search at the alert where none is known",
+    knows=Source.MODEL,
+)
 
 
 _VEHICLES, _DRIVEN = 3, 1

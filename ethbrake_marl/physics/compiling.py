@@ -24,7 +24,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import cache, partial
-from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from types import CodeType
@@ -52,9 +51,6 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 _OPTIONS = {"nopython": True, "boundscheck": None, "fastmath": False, "nogil": True, "error_model": "numpy"}
 _KNOWN = numba.__version__.startswith("0.68.")  # of others these inner parts were not tried: numba goes its own way
 _SETTINGS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DEBUGINFO_DEFAULT")  # numba's, of the code made
-# Instructions of the levels of x86-64 for which kernels are built ahead, the better one first.
-_V2 = {"+cx16", "+popcnt", "+sse4.2", "+ssse3"}
-_LEVELS = {"x86-64-v3": _V2 | {"+avx2", "+bmi", "+bmi2", "+f16c", "+fma", "+lzcnt", "+movbe"}, "x86-64-v2": _V2}
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _MARK = b"\n@compiled"  # of a decorator, at the start of its line
@@ -159,7 +155,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
     def _obtain(self, way: str, kinds: tuple[Any, ...], make: Callable[[], Any], load: Callable[..., None]) -> None:
         """Load what is kept under this name, or make and keep it, while no other process does."""
         name = self._name(way, kinds)
-        kept = load_kernel(name) or (self._ready_made(kinds) if way == "entry" else None)
+        kept = load_kernel(name)
         if kept is None:
             with _alone(name):
                 kept = load_kernel(name)  # another process may have made it meanwhile
@@ -170,17 +166,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
                     return
         load(*pickle.loads(kept))
 
-    def _ready_made(self, kinds: tuple[Any, ...]) -> bytes | None:
-        """What was installed for a processor like this one, unless the user named another."""
-        triple, _, features = self.targetctx.codegen().magic_tuple()
-        for level, needed in _LEVELS.items() if numba_config.CPU_NAME is None else ():
-            if needed <= set(features.split(",")):
-                kept = load_kernel(self._name("entry", kinds, (triple, level, "")), ready_made=True)
-                if kept is not None:
-                    return kept
-        return None
-
-    def _name(self, way: str, kinds: tuple[Any, ...], processor: tuple[str, ...] = ()) -> str:
+    def _name(self, way: str, kinds: tuple[Any, ...]) -> str:
         """Name of a signature's file in the store; empty where not all that makes the code is known."""
         code, source = self.py_func.__code__, Path(self.py_func.__code__.co_filename)
         digest, own = digest_of_sources(source), digest_of_sources(Path(__file__))
@@ -189,7 +175,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         made_of = (
             (way, sys.implementation.cache_tag, sys.flags.optimize, numba.__version__, llvmlite.__version__),
             [str(getattr(numba_config, setting)) for setting in _SETTINGS],
-            processor or self.targetctx.codegen().magic_tuple(),
+            self.targetctx.codegen().magic_tuple(),
             (own, digest, _place_of(source), self.__module__, self.__qualname__, code.co_firstlineno, code.co_code),
             [constant for constant in code.co_consts if not isinstance(constant, CodeType)],
             sorted(self.targetoptions.items()),
@@ -215,14 +201,13 @@ def _described(kind: Any) -> str:
     return f"{kind} {getattr(kind, 'fields', '')} {parts}"
 
 
-def load_kernel(name: str, *, ready_made: bool = False) -> bytes | None:
-    """What was kept, or installed, under a name; nothing where it is missing, damaged, or not this user's or root's.
+def load_kernel(name: str) -> bytes | None:
+    """What was kept under a name; nothing where it is missing, damaged, or not this user's or root's.
 
     Who else could write there could have us run anything.
     """
-    folder = _ready_made_folder() if ready_made else cache_folder()
     try:
-        with (folder / name).open("rb") as file:
+        with (cache_folder() / name).open("rb") as file:
             about, content = os.fstat(file.fileno()), file.read()
     except OSError:
         return None
@@ -271,13 +256,6 @@ def _alone(name: str) -> Iterator[None]:
         if lock.is_locked:
             Path(lock.lock_file).unlink(missing_ok=True)
             lock.release()
-
-
-@cache
-def _ready_made_folder() -> Path:
-    """Folder of the kernels that the distribution ethbrake-marl-kernels brings, or one that does not exist."""
-    found = find_spec("ethbrake_marl_kernels")
-    return Path(found.origin).parent if found and found.origin else Path(os.devnull)
 
 
 @cache

@@ -49,7 +49,7 @@ from ethbrake_marl.files.yaml import (
     require,
     suggestion,
 )
-from ethbrake_marl.harm import KINDS, objectives_of
+from ethbrake_marl.harm import OBJECTIVES, objectives_of
 from ethbrake_marl.observations import ListedFeatures, listed_features
 from ethbrake_marl.physics import (
     Bools,
@@ -656,7 +656,7 @@ class ScriptSpec(NamedTuple):
         if match["name"].endswith(".py") or ".py:" in spec:
             raise InvalidInput(
                 f"agent {spec!r}: is a function of a Python file, and those are loaded only where a person names them"
-                " (--agents, --plugin); no scenario does. A plug-in can register it under a name"
+                " (--agents); no scenario does. A package that you install can give it a name"
             )
         return ScriptSpec(match["name"], match["argument"])
 
@@ -932,8 +932,9 @@ class _ObjectiveSchema:
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        plain = [name for name, kind in KINDS.items() if ":" not in kind.form]
-        with_argument = "|".join(name for name, kind in KINDS.items() if ":" in kind.form)
+        kinds = OBJECTIVES.usable()
+        plain = [name for name, kind in kinds.items() if ":" not in kind.form]
+        with_argument = "|".join(name for name, kind in kinds.items() if ":" in kind.form)
         return {"type": "string", "anyOf": [{"enum": plain}, {"pattern": f"^({with_argument}):"}]}
 
 

@@ -57,6 +57,7 @@ from ethbrake_marl.engine import (
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep, check_one_learner, count_of, renumbered, unknown_name
 from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.physics import Bools, Floats, Ints, Vehicles, Worlds
+from ethbrake_marl.registry import Part
 from ethbrake_marl.scenario import Scenario, Task
 from ethbrake_marl.shield.enclosure import CORNERS, INTERIOR, checked_robust
 from ethbrake_marl.shield.step_shield import (
@@ -946,3 +947,29 @@ def shield_steps_robustly(policy: Agent, argument: str | None, settings: AgentSe
         where=where, robust=checked_robust(argument or CORNERS, where),
         uncertainty=None if settings.believes else mode_uncertainty("robust", settings.uncertainty, where),
     )  # fmt: skip
+
+
+# What this package's entry points name (pyproject.toml).
+
+
+EPISODE = Part(
+    shield_episodes,
+    form="+episode[:pairwise][:believed]",
+    about="behind Algorithm 1: it or E-V2X-BM drives the episode, whichever harms less; believed: as far as is"
+    " received",
+    knows=Source.MODEL,
+)
+STEP = Part(
+    shield_steps,
+    form="+step[:believed]",
+    about="every action certified, or replaced; of a team together; believed: certified in the world that is believed",
+    knows=Source.MODEL,
+    teams=True,
+)
+ROBUST = Part(
+    shield_steps_robustly,
+    form="+robust[:interior][:believed]",
+    about="as +step where not everything is known: in the corners of an uncertainty, interior: in all of it;"
+    " believed: against all that was not received",
+    knows=Source.MODEL,
+)

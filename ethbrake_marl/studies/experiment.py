@@ -256,7 +256,6 @@ def _show(
         "Harm that agents minimise": "first impacts only" if harm_count == "first" else "every impact",
         "Whole run": f"{wall_s:.0f} s",
         "Settings": ", ".join(config.get("settings", ())),
-        "Plug-ins": ", ".join(f"{each['name']} (SHA-256 {each['sha256']})" for each in config["plugins"]),
     }
     manifest, name = trained.policy.manifest, evaluation.scenario.name
     which = (

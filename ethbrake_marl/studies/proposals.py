@@ -1,4 +1,4 @@
-"""What Optuna proposes for a tuning, through Ray Tune, and kept in a file: what stands there is proposed again first.
+"""Proposals of Optuna for a tuning, through Ray Tune, kept in a file: those that stand there are proposed again first.
 
 A sampler is made anew for each trial, of a seed and the trial's number: what is proposed depends on what had
 ended by then, and not on how often the command was stopped in between.

@@ -1,4 +1,4 @@
-"""What the files of a sweep and of a tuning have in common: how they are read, and what a training of them is."""
+"""The common part of the files of a sweep and of a tuning: how they are read, and what a training of them is."""
 
 from __future__ import annotations
 

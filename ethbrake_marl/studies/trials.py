@@ -18,7 +18,6 @@ from typing import Any
 from ray import tune
 
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, OnProgress, Progress, describe_error
-from ethbrake_marl.files.plugins import load_the_same, noted_plugins
 from ethbrake_marl.studies.figures import HARM, REASON
 
 
@@ -50,7 +49,7 @@ def run_trials(
     """
     config.max_concurrent_trials, config.reuse_actors = jobs, True
     with TemporaryDirectory(prefix="ethbrake-ray-") as notes, redirect_stdout(StringIO()):
-        trainable = tune.with_parameters(_attempt, work=work, given=given, folder=folder.absolute(), plugins=_plugins())
+        trainable = tune.with_parameters(_attempt, work=work, given=given, folder=folder.absolute())
         results = tune.Tuner(
             tune.with_resources(trainable, {"CPU": 1}),
             param_space=dict(space),
@@ -65,18 +64,11 @@ def run_trials(
     ]
 
 
-def _attempt(
-    config: dict[str, Any],
-    work: Callable[..., None],
-    given: Mapping[str, Any],
-    folder: Path,
-    plugins: list[dict[str, str]],
-) -> None:
+def _attempt(config: dict[str, Any], work: Callable[..., None], given: Mapping[str, Any], folder: Path) -> None:
     """One attempt at a trial. An error of this package would come again, so Ray is not to try again."""
     try:
         if not folder.is_dir():
             raise InvalidInput(f"{folder}: is not there on {os.uname().nodename}; every computer must see this folder")
-        load_the_same(plugins)
         work(config, **given)
     except EthBrakeError as error:
         tune.report({REASON: str(error), HARM: math.inf})
@@ -113,15 +105,3 @@ class Told(tune.Callback):  # type: ignore[misc]  # Ray ships no types
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         """A trial is tried again."""
         self.say(f"{_reason(trial.get_pickled_error())}; tried again")
-
-
-def _plugins() -> list[dict[str, str]]:
-    """The plug-ins of this process, files by paths that workers elsewhere understand."""
-    plugins = noted_plugins()
-    load_the_same(plugins)  # a file that was changed since is refused here, in one line
-    return [
-        {**each, "source": str(Path(each["source"]).absolute())}
-        if each["source"].endswith(".py") or os.sep in each["source"]
-        else each
-        for each in plugins
-    ]

@@ -17,7 +17,6 @@ import numpy as np
 from pydantic import AfterValidator, Discriminator, Field, PlainValidator, Tag, WithJsonSchema, model_validator
 
 from ethbrake_marl.errors import InvalidInput, OnProgress, count_of, naming_extras
-from ethbrake_marl.files.plugins import noted_plugins
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import read_object, remove_unfinished, write_file
 from ethbrake_marl.files.yaml import FileModel, FileSchema, flow_text
@@ -270,7 +269,7 @@ class TuningPlan:
     file: TuningFile
     recipe: TrainingRecipe  # with the file's settings, its seed and its list
     scenario: Scenario
-    question: Mapping[str, Any]  # all that makes a trial's harm what it is, versions and plug-ins included
+    question: Mapping[str, Any]  # all that makes a trial's harm what it is, versions included
 
     @staticmethod
     def json_schema() -> dict[str, Any]:
@@ -310,7 +309,6 @@ class TuningPlan:
             **file.model_dump(mode="json", include={"search", "measure", "prune", "sampler"}),
             "order": [*file.search],
             "versions": installed_versions(),
-            "plugins": noted_plugins(),
         }
         plan = cls(file, recipe, scenario, told)
         for key, dimension in file.search.items():

@@ -357,7 +357,7 @@ def test_agent_names__are_those_that_ship_and_are_listed(capsys):
     assert agent_names() == tuple(sorted(names)) and run_command(["agent", "list"]) == 0
     table = capsys.readouterr().out
     assert [name for name in (*names, "+search", "+episode", "+step", "+robust") if name not in table] == []
-    assert all(callable(entry.load()) and entry.about and entry.knows for entry in agent_entries())
+    assert all(callable(entry.make) and entry.about and entry.knows for entry in agent_entries())
 
 
 def test_register_agent__makes_names_and_policies_known():

@@ -254,7 +254,7 @@ def agent_of(spec: str, scenario: eb.Scenario = PAPER) -> eb.Agent:
 
 def written_forms():
     """Every way in which an agent of the registry, or what goes around one, can be written."""
-    for form in (entry.form for entry in agent_entries() if isinstance(entry.make, str)):  # not those of other tests
+    for form in (entry.form for entry in agent_entries() if entry.is_ours):  # not those of other tests
         parts = re.split(r"\[([^]]*)\]", form)  # what must be there, and between what may be, as A|B
         choices = [(part,) if k % 2 == 0 else ("", *part.split("|")) for k, part in enumerate(parts)]
         yield form, {"".join(each) for each in itertools.product(*choices)}

@@ -306,7 +306,7 @@ def raising(): raise KeyError("weights")"""
         ("My+File.py:make_agent:3", "make_agent has no parameters, so it takes no argument"),
         ("My+File.py:wrong", "agent 'My+File.py:wrong': 'int' is no agent: it has no name and no act"),
         ("My+File.py:raising", "agent 'My+File.py:raising': KeyError: 'weights' (My+File.py, line 4)"),
-        ("My+File.py:nobody", "file 'My+File.py': has no function 'nobody'; name the one that makes the agent"),
+        ("My+File.py:nobody", "file 'My+File.py': has no 'nobody'; name what it defines: My+File.py:NAME"),
     ],
 )
 def test_file_of_an_agent__is_refused(spec: str, message: str, empty_folder: Path) -> None:

@@ -20,7 +20,7 @@ SPECS = {
     "cacc": ["cacc:T=0.8"],
     "coast": ["coast"],
     "constant": ["constant:3"],
-    "counterfactual": ["counterfactual@shipped/counterfactual-cooperation-1-front"],
+    "counterfactual": ["counterfactual@shipped"],
     "e_v2x_bm": ["e_v2x_bm", "e_v2x_bm:pairwise", "e_v2x_bm:believed", "e_v2x_bm:pairwise:believed"],
     "full_brake": ["full_brake"],
     "idm": ["idm:T=1.0"],
@@ -49,7 +49,7 @@ def theirs(argument, settings):
 def _their_agents(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("roles"))
-        patch.setattr(registry, "_ENTRIES", dict(registry._ENTRIES))
+        patch.setattr(registry._AGENTS, "loaded", {})
         eb.register_agent("theirs", theirs, takes_policy=True)
         make_policy(eb.ObservationSpec(), {"name": "paper-random"}).save("mine")
         for vehicle in ("vehicle_2", "vehicle_3"):

@@ -1,6 +1,5 @@
-"""The frame of all commands: names, help, completion, streams, signals, exit statuses; and plug-ins in one file."""
+"""The frame of all commands: names, help, completion, streams, signals, exit statuses; and agents from a file."""
 
-import hashlib
 import io
 import json
 import os
@@ -10,13 +9,11 @@ import subprocess
 import sys
 import time
 from contextlib import nullcontext
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 import typer
-import yaml
 from numba.core import event
 from rich.console import Console
 
@@ -24,13 +21,8 @@ from ethbrake_marl import __version__
 from ethbrake_marl.cli import app as frame, command
 from ethbrake_marl.cli.app import app, run_command, whole_command
 from ethbrake_marl.cli.command import DEFAULTS, MOVED, Commands, Out
-from ethbrake_marl.files import plugins
-from ethbrake_marl.learning.training import Training, load_recipe
 from ethbrake_marl.physics.compiling import compiled
-from ethbrake_marl.scenario import load_scenario, new_scenario_text
-from ethbrake_marl.studies.trainings import TrainingJob, train_all
-from tests.cli.conftest import TINY_RECIPE, Command, check_refused, told_json
-from tests.fixtures.registered import restore, tables
+from tests.cli.conftest import Command, check_refused, told_json
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = [""]  # every one, groups too
@@ -133,22 +125,22 @@ def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, 
 
 
 def test_results__stand_alone_on_stdout_whatever_a_file_of_the_users_prints(ethbrake: Command, tmp_path: Path) -> None:
-    (tmp_path / "noise.py").write_text('print("noise of a plug-in")\n')
     (tmp_path / "mine.py").write_text(
         "import numpy as np, ethbrake_marl as eb\n"
+        'print("noise of a file")\n'
         "def act(seen):\n"
         '    print("noise of a policy")\n'
         "    return np.full((len(seen), 1), -1.0)\n"
         "def make(): return eb.policy_agent(act)\n"
     )
-    files = ["--plugin", tmp_path / "noise.py", "--agents", f"full_brake,{tmp_path}/mine.py:make"]
+    files = ["--agents", f"full_brake,{tmp_path}/mine.py:make"]
     told = ethbrake("evaluate", *files, "--episodes", "3", "--json")
     assert len(told_json(told)) == 2
-    assert "noise of a plug-in" in told.err and "noise of a policy" in told.err
+    assert "noise of a file" in told.err and "noise of a policy" in told.err
     assert "noise" not in ethbrake("evaluate", *files, "--episodes", "3").out
 
 
-def test_a_command_of_a_plug_in__prints_where_it_likes(ethbrake: Command, monkeypatch) -> None:
+def test_a_command_of_a_program__prints_where_it_likes(ethbrake: Command, monkeypatch) -> None:
     monkeypatch.setattr(app, "registered_commands", [*app.registered_commands])
     app.command("my-words")(lambda: print("words"))
     assert ethbrake("my-words").out == "words\n"
@@ -167,7 +159,7 @@ def program(source: str, **environment: str) -> tuple[int, str, str]:
     """Exit status, stdout and stderr of Python source in a process of its own."""
     process = subprocess.run(
         [sys.executable, "-c", source],
-        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+        env={**os.environ, **environment},
         capture_output=True,
         encoding=environment.get("PYTHONIOENCODING", "utf-8"),
         check=False,
@@ -270,22 +262,12 @@ def test_command__ctrl_c_is_one_line_and_the_status_of_an_interruption(capsys) -
     assert capsys.readouterr().err == "interrupted; what was found is kept\n"
 
 
-# ---------------------------------------------------------------- plug-ins
+# ---------------------------------------------------------------- files and commands of the user's own
 
 
-PLUGIN = '''
+AGENT = """
 import numpy as np
 import ethbrake_marl as eb
-
-
-def calm(step):
-    """Minus the square of the own command in force."""
-    return -(step.command_mps2**2)
-
-
-def time_gap(worlds, vehicle):
-    """Time to where the vehicle ahead is now, 1 m/s at the least."""
-    return worlds.gaps_m[:, vehicle - 1] / np.maximum(worlds.speeds_mps[:, vehicle], 1.0)
 
 
 def make_gentle(argument: str, settings):
@@ -293,157 +275,23 @@ def make_gentle(argument: str, settings):
     return eb.policy_agent(lambda seen: np.full((len(seen), 1), -share), name="gentle", scenario=settings.scenario)
 
 
-eb.register_term("calm", calm, unit="m2/s4")
-eb.register_feature("time_gap_s", time_gap, unit="s", scale=1.0, low=0.0, high=10.0)
-eb.register_preset("hilly", {"preset": "nominal", "lost": 0.3})
-eb.register_agent("gentle", make_gentle, about="brakes with a constant share")
-assert make_gentle.__annotations__ == {"argument": str}  # a plug-in means what Python says it means
-'''
+assert make_gentle.__annotations__ == {"argument": str}  # a file means what Python says it means
+"""
 
 
-@pytest.fixture
-def again():
-    """Call it to go on as in a new process."""
-    before = tables()
-    return lambda: restore(before)
-
-
-@pytest.fixture
-def parts(tmp_path: Path) -> Path:
-    path = tmp_path / "my_parts.py"
-    path.write_text(PLUGIN)
-    return path
-
-
-@pytest.fixture
-def scenario(tmp_path: Path) -> Path:
-    """A scenario with the plug-in's preset."""
-    path = tmp_path / "hills.yaml"
-    content = yaml.safe_load(new_scenario_text("hills"))
-    path.write_text(yaml.safe_dump(content | {"v2x": "hilly", "early_impacts": "keep"}))
-    return path
-
-
-def write_recipe(folder: Path, **changes: object) -> Path:
-    path = folder / "calm.yaml"
-    path.write_text(yaml.safe_dump({**TINY_RECIPE, "name": "calm", "reward": {"harm": 1.0, "calm": 0.01}, **changes}))
-    return path
-
-
-@pytest.fixture
-def recipe(tmp_path: Path) -> Path:
-    """A recipe with the plug-in's term and feature."""
-    return write_recipe(tmp_path, observation=["own", "front_1", "rear_1", "time_gap_s"])
-
-
-@pytest.mark.filterwarnings(
-    "ignore::ethbrake_marl.evaluation.measures.IncompleteTable"
-)  # a list that shares worlds with a table
-@pytest.mark.usefixtures("undrawn")
-def test_one_file__adds_agent_term_feature_and_preset_and_is_seen_in_the_report(
-    ethbrake, tmp_path, parts, scenario, recipe, again
-):
-    assert len(PLUGIN.strip().splitlines()) <= 40
-    run = tmp_path / "run"
-    named = ("--plugin", parts)
-    made = ethbrake("run", *named, "--scenario", scenario, "--recipe", recipe, "--episodes", "20", "--output", run)
-    assert made.status == 0, made.err
-    config = json.loads((run / "config.json").read_text())
-    sha256 = hashlib.sha256(parts.read_bytes()).hexdigest()
-    assert config["plugins"] == [{"name": "my_parts.py", "source": str(parts), "sha256": sha256}]
-    assert config["recipe"]["reward"]["terms"] == {"calm": 0.01} and config["scenario"]["v2x"] == {"preset": "hilly"}
-    page = (run / "report.html").read_text()
-    assert f"my_parts.py (SHA-256 {sha256})" in page and "calm" in page
-    again()
-    driven = ethbrake(
-        "evaluate", *named, "--scenario", scenario, "--episodes", "20", "--agents", f"gentle,gentle:0.2+step,ppo@{run}"
-    )
-    assert driven.status == 0 and "gentle:0.2+step" in driven.out
-
-
-def test_agents_from_a_file__drive_on_the_command_line_behind_a_shield(ethbrake, parts):
-    spec = f"{parts}:make_gentle:0.3"
+def test_agents_from_a_file__drive_on_the_command_line_behind_a_shield(ethbrake, tmp_path):
+    (tmp_path / "my_agents.py").write_text(AGENT)
+    spec = f"{tmp_path / 'my_agents.py'}:make_gentle:0.3"
     answer = ethbrake("evaluate", "--episodes", "10", "--agents", f"{spec},{spec}+step", "--json")
     assert [row["agent"] for row in json.loads(answer.out)] == [spec, f"{spec}+step"]
     assert ethbrake("shield", "--episodes", "10", "--agents", spec).status == 0
 
 
-@pytest.fixture
-def stopped(ethbrake, tmp_path, parts, again):
-    """A training with the plug-in, stopped before its end, and a new process."""
-    folder = tmp_path / "stopped"
-    recipe = write_recipe(tmp_path, checkpoint_every_updates=1)
-    assert ethbrake("train", "--plugin", parts, "--recipe", recipe, "--output", folder).status == 0
-    status = json.loads((folder / "run.json").read_text())
-    (folder / "run.json").write_text(json.dumps(status | {"status": "interrupted"}))
-    again()
-    return folder
-
-
-def test_resume__needs_the_same_plugins_and_says_how_to_go_on(ethbrake, tmp_path, parts, stopped, again):
-    def refuse(told: str, *files: Path) -> None:
-        answer = ethbrake("train", "resume", stopped, *(word for file in files for word in ("--plugin", file)))
-        again()
-        check_refused(answer, told)
-
-    other, config = tmp_path / "other.py", (stopped / "config.json").read_text()
-    other.touch()
-    all_the_same = "or go on all the same with --other-versions"
-    refuse(f"needs the plug-in my_parts.py, which is not loaded; name it: --plugin {parts}")
-    refuse(f"was made without the plug-in {other}; leave it out, {all_the_same}", parts, other)
-    parts.write_text(PLUGIN + "# changed\n")
-    refuse("the plug-in my_parts.py was another file then (SHA-256 ", parts)
-    refuse(f"put it back as it was, {all_the_same}", parts)
-    assert ethbrake("train", "resume", stopped, "--plugin", parts, "--other-versions").status == 0
-    again()
-    parts.write_text(PLUGIN)
-    moved = parts.rename(tmp_path / "moved.py")  # the content counts, not the place
-    (stopped / "config.json").write_text(json.dumps(json.loads(config) | {"plugins": [{"name": 3}]}))
-    refuse("plugins must be a list of name, source and sha256", moved)
-    (stopped / "config.json").write_text(config)
-    refuse("this training has finished", moved)
-
-
-def test_option__stands_on_every_command_and_before_it(ethbrake, parts):
-    waiting = [whole_command()]
-    for each in waiting:
-        waiting += getattr(each, "commands", {}).values()
-        assert [option.name for option in each.params].count("plugin") == 1, each.name
-    answer = ethbrake("--plugin", parts, "agent", "list")
-    assert answer.status == 0 and "gentle[:ARGUMENT]" in answer.out
-
-
-def test_installed_plugin__is_loaded_only_when_it_is_named(ethbrake, tmp_path, monkeypatch):
-    (tmp_path / "installed_parts.py").write_text(PLUGIN)
-    monkeypatch.syspath_prepend(tmp_path)
-    point = EntryPoint("hills", "installed_parts", plugins.GROUP)
-    monkeypatch.setattr(plugins, "entry_points", lambda group: [point] if group == plugins.GROUP else [])
-    assert "gentle[" not in ethbrake("agent", "list").out and "installed_parts" not in sys.modules
-    assert "gentle[" in ethbrake("agent", "list", "--plugin", "hills").out
-    (noted,) = plugins.noted_plugins()
-    assert noted["name"] == "hills" and noted["sha256"] == hashlib.sha256(PLUGIN.encode()).hexdigest()
-    assert "unknown plug-in 'hill'; did you mean 'hills'?" in ethbrake("agent", "list", "--plugin", "hill").err
-    del sys.modules["installed_parts"]
-
-
-@pytest.mark.slow
-def test_worker_processes__load_the_plugins_of_their_parent(tmp_path, parts, monkeypatch):
-    monkeypatch.setenv("PYTHONPATH", os.getcwd())
-    plugins.load_plugin(parts)
-    recipe = load_recipe(str(write_recipe(tmp_path)))
-    scenario = load_scenario("paper-random")
-    wanted = [TrainingJob(Training.of(recipe, scenario, seed=seed), tmp_path / f"seed{seed}") for seed in (0, 1)]
-    assert train_all(wanted, 2)
-    for training in wanted:
-        config = json.loads((training.folder / "config.json").read_text())
-        assert [each["name"] for each in config["plugins"]] == ["my_parts.py"]
-
-
 @pytest.mark.parametrize(("content", "told"), [(b"x = 1\n\0\n", "null bytes"), (b"def f(:\n", "line 1: SyntaxError")])
-def test_plugin__that_is_no_python_names_no_line_that_is_not_there(ethbrake, tmp_path, content: bytes, told: str):
+def test_file__that_is_no_python_names_no_line_that_is_not_there(ethbrake, tmp_path, content: bytes, told: str):
     (tmp_path / "bad.py").write_bytes(content)
-    answer = ethbrake("agent", "list", "--plugin", tmp_path / "bad.py")
-    check_refused(answer, f"plug-in '{tmp_path / 'bad.py'}'", told)
+    answer = ethbrake("evaluate", "--agents", f"{tmp_path / 'bad.py'}:make")
+    check_refused(answer, f"file '{tmp_path / 'bad.py'}'", told)
     assert "None" not in answer.err
 
 

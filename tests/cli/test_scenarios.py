@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import runpy
 from pathlib import Path
 from textwrap import indent
 from unittest.mock import Mock
@@ -56,13 +57,13 @@ for name in ("own_calm", "own_fixed", "own_greedy", "own_fails"):
 
 
 def test_validate__drives_scripts_and_tells_what_refuses_them(ethbrake: Command, scenario_file, tmp_path) -> None:
-    plugin = tmp_path / "scripts.py"
-    plugin.write_text(SCRIPTS)
+    (tmp_path / "scripts.py").write_text(SCRIPTS)
+    runpy.run_path(str(tmp_path / "scripts.py"))
 
     def tried(script: str, *more: str) -> Answer:
         path = scenario_file("\n  vehicle_3: full_brake\n", f"\n  vehicle_3: {script}\n")
         path.write_text(path.read_text().replace("early_impacts: reject", "early_impacts: keep"))
-        return ethbrake("scenario", "validate", path, "--plugin", plugin, *more)
+        return ethbrake("scenario", "validate", path, *more)
 
     calm = told_json(tried("own_calm", "--json"))
     assert calm["not_state_free"] == {"vehicle_3": "own_calm"} and not calm["commands_out_of_range"]

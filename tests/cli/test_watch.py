@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -22,7 +21,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import NamedWorlds, check_agents, make_lineup
 from ethbrake_marl.evaluation.results import compare_results, read_result
 from ethbrake_marl.evaluation.statistics import mean, paired_difference, unpaired_difference
-from ethbrake_marl.files import plugins
+from ethbrake_marl.files import python_file
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.policies import shipped_policies
 from ethbrake_marl.scenario import Scenario, load_scenario
@@ -104,7 +103,6 @@ def test_evaluate__prints_the_papers_rows_where_they_are_asked_for_and_fit(ethbr
         check_refused(
             ethbrake(*words, *other, "--paper"), "paper: the paper's rows are about Vehicle 2", "leave paper out"
         )
-    check_refused(ethbrake(*words, "--shards", "1", "--paper"), "--paper: --shards prints no rows of the paper")
     check_refused(ethbrake(*words, "--scenario", "standards", "--paper"), "--paper: standards is a group")
 
 
@@ -140,7 +138,7 @@ def test_evaluate__one_agent_that_cannot_drive_is_refused_before_another_works(e
 
 def test_lineup__a_team_goes_behind_the_step_shield_and_no_other(monkeypatch) -> None:
     scenario, team = load_scenario("cooperation-3-pair"), Team.of(make_agent("coast"), [1, 2])
-    monkeypatch.setitem(registry._ENTRIES, "team", Entry("team@RUN", "", (), lambda argument, settings: team))
+    monkeypatch.setitem(registry._AGENTS.loaded, "team", Entry("team@RUN", "", (), lambda argument, settings: team))
     assert sorted(make_lineup(["team@run+step"], scenario)["team@run+step"].drivers) == [1, 2]
     with pytest.raises(InvalidInput, match=r"'team@run\+robust': is a team, and \+robust is for one driven vehicle"):
         make_lineup(["team@run+robust"], scenario)
@@ -239,7 +237,7 @@ def test_compare__difference_is_paired_by_world_where_every_world_is_there(resul
 
 
 def test_compare__marks_who_exploits_what_harm_does_not_count(ethbrake: Command, results: Path) -> None:
-    rows = json.loads((results / "a.csv.json").read_text())
+    rows = json.loads((results / "a/results.json").read_text())
     for name, shoved, moving in (("before", 4.0, 0), ("after", 6.0, rows[0]["episodes"])):
         told = [row | {"vehicle_1_shoved_m": shoved, "horizon_ends": moving} for row in rows[:1]] + rows[1:]
         (results / f"{name}.json").write_text(json.dumps(told))
@@ -263,7 +261,7 @@ def test_compare__marks_who_exploits_what_harm_does_not_count(ethbrake: Command,
     ],
 )
 def test_compare__refuses_what_no_evaluation_wrote(results: Path, wrong: dict[str, Any], says: str) -> None:
-    rows = [row | wrong for row in json.loads((results / "a.csv.json").read_text())]
+    rows = [row | wrong for row in json.loads((results / "a/results.json").read_text())]
     (results / "wrong.json").write_text(json.dumps(rows))
     with pytest.raises(InvalidInput, match=says):
         read_result(results / "wrong.json")
@@ -306,7 +304,7 @@ def test_compare__sees_that_an_agents_file_was_edited(tmp_path: Path) -> None:
         )
         answer = subprocess.run(
             [sys.executable, "-c", PROGRAM, "evaluate", "--agents", f"{file}:make", "--episodes", "5", "--json"],
-            env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=True,
+            capture_output=True, text=True, check=True,
         )  # fmt: skip
         (tmp_path / f"{name}.json").write_text(answer.stdout)
         read[name] = read_result(tmp_path / f"{name}.json")
@@ -327,7 +325,7 @@ def test_versions__tell_a_file_behind_the_at_by_its_hash(ethbrake: Command, tmp_
     rows: list[dict[str, Any]] = []
     for share in (-1.0, -0.2):
         np.save(tmp_path / "w.npy", [share])
-        plugins._READ.clear()
+        python_file._READ.clear()
         rows += told_json(ethbrake(*line))
     one, other = (row["versions"]["w.npy"] for row in rows)
     assert one.startswith("SHA-256 ") and one != other

@@ -171,6 +171,7 @@ TABLES: dict[str, How] = {
     "| `--draw` | full_brake": _by(SUITE, "tests/scenario/test_recorded.py"),
     "| agent in a host | here | SUMO": _by(SUITE, "tests/hosts/test_sumo.py"),
     "| work | has | lacks": _by(BY_HAND),
+    "| for | recipe | scenario | differs": _by(BY_HAND),
 }
 
 PICTURES: dict[str, How] = {

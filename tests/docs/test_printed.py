@@ -225,7 +225,7 @@ def test_notebook__runs_from_its_first_cell_to_its_last(name: str, tmp_path: Pat
         pytest.importorskip("ipywidgets", reason="no ipywidgets: pip install 'ethbrake-marl[notebook]'")
     done = subprocess.run(
         [sys.executable, "-c", "\n".join(cells)],
-        env={**os.environ, "PYTHONPATH": str(DOCS.parent), "OMP_NUM_THREADS": "1"},
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
         cwd=tmp_path,
         capture_output=True,
         text=True,

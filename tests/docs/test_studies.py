@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from typing import Any, get_args
 
@@ -26,6 +27,7 @@ from ethbrake_marl.studies import reproduction
 from ethbrake_marl.studies.reproduction import FULL_BRAKE, GAPS, ITEMS, NAMES, Reproduction, Result, checked_result
 from ethbrake_marl.studies.speed import Effort
 from tests.docs.site import DOCS, load
+from tests.fixtures.installed import write_metadata
 
 sampling, price, equal_time, scaling, cooperative = (
     load(f"../studies/{name}") for name in ("sampling", "price", "equal_time", "scaling", "cooperative")
@@ -300,7 +302,10 @@ def test_ablate_cooperation__its_files_and_commands_make_what_it_says(
     for language, name in (("python", "my_objective.py"), ("yaml", "my-level.yaml")):
         (text,) = re.findall(f"```{language}\n(.*?)```", ABLATION, re.DOTALL)
         (tmp_path / name).write_text(text, "utf-8")
-    environment = {**os.environ, "PYTHONPATH": str(DOCS.parent), "OMP_NUM_THREADS": "1"}
+    (package,) = re.findall("```toml\n(.*?)```", ABLATION, re.DOTALL)
+    write_metadata(tmp_path, tomllib.loads(package)["project"])  # as pip does
+    path = os.pathsep.join([os.environ["PYTHONPATH"], str(tmp_path)])
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path}
     small = "--seeds 1 --steps 512 --episodes 20 --search-episodes 3 --budget 50"
     for command in re.findall(r"^\$ (.*)", ABLATION, re.MULTILINE):
         words = command.replace("--seeds 3", small).split()[1:]

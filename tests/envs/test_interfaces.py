@@ -1,7 +1,6 @@
 """What is special to one interface; what all promise: ``tests/contract``."""
 
 import json
-import os
 import re
 import subprocess
 import sys
@@ -304,8 +303,7 @@ def test_import__stays_light_until_a_name_is_used_and_lets_gymnasium_make_it_by_
         "print(e.unwrapped.engine._watched, p.engine._watched, *{'PIL', 'pygame', 'matplotlib'} & set(sys.modules))"
     )
     command = [sys.executable, "-W", "error", "-c", program]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.stdout.splitlines() == ["[]", "['numba', 'pydantic']", "EthBrakeEnv", "{} {}"], result.stderr
 
 

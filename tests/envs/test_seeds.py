@@ -1,7 +1,6 @@
 """Copies of an environment play different worlds, and whoever names a seed or sets a generator decides which."""
 
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -67,9 +66,8 @@ def first_seeds() -> list[int]:
 
 def test_copies__have_different_seeds_in_every_interface_and_process() -> None:
     program = "import json\nfrom tests.envs.test_seeds import first_seeds\nprint(json.dumps(first_seeds()))"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", program]
-    ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    ran = subprocess.run(command, capture_output=True, text=True, check=True)
     seeds = [*first_seeds(), *first_seeds(), *json.loads(ran.stdout)]
     assert len(set(seeds)) == len(seeds) == 3 * len(MAKERS) * len(LOOKS)
     assert all(0 <= seed < 2**63 for seed in seeds)

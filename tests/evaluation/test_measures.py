@@ -5,7 +5,6 @@ import io
 import json
 import math
 import sys
-from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -24,8 +23,8 @@ from ethbrake_marl.evaluation import (
     Outcome,
     SummaryTable,
     evaluate,
+    load_measures,
     measures,
-    register_injury,
     summarise,
     write_per_world,
 )
@@ -33,7 +32,6 @@ from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.evaluation.measures import (
     KNOWN_OF_WORLDS,
     PAPER_ROWS,
-    REGISTERED,
     Between,
     Exploits,
     IncompleteTable,
@@ -731,18 +729,9 @@ def test_injury_probability__by_hand(speeds, side, curve, expected) -> None:
     assert np.round(injury_probability(np.array(speeds), side, curve), 9).tolist() == expected
 
 
-@pytest.fixture
-def registered() -> Iterator[None]:
-    """The measures of injuries are registered, twice as once."""
-    before = dict(REGISTERED)
-    register_injury()
-    register_injury()
-    yield
-    for name in set(REGISTERED) - set(before):
-        del REGISTERED[name]
-
-
-def test_injuries__of_a_crash_by_hand(registered: None) -> None:
+def test_injuries__of_a_crash_by_hand() -> None:
+    for _ in range(2):
+        load_measures(["injury"])
     # Vehicle 2 hits with 6 m/s, masses 1 and 3: 4.5 m/s at the rear of Vehicle 1, 1.5 m/s in front of Vehicle 2; in
     # 1,000 lines 1000 / (1 + exp(4.888 - 0.7965)) and 1000 / (1 + exp(4.457 - 0.2655)). Who is not hit has none.
     crash = {
@@ -756,7 +745,8 @@ def test_injuries__of_a_crash_by_hand(registered: None) -> None:
     assert injuries("full_brake", CRASH.replace(gaps_m=30)) == dict.fromkeys(crash, 0.0)
 
 
-def test_injuries__of_several_impacts_count_the_largest_or_each(registered: None) -> None:
+def test_injuries__of_several_impacts_count_the_largest_or_each() -> None:
+    load_measures(["injury"])
     # Vehicle 2 pushes Vehicle 1 into a wall.
     pushed = CRASH.replace(obstacle_gap_m=20, restitution=0.5, horizon_s=6, driving_capacity_mps2=6)
     wall = injuries("constant:-6", pushed)

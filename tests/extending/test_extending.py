@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +71,7 @@ def worst(episodes):
 eb.register_feature("urgency", urgency, unit="1/s", scale=10.0, low=0.0, high=4.0)
 eb.register_feature("load", load, unit="1", scale=1.0, low=0.0, high=8.0, of="neighbour", unknown=1.0)
 eb.register_term("calm", calm, unit="m/s2")
-eb.register_term("hurry", hurry, weight=0.0, unit="m/s")
+eb.register_term("hurry", hurry, unit="m/s")
 eb.register_preset("rural", {RURAL})
 eb.register_objective("front-first", front_first)
 eb.register_measure("worst", worst, unit="m/s")
@@ -81,7 +82,7 @@ eb.register_measure("worst", worst, unit="m/s")
 def mine(tmp_path: Path) -> None:
     """The parts of the user's file are registered."""
     (tmp_path / "my_parts.py").write_text(MINE)
-    eb.load_plugin(tmp_path / "my_parts.py")
+    runpy.run_path(str(tmp_path / "my_parts.py"))
 
 
 def changed(function: Any, told: str = "Another one.") -> Any:
@@ -292,7 +293,7 @@ def test_measure__sees_every_impact_whatever_the_chunk_and_changes_nothing_else(
 def test_measure__of_each_vehicle_stands_in_rows_frame_markdown_and_report() -> None:
     eb.register_measure("squared", squared, unit="m2/s2")
     injury = changed(lambda episodes: 1.0 / (1.0 + np.exp(4.457 - 0.177 * episodes.largest_speed_change_mps)))
-    eb.register_measure("injury", injury, unit="1")
+    eb.register_measure("injured", injury, unit="1")
     eb.register_measure("change", changed(lambda episodes: episodes.largest_speed_change_mps), unit="m/s")
     struck = changed(lambda each: np.isin(np.arange(each.worlds.n), each.rows.world[each.rows.pair == 1]))
     eb.register_measure("rear_ended", struck, unit="1")  # whether Vehicle 3 hit Vehicle 2
@@ -301,15 +302,15 @@ def test_measure__of_each_vehicle_stands_in_rows_frame_markdown_and_report() -> 
     changes = np.stack([braked.metrics[f"change_{i}"] for i in (1, 2, 3)], axis=1)
     assert (((changes > 0.0).sum(axis=1) > 1) == braked.collided).all() and (changes >= 0.0).all()  # of both in a pair
     assert ((changes[:, 2] > 0.0) == braked.metrics["rear_ended"]).all() and np.ptp(changes[:, 2]) > 0.0
-    assert [*rows[0].metrics][:4] == ["squared", "injury_1", "injury_2", "injury_3"]
-    assert rows[1].metrics["injury_2"] == mean(found.outcome("e_v2x_bm").metrics["injury_2"])
+    assert [*rows[0].metrics][:4] == ["squared", "injured_1", "injured_2", "injured_3"]
+    assert rows[1].metrics["injured_2"] == mean(found.outcome("e_v2x_bm").metrics["injured_2"])
     told = rows[0].to_json()
-    assert told["metric_squared"] == near(told["total_harm"]) and len(told["metric_injury_3_interval"]) == 2
-    assert told["metrics"]["injury_3"] == "injury, vehicle 3 (1)"
+    assert told["metric_squared"] == near(told["total_harm"]) and len(told["metric_injured_3_interval"]) == 2
+    assert told["metrics"]["injured_3"] == "injured, vehicle 3 (1)"
     frame, report = found.to_frame("columns"), Report("mine", rows, found).html
     assert frame["metric_squared"] == near(frame["total_harm"])
     for text in (rows.markdown(), report):
-        assert "squared (m2/s2)" in text and "injury, vehicle 2 (1)" in text
+        assert "squared (m2/s2)" in text and "injured, vehicle 2 (1)" in text
     assert "Squared closing speed of every impact." in report
 
 
@@ -346,17 +347,18 @@ def test_measure__one_function_and_it_stands_in_every_output(
 # ---------------------------------------------------------------- folders, the command line, the page
 
 
-def test_folder__makes_its_scenarios_known_by_name_and_a_plugin_may_register_it_on_the_command_line(
+@pytest.mark.usefixtures("mine")
+def test_folder__makes_its_scenarios_known_by_name_and_to_the_command_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder, before, file = tmp_path / "mine", eb.list_scenarios(), tmp_path / "parts.py"
+    folder, before = tmp_path / "mine", eb.list_scenarios()
     folder.mkdir()
     for name in ("hills", "coast-road"):
         (folder / f"{name}.yaml").write_text(new_scenario_text(name))
-    file.write_text(f"{MINE}\nfrom pathlib import Path\neb.register_scenarios(Path(__file__).parent / 'mine')\n")
+    eb.register_scenarios(folder)
 
     def told(*words: str) -> Any:
-        assert run_command([*words, "--plugin", str(file)]) == 0
+        assert run_command([*words]) == 0
         return capsys.readouterr().out
 
     words = ("evaluate", "--scenario", "hills", "--episodes", "5", "--agents", "full_brake")

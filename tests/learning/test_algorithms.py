@@ -4,6 +4,7 @@ import copy
 import itertools
 import json
 import math
+import runpy
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -66,7 +67,7 @@ from tests.learning.tiny import (
 def mine(tmp_path: Path) -> None:
     """An algorithm of a user's file is registered."""
     (tmp_path / "my_algorithm.py").write_text(A2C)
-    eb.load_plugin(tmp_path / "my_algorithm.py")
+    runpy.run_path(str(tmp_path / "my_algorithm.py"))
 
 
 A2C = '''

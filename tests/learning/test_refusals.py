@@ -11,6 +11,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents import script_agents
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, UnknownName
 from ethbrake_marl.evaluation.inputs import load_runnable
+from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.files.store import hold_lock
 from ethbrake_marl.learning.algorithms import Ppo, widened
 from ethbrake_marl.learning.runs import resume, train
@@ -74,7 +75,7 @@ RECIPES: dict[str, Callable[[], object]] = {
     ),
     "mine.yaml, line 9: gamma = .nan: must be a finite number": lambda: recipe("gamma: 0.99", "gamma: .nan"),
     "mine.yaml, line 9: gamma = 1.5: must be less than or equal to 1": lambda: recipe("gamma: 0.99", "gamma: 1.5"),
-    "must be one of ppo, sac, counterfactual, options": lambda: recipe("algorithm: ppo", "algorithm: trpo"),
+    "must be one of counterfactual, options, ppo, sac": lambda: recipe("algorithm: ppo", "algorithm: trpo"),
     "must be a whole number, written without a decimal point": lambda: recipe("total_steps: 4096", "total_steps: 1e6"),
     "mine.yaml, line 8: learning_rate.start = -0.001: must be greater than 0": lambda: recipe(
         "start: 1e-3", "start: -1e-3"
@@ -168,7 +169,6 @@ TRAININGS: dict[str, Callable[[], object]] = {
     "recipe 'options': among: sac@shipped/ppo: give policy@shipped/NAME, or ppo@ and its path": lambda: train(
         load_recipe("options").replace(among=["sac@shipped/ppo"], drawn=1), "paper-random", "new"
     ),
-    "algorithm 'ppo': is registered already; give another name": lambda: register_algorithm("ppo", PpoRecipe, Ppo),
     "algorithm 'My algorithm': must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _": lambda: (
         register_algorithm("My algorithm", PpoRecipe, Ppo)
     ),
@@ -239,6 +239,11 @@ def test_name__is_unknown(message: str) -> None:
         NAMES[message]()
 
 
+def test_algorithm__has_a_name_of_its_own() -> None:
+    with refused("algorithm 'ppo' is registered already; give another name", AlreadyExists):
+        register_algorithm("ppo", PpoRecipe, Ppo)
+
+
 def test_observation_and_network__hold_those_of_the_policy_to_start_from() -> None:
     turned = load_recipe("counterfactual").replace(observation=["own", "front_1", "contact"])
     with refused("observation: lacks rear_1.known, rear_1.gap, rear_1.closing_speed, rear_1.acceleration"):
@@ -272,14 +277,14 @@ def test_tried_actions__are_at_most_the_decisions_of_an_update() -> None:
     [
         ({"n_stepz": 3}, "mine.yaml, line 23: n_stepz: unknown key; did you mean n_steps?"),
         ({"n_steps": 2.5}, "mine.yaml, line 22: n_steps = 2.5: must be a whole number"),
-        ({"algorithm": "a3c"}, "mine.yaml, line 1: algorithm = a3c: must be one of ppo, sac"),
+        ({"algorithm": "a3c"}, "mine.yaml, line 1: algorithm = a3c: must be one of counterfactual, options, ppo, sac"),
         ({"scheme": "independent"}, "scheme independent: recipe 'mine' is for A2C; it needs one for PPO"),
     ],
     ids=lambda value: str(value)[:30],
 )
 def test_recipe_of_a_user__is_checked_as_ours(changes: dict[str, Any], message: str, empty_folder: Path) -> None:
     Path("my_algorithm.py").write_text(A2C)
-    eb.load_plugin("my_algorithm.py")
+    load_from_file("my_algorithm.py", "A2C")
     with refused(message):
         train(recipe_file(Path(), **changes), PAIR, Path("run"))
 

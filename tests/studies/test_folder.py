@@ -1,6 +1,5 @@
 """Studies that go on after a kill: one contract for their folders, and trainings several at a time."""
 
-import os
 import re
 import shutil
 import subprocess
@@ -89,7 +88,7 @@ def weights(folder: Path) -> dict[str, bytes]:
 @pytest.mark.slow
 def test_trainings__killed_with_their_workers_go_on_to_the_same_policies(tiny_total: Path, tmp_path: Path) -> None:
     line = [sys.executable, "-c", TRAINING, str(tiny_total), str(tmp_path / "killed")]
-    process = subprocess.Popen(line, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, start_new_session=True)
+    process = subprocess.Popen(line, cwd=ROOT, start_new_session=True)
     try:
         while not [*(tmp_path / "killed").glob("seed*/checkpoints/*")]:
             assert process.poll() is None

@@ -113,6 +113,7 @@ def test_finished_jobs__are_not_repeated_and_the_table_is_the_same(again, capsys
 
 @pytest.mark.slow
 def test_team__that_has_lost_a_policy_is_trained_again(write_sweep: Write, tiny: Path, tmp_path: Path) -> None:
+    pytest.importorskip("ray")
     job = {"scenario": "cooperation-3-pair", "recipe": str(tiny), "set": {"scheme": "independent", "total_steps": 1}}
     folder, file = tmp_path / "out", write_sweep(jobs=[job])
     assert sweep(file, folder) == 0

@@ -1,0 +1,272 @@
+"""Packages that are installed: what they name is loaded when it is used, stands in every output, and breaks nothing."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import yaml
+
+import ethbrake_marl as eb
+from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
+from ethbrake_marl.registry import versions_used
+from tests.learning.tiny import TINY_PPO
+
+Install = Callable[..., None]
+
+PROJECT = """
+[build-system]
+requires = ["setuptools"]
+build-backend = "setuptools.build_meta"
+
+[project]
+name = "hills"
+version = "0.3"
+
+[tool.setuptools]
+py-modules = ["hills"]
+
+[project.entry-points."ethbrake_marl.agents"]
+gentle = "hills:make_gentle"
+
+[project.entry-points."ethbrake_marl.shields"]
+softer = "hills:softer"
+
+[project.entry-points."ethbrake_marl.measures"]
+worst = "hills:WORST"
+
+[project.entry-points."ethbrake_marl.rewards"]
+calm = "hills:calm"
+
+[project.entry-points."ethbrake_marl.features"]
+urgency = "hills:URGENCY"
+
+[project.entry-points."ethbrake_marl.objectives"]
+front-first = "hills:front_first"
+
+[project.entry-points."ethbrake_marl.algorithms"]
+patient = "hills:PATIENT"
+
+[project.entry-points."ethbrake_marl.commands"]
+hello = "hills:hello"
+"""
+HILLS = '''
+import numpy as np
+import typer
+
+import ethbrake_marl as eb
+from ethbrake_marl.learning.training import PpoRecipe
+
+
+class Gentle:
+    name, knows, state_free = "gentle", "own sensors", True
+
+    def __init__(self, share):
+        self.share = share
+
+    def act(self, worlds, vehicle):
+        return -self.share * worlds.vehicles.braking_capacity_mps2[:, vehicle]
+
+
+def make_gentle(argument, settings):
+    return Gentle(float(argument or 0.5))
+
+
+def softer(agent, argument, settings):
+    return Gentle(agent.share / 2.0)
+
+
+def worst(episodes):
+    """Largest change of speed in the line."""
+    return episodes.largest_speed_change_mps.max(axis=1)
+
+
+def calm(step):
+    """Minus the square of the own command in force."""
+    return -(step.command_mps2**2)
+
+
+def urgency(worlds, vehicle):
+    """Own speed."""
+    return worlds.speeds_mps[:, vehicle]
+
+
+def front_first(harm, vehicle):
+    """The harm of the front vehicle and of the own."""
+    return harm.borne[:, 0] + harm.borne[:, vehicle]
+
+
+class PatientRecipe(PpoRecipe):
+    algorithm: str = "patient"
+
+
+WORST = eb.Part(worst, unit="m/s")
+URGENCY = eb.Part(urgency, unit="m/s", scale=10.0, low=0.0, high=4.0)
+PATIENT = eb.Part(PatientRecipe, "ethbrake_marl.learning.algorithms:Ppo")
+
+
+def hello(name: str, loud: bool = False) -> None:
+    """Say hello."""
+    typer.echo(f"hello {name}{'!' * loud}")
+'''
+
+
+@pytest.mark.slow
+def test_package__that_pip_installs_drives_measures_pays_and_commands(tmp_path: Path) -> None:
+    source, target = tmp_path / "hills", tmp_path / "target"
+    source.mkdir()
+    (source / "pyproject.toml").write_text(PROJECT)
+    (source / "hills.py").write_text(HILLS)
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
+    subprocess.run([*pip, "--target", target, source], check=True, cwd=tmp_path)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([os.environ["PYTHONPATH"], str(target)])}
+
+    def told(*words: str | Path) -> str:
+        line = [sys.executable, "-m", "ethbrake_marl", *words]
+        done = subprocess.run(line, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    assert (
+        "hello      Of the installed package hills." in told("--help")
+        and told("hello", "you", "--loud") == "hello you!\n"
+    )
+    assert "gentle[:ARGUMENT]" in told("agent", "list") and "+softer[:ARGUMENT]" in told("agent", "list")
+
+    agents, out = "full_brake,gentle,gentle:0.8+softer,gentle+step", tmp_path / "out"
+    words = ("--agents", agents, "--episodes", "20", "--measures", "worst", "--jobs", "2")
+    table = told("evaluate", *words, "--output", out, "--report")
+    assert "worst (m/s)" in " ".join(table.split()) and "gentle:0.8+softer" in table
+    rows = json.loads((out / "results.json").read_text())
+    rows = rows["agents"] if isinstance(rows, dict) else rows
+    assert [row["agent"] for row in rows] == agents.split(",") and rows[0]["versions"]["hills"] == "0.3"
+    assert all(row["metric_worst"] >= 0.0 for row in rows)
+    page = (out / "report.html").read_text()
+    assert "worst (m/s)" in page and "Largest change of speed in the line." in page
+
+    recipe = {**TINY_PPO.model_dump(mode="json"), "name": "mine", "algorithm": "patient", "total_steps": 512}
+    recipe |= {"reward": {"harm": 1.0, "calm": 0.01}, "observation": ["own", "urgency"]}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(recipe))
+    told("train", "--recipe", "mine.yaml", "--set", "objective=front-first", "--output", "run")
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert config["recipe"]["reward"]["terms"] == {"calm": 0.01} and config["versions"]["hills"] == "0.3"
+
+
+AGENTS = {"gentle": "hills:make_gentle"}
+
+
+def test_entry_point__is_loaded_when_its_name_is_used(install: Install, capsys: pytest.CaptureFixture[str]) -> None:
+    install(
+        "hills", HILLS, agents=AGENTS, objectives={"front-first": "hills:front_first"}, commands={"hi": "hills:hello"}
+    )
+    assert run_command(["--help"]) == 0 and "Of the installed package hills." in capsys.readouterr().out
+    assert "gentle" in eb.agent_names()
+    assert eb.make_agent("full_brake").name == "full_brake" and "hills" not in sys.modules and not versions_used()
+    assert eb.make_agent("gentle:0.8").share == 0.8  # type: ignore[union-attr]
+    assert versions_used() == {"hills": "1.2"}
+    scenario = eb.load_scenario("paper-random").replace(objective="front-first", roles={"vehicle_2": "gentle"})
+    assert eb.make_engine(scenario, 3).scenario.objective == "front-first"
+    assert run_command(["hi", "you"]) == 0 and capsys.readouterr().out == "hello you\n"
+
+
+def test_entry_point__that_fails_is_named_and_breaks_nothing_else(
+    install: Install, capsys: pytest.CaptureFixture[str]
+) -> None:
+    groups = ("agents", "measures", "rewards", "features", "objectives", "algorithms", "commands", "shields")
+    install("broken", "import nothing_of_this_name\n", **{group: {"hills": "broken:part"} for group in groups})
+    told = "broken:part of the installed package broken: cannot be imported: ModuleNotFoundError: No module named"
+    for use in (
+        lambda: eb.make_agent("hills"),
+        lambda: eb.make_agent("coast+hills"),
+        lambda: eb.make_engine("paper-random", 1, reward={"harm": 1.0, "hills": 1.0}),
+        lambda: eb.choose_observation(["hills"]),
+        lambda: eb.load_scenario("paper-random").replace(objective="hills"),
+        lambda: eb.load_recipe("ppo").replace(algorithm="hills"),
+    ):
+        with pytest.raises(InvalidInput, match=told):
+            use()
+    for words in (["hills"], ["evaluate", "--measures", "hills"]):
+        assert run_command(words) == 2 and told in capsys.readouterr().err
+    for words in (["--help"], ["evaluate", "--help"], ["scenario", "schema"], ["recipe", "schema"], ["agent", "list"]):
+        assert run_command(words) == 0
+    assert capsys.readouterr().err.count("left out: ") == 2
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ("hills:no_such_thing", "cannot be imported: AttributeError"),
+        ("hills:worst", "must be a plain name|has no|needs|gave|unknown"),
+        ("hills:WORST", "unexpected keyword argument 'unit'"),
+    ],
+)
+def test_entry_point__that_does_not_fit_is_named(install: Install, given: str, told: str) -> None:
+    install("hills", HILLS, agents={"gentle": given}, features={"gentle": given})
+    with pytest.raises(InvalidInput, match=f"feature 'gentle', {given} of the installed package hills"):
+        eb.choose_observation(["gentle"])
+    if "unit" in told:
+        with pytest.raises(InvalidInput, match=told):
+            eb.make_agent("gentle")
+
+
+def test_name__that_two_packages_give_is_told_with_both(install: Install, capsys: pytest.CaptureFixture[str]) -> None:
+    install("hills", HILLS, agents=AGENTS, commands={"evaluate": "hills:hello"})
+    install("valleys", HILLS, agents={"gentle": "valleys:make_gentle", "coast": "valleys:make_gentle"})
+    both = "installed packages hills and valleys give it; uninstall all but one"
+    with pytest.raises(InvalidInput, match=f"agent 'gentle': the {both}"):
+        eb.make_agent("gentle")
+    with pytest.raises(InvalidInput, match="agent 'coast': the installed packages ethbrake-marl and valleys give it"):
+        eb.make_agent("coast")
+    assert eb.make_agent("full_brake").name == "full_brake"
+    assert run_command(["evaluate", "--episodes", "3"]) == 2
+    assert "command 'evaluate': the installed packages ethbrake-marl and hills give it" in capsys.readouterr().err
+    with pytest.raises(UnknownName, match="unknown agent 'gentel'; did you mean 'gentle'"):
+        eb.make_agent("gentel")
+
+
+def test_register__is_the_way_of_both_and_refuses_another_of_that_name(install: Install) -> None:
+    install("hills", HILLS, agents=AGENTS, measures={"worst": "hills:WORST"})
+    import hills  # type: ignore[import-not-found]
+
+    eb.register_agent("gentle", hills.make_gentle)
+    eb.register_measure("worst", hills.worst, unit="m/s")
+    with pytest.raises(AlreadyExists, match="agent 'gentle' is registered already"):
+        eb.register_agent("gentle", hills.softer)
+    with pytest.raises(AlreadyExists, match="measure 'worst' is registered already"):
+        eb.register_measure("worst", hills.worst, unit="km/h")
+
+
+def test_measures__of_a_file_are_told_where_it_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mine.py").write_text(f"{HILLS}\npart = WORST\n")
+    words = ["evaluate", "--episodes", "5", "--agents", "full_brake", "--measures"]
+    assert run_command([*words, f"{tmp_path}/mine.py:worst,{tmp_path}/mine.py:part,injury", "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)
+    assert row["metric_worst"] == row["metric_part"] > 0.0 and row["metric_injury_lr4s"] > 0.0
+    assert row["metrics"]["part"] == "part (m/s)" and row["versions"]["mine.py"].startswith("SHA-256 ")
+
+
+def test_scenario_recipe_and_bundle__run_no_file_that_they_name(tmp_path: Path) -> None:
+    (tmp_path / "evil.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")
+    evil = f"{tmp_path}/evil.py:make"
+    paper, quick = eb.load_scenario("paper-random"), eb.load_recipe("quick")
+    for use in (
+        lambda: paper.replace(roles={"vehicle_1": evil}),
+        lambda: paper.replace(objective=evil),
+        lambda: paper.replace(observation=[evil]),
+        lambda: quick.replace(algorithm=evil),
+        lambda: quick.replace(reward={"harm": 1.0, evil: 1.0}),
+        lambda: quick.replace(observation=[evil]),
+    ):
+        with pytest.raises(InvalidInput):
+            use()
+    assert [path.name for path in tmp_path.iterdir()] == ["evil.py"]
+
+
+def test_metadata__that_is_missing_is_what_an_unknown_name_tells(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ethbrake_marl.registry.points", lambda group: {})
+    with pytest.raises(UnknownName, match="unknown agent 'mine': of the package ethbrake-marl no entry points are"):
+        eb.make_agent("mine")
