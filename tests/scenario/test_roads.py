@@ -1,6 +1,7 @@
 """Roads, tables, equipage, loads and later alerts: what a scenario may say beside the line."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from ethbrake_marl.evaluation import states_of
 from ethbrake_marl.limits import prove
 from ethbrake_marl.scenario import QUANTITY, Task
 from ethbrake_marl.shield import parse_uncertainty
+from tests.refused import refused
 
 PAPER = eb.load_scenario("paper-random")
 FIXED = PAPER.replace(gaps_m=40, speeds_mps=20, latency_s=0, early_impacts="keep", horizon_s=30)
@@ -231,3 +233,124 @@ def test_alert_s__everybody_goes_on_until_then() -> None:
     assert 4.8 < latency.max() <= 5
     assert drawn.bounds("latency_s") == ((1.0, 5.0), (1.0, 5.0), (1.0, 5.0))
     assert drawn.ranges().names == ("alert_s",)
+
+
+# ---------------------------------------------------------------- what is refused
+
+SILENT = {"sends": False, "hears": "none"}
+
+
+def lognormal(**changes: float) -> eb.Scenario:
+    """Gaps of this distribution."""
+    return PAPER.replace(gaps_m={"lognormal": {"median": 7.0, "sigma": 0.4, "low": 3.0, "high": 30.0, **changes}})
+
+
+ROADS: dict[str, Callable[[], object]] = {
+    "roles.vehicle_1 = constant:5: is above this vehicle's braking_capacity_mps2, 2.943 m/s2": lambda: FIXED.replace(
+        friction={"uniform": [0.3, 0.9]}, roles={"vehicle_1": "constant:5", "vehicle_2": "learner"}
+    ),
+    "scenario 'paper-random': friction = 0: must be finite and in (0, 2]": lambda: FIXED.replace(friction=0),
+    "must be a number or a distribution; a key that is not used is left out": lambda: FIXED.replace(friction=None),
+    "uncertainty: friction is one number for the whole line; give it without a vehicle": lambda: parse_uncertainty(
+        "friction.vehicle_2=0.1"
+    ),
+    "uncertainty: friction=0.1: friction is not known in every world; declare it in the scenario": lambda: (
+        parse_uncertainty("friction=0.1").members(FIXED.sample(1, 7).worlds)
+    ),
+    "uncertainty: friction=1: 0.6 in world 0 may be as low as -0.4; it must stay above 0": lambda: parse_uncertainty(
+        "friction=1"
+    ).members(FIXED.replace(friction=0.6).sample(1, 7).worlds),
+    "scenario 'paper-random': draws nothing: all its worlds are the same": lambda: eb.Scenario(
+        **{**FIXED.declared(), "table": {"columns": ["gap_1_m", "mass_3_t"], "rows": [[12, 30]]}}
+    ).ranges(),
+    "only without messages one by one (v2x: paper): what was": lambda: FIXED.replace(alert_s=2, v2x="nominal"),
+    "with latency_s a vehicle may act as late as 40 s; it must be below horizon_s": lambda: FIXED.replace(alert_s=40),
+}
+
+
+@pytest.mark.parametrize("message", ROADS)
+def test_road_or_alert__is_refused(message: str) -> None:
+    with refused(message):
+        ROADS[message]()
+
+
+TABLES: dict[str, Callable[[], object]] = {
+    "unknown column; did you mean gap_2_m (metres)?": lambda: tabled({**TABLE, "columns": ["gap_1_m", "gap_9_m"]}),
+    "scenario 'paper-random': table.columns = [gap_1_m]: each column can be given once": lambda: tabled(
+        {**TABLE, "columns": ["gap_1_m", "gap_1_m"]}
+    ),
+    "scenario 'paper-random': table.rows[0]: has 1 numbers; there are 2 columns": lambda: tabled(
+        {**TABLE, "rows": [[5.0]]}
+    ),
+    "speed_2_mps must be finite and in [0, 200] m/s (metres per": lambda: tabled({**TABLE, "rows": [[5.0, -1.0]]}),
+    "scenario 'paper-random': table.weights: must be one for each of 3 rows, all above 0, and their sum": lambda: (
+        tabled({**TABLE, "weights": [1, 1]})
+    ),
+    "scenario 'paper-random': table.file = other.csv: give either a file or rows, not both": lambda: tabled(
+        {**TABLE, "file": "other.csv"}
+    ),
+    "scenario 'paper-random': table.rows: files are read where they stand in a file (load_scenario); give": lambda: (
+        tabled({**TABLE, "weights": "count"})
+    ),
+    "scenario 'paper-random': gaps_m = 9: the table says it for all; leave it out": lambda: tabled(
+        {"columns": ["gap_1_m", "gap_2_m"], "rows": [[5, 6]]}
+    ),
+    "scenario: table.file = ../rows.csv: must be a path from the scenario's folder on": lambda: eb.load_scenario(
+        {**PAPER.declared(), "table": {"file": "../rows.csv"}}
+    ),
+    "scenario: no.csv: no such file": lambda: eb.load_scenario({**PAPER.declared(), "table": {"file": "no.csv"}}),
+}
+
+
+@pytest.mark.parametrize("message", TABLES)
+def test_table__is_refused(message: str) -> None:
+    with refused(message):
+        TABLES[message]()
+
+
+DISTRIBUTIONS: dict[str, Callable[[], object]] = {
+    "scenario 'paper-random': gaps_m.lognormal = {median: 0, sigma: 0.4, low: 3, high": lambda: lognormal(median=0.0),
+    "scenario 'paper-random': gaps_m.lognormal = {median: 7, sigma: 0, low: 3, high: 30}": lambda: lognormal(sigma=0.0),
+    "scenario 'paper-random': gaps_m.lognormal = {median: 7, sigma: 0.4, low": lambda: lognormal(low=3.0, high=3.0),
+    "[low, high] must hold at least 1e-06 of the untruncated distribution": lambda: lognormal(low=1e3, high=2e3),
+    "must be finite and in (0, 100] m/s2 (metres per second squared)": lambda: lorries(spread={"uniform": [-5, 0]}),
+    "scenario 'paper-random': vehicle_types.lorry.braking_capacity_mps2.spread = 0.3": lambda: lorries(spread=0.3),
+}
+
+
+@pytest.mark.parametrize("message", DISTRIBUTIONS)
+def test_distribution__is_refused(message: str) -> None:
+    with refused(message):
+        DISTRIBUTIONS[message]()
+
+
+LINKED: dict[str, Callable[[], object]] = {
+    "preset paper has no generated messages; leave it": lambda: PAPER.replace(v2x={"vehicles": {"vehicle_2": SILENT}}),
+    "v2x paper has no messages that a type could lack": lambda: PAPER.replace(vehicle_types={"car": {"v2x": SILENT}}),
+    "scenario 'paper-random': v2x.vehicles.vehicle_4: unknown vehicle": lambda: PAPER.replace(
+        v2x={**LINKS, "vehicles": {"vehicle_4": SILENT}}
+    ),
+    "scenario 'paper-random': v2x = {preset: nominal, senses: none, link_latency_s: 0.3, vehi...": lambda: (
+        PAPER.replace(
+            v2x={"preset": "nominal", "link_latency_s": 0.3, "vehicles": {"vehicle_2": SILENT}, "senses": "none"}
+        )
+    ),
+}
+
+
+@pytest.mark.parametrize("message", LINKED)
+def test_equipage__is_refused(message: str) -> None:
+    with refused(message):
+        LINKED[message]()
+
+
+def test_table_of_a_file__is_refused_with_the_row_of_the_file(empty_folder: Path) -> None:
+    Path("rows.csv").write_text("speed_1_mps\n" + "".join(f"{20 + row}\n" for row in range(1_200)))
+    with refused("table.rows[181][0] = 201: speed_1_mps must be finite and in [0, 200] m/s (metres per second)"):
+        eb.load_scenario({**PAPER.declared(), "table": {"file": "rows.csv", "columns": ["speed_1_mps"]}})
+
+
+def test_state_that_is_given__needs_a_channel_that_draws_nothing() -> None:
+    kinds = {"equipped": {"weight": 7}, "without": {"weight": 3, "v2x": SILENT}}
+    with refused("initial_state: the scenario draws what each vehicle knows when (v2x: nominal)"):
+        FIXED.replace(vehicle_types=kinds, v2x=LINKS).worlds_from_state({"gaps_m": [7, 7], "speeds_mps": [20, 20, 20]})

@@ -1,4 +1,4 @@
-"""What tunings, levels of cooperation, falsifications and reproductions refuse."""
+"""What sweeps, tunings, levels of cooperation, falsifications and reproductions refuse."""
 
 import json
 from collections.abc import Callable
@@ -14,6 +14,7 @@ from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies.ablation import Level, common_worlds, with_scheme
 from ethbrake_marl.studies.falsification import Measure, search
 from ethbrake_marl.studies.reproduction import Reproduction, read_results, render_page
+from ethbrake_marl.studies.sweep import SweepPlan
 from ethbrake_marl.studies.tuning import TuningPlan
 from tests.fixtures.pictures import draw_nothing
 from tests.refused import refused
@@ -143,6 +144,115 @@ NAMES: dict[str, Callable[[], object]] = {
 def test_name_in_a_tuning__is_unknown(message: str) -> None:
     with refused(message, UnknownName):
         NAMES[message]()
+
+
+GRID = {"scenario": "paper-random", "recipe": "ppo"}
+SWEPT = """title: One mistake
+set:
+  vf_coef: 0.4
+grid:
+  scenario: paper-random
+  recipe:
+  - ppo
+  - ppo-paper
+  set:
+    gamma: [0.9]
+    n_epochs: [2, 3]
+jobs:
+- scenario: cooperation-3-pair
+  recipe: cooperation-ppo
+  set: {scheme: shared}
+"""
+
+
+def sweep(content: Any) -> SweepPlan:
+    """The sweep that a file with this content says."""
+    Path("s.yaml").write_text(content if isinstance(content, str) else yaml.safe_dump(content))
+    return SweepPlan.read(Path("s.yaml"))
+
+
+SWEEPS: dict[str, Callable[[], object]] = {
+    "s.yaml: asks for 0 jobs; must be from 1 to 10,000": lambda: sweep({}),
+    "s.yaml, line 4: grid.seed = []: must not be empty": lambda: sweep({"grid": {**GRID, "seed": []}}),
+    "must be a whole number, written without a decimal point": lambda: sweep({"grid": {**GRID, "seed": ["one"]}}),
+    "s.yaml, line 5: grid.seed.cont: unknown key; did you mean count?": lambda: sweep(
+        {"grid": {**GRID, "seed": {"cont": 2}}}
+    ),
+    "s.yaml, line 5: grid.set.gamma = 0.9: must be a list": lambda: sweep({"grid": {**GRID, "set": {"gamma": 0.9}}}),
+    "s.yaml, line 5: grid.seed.count = 20000: must be less than or equal to 10000": lambda: sweep(
+        {"grid": {**GRID, "seed": {"count": 20_000}}}
+    ),
+    "s.yaml: asks for 10,001 jobs; must be from 1 to 10,000": lambda: sweep(
+        {"grid": {**GRID, "seed": {"count": 10_000}}, "jobs": [GRID]}
+    ),
+    "s.yaml, line 1: grid.scenario: missing; it is needed; docs/scaling.md shows an example": lambda: sweep(
+        {"grid": {"recipe": "ppo"}}
+    ),
+    "s.yaml, line 4: grid.sede: unknown key; did you mean seed?": lambda: sweep({"grid": {**GRID, "sede": [1]}}),
+    "s.yaml, line 4: jobs[0].sets: unknown key; did you mean set?": lambda: sweep({"jobs": [{**GRID, "sets": {}}]}),
+    "recipe 'ppo': reward.terminl: unknown key; did you mean terminal?": lambda: sweep(
+        {"set": {"reward.terminl": 1}, "jobs": [GRID]}
+    ),
+    "seed is no setting here; give it beside recipe, as seed": lambda: sweep({"set": {"seed": 3}, "jobs": [GRID]}),
+    's.yaml, line 4: set = {"gamma=0.9, x": 3}: "gamma=0.9, x": a key has no = in it': lambda: sweep(
+        {"set": {"gamma=0.9, x": 3}, "jobs": [GRID]}
+    ),
+    "s.yaml, line 5: jobs[0] (paper-random, ppo, seed 0, =3): --set '=3': must be KEY=VALUE or": lambda: sweep(
+        {"set": {"": 3}, "jobs": [GRID]}
+    ),
+    "jobs[1] (paper-random, ppo, seed 0): is the same training as jobs[0] (paper-random, ppo, seed 0)": lambda: sweep(
+        {"jobs": [GRID, {**GRID, "seed": 0}]}
+    ),
+    "grid (paper-random, ppo, seed 0): is the same training as grid (paper-random, ppo, seed 0)": lambda: sweep(
+        {"grid": {**GRID, "seed": [0, 0]}}
+    ),
+    "jobs[1] (paper-random, ppo, seed 0, gamma=0.995): is the same training as jobs[0] (paper-random": lambda: sweep(
+        {"jobs": [GRID, {**GRID, "set": {"gamma": 0.995}}]}
+    ),
+    "scenario 'cooperation-0-sensors': no vehicle learns; give at least one the role learner": lambda: sweep(
+        {"jobs": [{"scenario": "cooperation-0-sensors", "recipe": "ppo"}]}
+    ),
+    "--set network.policy.9: '9' must be an entry from 0 to 1": lambda: sweep(
+        {"jobs": [GRID, {**GRID, "set": {"network.policy.9": 4}}]}
+    ),
+    "--set gamma.x: there is nothing inside 0.995; set the whole value": lambda: sweep(
+        {"jobs": [GRID, {**GRID, "set": {"gamma.x": 4}}]}
+    ),
+    "s.yaml, line 1, column 45: key 'recipe' is given twice, first on line 1": lambda: sweep(
+        "grid: {scenario: paper-random, recipe: ppo, recipe: sac}\n"
+    ),
+    "s.yaml: must be a mapping with a grid or a list of jobs": lambda: sweep("- one\n"),
+    "s.yaml, line 10: grid.set.vf_coef: stands in the file's own set too; leave one of them out": lambda: sweep(
+        SWEPT.replace("gamma", "vf_coef", 1)
+    ),
+}
+
+
+@pytest.mark.usefixtures("empty_folder")
+@pytest.mark.parametrize("message", SWEEPS)
+def test_sweep__is_refused_with_its_line_and_job(message: str) -> None:
+    with refused(message):
+        SWEEPS[message]()
+
+
+SWEPT_NAMES: dict[str, Callable[[], object]] = {
+    "s.yaml, line 5: jobs[0] (paper-random, sac, seed 0, n_epochs=3): unknown setting 'n_epochs'": lambda: sweep(
+        {"jobs": [{**GRID, "recipe": "sac", "set": {"n_epochs": 3}}]}
+    ),
+    "s.yaml, line 5: grid (paper-randon, ppo, seed 0, vf_coef=0.4, gamma=0.9, n_epochs=2)": lambda: sweep(
+        SWEPT.replace("paper-random", "paper-randon", 1)
+    ),
+    "s.yaml, line 8: grid (paper-random, ppo-papr, seed 0, vf_coef=0.4, gamma=0.9, n_epochs=2)": lambda: sweep(
+        SWEPT.replace("ppo-paper", "ppo-papr", 1)
+    ),
+}
+
+
+@pytest.mark.usefixtures("empty_folder")
+@pytest.mark.parametrize("message", SWEPT_NAMES)
+def test_name_in_a_sweep__is_unknown(message: str) -> None:
+    with refused(message, UnknownName):
+        SWEPT_NAMES[message]()
 
 
 PAPER = load_scenario("paper-random")
