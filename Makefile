@@ -2,8 +2,8 @@
 # TORCH_INDEX: index to take torch from, e.g. make run TORCH_INDEX=ADDRESS; without it uv picks the build (see below)
 # PYTHON:      the interpreter that makes the environment, when the first one found is not the one wanted.
 # ARGS:        passed on by `make run` (to `ethbrake run`), `make test` (to pytest) and the long programmes.
+# NAME:        of the programme that `make programme` runs.
 # WORKERS:     processes of `make test`. 0: one process, as a debugger needs.
-# SEEDS:       of the orders of `make test-order`.
 
 SHELL := /bin/sh
 VENV := .venv
@@ -15,38 +15,22 @@ TORCH_INDEX ?=
 PYTHON ?=
 ARGS ?=
 WORKERS ?= 2
-SEEDS ?= 1 2 3 4 5 6 7 8 9 10
+NAME ?=
 INSTALL := sh .ci/install $(VENV)
 # uv compiles nothing (all of it would take 48 CPU-s). Python compiles what it imports, once, unless this is passed on.
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help venv run test lint check clean test-physics test-resume test-shield test-hostile test-light test-order planted-bugs mutation bench-peers test-libraries test-bounds test-machines proofs test-cluster docs dist audit figures
+.PHONY: help venv run test lint docs figures programme clean
 
 help:
+	@echo "make venv             the environment alone: $(VENV)"
 	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
 	@echo "make test [ARGS=...]  the test suite, without the tests marked slow or long (.ci/run runs the slow ones, too)"
 	@echo "make lint             ruff, ruff format --check, mypy --strict, deptry, import-linter"
-	@echo "make check            lint and test"
 	@echo "make docs             the documentation site, its notebooks run: docs/_build/html; a warning is an error"
 	@echo "make figures          the printed blocks, tables and pictures of README and docs made again and compared (minutes)"
-	@echo "make dist             wheel and sdist in dist/, built twice with the same SHA-256"
-	@echo "make test-physics     the long programme on the physics: one line per gate"
-	@echo "make test-resume      kill trainings at random moments, resume, compare: three lines"
-	@echo "make test-shield      try to break the step shield: speed, interference, search, interfaces, bound (three quarters of an hour of one core)"
-	@echo "make test-hostile     7,000 files and command lines of strangers: each refused in one line, or in order"
-	@echo "make audit            every pinned package with its licence; reported weaknesses where pip-audit is installed"
-	@echo "make test-light       install the wheel alone: at most 650 MB, no torch, and its examples run; then the sdist"
-	@echo "make test-libraries   train with other people's libraries, each in its own environment below .venvs/, and print the matrix"
-	@echo "make proofs           statements about the code that a solver proves, one line each"
-	@echo "make test-cluster     a sweep on a Ray cluster of two nodes on this machine, whose workers are killed at random, its driver once"
-	@echo "make test-bounds      the tests at the lowest versions that pyproject.toml allows, and at the newest"
-	@echo "make test-machines    recorded results again, as on nine older processors: the same bits"
-	@echo "make test-order       the suite ten times in random orders and in parallel: no failure"
-	@echo "make planted-bugs     plant 164 bugs, each in a copy of the code; each must turn a test red"
-	@echo "make mutation [ARGS=] 40 small random changes of each folder: how many turn a test red (ARGS='--folders shield')"
-	@echo "make bench-peers      speed beside other simulators, each in its own environment below .venvs/"
-	@echo "make venv             the environment alone: $(VENV)"
+	@echo "make programme NAME=NAME [ARGS=...]  a long programme (python -m tests.programmes); without a name they are listed"
 	@echo "make clean            remove $(VENV), .venvs, caches and builds (runs/ stays)"
 	@echo "TORCH_INDEX=URL       take torch from this index; else uv picks the build for this machine"
 
@@ -116,9 +100,6 @@ lint: $(STAMP)
 	@echo "== import-linter: imports point down, without a circle"
 	@$(BIN)/lint-imports --no-cache
 
-check: lint
-	@$(MAKE) --no-print-directory test
-
 $(DOCS_STAMP): $(STAMP)
 	@echo "== Installing what builds the site"
 	@$(INSTALL) -e ".[docs]"
@@ -133,76 +114,9 @@ figures: $(STAMP)
 	@echo "== what the pages show, made again"
 	@$(PROGRAMME) figures $(ARGS)
 
-dist: $(STAMP)
-	@echo "== wheel and sdist, twice"
-	@$(PROGRAMME) wheel --only built $(ARGS)
-
-test-physics: $(STAMP)
-	@echo "== long programme on the physics"
-	@$(PROGRAMME) physics $(ARGS)
-
-test-resume: $(STAMP)
-	@echo "== long programme on resuming: trainings are killed at random moments"
-	@$(PROGRAMME) resume $(ARGS)
-
-test-shield: $(STAMP)
-	@echo "== trying to break the step shield"
-	@$(PROGRAMME) shield $(ARGS)
-
-test-light: $(STAMP)
-	@echo "== the wheel alone in an empty environment: size, and what it must do without torch"
-	@$(PROGRAMME) wheel --only light $(ARGS)
-
-test-bounds: $(STAMP)
-	@echo "== the lowest and the highest versions"
-	@$(PROGRAMME) bounds $(ARGS)
-
-test-machines: $(STAMP)
-	@echo "== the same bits on other processors"
-	@$(PROGRAMME) machines $(ARGS)
-
-test-order: $(STAMP)
-	@echo "== the suite in random orders"
-	@for seed in $(SEEDS); do \
-	  $(BIN)/python -m pytest -q -p randomly -p xdist --randomly-seed=$$seed -n 2 --dist worksteal $(ARGS) || \
-	    { echo "== repeat it with SEEDS=$$seed" >&2; exit 1; }; \
-	done
-
-test-hostile: $(STAMP)
-	@echo "== files that a stranger wrote or a disk damaged"
-	@$(PROGRAMME) hostile $(ARGS)
-
-audit: $(STAMP)
-	@echo "== what the package stands on"
-	@$(PROGRAMME) audit $(ARGS)
-	@if [ -x $(BIN)/pip-audit ]; then \
-	  $(BIN)/pip-audit --requirement constraints.txt --no-deps --disable-pip --progress-spinner off; \
-	else echo "== pip-audit is not installed here: nobody was asked for reported weaknesses"; fi
-
-test-libraries: $(STAMP)
-	@echo "== other people's libraries"
-	@$(PROGRAMME) libraries $(ARGS)
-
-proofs: $(STAMP)
-	@echo "== proofs"
-	@NUMBA_DISABLE_JIT=1 $(PROGRAMME) proofs $(ARGS)
-
-test-cluster: $(STAMP)
-	@echo "== a sweep on a Ray cluster, disturbed"
-	@$(INSTALL) -e ".[cluster]"
-	@$(PROGRAMME) cluster $(ARGS)
-
-planted-bugs: $(STAMP)
-	@echo "== planted bugs"
-	@$(PROGRAMME) faults bugs $(ARGS)
-
-mutation: $(STAMP)
-	@echo "== mutation testing"
-	@$(PROGRAMME) faults mutants $(ARGS)
-
-bench-peers: $(STAMP)
-	@echo "== speed beside other simulators"
-	@PYTHONPATH="$(CURDIR)" $(BIN)/python docs/studies/peers.py $(ARGS)
+programme: $(STAMP)
+	@$(if $(filter cluster,$(NAME)),$(INSTALL) -e ".[cluster]",:)
+	@$(if $(filter proofs,$(NAME)),NUMBA_DISABLE_JIT=1) $(PROGRAMME) $(NAME) $(ARGS)
 
 clean:
 	rm -rf $(VENV) .venvs .pytest_cache .ruff_cache .mypy_cache .hypothesis build dist docs/_build

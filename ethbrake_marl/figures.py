@@ -37,7 +37,6 @@ from matplotlib.ticker import (
     StrMethodFormatter,
 )
 
-from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.envs import (
     BODY_M,
     COLOURS as COLOURS,  # one palette for figures and frames
@@ -55,10 +54,10 @@ from ethbrake_marl.evaluation import (
 )
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.files.store import write_output
+from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.limits import Unproven
 from ethbrake_marl.physics import Floats, Worlds
 from ethbrake_marl.scenario import QUANTITY, Sample, Scenario
-from ethbrake_marl.shield import OperatingPoint
 
 # Markers and dashes repeat the distinction of the colours.
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
@@ -813,33 +812,6 @@ def _lines(sample: Sample, shown: Mapping[int, str], part: Any) -> None:
         for x, y, text in told if worlds.N <= _MOST_NAMED else ():
             axes.text(x, y, text, ha="center", va="center", fontsize=7, color="black" if y else "white")
     name_axes(every[-1], x="Position from the front of Vehicle 1, at the alert (m)")
-
-
-# The price of the step shield: how often it intervenes against the harm that remains.
-
-LABELLED = 0.01  # points with fewer interventions lie on top of each other: they get no label
-
-
-def operating_figure(curves: Sequence[tuple[str, Sequence[OperatingPoint]]], *, caption: str = "") -> Figure:
-    """One curve per policy, from the strict shield (allowance 0) to none; points off the axis say their allowance.
-
-    Raises ``InvalidInput`` without a point.
-    """
-    if not curves or not all(points for _, points in curves):
-        raise InvalidInput("operating_figure: every curve needs at least one point")
-    figure, (axes,) = new_panels((6.4, 4.2))
-    for number, (name, points) in enumerate(curves):
-        rates, harms = [p.intervention_rate for p in points], [p.harm for p in points]
-        axes.plot(rates, harms, label=label_text(name), **series_style(number))
-        for point in (p for p in points if p.intervention_rate >= LABELLED):
-            axes.annotate(
-                f"{point.allowance:g}", (point.intervention_rate, point.harm), fontsize=7.5, xytext=(4, 4),
-                textcoords="offset points",
-            )  # fmt: skip
-    axes.xaxis.set_major_formatter(PercentFormatter(1.0))
-    name_axes(axes, x="Decisions in which the shield intervenes", y="Mean harm (m²/s²)")
-    axes.legend(fontsize=9, frameon=False)
-    return finish(figure, caption)
 
 
 LINEAR = 0.1  # m2/s2; axes are linear up to there and logarithmic beyond: harm falls to a hundredth

@@ -18,15 +18,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from ethbrake_marl.defaults import HARM_COUNTS as HARM_COUNTS, HarmCount as HarmCount
 from ethbrake_marl.errors import InvalidInput, count_of, describe_error, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.physics import Bools, Floats, Impacts, Ints, Worlds, compiled, exp, log, logistic
 from ethbrake_marl.registry import Registry
+
+HarmCount = Literal["first", "total"]
+HARM_COUNTS: tuple[HarmCount, ...] = get_args(HarmCount)
 
 
 def check_harm_count(harm_count: str) -> None:

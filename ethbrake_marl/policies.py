@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, JsonValue, ValidationError, model_validator
 from safetensors import SafetensorError
 
-from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, naming_extras, unknown_name
 from ethbrake_marl.files.arrays import ArrayRow, check_arrays, safetensors_headers
 from ethbrake_marl.files.store import new_folder, read_plain, write_file
 from ethbrake_marl.files.yaml import NAME_PATTERN, FileModel, first_mistake, read_json_model
+from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.observations import FEATURES, ObservationSpec, Of, choose_observation, registered_in
 from ethbrake_marl.physics import PER_LN2, compiled, exp_rest
 from ethbrake_marl.registry import versions_used

@@ -28,10 +28,9 @@ from typing import Annotated, Any, Self, TypeVar
 import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, describe_error, unknown_name
 from ethbrake_marl.files.yaml import UNSHOWN, FileModel, first_mistake, require
-from ethbrake_marl.harm import Declared, Objective, check_declared, objectives_of
+from ethbrake_marl.harm import Declared, HarmCount, Objective, check_declared, objectives_of
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, forecast, logistic
 from ethbrake_marl.registry import Registry
 

@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
-from ethbrake_marl.harm import check_harm_count
+from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import (
     CLOCK,
     GOES_ON,

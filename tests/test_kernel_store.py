@@ -149,7 +149,7 @@ def digest_in(package: Path, name: str) -> str:
         ("physics/batch.py", "physics/batch.py", True),  # its own file
         ("physics/batch.py", "physics/kernel.py", True),  # what it calls
         ("shield/step_shield.py", "physics/kernel.py", True),  # through several files
-        ("harm.py", "defaults.py", True),  # constants, from a file without kernels
+        ("search.py", "errors.py", False),  # a file without kernels or constants
         ("physics/batch.py", "search.py", False),  # kernels that it does not call
         ("physics/kernel.py", "physics/batch.py", False),  # its callers
         ("physics/batch.py", "physics/worlds.py", False),  # types

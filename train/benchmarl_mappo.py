@@ -3,7 +3,7 @@
     python train/benchmarl_mappo.py --scenario cooperation-3-pair --steps 200000 --output runs/mappo
     ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,team@runs/mappo
 
-`ethbrake train --scheme centralised` trains the same kind of team (one actor for all, a critic on the state of the
+`ethbrake train --set scheme=centralised` trains the same kind of team (one actor for all, a critic on the state of the
 line) without the extra, with checkpoints and measuring on the way; this file is for those who use BenchMARL.
 """
 

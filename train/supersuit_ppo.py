@@ -3,8 +3,9 @@
     python train/supersuit_ppo.py --scenario cooperation-3-pair --steps 200000 --output runs/supersuit
     ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,ppo@runs/supersuit
 
-The native way, `ethbrake train --scheme shared`, does the same many times faster, and goes on after a crash; this file
-is for those who build on PettingZoo. SuperSuit 3.11 has four traps on this way. Each is closed where it says "trap".
+The native way, `ethbrake train --set scheme=shared`, does the same many times faster, and goes on after a crash; this
+file is for those who build on PettingZoo. SuperSuit 3.11 has four traps on this way. Each is closed where it says
+"trap".
 """
 
 from __future__ import annotations

@@ -9,8 +9,8 @@ import numpy as np
 from markupsafe import Markup
 
 from ethbrake_marl.agents import make_agent
-from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.evaluation import EpisodeMotion
+from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.pages.page import Part, Played, read_file
 from ethbrake_marl.scenario import load_scenario
 

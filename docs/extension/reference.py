@@ -10,7 +10,6 @@ from typing import Any
 from ethbrake_marl import ethbrake_v0
 from ethbrake_marl.agents.registry import Source, agent_entries
 from ethbrake_marl.cli.app import whole_command
-from ethbrake_marl.cli.command import MOVED
 from ethbrake_marl.evaluation.measures import measures
 from ethbrake_marl.harm import OBJECTIVES
 from ethbrake_marl.learning import TrainingRecipe
@@ -53,11 +52,9 @@ def sections(**parts: str) -> str:
 
 
 def command_line() -> str:
-    """Every command: what its help page says, in the order of ``ethbrake --help``; then the names of before."""
+    """Every command: what its help page says, in the order of ``ethbrake --help``."""
     whole = whole_command()
-    moved = table(("up to version 0.3", "now"), [(f"`{old}`", f"`{new}`") for old, new in MOVED.items()])
-    commands = _commands(whole, whole.context_class(whole, info_name="ethbrake"), 2)
-    return "\n".join([*commands, sections(Where_commands_were_before=moved)])
+    return "\n".join(_commands(whole, whole.context_class(whole, info_name="ethbrake"), 2))
 
 
 def _commands(group: Any, context: Any, level: int) -> Iterator[str]:
@@ -68,8 +65,6 @@ def _commands(group: Any, context: Any, level: int) -> Iterator[str]:
         yield f"{'#' * level} {path}\n"
         yield "\n\n".join(map(_prose, command.help.split("\n\n"))) + "\n"
         if hasattr(command, "commands"):
-            if command.default is not None:
-                yield f"`ethbrake {path}` alone is `ethbrake {path} {command.default.name}`.\n"
             yield from _commands(command, inside, level + 1)
             continue
         usage = command.get_usage(inside).removeprefix("Usage: ")

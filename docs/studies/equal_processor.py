@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.figures import seed_curves, write_picture
+from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.learning import RunDirectory, TrainingRecipe, load_recipe
 from ethbrake_marl.limits.limits import best_harm
 from ethbrake_marl.scenario import load_scenario

@@ -21,7 +21,7 @@ from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.evaluation.measures import Outcome
 from ethbrake_marl.evaluation.statistics import paired_difference
 from ethbrake_marl.scenario import Sample, Scenario, load_scenario
-from ethbrake_marl.studies.speed import this_machine
+from ethbrake_marl.studies.machine import this_machine
 
 SEARCHED = "ppo@shipped+search+episode"  # the others' first-impact harm is compared with its
 SEARCHES = (  # without a policy, from a millisecond per world to what a search around a policy takes

@@ -17,15 +17,15 @@ from pathlib import Path
 
 import numpy as np
 
-from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import evaluate, worlds_sha256
 from ethbrake_marl.evaluation.inputs import make_lineup
+from ethbrake_marl.harm import HARM_COUNTS
 from ethbrake_marl.limits.limits import best_harm
 from ethbrake_marl.physics import Floats
 from ethbrake_marl.policies import Policy, load_policy, load_shipped, shipped_policies
 from ethbrake_marl.scenario import Sample, Scenario, list_scenarios, load_scenario
-from ethbrake_marl.studies.speed import this_machine
+from ethbrake_marl.studies.machine import this_machine
 from tests.docs.site import load
 
 WORLDS, SEED, BUDGET = 600, 20_261_126, 10_000

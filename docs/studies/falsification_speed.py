@@ -1,4 +1,4 @@
-"""How much sooner ``ethbrake search falsify`` finds a planted weakness than worlds drawn at random.
+"""How much sooner ``ethbrake study falsify`` finds a planted weakness than worlds drawn at random.
 
 ``python docs/studies/falsification_speed.py [--seeds N]``: an agent with a hole in 0.1 % of the worlds. Prints worlds
 tried until the first and the tenth in the hole, and how many in all: medians over seeds.

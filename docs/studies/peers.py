@@ -1,4 +1,4 @@
-"""Beside other simulators: speeds, all measured now, by one loop, on this machine: ``make bench-peers``.
+"""Beside other simulators: speeds, all measured now, by one loop, on this machine: ``python docs/studies/peers.py``.
 
 Each peer has an environment of its own below ``.venvs/``: some have licences or dependencies that this project does not
 want. One that cannot be installed or measured is told with the reason. Work is counted per second of processor time of
@@ -46,7 +46,7 @@ def rates(work: Work, repetitions: int = REPETITIONS, seconds: float = SECONDS) 
 
 
 def ours(name: str, n: int) -> Work:
-    """A loop of ``ethbrake doctor speed``."""
+    """A loop of ``python docs/studies/speed.py``."""
     from ethbrake_marl.studies import speed
 
     work: Work = getattr(speed, name)(n)

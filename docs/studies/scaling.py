@@ -12,10 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from speed import SEED, STEP_S, Effort, Work, braking, rates, stepping, until_rest
 
 from ethbrake_marl.figures import GREY, add_caption, new_figure, series_style, style_axes, write_picture
 from ethbrake_marl.physics import Floats, Worlds, advance, make_worlds
-from ethbrake_marl.studies.speed import SEED, STEP_S, Effort, Work, braking, rates, stepping, this_machine, until_rest
+from ethbrake_marl.studies.machine import this_machine
 
 WORLDS = (1, 4, 16, 64, 256, 1024, 4096, 16_384, 65_536)
 VEHICLES = (2, 3, 5, 8, 12, 20, 30, 50)

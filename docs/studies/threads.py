@@ -13,15 +13,15 @@ import time
 
 from ethbrake_marl.envs import make_engine
 from ethbrake_marl.physics import advance
-from ethbrake_marl.studies.speed import SCENARIO, SEED
 
-HARM_COUNTS = (1000, 3000, 10_000, 30_000, 100_000)
+SCENARIO, SEED = "paper-random", 7
+WORLDS = (1000, 3000, 10_000, 30_000, 100_000)
 REPETITIONS, WORLD_STEPS = 15, 200_000
 
 
 def main() -> None:
     """Print one line for each number of worlds."""
-    for n in HARM_COUNTS:
+    for n in WORLDS:
         worlds = make_engine(SCENARIO, n, seed=SEED).worlds
         command = -worlds.vehicles.braking_capacity_mps2
         calls = max(3, WORLD_STEPS // n)

@@ -31,10 +31,9 @@ from numpy.typing import ArrayLike
 
 from ethbrake_marl.agents.believed import Believing
 from ethbrake_marl.agents.registry import Agent, AgentSettings, Source, fixed_commands
-from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.engine import Memory, Script, is_state_free
 from ethbrake_marl.errors import InvalidInput, renumbered
-from ethbrake_marl.harm import check_harm_count
+from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import (
     BOUND,
     FLAG,

@@ -20,10 +20,9 @@ from ethbrake_marl.agents.registry import (
     make_agent,
     record_commands,
 )
-from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.engine import Memory, Script, renew_memory, take_memory
 from ethbrake_marl.errors import InvalidInput, check_whole_number, renumbered
-from ethbrake_marl.harm import check_harm_count
+from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import CLOCK, Bools, Decisions, Floats, Ints, Worlds
 from ethbrake_marl.registry import Part
 from ethbrake_marl.scenario import Scenario

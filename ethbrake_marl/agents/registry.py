@@ -19,11 +19,10 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
-from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.engine import Engine, Guard, Memory, Script, ask_script, begin_script, is_state_free
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, PhysicsError, describe_error, unknown_name
 from ethbrake_marl.files.python_file import load_from_file
-from ethbrake_marl.harm import Ledger, check_harm_count
+from ethbrake_marl.harm import HarmCount, Ledger, check_harm_count
 from ethbrake_marl.physics import Bools, Floats, Worlds
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.scenario import Scenario, ScriptSpec, load_scenario
@@ -532,7 +531,7 @@ def _make_driver(written: AgentSpec, settings: AgentSettings) -> Driver:
         if isinstance(driver, Team) and not entry.teams:
             raise InvalidInput(
                 f"agent {settings.spec!r}: is a team, and +{each} is for one driven vehicle, the others following"
-                " scripts; +step goes around a team; else name that vehicle (--vehicle vehicle_2) and one policy of the"
+                " scripts (--set roles.vehicle_3=full_brake); +step goes around a team; else name one policy of the"
                 " team (ppo@RUN/policy/vehicle_2)"
             )
         driver = _make(entry, each.partition(":")[2] or None, settings, driver)
@@ -784,7 +783,7 @@ def episode_engine(worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: i
         raise InvalidInput(
             f"agent {team.name!r} drives {', '.join(scenario.vehicle_names[i] for i in drivers) or 'nobody'}, but"
             f" {', '.join(undriven)} of scenario {scenario.name!r} must be driven too. An agent that rolls itself out"
-            " (+search, +episode, +robust) can drive one learner, the others need scripts: --vehicle NAME"
+            " (+search, +episode, +robust) can drive one learner, the others need scripts"
         )
     scripts = script_agents(scenario, except_for=drivers)
     shield = team.shield

@@ -12,20 +12,60 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from threading import Thread
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
 from typer.exceptions import TyperException
 from typer.main import get_command
 
-from ethbrake_marl.cli import doctor, evaluate, scenario, search, train
-from ethbrake_marl.cli.command import EVERY_S, Out, app
+from ethbrake_marl import __version__
+from ethbrake_marl.cli import doctor, evaluate, reproduce, scenario, study, train, watch
+from ethbrake_marl.cli.command import EVERY_S, Out, example
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, naming_extras
 from ethbrake_marl.kernel_store import is_temporary, on_first_compilation
 from ethbrake_marl.registry import Registry, giver, points
 
-__all__ = ["app", "doctor", "evaluate", "main", "run_command", "scenario", "search", "train"]
+app = typer.Typer(
+    context_settings={"help_option_names": ["-h", "--help"]},
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    help="Ethical emergency braking: train, shield, evaluate. Every command has its own --help with an example.",
+    epilog=example("run", "watch --agents full_brake,e_v2x_bm --output both.gif"),
+)
+_NAMES = "What --set, recipes and scenarios may name: ethbrake scenario parts"
+for name, command, shown in (
+    ("run", train.run_command, "run --steps 200000 --seed 1"),
+    ("train", train.train_command, "train --recipe sac --output runs/sac"),
+    ("evaluate", evaluate.evaluate_command, "evaluate --agents full_brake,constant:3.5,e_v2x_bm --episodes 1000"),
+    ("compare", evaluate.compare_command, "compare before/results.json after/results.json"),
+    ("shield", evaluate.shield_command, "shield --agents ppo@shipped,full_brake --episodes 500"),
+    ("doctor", doctor.doctor_command, "doctor"),
+    ("reproduce", reproduce.reproduce_command, "reproduce random-table harm-distance --quick --output runs/paper"),
+    ("watch", watch.watch_command, "watch --agents full_brake,e_v2x_bm --world 3 --output both.gif"),
+):
+    app.command(name, epilog=example(shown) + (f"\n\n{_NAMES}" if name in ("train", "evaluate") else ""))(command)
+for name, group in (
+    ("scenario", scenario.scenario_group),
+    ("agent", scenario.agent_group),
+    ("study", study.study_group),
+):
+    app.add_typer(group, name=name)
+
+
+def _show_version(asked: bool) -> None:
+    if asked:
+        Out().show(f"ethbrake {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _about(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_show_version, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Options of ``ethbrake`` itself."""
 
 
 def main() -> None:

@@ -1,31 +1,68 @@
-"""The frame of every command: groups, shared options, help, where a wrong name leads, and its output."""
+"""Options that commands share, and the output of a command."""
 
 from __future__ import annotations
 
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import redirect_stdout
-from difflib import get_close_matches
-from functools import wraps
-from inspect import Parameter, Signature, signature
+from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TextIO, TypeVar, get_origin, get_type_hints
+from types import TracebackType
+from typing import Annotated, Any, NoReturn, Self, TextIO
 
 import typer
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.segment import Segment
-from typer.core import TyperArgument, TyperCommand, TyperGroup
 
-from ethbrake_marl import __version__
-from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.envs import register_environments
-from ethbrake_marl.errors import InvalidInput, Progress as PartProgress, check_whole_number, need, one_line, plain_text
+from ethbrake_marl.errors import InvalidInput, Progress as PartProgress, one_line, plain_text
 
 _KEPT = "\n\t\N{NO-BREAK SPACE}"  # in lines of a result; the last stands between a number and its unit
 EVERY_S = 10.0  # between two signs of life where stderr is no terminal
+
+ScenarioOption = Annotated[
+    str, typer.Option(metavar="NAME|PATH", help="A shipped or registered scenario, or a path to a YAML file.")
+]
+RecipeOption = Annotated[str, typer.Option(metavar="NAME|PATH", help="A shipped recipe, or a path to a YAML file.")]
+SettingsOption = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Another value of a key: mass_t=40. Repeatable.")
+]
+StepsOption = Annotated[
+    int | None,
+    typer.Option(help="Training steps (decisions), rounded up to whole updates.", show_default="the recipe's"),
+]
+AgentsOption = Annotated[
+    str, typer.Option(metavar="A,B,...", help="Who drives, with commas between them: `ethbrake agent list`.")
+]
+SeedOption = Annotated[int, typer.Option(help="Seed of the list.")]
+JobsOption = Annotated[
+    int | None, typer.Option(help="So many at once, a process each; changes no result.", min=1, max=64)
+]
+RayOption = Annotated[
+    str | None, typer.Option(metavar="local|ADDRESS", help="Do the work on Ray, not in processes of our own.")
+]
+ForceOption = Annotated[bool, typer.Option("--force", help="Replace what is already there.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON, and nothing else, on stdout.")]
+
+
+def schema_option(module: str, model: str) -> Any:
+    """The option ``--schema`` of a command that reads files of one kind: print their JSON Schema and exit."""
+
+    def show_schema(asked: bool) -> None:
+        if asked:
+            Out().print_json(getattr(import_module(module), model).json_schema())
+            raise typer.Exit
+
+    told = "Print the JSON Schema of the file, and exit."
+    return Annotated[bool, typer.Option("--schema", is_eager=True, callback=show_schema, help=told)]
+
+
+def example(*lines: str) -> str:
+    """The end of a help page: command lines behind ``ethbrake``."""
+    return "\n\n".join(f"Example: ethbrake {line}" for line in lines)
 
 
 def say(text: str) -> None:
@@ -34,10 +71,11 @@ def say(text: str) -> None:
 
 
 class Out:
-    """The output of one command.
+    """The output of one command, used as ``with Out() as out``.
 
     ``as_json``: results are wanted as JSON. ``force``: files are replaced. ``kept``: what Ctrl-C leaves, in words.
-    Made before stdout is turned to stderr, for what a user's agent prints: results alone go to the stdout of then.
+    Inside ``with``, stdout is turned to stderr, for what a user's agent prints: results alone go to stdout. Ctrl-C
+    ends the command with one line and status 130.
     """
 
     def __init__(self, *, as_json: bool = False, force: bool = False, kept: str = "nothing was written") -> None:
@@ -48,6 +86,22 @@ class Out:
         self._tasks: dict[str, TaskID] = {}
         self._said_s = -EVERY_S  # when a line was said last, where stderr is no terminal
         self._begun: dict[str, tuple[float, int]] = {}  # when each part was first heard of, and how far it was
+        self._turned = redirect_stdout(sys.stderr)
+
+    def __enter__(self) -> Self:
+        """Turn stdout to stderr; code of the user's finds the environments registered."""
+        self._turned.__enter__()
+        register_environments()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Leave the bars as they are, and say what Ctrl-C left."""
+        self._turned.__exit__(kind, error, trace)
+        self.end_progress()
+        if isinstance(error, KeyboardInterrupt):
+            self.interrupted(f"interrupted; {self.kept}")
 
     def result(self, content: Any, *shown: RenderableType, end: str = "\n") -> None:
         """The result: ``content`` as JSON where that is asked for, else what is ``shown``."""
@@ -150,274 +204,3 @@ class _PlainConsole(Console):
         """The pieces of a line or table; those that rich made to style and move keep what they hold."""
         for piece in super().render(renderable, options):
             yield piece if piece.control else Segment(plain_text(piece.text, keep=_KEPT), piece.style)
-
-
-# The frame of every command: groups, options that commands share, help, and where a wrong name leads.
-
-Run = TypeVar("Run", bound=Callable[..., None])
-
-
-def whole_number(least: int, most: int | None = None) -> Callable[[typer.CallbackParam, int | None], int | None]:
-    """The callback of an option that is a whole number in this range."""
-
-    def check(option: typer.CallbackParam, value: int | None) -> int | None:
-        if value is not None:
-            check_whole_number(str(option.name).replace("_", "-"), value, least, most)
-        return value
-
-    return check
-
-
-OPTIONS: dict[str, Any] = {  # of parameters that bring no option of their own, by their name
-    "scenario": typer.Option(metavar="NAME|PATH", help="A shipped or registered scenario, or a path to a YAML file."),
-    "recipe": typer.Option(metavar="NAME|PATH", help="A shipped recipe, or a path to a YAML file."),
-    "settings": typer.Option(
-        "--set", metavar="KEY=VALUE", help="Another value of the scenario, or of the recipe: mass_t=40. Repeatable."
-    ),
-    "steps": typer.Option(help="Training steps (decisions), rounded up to whole updates.", show_default="the recipe's"),
-    "agents": typer.Option(metavar="A,B,...", help="Who drives, with commas between them: `ethbrake agent list`."),
-    "vehicle": typer.Option(help="Who is driven; other learners brake fully.", show_default="the learner"),
-    "episodes": typer.Option(help="Worlds of the list."),
-    "seed": typer.Option(help="Seed of the list."),
-    "world": typer.Option(help="Number of the world in the list.", min=0),
-    "harm_count": typer.Option(help="Harm that agents minimise: first impacts only, or all."),
-    "uncertainty": typer.Option(
-        metavar="QUANTITY=WIDTH,...",
-        help=f"What the robust shield does not know, such as {DEFAULT.UNCERTAINTY_EXAMPLE}.",
-    ),
-    "jobs": typer.Option(help="So many at once, a process each; changes no result.", callback=whole_number(1, 64)),
-    "ray": typer.Option(metavar="local|ADDRESS", help="Do the work on Ray, not in processes of our own."),
-    "force": typer.Option("--force", help="Replace what is already there."),
-    "as_json": typer.Option("--json", help="Print the figures as JSON, and nothing else, on stdout."),
-}
-
-ORDER = (
-    *("run", "train", "evaluate", "compare", "shield", "reproduce", "agent", "scenario", "recipe", "search", "study"),
-    *("watch", "doctor"),
-)
-DEFAULTS = {"train": "start", "doctor": "check"}  # of a group where no command is named
-MOVED = {  # commands of earlier versions
-    "resume": "train resume",
-    "learning-curves": "train curves",
-    "agents": "agent list",
-    "export": "agent export",
-    "best-harm": "search best-harm",
-    "falsify": "search falsify",
-    "sweep": "study sweep",
-    "tune": "study tune",
-    "ablate": "study ablate",
-    "record": "watch record",
-    "picture": "watch picture",
-    "dataset": "watch dataset",
-    "bench": "doctor speed",
-}
-PARTS = [  # as ``part_names`` tells them: to ask for them takes the engine, and this a hundredth of that
-    ("Reward terms", "harm, collision, risk, jerk, terminal, shaping"),
-    (
-        "Observation",
-        "own, front_K, rear_K, role, obstacle, front_K.age, rear_K.age, front_K.build_up_time, rear_K.build_up_time,"
-        " front_K.release_time, rear_K.release_time, own_build_up_time, own_release_time, place",
-    ),
-    ("V2X presets", "paper, clear, nominal, congested, blocked, sensors-only"),
-    ("Objectives", "total, own, social:ANGLE, maximin, mass-weighted, weighted:W1,W2,..., injury:CURVE"),
-    ("Algorithms", "ppo, sac, counterfactual, options"),
-    ("Measures", "injury"),
-]
-
-
-def _option(parameter: Parameter, hint: Any) -> Parameter:
-    """A parameter as Typer reads it, with the shared option of its name where it brings none."""
-    if get_origin(hint) is not Annotated and hint is not typer.Context:
-        hint = Annotated[hint, OPTIONS[parameter.name]]
-    return parameter.replace(annotation=hint, kind=Parameter.KEYWORD_ONLY)
-
-
-class CommandWithParts(TyperCommand):
-    """A command whose help ends with the names that recipes and scenarios may have."""
-
-    def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        """The epilog, and the names behind it; nothing can be registered where the physics is not even imported."""
-        super().format_epilog(ctx, formatter)
-        with formatter.section("What recipes and scenarios may name"):
-            formatter.write_dl(part_names() if "ethbrake_marl.physics" in sys.modules else PARTS)
-
-
-def part_names() -> list[tuple[str, str]]:
-    """Kinds of parts, each with its names; what is registered is among them."""
-    from ethbrake_marl.evaluation import MEASURES
-    from ethbrake_marl.harm import OBJECTIVES
-    from ethbrake_marl.learning import algorithm_names
-    from ethbrake_marl.observations import FEATURES
-    from ethbrake_marl.rewards import TERMS
-    from ethbrake_marl.scenario import CHANNELS
-
-    features = FEATURES.usable().items()
-    own = [name if entry.of == "own" else f"front_K.{name}, rear_K.{name}" for name, entry in features]
-    return [
-        ("Reward terms", ", ".join(TERMS)),
-        ("Observation", ", ".join(["own", "front_K", "rear_K", "role", "obstacle", *own])),
-        ("V2X presets", ", ".join(CHANNELS)),
-        ("Objectives", ", ".join(kind.form for kind in OBJECTIVES.usable().values())),
-        ("Algorithms", ", ".join(algorithm_names())),
-        ("Measures", ", ".join(MEASURES)),
-    ]
-
-
-class Group(TyperGroup):
-    """Commands, of which one may be meant where none is named; a wrong name is told where it leads."""
-
-    @property
-    def default(self) -> Any:
-        """The command that is meant where none is named."""
-        return self.commands.get(DEFAULTS.get(self.name or "", ""))
-
-    def list_commands(self, ctx: Any) -> list[str]:
-        """Their names, those of ``ethbrake`` by use; users' own are last."""
-        first = [] if ctx.parent is not None else [name for name in ORDER if name in self.commands]
-        return [*first, *(name for name in self.commands if name not in first)]
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put the default's name where no command is named; who asks for completion or help may want any."""
-        default, word = self.default, args[0] if args else ""
-        named = word in (*self.commands, "-h", "--help") or (not word and ctx.resilient_parsing)
-        if default is not None and not named:
-            takes_words = any(isinstance(each, TyperArgument) for each in default.params)
-            if not word or word.startswith("-") or takes_words:
-                args = [default.name, *args]
-        return super().parse_args(ctx, args)
-
-    def format_options(self, ctx: Any, formatter: Any) -> None:
-        """The commands, and the options of the default."""
-        if self.default is None:
-            super().format_options(ctx, formatter)
-            return
-        self.format_commands(ctx, formatter)
-        formatter.write_paragraph()
-        formatter.write_text(f"Without a command it is {self.default.name}:")
-        self.default.format_options(ctx, formatter)
-
-    def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        """The examples, and what the help of the default ends with."""
-        super().format_epilog(ctx, formatter)
-        if isinstance(self.default, CommandWithParts):
-            CommandWithParts(None).format_epilog(ctx, formatter)
-
-    def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
-        """What can follow: commands, and the options of the default."""
-        found = super().shell_complete(ctx, incomplete)
-        more = [] if self.default is None else self.default.shell_complete(ctx, incomplete)
-        return found + [each for each in more if each.value not in {one.value for one in found}]
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        """The command that is named."""
-        if args[0] not in self.commands and not args[0].startswith("-") and not ctx.resilient_parsing:
-            self._tell_where(ctx, args[0])
-        return super().resolve_command(ctx, args)
-
-    def _tell_where(self, ctx: Any, name: str) -> None:
-        """Fail, and say the place of a command that has moved, or of the nearest ones."""
-        root = ctx.find_root().command
-        if self is root and name in MOVED:
-            ctx.fail(f"{name} is now: {MOVED[name]}")
-        here = {each: f"{ctx.command_path} {each}" for each in self.commands}
-        places = {**{old: f"ethbrake {new}" for old, new in MOVED.items()}, **_places(root, "ethbrake"), **here}
-        close = get_close_matches(name, here, n=1) or get_close_matches(name, places, n=1)
-        hint = f"did you mean: {places[close[0]]}?" if close else f"known: {', '.join(self.commands)}"
-        ctx.fail(f"unknown command {name!r}; {hint}")
-
-
-def _places(group: Any, path: str) -> Mapping[str, str]:
-    """The whole of each command in a group, by its last word."""
-    found = {name: f"{path} {name}" for name in group.commands}
-    for name, each in group.commands.items():
-        if isinstance(each, TyperGroup):
-            found = {**_places(each, f"{path} {name}"), **found}
-    return found
-
-
-class Commands(typer.Typer):
-    """A group of commands: those of ``ethbrake`` itself, or of one group inside another."""
-
-    def group(self, name: str, about: str, *examples: str) -> Commands:
-        """A new group inside this one; its help page shows the examples."""
-        shown = "\n\n".join(f"Example: ethbrake {example}" for example in examples)
-        group = Commands(cls=Group, rich_markup_mode=None, help=about, epilog=shown)
-        self.add_typer(group, name=name)
-        return group
-
-    def add(
-        self,
-        name: str,
-        example: str,
-        *,
-        kept: str = "nothing was written",
-        needs: tuple[str, ...] = (),
-        json: bool = False,
-        force: bool = False,
-        parts: bool = False,
-    ) -> Callable[[Run], Run]:
-        """Make a function a command of this group; its first argument is the command's ``Out``.
-
-        Args:
-            name: of the command.
-            example: of its use, behind ``ethbrake``.
-            kept: what Ctrl-C leaves, in words.
-            needs: packages of extras, without which it ends before any work.
-            json: it has the option --json; its ``Out`` knows whether that was given.
-            force: the same of --force.
-            parts: its help ends with what recipes and scenarios may name.
-
-        """
-
-        def register(run: Run) -> Run:
-            hints = get_type_hints(run, include_extras=True)
-            given = [_option(each, hints[each.name]) for each in list(signature(run).parameters.values())[1:]]
-            flags = [flag for flag, wanted in (("force", force), ("as_json", json)) if wanted]
-            given += [_option(Parameter(each, Parameter.KEYWORD_ONLY, default=False), bool) for each in flags]
-
-            @wraps(run)
-            def call(**options: Any) -> None:
-                out = Out(**{flag: options.pop(flag) for flag in flags}, kept=kept)
-                with redirect_stdout(sys.stderr):
-                    for package in needs:
-                        need(package)
-                    register_environments()
-                    try:
-                        run(out, **options)
-                    except KeyboardInterrupt:
-                        out.interrupted(f"interrupted; {out.kept}")
-                    finally:
-                        out.end_progress()
-
-            call.__signature__ = Signature(given)  # type: ignore[attr-defined]  # what Typer reads
-            call.__annotations__ = {each.name: each.annotation for each in given}
-            cls = CommandWithParts if parts else TyperCommand
-            self.command(name, cls=cls, epilog=f"Example: ethbrake {example}")(call)
-            return run
-
-        return register
-
-
-app = Commands(
-    cls=Group,
-    context_settings={"help_option_names": ["-h", "--help"]},
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    help="Ethical emergency braking: train, shield, evaluate. Every command has its own --help with an example.",
-    epilog="Example: ethbrake run\n\nExample: ethbrake watch record --agents full_brake,e_v2x_bm --output both.gif",
-)
-
-
-def _show_version(asked: bool) -> None:
-    if asked:
-        Out().show(f"ethbrake {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def _about(
-    version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=_show_version, help="Show the version and exit.")
-    ] = False,
-) -> None:
-    """Options of ``ethbrake`` itself."""

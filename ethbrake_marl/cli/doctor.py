@@ -1,6 +1,6 @@
-"""The commands ``doctor``: is this installation in order, and how fast is this machine?
+"""The command ``doctor``: is this installation in order?
 
-Versions, folders, and the physics on worlds whose answer is known; speed per second of processor time.
+Versions, folders, and the physics on worlds whose answer is known.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ethbrake_marl import __version__
-from ethbrake_marl.cli.command import EVERY_S, Out, app
-from ethbrake_marl.files.sheet import Column, Sheet
+from ethbrake_marl.cli.command import EVERY_S, JsonOption, Out
 from ethbrake_marl.kernel_store import cache_folder, is_temporary
 
 if TYPE_CHECKING:
@@ -33,11 +32,11 @@ if TYPE_CHECKING:
 
 EXTRAS = ("train", "marl", "export", "data", "render", "cluster", "notebook")
 _TINY = ("--set=n_envs=16", "--set=n_steps=8", "--set=counterfactuals=16", "--set=evaluation.worlds=10")
-_LINEUP = "ladder,ppo@shipped,ppo@shipped+search+episode,full_brake+step,full_brake+robust"
+_LINEUP = "ladder,ppo@shipped,ppo@shipped+search+episode,full_brake+step"
 # Small calls of what people call first: what they use is what is compiled. One world alone lies otherwise in memory.
 _DOORS = (
     ("run", "--steps", "128", "--episodes", "20", "--output", "run", *_TINY),
-    ("evaluate", "--agents", _LINEUP, "--episodes", "20", "--uncertainty", "gaps_m=0.5"),
+    ("evaluate", "--agents", _LINEUP, "--episodes", "20"),
     ("evaluate", "--agents", "full_brake,ppo@shipped+episode,full_brake+step", "--episodes", "1"),
     ("shield", "--agents", "full_brake", "--episodes", "3"),
 )
@@ -46,12 +45,14 @@ _FOR_A_RUN = (
     *("-m", "ethbrake_marl", "evaluate", "--episodes", "20", "--output", "page", "--report"),
     *("--agents", "full_brake,e_v2x_bm,e_v2x_bm:pairwise,ppo@shipped,ppo@shipped+episode"),
 )
-_FIRST_STEP = """
+_IN_PYTHON = """
 import ethbrake_marl as eb
 for given in ({}, {"reward": {"harm": 0.05, "shaping": 0.05}}):  # shaped, as PPO is trained
     env = eb.parallel_env(agents="learners", **given)
     env.reset(seed=0)
     env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+robust = eb.make_agent("full_brake+robust", scenario="paper-random", uncertainty="gaps_m=0.5")
+eb.evaluate(agents={"robust": robust}, scenario="paper-random", episodes=20)
 """
 _PACKAGE = Path(__file__).resolve().parents[1]
 _CHECKOUT = _PACKAGE.parent  # or the folder of installed packages, where there is no pyproject.toml
@@ -199,7 +200,7 @@ def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str
         return False, "no folder can be written to keep what is compiled; set NUMBA_CACHE_DIR to a writable folder"
     begun, failed = perf_counter(), []
     doors = [("-m", "ethbrake_marl", *door) for door in _DOORS if training or door[0] != "run"]
-    doors = [_FOR_A_RUN] if run_alone else [*doors, ("-c", _FIRST_STEP, "first step")]
+    doors = [_FOR_A_RUN] if run_alone else [*doors, ("-c", _IN_PYTHON, "in Python")]
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         called = {pool.submit(_call, door, folder): door[2] for door in doors}
         waiting = set(called)
@@ -221,61 +222,20 @@ def _call(arguments: tuple[str, ...], folder: str) -> str:
     return (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1] if done.returncode else ""
 
 
-doctor = app.group(
-    "doctor", "Check this installation, or measure its speed.", "doctor --compile", "doctor speed --quick"
-)
-
-
-@doctor.add("check", "doctor", json=True)
-def check_command(
-    out: Out,
+def doctor_command(
     compile_all: Annotated[
         bool, typer.Option("--compile", help="Compile the physics now, on all cores, so that no later command waits.")
     ] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Check this installation: versions, folders, physics.
 
     One line per check, OK or FAIL; exit status 1 when any failed.
     """
-    checks = diagnose(compile_all=compile_all)
-    width = max(len(check.name) for check in checks)
-    lines = (f"{'OK' if check.ok else 'FAIL':4}  {check.name:{width}}  {check.detail}" for check in checks)
-    out.result([asdict(check) for check in checks], *lines)
-    if not all(check.ok for check in checks):
-        raise typer.Exit(1)
-
-
-@doctor.add("speed", "doctor speed --quick", needs=("stable_baselines3",), json=True)
-def speed_command(
-    out: Out,
-    quick: Annotated[bool, typer.Option("--quick", help="In about 20 s instead of a minute or two; coarser.")] = False,
-) -> None:
-    """Measure speed on this machine.
-
-    Per second of processor time on one core. Medians over repetitions. Other programs that run at the same time make
-    all figures worse.
-    """
-    from ethbrake_marl.studies.speed import measure, this_machine
-
-    machine, figures = this_machine(), list(measure(quick=quick, tell=out.show_progress))
-    rows = [
-        (
-            *(speed.name, f"{speed.worlds:,}", f"{_plain(speed.value)} {speed.unit.removesuffix('/s')}"),
-            f"{_plain(speed.lowest)} - {_plain(speed.highest)}",
-            "" if speed.relative is None else _plain(speed.value * speed.vehicles),  # of world-steps alone
-            "" if speed.floor is None else _plain(speed.floor),
-        )
-        for speed in figures
-    ]
-    columns: list[Column | str] = ["per CPU-second", *map(Column, ("worlds", "median", "range", "x vehicles", "aim"))]
-    note = "Medians over repetitions, and their range. Aim: at least, for seconds at most."
-    told = {"machine": asdict(machine), "figures": [asdict(speed) for speed in figures]}
-    out.result(told, Sheet("", columns, rows, note), f"Machine: {machine}")
-
-
-def _plain(value: float) -> str:
-    """Three digits, with k for thousands, M for millions and G beyond."""
-    for size, letter in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
-        if value >= size:
-            return f"{value / size:#.3g}".removesuffix(".") + letter
-    return f"{value:.3g}"
+    with Out(as_json=as_json) as out:
+        checks = diagnose(compile_all=compile_all)
+        width = max(len(check.name) for check in checks)
+        lines = (f"{'OK' if check.ok else 'FAIL':4}  {check.name:{width}}  {check.detail}" for check in checks)
+        out.result([asdict(check) for check in checks], *lines)
+        if not all(check.ok for check in checks):
+            raise typer.Exit(1)

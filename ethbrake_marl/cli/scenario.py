@@ -1,4 +1,4 @@
-"""The commands about what there is: ``scenario``, ``recipe`` and ``agent``."""
+"""The commands about what there is: ``scenario`` and ``agent``."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ import textwrap
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
 from ethbrake_marl import evaluation, learning, scenario as scenarios
-from ethbrake_marl.cli.command import Out, app
-from ethbrake_marl.defaults import DEFAULT, DataDraw, DataFormat
+from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, SeedOption, SettingsOption, example
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.files.store import new_file, read_plain
@@ -24,82 +23,84 @@ SCREEN = 24  # lines
 TABLE_WORLDS, PICTURE_WORLDS = 10, 1000  # by `scenario sample`
 
 NameArgument = Annotated[str, typer.Argument(metavar="NAME|PATH")]
-NewNameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Of the new file.")]
-BasedOnOption = Annotated[str, typer.Option(metavar="NAME|PATH", help="Whose values to start from.")]
-FolderOption = Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the new file.")]
 
-scenario_group = app.group(
-    "scenario",
-    "Look at scenarios, check one, start one, draw worlds.",
-    "scenario show paper-random",
-    "scenario sample paper-random --episodes 10 --output worlds.csv",
+scenario_group = typer.Typer(
+    help="Look at scenarios, check one, start one, draw worlds.",
+    epilog=example("scenario show paper-random", "scenario sample paper-random --episodes 10 --output worlds.csv"),
 )
 
 
-@scenario_group.add("list", "scenario list", json=True)
-def scenario_list(out: Out) -> None:
+@scenario_group.command("list", epilog=example("scenario list"))
+def scenario_list(as_json: JsonOption = False) -> None:
     """List the scenarios that have a name.
 
     Name and title, and the folder of those that a program registers.
     """
-    entries = scenarios.list_scenarios()
-    width = max(len(entry.name) for entry in entries)
-    out.result(
-        [{"name": e.name, "title": e.title, "path": str(e.path), "origin": e.origin} for e in entries],
-        *(f"{e.name:{width}}  {e.title}{'' if e.shipped else f'  (from {e.origin})'}" for e in entries),
-    )
+    with Out(as_json=as_json) as out:
+        entries = scenarios.list_scenarios()
+        width = max(len(entry.name) for entry in entries)
+        out.result(
+            [{"name": e.name, "title": e.title, "path": str(e.path), "origin": e.origin} for e in entries],
+            *(f"{e.name:{width}}  {e.title}{'' if e.shipped else f'  (from {e.origin})'}" for e in entries),
+        )
 
 
-@scenario_group.add("show", "scenario show paper-random")
-def scenario_show(out: Out, scenario: NameArgument) -> None:
+@scenario_group.command("show", epilog=example("scenario show paper-random"))
+def scenario_show(scenario: NameArgument) -> None:
     """Print the YAML of a scenario that is in order."""
-    scenarios.load_scenario(scenario)
-    _show_file(out, scenarios.scenario_path(scenario))
+    from ethbrake_marl.files.yaml import SIZE_LIMIT
+
+    with Out() as out:
+        scenarios.load_scenario(scenario)
+        path = scenarios.scenario_path(scenario)
+        out.show(read_plain(path, SIZE_LIMIT).decode("utf-8"), end="")
 
 
-@scenario_group.add("validate", "scenario validate my-scenario.yaml", json=True)
-def scenario_validate(out: Out, path: NameArgument) -> None:
+@scenario_group.command("validate", epilog=example("scenario validate my-scenario.yaml"))
+def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
     """Check a scenario, and try it in 200 worlds.
 
     Tells what is drawn, and what may not be meant; or what is wrong. The first worlds of its list are drawn, the
     scripts drive, and learners brake fully.
     """
-    scenario = evaluation.load_runnable(path)
-    sample = scenario.sample(TRIED_WORLDS, DEFAULT.LIST_SEED)
-    n, names = sample.worlds.n, [scenario.vehicle_names[i] for i in scenario.learners]
-    ranges, fixed, quantities = _drawn_lines(scenario, sample)
-    found = evaluation.try_scenario(scenario, sample.worlds)
-    told = {
-        "name": scenario.name, "vehicles": scenario.vehicles, "learners": names, "worlds": n, **found,
-        "rejected": sample.rejected, "quantities": quantities,
-        "kinds": {kind: dict(Counter(drawn.tolist())) for kind, drawn in sample.kinds.items()},
-    }  # fmt: skip
-    odd, beyond, late = (found[each] for each in ("not_state_free", "commands_out_of_range", "vehicle_1_late"))
-    head, *notes = (
-        f"{'NOT OK' if beyond else 'OK'}  {scenario.name}: {scenario.vehicles} vehicles, learners:"
-        f" {', '.join(names) or 'none'}; tried in {n} worlds",
-        sample.count_kinds().removeprefix("; "),
-        f"early impacts: {_share(sample.rejected, sample.rejected + n, 'draws')} refused,"
-        f" {_share(found['early_impacts'], n)} kept",
-        f"at the horizon ({scenario.horizon_s:g} s) something still moves in {_share(found['moving_at_horizon'], n)}"
-        + ("; what comes after counts nowhere, a longer horizon_s sees more" if found["moving_at_horizon"] else ""),
-        f"Vehicle 1, whose braking is the alert, has a latency above 0 in {_share(late, n)}"
-        if late and scenario.alert_s is None
-        else "",
-        "; ".join(f"{each} asks for more than it can in {_share(len(rows), n)}" for each, rows in beyond.items()),
-        f"not state-free: {', '.join(f'{each} ({script})' for each, script in odd.items())}; therefore refused by"
-        f" {', '.join(found['refused_by']) or 'nothing'}"
-        if odd
-        else "",
-    )
-    above, below = _folded(head, 2) + ranges, [line for note in notes for line in _folded(note, 3)]
-    out.result(told, *above, *_folded(fixed, max(SCREEN - len(above) - len(below), 1)), *below)
-    if beyond:
-        (vehicle, rows), *_ = beyond.items()
-        raise InvalidInput(
-            f"scenario {scenario.name!r}: roles.{vehicle} = {scenario.roles[vehicle]}: asks for more than its vehicle"
-            f" can in {_share(len(rows), n)}; {next(iter(rows.values()))}"
+    with Out(as_json=as_json) as out:
+        scenario = evaluation.load_runnable(path)
+        sample = scenario.sample(TRIED_WORLDS, evaluation.LIST_SEED)
+        n, names = sample.worlds.n, [scenario.vehicle_names[i] for i in scenario.learners]
+        ranges, fixed, quantities = _drawn_lines(scenario, sample)
+        found = evaluation.try_scenario(scenario, sample.worlds)
+        told = {
+            "name": scenario.name, "vehicles": scenario.vehicles, "learners": names, "worlds": n, **found,
+            "rejected": sample.rejected, "quantities": quantities,
+            "kinds": {kind: dict(Counter(drawn.tolist())) for kind, drawn in sample.kinds.items()},
+        }  # fmt: skip
+        odd, beyond, late = (found[each] for each in ("not_state_free", "commands_out_of_range", "vehicle_1_late"))
+        head, *notes = (
+            f"{'NOT OK' if beyond else 'OK'}  {scenario.name}: {scenario.vehicles} vehicles, learners:"
+            f" {', '.join(names) or 'none'}; tried in {n} worlds",
+            sample.count_kinds().removeprefix("; "),
+            f"early impacts: {_share(sample.rejected, sample.rejected + n, 'draws')} refused,"
+            f" {_share(found['early_impacts'], n)} kept",
+            f"at the horizon ({scenario.horizon_s:g} s) something still moves in"
+            f" {_share(found['moving_at_horizon'], n)}"
+            + ("; what comes after counts nowhere, a longer horizon_s sees more" if found["moving_at_horizon"] else ""),
+            f"Vehicle 1, whose braking is the alert, has a latency above 0 in {_share(late, n)}"
+            if late and scenario.alert_s is None
+            else "",
+            "; ".join(f"{each} asks for more than it can in {_share(len(rows), n)}" for each, rows in beyond.items()),
+            f"not state-free: {', '.join(f'{each} ({script})' for each, script in odd.items())}; therefore refused by"
+            f" {', '.join(found['refused_by']) or 'nothing'}"
+            if odd
+            else "",
         )
+        above, below = _folded(head, 2) + ranges, [line for note in notes for line in _folded(note, 3)]
+        out.result(told, *above, *_folded(fixed, max(SCREEN - len(above) - len(below), 1)), *below)
+        if beyond:
+            (vehicle, rows), *_ = beyond.items()
+            raise InvalidInput(
+                f"scenario {scenario.name!r}: roles.{vehicle} = {scenario.roles[vehicle]}: asks for more than its"
+                f" vehicle can in {_share(len(rows), n)}; {next(iter(rows.values()))}"
+            )
 
 
 def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tuple[list[str], str, dict[str, Any]]:
@@ -138,15 +139,16 @@ def _share(part: int, whole: int, things: str = "worlds") -> str:
     return f"{part:,} of {whole:,} {things} ({100.0 * part / whole:.1f} %)"
 
 
-@scenario_group.add("explain", "scenario explain paper-random", json=True)
-def scenario_explain(out: Out, scenario: NameArgument) -> None:
+@scenario_group.command("explain", epilog=example("scenario explain paper-random"))
+def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> None:
     """Say in plain sentences what a scenario is.
 
     Who stands in line, how each quantity is drawn, who knows what when, and whose harm counts.
     """
-    chosen = evaluation.load_runnable(scenario)
-    told = [each for each in _sentences(chosen) if each]
-    out.result({"name": chosen.name, "sentences": told}, *(line for each in told for line in _folded(each, 4, 100)))
+    with Out(as_json=as_json) as out:
+        chosen = evaluation.load_runnable(scenario)
+        told = [each for each in _sentences(chosen) if each]
+        out.result({"name": chosen.name, "sentences": told}, *(line for each in told for line in _folded(each, 4, 100)))
 
 
 def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
@@ -234,21 +236,53 @@ def _news_in_words(scenario: scenarios.Scenario) -> str:
     return f"V2X preset {scenario.v2x.preset}: {told or 'from its latency on each vehicle knows the whole line'}."
 
 
-@scenario_group.add("new", "scenario new my-scenario --based-on paper-distance", force=True)
+@scenario_group.command("new", epilog=example("scenario new my-scenario --based-on paper-distance"))
 def scenario_new(
-    out: Out, name: NewNameArgument, based_on: BasedOnOption = "paper-random", output: FolderOption = Path()
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Of the new file.")],
+    based_on: Annotated[str, typer.Option(metavar="NAME|PATH", help="Whose values to start from.")] = "paper-random",
+    output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the new file.")] = Path(),
+    force: ForceOption = False,
 ) -> None:
     """Write a commented NAME.yaml with every key."""
-    _write_new(out, "scenario", output / f"{name}.yaml", scenarios.new_scenario_text(name, based_on))
+    with Out(force=force) as out:
+        file = output / f"{name}.yaml"
+        out.write(file, scenarios.new_scenario_text(name, based_on))
+        out.note(f"written: {file}; change it, then: ethbrake scenario validate {file}")
 
 
-@scenario_group.add(
-    "from-data", "scenario from-data highd/data --format highd --output my-motorway.yaml", json=True, force=True
+@scenario_group.command("parts", epilog=example("scenario parts"))
+def scenario_parts(as_json: JsonOption = False) -> None:
+    """List what scenarios and recipes may name.
+
+    Reward terms, features of observations, V2X presets, objectives, training algorithms, recipes and measures.
+    """
+    from ethbrake_marl.harm import OBJECTIVES
+    from ethbrake_marl.observations import FEATURES
+    from ethbrake_marl.rewards import TERMS
+
+    features = FEATURES.usable().items()
+    own = [name if entry.of == "own" else f"front_K.{name}, rear_K.{name}" for name, entry in features]
+    parts = {
+        "Reward terms": [*TERMS],
+        "Observation": ["own", "front_K", "rear_K", "role", "obstacle", *own],
+        "V2X presets": [*scenarios.CHANNELS],
+        "Objectives": [kind.form for kind in OBJECTIVES.usable().values()],
+        "Algorithms": [*learning.algorithm_names()],
+        "Recipes": [*learning.TrainingRecipe.shipped()],
+        "Measures": [*evaluation.MEASURES],
+    }
+    with Out(as_json=as_json) as out:
+        out.result(
+            parts, Sheet("", ("What", "Names"), [(what, ", ".join(names)) for what, names in parts.items()], gap=2)
+        )
+
+
+@scenario_group.command(
+    "from-data", epilog=example("scenario from-data highd/data --format highd --output my-motorway.yaml")
 )
 def scenario_from_data(
-    out: Out,
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of the recordings.")],
-    format: Annotated[DataFormat, typer.Option(help="Whose recordings they are.")],
+    format: Annotated[Literal["highd", "ngsim", "openacc"], typer.Option(help="Whose recordings they are.")],
     output: Annotated[
         Path, typer.Option(metavar="FILE", help="The .yaml to write; its rows stand in the .csv beside.")
     ],
@@ -256,183 +290,130 @@ def scenario_from_data(
         str, typer.Option(metavar="NAME|PATH", help="What is not recorded is as here, and as many vehicles.")
     ] = "realistic-motorway",
     every: Annotated[float, typer.Option(help="Seconds between the moments that are looked at.")] = 1.0,
-    draw: Annotated[DataDraw, typer.Option(help="Whole rows, or each quantity by a fit to it.")] = "rows",
+    draw: Annotated[
+        Literal["rows", "normal", "lognormal", "quantiles"],
+        typer.Option(help="Whole rows, or each quantity by a fit to it."),
+    ] = "rows",
+    force: ForceOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Make a scenario of recorded traffic: highD, NGSIM, OpenACC.
 
     Vehicles that follow each other in a lane become rows: speeds, and gaps from bumper to bumper.
     """
-    rows = output.with_suffix(".csv")
-    out.check(output, ".yaml", what="the scenario")
-    out.check(rows)
-    text, table, told = scenarios.scenario_from_data(
-        output.stem, folder, format, based_on=based_on, every_s=every, draw=draw, progress=out.progress
-    )
-    with new_file(output) as partial:
-        partial.write_text(text, "utf-8")
-        if draw == "rows":
-            out.write(rows, table, what="rows")
-        else:  # those of before would be left behind, unnamed
-            rows.unlink(missing_ok=True)
-    out.note(f"written: {output}; try it: ethbrake scenario validate {output}")
-    out.result({"scenario": str(output), "rows": str(rows) if draw == "rows" else None, "found": told}, *told)
+    with Out(as_json=as_json, force=force) as out:
+        rows = output.with_suffix(".csv")
+        out.check(output, ".yaml", what="the scenario")
+        out.check(rows)
+        text, table, told = scenarios.scenario_from_data(
+            output.stem, folder, format, based_on=based_on, every_s=every, draw=draw, progress=out.progress
+        )
+        with new_file(output) as partial:
+            partial.write_text(text, "utf-8")
+            if draw == "rows":
+                out.write(rows, table, what="rows")
+            else:  # those of before would be left behind, unnamed
+                rows.unlink(missing_ok=True)
+        out.note(f"written: {output}; try it: ethbrake scenario validate {output}")
+        out.result({"scenario": str(output), "rows": str(rows) if draw == "rows" else None, "found": told}, *told)
 
 
-@scenario_group.add("schema", "scenario schema > scenario.schema.json")
-def scenario_schema(out: Out) -> None:
+@scenario_group.command("schema", epilog=example("scenario schema > scenario.schema.json"))
+def scenario_schema() -> None:
     """Print the JSON Schema of scenario files.
 
     For editors that complete and check YAML.
     """
-    out.print_json(scenarios.scenario_json_schema())
+    with Out() as out:
+        out.print_json(scenarios.scenario_json_schema())
 
 
-@scenario_group.add("sample", "scenario sample paper-random --output worlds.png", json=True, force=True)
+@scenario_group.command("sample", epilog=example("scenario sample paper-random --output worlds.png"))
 def scenario_sample(
-    out: Out,
     scenario: NameArgument,
     episodes: Annotated[
         int | None,
         typer.Option(help="Worlds of the list.", show_default=f"{TABLE_WORLDS}, of a picture {PICTURE_WORLDS}"),
     ] = None,
-    seed: int = DEFAULT.LIST_SEED,
-    settings: list[str] | None = None,
+    seed: SeedOption = 7,
+    settings: SettingsOption = None,
     output: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write .csv, .png, .svg or .pdf.", show_default="stdout")
     ] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Draw worlds of a list, as a table or a picture.
 
-    `ethbrake evaluate --initial-states` reads the table. A column is what the scenario does not fix. The picture shows
-    distributions, pairs of quantities, and three worlds. The same list, seed and number are the same worlds on every
-    machine.
+    `Scenario.read_worlds` reads the table. A column is what the scenario does not fix. The picture shows distributions,
+    pairs of quantities, and three worlds. The same list, seed and number are the same worlds on every machine.
     """
-    out.check(output, ".csv", ".png", ".svg", ".pdf", what="worlds")
-    chosen = evaluation.load_runnable(scenario, learning.read_settings(settings).scenario)
-    pictured = None if output is None or output.suffix.lower() == ".csv" else output
-    usual = TABLE_WORLDS if pictured is None else PICTURE_WORLDS
-    sample = chosen.sample(usual if episodes is None else episodes, seed)
-    states = evaluation.states_of(sample.worlds, chosen)
-    lines = [
-        ",".join(states[0]),
-        *(",".join("" if each is None else repr(each) for each in state.values()) for state in states),
-    ]
-    if pictured is not None:
-        from ethbrake_marl.figures import worlds_figure, write_picture
+    with Out(as_json=as_json, force=force) as out:
+        out.check(output, ".csv", ".png", ".svg", ".pdf", what="worlds")
+        chosen = evaluation.load_runnable(scenario, learning.read_settings(settings).scenario)
+        pictured = None if output is None or output.suffix.lower() == ".csv" else output
+        usual = TABLE_WORLDS if pictured is None else PICTURE_WORLDS
+        sample = chosen.sample(usual if episodes is None else episodes, seed)
+        states = evaluation.states_of(sample.worlds, chosen)
+        lines = [
+            ",".join(states[0]),
+            *(",".join("" if each is None else repr(each) for each in state.values()) for state in states),
+        ]
+        if pictured is not None:
+            from ethbrake_marl.figures import worlds_figure, write_picture
 
-        write_picture(pictured, worlds_figure(chosen, sample, seed=seed), force=out.force)
-        out.note(f"picture: {pictured}")
-    elif output is not None:
-        out.write(output, "\n".join([*lines, ""]), what="worlds")
-    if output is None or out.as_json:
-        out.result(states, *lines)
+            write_picture(pictured, worlds_figure(chosen, sample, seed=seed), force=out.force)
+            out.note(f"picture: {pictured}")
+        elif output is not None:
+            out.write(output, "\n".join([*lines, ""]), what="worlds")
+        if output is None or out.as_json:
+            out.result(states, *lines)
 
 
-recipe_group = app.group(
-    "recipe",
-    "Look at training recipes, check one, or start a new one.",
-    "recipe show ppo",
-    "recipe new my-recipe --based-on sac",
+agent_group = typer.Typer(
+    help="List who can drive, or hand a policy on.",
+    epilog=example("agent list", "agent export runs/early --onnx early.onnx"),
 )
 
 
-@recipe_group.add("list", "recipe list", json=True)
-def recipe_list(out: Out) -> None:
-    """List the shipped recipes: name, algorithm and title."""
-    found = {name: (learning.load_recipe(name), path) for name, path in learning.TrainingRecipe.shipped().items()}
-    width = max(map(len, found))
-    out.result(
-        [
-            {"name": name, "algorithm": recipe.algorithm, "title": recipe.title, "path": str(path)}
-            for name, (recipe, path) in found.items()
-        ],
-        *(f"{name:{width}}  {recipe.algorithm:4}  {recipe.title}" for name, (recipe, _) in found.items()),
-    )
-
-
-@recipe_group.add("show", "recipe show ppo")
-def recipe_show(out: Out, recipe: NameArgument) -> None:
-    """Print the YAML of a recipe that is in order."""
-    learning.load_recipe(recipe)
-    _show_file(out, learning.TrainingRecipe.file(recipe))
-
-
-@recipe_group.add("validate", "recipe validate my-recipe.yaml")
-def recipe_validate(out: Out, path: NameArgument) -> None:
-    """Check a recipe: one line, OK or what is wrong."""
-    recipe = learning.load_recipe(path)
-    others = ", ".join(name for name in recipe.schemes if name not in ("single", "shared"))
-    scheme = recipe.scheme or f"single, or shared for several learners{f'; also {others}' if others else ''}"
-    out.show(
-        f"OK  {recipe.name}: {recipe.algorithm}, {recipe.total_steps:,} steps, seed {recipe.seed}, scheme {scheme}"
-    )
-
-
-@recipe_group.add("new", "recipe new my-recipe --based-on sac", force=True)
-def recipe_new(out: Out, name: NewNameArgument, based_on: BasedOnOption = "ppo", output: FolderOption = Path()) -> None:
-    """Write a commented NAME.yaml with every key."""
-    _write_new(out, "recipe", output / f"{name}.yaml", learning.load_recipe(based_on).new_text(name))
-
-
-@recipe_group.add("schema", "recipe schema > recipe.schema.json")
-def recipe_schema(out: Out) -> None:
-    """Print the JSON Schema of recipe files.
-
-    For editors that complete and check YAML.
-    """
-    out.print_json(learning.TrainingRecipe.json_schema())
-
-
-def _show_file(out: Out, path: Path) -> None:
-    from ethbrake_marl.files.yaml import SIZE_LIMIT
-
-    out.show(read_plain(path, SIZE_LIMIT).decode("utf-8"), end="")
-
-
-def _write_new(out: Out, kind: str, file: Path, text: str) -> None:
-    out.write(file, text)
-    out.note(f"written: {file}; change it, then: ethbrake {kind} validate {file}")
-
-
-agent_group = app.group(
-    "agent", "List who can drive, or hand a policy on.", "agent list", "agent export runs/early --onnx early.onnx"
-)
-
-
-@agent_group.add("list", "agent list", json=True)
-def agent_list(out: Out) -> None:
+@agent_group.command("list", epilog=example("agent list"))
+def agent_list(as_json: JsonOption = False) -> None:
     """List all agents: how each is written, what it does, what it knows.
 
     What begins with + goes behind any agent, for instance full_brake+step: +search first, then one shield.
     """
-    from ethbrake_marl.agents import Knowledge, agent_entries, agents_refused
+    with Out(as_json=as_json) as out:
+        from ethbrake_marl.agents import Knowledge, agent_entries, agents_refused
 
-    told, rows = [], []
-    for entry in agent_entries():
-        knows, added = Knowledge.of(entry), "also " if entry.form.startswith("+") else ""
-        told.append({"agent": entry.form, "about": entry.about, "knows": list(knows), "omniscient": knows.sees_through})
-        rows.append((entry.form, entry.about, f"{added}{knows.text}{' †' if knows.sees_through else ''}"))
-    for reason in agents_refused():
-        out.note(f"left out: {reason}")
-    out.result(
-        told,
-        Sheet("", ("Agent", "Drives by", "Knows"), rows, gap=2),
-        "† omniscient: reads what no channel brought. With :believed behind it, it decides on what was received.",
-        "ladder stands for coast to best_harm; a typo gets a suggestion. See docs/baselines.md and docs/shield.md.",
-    )
+        told, rows = [], []
+        for entry in agent_entries():
+            knows, added = Knowledge.of(entry), "also " if entry.form.startswith("+") else ""
+            told.append(
+                {"agent": entry.form, "about": entry.about, "knows": list(knows), "omniscient": knows.sees_through}
+            )
+            rows.append((entry.form, entry.about, f"{added}{knows.text}{' †' if knows.sees_through else ''}"))
+        for reason in agents_refused():
+            out.note(f"left out: {reason}")
+        out.result(
+            told,
+            Sheet("", ("Agent", "Drives by", "Knows"), rows, gap=2),
+            "† omniscient: reads what no channel brought. With :believed behind it, it decides on what was received.",
+            "ladder stands for coast to best_harm; a typo gets a suggestion. See docs/baselines.md and docs/shield.md.",
+        )
 
 
-@agent_group.add("export", "agent export runs/early --onnx early.onnx", force=True)
+@agent_group.command("export", epilog=example("agent export runs/early --onnx early.onnx"))
 def agent_export(
-    out: Out,
     policy: Annotated[str, typer.Argument(metavar="FOLDER", help="A run, a policy bundle, or shipped/NAME.")],
     onnx: Annotated[Path, typer.Option(metavar="FILE", help="The ONNX model to write.")],
+    force: ForceOption = False,
 ) -> None:
     """Write a policy as an ONNX model: observation in, acceleration out.
 
     Needs the package onnx, which the extra `export` brings.
     """
-    from ethbrake_marl.policies import load_named_policy
+    with Out(force=force) as out:
+        from ethbrake_marl.policies import load_named_policy
 
-    out.check(onnx)
-    out.write(onnx, load_named_policy(policy).to_onnx(), what="written")
+        out.check(onnx)
+        out.write(onnx, load_named_policy(policy).to_onnx(), what="written")

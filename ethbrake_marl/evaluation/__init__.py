@@ -26,11 +26,12 @@ if TYPE_CHECKING:
         write_dataset as write_dataset,
     )
     from ethbrake_marl.evaluation.inputs import (
+        EPISODES as EPISODES,
         HELD as HELD,
+        LIST_SEED as LIST_SEED,
         NamedWorld as NamedWorld,
         NamedWorlds as NamedWorlds,
         check_agents as check_agents,
-        choose_worlds as choose_worlds,
         drawn_alike as drawn_alike,
         load_runnable as load_runnable,
         make_agents as make_agents,
@@ -57,13 +58,10 @@ if TYPE_CHECKING:
         SummaryRow as SummaryRow,
         SummaryTable as SummaryTable,
         Tally as Tally,
-        check_papers_test as check_papers_test,
         is_papers_test as is_papers_test,
         load_measures as load_measures,
         other_tests as other_tests,
-        proven_of_table as proven_of_table,
         register_measure as register_measure,
-        shipped_bounds as shipped_bounds,
         summarise as summarise,
         summarise_by as summarise_by,
     )

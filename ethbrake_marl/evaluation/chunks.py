@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from ethbrake_marl.agents import Driver, Knowledge, Team
-from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.evaluation.inputs import CHUNK, HELD, make_lineup, policies_of, result_versions, scenario_sha256
 from ethbrake_marl.evaluation.measures import REGISTERED, Conditions, Evaluation, SummaryTable, Tally, load_measures
 from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk
+from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.parallel import Call, run_each
 from ethbrake_marl.scenario import Sample, Scenario, Task
 from ethbrake_marl.shield import parse_uncertainty

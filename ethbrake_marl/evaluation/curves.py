@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.agents import optimise_coupled, optimise_pairwise, pairwise_harm
-from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.limits import Limits, Unproven, known_limits, scripted_commands
 from ethbrake_marl.physics import Floats, Worlds, advance, forecast, make_worlds
 from ethbrake_marl.scenario import Task

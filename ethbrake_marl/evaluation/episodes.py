@@ -15,7 +15,7 @@ from importlib.metadata import version
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import gymnasium
 import numpy as np
@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.actions import command_to_action
 from ethbrake_marl.agents import Agent, Driver, Episodes, Team, drive, episode_engine, script_agents
-from ethbrake_marl.defaults import DEFAULT, HARM_COUNTS, DatasetFormat
 from ethbrake_marl.engine import Engine, Step
 from ethbrake_marl.envs import Frame, Report, Scene, Trace, action_box, animate_films, feature_box
 from ethbrake_marl.errors import (
@@ -39,16 +38,16 @@ from ethbrake_marl.errors import (
     renumbered,
     unknown_name,
 )
-from ethbrake_marl.evaluation.inputs import policies_of, result_versions, scenario_sha256
+from ethbrake_marl.evaluation.inputs import LIST_SEED, make_lineup, policies_of, result_versions, scenario_sha256
 from ethbrake_marl.evaluation.measures import LeftOut, Tape
 from ethbrake_marl.evaluation.rollout import ShovedFront, controlled_vehicle
 from ethbrake_marl.files.sheet import parquet_file
 from ethbrake_marl.files.store import check_target, check_writable, new_folder
-from ethbrake_marl.harm import Ledger
+from ethbrake_marl.harm import HARM_COUNTS, Ledger
 from ethbrake_marl.observations import Observation, ObservationSpec, choose_observation
 from ethbrake_marl.physics import Bools, Floats, ImpactRows, Ints, Worlds, advance, leaving_out_failed, segment_pieces
 from ethbrake_marl.rewards import Reward, RewardParams, reward_params
-from ethbrake_marl.scenario import Sample, Scenario, observation_for
+from ethbrake_marl.scenario import Sample, Scenario, load_scenario, observation_for
 from ethbrake_marl.shield import HybridAgent
 
 _SAME = 1e-9  # m, m/s: a piece that goes on like the one before it is part of it
@@ -709,7 +708,7 @@ def env_spec(task: Task) -> EnvSpec:
     """
     names = [task.scenario.vehicle_names[i] for i in task.scenario.learners]
     check_one_learner(
-        task.scenario.name, names, "a dataset of Minari is one learner's: --vehicle NAME, or --format parquet"
+        task.scenario.name, names, "a dataset of Minari is one learner's; give the others a script, or write Parquet"
     )
     spec = copy.deepcopy(gymnasium.spec("EthBrake-v0"))
     spec.kwargs = {"scenario": task.scenario.declared(), "reward": task.reward.model_dump(mode="json")}
@@ -755,6 +754,7 @@ def _infos(recording: Recording, vehicle: int) -> dict[str, NDArray[Any]]:
 
 BATCH = 500  # worlds recorded together: bounds memory, changes no episode
 
+DatasetFormat = Literal["parquet", "minari"]
 _NEEDED_PACKAGES: dict[DatasetFormat, tuple[str, ...]] = {"parquet": ("pyarrow",), "minari": ("minari", "h5py")}
 
 
@@ -772,11 +772,11 @@ class DatasetSummary:
 
 def write_dataset(
     path: str | Path,
-    agents: Mapping[str, Driver],
+    agents: str | Sequence[str] | Mapping[str, Driver],
     *,
-    scenario: Scenario,
+    scenario: str | Path | Scenario,
     episodes: int,
-    seed: int = DEFAULT.LIST_SEED,
+    seed: int = LIST_SEED,
     format: DatasetFormat | None = None,
     reward: Reward = "harm",
     observation: Observation | None = None,
@@ -789,8 +789,9 @@ def write_dataset(
 
     Args:
         path: the file (``.parquet``), or the folder (``NAME-v0``) to write.
-        agents: name -> agent, or team, that drives the scenario's learners; they are left as they are.
-        scenario: whose worlds are driven in.
+        agents: specs as on the command line, or name -> agent, or team, that drives the scenario's learners; they are
+            left as they are.
+        scenario: whose worlds are driven in, also by name or path.
         episodes: worlds of the list, from its first one on.
         seed: of the list.
         format: ``parquet`` or ``minari``; None: as the path's ending says.
@@ -805,6 +806,9 @@ def write_dataset(
     """
     check_whole_number("write_dataset: episodes", episodes, 1)
     check_whole_number("write_dataset: seed", seed, 0)
+    scenario = load_scenario(scenario)
+    if isinstance(agents, Sequence):
+        agents = make_lineup(agents, scenario)
     if not agents:
         raise InvalidInput("write_dataset: no agents given; at least one is needed, for instance full_brake")
     chosen = check_dataset(path, scenario, format, force=force)
@@ -857,12 +861,12 @@ def check_dataset(
         need(package)
     if not scenario.learners:
         raise InvalidInput(
-            f"scenario {scenario.name!r} has no learner to record; say who is driven: --vehicle vehicle_2"
+            f"scenario {scenario.name!r} has no learner to record: scenario.with_learners(['vehicle_2'])"
         )
     if chosen == "parquet":
         check_target(target, force=force)
     else:
-        env_spec(Task(scenario, DEFAULT.LIST_SEED, reward_params("harm"), observation_for(scenario)))
+        env_spec(Task(scenario, LIST_SEED, reward_params("harm"), observation_for(scenario)))
         check_folder(target, force=force)
     return chosen  # type: ignore[no-any-return]  # one of them
 

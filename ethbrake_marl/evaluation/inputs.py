@@ -33,17 +33,17 @@ from ethbrake_marl.agents import (
     shield_forms,
     split_specs,
 )
-from ethbrake_marl.defaults import DEFAULT, HarmCount
 from ethbrake_marl.engine import Engine, ask_script, begin_script
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar, check_one_learner
 from ethbrake_marl.files.python_file import files_run
 from ethbrake_marl.files.yaml import FileModel, Override, Wording, flow_text, read_model, read_yaml
+from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.limits import task_problem
 from ethbrake_marl.physics import Floats, Ints, Worlds
 from ethbrake_marl.policies import Policy
 from ethbrake_marl.registry import versions_used
 from ethbrake_marl.scenario import QUANTITY, Sample, Scenario, ScriptSpec, Task, load_scenario, scenario_path
-from ethbrake_marl.shield import ShieldedDriver, Uncertainty
+from ethbrake_marl.shield import UNCERTAINTY_EXAMPLE, ShieldedDriver, Uncertainty
 
 # The identity of a result: the worlds, the scenario and the policies that it is about, and what computed it.
 #
@@ -57,6 +57,8 @@ _BLOCK = 50_000  # worlds hashed at once: news of a world may be a view that tak
 
 
 CHUNK = 2_500  # worlds advanced together: bounds memory, changes no result
+EPISODES, LIST_SEED = 10_000, 7  # of the list on which everything is measured; a training has a seed of its own
+MOST_NAMED_WORLDS = 1000  # of a file
 HELD = 100_000  # worlds of a list that is held in memory as a whole, unless each of its worlds is asked for
 HASHES = 1 << 256  # sums of hashes are kept modulo this
 
@@ -195,7 +197,7 @@ class NamedWorlds(FileModel):
     against: str | None = None
     harm_count: HarmCount
     found_by: str  # the command
-    worlds: Annotated[list[NamedWorld], Field(min_length=1, max_length=DEFAULT.MOST_NAMED_WORLDS)]
+    worlds: Annotated[list[NamedWorld], Field(min_length=1, max_length=MOST_NAMED_WORLDS)]
 
     @classmethod
     def of(cls, scenario: Scenario, /, **told: Any) -> NamedWorlds:
@@ -206,7 +208,7 @@ class NamedWorlds(FileModel):
     def read(cls, path: str | Path) -> NamedWorlds:
         """Read such a file; raises ``InvalidInput`` naming file, line and key."""
         document = read_yaml(path, SIZE_LIMIT)
-        found = read_model(document, cls, Wording(cls, "search again (ethbrake search falsify)"), "of named worlds")
+        found = read_model(document, cls, Wording(cls, "search again (ethbrake study falsify)"), "of named worlds")
         names = [world.name for world in found.worlds]
         if twice := next((name for k, name in enumerate(names) if name in names[:k]), None):
             raise InvalidInput(f"{path}: world {twice!r} is given twice; names must differ")
@@ -229,7 +231,7 @@ class NamedWorlds(FileModel):
             raise InvalidInput(
                 f"{where}: its worlds were found in scenario {self.scenario!r}"
                 f"{''.join(f' with --set {each}' for each in self.settings)}, which {scenario.name!r} is not, or is no"
-                " longer: their contents differ; use that scenario, or search again (ethbrake search falsify)"
+                " longer: their contents differ; use that scenario, or search again (ethbrake study falsify)"
             )
         columns = self.worlds[0].state.keys()
         for k, world in enumerate(self.worlds):
@@ -298,25 +300,20 @@ _GROUPS = {"ladder": LADDER, "field": FIELD}
 
 
 def load_runnable(
-    name_or_path: str,
-    settings: Sequence[Override] = (),
-    *,
-    vehicle: str | None = None,
-    drives: Literal["nobody", "one", "some"] = "nobody",
+    name_or_path: str, settings: Sequence[Override] = (), *, drives: Literal["nobody", "one", "some"] = "nobody"
 ) -> Scenario:
     """Load a scenario as ``load_scenario`` does, and try its scripts, which the file's own check cannot know.
 
-    ``settings`` are put in the place of what the file says. ``vehicle`` alone is to be driven; by default all learners
-    that there are. ``drives``: it must be one, or some, that are driven.
+    ``settings`` are put in the place of what the file says. ``drives``: one vehicle, or some, must be a learner.
 
     Raises ``InvalidInput`` naming the file, line, role and script that no agent of that name and argument can play, and
-    when there is no such vehicle, or no learner, or several and nothing says which one is driven.
+    when there is no learner, or several where one is needed.
     """
     scenario = load_scenario(name_or_path)
     if settings:
         content = {**scenario.model_dump(mode="json", exclude_none=True), **scenario.declared()}
         scenario = scenario.replace(**Override.put(content, settings))
-    worlds = scenario.replace(early_impacts="keep").sample(1, DEFAULT.LIST_SEED).worlds
+    worlds = scenario.replace(early_impacts="keep").sample(1, LIST_SEED).worlds
     for i, script in scenario.scripts.items():
         try:
             agent = make_role(scenario, i, most_candidates=TRIED_CANDIDATES)
@@ -327,15 +324,13 @@ def load_runnable(
             if not any(setting.top == "roles" for setting in settings):
                 where = read_yaml(scenario_path(name_or_path)).where(("roles", role))
             raise InvalidInput(f"{where}: roles.{role} = {script}: {error}") from None
-    if vehicle is not None:
-        return scenario.with_learners([vehicle])
     learners = [scenario.vehicle_names[i] for i in scenario.learners]
     if drives == "one":
-        check_one_learner(scenario.name, learners, "say which vehicle is driven, for instance --vehicle vehicle_2")
+        check_one_learner(scenario.name, learners, "give the others a script: --set roles.vehicle_3=full_brake")
     elif drives == "some" and not learners:
         raise InvalidInput(
             f"scenario {scenario.name!r} has no learner to drive; give the scenario that the agents were trained for"
-            " (--scenario), or say which vehicle is driven, for instance --vehicle vehicle_2"
+            " (--scenario), or say which vehicle is driven, for instance --set roles.vehicle_2=learner"
         )
     return scenario
 
@@ -395,14 +390,12 @@ def _refusals(scenario: Scenario, worlds: Worlds) -> dict[str, str]:
     """What refuses the scenario, each asked itself: agents, shields, a search, ``early_impacts: reject``; and why."""
 
     def drive_by(spec: str) -> None:
-        agent = make_agent(
-            spec, scenario=scenario, most_candidates=TRIED_CANDIDATES, uncertainty=DEFAULT.UNCERTAINTY_EXAMPLE
-        )
+        agent = make_agent(spec, scenario=scenario, most_candidates=TRIED_CANDIDATES, uncertainty=UNCERTAINTY_EXAMPLE)
         check_agents({spec: agent}, worlds, scenario)
 
     asked: dict[str, Callable[[], object]] = {spec: partial(drive_by, spec) for spec in LADDER}
     asked |= {f"+{shield}": partial(drive_by, f"full_brake+{shield}") for shield in shield_forms()}
-    asked["search best-harm"] = lambda: task_problem(worlds, Task(scenario, scenario.learners))
+    asked["search_list"] = lambda: task_problem(worlds, Task(scenario, scenario.learners))
     asked["early_impacts: reject"] = lambda: scenario.replace(early_impacts="reject")
     refused = {}
     for what, ask in asked.items():
@@ -531,25 +524,3 @@ def make_lineup(
 def make_agents(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCount = "first") -> dict[str, Agent]:
     """``make_lineup`` where one vehicle is driven."""
     return make_lineup(specs, scenario, harm_count=harm_count, alone=True)  # type: ignore[return-value]  # no teams
-
-
-def choose_worlds(
-    scenario: Scenario, *, initial_states: Path | None = None, episodes: int | None = None, seed: int | None = None
-) -> tuple[Sample, int | None]:
-    """The user's own worlds, or the first ``episodes`` of the list of ``seed``; and that seed, None for own worlds.
-
-    Raises ``InvalidInput`` when worlds are given and drawn at once, and what reading or drawing them raises.
-    """
-    if initial_states is None:
-        list_seed = DEFAULT.LIST_SEED if seed is None else seed
-        return scenario.sample(DEFAULT.EPISODES if episodes is None else episodes, list_seed), list_seed
-    if episodes is not None or seed is not None:
-        raise InvalidInput(
-            f"{initial_states}: gives the worlds already; leave out the number of episodes and the seed, which would"
-            " draw others"
-        )
-    if initial_states.suffix.lower() in (".yaml", ".yml"):
-        worlds = NamedWorlds.read(initial_states).worlds_of(scenario, str(initial_states))
-    else:
-        worlds = scenario.read_worlds(initial_states)
-    return Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0), None

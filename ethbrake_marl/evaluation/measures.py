@@ -17,41 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.agents import Knowledge, Source
-from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, describe_error, unknown_name
-from ethbrake_marl.evaluation.inputs import (
-    HASHES,
-    hash_of_chunks,
-    result_identity,
-    result_versions,
-    scenario_sha256,
-    worlds_sha256,
-)
+from ethbrake_marl.evaluation.inputs import HASHES, hash_of_chunks, result_versions, scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.statistics import Moments, exact_sum, mean, rate
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.files.sheet import DASH, Column, Estimate, Row, Sheet, Shown
-from ethbrake_marl.harm import INJURY_CURVES, Declared, Ledger, injury_probability, scored
-from ethbrake_marl.limits import (
-    BestHarmTable,
-    Limits,
-    Unproven,
-    known_limits,
-    prove,
-    shipped_tables,
-    task_problem,
-    unproven_because,
-)
-from ethbrake_marl.physics import (
-    Bools,
-    Floats,
-    ImpactRows,
-    Ints,
-    Messages,
-    Worlds,
-    advance,
-    leaving_out_failed,
-    make_worlds,
-)
+from ethbrake_marl.harm import HARM_COUNTS, INJURY_CURVES, Declared, HarmCount, Ledger, injury_probability, scored
+from ethbrake_marl.limits import Limits, Unproven, known_limits
+from ethbrake_marl.physics import Bools, Floats, ImpactRows, Ints, Messages, Worlds, advance, make_worlds
 from ethbrake_marl.registry import Part, Registry
 from ethbrake_marl.scenario import QUANTITY, Scenario, Task, load_scenario
 
@@ -1271,86 +1244,6 @@ class Tape:
             else:
                 found |= {f"{metric.name}_{i + 1}": column.copy() for i, column in enumerate(values.T)}
         return found
-
-
-# The proven bounds of a list of worlds, beside the least harm known there.
-#
-# *Contact proven* is not *impact proven*: in the worlds between, every command leads to contact, and it is open whether
-# to an impact. Either vehicles get away with leaning on each other there, or the proof is loose. The harm of the best
-# known profiles in these very worlds tells which: next to none, or much.
-
-
-def proven_of_table(worlds: Worlds, task: Task, table: BestHarmTable) -> dict[str, Any] | None:
-    """What is proven about the worlds of a list, beside the least harms of a table; None where nothing is.
-
-    The mean harm (m2/s2) that no command undercuts under either count, the shares with proven contact and proven
-    impact, and ``Between``; None for what is not decided. Worlds that cannot be advanced are left out.
-    """
-
-    def of(rows: Ints) -> dict[str, Any] | None:
-        some = worlds.take(rows)
-        proof, identity = prove(some, task), task_problem(some, task).identity
-        if isinstance(proof, Unproven):
-            return None
-        known = (table.harm(identity, harm_count) for harm_count in HARM_COUNTS)
-        contact, impact = proof.contact, proof.impact
-        return {
-            "proven_harm": float(proof.harm.mean()),
-            "contact_proven_rate": None if contact is None else float(contact.mean()),
-            "impact_proven_rate": float(impact.mean()),
-            "between": None if contact is None else asdict(Between.of(contact, impact, *known)),
-        }
-
-    return leaving_out_failed(of, np.arange(worlds.n))[0]
-
-
-def shipped_bounds(tables: Iterable[BestHarmTable] | None = None) -> tuple[list[dict[str, Any]], Sheet]:
-    """The least harm known, the proven one, and the gap of every shipped table: plain data, and means as a sheet.
-
-    A header names a shipped scenario and a list of it, of which every world is compared; raises ``InvalidInput`` if
-    the table does not hold them. A gap is best known minus proven harm, as a share of the best known.
-    """
-    harm, share = partial(Column, digits=3), partial(Column, digits=1, scale=100.0, unit=" %")
-    columns = (
-        "list", Column("worlds"), harm("proven"), harm("best known, first"), share("gap"), harm("best known, total"),
-        share("gap"), share("contact proven"), share("impact proven"), share("between"),
-        harm("best known there, first"), share("next to none there"),
-    )  # fmt: skip
-    found, rows = [], []
-    for table in shipped_tables() if tables is None else tables:
-        header = table.header
-        scenario = load_scenario(header["scenario"])
-        names, seed = tuple(header["vehicles"]), int(header["list_seed"])
-        task = Task(scenario, tuple(scenario.vehicle_names.index(name) for name in names))
-        sample = scenario.sample(int(header["episodes"]), seed)
-        table.check_holds_any(task_problem(sample.worlds, task).identity)
-        why = unproven_because(sample.worlds, task)
-        proven = None if why is not None else proven_of_table(sample.worlds, task, table)
-        known = {c: float(table.best[c].harm.mean()) if c in table.best else None for c in HARM_COUNTS}
-        gaps: dict[str, float | None] = dict.fromkeys(known)
-        for harm_count, best in known.items():
-            if proven is not None and best is not None:
-                gaps[harm_count] = 1.0 - proven["proven_harm"] / best if best > 0.0 else 0.0
-        found.append({
-            **result_identity("best-harm", scenario, sample),
-            "scenario": scenario.name,
-            "vehicles": names,
-            "list_seed": seed,
-            "worlds": len(table.identity),
-            **{f"best_known_{harm_count}": best for harm_count, best in known.items()},
-            "proven": proven,
-            "nothing_proven_because": why,
-            **{f"gap_{harm_count}": gap for harm_count, gap in gaps.items()},
-        })  # fmt: skip
-        told = proven or {}
-        inside = told.get("between") or {}
-        rows.append((
-            f"{scenario.name} (seed {seed}){f': {why}' if why else ''}", f"{len(table.identity):,}",
-            told.get("proven_harm"), known["first"], gaps["first"], known["total"], gaps["total"],
-            told.get("contact_proven_rate"), told.get("impact_proven_rate"),
-            inside.get("rate"), inside.get("mean_first"), inside.get("harmless_rate"),
-        ))  # fmt: skip
-    return found, Sheet("", columns, rows)
 
 
 @dataclass(frozen=True, slots=True)

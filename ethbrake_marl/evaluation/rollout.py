@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.agents import Driver, Episodes, Knowledge, Team, check_agent, drive, script_agents
-from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.engine import check_alert, is_state_free
 from ethbrake_marl.errors import (
     AgentFailed,
@@ -25,7 +24,7 @@ from ethbrake_marl.errors import (
     renumbered,
     unknown_name,
 )
-from ethbrake_marl.evaluation.inputs import CHUNK, make_lineup, policies_of, warn_unfamiliar
+from ethbrake_marl.evaluation.inputs import CHUNK, EPISODES, LIST_SEED, make_lineup, policies_of, warn_unfamiliar
 from ethbrake_marl.evaluation.measures import REGISTERED, Evaluation, LeftOut, Outcome, Tape
 from ethbrake_marl.physics import (
     Decisions,
@@ -182,8 +181,8 @@ def evaluate(
     if isinstance(agents, Sequence):
         agents = make_lineup(agents, scenario)
     if worlds is None:
-        seed = DEFAULT.LIST_SEED if seed is None else seed
-        worlds = scenario.sample(DEFAULT.EPISODES if episodes is None else episodes, seed=seed)
+        seed = LIST_SEED if seed is None else seed
+        worlds = scenario.sample(EPISODES if episodes is None else episodes, seed=seed)
     elif episodes is not None:
         raise InvalidInput(f"evaluate: episodes = {episodes!r}: the worlds are given; leave one of the two out")
     _check_request(worlds, agents, chunk)

@@ -576,10 +576,10 @@ class FileSchema(GenerateJsonSchema):
         return {"$schema": DIALECT, **schema}
 
 
-def schema_lines(kind: str) -> str:
-    """The comment by which a new file names its schema, ``scenario`` or ``recipe``, and how that is got."""
+def schema_lines(kind: str, command: str) -> str:
+    """The comment by which a new file names its schema, ``scenario`` or ``recipe``, and the command that prints it."""
     return (
         f"# yaml-language-server: $schema={kind}.schema.json\n"
         "# Your editor completes and checks this file once that schema stands beside it:\n"
-        f"#   ethbrake {kind} schema > {kind}.schema.json\n"
+        f"#   ethbrake {command} > {kind}.schema.json\n"
     )

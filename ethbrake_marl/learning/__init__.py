@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.learning.training import (
         WORDS as WORDS,
         RunDirectory as RunDirectory,
+        Settings as Settings,
         Training as Training,
         TrainingRecipe as TrainingRecipe,
         algorithm_names as algorithm_names,

@@ -33,10 +33,10 @@ from torch.nn.functional import mse_loss, softplus
 from torch.optim import Optimizer
 
 from ethbrake_marl.actions import command_to_action
-from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.engine import Engine, Moment
 from ethbrake_marl.envs import EthBrakeVecEnv
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
+from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.learning.training import (
     Algorithm,
     CounterfactualRecipe,

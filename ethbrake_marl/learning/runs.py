@@ -29,7 +29,6 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
 from ethbrake_marl.agents import Driver, LearnedAgent, Team
-from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.engine import Arrays
 from ethbrake_marl.envs import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.errors import CorruptBundle, EthBrakeError, InvalidInput, OnProgress, Progress, Told, stop_on_signal
@@ -46,7 +45,7 @@ from ethbrake_marl.files.store import (
     remove_unfinished,
     write_file,
 )
-from ethbrake_marl.harm import objective_harm
+from ethbrake_marl.harm import HarmCount, objective_harm
 from ethbrake_marl.learning.algorithms import tensors_of
 from ethbrake_marl.learning.training import Algorithm, RunDirectory, RunStatus, Scheme, Training, TrainingRecipe
 from ethbrake_marl.policies import Float32s, NetworkSpec, Policy, PolicyTeam, Trained, installed_versions

@@ -30,8 +30,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pydantic.json_schema import models_json_schema
 from pydantic_core import ErrorDetails
 
-from ethbrake_marl.agents import AgentSettings, Driver, LearnedAgent, Source, Team
-from ethbrake_marl.defaults import HarmCount
+from ethbrake_marl.agents import AgentSettings, Driver, LearnedAgent, Source, Team, split_names
 from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput, unknown_name
 from ethbrake_marl.files.store import new_folder, parse_strict_json, read_object, read_plain, write_file
 from ethbrake_marl.files.yaml import (
@@ -48,6 +47,7 @@ from ethbrake_marl.files.yaml import (
     refuse,
     schema_lines,
 )
+from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.observations import ListedFeatures, ObservationSpec, choose_observation, listed_features
 from ethbrake_marl.policies import (
     SHIPPED,
@@ -314,7 +314,7 @@ class TrainingRecipe(FileModel):
 
     def text(self, head: str) -> str:
         """A commented YAML file below ``head``: all keys written out, one that the recipe leaves out in a comment."""
-        lines = [head, schema_lines("recipe")]
+        lines = [head, schema_lines("recipe", "train --schema")]
         values = self.model_dump(mode="json")
         for key in type(self).model_fields:
             value = values.get(key)
@@ -797,6 +797,8 @@ class Settings(NamedTuple):
     texts: tuple[str, ...]  # as they were given
     scenario: tuple[Override, ...]
     recipe: tuple[Override, ...]
+    harm_count: HarmCount = "first"  # that agents minimise
+    measures: tuple[str, ...] = ()  # that an evaluation tells beside the usual ones
 
     def change(self, recipe: TrainingRecipe, tell: Callable[[str], None] | None = None) -> TrainingRecipe:
         """The recipe with those of its settings that it has; ``tell`` hears what else may have to be changed."""
@@ -815,16 +817,20 @@ class Settings(NamedTuple):
         return changed
 
 
-def read_settings(texts: Sequence[str] | None, recipes: Sequence[TrainingRecipe] = ()) -> Settings:
+def read_settings(
+    texts: Sequence[str] | None, recipes: Sequence[TrainingRecipe] = (), *, of_agents: Sequence[str] = ()
+) -> Settings:
     """Tell the settings apart: ``mass_t=40`` and ``scenario.mass_t=40`` are the scenario's, ``gamma=0.9`` a recipe's.
 
-    Raises ``UnknownName`` with a suggestion for a key that neither has.
+    ``of_agents``: which of ``harm_count=total`` and ``measures=A,B`` may stand among them. Raises ``UnknownName`` with
+    a suggestion for a key that nobody has, ``InvalidInput`` for an unknown count.
     """
     known = {
         "scenario": {*Scenario.model_fields} - _NO_SETTING,
         "recipe": {key for recipe in recipes for key in type(recipe).model_fields} - _NO_SETTING,
+        "agents": {*of_agents},
     }
-    found: dict[str, list[Override]] = {"scenario": [], "recipe": []}
+    found: dict[str, list[Override]] = {owner: [] for owner in known}
     for override in Override.parse(texts or ()):
         if override.top == "recipe" and len(override.path) > 1 and not recipes:
             raise InvalidInput(f"--set {override.key}: this command takes no recipe, so nothing of one can be set")
@@ -836,7 +842,10 @@ def read_settings(texts: Sequence[str] | None, recipes: Sequence[TrainingRecipe]
         if len(owners) > 1:
             raise InvalidInput(f"--set {override.key}: write scenario.{override.key} or recipe.{override.key}")
         found[owners[0]].append(inside)
-    return Settings(tuple(texts or ()), tuple(found["scenario"]), tuple(found["recipe"]))
+    asked = {each.top: each.value for each in found["agents"]}
+    check_harm_count(count := asked.get("harm_count", "first"))
+    measures = tuple(split_names(str(asked["measures"]))) if "measures" in asked else ()
+    return Settings(tuple(texts or ()), tuple(found["scenario"]), tuple(found["recipe"]), count, measures)
 
 
 # The folder of a run: its files, its configuration, how far it came, and who may train in it.
@@ -882,8 +891,8 @@ class RunDirectory:
             if not is_run:
                 raise AlreadyExists(f"{path}: is there already, and is no run; give another name")
             raise AlreadyExists(
-                f"{path}: is there already; give another name (--name), go on with it (ethbrake train resume), or"
-                " replace it with force (--force; make run ARGS=--force)"
+                f"{path}: is there already; give another folder (--output), go on with it (ethbrake train --resume),"
+                " or replace it with force (--force; make run ARGS=--force)"
             )
         with new_folder(path, replace=replace) as partial:
             new = RunDirectory(partial)

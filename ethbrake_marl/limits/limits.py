@@ -36,11 +36,11 @@ from ethbrake_marl.agents import (
     record_commands,
     script_agents,
 )
-from ethbrake_marl.defaults import DEFAULT, HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError, check_one_learner
 from ethbrake_marl.files.arrays import ArrayArchive, ArrayRow
 from ethbrake_marl.files.store import parse_strict_json, read_plain, write_file
 from ethbrake_marl.files.yaml import first_mistake
+from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.limits.lower_bound import avoidability, extreme_profiles, lower_bound, onset_states, team_bound
 from ethbrake_marl.physics import (
     CLOCK,
@@ -309,6 +309,7 @@ def _used(ends: NDArray[np.int64]) -> NDArray[np.int64]:
 #
 # What is found is realised harm: an upper bound of the true minimum, never below it. See docs/best-harm.md.
 
+SEARCH_BUDGET = 100_000  # candidates per world and count
 CHUNK = 200  # worlds between two reports of progress
 LEFT_OUT = "left_out"  # key of a table's header: number in the list -> why the world is in no row
 CONSTANTS = 29  # even grid of constant commands from which every search also starts
@@ -322,7 +323,7 @@ def best_harm(
     *,
     counts: Sequence[HarmCount] = HARM_COUNTS,
     vehicles: Sequence[int] | None = None,
-    budget: int = DEFAULT.SEARCH_BUDGET,
+    budget: int = SEARCH_BUDGET,
     seed: int = 0,
     threads: int | None = None,
     known: BestHarmTable | None = None,
@@ -376,7 +377,7 @@ def search_list(
     *,
     counts: Sequence[HarmCount] = HARM_COUNTS,
     vehicles: Sequence[int] | None = None,
-    budget: int = DEFAULT.SEARCH_BUDGET,
+    budget: int = SEARCH_BUDGET,
     seed: int = 0,
     threads: int | None = None,
     known: BestHarmTable | None = None,
@@ -666,8 +667,8 @@ class Limits:
             f" the other {missing:,} ({100.0 * missing / len(known):.1f} %), whose best is not proven either. There the"
             " best agent of this evaluation stands in: regrets are lower bounds, and no share of the possible"
             " reduction is stated. A"
-            " table is made for one list; a longer list, or one of another version, has other worlds (ethbrake"
-            " search best-harm)"
+            " table is made for one list; a longer list, or one of another version, has other worlds"
+            " (search_list makes one)"
         )
 
 

@@ -20,9 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import InvalidInput, check_whole_number
-from ethbrake_marl.harm import check_harm_count, empty_ledger
+from ethbrake_marl.harm import HarmCount, check_harm_count, empty_ledger
 from ethbrake_marl.physics import (
     BOUND,
     CLOCK,

@@ -15,7 +15,6 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from ethbrake_marl.agents import Driver
-from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation import (
     Conditions,
@@ -30,6 +29,7 @@ from ethbrake_marl.evaluation import (
 from ethbrake_marl.figures import harm_by_agent, harm_in_parts, regret_distribution
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown
 from ethbrake_marl.files.store import write_output
+from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.limits import Unproven
 from ethbrake_marl.pages.page import Page, Part, Played, Section
 from ethbrake_marl.physics import Bools, Floats, Ints

@@ -17,17 +17,19 @@ from functools import partial
 from itertools import count, groupby, islice
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.defaults import DataDraw, DataFormat
 from ethbrake_marl.errors import InvalidInput, count_of, plain_text
 from ethbrake_marl.files.store import open_plain
 from ethbrake_marl.files.yaml import flow_text, parse_numeral
 from ethbrake_marl.physics import Bools, Floats, exp, log
 from ethbrake_marl.scenario.sampling import MOST_NUMBERS, QUANTITY
 from ethbrake_marl.scenario.schema import Scenario, check_file_name, load_scenario
+
+DataFormat = Literal["highd", "ngsim", "openacc"]
+DataDraw = Literal["rows", "normal", "lognormal", "quantiles"]  # how worlds are drawn from it
 
 PIECE, HEAD = 50_000, 10  # lines that are read at once, and those of which one names the columns
 LONGEST_LINE, LARGEST_BYTES = 1 << 16, 1 << 40  # characters; of a file

@@ -14,7 +14,6 @@ import numpy as np
 from pydantic import BaseModel, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName, unknown_name
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.files.yaml import (
@@ -31,7 +30,7 @@ from ethbrake_marl.files.yaml import (
     schema_lines,
     suggestion,
 )
-from ethbrake_marl.harm import check_harm_count
+from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.scenario.sampling import (
     DISTRIBUTIONS,
     LEARNER,
@@ -776,7 +775,7 @@ def new_scenario_text(name: str, based_on: str = "paper-random") -> str:
     if base.members:
         values["mixture"] = [_short_member(entry) for entry in values["mixture"]]
     keys = [f"\n# {_comment(key)}\n{_line(key, values)}\n" for key in Scenario.model_fields]
-    return _HEAD.format(name=name, based_on=base.name) + schema_lines("scenario") + "".join(keys)
+    return _HEAD.format(name=name, based_on=base.name) + schema_lines("scenario", "scenario schema") + "".join(keys)
 
 
 _EXAMPLES = {

@@ -7,13 +7,7 @@ from typing import TYPE_CHECKING, Any
 from ethbrake_marl.doors import front_door
 
 if TYPE_CHECKING:
-    from ethbrake_marl.shield.evidence import (
-        SAME_HARM as SAME_HARM,
-        VERDICTS as VERDICTS,
-        OperatingPoint as OperatingPoint,
-        operating_curves as operating_curves,
-        review as review,
-    )
+    from ethbrake_marl.shield.evidence import SAME_HARM as SAME_HARM, VERDICTS as VERDICTS, review as review
     from ethbrake_marl.shield.guard import (
         HybridAgent as HybridAgent,
         MovingAtHorizon as MovingAtHorizon,
@@ -25,7 +19,11 @@ if TYPE_CHECKING:
     )
     from ethbrake_marl.shield.sb3 import ShieldedVecEnv as ShieldedVecEnv
     from ethbrake_marl.shield.step_shield import ShieldReason as ShieldReason, StepShield as StepShield
-    from ethbrake_marl.shield.uncertainty import Uncertainty as Uncertainty, parse_uncertainty as parse_uncertainty
+    from ethbrake_marl.shield.uncertainty import (
+        UNCERTAINTY_EXAMPLE as UNCERTAINTY_EXAMPLE,
+        Uncertainty as Uncertainty,
+        parse_uncertainty as parse_uncertainty,
+    )
     from ethbrake_marl.shield.wrappers import (
         HybridShield as HybridShield,
         ShieldedEnv as ShieldedEnv,

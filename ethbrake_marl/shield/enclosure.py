@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.engine import Script
 from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import BOUND, Bools, Floats, Ints, Worlds, compiled
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.search import ProfileProblem

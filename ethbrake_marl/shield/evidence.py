@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -12,9 +12,7 @@ from ethbrake_marl.actions import action_to_command
 from ethbrake_marl.agents import Agent, AgentAround, Driver, Team, drive
 from ethbrake_marl.engine import Memory, Script
 from ethbrake_marl.errors import InvalidInput, count_of, renumbered
-from ethbrake_marl.physics import Bools, Decisions, Floats, Ints, LeftOutRows, Worlds, measured_without_failed
-from ethbrake_marl.scenario import Task
-from ethbrake_marl.shield.guard import Shielded, ShieldedDriver
+from ethbrake_marl.physics import Bools, Decisions, Floats, Ints, Worlds
 from ethbrake_marl.shield.step_shield import StepShield, proposed_action
 
 SAME_HARM = 1e-9  # harms (m2/s2) closer than this are one harm
@@ -75,47 +73,6 @@ def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: In
     }
     with renumbered(world):
         return drive(worlds.take(world), Team(again, "released"), scenario).ledger.world_harm(shield.harm_count)
-
-
-class OperatingPoint(NamedTuple):
-    """What the shield does at one allowance."""
-
-    allowance: float  # m2/s2 above the bound that certificates may reach
-    intervention_rate: float  # share of decisions, of all shielded vehicles together
-    harm: float  # mean over worlds (m2/s2)
-    left_out: LeftOutRows = ()  # worlds that could not be advanced: in no point, whichever allowance met them
-
-
-def operating_curves(
-    worlds: Worlds,
-    policies: Mapping[str, Driver],
-    task: Task,
-    allowances: Sequence[float] = ALLOWANCES,
-    *,
-    on_progress: Callable[[str], None] | None = None,
-) -> dict[str, list[OperatingPoint]]:
-    """Interventions against residual harm for each policy: one point per allowance, from none to very large.
-
-    A world that cannot be advanced in one of the cases is left out of all, and named in ``left_out``; ``on_progress``
-    is told each policy that is done. Raises ``PhysicsError`` where no world is left.
-    """
-
-    def measured(at: Ints) -> dict[str, list[OperatingPoint]]:
-        curves = {}
-        for name, policy in policies.items():
-            points = []
-            for allowance in allowances:
-                team = ShieldedDriver.around(policy, task, allowance=allowance)
-                found = Shielded.of(drive(worlds.take(at), team, task.scenario), task)
-                rate = float(found.replaced.sum() / (found.decisions.sum() * found.replaced.shape[1]))
-                points.append(OperatingPoint(float(allowance), rate, float(found.harm.mean())))
-            curves[name] = points
-            if on_progress is not None:
-                on_progress(name)
-        return curves
-
-    curves, _, left_out = measured_without_failed(measured, worlds.n)
-    return {name: [point._replace(left_out=left_out) for point in points] for name, points in curves.items()}
 
 
 class _Released(AgentAround):

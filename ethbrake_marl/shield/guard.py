@@ -42,7 +42,6 @@ from ethbrake_marl.agents import (
     check_agent,
     drive,
 )
-from ethbrake_marl.defaults import DEFAULT, HarmCount
 from ethbrake_marl.engine import (
     Engine,
     Guard,
@@ -55,6 +54,7 @@ from ethbrake_marl.engine import (
     take_memory,
 )
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep, check_one_learner, count_of, renumbered, unknown_name
+from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.observations import ObservationSpec
 from ethbrake_marl.physics import Bools, Floats, Ints, Vehicles, Worlds
 from ethbrake_marl.registry import Part
@@ -70,7 +70,13 @@ from ethbrake_marl.shield.step_shield import (
     proposed_actions,
     seen_columns,
 )
-from ethbrake_marl.shield.uncertainty import Uncertainty, check_amount, check_scenario, parse_uncertainty
+from ethbrake_marl.shield.uncertainty import (
+    UNCERTAINTY_EXAMPLE,
+    Uncertainty,
+    check_amount,
+    check_scenario,
+    parse_uncertainty,
+)
 
 # The options of a shield around an interface, and their checks, the same for every interface.
 
@@ -98,9 +104,7 @@ def checked_uncertainty(given: object) -> Uncertainty | None:
         return given
     if isinstance(given, str):
         return parse_uncertainty(given)
-    raise InvalidInput(
-        f"uncertainty = {given!r}: must be an Uncertainty or text, for instance {DEFAULT.UNCERTAINTY_EXAMPLE!r}"
-    )
+    raise InvalidInput(f"uncertainty = {given!r}: must be an Uncertainty or text, for instance {UNCERTAINTY_EXAMPLE!r}")
 
 
 def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None:
@@ -108,7 +112,7 @@ def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None
     uncertainty = checked_uncertainty(given)
     if (mode == "robust") != (uncertainty is not None):
         what = "needs an uncertainty" if uncertainty is None else "takes no uncertainty; robust does"
-        raise InvalidInput(f"{where}: mode {mode} {what}, for instance {DEFAULT.UNCERTAINTY_EXAMPLE}")
+        raise InvalidInput(f"{where}: mode {mode} {what}, for instance {UNCERTAINTY_EXAMPLE}")
     return uncertainty
 
 

@@ -58,10 +58,9 @@ from ethbrake_marl.agents import (
     script_agents,
     write_down,
 )
-from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.engine import Memory, Script, ask_script, begin_script, renew_memory, take_memory
 from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, renumbered, unknown_name
-from ethbrake_marl.harm import check_harm_count, front_share
+from ethbrake_marl.harm import HarmCount, check_harm_count, front_share
 from ethbrake_marl.physics import (
     CLOCK,
     GOES_ON,

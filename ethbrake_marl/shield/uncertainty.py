@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.defaults import DEFAULT
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.physics import Floats, Vehicles, Worlds
 from ethbrake_marl.scenario import QUANTITY, Scenario
@@ -50,7 +49,8 @@ QUANTITIES = (*OF_VEHICLES, "speeds_mps", "gaps_m", "friction")
 POSITIVE = ("braking_capacity_mps2", "mass_t", "friction", "brake_rate_mps3", "release_rate_mps3")  # must stay above 0
 _OF_FRICTION = (0.0, 0.125, 0.25, 0.375, 0.625, 0.75, 0.875, 1.0)  # shares of its interval; told is 0.5
 MOST_CORNERS = 1024  # of one world: each costs as much as the world itself
-_FORM = f"must be quantity=half-width, for instance {DEFAULT.UNCERTAINTY_EXAMPLE}"
+UNCERTAINTY_EXAMPLE = "braking_capacity_mps2=5%,latency_s=0.1,gaps_m.pair_1=0.5"
+_FORM = f"must be quantity=half-width, for instance {UNCERTAINTY_EXAMPLE}"
 
 _ENTRY = re.compile(
     r"(?P<name>\w+)(?:\.(?P<what>vehicle|pair)_(?P<number>[1-9]\d*))?\s*=\s*(?P<width>[^=%\s]+)(?P<share>%?)", re.ASCII
@@ -103,7 +103,7 @@ class Uncertainty:
                 f"uncertainty: intervals = {self.intervals!r}: must be a tuple of Interval; parse_uncertainty reads it"
             )
         if not self.intervals:
-            raise InvalidInput(f"uncertainty: no interval; one is needed, for instance {DEFAULT.UNCERTAINTY_EXAMPLE}")
+            raise InvalidInput(f"uncertainty: no interval; one is needed, for instance {UNCERTAINTY_EXAMPLE}")
         for k, one in enumerate(self.intervals):
             for other in self.intervals[:k]:
                 same = None in (one.place, other.place) or one.place == other.place
@@ -132,7 +132,7 @@ class Uncertainty:
         if corners > MOST_CORNERS:
             raise InvalidInput(
                 f"uncertainty: {len(sides)} uncertain numbers in each world make {corners} corners; at most"
-                f" {MOST_CORNERS} can be certified: name vehicles or pairs, for instance {DEFAULT.UNCERTAINTY_EXAMPLE}"
+                f" {MOST_CORNERS} can be certified: name vehicles or pairs, for instance {UNCERTAINTY_EXAMPLE}"
             )
         every = [shares[::-1] for shares in product(*ends)] if sides else []
         parts = [worlds] + [_placed(worlds, sides, shares.__getitem__) for shares in every]

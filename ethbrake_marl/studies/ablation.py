@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents import Driver, Team, make_agent, split_names
-from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import InvalidInput, OnProgress, Progress, check_whole_number, count_of
 from ethbrake_marl.evaluation import (
+    LIST_SEED,
     evaluate,
     interquartile_mean,
     load_runnable,
@@ -30,7 +30,7 @@ from ethbrake_marl.figures import Figure, ablation_figures, write_picture
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.files.yaml import Override
-from ethbrake_marl.harm import Ledger, objective_harm
+from ethbrake_marl.harm import HARM_COUNTS, HarmCount, Ledger, objective_harm
 from ethbrake_marl.learning import WORDS, RunDirectory, Training, TrainingRecipe, load_recipe, read_settings
 from ethbrake_marl.limits import BestHarmTable, best_harm, chunks_left, search_list, task_problem
 from ethbrake_marl.pages.page import Page, Part, Played, Section
@@ -259,7 +259,7 @@ class Plan:
         return "\n".join([line, *(f"{file}: is damaged; its worlds are searched again" for file in damaged)])
 
 
-def with_scheme(recipe: TrainingRecipe, scheme: str | None) -> TrainingRecipe:
+def with_scheme(recipe: TrainingRecipe, scheme: str | None = None) -> TrainingRecipe:
     """The recipe with this scheme for several learners; None: its own, else shared."""
     return recipe.replace(scheme=scheme or recipe.scheme or "shared")
 
@@ -271,7 +271,6 @@ def _algorithm(recipe: TrainingRecipe) -> str:
 def plan_ablation(
     levels: str | None,
     recipes: str,
-    scheme: str | None,
     settings: Sequence[str] | None,
     *,
     quick: bool = False,
@@ -286,11 +285,12 @@ def plan_ablation(
     names = [*(LADDER if quick else STANDARD)] if levels is None else split_names(levels, os.path.isfile)
     loaded = [load_recipe(each.strip()) for each in split_names(recipes, os.path.isfile)]
     changed = read_settings(settings, loaded)
+    usual = {"list_seed": LIST_SEED, **(_QUICK if quick else _FULL)}
     plan = Plan(
         levels=tuple(read_levels([each.strip() for each in names], changed.scenario)),
-        recipes=tuple(with_scheme(changed.change(recipe, tell), scheme) for recipe in loaded),
+        recipes=tuple(with_scheme(changed.change(recipe, tell)) for recipe in loaded),
         noted=changed.texts,
-        **{**(_QUICK if quick else _FULL), **{name: value for name, value in given.items() if value is not None}},
+        **{**usual, **{name: value for name, value in given.items() if value is not None}},
     )
     for name in ("seeds", "steps_per_learner", "episodes", "search_episodes", "budget"):
         check_whole_number(name, getattr(plan, name), 1)

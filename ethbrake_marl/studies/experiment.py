@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.agents import Agent, LearnedAgent
-from ethbrake_marl.defaults import DEFAULT, HarmCount
 from ethbrake_marl.errors import OnProgress, Progress, Unfamiliar, check_one_learner
 from ethbrake_marl.evaluation import (
+    EPISODES,
+    LIST_SEED,
     TESTS,
     Evaluation,
     SummaryRow,
@@ -35,6 +36,7 @@ from ethbrake_marl.evaluation import (
 from ethbrake_marl.figures import harm_against_total_gap, learning_curve, trajectories, write_picture
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import read_object, write_output
+from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.learning import RunDirectory, TrainingRecipe, TrainResult, train
 from ethbrake_marl.pages.page import Part
 from ethbrake_marl.pages.report import TRAINED_POLICY, Report
@@ -141,8 +143,8 @@ def run_experiment(
     recipe: TrainingRecipe,
     steps: int | None = None,
     seed: int | None = None,
-    episodes: int = DEFAULT.EPISODES,
-    list_seed: int = DEFAULT.LIST_SEED,
+    episodes: int = EPISODES,
+    list_seed: int = LIST_SEED,
     force: bool = False,
     settings: Sequence[str] = (),
     on_progress: OnProgress | None = None,

@@ -5,18 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
 from ethbrake_marl.agents import Driver
-from ethbrake_marl.defaults import DEFAULT, HarmCount, MeasureName
-from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
+from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number, unknown_name
 from ethbrake_marl.evaluation import NamedWorld, evaluate, make_lineup, states_of
+from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.physics import Floats, Ints
 from ethbrake_marl.scenario import Sample, Scenario
 
 # Measures of an agent's weakness, world by world.
+
+MeasureName = Literal["harm", "regret", "difference", "bound"]
+MEASURES: tuple[MeasureName, ...] = get_args(MeasureName)
+HINDSIGHT = "best_harm"  # the reference of regret, unless another is given
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,19 +116,20 @@ class Measure:
         return Falsified(sample, kept, tried.scores, int(above[0]) + 1 if len(above) else None)
 
     @classmethod
-    def of(
-        cls, name: MeasureName, agent: str, against: str | None, scenario: Scenario, harm_count: HarmCount
-    ) -> Measure:
-        """The measure of that name; raises ``InvalidInput`` for a reference that is missing or that nobody asks."""
+    def of(cls, name: str, agent: str, against: str | None, scenario: Scenario, harm_count: HarmCount) -> Measure:
+        """The measure of that name; raises ``InvalidInput`` for a reference that is missing or not asked for."""
+        chosen = next((each for each in MEASURES if each == name), None)
+        if chosen is None:
+            raise unknown_name("measure", name, MEASURES)
         if name in ("harm", "bound") and against is not None:
             raise InvalidInput(f"--against {against}: --measure {name} compares with nobody; use regret or difference")
         if name == "difference" and against is None:
             raise InvalidInput("--measure difference: compares two agents; say which is the other one, --against AGENT")
-        specs = [agent] if name in ("harm", "bound") else [agent, against or DEFAULT.HINDSIGHT]
+        specs = [agent] if name in ("harm", "bound") else [agent, against or HINDSIGHT]
         lineup = make_lineup(specs, scenario, harm_count=harm_count)
         if len(lineup) != len(specs):
             raise InvalidInput(f"agent {' or '.join(specs)}: stands for several agents; one is needed here")
-        return cls(name, lineup, scenario, harm_count)
+        return cls(chosen, lineup, scenario, harm_count)
 
 
 # An adaptive search of the unit cube for the points of highest score, of which several far apart are wanted.

@@ -13,12 +13,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents import split_names
-from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import InvalidInput, OnProgress, count_of
 from ethbrake_marl.evaluation import interquartile_mean, result_identity, worlds_sha256
 from ethbrake_marl.figures import SeedCurve, seed_curves, write_picture
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import write_output
+from ethbrake_marl.harm import HARM_COUNTS
 from ethbrake_marl.learning import RunDirectory, Training, TrainingRecipe, load_recipe
 from ethbrake_marl.policies import load_policy
 from ethbrake_marl.scenario import Scenario

@@ -7,8 +7,8 @@ import ethbrake_marl as eb
 from ethbrake_marl import search
 from ethbrake_marl.agents import Searched, drive, make_agent, optimise_coupled, script_agents
 from ethbrake_marl.agents.planner import Planner
-from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import PhysicsError
+from ethbrake_marl.harm import HARM_COUNTS
 from ethbrake_marl.search import profile_problem
 from tests.fixtures.asked import Asked
 

@@ -8,8 +8,10 @@ import shlex
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -18,9 +20,10 @@ from numba.core import event
 from rich.console import Console
 
 from ethbrake_marl import __version__
-from ethbrake_marl.cli import app as frame, command
+from ethbrake_marl.cli import app as frame
 from ethbrake_marl.cli.app import app, run_command, whole_command
-from ethbrake_marl.cli.command import DEFAULTS, MOVED, Commands, Out
+from ethbrake_marl.cli.command import Out
+from ethbrake_marl.evaluation import EPISODES, LIST_SEED
 from ethbrake_marl.physics.compiling import compiled
 from tests.cli.conftest import Command, check_refused, told_json
 
@@ -28,7 +31,6 @@ ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = [""]  # every one, groups too
 for name, found in whole_command().commands.items():
     COMMANDS += [name, *(f"{name} {each}" for each in getattr(found, "commands", ()))]
-COMMANDS += [f"watch picture {each}" for each in whole_command().commands["watch"].commands["picture"].commands]
 
 
 @pytest.mark.parametrize("words", COMMANDS)
@@ -44,27 +46,30 @@ def test_help__has_examples_that_parse_and_a_short_name(
     assert len(examples) == (2 if "\nCommands:" in answer.out else 1)
     for example in examples:
         arguments = shlex.split(example.partition(" >")[0])
-        default = DEFAULTS.get(words.split()[0]) if words else None
-        assert " ".join(arguments).startswith(words.removesuffix(f" {default}"))
+        assert " ".join(arguments).startswith(words)
         assert ethbrake(*arguments, "--help").status == 0
 
 
-@pytest.mark.parametrize("old", sorted(MOVED))
-def test_old_name__is_told_its_new_place(ethbrake: Command, old: str) -> None:
-    told = f"ethbrake: error: {old} is now: {MOVED[old]} (see: ethbrake --help)\n"
-    assert MOVED[old] in COMMANDS and ethbrake(old, "--frob").err == told
+def test_command_line__is_small_enough_to_be_read() -> None:
+    leaves = [each for each in _leaves(whole_command())]
+    assert len(leaves) <= 24
+    for command in leaves:
+        options = {option for each in command.params for option in each.opts if option.startswith("--")}
+        assert len(options - {"--plugin"}) <= 12, command.name
 
 
-def test_default_command__has_its_options_on_the_page_of_its_group_and_behind_its_name(ethbrake: Command) -> None:
-    for group, default in DEFAULTS.items():
-        page, own = ethbrake(group, "--help").out, ethbrake(group, default, "--help").out
-        options = own.partition("\nOptions:\n")[2].partition("\n\n")[0]
-        assert "--json" in options and options in page
-    assert ethbrake("doctor", "check", "--json").out == ethbrake("doctor", "--json").out
+def _leaves(command: Any) -> Iterator[Any]:
+    inside = getattr(command, "commands", None)
+    yield from [command] if inside is None else (leaf for each in inside.values() for leaf in _leaves(each))
 
 
-def test_help__tells_the_parts_of_the_package_without_importing_them() -> None:
-    assert command.part_names() == command.PARTS
+def test_help__says_the_list_that_the_package_has(ethbrake: Command) -> None:
+    told = " ".join(ethbrake("evaluate", "--help").out.split())
+    assert f"[default: ({EPISODES})]" in told and f"[default: ({LIST_SEED})]" in told
+    assert all(
+        f"[default: {each}]" in " ".join(ethbrake("run", "--help").out.split()) for each in (EPISODES, LIST_SEED)
+    )
+    assert f"[default: {LIST_SEED}]" in ethbrake("watch", "--help").out
 
 
 @pytest.mark.parametrize(
@@ -151,7 +156,7 @@ def test_defect_of_the_program__keeps_its_traceback_and_missing_memory_is_one_li
     with pytest.raises(RuntimeError, match="a defect"):
         ethbrake("scenario", "list")
     short = Mock(side_effect=MemoryError("Unable to allocate 9 TiB"))
-    monkeypatch.setattr("ethbrake_marl.evaluation.inputs.choose_worlds", short)
+    monkeypatch.setattr("ethbrake_marl.evaluation.evaluate_held", short)
     check_refused(ethbrake("evaluate"), "not enough memory (Unable to allocate 9 TiB)", "fewer worlds")
 
 
@@ -247,17 +252,8 @@ def test_progress__on_a_terminal_each_part_has_one_bar_above_what_comes_next(mon
 
 
 def test_command__ctrl_c_is_one_line_and_the_status_of_an_interruption(capsys) -> None:
-    group = Commands()
-
-    @group.add("wait", "wait", kept="what was found is kept")
-    def wait(out: Out) -> None:
-        """Wait."""
+    with pytest.raises(typer.Exit) as raised, Out(kept="what was found is kept"):
         raise KeyboardInterrupt
-
-    (registered,) = group.registered_commands
-    assert registered.callback is not None
-    with pytest.raises(typer.Exit) as raised:
-        registered.callback()
     assert raised.value.exit_code == 130
     assert capsys.readouterr().err == "interrupted; what was found is kept\n"
 

@@ -1,10 +1,11 @@
-"""``ethbrake doctor``: what it finds wrong, what it compiles, what it measures. No speed is asserted."""
+"""``ethbrake doctor``: what it finds wrong, what it compiles; and measures of speed. No speed is asserted."""
 
 import dataclasses
 import math
 import re
 import time
-from unittest.mock import Mock, call
+from typing import Any
+from unittest.mock import Mock
 
 import numba
 import numpy as np
@@ -18,9 +19,11 @@ from ethbrake_marl.cli.doctor import Check, diagnose
 from ethbrake_marl.envs import make_engine
 from ethbrake_marl.kernel_store import cache_folder
 from ethbrake_marl.physics import advance
-from ethbrake_marl.studies import speed, speed as benchmark
-from ethbrake_marl.studies.speed import BENCHMARKS, Benchmark, Effort, Speed, braking, measure, rates, this_machine
+from ethbrake_marl.studies.machine import this_machine
 from tests.cli.conftest import Command, told_json
+from tests.docs.site import load
+
+benchmark = load("../studies/speed")
 
 
 def found(name: str) -> tuple[bool, str]:
@@ -115,37 +118,10 @@ def test_compile__leaves_nothing_to_compile(ethbrake: Command) -> None:
     assert set(cache_folder().iterdir()) == kernels
 
 
-SPEEDS = (
-    Speed("engine step", "of a test", 1024, 3, "world-steps/s", 9_876_543.0, 9_000_000.0, 10_000_000.0, 8e6),
-    Speed("import and first step", "of a test", 1, 3, "s", 0.91, 0.9, 0.95, 2.0),
-    Speed("sampling", "of a test", 10_000, 3, "worlds/s", 512.0, 500.0, 540.0),
-)
+# ---------------------------------------------------------------- speed, of docs/studies
 
 
-def test_speed__prints_a_table_and_the_machine_or_json(ethbrake: Command, monkeypatch) -> None:
-    look = [Mock(return_value=np.array([each.lowest, each.value, each.highest])) for each in SPEEDS]
-    measured = [
-        Benchmark(told.name, told.workload, told.unit, told.worlds, told.floor, values)
-        for told, values in zip(SPEEDS, look, strict=True)
-    ]
-    monkeypatch.setattr(speed, "BENCHMARKS", tuple(measured))
-    lines = ethbrake("doctor", "speed").out.splitlines()
-    rows = {cells[0]: cells[1:] for cells in (re.split(r"  +", line.strip()) for line in lines)}
-    assert rows["engine step"] == ["1,024", "9.88 M world-steps", "9.00 M - 10.0 M", "29.6 M", "8.00 M"]
-    assert rows["import and first step"][1:] == ["0.91 s", "0.9 - 0.95", "2"]
-    assert "512 worlds" in rows["sampling"] and lines[-1].startswith(f"Machine: {this_machine().processor}, ")
-    answer = ethbrake("doctor", "speed", "--quick", "--json")
-    told = told_json(answer)
-    assert [figure["name"] for figure in told["figures"]] == [each.name for each in SPEEDS]
-    assert (told["figures"][0]["value"], told["figures"][0]["relative"]) == (9_876_543.0, 1.0)
-    assert told["machine"]["cores"] >= 1 and told["machine"]["processor"] and "speed: 1 of 3" in answer.err
-    assert [each.call_args_list for each in look] == [[call(speed.FULL), call(speed.QUICK)]] * 3
-
-
-# ---------------------------------------------------------------- speed
-
-
-SHORT = Effort(1, 1e-6)
+SHORT = benchmark.Effort(1, 1e-6)
 
 
 def test_rates__are_work_per_processor_second_without_the_first_round(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,16 +132,16 @@ def test_rates__are_work_per_processor_second_without_the_first_round(monkeypatc
         return 10
 
     monkeypatch.setattr(time, "process_time", lambda: clock[0])
-    assert rates(work, Effort(2, 0.5)).tolist() == [10.0, 40.0]
+    assert benchmark.rates(work, benchmark.Effort(2, 0.5)).tolist() == [10.0, 40.0]
 
 
 def test_measure__sets_world_steps_against_the_first_figure(monkeypatch: pytest.MonkeyPatch) -> None:
-    def figure(unit: str, *values: float) -> Benchmark:
-        return Benchmark("x", "y", unit, 5, None, lambda effort: np.array(values))
+    def figure(unit: str, *values: float) -> Any:
+        return benchmark.Benchmark("x", "y", unit, 5, None, lambda effort: np.array(values))
 
     figures = (figure("world-steps/s", 7.0, 8.0, 9.0), figure("s", 4.0), figure("world-steps/s", 1.0, 2.0, 2.0))
     monkeypatch.setattr(benchmark, "BENCHMARKS", figures)
-    found = measure()
+    found = benchmark.measure()
     assert [speed.relative for speed in found] == [1.0, None, 0.25]
     assert [(speed.lowest, speed.value, speed.highest) for speed in found] == [(7, 8, 9), (4, 4, 4), (1, 2, 2)]
 
@@ -176,13 +152,13 @@ def test_braking__counts_world_steps_to_rest() -> None:
     steps = 0
     while worlds.speeds_mps.any():
         worlds, steps = advance(worlds, command, 0.1)[0], steps + 1
-    assert braking(5, 1.0)() == 5 * steps and steps > 20
+    assert benchmark.braking(5, 1.0)() == 5 * steps and steps > 20
 
 
 @pytest.mark.parametrize(
-    "each", [pytest.param(each, marks=pytest.mark.slow if each.unit == "s" else ()) for each in BENCHMARKS]
+    "each", [pytest.param(each, marks=pytest.mark.slow if each.unit == "s" else ()) for each in benchmark.BENCHMARKS]
 )
-def test_benchmarks__each_measures_something(each: Benchmark) -> None:
+def test_benchmarks__each_measures_something(each: Any) -> None:
     speed = each.measure(SHORT)
     assert each.workload and each.worlds >= 1 and 0.0 < speed.lowest == speed.value == speed.highest < math.inf
 

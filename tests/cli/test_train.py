@@ -1,7 +1,8 @@
-"""``ethbrake run``, ``train`` with ``resume`` and ``curves``, ``agent export``, on trainings of a few small updates."""
+"""``ethbrake run``, ``train``, ``agent export``, and learning curves, on trainings of a few small updates."""
 
 import inspect
 import json
+import re
 import shutil
 import signal
 import sys
@@ -18,11 +19,13 @@ import yaml
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.command import Out
+from ethbrake_marl.errors import InvalidInput, Progress
 from ethbrake_marl.evaluation.inputs import make_lineup, scenario_sha256, worlds_sha256
 from ethbrake_marl.figures import learning_curve
 from ethbrake_marl.studies import experiment
 from ethbrake_marl.studies.experiment import telling_world, write_figures
-from tests.cli.conftest import TINY_RECIPE, Answer, Command, check_refused, rows_of, told_json
+from ethbrake_marl.studies.learning_curves import LearningCurves
+from tests.cli.conftest import TINY_RECIPE, Command, check_refused, rows_of, told_json
 
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "trained policy", "hybrid"]
 SCENARIO = eb.load_scenario("paper-random")
@@ -114,9 +117,18 @@ def test_run__json_prints_the_rows_alone_and_force_replaces(ethbrake, tiny_recip
 
 
 @pytest.mark.slow
-def test_run__vehicle_chooses_among_several_learners(ethbrake, tiny_recipe, scenario_file, tmp_path) -> None:
+def test_run__roles_choose_among_several_learners(ethbrake, tiny_recipe, scenario_file, tmp_path) -> None:
     scenario = scenario_file("\n  vehicle_3: full_brake\n", "\n  vehicle_3: learner\n")
-    chosen = ["--scenario", scenario, "--vehicle", "vehicle_3", "--episodes", "20", "--output", tmp_path / "new"]
+    chosen = [
+        "--scenario",
+        scenario,
+        "--set",
+        "roles.vehicle_2=full_brake",
+        "--episodes",
+        "20",
+        "--output",
+        tmp_path / "new",
+    ]
     rows = told_json(ethbrake("run", "--recipe", tiny_recipe, *chosen, "--json"))
     assert {row["parameters"]["controlled_vehicle"] for row in rows} == {"vehicle_3"}
     assert not (tmp_path / "new" / "other_tests.json").exists()  # not one of the three tests
@@ -149,7 +161,7 @@ def test_run__interrupted_evaluates_the_policy_so_far_and_goes_on_as_a_training(
     assert last.startswith("interrupted after 128 training steps") and str(folder) in last
     assert status_of(folder, "status", "steps", "stage") == ("interrupted", 128, "report")
     assert "interrupted" in (folder / "report.html").read_text()
-    assert ethbrake("train", "resume", folder).status == 0
+    assert ethbrake("train", "--resume", folder).status == 0
     assert status_of(folder, "status", "steps") == ("finished", 256)
 
 
@@ -178,7 +190,17 @@ def test_run__with_sac_all_minimise_the_harm_it_is_for(ethbrake, tiny_sac, tmp_p
     rows = told_json(ethbrake("run", "--recipe", tiny_sac, *total, "--json"))
     assert [row["agent"] for row in rows][-2:] == ["trained policy", "hybrid"]
     agents = f"full_brake,e_v2x_bm,sac@{folder}+episode"
-    asked = ("--episodes", "20", "--harm-count", "total", "--output", tmp_path / "w", "--per-world", "csv", "--json")
+    asked = (
+        "--episodes",
+        "20",
+        "--set",
+        "harm_count=total",
+        "--output",
+        tmp_path / "w",
+        "--per-world",
+        "csv",
+        "--json",
+    )
     for row, then in zip(
         told_json(ethbrake("evaluate", "--agents", agents, *asked)), (rows[0], rows[1], rows[4]), strict=True
     ):
@@ -217,13 +239,13 @@ def test_train__names_its_folder_and_ends_at_the_number_that_it_announces(ethbra
 def test_train__by_a_scheme_leaves_a_team_that_evaluate_takes(ethbrake, tiny_recipe, tmp_path) -> None:
     scenario, folder = ("--scenario", "cooperation-3-pair"), tmp_path / "run"
     told = "policy/vehicle_2 drives vehicle_2; policy/vehicle_3 drives vehicle_3"
-    answer = ethbrake("train", *scenario, "--recipe", tiny_recipe, "--scheme", "independent", "--output", folder)
+    answer = ethbrake("train", *scenario, "--recipe", tiny_recipe, "--set", "scheme=independent", "--output", folder)
     assert answer.status == 0 and f"scheme independent: {told}" in answer.err
     words = ("--episodes", "20", "--agents", f"ppo@{folder},team@{folder}", "--json")
     alone, team = told_json(ethbrake("evaluate", *scenario, *words))
     assert alone["first_impact_harm"] == team["first_impact_harm"]
     check_refused(ethbrake("evaluate", *scenario, "--agents", f"sac@{folder}"), "was trained by PPO", f"ppo@{folder}")
-    check_refused(ethbrake("train", "resume", folder), "evaluate --scenario cooperation-3-pair --agents team@")
+    check_refused(ethbrake("train", "--resume", folder), "evaluate --scenario cooperation-3-pair --agents team@")
 
 
 def test_resume__goes_on_and_says_what_is_next(ethbrake, tiny_recipe, tmp_path, monkeypatch) -> None:
@@ -233,26 +255,29 @@ def test_resume__goes_on_and_says_what_is_next(ethbrake, tiny_recipe, tmp_path, 
         answer = ethbrake("train", "--recipe", tiny_recipe, "--output", folder)
     assert answer.status == 130 and status_of(folder, "policy") == ("policy",)
     last = answer.err.splitlines()[-1]
-    assert "interrupted after 128 training steps" in last and f"go on with: ethbrake train resume {folder}" in last
-    told = told_json(ethbrake("train", "resume", folder, "--json"))
+    assert "interrupted after 128 training steps" in last and f"go on with: ethbrake train --resume {folder}" in last
+    told = told_json(ethbrake("train", "--resume", folder, "--json"))
     assert (told["status"], told["steps"]) == ("finished", 256)
-    again = ethbrake("train", "resume", folder)
+    again = ethbrake("train", "--resume", folder)
     check_refused(again, "has finished", "ethbrake evaluate --scenario paper-random --agents ppo@")
 
 
 # Learning curves
 
 
-def test_curves__one_command_trains_draws_and_goes_on(ethbrake, tiny_recipe, tiny_sac, tmp_path, monkeypatch) -> None:
+def test_curves__are_trained_drawn_and_gone_on_with(tiny_recipe, tiny_sac, tmp_path) -> None:
     folder = tmp_path / "curves"
-    arguments = ("train", "curves", "--recipes", f"{tiny_recipe}:2,{tiny_sac}:2", "--output", folder, "--json")
-    with monkeypatch.context() as patch:
-        ctrl_c_when(patch, lambda shown: shown["name"] == "tiny-seed1" and shown["done"] == 128)
-        answer = ethbrake(*arguments)
-    assert answer.status == 130 and "the same command goes on" in answer.err
+    curves = LearningCurves(SCENARIO, LearningCurves.parse(f"{tiny_recipe}:2,{tiny_sac}:2"), folder)
+
+    def press(progress: Progress) -> None:
+        if (progress.name, progress.done) == ("tiny-seed1", 128):
+            signal.raise_signal(signal.SIGINT)
+
+    assert not curves.train(tell=press)
     manifest = folder / "tiny-seed0" / "policy" / "manifest.json"
     kept = manifest.stat().st_mtime_ns
-    summary = told_json(ethbrake(*arguments))
+    assert curves.train()
+    summary = curves.write()
     assert manifest.stat().st_mtime_ns == kept
     assert (folder / "learning_curves.png").read_bytes().startswith(b"\x89PNG")
     rows = [row for row in rows_of(folder / "learning_curves.csv") if row["figure"] != "return"]
@@ -268,32 +293,34 @@ def test_curves__one_command_trains_draws_and_goes_on(ethbrake, tiny_recipe, tin
     assert told["worlds_sha256"] == worlds_sha256(fixed.worlds, fixed.index)
     policies = [eb.load_policy(folder / f"tiny-seed{seed}").manifest.manifest_sha256 for seed in (0, 1)]
     assert told["policy_sha256"] == policies
-    assert ethbrake(*arguments, "--against", "cpu").status == 0
+    curves._replace(against="cpu").write()
     spent = [float(row["cpu_s"]) for row in rows_of(folder / "learning_curves.csv")[:3]]
     assert 0.0 <= spent[0] < spent[1] < spent[2]
 
 
 def test_curves__another_training_or_an_edited_scenario_is_told_before_any_is_begun(
-    ethbrake, tiny_recipe, scenario_file, tmp_path
+    tiny_recipe, scenario_file, tmp_path
 ) -> None:
     folder, other = tmp_path / "curves", tmp_path / "other.yaml"
     other.write_text(yaml.safe_dump({**TINY_RECIPE, "gamma": 0.9}))
 
-    def curves(recipes: str, old: str, new: str) -> Answer:
-        words = ("train", "curves", "--recipes", recipes, "--output", folder, "--scenario")
-        return ethbrake(*words, scenario_file(old, new))
+    def curves(recipes: str, old: str, new: str) -> None:
+        asked = LearningCurves(eb.load_scenario(scenario_file(old, new)), LearningCurves.parse(recipes), folder)
+        assert asked.train()
+        asked.write()
 
-    assert curves(f"{tiny_recipe}:1", "horizon_s: 8", "horizon_s: 8").status == 0
+    curves(f"{tiny_recipe}:1", "horizon_s: 8", "horizon_s: 8")
     drawn = (folder / "learning_curves.json").stat().st_mtime_ns
     for recipes, horizon, what in (
         (f"{tiny_recipe}:1", "horizon_s: 9", "scenario horizon_s"),
         (f"ppo:1,{other}:1", "horizon_s: 8", "recipe gamma"),
     ):
         told = f"tiny-seed0: holds another training (here other: {what}); give another folder"
-        check_refused(curves(recipes, "horizon_s: 8", horizon), told)
+        with pytest.raises(InvalidInput, match=re.escape(told)):
+            curves(recipes, "horizon_s: 8", horizon)
     assert (folder / "learning_curves.json").stat().st_mtime_ns == drawn and not (folder / "ppo-seed0").exists()
-    words = curves(f"{tiny_recipe}:1", 'title: "One line for lists and figures"', 'title: "Another line"')
-    assert words.status == 0  # words change no training: its result is kept
+    # Words change no training: its result is kept.
+    curves(f"{tiny_recipe}:1", 'title: "One line for lists and figures"', 'title: "Another line"')
 
 
 def test_export__writes_onnx(ethbrake: Command, finished_run: Path, tmp_path: Path, monkeypatch) -> None:

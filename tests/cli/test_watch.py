@@ -1,8 +1,7 @@
-"""``ethbrake evaluate``, ``compare``, ``watch``, ``search falsify``, ``shield``, ``reproduce``: what they leave."""
+"""``ethbrake evaluate``, ``compare``, ``watch``, ``study falsify``, ``shield``, ``reproduce``: what they leave."""
 
 import hashlib
 import json
-import re
 import shutil
 import subprocess
 import sys
@@ -14,12 +13,13 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_ind
 
+import ethbrake_marl as eb
 from ethbrake_marl.agents import registry
 from ethbrake_marl.agents.registry import Entry, Team, make_agent
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import NamedWorlds, check_agents, make_lineup
-from ethbrake_marl.evaluation.results import compare_results, read_result
+from ethbrake_marl.evaluation.results import compare_results, read_result, write_per_world
 from ethbrake_marl.evaluation.statistics import mean, paired_difference, unpaired_difference
 from ethbrake_marl.files import python_file
 from ethbrake_marl.files.sheet import Estimate
@@ -27,7 +27,6 @@ from ethbrake_marl.policies import shipped_policies
 from ethbrake_marl.scenario import Scenario, load_scenario
 from tests.cli.conftest import Command, check_refused, rows_of, told_json
 from tests.failing_worlds import plant
-from tests.fixtures.pictures import EMPTY
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENARIO = load_scenario("paper-random")
@@ -36,47 +35,24 @@ LIST = ("evaluate", "--agents", "full_brake", "--episodes", "2300", "--seed", "1
 
 
 def test_evaluate__the_harm_count_is_what_agents_lower(ethbrake: Command) -> None:
-    arguments = ("evaluate", "--episodes", "200", "--agents", "e_v2x_bm", "--json", "--harm-count")
-    (first,), (total,) = (told_json(ethbrake(*arguments, count)) for count in ("first", "total"))
+    arguments = ("evaluate", "--episodes", "200", "--agents", "e_v2x_bm", "--json", "--set")
+    (first,), (total,) = (told_json(ethbrake(*arguments, f"harm_count={count}")) for count in ("first", "total"))
     assert total["total_harm"] < first["total_harm"] and total["first_impact_harm"] > first["first_impact_harm"]
 
 
-def test_evaluate__a_world_computed_by_hand(ethbrake: Command, tmp_path: Path) -> None:
+def test_evaluate__a_world_computed_by_hand(tmp_path: Path) -> None:
     # Vehicle 2 at 10 m/s coasts 5 m in its 0.5 s and brakes the last 3 m with 7 m/s2 towards a standing Vehicle 1:
     # closing speed squared 10^2 - 2 * 7 * 3 = 58. Vehicle 3 stands 5 km behind. In the second world nobody moves.
-    worlds, out = tmp_path / "mine.csv", tmp_path / "new" / "worlds.csv"
-    worlds.write_text(
-        "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps,restitution\n8,5000,0,10,0,0\n8,5000,0,0,0,0\n"
-    )
-    words = (
-        "--initial-states",
-        worlds,
-        "--agents",
-        "full_brake",
-        "--output",
-        out.parent,
-        "--per-world",
-        "csv",
-        "--json",
-    )
-    (row,) = told_json(ethbrake("evaluate", *words))
-    told = row["episodes"], row["collision_rate"], row["first_impact_harm"]
+    own, out = tmp_path / "mine.csv", tmp_path / "worlds.csv"
+    own.write_text("gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps,restitution\n8,5000,0,10,0,0\n8,5000,0,0,0,0\n")
+    found = eb.evaluate(SCENARIO.read_worlds(own), "full_brake", scenario=SCENARIO)
+    (row,) = eb.summarise(found)
+    told = row.episodes, row.collision_rate.value, row.first_impact_harm.value
     assert told == (2, 0.5, pytest.approx(29.0, rel=1e-12))
+    write_per_world(out, found)
     columns = ("total_harm", "collided", "impacts", "final_gap_1_m")
     hit, still = ([float(each[name]) for name in columns] for each in rows_of(out))
     assert hit[:3] == [pytest.approx(58.0, rel=1e-12), 1.0, 1.0] and still == [0.0, 0.0, 0.0, 8.0]
-
-
-def test_by__writes_every_group_down(ethbrake: Command, tmp_path: Path) -> None:
-    out = tmp_path / "new"
-    command = ("evaluate", "--scenario", "mixture-delays", "--agents", "full_brake,coast", "--episodes", "30")
-    assert ethbrake(*command, "--by", "scenario", "--output", out, "--per-world", "csv").status == 0
-    found = [row["groups"] for row in json.loads((out / "results.json").read_text())]
-    sizes = {"paper-delay-high": 11, "paper-delay-low": 8, "paper-delay-middle": 11}
-    assert [{name: (each["episodes"], each["agent"]) for name, each in groups.items()} for groups in found] == [
-        {name: (size, agent) for name, size in sizes.items()} for agent in ("full_brake", "coast")
-    ]
-    assert sum(row["scenario"] == "paper-delay-low" for row in rows_of(out / "worlds.csv")) == 16
 
 
 def test_standards__full_braking_passes_as_published_and_is_struck_by_every_follower(ethbrake: Command) -> None:
@@ -92,22 +68,12 @@ def test_standards__full_braking_passes_as_published_and_is_struck_by_every_foll
     speed = 16.667
     way = 10.0 + 0.2 * speed + speed**2 / 18.0 - 0.75 * speed
     assert hardest == pytest.approx(3.6 * (speed**2 - 2.0 * 7.59 * way) ** 0.5, rel=1e-6)
-    refused = ethbrake(*words, "--by", "scenario")
-    assert refused.status == 2 and "--by: standards is a group of 10 scenarios; give one of them" in refused.err
-
-
-def test_evaluate__prints_the_papers_rows_where_they_are_asked_for_and_fit(ethbrake: Command) -> None:
-    words = ("evaluate", "--agents", "full_brake", "--episodes", "5")
-    assert "paper, random test" not in ethbrake(*words).out and "paper, random test" in ethbrake(*words, "--paper").out
-    for other in (("--scenario", "stress-wide"), ("--set", "mass_t=5"), ("--vehicle", "vehicle_3")):
-        check_refused(
-            ethbrake(*words, *other, "--paper"), "paper: the paper's rows are about Vehicle 2", "leave paper out"
-        )
-    check_refused(ethbrake(*words, "--scenario", "standards", "--paper"), "--paper: standards is a group")
+    refused = ethbrake(*words, "--jobs", "2")
+    assert refused.status == 2 and "--jobs: standards is a group of 10 scenarios; give one of them" in refused.err
 
 
 def test_benchmark__shares_are_those_of_each_scenario_alone(ethbrake: Command) -> None:
-    words = ("--agents", "full_brake,coast", "--episodes", "10", "--harm-count", "total", "--json")
+    words = ("--agents", "full_brake,coast", "--episodes", "10", "--set", "harm_count=total", "--json")
     told = told_json(ethbrake("evaluate", "--scenario", "benchmark", *words))
     assert len({row["scenario"] for row in told}) == 10 and len(told) == 20
     shares = {(row["scenario"], row["agent"]): row["share_of_possible_reduction"] for row in told}
@@ -181,19 +147,13 @@ def test_evaluate__by_force_leaves_no_file_of_earlier_results(ethbrake: Command,
 
 
 def test_evaluate__a_list_that_is_not_held_tells_what_needs_no_proof(ethbrake: Command, monkeypatch) -> None:
-    line = ("evaluate", "--agents", "full_brake,coast", "--episodes", "600", "--objective", "own", "--json")
+    line = ("evaluate", "--agents", "full_brake,coast", "--episodes", "600", "--json")
     held = told_json(ethbrake(*line))
     monkeypatch.setattr("ethbrake_marl.evaluation.inputs.HELD", 500)
     flat = told_json(ethbrake(*line))
     for one, other in zip(flat, held, strict=True):
         assert one["parameters"]["no_limits_because"]
-        for name in (
-            "first_impact_harm",
-            "total_harm_interval",
-            "collision_rate_interval",
-            "objectives",
-            "worlds_sha256",
-        ):
+        for name in ("first_impact_harm", "total_harm_interval", "collision_rate_interval", "worlds_sha256"):
             assert one[name] == other[name], name
         assert one["mean_regret"] is None is not other["mean_regret"]
 
@@ -286,7 +246,7 @@ def test_compare__a_run_its_report_and_shields_are_results_too(ethbrake, finishe
     page = (finished_run / "report.html").read_text()
     assert all(json.loads(results.read_text())[0][name] in page for name in ("worlds_sha256", "scenario_sha256"))
     for count in ("first", "total"):
-        line = ("shield", "--agents", "full_brake", "--episodes", "5", "--harm-count", count, "--json")
+        line = ("shield", "--agents", "full_brake", "--episodes", "5", "--set", f"harm_count={count}", "--json")
         (tmp_path / f"{count}.json").write_text(ethbrake(*line).out)
     told = told_json(ethbrake("compare", tmp_path / "first.json", tmp_path / "first.json", "--json"))
     found = {each["agent"]: each["harm_difference"] for each in told["agents"]}
@@ -331,10 +291,9 @@ def test_versions__tell_a_file_behind_the_at_by_its_hash(ethbrake: Command, tmp_
     assert one.startswith("SHA-256 ") and one != other
 
 
-# ---------------------------------------------------------------- pictures, data sets, shields
+# ---------------------------------------------------------------- files, shields
 
 
-PNG = b"\x89PNG\r\n\x1a\n"
 EVIL = """from pathlib import Path
 import ethbrake_marl as eb
 Path("ran").touch()
@@ -350,12 +309,12 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_again__runs_no_code_that_only_a_file_names(ethbrake: Command) -> None:
     Path("mine.py").write_text(EVIL)
-    found = ("search", "falsify", "--agent", "coast", "--against", "full_brake", "--budget", "64")
+    found = ("study", "falsify", "--agent", "coast", "--against", "full_brake", "--budget", "64")
     assert ethbrake(*found, "--output", "worst.yaml").status == 0
     whole = Path("worst.yaml").read_text()
     for line in ("agent: coast\n", "against: full_brake\n"):
         Path("worst.yaml").write_text(whole.replace(line, f'{line.partition(" ")[0]} "mine.py:make"\n'))
-        check_refused(ethbrake("search", "falsify", "--again", "worst.yaml"), "is code")
+        check_refused(ethbrake("study", "falsify", "--again", "worst.yaml"), "is code")
     assert not Path("ran").exists()
 
 
@@ -374,82 +333,20 @@ def test_report__says_which_harm_the_shield_bounds(ethbrake: Command) -> None:
 
 def test_falsify__as_many_worlds_as_it_keeps_read_back(ethbrake: Command) -> None:
     words = ("--agent", "full_brake", "--measure", "harm", "--scenario", "stress-wide", "--keep", "200")
-    words += ("--budget", "512", "--at-random", "--output", "many.yaml", "--json")
-    told, kept = told_json(ethbrake("search", "falsify", *words)), NamedWorlds.read(Path("many.yaml")).worlds
+    words += ("--budget", "512", "--output", "many.yaml", "--json")
+    told, kept = told_json(ethbrake("study", "falsify", *words)), NamedWorlds.read(Path("many.yaml")).worlds
     assert told["worlds"] == [world.model_dump(exclude_none=True) for world in kept] and len(kept) == 200
     assert Path("many.yaml").stat().st_size > 64 << 10
 
 
-# Pictures
-
-
-@pytest.mark.parametrize(
-    "words", [("shield", "--scenario", "cooperation-3-pair", "--agents", "full_brake", "--episodes", "6")]
-)
-def test_picture__is_drawn_and_said_where(ethbrake: Command, words: tuple[str, ...]) -> None:
-    answer = ethbrake("watch", "picture", *words, "--output", "x.png")
-    assert (answer.status, answer.out) == (0, "") and "picture: x.png" in answer.err
-    assert Path("x.png").read_bytes().startswith(PNG)
-
-
-@pytest.mark.parametrize(
-    ("ending", "magic"),
-    [
-        (".svg", b"<?xml"),
-        pytest.param(".pdf", b"%PDF", marks=pytest.mark.slow),
-        pytest.param(".PNG", PNG, marks=pytest.mark.slow),
-    ],
-)
-def test_picture__is_written_as_its_name_ends_and_the_same_bytes_again(ethbrake, ending: str, magic: bytes) -> None:
-    for world, name in (("0", "one"), ("0", "same"), ("5", "other")):
-        words = ("--world", world, "--output", f"{name}{ending}")
-        assert ethbrake("watch", "picture", "deceleration", *words).status == 0
-    one, same, other = (Path(f"{name}{ending}").read_bytes() for name in ("one", "same", "other"))
-    assert one.startswith(magic) and one == same != other
-    assert not re.search(rb"20\d\d-\d\d|CreationDate|dc:date|Matplotlib v", one)
-
-
-@pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize(
-    "words", [("deceleration",), pytest.param(("shield", "--episodes", "3"), marks=pytest.mark.slow)]
-)
-def test_picture__overwrites_only_by_force(ethbrake: Command, words: tuple[str, ...]) -> None:
-    out = Path("map.png")
-    out.write_bytes(b"mine")
-    check_refused(ethbrake("watch", "picture", *words, "--output", out), "--force")
-    assert out.read_bytes() == b"mine"
-    assert ethbrake("watch", "picture", *words, "--output", out, "--force").status == 0 and out.read_bytes() == EMPTY
-
-
-# Data sets
-
-
-@pytest.mark.parametrize(
-    ("packages", "words", "file", "told"),
-    [
-        (["pyarrow"], ["--agents", "full_brake,coast"], "a.parquet", "dataset: a.parquet, .* decisions"),
-        (["minari", "h5py"], ["--agents", "full_brake"], "brakes-v0",
-         r"load it: MINARI_DATASETS_PATH=(.*), minari.load_dataset\('brakes-v0'\)"),
-    ],
-)  # fmt: skip
-def test_dataset__is_written_and_told(ethbrake: Command, packages: list[str], words: Any, file: str, told: str) -> None:
-    for package in packages:
-        pytest.importorskip(package)
-    answer = ethbrake("watch", "dataset", *words, "--episodes", "3", "--output", file)
-    lines = answer.err.splitlines()
-    assert (answer.status, answer.out) == (0, "") and [path.name for path in Path().iterdir()] == [file]
-    assert "full_brake: 3 episodes; harm differs from `ethbrake evaluate` by at most 0 m2/s2 in a world" in lines
-    found = re.fullmatch(told, lines[-1])
-    assert found is not None and list(found.groups()) in ([], [str(Path().absolute())])
+# What an extra brings
 
 
 @pytest.mark.parametrize(
     ("package", "extra", "line"),
     [
-        ("pyarrow", "data", "watch dataset --episodes 2 --output a.parquet"),
-        ("minari", "data", "watch dataset --episodes 2 --output brakes-v0"),
         ("pyarrow", "data", "evaluate --agents coast --episodes 2 --output new --per-world parquet"),
-        ("imageio_ffmpeg", "render", "watch record --agents coast --output film.mp4"),
+        ("imageio_ffmpeg", "render", "watch --agents coast --output film.mp4"),
         ("onnx", "export", "agent export shipped/ppo --onnx policy.onnx"),
     ],
 )
@@ -466,15 +363,7 @@ def test_file__of_an_extra_that_is_missing_says_the_line_that_installs_it(
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("shield", "--agents", "full_brake"),
-        ("watch", "picture", "shield", "--agents", "coast,full_brake", "--output", "x.png"),
-    ],
-    ids=lambda words: " ".join(words[:3]),
-)
-def test_shield__names_the_worlds_that_it_leaves_out(ethbrake: Command, monkeypatch, words: tuple[str, ...]) -> None:
+def test_shield__names_the_worlds_that_it_leaves_out(ethbrake: Command, monkeypatch) -> None:
     sample = Scenario.sample
 
     def planted(self, n, seed, **options):
@@ -482,7 +371,7 @@ def test_shield__names_the_worlds_that_it_leaves_out(ethbrake: Command, monkeypa
         return replace(drawn, worlds=plant(drawn.worlds, [2] if n == 4 else []))
 
     monkeypatch.setattr(Scenario, "sample", planted)
-    answer = ethbrake(*words, "--episodes", "4")
+    answer = ethbrake("shield", "--agents", "full_brake", "--episodes", "4")
     assert answer.status == 0 and "LEFT OUT for every agent: 1 of 4 worlds" in answer.err
     assert "world 2 of seed 7 (a contact was missed" in answer.err
 

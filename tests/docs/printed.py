@@ -148,18 +148,18 @@ BLOCKS: dict[str, How] = {
     "ethbrake train --scenario cooperation-3-pair": TRAINED,
     "ethbrake agent export runs/early": TRAINED,
     "Agent,                           First-impact": _by(TRAINING, "make run"),
-    "resume, ppo: 20/20": _by(TRAINING, "make test-resume"),
+    "resume, ppo: 20/20": _by(TRAINING, "make programme NAME=resume"),
     "gap_1_m,gap_2_m,speed_1_mps": _by(BY_HAND),
     "paper-random full_brake        backward": EXACT,
 }
 
 _TESTS = tuple(
     f"ethbrake evaluate --scenario paper-random{test} --agents full_brake,e_v2x_bm,{agents},best_harm --episodes 2000"
-    " --seed 7 --measures injury --json"
+    " --set measures=injury --json"
     for test, agents in (
         ("", "ppo@shipped/ppo,universal@shipped"),
         ("-brake-only", "ppo@shipped/ppo,universal@shipped"),
-        ("-obstacle --harm-count total", "ppo@shipped/ppo,options@shipped"),
+        ("-obstacle --set harm_count=total", "ppo@shipped/ppo,options@shipped"),
         ("-buildup", "ppo@shipped/ppo,universal@shipped"),
     )
 )
@@ -175,10 +175,15 @@ TABLES: dict[str, How] = {
 }
 
 PICTURES: dict[str, How] = {
-    "emergency.svg": _by(NIGHTLY, "ethbrake watch record --agents full_brake,universal@shipped --output emergency.svg"),
+    "emergency.svg": _by(NIGHTLY, "ethbrake watch --agents full_brake,universal@shipped --output emergency.svg"),
     "model-": _by(SUITE, "tests/docs/test_studies.py"),
     "deceleration.png": _by(
-        NIGHTLY, "ethbrake watch picture deceleration --scenario paper-random --world 5 --output deceleration.png"
+        NIGHTLY,
+        'python -c "import ethbrake_marl as eb; from ethbrake_marl.scenario import Task;'
+        " scenario = eb.load_scenario('paper-random');"
+        " curve = eb.deceleration_curve(scenario.sample(1, 7, first=5).worlds, Task(scenario, scenario.learners));"
+        " figure = eb.deceleration_figure(curve, title='paper-random, world 5 of the list of seed 7');"
+        " eb.write_picture('deceleration.png', figure)\"",
     ),
     "sampled-convergence.png": _by(NIGHTLY, "python docs/studies/sampling.py sampled-convergence.png"),
     "price-of-not-knowing.png": _by(NIGHTLY, "python docs/studies/price.py price-of-not-knowing.png"),

@@ -6,6 +6,7 @@ from pathlib import Path
 from types import ModuleType
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
+sys.path.append(str(DOCS / "studies"))  # which import one another
 
 
 def load(name: str) -> ModuleType:

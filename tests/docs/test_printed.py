@@ -112,9 +112,10 @@ def test_block__is_what_its_commands_print(block: Shown, told: Run) -> None:
 
 
 @pytest.mark.slow
-def test_table_of_shipped_lists__is_printed_by_its_command(told: Run) -> None:
+def test_table_of_shipped_lists__is_printed_by_its_command(capsys: pytest.CaptureFixture[str]) -> None:
     (table,) = (each for each in MEASURED.read_tables("best-harm") if each.id == "proven-and-found")
-    printed = told("ethbrake search best-harm --shipped")[1].splitlines()
+    load("../studies/best_harm").main(["--shipped"])
+    printed = capsys.readouterr().out.splitlines()
     for row in (table.columns, *table.rows):
         assert any(one.startswith(f"| {' | '.join(row)}") for one in printed), row
 
@@ -200,7 +201,9 @@ def test_programs__of_a_page_run_and_print_what_stands_below_them(
 
 @pytest.mark.slow
 def test_howto_train__runs_and_beats_full_braking(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)  # MAPPO of BenchMARL, where it is missing here, is run by ``make test-libraries``
+    monkeypatch.chdir(
+        tmp_path
+    )  # MAPPO of BenchMARL, where it is missing here, is run by ``make programme NAME=libraries``
     assert {"one", "pair"} <= harm_of_howto().keys()
 
 
@@ -306,8 +309,7 @@ def test_reference__is_made_of_the_code_below_a_short_beginning() -> None:
         made = make()
         assert made.count("| --- |") >= 1 and "m/s2" not in re.sub("`.*?`", "", made), name
     commands = reference.COMPLETED["cli"]()
-    assert "\n### train resume\n" in commands and "| `--other-versions` |" in commands
-    assert "`ethbrake train` alone is `ethbrake train start`." in commands
+    assert "\n## train\n" in commands and "| `--other-versions` |" in commands and "\n### study ablate\n" in commands
     assert "| `mass_t` | mass of each vehicle | (0, 1000] t | required |" in reference.scenario_keys()
 
 
@@ -387,7 +389,7 @@ def test_version__is_the_same_wherever_it_stands() -> None:
     ("command", "file"),
     [
         ("scenario schema", "scenarios/scenario"),
-        ("recipe schema", "train/recipe"),
+        ("train --schema", "train/recipe"),
         ("study sweep --schema", "docs/sweep"),
         ("study tune --schema", "docs/tuning"),
     ],

@@ -12,6 +12,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
+from ethbrake_marl.studies.speed import Effort
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents import optimise_pairwise
@@ -25,7 +26,6 @@ from ethbrake_marl.limits.limits import best_known
 from ethbrake_marl.scenario import Task, load_scenario
 from ethbrake_marl.studies import reproduction
 from ethbrake_marl.studies.reproduction import FULL_BRAKE, GAPS, ITEMS, NAMES, Reproduction, Result, checked_result
-from ethbrake_marl.studies.speed import Effort
 from tests.docs.site import DOCS, load
 from tests.fixtures.installed import write_metadata
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.engine import Engine, Moment
 from ethbrake_marl.envs.interfaces import make_engine
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.harm import HARM_COUNTS
 from ethbrake_marl.learning import algorithms
 from ethbrake_marl.learning.algorithms import Offsets, play_to_the_end
 from tests.physics.random_worlds import line

@@ -16,7 +16,6 @@ import pytest
 from rich.console import Console
 
 import ethbrake_marl as eb
-from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation import (
     Evaluation,
@@ -24,7 +23,6 @@ from ethbrake_marl.evaluation import (
     SummaryTable,
     evaluate,
     load_measures,
-    measures,
     summarise,
     write_per_world,
 )
@@ -36,12 +34,18 @@ from ethbrake_marl.evaluation.measures import (
     Exploits,
     IncompleteTable,
     is_papers_test,
-    proven_of_table,
-    shipped_bounds,
 )
 from ethbrake_marl.evaluation.results import read_harms
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.harm import STANDARD, Ledger, declared_objectives, injury_probability, parse_objective, scored
+from ethbrake_marl.harm import (
+    HARM_COUNTS,
+    STANDARD,
+    Ledger,
+    declared_objectives,
+    injury_probability,
+    parse_objective,
+    scored,
+)
 from ethbrake_marl.limits import limits as limits_module
 from ethbrake_marl.limits.limits import BestHarmTable, Unproven, known_limits, shipped_tables, unproven_because
 from ethbrake_marl.pages.report import Report
@@ -49,6 +53,7 @@ from ethbrake_marl.physics.batch import Impacts
 from ethbrake_marl.scenario import Scenario, Task, list_scenarios, load_scenario
 from ethbrake_marl.studies.experiment import results_csv
 from tests.contract.interfaces import CRASH
+from tests.docs.site import load
 
 SILENT = pytest.mark.filterwarnings("ignore::ethbrake_marl.evaluation.measures.IncompleteTable")
 BRAKE = {"full_brake": eb.make_agent("full_brake")}
@@ -650,13 +655,16 @@ def test_limits__of_the_first_500_worlds_of_the_papers_random_test(name: str, un
 # ---------------------------------------------------------------- proven and best known harm beside each other
 
 
+STUDY = load("../studies/best_harm")
+
+
 def shipped(name: str, **header: Any) -> BestHarmTable:
     (table,) = (table for table in shipped_tables() if table.header["scenario"] == name)
     return replace(table, header={**table.header, **header})
 
 
 def test_shipped__stress_wide_has_a_loose_proof_and_says_so() -> None:
-    (found,), sheet = shipped_bounds([shipped("stress-wide")])
+    (found,), sheet = STUDY.shipped_bounds([shipped("stress-wide")])
     proven, inside = found["proven"], found["proven"]["between"]
     assert (found["worlds"], found["list_seed"]) == (5000, 7)
     assert (found["gap_first"], found["gap_total"]) == pytest.approx((0.057, 0.122), abs=5e-4)
@@ -664,21 +672,21 @@ def test_shipped__stress_wide_has_a_loose_proof_and_says_so() -> None:
     assert inside["mean_first"] > 0.9 and inside["harmless_rate"] < 0.55  # nobody leans there
     (_, _, line) = sheet.markdown().splitlines()
     assert "| 5.7 % |" in line and "| 12.2 % |" in line
-    (leaning,), _ = shipped_bounds([shipped("paper-delay-low", episodes=1000)])
+    (leaning,), _ = STUDY.shipped_bounds([shipped("paper-delay-low", episodes=1000)])
     assert leaning["proven"]["between"]["mean_first"] < 0.03  # in the paper's lists leaning explains what is between
 
 
 def test_shipped__every_table_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     names = [table.header["scenario"] for table in shipped_tables()]
     few = [replace(table, header={**table.header, "episodes": 20}) for table in shipped_tables()]
-    monkeypatch.setattr(measures, "shipped_tables", lambda: few)
-    found, sheet = shipped_bounds()
+    monkeypatch.setattr(STUDY, "shipped_tables", lambda: few)
+    found, sheet = STUDY.shipped_bounds()
     assert [one["scenario"] for one in found] == names and len(sheet.markdown().splitlines()) == 2 + len(found)
 
 
 def test_shipped__where_nothing_is_proven_the_reason_stands_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(measures, "unproven_because", lambda *_: "an obstacle stands ahead of vehicle_1")
-    (found,), sheet = shipped_bounds([shipped("paper-delay-low", episodes=5)])
+    monkeypatch.setattr(STUDY, "unproven_because", lambda *_: "an obstacle stands ahead of vehicle_1")
+    (found,), sheet = STUDY.shipped_bounds([shipped("paper-delay-low", episodes=5)])
     assert found["proven"] is None and found["gap_first"] is None
     assert "an obstacle stands ahead" in sheet.markdown().splitlines()[2]
 
@@ -765,7 +773,7 @@ def test_rows_of_the_paper__agree_with_themselves() -> None:
 def test_proven_of_table__leaves_out_what_cannot_be_advanced() -> None:
     scenario, table = load_scenario("paper-delay-low"), shipped("paper-delay-low")
     worlds, task = scenario.sample(6, 7).worlds, Task(scenario, (1,))
-    whole = proven_of_table(worlds.take([0, 1, 3, 4, 5]), task, table)
+    whole = STUDY.proven_of_table(worlds.take([0, 1, 3, 4, 5]), task, table)
     worlds.gaps_m[2], worlds.speeds_mps[2] = [0.2, -1.0], [10.0, 20.0, 16.0]
     assert whole is not None
-    assert proven_of_table(worlds, task, table) == whole
+    assert STUDY.proven_of_table(worlds, task, table) == whole

@@ -364,7 +364,7 @@ DATASETS: dict[str, Callable[[], object]] = {
     "brakes: a dataset of Minari is a folder called NAME-vNUMBER": lambda: dataset("brakes"),
     "nowhere/a.parquet: there is no folder nowhere; make it first": lambda: dataset("nowhere/a.parquet"),
     "nowhere/a-v0: there is no folder nowhere; make it first": lambda: dataset("nowhere/a-v0"),
-    "scenario 'paper-random' has no learner to record; say who is driven": lambda: dataset(scenario=NOBODY),
+    "has no learner to record: scenario.with_learners(['vehicle_2'])": lambda: dataset(scenario=NOBODY),
     "scenario 'cooperation-3-pair' has 2 learners (vehicle_2, vehicle_3)": lambda: dataset("a-v0", scenario=PAIR),
 }
 
@@ -394,10 +394,10 @@ def test_dataset__replaces_no_folder_that_is_none(empty_folder: Path) -> None:
 def test_clone__is_of_one_learner_of_a_dataset_and_says_which_drives(empty_folder: Path) -> None:
     Path("no.parquet").write_text("no")
     clone = load("../../train/clone")
-    with refused("no.parquet: is no dataset of `ethbrake watch dataset`"):
+    with refused("no.parquet: is no dataset of `eb.write_dataset`"):
         clone.train(Path("no.parquet"), 0, Path("clone"))
     eb.write_dataset("two.parquet", BRAKE, scenario=PAIR, episodes=1)
-    with refused("two.parquet: holds 2 learners, one is needed: --vehicle NAME"):
+    with refused("two.parquet: holds 2 learners, one is needed"):
         clone.train(Path("two.parquet"), 0, Path("clone"))
     Path("clone.py").write_text((DOCS.parent / "train" / "clone.py").read_text())
     with refused("agent 'clone.py:make_agent': say which clone drives: train/clone.py:make_agent:runs/clone"):

@@ -28,14 +28,7 @@ from ethbrake_marl.evaluation import (
     write_per_world,
 )  # fmt: skip
 from ethbrake_marl.evaluation.chunks import Lineup, evaluate_held, summarise_tally, tally_list
-from ethbrake_marl.evaluation.inputs import (
-    choose_worlds,
-    make_agents,
-    make_lineup,
-    policy_sha256,
-    scenario_sha256,
-    worlds_sha256,
-)
+from ethbrake_marl.evaluation.inputs import make_agents, make_lineup, policy_sha256, scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.measures import FAR_M, REGISTERED, Tally, measures
 from ethbrake_marl.evaluation.rollout import ShovedFront, chunks_of, drive_chunk
 from ethbrake_marl.limits import Limits
@@ -315,12 +308,7 @@ ABOUT = {"worlds_sha256": worlds_sha256(SAMPLE.worlds, SAMPLE.index), "scenario_
 
 
 @pytest.mark.parametrize(
-    ("kind", "command"),
-    [
-        ("evaluate", "evaluate --agents full_brake"),
-        ("shield", "shield --agents full_brake"),
-        ("best-harm", "search best-harm --budget 20"),
-    ],
+    ("kind", "command"), [("evaluate", "evaluate --agents full_brake"), ("shield", "shield --agents full_brake")]
 )
 def test_every_results_file__says_its_kind_worlds_scenario_and_versions(
     kind: str, command: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -619,12 +607,3 @@ def test_lineup__keeps_order_and_specs_and_the_ladder_is_every_rung() -> None:
         "constant:5",
         "e_v2x_bm:pairwise:believed",
     ]
-
-
-def test_worlds__are_the_list_of_the_seed() -> None:
-    (few, seed), (many, default) = choose_worlds(PAPER, episodes=5, seed=9), choose_worlds(PAPER)
-    assert few.worlds.n == 5
-    assert seed == 9
-    assert many.worlds.n == 10000
-    assert default == 7
-    assert few.worlds.gaps_m.tolist() == PAPER.sample(5, 9).worlds.gaps_m.tolist()

@@ -138,7 +138,7 @@ def test_package__that_pip_installs_drives_measures_pays_and_commands(tmp_path: 
     assert "gentle[:ARGUMENT]" in told("agent", "list") and "+softer[:ARGUMENT]" in told("agent", "list")
 
     agents, out = "full_brake,gentle,gentle:0.8+softer,gentle+step", tmp_path / "out"
-    words = ("--agents", agents, "--episodes", "20", "--measures", "worst", "--jobs", "2")
+    words = ("--agents", agents, "--episodes", "20", "--set", "measures=worst", "--jobs", "2")
     table = told("evaluate", *words, "--output", out, "--report")
     assert "worst (m/s)" in " ".join(table.split()) and "gentle:0.8+softer" in table
     rows = json.loads((out / "results.json").read_text())
@@ -189,7 +189,7 @@ def test_entry_point__that_fails_is_named_and_breaks_nothing_else(
     ):
         with pytest.raises(InvalidInput, match=told):
             use()
-    for words in (["hills"], ["evaluate", "--measures", "hills"]):
+    for words in (["hills"], ["evaluate", "--set", "measures=hills"]):
         assert run_command(words) == 2 and told in capsys.readouterr().err
     for words in (["--help"], ["evaluate", "--help"], ["scenario", "schema"], ["recipe", "schema"], ["agent", "list"]):
         assert run_command(words) == 0
@@ -242,8 +242,9 @@ def test_register__is_the_way_of_both_and_refuses_another_of_that_name(install: 
 
 def test_measures__of_a_file_are_told_where_it_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine.py").write_text(f"{HILLS}\npart = WORST\n")
-    words = ["evaluate", "--episodes", "5", "--agents", "full_brake", "--measures"]
-    assert run_command([*words, f"{tmp_path}/mine.py:worst,{tmp_path}/mine.py:part,injury", "--json"]) == 0
+    words = ["evaluate", "--episodes", "5", "--agents", "full_brake", "--json"]
+    measures = f"{tmp_path}/mine.py:worst,{tmp_path}/mine.py:part,injury"
+    assert run_command([*words, "--set", f"measures={measures}"]) == 0
     (row,) = json.loads(capsys.readouterr().out)
     assert row["metric_worst"] == row["metric_part"] > 0.0 and row["metric_injury_lr4s"] > 0.0
     assert row["metrics"]["part"] == "part (m/s)" and row["versions"]["mine.py"].startswith("SHA-256 ")

@@ -53,14 +53,7 @@ def test_write__replaces_a_plain_file_by_force_and_takes_the_longest_name(tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("words", "ending"),
-    [
-        ("search best-harm --output", "npz"),
-        ("search falsify --agent coast --output", "yaml"),
-        ("watch picture deceleration --output", "png"),
-        ("watch record --agents coast --output", "svg"),
-        ("watch dataset --format parquet --agents coast --output", "parquet"),
-    ],
+    ("words", "ending"), [("study falsify --agent coast --output", "yaml"), ("watch --agents coast --output", "svg")]
 )
 def test_target__that_cannot_be_replaced_is_refused_before_any_work(
     words: str, ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

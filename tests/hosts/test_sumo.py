@@ -7,7 +7,6 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl import errors
-from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.hosts import SumoHost, find_host
 from tests.docs.site import DOCS
 
@@ -15,43 +14,36 @@ PAGE = (DOCS / "hosts.md").read_text("utf-8")
 PAPER = eb.load_scenario("paper-random")
 
 
-def test_sumo__that_is_not_installed_is_told_in_one_line(monkeypatch, capsys):
+def test_sumo__that_is_not_installed_is_told_in_one_line(monkeypatch):
     monkeypatch.setattr(errors, "find_spec", lambda package: None)
-    assert run_command(["evaluate", "--host", "sumo"]) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1 and "needs the package libsumo, which is not installed: " in told
-    assert told.endswith("-m pip install 'ethbrake-marl[sumo]'\n")
+    with pytest.raises(eb.MissingExtra, match=r"needs the package libsumo, which .*'ethbrake-marl\[sumo\]'$"):
+        find_host("sumo")
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("spec", "message"),
     [
-        (["--host", "carla"], "unknown host 'carla'; known: sumo"),
-        (["--host", "sumo:x"], "host 'sumo:x': 'x' is no step in s; for instance sumo:0.01"),
-        (["--host", "sumo", "--jobs", "3"], "--jobs: a host drives in one process; leave it out, or --host"),
-        (["--host", "sumo", "--report", "--output", "a"], "--report: tells of the physics here; leave it out, or"),
-        (["--host", "sumo", "--measures", "injury"], "--measures: tells of the physics here; leave it out, or --host"),
-        (["--host", "sumo", "--scenario", "standards"], "--host: standards is a group of"),
+        ("carla", "unknown host 'carla'; known: sumo"),
+        ("sumo:x", "host 'sumo:x': 'x' is no step in s; for instance sumo:0.01"),
     ],
 )
-def test_option_host__refuses_what_does_not_go_with_it(words, message, capsys):
-    assert run_command(["evaluate", *words]) == 2
-    assert f"ethbrake: error: {message}" in capsys.readouterr().err
+def test_find_host__refuses_what_is_none(spec, message):
+    with pytest.raises(eb.EthBrakeError, match=message):
+        find_host(spec)
 
 
-def test_sumo__tells_the_table_of_the_page(capsys, monkeypatch):
+def test_sumo__tells_the_table_of_the_page(capsys):
     pytest.importorskip("libsumo")
-    monkeypatch.setenv("COLUMNS", "120")
-    (command,) = re.findall(r"```sh\nethbrake (.*?)```", PAGE, re.DOTALL)
-    assert run_command(command.replace("\\\n", " ").split()) == 0
-    told = capsys.readouterr().out
-    there = told[told.index("Here   There") :]
+    (program,) = re.findall(r"```python\n([^`]*find_host.*?)```", PAGE, re.DOTALL)
+    names = {}
+    exec(program, names)
+    told = capsys.readouterr().out.splitlines()
     shown = re.findall(r"^\| `(\S+)` \| (\S+) \| (\S+) \| (.*?) \|$", PAGE, re.MULTILINE)
-    assert len(shown) == 4
-    for row in shown:
-        assert re.search(rf"^{re.escape(row[0])} +{row[1]} +{row[2]} +{re.escape(row[3])} ", there, re.MULTILINE), row
-    assert re.search(r"^ppo@shipped\+robust .*\] +0 +0$", there, re.MULTILINE)  # above the bound, distrusted
-    assert "Regret" not in told and "proven" not in told  # of the physics here
+    assert told == [" ".join(row) for row in shown] and len(shown) == 3
+    outcome, distrusted = names["there"].outcome("ppo@shipped+robust"), names["distrusted"]["ppo@shipped+robust"]
+    assert not (outcome.first_impact_harm > outcome.predicted_harm).any() and not distrusted.any()
+    text = eb.summarise(names["there"]).markdown()
+    assert "Regret" not in text and "proven" not in text  # of the physics here
 
 
 def test_sumo__begins_where_it_is_told_and_is_one_at_a_time():

@@ -301,7 +301,7 @@ def run(empty_folder: Path) -> RunDirectory:
 
 def test_folder__that_is_there_is_not_replaced_unasked(run: RunDirectory) -> None:
     with refused(
-        "run: is there already; give another name (--name), go on with it (ethbrake train resume)", AlreadyExists
+        "run: is there already; give another folder (--output), go on with it (ethbrake train --resume)", AlreadyExists
     ):
         RunDirectory(run.path).create({})
     Path("thesis").mkdir()

@@ -717,16 +717,16 @@ def test_scheme__says_who_drives_what() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "expected"),
+    ("seed", "scheme", "folder"),
     [
-        ({}, "runs/paper-random-ppo-seed0"),
-        ({"seed": 4}, "runs/paper-random-ppo-seed4"),
-        ({"name": "mine"}, "runs/mine"),
-        ({"output": Path("/elsewhere/x")}, "/elsewhere/x"),
+        (None, None, "runs/paper-random-ppo-seed0"),
+        (4, None, "runs/paper-random-ppo-seed4"),
+        (None, "shared", "runs/paper-random-ppo-shared-seed0"),
     ],
 )
-def test_folder_of_a_run__says_scenario_recipe_and_seed_unless_it_is_named(given, expected) -> None:
-    assert str(run_folder(PAPER, eb.load_recipe("ppo"), **given)) == expected
+def test_folder_of_a_run__says_scenario_recipe_scheme_and_seed(seed, scheme, folder) -> None:
+    recipe = eb.load_recipe("ppo") if scheme is None else eb.load_recipe("ppo").replace(scheme=scheme)
+    assert str(run_folder(PAPER, recipe, seed)) == folder
 
 
 def test_network_of_the_paper__has_the_tensors_of_its_table() -> None:

@@ -10,11 +10,11 @@ import pytest
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
-from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.errors import AlreadyExists, plain_text
 from ethbrake_marl.evaluation.inputs import make_lineup
 from ethbrake_marl.figures import COLOURS, add_caption, inline_svg, new_figure
 from ethbrake_marl.files.sheet import Column, Sheet, Shown
+from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.pages import page as pages
 from ethbrake_marl.pages.page import Part, Section, read_file
 from ethbrake_marl.pages.report import Report, choose_shown, worst_rows

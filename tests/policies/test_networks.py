@@ -19,10 +19,10 @@ from torch import nn
 
 import ethbrake_marl as eb
 from ethbrake_marl import policies as bundle
-from ethbrake_marl.defaults import HARM_COUNTS, HarmCount
 from ethbrake_marl.errors import CorruptBundle
 from ethbrake_marl.evaluation import TESTS, evaluate, make_lineup
 from ethbrake_marl.evaluation.inputs import scenario_sha256
+from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.observations import observe
 from ethbrake_marl.policies import (
     Actor,

@@ -177,7 +177,7 @@ def with_member(name: str) -> bytes:
 
 # Numbers that are read in order, and do not fit the worlds that are searched.
 ONLY_A_PROBLEM_KNOWS = ("commands that cannot be", "phases out of order", "another world")
-COMMAND = ("search", "best-harm", "--episodes", "3", "--budget", "1", "--threads", "1", "--start", "t.npz", "--json")
+COMMAND = ("read-table", "t.npz")
 
 CERTAIN: dict[str, Callable[[random.Random], bytes]] = {
     "wrong shape": lambda r: swapped(

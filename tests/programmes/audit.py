@@ -1,7 +1,6 @@
 """What the package stands on: every pinned package with its licence, read from the environment.
 
-A package fails that has no licence that is known here, or another version than it is pinned to. `make audit` also asks
-pip-audit for reported weaknesses, where it is installed (`pip install pip-audit`).
+A package fails that has no licence that is known here, or another version than it is pinned to.
 """
 
 import re

@@ -25,8 +25,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.cli.app import app, run_command
+from ethbrake_marl.cli.command import Out
 from ethbrake_marl.errors import EthBrakeError
+from ethbrake_marl.evaluation import evaluate
+from ethbrake_marl.limits import BestHarmTable, search_list
+from ethbrake_marl.scenario import load_scenario
 
 CPU_LIMIT_S = 10  # of a case
 WALL_LIMIT_S = 90.0  # on a machine that does other things too
@@ -132,6 +136,20 @@ def _forked(work: Callable[[], int]) -> int:
     os._exit(status)
 
 
+def read_states(file: Path) -> None:
+    """A command of ours: drive in a table of initial states."""
+    with Out():
+        paper = load_scenario("paper-random")
+        evaluate(paper.read_worlds(file), "coast", scenario=paper)
+
+
+def read_table(file: Path) -> None:
+    """A command of ours: go on from a table of best known harm."""
+    with Out():
+        paper = load_scenario("paper-random")
+        search_list(paper, paper.sample(3, 7), budget=1, threads=1, known=BestHarmTable.load(file))
+
+
 def _run(case: Case, inside: Path, streams: list[Path]) -> int:
     for number, path in zip((1, 2), streams, strict=False):
         os.dup2(os.open(path, os.O_CREAT | os.O_WRONLY), number)
@@ -147,6 +165,8 @@ def _run(case: Case, inside: Path, streams: list[Path]) -> int:
     sys.addaudithook(lambda event, arguments: _keep_inside(event, arguments, own, seen))
     if case.reader is not None:
         _read(case, seen)
+    app.command("read-states")(read_states)
+    app.command("read-table")(read_table)
     return run_command([word.replace(HERE, f"{inside}") for word in case.command])
 
 

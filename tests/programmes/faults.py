@@ -1,7 +1,7 @@
 """Faults that some test must notice: small random changes of the code in every folder, and planted bugs.
 
-    make mutation ARGS="--folders physics,shield --sample 40 --seed 0"
-    make planted-bugs ARGS="--only WORD"
+    make programme NAME=faults ARGS="mutants --folders physics,shield --sample 40 --seed 0"
+    make programme NAME=faults ARGS="bugs --only WORD"
 
 A *mutant* changes one node of the syntax tree: an operator of arithmetic or comparison, a constant, a sign, a condition
 negated, a statement removed, min and max swapped. The *planted bugs* are those of ``bugs.yaml``: errors that people

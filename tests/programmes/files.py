@@ -338,7 +338,7 @@ def worlds_text() -> str:
     worlds = [NamedWorld(name=f"world-{k}", score=1e6, harm=1e6, state=state) for k, state in enumerate(states)]
     return NamedWorlds.of(
         scenario, scenario="paper-random", settings=["restitution=0.1"], agent="full_brake", measure="harm",
-        harm_count="first", found_by="ethbrake search falsify --measure harm", worlds=worlds,
+        harm_count="first", found_by="ethbrake study falsify --measure harm", worlds=worlds,
     ).text  # fmt: skip
 
 
@@ -354,8 +354,8 @@ def texts() -> dict[str, Text]:
     train = ("train", "--recipe", "mine.yaml", "--output", "taken")
     sweep = ("study", "sweep", "mine.yaml", "--output", "taken", "--jobs", "1")
     tune = ("study", "tune", "mine.yaml", "--output", "taken")
-    states = ("evaluate", "--agents", "coast", "--initial-states", "mine.csv")
-    again = ("search", "falsify", "--again", "mine.yaml")
+    states = ("read-states", "mine.csv")
+    again = ("study", "falsify", "--again", "mine.yaml")
     paper = eb.load_scenario("paper-random")
     return {
         "scenario": Text(SCENARIO, ("scenario", "validate", "mine.yaml"), eb.load_scenario, 25, both, own),
@@ -744,7 +744,7 @@ def run_cases(kind: str, rng: random.Random) -> Iterator[Case]:
             for algorithm in [each for each in algorithms for _ in range(count)]:
                 build = partial(_changed, partial(_run, algorithm), change, rng.random())
                 name = category.removeprefix("checkpoint: ")
-                yield Case(name, ("train", "resume", RUN), build, certain=certain, may_change=(RUN,))
+                yield Case(name, ("train", "--resume", RUN), build, certain=certain, may_change=(RUN,))
 
 
 def _run(algorithm: str, folder: Path) -> Path:

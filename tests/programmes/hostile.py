@@ -18,7 +18,7 @@ import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import chdir, redirect_stderr, redirect_stdout
+from contextlib import chdir, redirect_stderr, redirect_stdout, suppress
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -27,11 +27,26 @@ import torch
 import typer.main
 
 from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.limits.limits import BestHarmTable
 from ethbrake_marl.policies import load_policy
 from tests.programmes import Cases, Given, Told
 from tests.programmes.archives import COMMAND, good_bytes, table_cases
-from tests.programmes.cage import HERE, INSIDE, NASTY, OUTSIDE, PRECIOUS, REFUSED, Build, Case, Generator, judge, write
+from tests.programmes.cage import (
+    HERE,
+    INSIDE,
+    NASTY,
+    OUTSIDE,
+    PRECIOUS,
+    REFUSED,
+    Build,
+    Case,
+    Generator,
+    judge,
+    read_states,
+    read_table,
+    write,
+)
 from tests.programmes.files import (
     EVALUATE,
     MANIFEST,
@@ -181,20 +196,20 @@ VARIABLES = (
 )  # fmt: skip
 # Command lines with a word (``@``) that bites.
 LINES = (
-    "scenario show @", "scenario new @", "recipe show @", "recipe new @", "compare @ @", "train resume @", "@",
-    "evaluate --episodes 3 --set @", "evaluate --episodes 3 --set mass_t=@", "evaluate --episodes 3 --vehicle @",
-    "evaluate --no@", "train --name @", "train --recipe @", "evaluate --episodes 3 --objective @",
-    "shield --episodes 3 --agents @", "agent export @ --onnx x.onnx", "train curves --output o --scenario @",
+    "scenario show @", "scenario new @", "compare @ @", "train --resume @", "@",
+    "evaluate --episodes 3 --set @", "evaluate --episodes 3 --set mass_t=@", "evaluate --episodes 3 --set harm_count=@",
+    "evaluate --no@", "train --recipe @", "watch --agents coast --output @.svg",
+    "shield --episodes 3 --agents @", "agent export @ --onnx x.onnx", "study falsify --budget 10 --scenario @",
     "study ablate --levels @ --output o",
 )  # fmt: skip
 # Places below the case's own folder where nothing can be written, not even by the superuser.
 TARGETS = ("file", "file/x", "full", "link", "dangling", "loop", "pipe", "pipe/x", f"{HERE}/loop/x", "x" * 300, "\0b")
 WRITERS: dict[str, tuple[str, ...]] = {
     "results": ("evaluate", "--agents", "coast", *FEW, "--output"),
-    "table": ("search", "best-harm", *FEW, "--budget", "1", "--output"),
+    "worlds": ("study", "falsify", "--agent", "coast", "--against", "full_brake", "--budget", "9", "--output"),
     "run": ("train", "--steps", "1", "--output"),
     "new scenario": ("scenario", "new", "mine", "--output"),
-    "picture": ("watch", "picture", "deceleration", "--output"),
+    "film": ("watch", "--output"),
 }
 MAY_CHANGE = ("file", "full/results.json", "full/mine.yaml")
 
@@ -220,7 +235,11 @@ def commands(rng: random.Random) -> Iterator[Case]:
             yield line("number", ("evaluate", "--agents", "coast", option, number), certain=certain)
         if number != "10000001":  # a budget that takes its time is the user's own wish
             wrong = number in ("", "-1", "0", "1.5", "nan")
-            yield line("number", ("search", "best-harm", *FEW, "--budget", number), certain=wrong)
+            yield line(
+                "number",
+                ("study", "falsify", "--agent", "coast", "--measure", "harm", "--budget", number),
+                certain=wrong,
+            )
     for word, text in itertools.product(WORDS, LINES):
         yield line("word", tuple(each.replace("@", word) for each in text.split(" ")))
     for (what, command), target in itertools.product(WRITERS.items(), TARGETS):
@@ -299,13 +318,10 @@ WARM = (
           ("train --recipe", "recipe.yaml", " --output file"),
           ("study sweep", "sweep.yaml", " --output file"),
           ("study tune", "tuning.yaml", " --output file"),
-          ("search falsify --again", "worlds.yaml", ""),
-          (" ".join(COMMAND[:-2]), "t.npz", " --json"),
-          ("evaluate --agents ppo@shipped --initial-states", "CSV.csv", ""),
+          ("study falsify --again", "worlds.yaml", ""),
       )),
-    "train resume ppo", "train resume sac", "nonsense", "shield --agents x",
-    "study ablate --levels x --output x", "train curves --scenario x --output x", "agent export x --onnx x",
-    "watch picture deceleration --output file",
+    "train --resume ppo", "train --resume sac", "nonsense", "shield --agents x",
+    "study ablate --levels x --output x", "agent export x --onnx x", "watch --output file",
     "evaluate --agents coast,full_brake --episodes 3 --output out --per-world csv",
 )  # fmt: skip
 
@@ -324,6 +340,9 @@ def warm_up(folder: Path) -> None:
             shutil.copytree(stopped(algorithm), folder / algorithm)
         for line in WARM:
             run_command(line.split(" "))
+        for place, read in itertools.product((folder, folder / "bad"), (read_states, read_table)):
+            with suppress(EthBrakeError):
+                read(place / ("CSV.csv" if read is read_states else "t.npz"))
     sys.stdout.flush()
     gc.collect()
     gc.freeze()  # so that children share these pages

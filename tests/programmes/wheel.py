@@ -1,8 +1,8 @@
 """The packages: wheel and sdist with the same bytes twice, and the wheel alone without torch.
 
-``built`` leaves wheel and sdist in ``--output``, if two builds have the same SHA-256 (``make dist``). ``light``
-installs the wheel in an empty environment, weighs it, and runs there what must do without torch; then the sdist in its
-place, which must bring the same files (``make test-light``).
+``built`` leaves wheel and sdist in ``--output``, if two builds have the same SHA-256. ``light`` installs the wheel in
+an empty environment, weighs it, and runs there what must do without torch; then the sdist in its place, which must
+bring the same files. ``make programme NAME=wheel ARGS="--only built"`` runs one of them.
 """
 
 import hashlib

@@ -10,9 +10,9 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.defaults import DataDraw
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.scenario import recorded, scenario_from_data
+from ethbrake_marl.scenario.recorded import DataDraw
 from tests.docs.site import DOCS
 from tests.fixtures.recordings import HIGHD, write_files, write_highd, write_ngsim, write_openacc
 

@@ -17,11 +17,10 @@ from jsonschema import Draft202012Validator
 from pydantic import ValidationError
 
 import ethbrake_marl as eb
-from ethbrake_marl.defaults import HARM_COUNTS
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.inputs import load_runnable, scenario_sha256
 from ethbrake_marl.files.yaml import flow_text, read_yaml
-from ethbrake_marl.harm import empty_ledger
+from ethbrake_marl.harm import HARM_COUNTS, empty_ledger
 from ethbrake_marl.scenario import (
     QUANTITY,
     ScriptSpec,

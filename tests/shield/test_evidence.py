@@ -1,13 +1,11 @@
-"""The evidence on shields: operating curves, and what interventions were good for."""
+"""The evidence on shields: what interventions were good for."""
 
 import numpy as np
 import pytest
 
 from ethbrake_marl.agents import drive, make_agent
-from ethbrake_marl.figures import operating_figure
 from ethbrake_marl.scenario import Task, load_scenario
-from ethbrake_marl.shield import ShieldedDriver, operating_curves, parse_uncertainty, review
-from tests.failing_worlds import plant, without
+from ethbrake_marl.shield import ShieldedDriver, parse_uncertainty, review
 from tests.shield.test_step_shield import wavering
 
 SCENARIO = load_scenario("paper-random")
@@ -15,26 +13,6 @@ TASK = Task(SCENARIO, (1,))
 WORLDS = SCENARIO.sample(60, 3).worlds
 FEW = WORLDS.take(np.arange(25))
 INTERVALS = parse_uncertainty("gaps_m=1,mass_t.vehicle_3=20%")
-
-
-def test_operating_curve__fewer_interventions_cost_harm():
-    done, coast = [], {"coast": make_agent("coast")}
-    points = operating_curves(WORLDS, coast, TASK, [0.0, 20.0, 1e6], on_progress=done.append)["coast"]
-    rates, harms = [p.intervention_rate for p in points], [p.harm for p in points]
-    assert done == ["coast"] and rates == sorted(rates, reverse=True) and rates[-1] == 0.0
-    assert harms == sorted(harms) and harms[0] < harms[-1]
-    (drawn,) = operating_figure([("coast", points)]).axes[0].get_lines()
-    assert drawn.get_xdata().tolist() == rates
-
-
-def test_operating_curve__leaves_worlds_out_that_cannot_be_advanced_and_names_them():
-    agents = {"coast": make_agent("coast"), "brake": make_agent("full_brake")}
-    found = operating_curves(plant(WORLDS.take(np.arange(9)), [2, 6]), agents, TASK, [0.0, 20.0])
-    rest = operating_curves(WORLDS.take(without(9, [2, 6])), agents, TASK, [0.0, 20.0])
-    for name in agents:
-        assert [[world for world, _ in point.left_out] for point in found[name]] == [[2, 6]] * 2
-        assert [point[:-1] for point in found[name]] == [point[:-1] for point in rest[name]]
-        assert rest[name][0].left_out == ()
 
 
 def logged(policy, worlds=WORLDS, driver=None, **settings):

@@ -15,7 +15,6 @@ from ethbrake_marl.agents.registry import Team, drive, make_agent
 from ethbrake_marl.envs.interfaces import EthBrakeEnv, EthBrakeVectorEnv, env as aec_env, parallel_env
 from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.errors import UncertifiedStep, UnknownName
-from ethbrake_marl.figures import operating_figure
 from ethbrake_marl.scenario import Scenario, load_scenario
 from ethbrake_marl.shield import (
     HybridAgent,
@@ -448,8 +447,3 @@ def test_interior__takes_no_command_beyond_the_least_capacity() -> None:
     shield = StepShield(weak, 1, uncertainty=parse_uncertainty("braking_capacity_mps2=10%"), robust="interior")
     with refused("uncertainty: braking_capacity_mps2=10%: agent 'constant:5': above the braking capacity 4.68 m/s2"):
         shield.begin(weak.sample(1, 0).worlds, np.arange(1))
-
-
-def test_operating_figure__needs_a_point() -> None:
-    with refused("operating_figure: every curve needs at least one point"):
-        operating_figure([])

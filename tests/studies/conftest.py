@@ -25,10 +25,10 @@ RECIPE = {
 LEVELS = "cooperation-0-sensors,cooperation-3-pair,cooperation-3-congested"
 
 
-ABLATE = ["--levels", LEVELS, "--seeds", "2", "--episodes", "20", "--search-episodes", "4", "--budget", "50"]
+ABLATE = ["--levels", LEVELS, "--seeds", "2", "--episodes", "20", "--search-episodes", "4"]
 
 
-ABLATE += ["--steps", "128", "--scheme", "shared"]
+ABLATE += ["--steps", "128", "--set", "scheme=shared"]
 
 
 TRIALS = 5

@@ -13,8 +13,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.defaults import HarmCount
 from ethbrake_marl.figures import ALARM, ablation_figures
+from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.learning import runs as learning_train
 from ethbrake_marl.learning.training import Scheme, Training, TrainingRecipe, load_recipe
 from ethbrake_marl.limits.limits import best_harm, chunks_left

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.defaults import HARM_COUNTS, HarmCount, MeasureName
+from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.physics import Bools, Floats, Worlds
-from ethbrake_marl.studies.falsification import APART, Measure, Scored, far_apart, search
+from ethbrake_marl.studies.falsification import APART, Measure, MeasureName, Scored, far_apart, search
 
 SCENARIO = eb.load_scenario("paper-random")
 

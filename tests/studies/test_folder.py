@@ -149,8 +149,8 @@ STUDIES: dict[str, Callable[[Callable[[str], Any]], Study]] = {
     "ablation": lambda get: Study(
         ("study", "ablate", "--recipes", get("tiny_total"), *ABLATE),
         get("finished_ablation"),
-        ("study", "ablate", "--recipes", get("tiny_total"), *ABLATE, "--budget", "60", "--seeds", "3"),
-        "(seeds 2, here 3; budget 50, here 60)",
+        ("study", "ablate", "--recipes", get("tiny_total"), *ABLATE, "--search-episodes", "3", "--seeds", "3"),
+        "(seeds 2, here 3; search_episodes 4, here 3)",
         "settings.json",
     ),
 }

@@ -1,4 +1,4 @@
-"""The speed of a machine per second of processor time: the figures of ``ethbrake doctor speed``.
+"""The speed of a machine per second of processor time: ``python docs/studies/speed.py [--quick] [--json]``.
 
 Every rate is the median over repetitions of work done per second of this process's own processor time, on one core and
 after a first round that does not count (it compiles and fills caches). Programs that run beside it therefore weigh
@@ -8,17 +8,15 @@ calibration, a loop so simple that hardly anything but the machine can make it s
 
 from __future__ import annotations
 
-import os
-import platform
+import argparse
+import json
 import resource
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,10 +24,11 @@ import numpy as np
 import ethbrake_marl as eb
 from ethbrake_marl.agents import optimise_coupled, optimise_pairwise
 from ethbrake_marl.envs import make_engine, parallel_env
-from ethbrake_marl.errors import OnProgress, Progress
+from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.harm import empty_ledger
 from ethbrake_marl.physics import Floats, Worlds, advance, compiled, forecast
 from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.studies.machine import this_machine
 
 SCENARIO = "paper-random"
 SEED = 7
@@ -100,13 +99,9 @@ class Benchmark:
         return Speed(self.name, self.workload, self.worlds, _VEHICLES, self.unit, middle, low, high, self.floor)
 
 
-def measure(*, quick: bool = False, tell: OnProgress | None = None) -> list[Speed]:
+def measure(*, quick: bool = False) -> list[Speed]:
     """Every figure of ``BENCHMARKS``, one after the other; world-steps are set against the first, the calibration."""
-    found: list[Speed] = []
-    for benchmark in BENCHMARKS:
-        found.append(benchmark.measure(QUICK if quick else FULL))
-        if tell is not None:
-            tell(Progress("speed", len(found), len(BENCHMARKS)))
+    found = [benchmark.measure(QUICK if quick else FULL) for benchmark in BENCHMARKS]
     first = found[0].value
     return [replace(speed, relative=speed.value / first) if speed.unit == WORLD_STEPS else speed for speed in found]
 
@@ -276,40 +271,39 @@ BENCHMARKS: tuple[Benchmark, ...] = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Machine:
-    """The machine on which this runs: processor, load, versions; a figure of speed means nothing without it."""
-
-    processor: str
-    cores_usable: int
-    cores: int
-    load: float  # processes that were running, mean over the last minute
-    python: str
-    numpy: str
-    numba: str
-    ethbrake_marl: str
-
-    def __str__(self) -> str:
-        """The machine in words."""
-        return (
-            f"{self.processor}, {self.cores_usable} of {self.cores} cores usable, load {self.load:.1f};"
-            f" Python {self.python}, numpy {self.numpy}, numba {self.numba}, ethbrake_marl {self.ethbrake_marl}"
+def main() -> None:
+    """Measure, and print a table and the machine."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="in about 20 s instead of a minute or two; coarser")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    given = parser.parse_args()
+    machine, figures = this_machine(), measure(quick=given.quick)
+    if given.json:
+        told = {"machine": asdict(machine), "figures": [asdict(speed) for speed in figures]}
+        print(json.dumps(told, indent=2))
+        return
+    rows = [
+        (
+            *(speed.name, f"{speed.worlds:,}", f"{plain(speed.value)} {speed.unit.removesuffix('/s')}"),
+            f"{plain(speed.lowest)} - {plain(speed.highest)}",
+            "" if speed.relative is None else plain(speed.value * speed.vehicles),  # of world-steps alone
+            "" if speed.floor is None else plain(speed.floor),
         )
+        for speed in figures
+    ]
+    columns: list[Column | str] = ["per CPU-second", *map(Column, ("worlds", "median", "range", "x vehicles", "aim"))]
+    print(Sheet("", columns, rows).markdown())
+    print("Medians over repetitions, and their range. Aim: at least, for seconds at most.")
+    print(f"Machine: {machine}")
 
 
-def this_machine() -> Machine:
-    """The machine on which this runs."""
-    information = Path("/proc/cpuinfo")
-    lines = information.read_text("utf-8").splitlines() if information.is_file() else []
-    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return Machine(
-        models[0] if models else platform.processor() or platform.machine(),
-        usable,
-        os.cpu_count() or 1,
-        os.getloadavg()[0],
-        platform.python_version(),
-        version("numpy"),
-        version("numba"),
-        eb.__version__,
-    )
+def plain(value: float) -> str:
+    """Three digits, with k for thousands, M for millions and G beyond."""
+    for size, letter in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
+        if value >= size:
+            return f"{value / size:#.3g}".removesuffix(".") + letter
+    return f"{value:.3g}"
+
+
+if __name__ == "__main__":
+    main()

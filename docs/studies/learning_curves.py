@@ -1,0 +1,49 @@
+"""Train several seeds of recipes on one scenario, and draw their learning curves into one figure.
+
+``python docs/studies/learning_curves.py --scenario paper-delay-low --recipes ppo:5,sac:3 --output runs/low-delay``.
+The same command goes on after an interruption: finished trainings are kept, begun ones go on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from ethbrake_marl.errors import Progress
+from ethbrake_marl.evaluation import load_runnable
+from ethbrake_marl.learning import read_settings
+from ethbrake_marl.studies.learning_curves import AXES, LearningCurves
+
+
+def main(words: list[str]) -> int:
+    """Train, draw, and print the summary; 130 where Ctrl-C stopped it."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenario", default="paper-random")
+    parser.add_argument("--recipes", default="ppo:5,sac:3", help="recipes, each with its number of seeds (0, 1, ...)")
+    parser.add_argument("--output", type=Path, required=True, help="folder of the trainings, the figure and the table")
+    parser.add_argument("--steps", type=int, help="training steps (decisions)")
+    parser.add_argument("--jobs", type=int, default=1, help="so many trainings at once")
+    parser.add_argument("--against", choices=[*AXES], default="steps", help="what stands below the curves")
+    parser.add_argument("--set", action="append", metavar="KEY=VALUE", help="another value; repeatable")
+    given = parser.parse_args(words)
+    plan = LearningCurves.parse(given.recipes)
+    settings = read_settings(given.set, [recipe for recipe, _ in plan])
+    scenario = load_runnable(given.scenario, settings.scenario, drives="one")
+    changed = [(settings.change(recipe), seeds) for recipe, seeds in plan]
+    curves = LearningCurves(scenario, changed, given.output, given.against)
+    if not curves.train(steps=given.steps, jobs=given.jobs, settings=settings.texts, tell=_tell):
+        print("interrupted; the same command goes on with what is in the folder", file=sys.stderr)
+        return 130
+    print(json.dumps(curves.write(), indent=2))
+    print(f"figure: {given.output / 'learning_curves.png'}", file=sys.stderr)
+    return 0
+
+
+def _tell(progress: Progress) -> None:
+    print(f"{progress.name}: {progress.done:,} of {progress.total:,}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

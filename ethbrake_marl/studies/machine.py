@@ -1,0 +1,50 @@
+"""The machine on which this runs, for figures of speed and time."""
+
+from __future__ import annotations
+
+import os
+import platform
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import ethbrake_marl as eb
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """The machine on which this runs: processor, load, versions; a figure of speed means nothing without it."""
+
+    processor: str
+    cores_usable: int
+    cores: int
+    load: float  # processes that were running, mean over the last minute
+    python: str
+    numpy: str
+    numba: str
+    ethbrake_marl: str
+
+    def __str__(self) -> str:
+        """The machine in words."""
+        return (
+            f"{self.processor}, {self.cores_usable} of {self.cores} cores usable, load {self.load:.1f};"
+            f" Python {self.python}, numpy {self.numpy}, numba {self.numba}, ethbrake_marl {self.ethbrake_marl}"
+        )
+
+
+def this_machine() -> Machine:
+    """The machine on which this runs."""
+    information = Path("/proc/cpuinfo")
+    lines = information.read_text("utf-8").splitlines() if information.is_file() else []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return Machine(
+        models[0] if models else platform.processor() or platform.machine(),
+        usable,
+        os.cpu_count() or 1,
+        os.getloadavg()[0],
+        platform.python_version(),
+        version("numpy"),
+        version("numba"),
+        eb.__version__,
+    )
