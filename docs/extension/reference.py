@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from ethbrake_marl import ethbrake_v0
@@ -21,6 +22,7 @@ from ethbrake_marl.scenario import Scenario, list_scenarios, load_scenario, scen
 from ethbrake_marl.scenario.sampling import QUANTITY
 from ethbrake_marl.scenario.v2x import CHANNELS, V2X
 
+CARDS = Path(__file__).resolve().parents[2] / "ethbrake_marl" / "_policies"
 ON_EVERY_COMMAND = ("--help",)
 
 
@@ -307,8 +309,10 @@ def policies() -> str:
         reward = RewardParams(**told.reward)
         counts = f"{'first-impact' if reward.harm_count == 'first' else 'total'} harm"
         scenario = f"`{told.scenario['name']}`"
-        rows.append((f"[`{name}`](#{name})", scenario, counts if reward.harm else "the paper's reward", told.algorithm))
-    return table(("policy", "trained on", "for", "by"), rows)
+        why = re.search(r"^Not `universal`: (.*?)\n\n", (CARDS / name / "card.md").read_text("utf-8"), re.DOTALL | re.M)
+        aim = counts if reward.harm else "the paper's reward"
+        rows.append((f"[`{name}`](#{name})", scenario, aim, told.algorithm, why[1] if why else ""))
+    return table(("policy", "trained on", "for", "by", "why not `universal`"), rows)
 
 
 COMPLETED = {  # page -> what stands below what is written there

@@ -1,6 +1,6 @@
 """Several learners at equal processor time: table ``equal-learners`` of docs/results/cooperation.json, and its figure.
 
-    python docs/studies/cooperative.py runs/learners --seeds 0 1 2 3 4 --longer        # trains what is missing there
+    python docs/studies/cooperative.py runs/learners --seeds 0 1 2 3 4        # trains what is missing there
     python docs/studies/cooperative.py runs/learners --draw docs/figures/cooperative-learners.png
 
 Needs the extra `marl`. ``STEPS`` are about 20 s of one core; what each training took stands in the table, without
@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -35,7 +36,7 @@ STEPS = {  # decisions of all learners, in the order of METHODS
     "cooperation-3-pair": (400_000, 1_000_000, 550_000, 260_000, 260_000),
     "cooperation-4-all": (480_000, 1_000_000, 450_000, 270_000, 270_000),
 }
-LONGER, KIN = 12, ("ppo", "ippo", "mappo")  # so many times as many decisions, with one seed
+KIN = ("ppo", "ippo", "mappo")  # these learn by the settings of PPO's recipe
 WORLDS, SEED = 2000, 7
 SEEN = ["own", "front_1", "rear_1", "role", "obstacle"]
 SMALL = {
@@ -43,7 +44,7 @@ SMALL = {
     "learning_rate": {"start": 2e-3, "end": 3e-5},
 }  # fmt: skip
 HEAD = ["scenario", "method", "seeds", "decisions", "CPU", "first-impact", "IQM", "total", "IQM", "P(less than PPO)"]
-Harms = dict[str, tuple[float, Floats]]  # METHOD-TIMES -> processor seconds, harms [seeds, 2]
+Harms = dict[str, tuple[float, Floats]]  # method -> processor seconds, harms [seeds, 2]
 
 
 def learn(method: str, scenario: eb.Scenario, steps: int, seed: int, folder: Path) -> float:
@@ -58,15 +59,15 @@ def learn(method: str, scenario: eb.Scenario, steps: int, seed: int, folder: Pat
     return time.process_time() - begun
 
 
-def learn_missing(runs: Path, plan: Sequence[tuple[str, str, int, int]]) -> None:
-    """Train what the folder has not: ``LEVEL/METHOD-TIMES-SEED``, and its processor seconds beside it."""
+def learn_missing(runs: Path, seeds: Sequence[int]) -> None:
+    """Train what the folder has not: ``LEVEL/METHOD-SEED``, and its processor seconds beside it."""
     with TemporaryDirectory() as scratch:
         for method in METHODS:  # compiles, imports
             learn(method, eb.load_scenario("cooperation-3-pair"), 1, 0, Path(scratch) / method)
-    for level, method, times, seed in plan:
-        folder = runs / level / f"{method}-{times}-{seed}"
+    for seed, method, level in product(seeds, METHODS, STEPS):
+        folder = runs / level / f"{method}-{seed}"
         if not folder.with_suffix(".txt").exists():
-            steps = times * STEPS[level][list(METHODS).index(method)]
+            steps = STEPS[level][list(METHODS).index(method)]
             cpu_s = learn(method, eb.load_scenario(level), steps, seed, folder)
             folder.with_suffix(".txt").write_text(f"{cpu_s:.1f}\n", "utf-8")
             print(f"{folder}: {cpu_s:.1f} s", flush=True)
@@ -80,27 +81,25 @@ def drive(runs: Path, level: str) -> tuple[Harms, Floats]:
     found = eb.evaluate(scenario.sample(WORLDS, SEED), agents, scenario=scenario, aftermath=False)
     mean = {n: np.array([found.outcome(n).ledger.world_harm(c).mean() for c in ("first", "total")]) for n in agents}
     harms: Harms = {}
-    for key in (f"{method}-{times}" for times in (1, LONGER) for method in METHODS):
-        own = [each for each in files if each.stem.rpartition("-")[0] == key]
+    for method in METHODS:
+        own = [each for each in files if each.stem.rpartition("-")[0] == method]
         if own:
             cpu_s = np.mean([float(each.read_text("utf-8")) for each in own])
-            harms[key] = float(cpu_s), np.array([mean[each.stem] for each in own])
+            harms[method] = float(cpu_s), np.array([mean[each.stem] for each in own])
     return harms, mean["full_brake"]
 
 
 def lines(level: str, harms: Harms, braking: Floats) -> list[list[str]]:
     """The rows of a level."""
     found = [[f"`{level}`", "full braking", "–", "–", "–", f"{braking[0]:.2f}", "–", f"{braking[1]:.2f}", "–", "–"]]
-    ppo = harms["ppo-1"][1][:, 0]
-    for key, (cpu_s, harm) in harms.items():
-        method, times = key.split("-")
-        name = METHODS[method] + (f", {times} times as long" if times != "1" else "")
-        steps = int(times) * STEPS[level][list(METHODS).index(method)]
+    ppo = harms["ppo"][1][:, 0]
+    for method, (cpu_s, harm) in harms.items():
+        steps = STEPS[level][list(METHODS).index(method)]
         middle = [interquartile_mean([each]).in_words() if len(each) > 1 else "–" for each in harm.T]
         cells = [f"{harm[:, 0].mean():.2f}", middle[0], f"{harm[:, 1].mean():.2f}", middle[1]]
         pairs = np.sign(ppo - harm[:, :1])  # 1: less harm than that run of PPO's
         less = f"{0.5 + 0.5 * pairs.mean():.2f}" if len(harm) > 1 else "–"
-        found.append([f"`{level}`", name, f"{len(harm)}", f"{steps:,}", f"{cpu_s:.0f} s", *cells, less])
+        found.append([f"`{level}`", METHODS[method], f"{len(harm)}", f"{steps:,}", f"{cpu_s:.0f} s", *cells, less])
     return found
 
 
@@ -111,7 +110,7 @@ def draw(found: Mapping[str, tuple[Harms, Floats]]) -> Figure:
         for row, method in enumerate(METHODS):
             for number, what in enumerate(("first-impact harm", "total harm")):
                 style, at = series_style(number + 1), row + 0.24 * number - 0.12
-                values = harms[f"{method}-1"][1][:, number]
+                values = harms[method][1][:, number]
                 middle = interquartile_mean([values])
                 axes.plot(values, [at] * len(values), ".", color=style["color"], alpha=0.5, markersize=5)
                 axes.hlines(at, *middle.ends, color=style["color"], linewidth=1.6)
@@ -135,13 +134,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path)
     parser.add_argument("--seeds", type=int, nargs="+", default=[])
-    parser.add_argument("--longer", action="store_true", help="also PPO's kin, for longer")
     parser.add_argument("--draw", type=Path)
     given = parser.parse_args()
-    plan = [(level, method, 1, seed) for seed in given.seeds for method in METHODS for level in STEPS]
-    plan += [(next(iter(STEPS)), method, LONGER, 0) for method in KIN if given.longer]
-    if plan:
-        learn_missing(given.runs, plan)
+    if given.seeds:
+        learn_missing(given.runs, given.seeds)
     if given.draw:
         found = {level: drive(given.runs, level) for level in STEPS}
         write_picture(given.draw, draw(found), force=True)

@@ -1,4 +1,4 @@
-"""What a cluster is asked for: processor seconds per million decisions and worlds, and bytes per row.
+"""What a cluster is asked for: processor seconds per million decisions and worlds, the table of docs/scaling.md.
 
     python docs/studies/cost_model.py [--worlds 400]
 
@@ -14,12 +14,8 @@ import tempfile
 import time
 from pathlib import Path
 
-import yaml
-
 from ethbrake_marl.agents.registry import make_agent
-from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.evaluation import evaluate
-from ethbrake_marl.evaluation.results import write_per_world
 from ethbrake_marl.learning.runs import train
 from ethbrake_marl.learning.training import load_recipe
 from ethbrake_marl.scenario import load_scenario
@@ -57,27 +53,6 @@ def per_world(name: str, worlds: int) -> float:
     return (spent[2] - spent[1]) / ((LARGER - 1) * worlds)
 
 
-def sizes(folder: Path) -> dict[str, float]:
-    """Bytes of a row, by what it stands in."""
-    scenario = load_scenario(SCENARIO)
-    found = {}
-    driven = evaluate(scenario.sample(1000, 7), {"full_brake": make_agent("full_brake")}, scenario=scenario)
-    write_per_world(folder / "worlds.csv", driven)
-    found["world of evaluate --per-world csv"] = (folder / "worlds.csv").stat().st_size / 1000
-    settings = {"total_steps": 1, "evaluation.worlds": 100}
-    grid = {"scenario": SCENARIO, "recipe": "ppo", "seed": {"count": 2}}
-    (folder / "sweep.yaml").write_text(yaml.safe_dump({"set": settings, "grid": grid}))
-    out = folder / "sweep"
-    assert run_command(["study", "sweep", str(folder / "sweep.yaml"), "--output", str(out), "--jobs", "1"]) == 0
-    rows = (out / "results.csv").read_bytes().splitlines(keepends=True)
-    found["job in a sweep's table (CSV)"] = len(rows[1])
-    found["job in a sweep's journal"] = (out / "journal.jsonl").stat().st_size / 2
-    run = next((out / "runs").iterdir())
-    found["folder of a finished training of ppo"] = sum(f.stat().st_size for f in run.rglob("*") if f.is_file())
-    found["files in it"] = sum(f.is_file() for f in run.rglob("*"))
-    return found
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--worlds", type=int, default=400)
@@ -90,8 +65,6 @@ def main() -> int:
         for agent, times in AGENTS.items():
             each = per_world(agent, times * options.worlds)
             print(f"{agent}: {1e6 * each:.0f} s per million worlds", flush=True)
-        for what, size in sizes(Path(name)).items():
-            print(f"{what}: {size:,.0f}{'' if 'files' in what else ' bytes'}", flush=True)
     return 0
 
 

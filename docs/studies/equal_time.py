@@ -2,9 +2,9 @@
 
     .venv/bin/python docs/studies/equal_time.py [AGENT ...]
 
-With agents of your own the first is what the others are compared with (docs/searched-policies.md). Each is
-measured with its whole episode: what it does at the alert, every decision, and the motion of the worlds.
-No shipped table holds the worlds of this list, so ``best_harm:K`` has to search them.
+The first agent is what the others are compared with. Each is measured with its whole episode: what it does at the
+alert, every decision, and the motion of the worlds. No shipped table holds the worlds of this list, so ``best_harm:K``
+has to search them.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from ethbrake_marl.evaluation.statistics import paired_difference
 from ethbrake_marl.scenario import Sample, Scenario, load_scenario
 from ethbrake_marl.studies.machine import this_machine
 
-SEARCHED = "ppo@shipped+search+episode"  # the others' first-impact harm is compared with its
-SEARCHES = (  # without a policy, from a millisecond per world to what a search around a policy takes
-    *(f"best_harm:{candidates}" for candidates in (1000, 3000, 10_000, 20_000, 40_000)),
-    *(f"planner:{candidates}" for candidates in (64, 256, 1024, 2048)),
-)
+AGENTS = (
+    "ppo@shipped+search", "ppo@shipped", "universal@shipped", "full_brake+search", "e_v2x_bm",
+    *(f"best_harm:{candidates}" for candidates in (1000, 3000, 10_000, 40_000)),
+    *(f"planner:{candidates}" for candidates in (64, 256, 1024)),
+)  # fmt: skip
 WORLDS, SEED, REPEATS = 1000, 8, 2
 CHUNK = 500  # worlds driven together, for every agent alike
 HEAD = ("agent", "knows", "CPU, ms per world", "first-impact", "total", "difference")
@@ -64,7 +64,7 @@ def rows_of(driven: Mapping[str, tuple[float, Outcome]], against: str) -> list[S
 
 if __name__ == "__main__":
     scenario = load_scenario("paper-random")
-    agents = make_lineup(sys.argv[1:] or [SEARCHED, "e_v2x_bm", "ppo@shipped", *SEARCHES], scenario)
+    agents = make_lineup(sys.argv[1:] or AGENTS, scenario)
     rows = rows_of(drive(scenario.sample(WORLDS, SEED), agents, scenario, REPEATS), next(iter(agents)))
     print("\n".join(f"| {' | '.join(cells)} |" for cells in (HEAD, ["---"] * len(HEAD), *rows)))
     print(f"\nMachine: {this_machine()}")

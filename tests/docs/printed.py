@@ -150,7 +150,6 @@ BLOCKS: dict[str, How] = {
     "Agent,                           First-impact": _by(TRAINING, "make run"),
     "resume, ppo: 20/20": _by(TRAINING, "make programme NAME=resume"),
     "gap_1_m,gap_2_m,speed_1_mps": _by(BY_HAND),
-    "paper-random full_brake        backward": EXACT,
 }
 
 _TESTS = tuple(
@@ -191,7 +190,6 @@ PICTURES: dict[str, How] = {
     "cooperation-ablation": _by(TRAINING),
     "cooperative-learners.png": _by(TRAINING),
     "learning-curves": _by(TRAINING),
-    "speed-scaling.png": _by(SPEED),
 }
 
 

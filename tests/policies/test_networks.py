@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 import pickle
+import re
 import stat
 import sys
 from collections.abc import Callable, Mapping
@@ -36,7 +37,7 @@ from ethbrake_marl.policies import (
     squash,
 )
 from ethbrake_marl.shield import HybridAgent
-from tests.docs.site import load
+from tests.docs.site import DOCS
 
 RandomTensors = Callable[[NetworkSpec], dict[str, np.ndarray]]
 
@@ -520,7 +521,8 @@ def test_bundle__round_trip_is_exact_and_always_of_the_same_bytes(policy: Policy
     """Also without the critic, as policies ship; a second name of a file, as installers make one, is no sign of it."""
     for name in ("a", "run/policy"):
         policy.save(tmp_path / name)
-    load("../studies/ship_policy").actor_only(policy).save(tmp_path / "shipped")
+    (program,) = re.findall("```python\n(.*?)```", (DOCS / "releasing.md").read_text("utf-8"), re.DOTALL)
+    exec(program.replace("runs/mine", str(tmp_path / "a")).replace("mine/policy", str(tmp_path / "shipped")), {})
     os.link(tmp_path / "a" / "weights.safetensors", tmp_path / "elsewhere")
     one, other, shipped = (load_policy(tmp_path / name) for name in ("a", "run", "shipped"))
     assert one.manifest == other.manifest == policy.manifest and one.tensors.keys() == policy.tensors.keys()

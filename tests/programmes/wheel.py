@@ -72,12 +72,11 @@ COMMANDS = (
     Call(("ethbrake", "evaluate", "--agents", SHIPPED, "--episodes", "200")),
     Call(("ethbrake", "evaluate", "--agents", "full_brake,ppo@shipped+step", "--episodes", "20", "--json")),
     Call(("ethbrake", "shield", "--agents", "ppo@shipped", "--episodes", "20")),
-    Call(("ethbrake", "watch", "picture", "deceleration", "--output", "deceleration.png")),
+    Call(("ethbrake", "watch", "--output", "film.svg")),
     Call(("ethbrake", "scenario", "validate", "paper-random")),
     Call(("ethbrake", "doctor")),
     Call(("ethbrake", "train", "--steps", "1000"), 2, NEEDS_TRAIN),
     Call(("ethbrake", "run"), 2, NEEDS_TRAIN),
-    Call(("ethbrake", "doctor", "speed", "--quick"), 2, NEEDS_TRAIN),
     Call(("ethbrake", "agent", "export", "shipped/ppo", "--onnx", "ppo.onnx"), 2, "'ethbrake-marl[export]'"),
     Call(("python", "-c", "import ethbrake_marl as eb; eb.train"), 1, NEEDS_TRAIN),  # an exception, whose end says it
 )

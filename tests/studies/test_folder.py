@@ -16,9 +16,10 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.learning import Training, load_recipe
 from ethbrake_marl.scenario import load_scenario
+from ethbrake_marl.studies.ablation import plan_ablation
 from ethbrake_marl.studies.folder import StudyFolder
 from ethbrake_marl.studies.trainings import TrainingJob, train_all
-from tests.studies.conftest import ABLATE
+from tests.studies.conftest import ABLATE, LEVELS
 
 ROOT = Path(__file__).resolve().parents[2]
 QUESTION = {"seed": 1, "levels": [1, 2], "versions": {"numpy": "2", "torch": "2"}}
@@ -150,7 +151,7 @@ STUDIES: dict[str, Callable[[Callable[[str], Any]], Study]] = {
         ("study", "ablate", "--recipes", get("tiny_total"), *ABLATE),
         get("finished_ablation"),
         ("study", "ablate", "--recipes", get("tiny_total"), *ABLATE, "--search-episodes", "3", "--seeds", "3"),
-        "(seeds 2, here 3; search_episodes 4, here 3)",
+        "(seeds 2, here 3; search-episodes 4, here 3)",
         "settings.json",
     ),
 }
@@ -236,20 +237,24 @@ def test_damaged_file__is_named_in_one_line_before_anything_is_done(
 
 @pytest.mark.parametrize("study", ["ablation"], indirect=True)
 @pytest.mark.parametrize(
-    ("copied", "options", "patterns"),
+    ("copied", "seeds", "patterns"),
     [
-        (True, ["--cost"], ["to do: 0 trainings, 0 decisions: 0 s; joint", "npz: is damaged; its worlds are"]),
-        (True, ["--seeds", "3", "--cost"], ["to do: 2 trainings, 512 decisions at"]),
-        (False, ["--seeds", "1", "--cost"], ["to do: 2 trainings, 512 decisions at"]),
+        (True, 2, ["to do: 0 trainings, 0 decisions: 0 s; joint", "npz: is damaged; its worlds are"]),
+        (True, 3, ["to do: 2 trainings, 512 decisions at"]),
+        (False, 1, ["to do: 2 trainings, 512 decisions at"]),
     ],
 )
 def test_cost__is_told_and_nothing_is_made(
-    study: Study, copied: bool, options: list[str], patterns: list[str], told, tmp_path: Path
+    study: Study, copied: bool, seeds: int, patterns: list[str], tmp_path: Path
 ) -> None:
     folder = tmp_path / "there"
     if copied:
         shutil.copytree(study.folder, folder)
     for damaged in [*folder.glob("optimum/*/*.npz")][:1]:
         damaged.write_bytes(b"no table")
-    said = told(folder, *study.line, *options, status=0)
+    recipe = str(study.line[study.line.index("--recipes") + 1])
+    said = plan_ablation(
+        LEVELS, recipe, ["scheme=shared"], seeds=seeds, steps_per_learner=128, episodes=20, search_episodes=4,
+        folder=folder,
+    ).cost()  # fmt: skip
     assert [each for each in patterns if not re.search(each, said)] == [] and folder.exists() == copied

@@ -1,4 +1,4 @@
-"""Beside other simulators: speeds, all measured now, by one loop, on this machine: ``python docs/studies/peers.py``.
+"""Beside other simulators: speeds, all measured now, by one loop, on this machine.
 
 Each peer has an environment of its own below ``.venvs/``: some have licences or dependencies that this project does not
 want. One that cannot be installed or measured is told with the reason. Work is counted per second of processor time of
@@ -9,7 +9,6 @@ imports inside functions.
 from __future__ import annotations
 
 import json
-import os
 import statistics
 import sys
 import time
@@ -19,14 +18,15 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.programmes import NotInstalled, ready_python, watched
+from tests.docs.site import load
+from tests.programmes import Cases, Given, NotInstalled, Told, ready_python, watched
 
 Work = Callable[[], int]  # does some work and says how many worlds it advanced by a step
 
 REPETITIONS, SECONDS = 5, 1.0
 MOST_SECONDS = 900.0  # that a measurement may take
 VERSIONS = Path(__file__).with_name("peers.txt")
-THREADS = {  # one for every library: threads that wait also cost processor time
+SETTINGS = {  # one thread for every library: threads that wait also cost processor time
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
     **dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"),
 }
@@ -47,9 +47,7 @@ def rates(work: Work, repetitions: int = REPETITIONS, seconds: float = SECONDS) 
 
 def ours(name: str, n: int) -> Work:
     """A loop of ``python docs/studies/speed.py``."""
-    from ethbrake_marl.studies import speed
-
-    work: Work = getattr(speed, name)(n)
+    work: Work = getattr(load("../studies/speed"), name)(n)
     return work
 
 
@@ -182,7 +180,7 @@ def tell(name: str) -> None:
     print(json.dumps({"version": version(loop.distribution), "rates": rates(loop.make())}))
 
 
-def measured(name: str, medians: dict[str, float]) -> str:
+def measured(name: str, medians: dict[str, float]) -> Told:
     """What is told of a loop; of a peer also how many times our loop is faster."""
     loop = LOOPS[name]
     pins = ["-c", str(VERSIONS)]
@@ -192,15 +190,16 @@ def measured(name: str, medians: dict[str, float]) -> str:
             holds = NEEDS.get(loop.distribution, (loop.distribution,))
             python = ready_python(holds[-1], [*pins, *holds], project=False, torch=loop.distribution == "vmas")
     except NotInstalled as reason:
-        return f"not installed: {reason}"
-    status, told = watched([str(python), str(Path(__file__).resolve()), name], MOST_SECONDS, **THREADS)
+        return Told(None, f"not installed: {reason}")
+    status, told = watched([str(python), "-m", "tests.programmes.peers", name], MOST_SECONDS, **SETTINGS)
     last = (told.strip().splitlines() or [""])[-1]
     if status != 0:
-        return f"not measured: {last or f'ended with status {status}'}"
+        return Told(None, f"not measured: {last or f'ended with status {status}'}")
     found = json.loads(last)
     medians[name] = statistics.median(found["rates"])
     text = f"{found['version']}   {plain(medians[name])}   {plain(found['rates'][0])} - {plain(found['rates'][-1])}"
-    return f"{text}   ours: {plain(medians[loop.beside] / medians[name])} x" if loop.beside in medians else text
+    beside = f"   ours: {plain(medians[loop.beside] / medians[name])} x" if loop.beside in medians else ""
+    return Told(True, text + beside)
 
 
 def plain(value: float) -> str:
@@ -208,14 +207,12 @@ def plain(value: float) -> str:
     return f"{float(f'{value:.3g}'):,.{0 if value >= 99.95 else 1 if value >= 9.995 else 2}f}"
 
 
-def main() -> None:
-    """Print one line for each loop."""
+def cases(given: Given) -> Cases:
+    """Each loop: world-steps per second of processor time, the median of ``REPETITIONS``, lowest and highest."""
     medians: dict[str, float] = {}
-    print(f"World-steps per CPU-second: median of {REPETITIONS} x {SECONDS:g} s, lowest - highest; load", end=" ")
-    print(f"{os.getloadavg()[0]:.1f}", flush=True)
     for name, loop in LOOPS.items():
-        print(f"{name}: {loop.distribution}, {loop.what}: {measured(name, medians)}", flush=True)
+        yield f"{name}: {loop.distribution}, {loop.what}", partial(measured, name, medians)
 
 
 if __name__ == "__main__":
-    tell(sys.argv[1]) if len(sys.argv) > 1 else main()
+    tell(sys.argv[1])
