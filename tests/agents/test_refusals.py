@@ -315,6 +315,14 @@ def test_file_of_an_agent__is_refused(spec: str, message: str, empty_folder: Pat
         make_agent(spec, scenario=PAPER)
 
 
+def test_file_of_an_agent__is_the_same_as_long_as_the_process_lives(empty_folder: Path) -> None:
+    Path("mine.py").write_text(FILE)
+    make_agent("mine.py:make_agent")
+    Path("mine.py").write_text(f"{FILE}# changed")
+    with refused("file 'mine.py': was changed since it was loaded; begin a new process"):
+        make_agent("mine.py:make_agent")
+
+
 def test_file_of_an_agent__is_not_run_for_a_role(empty_folder: Path) -> None:
     Path("half.py").write_text("raise SystemExit('this ran')")
     with refused("agent 'half.py:make_agent': is a function of a Python file, and those are loaded only where"):

@@ -31,6 +31,7 @@ from ethbrake_marl.figures import (
     harm_against_total_gap,
     harm_by_agent,
     learning_curve,
+    picture_ending,
     seed_curves,
     trajectories,
 )
@@ -153,6 +154,19 @@ NAMES: dict[str, Callable[[], object]] = {
 def test_name__is_unknown(message: str) -> None:
     with refused(message, UnknownName):
         NAMES[message]()
+
+
+def test_groups__are_those_of_a_mixture_or_of_vehicle_types() -> None:
+    with refused("by 'scenario': these worlds have no groups; those of a mixture have scenario"):
+        eb.summarise_by(eb.evaluate(WORLDS, BRAKE, scenario=PAPER), "scenario")
+    mixed = eb.load_scenario("realistic-mixed")
+    with refused("unknown group 'vehicle_9_type'; did you mean 'vehicle_3_type'?", UnknownName):
+        eb.summarise_by(eb.evaluate(mixed.sample(3, 7), BRAKE, scenario=mixed), "vehicle_9_type")
+
+
+def test_uncertainty__is_for_an_agent_that_certifies_against_it() -> None:
+    with refused("uncertainty gaps_m=1: nobody uses it; an agent with +robust does: ppo@PATH+robust"):
+        make_lineup(["coast"], PAPER, uncertainty="gaps_m=1")
 
 
 def test_agent__says_what_it_knows() -> None:
@@ -335,6 +349,7 @@ FIGURES: dict[str, Callable[[], object]] = {
     "agent 'ppo' was not evaluated; evaluated: full_brake": lambda: harm_against_total_gap(
         eb.evaluate(PAPER.sample(2, 7), BRAKE, scenario=PAPER), agents=["ppo"]
     ),
+    "map.png.eps: pictures are written as PNG, SVG or PDF": lambda: picture_ending("map.png.eps"),
     "trajectories: no records given": lambda: trajectories({}),
 }
 

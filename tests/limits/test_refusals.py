@@ -125,3 +125,9 @@ def test_table__is_improved_by_a_harm_of_each_world() -> None:
     table = BestHarmTable.load(TABLES / "paper-random.npz")
     with refused("improve: (3,) harms for (2,) worlds"):
         table.improved(table.identity[:2], "first", np.zeros(3))
+
+
+def test_table__of_other_worlds_is_refused() -> None:
+    table = BestHarmTable.load(TABLES / "paper-delay-low.npz")
+    with refused("table of best known harm (scenario paper-delay-low, list_seed 7, episodes 2000"):
+        table.check_holds_any(problem().identity)

@@ -425,6 +425,13 @@ def test_estimated_worlds__that_leave_too_much_open_are_refused() -> None:
         make_agent("coast+robust:believed", scenario=wide)
 
 
+def test_uncertain_latency__ends_before_the_horizon() -> None:
+    with refused(
+        "uncertainty: latency_s=1000: vehicle_2 may decide first at 1000.5 s; must be before the horizon, 8 s"
+    ):
+        begun(PAPER, WORLDS, uncertainty=parse_uncertainty("latency_s=1000"))
+
+
 def test_interior__takes_no_brakes_that_began_to_build_up_before() -> None:
     slow = PAPER.replace(brake_rate_mps3=9)
     braking = replace(slow.sample(1, 3).worlds, command_mps2=np.full((1, 3), -1.0))

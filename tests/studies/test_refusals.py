@@ -13,6 +13,7 @@ from ethbrake_marl.errors import AlreadyExists, UnknownName
 from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies.ablation import Level, common_worlds, with_scheme
 from ethbrake_marl.studies.falsification import Measure, search
+from ethbrake_marl.studies.learning_curves import LearningCurves
 from ethbrake_marl.studies.reproduction import Reproduction, read_results, render_page
 from ethbrake_marl.studies.sweep import SweepPlan
 from ethbrake_marl.studies.tuning import TuningPlan
@@ -398,6 +399,19 @@ def test_figure__that_is_more_than_lines_is_not_shown(
     Path("out/gaps/a-figure.svg").write_text(f'<svg xmlns="http://www.w3.org/2000/svg">{svg}</svg>')
     with refused("out/gaps/a-figure.svg: is not a figure as it was drawn; make it again (--force)"):
         render_page(Path("out"), results)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("ppo", "recipes 'ppo': 'ppo' must be RECIPE:SEEDS, for instance ppo:5,sac:3"),
+        ("ppo:0", "recipes 'ppo:0': 'ppo:0' must be RECIPE:SEEDS"),
+        ("ppo:2,ppo:3", "recipes 'ppo:2,ppo:3': two recipes have the same name"),
+    ],
+)
+def test_recipes_of_learning_curves__are_refused(text: str, message: str) -> None:
+    with refused(message):
+        LearningCurves.parse(text)
 
 
 def test_reproduction__is_written_to_a_folder_of_its_own(empty_folder: Path) -> None:
