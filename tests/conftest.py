@@ -6,6 +6,7 @@ import functools
 import os
 import signal
 import sys
+from pathlib import Path
 
 import pytest
 import typer.main
@@ -46,6 +47,13 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # No deadline: the first example of a property pays for the kernel's compilation.
 settings.register_profile("deterministic", derandomize=True, deadline=None, database=None, print_blob=True)
 settings.load_profile("deterministic")
+
+
+@pytest.fixture
+def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder that the test runs in."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
 
 
 @pytest.fixture(autouse=True)

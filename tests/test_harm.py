@@ -1,6 +1,7 @@
 """Harm: shares by mass, ledger, injury, objectives; and reward terms by hand, shaping as a difference of potentials."""
 
 import math
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
@@ -9,12 +10,13 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import ethbrake_marl as eb
+from ethbrake_marl.actions import action_to_command, checked_action, command_to_action
 from ethbrake_marl.envs.interfaces import make_engine
-from ethbrake_marl.harm import STANDARD, Ledger, empty_ledger, objective_harm, objectives_of, split
+from ethbrake_marl.harm import STANDARD, Ledger, empty_ledger, objective_harm, objectives_of, scored, split
 from ethbrake_marl.physics import Floats, Impacts, Worlds, advance, forecast, make_worlds
-from ethbrake_marl.rewards import RewardParams, StepOutcome, WithoutEffect
+from ethbrake_marl.rewards import REWARDS, RewardParams, StepOutcome, WithoutEffect, reward_params
 from tests.contract.interfaces import CRASH, REST
-from tests.physics.random_worlds import driving_lines
+from tests.physics.random_worlds import driving_lines, line
 from tests.reference.tolerances import EPS
 
 # ---------------------------------------------------------------- shares
@@ -267,3 +269,181 @@ def test_reward__without_harm_says_that_the_scenarios_objective_changes_nothing(
         paid = make_engine(own, 2, reward="paper", seed=1)
     assert paid.reward.objective is None
     make_engine(own, 2, reward={"harm": 1.0, "risk": 0.1}, seed=1)
+
+
+def test_counts__differ_by_the_later_impacts() -> None:
+    # The two counts differ by the later impacts: 8, 4 and 2 m/s against a heavy holding wall, in two segments.
+    world = line([0.0], [0.0, 8.0], mass_t=[2.0**50, 1.0], restitution=0.5)
+    ledger = empty_ledger(world)
+    for until in (1.0, 3.25):
+        world, impacts = eb.advance(world, [-16.0, 4.0], until_s=until)
+        ledger = ledger.add(impacts)
+    assert ledger.pair_harm("first").tolist() == [[64.0]]
+    assert ledger.count.tolist() == [[3]]
+    assert ledger.collided.tolist() == [True]
+    assert ledger.vehicle_harm("first").sum().tolist() == 64.0
+    assert np.round(ledger.world_harm("total"), 9).tolist() == [64 + 16 + 4]
+
+
+def test_harm_of_the_obstacle__is_that_of_vehicle_1() -> None:
+    # 6 m/s into it, 8 and 10 m/s behind, all touching, e = 0: one round, all at rest.
+    world = line([0.0, 0.0], [6.0, 8.0, 10.0], obstacle_gap_m=0.0)
+    ledger = empty_ledger(world).add(eb.advance(world, 0.0, 0.0)[1])
+    assert ledger.obstacle_harm("first").tolist() == [36.0]
+    assert ledger.obstacle_harm("total").tolist() == [36.0]
+    assert ledger.pair_harm("total").tolist() == [[4.0, 4.0]]
+    assert ledger.world_harm("total").tolist() == [44.0]
+    assert ledger.vehicle_harm("first").tolist() == [[38.0, 4.0, 2.0]]
+    assert ledger.vehicle_harm("total").tolist() == [[38.0, 4.0, 2.0]]
+    alone = line([50.0], [20.0, 0.0], obstacle_gap_m=10.0)
+    assert empty_ledger(alone).add(eb.advance(alone, 0.0, 1.0)[1]).collided.tolist() == [True]
+
+
+BEYOND = np.nextafter(np.float32(1), np.float32(2))
+
+
+@pytest.mark.parametrize(
+    ("action", "taken"),
+    [([-1, 1], [-1.0, 1.0]), ([-BEYOND, BEYOND], [-1.0, 1.0]), ([1.0000000000000002, 0.5], [1.0, 0.5])],
+    ids=["bounds", "one step beyond", "rounding"],
+)
+def test_actions__are_taken_up_to_one_float32_step_beyond_their_bounds(action, taken) -> None:
+    assert checked_action(action, (2,), "vehicle_2").tolist() == taken
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (1, 1)])
+def test_action_of_one_vehicle__may_have_any_axes_of_length_1(shape) -> None:
+    assert checked_action(np.full(shape, 0.25), (1,), "vehicle_2").tolist() == [0.25]
+    assert checked_action(np.full(shape, 0.25), (1, 1), "vehicle_2").tolist() == [[0.25]]
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "commands", "back", "cut"),
+    [
+        (0, [-8.0, -4.0, 0.0, 1.0, 2.0], [-1.0, -0.5, 0.0, 0.5, 1.0], [-1.0, -1.0, 0.0, 1.0, 1.0]),
+        (1, [-6.0, -3.0, 0.0, 0.0, 0.0], [-1.0, -0.5, 0.0, 0.0, 0.0], [-1.0, -1.0, 0.0, 0.0, 0.0]),  # cannot drive
+    ],
+)
+def test_actions__are_linear_on_each_side_of_coasting_and_back(vehicle, commands, back, cut) -> None:
+    capacities = {"braking_capacity_mps2": [8.0, 6.0], "driving_capacity_mps2": [2.0, 0.0]}
+    worlds = eb.make_worlds(5.0, np.full((5, 2), 20.0), **capacities, latency_s=0.0, mass_t=1.0, restitution=0.0)
+    command = action_to_command(np.array([-1.0, -0.5, 0.0, 0.5, 1.0]), worlds.vehicles, vehicle)
+    assert command.tolist() == commands
+    assert command_to_action(command, worlds.vehicles, vehicle).tolist() == back
+    assert command_to_action(np.array([-99.0, -8.5, 0.0, 2.5, 99.0]), worlds.vehicles, vehicle).tolist() == cut
+
+
+@pytest.mark.parametrize(
+    ("harm", "mass", "expected"),
+    [
+        ([16, 0], [1, 3, 1], [[12.0, 4.0, 0.0]]),
+        ([16, 0], [3, 1, 1], [[4.0, 12.0, 0.0]]),
+        ([0, 16], [1, 3, 1], [[0.0, 4.0, 12.0]]),
+        ([16, 8], [1, 3, 1], [[12.0, 6.0, 6.0]]),
+    ],
+)
+def test_split__the_lighter_one_of_a_pair_bears_more(harm, mass, expected) -> None:
+    # The lighter one of a pair bears more, as in the paper: 16 of masses 1 and 3 are 12 and 4.
+    assert split(np.array([harm], float), np.array([mass], float)).tolist() == expected
+
+
+# Pair 1 met with 12 m2/s2 (masses 1, 2), pair 2 with 9 (masses 2, 1), then with 21 more; e = 0.5.
+MET = Ledger(
+    np.array([[12.0, 9.0]]),
+    np.array([[12.0, 30.0]]),
+    np.array([[1, 2]]),
+    *Impacts.no_obstacle(1),
+    np.array([[1.0, 2.0, 1.0]]),
+    np.array([0.5]),
+)
+
+
+@pytest.mark.parametrize(
+    ("objective", "harm"),
+    [
+        ("total", [21.0, 21.0, 21.0]),
+        ("own", [8.0, 7.0, 6.0]),
+        ("social:0", [8.0, 7.0, 6.0]),
+        ("social:90", [13.0, 14.0, 15.0]),
+        ("social:45", [21 / 2**0.5] * 3),
+        ("social:30", [x * 0.75**0.5 + (21 - x) / 2 for x in (8, 7, 6)]),
+        ("maximin", [8.0, 8.0, 8.0]),
+        ("mass-weighted", [21.0, 21.0, 21.0]),
+        ("weighted:1,4,2", [3 * (8 + 4 * 7 + 2 * 6) / 7] * 3),
+        ("weighted:1e6, 1e-6,1e6", [21.0, 21.0, 21.0]),
+        (("total", "own", "maximin"), [21.0, 7.0, 8.0]),
+    ],
+    ids=str,
+)
+def test_objectives__by_hand(objective, harm) -> None:
+    # Shares by mass: pair 1 gives 8 and 4, pair 2 gives 3 and 6 of its first: H = (8, 7, 6).
+    found = objective_harm(MET, "first", objectives_of(objective, 3))
+    assert found[0] == pytest.approx(harm, abs=1e-8)
+    (told,) = scored(MET, "first", [objective]).values()
+    assert told.tolist() == found.tolist()
+
+
+def test_objectives__of_total_harm() -> None:
+    # Pair 2 gives 10 and 20: H = (8, 14, 20).
+    found = objective_harm(MET, "total", objectives_of(("total", "own", "maximin"), 3))
+    assert found.tolist() == [[42.0, 14.0, 20.0]]
+
+
+def test_injuries__by_hand() -> None:
+    # The changes of speed are Vehicle 1's 2 / 3 1.5 sqrt(12) at the rear, Vehicle 2's 1 / 3 1.5 sqrt(12) in front and
+    # 1 / 3 1.5 3 at the rear, of which the front one counts, and Vehicle 3's 2 / 3 1.5 3 in front.
+    assert np.round(MET.speed_changes("first"), 8).tolist() == [[[0.0, 1.73205081, 3.0]], [[3.46410162, 1.5, 0.0]]]
+    logits = np.array([4.888 - 0.177 * 12**0.5, 4.457 - 0.177 * 3**0.5, 4.457 - 0.177 * 3])
+    injuries = objective_harm(MET, "first", objectives_of("injury:lr4s", 3))
+    assert injuries[0] == pytest.approx([(1000 / (1 + np.exp(logits))).sum()] * 3, abs=1e-8)
+
+
+def test_injuries__grow_with_a_harder_impact() -> None:
+    # Though a rear hit counts for less than one in front.
+    harder = [replace(MET, first_impact_harm=np.array([[400.0, w * w]])) for w in (19.9, 20.0, 20.1)]
+    injuries = [objective_harm(each, "first", objectives_of("injury:lr4s", 3))[0, 0] for each in harder]
+    assert injuries == sorted(set(injuries))
+
+
+def test_reward__has_the_objective_of_the_scenario_unless_it_has_its_own() -> None:
+    own = PAPER.replace(objective="own")
+    assert played("harm", own)[0].tolist() == played({"objective": "own"})[0].tolist()
+    assert played({"objective": "total"}, own)[0].tobytes() == played("harm")[0].tobytes()
+    assert played(RewardParams(objective=("total",) * 3))[0].tobytes() == played("harm")[0].tobytes()
+
+
+def test_reward__objective_changes_no_weight_and_no_other_term() -> None:
+    doubled, _ = played({"objective": "maximin", "harm": 2.0, "terminal": 3.0})
+    single, engine = played({"objective": "maximin"})
+    safe = ~engine.ledger.collided
+    assert safe.any()
+    assert doubled == pytest.approx(2.0 * single + 3.0 * safe[:, np.newaxis])
+    without, _ = played({"harm": 0.0, "terminal": 1.0})
+    assert without.tolist() == np.repeat(safe[:, np.newaxis] * 1.0, 3, axis=1).tolist()
+
+
+def one(step):
+    """One for all."""
+    return np.ones(len(step.time_s))
+
+
+def test_rewards__are_those_of_the_page() -> None:
+    assert REWARDS["harm"] == RewardParams(harm=1.0, harm_count="first")
+    assert REWARDS["total-harm"] == RewardParams(harm_count="total")
+    assert REWARDS["paper"] == RewardParams(harm=0.0, collision=1.0, risk=0.1, jerk=1e-5, terminal=10.0)
+    assert list(REWARDS) == ["harm", "total-harm", "paper"]
+    assert reward_params({"harm": 2, "jerk": 0.5}) == RewardParams(harm=2.0, jerk=0.5)
+
+
+@pytest.mark.parametrize(
+    ("reward", "terms"),
+    [({"harm": 1.0}, {}), ({"mine": 0.0}, {}), ("harm", {}), ({"harm": 0.0, "terms": {"mine": 2}}, {"mine": 2.0})],
+    ids=str,
+)
+def test_term_of_ones_own__counts_where_a_reward_says_so(reward, terms) -> None:
+    for _ in range(2):  # registered twice it is one
+        eb.register_term("mine", one)
+    assert reward_params(reward).terms == terms
+    settled = RewardParams(harm=1.0, terms={"mine": 3.0})
+    assert RewardParams(**settled.model_dump()) == settled
+    assert settled.weight("mine") == 3.0

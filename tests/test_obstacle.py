@@ -1,6 +1,7 @@
 """An obstacle ahead of Vehicle 1, from the scenario to the results: every module counts it, and counts it alike."""
 
 import csv
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from ethbrake_marl.policies import ObservationSchema
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from ethbrake_marl.search import profile_problem
 from ethbrake_marl.shield.guard import ShieldedDriver
+from tests.refused import refused
 
 ALL = load_scenario("cooperation-4-all")
 NEAR = ALL.replace(obstacle_gap_m={"uniform": [10, 45]})  # within the way of full braking in many worlds
@@ -115,3 +117,30 @@ def test_manifest__a_policys_observation_is_known_again_by_its_features(name: st
     schema = ObservationSchema.of(eb.observation_for(load_scenario(name)))
     assert schema.spec == eb.observation_for(load_scenario(name)) and ObservationSchema.of(schema.spec) == schema
     assert set(schema.model_dump()) == {"front", "rear", "features", "scaling_sha256"}  # as in every shipped policy
+
+
+STATE = {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
+REFUSED: dict[str, Callable[[], object]] = {
+    "scenario 'cooperation-4-all': obstacle_gap_m = 0: must be finite and in (0": lambda: ALL.replace(obstacle_gap_m=0),
+    "has nothing to brake for without an obstacle ahead; give obstacle_gap_m too": lambda: load_scenario(
+        "cooperation-3-pair"
+    ).with_learners([0, 1]),
+    "initial_state: obstacle_gap_m is missing, and random in scenario 'cooperation-4-all'": lambda: (
+        NEAR.worlds_from_state(STATE)
+    ),
+    "initial_state: obstacle_gap_m is not of this scenario: 'paper-random' has no obstacle_gap_m": lambda: (
+        load_scenario("paper-random").worlds_from_state({**STATE, "obstacle_gap_m": 30})
+    ),
+    "initial_state: obstacle_gap_m = 0: must be finite and in (0, 10000] m (metres)": lambda: ALL.worlds_from_state(
+        {**STATE, "obstacle_gap_m": 0}
+    ),
+    "avoidability: obstacle_gap_m[0] = 33.6372: must be beyond full braking of vehicle_1": lambda: avoidability(
+        NEAR.sample(200, 7).worlds
+    ),
+}
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_obstacle__that_is_missing_or_nowhere_is_refused(message: str) -> None:
+    with refused(message):
+        REFUSED[message]()

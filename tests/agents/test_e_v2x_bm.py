@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents import e_v2x_bm, optimise_coupled, optimise_pairwise, pairwise_harm
+from ethbrake_marl.agents import Team, drive, e_v2x_bm, make_agent, optimise_coupled, optimise_pairwise, pairwise_harm
 from ethbrake_marl.agents.e_v2x_bm import (
     CoupledOptimum,
     Line,
@@ -25,6 +25,7 @@ from ethbrake_marl.agents.e_v2x_bm import (
 from ethbrake_marl.physics import Floats, Impacts, Worlds, advance, forecast, make_worlds
 from ethbrake_marl.physics.compiling import compiled
 from ethbrake_marl.physics.kernel import FLAG, ROW
+from tests.agents.test_drive import PAIR
 
 PAPER = eb.load_scenario("paper-random")
 
@@ -416,3 +417,79 @@ def test_coupled__finds_what_it_found_when_each_step_ran_over_all_worlds_at_once
         name: hashlib.sha256(b"".join(np.ascontiguousarray(column).tobytes() for column in found)).hexdigest()[:16]
         for name, found in recorded_cases()
     } == RECORDED
+
+
+def test_optimum__takes_the_middle_of_a_flat_minimum() -> None:
+    # The front pair meets while both coast, whatever vehicle 2 does; the rear pair is spared up to 5 m/s2.
+    worlds = make_worlds(
+        [1.0, 5.0],
+        [10.0, 12.0, 12.0],
+        braking_capacity_mps2=[5, 8, 5],
+        driving_capacity_mps2=0,
+        latency_s=[1.0, 1.0, 1.0],
+        mass_t=1,
+        restitution=0,
+    )
+    best = optimise_pairwise(worlds, 1)
+    # The rear one stops in 14.4 m, so vehicle 2 may stop in 9.4 m: 7.66 m/s2.
+    assert best.spares_rear_mps2[0] == pytest.approx(72 / 9.4)
+    assert best.spares_front_mps2[0] == math.inf
+    assert best.harm[0] == 4.0
+    assert best.deceleration_mps2[0] == pytest.approx(36 / 9.4)
+
+
+def test_coupled__stays_off_the_edge_of_a_jump() -> None:
+    # The least harm, 1.2376, ends at a* = 5.93951, where a second impact makes it 1.6387: rounding must not decide.
+    world = make_worlds(
+        [7.59, 9.53],
+        [20.07, 19.34, 20.35],
+        braking_capacity_mps2=[6, 7, 6],
+        driving_capacity_mps2=6,
+        latency_s=[0, 0.5, 0.8],
+        mass_t=[4.5, 5.5, 5.9],
+        restitution=0.1,
+    )
+    best = optimise_coupled(world, 1)
+    around = [float(realised(world, 1, best.deceleration_mps2 + d).first_impact_harm.sum()) for d in (-1e-9, 0, 1e-9)]
+    assert around == pytest.approx([1.2376] * 3, abs=1e-4)
+    assert realised(world, 1, best.deceleration_mps2 + 1e-8).first_impact_harm.sum() > 1.6
+
+
+def test_coupled__follows_the_commands_of_the_others() -> None:
+    # Nobody else brakes: vehicle 2 harms nobody by coasting like them, and is hit if it brakes.
+    worlds = make_worlds(
+        [10.0, 10.0],
+        [20.0, 20.0, 20.0],
+        braking_capacity_mps2=6,
+        driving_capacity_mps2=0,
+        latency_s=0,
+        mass_t=1,
+        restitution=0,
+    )
+    best = optimise_coupled(worlds, 1, others_mps2=np.zeros((1, 3)), horizon_s=30.0)
+    assert best.total_harm[0] == 0.0
+    assert best.deceleration_mps2[0] == pytest.approx(0.0, abs=10 * 2 / 30**2)
+
+
+def test_coupled__finds_a_kink_to_nine_digits() -> None:
+    # Front pair alone: harm falls linearly to the grazing deceleration 2 + 4^2 / (2 * 8) = 3, from where it is zero.
+    world = make_worlds(
+        [8.0, 500.0],
+        [20.0, 24.0, 0.0],
+        braking_capacity_mps2=[2, 2.9, 6],
+        driving_capacity_mps2=0,
+        latency_s=0,
+        mass_t=1,
+        restitution=0,
+    )
+    best = optimise_coupled(world, 1, horizon_s=30.0)
+    assert best.deceleration_mps2[0] == 2.9  # beyond its brakes: as hard as it can
+    assert best.harm[0] == pytest.approx(16 - 2 * 0.9 * 8, abs=1e-12)
+    assert math.isclose(optimise_pairwise(world, 1).spares_front_mps2[0], 3.0)
+
+
+def test_e_v2x_bm__takes_the_other_learners_to_brake_fully() -> None:
+    worlds = PAIR.sample(30, 7).worlds
+    both = drive(worlds, Team.of(make_agent("e_v2x_bm"), (1, 2)), PAIR).memories[1]
+    alone = drive(worlds, make_agent("e_v2x_bm"), PAIR.with_learners(["vehicle_2"]), 1).memories[1]
+    assert both["deceleration_mps2"].tolist() == alone["deceleration_mps2"].tolist()

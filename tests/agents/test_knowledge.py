@@ -30,6 +30,7 @@ from ethbrake_marl.physics.messages import CHANNEL, LINK, Messages, link_at, pla
 from ethbrake_marl.scenario.v2x import PRESETS
 from ethbrake_marl.shield import ShieldedDriver, parse_uncertainty
 from ethbrake_marl.shield.step_shield import Proposer, proposed_action, seen_columns
+from tests.fixtures.asked import Acts
 from tests.fixtures.policies import make_policy
 
 
@@ -480,3 +481,14 @@ def test_believing__knows_of_the_obstacle_what_it_was_told(v2x: object) -> None:
     np.testing.assert_allclose(told.obstacle_m[heard], (now.obstacle_gap_m + now.gaps_m[:, 0])[heard], atol=1e-9)
     assert np.isinf(told.obstacle_m[~heard]).all() and np.isfinite(believed(engine).obstacle_gap_m).all()
     drive(scenario.sample(5, 3).worlds, make_agent("e_v2x_bm:believed", scenario=scenario), scenario, 1)
+
+
+def test_knowledge__of_an_agent_of_a_user_and_of_a_team() -> None:
+    team = eb.Team({1: agent_of("ppo@shipped/ppo"), 2: agent_of("full_brake")}, "both")
+    assert Knowledge.of(team) == (SENSORS, MESSAGES)
+    assert Knowledge.of(eb.Team({}, "scripts")).text == "–"
+    silent = Acts(lambda worlds, vehicle: np.zeros(worlds.n))
+    assert Knowledge.of(silent).text == "not stated"
+    assert not Knowledge.of(silent).sees_through
+    assert Knowledge.of(silent, also=MODEL) == (MODEL, Source.UNSTATED)
+    assert Knowledge.of(Leaking()) == (MESSAGES,)

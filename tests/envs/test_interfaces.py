@@ -1,4 +1,4 @@
-"""What is special to one interface; single calls: ``told/interfaces.txt``; what all promise: ``tests/contract``."""
+"""What is special to one interface; what all promise: ``tests/contract``."""
 
 import json
 import re
@@ -19,12 +19,25 @@ from stable_baselines3.common.monitor import Monitor
 
 import ethbrake_marl as eb
 from ethbrake_marl import ethbrake_v0
-from ethbrake_marl.envs import EthBrakeEnv, EthBrakeVecEnv, env, make_sb3_vec_env, parallel_env, register_environments
-from ethbrake_marl.envs.interfaces import IgnoredAction
+from ethbrake_marl.engine import Stream
+from ethbrake_marl.envs import (
+    EthBrakeEnv,
+    EthBrakeVecEnv,
+    action_box,
+    env,
+    feature_box,
+    make_sb3_vec_env,
+    parallel_env,
+    register_environments,
+)
+from ethbrake_marl.envs.interfaces import IgnoredAction, make_engine
 from ethbrake_marl.envs.registration import GYMNASIUM_ID, PETTINGZOO_ID
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.learning.algorithms import play_to_the_end
+from ethbrake_marl.observations import Feature
 from ethbrake_marl.scenario import full_state, state_features
 from tests.contract.interfaces import CRASH, FIVE, PAPER, REST, actions, initial_state, line
+from tests.engine.test_engine import act, no_offsets
 
 near = pytest.approx
 ROOT = Path(__file__).resolve().parents[2]
@@ -475,3 +488,246 @@ def test_appended__stands_behind_the_own_observation_in_every_row(appended: Any)
             assert appended == "state" or last[own] == row % 3
             ended += 1
     assert ended > 0
+
+
+def test_agents__are_all_vehicles_until_the_collective_end() -> None:
+    environment = started(REST)
+    both = ["vehicle_1", "vehicle_2"]
+    assert environment.possible_agents == both
+    assert eb.parallel_env(REST).agents == []
+    for step in range(10):
+        assert environment.agents == both
+        *results, _ = environment.step({"vehicle_2": BRAKE})
+        assert [list(part) for part in results] == [both] * 4
+        assert [set(part.values()) for part in results[2:]] == [{step == 9}, {False}]
+    assert environment.agents == []
+
+
+def test_agents__that_are_given_out_are_not_the_list_of_the_environment() -> None:
+    environment = started(REST)
+    environment.agents.clear()
+    environment.reset()
+    assert environment.agents == ["vehicle_1", "vehicle_2"]
+
+
+def test_episode__starts_when_a_learner_may_act_first() -> None:
+    # Who learned and no longer does brakes fully, also where early impacts are rejected.
+    assert started(CRASH).engine.worlds.time_s.tolist() == [0.5]
+    assert started(CRASH.replace(obstacle_gap_m=30), learners=["vehicle_1"]).engine.worlds.time_s.tolist() == [0.0]
+    observations, infos = eb.parallel_env(FIVE, learners=["vehicle_5", "vehicle_4"]).reset(seed=0)
+    assert [*observations] == ["vehicle_1", "vehicle_2", "vehicle_3", "vehicle_4", "vehicle_5"]
+    assert {info["time_s"] for info in infos.values()} == {0.51}
+    nobody = started("paper-random", learners=[])
+    assert nobody.engine.worlds.time_s.tolist() == [0.0]
+    assert nobody.step({})[4]["vehicle_2"]["chosen_action"].tolist() == [-1.0]
+
+
+def test_command__is_in_force_once_its_latency_has_elapsed() -> None:
+    # A command is in force once its latency has elapsed: Vehicle 3 wants to brake from t = 0; its latency is 0.8 s.
+    environment = started(PAPER)
+    for time, in_force in ((0.6, 0.0), (0.7, 0.0), (0.8, 0.0), (0.9, -6.0)):
+        infos = environment.step({"vehicle_2": np.array([0.5], np.float32)})[4]
+        assert infos["vehicle_3"]["time_s"] == near(time)
+        assert infos["vehicle_3"]["chosen_command_mps2"] == -6.0
+        assert infos["vehicle_3"]["command_in_force_mps2"] == in_force
+        assert infos["vehicle_2"]["command_in_force_mps2"] == 3.5
+
+
+def test_crash__is_split_by_mass_in_infos_and_rewards() -> None:
+    environment = started(CRASH)
+    results = [environment.step({"vehicle_2": np.zeros(1, np.float32)}) for _ in range(6)]
+    for told in results:
+        assert sum(info["reward_harm"] for info in told[4].values()) == sum(told[1].values())
+    for agent, share in (("vehicle_1", 27.0), ("vehicle_2", 9.0)):
+        info = results[-1][4][agent]
+        assert [info[name] for name in ("first_impact_harm", "total_harm")] == near([share, share])
+        assert (info["world_first_impact_harm"], info["collided"]) == (near(36.0), True)
+        assert sum(told[1][agent] for told in results) == near(-36.0)
+
+
+def test_reward_of_the_paper__names_its_terms_before_their_weights() -> None:
+    # The terms of the paper are named before their weights; from coasting to 7 m/s2 in 0.1 s the jerk is 70 m/s3.
+    *_, infos = results = started(PAPER, reward="paper").step({"vehicle_2": BRAKE})
+    told = infos["vehicle_2"]
+    weights = {"reward_collision": 1.0, "reward_risk": 0.1, "reward_jerk": 1e-5, "reward_terminal": 10.0}
+    assert {name for name in told if name.startswith("reward_")} == set(weights)
+    assert round(told["reward_jerk"], 3) == -4900.0
+    assert abs(results[1]["vehicle_2"] / sum(told[name] * weight for name, weight in weights.items()) - 1) < 1e-6
+
+
+def test_rewards__do_not_tell_the_harm_before_the_first_decision() -> None:
+    # Rewards do not tell the harm before the first decision: 1 m apart, braking against coasting, they meet at
+    # sqrt(2/6) s with w = 6 t, harm 12, before 0.6 s.
+    environment = eb.parallel_env(CRASH.replace(gaps_m=1, latency_s=[0, 0.6], horizon_s=3, early_impacts="keep"))
+    _, infos = environment.reset(seed=0)
+    assert round(infos["vehicle_2"]["world_first_impact_harm"], 6) == 12.0
+    told = 0.0
+    while environment.agents:
+        _, rewards, _, _, infos = environment.step({"vehicle_2": BRAKE})
+        told += rewards["vehicle_2"]
+    assert abs(told + infos["vehicle_2"]["world_first_impact_harm"] - 12.0) < 1e-9
+
+
+def test_state__by_hand() -> None:
+    # At 0.6 s Vehicle 1 has braked with 6 m/s2 all the time, and Vehicle 2 with 4 m/s2 for 0.1 s; the last three
+    # numbers are gap, impact and share of the horizon of 1.3 s. At 1.2 s they have met.
+    environment = started(CRASH)
+    environment.step({"vehicle_2": np.array([-0.5])})
+    state = environment.state().astype(float).round(6)
+    assert state[:7].tolist() == [0.82, -0.6, 0.6, 0.6, 0.1, 0.0, 0.0]
+    # round((20.0 - 6.0 * 0.6) / 20, 6) = 0.82
+    assert state[7:14].tolist() == [0.98, -0.4, 0.8, 0.4, 0.3, 0.0, 0.0]
+    # round((20.0 - 4.0 * 0.1) / 20, 6) = 0.98
+    assert state[14:].tolist() == [0.194, 0.0, 0.461538]
+    # round((3.0 - 0.5 * 6.0 * 0.6**2 + 0.5 * 4.0 * 0.1**2) / 10, 6) = 0.194
+    # round(0.6 / 1.3, 6) = 0.461538
+    for _ in range(6):
+        environment.step({"vehicle_2": np.zeros(1, np.float32)})
+    assert environment.state()[-3:].astype(float).round(6).tolist() == [0.0, 1.0, 0.923077]
+    # round(1.2 / 1.3, 6) = 0.923077
+
+
+def test_state__is_clipped_to_the_bounds_of_its_features() -> None:
+    strong = {"braking_capacity_mps2": 60, "driving_capacity_mps2": 60, "speed_limit_mps": 90}
+    worlds = eb.make_worlds(500.0, [90.0] * 3, **strong, latency_s=9, mass_t=400, restitution=1)
+    state = full_state(worlds, PAPER)[0]
+    assert state in feature_box(state_features(PAPER))
+    assert float(state[0]) == 4.0
+    assert float(state[21]) == 10.0
+    box = feature_box([Feature("a", "1", 1.0, -2.0, 4.0, ""), Feature("b", "1", 5.0, 0.0, 1.0, "")])
+    assert [(each.low.tolist(), each.high.tolist(), str(each.dtype)) for each in (box, action_box())] == [
+        ([-2.0, 0.0], [4.0, 1.0], "float32"),
+        ([-1.0], [1.0], "float32"),
+    ]
+
+
+def test_max_cycles__truncate_unless_the_episode_is_over_before() -> None:
+    environment = eb.parallel_env(max_cycles=3)
+    for _ in range(2):
+        environment.reset(seed=0)
+        assert [environment.step({"vehicle_2": [0.0]})[3]["vehicle_2"] for _ in range(3)] == [False, False, True]
+        assert environment.agents == []
+    plain, limited = started(), started(max_cycles=10_000)
+    while plain.agents:
+        assert plain.step({"vehicle_2": [-1.0]})[2:4] == limited.step({"vehicle_2": [-1.0]})[2:4]
+    assert limited.agents == []
+    at_its_end = started(REST, max_cycles=10)
+    for _ in range(10):
+        *_, terminated, truncated, _ = at_its_end.step({"vehicle_2": BRAKE})
+    assert terminated == {"vehicle_1": True, "vehicle_2": True}
+    assert truncated == {"vehicle_1": False, "vehicle_2": False}
+
+
+def test_seed__of_an_environment_without_one_can_be_read() -> None:
+    environment = eb.EthBrakeEnv()
+    start, _ = environment.reset()
+    assert np.array_equal(eb.EthBrakeEnv().reset(seed=environment.np_random_seed)[0], start)
+    environment = eb.EthBrakeEnv()
+    environment.np_random = np.random.default_rng(7)
+    info = environment.reset()[1]
+    assert info["world_seed"] == 5765488047046174021
+    assert info["world"] == 0
+    assert int(environment.np_random.integers(10**6)) == 684179
+
+
+def test_worlds_that_are_given__are_described_until_others_take_their_places() -> None:
+    start = {"gaps_m": [7, 8], "speeds_mps": [20, 18, 20], "mass_t": [1, 2, 3], "braking_capacity_mps2": 6}
+    start |= {"driving_capacity_mps2": 1, "latency_s": [0, 0.5, 0.8], "speed_limit_mps": 40}
+    mixed = eb.load_scenario("realistic-mixed")
+    environment = eb.EthBrakeVectorEnv(num_envs=2, scenario=mixed)
+    environment.reset(seed=3, options={"initial_state": start})
+    assert [environment.describe_worlds()[name].tolist() for name in ("gap_2_m", "mass_3_t", "world")] == [
+        [8.0, 8.0],
+        [3.0, 3.0],
+        [-1, -1],
+    ]
+    environment.engine.renew(np.array([1]))
+    told, kinds = environment.describe_worlds(), mixed.sample(1, 3, channel="training").types
+    assert float(told["gap_2_m"][0]) == 8.0
+    assert told["vehicle_2_type"].tolist() == ["", kinds[0, 1]]
+    environment.reset()
+    environment.engine.restore(environment.engine.snapshot())
+    assert environment.describe_worlds()["world"].min() >= 1
+
+
+@pytest.mark.parametrize("make", [eb.EthBrakeEnv, eb.parallel_env, lambda slow: eb.env(scenario=slow)])
+def test_drawing__plays_in_real_time(make) -> None:
+    metadata = make(CRASH.replace(time_step_s=0.05)).metadata
+    assert metadata["render_modes"] == ["human", "rgb_array", "rgb_array_list", "ansi"]
+    assert metadata["render_fps"] == 20
+    assert eb.EthBrakeVectorEnv(2).metadata["render_modes"] == ["rgb_array", "ansi"]
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "count", "harms", "world"),
+    [
+        (False, "first_impact_harm", [39.74, 32.51, 0.0], 72.25),
+        (False, "total_harm", [40.14, 32.84, 0.0], 72.98),
+        (True, "first_impact_harm", [539.41, 190.76, 0.0], 730.17),
+        (True, "total_harm", [826.4, 266.73, 0.0], 1093.13),
+    ],
+)
+def test_obstacle__is_hit_by_vehicle_1_and_belongs_to_the_sums_of_the_world(obstacle, count, harms, world) -> None:
+    scenario = PAPER.replace(obstacle_gap_m=12, gaps_m=[40, 6], early_impacts="keep") if obstacle else PAPER
+    environment = eb.parallel_env(scenario)
+    environment.reset(seed=3)
+    while environment.agents:
+        *_, infos = environment.step({"vehicle_2": [0.0]})
+    assert [round(info[count], 2) for info in infos.values()] == harms
+    assert round(infos["vehicle_1"][f"world_{count}"], 2) == world
+    assert all(info["collided"] for info in infos.values())
+
+
+@pytest.mark.parametrize("said", ["by an argument", "by the scenario"])
+def test_features__each_learner_may_observe_its_own(said) -> None:
+    own = {"vehicle_2": ["own", "place"], "vehicle_3": ["front_1.gap", "place"]}
+    pair = eb.load_scenario("cooperation-3-pair")
+    declared = pair.replace(observation=own)
+    environment = eb.parallel_env(pair, observation=own) if "argument" in said else eb.parallel_env(declared)
+    seen = environment.reset(seed=1)[0]
+    assert [each.shape for each in seen.values()] == [(27,), (8,), (2,)]  # who is not named observes as ever
+    assert [environment.observation_space(agent).shape for agent in seen] == [(27,), (8,), (2,)]
+    assert seen["vehicle_2"].tolist() == environment.engine.observe(1)[0].tolist()
+    assert seen["vehicle_3"][1] == 2.0
+    assert [eb.make_engine(declared, 2, learners=[name]).observe_all().shape for name in own] == [(2, 1, 8), (2, 1, 2)]
+    assert eb.EthBrakeEnv(declared, learners=["vehicle_3"]).reset(seed=1)[0].shape == (2,)
+    assert eb.observation_for(pair, "vehicle_2").size == 27
+    assert eb.Scenario(**declared.declared()) == declared
+    assert declared.replace(observation=["own"]).observation == ("own",)
+
+
+def test_shares_of_the_steps__add_up_to_those_of_the_episode() -> None:
+    pair = eb.load_scenario("cooperation-3-pair")
+    engine = eb.make_engine(pair, 6, seed=7)
+    shares = {"first": np.zeros((6, 3)), "total": np.zeros((6, 3))}
+    begun, cost = engine.ledger, np.zeros(6)
+    while not engine.ended.all():
+        before = engine.ledger
+        step = engine.step(np.full((6, 2), -1.0))
+        cost += step.counted_harm
+        for count, share in shares.items():
+            share += engine.ledger.since(before).vehicle_harm(count)
+    assert engine.observe_all().shape == (6, 2, 27)
+    assert step.reward.shape == (6, 3)
+    assert shares["first"].any()
+    for count, share in shares.items():
+        assert np.allclose(share, engine.ledger.since(begun).vehicle_harm(count))
+    assert np.allclose(cost, shares["first"].sum(axis=1))
+
+
+def test_branch__tells_nothing_of_a_row_that_cannot_be_advanced() -> None:
+    engine = make_engine("paper-random", 3, seed=3)
+    moment = engine.moment()
+    moment.state[1, -1 - 5] = np.nan
+    new = engine.branch(moment)
+    new.roster.failed[1] = "a contact was missed"
+    gained, _ = play_to_the_end(new, act, no_offsets(3), 1.0)
+    assert np.isnan(gained).tolist() == [False, True, False]
+
+
+def test_stream__gives_every_world_of_its_list_once_and_in_order() -> None:
+    stream = Stream(PAPER, [1], {0: eb.make_agent("full_brake"), 2: eb.make_agent("constant:5")}, seed=4)
+    taken = eb.Worlds.concatenate([stream.take(count).alert for count in (1000, 100, 3000, 50)])
+    expected = PAPER.sample(4150, 4, channel="training").worlds
+    assert (taken.gaps_m == expected.gaps_m).all()
+    assert (taken.speeds_mps == expected.speeds_mps).all()

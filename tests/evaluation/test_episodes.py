@@ -1,5 +1,6 @@
 """Single episodes: recorded, as exact motion, as a film; and datasets of them, Parquet and Minari."""
 
+import io
 import json
 import re
 from collections.abc import Callable
@@ -11,6 +12,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
+from PIL import Image, ImageSequence
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.registry import Team, drive, make_agent
@@ -23,6 +26,7 @@ from ethbrake_marl.evaluation.episodes import (
     Recording,
     Task,
     decision_columns,
+    env_spec,
     film_bytes,
     film_scenes,
     follow_episodes,
@@ -439,3 +443,38 @@ def test_work__leaves_a_failed_world_out_and_names_it(tmp_path: Path, monkeypatc
     assert [call.args for call in seen.call_args_list] == [("full_brake", 3), ("full_brake", 6), ("full_brake", 7)]
     assert [tuple(left) for left in work.left_out] == [(4, 7, "full_brake", "planted")]
     assert work.episodes == {"full_brake": 6}
+
+
+def test_record__a_vehicle_pushed_above_its_speed_limit_goes_on() -> None:
+    scenario = eb.Scenario(
+        name="pushed", vehicles=2, gaps_m=5, speeds_mps=[20, 25], braking_capacity_mps2=6, driving_capacity_mps2=3,
+        mass_t=[1.5, 10], latency_s=[0, 0.5], speed_limit_mps=[20, 30], time_step_s=1.0,
+        roles={"vehicle_1": "coast", "vehicle_2": "learner"},
+    )  # fmt: skip
+    record = record_episode(scenario.sample(1, 0).worlds, make_agent("coast"), scenario=scenario)
+    assert (record.speeds_mps[-1] > 24.0).all()  # momentum: 280/11.5 = 24.35 m/s in the mean
+    # Struck at 1 s by 5 m/s, e = 0.1.
+    np.testing.assert_allclose(record.positions_m[-1, 0], 20.0 + 7.0 * (20.0 + 1.1 * 5.0 * 10.0 / 11.5), rtol=1e-12)
+
+
+def test_environment_of_gymnasium__survives_json() -> None:
+    observation, reward = eb.choose_observation(["own", "front_1.gap"]), reward_params({"harm": 2.0, "jerk": 0.5})
+    env = EnvSpec.from_json(env_spec(Task(FIVE, 7, reward, observation)).to_json()).make().unwrapped
+    assert env.engine.scenario == FIVE
+    assert env.engine.observation == observation
+    assert env.learner == 3
+    assert env.engine.reward == reward
+
+
+def test_film__is_evenly_spaced_and_plays_in_real_time() -> None:
+    # See CRASH: an impact of 6 m/s at 1 s. A GIF ends with the longest.
+    scenes = film_scenes(CRASH.sample(1, seed=0).worlds, make_agent("coast"), scenario=CRASH)
+    assert [round(scene.time_s, 9) for scene in scenes] == [*(k / 25 for k in range(33)), 1.3]
+    assert [scene.ended for scene in scenes].index(True) == 33
+    assert len(scenes) == 34
+    assert next(round(s.time_s, 9) for s in scenes if s.total_harm > 0) == 1.0
+    assert round(scenes[-1].total_harm, 9) == 36.0
+    shown = Image.open(io.BytesIO(film_bytes({"a": scenes[:14], "b": scenes[:3]}, ".gif", fps=10)))
+    assert shown.n_frames == 14
+    assert shown.size == (800, 608)
+    assert {frame.info["duration"] for frame in ImageSequence.Iterator(shown)} == {100}

@@ -17,18 +17,42 @@ from rich.console import Console
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation import Evaluation, Outcome, SummaryTable, evaluate, summarise, write_per_world
+from ethbrake_marl.evaluation import (
+    Evaluation,
+    Outcome,
+    SummaryTable,
+    evaluate,
+    load_measures,
+    summarise,
+    write_per_world,
+)
 from ethbrake_marl.evaluation.inputs import make_lineup
-from ethbrake_marl.evaluation.measures import KNOWN_OF_WORLDS, PAPER_ROWS, Exploits, IncompleteTable, is_papers_test
+from ethbrake_marl.evaluation.measures import (
+    KNOWN_OF_WORLDS,
+    PAPER_ROWS,
+    Between,
+    Exploits,
+    IncompleteTable,
+    is_papers_test,
+)
 from ethbrake_marl.evaluation.results import read_harms
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.harm import HARM_COUNTS, STANDARD, Ledger
+from ethbrake_marl.harm import (
+    HARM_COUNTS,
+    STANDARD,
+    Ledger,
+    declared_objectives,
+    injury_probability,
+    parse_objective,
+    scored,
+)
 from ethbrake_marl.limits import limits as limits_module
 from ethbrake_marl.limits.limits import BestHarmTable, Unproven, known_limits, shipped_tables, unproven_because
 from ethbrake_marl.pages.report import Report
 from ethbrake_marl.physics.batch import Impacts
 from ethbrake_marl.scenario import Scenario, Task, list_scenarios, load_scenario
 from ethbrake_marl.studies.experiment import results_csv
+from tests.contract.interfaces import CRASH
 from tests.docs.site import load
 
 SILENT = pytest.mark.filterwarnings("ignore::ethbrake_marl.evaluation.measures.IncompleteTable")
@@ -665,3 +689,91 @@ def test_shipped__where_nothing_is_proven_the_reason_stands_there(monkeypatch: p
     (found,), sheet = STUDY.shipped_bounds([shipped("paper-delay-low", episodes=5)])
     assert found["proven"] is None and found["gap_first"] is None
     assert "an obstacle stands ahead" in sheet.markdown().splitlines()[2]
+
+
+def injuries(agent, scenario):
+    found = eb.evaluate(scenario.sample(2, 7), {"a": eb.make_agent(agent)}, scenario=scenario)
+    told = found.outcome("a").metrics | scored(found.outcome("a").ledger, "first", ["injury:lr4s"])
+    return {n: round(float(np.ravel(v)[0]), 6) for n, v in told.items() if "lr4s" in n}
+
+
+def test_between__proven_contact_and_proven_impact() -> None:
+    contact, impact = np.array([0, 1, 1, 1, 1], bool), np.array([0, 1, 0, 0, 0], bool)
+    first, total = np.array([0, 9, 1e-4, 6, np.nan]), np.array([0, 9, 2e-4, 8, np.nan])
+    found, nobody = (Between.of(contact, proven, first, total) for proven in (impact, contact))
+    assert found.rate == 0.6
+    assert found.harmless_rate == 0.5
+    assert round(found.mean_first, 9) == 3.00005
+    assert round(found.mean_total, 9) == 4.0001
+    assert nobody.rate == 0.0
+    assert nobody.mean_first is None
+    assert nobody.harmless_rate is None
+
+
+def test_objectives__several_by_one_name_and_one_of_an_angle() -> None:
+    assert declared_objectives(["standard", "weighted:1,2"], 2) == [
+        "total",
+        "own",
+        "social:45",
+        "maximin",
+        "mass-weighted",
+        "weighted:1,2",
+    ]
+    assert declared_objectives([], 2) == []
+    assert parse_objective("social:45").angle_deg == 45.0
+
+
+@pytest.mark.parametrize(
+    ("speeds", "side", "curve", "expected"),
+    [
+        ([0.0], "front", "lr4s", [0.011464152]),  # 1 / (1 + exp(4.457))
+        ([-10.0], "rear", "lr4s", [0.042370849]),  # 1 / (1 + exp(4.888 - 1.77))
+        ([10.0, 0.0, 99.0], "front", "reference", [0.081842489, 0.0, 1.0]),  # (10 / 51.287)^1.531, never above 1
+        ([10.0, 0.0, 99.0], "rear", "reference", [0.054414704, 0.0, 1.0]),  # (10 / 66.956)^1.531
+        ([10.0], "front", "gidas", [0.052153563]),  # 1 / (1 + exp(2.9))
+    ],
+)
+def test_injury_probability__by_hand(speeds, side, curve, expected) -> None:
+    assert np.round(injury_probability(np.array(speeds), side, curve), 9).tolist() == expected
+
+
+def test_injuries__of_a_crash_by_hand() -> None:
+    for _ in range(2):
+        load_measures(["injury"])
+    # Vehicle 2 hits with 6 m/s, masses 1 and 3: 4.5 m/s at the rear of Vehicle 1, 1.5 m/s in front of Vehicle 2; in
+    # 1,000 lines 1000 / (1 + exp(4.888 - 0.7965)) and 1000 / (1 + exp(4.457 - 0.2655)). Who is not hit has none.
+    crash = {
+        "injury_lr4s": 31.337641,
+        "injury_lr4s_vehicle_1": 16.439373,
+        "injury_lr4s_vehicle_2": 14.898267,
+        "injury_lr4s_every": 31.337641,
+        "injury:lr4s": 31.337641,
+    }
+    assert injuries("coast", CRASH) == crash
+    assert injuries("full_brake", CRASH.replace(gaps_m=30)) == dict.fromkeys(crash, 0.0)
+
+
+def test_injuries__of_several_impacts_count_the_largest_or_each() -> None:
+    load_measures(["injury"])
+    # Vehicle 2 pushes Vehicle 1 into a wall.
+    pushed = CRASH.replace(obstacle_gap_m=20, restitution=0.5, horizon_s=6, driving_capacity_mps2=6)
+    wall = injuries("constant:-6", pushed)
+    assert wall["injury_lr4s_every"] > wall["injury_lr4s"]
+    assert round(wall["injury_lr4s_vehicle_1"] + wall["injury_lr4s_vehicle_2"], 5) == 976.60554
+
+
+def test_rows_of_the_paper__agree_with_themselves() -> None:
+    for row in PAPER_ROWS:
+        assert row.collision_rate == pytest.approx(row.collisions / row.episodes, abs=5e-5)
+    random = {row.agent: row for row in PAPER_ROWS if row.table == "random test"}
+    for row in random.values():
+        assert row.harm_decrease == pytest.approx(1.0 - row.average_harm / random["Non-E"].average_harm, abs=1e-4)
+
+
+def test_proven_of_table__leaves_out_what_cannot_be_advanced() -> None:
+    scenario, table = load_scenario("paper-delay-low"), shipped("paper-delay-low")
+    worlds, task = scenario.sample(6, 7).worlds, Task(scenario, (1,))
+    whole = STUDY.proven_of_table(worlds.take([0, 1, 3, 4, 5]), task, table)
+    worlds.gaps_m[2], worlds.speeds_mps[2] = [0.2, -1.0], [10.0, 20.0, 16.0]
+    assert whole is not None
+    assert STUDY.proven_of_table(worlds, task, table) == whole

@@ -30,11 +30,11 @@ from ethbrake_marl.evaluation import (
 from ethbrake_marl.evaluation.chunks import Lineup, evaluate_held, summarise_tally, tally_list
 from ethbrake_marl.evaluation.inputs import make_agents, make_lineup, policy_sha256, scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.measures import FAR_M, REGISTERED, Tally, measures
-from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk
+from ethbrake_marl.evaluation.rollout import ShovedFront, chunks_of, drive_chunk
 from ethbrake_marl.limits import Limits
 from ethbrake_marl.pages.report import Report
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, advance_sampled
-from ethbrake_marl.scenario import Scenario, load_scenario
+from ethbrake_marl.scenario import Scenario, Task, load_scenario
 from tests.failing_worlds import planted_list, without
 
 BRAKE = {"full_brake": eb.make_agent("full_brake")}
@@ -535,3 +535,75 @@ def test_tally__is_the_one_that_was_recorded(worlds: int, scenario: str, harm_co
         limits = isinstance(driven.limits, Limits) and bool(driven.limits.known.all())
         parts.append(Tally.of(driven, (), limits=limits))
     assert digest_of(sum(parts[1:], parts[0])) == digest
+
+
+def test_aftermath__has_no_meaning_where_vehicle_1_reacts_or_another_than_vehicle_2_is_driven() -> None:
+    reacts = PUSH.replace(roles={"vehicle_1": "planner", "vehicle_2": "learner"})
+    assert ShovedFront.of(reacts.sample(1, 7).worlds, Task(reacts, (1,))) is None
+    third = PAPER.with_learners(["vehicle_3"])
+    assert evaluate(third.sample(1, 7), BRAKE, scenario=third).outcome("full_brake").sampled_harm is None
+
+
+COAST = eb.make_agent("coast")
+
+
+def test_objects__say_what_they_are_in_a_line() -> None:
+    sample = PAPER.sample(20, 7)
+    agents = {"full_brake": eb.make_agent("full_brake"), "coast": COAST}
+    evaluation = eb.evaluate(sample, agents, scenario=PAPER, seed=7)
+    outcome, worlds = evaluation.outcome("full_brake"), evaluation.worlds
+    record = eb.record_episode(worlds.take([0]), agents["full_brake"], scenario=PAPER)
+    lines = "20 worlds of 3 vehicles: gaps 5.11 to 9.85 m, speeds 18.1 to 22 m/s, at 0 s"
+    for value, text in (
+        (evaluation, "Evaluation('paper-random', 20 worlds of seed 7, vehicle_2 driven by 'full_brake', 'coast')"),
+        (sample, f"Sample(Worlds({lines}), numbers 0 to 19, 0 rejected)"),
+        (worlds.vehicles, "Vehicles(20 worlds of 3, masses 4.5 to 5.9 t)"),
+        (worlds.take(np.zeros(0, int)), "Worlds(0 worlds of 3 vehicles: gaps none m, speeds none m/s, at none s)"),
+        (outcome, "Outcome(20 worlds, 16 collided, harm 22.90 first-impact, 23.74 total)"),
+        (outcome.ledger, "Ledger(20 worlds, 41 impacts)"),
+    ):
+        assert str(value) == text
+    assert str(record).startswith("EpisodeRecord('full_brake' on 'paper-random', 196 samples to 3.9 s, 2 impacts, harm")
+    assert str(eb.load_shipped("ppo")).startswith("Policy('ppo', 27 observations, 19,660,800 steps on 'paper-random'")
+
+
+def test_objects__are_short_whatever_they_hold() -> None:
+    many = {f"{k}{200 * 'x'}": COAST for k in range(30)}
+    much = eb.evaluate(PAPER.sample(1, 7).worlds, many, scenario=PAPER, aftermath=False)
+    assert repr(much).startswith("Evaluation(") and len(repr(much)) <= 400
+    assert len(repr(PAPER.sample(5000, 7))) <= 400
+
+
+def test_commands__are_applied_unrounded() -> None:
+    # -3.52 / 7 * 7 is not -3.52 in floating point: a way through the action would show.
+    one = eb.evaluate(PAPER.sample(1, 0), {"c": eb.make_agent("constant:3.52")}, scenario=PAPER).outcome("c")
+    assert float(one.final.command_mps2[0, 1]) == -3.52
+
+
+def test_evaluation__notes_the_place_of_each_world_in_its_list() -> None:
+    sample = PAPER.sample(4, 7, first=10)
+    assert [
+        eb.evaluate(given, {"coast": COAST}, scenario=PAPER).index.tolist() for given in (sample, sample.worlds)
+    ] == [[10, 11, 12, 13], [0, 1, 2, 3]]
+
+
+@pytest.mark.parametrize(
+    ("shield", "expected"),
+    [("episode", ("HybridAgent", "coupled", "total")), ("episode:pairwise", ("HybridAgent", "pairwise", "total"))],
+)
+def test_lineup__of_a_hybrid_has_the_bound_and_the_count_that_were_asked(shield, expected) -> None:
+    (agent,) = make_lineup([f"ppo@shipped+{shield}"], PAPER, harm_count="total").values()
+    assert (type(agent).__name__, agent.bound, agent.harm_count) == expected
+
+
+def test_lineup__keeps_order_and_specs_and_the_ladder_is_every_rung() -> None:
+    assert list(make_lineup(["ladder", "constant:5", "e_v2x_bm:pairwise:believed"], PAPER)) == [
+        "coast",
+        "full_brake",
+        "e_v2x_bm:pairwise",
+        "e_v2x_bm",
+        "planner",
+        "best_harm",
+        "constant:5",
+        "e_v2x_bm:pairwise:believed",
+    ]

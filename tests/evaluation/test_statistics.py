@@ -1,5 +1,7 @@
 """Statistics: exact sums, intervals of rates, means and ratios, and what is told over seeds."""
 
+import csv
+import math
 from fractions import Fraction
 
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 from hypothesis import given, strategies as st
 from scipy.stats import bootstrap
 
+import ethbrake_marl as eb
 from ethbrake_marl.evaluation import statistics
 from ethbrake_marl.evaluation.statistics import (
     Moments,
@@ -14,10 +17,14 @@ from ethbrake_marl.evaluation.statistics import (
     interquartile_mean,
     mean,
     mean_over_seeds,
+    paired_difference,
     rate,
     relative_decrease,
+    root,
+    share_over_seeds,
 )
 from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.studies.experiment import results_csv
 
 # ---------------------------------------------------------------- exact sums
 
@@ -127,3 +134,135 @@ def test_mean_over_seeds__worlds_of_both_sides_are_drawn_together() -> None:
 def test_resamples__are_as_many_as_asked_for(resamples: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(statistics, "_AT_ONCE", 4)  # two at a time
     assert statistics._resample_means((np.arange(4.0).reshape(2, 2),), resamples, 0).shape == (resamples, 1)
+
+
+def rounded(estimate):
+    low_high = estimate.interval and tuple(round(float(end), 7) for end in estimate.interval)
+    return f"{float(estimate.value):.9g} {low_high}"
+
+
+def test_rate__has_the_interval_of_wilson() -> None:
+    assert rounded(rate(5, 10)) == "0.5 (0.2365931, 0.7634069)"
+
+
+def test_mean__has_the_interval_of_student() -> None:
+    # The mean of 1 to 5, whose variance is 2.5, with Student's t of 4 degrees of freedom; of one number; of
+    # differences that are all the same.
+    assert rounded(mean(np.arange(1.0, 6.0))) == "3 (1.0367568, 4.9632432)"
+    # t = 2.7764451, times sqrt(2.5 / 5)
+    assert rounded(mean(np.array([7.0]))) == "7 None"
+    assert rounded(paired_difference(np.array([-2.0, 8.0, 48.0]), np.array([0.0, 10.0, 50.0]))) == "-2 (-2.0, -2.0)"
+
+
+def test_relative_decrease__by_hand() -> None:
+    # A decrease: ratio 0.75; residuals -0.5 and 0.5, standard error sqrt(0.5) / (sqrt(2) * 2) = 0.25, t = 12.7062047
+    # of 1 degree of freedom. Of nothing there is none.
+    assert rounded(relative_decrease(np.array([1.0, 2.0]), np.array([2.0, 2.0]))) == "0.25 (-2.9265512, 3.4265512)"
+    assert relative_decrease(np.array([1.0, 0.0]), np.zeros(2)) is None
+
+
+def test_root__of_what_no_float_holds() -> None:
+    assert root(Fraction(10**800, 10**200)) == 9.999999999999999e299
+    assert root(Fraction(0, 3)) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("tasks", "expected"),
+    [
+        ([[7.0]], (7.0, True, True)),
+        ([[1.0, 2.0, 3.0]], (2.0, False, True)),
+        ([[1.0, 2.0, 3.0, 100.0]], (2.5, False, True)),
+        ([[100.0, 4.0, 6.0, 5.0, -90.0]], (5.0, False, True)),
+        ([[1.0, 2.0, 3.0, 4.0], [5.0, 6.0, 7.0, 80.0]], (4.5, False, True)),
+    ],
+)
+def test_interquartile_mean__leaves_out_the_ends(tasks, expected) -> None:
+    # The interquartile mean: nothing is left out of three, the ends of four; of eight in two strata 3, 4, 5, 6 are
+    # left; and the same again. Of one there is no interval.
+    found = interquartile_mean(tasks, resamples=200, seed=3)
+    assert (
+        round(found.value, 12),
+        found.interval is None,
+        found == interquartile_mean(tasks, resamples=200, seed=3),
+    ) == expected
+
+
+def test_interquartile_mean__has_the_interval_of_its_draws() -> None:
+    # Its interval is that of its draws: means 0, 1/2, 1 with chances 1/4, 1/2, 1/4. Strata are not mixed: from 1 to
+    # 9.
+    assert rounded(interquartile_mean([[0.0, 1.0]], resamples=2000)) == "0.5 (0.0, 1.0)"
+    assert rounded(interquartile_mean([[1.0] * 3, [9.0] * 3], resamples=2000)) == "5 (5.0, 5.0)"
+
+
+def test_mean_over_seeds__has_the_spread_of_the_seeds_alone() -> None:
+    worlds = np.array([1.0, 100.0, 1.0, 100.0])
+    assert rounded(mean_over_seeds(np.array([worlds - 1.0, worlds - 3.0]), worlds)) == "-2 (-3.0, -1.0)"
+    assert rounded(mean_over_seeds(np.array([[1.0] * 50, [3.0] * 50]))) == "2 (1.0, 3.0)"
+    assert rounded(mean_over_seeds(np.array([[1.0], [3.0]]), [[1.0]])) == "1 None"
+
+
+@pytest.mark.parametrize(
+    ("successes", "of", "expected"),
+    [
+        (np.ones((2, 20), np.bool_), 20, ("1 (0.8388748, 1.0)", "1 (0.8388748, 1.0)")),
+        (np.zeros((1, 20), np.bool_), 20, ("0 (0.0, 0.1611252)", "0 (0.0, 0.1611252)")),
+        (np.ones((1, 1), np.bool_), 1, ("1 (0.2065493, 1.0)", "1 (0.2065493, 1.0)")),
+    ],
+)
+def test_rate__is_no_certainty_where_all_worlds_were_alike(successes, of, expected) -> None:
+    assert (rounded(mean_over_seeds(successes)), rounded(rate(of * int(successes.all()), of))) == expected
+
+
+def test_intervals__of_two_worlds_exist() -> None:
+    assert rounded(share_over_seeds([[4.0, 6.0]], [10.0, 10.0], [0.0, 0.0])) == "0.5 (0.4, 0.6)"
+    assert rounded(mean_over_seeds([[4.0, 6.0]], [[0.0, 0.0]])) == "5 (4.0, 6.0)"
+    assert rounded(mean_over_seeds([[4.0, 6.0]])) == "5 (4.0, 6.0)"
+
+
+def test_exact_sum__of_many_of_the_largest_numbers() -> None:
+    many = np.full(100_000, -1.7976931348623157e308)
+    assert exact_sum(many) == 100_000 * exact_sum(many[:1])
+    assert exact_sum(many, many) == 100_000 * exact_sum(many[:1], many[:1])
+
+
+def test_share_over_seeds__by_hand() -> None:
+    rng = np.random.default_rng(3)
+    worst, best = 10.0 + rng.normal(size=200), np.full(200, 2.0)
+    seeds = np.array([[4.0], [6.0]]) + 0.1 * rng.normal(size=(2, 200))
+    found = share_over_seeds(seeds, worst, best)
+    assert found.value == pytest.approx((worst.mean() - seeds.mean()) / (worst.mean() - 2.0), rel=1e-12)
+    assert found.interval == pytest.approx((0.5, 0.75), abs=0.02)
+    assert share_over_seeds(seeds, worst, worst) is None
+    assert share_over_seeds([[4.0]], [10.0], [0.0]) == Estimate(0.6, None)
+
+
+def test_mean_over_seeds__of_truths_is_a_rate_and_against_a_baseline_a_difference() -> None:
+    low, high = mean_over_seeds(np.eye(4, dtype=np.bool_)[[0]].T.repeat(50, axis=1)).interval
+    assert low == 0.0
+    assert high > 0.7
+    found = mean_over_seeds(np.array([[True, False, False, True]]), np.array([[True] * 4]))
+    assert found.value == -0.5
+    assert found.interval[0] < -0.5 < found.interval[1] <= 0.0
+
+
+def test_difference_and_ratio__are_those_of_the_pairs() -> None:
+    x, y = np.random.default_rng(4).integers(0, 50, (2, 500)).astype(float) / 8.0  # no difference of them is rounded
+    both = exact_sum(x, y)
+    assert Moments.of(x).minus(Moments.of(y), both) == Moments.of(x - y)
+    residual = x - x.mean() / y.mean() * y
+    expected = residual.std(ddof=1) / math.sqrt(500) / y.mean()
+    assert Moments.of(x).ratio_error(Moments.of(y), both) == pytest.approx(expected, rel=1e-10)
+
+
+def test_intervals__are_two_columns_in_the_table_of_results() -> None:
+    paper = eb.load_scenario("paper-random")
+    agents = {name: eb.make_agent(name) for name in ("coast", "e_v2x_bm")}
+    rows = eb.summarise(eb.evaluate(paper.sample(3, 1), agents, scenario=paper))
+    lines = list(csv.DictReader(results_csv(rows).splitlines()))
+    for line, row in zip(lines, rows, strict=True):
+        assert [float(line[f"first_impact_harm_{end}"]) for end in ("low", "high")] == [*row.first_impact_harm.interval]
+        assert "parameters" not in line
+        assert line["harm_decrease_first"] == ""  # full braking was not evaluated
+    assert [line["agent"] for line in lines] == ["coast", "e_v2x_bm"]
+    assert lines[0]["predicted_harm"] == ""
+    assert float(lines[1]["predicted_harm"]) == rows[1]["predicted_harm"].value

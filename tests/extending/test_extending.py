@@ -1,4 +1,4 @@
-"""Parts of the user's own: trained with, evaluated, told in every output; refusals: ``refusals/extending.txt``."""
+"""Parts of the user's own: trained with, evaluated, told in every output; refusals: ``test_refusals``."""
 
 import csv
 import json

@@ -27,11 +27,13 @@ from ethbrake_marl.figures import (
     regret_distribution,
     seed_curves,
     series_style,
+    signed_ticks,
     trajectories,
     worlds_figure,
 )
 from ethbrake_marl.limits.limits import Limits, Proof
 from ethbrake_marl.scenario import Scenario, Task, load_scenario
+from tests.physics.random_worlds import line
 
 BRAKE = {"full_brake": eb.make_agent("full_brake")}
 DISTANCE = load_scenario("paper-distance")
@@ -274,3 +276,55 @@ def test_deceleration_figure__marks_what_e_v2x_bm_takes_and_the_best_known(
     axes, strips = deceleration_figure(deceleration_curve(pair.sample(1, 0).worlds, Task(pair, (1,)))).axes
     assert not [text for text in axes.texts if "best known" in text.get_text()]  # without limits
     assert [label.get_text() for label in strips.get_yticklabels()] == ["front pair"]
+
+
+def test_curve_of_scenario_1__changes_its_regimes_at_the_known_decelerations() -> None:
+    # The curve of Scenario 1 changes its regimes at the known decelerations 4.71845 and 5.01031 m/s2 (0.004 apart),
+    # and full braking does a harm of 28.98, by hand.
+    scenario = eb.load_scenario("paper-scenario-1")
+    curve = eb.deceleration_curve(scenario.sample(1, 7).worlds, Task(scenario, (1,)))
+    expected = {
+        "front pair": [("B", [0.0, 4.151]), ("C", [4.1545, 4.718]), ("none", [4.7184, 7.0])],
+        "rear pair": [("none", [0.0, 5.0103]), ("B", [5.012, 7.0])],
+    }
+    for pair, regimes in curve.regimes.items():
+        ends = [np.flatnonzero(regimes == regime)[[0, -1]] for regime in dict.fromkeys(regimes)]
+        found = [(str(regimes[a]), curve.deceleration_mps2[[a, b]].round(4).tolist()) for a, b in ends]
+        assert found == expected[pair]
+    spared = (curve.regimes["front pair"] == "none") & (curve.regimes["rear pair"] == "none")
+    assert spared.any()
+    assert not curve.predicted[spared].any()
+    assert round(float(curve.predicted[-1]), 9) == 28.98
+
+
+@pytest.mark.parametrize(
+    ("ends", "expected"),
+    [
+        ((-0.47, 0.05), [-0.2, -0.1, 0.0]),
+        ((-0.6, 0.3), [-0.3, -0.1, 0.0, 0.1, 0.3]),
+        ((-30.0, 12.0), [-10.0, -1.0, -0.1, 0.0, 0.1, 1.0, 10.0]),
+        ((-0.02, 0.0), [-0.01, -0.003, -0.001, 0.0]),
+        ((0.0, 0.0), [0.0]),
+    ],
+)
+def test_ticks__are_a_few_round_numbers(ends, expected) -> None:
+    assert signed_ticks(*ends) == expected
+
+
+@pytest.mark.parametrize(
+    ("gap", "speeds", "latency", "decelerations", "expected"),
+    [
+        (1.0, (20.0, 20.0), (0.0, 1.0), (6.0, 6.0), "A"),
+        (10.0, (3.0, 10.0), (0.0, 2.0), (6.0, 6.0), "A'"),
+        (10.0, (3.0, 10.0), (0.0, 0.5), (6.0, 2.0), "C"),
+        (10.0, (3.0, 10.0), (0.0, 0.5), (6.0, 10.0), "none"),
+        (1.0, (20.0, 20.0), (0.0, 0.5), (6.0, 6.0), "B"),
+        (1.0, (5.0, 10.0), (1.0, 0.0), (6.0, 2.0), "early"),
+    ],
+)
+def test_regimes__by_hand(gap, speeds, latency, decelerations, expected) -> None:
+    # A: sqrt(2 / 6) = 0.577 s, before 1 s. A': the leader stands at 0.5 s, 5.75 m ahead; hit at 1.075 s. C: the same
+    # leader; stopping takes 25 m of the 5.75 m; or 5 m. B: 0.25 m left at 0.5 s, 3 m/s closing for good. Early: 5 t -
+    # t^2 = 1 at 0.21 s, before 1 s.
+    worlds = line([[gap]], [speeds], latency_s=latency, mass_t=5.0, restitution=0.1)
+    assert module.regimes_of(worlds, 0, np.array([decelerations])).tolist() == [expected]

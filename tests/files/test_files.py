@@ -1,4 +1,4 @@
-"""Plain files that are read and replaced, and YAML; refusals: ``refusals/files.txt``."""
+"""Plain files that are read and replaced, and YAML; refusals: ``test_refusals``."""
 
 import math
 import os

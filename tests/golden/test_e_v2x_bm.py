@@ -54,3 +54,12 @@ def test_closed_form__one_call_gives_the_same_bits_as_five():
     for k, world in enumerate(worlds):
         for column, own in zip(from_batch, optimise_pairwise(world, 1), strict=True):
             np.testing.assert_array_equal(column[k], own[0])
+
+
+def test_closed_form__the_last_printed_harm_is_that_at_its_printed_deceleration():
+    world = paper_world((7, 7), (20, 18, 20), 0.8, 1.2)
+    assert as_printed(pairwise_harm(world, [6, 6.24679, 6]).sum(), "22.2623") == "22.2623"
+    by_hand = 18**2 / (2 * (7 + 400 / 12 - 18 * 0.8))
+    found = optimise_pairwise(world, 1)
+    assert found.deceleration_mps2[0] == pytest.approx(by_hand, abs=1e-12)
+    assert found.harm[0] == pytest.approx(11.76 * by_hand - 51.2, abs=1e-12)

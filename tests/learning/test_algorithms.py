@@ -43,7 +43,9 @@ from ethbrake_marl.learning.algorithms import (
     smallest_offset,
     stages_of,
     tensors_of,
+    trusted_targets,
     visit,
+    widened,
 )
 from ethbrake_marl.learning.runs import TrainingDiverged, make_environment, make_model
 from ethbrake_marl.learning.training import ModesPlan
@@ -577,3 +579,26 @@ def test_options__among_policies_drive_as_alone_and_costs_are_beside_those_usual
     least = both[order].min(axis=1)
     for m in range(2):  # the first time what is usual is the mean of these
         assert least[member[rows] == m].mean() == pytest.approx(1.0)
+
+
+def test_trusted_targets__keep_the_slope_and_never_leave_the_radius() -> None:
+    # Targets keep the slope and never leave the trust radius: with r = 0.05 and k = 3, g = 0.15 moves by 0.15 / (3 +
+    # 3), g = 1e6 by almost 0.05, g = 0 not at all; and no target is beyond an action that is allowed.
+    gradient = np.array([0.0, 0.15, -0.15, 1e6, 1e6, 0.15, -1e6, -0.15, -1e6], np.float32)
+    mean = np.array([0.3, 0.0, 0.0, 0.0, 1.0, -2.0, -2.0, 2.0, -1.0], np.float32)
+    tried = Tried(np.zeros((9, 1), np.float32), mean, gradient, np.ones(9, np.float32))
+    target, weight = trusted_targets(tried, 0.05, 3.0)
+    assert [round(float(each), 6) for each in target] == [0.3, 0.025, -0.025, 0.05, 1.0, -1.975, -2.0, 1.975, -1.0]
+    assert [round(float(each), 5) for each in weight[[0, 1, 2, 4]]] == [3.0, 6.0, 6.0, 3.0]
+    assert [round(float(each), 5) for each in (weight * (target - mean))[:3]] == [0.0, 0.15, -0.15]
+    assert round(float(weight[3] * target[3]) / 1e6, 4) == 1.0
+
+
+def test_widened_policy__keeps_the_weights_of_its_features_and_nothing_of_new_ones() -> None:
+    shipped, scenario = eb.load_shipped("ppo"), eb.load_scenario("paper-random")
+    turned = ["contact.brake_total_harm", *reversed(shipped.manifest.observation.features)]
+    wide = widened(shipped, Training.of(SHIPPED.replace(observation=turned), scenario))
+    first = wide["policy.0.weight"]
+    assert not first[:, 0].any()
+    assert (first[:, 1:] == shipped.tensors["policy.0.weight"][:, ::-1]).all()
+    assert "value.0.weight" not in wide

@@ -20,6 +20,7 @@ import pytest
 import torch
 
 import ethbrake_marl as eb
+from ethbrake_marl.cli.train import run_folder
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, Progress
 from ethbrake_marl.evaluation import evaluate, measures as outcomes, summarise
 from ethbrake_marl.files.store import new_folder, write_file
@@ -35,7 +36,9 @@ from ethbrake_marl.learning.runs import (
     read_checkpoint,
     write_checkpoint,
 )
-from ethbrake_marl.policies import Policy, Trained, load_policy, read_trained
+from ethbrake_marl.learning.training import LearningRate
+from ethbrake_marl.policies import Policy, Trained, dense, load_policy, read_trained
+from tests.docs.site import load
 from tests.learning.tiny import (
     MODES,
     TINY_COUNTERFACTUAL,
@@ -682,3 +685,103 @@ def test_resume__follows_no_link_out_of_the_run(run: Path, category: str) -> Non
         assert not CHANGES[category][2]
     assert sorted(path.name for path in outside.iterdir()) == ["precious.txt", "step_000000000001"]
     assert (outside / "precious.txt").read_text() == "years of work"
+
+
+def test_learning_rate__falls_as_a_cosine_and_never_rises_again() -> None:
+    # The last rollout may overshoot the end; the rate must not rise again.
+    rate = LearningRate(start=5e-4, end=1e-4)
+    assert [round(rate.at(left), 12) for left in (1.0, 0.75, 0.5, 0.0, -0.1)] == [
+        0.0005,
+        0.000441421356,
+        0.0003,
+        0.0001,
+        0.0001,
+    ]
+    # 1e-4 + 4e-4 * (1.0 + 0.5**0.5) / 2.0 = 0.0004414213562373095
+
+
+def test_recipe__tells_only_the_keys_that_it_has() -> None:
+    told = TINY_COUNTERFACTUAL.model_dump(mode="json")
+    assert {"focus", "modes"} & told.keys() == set()
+    assert "initial_action" not in told["network"]
+    assert TINY_COUNTERFACTUAL.replace(focus=0.75).model_dump(mode="json")["focus"] == 0.75
+
+
+def test_scheme__says_who_drives_what() -> None:
+    assert Training.of(TINY_PPO, PAIR, scheme="centralised").scheme == "centralised"
+    assert Training.of(TINY_PPO, PAIR).who_drives() == "scheme shared: policy drives vehicle_2, vehicle_3"
+    assert (
+        Training.of(TINY_PPO, PAIR, scheme="independent").who_drives()
+        == "scheme independent: policy/vehicle_2 drives vehicle_2; policy/vehicle_3 drives vehicle_3"
+    )
+
+
+@pytest.mark.parametrize(
+    ("seed", "scheme", "folder"),
+    [
+        (None, None, "runs/paper-random-ppo-seed0"),
+        (4, None, "runs/paper-random-ppo-seed4"),
+        (None, "shared", "runs/paper-random-ppo-shared-seed0"),
+    ],
+)
+def test_folder_of_a_run__says_scenario_recipe_scheme_and_seed(seed, scheme, folder) -> None:
+    recipe = eb.load_recipe("ppo") if scheme is None else eb.load_recipe("ppo").replace(scheme=scheme)
+    assert str(run_folder(PAPER, recipe, seed)) == folder
+
+
+def test_network_of_the_paper__has_the_tensors_of_its_table() -> None:
+    assert [(row.name, row.shape) for row in eb.load_recipe("ppo-paper").network_spec(27).tensors] == [
+        ("policy.0.weight", (256, 27)),
+        ("policy.0.bias", (256,)),
+        ("policy.1.weight", (256, 256)),
+        ("policy.1.bias", (256,)),
+        ("policy.output.weight", (1, 256)),
+        ("policy.output.bias", (1,)),
+        ("policy.log_std", (1,)),
+        ("value.0.weight", (256, 27)),
+        ("value.0.bias", (256,)),
+        ("value.1.weight", (256, 256)),
+        ("value.1.bias", (256,)),
+        ("value.2.weight", (128, 256)),
+        ("value.2.bias", (128,)),
+        ("value.output.weight", (1, 128)),
+        ("value.output.bias", (1,)),
+    ]
+
+
+def test_dense_layer__by_hand() -> None:
+    weight = np.array([[1, 2, 3, 4, 5], [0, 0, 0, 0, -1]], np.float32)
+    x, y = np.array([[1, 0], [1, 0], [1, 0], [1, 0], [1, 2]], np.float32), np.empty((2, 2), np.float32)
+    dense(weight, np.array([10, 20], np.float32), x, y)
+    assert y.tolist() == [[25.0, 20.0], [19.0, 18.0]]
+
+
+def test_independent_learners__have_features_of_their_own(empty_folder: Path) -> None:
+    own = PAIR.replace(
+        observation={"vehicle_2": ["own", "front_1.gap"], "vehicle_3": ["rear_1.gap", "place", "own.speed"]}
+    )
+    training = Training.of(TINY_PPO.replace(scheme="independent"), own)
+    assert training.observation.size == 10
+    assert training.columns == [[0, 1, 2, 3, 4, 5, 6, 7], [8, 9, 0]]
+    made = eb.train(training.recipe, own, "own", steps=300, on_progress=None).policies
+    assert {
+        name: (policy.observation.size, policy.manifest.observation.features[-1]) for name, policy in made.items()
+    } == {"vehicle_2": (8, "front_1.gap"), "vehicle_3": (3, "own.speed")}
+    assert sorted(eb.make_agent("team@own", scenario=own).drivers) == [1, 2]
+
+
+def test_script_with_a_memory__leaves_a_folder_whose_agent_remembers(
+    empty_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recurrent = load("../../train/recurrent")
+    for name, more, alike in (("gru", [], False), ("none", ["--memoryless"], True)):
+        line = "recurrent.py --scenario cooperation-3-pair --updates=1 --worlds=8 --output"
+        monkeypatch.setattr("sys.argv", [*line.split(), name, *more])
+        recurrent.main()
+        agent = recurrent.make_agent(name, None)
+        seen = np.zeros((2, agent.observation.size), np.float32)
+        zeros, ones = (agent._infer(seen, np.full((2, 64), size, np.float32))[0] for size in (0.0, 1.0))
+        assert (zeros == ones).all() == alike
+        assert (agent.observation.size, agent.observation.features[-1].name) == (30, "place")
+    made = eb.make_agent(f"{recurrent.__file__}:make_agent:gru", scenario=PAIR)
+    assert eb.evaluate(PAIR.sample(5, 7), {"gru": made}, scenario=PAIR).worlds.n == 5

@@ -238,7 +238,7 @@ def test_block__takes_the_limit_of_any_of_its_members_to_the_last_bit(limit: flo
     assert after.speeds_mps.tolist() == [[limit, limit]] and after.gaps_m.tolist() == [[0.0]]
 
 
-@pytest.mark.parametrize("gap", [-1.5e-9, -2e-9])  # beyond: `refusals/physics.txt`
+@pytest.mark.parametrize("gap", [-1.5e-9, -2e-9])  # beyond: `test_refusals.py`
 def test_overlap__at_an_event_is_rounding_up_to_1e_9_m(gap: float) -> None:
     # vehicle 1 leaves vehicle 2 with 1e-9 m/s; vehicle 3 meets them after 1 s, when 1e-9 m of the overlap are gone
     worlds = dataclasses.replace(line([0.0, 8.0], [1e-9, 0.0, 8.0]), gaps_m=np.array([[gap, 8.0]]))
@@ -367,3 +367,31 @@ def test_forecast__is_the_harm_of_the_advance_bit_for_bit(vehicle: int, until: f
 @pytest.mark.parametrize(("until", "harm"), [(-1.0, 0.0), (0.0, 0.0), (1e-3, 64.0)])
 def test_forecast__an_impact_that_is_due_counts_only_before_the_horizon(until: float, harm: float) -> None:
     assert forecast(line([[0.0]], [0.0, 8.0]), np.zeros((1, 2)), 0, np.zeros((1, 1)), until)[0].tolist() == [[harm]]
+
+
+def test_contact__one_double_before_the_end_of_a_segment_and_one_after() -> None:
+    worlds = line([6.0], [0.0, 8.0])
+    before, after = math.nextafter(0.75, 0.0), math.nextafter(0.75, 1.0)
+    counts = [[int(part.count[0, 0]) for part in run(worlds, 0.0, *times)[1]] for times in ([before], [after])]
+    assert counts == [[0], [1]]
+    assert [int(part.count[0, 0]) for part in run(worlds, 0.0, before, 0.75, 1.0)[1]] == [0, 1, 0]
+
+
+def test_impact__of_speeds_below_the_range_of_doubles_moves_by_less_than_their_spacing() -> None:
+    # 5e-324 m/s has no half: relative tolerances end at SMALLEST, nothing else happens
+    after, impacts = advance(line([0.0], (0.0, 5e-324), restitution=0.5), 0.0, 0.0)
+    front, rear = after.speeds_mps[0]
+    assert impacts.count.tolist() == [[0]]
+    assert after.gaps_m.tolist() == [[0.0]]
+    assert 0.0 <= front == rear <= 5e-324
+
+
+def test_plastic_cluster__of_three_does_not_hand_the_last_bit_to_and_fro() -> None:
+    # The regression joins all three at one speed, whose refined double is 1 ulp off for two of them; in doubles the
+    # rear two then approach the front one again, and so on for ever.
+    speeds = [float.fromhex(f"0x1.66d388ecfa50{digit}p+0") for digit in (5, 7, 6)]
+    mass = [float.fromhex(each) for each in ("0x1.38aa48a631a58p+4", "0x1.842a10bbca148p+2", "0x1.e8de440211adfp+3")]
+    after, impacts = advance(line([0.0, 0.0], speeds, mass_t=mass, restitution=0.1), 0.0, 0.0)
+    assert np.all(np.diff(after.speeds_mps) <= 0.0)
+    assert impacts.count.sum() == 0
+    assert after.speeds_mps[0] == pytest.approx(speeds, rel=4e-16)

@@ -332,3 +332,39 @@ def test_robust_shield__trusts_a_longer_line_inside_its_box() -> None:
     driven = drive(replace(told, gaps_m=told.gaps_m + shift), shielded, five)
     assert driven.guarded.shield.distrusted.sum() == 0
     assert driven.ledger.world_harm("first").sum() > 0.0
+
+
+def test_release__has_its_own_rate_and_passes_zero_without_a_stop() -> None:
+    worlds = line([50.0], [10.0, 10.0], brake_rate_mps3=8.0, release_rate_mps3=4.0)
+    braking, _ = advance(worlds, [[-4.0, -4.0]], 1.0)
+    driving, _ = advance(braking, [[2.0, 2.0]], 1.5)  # from -4 to 2 at 4 m/s3 takes 1.5 s
+    assert driving.command_mps2.tolist() == [[2.0, 2.0]]
+    assert driving.speeds_mps[0].tolist() == pytest.approx([7.0 - 4.0 * 1.5 + 0.5 * 4.0 * 1.5**2] * 2, rel=1e-15)
+
+
+def test_standing_vehicle__moves_when_its_force_passes_zero() -> None:
+    worlds = line([50.0], [0.0, 1.0], brake_rate_mps3=8.0, release_rate_mps3=4.0)
+    held, _ = advance(worlds, [[-4.0, -4.0]], 1.0)  # the brakes of a standing vehicle build up too
+    assert held.command_mps2.tolist() == [[-4.0, -4.0]]
+    assert held.speeds_mps.tolist() == [[0.0, 0.0]]
+    drives, _ = advance(held, [[2.0, -4.0]], 2.0)  # 1 s to release, then 0.5 s to 2 m/s2, then 0.5 s of it
+    assert drives.speeds_mps[0].tolist() == pytest.approx([0.5 + 1.0, 0.0], rel=1e-15)
+
+
+def test_pushed_vehicle__is_let_go_when_its_front_one_would_be_faster() -> None:
+    # Both touch at rest; the rear one pushes at once, the front one more and more; they part at equal forces.
+    worlds = line([0.0], [0.0, 0.0], release_rate_mps3=[4.0, math.inf])
+    after, impacts = advance(worlds, [[4.0, 2.0]], 1.0)
+    apart = 0.5 + 4.0 * 0.5**3 / 6.0  # from 0.5 s on the front one has 4 t, the rear one 2; both had the mean before
+    together = 0.5 * 2.0 * 0.5 + 0.25 * 4.0 * 0.5**2
+    assert impacts.count.sum() == 0
+    assert after.gaps_m[0, 0] == pytest.approx(4.0 * 0.5**3 / 6.0, rel=1e-9)
+    assert apart > 0.5
+    assert after.speeds_mps[0].tolist() == pytest.approx([together + 1.5, together + 1.0], rel=1e-9)
+
+
+def test_equal_vehicles__keep_their_gap_at_any_rate() -> None:
+    worlds = line([[3.0], [0.5]], [[20.0, 20.0]] * 2, brake_rate_mps3=[[12.65] * 2, [0.5] * 2])
+    after, _ = advance(worlds, -worlds.vehicles.braking_capacity_mps2, 60.0)
+    assert after.gaps_m.tolist() == worlds.gaps_m.tolist()
+    assert not after.speeds_mps.any()

@@ -159,3 +159,13 @@ def test_by_parts__raises_the_first_error_after_all_have_ended() -> None:
     with pytest.raises(ArithmeticError, match=r"^0$"):
         by_parts(work, 4, 4)
     assert sorted(ended) == [0, 1, 2, 3]
+
+
+def test_elementary_functions__have_their_limits() -> None:
+    assert exp(0.0) == 1.0
+    assert log(1.0) == 0.0
+    assert normal_quantile(0.5) == 0.0
+    assert normal_probability(0.0) == 0.5
+    assert (exp(710.0), exp(-746.0)) == (math.inf, 0.0)
+    assert math.isnan(exp(math.nan))
+    assert normal_quantile(0.0) == normal_quantile(1e-22) == -normal_quantile(1.0)

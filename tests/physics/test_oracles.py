@@ -12,7 +12,7 @@ from hypothesis import given, settings, strategies as st
 
 from ethbrake_marl.physics import Floats, Worlds, advance
 from ethbrake_marl.physics.kernel import contact
-from tests.physics.exact_simulator import line_of, regression, simulate, square_root
+from tests.physics.exact_simulator import Hit, Line, line_of, regression, simulate, square_root
 from tests.physics.manufacture import Case, floats, manufactured, pressed, stored, worlds_of
 from tests.physics.random_worlds import HORIZON_S, driving_lines, line, place_ahead, touching_lines
 from tests.physics.segments import meetings, random_segments, scan
@@ -217,3 +217,14 @@ def test_contact_time__is_right_to_the_last_digits_where_the_textbook_root_is_no
         exact = 2 * Fraction(g) / (Fraction(w) + root) if w > 0 else (root - Fraction(w)) / Fraction(b)
         assert abs(Fraction(time) / exact - 1) <= CONTACT_TIME_EPS * EPS * condition
         assert abs(Fraction(speed) / root - 1) <= CONTACT_TIME_EPS * EPS * condition
+
+
+def test_exact_simulator__by_hand() -> None:
+    # 10 m at 10 m/s: meets after 1 s; masses 2 and 3, e = 1/2: +9 and -6; one more second opens 5 m
+    f = Fraction
+    told = Line((f(10),), (f(0), f(10)), (f(0),) * 2, (f(0),) * 2, (f(2), f(3)), (f(99),) * 2, f(1, 2))
+    outcome = simulate(told, f(2))
+    assert outcome.hits == [Hit(f(1), 0, f(10), True, f(9), f(-6))]
+    assert outcome.gaps == (5,)
+    assert outcome.speeds == (9, 4)
+    assert np.isclose(float(simulate(told, f(2), bits=80).speeds[0]), 9.0)

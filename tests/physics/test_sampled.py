@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.physics import Floats, Impacts, Worlds, advance_sampled
+from ethbrake_marl.physics import Floats, Impacts, Worlds, advance, advance_sampled
 from tests.physics.random_worlds import line
 
 
@@ -133,7 +133,7 @@ def test_first_sample__is_a_time_that_rounding_parts_from_it(until: float) -> No
 
 # The line, its command, the step, the end, and columns of the state then.
 REACH: list[tuple[Worlds, float, float, float, dict[str, Any]]] = [
-    # a sample reaches to both sides (beyond: `refusals/physics.txt`), the first one to before it
+    # a sample reaches to both sides (beyond: `test_refusals.py`), the first one to before it
     *(
         (replace(line([9.0], [4.0, 4.0]), time_s=np.array([time])), 0.0, 1.0, 2.0, {"time_s": 2.0})
         for time in (1e-6, 1.0 + 0.5e-6, 1.0 - 0.5e-6)
@@ -236,3 +236,27 @@ def test_batch__a_world_has_the_same_bits_alone_and_inputs_are_left_alone() -> N
     alone = [told(*advance_sampled(worlds.take([k]), command[[k]], until_s=4.0))[0] for k in (0, 17, 49)]
     np.testing.assert_array_equal(alone, together[[0, 17, 49]])
     assert worlds.gaps_m.tolist() == gaps.tolist() and not worlds.pair_hit.any() and not worlds.time_s.any()
+
+
+def test_overlap__strikes_again_while_it_closes_and_only_the_first_is_a_first_impact() -> None:
+    # e = 0.5 at w = 4, 1 m deep: leaves at 2 m/s; pressed at 8 m/s2 it closes at 2 m/s after 0.5 s
+    seen, _ = advance_sampled(line([1.0], [2.0, 6.0], restitution=0.5), 0.0, until_s=0.5, step_s=0.5)
+    for until, first, total, count in ((1.5, 16.0, 20.0, 2), (2.0, 0.0, None, 1)):
+        seen, impacts = advance_sampled(seen, [0.0, 8.0], until_s=until, step_s=0.5)
+        assert (impacts.first_impact_harm.tolist(), impacts.count.tolist()) == ([[first]], [[count]])
+        assert total is None or impacts.total_harm.tolist() == [[total]]
+
+
+def test_detection__a_contact_between_samples_is_missed() -> None:
+    # 1 m at 4.5 m/s closing while the front vehicle drives off at 9 m/s2: contact after 1/3 s, but again 1 m at 1 s
+    worlds = line([1.0], [0.0, 4.5])
+    assert advance(worlds, [9.0, 0.0], 1.0)[1].count.tolist() == [[1]]
+    after, impacts = advance_sampled(worlds, [9.0, 0.0], until_s=2.0, step_s=1.0)
+    assert impacts.count.tolist() == [[0]]
+    assert after.gaps_m.tolist() == [[10.0]]
+
+
+def test_steps__of_one_call_are_a_billion_at_most() -> None:
+    worlds = line([9.0], [4.0, 4.0], latency_s=[0.0, 5000.0])  # before its first sample nothing is counted out
+    end = 1e9 * 2.0**-19
+    assert advance_sampled(worlds, 0.0, until_s=end, step_s=2.0**-19)[0].time_s.tolist() == [end]

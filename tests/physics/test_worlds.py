@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.physics import Worlds
-from ethbrake_marl.physics.batch import Packed
+from ethbrake_marl.physics import Worlds, make_worlds
+from ethbrake_marl.physics.batch import Packed, columns as places
 from tests.physics.random_worlds import line
 
 
@@ -117,3 +117,84 @@ def test_packed__gives_back_every_bit_in_its_own_memory_widened_or_not(n: int, N
         rows.state[:], rows.params[:] = -1.0, -1.0
         assert_same(back, columns(worlds))
         assert_same(wide, columns(worlds))
+
+
+def test_make_worlds__starts_at_the_alert_with_nothing_hit_and_nothing_commanded() -> None:
+    given = {"braking_capacity_mps2": 1, "driving_capacity_mps2": 0, "latency_s": 0, "mass_t": 1, "restitution": 1}
+    worlds = make_worlds([5.0, 6.0], [9.0, 9.0, 9.0], **given)
+    assert worlds.n == 1
+    assert worlds.N == 3
+    assert worlds.time_s.tolist() == [0.0]
+    assert worlds.pair_hit.tolist() == [[False, False]]
+    assert worlds.pair_hit.dtype == np.bool_
+    assert worlds.command_mps2.tolist() == [[0.0, 0.0, 0.0]]
+    assert worlds.obstacle_gap_m.tolist() == [np.inf]
+    assert worlds.vehicles.speed_limit_mps.tolist() == [[40.0, 40.0, 40.0]]
+
+
+def test_make_worlds__broadcasts_every_parameter_to_arrays_of_its_own() -> None:
+    worlds = line(5.0, np.full((4, 3), 10.0), mass_t=[1.0, 2.0, 3.0], latency_s=np.full((4, 1), 0.25))
+    found = columns(worlds)
+    shapes = {
+        **dict.fromkeys(found, (4, 3)),
+        **dict.fromkeys(("gaps_m", "pair_hit"), (4, 2)),
+        **dict.fromkeys(("time_s", "restitution", "obstacle_gap_m", "obstacle_hit"), (4,)),
+        "known_from_s": (4, 3, 3),
+        "pieces": (4, 3, 0),
+        "messages": (4, 0),
+        "road": (4, 0),
+    }
+    assert {name: column.shape for name, column in found.items()} == shapes
+    own = [column for name, column in found.items() if name not in ("known_from_s", "messages", "road")]
+    assert all(column.flags.c_contiguous and column.flags.owndata for column in own)
+    assert worlds.vehicles.mass_t[3].tolist() == [1.0, 2.0, 3.0]
+    assert worlds.vehicles.own_latency_s.tolist() == [
+        [0.25, 0.25, 0.25],
+        [0.25, 0.25, 0.25],
+        [0.25, 0.25, 0.25],
+        [0.25, 0.25, 0.25],
+    ]
+
+
+def test_with_obstacle__writes_it_out_in_front() -> None:
+    worlds = replace(line([5.0], [10.0, 9.0], obstacle_gap_m=12.0), obstacle_hit=np.array([True])).with_obstacle()
+    found = {name: column[0].tolist() for name, column in columns(worlds).items()}
+    expected = {
+        "gaps_m": [12.0, 5.0],
+        "speeds_mps": [0.0, 10.0, 9.0],
+        "pair_hit": [True, False],
+        "command_mps2": [0.0] * 3,
+        "mass_t": [np.inf, 1.0, 1.0],
+        "speed_limit_mps": [0.0, 64.0, 64.0],
+        "braking_capacity_mps2": [0.0, 16.0, 16.0],
+        "driving_capacity_mps2": [0.0, 16.0, 16.0],
+        "latency_s": [0.0] * 3,
+        "obstacle_gap_m": np.inf,
+        "obstacle_hit": False,
+    }
+    assert {name: found[name] for name in expected} == expected
+    assert worlds.vehicles.known_from_s.shape == (1, 3, 3)
+
+
+def test_packed__columns_follow_each_other_without_a_hole() -> None:
+    # 3 vehicles, 2 pairs: time | speeds 3 | commands 3 | before 3 | gaps 2 | hit 2 | first 2 | total 2 | count 2 and
+    # restitution | braking 3 | driving 3 | latency 3 | mass 3 | limit 3 | brake rate 3 | release rate 3 | own latency
+    # 3 | news 9
+    rows = Packed.of(line([5.0, 6.0], [9.0, 9.0, 9.0]))
+    assert places(rows.state) == rows.column == (3, 0, 1, 4, 7, 10, 12, 14, 20, 0, 1, 4, 7, 10, 13, 16, 19, 22, 25, 34)
+    assert rows.state.shape == (1, 20)
+    assert rows.params.shape == (1, 22)
+    wide = rows.widened(obstacle=True, news=True)
+    assert wide.state.shape == (1, 25)
+    assert wide.params.shape == (1, 34)
+
+
+def test_packed__ledger_is_that_of_the_columns_of_harm_in_its_own_memory() -> None:
+    rows = Packed(np.arange(25.0)[None], np.empty((1, 22)))
+    first, total, count, *of_obstacle = rows.ledger()
+    rows.state[:] = 5.0
+    assert first.tolist() == [[14.0, 15.0]]
+    assert total.tolist() == [[16.0, 17.0]]
+    assert count.tolist() == [[18, 19]]
+    assert [each.tolist() for each in of_obstacle] == [[22.0], [23.0], [24]]
+    assert count.dtype == of_obstacle[2].dtype == np.int64

@@ -376,15 +376,19 @@ def sample_of(folder: str, count: int, seed: int) -> list[Fault]:
 
 
 def planted() -> tuple[list[Fault], list[str]]:
-    """The planted bugs, and what does not fit the code."""
+    """The planted bugs that fit the code, and what does not."""
     bugs, misfits = [], []
     for name, patches in yaml.safe_load(BUGS.read_text("utf-8")).items():
         texts: dict[str, str] = {}
+        fits = True
         for place, old, new in patches:
             text = texts.get(place) or (PACKAGE / place).read_text("utf-8")
             if text.count(old) != 1:
                 misfits.append(f"{name}: {place} holds {old!r} {text.count(old)} times, not once")
+                fits = False
             texts[place] = text.replace(old, new)
+        if not fits:
+            continue
         place, old, _ = patches[0]
         text = (PACKAGE / place).read_text("utf-8")
         at = text.find(old) + next((k for k, (a, b) in enumerate(zip(old, patches[0][2], strict=False)) if a != b), 0)
@@ -611,7 +615,7 @@ def cases(given: Given) -> Cases:
         yield wrong, partial(Told, False, "does not fit the code")
     faults = [fault for fault in faults if given.only in fault.name and fault.folder in wanted]
     known = verdicts_of(given.journal)
-    fresh = [] if given.list or misfits else [fault for fault in faults if fault.digest not in known]
+    fresh = [] if given.list else [fault for fault in faults if fault.digest not in known]
     if fresh:
         record(given.jobs)
         preload()

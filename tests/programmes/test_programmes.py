@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 
 from tests.programmes import ROOT, Told, __main__ as runner, audit, faults, hostile, libraries
+from tests.programmes.audit import Package
 from tests.programmes.cage import Case, judge
-from tests.programmes.faults import PACKAGE
+from tests.programmes.faults import PACKAGE, Callers, functions_of
 
 PAGE = ROOT / "docs" / "security.md"
 
@@ -186,3 +187,69 @@ def test_mutants__are_code_of_as_many_lines_and_the_same_for_the_same_seed() -> 
         ast.parse(text)
         assert text != original
         assert text.count("\n") == original.count("\n")
+
+
+@pytest.mark.parametrize(
+    ("licence", "family"),
+    [
+        ("MIT", "MIT"),
+        ("GPL / BSD License", "BSD"),
+        ("GNU General Public License v3 (GPLv3)", ""),
+        ("AGPL-3.0", ""),
+        ("", ""),
+        ("Proprietary", ""),
+        ("MIT AND GPL-3.0", ""),
+    ],
+)
+def test_licence__that_is_not_known_is_a_fault(licence: str, family: str) -> None:
+    package = Package("mine", "1.0", "1.0", licence)
+    assert (package.family or "") == family
+    assert package.fault == ("" if family else f"licence {licence!r} is none that is known")
+
+
+def test_version__that_is_not_the_pinned_one_is_a_fault_but_not_its_local_part() -> None:
+    assert Package("torch", "2.13.0", "2.13.0+cpu", "BSD").fault == ""
+    assert Package("torch", "2.13.0", "2.12.0", "BSD").fault == "is pinned to 2.13.0"
+
+
+def test_tests_of_a_function__are_those_that_call_it() -> None:
+    summing = ["physics/worlds.py:sum_rows"]
+    tests = Callers(
+        {
+            "tests/test_a.py::test_one": (0.1, ["physics/batch.py:advance"]),
+            "tests/test_b.py::test_two": (0.2, summing),
+            "tests/physics/test_c.py::test_three": (9.0, summing),
+            "tests/test_d.py::test_shoving": (9.0, summing),
+        }
+    )
+    kernel = next(f for f in functions_of(PACKAGE / "physics/batch.py") if f.key.endswith(":advance_worlds"))
+    assert kernel.compiled
+    assert tests.of(kernel) == {"tests/test_a.py::test_one"}
+    file = PACKAGE / "physics/worlds.py"
+    first = file.read_text("utf-8").splitlines().index("def sum_rows(values: Floats) -> Floats:") + 1
+    summed = tests.at(file, first + 2)
+    assert summed.key == "physics/worlds.py:sum_rows"
+
+
+def test_tests__near_the_module_come_first_then_the_quick_ones() -> None:
+    file = PACKAGE / "physics/worlds.py"
+    first = file.read_text("utf-8").splitlines().index("def sum_rows(values: Floats) -> Floats:") + 1
+    summing = ["physics/worlds.py:sum_rows"]
+    tests = Callers(
+        {
+            "tests/test_a.py::test_one": (0.1, ["physics/batch.py:advance"]),
+            "tests/test_b.py::test_two": (0.2, summing),
+            "tests/physics/test_c.py::test_three": (9.0, summing),
+            "tests/test_d.py::test_shoving": (9.0, summing),
+        }
+    )
+    summed = tests.at(file, first + 2)
+    assert tests.ordered(summed, (), "", 10.0, 9) == [
+        "tests/physics/test_c.py::test_three",
+        "tests/test_b.py::test_two",
+    ]
+    assert tests.ordered(summed, (), "", 5.0, 9) == ["tests/test_b.py::test_two"]
+    assert tests.ordered(summed, (), "shoving counted twice", 10.0, 9) == [
+        "tests/test_d.py::test_shoving",
+        "tests/test_b.py::test_two",
+    ]

@@ -1,6 +1,6 @@
 """Worlds that are drawn, derived or given, by every key.
 
-By hand: ``told/worlds.txt``, ``told/roads.txt``; refusals: ``refusals/worlds.txt``, ``keys.txt``; worlds: ``golden``.
+By hand: ``test_given_worlds``, ``test_roads``; refusals: ``test_refusals``, ``test_refused_worlds``.
 """
 
 from dataclasses import fields
@@ -15,8 +15,8 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents import drive, make_agent
 from ethbrake_marl.evaluation import worlds_sha256
 from ethbrake_marl.physics import Vehicles
-from ethbrake_marl.scenario import load_scenario
-from ethbrake_marl.scenario.sampling import Choice, LogUniform, Normal, Uniform, support, values
+from ethbrake_marl.scenario import QUANTITY, load_scenario
+from ethbrake_marl.scenario.sampling import BLOCK, Choice, LogUniform, Normal, Uniform, support, values
 from ethbrake_marl.scenario.v2x import PRESETS
 from ethbrake_marl.shield import ShieldedDriver, parse_uncertainty
 
@@ -278,3 +278,26 @@ def test_friction__no_truth_of_its_box_is_distrusted_and_no_corner_is_above_the_
         assert not found.guarded.shield.distrusted.any()
         harm = found.ledger.world_harm("first")
         assert not corners or (harm <= found.guarded.shield.predicted_harm + 1e-9).all()
+
+
+def test_types__of_each_place() -> None:
+    scenario = typed(types=["truck", {"car": 1, "truck": 9}, "any"])
+    counts = (scenario.sample(N, 1).types == "truck").sum(axis=0)
+    assert counts[0] == N
+    assert [stats.binomtest(counts[i], N, p).pvalue > 0.001 for i, p in ((1, 0.9), (2, 0.25))] == [True, True]
+    assert scenario.bounds("mass_t") == ((14.0, 40.0), (1.0, 40.0), (1.0, 40.0))
+    roles = {"vehicle_1": "constant:5", "vehicle_2": "learner"}  # within the capacity of every type of its place
+    assert typed(roles=roles, types=["car", "any", "any"]).scripts[0] == "constant:5"
+
+
+def test_columns__every_entry_of_a_world_has_its_own() -> None:
+    rules = [*QUANTITY.usual.values(), QUANTITY.otherwise["line_speed_mps"]]
+    streams, places = zip(*(rule.place(index) for rule in rules for index in range(rule.count(64))), strict=True)
+    assert set(streams) == {()}
+    assert len(set(places)) == len(places)
+    assert max(places) < BLOCK * 64
+    assert BLOCK % 4 == 0
+    for_all = {"braking_capacity_mps2": 6, "driving_capacity_mps2": 6, "mass_t": 5, "latency_s": 0.5}
+    worlds = PAPER.replace(vehicles=5, roles={"vehicle_2": "learner"}, **for_all).sample(7, 1).worlds
+    assert len(np.unique(worlds.speeds_mps)) == 35
+    assert worlds.gaps_m.shape == (7, 4)

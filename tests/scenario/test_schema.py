@@ -1,7 +1,7 @@
 """What a scenario says, the shipped ones, and what editors and pages are told.
 
-Single calls: ``told/declared.txt``; refusals: ``refusals/scenario.txt``. The names of the shipped
-ones stand in ``cli/printed/scenarios.txt``, their worlds in ``golden``.
+Refusals: ``test_refusals``. The names of the shipped ones stand in ``cli/printed/scenarios.txt``, their worlds in
+``golden``.
 """
 
 import copy
@@ -23,6 +23,8 @@ from ethbrake_marl.files.yaml import flow_text, read_yaml
 from ethbrake_marl.harm import HARM_COUNTS, empty_ledger
 from ethbrake_marl.scenario import (
     QUANTITY,
+    ScriptSpec,
+    Uniform,
     new_scenario_text,
     parse_yaml,
     scenario_json_schema,
@@ -239,3 +241,141 @@ def test_page__shows_what_answers_a_mistake(old: str, new: str) -> None:
     with pytest.raises(InvalidInput) as caught:
         eb.Scenario.from_document(parse_yaml(text.replace(old, new), "my.yaml"))
     assert old in text and f"\n{caught.value}\n" in PAGE
+
+
+def test_scenario__has_defaults_for_what_it_leaves_out() -> None:
+    scenario = build()
+    assert scenario.vehicles == 3
+    assert scenario.time_step_s == 0.1
+    assert scenario.horizon_s == 8.0
+    assert scenario.speed_limit_mps == 40.0
+    assert scenario.restitution == 0.1
+    assert scenario.early_impacts == "keep"
+    assert dict(scenario.roles) == {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "full_brake"}
+
+
+def test_scenario__one_entry_stands_for_all() -> None:
+    scenario = build(mass_t=5, gaps_m=[7, {"uniform": [5, 10]}])
+    assert scenario.quantities("mass_t") == (5.0, 5.0, 5.0)
+    assert scenario.quantities("restitution") == (0.1,)
+    assert scenario.quantities("gaps_m") == (7.0, Uniform(uniform=(5.0, 10.0)))
+
+
+def test_replacement__changes_one_field_and_checks_again() -> None:
+    scenario = build().replace(latency_s=[0, 0.2, 0.8])
+    assert scenario.latency_s == (0.0, 0.2, 0.8)
+    assert scenario.mass_t == (4.5, 5.5, 5.9)
+    numpys = build(speeds_mps=np.array([20, 18, 20]), restitution=np.float64(0.3))
+    assert numpys.speeds_mps == (20.0, 18.0, 20.0)
+    assert numpys.restitution == 0.3
+    same = {key: 5 for key in ("speeds_mps", "braking_capacity_mps2", "driving_capacity_mps2", "mass_t")}
+    scenario = eb.Scenario(name="any", gaps_m=7, latency_s=0.1, **same)
+    assert scenario.replace(vehicles=5).sample(1, 0).worlds.N == 5
+    assert scenario.replace(vehicles=5).learners == (1,)
+    assert dict(scenario.replace(vehicles=2).roles) == {"vehicle_1": "full_brake", "vehicle_2": "learner"}
+
+
+@pytest.mark.parametrize("learners", [["vehicle_2", "vehicle_3"], [1, 2], (np.int64(2), "vehicle_2")])
+def test_learners__are_given_by_name_or_index(learners) -> None:
+    scenario = build(roles={"vehicle_1": "constant:3", "vehicle_2": "learner"}).with_learners(learners)
+    assert scenario.learners == (1, 2)
+    assert dict(scenario.roles) == {"vehicle_1": "constant:3", "vehicle_2": "learner", "vehicle_3": "learner"}
+
+
+def test_learners__whoever_is_left_out_or_no_longer_learns_brakes_fully() -> None:
+    for scenario in (build(roles={"vehicle_3": "learner"}), build().with_learners(["vehicle_3"])):
+        assert scenario.learners == (2,)
+        assert scenario.scripts == {0: "full_brake", 1: "full_brake"}
+        assert dict(scenario.roles) == {"vehicle_1": "full_brake", "vehicle_2": "full_brake", "vehicle_3": "learner"}
+    assert build().with_learners([]).learners == ()
+    assert type(build().model_dump()["roles"]) is dict
+
+
+@pytest.mark.parametrize(
+    ("spec", "expected"),
+    [
+        ("full_brake", (("full_brake", None), True, [-6.0, -7.0])),
+        ("coast", (("coast", None), True, [0.0, 0.0])),
+        ("constant:3.5", (("constant", "3.5"), True, [-3.5, -3.5])),
+        ("constant:6", (("constant", "6"), True, [-6.0, -6.0])),
+        ("constant:-2", (("constant", "-2"), True, [2.0, 2.0])),
+        ("e_v2x_bm:pairwise", (("e_v2x_bm", "pairwise"), False, None)),
+        ("learned:runs/my-run", (("learned", "runs/my-run"), False, None)),
+        ("policy@best.v1-a:b:c", (("policy@best.v1-a", "b:c"), False, None)),
+    ],
+)
+def test_script__is_parted_at_the_first_colon_and_has_a_command_if_free_of_the_state(spec, expected) -> None:
+    script = ScriptSpec.parse(spec)
+    command = script.command([6.0, 7.0], [2.0, 3.0])
+    assert (tuple(script), script.is_state_free(), command if command is None else command.tolist()) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "gaps_m", "speeds_mps", "latency_s"),
+    [
+        ("random", {"uniform": [5, 10]}, {"uniform": [18, 22]}, [0, 0.5, 0.8]),
+        ("random-early", {"uniform": [5, 10]}, {"uniform": [18, 22]}, [0, 0.2, 0.8]),
+        ("distance", {"uniform": [5, 10]}, [20, 18, 20], [0, 0.5, 0.8]),
+        ("scenario-1", [10, 8], [20, 18, 20], [0, 0.5, 0.8]),
+        ("scenario-2", [5, 9], [22, 18, 20], [0, 0.5, 0.8]),
+        ("delay-low", {"uniform": [5, 10]}, {"uniform": [18, 22]}, [0, 0.1, 0.3]),
+        ("delay-middle", {"uniform": [5, 10]}, {"uniform": [18, 22]}, [0, 0.3, 0.6]),
+        ("delay-high", {"uniform": [5, 10]}, {"uniform": [18, 22]}, [0, 0.8, 1.2]),
+    ],
+)
+def test_scenarios_of_the_paper__by_hand(name, gaps_m, speeds_mps, latency_s) -> None:
+    scenario = eb.load_scenario(f"paper-{name}")
+    declared = scenario.declared()
+    assert (declared["gaps_m"], declared["speeds_mps"], declared["latency_s"]) == (gaps_m, speeds_mps, latency_s)
+    assert declared["braking_capacity_mps2"] == declared["driving_capacity_mps2"] == [6, 7, 6]
+    assert declared["mass_t"] == [4.5, 5.5, 5.9]
+    assert (scenario.vehicles, scenario.restitution, scenario.early_impacts) == (3, 0.1, "reject")
+    assert (scenario.time_step_s, scenario.horizon_s, scenario.speed_limit_mps) == (0.1, 8.0, 40.0)
+    assert (scenario.learners, scenario.scripts) == ((1,), {0: "full_brake", 2: "full_brake"})
+
+
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [("paper-random-brake-only", "driving_capacity_mps2"), ("paper-random-obstacle", "obstacle_margin_m")],
+)
+def test_variants_of_the_paper__differ_from_the_random_test_in_one_key(name, key) -> None:
+    beside = {"name", "title", "description", "source"}
+    plain, variant = (eb.load_scenario(each).model_dump(exclude=beside) for each in ("paper-random", name))
+    assert [each for each in plain if plain[each] != variant[each]] == [key]
+
+
+@pytest.mark.parametrize("path", ["wide.yaml", "wide.yml", "stress/wide"])
+def test_file_of_the_user__goes_before_a_shipped_scenario(path: str, empty_folder: Path) -> None:
+    Path(path).parent.mkdir(exist_ok=True)
+    Path(path).write_text(new_scenario_text("wide"))
+    assert eb.load_scenario(path).name == eb.load_scenario(Path(path)).name == "wide"
+    assert eb.load_scenario("stress-wide").name == "stress-wide"
+
+
+def test_examples_of_the_pages__are_valid_scenarios() -> None:
+    pages = "".join((DOCS / name).read_text("utf-8") for name in ("scenarios.md", "types-and-mixtures.md"))
+    examples = re.findall(r"^```yaml\n(name:.*?)^```$", pages, re.MULTILINE | re.DOTALL)
+    assert [eb.Scenario.from_document(parse_yaml(text)).sample(10, 0).worlds.n for text in examples] == [10, 10]
+
+
+PAPER = eb.load_scenario("paper-random")
+
+
+def test_hash_of_a_scenario__tells_its_values_not_its_words() -> None:
+    own = scenario_sha256(PAPER)
+    assert scenario_sha256(PAPER.replace(name="mine", title="t", description="d", source="s")) == own
+    others = [PAPER.replace(restitution=0.2), PAPER.replace(horizon_s=9.0), PAPER.with_learners(["vehicle_3"])]
+    assert len({own, *map(scenario_sha256, others)}) == 4
+    types = {"car": {}, "truck": {"speed_limit_mps": 40.0}}
+    for each in (PAPER, PAPER.replace(speed_limit_mps=30.0, vehicle_types=types, types=["car", "car", "truck"])):
+        assert scenario_sha256(eb.Scenario.of_dump(each.model_dump(mode="json"))) == scenario_sha256(each)
+
+
+@pytest.mark.parametrize(
+    "objective",
+    ["own", "maximin", "mass-weighted", "social:30", "weighted:1,4,2", "injury:gidas", ("own", "total", "own")],
+)
+def test_objective__comes_back_from_what_is_declared(objective) -> None:
+    scenario = PAPER.replace(objective=objective)
+    assert scenario.objective == objective
+    assert eb.Scenario(**scenario.declared()) == scenario

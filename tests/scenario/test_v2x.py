@@ -1,4 +1,4 @@
-"""Who hears of whom, and when: distributions against formulas, nothing that leaks; by hand: ``told/news.txt``."""
+"""Who hears of whom, and when: distributions against formulas, nothing that leaks."""
 
 import math
 from dataclasses import replace
@@ -10,10 +10,14 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents import script_agents
 from ethbrake_marl.envs import make_engine
+from ethbrake_marl.evaluation import worlds_sha256
 from ethbrake_marl.observations import observe
 from ethbrake_marl.physics.batch import Packed
-from ethbrake_marl.physics.messages import CHANNEL, Messages
-from ethbrake_marl.scenario.v2x import PER_LINK, PRESETS, V2X, Channel, Equipage, Equipped
+from ethbrake_marl.physics.kernel import CLOCK
+from ethbrake_marl.physics.messages import CHANNEL, Messages, chance
+from ethbrake_marl.scenario import CHANNELS, full_state, state_features
+from ethbrake_marl.scenario.v2x import PER_LINK, PRESETS, V2X, Channel, Equipage, Equipped, burst_periods
+from ethbrake_marl.search import identities
 from tests.agents.test_knowledge import alter_unreceived
 
 PAPER = eb.load_scenario("paper-random")
@@ -247,3 +251,148 @@ def test_interfaces__see_the_same() -> None:
         alike, _, _, _ = vec.step(np.full((3, 1), -0.5, np.float32))
     np.testing.assert_array_equal(alike, vec.engine.observe(1))
     assert np.isfinite(alike).all() and vec.reset_infos[0]["age_s"].shape == (3,)
+
+
+def delayed(gaps_m):
+    base = BASE.replace(gaps_m=gaps_m, speeds_mps=[20.0, 20.0, 20.0])
+    return engine_of(periodic("paper", base, link_latency_s=0.2, senses="front", sensing_s=[5.0, 5.0]), n=1)
+
+
+def test_burst_periods__by_hand() -> None:
+    # The periods of a burst, p = r = 0.5: P(k >= 1) = 1/2, P(k >= 2) = 1/4, P(k >= 3) = 1/8; all exact in binary.
+    u = np.array([0.5, 0.4999, 0.25, 0.2499, 0.125, 0.1249, 0.99])
+    assert burst_periods(u, 0.5, 0.5).tolist() == [0, 1, 1, 2, 2, 3, 0]
+    assert burst_periods(u, 0.0, 0.5).tolist() == [0, 0, 0, 0, 0, 0, 0]
+    assert burst_periods(np.array([0.0]), 0.5, 1.0).tolist() == [1]
+
+
+def test_channels__are_those_of_the_page() -> None:
+    assert [(name, *channel) for name, channel in CHANNELS.items()] == [
+        ("paper", "latency", "all", "none", 0.0, 0.0, 1.0, 0.0, 0.1, 0.02, 0.1, 0.2, (0.8, 1.1), "first"),
+        ("clear", "messages", "all", "both", 0.0, 0.01, 0.5, 0.0, 0.1, 0.02, 0.1, 0.2, (0.8, 1.1), "first"),
+        ("nominal", "messages", "all", "both", 0.0, 0.05, 0.5, 0.0, 0.1, 0.02, 0.1, 0.2, (0.8, 1.1), "first"),
+        ("congested", "messages", "all", "both", 0.0, 0.1, 0.3, 0.05, 0.1, 0.02, 0.1, 0.2, (0.8, 1.1), "first"),
+        ("blocked", "messages", "all", "both", 0.0, 0.2, 0.2, 0.2, 0.1, 0.02, 0.1, 0.2, (0.8, 1.1), "first"),
+        ("sensors-only", "messages", "none", "both", 0.0, 0.0, 1.0, 0.0, 0.1, 0.02, 0.1, 0.2, (0.8, 1.1), "first"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ("paper", (False, False)),
+        ("nominal", (True, True)),
+        ("sensors-only", (True, True)),
+        ({"preset": "sensors-only", "sensing_s": [0.9, 0.9]}, (True, False)),
+        ({"hears": "front"}, (True, False)),
+        ({"lost": 0.5}, (True, True)),
+        ({"lost": 1.0}, (True, False)),
+        ({"preset": "nominal", "link_latency_s": 0.4}, (True, True)),
+        ({"preset": "nominal", "link_latency_s": 0.4, "sensing_s": [1, 1]}, (True, False)),
+        ({"preset": "nominal", "link_latency_s": 0.4, "sensing_s": [1, 1], "lost": 0.5}, (True, True)),
+        ({"preset": "nominal", "link_latency_s": 0.4, "sensing_s": [1, 1], "lost": 1.0}, (True, False)),
+        ({"link_latency_s": 0.4, "senses": "none"}, (True, False)),
+    ],
+)
+def test_channel__says_whether_it_differs_from_the_paper_and_whether_chance_decides(given, expected) -> None:
+    v2x = V2X.model_validate(given)
+    assert (v2x.by_link, v2x.drawn) == expected
+
+
+def test_observation__tells_own_parts_of_latencies_and_nothing_that_was_drawn() -> None:
+    # An observation tells own parts of latencies, and nothing that the channel has drawn: Vehicle 2 knows Vehicle 3
+    # from 0.4 s on; Vehicle 3's own part is 0.5 s, Vehicle 1's message reaches it at 0.9 s. Of each time, what
+    # Vehicle 2 is told to be left of its own latency and of that of Vehicle 3.
+    scenario = PAPER.replace(v2x="congested", latency_s=[0, 0.1, 0.5], early_impacts="keep")
+    worlds, spec = scenario.sample(1, 7).worlds, eb.observation_for(scenario)
+    worlds.vehicles.latency_s[0] = [0.0, 0.4, 0.9]
+    worlds.vehicles.known_from_s[0] = [[0.0, 0.8, 0.8], [0.4, 0.4, 0.4], [0.9, 0.9, 0.9]]
+    assert worlds.vehicles.own_latency_s.tolist() == [[0.0, 0.1, 0.5]]
+    at = [5, [feature.name for feature in spec.features].index("rear_1.latency_left")]
+    assert [
+        observe(replace(worlds, time_s=np.full(1, time)), 1, spec)[0, at].astype(float).round(6).tolist()
+        for time in (0.0, 0.4, 0.6, 0.95)
+    ] == [[0.1, 0.0], [0.0, 0.1], [0.0, 0.0], [0.0, 0.0]]
+
+
+def test_full_state__has_the_latency_that_was_drawn() -> None:
+    blocked = channel_of("blocked")
+    worlds = blocked.sample(50, 7).worlds
+    at = [feature.name for feature in state_features(blocked)].index("vehicle_3.latency_left")
+    assert (full_state(worlds, blocked)[:, at] == worlds.vehicles.latency_s[:, 2].astype(np.float32)).all()
+
+
+def test_initial_state__of_a_channel_without_chance_has_its_news() -> None:
+    fixed, given = channel_of("nominal", link_latency_s=0.25, sensing_s=[1, 1]), {"gaps_m": [7, 7]}
+    assert fixed.worlds_from_state({**given, "speeds_mps": [20, 18, 20]}).vehicles.latency_s.tolist() == [
+        [0.0, 0.25, 0.25]
+    ]
+
+
+def test_persistence__first_is_the_default_and_adds_nothing() -> None:
+    said, unsaid = BASE.replace(v2x={"preset": "blocked", "persistence": "first"}), BASE.replace(v2x="blocked")
+    one, other = said.sample(50, 3), unsaid.sample(50, 3)
+    assert one.worlds.messages.shape == (50, 0)
+    assert worlds_sha256(one.worlds, one.index) == worlds_sha256(other.worlds, other.index)
+    assert "persistence" not in unsaid.v2x.model_dump(mode="json")
+
+
+def test_fixed_delay__tells_what_was_sent_and_moves_it_on() -> None:
+    # All at 20 m/s; one message every 0.1 s from the alert on, 0.2 s on its way, decisions at 0.5, 0.6, ..., and who
+    # is behind is not in sight. Each message carries the sample of the moment at which it is sent, so whatever is
+    # known is 0.2 s old: sent at t, a speed of 20 - 6 t and a place of 20 t - 3 t^2, since Vehicle 1 brakes with 6
+    # from the alert on. Moved on with the command of then, it is where Vehicle 1 is.
+    engine = delayed([8.0, 8.0])
+    for step in range(6):
+        told, gap_m = Messages.of(engine.worlds).newest_told(1), engine.worlds.gaps_m[0, 0]
+        sent = 0.3 + 0.1 * step
+        assert engine.worlds.time_s[0] == pytest.approx(sent + 0.2)
+        known = [told.at_s[0, 0], told.speed_mps[0, 0], told.place_m[0, 0]]
+        assert known == pytest.approx([sent, 20.0 - 6.0 * sent, 20.0 * sent - 3.0 * sent**2])
+        assert abs(engine.observe(1)[0, 8] - gap_m / 10.0) <= 1e-6
+        engine.step(np.full((1, 1), -0.5))
+    # Vehicle 3 begins to brake at 0.8 s; at 0.9 s Vehicle 2 knows it as it was at 0.7 s, coasting, at 1 s as at 0.8
+    # s: an estimate moves on with the command of then. It is 9 m + 3 x 0.1^2 behind.
+    engine = delayed([8.0, 9.0])
+    for _ in range(4):
+        engine.step(np.zeros((1, 1)))
+    seen = engine.observe(1)[0].astype(float)
+    assert round(float(engine.worlds.time_s[0]), 6) == 0.9
+    assert seen[18:20].round(6).tolist() == [0.9, 0.0]
+    assert float(seen[20]) == 0.0
+    assert round(float(engine.worlds.gaps_m[0, 1]), 6) == 9.03
+
+
+def test_identities__do_not_depend_on_the_news() -> None:
+    worlds = PAPER.sample(5, 7).worlds
+    clock, command = np.zeros((5, CLOCK.WIDTH)), -worlds.vehicles.braking_capacity_mps2
+    late = replace(worlds.vehicles, known_from_s=worlds.vehicles.known_from_s + 1.0)
+    plain, told = (identities(w, command, clock, np.array([1])) for w in (worlds, replace(worlds, vehicles=late)))
+    assert plain.tolist() == told.tolist()
+    assert len(set(plain.tolist())) == 5
+
+
+def test_periodic__the_first_news_and_the_motion_are_those_of_first() -> None:
+    scenario = periodic("blocked")
+    one, other = engine_of(scenario), engine_of(first_only(scenario))
+    assert np.array_equal(one.packed.known_from_s, other.packed.known_from_s)
+    driven(one, 20), driven(other, 20)
+    assert np.array_equal(one.worlds.speeds_mps, other.worlds.speeds_mps)
+    assert np.array_equal(one.worlds.gaps_m, other.worlds.gaps_m)
+
+
+def test_chance__is_uniform_and_of_its_own_for_every_link_and_message() -> None:
+    u = np.array([[[chance(key, link, number) for number in range(40)] for link in range(9)] for key in
+                  (0.0, 1.0, 2.0**53 - 1)])  # fmt: skip
+    assert len(np.unique(u)) == u.size
+    assert (u >= 0.0).all()
+    assert (u < 1.0).all()
+    assert abs(u.mean() - 0.5) < 0.03
+    assert abs(np.corrcoef(u[0, :, :-1].ravel(), u[0, :, 1:].ravel())[0, 1]) < 0.1
+
+
+def test_mixture__its_scenarios_share_the_persistence() -> None:
+    members = [periodic(preset, BASE.replace(name=preset)) for preset in ("nominal", "blocked")]
+    mixed = eb.Scenario(name="mixed", mixture=[{"scenario": member} for member in members])
+    assert Messages.of(mixed.sample(30, 3).worlds).periodic.all()
+    driven(engine_of(mixed), 5)

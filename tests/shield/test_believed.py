@@ -210,3 +210,12 @@ def test_batch__rows_that_begin_again_are_those_of_a_fresh_episode(make: Any) ->
         assert (told <= bounds + ABOVE)[~idle].all()
         begun += int(fresh.sum())
     assert begun >= 4  # each row at least twice: an episode has at most 80 steps
+
+
+def test_latencies_that_are_over__are_not_waited_for_again() -> None:
+    late = eb.Scenario(
+        name="late", vehicles=2, gaps_m=15, speeds_mps=[0, 10], braking_capacity_mps2=5, driving_capacity_mps2=5,
+        mass_t=1, latency_s=[0, 0.6], roles={"vehicle_1": "full_brake", "vehicle_2": "learner"},
+    )  # fmt: skip
+    for found in driven(make_agent("full_brake+episode:believed", scenario=late), late, 1):
+        assert found == pytest.approx([10.0**2 - 2 * 5 * 9])  # 9 m are left when it begins to brake

@@ -24,6 +24,7 @@ from ethbrake_marl.shield.enclosure import (
     cell_of,
     go_on,
     high,
+    hold,
     may_meet_unseen,
     meet,
     move_alone,
@@ -373,3 +374,38 @@ def encloses(cell, path: Path, now: eb.Worlds, harm, k: int, at) -> bool:
             room[N + p] = np.inf
     state = np.concatenate([now.speeds_mps[k], now.gaps_m[k], harm[k : k + 1]])
     return bool((np.abs(state - exact) <= room).all())
+
+
+def test_drive_that_a_speed_limit_may_end__gives_any_part_of_its_way() -> None:
+    # 20 m/s are its limit: 2 m in 0.1 s, and not the 2.035 m of a drive with 7 m/s2
+    case = boxed("gaps_m=1", speeds_mps=20, speed_limit_mps=20, latency_s=0)
+    cell, _ = cell_in(case, case.boxes.low[0], np.ones(STEPS))
+    path = Path(np.concatenate([cell.speed, cell.gap, 0 * cell.gap[:1]]), np.zeros((2, TOUCH_WIDTH)), np.zeros(5, int))
+    move_alone(cell, path, 0, motion := new_motion(3, cell.drive.shape[0]))
+    assert [enclosure.low(motion.reach[1]), enclosure.high(motion.reach[1])] == pytest.approx([2.0, 2.035], abs=1e-9)
+
+
+def test_brakes_released_at_standstill__hold_until_the_vehicle_drives() -> None:
+    # from -1 to 1 m/s2 in 0.1 s: it stands for 0.05 s, and drives to 0.025 m/s
+    motion = new_motion(1, 3)
+    motion.vague[0] = 1.0
+    hold(np.zeros(3), 0, 0.1, motion)
+    assert enclosure.low(motion.onward[0]) <= 0.0 < 0.025 <= enclosure.high(motion.onward[0]) <= 0.1 + 1e-12
+
+
+def test_bound__of_two_that_touch_from_the_alert_on() -> None:
+    # gap 0, and pressed together without an impact; then vehicle_2 brakes harder, drives, and strikes
+    roles = {"vehicle_1": "full_brake", "vehicle_2": "learner"}
+    line = {"vehicles": 2, "gaps_m": 0, "speeds_mps": 20, "mass_t": 5, "latency_s": [0, 0.3], "roles": roles}
+    line |= {"braking_capacity_mps2": [6, 7], "driving_capacity_mps2": 7}
+    case = boxed("braking_capacity_mps2.vehicle_1=2%", **line)
+    plan = np.where(np.arange(STEPS) // 6 == 1, 0.9, -1.0)
+    assert 1.0 < harm_inside(*case[:3], plan, 50).max() <= bound_of(case, plan, 5)
+
+
+def test_bound__is_never_above_what_speeds_allow() -> None:
+    # a light one, thrown back by a heavy one: no path is followed, and the bound is still a number
+    changed, text = UNUSUAL["very unequal masses"]
+    case, plan = boxed(text, **changed), np.full(STEPS, -0.9)
+    bound, fastest, e = bound_of(case, plan, 1), case.worlds.speeds_mps.max(), 0.3
+    assert harm_inside(*case[:3], plan, 50).max() <= bound <= fastest**2 * (1.0 + (1.0 + e) ** 2) + 1e-9

@@ -1,5 +1,7 @@
 """The step shield, of one vehicle and of several: decisions by hand, and in the engine, where bounds hold."""
 
+import copy
+
 import numpy as np
 import pytest
 
@@ -23,6 +25,7 @@ from ethbrake_marl.shield.step_shield import (
     certify,
     certify_rollouts,
     ends_under,
+    joint_constants,
     plan_harm,
 )
 from tests.fixtures.asked import Acts
@@ -534,3 +537,124 @@ def test_evaluation__later_rollouts_of_the_team_let_more_of_it_through():
         assert (episodes.ledger.world_harm("first") <= episodes.guarded.shield.predicted_harm).all()
         replaced[later] = episodes.guarded.shield.interventions.sum()
     assert replaced[True] < replaced[False]
+
+
+def test_plan__a_proposal_equal_to_it_costs_nothing_and_changes_nothing() -> None:
+    running, backup = start(two(15.0)[1], braking(-0.7))
+    decision = certify(running, np.array([-0.7]), backup, backup.harm)
+    assert reason(decision) == "same as plan"
+    assert not decision.intervened[0]
+    assert decision.bound.tolist() == backup.harm.tolist()
+    assert decision.margin.tolist() == [0.0]
+
+
+def test_constant__gives_a_certificate_where_the_plan_gives_none() -> None:
+    _, worlds = two(12.0)  # 14.4 m to stop
+    plan = braking(-0.96 - 1e-9)  # 15 m to stop: nothing to spare
+    running, backup = start(worlds, plan)
+    assert backup.harm[0] == 0.0
+    decision = certify(running, np.array([-0.9]), backup, backup.harm)
+    assert reason(decision) == "constant"
+    assert decision.backup.plan[0, 1:].tolist() == [-1.0] * (STEPS - 1)
+    without = certify(running, np.array([-0.9]), backup._replace(constants=np.zeros(0)), backup.harm)
+    assert without.intervened[0]
+    assert without.applied[0] == plan[0, 0]
+
+
+def test_two_proposals__the_harmless_one_is_accepted_the_other_replaced() -> None:
+    # Braking fully they stop after 2.5 m and 10 m; Vehicle 3 then stands 2.5 m behind Vehicle 2.
+    running, backup = start_pair(three(gaps_m=[2.6, 10]), braking(-1.0, 2))
+    assert backup.harm.tolist() == [0.0]
+    # Vehicle 2 has 0.1 m to spare, Vehicle 3 2.5 m: 0.1 s of coasting costs 0.5 m and 1 m.
+    decision = certify(running, np.zeros((1, 2)), backup, backup.harm)
+    assert decision.applied.tolist() == [[-1.0, 0.0]]
+    assert decision.intervened.tolist() == [[True, False]]
+    assert told(decision) == ["no certificate", "plan remains"]
+    assert decision.bound.tolist() == [0.0]
+    assert decision.margin[0, 0] < 0.0 == decision.margin[0, 1]
+    assert decision.backup.plan[0, :2].tolist() == [[-1.0, 0.0], [-1.0, -1.0]]
+
+
+def test_bound__has_at_once_what_one_of_two_makes_better() -> None:
+    plan = braking(-1.0, 2)
+    plan[0, 0, 1] = -0.5  # Vehicle 3 runs into Vehicle 2, and brakes too little at first
+    running, backup = start_pair(three(gaps_m=[2.6, 10], speeds_mps=[0, 5, 11]), plan)
+    decision = certify(running, np.array([[1.0, -1.0]]), backup, backup.harm)
+    assert decision.intervened.tolist() == [[True, False]]
+    assert decision.bound.tolist() == plan_harm(decision.after, decision.backup.plan).tolist()
+    assert decision.bound[0] < backup.harm[0] - 1.0
+
+
+def test_no_number__keeps_the_plan_and_what_is_beyond_is_clipped() -> None:
+    running, backup = start_pair(three(), braking(-0.9, 2))
+    decision = certify(running, np.array([[np.nan, -7.0]]), backup, backup.harm)
+    assert told(decision) == ["not a number", "plan remains"]
+    assert decision.applied.tolist() == [[-0.9, -1.0]]
+    assert decision.intervened.tolist() == [[True, False]]
+
+
+def test_surprise__after_the_last_step_replaces_nothing() -> None:
+    shield = begun(TWO.replace(horizon_s=0.5), SMALL)  # decisions at 0.35 and 0.45 s
+    while not shield.running.finished.all():
+        _ = shield.decide(np.ones(4))
+    replaced, seen = shield.interventions.tolist(), shield.running.states + 0.1
+    decision = shield.decide(np.ones(4), seen=seen, only=np.ones(4, bool))
+    assert shield.distrusted.all()
+    assert [ShieldReason(each).text for each in decision.reason] == ["ended", "ended", "ended", "ended"]
+    assert shield.interventions.tolist() == replaced
+    assert shield.running.steps.tolist() == [2, 2, 2, 2]
+
+
+def test_copy__goes_on_apart_its_log_included() -> None:
+    shield = StepShield(PAPER, 1, logging=True)
+    shield.begin(PAPER.sample(2, 0).worlds, np.arange(2))
+    other = copy.copy(shield)
+    other.decide(np.ones(2))
+    shield.decide(np.full(2, 0.5))
+    assert shield.running.steps.tolist() == [1, 1]
+    assert other.running.steps.tolist() == [1, 1]
+    assert [entry.proposed for entry in shield.log + other.log] == [0.5, 0.5, 1.0, 1.0]
+
+
+def test_surprise__of_one_world_hands_the_whole_team_to_the_fallback() -> None:
+    scenario = eb.load_scenario(TEAMS[4, 3])
+    shield = begun(scenario, scenario.sample(3, 1).worlds)
+    seen = shield.running.states.copy()
+    seen[1, 1] -= 0.5  # a vehicle is slower than it can be
+    decision = shield.decide(np.ones((3, 3)), seen=seen)
+    assert shield.distrusted.tolist() == [False, True, False]
+    assert [ShieldReason(each).text for each in decision.reason[1]] == [
+        "assumption broken",
+        "assumption broken",
+        "assumption broken",
+    ]
+    assert decision.intervened[1].all()
+    assert (decision.applied[1] <= 0.0).all()
+
+
+def test_joint_constants__hold_all_alike_and_ladders_each_once() -> None:
+    constants = joint_constants(3)
+    assert len({tuple(row) for row in constants.tolist()}) == len(constants) == 31
+    assert constants.min() == -1.0
+    assert constants.max() == 0.0
+
+
+def test_bound_at_the_alert__is_at_most_full_braking_and_any_single_constant() -> None:
+    worlds = PAIR.sample(40, 8).worlds
+    joint = begun(PAIR, worlds)
+    braked = plan_harm(joint.running, np.full((40, STEPS, 2), -1.0))
+    assert (joint.first_bound <= braked).all()
+    assert joint.first_bound.mean() < 0.8 * braked.mean()
+    for vehicle in (1, 2):
+        assert (joint.first_bound <= begun(PAIR.with_learners([vehicle]), worlds).first_bound + 1e-6).all()
+
+
+def test_settles__says_what_the_plan_comes_to_in_the_engine() -> None:
+    worlds = PAPER.sample(60, 5).worlds
+    scenario = PAPER.replace(horizon_s=4.2)
+    shield = StepShield(scenario, 1)
+    shield.begin(worlds, np.arange(60))
+    episodes = drive(worlds, ShieldedDriver(eb.make_agent("e_v2x_bm"), scenario), scenario, 1)
+    rests = (episodes.final.speeds_mps == 0.0).all(axis=1)
+    assert rests.tolist() == shield.settles.tolist()
+    assert 0 < rests.sum() < 60

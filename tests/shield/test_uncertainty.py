@@ -8,9 +8,11 @@ import pytest
 from ethbrake_marl.agents.registry import drive, make_agent
 from ethbrake_marl.scenario import Scenario
 from ethbrake_marl.shield import ShieldedDriver
+from ethbrake_marl.shield.guard import checked_uncertainty
+from ethbrake_marl.shield.step_shield import ShieldReason, plan_harm
 from ethbrake_marl.shield.uncertainty import parse_uncertainty
 from tests.limits.worlds import line as one_line
-from tests.shield.attacks import Hostile, line
+from tests.shield.attacks import Hostile, begun, line
 
 EVERY = {
     3: "braking_capacity_mps2=5%,latency_s.vehicle_2=0.15,gaps_m.pair_1=0.5,mass_t.vehicle_3=20%",
@@ -100,3 +102,54 @@ def test_seen__inside_the_range_of_the_members_is_no_surprise_outside_is_one(gap
     shield = episodes.guarded.shield
     assert shield.distrusted.tolist() == [surprising]
     assert surprising or 0.0 < episodes.ledger.world_harm("first")[0] <= shield.predicted_harm[0]
+
+
+def test_parse__reads_what_str_writes_whatever_the_blanks() -> None:
+    text = "braking_capacity_mps2=5%,latency_s.vehicle_2=0.1,gaps_m.pair_1=0.5"
+    found = parse_uncertainty(text.replace("=", " = ").replace(",", " ,"))
+    assert [(str(each), each.half_width, each.place) for each in found.intervals] == [
+        ("braking_capacity_mps2=5%", 0.05, None),
+        ("latency_s.vehicle_2=0.1", 0.1, 1),
+        ("gaps_m.pair_1=0.5", 0.5, 0),
+    ]
+    assert str(found) == text
+    assert parse_uncertainty(text) == checked_uncertainty(found) == found
+
+
+def test_members__are_the_world_itself_and_every_corner() -> None:
+    worlds = WORLD.take(np.zeros(2, np.int64))
+    members = parse_uncertainty("gaps_m.pair_1=0.5,mass_t.vehicle_3=10%").members(worlds)
+    assert members.gaps_m[:, 0].tolist() == [10.0, 9.5, 10.5, 9.5, 10.5, 10.0, 9.5, 10.5, 9.5, 10.5]
+    assert members.vehicles.mass_t[:, 2] == pytest.approx(2 * [4.0, 3.6, 3.6, 4.4, 4.4], abs=1e-12)
+    assert (members.gaps_m[:, 1] == 8.0).all()
+    assert (members.vehicles.latency_s[:, 1] == 0.4).all()
+    assert worlds.gaps_m[0, 0] == 10.0
+
+
+def test_members__stay_within_what_is_possible() -> None:
+    members = parse_uncertainty("latency_s.vehicle_1=0.1,speeds_mps.vehicle_3=5").members(WORLD)
+    assert members.vehicles.latency_s[:, 0].tolist() == [0.0, 0.0, 0.1, 0.0, 0.1]
+    assert members.speeds_mps[:, 2] == pytest.approx([39.9, 34.9, 34.9, 40.0, 40.0])
+
+
+def test_bound_at_the_alert__is_that_of_the_best_constant_in_the_worst_corner() -> None:
+    scenario = Scenario(
+        name="between", vehicles=3, gaps_m=[6, 6], speeds_mps=[20, 20, 20], braking_capacity_mps2=[8, 8, 5],
+        driving_capacity_mps2=2, mass_t=1, latency_s=[0, 0.5, 0.5],
+        roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "full_brake"},
+    )  # fmt: skip
+    worlds, uncertainty = scenario.sample(1, 0).worlds, parse_uncertainty("gaps_m=3")
+    shield = begun(scenario, worlds, uncertainty=uncertainty)
+    alone = [begun(scenario, uncertainty.members(worlds).take([m])).first_bound[0] for m in range(5)]
+    tried = [plan_harm(shield.running, np.full((1, 81), -a))[0] for a in np.linspace(0.0, 1.0, 41)]
+    assert shield.running.members == 5
+    assert len(set(alone)) > 2
+    # No single deceleration is best in all of them.
+    assert max(*alone, alone[0] + 1.0) - 1e-9 <= shield.first_bound[0] <= min(tried)
+
+
+def test_seen__counts_from_then_on() -> None:
+    shield = begun(STANDING, STANDING.sample(1, 0).worlds, uncertainty=OPEN)
+    decision = shield.decide(np.zeros(1), seen=np.array([[0.0, 14.0, 5.0, 0.0]]))
+    assert (ShieldReason(decision.reason[0]).text, decision.applied[0]) == ("assumption broken", -1.0)
+    assert decision.bound[0] == pytest.approx(14.0**2 - 2 * 5 * 5)

@@ -18,10 +18,11 @@ from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.learning import runs as learning_train
 from ethbrake_marl.learning.training import Scheme, Training, TrainingRecipe, load_recipe
 from ethbrake_marl.limits.limits import best_harm, chunks_left
-from ethbrake_marl.scenario import Sample, load_scenario
+from ethbrake_marl.scenario import Sample, load_scenario, scenario_path
 from ethbrake_marl.shield.guard import Shielded
 from ethbrake_marl.studies.ablation import (
     FIGURES,
+    STANDARD,
     Goal,
     Harms,
     Level,
@@ -433,3 +434,38 @@ def test_measure__all_brake_fully_whatever_their_roles():
 
 
 PAIR = load_scenario("cooperation-3-pair")
+
+
+def test_standard_levels__are_a_ladder_and_its_worse_channels(empty_folder: Path) -> None:
+    assert [
+        (level.name, [vehicle + 1 for vehicle in level.scenario.learners], level.clear)
+        for level in read_levels([*STANDARD, "cooperation-3-congested"])
+    ] == [
+        ("cooperation-0-sensors", [], None),
+        ("cooperation-1-front", [2], None),
+        ("cooperation-2-paper", [2], None),
+        ("cooperation-3-pair", [2, 3], None),
+        ("cooperation-4-all", [1, 2, 3], None),
+        ("cooperation-2-blocked", [2], "cooperation-2-paper"),
+        ("cooperation-3-congested", [2, 3], "cooperation-3-pair"),
+    ]
+    text = scenario_path("cooperation-2-paper").read_text().replace("v2x: paper", "v2x: nominal")
+    Path("mine.yaml").write_text(text.replace("name: cooperation-2-paper", "name: mine"))
+    assert [level.clear for level in read_levels(["cooperation-2-paper", "mine.yaml"])] == [None, "cooperation-2-paper"]
+    assert [level.clear for level in read_levels(["mine.yaml", "cooperation-2-paper"])] == [None, "mine"]
+
+
+def test_levels__are_compared_in_the_same_gaps_and_speeds() -> None:
+    every = [sample.worlds for sample in common_worlds(read_levels(STANDARD), 50, 7)]
+    assert len(every) == 6
+    assert {worlds.gaps_m.tobytes() for worlds in every} == {every[0].gaps_m.tobytes()}
+    assert {worlds.speeds_mps.tobytes() for worlds in every} == {every[0].speeds_mps.tobytes()}
+
+
+def test_best_known__counts_an_obstacle_that_is_reached() -> None:
+    # All brake fully: without an obstacle it is harmless; one 20 m ahead stands where Vehicle 1 runs into it.
+    pair = load_scenario("cooperation-3-pair").replace(gaps_m=60)
+    near = pair.replace(name="near", roles=dict.fromkeys(pair.vehicle_names, "learner"), obstacle_gap_m=20)
+    answers = [answer(Level(pair), 1), answer(Level(near), 1)]
+    assert best_known(answers[0], answers)["total"].max() == 0.0
+    assert best_known(answers[1], answers)["total"].min() > 0.0

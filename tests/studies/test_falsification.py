@@ -8,7 +8,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.physics import Bools, Floats, Worlds
-from ethbrake_marl.studies.falsification import Measure, MeasureName, far_apart, search
+from ethbrake_marl.studies.falsification import APART, Measure, MeasureName, Scored, far_apart, search
 
 SCENARIO = eb.load_scenario("paper-random")
 
@@ -91,3 +91,42 @@ class Holed:
 def in_hole(worlds: Worlds) -> Bools:
     """Three conditions, each of which a tenth of the worlds meets."""
     return np.asarray((worlds.gaps_m < 5.5).all(axis=1) & (worlds.speeds_mps[:, 1] > 21.6))
+
+
+def test_far_apart__takes_the_best_first_without_what_does_not_count() -> None:
+    points = np.array([[0.1, 0.1], [0.1, 0.1 + 0.9 * APART], [0.9, 0.9], [0.5, 0.5]])
+    assert far_apart(Scored(points, np.array([1.0, 2.0, 0.5, -np.inf])), 9).tolist() == [1, 2]
+
+
+def test_ranges__are_what_a_scenario_draws() -> None:
+    paper, wide = eb.load_scenario("paper-random"), eb.load_scenario("stress-wide").ranges()
+    sample, accepted = paper.ranges().sample(np.full((1, 5), 0.5))
+    assert len(paper.ranges().names) == 5
+    assert accepted.tolist() == [True]
+    assert sample.worlds.gaps_m.tolist() == [[7.5, 7.5]]
+    assert sample.worlds.speeds_mps.tolist() == [[20.0, 20.0, 20.0]]
+    assert float(wide.sample(np.random.default_rng(0).random((2_000, len(wide.names))))[1].mean()) == 0.9625
+
+
+def test_search__keeps_nothing_where_nothing_is_wrong() -> None:
+    paper, _wide = eb.load_scenario("paper-random"), eb.load_scenario("stress-wide").ranges()
+    braking = eb.make_agent("full_brake")
+    found = Measure("difference", {"mine": braking, "full_brake": braking}, paper, "first").falsify(300, 0)
+    assert found.sample.worlds.n == 0
+    assert len(found.worlds) == 0
+    assert found.first_above is None
+    assert found.share_above == 0.0
+
+
+def test_search__stays_in_the_cube_and_repeats_by_seed() -> None:
+    one, same, other = (search(_peak, 2, 700, seed) for seed in (1, 1, 2))
+    assert len(one.points) == len(one.scores) == 700
+    assert ((one.points >= 0.0) & (one.points < 1.0)).all()
+    assert np.array_equal(one.points, same.points)
+    assert not np.array_equal(one.points, other.points)
+
+
+def test_search__spreads_evenly_while_all_points_are_alike() -> None:
+    found = search(lambda points: np.zeros(len(points)), 3, 1_024, 0)
+    cells = np.unique((found.points * 8).astype(int), axis=0)
+    assert len(cells) == 512

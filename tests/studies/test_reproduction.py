@@ -38,13 +38,16 @@ from ethbrake_marl.studies.reproduction import (
     checked_result,
     compare_number,
     compare_rows,
+    decrease_verdict,
     docs_page,
     judge_statement,
     lineup,
     read_results,
     render_page,
     rows_table,
+    selection_verdict,
     stated,
+    summarise_verdicts,
     write_docs,
 )
 from tests.learning.tiny import TINY_PPO
@@ -383,3 +386,56 @@ def test_trajectories__are_watched_side_by_side(tmp_path: Path) -> None:
     assert titles[0] == "Scenario 1, as stated" and len(set(titles)) == 4
     whys = [world["why"] for world in content["worlds"]]
     assert whys[0] == "" and whys[3].startswith("--set latency_s=[")
+
+
+def test_course_of_a_training__by_hand() -> None:
+    # Measures of planted courses of a training: changes of 2 and 0, then of 3 and 0.
+    one = course([[-10.0, -4.0, 0.0, 0.0], [-10.0, -6.0, 0.0, 0.0]], [[100.0, 50.0, 10.0, 0.0], [100.0, 5.0, 1.0, 0.0]])
+    assert [
+        np.round(measure, 9).tolist()
+        for measure in (one.last_returns, one.decisions_to_converge, one.spread, one.unrest(2), one.unrest(3))
+    ] == [[0.0, 0.0], [2.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.1, 0.15]]
+    assert one.rise == 10.0
+    assert one.still_rising == 0.0
+    assert round(course([[-4.0, -3.0, -2.0, -1.0, 0.0]], [[1.0] * 5]).still_rising, 9) == 0.25
+
+
+def test_printed_results__hybrid_avoids_more_than_its_parts_can() -> None:
+    parts = [printed("hybrid test", agent) for agent in ("E-V2X-BM", "Standalone DRL", "Hybrid")]
+    assert selection_verdict(*parts).outcome == "cannot agree"
+    assert "so it avoids at most 737 + 1,263 = 2,000 collisions; printed: 2,005" in selection_verdict(*parts).because
+    assert selection_verdict(*parts[:2], replace(parts[2], collisions=3_000)).outcome == "agrees"
+    row, baseline = printed("random test", "Hybrid PPO"), printed("random test", "Non-E")
+    assert decrease_verdict(row, baseline).outcome == "agrees"
+    assert decrease_verdict(replace(row, harm_decrease=0.85), baseline).outcome == "cannot agree"
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "expected"),
+    [
+        (("agrees", "agrees"), ("agrees", "of 2 comparisons 2 agree; w0: b0")),
+        (("agrees", "differs"), ("differs", "of 2 comparisons 1 differs, 1 agrees; w1: b1")),
+        (
+            ("differs", "cannot agree", "agrees"),
+            ("cannot agree", "of 3 comparisons 1 cannot agree, 1 differs, 1 agrees; w1: b1"),
+        ),
+        (("agrees", "not run"), ("not run", "of 2 comparisons 1 not run, 1 agrees; w1: b1")),
+        (
+            ("not run", "undecided", "agrees"),
+            ("undecided", "of 3 comparisons 1 undecided, 1 not run, 1 agrees; w1: b1"),
+        ),
+        ((), ("not run", "nothing was compared")),
+    ],
+)
+def test_verdicts__the_worst_is_told_and_counts(outcomes, expected) -> None:
+    found = summarise_verdicts([Verdict(f"w{k}", outcome, f"b{k}") for k, outcome in enumerate(outcomes)])
+    assert (found.outcome, found.because) == expected
+
+
+def test_returns__of_a_shaped_reward_say_nothing_between_delays_so_its_harm_is_compared() -> None:
+    worse = course([[-9.0] * 20, [-8.99] * 20], [[90.0] * 20, [80.0] * 20])
+    better = course([[-10.0] * 20, [-9.99] * 20], [[10.0] * 20, [8.0] * 20])  # of lower returns
+    for recipe, outcome, told in (("ppo", "agrees", "minus its harm"), ("ppo-paper", "differs", "ppo-paper")):
+        assert bool(eb.load_recipe(recipe).reward.shaping) == (recipe == "ppo")
+        verdict = reproduction._higher_when_low({"high": {recipe: worse}, "low": {recipe: better}})
+        assert (verdict.outcome, told in verdict.because) == (outcome, True)

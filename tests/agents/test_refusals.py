@@ -1,0 +1,438 @@
+"""What agents, policies of others, searches and teams refuse, and how an agent fails."""
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import PPO
+
+import ethbrake_marl as eb
+from ethbrake_marl.agents import make_agent, optimise_pairwise, register_agent
+from ethbrake_marl.agents.e_v2x_bm import pairwise_harm
+from ethbrake_marl.agents.planner import Searched
+from ethbrake_marl.agents.policy import LearnedAgent
+from ethbrake_marl.agents.registry import Knowledge, Team, drive
+from ethbrake_marl.errors import AgentFailed, AlreadyExists, UnknownName
+from ethbrake_marl.observations import observe
+from ethbrake_marl.search import ProfileProblem, profile_problem
+from tests.fixtures.asked import Asked
+from tests.refused import refused
+
+PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
+WORLDS = PAPER.sample(12, 7).worlds
+FREE = PAPER.replace(early_impacts="keep")
+SLOW = PAPER.replace(brake_rate_mps3=9)
+PIECES = PAPER.replace(roles={"vehicle_1": "profile:0=3,1=5", "vehicle_2": "learner"})
+BRAKE = make_agent("full_brake")
+SEVENTH = observe(WORLDS, 1, eb.ObservationSpec())[7, 0]
+
+
+@cache
+def problem(*vehicles: int) -> ProfileProblem:
+    return profile_problem(WORLDS, vehicles)
+
+
+class Own:
+    """An agent that gives this answer."""
+
+    def __init__(self, answer: Callable[[Any], Any], name: str = "own") -> None:
+        self.answer, self.name = answer, name
+
+    def act(self, worlds: Any, vehicle: int) -> Any:
+        return self.answer(worlds)
+
+
+class Remembers:
+    """An agent that makes and keeps a memory so."""
+
+    name = "mine"
+
+    def __init__(self, begun: Callable[[int], Any], kept: Callable[[Any, int], Any]) -> None:
+        self.begun, self.kept = begun, kept
+
+    def begin(self, alert: Any, vehicle: int, scripts: Any) -> Any:
+        return self.begun(alert.n)
+
+    def act(self, worlds: Any, memory: Any, vehicle: int) -> Any:
+        return np.zeros(worlds.n), self.kept(memory, worlds.n)
+
+
+def evaluated(agent: Any, scenario: eb.Scenario = PAPER) -> object:
+    return eb.evaluate(scenario.sample(12, 7), {"own": agent}, scenario=scenario)
+
+
+def policy(answer: Callable[[int], Any]) -> Any:
+    return eb.policy_agent(lambda seen: answer(len(seen)), name="mine")
+
+
+SPECS: dict[str, Callable[[], object]] = {
+    "agent 'planner+step+episode': +search comes first and once, then one shield of +episode": lambda: make_agent(
+        "planner+step+episode", scenario=PAPER
+    ),
+    "agent 'coast:1': coast takes no argument": lambda: make_agent("coast:1"),
+    "agent 'full_brake@': a path is needed after '@'": lambda: make_agent("full_brake@"),
+    "agent 'coast@runs/x': coast takes no policy": lambda: make_agent("coast@runs/x"),
+    "agent 'ppo@shipped+robust': mode robust needs an uncertainty": lambda: make_agent(
+        "ppo@shipped+robust", scenario=PAPER
+    ),
+    "agent 'ladder': stands for several agents in --agents; here one is needed": lambda: make_agent("ladder"),
+    "agent 'constant': constant needs a finite deceleration in m/s2 after the colon": lambda: make_agent("constant"),
+    "agent 'constant:fast': constant needs a finite deceleration in m/s2 after the colon": lambda: make_agent(
+        "constant:fast"
+    ),
+    "agent 'e_v2x_bm:total': the argument must be 'coupled' or 'pairwise'": lambda: make_agent("e_v2x_bm:total"),
+    "agent 'e_v2x_bm:believed': needs a scenario: make_agent('e_v2x_bm:believed'": lambda: make_agent(
+        "e_v2x_bm:believed"
+    ),
+    "scenario 'mixture-delays': is a mixture, and a vehicle that is not known could be of any": lambda: make_agent(
+        "e_v2x_bm:believed", scenario=eb.load_scenario("mixture-delays")
+    ),
+    "agent 'planner:0': the argument must be a number of candidates per decision": lambda: make_agent("planner:0"),
+    "agent 'planner:1.5': the argument must be a number of candidates per decision": lambda: make_agent("planner:1.5"),
+    "best_harm: budget = 0; at least 1 candidate is needed": lambda: make_agent("best_harm", most_candidates=0),
+    "harm_count 'both': must be 'first' or 'total'": lambda: make_agent("e_v2x_bm", harm_count="both"),
+    "horizon_s 0.0: must be a positive number of seconds": lambda: make_agent("e_v2x_bm", horizon_s=0.0),
+    "agent name 'mine:x': must be a plain name without argument": lambda: register_agent("mine:x", Own),
+    "file 'nowhere/none.py': there is no such file": lambda: make_agent("nowhere/none.py:make_agent"),
+    "agent 'profile:0=3,1=5+step': a profile is a role of a scenario, fixed at the alert; it is no agent": lambda: (
+        make_agent("profile:0=3,1=5+step", scenario=PAPER)
+    ),
+    "agent 'idm:a=0': a must be a number above 0, for instance a=1.4": lambda: make_agent("idm:a=0"),
+    "agent 'idm:T=1:T=2': T is given twice": lambda: make_agent("idm:T=1:T=2"),
+    "agent 'acc:T': T must be a number 0 or more, for instance T=1.1": lambda: make_agent("acc:T"),
+    "agent 'r157_fsm:b_min=7': b_min 7 must not be above b_max 6": lambda: make_agent("r157_fsm:b_min=7"),
+    "agent 'ppo': a policy is needed: ppo@PATH, where PATH is a run": lambda: make_agent("ppo+step", scenario=PAPER),
+}
+
+
+@pytest.mark.parametrize("message", SPECS)
+def test_agent__is_refused(message: str) -> None:
+    with refused(message):
+        SPECS[message]()
+
+
+SEARCHES: dict[str, Callable[[], object]] = {
+    "agent 'constant:7.5': above the braking capacity 7 m/s2": lambda: (
+        Asked(make_agent("constant:7.5")).begin(WORLDS, 1).act(WORLDS, 1)
+    ),
+    "agent 'constant:-7.5': above the driving capacity 7 m/s2": lambda: (
+        Asked(make_agent("constant:-7.5")).begin(WORLDS, 1).act(WORLDS, 1)
+    ),
+    "search: candidates = 0: must be a whole number in 1..1000000": lambda: Searched(BRAKE, PAPER, candidates=0),
+    "refine: commands of shape (3, 75); (12, 75) of one vehicle are needed": lambda: problem(1).refine(
+        np.zeros((3, 75)), budget=5
+    ),
+    "refine: a command is beyond the vehicle's capacity": lambda: problem(1).refine(
+        np.full((12, problem(1).last_step.max()), -50.0), budget=5
+    ),
+    "budget = 0: must be a whole number, at least 1": lambda: problem(1).refine(
+        np.zeros((12, problem(1).last_step.max())), budget=0
+    ),
+    "templates = 0: must be a whole number, at least 1": lambda: problem(1).best_templates(
+        np.full(12, np.inf), number=0
+    ),
+    "templates: 2 vehicles; they are of one": lambda: problem(1, 2).best_templates(np.full(12, np.inf), number=40),
+    "vehicle 3: must be an index in 0..2": lambda: optimise_pairwise(WORLDS, 3),
+    "deceleration_mps2[0, 1] = -1: must be finite and >= 0": lambda: pairwise_harm(WORLDS.take([0]), [1.0, -1.0, 1.0]),
+    "team 't': 'vehicle_2': must be the index of a vehicle, 0 or more": lambda: Team({"vehicle_2": BRAKE}, "t"),
+    "team 't': vehicle_2 is driven by 'coast', which is no agent": lambda: Team({1: "coast"}, "t"),
+    "team 't' drives vehicle_2; the vehicles to drive are vehicle_2": lambda: Team.of(Team({1: BRAKE}, "t"), (1, 2)),
+    "scenario 'cooperation-3-pair': needs one driven vehicle; driven are: vehicle_2, vehicle_3": lambda: (
+        eb.evaluate(PAIR.sample(2, 0), {"b": BRAKE}, scenario=PAIR).vehicle
+    ),
+    "agent 'coast' drives vehicle_3, but vehicle_2 of scenario 'cooperation-3-pair'": lambda: eb.evaluate(
+        PAIR.sample(2, 0), {"h": make_agent("coast+episode", scenario=PAIR.with_learners(["vehicle_2"]))}, scenario=PAIR
+    ),
+}
+
+
+@pytest.mark.parametrize("message", SEARCHES)
+def test_command_search_or_team__is_refused(message: str) -> None:
+    with refused(message):
+        SEARCHES[message]()
+
+
+OWN: dict[str, Callable[[], object]] = {
+    "agent 'own' of vehicle_2: act on 12 worlds at 0.50 s: ZeroDivisionError: division by zero": lambda: evaluated(
+        Own(lambda worlds: 1 / 0)
+    ),
+    "memory: act gave a memory of another form ((dtype('float64'),)) than it was given (None)": lambda: evaluated(
+        Remembers(lambda n: None, lambda m, n: np.zeros(n))
+    ),
+    "memory: act gave a memory of another form ({'a': (dtype('float64'),), 'b': (dtype('float64'),)})": lambda: (
+        evaluated(Remembers(lambda n: {"a": np.zeros(n)}, lambda m, n: m | {"b": np.zeros(n)}))
+    ),
+    "memory: act gave a memory of another form ((dtype('int64'),)) than it was given": lambda: evaluated(
+        Remembers(np.zeros, lambda m, n: np.zeros(n, np.int64))
+    ),
+    "memory: act gave a memory of another form ((dtype('float64'), 2)) than it was given": lambda: evaluated(
+        Remembers(lambda n: np.zeros((n, 1)), lambda m, n: np.zeros((n, 2)))
+    ),
+    "agent 'mine' of vehicle_2: memory: key 'b.c'; must be a name": lambda: evaluated(
+        Remembers(lambda n: {"a": (np.zeros(n), {"b.c": np.zeros(n)})}, lambda m, n: m)
+    ),
+    "agent 'mine' of vehicle_2: memory: key 0; must be a name": lambda: evaluated(
+        Remembers(lambda n: {0: np.zeros(n)}, lambda m, n: m)
+    ),
+    "agent 'mine' of vehicle_2: memory: an array of objects; it must hold numbers, truths or texts": lambda: evaluated(
+        Remembers(lambda n: np.array([[]] * n + [[1]], object)[:n], lambda m, n: m)
+    ),
+    "the closed form of E-V2X-BM and planner: brakes of world 0 build up (brake_rate_mps3": lambda: evaluated(
+        make_agent("e_v2x_bm:pairwise"), SLOW
+    ),
+    ":believed: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and nothing exact is": lambda: (
+        evaluated(make_agent("full_brake+step:believed", scenario=SLOW), SLOW)
+    ),
+    "the closed form of E-V2X-BM and planner: a vehicle of world 0 brakes in pieces (profile)": lambda: evaluated(
+        make_agent("e_v2x_bm:pairwise"), PIECES
+    ),
+    ":believed: a vehicle of world 0 brakes in pieces (profile), and nothing exact is known for these": lambda: (
+        evaluated(make_agent("full_brake+step:believed", scenario=PIECES), PIECES)
+    ),
+    "shield: robust interior: vehicle_1 is driven by 'profile:0=3,1=5', which it cannot enclose": lambda: evaluated(
+        make_agent("full_brake+robust:interior", scenario=PIECES, uncertainty="latency_s=0.1"), PIECES
+    ),
+}
+
+
+@pytest.mark.parametrize("message", OWN)
+def test_agent_of_a_user__is_refused(message: str) -> None:
+    with refused(message):
+        OWN[message]()
+
+
+FAILED: dict[str, Callable[[], object]] = {
+    "agent 'own', world 0, vehicle_2 at 0.50 s: gave float64 of shape (12, 1); one number per world is": lambda: (
+        evaluated(Own(lambda worlds: np.zeros((worlds.n, 1))))
+    ),
+    "agent 'own', world 0, vehicle_2 at 0.50 s: gave float64 of shape ()": lambda: evaluated(Own(lambda worlds: 1.0)),
+    "agent 'own', world 0, vehicle_2 at 0.50 s: gave object of shape ()": lambda: evaluated(Own(lambda worlds: None)),
+    "agent 'own', world 0, vehicle_2 at 0.50 s: gave <U1 of shape (12,); one number per world is needed": lambda: (
+        evaluated(Own(lambda worlds: ["x"] * worlds.n))
+    ),
+    "agent 'own', world 7, vehicle_2 at 0.50 s: gave float64 of shape (7,); one number per world is": lambda: evaluated(
+        Own(lambda worlds: np.zeros(7))
+    ),
+    "agent 'own', world 4, vehicle_2 at 0.50 s: command nan m/s2; must be in [-7, 7]": lambda: evaluated(
+        Own(lambda worlds: np.where(np.arange(worlds.n) == 4, np.nan, 0.0))
+    ),
+    "agent 'own', world 4, vehicle_2 at 0.50 s: command -99 m/s2; must be in [-7, 7]": lambda: evaluated(
+        Own(lambda worlds: np.where(np.arange(worlds.n) == 4, -99.0, 0.0))
+    ),
+    "agent 'own', world 0, step 1 (0.50 s): gave float64 of shape (12, 2) for observations of shape (12": lambda: (
+        evaluated(policy(lambda n: np.zeros((n, 2))))
+    ),
+    "agent 'own', world 0, step 1 (0.50 s): gave float64 of shape (12,) for observations of shape (12": lambda: (
+        evaluated(policy(lambda n: np.zeros(n)))
+    ),
+    "agent 'own', world 5, step 1 (0.50 s): gave float64 of shape (5, 1) for observations of shape (12": lambda: (
+        evaluated(policy(lambda n: np.zeros((n, 1))[:5]))
+    ),
+    "agent 'own', world 3, step 1 (0.50 s): gave float64 of shape (12, 1) for observations of shape (12": lambda: (
+        evaluated(policy(lambda n: np.where(np.arange(n) == 3, np.nan, -1.0)[:, None]))
+    ),
+    "agent 'own', world 2, step 1 (0.50 s): gave float64 of shape (12, 1) for observations of shape (12": lambda: (
+        evaluated(policy(lambda n: 1.5 * np.eye(n)[:, 2:3]))
+    ),
+    "agent 'own', world 0, step 1 (0.50 s): observations of shape (12, 27): gave a tuple of 2 in place": lambda: (
+        evaluated(policy(lambda n: (np.zeros((n, 1)), None)))
+    ),
+}
+
+
+@pytest.mark.parametrize("message", FAILED)
+def test_agent__fails_with_its_world_and_step(message: str) -> None:
+    with refused(message, AgentFailed):
+        FAILED[message]()
+
+
+POLICIES: dict[str, Callable[[], object]] = {
+    "agent 'int': 3 is no policy; must be a function of observations, an object": lambda: eb.policy_agent(3),
+    "agent 'none': policy 'none.onnx': there is no such file": lambda: eb.policy_agent(Path("none.onnx")),
+    "agent 'ActorCriticPolicy': the policy takes observations of shape (27,), here are 37 features": lambda: (
+        eb.policy_agent(PPO("MlpPolicy", eb.EthBrakeEnv()).policy, observation=eb.ObservationSpec(front=2))
+    ),
+    "agent 'PPO': initial_state is for a function (observation, state) -> (action, state)": lambda: eb.policy_agent(
+        PPO("MlpPolicy", eb.EthBrakeEnv()), initial_state=lambda n: np.zeros((n, 1))
+    ),
+    "agent 'Sequential': Dropout is in training mode, where it draws, or mixes the worlds of a batch": lambda: (
+        eb.policy_agent(torch.nn.Sequential(torch.nn.Linear(27, 4), torch.nn.Dropout(0.5), torch.nn.Linear(4, 1)))
+    ),
+    "agent 'Sequential': BatchNorm1d is in training mode, where it draws, or mixes the worlds of a batch": lambda: (
+        eb.policy_agent(torch.nn.Sequential(torch.nn.Linear(27, 4), torch.nn.BatchNorm1d(4), torch.nn.Linear(4, 1)))
+    ),
+}
+
+
+@pytest.mark.parametrize("message", POLICIES)
+def test_policy_of_another_library__is_refused(message: str) -> None:
+    with refused(message):
+        POLICIES[message]()
+
+
+NAMES: dict[str, Callable[[], object]] = {
+    "unknown agent 'full_break'; did you mean 'full_brake'?": lambda: make_agent("full_break"),
+    "unknown agent 'ful_brake'; did you mean 'full_brake'?": lambda: make_agent("ful_brake+step", scenario=PAPER),
+    "unknown shield or search 'stpe'; did you mean 'step'?": lambda: make_agent("full_brake+stpe", scenario=PAPER),
+    "unknown shield or search ''": lambda: make_agent("full_brake+", scenario=PAPER),
+    "unknown agent 'idm:t=1': parameter 't'": lambda: make_agent("idm:t=1"),
+    "unknown scenario 'paper-randon'; did you mean 'paper-random'?": lambda: make_agent(
+        "planner+episode", scenario="paper-randon"
+    ),
+}
+
+
+@pytest.mark.parametrize("message", NAMES)
+def test_name__is_unknown(message: str) -> None:
+    with refused(message, UnknownName):
+        NAMES[message]()
+
+
+FILE = """import numpy as np, ethbrake_marl as eb
+def make_agent(): return eb.policy_agent(lambda seen: np.full((len(seen), 1), -0.5), name="half")
+def wrong(): return 3
+def raising(): raise KeyError("weights")"""
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("My+File.py:", "agent 'My+File.py:': one from a file is FILE.py:FUNCTION, FILE.py:FUNCTION:ARGUMENT or"),
+        ("My+File.py:make_agent+stpe", "unknown shield or search 'stpe'; did you mean 'step'?"),
+        ("My+File.py:make_agent:3", "make_agent has no parameters, so it takes no argument"),
+        ("My+File.py:wrong", "agent 'My+File.py:wrong': 'int' is no agent: it has no name and no act"),
+        ("My+File.py:raising", "agent 'My+File.py:raising': KeyError: 'weights' (My+File.py, line 4)"),
+        ("My+File.py:nobody", "file 'My+File.py': has no 'nobody'; name what it defines: My+File.py:NAME"),
+    ],
+)
+def test_file_of_an_agent__is_refused(spec: str, message: str, empty_folder: Path) -> None:
+    Path("My+File.py").write_text(FILE)
+    with refused(message):
+        make_agent(spec, scenario=PAPER)
+
+
+def test_file_of_an_agent__is_the_same_as_long_as_the_process_lives(empty_folder: Path) -> None:
+    Path("mine.py").write_text(FILE)
+    make_agent("mine.py:make_agent")
+    Path("mine.py").write_text(f"{FILE}# changed")
+    with refused("file 'mine.py': was changed since it was loaded; begin a new process"):
+        make_agent("mine.py:make_agent")
+
+
+def test_file_of_an_agent__is_not_run_for_a_role(empty_folder: Path) -> None:
+    Path("half.py").write_text("raise SystemExit('this ran')")
+    with refused("agent 'half.py:make_agent': is a function of a Python file, and those are loaded only where"):
+        PAPER.replace(roles={"vehicle_1": "half.py:make_agent"})
+
+
+def test_agent_that_is_registered__takes_a_policy_only_if_it_says_so() -> None:
+    with refused("agent 'ppo' is registered already", AlreadyExists):
+        register_agent("ppo", Own)
+    register_agent("leads", lambda argument, settings: make_agent(f"constant:{argument}"))
+    with refused(
+        "agent 'leads@anything': leads takes no policy; register_agent(..., takes_policy=True) says that it does"
+    ):
+        make_agent("leads@anything")
+
+
+@pytest.mark.parametrize(
+    ("drives", "third"),
+    [
+        (lambda: make_agent("e_v2x_bm").begin(WORLDS, 1, {2: Own(len, "steering")}), "steering"),
+        (lambda: make_agent("e_v2x_bm").begin(WORLDS, 1, {2: make_agent("idm")}), "idm"),
+        (lambda: eb.parallel_env(TWO_OPTIMISE), "e_v2x_bm"),
+        (lambda: drive(WORLDS, Searched(BRAKE, PLANS), PLANS, 1), "planner:8"),
+    ],
+    ids=["own", "idm", "e_v2x_bm", "planner"],
+)
+def test_looking_ahead__needs_commands_that_are_fixed_at_the_alert(drives: Callable[[], object], third: str) -> None:
+    with refused(f"vehicle_3 is driven by '{third}', whose command is not fixed at the alert"):
+        drives()
+
+
+TWO_OPTIMISE = FREE.replace(
+    obstacle_gap_m=42, roles={"vehicle_1": "learner", "vehicle_2": "e_v2x_bm", "vehicle_3": "e_v2x_bm"}
+)
+PLANS = FREE.replace(roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "planner:8"})
+
+
+@pytest.mark.parametrize("knows", ["everything", ("messages", "gossip")])
+def test_knowledge__is_of_known_kinds(knows: Any) -> None:
+    agent = Own(len)
+    agent.knows = knows
+    with refused(
+        f"agent 'own': knows = {knows!r}: must be one or several of 'own sensors', 'messages', 'believed model'"
+    ):
+        Knowledge.of(agent)
+
+
+def test_agent__has_a_name_and_its_act_takes_a_memory_if_it_begins_with_one() -> None:
+    nameless = Own(len)
+    del nameless.name
+    with refused("evaluate: agent 'own': 'Own' is no agent: it has no name; make_agent(name) makes one"):
+        evaluated(nameless)
+
+    class Begins(Own):
+        def begin(self, worlds: Any) -> None:
+            return None
+
+    with refused("agent 'own' of vehicle_2: has begin, and act without a memory; one that remembers has"):
+        evaluated(Begins(len))
+
+
+def test_policy__gives_one_action_per_world_and_a_state_per_world() -> None:
+    class Fixed:
+        observation = eb.ObservationSpec()
+
+        def __call__(self, seen: Any) -> Any:
+            return np.zeros((len(seen), 2), np.float32)
+
+    class Shared:
+        def predict(self, seen: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False) -> Any:
+            return np.zeros((len(seen), 1)), np.zeros((1, 8))
+
+    with refused("learned: actions of shape (12, 2); one per world is needed, (12, 1)"):
+        LearnedAgent(Fixed()).act(WORLDS, 1)
+    with refused("predict on 27 features: its state has arrays of shape (1, 8) for two worlds and (1, 8) for three"):
+        eb.policy_agent(Shared())
+    states = eb.policy_agent(lambda seen, state: (seen, state), name="mine", initial_state=lambda n: np.zeros(3))
+    with refused("initial_state(12): state: ndarray of shape (3,); its first axis must be the 12 worlds", AgentFailed):
+        states.begin(WORLDS, 1, {})
+
+
+@pytest.mark.parametrize("around", ["", "+search", "+episode", "+episode:pairwise", "+step", "+search+step"])
+def test_failure__is_told_with_its_world_whatever_stands_around_the_agent(around: str) -> None:
+    def answer(seen: Any) -> Any:
+        return 1 / 0 if SEVENTH in seen[:, 0] else np.full((len(seen), 1), -0.5)
+
+    agent = eb.policy_agent(answer, name="mine")
+    register_agent("theirs", lambda argument, settings: agent)
+    with refused(
+        "agent 'mine', world 7, step 1 (0.50 s): observations of shape (5, 27): ZeroDivisionError", AgentFailed
+    ):
+        eb.evaluate(
+            PAPER.sample(12, 7), {"mine": make_agent("theirs" + around, scenario=PAPER)}, scenario=PAPER, chunk=5
+        )
+
+
+def test_failure__after_the_first_step_is_told_with_its_step() -> None:
+    once = iter([1, 1, 1, 1, 0] + [1] * 99)
+    tired = eb.policy_agent(lambda seen: np.zeros((len(seen), 1 // next(once))), name="tired")
+    with refused("agent 'own', step 5: observations of shape (12, 27): ZeroDivisionError", AgentFailed):
+        evaluated(tired)
+
+
+def test_model_of_stable_baselines3__was_trained_on_the_features_that_it_is_given() -> None:
+    rows = eb.make_sb3_vec_env(PAPER, 2, observation=eb.ObservationSpec(front=2, rear=0))
+    with refused("agent 'PPO': the model is trained on other features than ObservationSpec(front=1, rear=1"):
+        eb.policy_agent(PPO("MlpPolicy", rows), observation=eb.ObservationSpec())
+    numbered = PPO("MlpPolicy", eb.make_sb3_vec_env(PAIR, 2, appended="number")).policy
+    with refused("the policy takes observations of shape (28,), here are 27 features; give what it was trained on"):
+        eb.policy_agent(numbered, scenario=PAIR)
+    stated = PPO("MlpPolicy", eb.make_sb3_vec_env(PAIR, 2, appended="state")).policy
+    with refused("agent 'ActorCriticPolicy': appended = 'state' needs the scenario that it was trained in"):
+        eb.policy_agent(stated, appended="state")

@@ -1,0 +1,419 @@
+"""What evaluations, their results, episodes, statistics, datasets and figures refuse."""
+
+import json
+from collections.abc import Callable
+from math import inf, nan
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.errors import AlreadyExists, UnknownName
+from ethbrake_marl.evaluation import episodes, evaluate, summarise
+from ethbrake_marl.evaluation.curves import deceleration_curve
+from ethbrake_marl.evaluation.episodes import film_bytes, film_scenes
+from ethbrake_marl.evaluation.inputs import make_lineup
+from ethbrake_marl.evaluation.results import compare_results, read_harms, read_result
+from ethbrake_marl.evaluation.statistics import (
+    exact_sum,
+    interquartile_mean,
+    mean,
+    mean_over_seeds,
+    paired_difference,
+    rate,
+    share_over_seeds,
+)
+from ethbrake_marl.figures import (
+    SeedCurve,
+    harm_against_total_gap,
+    harm_by_agent,
+    learning_curve,
+    picture_ending,
+    seed_curves,
+    trajectories,
+)
+from ethbrake_marl.physics import advance
+from ethbrake_marl.scenario import Task
+from tests.contract.interfaces import CRASH
+from tests.docs.site import DOCS, load
+from tests.refused import refused
+
+PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
+WORLDS = PAPER.sample(3, 0).worlds
+BRAKE = {"full_brake": eb.make_agent("full_brake")}
+FOUR = PAPER.replace(
+    vehicles=4,
+    gaps_m=7.0,
+    speeds_mps=20.0,
+    braking_capacity_mps2=6.0,
+    driving_capacity_mps2=6.0,
+    mass_t=5.0,
+    latency_s=0.5,
+    roles={"vehicle_2": "learner"},
+)
+HEAD = "agent,world,first_impact_harm,total_harm\n"
+
+
+class Confused:
+    """An agent that predicts harm of another shape."""
+
+    name, knows = "confused", "own sensors"
+
+    def __init__(self, shape):
+        self.shape = shape
+
+    def begin(self, alert, vehicle, scripts):
+        return {"predicted_harm": np.zeros(self.shape)}
+
+    def act(self, worlds, memory, vehicle):
+        return np.zeros(3), memory
+
+
+EVALUATIONS: dict[str, Callable[[], object]] = {
+    "evaluate: no agents given; at least one": lambda: eb.evaluate(WORLDS, {}, scenario=PAPER),
+    "evaluate: chunk = 0: must be a whole number, at least 1": lambda: eb.evaluate(
+        WORLDS, BRAKE, scenario=PAPER, chunk=0
+    ),
+    "evaluate: chunk = 2.5: must be a whole number, at least 1": lambda: eb.evaluate(
+        WORLDS, BRAKE, scenario=PAPER, chunk=2.5
+    ),
+    "vehicle = 3: must be a name or an index from 0 to 2": lambda: eb.evaluate(
+        WORLDS, BRAKE, scenario=PAPER, vehicle=3
+    ),
+    "scenario 'paper-random' has 0 learners (none); say which vehicle the agents drive": lambda: eb.evaluate(
+        WORLDS, BRAKE, scenario=PAPER.replace(roles={}, early_impacts="keep")
+    ),
+    "scenario 'paper-random': vehicle_2, vehicle_3 learn, but only vehicle_2 is driven": lambda: eb.evaluate(
+        WORLDS, BRAKE, scenario=PAPER.with_learners([1, 2]), vehicle=1
+    ),
+    "reset: 3 worlds of 3 vehicles are given; 3 of 4 vehicles needed": lambda: eb.evaluate(
+        WORLDS, BRAKE, scenario=FOUR
+    ),
+    "evaluate: worlds: there are none; at least one is needed": lambda: eb.evaluate(
+        WORLDS.take(np.arange(0)), BRAKE, scenario=PAPER
+    ),
+    "reset: world 0 is at 0.1 s; episodes start at the alert, t = 0, without any impact": lambda: eb.evaluate(
+        advance(WORLDS, -WORLDS.vehicles.braking_capacity_mps2, until_s=0.1)[0], BRAKE, scenario=PAPER
+    ),
+    "must be worlds or a sample, as scenario.sample(n, seed) gives": lambda: eb.evaluate(5, BRAKE, scenario=PAPER),
+    "must be specs such as 'full_brake,ppo@shipped', or a mapping": lambda: eb.evaluate(WORLDS, 5, scenario=PAPER),
+    "agent 5: must be name or name:argument": lambda: eb.evaluate(agents=[5], scenario=PAPER, episodes=2),
+    "the worlds are given; leave one of the two out": lambda: eb.evaluate(WORLDS, BRAKE, scenario=PAPER, episodes=2),
+    "number of worlds = 0: must be a whole number, at least 1": lambda: eb.evaluate(
+        agents="coast", scenario=PAPER, episodes=0
+    ),
+    "evaluate: agent 'a': 'str' is no agent: it has no name and no act; make_agent(name) makes one": lambda: (
+        eb.evaluate(WORLDS, {"a": "full_brake"}, scenario=PAPER)
+    ),
+    "agent 'confused': predicted_harm is float64 of shape (3, 2); one number per world, (3,), is needed": lambda: (
+        eb.evaluate(WORLDS, {"x": Confused((3, 2))}, scenario=PAPER)
+    ),
+    "agent 'confused' of vehicle_2: memory: ndarray of shape (2,); its first axis must be the 3 worlds": lambda: (
+        eb.evaluate(WORLDS, {"x": Confused((2,))}, scenario=PAPER)
+    ),
+    "agent 'ppo' was not evaluated; evaluated: full_brake": lambda: eb.evaluate(WORLDS, BRAKE, scenario=PAPER).outcome(
+        "ppo"
+    ),
+    "x.csv: is no file of --per-world: 'agent'": lambda: read_harms(Path("x.csv"), b"a,b\n1,2\n"),
+    "x.csv: is no file of --per-world: invalid literal for int() with base 10: 'x'": lambda: read_harms(
+        Path("x.csv"), f"{HEAD}a,x,1,1\n".encode()
+    ),
+    "x.csv: is no file of --per-world: world 1: harm ['nan', '1']": lambda: read_harms(
+        Path("x.csv"), f"{HEAD}a,1,nan,1\n".encode()
+    ),
+    "x.csv: is no file of --per-world: world 1: harm ['1', '1e300']": lambda: read_harms(
+        Path("x.csv"), f"{HEAD}a,1,1,1e300\n".encode()
+    ),
+}
+
+
+@pytest.mark.parametrize("message", EVALUATIONS)
+def test_evaluation__is_refused(message: str) -> None:
+    with refused(message):
+        EVALUATIONS[message]()
+
+
+NAMES: dict[str, Callable[[], object]] = {
+    "unknown vehicle 'vehicle_9'; did you mean 'vehicle_3'?": lambda: eb.evaluate(
+        WORLDS, BRAKE, scenario=PAPER, vehicle="vehicle_9"
+    ),
+    "unknown scenario 'paper-randm'; did you mean 'paper-random'?": lambda: eb.evaluate(
+        WORLDS, BRAKE, scenario="paper-randm"
+    ),
+    "unknown agent 'full_brak'; did you mean 'full_brake'?": lambda: eb.evaluate(WORLDS, ["full_brak"], scenario=PAPER),
+    "unknown library 'panda'; did you mean 'pandas'?": lambda: eb.evaluate(WORLDS, BRAKE, scenario=PAPER).to_frame(
+        "panda"
+    ),
+}
+
+
+@pytest.mark.parametrize("message", NAMES)
+def test_name__is_unknown(message: str) -> None:
+    with refused(message, UnknownName):
+        NAMES[message]()
+
+
+def test_groups__are_those_of_a_mixture_or_of_vehicle_types() -> None:
+    with refused("by 'scenario': these worlds have no groups; those of a mixture have scenario"):
+        eb.summarise_by(eb.evaluate(WORLDS, BRAKE, scenario=PAPER), "scenario")
+    mixed = eb.load_scenario("realistic-mixed")
+    with refused("unknown group 'vehicle_9_type'; did you mean 'vehicle_3_type'?", UnknownName):
+        eb.summarise_by(eb.evaluate(mixed.sample(3, 7), BRAKE, scenario=mixed), "vehicle_9_type")
+
+
+def test_uncertainty__is_for_an_agent_that_certifies_against_it() -> None:
+    with refused("uncertainty gaps_m=1: nobody uses it; an agent with +robust does: ppo@PATH+robust"):
+        make_lineup(["coast"], PAPER, uncertainty="gaps_m=1")
+
+
+def test_agent__says_what_it_knows() -> None:
+    knowing = Confused((3,))
+    knowing.knows = "all"
+    with refused("agent 'confused': knows = 'all': must be one or several of 'own sensors', 'messages'"):
+        eb.evaluate(WORLDS, {"x": knowing}, scenario=PAPER)
+
+
+# ---------------------------------------------------------------- results that are compared
+
+
+def result(content: Any) -> Any:
+    """What a results file with this content holds."""
+    Path("x.json").write_text(content if isinstance(content, str) else json.dumps(content))
+    return read_result(Path("x.json"))
+
+
+def row(**changes: Any) -> dict[str, Any]:
+    """One row of an evaluation of full braking in five worlds, with changes."""
+    found = evaluate(PAPER.sample(5, 7), make_lineup(["full_brake"], PAPER), scenario=PAPER, seed=7)
+    return {**summarise(found)[0].to_json(), **changes}
+
+
+RESULTS: dict[str, Callable[[], object]] = {
+    "x.json: is no JSON, or was not written to its end: Expecting value: line 1 column 2 (char 1)": lambda: result("["),
+    "x.json: is no results file, as ethbrake evaluate --json prints one (kind is missing)": lambda: result("{}"),
+    "x.json: is no results file, as ethbrake evaluate --json prints one": lambda: result("3"),
+    "x.json: unknown kind of results 'evalute'; did you mean 'evaluate'?": lambda: result('[{"kind": "evalute"}]'),
+    "x.json: results of best-harm cannot be compared; those of evaluate": lambda: result('{"kind": "best-harm"}'),
+    "x.json: agents is missing or no list of objects: it is not whole": lambda: result(
+        '{"kind": "evaluate", "seed": 7}'
+    ),
+    "x.json: worlds_sha256 is missing or no str: evaluate again": lambda: result(
+        '[{"kind": "evaluate", "agent": "x", "episodes": 3}]'
+    ),
+    "x.json: full_brake: first_impact_harm is no mean with an interval [low": lambda: result([row(episodes=1)]),
+    "x.json: full_brake: episodes = 0: must be 1 to 1,000,000,000,000": lambda: result([row(episodes=0)]),
+    "x.json: full_brake: episodes = True: must be 1 to 1,000,000,000,000": lambda: result([row(episodes=True)]),
+    "x.json: full_brake stands in it twice": lambda: result([row(), row()]),
+}
+
+
+@pytest.mark.usefixtures("empty_folder")
+@pytest.mark.parametrize("message", RESULTS)
+def test_results_file__is_refused(message: str) -> None:
+    with refused(message):
+        RESULTS[message]()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"total_harm": "x"},
+        {"total_harm": True},
+        {"total_harm": 1e300},
+        {"total_harm": 10**400},
+        {"total_harm_interval": [1]},
+        {"total_harm_interval": [1e6, 2e6]},
+        {"total_harm_interval": [9, 1]},
+        {"total_harm": -5.0, "total_harm_interval": [-6, 1]},
+    ],
+    ids=lambda changes: str(changes)[:40],
+)
+def test_results_file__has_means_inside_their_intervals(changes: dict[str, Any], empty_folder: Path) -> None:
+    with refused("x.json: full_brake: total_harm is no mean with an interval [low, high] around it"):
+        result([row(**changes)])
+
+
+@pytest.mark.parametrize(
+    ("key", "message"),
+    [
+        ("scenario_sha256", "is about another scenario than x.json"),
+        ("worlds_sha256", "is about another list of worlds"),
+    ],
+)
+def test_results__of_something_else_are_not_compared(key: str, message: str, empty_folder: Path) -> None:
+    with refused(f"x.json: {message}"):
+        compare_results(result([row()]), result([row(**{key: "0" * 64})]))
+
+
+def test_results__whose_mean_is_not_that_of_their_worlds_are_not_compared(empty_folder: Path) -> None:
+    assert (
+        run_command(["evaluate", "--agents", "full_brake", "--episodes", "5", "--output", "a", "--per-world", "csv"])
+        == 0
+    )
+    (told,) = json.loads(Path("a/results.json").read_text())
+    changed = {**told, "first_impact_harm": 3.0, "first_impact_harm_interval": [2.0, 4.0]}
+    Path("a/x.json").write_text(json.dumps([changed]))
+    with refused("a/x.json: full_brake: first_impact_harm = 3, but the mean of its worlds is 27.1787"):
+        compare_results(read_result(Path("a/results.json")), read_result(Path("a/x.json")))
+
+
+# ---------------------------------------------------------------- episodes, statistics, figures
+
+
+@pytest.fixture(scope="module")
+def scene() -> Any:
+    return film_scenes(CRASH.sample(1, seed=0).worlds, eb.make_agent("full_brake"), scenario=CRASH)[:1]
+
+
+@pytest.mark.parametrize(
+    ("films", "message"),
+    [
+        (lambda scene: film_bytes({"a": scene}, ".gif", fps=30), "film_bytes: fps = 30: must divide 100"),
+        (lambda scene: film_bytes({}, ".gif"), "film_bytes: no films given"),
+        (
+            lambda scene: film_bytes({str(k): scene for k in range(13)}, ".gif"),
+            "film: 13 agents, one below the other; at most 12 are shown",
+        ),
+        (
+            lambda scene: film_bytes({str(k): scene * 5000 for k in range(2)}, ".gif"),
+            "film of 2 agents for 200 s: needs 10,000 pictures, and at most 2,500 are kept",
+        ),
+    ],
+    ids=["rate", "none", "too many", "too long"],
+)
+def test_film__is_refused(films: Callable[[Any], bytes], message: str, scene: Any) -> None:
+    with refused(message):
+        films(scene)
+
+
+@pytest.mark.parametrize("sample_s", [0.0, nan, inf])
+def test_record__is_of_one_world_at_a_positive_time(sample_s: float) -> None:
+    with refused("record_episode: 3 worlds given; exactly 1 is needed, for instance worlds.take([0])"):
+        eb.record_episode(WORLDS, BRAKE["full_brake"], scenario=PAPER)
+    with refused(f"record_episode: sample_s = {sample_s}; must be finite and above 0"):
+        eb.record_episode(WORLDS.take([0]), BRAKE["full_brake"], scenario=PAPER, sample_s=sample_s)
+
+
+STATISTICS: dict[str, Callable[[], object]] = {
+    "exact sum: shape (1,); finite numbers, as [n], are needed": lambda: exact_sum(np.array([nan])),
+    "exact sum: shape (1, 1); finite numbers, as [n], are needed": lambda: exact_sum(np.array([[1.0]])),
+    "rate: -1 of 10: must be 0 <= successes <= count, and count at least 1": lambda: rate(-1, 10),
+    "rate: 11 of 10: must be 0 <= successes <= count, and count at least 1": lambda: rate(11, 10),
+    "rate: 0 of 0: must be 0 <= successes <= count, and count at least 1": lambda: rate(0, 0),
+    "statistics: shape (0,); at least one finite number per world is needed, as [n]": lambda: mean(np.array([])),
+    "statistics: shape (2,); at least one finite number per world is needed": lambda: mean(np.array([1.0, nan])),
+    "statistics: 3 values cannot be paired with 2 of the baseline": lambda: paired_difference(np.zeros(3), np.zeros(2)),
+    "interquartile_mean: no tasks; at least one list of figures is needed": lambda: interquartile_mean([]),
+    "interquartile_mean: task 0: shape (0,); at least one finite number per seed is": lambda: interquartile_mean([[]]),
+    "interquartile_mean: task 0: shape (2,); at least one finite number per": lambda: interquartile_mean([[1.0, nan]]),
+    "mean_over_seeds: shapes (1, 2) and (1, 3): must be [seeds, worlds] with the same worlds": lambda: mean_over_seeds(
+        [[1.0, 2.0]], [[1.0, 2.0, 3.0]]
+    ),
+    "mean_over_seeds: every harm must be finite": lambda: mean_over_seeds([[inf, 1.0, 2.0]], [[1.0, 2.0, 3.0]]),
+    "mean_over_seeds: shapes (1, 1, 3) and (1, 3): must be [seeds, worlds] with the same worlds": lambda: (
+        mean_over_seeds([[[1.0, 2.0, 3.0]]], [[1.0, 2.0, 3.0]])
+    ),
+    "share_over_seeds: shapes (2, 200) and (1, 200) and (1, 5): must be [seeds, worlds] with the same": lambda: (
+        share_over_seeds(np.ones((2, 200)), np.ones(200), np.zeros(5))
+    ),
+}
+
+
+@pytest.mark.parametrize("message", STATISTICS)
+def test_statistics__are_of_finite_numbers_that_fit(message: str) -> None:
+    with refused(message):
+        STATISTICS[message]()
+
+
+FIGURES: dict[str, Callable[[], object]] = {
+    "deceleration curve: 2 worlds given; exactly one is drawn": lambda: deceleration_curve(
+        PAPER.sample(2, 7).worlds, Task(PAPER, (1,))
+    ),
+    "deceleration curve: points = 1; at least 2 are needed": lambda: deceleration_curve(
+        PAPER.sample(1, 7).worlds, Task(PAPER, (1,)), points=1
+    ),
+    "curves of several seeds: the trainings were never evaluated at the same step": lambda: SeedCurve.of(
+        [{0: 1.0}, {1: 1.0}]
+    ),
+    "seed_curves: nothing to draw; at least one training with one evaluation is needed": lambda: seed_curves(
+        {"harm": {}}
+    ),
+    "harm_by_agent: no rows; evaluate at least one agent": lambda: harm_by_agent([]),
+    "learning_curve: no points; evaluate the policy at least once during training": lambda: learning_curve([]),
+    "harm_against_total_gap: bins = 0; at least 1 is needed": lambda: harm_against_total_gap(
+        eb.evaluate(PAPER.sample(2, 7), BRAKE, scenario=PAPER), bins=0
+    ),
+    "agent 'ppo' was not evaluated; evaluated: full_brake": lambda: harm_against_total_gap(
+        eb.evaluate(PAPER.sample(2, 7), BRAKE, scenario=PAPER), agents=["ppo"]
+    ),
+    "map.png.eps: pictures are written as PNG, SVG or PDF": lambda: picture_ending("map.png.eps"),
+    "trajectories: no records given": lambda: trajectories({}),
+}
+
+
+@pytest.mark.parametrize("message", FIGURES)
+def test_figure__needs_something_to_draw(message: str) -> None:
+    with refused(message):
+        FIGURES[message]()
+
+
+# ---------------------------------------------------------------- datasets
+
+
+def dataset(path: str = "a.parquet", agents: Any = None, **given: Any) -> None:
+    """Writes a dataset of two episodes, as if the extra were installed."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(episodes, "need", lambda package: None)
+        eb.write_dataset(path, BRAKE if agents is None else agents, **{"scenario": PAPER, "episodes": 2, **given})
+
+
+NOBODY = PAPER.with_learners([])
+DATASETS: dict[str, Callable[[], object]] = {
+    "write_dataset: episodes = 0: must be a whole number, at least 1": lambda: dataset(episodes=0),
+    "write_dataset: no agents given; at least one": lambda: dataset(agents={}),
+    "a.parquet: the format minari is written to a folder called NAME-vNUMBER": lambda: dataset(format="minari"),
+    "a-v0: the format parquet is written to a file ending in .parquet": lambda: dataset("a-v0", format="parquet"),
+    "brakes: a dataset of Minari is a folder called NAME-vNUMBER": lambda: dataset("brakes"),
+    "nowhere/a.parquet: there is no folder nowhere; make it first": lambda: dataset("nowhere/a.parquet"),
+    "nowhere/a-v0: there is no folder nowhere; make it first": lambda: dataset("nowhere/a-v0"),
+    "has no learner to record: scenario.with_learners(['vehicle_2'])": lambda: dataset(scenario=NOBODY),
+    "scenario 'cooperation-3-pair' has 2 learners (vehicle_2, vehicle_3)": lambda: dataset("a-v0", scenario=PAIR),
+}
+
+
+@pytest.mark.usefixtures("empty_folder")
+@pytest.mark.parametrize("message", DATASETS)
+def test_dataset__is_refused(message: str) -> None:
+    with refused(message):
+        DATASETS[message]()
+
+
+@pytest.mark.parametrize(("name", "make"), [("a.parquet", Path.touch), ("a-v0", Path.mkdir)])
+def test_dataset__replaces_nothing_unasked(name: str, make: Callable[[Path], None], empty_folder: Path) -> None:
+    make(Path(name))
+    with refused(f"{name}: is there already; give another name or use force (--force)", AlreadyExists):
+        dataset(name)
+
+
+def test_dataset__replaces_no_folder_that_is_none(empty_folder: Path) -> None:
+    Path("a-v0").mkdir()
+    with refused("a-v0: is no dataset of Minari, and is not replaced; give another name"):
+        dataset("a-v0", force=True)
+    with refused("unknown format 'csv'; known: minari, parquet", UnknownName):
+        dataset(format="csv")
+
+
+def test_clone__is_of_one_learner_of_a_dataset_and_says_which_drives(empty_folder: Path) -> None:
+    Path("no.parquet").write_text("no")
+    clone = load("../../train/clone")
+    with refused("no.parquet: is no dataset of `eb.write_dataset`"):
+        clone.train(Path("no.parquet"), 0, Path("clone"))
+    eb.write_dataset("two.parquet", BRAKE, scenario=PAIR, episodes=1)
+    with refused("two.parquet: holds 2 learners, one is needed"):
+        clone.train(Path("two.parquet"), 0, Path("clone"))
+    Path("clone.py").write_text((DOCS.parent / "train" / "clone.py").read_text())
+    with refused("agent 'clone.py:make_agent': say which clone drives: train/clone.py:make_agent:runs/clone"):
+        eb.make_agent("clone.py:make_agent", scenario=PAPER)

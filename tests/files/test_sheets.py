@@ -1,0 +1,145 @@
+"""One table, written in five ways."""
+
+import sys
+
+import pytest
+from rich.console import Console
+
+from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
+
+RATE = Column("Collisions", "rate", digits=1, scale=100.0, unit=" %", short="Hit", interval="below")
+CHANGE = Column("Change", sign="+", interval="hidden", wide=True)
+HARM = Estimate(0.25, (0.125, 0.5))
+SHEET = Sheet(
+    "Two agents",
+    ["Agent", RATE, CHANGE],
+    [("a|b\nknows", HARM, Estimate(-0.001, None)), "paper, <test>", ("Non-E", None, 2.0), ("last",)],
+    note="In m²/s².",
+)
+
+
+def printed(sheet: Sheet, width: int, capsys: pytest.CaptureFixture[str]) -> str:
+    Console(file=sys.stdout, width=width).print(sheet)
+    return "\n".join(line.rstrip() for line in capsys.readouterr().out.split("\n"))
+
+
+def test_sheet__in_a_wide_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    assert (
+        printed(SHEET, 120, capsys)
+        == """Two agents
+Agent                  Hit   Change
+───────────────────────────────────
+a|b                 25.0 %    -0.00
+knows           12.5, 50.0
+
+paper, <test>
+Non-E                    –    +2.00
+last
+
+In m²/s².
+"""
+    )
+
+
+def test_sheet__in_a_narrow_terminal_leaves_out_wide_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    assert (
+        printed(SHEET, 60, capsys)
+        == """Two agents
+Agent                  Hit
+──────────────────────────
+a|b                 25.0 %
+knows           12.5, 50.0
+
+paper, <test>
+Non-E                    –
+last
+
+In m²/s².
+"""
+    )
+
+
+def test_sheet__moves_no_cursor_and_reads_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    marked = Sheet("[b]t[/b]", ["[red]x"], [("\x1b[31m[/]",)])
+    assert printed(marked, 80, capsys) == "[b]t[/b]\n[red]x\n───────────\n\\x1b[31m[/]\n"
+
+
+def test_sheet__in_a_document() -> None:
+    assert SHEET.markdown().split("\n") == [
+        "| Agent | Collisions | Change |",
+        "| --- | ---: | ---: |",
+        r"| a\|b knows | 25.0 % [12.5, 50.0] | -0.00 |",
+        "| paper, <test>: Non-E | – | +2.00 |",
+        "| paper, <test>: last |  |  |",
+    ]
+
+
+def test_sheet__in_a_notebook() -> None:
+    assert SHEET.html().split("\n") == [
+        '<div class="wide" tabindex="0" role="region" aria-label="Two agents"><table>',
+        "<caption>Two agents</caption>",
+        "<thead><tr>",
+        '<th scope="col">Agent</th>',
+        '<th scope="col">Collisions</th>',
+        '<th scope="col">Change</th>',
+        "</tr></thead>",
+        "<tbody>",
+        '<tr><th scope="row">a|b\\nknows</th>',
+        '<td>25.0 % <span class="interval">[12.5, 50.0]</span></td>',
+        "<td>-0.00</td>",
+        "</tr>",
+        '<tr class="block"><th colspan="3" scope="rowgroup">paper, &lt;test&gt;</th></tr>',
+        '<tr><th scope="row">Non-E</th>',
+        "<td>–</td>",
+        "<td>+2.00</td>",
+        "</tr>",
+        '<tr><th scope="row">last</th>',
+        "<td></td>",
+        "<td></td>",
+        "</tr>",
+        "</tbody>",
+        "</table></div>",
+        "<p>In m²/s².</p>",
+    ]
+
+
+def test_sheet__as_data() -> None:
+    assert SHEET.json() == [
+        {"Agent": "a|b\nknows", "rate": 0.25, "rate_interval": [0.125, 0.5], "Change": -0.001, "Change_interval": None},
+        {"Agent": "Non-E", "rate": None, "Change": 2.0},
+        {"Agent": "last"},
+    ]
+    assert SHEET.csv().split("\n") == [
+        "Agent,rate,rate_low,rate_high,Change,Change_low,Change_high",
+        '"a|b',
+        'knows",0.25,0.125,0.5,-0.001,,',
+        "Non-E,,,,2.0,,",
+        "last,,,,,,",
+        "",
+    ]
+    assert csv_text([{"x": 1}], ["x", "y"]) == "x,y\n1,\n"
+    with pytest.raises(ValueError, match="dict contains fields not in fieldnames: 'z'"):
+        csv_text([{"z": 1}], ["x"])
+
+
+def test_sheet__of_some_columns() -> None:
+    some = Sheet("", ["Agent", "Knows", RATE], [("coast", None, 0.5), "section", ("other", None, None)])
+    assert some.filled() == [0, 2]
+    assert some.only([2, 0]).headings == ["Collisions", "Agent"]
+    first, section, last = some.only([2]).shown()
+    assert (first[0].value, section, last[0].value) == ("50.0 %", "section", "–")
+
+
+def test_estimates__in_words_and_as_data() -> None:
+    assert Estimate(24.186, (23.85, 24.53)).in_words() == "24.19 [23.85, 24.53]"
+    assert Estimate(-0.001, None).in_words() == "0.00"
+    assert HARM.in_words(digits=1, scale=100.0, unit=" %") == "25.0 % [12.5, 50.0]"
+    assert Estimate(2.0, (1.0, 3.0)).to_json() == {"value": 2.0, "interval": [1.0, 3.0]}
+    assert Estimate.side_by_side({"harm": Estimate(2.0, (1.0, 3.0)), "alone": Estimate(4.0, None), "absent": None}) == {
+        "harm": 2.0,
+        "harm_interval": [1.0, 3.0],
+        "alone": 4.0,
+        "alone_interval": None,
+        "absent": None,
+        "absent_interval": None,
+    }

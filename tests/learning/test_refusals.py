@@ -1,0 +1,471 @@
+"""What recipes, settings, trainings, their folders and teams refuse."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.agents import script_agents
+from ethbrake_marl.errors import AlreadyExists, CorruptBundle, UnknownName
+from ethbrake_marl.evaluation.inputs import load_runnable
+from ethbrake_marl.files.python_file import load_from_file
+from ethbrake_marl.files.store import hold_lock
+from ethbrake_marl.learning.algorithms import Ppo, widened
+from ethbrake_marl.learning.runs import resume, train
+from ethbrake_marl.learning.training import (
+    PpoRecipe,
+    RunDirectory,
+    Training,
+    load_recipe,
+    read_settings,
+    register_algorithm,
+)
+from ethbrake_marl.policies import load_policy
+from tests.fixtures.policies import make_policy
+from tests.learning.test_algorithms import A2C, recipe_file
+from tests.learning.tiny import TINY_COUNTERFACTUAL, TINY_MODES, TINY_OPTIONS, TINY_PPO
+from tests.refused import refused
+
+PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
+PPO = load_recipe("ppo")
+GOOD = """name: mine
+algorithm: ppo
+total_steps: 4096
+n_envs: 16
+n_steps: 32
+batch_size: 128
+n_epochs: 2
+learning_rate: {start: 1e-3, end: 1e-4}
+gamma: 0.99
+gae_lambda: 0.95
+clip_range: 0.2
+ent_coef: 0
+vf_coef: 0.5
+max_grad_norm: 0.5
+network: {policy: [8], value: [8, 4]}
+reward: {harm: 1}
+evaluation: {every_updates: 2, worlds: 10, seed: 7}
+checkpoint_every_updates: 3
+"""
+
+
+def recipe(old: str, new: str) -> Any:
+    """The recipe of a file that is GOOD with one text changed."""
+    assert old in GOOD
+    Path("mine.yaml").write_text(GOOD.replace(old, new, 1))
+    return load_recipe("mine.yaml")
+
+
+def modes(**changes: Any) -> Any:
+    """The recipe of several networks, with changes in how they are trained."""
+    return TINY_MODES.replace(modes=TINY_MODES.model_dump(mode="json")["modes"] | changes)
+
+
+RECIPES: dict[str, Callable[[], object]] = {
+    "mine.yaml, line 4: n_env: unknown key; did you mean n_envs?": lambda: recipe("n_envs: 16", "n_env: 16"),
+    "mine.yaml, line 15: network.policies: unknown key; did you mean policy?": lambda: recipe(
+        "policy: [8]", "policies: [8]"
+    ),
+    "mine.yaml, line 16: reward.speed: unknown key": lambda: recipe("harm: 1", "speed: 1"),
+    "mine.yaml: gamma: missing; it is needed; every key is in the shipped recipe ppo": lambda: recipe(
+        "gamma: 0.99\n", ""
+    ),
+    "mine.yaml, line 9: gamma = .nan: must be a finite number": lambda: recipe("gamma: 0.99", "gamma: .nan"),
+    "mine.yaml, line 9: gamma = 1.5: must be less than or equal to 1": lambda: recipe("gamma: 0.99", "gamma: 1.5"),
+    "must be one of counterfactual, options, ppo, sac": lambda: recipe("algorithm: ppo", "algorithm: trpo"),
+    "must be a whole number, written without a decimal point": lambda: recipe("total_steps: 4096", "total_steps: 1e6"),
+    "mine.yaml, line 8: learning_rate.start = -0.001: must be greater than 0": lambda: recipe(
+        "start: 1e-3", "start: -1e-3"
+    ),
+    "mine.yaml, line 6: batch_size = 100: must divide n_envs x n_steps = 512": lambda: recipe(
+        "batch_size: 128", "batch_size: 100"
+    ),
+    "n_envs x n_steps = 3200000000 decisions per update": lambda: recipe("n_envs: 16", "n_envs: 100000000"),
+    "mine.yaml, line 15: network.policy = []: must not be empty": lambda: recipe("policy: [8]", "policy: []"),
+    "mine.yaml, line 16: reward = {harm: 0}: every weight is 0; nothing could be learned": lambda: recipe(
+        "harm: 1", "harm: 0"
+    ),
+    "mine.yaml, line 17: evaluation.every_updates = 0: must be greater than or equal to 1": lambda: recipe(
+        "every_updates: 2", "every_updates: 0"
+    ),
+    "must be 1 to 64 lower case letters, digits, - and _, beginning": lambda: recipe("name: mine", "name: ../mine"),
+    "mine.yaml, line 8: learning_rate = 0.0003: must be a mapping": lambda: recipe("{start: 1e-3, end: 1e-4}", "3e-4"),
+    "mine.yaml, line 2, column 10: not valid YAML: expected ',' or ']'": lambda: recipe("name: mine", "name: [mine"),
+    "mine.yaml: must be a mapping of keys to values": lambda: recipe(GOOD, "- ppo\n"),
+    "recipe 'ppo': seed = -1: must be greater than or equal to 0": lambda: load_recipe("ppo").replace(seed=-1),
+    "recipe 'sac': ent_coef = automatic: must be auto or a number of at least 0": lambda: load_recipe("sac").replace(
+        ent_coef="automatic"
+    ),
+    "recipe 'sac': buffer_size = 63: must be at least n_envs = 128": lambda: load_recipe("sac").replace(buffer_size=63),
+    "recipe 'sac': n_steps: unknown key; did you mean total_steps?": lambda: load_recipe("sac").replace(n_steps=3),
+    "recipe 'options': averaging = 1: must be less than 1": lambda: load_recipe("options").replace(averaging=1.0),
+    "recipe 'options': near = [{smallest: 0.1, largest: 1}, {smallest: 0.1, largest: 1}...": lambda: load_recipe(
+        "options"
+    ).replace(near=[{"smallest": 0.1, "largest": 1.0}] * 9),
+    "recipe 'counterfactual': reward.shaping = 0.1: must be 0: what is tried is played to the end": lambda: (
+        TINY_COUNTERFACTUAL.replace(reward={"harm": 1.0, "shaping": 0.1})
+    ),
+    "recipe 'counterfactual': offset.largest = 0.1: must be at least smallest = 0.3": lambda: (
+        TINY_COUNTERFACTUAL.replace(offset={"smallest": 0.3, "largest": 0.1})
+    ),
+    "recipe 'counterfactual': gradient_limit = often: must be auto or a finite number above 0": lambda: (
+        TINY_COUNTERFACTUAL.replace(gradient_limit="often")
+    ),
+    "must be ppo@, counterfactual@ or universal@ and a": lambda: TINY_COUNTERFACTUAL.replace(start="sac@shipped"),
+    "n_envs x n_steps = 16777216 decisions per update; at most": lambda: TINY_COUNTERFACTUAL.replace(n_envs=2**22),
+    "must be single, shared, independent or centralised": lambda: TINY_COUNTERFACTUAL.replace(scheme="centralized"),
+    "recipe 'options': memory = 15: must be at least tried = 16": lambda: TINY_OPTIONS.replace(memory=15),
+    "must hold a range where there are neither fixed no": lambda: TINY_OPTIONS.replace(near=[], fixed=[], drawn=0),
+    "recipe 'counterfactual': modes.networks = 1: must be greater than or equal to 2": lambda: modes(networks=1),
+    "recipe 'counterfactual': modes.shares = {alone: 0.5, further: 0.5, gate: 0.5, together: 0}: alone": lambda: modes(
+        shares={"alone": 0.5, "further": 0.5, "gate": 0.5, "together": 0.0}
+    ),
+    "recipe 'counterfactual': modes.gat: unknown key; did you mean gate?": lambda: modes(gat=[8]),
+}
+
+
+@pytest.mark.usefixtures("empty_folder")
+@pytest.mark.parametrize("message", RECIPES)
+def test_recipe__is_refused(message: str) -> None:
+    with refused(message):
+        RECIPES[message]()
+
+
+SETTINGS: dict[str, Callable[[], object]] = {
+    "--set 'gamma': must be KEY=VALUE or KEY.KEY=VALUE": lambda: read_settings(["gamma"], [PPO]),
+    "--set 'a..b=1': must be KEY=VALUE or KEY.KEY=VALUE": lambda: read_settings(["a..b=1"], [PPO]),
+    "--set gamma, line 1, column 2: not valid YAML: expected the node content, but found '<stream end>'": lambda: (
+        read_settings(["gamma=["], [PPO])
+    ),
+    "--set gamma: is given twice": lambda: read_settings(["gamma=0.9", "gamma=0.8"], [PPO]),
+    "recipe 'ppo': reward.terminl: unknown key; did you mean terminal?": lambda: read_settings(
+        ["reward.terminl=1"], [PPO]
+    ).change(PPO),
+    "--set gamma.x: there is nothing inside 0.995; set the whole value": lambda: read_settings(
+        ["gamma.x=1"], [PPO]
+    ).change(PPO),
+    "scenario 'paper-random': restitution = 3: must be finite and in [0, 1]": lambda: load_runnable(
+        "paper-random", read_settings(["restitution=3"]).scenario
+    ),
+}
+
+
+@pytest.mark.parametrize("message", SETTINGS)
+def test_setting__is_refused(message: str) -> None:
+    with refused(message):
+        SETTINGS[message]()
+
+
+TRAININGS: dict[str, Callable[[], object]] = {
+    "runs/mine: is not a folder; give a policy bundle (manifest.json, weights.safetensors) or a run": lambda: train(
+        load_recipe("counterfactual").replace(start="ppo@runs/mine"), "cooperation-2-five", "run", steps=1
+    ),
+    "recipe 'options': drawn = 2: must be at most the 1 of among": lambda: train(
+        load_recipe("options").replace(among=["policy@shipped/ppo"]), "paper-random", "new"
+    ),
+    "recipe 'options': among: sac@shipped/ppo: give policy@shipped/NAME, or ppo@ and its path": lambda: train(
+        load_recipe("options").replace(among=["sac@shipped/ppo"], drawn=1), "paper-random", "new"
+    ),
+    "algorithm 'My algorithm': must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _": lambda: (
+        register_algorithm("My algorithm", PpoRecipe, Ppo)
+    ),
+    "algorithm 'new': recipe = <class 'dict'>: must be a class with network_spec": lambda: register_algorithm(
+        "new", dict, Ppo
+    ),
+    "algorithm 'new': algorithm = <built-in function len>: must be a class with build": lambda: register_algorithm(
+        "new", PpoRecipe, len
+    ),
+    "recipe 'ppo': total_steps = 0: must be greater than or equal to 1": lambda: train(
+        "ppo", "paper-random", Path("run"), steps=0
+    ),
+    "scenario 'cooperation-3-pair': no vehicle learns; give at least one the role learner": lambda: train(
+        TINY_PPO, PAIR.with_learners([]), Path("run")
+    ),
+    "scheme single: scenario 'cooperation-3-pair' has 2 learners; use shared, independent or centralised": lambda: (
+        train(TINY_PPO, PAIR, Path("run"), scheme="single")
+    ),
+    "scheme independent: scenario 'paper-random' has one learner; use single": lambda: train(
+        TINY_PPO, PAPER, Path("run"), scheme="independent"
+    ),
+    "scheme independent: recipe 'sac' is for SAC; it needs one for PPO": lambda: train(
+        "sac", PAIR, Path("run"), scheme="independent"
+    ),
+    "scheme centralised: recipe 'sac' is for SAC; it needs one for PPO": lambda: train(
+        "sac", PAIR, Path("run"), scheme="centralised"
+    ),
+    "recipe 'ppo': turns = 3: is for scheme: independent only; leave it out": lambda: train(
+        TINY_PPO, PAIR, Path("run"), scheme="shared", turns=3
+    ),
+    "recipe 'ppo': turns = 5: 2 learners need 10 updates, total_steps = 2048 are 8": lambda: train(
+        TINY_PPO, PAIR, Path("run"), scheme="independent", steps=2048, turns=5
+    ),
+    "recipe 'counterfactual': modes: are for one learner, not for 2": lambda: train(TINY_MODES, PAIR, Path("run")),
+    ".: holds no training; give the folder of a run": lambda: resume(Path()),
+    ".: holds no team (team.json); give the folder of a run, or a bundle as ppo@.": lambda: RunDirectory(
+        Path()
+    ).load_team(PAIR),
+}
+
+
+@pytest.mark.usefixtures("empty_folder")
+@pytest.mark.parametrize("message", TRAININGS)
+def test_training__is_refused(message: str) -> None:
+    with refused(message):
+        TRAININGS[message]()
+
+
+NAMES: dict[str, Callable[[], object]] = {
+    "unknown recipe 'ppo-papre'; did you mean 'ppo-paper'?": lambda: load_recipe("ppo-papre"),
+    "unknown shipped policy 'nobody'": lambda: train(
+        load_recipe("options").replace(among=["policy@shipped/nobody"], drawn=1), "paper-random", "new"
+    ),
+    "unknown recipe 'pppo'; did you mean 'ppo'?": lambda: train("pppo", PAPER, Path("run")),
+    "unknown scenario 'paper-randm'; did you mean 'paper-random'?": lambda: train("ppo", "paper-randm", Path("run")),
+    "unknown setting 'gama'; did you mean 'gamma'?": lambda: read_settings(["gama=0.9"], [PPO]),
+    "unknown setting 'mass_t'": lambda: read_settings(["recipe.mass_t=1"], [PPO]),
+    "unknown setting 'mass'; did you mean 'mass_t'?": lambda: load_runnable(
+        "paper-random", read_settings(["mass=3"]).scenario
+    ),
+}
+
+
+@pytest.mark.usefixtures("empty_folder")
+@pytest.mark.parametrize("message", NAMES)
+def test_name__is_unknown(message: str) -> None:
+    with refused(message, UnknownName):
+        NAMES[message]()
+
+
+def test_algorithm__has_a_name_of_its_own() -> None:
+    with refused("algorithm 'ppo' is registered already; give another name", AlreadyExists):
+        register_algorithm("ppo", PpoRecipe, Ppo)
+
+
+def test_observation_and_network__hold_those_of_the_policy_to_start_from() -> None:
+    turned = load_recipe("counterfactual").replace(observation=["own", "front_1", "contact"])
+    with refused("observation: lacks rear_1.known, rear_1.gap, rear_1.closing_speed, rear_1.acceleration"):
+        widened(eb.load_shipped("ppo"), Training.of(turned, PAPER))
+    smaller = load_recipe("counterfactual").replace(network={"policy": [64, 64]})
+    with refused(
+        "network: policy_hidden is (64, 64), but (128, 128) in the policy to start from; they must be the same"
+    ):
+        widened(eb.load_shipped("ppo"), Training.of(smaller, PAPER))
+
+
+def test_policy_to_start_from__has_one_network(empty_folder: Path) -> None:
+    several = {"networks": 3, "gate_hidden": (6,), "value_hidden": ()}
+    several = make_policy(eb.ObservationSpec(), {"name": "paper-random"}, "counterfactual", **several)
+    several.save(Path("first"))
+    with refused("recipe 'counterfactual': start: has 3 networks; give a policy of one"):
+        train(TINY_MODES.replace(start="counterfactual@first"), PAPER, Path("run"))
+
+
+def test_tried_actions__are_at_most_the_decisions_of_an_update() -> None:
+    assert TINY_COUNTERFACTUAL.replace(counterfactuals=32).counterfactuals == 8 * 4
+    with refused("counterfactuals = 33: must be at most n_envs x n_steps = 32"):
+        TINY_COUNTERFACTUAL.replace(counterfactuals=33)
+    assert TINY_OPTIONS.replace(tried=32, memory=99).tried == 8 * 4
+    with refused("tried = 33: must be at most n_envs x n_steps = 32"):
+        TINY_OPTIONS.replace(tried=33, memory=99)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"n_stepz": 3}, "mine.yaml, line 23: n_stepz: unknown key; did you mean n_steps?"),
+        ({"n_steps": 2.5}, "mine.yaml, line 22: n_steps = 2.5: must be a whole number"),
+        ({"algorithm": "a3c"}, "mine.yaml, line 1: algorithm = a3c: must be one of counterfactual, options, ppo, sac"),
+        ({"scheme": "independent"}, "scheme independent: recipe 'mine' is for A2C; it needs one for PPO"),
+    ],
+    ids=lambda value: str(value)[:30],
+)
+def test_recipe_of_a_user__is_checked_as_ours(changes: dict[str, Any], message: str, empty_folder: Path) -> None:
+    Path("my_algorithm.py").write_text(A2C)
+    load_from_file("my_algorithm.py", "A2C")
+    with refused(message):
+        train(recipe_file(Path(), **changes), PAIR, Path("run"))
+
+
+# ---------------------------------------------------------------- the folder of a run
+
+
+@pytest.fixture
+def run(empty_folder: Path) -> RunDirectory:
+    """The folder of a training that has begun."""
+    scenario = PAPER.model_dump(mode="json", exclude_unset=True)
+    return RunDirectory(Path("run")).create({"recipe": TINY_PPO.model_dump(mode="json"), "scenario": scenario})
+
+
+def test_folder__that_is_there_is_not_replaced_unasked(run: RunDirectory) -> None:
+    with refused(
+        "run: is there already; give another folder (--output), go on with it (ethbrake train --resume)", AlreadyExists
+    ):
+        RunDirectory(run.path).create({})
+    Path("thesis").mkdir()
+    Path("thesis/chapter-1").touch()
+    with refused("thesis: is there already, and is no run; give another name", AlreadyExists):
+        RunDirectory(Path("thesis")).create({}, force=True)
+    with refused("thesis: is there already, and is no run; give another name", AlreadyExists):
+        train(TINY_PPO, PAPER, Path("thesis"))
+
+
+@pytest.mark.parametrize(
+    ("training", "other"),
+    [
+        (lambda: Training.of(TINY_PPO.replace(seed=1), PAPER), "recipe seed"),
+        (lambda: Training.of(TINY_PPO.replace(reward={"harm": 2.0}), PAPER), "recipe reward"),
+        (
+            lambda: Training.of(TINY_PPO, PAPER.replace(v2x="clear", early_impacts="keep")),
+            "scenario early_impacts, scenario v2x",
+        ),
+        (lambda: Training.of(TINY_PPO, PAPER.replace(name="mine")), "scenario name"),
+    ],
+    ids=["seed", "reward", "channel", "name"],
+)
+def test_folder__of_another_training_is_refused(
+    training: Callable[[], Training], other: str, run: RunDirectory
+) -> None:
+    with refused(f"run: holds another training (here other: {other}); give another folder (--output)"):
+        run.check_same(training())
+
+
+@pytest.mark.parametrize(
+    ("status", "message"),
+    [
+        (
+            '{"format": "ethbrake',
+            "run/run.json: is damaged: Unterminated string starting at: line 1 column 12 (char 11)",
+        ),
+        ("[]", "run/run.json: is damaged: holds no JSON object"),
+        ("{}", "run/run.json: format = None: must be ethbrake-run"),
+        (
+            '{"format": "ethbrake-run", "status": "done"}',
+            "run/run.json: status = 'done': must be running or finished or",
+        ),
+        (None, "run/run.json: is missing; nothing goes on without it"),
+    ],
+    ids=["cut off", "a list", "empty", "other status", "missing"],
+)
+def test_status_of_a_run__is_refused(status: str | None, message: str, run: RunDirectory) -> None:
+    run.status.unlink() if status is None else run.status.write_text(status)
+    with refused(message):
+        resume(run.path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"recipe": None}, "run/config.json: is not the configuration of a training: 'recipe' is missing"),
+        ({"recipe": 3}, "run/config.json: recipe: must be a mapping of keys to values, for instance algorithm: ppo"),
+        ({"scenario": {"name": "paper-random"}}, "run/config.json: scenario: braking_capacity_mps2: missing"),
+        ({"library": "benchmarl"}, "run: was trained by benchmarl, which leaves nothing to go on from; train again"),
+    ],
+    ids=lambda value: str(value)[:30],
+)
+def test_configuration_of_a_run__is_refused(changes: dict[str, Any], message: str, run: RunDirectory) -> None:
+    told = json.loads(run.config.read_text()) | changes
+    run.config.write_text(json.dumps({key: value for key, value in told.items() if value is not None}))
+    with refused(message):
+        resume(run.path)
+
+
+def test_training_that_has_finished__says_how_to_measure_it(run: RunDirectory) -> None:
+    run.write_status("finished")
+    with refused(
+        "finished; measure what it has learned with: ethbrake evaluate --scenario paper-random --agents ppo@run+epis"
+    ):
+        resume(run.path)
+    team = RunDirectory(Path("team")).create(Training.of(TINY_PPO, PAIR, scheme="independent").config())
+    team.write_status("finished")
+    with refused(
+        "measure what it has learned with: ethbrake evaluate --scenario cooperation-3-pair --agents team@team"
+    ):
+        resume(team.path)
+
+
+def test_lock__is_held_by_one_and_is_a_file(empty_folder: Path) -> None:
+    Path("some.lock").mkdir()
+    with refused("some.lock: cannot be used as a lock (Is a directory); delete it"), hold_lock(Path("some.lock"), ""):
+        pass
+    with (
+        hold_lock(Path("other.lock"), "somebody works here"),
+        refused(".: somebody works here"),
+        hold_lock(Path("other.lock"), "somebody works here"),
+    ):
+        pass
+
+
+# ---------------------------------------------------------------- a policy for each vehicle
+
+FOUR = PAIR.replace(
+    vehicles=4,
+    braking_capacity_mps2=6,
+    driving_capacity_mps2=6,
+    mass_t=5,
+    latency_s=0.5,
+    roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "learner", "vehicle_4": "full_brake"},
+)
+TEAM = Path("team/team.json")
+DRIVERS = {name: f"policy/{name}" for name in ("vehicle_2", "vehicle_3")}
+
+
+@pytest.fixture
+def team(empty_folder: Path) -> RunDirectory:
+    """A run whose learners have a policy each."""
+    for path in DRIVERS.values():
+        make_policy(eb.ObservationSpec(), {"name": "cooperation-3-pair"}).save(TEAM.parent / path)
+    TEAM.write_text(json.dumps({"scheme": "independent", "vehicles": 3, "drivers": DRIVERS}))
+    return RunDirectory(TEAM.parent)
+
+
+def test_team__drives_a_line_of_its_length_and_vehicles_of_its_own(team: RunDirectory) -> None:
+    assert sorted(team.load_team(PAIR).drivers) == [1, 2]
+    assert sorted(team.load_team(PAIR.with_learners(["vehicle_3"])).drivers) == [2]
+    with refused("team: is a team for a line of 3 vehicles, scenario 'cooperation-3-pair' has 4; only a shared policy"):
+        team.load_team(FOUR)
+    with refused("team: drives vehicle_2, vehicle_3; scenario 'cooperation-3-pair' has nobody to drive"):
+        team.load_team(PAIR.with_learners([]))
+    with refused("team: each of its learners has a policy of its own; name one, for instance team/policy/vehicle_2"):
+        load_policy(TEAM.parent)
+    with refused("team: drives vehicle_2, vehicle_3; scenario 'cooperation-3-pair' has vehicle_1 to drive"):
+        script_agents(PAIR.replace(roles={"vehicle_1": "team@team", "vehicle_2": "team@team", "vehicle_3": "learner"}))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "team/team.json: is not JSON (Expecting property name enclosed in double quotes"),
+        ("[]", "team/team.json: must be a mapping of keys to values"),
+        ("{}", "team/team.json: scheme: missing"),
+        (
+            {"drivers": {**DRIVERS, "vehicle_3": "../policy"}},
+            'drivers.vehicle_3 = "../policy": must be policy/vehicle_3',
+        ),
+        (
+            {"drivers": {**DRIVERS, "vehicle_3": "policy/vehicle_2"}},
+            "must be policy/vehicle_3 under scheme independent",
+        ),
+        ({"scheme": "shared"}, "drivers.vehicle_2 = policy/vehicle_2: must be policy under scheme shared"),
+        ({"vehicles": 2}, "drivers = vehicle_3: must be one of vehicle_1 to vehicle_2"),
+        ({"scheme": "together"}, "scheme = together: must be single, shared, independent or centralised"),
+        ({"drivers": {"vehicle_3": "policy/vehicle_3"}}, "must be two vehicles or more under scheme independent"),
+    ],
+    ids=lambda value: str(value)[:40],
+)
+def test_file_of_a_team__is_refused(content: Any, message: str, team: RunDirectory) -> None:
+    good = {"scheme": "independent", "vehicles": 3, "drivers": DRIVERS}
+    TEAM.write_text(content if isinstance(content, str) else json.dumps(good | content))
+    with refused(message, CorruptBundle):
+        team.load_team(PAIR)
+
+
+def test_policy_of_a_team__is_whole(team: RunDirectory) -> None:
+    Path("team/policy/vehicle_3/weights.safetensors").unlink()
+    with refused("team/policy/vehicle_3/weights.safetensors: is missing", CorruptBundle):
+        team.load_team(PAIR)
+    Path("team/policy/vehicle_2/manifest.json").write_text("{}")
+    with refused("team/policy/vehicle_2/manifest.json: algorithm: is missing", CorruptBundle):
+        team.load_team(PAIR)

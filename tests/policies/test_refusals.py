@@ -1,0 +1,113 @@
+"""What policies, their folders and their observations may not be."""
+
+import os
+import socket
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.errors import AlreadyExists, CorruptBundle, UnknownName
+from ethbrake_marl.evaluation.inputs import make_lineup
+from ethbrake_marl.learning.training import load_recipe
+from ethbrake_marl.policies import Actor, Policy, load_named_policy, load_policy, shipped_name
+from tests.refused import refused
+
+PAPER = eb.load_scenario("paper-random")
+SHIPPED = load_named_policy("shipped/ppo")
+
+
+@cache
+def actor() -> Actor:
+    """An actor of four features whose weights are 0."""
+    spec = load_recipe("ppo-paper").network_spec(4)
+    return Actor(spec, {row.name: np.zeros(row.shape, np.float32) for row in spec.tensors})
+
+
+POLICIES: dict[str, Callable[[], object]] = {
+    "/dev/zero: is not a folder; give a policy bundle (manifest.json": lambda: load_policy("/dev/zero"),
+    "nothing: is not a folder; give a policy bundle (manifest.json": lambda: load_policy("nothing"),
+    "policy None: must be the path of a run or of a policy bundle": lambda: load_policy(None),
+    "observation: float32 of shape (3, 5); this policy takes float32 [n, 4]": lambda: actor()(
+        np.zeros((3, 5), np.float32)
+    ),
+    "observation: float32 of shape (4,); this policy takes float32 [n, 4]": lambda: actor()(np.zeros(4, np.float32)),
+    "observation: float64 of shape (3, 4); this policy takes float32 [n, 4]": lambda: actor()(np.zeros((3, 4))),
+    "observation[1, 2] = nan: must be finite": lambda: actor()(np.array([[0, 0, 0, 0], [0, 0, np.nan, 0]], np.float32)),
+    "observation[0, 1] = inf: must be finite": lambda: actor()(np.array([[0, np.inf, 0, 0]], np.float32)),
+    "shipped policy sac for scenario 'paper-delay-low': there is none; shipped are: counterfactual": lambda: (
+        shipped_name("sac", eb.load_scenario("paper-delay-low"), "first")
+    ),
+    "agent 'universal@runs/x': must be universal@shipped; for another policy: ppo@PATH or sac@PATH": lambda: (
+        make_lineup(["universal@runs/x"], PAPER)
+    ),
+    "agent 'sac@shipped/universal': that policy was trained by OPTIONS: options@shipped/universal": lambda: make_lineup(
+        ["sac@shipped/universal"], PAPER
+    ),
+    "agent 'ppo@': a path is needed after '@'": lambda: make_lineup(["ppo@"], PAPER),
+    "agent 'sac': a policy is needed: sac@PATH, where PATH is a run": lambda: make_lineup(["sac"], PAPER),
+}
+
+
+@pytest.mark.usefixtures("empty_folder")
+@pytest.mark.parametrize("message", POLICIES)
+def test_policy__is_refused(message: str) -> None:
+    with refused(message):
+        POLICIES[message]()
+
+
+def listen(path: Path) -> None:
+    """A socket at this path."""
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(path))
+
+
+@pytest.mark.parametrize("make", [listen, os.mkfifo], ids=["socket", "pipe"])
+def test_folder_of_a_policy__is_a_plain_folder(make: Callable[[Path], None], empty_folder: Path) -> None:
+    make(Path("door"))
+    with refused(
+        "door: is not a folder; give a policy bundle (manifest.json, weights.safetensors) or a run that finished"
+    ):
+        load_policy("door")
+
+
+def test_files_of_a_policy__are_plain_files(empty_folder: Path) -> None:
+    listen(Path("manifest.json"))
+    Path("weights.safetensors").touch()
+    with refused("manifest.json: is not a plain file but a device, a pipe or a socket", CorruptBundle):
+        load_policy(".")
+
+
+def test_folder_of_a_policy__holds_one_and_replaces_none(empty_folder: Path) -> None:
+    Path("empty").mkdir()
+    with refused("empty: holds no policy; give a policy bundle"):
+        load_policy("empty")
+    with refused("empty: is there already; give another name", AlreadyExists):
+        SHIPPED.save(Path("empty"))
+
+
+@pytest.mark.parametrize("link", ["policy", "run/policy"])
+def test_folder_of_a_policy__is_no_link(link: str, empty_folder: Path) -> None:
+    SHIPPED.save(Path("elsewhere"))
+    Path("run").mkdir()
+    Path(link).symlink_to(Path("elsewhere").absolute())
+    with refused(f"{link}: is a symbolic link; give the folder it points to", CorruptBundle):
+        load_policy(link.removesuffix("/policy"))
+
+
+def test_policy__is_made_of_finite_numbers_and_possible_fields() -> None:
+    fields = {name: getattr(SHIPPED.manifest, name) for name in type(SHIPPED.manifest).model_fields}
+    fields = {name: value for name, value in fields.items() if not name.endswith("_sha256")}
+    with refused("policy: steps: must be greater than or equal to 0"):
+        Policy.make(SHIPPED.tensors, **{**fields, "steps": -1})
+    bias = np.full_like(SHIPPED.tensors["policy.0.bias"], np.nan)
+    with refused("policy: tensor 'policy.0.bias' holds a number that is not finite"):
+        Policy.make({**SHIPPED.tensors, "policy.0.bias": bias}, **fields)
+
+
+def test_shipped_policy__is_told_what_is_near() -> None:
+    with refused("unknown shipped policy 'universel'; did you mean 'universal'?", UnknownName):
+        load_named_policy("shipped/universel")

@@ -1,0 +1,418 @@
+"""What a scenario may not say, and what its methods refuse."""
+
+import copy
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from ethbrake_marl.errors import UnknownName
+from ethbrake_marl.scenario import Scenario, load_scenario, new_scenario_text, parse_yaml
+from ethbrake_marl.scenario.sampling import ScriptSpec
+from tests.refused import refused
+
+PAPER, DELAYS = load_scenario("paper-random"), load_scenario("mixture-delays")
+LINES = """name: bad
+vehicles: 3
+time_step_s: 0.1
+horizon_s: 8
+gaps_m: {uniform: [5, 10]}
+speeds_mps: [20, 18, 20]
+braking_capacity_mps2: [6, 7, 6]
+driving_capacity_mps2: [6, 7, 6]
+mass_t: [4.5, 5.5, 5.9]
+latency_s: [0, 0.5, 0.8]
+speed_limit_mps: 40
+restitution: 0.1
+roles: {vehicle_1: full_brake, vehicle_2: learner, vehicle_3: full_brake}
+early_impacts: reject"""
+WHOLE = "gaps_m: 7, speeds_mps: 20, braking_capacity_mps2: 9, driving_capacity_mps2: 5, latency_s: 0.5, mass_t: 1"
+
+
+def given(**changed: str | None) -> Scenario:
+    """The scenario of LINES with other texts after some keys; None leaves a line empty."""
+    lines = dict(line.split(": ", 1) for line in LINES.split("\n")) | changed
+    text = "\n".join("" if value is None else f"{key}: {value}" for key, value in lines.items())
+    return Scenario.from_document(parse_yaml(text, "bad.yaml"))
+
+
+def loaded(text: str) -> Scenario:
+    """The scenario of a file that says this under its name."""
+    Path("mine.yaml").write_text(f"name: mine\n{text}\n")
+    return load_scenario("mine.yaml")
+
+
+QUANTITIES_AND_ROLES: dict[str, Callable[[], object]] = {
+    "line 15: road_friction: unknown key; friction is that of the road, one for the whole line": lambda: given(
+        gaps_m=None, road_friction="0.7"
+    ),
+    "line 15: gaps_km: unknown key; did you mean gaps_m (metres)?": lambda: given(gaps_m=None, gaps_km="0.007"),
+    "line 15: restituton: unknown key; did you mean restitution?": lambda: given(restitution=None, restituton="0.1"),
+    "line 15: zzz: unknown key": lambda: given(restitution=None, zzz="0.1"),
+    "bad.yaml: gaps_m: missing; the bumper-to-bumper gap of each pair at the alert, front": lambda: given(gaps_m=None),
+    "bad.yaml: name: missing; it is needed, for instance name: my-scenario": lambda: given(name=None),
+    "line 5: gaps_m = -1: must be finite and in [0, 10000] m (metres)": lambda: given(gaps_m="-1"),
+    "line 5: gaps_m: has 3 entries; 3 vehicles need 2 (one per pair), or one": lambda: given(gaps_m="[7, 7, 7]"),
+    "line 5: gaps_m = []: must not be empty": lambda: given(gaps_m="[]"),
+    'line 5: gaps_m = "7": must be a number, not text; write it without quotes': lambda: given(gaps_m='"7"'),
+    "line 5: gaps_m = true: must be a number or a distribution": lambda: given(gaps_m="true"),
+    "must be a number or a distribution; a key that is not used is left out": lambda: given(gaps_m=""),
+    "line 5: gaps_m[1] (vehicle_2 to vehicle_3) = .inf: must be a finite number": lambda: given(gaps_m="[7, .inf]"),
+    "line 5: gaps_m[0] (vehicle_1 to vehicle_2) = [7]: must be a number, {uniform": lambda: given(gaps_m="[[7], 7]"),
+    "line 5: gaps_m = {unifrom: [5, 9]}: must be a number, {uniform: [low, high]}, {loguniform": lambda: given(
+        gaps_m="{unifrom: [5, 9]}"
+    ),
+    "line 5: gaps_m.uniform = 5: must be a list": lambda: given(gaps_m="{uniform: 5}"),
+    "line 5: gaps_m.uniform[1]: missing; two numbers [low, high] are needed": lambda: given(gaps_m="{uniform: [5]}"),
+    "line 5: gaps_m.uniform = [5, 6, 7]: must have 2 entries": lambda: given(gaps_m="{uniform: [5, 6, 7]}"),
+    "line 5: gaps_m.uniform = [9, 6]: low must not be above high": lambda: given(gaps_m="{uniform: [9, 6]}"),
+    "line 5: gaps_m.uniform[1] = .nan: must be a finite number": lambda: given(gaps_m="{uniform: [5, .nan]}"),
+    "line 5: gaps_m.choice: does not go with what stands beside it; a quantity has one distribution": lambda: given(
+        gaps_m="{uniform: [5, 9], choice: [7]}"
+    ),
+    "line 5: gaps_m.normal.high: missing; a number is needed, as in {normal: {mean: 20": lambda: given(
+        gaps_m="{normal: {mean: 7, sd: 1, low: 5}}"
+    ),
+    "line 5: gaps_m.normal.std: unknown key; did you mean sd?": lambda: given(
+        gaps_m="{normal: {mean: 7, std: 1, low: 5, high: 9}}"
+    ),
+    "line 5: gaps_m.normal = {mean: 7, sd: 0, low: 5, high: 9}: sd must be above 0": lambda: given(
+        gaps_m="{normal: {mean: 7, sd: 0, low: 5, high: 9}}"
+    ),
+    "line 5: gaps_m.normal = {mean: 7, sd: 1, low: 9, high: 9}: low must be below high": lambda: given(
+        gaps_m="{normal: {mean: 7, sd: 1, low: 9, high: 9}}"
+    ),
+    "line 5: gaps_m.normal = {mean: 7, sd: 1, low: 20, high: 99}: [low, high] must hold at least 1e-06": lambda: given(
+        gaps_m="{normal: {mean: 7, sd: 1, low: 20, high: 99}}"
+    ),
+    "line 5: gaps_m.choice = []: must not be empty": lambda: given(gaps_m="{choice: []}"),
+    "line 5: gaps_m.weights = [1]: must have as many entries as choice, 2": lambda: given(
+        gaps_m="{choice: [7, 8], weights: [1]}"
+    ),
+    "every weight must be above 0, and their sum finite": lambda: given(gaps_m="{choice: [7, 8], weights: [1, 0]}"),
+    "line 5: gaps_m.loguniform = [0, 1]: low must be above 0": lambda: given(gaps_m="{loguniform: [0, 1]}"),
+    "line 9: mass_t[1] (vehicle_2) = -5.5: must be finite and in (0, 1000] t": lambda: given(mass_t="[4.5, -5.5, 5.9]"),
+    "line 7: braking_capacity_mps2 = 0: must be finite and in (0, 100] m/s2": lambda: given(braking_capacity_mps2="0"),
+    "must not be above speed_limit_mps of vehicle_3, 40 m/s": lambda: given(speeds_mps="[1, 2, {choice: [3, 41]}]"),
+    "must not be above speed_limit_mps of vehicle_1, {uniform": lambda: given(speed_limit_mps="{uniform: [19, 40]}"),
+    "line 10: latency_s[2] (vehicle_3) = 8: must be below horizon_s (8 s)": lambda: given(latency_s="[0, 0.5, 8]"),
+    "line 12: restitution = 1.01: must be finite and in [0, 1]": lambda: given(restitution="1.01"),
+    "line 3: time_step_s = 9: must not be above horizon_s (8 s)": lambda: given(time_step_s="9"),
+    "line 4: horizon_s = -8: must be greater than 0": lambda: given(horizon_s="-8"),
+    "line 2: vehicles = 1: must be greater than or equal to 2": lambda: given(vehicles="1"),
+    "must be a whole number, written without a decimal point or an exponent": lambda: given(vehicles="3.0"),
+    "unknown vehicle; this scenario has vehicle_1 ...": lambda: given(roles="{vehicle_2: learner, vehicle_4: coast}"),
+    "line 13: roles.vehicel_2 = learner: unknown vehicle; did you mean vehicle_2?": lambda: given(
+        roles="{vehicel_2: learner}"
+    ),
+    "line 13: roles.vehicle_2 = Learner: agent 'Learner': must be name or name:argument": lambda: given(
+        roles="{vehicle_2: Learner}"
+    ),
+    "line 13: roles.vehicle_2 = learner:1: learner takes no argument": lambda: given(roles="{vehicle_2: learner:1}"),
+    "line 13: roles.vehicle_2 = 2: must be text": lambda: given(roles="{vehicle_2: 2}"),
+    "line 13: roles = [learner]: must be a mapping": lambda: given(roles="[learner]"),
+    "line 13: roles.vehicle_1 = constant: agent 'constant': constant needs a finite deceleration": lambda: given(
+        roles="{vehicle_1: constant, vehicle_2: learner}"
+    ),
+    "line 13: roles.vehicle_1 = constant:7: is above this vehicle's braking_capacity_mps2, 6 m/s2": lambda: given(
+        roles="{vehicle_1: constant:7, vehicle_2: learner}"
+    ),
+    "line 13: roles.vehicle_1 = constant:-7: is above this vehicle's driving_capacity_mps2, 6 m/s2": lambda: given(
+        roles="{vehicle_1: constant:-7, vehicle_2: learner}"
+    ),
+    "line 13: roles.vehicle_1 = {profile: []}: a profile is 1 to 64 pieces [s after the latency": lambda: given(
+        roles="{vehicle_1: {profile: []}, vehicle_2: learner}"
+    ),
+    'line 13: roles.vehicle_1 = "profile:0=3,1=6.5": is above this vehicle\'s braking_capacity_mps2': lambda: given(
+        roles="{vehicle_1: {profile: [[0, 3], [1, 6.5]]}, vehicle_2: learner}"
+    ),
+    "m/s2 of braking], such as [[0, 3], [1, 7]]; times begin with 0 and rise": lambda: given(
+        roles="{vehicle_1: {profile: [[0.5, 3]]}, vehicle_2: learner}"
+    ),
+    "both in [0, 3600], which [1, -1] is not": lambda: given(
+        roles="{vehicle_1: {profile: [[0, 3], [1, -1]]}, vehicle_2: learner}"
+    ),
+    "line 13: roles.vehicle_1 = {profile: [[0, 3]], coast: 1}: must be learner, a script": lambda: given(
+        roles="{vehicle_1: {profile: [[0, 3]], coast: 1}, vehicle_2: learner}"
+    ),
+    "line 13: roles.vehicle_3 = e_v2x_bm: with early_impacts: reject a script must be full_brake": lambda: given(
+        roles="{vehicle_3: e_v2x_bm, vehicle_2: learner}"
+    ),
+    "a script must be full_brake, coast, constant:a or a profile; did you mean full_brake?": lambda: given(
+        roles="{vehicle_3: ful_brake, vehicle_2: learner}"
+    ),
+    "line 14: early_impacts = refuse: must be keep or reject": lambda: given(early_impacts="refuse"),
+    "must be 1 to 64 lower case letters, digits, - and _, beginning with a letter": lambda: given(name="Bad Name"),
+    "bad.yaml: speeds_mps: missing; the speed of each vehicle at the alert": lambda: given(speeds_mps=None, gaps_m="7"),
+    "line 15: time_gaps_s = 1: give either gaps_m or time_gaps_s, not both": lambda: given(
+        gaps_m="7", time_gaps_s="1", speeds_mps="20"
+    ),
+    "line 15: line_speed_mps = 20: give either speeds_mps or line_speed_mps, not both": lambda: given(
+        gaps_m="7", speeds_mps="20", line_speed_mps="20"
+    ),
+    "line 15: speed_deviations_mps = 0: needs line_speed_mps, the speed that it is added to": lambda: given(
+        gaps_m="7", speeds_mps="20", speed_deviations_mps="0"
+    ),
+    "line 15: time_gaps_s[1] (vehicle_2 to vehicle_3) = 61: must be finite and in (0, 60] s": lambda: given(
+        gaps_m=None, time_gaps_s="[1, 61]", speeds_mps="20"
+    ),
+    "line 15: time_gaps_s[1] (vehicle_2 to vehicle_3) = 60: is up to 11400 m at the speed": lambda: given(
+        gaps_m=None, time_gaps_s="[1, 60]", speeds_mps="[20, 20, 190]", speed_limit_mps="200"
+    ),
+    "line 15: line_speed_mps = {uniform: [1, 38]}: with speed_deviations_mps vehicle_2 drives -1": lambda: given(
+        speeds_mps=None,
+        gaps_m="7",
+        line_speed_mps="{uniform: [1, 38]}",
+        speed_deviations_mps="[0, {uniform: [-2, 2]}, 0]",
+    ),
+    "give either obstacle_gap_m or obstacle_margin_m": lambda: given(obstacle_margin_m="1.7", obstacle_gap_m="42"),
+    "line 15: obstacle_margin_m = 0: must be finite and in (0, 10000] m (metres)": lambda: given(obstacle_margin_m="0"),
+    "line 15: obstacle_margin_m = 5: puts the obstacle up to 20005 m ahead of vehicle_1": lambda: given(
+        obstacle_margin_m="5", braking_capacity_mps2="{uniform: [0.01, 5]}"
+    ),
+    "has nothing to brake for without an obstacle ahead": lambda: given(roles="{vehicle_1: learner}"),
+    "must be finite and in (0, 1e+06] m/s3 (metres per second cubed)": lambda: given(brake_rate_mps3="0"),
+}
+
+
+@pytest.mark.parametrize("message", QUANTITIES_AND_ROLES)
+def test_key__is_refused_with_its_line_and_what_would_be_right(message: str) -> None:
+    with refused(message):
+        QUANTITIES_AND_ROLES[message]()
+
+
+VEHICLE_TYPES: dict[str, Callable[[], object]] = {
+    "line 15: vehicle_types.any: any stands for every type; give another name": lambda: given(
+        vehicle_types="{any: {}}"
+    ),
+    "must not be empty; a key that is not used is left out": lambda: given(vehicle_types="{}"),
+    "must be a number or a distribution; a key that is not used": lambda: given(vehicle_types="{car: {mass_t: null}}"),
+    "line 15: vehicle_types.car.load = 2: must be in [0, 1]: 0 empty": lambda: given(vehicle_types="{car: {load: 2}}"),
+    "line 15: vehicle_types.car.weight = 0: must be greater than 0": lambda: given(vehicle_types="{car: {weight: 0}}"),
+    "line 10: latency_s = [0, 0.5, 0.8]: every type declares it; leave it out": lambda: given(
+        vehicle_types="{car: {latency_s: 3}}"
+    ),
+    "line 15: types = car: needs vehicle_types, which says what the types are": lambda: given(types="car"),
+    "line 16: types: has 2 entries; 3 vehicles need 3, or one for all": lambda: given(
+        vehicle_types="{car: {}}", types="[car, car]"
+    ),
+    "line 16: types[1] = cra: unknown type cra; did you mean car?": lambda: given(
+        vehicle_types="{car: {}}", types="[car, cra, car]"
+    ),
+    "line 1: mass_t: type bus does not declare it: give it there, or here for every type": lambda: given(
+        mass_t=None, vehicle_types="{car: {mass_t: 2}, bus: {braking_capacity_mps2: 5}}"
+    ),
+    "line 9: mass_t = {with_load: [1, 2]}: must be a number, {uniform: [low, high]}": lambda: given(
+        mass_t="{with_load: [1, 2]}"
+    ),
+}
+
+
+@pytest.mark.parametrize("message", VEHICLE_TYPES)
+def test_vehicle_types__that_say_too_little_or_twice_are_refused(message: str) -> None:
+    with refused(message):
+        VEHICLE_TYPES[message]()
+
+
+V2X: dict[str, Callable[[], object]] = {
+    "must be paper, clear, nominal, congested, blocked or sensors-only": lambda: given(v2x="papr"),
+    "preset paper has no generated messages; leave it out": lambda: given(v2x="{loss_begins: 0.1}"),
+    "without sight of the vehicle ahead, one that hears nothing would never react; use senses: both or front": lambda: (
+        given(v2x="{preset: clear, senses: none}")
+    ),
+    "line 15: v2x.loss_ends = 0: must be greater than or equal to 0.01": lambda: given(
+        v2x="{preset: clear, loss_ends: 0}"
+    ),
+    "line 15: v2x.sensing_s = [2, 1]: low must not be above high": lambda: given(
+        v2x="{preset: clear, sensing_s: [2, 1]}"
+    ),
+    "line 15: v2x.radio_s = 0.1: a fixed link_latency_s has no generated messages; leave it out": lambda: given(
+        v2x="{preset: clear, link_latency_s: 0.1, radio_s: 0.1}"
+    ),
+    "line 15: v2x.radio_s = 0.1: hears none has no messages; leave it out": lambda: given(
+        v2x="{preset: clear, hears: none, radio_s: 0.1}"
+    ),
+    "senses none has nobody in sight; leave it out": lambda: given(v2x="{sensing_s: [0.8, 1]}"),
+    "must be a preset (paper, clear, nominal, congested, blocked, sensors-only)": lambda: given(v2x="5"),
+    "v2x = {preset: blocked}: vehicle_3 may have no news until 2.2 s; it must be below horizon_s (2 s)": lambda: given(
+        v2x="blocked", horizon_s="2"
+    ),
+    "nobody sends messages one by one here; give a preset": lambda: given(v2x="{preset: paper, persistence: periodic}"),
+    "line 15: v2x.persistence = always: must be first or periodic": lambda: given(
+        v2x="{preset: nominal, persistence: always}"
+    ),
+    "persistence: perio...: a message is on its way for 1500 time steps; at most 997 are possible": lambda: given(
+        v2x="{preset: nominal, link_latency_s: 1.5, persistence: periodic}", time_step_s="1e-3", latency_s="0"
+    ),
+}
+
+
+@pytest.mark.parametrize("message", V2X)
+def test_v2x__that_has_no_effect_or_leaves_somebody_without_news_is_refused(message: str) -> None:
+    with refused(message):
+        V2X[message]()
+
+
+MIXTURES: dict[str, Callable[[], object]] = {
+    "mine.yaml, line 2: mixture = 3: must be a list": lambda: loaded("mixture: 3"),
+    "must not be empty; a key that is not used is left out": lambda: loaded("mixture: []"),
+    "mine.yaml, line 2: mixture[0].scenario: missing; it is needed": lambda: loaded("mixture: [{weight: 1}]"),
+    "mixture[0].scenario = paper-randon: unknown scenario 'paper-randon'; did you mean 'paper-random'?": lambda: loaded(
+        "mixture:\n  - scenario: paper-randon"
+    ),
+    "mine.yaml, line 2: mixture[0].weight = 0: must be greater than 0": lambda: loaded(
+        "mixture: [{scenario: paper-random, weight: 0}]"
+    ),
+    "mine.yaml, line 2: mixture[0].scenario = mixture-delays: mixture-delays is a mixture itself": lambda: loaded(
+        "mixture: [{scenario: mixture-delays}]"
+    ),
+    "mine.yaml, line 2: mixture[1]: paper-random is given twice; give it once, with the sum of the weights": lambda: (
+        loaded("mixture: [{scenario: paper-random}, {scenario: paper-random}]")
+    ),
+    "mine.yaml, line 2: mixture: horizon_s must be the same in all: paper-random has 8, stress-wide has 16": lambda: (
+        loaded("mixture: [{scenario: paper-random}, {scenario: stress-wide}]")
+    ),
+    "mine.yaml, line 2: mixture: vehicles must be the same in all: paper-random has 3": lambda: loaded(
+        "mixture: [{scenario: paper-random}, {scenario: cooperation-4-five}]"
+    ),
+    "mine.yaml, line 2: mixture: vehicles = 5: its scenarios have 3, which nothing beside them can change": lambda: (
+        loaded("mixture: [{scenario: paper-random}]\nvehicles: 5")
+    ),
+    "mine.yaml: mixture[0] (paper-random), line 3: horizon_s = -8: must be greater than 0": lambda: loaded(
+        "mixture: [{scenario: paper-random}]\nhorizon_s: -8"
+    ),
+    "mine.yaml: mixture[0] (x), line 3: massx: unknown key; did you mean mass_t (tonnes)?": lambda: loaded(
+        "mixture: [{scenario: {name: x,\n   massx: 3}}]"
+    ),
+    "mine.yaml, line 2: mixture: v2x.persistence must be the same in all, and so must the delay": lambda: loaded(
+        f"mixture: [{{scenario: {{name: a, {WHOLE}, v2x: nominal}}}},"
+        f" {{scenario: {{name: b, {WHOLE}, v2x: {{preset: nominal, persistence: periodic}}}}}}]"
+    ),
+    "mine.yaml, line 1: brake_rate_mps3: type van does not declare it: give it there, or here for every type": lambda: (
+        loaded(
+            "vehicle_types: {car: {mass_t: 1, brake_rate_mps3: 9}, van: {mass_t: 2}}\n"
+            + WHOLE.removesuffix(", mass_t: 1").replace(", ", "\n")
+        )
+    ),
+}
+
+
+@pytest.mark.usefixtures("empty_folder")
+@pytest.mark.parametrize("message", MIXTURES)
+def test_file_of_a_mixture_or_of_types__is_refused(message: str) -> None:
+    with refused(message):
+        MIXTURES[message]()
+
+
+CALLS: dict[str, Callable[[], object]] = {
+    "x.yaml: must be a mapping of keys to values": lambda: Scenario.from_document(parse_yaml("", "x.yaml")),
+    "scenario 'x': mixture[0].scenario = paper-random: must be what a scenario says": lambda: Scenario(
+        name="x", mixture=[{"scenario": "paper-random"}]
+    ),
+    "scenario 'mixture-delays': is a mixture; its members say what mass_t is": lambda: DELAYS.quantities("mass_t"),
+    "initial_state: scenario 'mixture-delays' is a mixture, and nothing says which": lambda: DELAYS.worlds_from_state(
+        {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
+    ),
+    "scenario 'paper-random': mass_t[0] (vehicle_1) = -1: must be finite and": lambda: PAPER.replace(mass_t=[-1, 2, 3]),
+    "scenario 'paper-random': objective = frontfirst: unknown objective": lambda: PAPER.replace(objective="frontfirst"),
+    "objective 'maximin:3': maximin takes no argument": lambda: PAPER.replace(objective="maximin:3"),
+    "learners: 3: must be a name (vehicle_1 ... vehicle_3) or an index from 0 to 2": lambda: PAPER.with_learners([3]),
+    "learners: vehicle_2 is listed twice": lambda: PAPER.with_learners(["vehicle_2", 1]),
+    "learners: 'vehicle_2': must be a list of vehicles": lambda: PAPER.with_learners("vehicle_2"),
+    "scenario 'paper-random': gaps_m is not given; it is derived, see Scenario.bounds": lambda: PAPER.replace(
+        time_gaps_s=1
+    ).quantities("gaps_m"),
+    "roles of a scenario are frozen; use scenario.replace(roles=...)": lambda: given(roles=None).roles.clear(),
+    "agent 'constant:6.01': above the braking capacity 6 m/s2": lambda: ScriptSpec.parse("constant:6.01").command(
+        [7.0, 6.0], [3.0, 2.0]
+    ),
+    "agent 'constant:-2.01': above the driving capacity 2 m/s2": lambda: ScriptSpec.parse("constant:-2.01").command(
+        [7.0, 6.0], [3.0, 2.0]
+    ),
+    "agent 'constant:nan': constant needs a finite deceleration in m/s2 after the colon": lambda: ScriptSpec.parse(
+        "constant:nan"
+    ).command([7.0, 6.0], [3.0, 2.0]),
+    "agent 'full_brake:3': full_brake takes no argument": lambda: ScriptSpec.parse("full_brake:3").command(
+        [7.0, 6.0], [3.0, 2.0]
+    ),
+    "agent '': must be name or name:argument, the name in lower case letters, digits": lambda: ScriptSpec.parse(""),
+    "scenario name '': must be 1 to 64 lower case letters, digits, - and _, beginning": lambda: new_scenario_text(""),
+    "missing.yaml: no such file": lambda: load_scenario("missing.yaml"),
+}
+
+
+@pytest.mark.parametrize("message", CALLS)
+def test_call_with_a_scenario__is_refused(message: str) -> None:
+    with refused(message):
+        CALLS[message]()
+
+
+def test_first_mistake__is_shown_with_the_number_of_others() -> None:
+    with refused(
+        "braking_capacity_mps2 = 0: must be finite and in (0, 100] m/s2 (metres per second squared) (and 2 more mist"
+    ):
+        given(braking_capacity_mps2="0", mass_t="0", restitution="2")
+
+
+ROLES = {
+    "__setitem__": ("vehicle_3", "learner"),
+    "__delitem__": ("vehicle_3",),
+    "__ior__": ({"vehicle_3": "learner"},),
+    "update": ({"vehicle_3": "learner"},),
+    "setdefault": ("vehicle_4", "learner"),
+    "pop": ("vehicle_3",),
+    "popitem": (),
+    "clear": (),
+}
+
+
+@pytest.mark.parametrize("method", ROLES)
+def test_roles__are_frozen(method: str) -> None:
+    with refused("roles of a scenario are frozen; use scenario.replace(roles=...) or scenario.with_learners"):
+        getattr(PAPER.roles, method)(*ROLES[method])
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [pickle.loads(pickle.dumps(PAPER)), copy.deepcopy(PAPER), PAPER.replace(title="Mine")],
+    ids=["pickled", "copied", "replaced"],
+)
+def test_roles__of_a_copy_are_frozen(scenario: Scenario) -> None:
+    with refused("roles of a scenario are frozen"):
+        scenario.roles.clear()
+
+
+@pytest.mark.parametrize("spec", ["Full_brake", "2fast", "full brake", "constant:", ":3", "constant: 3", "a\n", None])
+def test_agent_of_a_role__is_a_name_in_lower_case_and_an_argument(spec: object) -> None:
+    with refused(f"agent {spec!r}: must be name or name:argument"):
+        ScriptSpec.parse(spec)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["My Scenario", "-x", "x" * 65, "../x", "x\n"])
+def test_name_of_a_new_scenario__is_a_plain_word(name: str) -> None:
+    with refused(f"scenario name {name!r}: must be 1 to 64 lower case letters, digits, - and _"):
+        new_scenario_text(name)
+
+
+def test_unknown_vehicle_or_scenario__is_told_what_is_near() -> None:
+    with refused("unknown vehicle 'vehicle_4'; did you mean 'vehicle_3'?", UnknownName):
+        PAPER.with_learners(["vehicle_4"])
+    with refused("unknown scenario 'paper-randon'; did you mean 'paper-random'?", UnknownName):
+        load_scenario("paper-randon")
+    with refused("unknown scenario 'zzz'; known: cooperation-0-sensors, ", UnknownName):
+        load_scenario("zzz")
+
+
+@pytest.mark.parametrize(("near", "name"), [("near.yml", "near"), ("sub/near.yaml", "near")])
+def test_unknown_scenario__is_told_a_file_that_is_near(near: str, name: str, empty_folder: Path) -> None:
+    Path("sub").mkdir()
+    Path(near).touch()
+    with refused(f"unknown scenario '{name}'; did you mean {near}?", UnknownName):
+        load_scenario(name)
+
+
+def test_file__has_the_name_of_its_scenario(empty_folder: Path) -> None:
+    Path("other.yaml").write_text(new_scenario_text("mine"))
+    with refused("other.yaml, line 13: name = mine: must be the file's name, other (or rename the file to mine.yaml)"):
+        load_scenario("other.yaml")

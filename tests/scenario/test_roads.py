@@ -1,0 +1,356 @@
+"""Roads, tables, equipage, loads and later alerts: what a scenario may say beside the line."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import ethbrake_marl as eb
+from ethbrake_marl.agents import Team, drive, make_agent
+from ethbrake_marl.evaluation import states_of
+from ethbrake_marl.limits import prove
+from ethbrake_marl.scenario import QUANTITY, Task
+from ethbrake_marl.shield import parse_uncertainty
+from tests.refused import refused
+
+PAPER = eb.load_scenario("paper-random")
+FIXED = PAPER.replace(gaps_m=40, speeds_mps=20, latency_s=0, early_impacts="keep", horizon_s=30)
+
+
+def final(scenario):
+    """The world once everybody has braked fully, or as its script says."""
+    team = Team.of(make_agent("full_brake"), list(scenario.learners))
+    return drive(scenario.sample(1, 7).worlds, team, scenario).final
+
+
+def without(scenario, *keys):
+    """What a scenario declares, but these keys."""
+    return {key: value for key, value in scenario.declared().items() if key not in keys}
+
+
+TABLE = {"columns": ["gap_1_m", "speed_2_mps"], "rows": [[5.0, 18.0], [6.0, 19.0], [7.0, 20.0]]}
+
+
+def tabled(table):
+    given = {"gaps_m": 9.0, "speeds_mps": {"uniform": [18, 22]}, "table": table}
+    return eb.Scenario(**without(PAPER, *given), **given)
+
+
+LINKS = {"preset": "nominal", "link_latency_s": 0.3, "sensing_s": [1.0, 1.0]}
+
+
+def lorries(**spread):
+    capacity = {"with_load": [7, 5], **spread}
+    kinds = {"lorry": {"mass_t": {"with_load": [10, 40]}, "braking_capacity_mps2": capacity}}
+    return eb.Scenario(**without(FIXED, "mass_t", "braking_capacity_mps2"), vehicle_types=kinds)
+
+
+@pytest.mark.parametrize(
+    ("friction", "capacity", "gaps_m"),
+    [
+        (0.6, [4, 7, 7], [40 + 400 / 8 - 400 / 11.772, 40]),  # 4 < 5.886 < 7
+        (0.3, [4, 7, 7], [40, 40]),  # all 2.943
+        (1.0, [4, 7, 6], [40 + 400 / 8 - 400 / 14, 40 + 400 / 14 - 400 / 12]),  # dry enough
+    ],
+)
+def test_friction__limits_braking(friction, capacity, gaps_m) -> None:
+    # Stopping ways are v^2 / (2 min(capacity, 9.81 mu)).
+    found = final(FIXED.replace(friction=friction, braking_capacity_mps2=capacity)).gaps_m[0]
+    assert found == pytest.approx(np.array(gaps_m), abs=1e-9)
+
+
+def test_friction__is_one_number_for_the_whole_line_and_moves_nothing_else() -> None:
+    wet = PAPER.replace(friction={"uniform": [0.2, 0.9]}, early_impacts="keep")
+    worlds, dry = wet.sample(200, 7).worlds, PAPER.replace(early_impacts="keep").sample(200, 7).worlds
+    assert 0.2 <= worlds.friction.min() < 0.22 and 0.88 < worlds.friction.max() <= 0.9
+    for name in ("braking_capacity_mps2", "driving_capacity_mps2"):
+        own, allowed = getattr(dry.vehicles, name), 9.81 * worlds.friction[:, np.newaxis]
+        assert (getattr(worlds.vehicles, name) == np.minimum(own, allowed)).all()
+        assert (worlds.dry(name) == own).all()
+    for name in ("gaps_m", "speeds_mps"):
+        assert (getattr(worlds, name) == getattr(dry, name)).all()
+    assert wet.bounds("braking_capacity_mps2") == ((9.81 * 0.2, 6.0), (9.81 * 0.2, 7.0), (9.81 * 0.2, 6.0))
+    assert wet.bounds("braking_capacity_mps2", dry=True) == ((6.0, 6.0), (7.0, 7.0), (6.0, 6.0))
+    assert wet.ranges().names[-1] == "friction"
+
+
+def test_margin__is_added_to_the_way_on_that_road() -> None:
+    short = FIXED.replace(friction=0.3, obstacle_margin_m=1.7)
+    assert short.sample(1, 7).worlds.obstacle_gap_m[0] == pytest.approx(1.7 + 400 / (2 * 2.943))
+    assert short.farthest_obstacle_m == pytest.approx(1.7 + 400 / (2 * 2.943))
+
+
+def test_table_of_initial_states__gives_the_same_worlds() -> None:
+    wet = PAPER.replace(friction={"uniform": [0.2, 0.9]}, braking_capacity_mps2={"uniform": [3, 9]})
+    worlds = wet.sample(50, 3).worlds
+    states = states_of(worlds, wet)
+    assert list(states[0])[-1] == "friction"
+    assert "braking_capacity_2_mps2" in states[0]
+    again = wet.worlds_from_table({name: [state[name] for state in states] for name in states[0]})
+    assert (again.road == worlds.road).all()
+    assert (again.vehicles.braking_capacity_mps2 == worlds.vehicles.braking_capacity_mps2).all()
+    state = {"friction": 0.5, "gaps_m": 7, "speeds_mps": 20, "braking_capacity_mps2": 6}
+    assert wet.worlds_from_state(state).friction.tolist() == [0.5]
+
+
+def test_uncertainty_of_friction__moves_all_capacities_together() -> None:
+    # Its uncertainty moves all capacities together: of 0.6 +- 0.2, shares 0, 1/8, ..., 1 of the way up.
+    worlds = FIXED.replace(friction=0.6, braking_capacity_mps2=[4, 7, 9]).sample(1, 7).worlds
+    members = parse_uncertainty("friction=0.2,braking_capacity_mps2.vehicle_3=3").members(worlds)
+    shares, dry = [0, 0.125, 0.25, 0.375, 0.625, 0.75, 0.875, 1], ([4, 7, 6], [4, 7, 12])
+    expected = [[4, 5.886, 5.886]] + [np.minimum(d, 9.81 * (0.4 + 0.4 * share)) for d in dry for share in shares]
+    assert members.vehicles.braking_capacity_mps2.shape == (17, 3)
+    assert len(expected) == 17
+    assert np.abs(members.vehicles.braking_capacity_mps2 - np.array(expected)).max() <= 1e-12
+
+
+def test_mixture__where_only_some_tell_it_tells_no_friction() -> None:
+    told = PAPER.replace(name="wet", friction=0.4).declared()
+    mixed = eb.Scenario(name="road", mixture=[{"scenario": PAPER}, {"scenario": told}])
+    worlds = mixed.sample(40, 7).worlds
+    braking = worlds.vehicles.braking_capacity_mps2[:, 1]
+    assert sorted(set(worlds.friction.tolist())) == [0.4, np.inf]
+    assert sorted(set(braking.tolist())) == [9.81 * 0.4, 7.0]
+    columns = QUANTITY.columns(worlds)
+    assert "friction" not in columns
+    assert (columns["braking_capacity_2_mps2"] == braking).all()
+    assert [state["braking_capacity_2_mps2"] for state in states_of(worlds, mixed)] == braking.tolist()
+
+
+def test_proof__reads_what_the_road_allows() -> None:
+    # The proof reads what the road allows; and 20 x 0.5 = 10 m are lost where all brake alike.
+    near = FIXED.replace(gaps_m=30, braking_capacity_mps2=[9, 7, 6], latency_s=[0, 0.5, 0.8])
+    assert [
+        prove(near.replace(friction=mu).sample(1, 7).worlds, Task(near, (1,))).avoidable.tolist() for mu in (0.3, 1.0)
+    ] == [[True], [True]]
+    assert final(FIXED.replace(gaps_m=[4, 40], latency_s=[0, 0.5, 0.5], friction=0.3)).pair_hit[0].tolist() == [
+        True,
+        False,
+    ]
+
+
+def test_table__has_one_row_for_each_world_of_which_none_is_torn() -> None:
+    found = tabled(TABLE).sample(600, 7).worlds
+    rows = np.stack([found.gaps_m[:, 0], found.speeds_mps[:, 1]], axis=1)
+    kinds, counts = np.unique(rows, axis=0, return_counts=True)
+    assert kinds.tolist() == [[5.0, 18.0], [6.0, 19.0], [7.0, 20.0]]
+    assert (np.abs(counts - 200) < 60).all()
+    assert np.unique(found.gaps_m[:, 1]).tolist() == [9.0]
+    alone = tabled({**TABLE, "weights": [1, 1, 8]}).sample(600, 7).worlds
+    assert (alone.speeds_mps[:, [0, 2]] == found.speeds_mps[:, [0, 2]]).all()
+    assert abs(np.mean(alone.gaps_m[:, 0] == 7.0) - 0.8) < 0.05
+    assert tabled(TABLE).ranges().names[-1] == "row of the table"
+    assert tabled(TABLE).bounds("gaps_m") == ((5.0, 7.0), (9.0, 9.0))
+    assert tabled(TABLE).middle_world().gaps_m[0].tolist() == [6.0, 9.0]
+    one = eb.Scenario(**{**FIXED.declared(), "table": {"columns": ["gap_1_m", "mass_3_t"], "rows": [[12, 30]]}})
+    assert one.sample(3, 7).worlds.gaps_m.tolist() == [[12.0, 40.0], [12.0, 40.0], [12.0, 40.0]]
+    assert one.sample(3, 7).worlds.vehicles.mass_t[:, 2].tolist() == [30.0, 30.0, 30.0]
+    stopped = final(one).gaps_m[0].tolist()
+    assert stopped == pytest.approx([12 + 400 / 12 - 400 / 14, 40 + 400 / 14 - 400 / 12], abs=1e-9)
+
+
+def test_table_of_a_file__is_read_once_and_goes_along(empty_folder: Path) -> None:
+    whole = {"gap_1_m": 5.5, "gap_2_m": 6.5, "speed_1_mps": 20, "speed_2_mps": 19, "speed_3_mps": 18, "count": 3}
+    lines = [",".join(whole), *(",".join(str(value + k) for value in whole.values()) for k in range(14))]
+    Path("rows.csv").write_text("\n".join(lines) + "\n\n")
+    table = {"file": "rows.csv", "columns": [*whole][:5], "weights": "count"}
+    declared = {**without(PAPER, "gaps_m", "speeds_mps"), "name": "mine", "early_impacts": "keep"}
+    Path("mine.yaml").write_text(json.dumps({**declared, "table": table}))
+    mine = eb.load_scenario(Path("mine.yaml"))
+    Path("rows.csv").unlink()
+    again = eb.Scenario(**mine.declared()).replace(horizon_s=9)
+    assert len(again.table.rows) == 14
+    assert again.table.weights == (3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0, 16.0)
+    assert (again.sample(50, 7).worlds.gaps_m == mine.sample(50, 7).worlds.gaps_m).all()
+
+
+def test_lognormal__is_truncated_as_in_the_textbook() -> None:
+    law, u = stats.lognorm(s=0.4, scale=1.1), np.array([0.0, 0.5, 0.975])
+    low, high = law.cdf(0.3), law.cdf(3.0)
+    shape = {"median": 1.1, "sigma": 0.4, "low": 0.3, "high": 3.0}
+    (entry, _) = PAPER.replace(time_gaps_s={"lognormal": shape}).quantities("time_gaps_s")
+    assert np.allclose(entry.value(u), law.ppf(low + (high - low) * u), rtol=1e-9, atol=0.0)
+
+
+@pytest.mark.parametrize(
+    ("vehicles", "expected"),
+    [
+        ({}, ([0.0, 0.3, 0.3], [0.3, 0.3])),
+        ({"vehicle_1": {"sends": False}}, ([0.0, 1.0, 2.0], [2.0, 1.0])),
+        ({"vehicle_3": {"sends": False, "hears": "none"}}, ([0.0, 0.3, 1.3], [1.3, 1.0])),
+        ({"vehicle_2": {"sends": False, "hears": "front"}}, ([0.0, 0.3, 0.3], [1.0, 1.0])),
+    ],
+)
+def test_equipage__who_sends_and_who_hears(vehicles, expected) -> None:
+    # Equipage, who sends and who hears: latencies, what Vehicle 3 knows of Vehicle 2, and Vehicle 2 of Vehicle 3.
+    # Where Vehicle 1 does not send, one sees it brake, and the other one that; where Vehicle 2 hears the front only,
+    # it sees Vehicle 3.
+    v2x = {**LINKS, **({"vehicles": vehicles} if vehicles else {})}
+    found = FIXED.replace(v2x=v2x).sample(1, 7).worlds.vehicles
+    assert (found.latency_s[0].round(12).tolist(), found.known_from_s[0, [2, 1], [1, 2]].round(12).tolist()) == expected
+
+
+def test_equipage__of_types_is_drawn_with_them() -> None:
+    kinds = {"equipped": {"weight": 7}, "without": {"weight": 3, "v2x": {"sends": False, "hears": "none"}}}
+    sample = FIXED.replace(vehicle_types=kinds, v2x=LINKS).sample(2000, 7)
+    silent, latency = sample.types == "without", sample.worlds.vehicles.latency_s
+    second = np.where(silent[:, 0] | silent[:, 1], 1.0, 0.3)
+    third = np.where(silent[:, 0] | silent[:, 2], second + 1.0, 0.3)
+    assert (latency[:, 1] == second).all()
+    assert np.abs(latency[:, 2] - third).max() < 1e-12
+
+
+def test_spread__is_added_to_what_the_load_gives() -> None:
+    spread = lorries(spread={"uniform": [-0.5, 0.5]})
+    plain, wide = (scenario.sample(3000, 7).worlds.vehicles for scenario in (lorries(), spread))
+    by_load = 7 - 2 * (plain.mass_t - 10) / 30
+    assert np.abs(plain.braking_capacity_mps2 - by_load).max() <= 1e-12
+    more = wide.braking_capacity_mps2 - by_load
+    assert (wide.mass_t == plain.mass_t).all()
+    assert -0.5 <= more.min() < -0.49
+    assert 0.49 < more.max() <= 0.5
+    assert abs(np.corrcoef(wide.mass_t.ravel(), more.ravel())[0, 1]) < 0.02
+    assert spread.bounds("braking_capacity_mps2")[0] == (4.5, 7.5)
+    assert [f"{key} of vehicle_1" in spread.ranges().names for key in ("braking_capacity_mps2", "mass_t")] == [
+        True,
+        False,
+    ]
+
+
+def test_alert_s__everybody_goes_on_until_then() -> None:
+    # Where the alert comes later, everybody goes on until then: after 2 s the gaps are 2 x 2 m shorter, or longer.
+    late = FIXED.replace(alert_s=2, speeds_mps=[20, 18, 20], latency_s=[0, 0.5, 0.8])
+    assert late.sample(1, 7).worlds.vehicles.latency_s.tolist() == [[2.0, 2.5, 2.8]]
+    now = eb.Scenario(**without(late.replace(gaps_m=[40 + 2 * 2, 40 - 2 * 2]), "alert_s"))
+    assert np.abs(final(late).gaps_m - final(now).gaps_m).max() <= 1e-9
+    drawn = FIXED.replace(alert_s={"uniform": [1, 5]})
+    latency = drawn.sample(100, 7).worlds.vehicles.latency_s
+    assert (latency == latency[:, :1]).all()
+    assert 1 <= latency.min() < 1.2
+    assert 4.8 < latency.max() <= 5
+    assert drawn.bounds("latency_s") == ((1.0, 5.0), (1.0, 5.0), (1.0, 5.0))
+    assert drawn.ranges().names == ("alert_s",)
+
+
+# ---------------------------------------------------------------- what is refused
+
+SILENT = {"sends": False, "hears": "none"}
+
+
+def lognormal(**changes: float) -> eb.Scenario:
+    """Gaps of this distribution."""
+    return PAPER.replace(gaps_m={"lognormal": {"median": 7.0, "sigma": 0.4, "low": 3.0, "high": 30.0, **changes}})
+
+
+ROADS: dict[str, Callable[[], object]] = {
+    "roles.vehicle_1 = constant:5: is above this vehicle's braking_capacity_mps2, 2.943 m/s2": lambda: FIXED.replace(
+        friction={"uniform": [0.3, 0.9]}, roles={"vehicle_1": "constant:5", "vehicle_2": "learner"}
+    ),
+    "scenario 'paper-random': friction = 0: must be finite and in (0, 2]": lambda: FIXED.replace(friction=0),
+    "must be a number or a distribution; a key that is not used is left out": lambda: FIXED.replace(friction=None),
+    "uncertainty: friction is one number for the whole line; give it without a vehicle": lambda: parse_uncertainty(
+        "friction.vehicle_2=0.1"
+    ),
+    "uncertainty: friction=0.1: friction is not known in every world; declare it in the scenario": lambda: (
+        parse_uncertainty("friction=0.1").members(FIXED.sample(1, 7).worlds)
+    ),
+    "uncertainty: friction=1: 0.6 in world 0 may be as low as -0.4; it must stay above 0": lambda: parse_uncertainty(
+        "friction=1"
+    ).members(FIXED.replace(friction=0.6).sample(1, 7).worlds),
+    "scenario 'paper-random': draws nothing: all its worlds are the same": lambda: eb.Scenario(
+        **{**FIXED.declared(), "table": {"columns": ["gap_1_m", "mass_3_t"], "rows": [[12, 30]]}}
+    ).ranges(),
+    "only without messages one by one (v2x: paper): what was": lambda: FIXED.replace(alert_s=2, v2x="nominal"),
+    "with latency_s a vehicle may act as late as 40 s; it must be below horizon_s": lambda: FIXED.replace(alert_s=40),
+}
+
+
+@pytest.mark.parametrize("message", ROADS)
+def test_road_or_alert__is_refused(message: str) -> None:
+    with refused(message):
+        ROADS[message]()
+
+
+TABLES: dict[str, Callable[[], object]] = {
+    "unknown column; did you mean gap_2_m (metres)?": lambda: tabled({**TABLE, "columns": ["gap_1_m", "gap_9_m"]}),
+    "scenario 'paper-random': table.columns = [gap_1_m]: each column can be given once": lambda: tabled(
+        {**TABLE, "columns": ["gap_1_m", "gap_1_m"]}
+    ),
+    "scenario 'paper-random': table.rows[0]: has 1 numbers; there are 2 columns": lambda: tabled(
+        {**TABLE, "rows": [[5.0]]}
+    ),
+    "speed_2_mps must be finite and in [0, 200] m/s (metres per": lambda: tabled({**TABLE, "rows": [[5.0, -1.0]]}),
+    "scenario 'paper-random': table.weights: must be one for each of 3 rows, all above 0, and their sum": lambda: (
+        tabled({**TABLE, "weights": [1, 1]})
+    ),
+    "scenario 'paper-random': table.file = other.csv: give either a file or rows, not both": lambda: tabled(
+        {**TABLE, "file": "other.csv"}
+    ),
+    "scenario 'paper-random': table.rows: files are read where they stand in a file (load_scenario); give": lambda: (
+        tabled({**TABLE, "weights": "count"})
+    ),
+    "scenario 'paper-random': gaps_m = 9: the table says it for all; leave it out": lambda: tabled(
+        {"columns": ["gap_1_m", "gap_2_m"], "rows": [[5, 6]]}
+    ),
+    "scenario: table.file = ../rows.csv: must be a path from the scenario's folder on": lambda: eb.load_scenario(
+        {**PAPER.declared(), "table": {"file": "../rows.csv"}}
+    ),
+    "scenario: no.csv: no such file": lambda: eb.load_scenario({**PAPER.declared(), "table": {"file": "no.csv"}}),
+}
+
+
+@pytest.mark.parametrize("message", TABLES)
+def test_table__is_refused(message: str) -> None:
+    with refused(message):
+        TABLES[message]()
+
+
+DISTRIBUTIONS: dict[str, Callable[[], object]] = {
+    "scenario 'paper-random': gaps_m.lognormal = {median: 0, sigma: 0.4, low: 3, high": lambda: lognormal(median=0.0),
+    "scenario 'paper-random': gaps_m.lognormal = {median: 7, sigma: 0, low: 3, high: 30}": lambda: lognormal(sigma=0.0),
+    "scenario 'paper-random': gaps_m.lognormal = {median: 7, sigma: 0.4, low": lambda: lognormal(low=3.0, high=3.0),
+    "[low, high] must hold at least 1e-06 of the untruncated distribution": lambda: lognormal(low=1e3, high=2e3),
+    "must be finite and in (0, 100] m/s2 (metres per second squared)": lambda: lorries(spread={"uniform": [-5, 0]}),
+    "scenario 'paper-random': vehicle_types.lorry.braking_capacity_mps2.spread = 0.3": lambda: lorries(spread=0.3),
+}
+
+
+@pytest.mark.parametrize("message", DISTRIBUTIONS)
+def test_distribution__is_refused(message: str) -> None:
+    with refused(message):
+        DISTRIBUTIONS[message]()
+
+
+LINKED: dict[str, Callable[[], object]] = {
+    "preset paper has no generated messages; leave it": lambda: PAPER.replace(v2x={"vehicles": {"vehicle_2": SILENT}}),
+    "v2x paper has no messages that a type could lack": lambda: PAPER.replace(vehicle_types={"car": {"v2x": SILENT}}),
+    "scenario 'paper-random': v2x.vehicles.vehicle_4: unknown vehicle": lambda: PAPER.replace(
+        v2x={**LINKS, "vehicles": {"vehicle_4": SILENT}}
+    ),
+    "scenario 'paper-random': v2x = {preset: nominal, senses: none, link_latency_s: 0.3, vehi...": lambda: (
+        PAPER.replace(
+            v2x={"preset": "nominal", "link_latency_s": 0.3, "vehicles": {"vehicle_2": SILENT}, "senses": "none"}
+        )
+    ),
+}
+
+
+@pytest.mark.parametrize("message", LINKED)
+def test_equipage__is_refused(message: str) -> None:
+    with refused(message):
+        LINKED[message]()
+
+
+def test_table_of_a_file__is_refused_with_the_row_of_the_file(empty_folder: Path) -> None:
+    Path("rows.csv").write_text("speed_1_mps\n" + "".join(f"{20 + row}\n" for row in range(1_200)))
+    with refused("table.rows[181][0] = 201: speed_1_mps must be finite and in [0, 200] m/s (metres per second)"):
+        eb.load_scenario({**PAPER.declared(), "table": {"file": "rows.csv", "columns": ["speed_1_mps"]}})
+
+
+def test_state_that_is_given__needs_a_channel_that_draws_nothing() -> None:
+    kinds = {"equipped": {"weight": 7}, "without": {"weight": 3, "v2x": SILENT}}
+    with refused("initial_state: the scenario draws what each vehicle knows when (v2x: nominal)"):
+        FIXED.replace(vehicle_types=kinds, v2x=LINKS).worlds_from_state({"gaps_m": [7, 7], "speeds_mps": [20, 20, 20]})

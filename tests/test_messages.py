@@ -1,0 +1,109 @@
+"""Texts of errors and what a terminal is shown."""
+
+import pickle
+import re
+
+import pytest
+from rich.text import Text
+
+import ethbrake_marl as eb
+from ethbrake_marl.cli import doctor
+from ethbrake_marl.cli.command import Out, say
+from ethbrake_marl.errors import (
+    LINE_LIMIT,
+    AlreadyExists,
+    CorruptBundle,
+    InvalidInput,
+    PhysicsError,
+    UnknownName,
+    count_of,
+    one_line,
+    plain_text,
+    unknown_name,
+)
+
+
+@pytest.mark.parametrize(
+    ("known", "name", "text"),
+    [
+        ([], "mine", "unknown agent 'mine'; known: none; one of your own must be registered or installed first"),
+        (
+            ["coast"],
+            "mine",
+            "unknown agent 'mine'; known: coast; one of your own must be registered or installed first",
+        ),
+        (["coast"], "cost", "unknown agent 'cost'; did you mean 'coast'?"),
+    ],
+)
+def test_unknown_name__reminds_of_what_is_of_ones_own_where_nothing_is_close(known, name, text) -> None:
+    assert str(unknown_name("agent", name, known, may_be_own=True)).startswith(text)
+
+
+def test_count_of__one_is_no_plural() -> None:
+    assert [count_of(n, "world") for n in (0, 1, 2, 10_000)] == ["0 worlds", "1 world", "2 worlds", "10,000 worlds"]
+    assert str(PhysicsError(dict.fromkeys(range(6), "broke"))).endswith("world 4: broke; and 1 more world")
+
+
+def test_control_characters__are_shown_not_sent(capsys: pytest.CaptureFixture[str]) -> None:
+    assert plain_text("a\tb\nc\r", keep="\n\t") == "a\tb\nc\\r"
+    say("runs/\x1b[2J\nx")
+    assert capsys.readouterr().err == "runs/\\x1b[2J\\nx\n"
+    Out().show("# \u202egnp\n", Text("[/] ppo@\x1b[31m :smile:"), "6\N{NO-BREAK SPACE}m/s²")
+    assert capsys.readouterr().out == "# \\u202egnp\n\n[/] ppo@\\x1b[31m :smile:\n6\N{NO-BREAK SPACE}m/s²\n"
+
+
+def test_requirement__stands_with_the_extra_that_brings_it() -> None:
+    extra_of = {requirement.name: extra for extra, requirement in doctor._requirements()}
+    assert [extra_of.get(name) for name in ("numpy", "numba", "torch", "benchmarl", "onnx", "ray", "pytest")] == [
+        "",
+        "",
+        "train",
+        "marl",
+        "export",
+        "cluster",
+        None,
+    ]
+
+
+def test_public_name_that_there_is_not__suggests_the_nearest() -> None:
+    with pytest.raises(
+        AttributeError, match=re.escape("module 'ethbrake_marl' has no attribute 'evalute'; did you mean 'evaluate'?")
+    ):
+        _ = eb.evalute
+    with pytest.raises(AttributeError, match=re.escape("module 'ethbrake_marl' has no attribute 'zzzzzz'")):
+        _ = eb.zzzzzz
+
+
+def test_physics_error__lists_a_few_worlds_and_travels_between_processes() -> None:
+    error = PhysicsError({k: "broke" for k in range(8)})
+    copy = pickle.loads(pickle.dumps(error))
+    assert (copy.worlds, str(copy)) == (error.worlds, str(error))
+    assert str(copy).endswith("world 3: broke; world 4: broke; and 3 more worlds")
+
+
+@pytest.mark.parametrize("family", [InvalidInput, UnknownName, AlreadyExists, CorruptBundle])
+def test_message__shows_what_would_command_the_terminal(family) -> None:
+    assert str(family("a\x1b[2J \u202egnp\n\x9b b\u2028\ud800")) == "a\\x1b[2J \\u202egnp\\n\\x9b b\\u2028\\ud800"
+    assert str(family("vehicle_2: 7 m/s² is too fast – «mine»")) == "vehicle_2: 7 m/s² is too fast – «mine»"
+
+
+@pytest.mark.parametrize(
+    "long",
+    ["x" * 100_000, "\x1b" * 100_000, "\u202e" * (LINE_LIMIT - 1), "é" * (2 * LINE_LIMIT)],
+    ids=["x", "escape", "right to left", "é"],
+)
+def test_message__that_is_long_keeps_its_beginning_and_end(long) -> None:
+    text = str(InvalidInput(f"mine.yaml, line 3: gaps_m = {long}: must be a number"))
+    assert text.startswith("mine.yaml, line 3: gaps_m = ") and text.endswith(": must be a number")
+    assert f"({len(long) + 46:,} characters)" in text
+    assert len(text) <= LINE_LIMIT and text.isprintable()
+
+
+@pytest.mark.parametrize(
+    ("text", "same"),
+    [("plain", True), ("\x1b[2J", False), ("x" * 5000, False), ("a" * LINE_LIMIT, True)],
+    ids=["plain", "escape", "long", "at the limit"],
+)
+def test_one_line__is_the_same_the_second_time(text, same) -> None:
+    assert (one_line(text) == text) == same
+    assert one_line(one_line(text)) == one_line(text)
