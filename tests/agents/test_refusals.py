@@ -184,8 +184,8 @@ OWN: dict[str, Callable[[], object]] = {
     "the closed form of E-V2X-BM and planner: brakes of world 0 build up (brake_rate_mps3": lambda: evaluated(
         make_agent("e_v2x_bm:pairwise"), SLOW
     ),
-    ":believed: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and nothing exact is": lambda: (
-        evaluated(make_agent("full_brake+step:believed", scenario=SLOW), SLOW)
+    ":believed: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and nothing exact": lambda: evaluated(
+        make_agent("full_brake+step:believed", scenario=SLOW), SLOW
     ),
     "the closed form of E-V2X-BM and planner: a vehicle of world 0 brakes in pieces (profile)": lambda: evaluated(
         make_agent("e_v2x_bm:pairwise"), PIECES
@@ -206,15 +206,15 @@ def test_agent_of_a_user__is_refused(message: str) -> None:
 
 
 FAILED: dict[str, Callable[[], object]] = {
-    "agent 'own', world 0, vehicle_2 at 0.50 s: gave float64 of shape (12, 1); one number per world is": lambda: (
-        evaluated(Own(lambda worlds: np.zeros((worlds.n, 1))))
+    "agent 'own', world 0, vehicle_2 at 0.50 s: gave float64 of shape (12, 1); one number per world": lambda: evaluated(
+        Own(lambda worlds: np.zeros((worlds.n, 1)))
     ),
     "agent 'own', world 0, vehicle_2 at 0.50 s: gave float64 of shape ()": lambda: evaluated(Own(lambda worlds: 1.0)),
     "agent 'own', world 0, vehicle_2 at 0.50 s: gave object of shape ()": lambda: evaluated(Own(lambda worlds: None)),
     "agent 'own', world 0, vehicle_2 at 0.50 s: gave <U1 of shape (12,); one number per world is needed": lambda: (
         evaluated(Own(lambda worlds: ["x"] * worlds.n))
     ),
-    "agent 'own', world 7, vehicle_2 at 0.50 s: gave float64 of shape (7,); one number per world is": lambda: evaluated(
+    "agent 'own', world 7, vehicle_2 at 0.50 s: gave float64 of shape (7,); one number per world": lambda: evaluated(
         Own(lambda worlds: np.zeros(7))
     ),
     "agent 'own', world 4, vehicle_2 at 0.50 s: command nan m/s2; must be in [-7, 7]": lambda: evaluated(
@@ -222,21 +222,6 @@ FAILED: dict[str, Callable[[], object]] = {
     ),
     "agent 'own', world 4, vehicle_2 at 0.50 s: command -99 m/s2; must be in [-7, 7]": lambda: evaluated(
         Own(lambda worlds: np.where(np.arange(worlds.n) == 4, -99.0, 0.0))
-    ),
-    "agent 'own', world 0, step 1 (0.50 s): gave float64 of shape (12, 2) for observations of shape (12": lambda: (
-        evaluated(policy(lambda n: np.zeros((n, 2))))
-    ),
-    "agent 'own', world 0, step 1 (0.50 s): gave float64 of shape (12,) for observations of shape (12": lambda: (
-        evaluated(policy(lambda n: np.zeros(n)))
-    ),
-    "agent 'own', world 5, step 1 (0.50 s): gave float64 of shape (5, 1) for observations of shape (12": lambda: (
-        evaluated(policy(lambda n: np.zeros((n, 1))[:5]))
-    ),
-    "agent 'own', world 3, step 1 (0.50 s): gave float64 of shape (12, 1) for observations of shape (12": lambda: (
-        evaluated(policy(lambda n: np.where(np.arange(n) == 3, np.nan, -1.0)[:, None]))
-    ),
-    "agent 'own', world 2, step 1 (0.50 s): gave float64 of shape (12, 1) for observations of shape (12": lambda: (
-        evaluated(policy(lambda n: 1.5 * np.eye(n)[:, 2:3]))
     ),
     "agent 'own', world 0, step 1 (0.50 s): observations of shape (12, 27): gave a tuple of 2 in place": lambda: (
         evaluated(policy(lambda n: (np.zeros((n, 1)), None)))
@@ -248,6 +233,24 @@ FAILED: dict[str, Callable[[], object]] = {
 def test_agent__fails_with_its_world_and_step(message: str) -> None:
     with refused(message, AgentFailed):
         FAILED[message]()
+
+
+@pytest.mark.parametrize(
+    ("answer", "world", "reason"),
+    [
+        (lambda n: np.zeros((n, 2)), 0, "; one number per world is needed, shape (12, 1)"),
+        (lambda n: np.zeros(n), 0, "; one number per world is needed, shape (12, 1)"),
+        (lambda n: np.zeros((n, 1))[:5], 5, "; one number per world is needed, shape (12, 1)"),
+        (lambda n: np.where(np.arange(n) == 3, np.nan, -1.0)[:, None], 3, ", in which stands nan; must be in [-1, 1]"),
+        (lambda n: 1.5 * np.eye(n)[:, 2:3], 2, ", in which stands 1.5; must be in [-1, 1]; with clip=True"),
+    ],
+    ids=["two columns", "no column", "too few", "nan", "beyond 1"],
+)
+def test_policy__fails_with_its_world_and_step(answer: Callable[[int], Any], world: int, reason: str) -> None:
+    shape = answer(12).shape
+    told = f"gave float64 of shape {shape} for observations of shape (12, 27){reason}"
+    with refused(f"agent 'own', world {world}, step 1 (0.50 s): {told}", AgentFailed):
+        evaluated(policy(answer))
 
 
 POLICIES: dict[str, Callable[[], object]] = {

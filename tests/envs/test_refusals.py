@@ -37,7 +37,7 @@ MADE: dict[str, Callable[[], object]] = {
         {**load_scenario("paper-random").declared(), "mass_t": -1.0}
     ),
     "must be a name (harm, total-harm, paper), a mapping such as {'harm': 1.0}": lambda: parallel_env(reward=5),
-    "observation = 'x': must be an ObservationSpec, for instance ObservationSpec(1, 1), its fields as a": lambda: (
+    "observation = 'x': must be an ObservationSpec, for instance ObservationSpec(1, 1), its fields": lambda: (
         parallel_env(observation="x")
     ),
     "observation: front = 'two'; must be a whole number in 0..64": lambda: parallel_env(observation={"front": "two"}),
@@ -73,7 +73,7 @@ MADE: dict[str, Callable[[], object]] = {
         "label", 8, indices=0
     ),
     "ShieldedVectorEnv: goes around gymnasium.make_vec('EthBrake-v0')": lambda: eb.ShieldedVectorEnv(parallel_env()),
-    "observation: vehicle_2 and vehicle_3 of 'five' observe different features, here learners must": lambda: (
+    "observation: vehicle_2 and vehicle_3 of 'five' observe different features, here learners": lambda: (
         eb.make_sb3_vec_env(FIVE, 3, learners=PAIR, observation={"vehicle_3": ["own"]})
     ),
     "observe_all: vehicle_2, vehicle_3 observe different features; use observe for each": lambda: eb.make_engine(
@@ -86,7 +86,7 @@ MADE: dict[str, Callable[[], object]] = {
         PAPER.replace(observation={"vehicle_2": ["own", "own.speed"]})
     ),
     "scenario 'paper-random': observation = {}: must be a list of groups": lambda: PAPER.replace(observation={}),
-    "observation: vehicle_2 and vehicle_3 of 'five' observe different features, here learners": lambda: eb.train(
+    "observe different features, here learners must observe the same: give one list for all": lambda: eb.train(
         "cooperation-ppo", FIVE.with_learners(PAIR).replace(observation={"vehicle_2": ["own"]}), "run", scheme="shared"
     ),
 }

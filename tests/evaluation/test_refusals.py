@@ -307,8 +307,8 @@ STATISTICS: dict[str, Callable[[], object]] = {
     "statistics: shape (2,); at least one finite number per world is needed": lambda: mean(np.array([1.0, nan])),
     "statistics: 3 values cannot be paired with 2 of the baseline": lambda: paired_difference(np.zeros(3), np.zeros(2)),
     "interquartile_mean: no tasks; at least one list of figures is needed": lambda: interquartile_mean([]),
-    "interquartile_mean: task 0: shape (0,); at least one finite number per seed is": lambda: interquartile_mean([[]]),
-    "interquartile_mean: task 0: shape (2,); at least one finite number per": lambda: interquartile_mean([[1.0, nan]]),
+    "interquartile_mean: task 0: shape (0,); at least one finite number per seed": lambda: interquartile_mean([[]]),
+    "interquartile_mean: task 0: shape (2,); at least one finite number": lambda: interquartile_mean([[1.0, nan]]),
     "mean_over_seeds: shapes (1, 2) and (1, 3): must be [seeds, worlds] with the same worlds": lambda: mean_over_seeds(
         [[1.0, 2.0]], [[1.0, 2.0, 3.0]]
     ),

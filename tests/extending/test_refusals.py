@@ -86,7 +86,7 @@ PARTS: dict[str, Callable[[], object]] = {
     "preset 'My preset': must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _": lambda: eb.register_preset(
         "My preset", {}
     ),
-    "must be paper, clear, nominal, congested, blocked or": lambda: eb.register_preset("mine", {"preset": "ruarl"}),
+    "must be paper, clear, nominal, congested, blocked": lambda: eb.register_preset("mine", {"preset": "ruarl"}),
     "preset 'mine': los: unknown key; did you mean lost?": lambda: eb.register_preset("mine", {"los": 1}),
     "preset 'mine': lost = 2: must be less than or equal to 1": lambda: eb.register_preset(
         "mine", {"preset": "clear", "lost": 2.0}

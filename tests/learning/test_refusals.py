@@ -114,11 +114,11 @@ RECIPES: dict[str, Callable[[], object]] = {
     "recipe 'counterfactual': gradient_limit = often: must be auto or a finite number above 0": lambda: (
         TINY_COUNTERFACTUAL.replace(gradient_limit="often")
     ),
-    "must be ppo@, counterfactual@ or universal@ and a": lambda: TINY_COUNTERFACTUAL.replace(start="sac@shipped"),
+    "must be ppo@, counterfactual@ or universal@": lambda: TINY_COUNTERFACTUAL.replace(start="sac@shipped"),
     "n_envs x n_steps = 16777216 decisions per update; at most": lambda: TINY_COUNTERFACTUAL.replace(n_envs=2**22),
     "must be single, shared, independent or centralised": lambda: TINY_COUNTERFACTUAL.replace(scheme="centralized"),
     "recipe 'options': memory = 15: must be at least tried = 16": lambda: TINY_OPTIONS.replace(memory=15),
-    "must hold a range where there are neither fixed no": lambda: TINY_OPTIONS.replace(near=[], fixed=[], drawn=0),
+    "must hold a range where there are neither fixed": lambda: TINY_OPTIONS.replace(near=[], fixed=[], drawn=0),
     "recipe 'counterfactual': modes.networks = 1: must be greater than or equal to 2": lambda: modes(networks=1),
     "recipe 'counterfactual': modes.shares = {alone: 0.5, further: 0.5, gate: 0.5, together: 0}: alone": lambda: modes(
         shares={"alone": 0.5, "further": 0.5, "gate": 0.5, "together": 0.0}

@@ -63,7 +63,7 @@ PROOFS: dict[str, Callable[[], object]] = {
     "team_bound: vehicle_1 follows 'coast'; must be 'full_brake'": lambda: team_bound(
         TEAM, (1, 2), scripts={0: "coast"}
     ),
-    "avoidability: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and nothing exact is": lambda: (
+    "avoidability: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and nothing exact": lambda: (
         avoidability(PAPER.replace(brake_rate_mps3=9).sample(2, 7).worlds)
     ),
     "avoidability: a vehicle of world 0 brakes in pieces (profile), and nothing exact is known for these": lambda: (

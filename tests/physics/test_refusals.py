@@ -84,7 +84,7 @@ SAMPLED: dict[str, Callable[[], object]] = {
     "advance_sampled: world 0 is at 0 s and cannot be advanced to -1 s in 0 to 1,000,000,000 steps of 0.1": lambda: (
         advance_sampled(FOUR, 0.0, until_s=-1.0)
     ),
-    "advance_sampled: world 2 is at 0 s and cannot be advanced to nan s in 0 to 1,000,000,000 steps of": lambda: (
+    "advance_sampled: world 2 is at 0 s and cannot be advanced to nan s in 0 to 1,000,000,000 steps": lambda: (
         advance_sampled(FOUR, 0.0, until_s=[1.0, 1.0, nan, 1.0])
     ),
     "cannot be advanced to 1907.35 s in 0 to 1,000,000,000 steps of 1.90735e-06 s": lambda: advance_sampled(
@@ -92,7 +92,7 @@ SAMPLED: dict[str, Callable[[], object]] = {
     ),
     "step_s = 0: must be finite and at least 1e-06 s": lambda: advance_sampled(FOUR, 0.0, until_s=1.0, step_s=0.0),
     "step_s = nan: must be finite and at least 1e-06 s": lambda: advance_sampled(FOUR, 0.0, until_s=1.0, step_s=nan),
-    "advance_sampled: world 0 is at 0.53 s, between two of its samples 0.5 s + n * 0.1 s; begin at a": lambda: (
+    "advance_sampled: world 0 is at 0.53 s, between two of its samples 0.5 s + n * 0.1 s; begin at": lambda: (
         advance_sampled(advance(FOUR, 0.0, until_s=0.53)[0], 0.0, until_s=1.0)
     ),
     "world 0 is at 1 s, between two of its samples 0 s + n * 1 s": lambda: advance_sampled(
@@ -107,7 +107,7 @@ SAMPLED: dict[str, Callable[[], object]] = {
     "advance_sampled: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3)": lambda: advance_sampled(
         line([5.0], [9.0, 9.0], brake_rate_mps3=9.0), [[0.0, 0.0]], until_s=1.0
     ),
-    "advance_sampled: a vehicle of world 0 brakes in pieces (profile), and nothing exact is known for": lambda: (
+    "advance_sampled: a vehicle of world 0 brakes in pieces (profile), and nothing exact is known": lambda: (
         advance_sampled(line([5.0], [9.0, 9.0]).play_pieces({1: [(0, 3), (1, 5)]}), [[0.0, 0.0]], until_s=1.0)
     ),
 }

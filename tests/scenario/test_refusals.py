@@ -151,7 +151,7 @@ QUANTITIES_AND_ROLES: dict[str, Callable[[], object]] = {
     "line 15: line_speed_mps = 20: give either speeds_mps or line_speed_mps, not both": lambda: given(
         gaps_m="7", speeds_mps="20", line_speed_mps="20"
     ),
-    "line 15: speed_deviations_mps = 0: needs line_speed_mps, the speed that it is added to": lambda: given(
+    "line 15: speed_deviations_mps = 0: needs line_speed_mps, the speed that it is added": lambda: given(
         gaps_m="7", speeds_mps="20", speed_deviations_mps="0"
     ),
     "line 15: time_gaps_s[1] (vehicle_2 to vehicle_3) = 61: must be finite and in (0, 60] s": lambda: given(
@@ -314,7 +314,7 @@ CALLS: dict[str, Callable[[], object]] = {
     "initial_state: scenario 'mixture-delays' is a mixture, and nothing says which": lambda: DELAYS.worlds_from_state(
         {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
     ),
-    "scenario 'paper-random': mass_t[0] (vehicle_1) = -1: must be finite and": lambda: PAPER.replace(mass_t=[-1, 2, 3]),
+    "scenario 'paper-random': mass_t[0] (vehicle_1) = -1: must be finite": lambda: PAPER.replace(mass_t=[-1, 2, 3]),
     "scenario 'paper-random': objective = frontfirst: unknown objective": lambda: PAPER.replace(objective="frontfirst"),
     "objective 'maximin:3': maximin takes no argument": lambda: PAPER.replace(objective="maximin:3"),
     "learners: 3: must be a name (vehicle_1 ... vehicle_3) or an index from 0 to 2": lambda: PAPER.with_learners([3]),

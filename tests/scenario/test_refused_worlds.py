@@ -83,13 +83,13 @@ GIVEN: dict[str, Callable[[], object]] = {
     "initial states: gap_1_m = ['1', '2', '3']: is not a number; must be a number or a list of numbers": lambda: (
         PAPER.worlds_from_table(COLUMNS | {"gap_1_m": ["1", "2", "3"]})
     ),
-    "initial states: gap_1_m = [True, True, True]: is a truth value; must be a number or a list of": lambda: (
+    "initial states: gap_1_m = [True, True, True]: is a truth value; must be a number or a list": lambda: (
         PAPER.worlds_from_table(COLUMNS | {"gap_1_m": [True, True, True]})
     ),
     "initial states: gap_1_m = [[1], [2, 3]]: has rows of different lengths; must be a number or a list": lambda: (
         PAPER.worlds_from_table(COLUMNS | {"gap_1_m": [[1], [2, 3]]})
     ),
-    "initial states, row 1, column speed_2_mps = nan: must be finite and in [0, 200] m/s (metres per": lambda: (
+    "initial states, row 1, column speed_2_mps = nan: must be finite and in [0, 200] m/s (metres": lambda: (
         PAPER.worlds_from_table(COLUMNS | {"speed_2_mps": [1, np.nan, 3]})
     ),
     "initial states: unknown column 'gaps_1_m'; did you mean gap_1_m (metres)?": lambda: PAPER.worlds_from_table(

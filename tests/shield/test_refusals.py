@@ -123,7 +123,7 @@ AGENTS: dict[str, Callable[[], object]] = {
     "agent 'e_v2x_bm:believed+episode:believed': e_v2x_bm:believed decides on what was received itself": lambda: (
         make_agent("e_v2x_bm:believed+episode:believed", scenario=PERIODIC)
     ),
-    "shield: robust interior: total harm: it certifies first-impact harm of at most 3 vehicles without an": lambda: (
+    "shield: robust interior: total harm: it certifies first-impact harm of at most 3 vehicles without": lambda: (
         make_agent("coast+robust:interior:believed", scenario=PERIODIC, harm_count="total")
     ),
     "shield: robust interior: an obstacle ahead: it certifies first-impact harm": lambda: make_agent(
@@ -174,7 +174,7 @@ UNCERTAINTIES: dict[str, Callable[[], object]] = {
     "uncertainty: mass_t=1: 1 of vehicle_1 in world 0 may be as low as 0; it must stay above 0": lambda: (
         parse_uncertainty("mass_t=1").members(WORLD)
     ),
-    "gaps_m=1e+308: 10 of vehicle_1 to vehicle_2 in world 0 may be as high as 1e+308; must be finite and": lambda: (
+    "gaps_m=1e+308: 10 of vehicle_1 to vehicle_2 in world 0 may be as high as 1e+308; must be finite": lambda: (
         parse_uncertainty("gaps_m=1e308").members(WORLD)
     ),
     "11 uncertain numbers in each world make 2048 corners; at most 1024 can be certified: name vehicles": lambda: (
@@ -246,7 +246,7 @@ AROUND: dict[str, Callable[[], object]] = {
     "ShieldedVecEnv: bound = 'pairwise': mode step takes none; episode does": lambda: ShieldedVecEnv(
         make_sb3_vec_env(PAPER, 2), mode="step", bound="pairwise"
     ),
-    "HybridShield: goes around eb.parallel_env, not None; eb.shield(env) chooses the one for an": lambda: HybridShield(
+    "HybridShield: goes around eb.parallel_env, not None; eb.shield(env) chooses the one": lambda: HybridShield(
         None, BRAKE
     ),
     "ShieldedEnv: goes around gymnasium.make('EthBrake-v0')": lambda: ShieldedEnv(gymnasium.make("CartPole-v1")),
@@ -254,7 +254,7 @@ AROUND: dict[str, Callable[[], object]] = {
         HybridShield(parallel_env(), "ppo@shipped")
     ),
     "HybridShield: agents = 5: must be a list of names": lambda: HybridShield(parallel_env(), BRAKE, agents=5),
-    "HybridShield: shields every learner, ('vehicle_2',), and nobody else; got ('vehicle_1',). What an": lambda: (
+    "HybridShield: shields every learner, ('vehicle_2',), and nobody else; got ('vehicle_1',). What": lambda: (
         HybridShield(parallel_env(), BRAKE, agents=["vehicle_1"])
     ),
     "HybridShield: policy: one for each of vehicle_2, vehicle_3 is needed, and for nobody else": lambda: HybridShield(
@@ -272,7 +272,7 @@ AROUND: dict[str, Callable[[], object]] = {
     "HybridShield: goes around eb.parallel_env, not ethbrake_v0; eb.shield(env) chooses the one": lambda: HybridShield(
         aec_env(), mode="step"
     ),
-    "shield: BaseWrapper<ethbrake_v0> acts in turns: put the shield inside it, as": lambda: eb.shield(
+    "shield: BaseWrapper<ethbrake_v0> acts in turns: put the shield inside it": lambda: eb.shield(
         BaseWrapper(aec_env())
     ),
     "shield: None has none of the interfaces: parallel_env, env (agents in turn), EthBrakeEnv": lambda: eb.shield(None),

@@ -109,7 +109,7 @@ def test_ranges__are_what_a_scenario_draws() -> None:
 
 
 def test_search__keeps_nothing_where_nothing_is_wrong() -> None:
-    paper, _wide = eb.load_scenario("paper-random"), eb.load_scenario("stress-wide").ranges()
+    paper = eb.load_scenario("paper-random")
     braking = eb.make_agent("full_brake")
     found = Measure("difference", {"mine": braking, "full_brake": braking}, paper, "first").falsify(300, 0)
     assert found.sample.worlds.n == 0

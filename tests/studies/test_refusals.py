@@ -86,7 +86,7 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml, line 4: search.total_steps: is not searched: every trial gets the same number of decisions": lambda: plan(
         search={"total_steps": {"low": 100, "high": 900}}
     ),
-    "t.yaml, line 4: search.reward.harm_count: is not searched: it says which harm is least; give it in": lambda: plan(
+    "t.yaml, line 4: search.reward.harm_count: is not searched: it says which harm is least; give it": lambda: plan(
         search={"reward.harm_count": {"choices": ["first", "total"]}}
     ),
     "t.yaml, line 4: search.algorithm: is not searched: each algorithm has a recipe of its own": lambda: plan(
@@ -198,7 +198,7 @@ SWEEPS: dict[str, Callable[[], object]] = {
     's.yaml, line 4: set = {"gamma=0.9, x": 3}: "gamma=0.9, x": a key has no = in it': lambda: sweep(
         {"set": {"gamma=0.9, x": 3}, "jobs": [GRID]}
     ),
-    "s.yaml, line 5: jobs[0] (paper-random, ppo, seed 0, =3): --set '=3': must be KEY=VALUE or": lambda: sweep(
+    "s.yaml, line 5: jobs[0] (paper-random, ppo, seed 0, =3): --set '=3': must be KEY=VALUE": lambda: sweep(
         {"set": {"": 3}, "jobs": [GRID]}
     ),
     "jobs[1] (paper-random, ppo, seed 0): is the same training as jobs[0] (paper-random, ppo, seed 0)": lambda: sweep(
