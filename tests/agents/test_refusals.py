@@ -28,7 +28,6 @@ FREE = PAPER.replace(early_impacts="keep")
 SLOW = PAPER.replace(brake_rate_mps3=9)
 PIECES = PAPER.replace(roles={"vehicle_1": "profile:0=3,1=5", "vehicle_2": "learner"})
 BRAKE = make_agent("full_brake")
-SEVENTH = observe(WORLDS, 1, eb.ObservationSpec())[7, 0]
 
 
 @cache
@@ -409,8 +408,10 @@ def test_policy__gives_one_action_per_world_and_a_state_per_world() -> None:
 
 @pytest.mark.parametrize("around", ["", "+search", "+episode", "+episode:pairwise", "+step", "+search+step"])
 def test_failure__is_told_with_its_world_whatever_stands_around_the_agent(around: str) -> None:
+    seventh = observe(WORLDS, 1, eb.ObservationSpec())[7, 0]
+
     def answer(seen: Any) -> Any:
-        return 1 / 0 if SEVENTH in seen[:, 0] else np.full((len(seen), 1), -0.5)
+        return 1 / 0 if seventh in seen[:, 0] else np.full((len(seen), 1), -0.5)
 
     agent = eb.policy_agent(answer, name="mine")
     register_agent("theirs", lambda argument, settings: agent)

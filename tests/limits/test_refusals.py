@@ -107,17 +107,12 @@ def test_search__is_refused(message: str) -> None:
         SEARCHES[message]()
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"no table", "t.npz: is not a table of best known harm: not a plain .npz archive"),
-        (packed({**good(), "first_harm": np.zeros(4)}), "array 'first_harm' is <f8 [4], should be <f8 [3]"),
-    ],
-    ids=["no archive", "other shape"],
-)
-def test_file__is_no_table(content: bytes, message: str, empty_folder: Path) -> None:
-    Path("t.npz").write_bytes(content)
-    with refused(message, CorruptBundle):
+def test_file__is_no_table(empty_folder: Path) -> None:
+    Path("t.npz").write_bytes(b"no table")
+    with refused("t.npz: is not a table of best known harm: not a plain .npz archive", CorruptBundle):
+        BestHarmTable.load(Path("t.npz"))
+    Path("t.npz").write_bytes(packed({**good(), "first_harm": np.zeros(4)}))
+    with refused("array 'first_harm' is <f8 [4], should be <f8 [3]", CorruptBundle):
         BestHarmTable.load(Path("t.npz"))
 
 
