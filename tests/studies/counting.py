@@ -52,10 +52,10 @@ class Counting(SweepPlan):
         count(path / RUNS / row.name, row.asked.seed)
 
     def results(self, path: Path) -> dict[str, dict[str, Any]]:
-        files = {row: path / RUNS / row.name / "run.json" for row in self.rows}
+        files = {row.name: path / RUNS / row.name / "run.json" for row in self.rows}
         return {
-            row.name: {FIGURES[0]: STEPS, FIGURES[-1]: json.loads(file.read_text())["text"]}
-            for row, file in files.items()
+            name: {FIGURES[0]: STEPS, FIGURES[-1]: json.loads(file.read_text())["text"]}
+            for name, file in files.items()
             if file.exists()
         }
 
