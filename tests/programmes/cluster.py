@@ -107,7 +107,6 @@ OPTIONS = {
 def cases(given: Given) -> Cases:
     # Before Ray is loaded: 127.0.0.1 is the address of both nodes, and a token is asked of everybody.
     os.environ |= {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_AUTH_MODE": "token", "RAY_USAGE_STATS_ENABLED": "0"}
-    os.environ["RAY_raylet_start_wait_time_s"] = "300"  # noqa: SIM112  # Ray's own spelling; much else may run here
     os.environ |= {"RAY_AUTH_TOKEN": secrets.token_hex(32), "PYTHONPATH": os.getcwd()}
     with tempfile.TemporaryDirectory(prefix="ethbrake-") as folder:
         yield f"{given.jobs} jobs, {given.work}", partial(run, Path(folder), given)
