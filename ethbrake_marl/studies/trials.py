@@ -59,7 +59,14 @@ def run_trials(
             ),
         ).fit()
     return [
-        {**(each.metrics or {}), **({REASON: _reason(each.error)} if each.error is not None else {})}
+        {
+            **(each.metrics or {}),
+            **(
+                {REASON: describe_error(getattr(each.error, "cause", None) or each.error)}
+                if each.error is not None
+                else {}
+            ),
+        }
         for each in results
     ]
 
@@ -72,10 +79,6 @@ def _attempt(config: dict[str, Any], work: Callable[..., None], given: Mapping[s
         work(config, **given)
     except EthBrakeError as error:
         tune.report({REASON: str(error), HARM: math.inf})
-
-
-def _reason(error: BaseException) -> str:
-    return describe_error(getattr(error, "cause", None) or error)
 
 
 class Told(tune.Callback):  # type: ignore[misc]  # Ray ships no types
@@ -100,8 +103,8 @@ class Told(tune.Callback):  # type: ignore[misc]  # Ray ships no types
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         """A trial was tried often enough."""
         self._done += 1
-        self.say(f"{_reason(trial.get_pickled_error())}; given up")
+        self.say("a process was lost or failed, too often: the table says why")
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
         """A trial is tried again."""
-        self.say(f"{_reason(trial.get_pickled_error())}; tried again")
+        self.say("a process was lost or failed: tried again")
