@@ -33,8 +33,8 @@ def is_done(job: TrainingJob) -> bool:
     return run.is_finished and all(Policy.stands_in(job.folder / place) for place in job.training.drivers.values())
 
 
-def finish(job: TrainingJob, stop_at: StopAt | None = None) -> None:
-    """Bring a training to its end, from where it stopped.
+def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
+    """Bring a training to its end, from where it stopped; False where ``stop_at`` stopped it.
 
     Raises what a training raises, ``InvalidInput`` where the folder holds another one, and ``BlockingIOError`` where
     another worker has just begun it.
@@ -46,7 +46,7 @@ def finish(job: TrainingJob, stop_at: StopAt | None = None) -> None:
         if run.is_finished and not is_done(job):
             remove_folder(job.folder)  # a finished run has no checkpoint: it is trained anew
     try:
-        job.finish(stop_at=stop_at)
+        return bool(job.finish(stop_at=stop_at))
     except AlreadyExists as error:
         raise BlockingIOError(str(error)) from None
 

@@ -258,6 +258,7 @@ _NOT_SEARCHED = {  # key -> why; what is inside it, too
     "checkpoint_every_updates": "it changes no result",
     "reward.harm_count": "it says which harm is least; give it in set",
 }
+PRUNED = "pruned: too much harm for so many decisions"
 _TRIED = 200  # points of the space that are checked before anything starts
 TABLE, TRIALS, PROPOSALS = "trials.csv", "trials", "proposals.json"  # inside the folder
 
@@ -546,7 +547,7 @@ def read_proposals(file: Path, tuning: TuningFile) -> list[Values]:
 
 
 def do_trial(config: dict[str, Any], plan: TuningPlan, path: Path) -> None:
-    """Train to the end and report every evaluation; Ray ends the process where the trial is pruned."""
+    """Train to the end and report every evaluation; Ray ends it there where the trial is pruned."""
     from ray.tune import report
 
     job = plan.job(plan.file.values(config["values"]), path)
@@ -560,9 +561,17 @@ def do_trial(config: dict[str, Any], plan: TuningPlan, path: Path) -> None:
         if evaluation["steps"] < last:
             report(figures(job, evaluations))
 
+    def stop_at(evaluation: Evaluation) -> str | None:
+        try:
+            judge(evaluation)
+        except SystemExit:  # how Ray ends a trial: the training is to close its folder first
+            return PRUNED
+        return None
+
     for evaluation in evaluations_of(job):
         judge(evaluation)
-    finish(job, judge)
+    if not finish(job, stop_at):
+        raise SystemExit
     report(final_figures(job))
 
 

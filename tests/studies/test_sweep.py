@@ -320,7 +320,8 @@ def test_pruned_trials__stop_early_with_more_harm_than_the_median_had(finished_t
     least = min(float(row["first_impact_harm"]) for row in finished)
     for row in pruned:
         assert 0 < int(row["steps"]) < 512 and float(row["first_impact_harm"]) > least and not row["policy_sha256"]
-        assert run_of(finished_tuning, row, "run.json")["status"] == "running"
+        run = run_of(finished_tuning, row, "run.json")  # the last one's process may have ended before it was closed
+        assert run["status"] == "running" or run["reason"].startswith("pruned: ")
 
 
 def test_export__is_a_recipe_that_trains_the_best_trial_again_to_the_bit(finished_tuning, tmp_path):
