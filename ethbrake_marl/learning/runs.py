@@ -600,14 +600,17 @@ def make_policies(
 def open_logs(run: RunDirectory, state: TrainingState | None) -> list[KVWriter]:
     """``progress.csv`` and TensorBoard's events, which go on after the rows of ``state``; None: from the beginning."""
     run.progress.unlink(missing_ok=True)  # it may be a link
+    if state is None:
+        for left in run.tensorboard.glob("events.out.tfevents.*"):
+            left.unlink()
     table = CSVOutputFormat(str(run.progress))
     events: Any = TensorBoardOutputFormat(str(run.tensorboard))  # whose writer torch declares as None
     if state is not None:
         table.file.write(state.numbers["progress"])
         table.file.flush()
-        table.keys = state.numbers["progress"].partition("\n")[0].split(",")
-    restart = Event(step=0 if state is None else state.steps + 1, session_log=SessionLog(status=SessionLog.START))
-    events.writer.file_writer.add_event(restart)  # TensorBoard forgets what an earlier stretch wrote from this step on
+        table.keys = [name for name in state.numbers["progress"].partition("\n")[0].split(",") if name]
+        restart = Event(step=state.steps + 1, session_log=SessionLog(status=SessionLog.START))
+        events.writer.file_writer.add_event(restart)  # TensorBoard forgets what was written from this step on
     return [table, events]
 
 

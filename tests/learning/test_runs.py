@@ -416,11 +416,13 @@ def measure(training: Training) -> Callable[[Trained], dict[str, float]]:
 CLOCKS = ("time/fps", "time/time_elapsed")
 
 
-def told_by(run: Path) -> tuple[list[dict[str, str]], dict[str, list[tuple[int, float]]]]:
+def told_by(run: Path) -> tuple[list[dict[str, str]], dict[str, dict[int, float]]]:
     """The progress table and the events, without their clocks."""
     return (
         [{name: value for name, value in row.items() if name not in CLOCKS} for row in RunDirectory(run).rows()],
-        {tag: told for tag, told in scalars(run / "tensorboard").items() if tag not in CLOCKS},
+        {
+            tag: dict(told) for tag, told in scalars(run / "tensorboard").items() if tag not in CLOCKS
+        },  # in one second no order
     )
 
 
