@@ -368,6 +368,8 @@ def test_open_logs__goes_on_after_the_rows_of_a_checkpoint(tmp_path: Path, monke
     assert scalars(run.tensorboard) == {"loss": [(step, pytest.approx(loss)) for step, loss in expected]}
     write(None, s1=0.4)
     assert len(run.rows()) == 1 and scalars(run.tensorboard)["loss"] == [(1, pytest.approx(0.4))]
+    write(TrainingState({"steps": 0, "progress": ""}, {}), s1=0.3)  # before the first row
+    assert run.rows() == [{"steps": "1", "loss": "0.3"}]
 
 
 # ---------------------------------------------------------------- going on
@@ -417,12 +419,10 @@ CLOCKS = ("time/fps", "time/time_elapsed")
 
 
 def told_by(run: Path) -> tuple[list[dict[str, str]], dict[str, dict[int, float]]]:
-    """The progress table and the events, without their clocks."""
+    """The progress table and the events, without their clocks; event files of one second have no order."""
     return (
         [{name: value for name, value in row.items() if name not in CLOCKS} for row in RunDirectory(run).rows()],
-        {
-            tag: dict(told) for tag, told in scalars(run / "tensorboard").items() if tag not in CLOCKS
-        },  # in one second no order
+        {tag: dict(told) for tag, told in scalars(run / "tensorboard").items() if tag not in CLOCKS},
     )
 
 
