@@ -148,7 +148,11 @@ class Registry(Mapping[str, T]):
         if name not in self.loaded and name in self and name not in self._loading:
             self.load(name)
         if not is_same(self.loaded.setdefault(name, part)):
-            raise AlreadyExists(f"{self.kind} {name!r} is registered already; give another name")
+            package = next((giver(point) for point in points(self.group).get(name, ()) if giver(point) != OURS), None)
+            raise AlreadyExists(
+                f"{self.kind} {name!r} is registered already; give another name"
+                + f", or none in the package {package}, whose entry point gives it" * (package is not None)
+            )
 
     def usable(self) -> dict[str, T]:
         """All that can be loaded, which is done; for lists that have to say more than names."""

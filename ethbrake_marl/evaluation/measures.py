@@ -531,7 +531,8 @@ def check_papers_test(task: Task, seed: int | None) -> None:
     if not is_papers_test(task, seed):
         raise InvalidInput(
             f"paper: the paper's rows are about Vehicle 2 in a list of {' or '.join(_SHOWN_WITH)} as shipped, and these"
-            f" are {'worlds' if seed is None else 'a list'} of {task.scenario.name!r}; leave paper out"
+            f" are {'worlds of no known seed' if seed is None else 'a list'} of {task.scenario.name!r};"
+            f" {'give evaluate the seed of the list, or ' if seed is None else ''}leave paper out"
         )
 
 

@@ -282,8 +282,8 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
         raise InvalidInput(f"vehicle = {vehicle!r}: must be a name or an index from 0 to {scenario.vehicles - 1}")
     if set(learners) - {vehicle}:
         raise InvalidInput(
-            f"scenario {scenario.name!r}: {', '.join(names)} learn, but only {scenario.vehicle_names[vehicle]} is"
-            " driven; give the others a script"
+            f"scenario {scenario.name!r}: its learners are {', '.join(names)}, but only"
+            f" {scenario.vehicle_names[vehicle]} is driven; give the others a script (scenario.replace(roles=...))"
         )
     return int(vehicle)
 

@@ -439,7 +439,7 @@ class TuningPlan:
         total, prune = max(trials, len(known)), self.file.prune
         told = Told("tuning", 0, total, tell)
         if known:
-            told.say(f"{count_of(len(known), 'trial')} begun already, each goes on from where it stopped")
+            told.say(f"{count_of(len(known), 'trial')} begun before: what ended is kept, the rest goes on")
         elif own is None:
             told.say("the recipe's own values are not in the space, so no trial has them")
         ends = run_trials(
