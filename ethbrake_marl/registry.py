@@ -104,6 +104,9 @@ class Registry(Mapping[str, T]):
 
     def __getitem__(self, name: str) -> T:
         self.load(name)
+        if name not in self.loaded:
+            why = "is asked for while it is loaded" if name in self._loading else "stands for several of other names"
+            raise InvalidInput(f"{self.kind} {name!r}: {why}")
         return self.loaded[name]
 
     def load(self, name: str) -> None:

@@ -300,9 +300,6 @@ def _write_report(
 _FILE = typer.Argument(metavar="RESULTS.json", help="Results of evaluate, shield (--json) or run.")
 
 
-_FILE = typer.Argument(metavar="RESULTS.json", help="Results of evaluate, shield (--json) or run.")
-
-
 def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE], as_json: JsonOption = False) -> None:
     """Tell the difference of harm between two results.
 

@@ -9,16 +9,28 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
-from ethbrake_marl.agents import Driver, Knowledge, Team
+from ethbrake_marl.agents import Driver, Knowledge, Team, parse_spec
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
-from ethbrake_marl.evaluation.inputs import CHUNK, HELD, make_lineup, policies_of, result_versions, scenario_sha256
+from ethbrake_marl.evaluation.inputs import (
+    CHUNK,
+    HELD,
+    make_lineup,
+    own_versions,
+    policies_of,
+    result_versions,
+    scenario_sha256,
+)
 from ethbrake_marl.evaluation.measures import REGISTERED, Conditions, Evaluation, SummaryTable, Tally, load_measures
 from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk
+from ethbrake_marl.files.python_file import file_sha256
 from ethbrake_marl.harm import HarmCount
 from ethbrake_marl.parallel import Call, run_each
+from ethbrake_marl.registry import versions_used
 from ethbrake_marl.scenario import Sample, Scenario, Task
 from ethbrake_marl.shield import parse_uncertainty
 
@@ -38,6 +50,7 @@ class Lineup:
         uncertainty: what agents behind ``+robust`` do not know, as on the command line.
         measures: that evaluations tell, too, as ``load_measures`` takes them.
         same: what must be the same in every process; see ``Lineup.of``.
+        packages: name -> version of each that gave a part to the process that asks: no other may be installed.
 
     """
 
@@ -47,6 +60,7 @@ class Lineup:
     uncertainty: str | None = None
     measures: tuple[str, ...] = ()
     same: str = ""
+    packages: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, agents: Sequence[str], scenario: Scenario, **how: Any) -> Lineup:
@@ -59,13 +73,13 @@ class Lineup:
         same = lineup._same(made)
         _MADE.clear()
         _MADE[same] = made
-        return cls(tuple(agents), scenario, **how, same=same)
+        return replace(lineup, same=same, packages=versions_used())
 
     def make(self) -> Mapping[str, Driver]:
         """The agents in this process; raises ``InvalidInput`` where they are others than in the process that asks."""
         if self.same not in _MADE:
             made = self._make_anew()
-            if self._same(made) != self.same:
+            if self._same(made) != self.same or any(_installed(name) != used for name, used in self.packages.items()):
                 raise InvalidInput(
                     "evaluate: a worker has other policies, measures or versions than the process that asks it;"
                     " install the same everywhere, and change no file while an evaluation runs"
@@ -82,8 +96,21 @@ class Lineup:
     def _same(self, made: Mapping[str, Driver]) -> str:
         policies = {name: policies_of(Team.of(agent, self.scenario.learners).drivers) for name, agent in made.items()}
         asked = self.harm_count, self.uncertainty, scenario_sha256(self.scenario)
-        text = json.dumps([asked, policies, sorted(REGISTERED), result_versions()], sort_keys=True)
+        text = json.dumps([asked, policies, self._digests(), sorted(REGISTERED), own_versions()], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
+
+    def _digests(self) -> list[str]:
+        """SHA-256 of every file that it names: code, and weights of an agent that is code."""
+        named = [part for spec in map(parse_spec, self.agents) if spec.file for part in (spec.file[0], spec.policy)]
+        named += [name.rpartition(":")[0] for name in self.measures]
+        return [file_sha256(Path(each)) for each in named if each is not None and Path(each).is_file()]
+
+
+def _installed(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
 
 
 def evaluate_held(

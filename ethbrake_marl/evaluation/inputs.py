@@ -143,8 +143,12 @@ def result_versions() -> dict[str, str]:
 
     Packages that gave a part to this process are among them; of the user's own files that it ran the SHA-256 is told.
     """
-    versions = {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES} | versions_used()
-    return versions | {name: f"SHA-256 {sha256}" for name, sha256 in files_run().items()}
+    return own_versions() | versions_used() | {name: f"SHA-256 {sha256}" for name, sha256 in files_run().items()}
+
+
+def own_versions() -> dict[str, str]:
+    """Those of them that every process has, whatever else it loaded."""
+    return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}
 
 
 def result_identity(

@@ -33,9 +33,14 @@ def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
     if not hasattr(module, name):
         raise InvalidInput(f"file {path!r}: has no {name!r}; name what it defines: {path}:NAME")
     if reads is not None and Path(reads).is_file():
-        with Path(reads).open("rb") as file:
-            _READ.setdefault(Path(reads).name, set()).add(hashlib.file_digest(file, "sha256").hexdigest())
+        _READ.setdefault(Path(reads).name, set()).add(file_sha256(Path(reads)))
     return getattr(module, name)
+
+
+def file_sha256(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def files_run() -> dict[str, str]:

@@ -21,6 +21,7 @@ import numpy as np
 import safetensors.numpy
 import torch
 from numpy.typing import NDArray
+from safetensors import SafetensorError
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import CSVOutputFormat, KVWriter, Logger, TensorBoardOutputFormat
@@ -335,7 +336,8 @@ class Session(BaseCallback):
         numbers, course = state.numbers, self.course
         try:
             restore_model(self.model, self.algorithm, state)
-            self.updates, self._ended = numbers["updates"], numbers["ended"]
+            self.updates = numbers["updates"]
+            self._ended = {column: [float(each) for each in numbers["ended"][column]] for column in EPISODE_COLUMNS}
             course.restore(numbers["course"])
             self._rest()
             if numbers["best_steps"] is not None:
@@ -720,6 +722,15 @@ def weights_are_finite(model: Model, algorithm: Algorithm) -> bool:
 # A training at rest between two updates: a folder with its arrays and its plain numbers, whole or not there.
 
 ARRAYS, NUMBERS = "arrays.safetensors", "numbers.json"
+_KINDS = {
+    "training": str,
+    "versions": dict,
+    "steps": int,
+    "updates": int,
+    "ended": dict,
+    "course": dict,
+    "progress": str,
+}
 KEPT = 2  # checkpoints of a running training; a torn last one leaves the one before
 COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining", "_total_timesteps")
 
@@ -750,7 +761,7 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
 
 
 def read_checkpoint(folder: Path) -> TrainingState:
-    """Read ``folder``; raises ``CorruptBundle`` unless it is as it was written, ``InvalidInput`` of another version."""
+    """Read ``folder``; raises ``CorruptBundle`` unless it is as it was written, ``InvalidInput`` of another form."""
     if not os.path.lexists(folder / NUMBERS):
         raise InvalidInput(
             f"{folder}: has no {NUMBERS}, so another version of this package wrote it; go on with that version, or"
@@ -765,7 +776,17 @@ def read_checkpoint(folder: Path) -> TrainingState:
             whole = False
     if not whole:
         raise CorruptBundle(f"{folder}: its files are not those that were written (the SHA-256 differs)")
-    return TrainingState(numbers, safetensors.numpy.load_file(folder / ARRAYS))
+    try:
+        state = TrainingState(numbers, safetensors.numpy.load_file(folder / ARRAYS))
+    except SafetensorError as error:
+        raise InvalidInput(f"{folder / ARRAYS}: {error}; delete the checkpoint to go on from the one before") from None
+    for name, kind in _KINDS.items():
+        if type(numbers.get(name)) is not kind:
+            raise InvalidInput(
+                f"{folder / NUMBERS}: {name} = {numbers.get(name)!r:.60}: must be of type {kind.__name__}; delete the"
+                " checkpoint to go on from the one before"
+            )
+    return state
 
 
 def _digest(arrays: BufferedReader, numbers: Mapping[str, Any]) -> str:

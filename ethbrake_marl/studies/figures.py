@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -52,14 +54,19 @@ def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
 
 
 def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
-    """What its folder says was measured so far."""
+    """What its folder says was measured so far; raises ``InvalidInput`` where its table is damaged."""
     run, names = RunDirectory(job.folder), (*_MEASURED, RunDirectory.OBJECTIVE)
-    rows = run.rows() if run.progress.is_file() else []
-    return [
-        {"steps": int(row["steps"]), **{name: float(row[f"eval/{name}"]) for name in names if row.get(f"eval/{name}")}}
-        for row in rows
-        if row.get(f"eval/{_MEASURED[0]}")
-    ]
+    try:
+        rows = [row for row in (run.rows() if run.progress.is_file() else []) if row.get(f"eval/{_MEASURED[0]}")]
+        found = [
+            {"steps": int(row["steps"])} | {n: float(row[f"eval/{n}"]) for n in names if row.get(f"eval/{n}")}
+            for row in rows
+        ]
+        if any(not {*_MEASURED} <= each.keys() or not all(map(math.isfinite, each.values())) for each in found):
+            raise ValueError("a measure is missing or not finite")
+    except (ValueError, LookupError, csv.Error) as error:
+        raise InvalidInput(f"{run.progress}: is damaged ({error}); delete its folder to train anew") from None
+    return found
 
 
 def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, Any]:

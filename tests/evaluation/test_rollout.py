@@ -5,6 +5,7 @@ import hashlib
 import json
 import warnings
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import fields, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl import registry
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput, PhysicsError, Unfamiliar
 from ethbrake_marl.evaluation import (
@@ -31,6 +33,7 @@ from ethbrake_marl.evaluation.chunks import Lineup, evaluate_held, summarise_tal
 from ethbrake_marl.evaluation.inputs import make_agents, make_lineup, policy_sha256, scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.measures import FAR_M, REGISTERED, Tally, measures
 from ethbrake_marl.evaluation.rollout import ShovedFront, chunks_of, drive_chunk
+from ethbrake_marl.files import python_file
 from ethbrake_marl.limits import Limits
 from ethbrake_marl.pages.report import Report
 from ethbrake_marl.physics import Bools, Floats, Ints, Worlds, advance_sampled
@@ -411,6 +414,24 @@ def test_worker__of_other_measures_is_refused(paper_random: Scenario, monkeypatc
     lineup = Lineup.of(("full_brake",), paper_random)
     with pytest.raises(InvalidInput, match="a worker has other policies, measures or versions than the process"):
         tally_list(lineup, 6_000, 5, jobs=2)
+
+
+@pytest.mark.parametrize("other", ["", "version", "package", "file"])
+def test_worker__needs_the_packages_and_files_of_the_process_that_asks_and_no_others(
+    paper_random: Scenario, failing: Callable[[float], str], tmp_path: Path, monkeypatch, other: str
+) -> None:
+    """As where that process loaded them for a role, a command or an evaluation before."""
+    used = {"": {"numpy": np.__version__}, "version": {"numpy": "0.1"}, "package": {"none-such": "1"}}.get(other, {})
+    monkeypatch.setattr(registry, "_VERSIONS", used)
+    monkeypatch.setattr(python_file, "_RUN", {})
+    make_lineup([failing(9.0)], paper_random)
+    lineup = Lineup.of((failing(9.0) if other == "file" else "full_brake",), paper_random)
+    monkeypatch.setattr(registry, "_VERSIONS", {})
+    monkeypatch.setattr(python_file, "_RUN", {})
+    monkeypatch.setattr(chunks, "_MADE", {})
+    (tmp_path / "failing.py").write_text(f"{FAILING}# changed")
+    with pytest.raises(InvalidInput, match="a worker has other policies") if other else nullcontext():
+        lineup.make()
 
 
 def test_figures__of_a_list_that_is_not_held_are_those_of_evaluate(lineup, paper_random, monkeypatch) -> None:

@@ -213,6 +213,17 @@ def test_entry_point__that_does_not_fit_is_named(install: Install, given: str, t
             eb.make_agent("gentle")
 
 
+def test_entry_point__without_a_part_of_its_name_is_named(install: Install) -> None:
+    more = "\nSEVERAL = {'other': make_gentle}\n"
+    install("hills", HILLS + more, agents={"hills": "hills:SEVERAL", "itself": "circle:make"})
+    install("circle", "import ethbrake_marl as eb\nmake = eb.make_agent('itself')\n")
+    with pytest.raises(InvalidInput, match="agent 'hills': stands for several of other names"):
+        eb.make_agent("hills")
+    assert eb.make_agent("other").name == "gentle"
+    with pytest.raises(InvalidInput, match=r"agent 'itself', .*: agent 'itself': is asked for while it is loaded"):
+        eb.make_agent("itself")
+
+
 def test_name__that_two_packages_give_is_told_with_both(install: Install, capsys: pytest.CaptureFixture[str]) -> None:
     install("hills", HILLS, agents=AGENTS, commands={"evaluate": "hills:hello"})
     install("valleys", HILLS, agents={"gentle": "valleys:make_gentle", "coast": "valleys:make_gentle"})

@@ -17,6 +17,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+import safetensors.numpy
 import torch
 
 import ethbrake_marl as eb
@@ -654,12 +655,25 @@ def test_resume__one_process_at_a_time(run: Path, monkeypatch: pytest.MonkeyPatc
     assert asked == [5]
 
 
-@pytest.mark.parametrize("change", ["lost", "forged"])
-def test_resume__a_checkpoint_that_does_not_fit_is_refused_and_stays(run: Path, change: str) -> None:
+@pytest.mark.parametrize("change", ["lost", "forged", "versions", "steps", "progress", "arrays", "ended"])
+def test_resume__a_checkpoint_that_does_not_fit_is_refused_and_stays(
+    run: Path, change: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     place = newest(run)
     if change == "lost":  # as of another version
         (place / NUMBERS).unlink()
         told = rf"{place}: has no numbers.json, so another version of this package wrote it"
+    elif change == "arrays":
+        monkeypatch.setattr(safetensors.numpy, "save_file", lambda arrays, file: file.write_bytes(b"forged"))
+        state = read_checkpoint(place)
+        shutil.rmtree(place)
+        write_checkpoint(place, state)
+        told = rf"{place / ARRAYS}: .*; delete the checkpoint to go on from the one before"
+    elif change != "forged":
+        state = read_checkpoint(place)
+        shutil.rmtree(place)
+        write_checkpoint(place, TrainingState({**state.numbers, change: ["forged"]}, state.arrays))
+        told = rf"{place / NUMBERS}: {change} = \['forged'\]: must be of type"
     else:  # whole, and not of this model
         state = read_checkpoint(place)
         shutil.rmtree(place)

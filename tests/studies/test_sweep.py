@@ -111,6 +111,16 @@ def test_finished_jobs__are_not_repeated_and_the_table_is_the_same(again, capsys
         assert len(others) == 2 and all(path.stat().st_mtime_ns == written[path] for path in others)
 
 
+@pytest.mark.parametrize("damage", [b"steps,eval/first_impact_harm\nx,1.0\n", b"eval/first_impact_harm\n1\n", b"\xff"])
+def test_table__of_a_run_that_is_damaged_is_named(again, capsys, damage: bytes) -> None:
+    file, folder = again
+    damaged = sorted((folder / "runs").iterdir())[0] / "progress.csv"
+    damaged.write_bytes(damage)
+    assert sweep(file, folder) == 2
+    (told,) = capsys.readouterr().err.splitlines()
+    assert f"{damaged}: is damaged (" in told and told.endswith("; delete its folder to train anew")
+
+
 @pytest.mark.slow
 def test_team__that_has_lost_a_policy_is_trained_again(write_sweep: Write, tiny: Path, tmp_path: Path) -> None:
     pytest.importorskip("ray")
