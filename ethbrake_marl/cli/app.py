@@ -194,7 +194,8 @@ def add_command(name: str, command: typer.Typer | Callable[..., Any]) -> None:
     else:
         given = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
         given.command()(command)
-    COMMANDS.add(name, get_command(given), lambda other: True)
+    made = get_command(given)
+    COMMANDS.add(name, made, lambda other: other is made)
 
 
 def _names() -> list[str]:
@@ -226,11 +227,11 @@ def whole_command() -> Any:
 
     Raises ``AlreadyExists`` for a command of a program that would take the place of another one.
     """
-    installed = points(COMMANDS.group)
-    names = [*_names(), *(name for name in installed if name not in _OURS)]
+    added = [name for name in COMMANDS if name not in _OURS]
+    names = [*_names(), *added]
     for k, name in enumerate(names):
         if name in names[:k]:
             raise AlreadyExists(f"command {name!r} is there already; give yours another name: app.command('my-{name}')")
     whole: Any = get_command(app)
-    whole.commands |= {name: Installed(name) for name in installed}
+    whole.commands |= {name: COMMANDS.loaded.get(name) or Installed(name) for name in [*points(COMMANDS.group), *added]}
     return whole

@@ -98,13 +98,15 @@ def evaluate_command(
 
     with Out(as_json=as_json, force=force) as out:
         _check_outputs(out, output, per_world, report=report)
+        given = learning.read_settings(settings, of_agents=("harm_count", "measures"))
         if group := scenarios.group_of_scenarios(scenario):
             other = {"--per-world": per_world, "--report": report, "--jobs": jobs, "--ray": ray}
             for option in (name for name, value in other.items() if value):
                 raise InvalidInput(f"{option}: {scenario} is a group of {len(group)} scenarios; give one of them")
-            _evaluate_group(out, output, [read_task(name, settings) for name in group], agents, episodes, seed)
+            if given.measures:
+                raise InvalidInput(f"--set measures: {scenario} is a group of {len(group)} scenarios; give one of them")
+            _evaluate_group(out, output, [_task_of(name, given) for name in group], agents, episodes, seed)
             return
-        given = learning.read_settings(settings, of_agents=("harm_count", "measures"))
         task = _task_of(scenario, given)
         lineup = evaluation.Lineup.of(
             split_specs(agents), task.scenario, harm_count=task.harm_count, measures=given.measures

@@ -844,8 +844,16 @@ def read_settings(
         found[owners[0]].append(inside)
     asked = {each.top: each.value for each in found["agents"]}
     check_harm_count(count := asked.get("harm_count", "first"))
-    measures = tuple(split_names(str(asked["measures"]))) if "measures" in asked else ()
-    return Settings(tuple(texts or ()), tuple(found["scenario"]), tuple(found["recipe"]), count, measures)
+    measures = asked.get("measures", "")
+    if not isinstance(measures, str) or ("measures" in asked and not measures):
+        raise InvalidInput("--set measures: must be names with commas between them, for instance measures=injury")
+    return Settings(
+        tuple(texts or ()),
+        tuple(found["scenario"]),
+        tuple(found["recipe"]),
+        count,
+        tuple(split_names(measures)) if measures else (),
+    )
 
 
 # The folder of a run: its files, its configuration, how far it came, and who may train in it.

@@ -21,8 +21,9 @@ from rich.console import Console
 
 from ethbrake_marl import __version__
 from ethbrake_marl.cli import app as frame
-from ethbrake_marl.cli.app import app, run_command, whole_command
+from ethbrake_marl.cli.app import add_command, app, run_command, whole_command
 from ethbrake_marl.cli.command import Out
+from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.evaluation import EPISODES, LIST_SEED
 from ethbrake_marl.physics.compiling import compiled
 from tests.cli.conftest import Command, check_refused, told_json
@@ -300,3 +301,25 @@ def test_command__of_the_users_cannot_take_the_place_of_a_built_in_one(ethbrake,
 
     answer = ethbrake("evaluate", "--episodes", "3")
     check_refused(answer, "command 'evaluate' is there already; give yours another name: app.command('my-evaluate')")
+
+
+def test_command_of_a_program__appears_runs_and_takes_no_other_place(ethbrake, monkeypatch):
+    monkeypatch.setattr(frame.COMMANDS, "loaded", dict(frame.COMMANDS.loaded))
+
+    def hello() -> None:
+        """Say hello."""
+        print("hello")
+
+    add_command("hello", hello)
+    assert "Say hello." in ethbrake("--help").out and ethbrake("hello").out == "hello\n"
+    for name in ("hello", "evaluate"):
+        with pytest.raises(AlreadyExists, match=f"command '{name}' is registered already"):
+            add_command(name, lambda: None)
+
+
+def test_measures__asked_for_wrongly_are_one_line(ethbrake):
+    check_refused(ethbrake("evaluate", "--set", "measures="), "--set measures: must be names with commas between them")
+    check_refused(
+        ethbrake("evaluate", "--scenario", "benchmark", "--set", "measures=injury"),
+        "--set measures: benchmark is a group",
+    )
