@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.programmes import ROOT, Told, __main__ as runner, audit, faults, hostile, libraries
+from tests.programmes import ROOT, Told, __main__ as runner, audit, bounds, faults, hostile, libraries
 from tests.programmes.audit import Package
 from tests.programmes.cage import Case, judge
 from tests.programmes.faults import PACKAGE, Callers, functions_of
@@ -54,6 +54,13 @@ def test_runner__lists_every_programme_and_knows_no_other(capsys):
     assert runner.main([]) == 0 and {"audit", "shield", "wheel"} <= runner.programmes().keys()
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == [*runner.programmes()]
     assert runner.main(["nobody"]) == 2
+
+
+# ---------------------------------------------------------------- bounds
+
+
+def test_bounds__names_folders_of_tests_that_there_are() -> None:
+    assert [folder for folder in bounds.TESTS if not [*(ROOT / "tests" / folder).glob("test_*.py")]] == []
 
 
 # ---------------------------------------------------------------- audit
