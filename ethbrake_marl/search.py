@@ -525,77 +525,6 @@ class ProfileProblem(NamedTuple):
         if not ordered:
             raise InvalidInput("profiles: phases must end in order, the last one at the last step")
 
-    def search(self, given: Profiles, *, budget: int, seed: int = 0, threads: int = 1) -> Found:
-        """The best profiles of at most ``MOST_PHASES`` phases that about ``budget`` candidates per world find.
-
-        And their harm [n] under each count (m2/s2), as the engine counts it.
-
-        ``given`` [n * Q]: Q profiles of each world, world by world, from which to start; the result is never worse than
-        any of them. Raises ``InvalidInput`` for a budget below 1 and ``PhysicsError`` naming the worlds of which no
-        profile could be followed.
-        """
-        for name, value, least in (("budget", budget, 1), ("threads", threads, 1), ("seed", seed, 0)):
-            check_whole_number(name, value, least)
-        n, C = self.n, len(self.vehicles)
-        ends = np.ascontiguousarray(given.ends.reshape(n, -1, MOST_PHASES))
-        commands = np.ascontiguousarray(given.commands_mps2.reshape(n, -1, MOST_PHASES, C))
-        best = Profiles(np.zeros((n, MOST_PHASES), np.int64), np.zeros((n, MOST_PHASES, C)))
-        random = seeded(self.identity, seed)
-
-        def work(k: int) -> int:
-            world = make_search_world(self, k, random)
-            return search_world(world, self.start[k], ends[k], commands[k], budget, best.ends[k], best.commands_mps2[k])
-
-        if threads == 1:
-            used = [work(k) for k in range(n)]
-        else:
-            with ThreadPoolExecutor(threads) as pool:
-                used = list(pool.map(work, range(n)))
-        if 0 in used:
-            raise PhysicsError({k: "no profile could be followed" for k in range(n) if used[k] == 0})
-        first, total = self.follow(best)
-        return best, {"first": first, "total": total}
-
-    def refine(self, commands_mps2: Floats, *, budget: int, seed: int = 0) -> tuple[Floats, Floats]:
-        """Search around ``commands_mps2`` [n, T] of the one controlled vehicle, with ``budget`` candidates per world.
-
-        Returns the commands found, never worse than the given ones, and their harm [n] under the problem's count, as
-        the engine counts it (m2/s2).
-        Worlds are independent of each other. Raises ``InvalidInput`` for several vehicles, commands of another shape or
-        beyond a capacity, or a budget below 1, ``PhysicsError`` naming worlds in which the given commands cannot be
-        played.
-        """
-        check_whole_number("budget", budget, 1)
-        n, steps = self.n, int(self.last_step.max(initial=0))
-        low, high = self.bounds[:, :1, 0], self.bounds[:, :1, 1]
-        if len(self.vehicles) != 1 or commands_mps2.shape != (n, steps):
-            raise InvalidInput(
-                f"refine: commands of shape {commands_mps2.shape}; ({n}, {steps}) of one vehicle are needed"
-            )
-        if not ((commands_mps2 >= low) & (commands_mps2 <= high)).all():
-            raise InvalidInput("refine: a command is beyond the vehicle's capacity")
-        best, first, total = commands_mps2.copy(), np.zeros(n), np.zeros(n)
-        failed = np.zeros(n, np.bool_)
-        _refine_worlds(self, seeded(self.identity, seed), budget, best, first, total, failed)
-        if failed.any():
-            raise PhysicsError({k: "its commands could not be played" for k in np.flatnonzero(failed).tolist()})
-        return best, np.where(self.clock[:, CLOCK.HARM_IS_TOTAL] == 1.0, total, first)
-
-    def best_templates(self, bound: Floats, *, number: int, seed: int = 0) -> tuple[Floats, Ints]:
-        """The best of ``number`` templates below ``bound`` [n] (m2/s2) in each world, of the one controlled vehicle.
-
-        Returns its commands [n, T] (m/s2), and in how many steps it was played to its end [n]: 0 where none was below.
-        Each world draws its own; worlds are independent of each other. Raises ``InvalidInput`` for several vehicles, or
-        no template.
-        """
-        check_whole_number("templates", number, 1)
-        if len(self.vehicles) != 1:
-            raise InvalidInput(f"templates: {len(self.vehicles)} vehicles; they are of one")
-        commands = np.zeros((self.n, int(self.last_step.max(initial=0))))
-        steps = np.zeros(self.n, np.int64)
-        _best_templates(self, seeded(self.identity, seed), bound, number, commands, steps)
-        return commands, steps
-
 
 def profile_problem(
     worlds: Worlds,
@@ -758,6 +687,38 @@ class Profiles(NamedTuple):
 Found = tuple[Profiles, dict[HarmCount, Floats]]
 
 
+def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, seed: int = 0, threads: int = 1) -> Found:
+    """The best profiles of at most ``MOST_PHASES`` phases that about ``budget`` candidates per world find.
+
+    And their harm [n] under each count (m2/s2), as the engine counts it.
+
+    ``given`` [n * Q]: Q profiles of each world, world by world, from which to start; the result is never worse than
+    any of them. Raises ``InvalidInput`` for a budget below 1 and ``PhysicsError`` naming the worlds of which no
+    profile could be followed.
+    """
+    for name, value, least in (("budget", budget, 1), ("threads", threads, 1), ("seed", seed, 0)):
+        check_whole_number(name, value, least)
+    n, C = problem.n, len(problem.vehicles)
+    ends = np.ascontiguousarray(given.ends.reshape(n, -1, MOST_PHASES))
+    commands = np.ascontiguousarray(given.commands_mps2.reshape(n, -1, MOST_PHASES, C))
+    best = Profiles(np.zeros((n, MOST_PHASES), np.int64), np.zeros((n, MOST_PHASES, C)))
+    random = seeded(problem.identity, seed)
+
+    def work(k: int) -> int:
+        world = make_search_world(problem, k, random)
+        return search_world(world, problem.start[k], ends[k], commands[k], budget, best.ends[k], best.commands_mps2[k])
+
+    if threads == 1:
+        used = [work(k) for k in range(n)]
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            used = list(pool.map(work, range(n)))
+    if 0 in used:
+        raise PhysicsError({k: "no profile could be followed" for k in range(n) if used[k] == 0})
+    first, total = problem.follow(best)
+    return best, {"first": first, "total": total}
+
+
 @compiled
 def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> SearchWorld:
     """The surroundings of world k, with room to work in; ``random`` [n]: the states of all worlds' random numbers."""
@@ -812,6 +773,30 @@ class Plan(NamedTuple):
 
     commands: Floats  # [T]
     states: Floats  # [T + 1, S] at the start of each step
+
+
+def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed: int = 0) -> tuple[Floats, Floats]:
+    """Search around ``commands_mps2`` [n, T] of the one controlled vehicle, with ``budget`` candidates per world.
+
+    Returns the commands found, never worse than the given ones, and their harm [n] under the problem's count, as
+    the engine counts it (m2/s2).
+    Worlds are independent of each other. Raises ``InvalidInput`` for several vehicles, commands of another shape or
+    beyond a capacity, or a budget below 1, ``PhysicsError`` naming worlds in which the given commands cannot be
+    played.
+    """
+    check_whole_number("budget", budget, 1)
+    n, steps = problem.n, int(problem.last_step.max(initial=0))
+    low, high = problem.bounds[:, :1, 0], problem.bounds[:, :1, 1]
+    if len(problem.vehicles) != 1 or commands_mps2.shape != (n, steps):
+        raise InvalidInput(f"refine: commands of shape {commands_mps2.shape}; ({n}, {steps}) of one vehicle are needed")
+    if not ((commands_mps2 >= low) & (commands_mps2 <= high)).all():
+        raise InvalidInput("refine: a command is beyond the vehicle's capacity")
+    best, first, total = commands_mps2.copy(), np.zeros(n), np.zeros(n)
+    failed = np.zeros(n, np.bool_)
+    _refine_worlds(problem, seeded(problem.identity, seed), budget, best, first, total, failed)
+    if failed.any():
+        raise PhysicsError({k: "its commands could not be played" for k in np.flatnonzero(failed).tolist()})
+    return best, np.where(problem.clock[:, CLOCK.HARM_IS_TOTAL] == 1.0, total, first)
 
 
 @compiled
@@ -960,8 +945,24 @@ def copy_steps(commands: Floats, to: Floats, first: int) -> None:
 
 # Random templates of a whole episode, of which the best one in each world is kept: brake fully, give way, brake again.
 #
-# They show how a world could be driven quite otherwise than a policy drives it (``search.refine`` climbs from the same
+# They show how a world could be driven quite otherwise than a policy drives it (``refine`` climbs from the same
 # ones). Nothing is improved: what does little harm as it was drawn stands on no edge, and a policy can imitate it.
+
+
+def best_templates(problem: ProfileProblem, bound: Floats, *, number: int, seed: int = 0) -> tuple[Floats, Ints]:
+    """The best of ``number`` templates below ``bound`` [n] (m2/s2) in each world, of the one controlled vehicle.
+
+    Returns its commands [n, T] (m/s2), and in how many steps it was played to its end [n]: 0 where none was below.
+    Each world draws its own; worlds are independent of each other. Raises ``InvalidInput`` for several vehicles, or
+    no template.
+    """
+    check_whole_number("templates", number, 1)
+    if len(problem.vehicles) != 1:
+        raise InvalidInput(f"templates: {len(problem.vehicles)} vehicles; they are of one")
+    commands = np.zeros((problem.n, int(problem.last_step.max(initial=0))))
+    steps = np.zeros(problem.n, np.int64)
+    _best_templates(problem, seeded(problem.identity, seed), bound, number, commands, steps)
+    return commands, steps
 
 
 @compiled

@@ -26,7 +26,7 @@ from ethbrake_marl.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics import CLOCK, Bools, Decisions, Floats, Ints, Worlds
 from ethbrake_marl.registry import Part
 from ethbrake_marl.scenario import Scenario
-from ethbrake_marl.search import TIME_STEP_S, ProfileProblem, Profiles, profile_problem
+from ethbrake_marl.search import TIME_STEP_S, ProfileProblem, Profiles, profile_problem, refine, search_profiles
 
 MOST_CANDIDATES = 1_000_000  # per world and decision
 
@@ -152,7 +152,7 @@ class Planner:
         commands = constants.commands_mps2.reshape(n, -1, K, 1)
         commands = np.concatenate([plan.commands_mps2[:, np.newaxis], commands], axis=1)
         given = Profiles(ends.reshape(-1, K), commands.reshape(-1, K, 1))
-        plan, harm = problem.search(given, budget=self._candidates, seed=0)
+        plan, harm = search_profiles(problem, given, budget=self._candidates, seed=0)
         return plan, harm[self._outlook.harm_count]
 
 
@@ -248,15 +248,15 @@ class BestHarm:
             worlds, vehicle, harm_count=outlook.harm_count, horizon_s=outlook.horizon_s, others_mps2=others
         )
         given = problem.constant(-coupled.deceleration_mps2[:, np.newaxis, np.newaxis])
-        found, harms = problem.search(given, budget=self._budget)
+        found, harms = search_profiles(problem, given, budget=self._budget)
         best = self._stepwise(found)
         if self._scenario is None or set(self._scenario.learners) - {vehicle}:
             return best, harms[outlook.harm_count]
         policy, steps = make_agent(START, scenario=self._scenario), int(problem.last_step.max())
         driven = record_commands(policy, worlds, self._scenario, vehicle, steps)
-        of_policy = problem.refine(driven, budget=1)[1]
+        of_policy = refine(problem, driven, budget=1)[1]
         better = (of_policy < harms[outlook.harm_count])[:, np.newaxis]
-        best[:, :steps], harm = problem.refine(np.where(better, driven, best[:, :steps]), budget=self._budget)
+        best[:, :steps], harm = refine(problem, np.where(better, driven, best[:, :steps]), budget=self._budget)
         return best, harm
 
     def _stepwise(self, profiles: Profiles) -> Floats:
@@ -310,7 +310,7 @@ class Searched(AgentAround):
         others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
         problem = self._outlook.problem(alert, vehicle, others)
         own = record_commands(self.policy, alert, self.scenario, vehicle, int(problem.last_step.max()))
-        commands, harm = problem.refine(own, budget=self._candidates)
+        commands, harm = refine(problem, own, budget=self._candidates)
         return {
             "commands_mps2": np.pad(commands, ((0, 0), (0, self._outlook.decisions - own.shape[1])), mode="edge"),
             "start_s": problem.clock[:, CLOCK.START].copy(),  # of the first decision

@@ -50,7 +50,7 @@ from ethbrake_marl.learning.training import (
 from ethbrake_marl.observations import Observations
 from ethbrake_marl.physics import Bools, Floats, Ints, Packed, Worlds, columns, compiled, exp, log
 from ethbrake_marl.policies import Activation, Actor, Float32s, Layers, NetworkSpec, Policy, load_named_policy
-from ethbrake_marl.search import profile_problem
+from ethbrake_marl.search import best_templates, profile_problem
 
 ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh}
 
@@ -1238,7 +1238,7 @@ def show_templates(engine: Engine, plan: ModesPlan, found: Explored, gamma: floa
         time_step_s=engine.scenario.time_step_s,
         others_mps2=found.start.wanted,
     )
-    commands, steps = problem.best_templates(found.harm, number=plan.templates, seed=seed)
+    commands, steps = best_templates(problem, found.harm, number=plan.templates, seed=seed)
     rows = np.flatnonzero(steps > 0)
     worlds = found.alert.take(rows).vehicles
     each = [command_to_action(commands[rows, t], worlds, vehicle) for t in range(commands.shape[1])]

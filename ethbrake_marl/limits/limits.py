@@ -55,7 +55,7 @@ from ethbrake_marl.physics import (
 )
 from ethbrake_marl.registry import Part
 from ethbrake_marl.scenario import Sample, Scenario, Task
-from ethbrake_marl.search import MOST_PHASES, Found, ProfileProblem, Profiles, profile_problem
+from ethbrake_marl.search import MOST_PHASES, Found, ProfileProblem, Profiles, profile_problem, search_profiles
 
 # Tables of best known harm: small files that are looked up by what a world is, never by its place in a list.
 
@@ -520,7 +520,7 @@ def _searched(
             commands = np.broadcast_to(least, (*alone.ends.shape, len(task.vehicles))).copy()
             commands[..., c] = alone.commands_mps2[..., 0]
             starts.append(Profiles(alone.ends, commands))
-    return problem.search(_joined(starts, problem.n), **effort)
+    return search_profiles(problem, _joined(starts, problem.n), **effort)
 
 
 def _startable(profiles: Profiles) -> Profiles:

@@ -9,7 +9,7 @@ from ethbrake_marl.agents import Searched, drive, make_agent, optimise_coupled, 
 from ethbrake_marl.agents.planner import Planner
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.harm import HARM_COUNTS
-from ethbrake_marl.search import profile_problem
+from ethbrake_marl.search import profile_problem, refine
 from tests.fixtures.asked import Asked
 
 SCENARIO = eb.load_scenario("paper-random")
@@ -103,14 +103,14 @@ def test_searched__where_nothing_is_better_drives_as_the_policy_does():
 def test_refine__is_a_function_of_the_world_and_the_seed(monkeypatch):
     problem = profile_problem(WORLDS, [1])
     given = np.repeat(-WORLDS.vehicles.braking_capacity_mps2[:, 1:2], int(problem.last_step.max()), axis=1)
-    found = problem.refine(given, budget=300)
+    found = refine(problem, given, budget=300)
     assert found[1].mean() < 0.5 * harm(make_agent("full_brake")).mean()
-    assert problem.refine(given, budget=300)[0].tobytes() == found[0].tobytes()
-    assert problem.refine(given, budget=300, seed=1)[0].tobytes() != found[0].tobytes()
+    assert refine(problem, given, budget=300)[0].tobytes() == found[0].tobytes()
+    assert refine(problem, given, budget=300, seed=1)[0].tobytes() != found[0].tobytes()
 
     def fail(*arguments):
         arguments[-1][4] = True
 
     monkeypatch.setattr(search, "_refine_worlds", fail)
     with pytest.raises(PhysicsError, match="world 4: its commands could not be played"):
-        problem.refine(given, budget=5)
+        refine(problem, given, budget=5)

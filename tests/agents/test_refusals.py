@@ -18,7 +18,7 @@ from ethbrake_marl.agents.policy import LearnedAgent
 from ethbrake_marl.agents.registry import Knowledge, Team, drive
 from ethbrake_marl.errors import AgentFailed, AlreadyExists, UnknownName
 from ethbrake_marl.observations import observe
-from ethbrake_marl.search import ProfileProblem, profile_problem
+from ethbrake_marl.search import ProfileProblem, best_templates, profile_problem, refine
 from tests.fixtures.asked import Asked
 from tests.refused import refused
 
@@ -122,19 +122,19 @@ SEARCHES: dict[str, Callable[[], object]] = {
         Asked(make_agent("constant:-7.5")).begin(WORLDS, 1).act(WORLDS, 1)
     ),
     "search: candidates = 0: must be a whole number in 1..1000000": lambda: Searched(BRAKE, PAPER, candidates=0),
-    "refine: commands of shape (3, 75); (12, 75) of one vehicle are needed": lambda: problem(1).refine(
-        np.zeros((3, 75)), budget=5
+    "refine: commands of shape (3, 75); (12, 75) of one vehicle are needed": lambda: refine(
+        problem(1), np.zeros((3, 75)), budget=5
     ),
-    "refine: a command is beyond the vehicle's capacity": lambda: problem(1).refine(
-        np.full((12, problem(1).last_step.max()), -50.0), budget=5
+    "refine: a command is beyond the vehicle's capacity": lambda: refine(
+        problem(1), np.full((12, problem(1).last_step.max()), -50.0), budget=5
     ),
-    "budget = 0: must be a whole number, at least 1": lambda: problem(1).refine(
-        np.zeros((12, problem(1).last_step.max())), budget=0
+    "budget = 0: must be a whole number, at least 1": lambda: refine(
+        problem(1), np.zeros((12, problem(1).last_step.max())), budget=0
     ),
-    "templates = 0: must be a whole number, at least 1": lambda: problem(1).best_templates(
-        np.full(12, np.inf), number=0
+    "templates = 0: must be a whole number, at least 1": lambda: best_templates(
+        problem(1), np.full(12, np.inf), number=0
     ),
-    "templates: 2 vehicles; they are of one": lambda: problem(1, 2).best_templates(np.full(12, np.inf), number=40),
+    "templates: 2 vehicles; they are of one": lambda: best_templates(problem(1, 2), np.full(12, np.inf), number=40),
     "vehicle 3: must be an index in 0..2": lambda: optimise_pairwise(WORLDS, 3),
     "deceleration_mps2[0, 1] = -1: must be finite and >= 0": lambda: pairwise_harm(WORLDS.take([0]), [1.0, -1.0, 1.0]),
     "team 't': 'vehicle_2': must be the index of a vehicle, 0 or more": lambda: Team({"vehicle_2": BRAKE}, "t"),

@@ -11,12 +11,14 @@ from unittest.mock import Mock
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.agents import planner
 from ethbrake_marl.cli import scenario as module
 from ethbrake_marl.evaluation.inputs import load_runnable
 from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.learning.training import TrainingRecipe, load_recipe
+from ethbrake_marl.limits import limits
 from ethbrake_marl.scenario import QUANTITY, Scenario, list_scenarios, load_scenario, parse_yaml
-from ethbrake_marl.search import ProfileProblem
+from ethbrake_marl.search import search_profiles
 from tests.cli.conftest import Answer, Command, check_refused, rows_of, told_json
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -26,8 +28,9 @@ ADD, OWN_DATA = ((ROOT / "docs" / f"{name}.md").read_text("utf-8") for name in (
 
 @pytest.mark.parametrize("script", ["planner", "planner:1000000", "best_harm", "best_harm:1000000"])
 def test_validate__trying_a_search_has_a_budget(ethbrake: Command, scenario_file, monkeypatch, script: str) -> None:
-    searched = Mock(side_effect=ProfileProblem.search)
-    monkeypatch.setattr(ProfileProblem, "search", lambda *given, **how: searched(*given, **how))
+    searched = Mock(side_effect=search_profiles)
+    for searching in (planner, limits):
+        monkeypatch.setattr(searching, "search_profiles", searched)
     monkeypatch.setattr(module, "TRIED_WORLDS", 5)
     path = scenario_file("\n  vehicle_3: full_brake\n", f"\n  vehicle_3: {script}\n")
     path.write_text(path.read_text().replace("early_impacts: reject", "early_impacts: keep"))

@@ -50,7 +50,7 @@ from ethbrake_marl.learning.algorithms import (
 from ethbrake_marl.learning.runs import TrainingDiverged, make_environment, make_model
 from ethbrake_marl.learning.training import ModesPlan
 from ethbrake_marl.policies import Actor, load_policy
-from ethbrake_marl.search import profile_problem
+from ethbrake_marl.search import best_templates, profile_problem
 from tests.learning.tiny import (
     MODES,
     TINY_COUNTERFACTUAL,
@@ -358,12 +358,12 @@ def test_stages__share_the_updates_and_leave_none_out() -> None:
 def test_templates__are_played_as_they_were_found_and_depend_on_no_batch() -> None:
     """In each world the best of its own templates; below the bound, or none."""
     problem, open_ended = profile_problem(SCENARIO.sample(40, 3).worlds, [1]), np.full(40, np.inf)
-    commands, steps = problem.best_templates(open_ended, number=40, seed=1)
+    commands, steps = best_templates(problem, open_ended, number=40, seed=1)
     assert (steps > 0).all() and (commands >= problem.bounds[:, :, 0]).all()
     some = np.array([7, 31])
-    assert np.array_equal(problem.take(some).best_templates(np.full(2, np.inf), number=40, seed=1)[0], commands[some])
-    assert not np.array_equal(problem.best_templates(open_ended, number=40, seed=2)[0], commands)
-    assert (problem.best_templates(np.zeros(40), number=40, seed=1)[1] == 0).all()  # no harm is below 0
+    assert np.array_equal(best_templates(problem.take(some), np.full(2, np.inf), number=40, seed=1)[0], commands[some])
+    assert not np.array_equal(best_templates(problem, open_ended, number=40, seed=2)[0], commands)
+    assert (best_templates(problem, np.zeros(40), number=40, seed=1)[1] == 0).all()  # no harm is below 0
 
 
 def test_shown__is_what_gains_more_than_every_network() -> None:

@@ -35,7 +35,7 @@ from ethbrake_marl.pages.report import avoidable_section, worst_section
 from ethbrake_marl.physics import Floats, Worlds, advance
 from ethbrake_marl.policies import load_shipped, shipped_policies
 from ethbrake_marl.scenario import Scenario, Task, group_of_scenarios, load_scenario
-from ethbrake_marl.search import Profiles, profile_problem
+from ethbrake_marl.search import Profiles, profile_problem, search_profiles
 from tests.docs.site import load
 from tests.failing_worlds import planted_list, without
 from tests.limits.worlds import line
@@ -66,7 +66,7 @@ def test_follow__hits_a_standing_car_with_the_closing_speed_computed_by_hand() -
     # 0.5 s of braking, then coasting: v^2 = 17.5^2 at the wall
     half = Profiles(np.array([[5, 80]]), np.array([[[-5.0], [0.0]]]))
     assert problem.follow(half)[0] == pytest.approx([17.5**2]) and total[0] >= first[0]
-    _, found = problem.search(problem.constant(np.array([[[2.0]]])), budget=2000)  # cannot beat full braking
+    _, found = search_profiles(problem, problem.constant(np.array([[[2.0]]])), budget=2000)  # cannot beat full braking
     assert found["first"] == pytest.approx([200.0], abs=1e-3)
 
 

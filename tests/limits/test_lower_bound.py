@@ -49,7 +49,7 @@ from ethbrake_marl.limits.lower_bound import (
 from ethbrake_marl.physics import Vehicles, Worlds, advance, make_worlds
 from ethbrake_marl.physics.kernel import solo_motion
 from ethbrake_marl.scenario import Task, load_scenario
-from ethbrake_marl.search import Profiles, profile_problem
+from ethbrake_marl.search import Profiles, profile_problem, search_profiles
 from tests.limits.worlds import (
     REGIONS,
     line,
@@ -206,7 +206,9 @@ def test_bound__is_never_above_a_searched_profile_in_any_region(region, obstacle
     assert np.all(any_time <= decided)
     for bound, harm_count, step in ((decided, "first", 0.1), (decided, "total", 0.1), (any_time, "first", 0.025)):
         problem = profile_problem(worlds, [1], harm_count=harm_count, horizon_s=60.0, time_step_s=step)
-        assert np.all(bound <= problem.search(problem.constant(problem.even_grid(9)), budget=budget)[1][harm_count])
+        assert np.all(
+            bound <= search_profiles(problem, problem.constant(problem.even_grid(9)), budget=budget)[1][harm_count]
+        )
 
 
 def bounded_and_found(region, n, budget, seed):
@@ -216,7 +218,7 @@ def bounded_and_found(region, n, budget, seed):
     for harm_count in ("first", "total"):
         problem = profile_problem(worlds, [1], harm_count=harm_count, horizon_s=20.0)
         tried = np.concatenate([problem.even_grid(9), np.zeros((worlds.n, 1, 1))], axis=1)
-        found = problem.search(problem.constant(tried), budget=budget)[1][harm_count]
+        found = search_profiles(problem, problem.constant(tried), budget=budget)[1][harm_count]
         yield lower_bound(worlds, harm_count=harm_count, horizon_s=20.0), found
 
 
@@ -672,7 +674,7 @@ def test_bound__does_not_depend_on_the_batch_or_the_order_of_the_vehicles():
 
 
 def searched(problem, harm_count, budget):
-    return problem.search(problem.constant(problem.even_grid(5)), budget=budget)[1][harm_count]
+    return search_profiles(problem, problem.constant(problem.even_grid(5)), budget=budget)[1][harm_count]
 
 
 def at_random(problem, rng, phases=8):
