@@ -30,6 +30,7 @@ from ethbrake_marl.learning import read_settings
 from ethbrake_marl.limits import (
     BestHarmTable,
     Unproven,
+    fold_episodes,
     prove,
     search_list,
     shipped_tables,
@@ -96,7 +97,7 @@ def search(given: argparse.Namespace, command: str) -> tuple[BestHarmTable, dict
         known=None if given.start is None else BestHarmTable.load(given.start),
     )  # fmt: skip
     for name in lineups[counts[0]]:
-        table = table.folded(chosen, sample.worlds, name, {each: lineups[each][name] for each in counts})
+        table = fold_episodes(table, chosen, sample.worlds, name, {each: lineups[each][name] for each in counts})
     header = {**table.header, "episodes": given.episodes, "list_seed": given.seed, "command": command}
     table = replace(table, header=header)
     figures: dict[str, object] = {key: value for key, value in header.items() if key != "after"}

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
         Unproven as Unproven,
         best_harm as best_harm,
         chunks_left as chunks_left,
+        fold_episodes as fold_episodes,
         known_limits as known_limits,
         prove as prove,
         scripted_commands as scripted_commands,

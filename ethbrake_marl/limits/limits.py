@@ -65,6 +65,8 @@ UNPACKED_LIMIT_BYTES = 256 << 20  # of its arrays
 DECODED_LIMIT = 1 << 26  # numbers of the profiles of one count, every world with as many phases as the longest
 TOLERANCE = 1e-6  # an agent must be this much (m2/s2) below the table to replace its value
 _ABOUT = ("scenario", "list_seed", "episodes", "vehicles")  # of the header, in an error
+LEFT_OUT = "left_out"  # key of a table's header: number in the list -> why the world is in no row
+LOWERED = "lowered_by"  # key of a table's header: agent -> count -> in how many worlds it did less harm
 _COUNTS: tuple[HarmCount, ...] = ("first", "total")
 
 
@@ -186,41 +188,6 @@ class BestHarmTable:
         kept.commands_mps2[at] = new.commands_mps2[better]
         return replace(self, best={**self.best, harm_count: BestKnown(new_harm, kept)}), better
 
-    def folded(self, scenario: Scenario, worlds: Worlds, name: str, agents: Mapping[HarmCount, Agent]) -> BestHarmTable:
-        """The table with the episodes of ``agents`` in it where they do less harm; its header says in how many worlds.
-
-        ``agents``: for each count, ``name`` made to minimise it. Each drives the scenario's learner through ``worlds``
-        (at t = 0; those that are known to end without harm are left out), and either count takes from either episode.
-        Harms are those of the profiles, driven again. Where an agent cannot drive a world to its end, the table stays
-        as it is. Raises ``InvalidInput`` if the scenario has not exactly one learner.
-        """
-        learners = [scenario.vehicle_names[i] for i in scenario.learners]
-        check_one_learner(scenario.name, learners, "agents whose episodes are kept drive exactly one")
-        task = Task(scenario, scenario.learners)
-        table, identity = self, task_problem(worlds, task).identity
-        known = np.max([table.harm(identity, harm_count) for harm_count in table.best], axis=0)
-        hard = np.flatnonzero(known > 0.0)
-        before = table.header.get(LOWERED, {})
-        lowered = {harm_count: before.get(name, {}).get(harm_count, 0) for harm_count in table.best}
-        if hard.size:
-            worlds, identity = worlds.take(hard), identity[hard]
-            problem = task_problem(worlds, task)
-            for agent in agents.values():
-
-                def work(at: Ints, agent: Agent = agent) -> Profiles:
-                    return driven_profiles(agent, worlds.take(at), task, problem.last_step[at])
-
-                profiles, rows, _ = leaving_out_failed(work, np.arange(worlds.n))
-                if profiles is None:
-                    continue
-                first, total = problem.take(rows).follow(profiles)
-                for harm_count in table.best:
-                    table, better = table.improved(
-                        identity[rows], harm_count, first if harm_count == "first" else total, profiles
-                    )
-                    lowered[harm_count] += int(better.sum())
-        return replace(table, header={**table.header, LOWERED: {**before, name: lowered}})
-
 
 def table_bytes(table: BestHarmTable) -> bytes:
     """The table as a compressed .npz without pickles: only the phases in use, bytes of like weight together."""
@@ -311,7 +278,6 @@ def _used(ends: NDArray[np.int64]) -> NDArray[np.int64]:
 
 SEARCH_BUDGET = 100_000  # candidates per world and count
 CHUNK = 200  # worlds between two reports of progress
-LEFT_OUT = "left_out"  # key of a table's header: number in the list -> why the world is in no row
 CONSTANTS = 29  # even grid of constant commands from which every search also starts
 
 Progress = Callable[[int, int], None]  # worlds done, of how many
@@ -545,8 +511,6 @@ def _joined(parts: list[Profiles], n: int) -> Profiles:
 
 # Episodes that agents drive, as profiles: what one does better than the best known becomes the best known.
 
-LOWERED = "lowered_by"  # key of a table's header: agent -> count -> in how many worlds it did less harm
-
 
 def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) -> Profiles:
     """What ``agent`` commands the vehicle in every step of its episodes, as profiles; equal neighbours are joined."""
@@ -558,6 +522,44 @@ def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) 
     padded = np.array([np.append(each, np.full(width - len(each), steps)) for each in ends])
     chosen = np.take_along_axis(commands, padded - 1, axis=1)
     return Profiles(np.minimum(padded, last_step[:, np.newaxis]), chosen[:, :, np.newaxis])
+
+
+def fold_episodes(
+    table: BestHarmTable, scenario: Scenario, worlds: Worlds, name: str, agents: Mapping[HarmCount, Agent]
+) -> BestHarmTable:
+    """The table with the episodes of ``agents`` in it where they do less harm; its header says in how many worlds.
+
+    ``agents``: for each count, ``name`` made to minimise it. Each drives the scenario's learner through ``worlds``
+    (at t = 0; those that are known to end without harm are left out), and either count takes from either episode.
+    Harms are those of the profiles, driven again. Where an agent cannot drive a world to its end, the table stays
+    as it is. Raises ``InvalidInput`` if the scenario has not exactly one learner.
+    """
+    learners = [scenario.vehicle_names[i] for i in scenario.learners]
+    check_one_learner(scenario.name, learners, "agents whose episodes are kept drive exactly one")
+    task = Task(scenario, scenario.learners)
+    identity = task_problem(worlds, task).identity
+    known = np.max([table.harm(identity, harm_count) for harm_count in table.best], axis=0)
+    hard = np.flatnonzero(known > 0.0)
+    before = table.header.get(LOWERED, {})
+    lowered = {harm_count: before.get(name, {}).get(harm_count, 0) for harm_count in table.best}
+    if hard.size:
+        worlds, identity = worlds.take(hard), identity[hard]
+        problem = task_problem(worlds, task)
+        for agent in agents.values():
+
+            def work(at: Ints, agent: Agent = agent) -> Profiles:
+                return driven_profiles(agent, worlds.take(at), task, problem.last_step[at])
+
+            profiles, rows, _ = leaving_out_failed(work, np.arange(worlds.n))
+            if profiles is None:
+                continue
+            first, total = problem.take(rows).follow(profiles)
+            for harm_count in table.best:
+                table, better = table.improved(
+                    identity[rows], harm_count, first if harm_count == "first" else total, profiles
+                )
+                lowered[harm_count] += int(better.sum())
+    return replace(table, header={**table.header, LOWERED: {**before, name: lowered}})
 
 
 # The tables of best known harm that travel with the package, and the agent that drives their profiles.

@@ -25,6 +25,7 @@ from ethbrake_marl.limits.limits import (
     BestHarmTable,
     best_harm,
     best_known,
+    fold_episodes,
     search_list,
     shipped_profiles,
     shipped_tables,
@@ -377,7 +378,9 @@ def test_best_harm_programme__takes_what_agents_do_better(tmp_path: Path) -> Non
         assert after.header["lowered_by"]["planner:60"][count] >= changed.sum()
         assert count == "first" or changed.sum() >= 1
         assert problem.follow(after.best[count].profiles)[k].tolist() == harm.tolist()
-    again = after.folded(SCENARIO, SCENARIO.sample(15, 7).worlds, "planner:60", {"first": make_agent("full_brake")})
+    again = fold_episodes(
+        after, SCENARIO, SCENARIO.sample(15, 7).worlds, "planner:60", {"first": make_agent("full_brake")}
+    )
     assert again.header["lowered_by"] == after.header["lowered_by"]  # what it lowered before stays counted
 
 
