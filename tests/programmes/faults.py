@@ -160,6 +160,7 @@ class Function(NamedTuple):
     words: frozenset[str]  # names and attributes that its body mentions
 
 
+@cache
 def functions_of(file: Path) -> list[Function]:
     """What a file defines: the module first, then what stands in it, each before its parts."""
     tree, place = ast.parse(file.read_text("utf-8")), file.relative_to(PACKAGE).as_posix()

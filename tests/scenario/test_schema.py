@@ -8,6 +8,7 @@ import copy
 import json
 import pickle
 import re
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +96,11 @@ def not_used(scenario: eb.Scenario) -> set[str]:
     return {*gaps, *speeds, *obstacle, *(key for key in chosen if getattr(scenario, key) is None)}
 
 
+@cache
+def editor() -> Draft202012Validator:
+    return Draft202012Validator(scenario_json_schema())
+
+
 @pytest.mark.parametrize("path", [entry.path for entry in eb.list_scenarios()], ids=lambda path: path.stem)
 def test_shipped__reads_back_by_name_path_and_folder_and_a_new_file_is_based_on_it(path: Path) -> None:
     scenario, folder = eb.load_scenario(path.stem), path.parent.name
@@ -109,9 +115,8 @@ def test_shipped__reads_back_by_name_path_and_folder_and_a_new_file_is_based_on_
     assert all(re.search(rf"^# .*\n(# )?{key}:", text, re.MULTILINE) for key in eb.Scenario.model_fields)
     assert {key for key in eb.Scenario.model_fields if f"\n# {key}:" in text} == not_used(scenario)
     assert not re.search(r"[ \t]$", text, re.MULTILINE)
-    editor = Draft202012Validator(scenario_json_schema())
     for content in (read_yaml(path).content, parse_yaml(text).content):
-        assert [error.message for error in editor.iter_errors(content)] == []
+        assert [error.message for error in editor().iter_errors(content)] == []
 
 
 def test_path__a_name_that_nobody_has_is_that_of_a_file_without_its_ending(
