@@ -40,11 +40,11 @@ def reproduce_command(
     """
     with Out(as_json=as_json, force=force, kept=KEPT) as out:
         from ethbrake_marl.studies.machine import this_machine
-        from ethbrake_marl.studies.reproduction import Reproduction
+        from ethbrake_marl.studies.reproduction import Reproduction, choose_items, make_items
 
         if quick and full:
             raise InvalidInput("--quick and --full: give one of the two")
-        chosen = Reproduction.choose(names or ())
+        chosen = choose_items(names or ())
         if listed:
             rows = [(item.name, ", ".join(item.labels), item.title) for item in chosen]
             known = {"Item": "name", "Label in the paper": "labels", "What": "title"}
@@ -59,7 +59,7 @@ def reproduce_command(
         out.note(asked.cost(chosen))
         if cost:
             return
-        results, finished = asked.make(chosen, force=out.force)
+        results, finished = make_items(asked, chosen, force=out.force)
         verdicts = [(result.name, result.verdict.outcome, result.verdict.because) for result in results]
         out.result([result.in_words() for result in results], Sheet("", ("Item", "Verdict", "Because"), verdicts))
         out.note(f"page: {output / 'index.html'}")

@@ -195,7 +195,7 @@ def ablate_command(
     ones go on. Writes ablation.html, ablation.md, ablation.csv, ablation.json and three figures.
     """
     with Out(as_json=as_json, kept=KEPT) as out:
-        from ethbrake_marl.studies.ablation import plan_ablation
+        from ethbrake_marl.studies.ablation import ablation_cost, plan_ablation, run_ablation
         from ethbrake_marl.studies.machine import this_machine
 
         plan = plan_ablation(
@@ -203,8 +203,8 @@ def ablate_command(
             episodes=episodes, search_episodes=search_episodes, shield=shield, folder=output,
         )  # fmt: skip
         plan.study_folder().check()
-        out.note(plan.cost())
-        written = plan.run(jobs or 1, str(this_machine()), out.show_progress)
+        out.note(ablation_cost(plan))
+        written = run_ablation(plan, jobs or 1, str(this_machine()), out.show_progress)
         if written is None:
             out.interrupted(f"interrupted; {KEPT}")
         found, (page, text, *figures) = written

@@ -1089,7 +1089,7 @@ class Training:
 
         A recipe's ``ppo@shipped`` stands for what ships for the scenario, if anything does.
         """
-        asked = self.recipe.start if isinstance(self.recipe, CounterfactualRecipe) else None
+        asked: str | None = getattr(self.recipe, "start", None)
         kind, _, path = (asked or "").partition("@")
         if path != SHIPPED:
             return asked
@@ -1100,9 +1100,9 @@ class Training:
     @property
     def begins(self) -> str | None:
         """What its weights begin as, in words; None where no recipe of its algorithm names a policy."""
-        if not isinstance(self.recipe, CounterfactualRecipe):
+        if "start" not in type(self.recipe).model_fields:
             return None
-        asked, name = self.recipe.start, self.scenario.name
+        asked, name = getattr(self.recipe, "start", None), self.scenario.name
         return self.start or f"random weights{'' if asked is None else f', as {asked} has none for scenario {name!r}'}"
 
     def content(self) -> dict[str, dict[str, Any]]:

@@ -23,7 +23,16 @@ from ethbrake_marl.learning.training import Scheme
 from ethbrake_marl.limits.limits import best_known
 from ethbrake_marl.scenario import Task, load_scenario
 from ethbrake_marl.studies import reproduction
-from ethbrake_marl.studies.reproduction import FULL_BRAKE, GAPS, ITEMS, NAMES, Reproduction, Result, checked_result
+from ethbrake_marl.studies.reproduction import (
+    FULL_BRAKE,
+    GAPS,
+    ITEMS,
+    NAMES,
+    Reproduction,
+    Result,
+    checked_result,
+    choose_items,
+)
 from tests.docs.site import DOCS, load
 from tests.fixtures.installed import write_metadata
 
@@ -231,7 +240,7 @@ def test_reproduction__every_figure_is_there_and_no_other() -> None:
 
 
 def test_reproduction__trajectories_and_full_braking_are_as_committed(tmp_path: Path) -> None:
-    (item,) = Reproduction.choose(["trajectories"])
+    (item,) = choose_items(["trajectories"])
     made, committed = item.make(Reproduction("quick", tmp_path)), RESULTS["trajectories"]
     assert made.verdicts == committed.comparisons
     (table,), (kept,) = made.tables, committed.tables

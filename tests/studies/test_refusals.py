@@ -14,7 +14,7 @@ from ethbrake_marl.scenario import load_scenario
 from ethbrake_marl.studies.ablation import Level, common_worlds, with_scheme
 from ethbrake_marl.studies.falsification import Measure, search
 from ethbrake_marl.studies.learning_curves import LearningCurves
-from ethbrake_marl.studies.reproduction import Reproduction, read_results, render_page
+from ethbrake_marl.studies.reproduction import Reproduction, make_items, open_folder, read_results, render_page
 from ethbrake_marl.studies.sweep import SweepPlan
 from ethbrake_marl.studies.tuning import TuningPlan
 from tests.fixtures.pictures import draw_nothing
@@ -331,8 +331,9 @@ def test_falsification__is_refused(message: str) -> None:
 
 def reproduced(figures: Any, changes: dict[str, Any]) -> dict[str, Any]:
     """A reproduction of one planted item, whose result on the disk was changed; its results."""
-    results, _ = Reproduction("quick", Path("out"), 24, machine="a machine").make(
-        [planted("gaps", lambda settings: made(figures=figures))]
+    results, _ = make_items(
+        Reproduction("quick", Path("out"), 24, machine="a machine"),
+        [planted("gaps", lambda settings: made(figures=figures))],
     )
     file = Path("out/gaps/result.json")
     file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))
@@ -368,8 +369,9 @@ def test_result__that_was_changed_is_made_again(where: str, changes: dict[str, A
     with refused(f"out/gaps/result.json: {where}: is not what a reproduction writes; make it again (--force)"):
         read_results(Path("out"))
     with refused(f"out/gaps/result.json: {where}: is not what a reproduction writes; make it again (--force)"):
-        Reproduction("quick", Path("out"), 24, machine="a machine").make(
-            [planted("harm-delays", lambda settings: made())]
+        make_items(
+            Reproduction("quick", Path("out"), 24, machine="a machine"),
+            [planted("harm-delays", lambda settings: made())],
         )
 
 
@@ -418,10 +420,10 @@ def test_reproduction__is_written_to_a_folder_of_its_own(empty_folder: Path) -> 
     Path("mine").mkdir()
     Path("link").symlink_to("mine")
     with refused("link: is no plain folder; give another (--output)"):
-        Reproduction("quick", Path("link"), 24).open_folder()
+        open_folder(Reproduction("quick", Path("link"), 24))
     Path("mine/thesis.txt").write_text("years of work")
     with refused("mine: is there already, and holds no reproduction; give another folder", AlreadyExists):
-        Reproduction("quick", Path("mine"), 24).open_folder(force=True).check()
+        open_folder(Reproduction("quick", Path("mine"), 24), force=True).check()
     assert Path("mine/thesis.txt").read_text() == "years of work"
     with refused("page.html: must end in .md"):
         Reproduction("quick", Path("out"), 24, docs=Path("page.html"))

@@ -36,12 +36,15 @@ from ethbrake_marl.studies.reproduction import (
     TrainedRecipe,
     Verdict,
     checked_result,
+    choose_items,
     compare_number,
     compare_rows,
     decrease_verdict,
     docs_page,
     judge_statement,
     lineup,
+    make_items,
+    open_folder,
     read_results,
     render_page,
     rows_table,
@@ -210,7 +213,7 @@ def test_item__has_verdicts_parameters_tables_and_data(made_of: dict[str, Made],
 
 def test_page__whatever_a_result_says_is_text_and_no_name_leads_elsewhere(settings: Reproduction) -> None:
     own = replace(settings, folder=settings.folder.parent / "<b>out</b>'\"; {{ 7 * 7 }}\u202e")
-    (result,), _ = own.make([planted("gaps", lambda s: made(HOSTILE))])
+    (result,), _ = make_items(own, [planted("gaps", lambda s: made(HOSTILE))])
     page, docs = (own.folder / "index.html").read_text("utf-8"), docs_page([result])
     assert "<script" not in page + docs and "&lt;script&gt;" in page and "\u202e" not in page + docs
     assert own.folder.name not in page and "data-episodes" not in page
@@ -226,9 +229,9 @@ def test_make__keeps_what_is_there_and_makes_it_again_by_force_or_for_other_sett
     calls = []
     items = [planted("gaps", lambda s: calls.append(1) or made())]
     for force, number in ((False, 1), (False, 1), (True, 2)):
-        settings.make(items, force=force)
+        make_items(settings, items, force=force)
         assert len(calls) == number
-    replace(settings, episodes=30).open_folder(force=True)
+    open_folder(replace(settings, episodes=30), force=True)
     assert read_results(settings.folder) == []
 
 
@@ -265,7 +268,7 @@ def hidden(folder: Path) -> list[Path]:
 
 
 def test_reproduce__writes_figures_data_results_docs_and_one_page(settings: Reproduction, tmp_path: Path) -> None:
-    results, finished = settings.make([planted("gaps", lambda s: made(figures=drawn()))])
+    results, finished = make_items(settings, [planted("gaps", lambda s: made(figures=drawn()))])
     assert finished and [each.name for each in results] == ["gaps"] and hidden(settings.folder) == []
     names = sorted(path.name for path in (settings.folder / "gaps").iterdir())
     assert names == ["a-figure.png", "a-figure.svg", "data.csv", "result.json"]
@@ -283,7 +286,7 @@ def test_pages__tell_everything_that_a_result_holds(settings: Reproduction) -> N
     """Their texts are those of the snapshot, also of a result of earlier versions, which tells no worlds."""
     sheet = Sheet("A table", ("Who", HARM), (("PPO", Estimate(1.5, (1.25, 1.75))),), "Of 24 worlds.")
     own = replace(settings, machine="a CPU, load 3.1, numpy 2.4.6")
-    (result,), _ = own.make([planted("gaps", lambda s: replace(made(), tables=(sheet,)))])
+    (result,), _ = make_items(own, [planted("gaps", lambda s: replace(made(), tables=(sheet,)))])
     content = {name: value for name, value in asdict(result).items() if name != "episodes"}
     earlier = Page(render_page(own.folder, [checked_result(content, "result.json", "gaps")]))
     page = Page((own.folder / "index.html").read_text("utf-8"))
@@ -301,11 +304,11 @@ def test_reproduce__an_interruption_leaves_whole_files_and_goes_on(settings: Rep
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        settings.make([planted("harm-delays", lambda s: made()), planted("gaps", stop)])
+        make_items(settings, [planted("harm-delays", lambda s: made()), planted("gaps", stop)])
     assert [each.name for each in read_results(settings.folder)] == ["harm-delays"]
     assert "A title" in (settings.folder / "index.html").read_text("utf-8")
     assert hidden(settings.folder) == []
-    results, _ = settings.make([planted("harm-delays", stop), planted("gaps", lambda s: made())])
+    results, _ = make_items(settings, [planted("harm-delays", stop), planted("gaps", lambda s: made())])
     assert [each.name for each in results] == ["harm-delays", "gaps"]
 
 
@@ -320,17 +323,17 @@ def test_full__trains_draws_and_keeps_what_is_trained(settings: Reproduction, mo
     monkeypatch.setattr(reproduction, "groups", lambda: groups)
     monkeypatch.setattr(reproduction, "CURVES", {"low": ("low",), "high": ("high",)})
     full = replace(settings, mode="full", episodes=5)
-    (item,) = Reproduction.choose(["learning-low"])
+    (item,) = choose_items(["learning-low"])
     small = replace(item, trained=("low", "high"))
     assert full.seconds_left(small.trained) == pytest.approx(2 * 1.024)
-    (result,), finished = full.make([small])
+    (result,), finished = make_items(full, [small])
     assert finished and result.trained == ["low/ppo", "high/ppo"] and full.seconds_left(small.trained) == 0.0
     assert [each.stem for each in result.figures] == ["learning-low-ours"]
     assert "1 seeds of ppo to 1,024 decisions" in result.notes[0] and "sac" in result.notes[1]
     (higher,) = [each for each in result.comparisons if each.what.startswith("both algorithms reach higher")]
     assert higher.outcome in ("agrees", "differs")
     before = {path: path.stat().st_mtime_ns for path in (full.folder / "trainings").rglob("run.json")}
-    full.make([small], force=True)
+    make_items(full, [small], force=True)
     assert before == {path: path.stat().st_mtime_ns for path in before} and len(before) == 2
 
 
@@ -341,11 +344,11 @@ def test_full__interrupted_makes_what_is_finished_and_an_item_again_when_more_is
     monkeypatch.setattr(Reproduction, "train", lambda *given: whole.pop(0))
     monkeypatch.setattr(Reproduction, "trained", lambda *given: trained)
     gaps = replace(planted("gaps", lambda s: calls.append(1) or made()), trained=("open",))
-    results, finished = full.make([gaps, planted("harm-delays", lambda s: made())])
+    results, finished = make_items(full, [gaps, planted("harm-delays", lambda s: made())])
     assert not finished and [each.name for each in results] == ["harm-delays", "gaps"]
     for more, number in (({}, 1), ({}, 1), ({"open/ppo-paper": []}, 2)):
         trained |= more
-        full.make([gaps])
+        make_items(full, [gaps])
         assert len(calls) == number
 
 
@@ -376,7 +379,7 @@ def course(returns: list[list[float]], harm: list[list[float]]) -> Course:
 
 @pytest.mark.slow
 def test_trajectories__are_watched_side_by_side(tmp_path: Path) -> None:
-    Reproduction("quick", tmp_path / "out", 10).make(Reproduction.choose(["trajectories"]))
+    make_items(Reproduction("quick", tmp_path / "out", 10), choose_items(["trajectories"]))
     page = (tmp_path / "out" / "index.html").read_text("utf-8")
     shown, text = Page(page), page.split('type="application/json"')[1].partition(">")[2]
     content = json.loads(text.partition("</script>")[0])
