@@ -321,8 +321,11 @@ def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE
         for which, agents in zip(("first", "second"), found.left_over, strict=True):
             if agents:
                 out.note(f"in the {which} only: {', '.join(agents)}")
-        for name, (one, other) in {**found.other_settings, **found.other_versions}.items():
-            out.note(f"note: {name} {one} in the first, {other} in the second")
+        for name, both in {**found.other_settings, **found.other_versions}.items():
+            if "SHA-256 " in f"{both[0]}{both[1]}":  # of a file; --json has the hashes
+                out.note(f"note: {name} {'was read for one of the two' if None in both else 'changed between the two'}")
+            else:
+                out.note(f"note: {name} {both[0]} in the first, {both[1]} in the second")
 
 
 def shield_command(

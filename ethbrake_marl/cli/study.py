@@ -114,19 +114,25 @@ def tune_command(
         plan = TuningPlan.read(file)
         plan.folder(output).check()
         if export is not None:  # raise now what would be raised at the end
-            if export.is_file():  # what this tuning wrote before is replaced: the same command goes on
-                out.force = out.force or export.read_bytes().startswith(plan.export_head(export).encode())
             if export.suffix != ".yaml":
                 raise InvalidInput(f"export {export}: must end in .yaml, as recipes do")
             plan.best_recipe({}, export, "")
+            out.force = out.force or plan.has_exported(output, export)  # the same command goes on
             out.check(export)
         if dry_run:
             own = plan.own_values()
             space = {key: dimension.model_dump(mode="json") for key, dimension in plan.file.search.items()}
             now = {key: "not in the space" if own is None else f"the recipe has {own[key]}" for key in space}
+            begun, steps, example = len(plan.proposals(output)), plan.recipe.total_steps, plan.example()
             out.result(
-                {"search": space, "own_values": own, "trials": trials},
+                {
+                    **{"search": space, "own_values": own, "trials": trials, "begun": begun, "total_steps": steps},
+                    **{"scenario": plan.file.scenario, "recipe": plan.file.recipe, "example": example},
+                },
+                f"{count_of(trials, 'trial')} ({begun:,} begun before): recipe {plan.file.recipe} in scenario"
+                f" {plan.file.scenario}, {steps:,} decisions each unless it is pruned",
                 *(f"{key}  {dimension}  ({now[key]})" for key, dimension in plan.file.search.items()),
+                f"{'the first' if own else 'for example'}: {example}",
             )
             return
         need("ray")
@@ -135,8 +141,11 @@ def tune_command(
         told, best, shown, lines = f"trials: {counted or 'none'}; table: {result.table}", result.best, None, []
         export = None if best is None or result.interrupted else export  # what goes on exports at its end
         if best is not None:
-            shown = {"trial": best.number, "harm": best.harm, "values": best.values}
-            lines = [f"best: trial {best.number}, {best.harm:.4f}", *(f"  {k} = {v}" for k, v in best.values.items())]
+            measure = learning.RunDirectory.chosen_by([best.figures], plan.recipe.reward.harm_count)
+            shown = {"trial": best.number, "measure": measure, "harm": best.harm, "values": best.values}
+            unit = "" if measure == learning.RunDirectory.OBJECTIVE else " m²/s²"  # injuries have another one
+            lines = [f"best: trial {best.number}, {measure} {best.harm:.4f}{unit}"]
+            lines += [f"  {key} = {value}" for key, value in best.values.items()]
             if export is not None:
                 source = f"trial {best.number}, {best.harm!r} on the list of seed {plan.file.measure.seed}"
                 out.write(export, plan.best_recipe(best.values, export, f"ethbrake study tune: {source}"))
