@@ -335,9 +335,9 @@ def split_specs(text: str) -> list[str]:
 
 
 def _is_one_spec(text: str) -> bool:
-    core, _ = _strip_around(text)
+    core, around = _strip_around(text)
     head, _, path = core[len(_existing_file(core)) :].partition("@")
-    return "," not in head and ("," not in path or os.path.lexists(path))
+    return "," not in "".join([head, *around]) and ("," not in path or os.path.lexists(path))
 
 
 def _existing_file(core: str) -> str:

@@ -214,8 +214,9 @@ class Installed(TyperCommand):
     """A command of an installed package, which is loaded when it is called."""
 
     def __init__(self, name: str) -> None:
-        of = " and ".join(giver(point) for point in points(COMMANDS.group)[name])
-        super().__init__(name, help=f"Of the installed package {of}.", rich_markup_mode=None)
+        givers = [giver(point) for point in points(COMMANDS.group)[name]]
+        packages = f"package{'s' if len(givers) > 1 else ''} {' and '.join(givers)}"
+        super().__init__(name, help=f"Of the installed {packages}.", rich_markup_mode=None)
 
     def make_context(self, *given: Any, **settings: Any) -> Any:
         """The context of the command itself."""
