@@ -90,10 +90,10 @@ def evaluate_command(
     """Compare agents on the same fixed list of worlds.
 
     `ethbrake agent list` says who can drive; ladder stands for all of them from coast to best_harm. Behind any agent:
-    +search, then one shield, +episode or +step (+robust, whose uncertainty is given in Python, is for Python alone);
-    for instance full_brake+step or ppo@PATH+search+episode.
-    PATH is a run or a policy bundle, or shipped. With --set harm_count=total agents minimise the harm of all impacts,
-    not that of first impacts only. --set measures=injury,my_file.py:worst shows these beside the usual ones.
+    +search, then one shield, +episode or +step; for instance full_brake+step or ppo@PATH+search+episode.
+    PATH is a run or a policy bundle, or shipped. +robust needs an uncertainty, which is given in Python;
+    +robust:believed needs none. With --set harm_count=total agents minimise the harm of all impacts, not that of first
+    impacts only. --set measures=injury,my_file.py:worst shows these beside the usual ones.
     """
     from ethbrake_marl.agents import split_specs
 

@@ -55,7 +55,7 @@ class Lineup:
         agents: specs, as on the command line.
         scenario: whose learners they drive.
         harm_count: harm that agents minimise.
-        uncertainty: what agents behind ``+robust`` do not know, as on the command line.
+        uncertainty: what agents behind ``+robust`` do not know, as ``parse_uncertainty`` reads it.
         measures: that evaluations tell, too, as ``load_measures`` takes them; with those that it was given before.
         told: names of all measures that evaluations tell, whatever is registered later.
         same: what must be the same in every process; see ``Lineup.of``.

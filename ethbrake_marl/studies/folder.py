@@ -47,8 +47,8 @@ class StudyFolder:
     def check(self) -> bool:
         """Whether the record of the question is still to be written; makes nothing.
 
-        Raises ``InvalidInput`` for what is no folder, cannot be written to (or one of its files), or answers another question, with what
-        differs; ``AlreadyExists`` for a folder of something else.
+        Raises ``InvalidInput`` for what is no folder, cannot be written to (nor one of ``writes``), or answers another
+        question, with what differs; ``AlreadyExists`` for a folder of something else.
         """
         check_folder(self.path, self._writes, force=True)
         if self._question is None:
