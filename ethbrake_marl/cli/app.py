@@ -137,14 +137,10 @@ def prepare_streams() -> None:
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
-    if sys.stdout is not None and sys.stdout is sys.__stdout__ and sys.stderr is not None:
-        how = {
-            "encoding": sys.stdout.encoding,
-            "errors": "replace",
-            "buffering": 1 if sys.stdout.line_buffering else -1,
-        }
-        sys.stdout = os.fdopen(os.dup(1), "w", **how)
-        os.dup2(2, 1)
+        if sys.stdout is sys.__stdout__ and sys.stderr is not None:
+            buffering = 1 if sys.stdout.line_buffering else -1
+            sys.stdout = os.fdopen(os.dup(1), "w", buffering, sys.stdout.encoding, "replace")
+            os.dup2(2, 1)
     shown = warnings.showwarning
 
     def show_warning(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
