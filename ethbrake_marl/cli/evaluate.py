@@ -93,9 +93,10 @@ def evaluate_command(
     """Compare agents on the same fixed list of worlds.
 
     `ethbrake agent list` says who can drive; ladder stands for all of them from coast to best_harm. Behind any agent:
-    +search, then one shield, +episode, +step or +robust; for instance full_brake+step or ppo@PATH+search+episode.
-    PATH is a run or a policy bundle, or shipped. With --set harm_count=total agents minimise the harm of all impacts,
-    not that of first impacts only. --set measures=injury,my_file.py:worst shows these beside the usual ones.
+    +search, then one shield, +episode or +step; for instance full_brake+step or ppo@PATH+search+episode.
+    PATH is a run or a policy bundle, or shipped. +robust needs an uncertainty, which is given in Python;
+    +robust:believed needs none. With --set harm_count=total agents minimise the harm of all impacts, not that of first
+    impacts only. --set measures=injury,my_file.py:worst shows these beside the usual ones.
     """
     from ethbrake_marl.agents import split_specs
 
@@ -115,7 +116,7 @@ def evaluate_command(
             split_specs(agents), task.scenario, harm_count=task.harm_count, measures=given.measures
         )
         _tell_shipped(lineup.make())
-        used = {"harm_count": task.harm_count, "uncertainty": None}
+        used = {"harm_count": task.harm_count}
         seed = evaluation.LIST_SEED if seed is None else seed
         episodes = evaluation.EPISODES if episodes is None else episodes
         if episodes > evaluation.HELD and not (per_world or report):

@@ -232,6 +232,14 @@ class Evaluation:
             f" by {', '.join(drivers)})"
         )
 
+    def telling(self, names: Collection[str]) -> Evaluation:
+        """The same, of registered measures with these alone."""
+        outcomes = {}
+        for agent, outcome in self.outcomes.items():
+            kept = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
+            outcomes[agent] = replace(outcome, metrics=kept)
+        return replace(self, outcomes=outcomes)
+
     @property
     def vehicle(self) -> int:
         """The vehicle that was driven; raises ``InvalidInput`` if it is not exactly one."""
@@ -1090,6 +1098,7 @@ def register_measure(name: str, function: EpisodeFunction, *, unit: str = "1") -
 
 MEASURES: Registry[_Registered] = Registry("measure", "measures", register_measure)
 REGISTERED = MEASURES.loaded  # those that every evaluation tells
+LOADED: dict[str, None] = {}  # names that ``load_measures`` was given, in order
 
 
 def load_measures(names: Iterable[str]) -> None:
@@ -1106,6 +1115,7 @@ def load_measures(names: Iterable[str]) -> None:
             register_measure(own, *given, **settings)
         else:
             MEASURES.load(name)
+        LOADED[name] = None
 
 
 def _injury(curve: str, rule: Literal["", "_vehicle", "_every"]) -> EpisodeFunction:

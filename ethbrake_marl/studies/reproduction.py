@@ -330,8 +330,9 @@ class Reproduction:
             write_file(path / _SETTINGS, _text({**_FORMAT, **question}))
         advice = "give another folder (--output), or replace it with force (--force)"
         return StudyFolder(
-            path, "reproduction", question, record=_SETTINGS, more=_FORMAT, advice=advice, beside=("trainings",)
-        )
+            path, "reproduction", question, record=_SETTINGS, more=_FORMAT, advice=advice, beside=("trainings",),
+            writes=("index.html",),
+        )  # fmt: skip
 
     def make(self, items: Sequence[Item], *, force: bool = False) -> tuple[list[Result], bool]:
         """Make the items; gives every result that the folder then holds, and whether nothing stopped the trainings.

@@ -109,7 +109,7 @@ class Range(FileModel):
         return FloatDistribution(float(self.low), float(self.high), log=self.log)
 
     def stored(self, value: Any) -> Any:
-        """A value as the storage has it: as it is."""
+        """A value as Optuna has it: as it is."""
         return value
 
     value = stored
@@ -148,11 +148,11 @@ class Choices(FileModel):
         return CategoricalDistribution([*map(flow_text, self.choices)])
 
     def stored(self, value: Any) -> str:
-        """A value as the storage has it: its text, for a storage keeps no lists."""
+        """A value as Optuna has it: its text, for Optuna chooses among no lists."""
         return flow_text(value)
 
     def value(self, stored: Any) -> Any:
-        """What the storage has as a value."""
+        """What Optuna has as a value."""
         return {flow_text(value): value for value in self.choices}[stored]
 
 
@@ -379,7 +379,7 @@ class TuningPlan:
 
     def folder(self, path: Path) -> StudyFolder:
         """The folder, which no other tuning may have."""
-        return StudyFolder(path, "a tuning", self.question, record="tuning.json")
+        return StudyFolder(path, "a tuning", self.question, record="tuning.json", writes=(TABLE,))
 
     def proposals(self, path: Path) -> list[Values]:
         """What was proposed in a folder, as Optuna has it; raises ``InvalidInput`` unless it is all in the space."""

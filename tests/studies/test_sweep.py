@@ -122,6 +122,23 @@ def test_table__of_a_run_that_is_damaged_is_named(again, capsys, damage: bytes) 
     assert f"{damaged}: is damaged (" in told and told.endswith("; delete its folder to train anew")
 
 
+def test_run__of_another_training_is_not_done(again, capsys) -> None:
+    file, folder = again
+    other = sorted((folder / "runs").iterdir())[0] / "config.json"
+    config = json.loads(other.read_text())
+    other.write_text(json.dumps({**config, "recipe": {**config["recipe"], "gamma": 0.9}}))
+    assert sweep(file, folder) == 2
+    (told,) = capsys.readouterr().err.splitlines()
+    assert f"{other.parent}: holds another training (here other: recipe gamma); give another folder" in told
+
+
+@pytest.mark.parametrize("name", [TABLE, "failures.csv"])
+def test_file__that_cannot_be_written_at_the_end_is_told_at_once(write_sweep, tmp_path, capsys, name: str) -> None:
+    (tmp_path / "out" / name).mkdir(parents=True)
+    assert sweep(write_sweep(grid=GRID), tmp_path / "out") == 2
+    assert f"{name}: is a folder; give the name of a file" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_team__that_has_lost_a_policy_is_trained_again(write_sweep: Write, tiny: Path, tmp_path: Path) -> None:
     pytest.importorskip("ray")
