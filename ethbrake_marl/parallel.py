@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import signal
 import sys
 import threading
 import time
@@ -59,7 +60,7 @@ def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = N
         from joblib import Parallel, delayed, parallel_config
         from joblib.externals.loky.process_executor import BrokenProcessPool
     work = (delayed(_answer)(pickle.dumps(call)) for call in calls)
-    with _backend(ray, jobs) as (backend, at_once):
+    with _backend(ray, jobs) as (backend, at_once), _sigterm_as_ctrl_c():
         with parallel_config(**backend):
             parallel = Parallel(at_once, batch_size=1, return_as="generator" if ray is None else "list")
         if ray is not None:  # its backend gives lists
@@ -95,6 +96,20 @@ def _end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, args=(os.getppid(),), daemon=True).start()
+
+
+@contextmanager
+def _sigterm_as_ctrl_c() -> Iterator[None]:
+    """Nothing of joblib is left behind when a signal ends the process, unless somebody else answers the signal."""
+    before = signal.getsignal(signal.SIGTERM)
+    if threading.current_thread() is not threading.main_thread() or before is not signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager

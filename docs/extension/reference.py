@@ -56,7 +56,7 @@ def sections(**parts: str) -> str:
 def command_line() -> str:
     """Every command: what its help page says, in the order of ``ethbrake --help``."""
     whole = whole_command()
-    return "\n".join(_commands(whole, whole.context_class(whole, info_name="ethbrake"), 2))
+    return "\n".join(_commands(whole, whole.context_class(whole, info_name="ethbrake", **whole.context_settings), 2))
 
 
 def _commands(group: Any, context: Any, level: int) -> Iterator[str]:

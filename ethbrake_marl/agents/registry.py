@@ -20,7 +20,7 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 import numpy as np
 
 from ethbrake_marl.engine import Engine, Guard, Memory, Script, ask_script, begin_script, is_state_free
-from ethbrake_marl.errors import EthBrakeError, InvalidInput, PhysicsError, describe_error, unknown_name
+from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, PhysicsError, describe_error, unknown_name
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.harm import HarmCount, Ledger, check_harm_count
 from ethbrake_marl.physics import Bools, Floats, Worlds
@@ -335,9 +335,9 @@ def split_specs(text: str) -> list[str]:
 
 
 def _is_one_spec(text: str) -> bool:
-    core, _ = _strip_around(text)
+    core, around = _strip_around(text)
     head, _, path = core[len(_existing_file(core)) :].partition("@")
-    return "," not in head and ("," not in path or os.path.lexists(path))
+    return "," not in "".join([head, *around]) and ("," not in path or os.path.lexists(path))
 
 
 def _existing_file(core: str) -> str:
@@ -569,9 +569,9 @@ def find_entry(spec: AgentSpec | str) -> Entry:
     if written.file is not None:
         return Entry(f"{written.name}[:ARGUMENT][@POLICY]", "your own", Source.UNSTATED, make_from_file)
     if written.name not in _AGENTS:
-        if written.name in ("ladder", "field"):
+        if written.name in _SEVERAL:
             raise InvalidInput(f"agent {written.core!r}: stands for several agents in --agents; here one is needed")
-        raise _AGENTS.unknown(written.name, {*agent_names(), "ladder", "field"})
+        raise _AGENTS.unknown(written.name, {*agent_names(), *_SEVERAL})
     entry = _AGENTS[written.name]
     if written.argument is not None and ":" not in entry.form:
         raise InvalidInput(f"agent {written.core!r}: {written.name} takes no argument")
@@ -642,6 +642,8 @@ def register_agent(
     """
     if parse_spec(name) != AgentSpec(name, None, None, ()):
         raise InvalidInput(f"agent name {name!r}: must be a plain name without argument")
+    if name in _SEVERAL:
+        raise AlreadyExists(f"agent {name!r}: stands for several agents in --agents; give another name")
     form = f"{name}[:ARGUMENT]{'[@POLICY]' * takes_policy}" if form is None else form
     _AGENTS.add(name, Entry(form, about, knows, factory), lambda entry: entry.make is factory)
 
@@ -682,6 +684,7 @@ def register_shield(
 
 _PLAIN = re.compile(r"[a-z][a-z0-9_.-]*")
 _PROFILE = "profile"  # a role of scenarios alone
+_SEVERAL = ("ladder", "field")  # stand for several agents in ``--agents``
 _AGENTS: Registry[Entry] = Registry("agent", "agents", register_agent)
 _SHIELDS: Registry[Entry] = Registry("shield or search", "shields", register_shield)
 

@@ -22,7 +22,7 @@ from typer.main import get_command
 from ethbrake_marl import __version__
 from ethbrake_marl.cli import doctor, evaluate, reproduce, scenario, study, train, watch
 from ethbrake_marl.cli.command import EVERY_S, Out, example
-from ethbrake_marl.errors import AlreadyExists, EthBrakeError, naming_extras
+from ethbrake_marl.errors import AlreadyExists, EthBrakeError, describe_error, naming_extras
 from ethbrake_marl.kernel_store import is_temporary, on_first_compilation
 from ethbrake_marl.registry import Registry, giver, points
 
@@ -105,6 +105,10 @@ def run_command(arguments: Sequence[str]) -> int:
         return _refuse(f"{error.filename or 'output'!s:.200}: {error.strerror or error}")
     except MemoryError as error:
         return _refuse(f"not enough memory{f' ({error})' if str(error) else ''}; ask for fewer worlds at once")
+    except (Exception, KeyboardInterrupt):
+        raise
+    except BaseException as error:  # GeneratorExit and its like, which nothing of ours raises
+        return _refuse(f"code of yours ended the process: {describe_error(error)}")
     return status if isinstance(status, int) else 0
 
 
@@ -128,10 +132,15 @@ def _refuse(reason: str) -> int:
 def prepare_streams() -> None:
     """Show ``?`` for what stdout's encoding does not have (m², box lines in Latin-1) instead of failing at the end.
 
+    What writes past Python to file descriptor 1, here or in a process that is begun here, writes to stderr.
     The package's own warnings are one line each, and one says why the first command takes longer.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
+        if sys.stdout is sys.__stdout__ and sys.stderr is not None:
+            buffering = 1 if sys.stdout.line_buffering else -1
+            sys.stdout = os.fdopen(os.dup(1), "w", buffering, sys.stdout.encoding, "replace")
+            os.dup2(2, 1)
     shown = warnings.showwarning
 
     def show_warning(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
@@ -214,8 +223,9 @@ class Installed(TyperCommand):
     """A command of an installed package, which is loaded when it is called."""
 
     def __init__(self, name: str) -> None:
-        of = " and ".join(giver(point) for point in points(COMMANDS.group)[name])
-        super().__init__(name, help=f"Of the installed package {of}.", rich_markup_mode=None)
+        givers = [giver(point) for point in points(COMMANDS.group)[name]]
+        packages = f"package{'s' if len(givers) > 1 else ''} {' and '.join(givers)}"
+        super().__init__(name, help=f"Of the installed {packages}.", rich_markup_mode=None)
 
     def make_context(self, *given: Any, **settings: Any) -> Any:
         """The context of the command itself."""

@@ -28,27 +28,26 @@ ScenarioOption = Annotated[
 ]
 RecipeOption = Annotated[str, typer.Option(metavar="NAME|PATH", help="A shipped recipe, or a path to a YAML file.")]
 SettingsOption = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Another value of a key: mass_t=40. Repeatable.")
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Set a key to another value: mass_t=40. Repeatable."),
 ]
 StepsOption = Annotated[
     int | None,
     typer.Option(help="Training steps (decisions), rounded up to whole updates.", show_default="the recipe's"),
 ]
 AgentsOption = Annotated[
-    str, typer.Option(metavar="A,B,...", help="Who drives, with commas between them: `ethbrake agent list`.")
+    str, typer.Option(metavar="A,B,...", help="Agents, separated by commas; `ethbrake agent list` shows all.")
 ]
 SeedOption = Annotated[int, typer.Option(help="Seed of the list.")]
-JobsOption = Annotated[
-    int | None, typer.Option(help="So many at once, a process each; changes no result.", min=1, max=64)
-]
+JobsOption = Annotated[int | None, typer.Option(help="Processes at once; changes no result.", min=1, max=64)]
 RayOption = Annotated[
-    str | None, typer.Option(metavar="local|ADDRESS", help="Do the work on Ray, not in processes of our own.")
+    str | None, typer.Option(metavar="local|ADDRESS", help="Work on Ray: on this machine, or on a running cluster.")
 ]
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace what is already there.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON, and nothing else, on stdout.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the results as JSON, and nothing else, on stdout.")]
 
 
-def schema_option(module: str, model: str) -> Any:
+def schema_option(module: str, model: str, kind: str) -> Any:
     """The option ``--schema`` of a command that reads files of one kind: print their JSON Schema and exit."""
 
     def show_schema(asked: bool) -> None:
@@ -56,7 +55,7 @@ def schema_option(module: str, model: str) -> Any:
             Out().print_json(getattr(import_module(module), model).json_schema())
             raise typer.Exit
 
-    told = "Print the JSON Schema of the file, and exit."
+    told = f"Print the JSON Schema of {kind} files, and exit."
     return Annotated[bool, typer.Option("--schema", is_eager=True, callback=show_schema, help=told)]
 
 

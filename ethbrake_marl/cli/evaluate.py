@@ -77,10 +77,13 @@ def evaluate_command(
     ] = None,
     per_world: Annotated[
         Literal["csv", "parquet"] | None,
-        typer.Option(help="Write one row per world and agent, too: worlds.csv or worlds.parquet."),
+        typer.Option(help="With --output: also write a row per world and agent, worlds.csv or worlds.parquet."),
     ] = None,
     report: Annotated[
-        bool, typer.Option("--report", help="Write a page with tables, figures and episodes, too: report.html.")
+        bool,
+        typer.Option(
+            "--report", help="With --output: also write a page with tables, figures and episodes, report.html."
+        ),
     ] = False,
     jobs: JobsOption = None,
     ray: RayOption = None,
@@ -90,9 +93,10 @@ def evaluate_command(
     """Compare agents on the same fixed list of worlds.
 
     `ethbrake agent list` says who can drive; ladder stands for all of them from coast to best_harm. Behind any agent:
-    +search, then one shield, +episode, +step or +robust; for instance full_brake+step or ppo@PATH+search+episode.
-    PATH is a run or a policy bundle, or shipped. With --set harm_count=total agents minimise the harm of all impacts,
-    not that of first impacts only. --set measures=injury,my_file.py:worst shows these beside the usual ones.
+    +search, then one shield, +episode or +step; for instance full_brake+step or ppo@PATH+search+episode.
+    PATH is a run or a policy bundle, or shipped. +robust needs an uncertainty, which is given in Python;
+    +robust:believed needs none. With --set harm_count=total agents minimise the harm of all impacts, not that of first
+    impacts only. --set measures=injury,my_file.py:worst shows these beside the usual ones.
     """
     from ethbrake_marl.agents import split_specs
 
@@ -112,7 +116,7 @@ def evaluate_command(
             split_specs(agents), task.scenario, harm_count=task.harm_count, measures=given.measures
         )
         _tell_shipped(lineup.make())
-        used = {"harm_count": task.harm_count, "uncertainty": None}
+        used = {"harm_count": task.harm_count}
         seed = evaluation.LIST_SEED if seed is None else seed
         episodes = evaluation.EPISODES if episodes is None else episodes
         if episodes > evaluation.HELD and not (per_world or report):
@@ -299,11 +303,13 @@ def _write_report(
     out.note(f"report: {path}")
 
 
-_FILE = typer.Argument(metavar="RESULTS.json", help="Results of evaluate, shield (--json) or run.")
+_FILE = typer.Argument(
+    metavar="RESULTS.json", help="results.json of evaluate or run, or what evaluate or shield --json printed."
+)
 
 
 def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE], as_json: JsonOption = False) -> None:
-    """Tell the difference of harm between two results.
+    """Show how harm differs between two results.
 
     The second minus the first, for agents of the same name. Both must be of one command, and about the same worlds of
     the same scenario. Intervals are paired by world where the files of --per-world lie beside both results.
@@ -321,8 +327,11 @@ def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE
         for which, agents in zip(("first", "second"), found.left_over, strict=True):
             if agents:
                 out.note(f"in the {which} only: {', '.join(agents)}")
-        for name, (one, other) in {**found.other_settings, **found.other_versions}.items():
-            out.note(f"note: {name} {one} in the first, {other} in the second")
+        for name, both in {**found.other_settings, **found.other_versions}.items():
+            if "SHA-256 " in f"{both[0]}{both[1]}":  # of a file; --json has the hashes
+                out.note(f"note: {name} {'was read for one of the two' if None in both else 'changed between the two'}")
+            else:
+                out.note(f"note: {name} {both[0]} in the first, {both[1]} in the second")
 
 
 def shield_command(
@@ -334,9 +343,9 @@ def shield_command(
 ) -> None:
     """Compare agents without and behind the shield.
 
-    No shield, episode mode and step mode, on the same worlds. The agents propose, without a shield of their own. The
-    harm of first impacts is guaranteed; with --set harm_count=total that of all. Where several vehicles learn: no
-    shield, step mode, and step mode with caps, for the whole team. Each decision that step mode replaced is simulated
+    They drive the same worlds without a shield, in episode mode and in step mode; name them without a shield. The
+    shield bounds first-impact harm; with --set harm_count=total, total harm. Where several vehicles learn: no shield,
+    step mode, and step mode with caps, for the whole team. Each decision that step mode replaced is simulated
     again without it: needed (harm would have been higher), harmless (the same), costly (lower).
     """
     with Out(as_json=as_json) as out:

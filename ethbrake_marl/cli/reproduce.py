@@ -17,26 +17,31 @@ PAPER_EPISODES = 10_000
 
 def reproduce_command(
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="[ITEM ...]", help="What to make.", show_default="everything")
+        list[str] | None,
+        typer.Argument(
+            metavar="ITEM", help="Figures and tables to make; --list names them.", show_default="everything"
+        ),
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Train nothing: shipped policies (the default).")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Train nothing, use shipped policies (the default).")] = False,
     full: Annotated[bool, typer.Option("--full", help="Train learning curves and a policy stopped early.")] = False,
-    output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of everything.")] = Path("runs/reproduction"),
+    output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")] = Path("runs/reproduction"),
     episodes: Annotated[
         int, typer.Option(help="The most worlds of any list; the paper has 10,000.", min=2, max=PAPER_EPISODES)
     ] = PAPER_EPISODES,
     docs: Annotated[
-        Path | None, typer.Option(metavar="FILE.md", help="Write the results as Markdown, too, figures beside it.")
+        Path | None, typer.Option(metavar="FILE.md", help="Also write the results as Markdown, figures beside it.")
     ] = None,
-    cost: Annotated[bool, typer.Option("--cost", help="Say what is left to do and what it takes; stop.")] = False,
-    listed: Annotated[bool, typer.Option("--list", help="List the items; stop.")] = False,
+    cost: Annotated[
+        bool, typer.Option("--cost", help="Print what is left to do and how long it takes, and exit.")
+    ] = False,
+    listed: Annotated[bool, typer.Option("--list", help="List the items, and exit.")] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Make the paper's figures and tables again.
 
     Says what agrees, what differs and what cannot agree. Writes one page (index.html), and for each item its figures,
-    its data and its result. Says first what it will take. The same command goes on after an interruption.
+    its data and its result. Prints first how long it will take. The same command goes on after an interruption.
     """
     with Out(as_json=as_json, force=force, kept=KEPT) as out:
         from ethbrake_marl.studies.machine import this_machine

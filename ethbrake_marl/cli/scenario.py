@@ -22,7 +22,9 @@ MOST_RANGES = 8  # that it tells apart
 SCREEN = 24  # lines
 TABLE_WORLDS, PICTURE_WORLDS = 10, 1000  # by `scenario sample`
 
-NameArgument = Annotated[str, typer.Argument(metavar="NAME|PATH")]
+NameArgument = Annotated[
+    str, typer.Argument(metavar="NAME|PATH", help="A shipped or registered scenario, or a path to a YAML file.")
+]
 
 scenario_group = typer.Typer(
     help="Look at scenarios, check one, start one, draw worlds.",
@@ -47,7 +49,7 @@ def scenario_list(as_json: JsonOption = False) -> None:
 
 @scenario_group.command("show", epilog=example("scenario show paper-random"))
 def scenario_show(scenario: NameArgument) -> None:
-    """Print the YAML of a scenario that is in order."""
+    """Print the YAML file of a scenario."""
     from ethbrake_marl.files.yaml import SIZE_LIMIT
 
     with Out() as out:
@@ -60,7 +62,7 @@ def scenario_show(scenario: NameArgument) -> None:
 def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
     """Check a scenario, and try it in 200 worlds.
 
-    Tells what is drawn, and what may not be meant; or what is wrong. The first worlds of its list are drawn, the
+    Says what is drawn and what may be a mistake, or what is wrong. The first worlds of its list are drawn, the
     scripts drive, and learners brake fully.
     """
     with Out(as_json=as_json) as out:
@@ -141,7 +143,7 @@ def _share(part: int, whole: int, things: str = "worlds") -> str:
 
 @scenario_group.command("explain", epilog=example("scenario explain paper-random"))
 def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> None:
-    """Say in plain sentences what a scenario is.
+    """Describe a scenario in plain sentences.
 
     Who stands in line, how each quantity is drawn, who knows what when, and whose harm counts.
     """
@@ -238,8 +240,10 @@ def _news_in_words(scenario: scenarios.Scenario) -> str:
 
 @scenario_group.command("new", epilog=example("scenario new my-scenario --based-on paper-distance"))
 def scenario_new(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Of the new file.")],
-    based_on: Annotated[str, typer.Option(metavar="NAME|PATH", help="Whose values to start from.")] = "paper-random",
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the new scenario and file.")],
+    based_on: Annotated[
+        str, typer.Option(metavar="NAME|PATH", help="Scenario whose values to start from.")
+    ] = "paper-random",
     output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the new file.")] = Path(),
     force: ForceOption = False,
 ) -> None:
@@ -281,18 +285,19 @@ def scenario_parts(as_json: JsonOption = False) -> None:
     "from-data", epilog=example("scenario from-data highd/data --format highd --output my-motorway.yaml")
 )
 def scenario_from_data(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of the recordings.")],
-    format: Annotated[Literal["highd", "ngsim", "openacc"], typer.Option(help="Whose recordings they are.")],
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the recordings.")],
+    format: Annotated[Literal["highd", "ngsim", "openacc"], typer.Option(help="Format of the recordings.")],
     output: Annotated[
         Path, typer.Option(metavar="FILE", help="The .yaml to write; its rows stand in the .csv beside.")
     ],
     based_on: Annotated[
-        str, typer.Option(metavar="NAME|PATH", help="What is not recorded is as here, and as many vehicles.")
+        str,
+        typer.Option(metavar="NAME|PATH", help="Scenario for what is not recorded, and for the number of vehicles."),
     ] = "realistic-motorway",
-    every: Annotated[float, typer.Option(help="Seconds between the moments that are looked at.")] = 1.0,
+    every: Annotated[float, typer.Option(help="Seconds between two moments that become rows.")] = 1.0,
     draw: Annotated[
         Literal["rows", "normal", "lognormal", "quantiles"],
-        typer.Option(help="Whole rows, or each quantity by a fit to it."),
+        typer.Option(help="Draw whole rows, or each quantity from a fit to it."),
     ] = "rows",
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -345,8 +350,9 @@ def scenario_sample(
 ) -> None:
     """Draw worlds of a list, as a table or a picture.
 
-    `Scenario.read_worlds` reads the table. A column is what the scenario does not fix. The picture shows distributions,
-    pairs of quantities, and three worlds. The same list, seed and number are the same worlds on every machine.
+    The table has a column for each quantity that the scenario does not fix; `Scenario.read_worlds` reads it. The
+    picture shows distributions, pairs of quantities, and three worlds. The same list, seed and number are the same
+    worlds on every machine.
     """
     with Out(as_json=as_json, force=force) as out:
         out.check(output, ".csv", ".png", ".svg", ".pdf", what="worlds")
@@ -371,7 +377,7 @@ def scenario_sample(
 
 
 agent_group = typer.Typer(
-    help="List who can drive, or hand a policy on.",
+    help="List the agents, or export a policy.",
     epilog=example("agent list", "agent export runs/early --onnx early.onnx"),
 )
 

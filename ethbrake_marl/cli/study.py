@@ -20,17 +20,15 @@ KEPT = "the same command goes on with what is in the folder"
 ROUNDING = 1e-6  # m2/s2
 MOST_WORKERS = 4096
 
-FolderOption = Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of everything.")]
-RetriesOption = Annotated[int, typer.Option(help="Further attempts at a job whose process was lost.", min=0, max=100)]
-DryRunOption = Annotated[
-    bool, typer.Option("--dry-run", help="Print what would be done and what it takes; do nothing.")
-]
+FolderOption = Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")]
+RetriesOption = Annotated[int, typer.Option(help="How often to try again when a process is lost.", min=0, max=100)]
+DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Print what would be trained; do nothing.")]
 ClusterOption = Annotated[
-    str, typer.Option(metavar="local|ADDRESS", help="A Ray of this machine alone, or a cluster that runs.")
+    str, typer.Option(metavar="local|ADDRESS", help="Ray on this machine, or on a running cluster.")
 ]
 
 study_group = typer.Typer(
-    help="Train and compare many; find worst worlds.",
+    help="Train and compare many policies; search for the worst worlds.",
     epilog=example("study sweep sweep.yaml --output runs/sweep", "study ablate --quick --output runs/ablation-quick"),
 )
 
@@ -42,21 +40,18 @@ def sweep_command(
     jobs: Annotated[
         int | None,
         typer.Option(
-            help="Jobs at once, a process with one thread each.",
-            show_default="one for each core",
-            min=1,
-            max=MOST_WORKERS,
+            help="Jobs at once, one process and thread each.", show_default="one for each core", min=1, max=MOST_WORKERS
         ),
     ] = None,
     ray: ClusterOption = "local",
     retries: RetriesOption = 2,
     dry_run: DryRunOption = False,
-    schema: schema_option("ethbrake_marl.studies.sweep", "SweepPlan") = False,  # type: ignore[valid-type]  # made here
+    schema: schema_option("ethbrake_marl.studies.sweep", "SweepPlan", "sweep") = False,  # type: ignore[valid-type]  # made here
     as_json: JsonOption = False,
 ) -> None:
     """Train every job of a file, and write one table.
 
-    It shows what they reached. The same command goes on after an interruption: finished jobs are kept, begun ones go
+    The same command goes on after an interruption: finished jobs are kept, begun ones go
     on. Exit status 1 where jobs failed: failures.csv says why.
     """
     with Out(as_json=as_json, kept=KEPT) as out:
@@ -85,11 +80,15 @@ def sweep_command(
 def tune_command(
     file: Annotated[Path, typer.Argument(metavar="TUNING.yaml", help="A training and the ranges of its settings.")],
     output: FolderOption,
-    trials: Annotated[int, typer.Option(help="Trials that the folder shall have altogether.", min=1, max=10_000)] = 30,
+    trials: Annotated[
+        int, typer.Option(help="Trials that the folder has at the end, earlier ones included.", min=1, max=10_000)
+    ] = 30,
     jobs: Annotated[
         int,
         typer.Option(
-            help="Trials at once, a process each; more than one change what is tried.", min=1, max=MOST_WORKERS
+            help="Trials at once, one process each; more than 1 changes which values are tried.",
+            min=1,
+            max=MOST_WORKERS,
         ),
     ] = 1,
     ray: ClusterOption = "local",
@@ -98,14 +97,14 @@ def tune_command(
         Path | None, typer.Option(metavar="NAME.yaml", help="Write the best trial as a recipe of this name.")
     ] = None,
     dry_run: DryRunOption = False,
-    schema: schema_option("ethbrake_marl.studies.tuning", "TuningPlan") = False,  # type: ignore[valid-type]  # made here
+    schema: schema_option("ethbrake_marl.studies.tuning", "TuningPlan", "tuning") = False,  # type: ignore[valid-type]  # made here
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Search the settings of a recipe for the least harm.
 
-    Harm on a list of worlds of its own. The same command goes on after an interruption: trials that ended are kept,
-    those that were begun go on. Exit status 1 where no trial came to its end.
+    Harm is measured on a list of worlds of its own. The same command goes on after an interruption: trials that ended
+    are kept, those that were begun go on. Exit status 1 where no trial came to its end.
     """
     with Out(as_json=as_json, force=force, kept=KEPT) as out:
         need("optuna")
@@ -114,19 +113,25 @@ def tune_command(
         plan = TuningPlan.read(file)
         plan.folder(output).check()
         if export is not None:  # raise now what would be raised at the end
-            if export.is_file():  # what this tuning wrote before is replaced: the same command goes on
-                out.force = out.force or export.read_bytes().startswith(plan.export_head(export).encode())
             if export.suffix != ".yaml":
                 raise InvalidInput(f"export {export}: must end in .yaml, as recipes do")
             plan.best_recipe({}, export, "")
+            out.force = out.force or plan.has_exported(output, export)  # the same command goes on
             out.check(export)
         if dry_run:
             own = plan.own_values()
             space = {key: dimension.model_dump(mode="json") for key, dimension in plan.file.search.items()}
             now = {key: "not in the space" if own is None else f"the recipe has {own[key]}" for key in space}
+            begun, steps, example = len(plan.proposals(output)), plan.recipe.total_steps, plan.example()
             out.result(
-                {"search": space, "own_values": own, "trials": trials},
+                {
+                    **{"search": space, "own_values": own, "trials": trials, "begun": begun, "total_steps": steps},
+                    **{"scenario": plan.file.scenario, "recipe": plan.file.recipe, "example": example},
+                },
+                f"{count_of(trials, 'trial')} ({begun:,} begun before): recipe {plan.file.recipe} in scenario"
+                f" {plan.file.scenario}, {steps:,} decisions each unless it is pruned",
                 *(f"{key}  {dimension}  ({now[key]})" for key, dimension in plan.file.search.items()),
+                f"{'the first' if own else 'for example'}: {example}",
             )
             return
         need("ray")
@@ -135,8 +140,11 @@ def tune_command(
         told, best, shown, lines = f"trials: {counted or 'none'}; table: {result.table}", result.best, None, []
         export = None if best is None or result.interrupted else export  # what goes on exports at its end
         if best is not None:
-            shown = {"trial": best.number, "harm": best.harm, "values": best.values}
-            lines = [f"best: trial {best.number}, {best.harm:.4f}", *(f"  {k} = {v}" for k, v in best.values.items())]
+            measure = learning.RunDirectory.chosen_by([best.figures], plan.recipe.reward.harm_count)
+            shown = {"trial": best.number, "measure": measure, "harm": best.harm, "values": best.values}
+            unit = "" if measure == learning.RunDirectory.OBJECTIVE else " m²/s²"  # injuries have another one
+            lines = [f"best: trial {best.number}, {measure} {best.harm:.4f}{unit}"]
+            lines += [f"  {key} = {value}" for key, value in best.values.items()]
             if export is not None:
                 source = f"trial {best.number}, {best.harm!r} on the list of seed {plan.file.measure.seed}"
                 out.write(export, plan.best_recipe(best.values, export, f"ethbrake study tune: {source}"))
@@ -165,20 +173,21 @@ def _end_study(out: Out, told: str, *, interrupted: bool, failed: bool) -> None:
 def ablate_command(
     output: FolderOption,
     levels: Annotated[
-        str | None, typer.Option(metavar="A,B,...", help="Scenarios in this order.", show_default="the shipped ladder")
+        str | None,
+        typer.Option(metavar="A,B,...", help="Scenarios to compare, in this order.", show_default="the shipped ladder"),
     ] = None,
     recipes: Annotated[str, typer.Option(metavar="A,B,...", help="Training recipes.")] = "cooperation",
     seeds: Annotated[
-        int | None, typer.Option(help="Trainings of each, seeds 0, 1, ...", show_default="5", min=1)
+        int | None, typer.Option(help="Trainings per level and recipe, seeds 0, 1, ...", show_default="5", min=1)
     ] = None,
     steps: Annotated[
         int | None, typer.Option(help="Decisions per training, for each of its learners.", show_default="400000", min=1)
     ] = None,
     episodes: Annotated[
-        int | None, typer.Option(help="Common worlds to measure on.", show_default="4000", min=1)
+        int | None, typer.Option(help="Worlds on which all are measured.", show_default="4000", min=1)
     ] = None,
     search_episodes: Annotated[
-        int | None, typer.Option(help="Worlds of the joint optimum, the first ones.", show_default="600", min=1)
+        int | None, typer.Option(help="How many of these to search for the joint optimum.", show_default="600", min=1)
     ] = None,
     shield: Annotated[
         str | None,
@@ -191,8 +200,8 @@ def ablate_command(
 ) -> None:
     """Train levels of cooperation, compare them on common worlds.
 
-    Says first what it will take. The same command goes on after an interruption: finished trainings are kept, begun
-    ones go on. Writes ablation.html, ablation.md, ablation.csv, ablation.json and three figures.
+    Prints first how long it will take. The same command goes on after an interruption: finished trainings are kept,
+    begun ones go on. Writes ablation.html, ablation.md, ablation.csv, ablation.json and three figures.
     """
     with Out(as_json=as_json, kept=KEPT) as out:
         from ethbrake_marl.studies.ablation import ablation_cost, plan_ablation, run_ablation
@@ -223,23 +232,24 @@ def falsify_command(
     ] = None,
     measure: Annotated[
         str | None,
-        typer.Option(metavar="harm|regret|difference|bound", help="What is searched for.", show_default="regret"),
+        typer.Option(metavar="harm|regret|difference|bound", help="What to search for.", show_default="regret"),
     ] = None,
     against: Annotated[
         str | None,
-        typer.Option(metavar="AGENT", help="Whom regret or difference compares with.", show_default="best_harm"),
+        typer.Option(metavar="AGENT", help="Agent with which regret or difference compares.", show_default="best_harm"),
     ] = None,
     scenario: Annotated[
-        str | None, typer.Option(metavar="NAME|PATH", help="Whose ranges are searched.", show_default="paper-random")
+        str | None,
+        typer.Option(metavar="NAME|PATH", help="Scenario whose ranges are searched.", show_default="paper-random"),
     ] = None,
-    budget: Annotated[int | None, typer.Option(help="Worlds that are tried.", min=1, show_default="4000")] = None,
+    budget: Annotated[int | None, typer.Option(help="Worlds to try.", min=1, show_default="4000")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the search.", min=0, show_default="0")] = None,
     keep: Annotated[
-        int | None, typer.Option(help="Worlds that are kept, at most.", min=1, max=1000, show_default="20")
+        int | None, typer.Option(help="Worlds to keep, at most.", min=1, max=1000, show_default="20")
     ] = None,
     settings: SettingsOption = None,
     output: Annotated[
-        Path | None, typer.Option(metavar="FILE.yaml", help="Write the worlds, by name, for --again.")
+        Path | None, typer.Option(metavar="FILE.yaml", help="Write the worlds to a file for --again.")
     ] = None,
     again: Annotated[
         Path | None, typer.Option(metavar="FILE.yaml", help="Drive the worlds of a file again instead of searching.")
@@ -249,10 +259,10 @@ def falsify_command(
 ) -> None:
     """Search for the worlds in which an agent is worst.
 
-    It searches the ranges of a scenario. regret: what the agent does more than --against, by default the best profile
-    found with hindsight. bound: how near a shield comes to the bound it told; above zero it is broken. difference:
-    where two agents differ most. With --again FILE the kept worlds are driven again, by --agent or who drove then; exit
-    status 1: one of them is worse.
+    It searches the ranges of a scenario. regret: harm beyond that of --against, by default the best profile found with
+    hindsight. bound: how near a shield comes to the bound that it gave; above zero the bound is broken. difference:
+    where the harm of two agents differs most. --again FILE drives the kept worlds again, by --agent or the agent of the
+    file; exit status 1 where one of them is worse.
     """
     with Out(as_json=as_json, force=force) as out:
         import numpy as np

@@ -25,9 +25,7 @@ KEPT = (
     "if the training had begun, the run's folder keeps the last good policy, and ethbrake train --resume FOLDER goes on"
 )
 RUNS = Path("runs")
-TrainingSeedOption = Annotated[
-    int | None, typer.Option(help="Seed of the training alone.", show_default="the recipe's")
-]
+TrainingSeedOption = Annotated[int | None, typer.Option(help="Seed of the training.", show_default="the recipe's")]
 OutputOption = Annotated[
     Path | None, typer.Option(metavar="FOLDER", help="Folder of the run.", show_default="runs/SCENARIO-RECIPE-seedSEED")
 ]
@@ -111,15 +109,17 @@ def train_command(
     ] = None,
     other_versions: Annotated[
         bool,
-        typer.Option("--other-versions", help="With --resume: although other versions trained it; numbers may differ."),
+        typer.Option(
+            "--other-versions", help="With --resume: go on although other versions trained it; numbers may differ."
+        ),
     ] = False,
-    schema: schema_option("ethbrake_marl.learning", "TrainingRecipe") = False,  # type: ignore[valid-type]  # made here
+    schema: schema_option("ethbrake_marl.learning", "TrainingRecipe", "recipe") = False,  # type: ignore[valid-type]  # made here
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Train a policy, or those of several learners.
 
-    They are kept in a run's folder. Afterwards: `ethbrake evaluate --agents full_brake,ppo@FOLDER,ppo@FOLDER+episode`;
+    Writes a run's folder. Afterwards: `ethbrake evaluate --agents full_brake,ppo@FOLDER,ppo@FOLDER+episode`;
     of several: `team@FOLDER`. Ctrl-C ends the training after the update in progress and keeps the policy; `ethbrake
     train --resume FOLDER` goes on: the policy is the one that the training would have come to without the stop, bit
     for bit.

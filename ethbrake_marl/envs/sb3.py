@@ -209,6 +209,11 @@ class EthBrakeVecEnv(Begun, VecEnv):
         """Go on from a ``snapshot`` of the same scenario and size, without a reset; raises ``InvalidInput``."""
         prefix = "engine."
         self.engine.restore({n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)})
+        rows = {"return": self._return, "steps": self._steps, "begun": Report.of(self.engine).values}
+        for name, like in rows.items():
+            have = arrays[name]
+            if (have.shape, have.dtype) != (like.shape, like.dtype) or not np.isfinite(have).all():
+                raise InvalidInput(f"environment snapshot: {name}: {like.shape} finite {like.dtype} are needed")
         self._return, self._steps = arrays["return"].copy(), arrays["steps"].copy()
         self._begun, self._begun_shield = arrays["begun"].copy(), {}
         self._set_seed(self.engine.seed)

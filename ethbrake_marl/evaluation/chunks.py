@@ -25,7 +25,15 @@ from ethbrake_marl.evaluation.inputs import (
     result_versions,
     scenario_sha256,
 )
-from ethbrake_marl.evaluation.measures import REGISTERED, Conditions, Evaluation, SummaryTable, Tally, load_measures
+from ethbrake_marl.evaluation.measures import (
+    LOADED,
+    REGISTERED,
+    Conditions,
+    Evaluation,
+    SummaryTable,
+    Tally,
+    load_measures,
+)
 from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk
 from ethbrake_marl.files.python_file import file_sha256
 from ethbrake_marl.harm import HarmCount
@@ -47,8 +55,9 @@ class Lineup:
         agents: specs, as on the command line.
         scenario: whose learners they drive.
         harm_count: harm that agents minimise.
-        uncertainty: what agents behind ``+robust`` do not know, as on the command line.
-        measures: that evaluations tell, too, as ``load_measures`` takes them.
+        uncertainty: what agents behind ``+robust`` do not know, as ``parse_uncertainty`` reads it.
+        measures: that evaluations tell, too, as ``load_measures`` takes them; with those that it was given before.
+        told: names of all measures that evaluations tell, whatever is registered later.
         same: what must be the same in every process; see ``Lineup.of``.
         packages: name -> version of each that gave a part to the process that asks: no other may be installed.
 
@@ -59,6 +68,7 @@ class Lineup:
     harm_count: HarmCount = "first"
     uncertainty: str | None = None
     measures: tuple[str, ...] = ()
+    told: tuple[str, ...] = ()
     same: str = ""
     packages: Mapping[str, str] = field(default_factory=dict)
 
@@ -68,7 +78,8 @@ class Lineup:
 
         Raises what ``make_lineup`` raises.
         """
-        lineup = cls(tuple(agents), scenario, **how)
+        load_measures(how.pop("measures", ()))
+        lineup = cls(tuple(agents), scenario, measures=tuple(LOADED), told=tuple(REGISTERED), **how)
         made = lineup._make_anew()
         same = lineup._same(made)
         _MADE.clear()
@@ -78,8 +89,10 @@ class Lineup:
     def make(self) -> Mapping[str, Driver]:
         """The agents in this process; raises ``InvalidInput`` where they are others than in the process that asks."""
         if self.same not in _MADE:
+            load_measures(self.measures)
             made = self._make_anew()
-            if self._same(made) != self.same or any(_installed(name) != used for name, used in self.packages.items()):
+            same = self._same(made) == self.same and {*self.told} <= REGISTERED.keys()
+            if not same or any(_installed(name) != used for name, used in self.packages.items()):
                 raise InvalidInput(
                     "evaluate: a worker has other policies, measures or versions than the process that asks it;"
                     " install the same everywhere, and change no file while an evaluation runs"
@@ -89,14 +102,13 @@ class Lineup:
         return _MADE[self.same]
 
     def _make_anew(self) -> Mapping[str, Driver]:
-        load_measures(self.measures)
         intervals = None if self.uncertainty is None else parse_uncertainty(self.uncertainty)
         return make_lineup(self.agents, self.scenario, harm_count=self.harm_count, uncertainty=intervals)
 
     def _same(self, made: Mapping[str, Driver]) -> str:
         policies = {name: policies_of(Team.of(agent, self.scenario.learners).drivers) for name, agent in made.items()}
         asked = self.harm_count, self.uncertainty, scenario_sha256(self.scenario)
-        text = json.dumps([asked, policies, self._digests(), sorted(REGISTERED), own_versions()], sort_keys=True)
+        text = json.dumps([asked, policies, self._digests(), self.told, own_versions()], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _digests(self) -> list[str]:
@@ -132,7 +144,8 @@ def evaluate_held(
 
 
 def _drive(lineup: Lineup, part: Sample, seed: int | None, first: int) -> Evaluation:
-    return drive_chunk(part, lineup.make(), lineup.scenario, seed, lineup.scenario.learners, first)
+    found = drive_chunk(part, lineup.make(), lineup.scenario, seed, lineup.scenario.learners, first)
+    return found.telling(lineup.told)
 
 
 def tally_list(

@@ -56,7 +56,7 @@ _WORDS = {"name", "title", "description", "source"}  # what a scenario is called
 _BLOCK = 50_000  # worlds hashed at once: news of a world may be a view that takes no memory
 
 
-CHUNK = 2_500  # worlds advanced together: bounds memory, changes no result
+CHUNK = 2_500  # worlds advanced together: bounds memory; of results only ``worlds_sha256`` of a long list has it
 EPISODES, LIST_SEED = 10_000, 7  # of the list on which everything is measured; a training has a seed of its own
 MOST_NAMED_WORLDS = 1000  # of a file
 HELD = 100_000  # worlds of a list that is held in memory as a whole, unless each of its worlds is asked for

@@ -21,7 +21,7 @@ from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, describe_
 from ethbrake_marl.evaluation.inputs import HASHES, hash_of_chunks, result_versions, scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.statistics import Moments, exact_sum, mean, rate
 from ethbrake_marl.files.python_file import load_from_file
-from ethbrake_marl.files.sheet import DASH, Column, Estimate, Row, Sheet, Shown
+from ethbrake_marl.files.sheet import DASH, Column, Estimate, Row, Sheet, Shown, terminal_text
 from ethbrake_marl.harm import HARM_COUNTS, INJURY_CURVES, Declared, HarmCount, Ledger, injury_probability, scored
 from ethbrake_marl.limits import Limits, Unproven, known_limits
 from ethbrake_marl.physics import Bools, Floats, ImpactRows, Ints, Messages, Worlds, advance, make_worlds
@@ -231,6 +231,14 @@ class Evaluation:
             f"Evaluation({self.scenario.name!r}, {count_of(self.worlds.n, 'world')}{seed}, {self.task.names:.80} driven"
             f" by {', '.join(drivers)})"
         )
+
+    def telling(self, names: Collection[str]) -> Evaluation:
+        """The same, of registered measures with these alone."""
+        outcomes = {}
+        for agent, outcome in self.outcomes.items():
+            kept = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
+            outcomes[agent] = replace(outcome, metrics=kept)
+        return replace(self, outcomes=outcomes)
 
     @property
     def vehicle(self) -> int:
@@ -1090,6 +1098,7 @@ def register_measure(name: str, function: EpisodeFunction, *, unit: str = "1") -
 
 MEASURES: Registry[_Registered] = Registry("measure", "measures", register_measure)
 REGISTERED = MEASURES.loaded  # those that every evaluation tells
+LOADED: dict[str, None] = {}  # names that ``load_measures`` was given, in order
 
 
 def load_measures(names: Iterable[str]) -> None:
@@ -1106,6 +1115,7 @@ def load_measures(names: Iterable[str]) -> None:
             register_measure(own, *given, **settings)
         else:
             MEASURES.load(name)
+        LOADED[name] = None
 
 
 def _injury(curve: str, rule: Literal["", "_vehicle", "_every"]) -> EpisodeFunction:
@@ -1263,17 +1273,24 @@ class Rescored:
 
 
 class Rescores(list[Rescored]):
-    """Agents under objectives and counts."""
+    """Agents under objectives and counts: a list that ``print`` and a notebook show as two tables."""
+
+    def __str__(self) -> str:
+        return terminal_text(self.sheet("first"), "", self.sheet("total"))
+
+    def _repr_html_(self) -> str:
+        return "\n".join(self.sheet(harm_count).html() for harm_count in HARM_COUNTS)
 
     def sheet(self, harm_count: HarmCount) -> Sheet:
         """The means under one count: one line per agent and objective, one column per vehicle."""
         shown = [row for row in self if row.harm_count == harm_count]
         vehicles = range(len(shown[0].each) if shown else 0)
-        columns = [Column(f"Vehicle {i + 1}", interval="hidden") for i in vehicles]
+        columns = [Column(f"Vehicle {i + 1}", interval="below") for i in vehicles]
         names = ["" if k and shown[k - 1].agent == row.agent else row.agent for k, row in enumerate(shown)]
         lines = [(name, row.objective, *row.each) for name, row in zip(names, shown, strict=True)]
         title = f"Objectives, {'first-impact' if harm_count == 'first' else 'total'} harm"
-        return Sheet(title, ["Agent", "Objective", *columns], lines)
+        note = "Means per world in m²/s² (injury:CURVE: injuries in 1,000 lines), with their 95 % intervals."
+        return Sheet(title, ["Agent", "Objective", *columns], lines, note)
 
 
 @dataclass(frozen=True, slots=True)
@@ -1468,12 +1485,7 @@ class SummaryTable(list[SummaryRow]):
         return f"SummaryTable({', '.join(row.agent for row in self)})"
 
     def __str__(self) -> str:
-        from rich.console import Console
-
-        console = Console(highlight=False)
-        with console.capture() as captured:
-            console.print(*self.tables())
-        return captured.get()
+        return terminal_text(*self.tables())
 
     def _repr_html_(self) -> str:
         note = "Harm: means per world in m²/s². In brackets: 95 % intervals. Decrease: of full braking's harm."

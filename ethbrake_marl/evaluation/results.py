@@ -83,7 +83,7 @@ def read_harms(path: Path, data: bytes) -> dict[str, dict[int, tuple[float, ...]
         raise InvalidInput(f"{path}: is no file of --per-world: {error}") from None
 
 
-USUAL: Mapping[str, str | None] = {"harm_count": "first", "uncertainty": None}  # settings of agents
+USUAL: Mapping[str, str] = {"harm_count": "first"}  # settings of agents
 _COMPARED: dict[Kind, tuple[str, ...]] = {  # harms of each
     "evaluate": HARMS,
     "shield": ("harm",),
@@ -115,11 +115,11 @@ def results_to_json(
     told: Sequence[Rescored] = (),
     groups: Mapping[str, Sequence[SummaryRow]] | None = None,
     per_world: Path | None = None,
-    settings: Mapping[str, str | None] = USUAL,
+    settings: Mapping[str, str] = USUAL,
 ) -> list[dict[str, Any]]:
     """What a results file holds: one object per row, with what was ``told`` of it under other objectives.
 
-    ``settings`` are those of all agents: the harm that they minimise, what a robust shield does not know.
+    ``settings`` are those of all agents: the harm that they minimise.
 
     ``groups``, by name, are rows of the same agents on parts of the worlds (``summarise_by``).
     ``per_world`` is the file with one row per world, written before; its name and hash go into every object.

@@ -267,6 +267,16 @@ class Sheet:
         return csv_text(self.json())
 
 
+def terminal_text(*shown: RenderableType) -> str:
+    """Tables and texts as ``print`` shows them, as wide as the terminal."""
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    with console.capture() as captured:
+        console.print(*shown)
+    return captured.get()
+
+
 def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
     """A CSV file of objects, with the ``columns`` given or all that some row has, in the order of their appearance.
 

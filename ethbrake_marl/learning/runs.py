@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import math
@@ -336,6 +337,8 @@ class Session(BaseCallback):
         numbers, course = state.numbers, self.course
         try:
             restore_model(self.model, self.algorithm, state)
+            for name in ("steps", "updates"):
+                _check_counter(name, numbers[name], int)
             self.updates = numbers["updates"]
             self._ended = {column: [float(each) for each in numbers["ended"][column]] for column in EPISODE_COLUMNS}
             course.restore(numbers["course"])
@@ -899,12 +902,16 @@ def restore_model(model: Model, algorithm: Algorithm, state: TrainingState) -> N
         for group in groups:
             group["lr"] = plain["learning_rates"][name]
         optimizer.load_state_dict({"state": kept, "param_groups": groups})
+        _try_step(optimizer)
     environment: Any = model.env
     environment.restore(_group(arrays, "environment."))
     for name in COUNTERS:
+        _check_counter(name, plain["counters"][name], type(getattr(model, name)))
         setattr(model, name, plain["counters"][name])
-    model._last_obs = arrays["last.observations"].copy()
-    model._last_episode_starts = arrays["last.episode_starts"].copy()
+    space = environment.observation_space
+    seen = np.zeros((environment.num_envs, *space.shape), space.dtype)
+    model._last_obs = _like(seen, arrays, "last.observations").copy()
+    model._last_episode_starts = _like(np.zeros(len(seen), np.bool_), arrays, "last.episode_starts").copy()
     model.ep_info_buffer, model.ep_success_buffer = (deque[Any](maxlen=model._stats_window_size) for _ in range(2))
     for gained, steps in zip(arrays["episodes.return"].tolist(), arrays["episodes.steps"].tolist(), strict=True):
         model.ep_info_buffer.append({"r": gained, "l": steps, "t": 0.0})
@@ -920,10 +927,35 @@ def restore_model(model: Model, algorithm: Algorithm, state: TrainingState) -> N
         model.logger.name_to_excluded[name] = tuple(excluded)
     memory: Any = getattr(model, "replay_buffer", None)
     if memory is not None:
+        position, full = plain["replay"]
+        if (type(position), type(full)) != (int, bool) or not 0 <= position < memory.buffer_size:
+            raise ValueError(f"replay = {plain['replay']!r:.60}: is no place in its memory")
+        memory.pos, memory.full = position, full
         for name in REPLAY:
-            filled = arrays[f"replay.{name}"]
-            getattr(memory, name)[: len(filled)] = filled
-        memory.pos, memory.full = plain["replay"]
+            filled = getattr(memory, name)[: memory.size()]
+            filled[:] = _like(filled, arrays, f"replay.{name}")
+
+
+def _try_step(optimizer: torch.optim.Optimizer) -> None:
+    """Make a step in a copy; raises what a state raises that is not of these weights."""
+    tried = copy.deepcopy(optimizer)
+    for group in tried.param_groups:
+        for weights in group["params"]:
+            weights.grad = torch.zeros_like(weights)
+    tried.step()
+
+
+def _check_counter(name: str, value: object, kind: type) -> None:
+    if type(value) is not kind or (kind is int and not 0 <= value < 1 << 53):  # type: ignore[operator]  # an int
+        raise ValueError(f"{name} = {value!r:.60}: must be of type {kind.__name__}, and a whole number at least 0")
+
+
+def _like(model: NDArray[Any], arrays: Arrays, name: str) -> NDArray[Any]:
+    """The array of this name; raises ``ValueError`` unless it is finite, and of shape and type as ``model``."""
+    found = arrays[name]
+    if (found.shape, found.dtype) != (model.shape, model.dtype) or not np.isfinite(found).all():
+        raise ValueError(f"{name}: {model.shape} finite {model.dtype} are needed")
+    return found
 
 
 def _group(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Arrays:

@@ -927,9 +927,9 @@ class RunDirectory:
         """The configuration; raises ``InvalidInput`` where there is no run, or naming the file that is damaged."""
         if not (os.path.lexists(self.status) or os.path.lexists(self.config)):
             raise InvalidInput(f"{self.path}: holds no training; give the folder of a run, for instance runs/my-run")
-        for folder in (self.checkpoints, self.tensorboard):
+        for folder in (self.checkpoints, self.tensorboard, self.policy, self.last_policy):
             if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-                raise InvalidInput(f"{folder}: is not a plain folder; a training deletes in it what it no longer needs")
+                raise InvalidInput(f"{folder}: is not a plain folder; a training deletes in it, or replaces it")
         status, config = read_object(self.status), read_object(self.config)
         for key, right in (("format", ("ethbrake-run",)), ("status", get_args(RunStatus))):
             if status.get(key) not in right:

@@ -198,7 +198,8 @@ class Plan:
     def study_folder(self) -> StudyFolder:
         """The folder, which no ablation with other settings may have: its results would be lost."""
         advice = f"give another folder (--output), or, to use its trainings, a copy of it without {SETTINGS}"
-        return StudyFolder(self.folder, "an ablation", self.settings(), record=SETTINGS, advice=advice)
+        written = (*FIGURES, *(f"ablation.{ending}" for ending in ("html", "md", "csv", "json")))
+        return StudyFolder(self.folder, "an ablation", self.settings(), record=SETTINGS, advice=advice, writes=written)
 
     def optimum_folder(self, level: Level) -> Path:
         """Where the parts of its search stand."""

@@ -54,7 +54,7 @@ def write_results(
     folder: Path, name: str, rows: Sequence[SummaryRow], harm_count: HarmCount, per_world: Path | None = None
 ) -> list[dict[str, Any]]:
     """Write the rows as ``NAME.json`` and, flat, as ``NAME.csv``; gives what the JSON holds."""
-    results = results_to_json(rows, per_world=per_world, settings={"harm_count": harm_count, "uncertainty": None})
+    results = results_to_json(rows, per_world=per_world, settings={"harm_count": harm_count})
     content = json.dumps(results, indent=2, allow_nan=False) + "\n"
     write_output(folder / f"{name}.json", content.encode(), force=True)
     write_output(folder / f"{name}.csv", results_csv(rows).encode(), force=True)

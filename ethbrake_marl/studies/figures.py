@@ -30,9 +30,12 @@ Evaluation = Mapping[str, float]  # steps, and what was measured then
 
 
 def is_done(job: TrainingJob) -> bool:
-    """Whether the folder holds the training to its end, and its policies."""
+    """Whether the folder holds the training to its end, and its policies; raises ``InvalidInput`` for another one."""
     run = RunDirectory(job.folder)
-    return run.is_finished and all(Policy.stands_in(job.folder / place) for place in job.training.drivers.values())
+    if not run.is_finished:
+        return False
+    run.check_same(job.training)
+    return all(Policy.stands_in(job.folder / place) for place in job.training.drivers.values())
 
 
 def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:

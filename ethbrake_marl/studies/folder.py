@@ -24,6 +24,7 @@ class StudyFolder:
         record: name of the file with the question, and with what ``more`` adds to it when it is written.
         advice: what to do about a folder that answers another question.
         beside: names of what may be in a folder without a record; None: anything.
+        writes: names of files that its work replaces, at its end perhaps.
 
     """
 
@@ -37,18 +38,19 @@ class StudyFolder:
         more: Mapping[str, Any] | None = None,
         advice: str = "give another folder (--output)",
         beside: Collection[str] | None = None,
+        writes: Collection[str] = (),
     ) -> None:
-        self.path, self._kind, self._advice, self._beside = path, kind, advice, beside
+        self.path, self._kind, self._advice, self._beside, self._writes = path, kind, advice, beside, writes
         self._question: dict[str, Any] | None = None if question is None else json.loads(json.dumps(question))
         self._record, self._more = path / record, dict(more or {})
 
     def check(self) -> bool:
         """Whether the record of the question is still to be written; makes nothing.
 
-        Raises ``InvalidInput`` for what is no folder, cannot be written to, or answers another question, with what
-        differs; ``AlreadyExists`` for a folder of something else.
+        Raises ``InvalidInput`` for what is no folder, cannot be written to (nor one of ``writes``), or answers another
+        question, with what differs; ``AlreadyExists`` for a folder of something else.
         """
-        check_folder(self.path)
+        check_folder(self.path, self._writes, force=True)
         if self._question is None:
             if self._record.is_file():
                 raise AlreadyExists(

@@ -79,7 +79,8 @@ class LearningCurves(NamedTuple):
             for recipe, seeds in self.plan
             for seed in range(seeds)
         ]
-        with StudyFolder(self.folder, "learning curves").work():
+        written = [f"learning_curves.{ending}" for ending in ("png", "csv", "json")]
+        with StudyFolder(self.folder, "learning curves", writes=written).work():
             return train_all(trainings, jobs, tell)
 
     def write(self) -> dict[str, Any]:

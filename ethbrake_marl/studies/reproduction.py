@@ -1979,8 +1979,9 @@ def open_folder(asked: Reproduction, *, force: bool = False) -> StudyFolder:
         write_file(path / _SETTINGS, _text({**_FORMAT, **question}))
     advice = "give another folder (--output), or replace it with force (--force)"
     return StudyFolder(
-        path, "reproduction", question, record=_SETTINGS, more=_FORMAT, advice=advice, beside=("trainings",)
-    )
+        path, "reproduction", question, record=_SETTINGS, more=_FORMAT, advice=advice, beside=("trainings",),
+        writes=("index.html",),
+    )  # fmt: skip
 
 
 def make_items(asked: Reproduction, items: Sequence[Item], *, force: bool = False) -> tuple[list[Result], bool]:

@@ -252,7 +252,7 @@ class SweepPlan:
     @staticmethod
     def folder(path: Path) -> StudyFolder:
         """The folder of a sweep; its jobs know by themselves what they are."""
-        return StudyFolder(path, "a sweep")
+        return StudyFolder(path, "a sweep", writes=(TABLE, FAILURES))
 
     @staticmethod
     def job(row: Row, path: Path) -> TrainingJob:

@@ -7,6 +7,7 @@ was stopped.
 from __future__ import annotations
 
 import math
+import shlex
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -108,7 +109,7 @@ class Range(FileModel):
         return FloatDistribution(float(self.low), float(self.high), log=self.log)
 
     def stored(self, value: Any) -> Any:
-        """A value as the storage has it: as it is."""
+        """A value as Optuna has it: as it is."""
         return value
 
     value = stored
@@ -147,11 +148,11 @@ class Choices(FileModel):
         return CategoricalDistribution([*map(flow_text, self.choices)])
 
     def stored(self, value: Any) -> str:
-        """A value as the storage has it: its text, for a storage keeps no lists."""
+        """A value as Optuna has it: its text, for Optuna chooses among no lists."""
         return flow_text(value)
 
     def value(self, stored: Any) -> Any:
-        """What the storage has as a value."""
+        """What Optuna has as a value."""
         return {flow_text(value): value for value in self.choices}[stored]
 
 
@@ -345,6 +346,19 @@ class TuningPlan:
         own = {key: dimension.own(_value_at(content, key)) for key, dimension in self.file.search.items()}
         return None if None in own.values() else own
 
+    def example(self) -> str:
+        """The command line that trains what a trial trains: the first one, where the space holds the recipe's values.
+
+        Else one with values of the space by chance.
+        """
+        values = self.own_values() or next(self.file.points(1))
+        measured = {"evaluation": self.training(values).recipe.evaluation.model_dump(mode="json")}
+        words = ["ethbrake", "train", "--scenario", self.file.scenario, "--recipe", self.file.recipe]
+        words += ["--seed", str(self.file.seed)]
+        for text in texts_of({**self.file.settings, **values, **measured}):
+            words += ["--set", text]
+        return shlex.join(words)
+
     def _check_dimension(self, key: str, dimension: Range | Choices) -> None:
         own = _value_at(self.recipe.model_dump(mode="json"), key)
         if isinstance(dimension, Range) and not dimension.whole and type(own) is int:
@@ -365,7 +379,22 @@ class TuningPlan:
 
     def folder(self, path: Path) -> StudyFolder:
         """The folder, which no other tuning may have."""
-        return StudyFolder(path, "a tuning", self.question, record="tuning.json")
+        return StudyFolder(path, "a tuning", self.question, record="tuning.json", writes=(TABLE,))
+
+    def proposals(self, path: Path) -> list[Values]:
+        """What was proposed in a folder, as Optuna has it; raises ``InvalidInput`` unless it is all in the space."""
+        file, space = path / PROPOSALS, self.file.search
+        if not file.exists():
+            return []
+        known: Any = read_object(file).get("trials")
+        try:
+            for proposal in known:
+                values = self.file.values(proposal)
+                if values.keys() != space.keys() or None in (space[key].own(value) for key, value in values.items()):
+                    raise ValueError
+        except (TypeError, ValueError, AttributeError, LookupError):
+            raise InvalidInput(f"{file}: is damaged: a trial has other keys or values than the space") from None
+        return [*known]
 
     def job(self, values: Values, path: Path) -> TrainingJob:
         """The training of a trial in the folder of a tuning; equal trials are one training."""
@@ -401,7 +430,7 @@ class TuningPlan:
         with self.folder(path).work():
             (path / TRIALS).mkdir(exist_ok=True)
             remove_unfinished(path / TRIALS)
-            known = read_proposals(path / PROPOSALS, self.file)
+            known = self.proposals(path)
             with connected(ray, jobs):
                 proposed, ends = self._search(path, known, trials, jobs, retries, tell)
             records = [
@@ -464,19 +493,24 @@ class TuningPlan:
         recipe = self.training(values).recipe.replace(
             name=file.stem, title=self.file.title, description=described, source=source
         )
-        return recipe.text(self.export_head(file))
-
-    def export_head(self, file: Path) -> str:
-        """The first line of an exported recipe, with the settings that are the scenario's: no recipe has them."""
         parts = {*type(self.recipe).model_fields, "recipe"}
-        of_scenario = {
+        of_scenario = {  # no recipe has these
             key: value
             for key, value in self.file.settings.items()
             if key.startswith("scenario.") or key.partition(".")[0] not in parts
         }
         settings = "".join(f" --set {text}" for text in texts_of(of_scenario))
         command = f"ethbrake train --scenario {self.file.scenario}{settings} --recipe {file.name}"
-        return f"# The best trial of a tuning, trained again: {command}\n"
+        return recipe.text(f"# The best trial of a tuning, trained again: {command}\n")
+
+    def has_exported(self, path: Path, file: Path) -> bool:
+        """Whether a file is what the tuning in this folder exported: the recipe of one of its trials."""
+        try:
+            source, text = load_recipe(file).source, file.read_text("utf-8")
+        except InvalidInput:
+            return False
+        values = map(self.file.values, self.proposals(path))
+        return any(self.best_recipe(each, file, source) == text for each in values)
 
 
 State = Literal["running", "finished", "pruned", "failed"]
@@ -529,21 +563,6 @@ class TuningResult:
         """The finished trial of least harm, of equals the first; None where none has finished."""
         finished = [each for each in self.trials if each.harm is not None]
         return min(finished, key=lambda each: (each.harm, each.number), default=None)
-
-
-def read_proposals(file: Path, tuning: TuningFile) -> list[Values]:
-    """What was proposed, as Optuna has it; raises ``InvalidInput`` unless every value is in the space."""
-    if not file.exists():
-        return []
-    known: Any = read_object(file).get("trials")
-    try:
-        for proposal in known:
-            values = tuning.values(proposal)
-            if values.keys() != tuning.search.keys() or None in (tuning.search[k].own(v) for k, v in values.items()):
-                raise ValueError
-    except (TypeError, ValueError, AttributeError, LookupError):
-        raise InvalidInput(f"{file}: is damaged: a trial has other keys or values than the space") from None
-    return [*known]
 
 
 def do_trial(config: dict[str, Any], plan: TuningPlan, path: Path) -> None:

@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
 import time
@@ -19,7 +20,7 @@ import typer
 from numba.core import event
 from rich.console import Console
 
-from ethbrake_marl import __version__
+from ethbrake_marl import __version__, parallel
 from ethbrake_marl.cli import app as frame
 from ethbrake_marl.cli.app import add_command, app, run_command, whole_command
 from ethbrake_marl.cli.command import Out
@@ -323,3 +324,59 @@ def test_measures__asked_for_wrongly_are_one_line(ethbrake):
         ethbrake("evaluate", "--scenario", "benchmark", "--set", "measures=injury"),
         "--set measures: benchmark is a group",
     )
+
+
+BAD = """
+class Leaves:
+    name = "leaves"
+
+    def act(self, worlds, vehicle):
+        raise GeneratorExit("enough")
+"""
+
+
+def test_agent__that_raises_no_exception_is_told_in_one_line(ethbrake: Command, tmp_path: Path) -> None:
+    (tmp_path / "bad.py").write_text(BAD)
+    check_refused(
+        ethbrake("evaluate", "--episodes", "2", "--agents", f"{tmp_path}/bad.py:Leaves"),
+        "code of yours ended the process: GeneratorExit: enough (bad.py, line 6)",
+    )
+
+
+def test_stdout__has_results_alone_whatever_writes_past_python(capfd, monkeypatch) -> None:
+    for owner, name in ((sys, "stdout"), (frame.warnings, "showwarning")):
+        monkeypatch.setattr(owner, name, getattr(owner, name))
+    monkeypatch.setattr(frame, "on_first_compilation", Mock())
+    before = os.dup(1)
+    sys.stdout = sys.__stdout__
+    try:
+        frame.prepare_streams()
+        os.write(1, b"raw")
+        with sys.stdout:
+            print("result")
+    finally:
+        os.dup2(before, 1)
+        os.close(before)
+    assert capfd.readouterr() == ("result\n", "raw")
+
+
+def test_sigterm__is_as_ctrl_c_while_processes_work_unless_somebody_else_answers(monkeypatch) -> None:
+    usual = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt), parallel._sigterm_as_ctrl_c():
+        signal.raise_signal(signal.SIGTERM)
+    assert signal.getsignal(signal.SIGTERM) is usual is signal.SIG_DFL
+    signal.signal(signal.SIGTERM, answered := Mock())
+    try:
+        with parallel._sigterm_as_ctrl_c():
+            signal.raise_signal(signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGTERM, usual)
+    assert answered.call_count == 1
+
+
+def test_evaluate__says_where_the_uncertainty_of_robust_is_given_and_keeps_no_place_for_it(ethbrake: Command) -> None:
+    assert "+robust needs an uncertainty, which is given in Python" in " ".join(
+        ethbrake("evaluate", "--help").out.split()
+    )
+    (row,) = told_json(ethbrake("evaluate", "--episodes", "2", "--agents", "full_brake", "--json"))
+    assert row["agent_settings"] == {"harm_count": "first"}

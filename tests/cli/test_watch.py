@@ -255,7 +255,7 @@ def test_compare__a_run_its_report_and_shields_are_results_too(ethbrake, finishe
 
 
 @pytest.mark.slow
-def test_compare__sees_that_an_agents_file_was_edited(tmp_path: Path) -> None:
+def test_compare__sees_that_an_agents_file_was_edited(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Each evaluation is a process of its own, as a person's two commands are."""
     file, read = tmp_path / "mine.py", {}
     for name, deceleration in (("before", 2), ("after", 3)):
@@ -272,6 +272,9 @@ def test_compare__sees_that_an_agents_file_was_edited(tmp_path: Path) -> None:
     assert after.about["versions"]["mine.py"] == f"SHA-256 {hashlib.sha256(file.read_bytes()).hexdigest()}"
     assert set(compare_results(before, after).other_versions) == {"mine.py"}
     assert compare_results(after, after).other_versions == {}
+    assert run_command(["compare", str(tmp_path / "before.json"), str(tmp_path / "after.json")]) == 0
+    told = capsys.readouterr().err
+    assert "note: mine.py changed between the two\n" in told and "SHA-256" not in told
 
 
 def test_versions__tell_a_file_behind_the_at_by_its_hash(ethbrake: Command, tmp_path: Path) -> None:

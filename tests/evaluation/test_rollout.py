@@ -31,7 +31,7 @@ from ethbrake_marl.evaluation import (
 )  # fmt: skip
 from ethbrake_marl.evaluation.chunks import Lineup, evaluate_held, summarise_tally, tally_list
 from ethbrake_marl.evaluation.inputs import make_agents, make_lineup, policy_sha256, scenario_sha256, worlds_sha256
-from ethbrake_marl.evaluation.measures import FAR_M, REGISTERED, Tally, measures
+from ethbrake_marl.evaluation.measures import FAR_M, MEASURES, REGISTERED, Tally, measures
 from ethbrake_marl.evaluation.rollout import ShovedFront, chunks_of, drive_chunk
 from ethbrake_marl.files import python_file
 from ethbrake_marl.limits import Limits
@@ -414,6 +414,21 @@ def test_worker__of_other_measures_is_refused(paper_random: Scenario, monkeypatc
     lineup = Lineup.of(("full_brake",), paper_random)
     with pytest.raises(InvalidInput, match="a worker has other policies, measures or versions than the process"):
         tally_list(lineup, 6_000, 5, jobs=2)
+
+
+def test_lineup__tells_the_measures_of_its_time_in_every_process(paper_random: Scenario, monkeypatch) -> None:
+    before = Lineup.of(("full_brake",), paper_random)
+    after = Lineup.of(("full_brake",), paper_random, measures=("injury",)), Lineup.of(("full_brake",), paper_random)
+
+    def told(lineup: Lineup) -> set[str]:
+        return set(evaluate_held(lineup, paper_random.sample(3, 7), 7).outcome("full_brake").metrics)
+
+    found = [told(each) for each in (before, *after)]
+    assert found[0] == set() and found[1] == found[2] and "injury_lr4s" in found[1]
+    MEASURES.loaded.clear()  # as in a worker, which makes them in whatever order
+    for lineup, expected in zip((before, *after, before), (*found, found[0]), strict=True):
+        monkeypatch.setattr(chunks, "_MADE", {})
+        assert told(lineup) == expected
 
 
 @pytest.mark.parametrize("other", ["", "version", "package", "file"])

@@ -225,14 +225,16 @@ def test_entry_point__without_a_part_of_its_name_is_named(install: Install) -> N
 
 
 def test_name__that_two_packages_give_is_told_with_both(install: Install, capsys: pytest.CaptureFixture[str]) -> None:
-    install("hills", HILLS, agents=AGENTS, commands={"evaluate": "hills:hello"})
-    install("valleys", HILLS, agents={"gentle": "valleys:make_gentle", "coast": "valleys:make_gentle"})
+    install("hills", HILLS, agents=AGENTS, commands={"evaluate": "hills:hello", "hey": "hills:hello"})
+    agents = {"gentle": "valleys:make_gentle", "coast": "valleys:make_gentle"}
+    install("valleys", HILLS, agents=agents, commands={"hey": "valleys:hello"})
     both = "installed packages hills and valleys give it; uninstall all but one"
     with pytest.raises(InvalidInput, match=f"agent 'gentle': the {both}"):
         eb.make_agent("gentle")
     with pytest.raises(InvalidInput, match="agent 'coast': the installed packages ethbrake-marl and valleys give it"):
         eb.make_agent("coast")
     assert eb.make_agent("full_brake").name == "full_brake"
+    assert run_command(["--help"]) == 0 and "Of the installed packages hills and valleys." in capsys.readouterr().out
     assert run_command(["evaluate", "--episodes", "3"]) == 2
     assert "command 'evaluate': the installed packages ethbrake-marl and hills give it" in capsys.readouterr().err
     with pytest.raises(UnknownName, match="unknown agent 'gentel'; did you mean 'gentle'"):

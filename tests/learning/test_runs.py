@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import torch
+from stable_baselines3.common.logger import Logger
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.train import run_folder
@@ -685,6 +686,62 @@ def test_resume__a_checkpoint_that_does_not_fit_is_refused_and_stays(
         resume(run, measure=measure)
     del before[run / "team.json"]  # is written anew
     assert "\n" not in str(error.value) and all(file.read_bytes() == data for file, data in before.items())
+
+
+FORGED_ARRAYS = {
+    "optimizer.policy.0.exp_avg": np.zeros((2, 1), np.float32),
+    "optimizer.policy.0.step": np.zeros(3, np.float32),
+    "environment.begun": np.zeros((2, 3, 9)),
+    "environment.return": np.full(8, np.nan),
+    "last.observations": np.zeros((2, 27), np.float32),
+    "last.episode_starts": np.zeros(7, np.bool_),
+}
+FORGED_COUNTERS = {"num_timesteps": 1 << 70, "_n_updates": "x", "_current_progress_remaining": None, "_episode_num": -1}
+
+
+@pytest.mark.parametrize("name", [*FORGED_ARRAYS, *FORGED_COUNTERS, "optimizer.policy.1.exp_avg_sq", "updates"])
+def test_resume__a_forged_checkpoint_is_refused_in_one_line(run: Path, name: str) -> None:
+    place = newest(run)
+    (numbers, arrays), told = read_checkpoint(place), name.rpartition(".")[2]
+    shutil.rmtree(place)
+    if name in FORGED_ARRAYS:
+        arrays[name] = FORGED_ARRAYS[name]
+        told = "" if name.startswith("optimizer") else told  # torch says what is wrong
+    elif name in FORGED_COUNTERS:
+        numbers["counters"][name] = FORGED_COUNTERS[name]
+    elif name == "updates":
+        numbers[name] = -1
+    else:
+        del arrays[name]
+    write_checkpoint(place, TrainingState(numbers, arrays))
+    with pytest.raises(EthBrakeError, match=rf"is not of this training: .*{told}.*; delete it to go on") as error:
+        resume(run, measure=measure)
+    assert "\n" not in str(error.value)
+
+
+def test_restore__a_forged_replay_memory_of_sac_is_refused() -> None:
+    training = Training.of(*TRAININGS["sac"])
+    algorithm, environment = training.recipe.make_algorithm(), runs.make_environment(training)
+    with runs.own_random_state():
+        model = runs.make_model(algorithm, training, environment)
+        model._last_obs, model._last_episode_starts = environment.reset(), np.ones(environment.num_envs)
+        model.set_logger(Logger(None, []))
+        numbers, arrays = runs.capture_model(model, algorithm)
+        restore = partial(runs.restore_model, model, algorithm)
+        restore(TrainingState(numbers, arrays))
+        for forged in ([-1, False], [1.5, False], [1 << 40, True], [0, 1]):
+            with pytest.raises(ValueError, match=r"replay = .*: is no place in its memory"):
+                restore(TrainingState(numbers | {"replay": forged}, arrays))
+        with pytest.raises(ValueError, match=r"replay.observations: .* are needed"):
+            restore(TrainingState(numbers | {"replay": [3, False]}, arrays))
+
+
+@pytest.mark.parametrize("name", ["policy", "policy-last"])
+def test_resume__a_policy_that_cannot_be_replaced_is_refused_at_once(run: Path, name: str) -> None:
+    shutil.rmtree(run / name)
+    (run / name).touch()
+    with pytest.raises(InvalidInput, match=rf"{name}: is not a plain folder; a training deletes in it, or replaces it"):
+        resume(run, measure=measure)
 
 
 @pytest.mark.parametrize("category", [name for name in CHANGES if name.endswith(": link outside")])

@@ -57,6 +57,18 @@ def test_folder__of_another_question_is_refused_with_what_differs(tmp_path: Path
         StudyFolder(tmp_path / "new", "curves").check()
 
 
+@pytest.mark.parametrize("is_new", [True, False])
+def test_folder__a_file_that_cannot_be_replaced_at_the_end_is_refused_at_once(tmp_path: Path, is_new: bool) -> None:
+    folder = StudyFolder(tmp_path, "sums", None if is_new else QUESTION, writes=("sums.csv",))
+    folder.check()
+    (tmp_path / "sums.csv").write_text("of the last time")
+    folder.check()
+    (tmp_path / "sums.csv").unlink()
+    (tmp_path / "sums.csv").mkdir()
+    with pytest.raises(InvalidInput, match=r"sums.csv: is a folder; give the name of a file"):
+        folder.check()
+
+
 def test_folder__what_a_killed_writer_left_goes(tmp_path: Path) -> None:
     tmp_path.joinpath(".ethbrake-x.partial").write_text("half")
     with StudyFolder(tmp_path, "sums").work():

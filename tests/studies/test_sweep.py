@@ -1,6 +1,7 @@
 """``ethbrake study sweep`` and ``tune``: files, tables, that nothing is lost, and that no disturbance shows."""
 
 import json
+import shlex
 import shutil
 import signal
 import subprocess
@@ -18,7 +19,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import read_yaml
-from ethbrake_marl.learning.training import TrainingRecipe, load_recipe
+from ethbrake_marl.learning.training import Training, TrainingRecipe, load_recipe, read_settings
 from ethbrake_marl.studies.sweep import SweepFile, SweepPlan
 from ethbrake_marl.studies.tuning import TuningFile, TuningPlan
 from tests.cli.conftest import rows_of as read
@@ -119,6 +120,23 @@ def test_table__of_a_run_that_is_damaged_is_named(again, capsys, damage: bytes) 
     assert sweep(file, folder) == 2
     (told,) = capsys.readouterr().err.splitlines()
     assert f"{damaged}: is damaged (" in told and told.endswith("; delete its folder to train anew")
+
+
+def test_run__of_another_training_is_not_done(again, capsys) -> None:
+    file, folder = again
+    other = sorted((folder / "runs").iterdir())[0] / "config.json"
+    config = json.loads(other.read_text())
+    other.write_text(json.dumps({**config, "recipe": {**config["recipe"], "gamma": 0.9}}))
+    assert sweep(file, folder) == 2
+    (told,) = capsys.readouterr().err.splitlines()
+    assert f"{other.parent}: holds another training (here other: recipe gamma); give another folder" in told
+
+
+@pytest.mark.parametrize("name", [TABLE, "failures.csv"])
+def test_file__that_cannot_be_written_at_the_end_is_told_at_once(write_sweep, tmp_path, capsys, name: str) -> None:
+    (tmp_path / "out" / name).mkdir(parents=True)
+    assert sweep(write_sweep(grid=GRID), tmp_path / "out") == 2
+    assert f"{name}: is a folder; give the name of a file" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -324,6 +342,27 @@ def test_table__has_every_trial_the_first_with_the_recipes_own_values(finished_t
         assert recipe["evaluation"] == {"every_updates": 1, "worlds": 10, "seed": 11}
 
 
+def test_dry_run__tells_how_many_trials_of_what_and_a_command_that_trains_the_first(
+    finished_tuning: Path, write_tuning: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = write_tuning()
+    recipe = TuningPlan.read(file).file.recipe
+    assert tune(file, finished_tuning, "--trials", "7", "--dry-run") == 0
+    head, *_, last = capsys.readouterr().out.splitlines()
+    assert head == (
+        f"7 trials ({TRIALS} begun before): recipe {recipe} in scenario paper-random,"
+        " 512 decisions each unless it is pruned"
+    )
+    assert last.startswith(f"the first: ethbrake train --scenario paper-random --recipe {recipe} --seed 0 --set ")
+    settings = [word for word in shlex.split(last) if "=" in word]
+    trained = read_settings(settings, [load_recipe(recipe)]).change(load_recipe(recipe))
+    identity = Training.of(trained, eb.load_scenario("paper-random")).identity
+    assert identity == read(finished_tuning / TRIALS_TABLE)[0]["hash"]
+    other = write_tuning(search={"max_grad_norm": {"low": 0.6, "high": 0.9}})  # the recipe has 0.5
+    assert tune(other, tmp_path / "new", "--dry-run") == 0
+    assert "\nfor example: ethbrake train " in capsys.readouterr().out and not (tmp_path / "new").exists()
+
+
 def test_pruned_trials__stop_early_with_more_harm_than_the_median_had(finished_tuning: Path) -> None:
     rows = read(finished_tuning / TRIALS_TABLE)
     pruned, finished = ([row for row in rows if row["state"] == state] for state in ("pruned", "finished"))
@@ -399,6 +438,10 @@ def test_same_command__exports_again_over_its_own_recipe_alone(finished_tuning, 
     text = export.read_text()
     assert "Settings of" in text and tune(file, tmp_path / "all" / "out", "--export", str(export)) == 0
     assert export.read_text() == text
-    export.write_text(text[1:])
-    assert tune(file, tmp_path / "all" / "out", "--export", str(export)) == 2
-    assert "best.yaml: is there already" in capsys.readouterr().err
+    best, *_ = capsys.readouterr().out.splitlines()
+    assert best.startswith("best: trial ") and ", first_impact_harm " in best and best.endswith(" m²/s²")
+    for other, folder in ((text[1:], "out"), (text, "another")):
+        export.write_text(other)
+        assert tune(file, tmp_path / "all" / folder, "--export", str(export)) == 2
+        assert "best.yaml: is there already; give another name or use force" in capsys.readouterr().err
+        assert export.read_text() == other
